@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import html
 import io
-import subprocess
-import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -225,16 +223,3 @@ def test_bad_input_is_a_value_error_that_names_the_file(scene: spackle.Scene, tm
     with pytest.raises(spackle.InputError, match=r"video\.txt"):
         scene.save_video(tmp_path / "video.txt")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["depth.npy", "photo.png", "wrong.npy"]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "example", sorted((Path(__file__).parents[1] / "examples").glob("0[1-3]*.py")), ids=lambda p: p.stem
-)
-def test_the_examples_run(tmp_path: Path, example: Path) -> None:
-    pytest.importorskip("skimage.data")
-    command = [sys.executable, "-W", "error", str(example), str(tmp_path / "new" / "out")]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=600, cwd=tmp_path)
-    assert result.returncode == 0, result.stderr
-    assert "Look at" in result.stdout
-    assert len(list((tmp_path / "new" / "out").iterdir())) >= 2

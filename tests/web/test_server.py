@@ -341,12 +341,18 @@ def test_no_other_command_waits_for_the_server() -> None:
 
 def test_the_example_mounts_the_app(tmp_path: Path) -> None:
     """In an app of somebody else, with the real pipeline."""
-    command = [sys.executable, ROOT / "examples" / "04_http_service.py", tmp_path, "0"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as service:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+
+    def listens() -> bool:
+        with socket.socket() as probe:
+            return probe.connect_ex(("127.0.0.1", port)) == 0
+
+    with subprocess.Popen([sys.executable, ROOT / "examples" / "11_server.py", tmp_path, str(port)]) as service:
         try:
-            assert service.stdout is not None
-            mine = Served(int(service.stdout.readline().split(":")[-1]), "/spackle")
-            eventually(lambda: mine.ask("/healthz").json == {"status": "ok"})
+            mine = Served(port, "/spackle")
+            eventually(listens, 60)
+            assert mine.ask("/healthz").json == {"status": "ok"}
             depth = io.BytesIO()
             np.save(depth, metres())
             sent = mine.send(

@@ -1,0 +1,37 @@
+"""A base of your own: any class with a name that turns a photo into Gaussians.
+
+python examples/04_own_base.py photo.jpg out
+"""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+
+import spackle
+from spackle.bases.lift import lift
+
+
+class Street:
+    """A depth that falls from 20 m at the top of the picture to 2 m at its foot: put your own network here."""
+
+    name = "street"
+
+    def predict(
+        self, photo: spackle.Photo, progress: Callable[[int, int], None] | None = None
+    ) -> spackle.BasePrediction:
+        """Gaussians of everything that the photo shows."""
+        metres = torch.linspace(20, 2, photo.height)[:, None].repeat(1, photo.width)
+        depth = spackle.DepthMap(metres, metres > 0, None, None, "depth", photo.path)
+        return lift(photo.rgb, depth, photo.camera)
+
+
+def main(photo: Path, out: Path) -> None:
+    out.mkdir(parents=True, exist_ok=True)
+    scene = spackle.predict(photo, base=Street(), disparity=0.1)
+    scene.save(out / "scene.ply")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), Path(sys.argv[2]))

@@ -1,0 +1,29 @@
+"""Fill the holes of a scene that another tool made of a photo, such as SHARP's PLY.
+
+python examples/05_scene_of_another_tool.py scene.ply photo.jpg completed.ply
+
+The Gaussians have to lie in the frame of the photo's camera: x right, y down, z forward, the eye at the origin.
+"""
+
+import sys
+from pathlib import Path
+
+import spackle
+
+
+def main(file: Path, photo: Path, out: Path) -> None:
+    gaussians = spackle.load_ply(file)
+    camera = spackle.load_photo(photo).camera  # its lens is EXIF's; give fov=... where that is missing
+
+    before = spackle.Scene(gaussians, gaussians.select(slice(0)), camera)
+    path = before.path("swipe", disparity=0.3)
+    prediction = spackle.BasePrediction(gaussians, camera, notes={})
+    scene = spackle.complete(prediction, path)
+
+    holes = [spackle.hole_area_ratio(each.render(path[0]).alpha) for each in (before, scene)]
+    print(f"holes at the left end of the path: {holes[0]:.1%} -> {holes[1]:.2%}")
+    scene.save(out, disparity=0.3)  # the first Gaussians are those of the file, bit for bit
+
+
+if __name__ == "__main__":
+    main(*(Path(word) for word in sys.argv[1:4]))

@@ -1,0 +1,40 @@
+"""The renderer is differentiable: fit the colours of the aux Gaussians to a true photo of the hole.
+
+python examples/10_gradients.py out
+
+Training a residual network is this, with a network in place of the colours and many photos.
+"""
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import torch
+
+import spackle
+from spackle.bases.lift import lift
+from spackle.evaluation.datasets.stereo import load_motorcycle
+from spackle.formats import save_png
+
+
+def main(out: Path, steps: int = 25) -> None:
+    pair = load_motorcycle()
+    camera, renderer = pair.right_camera, spackle.get_renderer()
+    base = lift(pair.left, pair.depth, pair.left_camera).gaussians
+    aux = spackle.fill_view(spackle.FillContext(base, pair.left_camera, renderer), camera).aux
+    hole = spackle.hole_mask(renderer.render(base, camera).alpha)
+
+    colors = aux.colors.clone().requires_grad_()
+    optimizer = torch.optim.Adam([colors], lr=0.02)
+    for step in range(steps):
+        view = renderer.render([base, dataclasses.replace(aux, colors=colors)], camera)
+        loss = (view.rgb - pair.right)[hole].square().mean()
+        print(f"step {step}: {-10 * loss.detach().log10():.2f} dB in the hole")
+        optimizer.zero_grad()
+        torch.autograd.backward(loss)
+        optimizer.step()
+    save_png(view.rgb, out)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

@@ -1,0 +1,39 @@
+"""An app of your own that completes photos under /spackle, beside what else it does.
+
+python examples/11_server.py folder 8000
+
+Mounted like this, everybody who reaches the port may send photos: your app decides who does.
+"""
+
+import contextlib
+import sys
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import uvicorn
+from fastapi import FastAPI
+
+from spackle.web import create_app
+
+
+def app(folder: Path) -> FastAPI:
+    """Your app, and Spackle's page and HTTP interface below it."""
+    scenes = create_app(folder)
+
+    @contextlib.asynccontextmanager
+    async def until_the_end(app: FastAPI) -> AsyncIterator[None]:
+        yield
+        scenes.state.jobs.close()
+
+    mine = FastAPI(lifespan=until_the_end)
+
+    @mine.get("/")
+    def home() -> dict[str, str]:
+        return {"photos": "/spackle/api/v1/scenes", "page": "/spackle/"}
+
+    mine.mount("/spackle", scenes)
+    return mine
+
+
+if __name__ == "__main__":
+    uvicorn.run(app(Path(sys.argv[1])), port=int(sys.argv[2]))

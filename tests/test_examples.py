@@ -1,0 +1,122 @@
+"""The examples: each runs on small inputs, keeps to forty lines, and stands in the docs."""
+
+from __future__ import annotations
+
+import runpy
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+from photos import write_depth, write_photo
+from PIL import Image
+from sharp_weights import write_tiny
+
+import spackle
+
+ROOT = Path(__file__).parents[1]
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+
+
+def main_of(number: int) -> Callable[..., Any]:
+    """The function that an example's command calls."""
+    (file,) = (ROOT / "examples").glob(f"{number:02}_*.py")
+    main: Callable[..., Any] = runpy.run_path(str(file))["main"]
+    return main
+
+
+def frames(path: Path) -> int:
+    with av.open(str(path)) as container:
+        return len(list(container.decode(video=0)))
+
+
+@pytest.fixture(scope="module")
+def photo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_photo(tmp_path_factory.mktemp("photo") / "photo.jpg", 96, 72)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("scene")
+    made = spackle.predict(write_photo(folder / "photo.png"), write_depth(folder / "depth.npy"), trajectory="swipe")
+    made.save(folder / "scene.ply")
+    return folder / "scene.ply"
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
+def test_an_example_is_short_and_in_the_docs(example: Path) -> None:
+    text = example.read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 40
+    assert example.name in (ROOT / "docs" / "examples.md").read_text(encoding="utf-8")
+
+
+def test_examples_of_a_photo(photo: Path, tmp_path: Path) -> None:
+    main_of(1)(photo, tmp_path / "1")
+    assert {path.suffix for path in (tmp_path / "1").iterdir()} == {".mp4", ".ply", ".html"}
+    main_of(4)(photo, tmp_path / "4")
+    own = spackle.Scene.load(tmp_path / "4" / "scene.ply")
+    assert float(own.base.means[:, 2].median()) == pytest.approx(11, abs=3)  # between 2 and 20 m
+    main_of(6)(photo, tmp_path / "6.mp4")
+    assert frames(tmp_path / "6.mp4") == 60
+
+
+def test_the_example_of_a_depth_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    main_of(2)(write_photo(tmp_path / "photo.png"), write_depth(tmp_path / "depth.png"), tmp_path / "out")
+    assert "from the scene's own depth" in capsys.readouterr().out
+    assert spackle.Scene.load(tmp_path / "out" / "scene.ply").disparity == pytest.approx(0.2)
+
+
+def test_the_example_completes_a_scene_of_another_tool(scene: Path, tmp_path: Path) -> None:
+    base = spackle.Scene.load(scene).base
+    spackle.save_ply(base, tmp_path / "theirs.ply")
+    main_of(5)(tmp_path / "theirs.ply", scene.with_name("photo.png"), tmp_path / "completed.ply")
+    completed = spackle.Scene.load(tmp_path / "completed.ply")
+    assert len(completed.base) == len(base)
+    assert len(completed.aux) > 100
+
+
+def test_examples_of_videos(scene: Path, tmp_path: Path) -> None:
+    main_of(7)(scene, tmp_path)
+    assert [frames(tmp_path / f"{name}.mp4") for name in ("swipe", "keyframes", "truck")] == [48, 24, 24]
+    main_of(8)(scene, tmp_path)
+    assert frames(tmp_path / "sbs.mp4") == 24
+    files = (tmp_path / "anaglyph.png", scene.with_name("photo.png"))
+    glasses, photo = (np.asarray(Image.open(file), float) for file in files)
+    assert np.abs(glasses[..., 0] - photo[..., 0]).mean() > 5  # of 255: the left eye's red, and not the photo's
+
+
+@pytest.mark.slow
+def test_the_example_of_sharp(photo: Path, tmp_path: Path) -> None:
+    main_of(3)(write_tiny(tmp_path / "sharp.pt"), tmp_path / "out", [photo])
+    assert len(spackle.Scene.load(tmp_path / "out" / "photo.ply").base) > 1000
+
+
+@pytest.mark.slow
+def test_examples_with_a_true_second_photo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("skimage.data")
+    main_of(9)(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"base.png", "completed.png", "truth.png"}
+    capsys.readouterr()
+    main_of(10)(tmp_path / "fitted.png")
+    lines = capsys.readouterr().out.splitlines()
+    assert float(lines[-1].split()[2]) > float(lines[0].split()[2]) + 1  # dB
+    figures = {(row.method, row.metric): row.value for row in main_of(13)()}
+    assert figures["spackle", "psnr_hole"] > figures["mine", "psnr_hole"] + 2
+
+
+@pytest.mark.slow
+def test_the_example_of_training(tmp_path: Path) -> None:
+    for index in range(3):
+        write_photo(tmp_path / "photos" / f"{index}.png", 96 + 16 * index, 80)
+    main_of(12)(tmp_path / "photos", tmp_path / "out")
+    assert frames(tmp_path / "out" / "video.mp4") == 60
+
+
+def test_the_example_of_a_notebook(photo: Path, tmp_path: Path) -> None:
+    (tmp_path / "photo.jpg").write_bytes(photo.read_bytes())
+    subprocess.run([sys.executable, ROOT / "examples" / "14_notebook.py"], cwd=tmp_path, check=True, timeout=300)
+    assert (tmp_path / "photo.html").stat().st_size > 10_000
