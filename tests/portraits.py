@@ -251,14 +251,12 @@ def heic(
     """
     turns = [box(name, bytes([value])) for name, value in TURNS.get(orientation, [])]
     data, properties = _encoded_heif(picture())
-    items = [(b"hvc1", data, properties + turns)]
+    items = [(data, properties + turns)]
     if map_ is not None:
         data, properties = _encoded_heif(map_)
         auxiliary = full(b"auxC", kind + b"\0" + INFORMATION[information])
-        items.append((b"hvc1", data, [*properties, auxiliary, *(turns if own_turn else [])]))
-    if packet is not None:
-        items.append((b"mime", packet, []))
-    return _file(items)
+        items.append((data, [*properties, auxiliary, *(turns if own_turn else [])]))
+    return _file(items) + (b"" if packet is None else box(b"free", packet))
 
 
 def _encoded_heif(values: Codes) -> tuple[bytes, list[bytes]]:
@@ -270,18 +268,17 @@ def _encoded_heif(values: Codes) -> tuple[bytes, list[bytes]]:
     return parts[b"mdat"], [box(kind, body) for kind, body in boxes(properties[b"ipco"]) if kind != b"colr"]
 
 
-def _file(items: list[tuple[bytes, bytes, list[bytes]]]) -> bytes:
-    """A HEIC of these items: the photo, and its auxiliary image and that one's XMP where they are given."""
+def _file(items: list[tuple[bytes, list[bytes]]]) -> bytes:
+    """A HEIC of these items: the photo, and its auxiliary image if it is given."""
     entries = associations = references = b""
     stored: list[bytes] = []
-    for number, (kind, _, properties) in enumerate(items, 1):
-        mime = b"application/rdf+xml\0" if kind == b"mime" else b""
-        entries += full(b"infe", struct.pack(">HH4s", number, 0, kind) + b"\0" + mime, version=2)
+    for number, (_, properties) in enumerate(items, 1):
+        entries += full(b"infe", struct.pack(">HH4s", number, 0, b"hvc1") + b"\0", version=2)
         indices = bytes(range(len(stored) + 1, len(stored) + 1 + len(properties)))
         associations += struct.pack(">HB", number, len(indices)) + indices
         stored += properties
         if number > 1:
-            references += box((b"auxl", b"cdsc")[number - 2], struct.pack(">HHH", number, 1, number - 1))
+            references = box(b"auxl", struct.pack(">HHH", 2, 1, 1))
     meta = full(b"hdlr", b"\0\0\0\0pict" + bytes(13)) + full(b"pitm", struct.pack(">H", 1))
     meta += full(b"iinf", struct.pack(">H", len(items)) + entries)
     meta += full(b"iref", references) if references else b""
@@ -289,11 +286,11 @@ def _file(items: list[tuple[bytes, bytes, list[bytes]]]) -> bytes:
     head = box(b"ftyp", b"heic\0\0\0\0mif1heic")
     at = len(head) + 12 + len(meta) + 16 + 14 * len(items) + 8  # behind the heads of meta, iloc and mdat
     places = b""
-    for number, (_, data, _) in enumerate(items, 1):
+    for number, (data, _) in enumerate(items, 1):
         places += struct.pack(">HHHII", number, 0, 1, at, len(data))
         at += len(data)
     meta += full(b"iloc", struct.pack(">HH", 0x4400, len(items)) + places)
-    return head + full(b"meta", meta) + box(b"mdat", b"".join(data for _, data, _ in items))
+    return head + full(b"meta", meta) + box(b"mdat", b"".join(data for data, _ in items))
 
 
 def box(kind: bytes, body: bytes) -> bytes:

@@ -64,10 +64,9 @@ def find_frame(rgb: Tensor) -> PhotoFrame | None:
         if plain[side] >= NARROWEST and edge.max(initial=0.0) >= STRAIGHT:
             widths[side] = plain[side] + int((edge >= 0.95 * edge.max()).argmax()) + 1
     for side in (0, 1):
-        if widths[side] and widths[side + 2]:
-            widths[np.abs(colors - colors[side]).max(1) > NOISE] = 0
-            if widths[side] and widths[side + 2]:
-                frame = PhotoFrame(*widths.tolist())
-                inner = find_frame(frame.inside(rgb, *down.shape[1::-1]))  # a mount may have a line in it
-                return PhotoFrame(*(widths + (inner.widths if inner else 0)).tolist())
+        alike = np.where(np.abs(colors - colors[side]).max(1) <= NOISE, widths, 0)
+        if alike[side] and alike[side + 2]:
+            frame = PhotoFrame(*alike.tolist())
+            inner = find_frame(frame.inside(rgb, *down.shape[1::-1]))  # a mount may have a line in it
+            return PhotoFrame(*(alike + (inner.widths if inner else 0)).tolist())
     return None

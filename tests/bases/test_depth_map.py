@@ -189,8 +189,8 @@ def test_relative_maps(tmp_path: Path, content: bytes, step: float | None, kind:
 @pytest.mark.parametrize(
     ("content", "options", "says"),
     [
-        (greys(SLOPE, "L"), {}, "an 8-bit PNG holds no metres: give --depth-kind near-white"),
-        (greys(SLOPE, "L"), {"kind": "metric"}, "give 16 bits in millimetres"),
+        (greys(SLOPE, "L"), {}, "an 8-bit PNG holds no metres: give 16 bits, or --depth-kind near-white"),
+        (greys(SLOPE, "L"), {"kind": "metric"}, "an 8-bit PNG holds no metres"),
         (greys(SLOPE, "I;16"), {}, "fill the range of 16 bits, .*: give --depth-kind near-white"),
         (greys(SLOPE, "RGBA"), {}, "mode RGBA holds no millimetres: give --depth-kind near-white"),
         (greys(SLOPE, "L"), {"kind": "disparity"}, "no calibration lies beside it: give --calib"),

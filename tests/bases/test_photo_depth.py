@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pillow_heif
 import portraits
 import pytest
 import torch
@@ -127,16 +126,6 @@ def test_the_depth_of_each_layout(tmp_path: Path, name: str) -> None:
     assert depth.note.endswith(note)
     assert (depth.K is None) == (data.count(b"IntrinsicMatrixReferenceWidth") == 0)
     assert depth.K is None or depth.K.tolist() == [[35, 0, 10], [0, 25, 15], [0, 0, 1]]
-
-
-def test_heics_words_of_another_picture_are_not_the_maps(tmp_path: Path) -> None:
-    """They belong to the item that they refer to, wherever they stand in the file."""
-    data = portraits.heic(codes(), apple_xmp(), information="disparity, 0.25 to 3")
-    others = pillow_heif.open_heif(io.BytesIO(data)).info["depth_images"]
-    np.testing.assert_array_equal(np.asarray(others[0]), codes())  # libheif sees the same map
-    link = b"cdsc" + struct.pack(">HHH", 3, 1, 2)
-    assert data.count(link) == 1
-    same(found(tmp_path, data.replace(link, link[:-1] + b"\1")), between(0.25, 3))
 
 
 def test_apples_type_counts_where_the_format_is_not_given(tmp_path: Path) -> None:
@@ -385,7 +374,6 @@ def test_hostile_xmp(tmp_path: Path, hostile: bytes, why: str) -> None:
         refused(tmp_path, portraits.with_segments(photo, portraits.xmp_segment(google)), why)
         packet = hostile + b"<!-- http://ns.apple.com/pixeldatainfo/1.0/ -->"
         refused(tmp_path, portraits.apple_jpeg(codes(), packet), why)
-        refused(tmp_path, portraits.heic(codes(), packet), why)
 
 
 def test_huge_announced_sizes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -404,10 +392,8 @@ def test_nothing_in_a_file_makes_the_search_endless(tmp_path: Path) -> None:
     fill = b"\xff\xd8\xff" + b"\xff" * 300_000
     tiny = b"\xff\xd8" + b"\xff\xe5\x00\x02" * 100_000
     scans = portraits.dynamic_jpeg(png(codes())).replace(b"\xff\xd9", b"\xff\xda\x00\x02" * 500_000)
-    places = portraits.full(b"iloc", b"\0\0\xff\xff" + b"\0\x09\0\0\xff\xff" * 60_000)  # numbers of no length
-    parts = portraits.boxes(portraits.heic(codes(), apple_xmp()))
-    empty = b"".join(portraits.box(kind, body + (places if kind == b"meta" else b"")) for kind, body in parts)
-    for data in (fill, tiny, scans, empty):
+    packets = portraits.heic(codes(), b"<x:xmpmeta" * 300_000)
+    for data in (fill, tiny, scans, packets):
         with contextlib.suppress(InputError):
             load_photo_depth(portraits.write(tmp_path / "slow.jpg", data))
     assert time.process_time() - start < 5

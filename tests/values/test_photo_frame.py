@@ -93,6 +93,12 @@ FRAMELESS = {
 }
 
 
+def test_bars_of_two_colours_hide_no_letterbox() -> None:
+    frame = found(framed(FRAMELESS["bars of two colours"], (0, 3, 0, 3), (0.0, 0.0, 0.0)))
+    assert frame is not None
+    assert [width > 0 for width in frame.widths] == [False, True, False, True]
+
+
 @pytest.mark.parametrize("kind", FRAMELESS)
 def test_what_only_looks_like_a_frame_is_none(kind: str) -> None:
     assert found(FRAMELESS[kind]) is None

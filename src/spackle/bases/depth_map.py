@@ -198,8 +198,6 @@ def relative_depth(
 
 def _check_metric(stored: Array, path: StrPath) -> None:
     """InputError for a PNG that holds no millimetres."""
-    if stored.dtype == np.uint8:
-        raise InputError(f"{path}: an 8-bit PNG holds no metres: {WHICH}")
     known = stored[(stored > 0) & (stored < 65535)]
     if known.size and known.min() < FILLED * 65535 and known.max() > (1 - FILLED) * 65535:
         raise InputError(f"{path}: its values fill the range of 16 bits, as those of a relative map do: {WHICH}")
@@ -300,7 +298,9 @@ def _as_depth(stored: Array, is_png: bool, path: StrPath) -> tuple[Array, Array,
     """Depth in metres, validity and the unit of the stored values in metres."""
     if is_png:
         if stored.dtype == np.uint8:
-            raise InputError(f"{path}: an 8-bit PNG holds no metres: give 16 bits in millimetres")
+            raise InputError(
+                f"{path}: an 8-bit PNG holds no metres: give 16 bits, or --depth-kind near-white or near-black"
+            )
         return stored * PNG_UNIT_M, stored != 65535, PNG_UNIT_M
     if stored.dtype.kind in "iu" and np.median(stored) > 500:
         raise InputError(f"{path}: whole numbers around {np.median(stored):.0f} are hardly metres: divide by 1000")

@@ -6,12 +6,11 @@ import io
 import math
 import re
 import struct
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 from PIL.JpegImagePlugin import JpegImageFile
-from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 from spackle.errors import reason_in_a_line
 
@@ -24,7 +23,7 @@ XMP, MORE_XMP = b"http://ns.adobe.com/xap/1.0/\0", b"http://ns.adobe.com/xmp/ext
 MAX_MARKERS = 10_000
 MAX_PICTURES = 64
 _GUID = re.compile(rb"HasExtendedXMP\s*(?:=\s*[\"']|>\s*)([0-9A-Fa-f]{32})")
-_PICTURE_LIST = 0xB002
+_PICTURES = 0xB002
 _MARKER = re.compile(rb"\xff([^\x00\xd0-\xd7\xff])")  # in compressed data all others are data or restarts
 _END = b"\xd9"
 
@@ -71,17 +70,20 @@ def end_of_picture(data: bytes) -> int | None:
 
 def further_pictures(image: JpegImageFile) -> list[tuple[int, int]]:
     """(begin, end) of the pictures that the Multi-Picture Format lists behind the first, wherever the file ends."""
-    try:
-        file = io.BytesIO(image.info["mp"])
-        directory = ImageFileDirectory_v2(file.read(8))
-        file.seek(directory.next)
-        directory.load(file)
-        order = "<" if image.info["mp"].startswith(b"II") else ">"
-        entries = list(struct.iter_unpack(f"{order}4xII4x", directory[_PICTURE_LIST]))[1:MAX_PICTURES]
+    try:  # the offsets count from the list's byte order mark
+        starts = [
+            (image.info["mpoffset"] + entry["DataOffset"], entry["Size"]) for entry in (image._getmp() or {})[_PICTURES]
+        ]
     except Exception:  # there is no list, or none that can be read
         return []
-    # The offsets count from the list's byte order mark.
-    return [(image.info["mpoffset"] + offset, image.info["mpoffset"] + offset + size) for size, offset in entries]
+    return [(start, start + size) for start, size in starts[1:MAX_PICTURES]]
+
+
+def xmp_packets(data: bytes) -> Iterator[bytes]:
+    """The XMP packets that stand unpacked in a file."""
+    for part in data.split(b"<x:xmpmeta", MAX_PICTURES)[1:]:
+        body, end, _ = part.partition(b"</x:xmpmeta>")
+        yield b"<x:xmpmeta" + body + end
 
 
 # Turns are steps: t swaps rows and columns, x left and right, y top and bottom.
@@ -90,40 +92,30 @@ BY_ORIENTATION = {2: "x", 3: "xy", 4: "y", 5: "t", 6: "tx", 7: "txy", 8: "ty"}  
 _TURNS = {b"irot": ("", "ty", "xy", "tx"), b"imir": ("y", "x")}
 _DEPTH_TYPES = {b"urn:mpeg:hevc:2015:auxid:2", b"urn:mpeg:avc:2015:auxid:2"}
 _DEPTH_TYPES |= {b"urn:mpeg:mpegB:cicp:systems:auxiliary:depth"}
-_XMP_TYPE = b"application/rdf+xml"
-MAX_XMP_BYTES = 1 << 20
 _MALFORMED = (struct.error, KeyError, IndexError, ValueError)
 Boxes = Iterator[tuple[bytes, memoryview]]
 
 
-def find_depth_item(data: bytes) -> tuple[bytes, str, str] | None:
+def find_depth_item(data: bytes) -> tuple[bool, str, str] | None:
     """The auxiliary depth map of the primary picture; None without any, or where the boxes are broken.
 
     Returns:
-        Its XMP, empty if unreachable; its own rotation and mirroring, which a decoder applies; and those of the
-        primary picture if it has none of its own.
+        Whether there is one alone; its own rotation and mirroring, which a decoder applies; and those of the primary
+        picture if it has none of its own.
     """
     try:
         content = next(body for kind, body in _boxes(memoryview(data)) if kind == b"meta")
         meta = dict(_boxes(content[4:]))
         (primary,) = struct.unpack_from(">I" if meta[b"pitm"][0] else ">H", meta[b"pitm"], 4)
-        references, properties = list(_references(meta[b"iref"])), _properties(meta[b"iprp"])
+        auxiliary, properties = list(_auxiliary(meta[b"iref"], primary)), _properties(meta[b"iprp"])
     except (*_MALFORMED, StopIteration):
         return None
-    auxiliary = [item for kind, item, targets in references if kind == b"auxl" and primary in targets]
     depth = [item for item in auxiliary if _is_depth(properties.get(item, ()))]
-    if not depth:
-        return None
-    if len(depth) > 1:  # whose XMP describes the one that the decoder picks is unknown
-        return b"", "", ""
+    if len(depth) != 1:  # of several, which one the decoder picks is unknown
+        return (False, "", "") if depth else None
     own, of_primary = (_turn(properties.get(item, ())) for item in (depth[0], primary))
-    describing = {item for kind, item, targets in references if kind == b"cdsc" and depth[0] in targets}
-    try:  # empty where there is none, or none that can be reached
-        xmp = next(_packets(data, meta, describing & set(_xmp_items(meta[b"iinf"]))), b"")
-    except _MALFORMED:
-        xmp = b""
     # Apple rotates the picture and leaves the map as the sensor saw it.
-    return xmp, own or "", "" if own is not None else of_primary or ""
+    return True, own or "", "" if own is not None else of_primary or ""
 
 
 def _boxes(body: memoryview) -> Boxes:
@@ -139,12 +131,13 @@ def _boxes(body: memoryview) -> Boxes:
         at += size
 
 
-def _references(iref: memoryview) -> Iterator[tuple[bytes, int, tuple[int, ...]]]:
-    """(type, from, to) of each reference between items."""
+def _auxiliary(iref: memoryview, primary: int) -> Iterator[int]:
+    """The items that are auxiliary to the primary one."""
     number, head = ("I", 6) if iref[0] else ("H", 4)
     for kind, body in _boxes(iref[4:]):
         source, count = struct.unpack_from(f">{number}H", body)
-        yield kind, source, struct.unpack_from(f">{count}{number}", body, head)
+        if kind == b"auxl" and primary in struct.unpack_from(f">{count}{number}", body, head):
+            yield source
 
 
 def _properties(iprp: memoryview) -> dict[int, list[tuple[bytes, memoryview]]]:
@@ -172,38 +165,6 @@ def _turn(properties: Iterable[tuple[bytes, memoryview]]) -> str | None:
     """Rotations and mirrorings, in the order in which they apply; None where there is not one."""
     turns = [_TURNS[kind][body[0] % len(_TURNS[kind])] for kind, body in properties if kind in _TURNS and body]
     return "".join(turns) if turns else None
-
-
-def _xmp_items(iinf: memoryview) -> Iterator[int]:
-    for kind, body in _boxes(iinf[8 if iinf[0] else 6 :]):
-        if kind == b"infe" and body[0] in (2, 3):
-            entry = struct.Struct(">I2x4s" if body[0] == 3 else ">H2x4s")
-            item, item_type = entry.unpack_from(body, 4)
-            _, content_type, *_ = bytes(body[4 + entry.size :]).split(b"\0")
-            if item_type == b"mime" and content_type == _XMP_TYPE:
-                yield item
-
-
-def _packets(data: bytes, meta: Mapping[bytes, memoryview], items: set[int]) -> Iterator[bytes]:
-    """The bytes of these items, as far as they are in the file."""
-    iloc = meta[b"iloc"]
-    version, sizes = iloc[0], int.from_bytes(iloc[4:6], "big")
-    of_offset, of_length, of_base, of_index = (sizes >> shift & 15 for shift in (12, 8, 4, 0))
-    of_item, of_method, of_index = (4 if version == 2 else 2), (2 if version else 0), (of_index if version else 0)
-    head = struct.Struct(f">{of_item}s{of_method}s2x{of_base}sH")
-    extent = struct.Struct(f">{of_index}x{of_offset}s{of_length}s")
-    at = 6 + of_item
-    for _ in range(int.from_bytes(iloc[6:at], "big")):
-        *fields, count = head.unpack_from(iloc, at)
-        item, method, base = (int.from_bytes(field, "big") for field in fields)
-        if not of_length or method & 15 > 1:
-            raise ValueError("an item without a length, or made of others")
-        source = meta.get(b"idat", b"") if method & 15 else data
-        extents = [extent.unpack_from(iloc, at + head.size + k * extent.size) for k in range(count)]
-        spans = [(base + int.from_bytes(offset, "big"), int.from_bytes(length, "big")) for offset, length in extents]
-        if item in items and spans and sum(length for _, length in spans) <= MAX_XMP_BYTES:
-            yield b"".join(source[begin : begin + length] for begin, length in spans)
-        at += head.size + count * extent.size
 
 
 MAX_TAGS = 40_000

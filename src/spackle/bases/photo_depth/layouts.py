@@ -34,6 +34,7 @@ from spackle.bases.photo_depth.containers import (
     open_jpeg,
     parse_xmp,
     xmp_of,
+    xmp_packets,
 )
 from spackle.camera import Camera
 from spackle.errors import InputError, reading, reason_in_a_line
@@ -369,13 +370,14 @@ def _find_in_heif(data: bytes) -> CodedDepth | None:
 
     if (item := find_depth_item(data)) is None:
         return None
-    xmp, turned, turn = item
+    alone, turned, turn = item
     with _decoding():
         image = pillow_heif.open_heif(io.BytesIO(data), hdr_to_16bit=False).info["depth_images"][0]
         width, height = image.size
         check_pixels(width, height, len(data), "it")
         codes, full = np.array(image), FULL_CODES[image.mode]  # its own rotation is applied
-    scale, lens, source = describe(xmp) or (None, None, "")
+    packets = xmp_packets(data) if alone else ()
+    scale, lens, source = next(filter(None, map(describe, packets)), (None, None, ""))
     if scale is None:  # Apple's words count more than HEVC's
         scale, source = _hevc_scale(image.info.get("metadata") or {})
     return CodedDepth(codes, full, scale, source, lens, turned, turn)
