@@ -7,7 +7,6 @@ from collections.abc import Iterable
 
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,7 +99,7 @@ class Gaussians:
 
 def quat_to_matrix(quats: Tensor) -> Tensor:
     """Rotation matrices [..., 3, 3] of quaternions [..., 4] (wxyz), normalised here."""
-    w, x, y, z = normalize(quats, dim=-1).unbind(-1)
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
@@ -123,7 +122,7 @@ def quat_from_matrix(rotation: Tensor) -> Tensor:
     candidates = torch.stack([w, x, y, z], dim=-2)  # row k is the quaternion times 4·component k
     best = torch.stack([w[..., 0], x[..., 1], y[..., 2], z[..., 3]], -1).argmax(-1)
     index = best[..., None, None].expand(*best.shape, 1, 4)
-    quats = normalize(candidates.gather(-2, index).squeeze(-2), dim=-1)
+    quats = torch.nn.functional.normalize(candidates.gather(-2, index).squeeze(-2), dim=-1)
     return torch.where(quats[..., :1] < 0, -quats, quats)
 
 
@@ -140,58 +139,3 @@ def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
         ],
         dim=-1,
     )
-
-
-SWEEPS = 4  # after three, the cosine between two columns was 3e-3 at worst; after four, 1e-15
-UPRIGHT = 0.5  # squared sine of the angle between two columns below which the shorter one is noise
-
-
-def stretch_gaussians(gaussians: Gaussians, stretch: tuple[float, float, float]) -> Gaussians:
-    """Map N Gaussians by D = diag(stretch), which turns and reshapes each one.
-
-    A covariance R S² Rᵀ becomes M Mᵀ with M = D R S. Rotations of M from the right leave that as it is; once they have
-    made M's columns orthogonal (one-sided Jacobi), the columns' lengths are the new scales and their directions the new
-    axes. The covariance itself is never formed: it would square the ratio of the scales, and lose the small ones.
-
-    Returns:
-        N Gaussians with descending scales and unit quats with w ≥ 0 (a zero one counts as no rotation); opacities and
-        colors are the same tensors; the rest is cut off from autograd.
-    """
-    means, quats, scales = (t.detach() for t in gaussians.tensors[:3])
-    dtype = torch.promote_types(scales.dtype, torch.float32)
-    # Not new_tensor, for whose copy to a GPU the processor would wait.
-    factors = torch.stack([scales.new_full((), number, dtype=dtype) for number in stretch])
-    # In units of each Gaussian's largest scale no square overflows, and none that matters underflows.
-    unit = scales.abs().amax(1, keepdim=True).to(dtype).clamp(min=torch.finfo(dtype).tiny)
-    matrix = quat_to_matrix(quats.to(dtype)) * (scales / unit)[:, None] * factors[:, None]
-    columns = list(matrix.unbind(2))
-    for _ in range(SWEEPS):
-        for i, j in ((0, 1), (0, 2), (1, 2)):
-            columns[i], columns[j] = _orthogonal(columns[i], columns[j])
-    matrix = torch.stack(columns, 2)
-    sizes, order = torch.linalg.vector_norm(matrix, dim=1).sort(dim=1, descending=True, stable=True)
-    a, b, _ = matrix.gather(2, order[:, None].expand_as(matrix)).unbind(2)
-    turned, scaled = quat_from_matrix(_frame(a, b)).to(quats.dtype), (sizes * unit).to(scales.dtype)
-    return Gaussians(means * factors.to(means.dtype), turned, scaled, gaussians.opacities, gaussians.colors)
-
-
-def _orthogonal(p: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
-    """Rotate columns [N, 3] in their plane, by 45° at most, so that they become orthogonal."""
-    skew, lead = 2 * (p * q).sum(1, keepdim=True), (q * q - p * p).sum(1, keepdim=True)
-    # hypot, because a small lead's square would underflow.
-    tangent = skew / (lead.abs() + torch.hypot(lead, skew)).clamp(min=torch.finfo(lead.dtype).tiny)
-    tangent = torch.where(lead < 0, -tangent, tangent)
-    cosine = 1 / (1 + tangent * tangent).sqrt()
-    sine = tangent * cosine
-    return cosine * p - sine * q, sine * p + cosine * q
-
-
-def _frame(a: Tensor, b: Tensor) -> Tensor:
-    """Rotations [N, 3, 3] with the first axis along a and the second nearly along b, any where they are zero."""
-    axes, tiny = torch.eye(3, dtype=a.dtype, device=a.device), torch.finfo(a.dtype).tiny
-    a, b = normalize(a, dim=1, eps=tiny), normalize(b, dim=1, eps=tiny)
-    a = torch.where(a.any(1, keepdim=True), a, axes[0])
-    c = torch.linalg.cross(a, b)
-    usable = (c * c).sum(1, keepdim=True) > UPRIGHT
-    c = normalize(torch.where(usable, c, torch.linalg.cross(a, axes[a.abs().argmin(1)])), dim=1)
-    return torch.stack([a, torch.linalg.cross(c, a), c], dim=2)

@@ -20,8 +20,8 @@ from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.base import expected_shapes, load_network, to_metric
 from spackle.bases.sharp.encoder import FULL, FULL_WINDOWS, HALF_WINDOWS, TINY, cut, merge, set_precision
 from spackle.bases.sharp.network import GroupNorm, SharpNetwork, compose, make_start
+from spackle.bases.sharp.unproject import stretch_gaussians
 from spackle.device import enough_memory, multiplies_bf16, own_arithmetic, pick_device, pick_dtype
-from spackle.gaussians import stretch_gaussians
 from spackle.image import Photo, load_photo
 from spackle.render import CpuRenderer
 

@@ -26,11 +26,12 @@ from spackle.bases.sharp.network import (
     compose,
     normed_residual,
 )
+from spackle.bases.sharp.unproject import stretch_gaussians
 from spackle.camera import Camera
 from spackle.device import Precision, enough_memory, memory_is_short, own_arithmetic, pick_device, pick_dtype
 from spackle.errors import InputError, one_line, reading, reason_in_a_line
 from spackle.files import sha256_of
-from spackle.gaussians import Gaussians, stretch_gaussians
+from spackle.gaussians import Gaussians
 from spackle.image import Photo, working_size
 from spackle.network_file import Shapes, load_strict, read_note, read_tensors
 

@@ -1,0 +1,223 @@
+"""Gaussians stretched along the axes of the world, as SHARP's are on their way to metres."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from spackle._numba import kernel
+from spackle.device import run_chunks
+from spackle.gaussians import Gaussians, quat_from_matrix, quat_to_matrix
+
+SWEEPS = 4  # after three, the cosine between two columns was 3e-3 at worst; after four, 1e-15
+UPRIGHT = 0.5  # squared sine of the angle between two columns below which the shorter one is noise
+BLOCK = 64  # Gaussians whose columns lie side by side in the first-level cache
+LEAST = 1e-300  # keeps 0/0 out, and is below every square of a float32
+GRAIN = 256 * BLOCK  # Gaussians that a thread takes at a time
+PAIRS = (0, 1), (0, 2), (1, 2)  # the columns that a sweep turns
+
+
+def stretch_gaussians(gaussians: Gaussians, stretch: tuple[float, float, float]) -> Gaussians:
+    """Map N Gaussians by D = diag(stretch), which turns and reshapes each one.
+
+    A covariance R S² Rᵀ becomes M Mᵀ with M = D R S. Rotations of M from the right leave that as it is; once they have
+    made M's columns orthogonal (one-sided Jacobi), the columns' lengths are the new scales and their directions the new
+    axes. The covariance itself is never formed: it would square the ratio of the scales, and lose the small ones.
+
+    Returns:
+        N Gaussians with descending scales and unit quats with w ≥ 0 (a zero one counts as no rotation); opacities and
+        colors are the same tensors; the rest is cut off from autograd.
+    """
+    quats, scales = gaussians.quats.detach(), gaussians.scales.detach()
+    plain = any(t.device.type != "cpu" or t.dtype != torch.float32 for t in (quats, scales))
+    if plain:
+        quats, scales = plain_stretch(quats, scales, stretch)
+    else:
+        source = quats.contiguous().numpy(), scales.contiguous().numpy()
+        result = np.empty((len(quats), 4), np.float32), np.empty((len(quats), 3), np.float32)
+        factors = float(stretch[0]), float(stretch[1]), float(stretch[2])
+        run_chunks(lambda start, stop: stretch_chunk(start, stop, *source, factors, *result), len(quats), GRAIN)
+        quats, scales = torch.from_numpy(result[0]), torch.from_numpy(result[1])
+    means = gaussians.means.detach()
+    return Gaussians(means * _vector(stretch, means), quats, scales, gaussians.opacities, gaussians.colors)
+
+
+def plain_stretch(quats: Tensor, scales: Tensor, stretch: tuple[float, float, float]) -> tuple[Tensor, Tensor]:
+    """The same sweeps as batched operations over quats [N, 4] and scales [N, 3], for any device and floating dtype."""
+    dtype = torch.promote_types(scales.dtype, torch.float32)
+    # In units of each Gaussian's largest scale no square overflows, and none that matters underflows.
+    unit = scales.abs().amax(1, keepdim=True).to(dtype).clamp(min=torch.finfo(dtype).tiny)
+    matrix = quat_to_matrix(quats.to(dtype)) * (scales / unit)[:, None] * _vector(stretch, unit)[:, None]
+    columns = list(matrix.unbind(2))
+    for _ in range(SWEEPS):
+        for i, j in PAIRS:
+            columns[i], columns[j] = _plain_turn(columns[i], columns[j])
+    matrix = torch.stack(columns, 2)
+    sizes, order = torch.linalg.vector_norm(matrix, dim=1).sort(dim=1, descending=True, stable=True)
+    a, b, _ = matrix.gather(2, order[:, None].expand_as(matrix)).unbind(2)
+    rotation = _plain_frame(a, b)
+    return quat_from_matrix(rotation).to(quats.dtype), (sizes * unit).to(scales.dtype)
+
+
+def _vector(numbers: tuple[float, float, float], like: Tensor) -> Tensor:
+    """`like.new_tensor(numbers)` without a copy to the device, for which the processor would wait."""
+    return torch.stack([like.new_full((), number) for number in numbers])
+
+
+def _plain_turn(p: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
+    """Rotate columns [N, 3] in their plane, by 45° at most, so that they become orthogonal."""
+    skew, lead = 2 * (p * q).sum(1, keepdim=True), (q * q - p * p).sum(1, keepdim=True)
+    # hypot, because a small lead's square would underflow.
+    tangent = skew / (lead.abs() + torch.hypot(lead, skew)).clamp(min=torch.finfo(lead.dtype).tiny)
+    tangent = torch.where(lead < 0, -tangent, tangent)
+    cosine = 1 / (1 + tangent * tangent).sqrt()
+    sine = tangent * cosine
+    return cosine * p - sine * q, sine * p + cosine * q
+
+
+def _plain_frame(a: Tensor, b: Tensor) -> Tensor:
+    """Rotations [N, 3, 3] with the first axis along a and the second nearly along b, any where they are zero."""
+    axes = torch.eye(3, dtype=a.dtype, device=a.device)
+    a, b = normalize(a, dim=1, eps=torch.finfo(a.dtype).tiny), normalize(b, dim=1, eps=torch.finfo(a.dtype).tiny)
+    a = torch.where(a.any(1, keepdim=True), a, axes[0])
+    c = torch.linalg.cross(a, b)
+    usable = (c * c).sum(1, keepdim=True) > UPRIGHT
+    c = normalize(torch.where(usable, c, torch.linalg.cross(a, axes[a.abs().argmin(1)])), dim=1)
+    return torch.stack([a, torch.linalg.cross(c, a), c], dim=2)
+
+
+@kernel
+def stretch_chunk(
+    start: int, stop: int, quats: Any, scales: Any, stretch: Any, new_quats: Any, new_scales: Any
+) -> None:
+    """Stretch Gaussians start..stop of quats [N, 4], scales [N, 3] in float64, block by block, into two like arrays."""
+    columns = np.zeros((9, BLOCK))
+    for first in range(start, stop, BLOCK):
+        count = min(BLOCK, stop - first)
+        _load_block(first, count, quats, scales, stretch, columns)
+        for _ in range(SWEEPS):
+            _sweep_block(columns)
+        _store_block(first, count, columns, new_quats, new_scales)
+
+
+@kernel
+def _load_block(first: int, count: int, quats: Any, scales: Any, stretch: Any, columns: Any) -> None:
+    """Write D R S to [9, BLOCK]: three rows for each column of the matrix."""
+    sx, sy, sz = stretch
+    for i in range(count):
+        n = first + i
+        w, x, y, z = np.float64(quats[n, 0]), np.float64(quats[n, 1]), np.float64(quats[n, 2]), np.float64(quats[n, 3])
+        two = 2.0 / max(w * w + x * x + y * y + z * z, 1e-24)  # 2/‖q‖² makes the rotation a unit one
+        a, b, c = np.float64(scales[n, 0]), np.float64(scales[n, 1]), np.float64(scales[n, 2])
+        columns[0, i] = sx * a * (1.0 - two * (y * y + z * z))
+        columns[1, i] = sy * a * two * (x * y + w * z)
+        columns[2, i] = sz * a * two * (x * z - w * y)
+        columns[3, i] = sx * b * two * (x * y - w * z)
+        columns[4, i] = sy * b * (1.0 - two * (x * x + z * z))
+        columns[5, i] = sz * b * two * (y * z + w * x)
+        columns[6, i] = sx * c * two * (x * z + w * y)
+        columns[7, i] = sy * c * two * (y * z - w * x)
+        columns[8, i] = sz * c * (1.0 - two * (x * x + y * y))
+
+
+@kernel
+def _sweep_block(columns: Any) -> None:
+    """Turn each pair of columns once. Always the whole block and no branches: this loop runs in vector registers."""
+    for i in range(BLOCK):
+        a, b, c = _column(columns, 0, i), _column(columns, 1, i), _column(columns, 2, i)
+        a, b = _turn(a, b)
+        a, c = _turn(a, c)
+        b, c = _turn(b, c)
+        columns[0, i], columns[1, i], columns[2, i] = a
+        columns[3, i], columns[4, i], columns[5, i] = b
+        columns[6, i], columns[7, i], columns[8, i] = c
+
+
+@kernel
+def _column(columns: Any, k: int, i: int) -> Any:
+    return columns[3 * k, i], columns[3 * k + 1, i], columns[3 * k + 2, i]
+
+
+@kernel
+def _turn(p: Any, q: Any) -> Any:
+    """Rotate two columns in their plane, by 45° at most, so that they become orthogonal."""
+    skew, lead = 2.0 * _dot(p, q), _dot(q, q) - _dot(p, p)
+    tangent = skew / (abs(lead) + math.sqrt(lead * lead + skew * skew) + LEAST)
+    tangent = -tangent if lead < 0.0 else tangent
+    cosine = 1.0 / math.sqrt(1.0 + tangent * tangent)
+    sine = tangent * cosine
+    turned = cosine * p[0] - sine * q[0], cosine * p[1] - sine * q[1], cosine * p[2] - sine * q[2]
+    return turned, (sine * p[0] + cosine * q[0], sine * p[1] + cosine * q[1], sine * p[2] + cosine * q[2])
+
+
+@kernel
+def _store_block(first: int, count: int, columns: Any, new_quats: Any, new_scales: Any) -> None:
+    """Read scales and rotations off orthogonal columns, longest first."""
+    for i in range(count):
+        n = first + i
+        a, b, c = _column(columns, 0, i), _column(columns, 1, i), _column(columns, 2, i)
+        la, lb, lc = math.sqrt(_dot(a, a)), math.sqrt(_dot(b, b)), math.sqrt(_dot(c, c))
+        if la < lb:
+            la, a, lb, b = lb, b, la, a
+        if lb < lc:
+            lb, b, lc, c = lc, c, lb, b
+        if la < lb:
+            la, a, lb, b = lb, b, la, a
+        new_scales[n, 0], new_scales[n, 1], new_scales[n, 2] = la, lb, lc
+        a = _scaled(a, 1.0 / la) if la > 0.0 else (1.0, 0.0, 0.0)
+        b, c = _other_axes(a, _scaled(b, 1.0 / max(lb, LEAST)))
+        new_quats[n, 0], new_quats[n, 1], new_quats[n, 2], new_quats[n, 3] = _quat_of_axes(a, b, c)
+
+
+@kernel
+def _other_axes(a: Any, b: Any) -> Any:
+    """The second and third axis of a right-handed frame: b straightened, or any where b has no direction."""
+    c = _cross(a, b)
+    if not _dot(c, c) > UPRIGHT:
+        x, y, z = abs(a[0]), abs(a[1]), abs(a[2])
+        if x <= y and x <= z:
+            c = _cross(a, (1.0, 0.0, 0.0))
+        else:
+            c = _cross(a, (0.0, 1.0, 0.0) if y <= z else (0.0, 0.0, 1.0))
+    c = _scaled(c, 1.0 / math.sqrt(_dot(c, c)))
+    return _cross(c, a), c
+
+
+@kernel
+def _quat_of_axes(a: Any, b: Any, c: Any) -> Any:
+    """`quat_from_matrix` of a rotation's columns."""
+    ww, xx = 1.0 + a[0] + b[1] + c[2], 1.0 + a[0] - b[1] - c[2]
+    yy, zz = 1.0 - a[0] + b[1] - c[2], 1.0 - a[0] - b[1] + c[2]
+    wx, wy, wz = b[2] - c[1], c[0] - a[2], a[1] - b[0]
+    xy, xz, yz = b[0] + a[1], c[0] + a[2], c[1] + b[2]
+    if ww >= max(xx, yy, zz):
+        w, x, y, z = ww, wx, wy, wz
+    elif xx >= max(yy, zz):
+        w, x, y, z = wx, xx, xy, xz
+    elif yy >= zz:
+        w, x, y, z = wy, xy, yy, yz
+    else:
+        w, x, y, z = wz, xz, yz, zz
+    unit = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
+    unit = -unit if w < 0.0 else unit
+    return w * unit, x * unit, y * unit, z * unit
+
+
+@kernel
+def _dot(p: Any, q: Any) -> Any:
+    return p[0] * q[0] + p[1] * q[1] + p[2] * q[2]
+
+
+@kernel
+def _cross(p: Any, q: Any) -> Any:
+    return p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]
+
+
+@kernel
+def _scaled(p: Any, factor: float) -> Any:
+    return factor * p[0], factor * p[1], factor * p[2]
