@@ -19,6 +19,7 @@ from spackle.bases.settings import AUTO, AUTO_NETWORKS, BaseSettings
 from spackle.files import write_json
 from spackle.folders import file_records, results_folder, whole_set
 from spackle.formats import save_gray_png, save_ply, save_png, save_video
+from spackle.formats.depth import save_depth
 from spackle.gaussians import Gaussians
 from spackle.image import Photo, load_photo
 from spackle.pipeline import CompletedPhoto, Pipeline
@@ -38,12 +39,14 @@ def predict_photo(
     lens: Mapping[str, float | None],
     keep_frame: bool = False,
     keep_base: bool = False,
+    depth_out: str | None = None,
     render: bool = True,
     request: str | None = None,
 ) -> None:
     """One photo to `folder`: scene.ply, a video if it is to `render`, report.json, and views/ with --cameras.
 
-    With `keep_base` also base.ply, the photo's own Gaussians. `lens` and `keep_frame` are as `load_photo` takes them;
+    With `keep_base` also base.ply, the photo's own Gaussians, and with `depth_out` a file of that name, the photo's
+    depth. `lens` and `keep_frame` are as `load_photo` takes them;
     the report holds the digest `request`. The files take their places once all are whole. InputError for a photo, a
     depth map or a folder that cannot be used.
     """
@@ -52,7 +55,8 @@ def predict_photo(
         photo = load_photo(path, keep_frame=keep_frame or options.give_geometry, **lens)
     video_file = f"video{options.path.video.suffix}"
     with contextlib.ExitStack() as folders:
-        files = [*(["base.ply"] if keep_base else []), "scene.ply", REPORT, *([video_file] if render else [])]
+        wanted = {"base.ply": keep_base, "scene.ply": True, REPORT: True, video_file: render, depth_out: depth_out}
+        files = [file for file, is_wanted in wanted.items() if file and is_wanted]
         folders.enter_context(results_folder(folder, files, alone=True))
         stills = range(len(pipeline.given_views or []))
         if stills:
@@ -66,6 +70,8 @@ def predict_photo(
             parts = {"scene.ply": scene.gaussians} | ({"base.ply": scene.base} if keep_base else {})
             for file, part in parts.items():
                 save_ply(part, new / file, camera=scene.camera, base_count=len(scene.base), disparity=scene.disparity)
+            if depth_out is not None:
+                save_depth(scene.depth_map(pipeline.renderer), new / depth_out)
         video = None
         if render:
             video = views.maker.note(video_file, views.cameras[views.frames[0][0]], len(views.frames))

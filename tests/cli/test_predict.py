@@ -79,8 +79,12 @@ def test_predict_writes_a_scene_a_video_and_a_report(plain: tuple[Path, Run]) ->
 
 
 def test_a_second_run_replaces_the_first(tmp_path: Path, pair: tuple[Path, Path]) -> None:
-    predicted(*pair, tmp_path, "--residual", "none", "--no-render", "--fov", 90, "--keep-base")
-    assert names_in(tmp_path / "photo") == FILES - {"video.mp4"} | {"base.ply"}
+    predicted(
+        *pair, tmp_path, "--residual", "none", "--no-render", "--fov", 90, "--keep-base", "--depth-out", "depth.png"
+    )
+    assert names_in(tmp_path / "photo") == FILES - {"video.mp4"} | {"base.ply", "depth.png"}
+    error = pixels(tmp_path / "photo" / "depth.png") / 1000 / metres() - 1  # but where the box begins
+    assert np.quantile(np.abs(error), 0.9) < 0.01
     report, bare = report_of(tmp_path / "photo"), read_ply(tmp_path / "photo" / "scene.ply")
     assert (report["focal_source"], report["focal_px"]) == ("--fov", WIDTH / 2)
     row = bare.row(0)
@@ -95,7 +99,7 @@ def test_a_second_run_replaces_the_first(tmp_path: Path, pair: tuple[Path, Path]
     assert all(view["after"] < 0.01 < view["before"] for view in report["hole_area_ratio"])
     first, whole = (read_ply(tmp_path / "photo" / name) for name in ("base.ply", "scene.ply"))
     assert (whole.names, whole.body[: len(first.body)]) == (first.names, first.body)  # rule 1
-    assert names_in(tmp_path / "photo") == FILES | {"base.ply"}
+    assert names_in(tmp_path / "photo") == FILES | {"base.ply", "depth.png"}
 
 
 def test_cameras_completes_exactly_the_given_views(tmp_path: Path, pair: tuple[Path, Path]) -> None:

@@ -55,6 +55,8 @@ PREDICT = [
     *((f"--residual {file}.safetensors", f"{file}.safetensors") for file in ("nowhere", "bad")),
     *((f"{option} 0", f"{option} must be between 1 and") for option in ("--workers", "--threads")),
     *((f"--no-render {option}", option) for option in ("--fps 24.0", "--loop 2", "--format webm")),
+    ("--depth-out depth.tiff", "depth.tiff"),
+    ("--depth-out a/depth.npy", "--depth-out a/depth.npy"),
     ("--precision bf16", "--precision"),
     ("--base sharp9", "--base"),
     ("--device cuda", "--device"),

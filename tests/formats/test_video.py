@@ -18,6 +18,7 @@ from torch import Tensor
 
 from spackle.errors import InputError
 from spackle.formats import VideoWriter, save_gray_png, save_png, save_video
+from spackle.formats.depth import save_depth
 
 
 def frames(count: int, height: int, width: int) -> list[Tensor]:
@@ -187,6 +188,19 @@ def test_what_a_format_does_not_know_is_refused(tmp_path: Path, name: str, fps: 
     with pytest.raises(InputError, match="too large"), VideoWriter(tmp_path / "b.webp") as writer:
         writer.add(torch.zeros(1, 16_384, 3))
     assert not os.listdir(tmp_path)
+
+
+def test_depth_maps_are_read_back_by_other_programs(tmp_path: Path) -> None:
+    depth = torch.linspace(0, 9, 37 * 53).reshape(37, 53)
+    for suffix in (".npy", ".exr", ".png"):
+        save_depth(depth, tmp_path / f"a{suffix}")
+    assert np.array_equal(np.load(tmp_path / "a.npy"), depth.numpy())
+    with av.open(str(tmp_path / "a.exr")) as container:  # FFmpeg
+        assert np.array_equal(next(container.decode(video=0)).to_ndarray(), depth.numpy())
+    with Image.open(tmp_path / "a.png") as image:
+        assert np.array_equal(np.array(image), np.round(1000 * depth.numpy()))
+    with pytest.raises(InputError, match=r"a\.tiff"):
+        save_depth(depth, tmp_path / "a.tiff")
 
 
 def test_colour_and_grey_png(tmp_path: Path) -> None:

@@ -40,6 +40,7 @@ def clip_options(predict: PredictOptions) -> Options:
         ("path", path.path, path.path is not None, follows),
         ("mode", fill.mode, fill.mode != "scene", "each of its frames is one view"),
         ("fill", fill.fill, fill.fill in ("exemplar", "lama"), "its texture would flicker"),
+        ("depth-out", predict.depth_out, predict.depth_out is not None, "its video is all that is written"),
         ("no-render", "", not predict.render, "its video is all that there is to write"),
         *(
             (field.name, "", getattr(video, field.name) != getattr(plain, field.name), "its video is as the clip is")

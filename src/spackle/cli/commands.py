@@ -92,6 +92,12 @@ def predict(
     keep_base: Annotated[
         bool, typer.Option("--keep-base", hidden=True, help="Write base.ply, too: what the photo shows.")
     ] = False,
+    depth_out: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME", hidden=True, help="Write the photo's depth, too: depth.png (mm), .npy or .exr (m)."
+        ),
+    ] = None,
     path: PathOptions,
     mode: Annotated[
         Literal["scene", "view"],
@@ -135,7 +141,7 @@ def predict(
     settings = BaseSettings(base, depth, *reading, checkpoint, precision, device=device, **speed)
     scene = Options(settings, path, FillOptions(residual, fill, mode))
     lens = {"focal_px": focal_px, "focal_mm": focal_mm, "fov": fov}
-    options = PredictOptions(scene, lens, render, keep_base, keep_frame, overwrite, workers, threads, ray)
+    options = PredictOptions(scene, lens, render, keep_base, depth_out, keep_frame, overwrite, workers, threads, ray)
     if predict_all(photos, output, options, Reporter(verbose, as_json=as_json)):
         raise typer.Exit(1)
 

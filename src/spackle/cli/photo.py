@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from pathlib import Path
 
 from spackle.errors import InputError
+from spackle.formats.depth import check_depth_name
 from spackle.pipeline import Options, Pipeline
 from spackle.video_frames import video_problem
 
@@ -18,6 +20,7 @@ class PredictOptions:
     lens: Mapping[str, float | None]  # `focal_px`, `focal_mm` and `fov`, as `load_photo` takes them
     render: bool = True  # write a video
     keep_base: bool = False  # write base.ply
+    depth_out: str | None = None  # write the photo's depth, under this name
     keep_frame: bool = False  # a uniform frame around a photo is part of it
     overwrite: bool = False  # of many photos, do again what is done already
     workers: int = 1  # processes that share the photos
@@ -26,6 +29,10 @@ class PredictOptions:
 
     def open(self) -> Pipeline:
         """What all photos share; InputError for an option that cannot be used, whatever the photo."""
+        if self.depth_out is not None:
+            check_depth_name(self.depth_out)
+            if Path(self.depth_out).name != self.depth_out:
+                raise InputError(f"--depth-out {self.depth_out}: goes beside scene.ply: give a name without a folder")
         pipeline, path = Pipeline.open(self.scene), self.scene.path
         if not self.render:
             for option in ("format", "fps", "loop"):

@@ -19,7 +19,8 @@ import torch
 
 import spackle
 from spackle._numba import is_compiled
-from spackle.bases.depth_map import calibrations_beside, find_depth
+from spackle.bases.depth_map import calibrations_beside, depth_of_array, find_depth
+from spackle.bases.lift import lift
 from spackle.bases.open import BaseError
 from spackle.camera import Camera
 from spackle.cli.clip import FILES as CLIP_FILES
@@ -250,6 +251,7 @@ class Predictor:
                 lens=options.lens,
                 keep_frame=options.keep_frame,
                 keep_base=options.keep_base,
+                depth_out=options.depth_out,
                 render=options.render,
                 request=self.request(photo),
             )
@@ -270,7 +272,7 @@ def _shared_digest(options: PredictOptions, pipeline: Pipeline) -> str:
     base = dataclasses.replace(base, name=name, depth=None, calib=None, checkpoint=None, windows=None, compiled=False)
     path = dataclasses.replace(path, cameras=None, path=None)
     choices: list[object] = [dataclasses.asdict(base), dataclasses.asdict(path), fill.weights, fill.texture, fill.mode]
-    choices += [options.lens, options.render, options.keep_base, options.keep_frame]
+    choices += [options.lens, options.render, options.keep_base, options.depth_out, options.keep_frame]
     prints = {kind: fingerprint(file, kind) for kind, file in _shared_files(options.scene).items()}
     return digest_of([spackle.__version__, choices, pipeline.base.fingerprints, prints])
 
@@ -319,3 +321,4 @@ def compile_kernels() -> None:
     guard = OcclusionGuard.of(get_renderer("cpu").render(base, camera), camera)
     free_factors(base, moved.position, [guard])
     assert len(fill_scene(FillContext(base, camera, get_renderer("cpu")), [moved, camera]).aux)
+    lift(rgb, depth_of_array(depth[::2, ::2].numpy(), Path("depth")), camera)  # of another size, as lite's is
