@@ -26,7 +26,7 @@ def one_thread() -> Iterator[None]:
 
 
 def state(folder: Path) -> Checkpoint:
-    checkpoint = load_checkpoint(folder, print)
+    checkpoint = load_checkpoint(folder)
     assert checkpoint is not None
     return checkpoint
 

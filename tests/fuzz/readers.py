@@ -210,7 +210,7 @@ def _weights(write: Callable[[dict[str, torch.Tensor], Path], None]) -> Maker:
 
 def _read_weights(folder: Path) -> None:
     if (folder / "checkpoint.pt").exists():
-        load_checkpoint(folder, _say)
+        load_checkpoint(folder)
         read_tensors(folder / "checkpoint.pt", "give others")
     else:
         read_tensors(_only(folder), "give others")

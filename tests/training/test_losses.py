@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -129,22 +128,6 @@ def test_perceptual_resizes_and_looks_only_near_the_hole(size: int | None, seen:
     assert perceptual_loss(Pixels(1), target, target, hole, size=size).item() == 0
 
 
-LOSSES: dict[str, Callable[[Tensor, Tensor, Tensor], Tensor]] = {
-    "color": color_loss,
-    "blurred color": lambda rgb, target, hole: color_loss(rgb, target, hole, 1.5),
-    "alpha": lambda rgb, _, hole: alpha_loss(rgb[..., 0], hole),
-    "preserve": preserve_loss,
-    "perceptual": lambda rgb, target, hole: perceptual_loss(Pixels(1, 2), rgb, target, hole, dilation=3, size=12),
-}
-
-
-@pytest.mark.parametrize("name", LOSSES)
-def test_gradients_are_those_of_finite_differences(name: str) -> None:
-    rgb, target = pictures(2, 6, 7)
-    hole = torch.rand(2, 6, 7, generator=torch.Generator().manual_seed(3)) < 0.2
-    assert torch.autograd.gradcheck(lambda rgb: LOSSES[name](rgb, target, hole), (rgb,))
-
-
 def test_without_a_hole_there_is_nothing_to_fill() -> None:
     rgb, alpha = RGB.clone().requires_grad_(), torch.tensor([[[0.0, 0.5]]], requires_grad=True)
     loss, terms = total_loss(rgb, alpha, TARGET, RGB, NO_HOLE, recipe=PAPER, features=Pixels(1))
@@ -264,9 +247,7 @@ def test_squeezenet_has_caffes_sizes_and_input(squeezed: dict[str, np.ndarray], 
     np.testing.assert_allclose(squeezenet(image[None])[0][0, :, 4, 9].numpy(), cell, rtol=1e-4, atol=1e-3)
 
 
-def test_what_is_not_a_networks_weights_is_refused(
-    resnet: dict[str, Tensor], squeezed: dict[str, np.ndarray], tmp_path: Path
-) -> None:
+def test_what_is_not_a_networks_weights_is_refused(squeezed: dict[str, np.ndarray], tmp_path: Path) -> None:
     def refused(name: Any, path: Path | None, said: str) -> None:
         with pytest.raises(InputError, match=rf"(?=.*{re.escape(said)})(?=.*{re.escape(str(path or ''))})"):
             load_features(name, path)
@@ -274,15 +255,8 @@ def test_what_is_not_a_networks_weights_is_refused(
     assert load_features("none", None) is None
     refused("resnet50", None, "name their file")
     refused("squeezenet", tmp_path / "missing.npz", "no such weight file")
-    path = tmp_path / "other.pth"
-    path.write_bytes(b"\x80\x02cos\nsystem\n.")  # a pickle that would run a command
-    refused("resnet50", path, "nothing in it was run")
-    torch.save({name: value for name, value in resnet.items() if name != "bn1.bias"}, path)
-    refused("resnet50", path, "1 missing (bn1.bias)")
-    first = squeezed["conv1.w"]
     for change, said in (
-        ({"conv1.w": first[:, :, :3, :3]}, "1 of another shape (conv1.weight"),
-        ({"conv1.w": np.full_like(first, np.nan)}, "numbers that are not finite (conv1.weight)"),
+        ({"conv1.w": squeezed["conv1.w"][:, :, :3, :3]}, "1 of another shape (conv1.weight"),
         ({"conv1.w": np.array([{}])}, "not a file of weights"),  # an object: would have to be unpickled
     ):
         np.savez(tmp_path / "other.npz", **(squeezed | change))

@@ -295,7 +295,7 @@ def test_pictures_that_make_a_loss_that_is_no_number_are_named(
     monkeypatch.setattr(Mixture, "batch", broken)
     done = train(place, tmp_path / "out")
     assert done.code == 2
-    assert "out/bad_batch: step 0 gave numbers that are not finite (loss, " in done.lines[-1]
+    assert "out: step 0 gave numbers that are not finite (loss, " in done.lines[-1]
     assert " among " in done.lines[-1]
     assert not (tmp_path / "out" / "checkpoint.pt").exists()
 

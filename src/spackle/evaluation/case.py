@@ -49,7 +49,6 @@ class Case:
     points: Callable[[], Points] | None = None
     bounds: tuple[float, float] | None = None  # nearest and farthest depth of the view, where no more is known
     seconds: tuple[SecondView, ...] = ()
-    problem: str | None = None  # why it cannot be used, where that is seen before its turn: of itself, not of the rest
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,8 +103,6 @@ def load_case(case: Case, max_side: int = MAX_SIDE) -> LoadedCase:
     Raises:
         InputError: the photo, or each of the second photos, is missing, no image, or of another shape than its camera.
     """
-    if case.problem is not None:
-        raise InputError(case.problem)
     full = load_photo(case.photo)
     if case.camera is not None:
         _check_shape(case.photo, full, case.camera)

@@ -188,12 +188,11 @@ def open_evaluation(options: EvaluateOptions) -> Evaluation:
     ]
     if not cases:
         raise InputError(f"{options.root}: {dataset.name}: no images: check the folder")
-    if not all(case.problem for case in cases):  # else each is named in its turn
-        if options.near and not any(case.seconds for case in cases):
-            raise InputError(f"{options.root}: {dataset.name}: has no second photos: take --protocol large-view")
-        if not base.network and not any(case.depth or case.points for case in cases):
-            problem = "has no depth of any kind, which --base rgbd takes"
-            raise InputError(f"{options.root}: {dataset.name}: {problem}: take {', '.join(NETWORKS)}")
+    if options.near and not any(case.seconds for case in cases):
+        raise InputError(f"{options.root}: {dataset.name}: has no second photos: take --protocol large-view")
+    if not base.network and not any(case.depth or case.points for case in cases):
+        problem = "has no depth of any kind, which --base rgbd takes"
+        raise InputError(f"{options.root}: {dataset.name}: {problem}: take {', '.join(NETWORKS)}")
     network, direct, features, inpainter = fill.load(), None, None, None
     if "inpaint2d" in options.methods:
         inpainter = get_inpainter(options.inpainter, InpainterOptions(device=options.device.type))
@@ -307,9 +306,9 @@ def measure_case(
     InputError for a file that cannot be used or is missing; BaseError where no image can be worked on.
     """
     options = evaluation.options
-    if options.near and not case.seconds and case.problem is None:
-        raise InputError(f"{case.name}: has no second photo")
     loaded = load_case(case, options.max_side)
+    if options.near and not case.seconds:
+        raise InputError(f"{case.name}: has no second photo")
     prediction = evaluation.open(loaded).predict(loaded.full)[0]
     alignment = _align(loaded, prediction, evaluation, not options.base.network) if options.near else None
     if alignment:

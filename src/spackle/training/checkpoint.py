@@ -1,4 +1,4 @@
-"""What a run leaves in its folder: checkpoints to resume from, each whole or the one before it, and curves."""
+"""What a run leaves in its folder: a checkpoint to resume from, always a whole one, and curves."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import contextlib
 import dataclasses
 import io
 import math
-import os
 import shutil
 import warnings
 from collections.abc import Callable
@@ -17,14 +16,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from spackle.errors import InputError, reason_in_a_line
+from spackle.errors import InputError, reading
 from spackle.files import atomic_path
 from spackle.training.recipe import AnyRecipe, differences
 
-NEWEST, PREVIOUS = "checkpoint.pt", "checkpoint.previous.pt"
+CHECKPOINT = "checkpoint.pt"
 BEST, LAST, RUN = "best.safetensors", "last.safetensors", "run.json"
-RESULTS = (NEWEST, PREVIOUS, BEST, LAST, RUN)
-PICTURES, LOGS, BAD = "pictures", "logs", "bad_batch"
+RESULTS = (CHECKPOINT, BEST, LAST, RUN)
+PICTURES, LOGS = "pictures", "logs"
 Log = Callable[[str], None]
 
 
@@ -64,48 +63,29 @@ class Checkpoint:
 
 
 def save_checkpoint(checkpoint: Checkpoint, folder: Path) -> None:
-    """Write checkpoint.pt; the one before it stays as checkpoint.previous.pt.
-
-    InputError where it cannot be written, or the disk is full; what was there stays.
-    """
+    """Write checkpoint.pt; InputError where it cannot be written, or the disk is full: then the one before it stays."""
     buffer = io.BytesIO()  # torch's own writer hides that a disk is full
     torch.save({**vars(checkpoint), "progress": dataclasses.asdict(checkpoint.progress)}, buffer)
-    newest = folder / NEWEST
-    with atomic_path(newest) as temporary:
+    with atomic_path(folder / CHECKPOINT, durable=True) as temporary:
         temporary.write_bytes(buffer.getbuffer())
-        if newest.exists():
-            os.replace(newest, folder / PREVIOUS)
 
 
-def load_checkpoint(folder: Path, log: Log) -> Checkpoint | None:
-    """The last whole checkpoint of a folder, if any; logs what is wrong with a newer one.
-
-    InputError for checkpoints of which none can be read.
-    """
-    problem = None
-    for path in (folder / NEWEST, folder / PREVIOUS):
-        if not path.exists():
-            continue
-        try:
-            state = torch.load(path, map_location="cpu", weights_only=True)
-            checkpoint = Checkpoint(**{**state, "progress": Progress(**state["progress"])})
-        except Exception as error:  # a damaged file can raise anything
-            problem = problem or f"{path}: cannot be read ({reason_in_a_line(error)})"
-        else:
-            if problem:
-                log(f"{problem}: going on from the one before it")
-            return checkpoint
-    if problem:
-        raise InputError(f"{problem}, nor is there one before it: --overwrite starts anew")
-    return None
+def load_checkpoint(folder: Path) -> Checkpoint | None:
+    """The checkpoint of a folder, if any; InputError for one that cannot be read."""
+    path = folder / CHECKPOINT
+    if not path.exists():
+        return None
+    with reading(path, "cannot be read ({reason}): --overwrite starts anew"):
+        state = torch.load(path, map_location="cpu", weights_only=True)
+        return Checkpoint(**{**state, "progress": Progress(**state["progress"])})
 
 
 def find_checkpoint(output: Path, method: str, recipe: AnyRecipe, digest: str, log: Log) -> Checkpoint | None:
     """The checkpoint that a run goes on from, if any.
 
-    InputError where the folder holds another run, or none of its checkpoints can be read.
+    InputError where the folder holds another run, or its checkpoint cannot be read.
     """
-    checkpoint = load_checkpoint(output, log)
+    checkpoint = load_checkpoint(output)
     if checkpoint is None:
         return None
     what, other = "", differences(checkpoint.recipe, recipe)
@@ -123,7 +103,7 @@ def find_checkpoint(output: Path, method: str, recipe: AnyRecipe, digest: str, l
 
 def remove_run(output: Path) -> None:
     """Delete what a run has left; its samples stay."""
-    for path in (output / name for name in (*RESULTS, PICTURES, LOGS, BAD)):
+    for path in (output / name for name in (*RESULTS, PICTURES, LOGS)):
         shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
 
 

@@ -38,7 +38,6 @@ from spackle.formats import save_png
 from spackle.machine import hardware, versions
 from spackle.progress import Reporter, asked_to_stop
 from spackle.training.checkpoint import (
-    BAD,
     BEST,
     LAST,
     PICTURES,
@@ -227,14 +226,10 @@ def _learn(
             stopped = totals.pop("stop") > 0
             numbers = {name: total / rank_count() for name, total in totals.items()}
             if bad := [name for name, value in numbers.items() if not math.isfinite(value)]:
-                if rank() == 0:
-                    (folder / BAD).mkdir(exist_ok=True)
-                    save_checkpoint(state(), folder / BAD)
-                wait_for_ranks()
                 names = ", ".join(task.names(step, [item for part in split for item in part]))
                 raise InputError(
-                    f"{folder / BAD}: step {step} gave numbers that are not finite ({', '.join(bad)}); the weights "
-                    f"before it are there: lower optim.lr, or remove what is broken among {names}"
+                    f"{folder}: step {step} gave numbers that are not finite ({', '.join(bad)}): "
+                    f"lower optim.lr, or remove what is broken among {names}"
                 )
 
             # Step

@@ -32,10 +32,6 @@ MOTORCYCLE_FOCAL, MOTORCYCLE_CX, MOTORCYCLE_CY = 994.978, 311.193, 254.877
 MOTORCYCLE_DOFFS, MOTORCYCLE_BASELINE = 31.086, 0.193001
 
 
-class BrokenPhoto(InputError):
-    """A photo that is there and cannot be read: a matter of its own case, and not of the folder's layout."""
-
-
 def _pair(
     name: str, left: Path, right: Path, lens: Calibration, size: tuple[int, int], depth: Callable[[], DepthMap]
 ) -> Case:
@@ -55,13 +51,13 @@ def _cameras(lens: Calibration, size: tuple[int, int]) -> tuple[Camera, Camera]:
     return Camera(lens.K, torch.eye(4), *size), Camera(K, pose, *size)
 
 
-def _picture_size(path: Path) -> tuple[int, int]:
-    """(width, height) from a picture's header; BrokenPhoto where it cannot be read, InputError where it is missing."""
+def _picture_size(path: Path) -> tuple[int, int] | None:
+    """(width, height) from a picture's header; None where it cannot be read, InputError where it is missing."""
     try:
         return read_image(path, lambda image: (image.width, image.height))
-    except InputError as error:
+    except InputError:
         if path.exists():
-            raise BrokenPhoto(str(error)) from error
+            return None
         raise
 
 
@@ -129,11 +125,9 @@ def _middlebury_case(folder: Path) -> Case:
     with reading(path, "not a scene description: needs the photos and the disparity map"):
         facts = json.loads(read_text(path))
         left, right, truth = (folder / str(facts[key]) for key in ("left", "right", "disparity"))
-    try:
-        size = _picture_size(left)
-    except BrokenPhoto as error:
-        return Case(folder.name, folder, problem=str(error))
-    return _pair(folder.name, left, right, lens, size, partial(load_depth, truth, calib=path))
+    size, depth = _picture_size(left), partial(load_depth, truth, calib=path)
+    # A photo that is damaged is named in its turn.
+    return _pair(folder.name, left, right, lens, size, depth) if size else Case(folder.name, left, depth=depth)
 
 
 # --- Booster
@@ -154,19 +148,14 @@ def _lights_of(scene: Path) -> list[Case]:
     photos = photo_files(scene / "camera_00")
     if not photos:
         raise InputError(f"{scene / 'camera_00'}: no photos: expected im0.png and more; unpack the scene again")
-    names, problems = [f"{scene.name}/{photo.stem}" for photo in photos], []
-    for photo in photos:  # all of a scene are of one size
-        try:
-            size = _picture_size(photo)
-            break
-        except BrokenPhoto as error:
-            problems.append(str(error))
-    else:
-        return [Case(name, p, problem=why) for name, p, why in zip(names, photos, problems, strict=True)]
+    names = [f"{scene.name}/{photo.stem}" for photo in photos]
+    size = next((size for photo in photos if (size := _picture_size(photo))), None)  # all of a scene are of one size
     lens, truth = _read_opencv(scene / "calib_00-02.xml"), scene / "disp_00.npy"
     if not truth.is_file():
         raise InputError(f"{truth}: no such disparity map: give train/balanced; Booster's test scenes have none")
     depth, rights = _depth_by(lens, truth, lambda: read_array(truth)[0]), scene / "camera_02"
+    if size is None:  # each is named in its turn
+        return [Case(name, p, depth=depth) for name, p in zip(names, photos, strict=True)]
     return [_pair(name, p, rights / p.name, lens, size, depth) for name, p in zip(names, photos, strict=True)]
 
 
