@@ -17,17 +17,17 @@ from spackle.cli.weights import deterministic_weights
 DATA = Path(__file__).parent / "data"
 
 
-def tiny_weights() -> dict[str, Tensor]:
+def tiny_weights(config: SharpConfig = TINY) -> dict[str, Tensor]:
     """A whole state dict, with what inference never uses."""
-    return deterministic_weights(expected_shapes(TINY))
+    return deterministic_weights(expected_shapes(config))
 
 
-def write_tiny(path: Path) -> Path:
-    """A checkpoint of the tiny network, .pt or .safetensors by the name."""
+def write_tiny(path: Path, config: SharpConfig = TINY) -> Path:
+    """A checkpoint of a small network, .pt or .safetensors by the name."""
     if path.suffix == ".safetensors":
-        save_file(tiny_weights(), path)
+        save_file(tiny_weights(config), path)
     else:
-        torch.save(tiny_weights(), path)
+        torch.save(tiny_weights(config), path)
     return path
 
 

@@ -20,7 +20,6 @@ from command import names_in, refuses, run
 from dataset_builds import SHORT, build, content, dying_build, is_alive, write_inputs
 from photos import metres, picture, write_depth
 from PIL import Image
-from sharp_weights import write_tiny
 
 from spackle.dataset import DatasetFiles
 from spackle.dataset import build as building
@@ -225,9 +224,9 @@ def test_another_configuration_and_a_held_folder_are_refused(whole: Path, place:
         refuses(build(place, copy), "another run is at work")
 
 
-def test_sharp_needs_no_depth_and_a_path_is_spelled_either_way(tmp_path: Path) -> None:
+def test_sharp_needs_no_depth_and_a_path_is_spelled_either_way(made: dict[str, Path], tmp_path: Path) -> None:
     write_inputs(tmp_path, 1, 64, 48)
-    weights = write_tiny(tmp_path / "tiny.safetensors")
+    weights = made["sharp"]
     options = ["--base", "sharp", "-c", weights, "--views", 2, "--inpainter", "none", "-o", tmp_path / "out"]
     for spelling in ("rotate_forward", "rotate-forward"):  # the same build, which is done the second time
         done = run("dataset", "build", tmp_path / "photos", *options, "--trajectory", spelling)
@@ -260,10 +259,10 @@ def test_training_takes_each_view_once_and_judges_by_other_photos(whole: Path, c
 
 def test_the_papers_recipe_learns_from_a_dataset(whole: Path, tmp_path: Path) -> None:
     options = f"data.pseudo={whole} data.cells=16 data.validation_views=8 loss.features=none optim.batch=2"
-    done = run("train", "--recipe", "paper", "-o", tmp_path / "out", *options.split(), "optim.steps=3")
+    done = run("train", "--recipe", "paper", "-o", tmp_path / "out", *options.split(), "optim.steps=1")
     assert done.code == 0, done.err
     report = json.loads((tmp_path / "out" / "run.json").read_text())
-    assert (report["ended"], report["step"], report["recipe"]["network"]) == ("steps", 3, "sharp-decoder")
+    assert (report["ended"], report["step"], report["recipe"]["network"]) == ("steps", 1, "sharp-decoder")
     assert 0 < report["samples"]["train"] <= 9
     assert report["hole_psnr"]["untrained"] + 3 < report["hole_psnr"]["colours of the targets"]
 

@@ -67,6 +67,7 @@ def on(address: str, place: Path, output: Path, *more: object) -> Run:
     return build(place, output, "--ray", address, "--workers", 2, *more)
 
 
+@pytest.mark.slow
 def test_a_local_cluster_makes_the_same_bytes_and_ends(place: Path, whole: Path, tmp_path: Path) -> None:
     before = signal.getsignal(signal.SIGTERM)
     done = on("local", place, tmp_path / "out")

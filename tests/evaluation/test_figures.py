@@ -12,7 +12,7 @@ import pytest
 from command import names_in, refuses, run
 from evaluation_data import write_boxes
 from PIL import Image
-from sharp_weights import write_tiny
+from sharp_weights import MICRO, write_tiny
 
 from spackle.evaluation.pictures import hole_boxes
 
@@ -52,7 +52,7 @@ def check_latex(folder: Path, *files: Path) -> None:
 def test_both_figures_and_all_tables_are_latex(tmp_path: Path) -> None:
     data, large, near, bench = (tmp_path / name for name in ("data", "large", "near", "bench"))
     write_boxes(data / "Ball_1", 0)
-    tiny, words = write_tiny(tmp_path / "sharp.safetensors"), (data, "--dataset", "middlebury")
+    tiny, words = write_tiny(tmp_path / "sharp.safetensors", MICRO), (data, "--dataset", "middlebury")
     sharp = ("--base", "sharp", "-c", tiny, "--precision", "fp32", "--metrics", "none")
     choices = ("--methods", "base,paper,direct-ft", "--direct-ft", tiny, "--disparity", "0.6")
     done = run("evaluate", *words, *sharp, *choices, "-o", large)

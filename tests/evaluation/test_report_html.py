@@ -17,7 +17,8 @@ from PIL import Image
 from spackle.evaluation.folder import image_file
 from spackle.evaluation.methods import METHODS as FACTS
 from spackle.evaluation.pictures import encode, evenly
-from spackle.evaluation.report import BUDGET, fitting, make_report, overhead_plot
+from spackle.evaluation.report import fitting, make_report, overhead_plot
+from spackle.evaluation.rows import IMAGES
 from spackle.evaluation.rows import Run as Results
 from spackle.evaluation.tables import make_tables
 
@@ -124,13 +125,13 @@ def test_every_string_from_outside_is_escaped(tmp_path: Path) -> None:
     assert page.drawings()
 
 
-def test_many_evaluations_and_images_still_fit(tmp_path: Path) -> None:
-    runs = [results(near, 3, title) for title in ("Middlebury", "Booster", "LLFF") for near in (True, False)]
+def test_many_evaluations_and_images_still_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    runs = [results(False, 2, title) for title in IMAGES]
     assert len(Page(report(tmp_path, *runs)).named("article")) == 2 * 6
     noise = encode(Image.effect_noise((960, 720), 90).convert("RGB"))
-    fits = fitting([{"base": noise, "spackle": noise}] * 12)
-    assert sum(len(data) * 4 / 3 for case in fits for data in case.values()) <= BUDGET
     assert fitting([{"base": noise}]) == [{"base": noise}]
+    monkeypatch.setattr("spackle.evaluation.report.BUDGET", len(noise))
+    assert sum(len(data) * 4 / 3 for data in fitting([{"base": noise, "spackle": noise}])[0].values()) <= len(noise)
 
 
 def test_plots_show_each_value_once_in_a_form_of_its_method() -> None:

@@ -7,15 +7,10 @@ from pathlib import Path
 
 import pytest
 import suite
-import torch
 from command import names_in
 from naive_renderer import naive_render
-from scenes import box_before_wall
-from sharp_weights import MICRO, gaussians_of, micro_network
 from suite_scenes import photo_scene
 
-from spackle.bases.sharp import SharpBase
-from spackle.image import Photo
 from spackle.render import CpuRenderer
 
 SIDE = 64
@@ -37,20 +32,6 @@ def test_the_renderers_section_and_the_naive_renderers_picture() -> None:
     assert float(difference.amax()) < 0.02
     assert facts["gaussians"] == (count := len(scene)) == SIDE * SIDE // 2
     assert whole.limit_ms == pytest.approx((count * 56 + SIDE * SIDE * 20) / 2e6)
-
-
-def test_a_video_frame_by_frame_and_sharp_in_its_stages() -> None:
-    section = suite.video_section(1, box_before_wall(width=64, height=48).lift, CpuRenderer(), None, frames=4)
-    found = rows_of(section)
-    once, each = "the same, the photo's occlusion guard made once", "frame by frame over one scene"
-    assert found[once].values[0] < found[each].values[0]
-    assert section[1]["added"] > 0
-    photo = Photo(torch.rand(MICRO.side, MICRO.side, 3), 1.2 * MICRO.side, "", Path("photo.png"))
-    section = suite.sharp_section(1, SharpBase(micro_network(), weights="micro"), photo, PEAKS)
-    found, facts = rows_of(section), section[1]
-    assert facts["gaussians"] == gaussians_of(MICRO)
-    assert (found[suite.FORWARD].limit_ms or 0) > 1e3  # 1e9 operations at 1e6 a millisecond
-    assert found["photo to scene"].values[0] >= found[suite.FORWARD].values[0]
 
 
 def test_sections_are_gathered_and_what_cannot_run_is_named(tmp_path: Path) -> None:

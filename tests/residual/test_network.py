@@ -12,12 +12,11 @@ from holes import CPU, box_view, features_of, random_network, random_view
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.torch import save_file
-from sharp_weights import tiny_weights, write_tiny
 
 from spackle.camera import Camera
 from spackle.color import linear_to_srgb, srgb_to_linear
 from spackle.errors import InputError
-from spackle.network_file import channels_last
+from spackle.network_file import channels_last, read_tensors
 from spackle.render.protocol import Rendering
 from spackle.residual import ViewFeatures, hole_area_ratio, hole_mask
 from spackle.residual.architectures import NOTE, SharpDecoder, load_residual, open_residual
@@ -119,11 +118,12 @@ def test_the_photo_is_seen_where_a_cells_point_lies_in_it() -> None:
     assert not seen[:, 24:].any()
 
 
-def test_the_paper_architecture_starts_as_sharps_decoder(tmp_path: Path) -> None:
-    network = first_network("sharp-decoder", write_tiny(tmp_path / "tiny.pt"))
+def test_the_paper_architecture_starts_as_sharps_decoder(made: dict[str, Path]) -> None:
+    network = first_network("sharp-decoder", made["sharp"])
     assert isinstance(network, SharpDecoder)
+    theirs = read_tensors(made["sharp"], "give others")
     weights = {f"feature_model.{key}": value for key, value in network.feature_model.state_dict().items()}
-    assert all(torch.equal(value, tiny_weights()[key]) for key, value in weights.items())
+    assert all(torch.equal(value, theirs[key]) for key, value in weights.items())
     assert not network(torch.randn(1, PHOTO.stop, 16, 16)).any()
-    with pytest.raises(InputError, match=r"tiny.pt: .*another network"):
-        first_network("unet", tmp_path / "tiny.pt")
+    with pytest.raises(InputError, match=rf"{made['sharp'].name}: .*another network"):
+        first_network("unet", made["sharp"])

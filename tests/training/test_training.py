@@ -20,7 +20,6 @@ from holes import random_network
 from photos import picture
 from PIL import Image
 from scenes import box_before_wall, shifted, tensors_of
-from sharp_weights import write_tiny
 from training_runs import assert_same_weights, losses_of, one_thread, run_two, state
 from two_gpus import TwoGpus
 
@@ -112,9 +111,11 @@ def test_a_run_leaves_weights_pictures_and_a_report(whole: Path, done: Run) -> N
         assert all(name in events.read_bytes() for name in (b"train/color", b"train/lr", b"validation/har_after"))
 
 
-def test_the_papers_architecture_learns_from_sharps_decoder_and_predicts(place: Path, tmp_path: Path) -> None:
-    tiny, out = write_tiny(tmp_path / "tiny.pt"), tmp_path / "out"
-    done = train(place, out, "network=sharp-decoder", f"init={tiny}", "optim.steps=2")
+def test_the_papers_architecture_learns_from_sharps_decoder_and_predicts(
+    place: Path, made: dict[str, Path], tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    done = train(place, out, "network=sharp-decoder", f"init={made['sharp']}", "optim.steps=2")
     assert done.code == 0, done.err
     network = load_residual(out / "best.safetensors")
     assert network.name == "sharp-decoder"
@@ -189,11 +190,13 @@ def test_the_second_process_puts_nothing_on_the_first_gpu(
     place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("spackle.render.cuda.load_gsplat", lambda device: gsplat_stand_in)
+    monkeypatch.setattr("spackle.training.sources.COMPOSITE_SIZE", (64, 80))
     monkeypatch.setattr("torch.distributed.init_process_group", lambda backend, **options: None)
     for name, value in {"WORLD_SIZE": "2", "RANK": "1", "LOCAL_RANK": "1"}.items():
         monkeypatch.setenv(name, value)
     with TwoGpus(monkeypatch) as gpus:
-        options = ("run.device=cuda", f"data.cache={tmp_path}/cache", "optim.steps=2", "run.validate_every=2")
+        small = ("data.views=2", "data.validation_views=1", "data.crops=1", "optim.steps=1", "run.validate_every=1")
+        options = ("run.device=cuda", f"data.cache={tmp_path}/cache", *small)
         done = train(place, tmp_path / "out", *options)
     assert (done.code, gpus.used) == (0, {1}), done.err
 
