@@ -28,13 +28,12 @@ from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.base import to_metric
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, extremes
-from spackle.device import Precision
+from spackle.device import Precision, hardware, versions
 from spackle.errors import InputError
 from spackle.evaluation.bench import TOTAL, Task, measure
 from spackle.files import write_whole
 from spackle.gaussians import Gaussians
 from spackle.image import Photo
-from spackle.machine import hardware, versions
 from spackle.render import CpuRenderer
 from spackle.render.cpu import project, wanted_tiles
 from spackle.render.cuda import GsplatRenderer, Material, load_gsplat

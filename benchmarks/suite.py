@@ -34,6 +34,7 @@ from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.base import to_metric, to_processor
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, trajectory
+from spackle.device import hardware, load_average, versions
 from spackle.errors import InputError, check_name
 from spackle.evaluation.bench import CPU, MS, TOTAL, Lap, Task, Values, complete_in_laps, measure
 from spackle.evaluation.datasets.stereo import load_motorcycle
@@ -43,7 +44,6 @@ from spackle.folders import make_folder
 from spackle.formats import save_ply, save_video
 from spackle.gaussians import Gaussians
 from spackle.image import Photo
-from spackle.machine import hardware, load_average, versions
 from spackle.render import CpuRenderer, Renderer, get_renderer
 from spackle.render.cpu import blend, list_tiles, project, sort_by_depth, wanted_tiles
 from spackle.render.project import KernelCamera

@@ -1,4 +1,4 @@
-"""Where arithmetic runs: the device and its memory, the precision, and the threads of compiled kernels.
+"""Where arithmetic runs: the device and its memory, the precision, the threads of compiled kernels; for reports, too.
 
 Numba's own parallel loops need a threading layer that is unsafe to enter from two Python threads or after a fork; a
 plain thread pool is neither, and its kernels compile faster. The last bits of a network's output depend on the number
@@ -8,14 +8,18 @@ of threads, because sums run in another order.
 from __future__ import annotations
 
 import os
+import platform
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import Literal
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Literal
 
 import torch
 
+import spackle
 from spackle.errors import InputError
 
 # How torch says that memory is short, beside the exceptions that it has for it.
@@ -169,3 +173,25 @@ def _forget_pool() -> None:
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_forget_pool)
+
+
+def versions() -> dict[str, str]:
+    """Ours, and those of what computes."""
+    ours = {"spackle": spackle.__version__, "python": platform.python_version(), "torch": torch.__version__}
+    return ours | {name: version(name) for name in ("numba", "numpy")}
+
+
+def hardware(device: torch.device) -> dict[str, Any]:
+    """Processor, cores and threads, and the GPU where that is the device."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:  # not a Linux
+        lines = []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    facts = {"cpu": names[0] if names else platform.machine(), "cores": os.cpu_count(), "threads": thread_count()}
+    return facts | ({"gpu": torch.cuda.get_device_name(device)} if device.type == "cuda" else {})
+
+
+def load_average() -> float | None:
+    """Of the machine over the last minute, where it tells."""
+    return round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None

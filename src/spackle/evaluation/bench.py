@@ -20,6 +20,7 @@ from spackle.bases.sharp.base import unused_shapes
 from spackle.bases.sharp.encoder import FULL
 from spackle.bases.sharp.network import SharpNetwork
 from spackle.camera import Camera
+from spackle.device import hardware, load_average, versions
 from spackle.evaluation.case import Case, Viewpoint, load_case
 from spackle.evaluation.evaluate import EvaluateOptions, Evaluation, open_evaluation
 from spackle.evaluation.folder import ROWS, measure_images, write_rows
@@ -29,7 +30,6 @@ from spackle.evaluation.rows import BASE_PATH, EXTRA, NOTE, STAGES, Row
 from spackle.evaluation.tables import make_tables, write_tables
 from spackle.folders import results_folder
 from spackle.gaussians import Gaussians
-from spackle.machine import hardware, load_average, versions
 from spackle.progress import Reporter
 from spackle.render import Renderer, device_of
 from spackle.render.protocol import Rendering

@@ -17,7 +17,7 @@ from spackle.bases.lift import RgbdBase
 from spackle.bases.open import OpenedBase, open_base, open_loaded
 from spackle.bases.settings import NETWORKS, BaseSettings
 from spackle.camera_path import MAX_DISPARITY
-from spackle.device import pick_device, pick_dtype
+from spackle.device import hardware, pick_device, pick_dtype, versions
 from spackle.errors import InputError, check_name
 from spackle.evaluation.case import Case, LoadedCase, known_depth, load_case
 from spackle.evaluation.datasets import DATASETS, read_cases
@@ -35,7 +35,6 @@ from spackle.folders import digest_of, results_folder
 from spackle.gaussians import Gaussians
 from spackle.image import MAX_SIDE
 from spackle.inpaint import INPAINTERS, Inpainter, InpainterOptions, get_inpainter
-from spackle.machine import hardware, versions
 from spackle.pipeline import FillOptions
 from spackle.progress import Reporter, counted
 from spackle.render import Renderer, device_of, get_renderer

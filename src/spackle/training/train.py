@@ -30,12 +30,11 @@ from torch.nn.parallel import DistributedDataParallel
 from torch.nn.utils import clip_grad_norm_
 from torch.optim import AdamW
 
-from spackle.device import pick_device
+from spackle.device import hardware, pick_device, versions
 from spackle.errors import InputError, reading
 from spackle.files import write_json
 from spackle.folders import results_folder
 from spackle.formats import save_png
-from spackle.machine import hardware, versions
 from spackle.progress import Reporter, asked_to_stop
 from spackle.training.checkpoint import (
     BEST,

@@ -16,8 +16,9 @@ from typing import Annotated, Literal
 import torch
 from pydantic import BaseModel, Field, ValidationError, model_validator
 from torch import Tensor, nn
-from torch.nn.functional import gelu, interpolate, scaled_dot_product_attention
+from torch.nn.functional import interpolate
 
+from spackle.bases.sharp.encoder import NORM_EPS, TransformerBlock
 from spackle.errors import InputError, one_line, shown
 from spackle.network_file import channels_last, load_strict, read_checkpoint
 
@@ -25,7 +26,6 @@ ADVICE = "give MoGe-2's model.pt as it was downloaded"
 BACKBONES = {"dinov2_vits14": (384, 12, 6), "dinov2_vitb14": (768, 12, 12), "dinov2_vitl14": (1024, 24, 16)}
 PATCH = 14  # pixels of a token's side
 GRID = 37  # tokens of a side that the positions were learned on
-NORM_EPS = 1e-6
 LEVELS = 5  # of a pyramid, each twice as fine as the one before
 FINEST = 2 ** (LEVELS - 1)  # pixels of an output for each token's side
 conv3 = functools.partial(nn.Conv2d, kernel_size=3, padding=1, padding_mode="replicate")
@@ -94,27 +94,6 @@ class MogeOutput:
     metric_scale: Tensor  # [] metres for each unit of the points
 
 
-class DinoBlock(nn.Module):
-    """Self-attention, then a perceptron, scaled by channel and added to the tokens [B, T, C] in float32."""
-
-    def __init__(self, width: int, heads: int) -> None:
-        super().__init__()
-        self.heads = heads
-        self.norm1, self.norm2 = (nn.LayerNorm(width, eps=NORM_EPS) for _ in range(2))
-        self.attn = nn.ModuleDict({"qkv": nn.Linear(width, 3 * width), "proj": nn.Linear(width, width)})
-        self.mlp = nn.ModuleDict({"fc1": nn.Linear(width, 4 * width), "fc2": nn.Linear(4 * width, width)})
-        self.ls1, self.ls2 = (nn.ParameterDict({"gamma": torch.ones(width)}) for _ in range(2))
-
-    def forward(self, tokens: Tensor) -> Tensor:
-        dtype = self.attn["proj"].weight.dtype
-        qkv = self.attn["qkv"](self.norm1(tokens).to(dtype))
-        query, key, value = qkv.unflatten(2, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
-        attended = scaled_dot_product_attention(query, key, value).transpose(1, 2).flatten(2)
-        tokens = tokens + self.attn["proj"](attended) * self.ls1["gamma"]
-        out: Tensor = tokens + self.mlp["fc2"](gelu(self.mlp["fc1"](self.norm2(tokens).to(dtype)))) * self.ls2["gamma"]
-        return out
-
-
 class DinoBackbone(nn.Module):
     """DINOv2 (Oquab et al. 2023) without registers."""
 
@@ -124,7 +103,7 @@ class DinoBackbone(nn.Module):
         self.pos_embed = nn.Parameter(torch.zeros(1, 1 + GRID**2, width))
         self.mask_token = nn.Parameter(torch.zeros(1, width))  # of training alone
         self.patch_embed = nn.ModuleDict({"proj": nn.Conv2d(3, width, PATCH, stride=PATCH)})
-        self.blocks = nn.ModuleList(DinoBlock(width, heads) for _ in range(depth))
+        self.blocks = nn.ModuleList(TransformerBlock(width, heads) for _ in range(depth))
         self.norm = nn.LayerNorm(width, eps=NORM_EPS)
 
     def forward(self, image: Tensor, layers: Sequence[int]) -> list[Tensor]:
@@ -287,7 +266,7 @@ def load_network(path: str | os.PathLike[str], dtype: torch.dtype) -> MogeNetwor
 def set_precision(network: nn.Module, dtype: torch.dtype) -> None:
     """Convert what is added to the features to `dtype`, in place, and kernels to channels-last."""
     for block in network.modules():
-        if isinstance(block, (DinoBlock, ConvBlock)):
+        if isinstance(block, (TransformerBlock, ConvBlock)):
             for layer in block.modules():
                 if isinstance(layer, (nn.Linear, nn.Conv2d)):
                     layer.to(dtype)

@@ -91,7 +91,7 @@ class VisionTransformer(nn.Module):
         self.cls_token = nn.Parameter(torch.zeros(1, 1, config.embed))
         self.pos_embed = nn.Parameter(torch.zeros(1, 1 + config.grid**2, config.embed))
         self.patch_embed = nn.ModuleDict({"proj": ExactConv(3, config.embed, config.patch, stride=config.patch)})
-        self.blocks = nn.ModuleList(TransformerBlock(config) for _ in range(config.depth))
+        self.blocks = nn.ModuleList(TransformerBlock(config.embed, config.heads) for _ in range(config.depth))
         self.norm = nn.LayerNorm(config.embed, eps=NORM_EPS)
 
     def forward(self, windows: Tensor, taps: tuple[int, ...] = ()) -> tuple[Tensor, list[Tensor]]:
@@ -111,12 +111,11 @@ class VisionTransformer(nn.Module):
 
 
 class TransformerBlock(nn.Module):
-    """Self-attention, then a perceptron, each scaled by channel and added; tokens [B, T, C] float32."""
+    """DINOv2's: self-attention, then a perceptron, scaled by channel and added to tokens [B, T, C] in float32."""
 
-    def __init__(self, config: SharpConfig) -> None:
+    def __init__(self, width: int, heads: int) -> None:
         super().__init__()
-        width = config.embed
-        self.heads = config.heads
+        self.heads = heads
         self.norm1, self.norm2 = (nn.LayerNorm(width, eps=NORM_EPS) for _ in range(2))
         self.attn = nn.ModuleDict({"qkv": nn.Linear(width, 3 * width), "proj": nn.Linear(width, width)})
         self.mlp = nn.ModuleDict(
