@@ -22,6 +22,7 @@ ELSEWHERE = {
     "comfyui.md": "integrations/comfyui/README.md",
     "weights.md": "src/spackle/weights/README.md",
 }
+CODE = {"python.md": "src/spackle/__init__.py", "commands.md": "src/spackle/cli/commands.py"}  # what a page is made of
 COMMANDS = ("predict", "view", "render", "export", "info", "demo", "weights get", "weights list", "weights make")
 COMMANDS += ("train", "dataset build", "dataset info", "dataset verify", "dataset preview", "evaluate", "tables")
 COMMANDS += ("bench",)
@@ -41,7 +42,7 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Let links lead to pages of the site; what is not on it stays as words."""
     here = page.file.src_uri
     source = ROOT / ELSEWHERE.get(here, f"docs/{here}")
-    moved = {(ROOT / place).resolve(): name for name, place in ELSEWHERE.items()}
+    moved = {(ROOT / place).resolve(): name for name, place in (ELSEWHERE | CODE).items()}
 
     def lead(found: re.Match[str]) -> str:
         picture, words, target = found.groups()
