@@ -26,6 +26,7 @@ CODE = {"python.md": "src/spackle/__init__.py", "commands.md": "src/spackle/cli/
 COMMANDS = ("predict", "view", "render", "export", "info", "demo", "weights get", "weights list", "weights make")
 COMMANDS += ("train", "dataset build", "dataset info", "dataset verify", "dataset preview", "evaluate", "tables")
 COMMANDS += ("bench",)
+EXAMPLE = re.compile(r"^`(examples/\w+\.py)`$", re.MULTILINE)  # what a line with nothing but a link becomes
 LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)\s]+)\)")
 
 
@@ -57,7 +58,12 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
             return words
         return f"{picture}[{words}]({os.path.relpath(name, Path(here).parent)}{hash_}{section})"
 
-    return LINK.sub(lead, markdown)
+    return EXAMPLE.sub(_code, LINK.sub(lead, markdown))
+
+
+def _code(found: re.Match[str]) -> str:
+    """An example, in place of its name."""
+    return f'```python title="{found[1]}"\n{(ROOT / found[1]).read_text(encoding="utf-8")}```'
 
 
 def _commands() -> str:
