@@ -199,7 +199,7 @@ def precisions(options: argparse.Namespace) -> Iterator[str]:
     ]  # fmt: skip
     for name, precision, compiled in ways:
         base, photo = sharp(options, precision, compiled=compiled)
-        found[name] = to_metric(base.infer(photo), photo).means.cpu()
+        found[name] = to_metric(base.infer(photo), photo).means
         if base.compile_problem:
             yield f"{name}: not compiled: {base.compile_problem}"
             continue

@@ -96,7 +96,7 @@ def run_ours(clock: Clock, weights: Path, photo: Path, output: Path, **options: 
     """The same with Spackle."""
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line does
     import spackle
-    from spackle.bases.sharp.base import to_metric, to_processor
+    from spackle.bases.sharp.base import to_metric
 
     clock.lap("import")
     base = spackle.SharpBase.load(weights, device=clock.device, **options)
@@ -104,7 +104,7 @@ def run_ours(clock: Clock, weights: Path, photo: Path, output: Path, **options: 
     picture = spackle.load_photo(photo)
     found = base.infer(picture)
     clock.lap("network")
-    gaussians = to_processor(to_metric(found, picture))
+    gaussians = to_metric(found, picture)
     clock.lap("post-processing")
     spackle.save_ply(gaussians, output, camera=picture.camera)
     clock.lap("save")

@@ -31,7 +31,7 @@ from spackle.bases.lift import lift
 from spackle.bases.open import open_base
 from spackle.bases.settings import BaseSettings
 from spackle.bases.sharp import SharpBase
-from spackle.bases.sharp.base import to_metric, to_processor
+from spackle.bases.sharp.base import to_metric
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, trajectory
 from spackle.device import hardware, load_average, versions
@@ -217,7 +217,7 @@ def sharp_section(runs: int, base: SharpBase, photo: Photo, peaks: Peaks, device
         nonlocal count
         output = base.infer(photo)
         lap(FORWARD)
-        gaussians = to_processor(to_metric(output, photo))
+        gaussians = to_metric(output, photo)
         count = len(gaussians)
         lap(UNPROJECT)
         with tempfile.TemporaryDirectory() as folder:

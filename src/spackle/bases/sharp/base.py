@@ -108,7 +108,7 @@ class SharpBase:
         """
         advice = [] if self.windows == 1 else ["try --sharp windows=1"]
         with enough_memory(*advice):
-            gaussians = to_processor(to_metric(self.infer(photo, progress), photo))
+            gaussians = to_metric(self.infer(photo, progress), photo)
         camera = Camera.from_focal(photo.focal_px, photo.width, photo.height)
         notes: dict[str, float | int | str] = {"precision": self.precision, "weights": self.weights}
         return BasePrediction(gaussians, camera.resized(*working_size(photo.width, photo.height)), notes)
@@ -144,13 +144,13 @@ def check_windows(option: str, windows: int | None) -> None:
 
 
 def to_metric(output: SharpOutput, photo: Photo) -> Gaussians:
-    """Gaussians in metres, on the network's device: the normalised space is x and y in -1..1 times z."""
+    """Gaussians in metres, on the processor: the normalised space is x and y in -1..1 times z."""
     stretch = (photo.width / (2 * photo.focal_px), photo.height / (2 * photo.focal_px), 1.0)
     with own_arithmetic(output.deltas.device):
-        return stretch_gaussians(compose(output.start, output.deltas), stretch)
+        return stretch_gaussians(_to_processor(compose(output.start, output.deltas)), stretch)
 
 
-def to_processor(gaussians: Gaussians) -> Gaussians:
+def _to_processor(gaussians: Gaussians) -> Gaussians:
     """The same on the processor; from a GPU in one copy, the only one that waits for it: five would wait five times."""
     if gaussians.means.device.type == "cpu":
         return gaussians

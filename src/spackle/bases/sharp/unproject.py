@@ -7,23 +7,20 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
-from torch.nn.functional import normalize
 
 from spackle._numba import kernel
 from spackle.device import run_chunks
-from spackle.gaussians import Gaussians, quat_from_matrix, quat_to_matrix
+from spackle.gaussians import Gaussians
 
 SWEEPS = 4  # after three, the cosine between two columns was 3e-3 at worst; after four, 1e-15
 UPRIGHT = 0.5  # squared sine of the angle between two columns below which the shorter one is noise
 BLOCK = 64  # Gaussians whose columns lie side by side in the first-level cache
 LEAST = 1e-300  # keeps 0/0 out, and is below every square of a float32
 GRAIN = 256 * BLOCK  # Gaussians that a thread takes at a time
-PAIRS = (0, 1), (0, 2), (1, 2)  # the columns that a sweep turns
 
 
 def stretch_gaussians(gaussians: Gaussians, stretch: tuple[float, float, float]) -> Gaussians:
-    """Map N Gaussians by D = diag(stretch), which turns and reshapes each one.
+    """Map N Gaussians on the processor by D = diag(stretch), which turns and reshapes each one.
 
     A covariance R S² Rᵀ becomes M Mᵀ with M = D R S. Rotations of M from the right leave that as it is; once they have
     made M's columns orthogonal (one-sided Jacobi), the columns' lengths are the new scales and their directions the new
@@ -33,62 +30,13 @@ def stretch_gaussians(gaussians: Gaussians, stretch: tuple[float, float, float])
         N Gaussians with descending scales and unit quats with w ≥ 0 (a zero one counts as no rotation); opacities and
         colors are the same tensors; the rest is cut off from autograd.
     """
-    quats, scales = gaussians.quats.detach(), gaussians.scales.detach()
-    plain = any(t.device.type != "cpu" or t.dtype != torch.float32 for t in (quats, scales))
-    if plain:
-        quats, scales = plain_stretch(quats, scales, stretch)
-    else:
-        source = quats.contiguous().numpy(), scales.contiguous().numpy()
-        result = np.empty((len(quats), 4), np.float32), np.empty((len(quats), 3), np.float32)
-        factors = float(stretch[0]), float(stretch[1]), float(stretch[2])
-        run_chunks(lambda start, stop: stretch_chunk(start, stop, *source, factors, *result), len(quats), GRAIN)
-        quats, scales = torch.from_numpy(result[0]), torch.from_numpy(result[1])
-    means = gaussians.means.detach()
-    return Gaussians(means * _vector(stretch, means), quats, scales, gaussians.opacities, gaussians.colors)
-
-
-def plain_stretch(quats: Tensor, scales: Tensor, stretch: tuple[float, float, float]) -> tuple[Tensor, Tensor]:
-    """The same sweeps as batched operations over quats [N, 4] and scales [N, 3], for any device and floating dtype."""
-    dtype = torch.promote_types(scales.dtype, torch.float32)
-    # In units of each Gaussian's largest scale no square overflows, and none that matters underflows.
-    unit = scales.abs().amax(1, keepdim=True).to(dtype).clamp(min=torch.finfo(dtype).tiny)
-    matrix = quat_to_matrix(quats.to(dtype)) * (scales / unit)[:, None] * _vector(stretch, unit)[:, None]
-    columns = list(matrix.unbind(2))
-    for _ in range(SWEEPS):
-        for i, j in PAIRS:
-            columns[i], columns[j] = _plain_turn(columns[i], columns[j])
-    matrix = torch.stack(columns, 2)
-    sizes, order = torch.linalg.vector_norm(matrix, dim=1).sort(dim=1, descending=True, stable=True)
-    a, b, _ = matrix.gather(2, order[:, None].expand_as(matrix)).unbind(2)
-    rotation = _plain_frame(a, b)
-    return quat_from_matrix(rotation).to(quats.dtype), (sizes * unit).to(scales.dtype)
-
-
-def _vector(numbers: tuple[float, float, float], like: Tensor) -> Tensor:
-    """`like.new_tensor(numbers)` without a copy to the device, for which the processor would wait."""
-    return torch.stack([like.new_full((), number) for number in numbers])
-
-
-def _plain_turn(p: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
-    """Rotate columns [N, 3] in their plane, by 45° at most, so that they become orthogonal."""
-    skew, lead = 2 * (p * q).sum(1, keepdim=True), (q * q - p * p).sum(1, keepdim=True)
-    # hypot, because a small lead's square would underflow.
-    tangent = skew / (lead.abs() + torch.hypot(lead, skew)).clamp(min=torch.finfo(lead.dtype).tiny)
-    tangent = torch.where(lead < 0, -tangent, tangent)
-    cosine = 1 / (1 + tangent * tangent).sqrt()
-    sine = tangent * cosine
-    return cosine * p - sine * q, sine * p + cosine * q
-
-
-def _plain_frame(a: Tensor, b: Tensor) -> Tensor:
-    """Rotations [N, 3, 3] with the first axis along a and the second nearly along b, any where they are zero."""
-    axes = torch.eye(3, dtype=a.dtype, device=a.device)
-    a, b = normalize(a, dim=1, eps=torch.finfo(a.dtype).tiny), normalize(b, dim=1, eps=torch.finfo(a.dtype).tiny)
-    a = torch.where(a.any(1, keepdim=True), a, axes[0])
-    c = torch.linalg.cross(a, b)
-    usable = (c * c).sum(1, keepdim=True) > UPRIGHT
-    c = normalize(torch.where(usable, c, torch.linalg.cross(a, axes[a.abs().argmin(1)])), dim=1)
-    return torch.stack([a, torch.linalg.cross(c, a), c], dim=2)
+    means, quats, scales = (t.detach() for t in gaussians.tensors[:3])
+    source = quats.contiguous().numpy(), scales.contiguous().numpy()
+    result = np.empty((len(quats), 4), np.float32), np.empty((len(quats), 3), np.float32)
+    factors = float(stretch[0]), float(stretch[1]), float(stretch[2])
+    run_chunks(lambda start, stop: stretch_chunk(start, stop, *source, factors, *result), len(quats), GRAIN)
+    turned, scaled = torch.from_numpy(result[0]), torch.from_numpy(result[1])
+    return Gaussians(means * means.new_tensor(stretch), turned, scaled, gaussians.opacities, gaussians.colors)
 
 
 @kernel
@@ -190,7 +138,7 @@ def _other_axes(a: Any, b: Any) -> Any:
 
 @kernel
 def _quat_of_axes(a: Any, b: Any, c: Any) -> Any:
-    """`quat_from_matrix` of a rotation's columns."""
+    """`spackle.gaussians.quat_from_matrix` of a rotation's columns."""
     ww, xx = 1.0 + a[0] + b[1] + c[2], 1.0 + a[0] - b[1] - c[2]
     yy, zz = 1.0 - a[0] + b[1] - c[2], 1.0 - a[0] - b[1] + c[2]
     wx, wy, wz = b[2] - c[1], c[0] - a[2], a[1] - b[0]
