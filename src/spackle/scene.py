@@ -17,6 +17,7 @@ from spackle.camera import Camera
 from spackle.camera_path import OVERSCAN, DepthRange, KeyframePath, TrajectoryKind
 from spackle.errors import renamed
 from spackle.files import Target, check_writable, write_bytes
+from spackle.formats.html import PageScene, page_scene, single_html
 from spackle.formats.ply import save_ply
 from spackle.formats.scene_files import Encoder, SceneFile, at_origin, encoder_of, load_scene
 from spackle.formats.video import check_video, save_video
@@ -26,7 +27,6 @@ from spackle.render import Renderer, get_renderer
 from spackle.render.protocol import Rendering
 from spackle.residual.view_features import hole_mask
 from spackle.views import PATH_FRAMES, SECONDS, scene_path
-from spackle.web.page import PageScene, page_scene, single_html
 
 DEFAULT_SIZE = (1280, 720)  # of a scene without a camera
 

@@ -48,6 +48,7 @@ def test_a_photo_becomes_a_scene(server: Served) -> None:
     assert server.events(id) == told[-1:]  # again: a page that comes late
     state = server.ask(f"{SCENES}/{id}").json
     assert (state["state"], state["error"], state["share"], "source" in state) == ("done", None, None, False)
+    assert state["files"] == ["photo.jpg"]  # no such thing as page.json
     page = server.ask(f"{SCENES}/{id}/files/page.json").json
     assert (page["depth"], page["options"]) == ("depth", {"base": "auto", "frames": 3})
     assert server.ask(f"{SCENES}/{id}/files/base.splats").body == PHOTO

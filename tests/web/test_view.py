@@ -74,6 +74,7 @@ def test_a_scene_keeps_its_parts_and_its_camera(tmp_path: Path, visit: Callable[
 
     def browse(server: Served, id: str) -> None:
         seen.append(page_of(server, id))
+        assert server.ask(f"{SCENES}/{id}").json["files"] == ["scene.ply"]  # there is no photo to show meanwhile
         assert server.ask(f"{SCENES}/{id}/files/scene.spz").body[:2] == b"\x1f\x8b"
         assert server.ask(f"{SCENES}/{id}/files/report.json").status == 404
 

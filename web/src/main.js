@@ -79,9 +79,9 @@ async function watch(id) {
   working = id;
   viewer.playing = false; // the processor is needed elsewhere
   history.replaceState(null, "", `#${id}`);
-  if (!stand.url) stand(source.file(id, "photo.jpg"));
   progress(null, null);
   try {
+    if (!stand.url && (await source.state(id)).files.includes("photo.jpg")) stand(source.file(id, "photo.jpg"));
     await source.follow(id, ({ stage, share }) => progress(stage, share));
     await show(await source.load(id, (share) => progress("load", share)), id);
   } catch (error) {

@@ -17,6 +17,11 @@ export async function current() {
   return (await answer(await fetch(here("/page.json"), { cache: "no-store" }))).json();
 }
 
+/** How far a scene is, and the `files` that are there. */
+export async function state(id) {
+  return (await answer(await fetch(here(`${SCENES}/${id}`)))).json();
+}
+
 /** The address of a scene's file. */
 export function file(id, name) {
   return here(`${SCENES}/${id}/files/${name}`);

@@ -21,6 +21,7 @@ from spackle.errors import InputError
 from spackle.files import check_writable, write_whole
 from spackle.folders import results_folder
 from spackle.formats import save_png, save_video
+from spackle.formats.html import PageScene, single_html
 from spackle.formats.scene_files import Encoder, SceneFile, encoder_of, load_scene
 from spackle.formats.spz import LARGEST, spz_grid
 from spackle.formats.video import FORMATS
@@ -31,7 +32,6 @@ from spackle.residual import hole_area_ratio
 from spackle.scene import DEFAULT_SIZE, Scene
 from spackle.video_frames import FrameMaker, video_problem
 from spackle.views import PathOptions
-from spackle.web.page import PageScene, single_html
 
 TOLERATED = 0.01  # fraction of a frame that may be holes without a line about it
 PAGE: dict[str, Encoder] = {".html": lambda scene: single_html(page_of(Scene.of_file(scene), scene.path))}

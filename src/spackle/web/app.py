@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 import re
 import shutil
 from collections.abc import AsyncIterator
@@ -24,15 +25,16 @@ from starlette.staticfiles import StaticFiles
 import spackle
 from spackle.bases.settings import AUTO
 from spackle.errors import InputError, check_name, one_line
+from spackle.formats.html import page_file
 from spackle.image import PHOTO_SUFFIXES
 from spackle.task_process import Work
 from spackle.web.guard import Access, Guard, Limits
 from spackle.web.jobs import Job, Jobs, Keep, SceneState
-from spackle.web.page import page_file
-from spackle.web.work import PREVIEW, FileName, SceneOptions, SceneWork, check_photo
+from spackle.web.work import PREVIEW, Download, FileName, SceneOptions, SceneWork, Video, check_photo
 
 PagePart = Literal["page.json", "base.splats", "aux.splats", "photo.jpg"]  # what the page draws
 SCENES = "/api/v1/scenes"
+FILES = [PREVIEW, *get_args(Download), *get_args(Video)]  # that a state lists
 DEPTH_SUFFIXES = (".npy", ".npz", ".png", ".pfm")  # of a photo, as `spackle predict --depth` takes them
 PACE_S = 0.1  # between two looks of a listener
 WORK, KEEP, LIMITS = SceneWork(), Keep(), Limits()
@@ -118,8 +120,10 @@ def create_app(
 
     @app.get(SCENES + "/{id}")
     async def get_state(id: str) -> SceneState:
-        """How far a photo is."""
-        return job_of(id)
+        """How far a photo is, and which files there are."""
+        job = job_of(id)
+        names = {name for folder in (job.folder, job.results) if folder.is_dir() for name in os.listdir(folder)}
+        return job.model_copy(update={"files": sorted(names.intersection(FILES))})
 
     @app.delete(SCENES + "/{id}", status_code=204)
     async def delete(id: str) -> None:

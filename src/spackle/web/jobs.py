@@ -47,6 +47,7 @@ class SceneState(BaseModel):
     share: float | None = Field(default=None, description="How much of the stage is done, 0 to 1, where it is known.")
     line: str | None = Field(default=None, description="What was said last.")
     error: str | None = Field(default=None, description="Why it failed, in a line.")
+    files: list[str] = Field(default=[], description="What lies there; of a scene that is done more can be had.")
     created: float = Field(default_factory=time.time, description="Seconds since 1970.")
     ended: float | None = None
 

@@ -22,6 +22,7 @@ from spackle.camera_path import MAX_DISPARITY, OVERSCAN, TRAJECTORIES, Trajector
 from spackle.errors import InputError
 from spackle.files import write_whole
 from spackle.formats import save_video
+from spackle.formats.html import as_json, single_html
 from spackle.formats.scene_files import scene_kind
 from spackle.image import PHOTO_SUFFIXES, read_image
 from spackle.photo_results import REPORT, predict_photo
@@ -33,7 +34,6 @@ from spackle.task_process import Tell
 from spackle.video_frames import DEFAULT_FPS
 from spackle.views import MAX_FRAMES, SECONDS, PathOptions
 from spackle.web.jobs import Job
-from spackle.web.page import as_json, single_html
 
 Download = Literal["scene.ply", "scene.spz", "scene.sog", "scene.glb", "scene.html", "report.json"]
 Video = Literal[

@@ -1,0 +1,89 @@
+"""The single HTML file: how a layer is packed, how far the eye may go, and which scripts run."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import hashlib
+import json
+import math
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scenes import box_before_wall
+
+from spackle.color import linear_to_srgb
+from spackle.formats.html import BYTES, encode_layer, page_scene, single_html
+from spackle.gaussians import Gaussians
+from spackle.gaussians import quat_to_matrix as matrices
+
+EVIL = "</script><b>&\"'\ud800"
+BOX = box_before_wall(width=64, height=48, focal=53)
+
+
+def decoded(data: bytes, low: float, step: float) -> Gaussians:
+    """The plain twin of the page's own reading, as the docstring of `encode_layer` has it."""
+    count = len(data) // BYTES
+    planes = np.frombuffer(data, np.uint8).reshape(BYTES, count).astype(np.int64)
+    rows = []
+    for i in range(count):
+        b = [int(value) for value in planes[:, i]]
+        words = [b[3 * k] << 8 | b[3 * k + 1] << 16 | b[3 * k + 2] << 24 for k in range(3)]
+        means = [float(np.uint32(word).view(np.float32)) for word in words]
+        scales = [math.exp(low + step * value) for value in b[9:12]]
+        quat = [(value - 128) / 127 / math.sqrt(2) for value in b[13:16]]
+        quat.insert(b[12], math.sqrt(max(0.0, 1 - sum(part * part for part in quat))))
+        rows.append([*means, *quat, *scales, b[19] / 255, *(value / 255 for value in b[16:19])])
+    table = torch.tensor(rows)
+    return Gaussians(table[:, :3], table[:, 3:7], table[:, 7:10], table[:, 10], table[:, 11:])
+
+
+def random_gaussians(count: int = 200) -> Gaussians:
+    """Near things and a sky, thin and thick, turned every way."""
+    torch.manual_seed(3)
+    means = torch.randn(count, 3) * torch.logspace(-1, 4, count)[:, None]
+    scales = torch.exp(torch.rand(count, 3) * 14 - 9)
+    return Gaussians(means, torch.randn(count, 4) * 3, scales, torch.rand(count), torch.rand(count, 3))
+
+
+def test_a_layer_is_read_back_as_precisely_as_it_says() -> None:
+    wanted = random_gaussians()
+    data, low, step = encode_layer(wanted)
+    got = decoded(data, low, step)
+    assert len(got) == len(wanted)
+    torch.testing.assert_close(got.means, wanted.means, rtol=2.0**-16, atol=0)
+    assert step < 0.06
+    torch.testing.assert_close(got.scales.log(), wanted.scales.log(), rtol=0, atol=step / 2 + 1e-4)
+    turn = matrices(got.quats) @ matrices(wanted.quats).transpose(1, 2)
+    assert float(torch.arccos(((turn.diagonal(dim1=1, dim2=2).sum(-1) - 1) / 2).clamp(-1, 1)).max()) < 0.017  # radians
+    torch.testing.assert_close(got.colors, linear_to_srgb(wanted.colors), rtol=0, atol=0.502 / 255)
+    torch.testing.assert_close(got.opacities, wanted.opacities, rtol=0, atol=0.502 / 255)
+    # One broken size does not cost the others their precision.
+    scales = torch.cat([torch.full((1, 3), 1e-37), wanted.scales[1:]])
+    assert encode_layer(dataclasses.replace(wanted, scales=scales))[2] < 0.11
+    assert page_scene("alone", wanted, Gaussians.empty(), BOX.camera).files["aux.splats"] == b""
+
+
+@pytest.mark.parametrize(("disparity", "filled", "free"), [(0.2, 1, 0.2), (None, 1, 0.3), (None, 0, 0.6), (5, 1, 1)])
+def test_the_eye_goes_as_far_as_the_scene_was_completed(disparity: float | None, filled: bool, free: float) -> None:
+    aux = random_gaussians() if filled else Gaussians.empty()
+    orbit: Any = page_scene("a", BOX.base(), aux, BOX.camera, disparity).description["orbit"]
+    assert (orbit["free"], orbit["limit"]) == (free, free)
+
+
+def test_the_single_file_runs_its_own_script_and_style_alone() -> None:
+    page = single_html(page_scene(EVIL, BOX.base(), Gaussians.empty(), BOX.camera))
+    assert page == single_html(page_scene(EVIL, BOX.base(), Gaussians.empty(), BOX.camera))
+    assert EVIL[:9].encode() + b"<b>" not in page
+    (inside,) = re.findall(rb'<script type="application/json" id="spackle-scene">(.*?)</script>', page)
+    assert json.loads(inside)["description"]["name"] == EVIL
+    (policy,) = re.findall(r'Content-Security-Policy" content="([^"]+)"', page.decode())
+    assert policy.startswith("default-src 'none';")
+    assert "unsafe-inline" not in policy
+    for element in ("script", "style"):
+        (text,) = re.findall(rf"<{element}>(.*?)</{element}>", page.decode(), re.DOTALL)
+        digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+        assert f"'sha256-{digest}'" in policy
