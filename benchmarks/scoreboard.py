@@ -21,7 +21,6 @@ seam ↓        mean grey difference within 2 pixels of the photo's former borde
 photo ↑       PSNR of the completed scene at the photo's own camera against the photo, dB
 agreement ↑   the same against the lifted photo, at most 100 dB
 HAR ↓         what is left of the hole, percent of the view
-NIQE ↓        of the view over that of the right photo, with --niqe
 base, aux     thousands of Gaussians; s lift and s fill: processor seconds of all threads
 
 --small N gives the lift maps of a side N times smaller, in 256 steps of inverse depth, as phones store them. --without
@@ -50,7 +49,6 @@ from unittest import mock
 import numpy as np
 import torch
 import torch.nn.functional as F
-from niqe import NiqeModel, load_niqe, niqe
 from PIL import Image
 from torch import Tensor
 
@@ -76,7 +74,7 @@ LAYERS = ("conv1", "fire3", "fire5", "fire9")
 BAND_PX = 8
 NEAR, BESIDE, STEP = 2, 20, 0.05  # of a seam: pixels, pixels, and the relative step of depth that makes it none
 STEPS = 255  # of a phone's inverse depth
-DIGITS = dict.fromkeys(("distance", "texture", "seam", "HAR", "NIQE"), 3)  # others 2
+DIGITS = dict.fromkeys(("distance", "texture", "seam", "HAR"), 3)  # others 2
 SECONDS = ("s lift", "s fill")
 PHOTOS, PHOTO_HEIGHT = 8, 256  # of a sheet
 CUT_PHOTOS = 24  # of a folder, whose sides are cut off
@@ -200,7 +198,7 @@ class Pair:
         seeds = spackle.complete(prediction, [self.beside], exact=True, network=None, fill="network")
         self.crossings = crossings(seeds.render(self.beside).depth, self.beside, self.camera)
 
-    def measure(self, run: str, perception: Perception | None, model: NiqeModel | None) -> Row:
+    def measure(self, run: str, perception: Perception | None) -> Row:
         """A run's figures."""
         began = time.process_time()
         with switched_off(run, LIFT):
@@ -221,8 +219,6 @@ class Pair:
         base = RENDERER.render(prediction.gaussians, self.camera).rgb
         row["agreement"] = min(hole_psnr(photo, base, everywhere), 100.0)
         row["HAR"] = 100 * hole_area_ratio(view.alpha)
-        if model:
-            row["NIQE"] = niqe(view.rgb, model) / niqe(self.right, model)
         row |= {"base": len(scene.base) / 1000, "aux": len(scene.aux) / 1000}
         return row | dict(zip(SECONDS, seconds, strict=True))
 
@@ -362,7 +358,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, nargs="?", metavar="PAIRS")
     parser.add_argument("--features", type=Path, help="SqueezeNet 1.0's weights; distance and texture need them")
-    parser.add_argument("--niqe", type=Path, help="NIQE's pristine model")
     parser.add_argument("--small", type=int, default=1, help="how many times smaller a side of the depth maps is")
     parser.add_argument("--scenes", default="", help="words, one of which a scene's name has to have")
     parser.add_argument("--without", action="append", default=[], help=f"NAME+...: {', '.join(MECHANISMS)}")
@@ -386,12 +381,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if before and before["small"] != chosen.small:
         parser.error(f"{chosen.against}: its depth maps are {before['small']} times smaller, not {chosen.small}")
     network = load_features("squeezenet", chosen.features) if chosen.features else None
-    perception, model = Perception(network) if network else None, load_niqe(chosen.niqe) if chosen.niqe else None
+    perception = Perception(network) if network else None
     runs: dict[str, Rows] = {name: {} for name in names}
     for folder in folders:
         pair = Pair(folder, chosen.small)
         for name, rows in runs.items():
-            rows[folder.name] = pair.measure(name, perception, model)
+            rows[folder.name] = pair.measure(name, perception)
             print(folder.name, name, *(f"{m} {text(m, v)}" for m, v in rows[folder.name].items()), file=sys.stderr)
         if chosen.output:
             chosen.output.write_text(json.dumps({"small": chosen.small, "runs": runs}, indent=1) + "\n")

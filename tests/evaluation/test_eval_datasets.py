@@ -23,11 +23,10 @@ from spackle.bases.settings import BaseSettings
 from spackle.camera import Camera
 from spackle.errors import InputError
 from spackle.evaluation.case import Case, Points, known_depth, load_case
-from spackle.evaluation.datasets import DATASETS, read_cases
+from spackle.evaluation.datasets import read_cases
 from spackle.evaluation.datasets.multiview import spread
 from spackle.evaluation.evaluate import EvaluateOptions, open_evaluation
 from spackle.evaluation.protocols import Alignment, align, to_base
-from spackle.evaluation.rows import IMAGES
 from spackle.image import working_size
 
 Array = NDArray[Any]
@@ -177,12 +176,6 @@ def test_each_tree_is_read_by_its_dataset_and_known_by_others(there: str, tmp_pa
     assert load_case(found[0]).seconds
 
 
-def test_names_and_roots_without_anything(tmp_path: Path) -> None:
-    assert {dataset.title for dataset in DATASETS.values()} == set(IMAGES)
-    assert "no such folder" in error_of("llff", tmp_path / "nowhere")
-    assert "looks like" not in error_of("llff", tmp_path)
-
-
 MIDDLEBURY, BOOSTER, WILD = "Piano-perfect", "train/balanced/Bathroom", "apple/scenes/scene_000"
 MODEL = "courtyard/dslr_calibration_undistorted"
 BROKEN: list[tuple[str, str, str | None, str]] = [  # dataset, file, its content or None where it is gone, the message
@@ -217,6 +210,8 @@ def test_a_lost_or_damaged_file_is_named(name: str, file: str, content: str | No
 
 
 def test_too_few_photos_odd_poses_and_lenses_that_bend_are_refused(tmp_path: Path) -> None:
+    assert "no such folder" in error_of("llff", tmp_path / "nowhere")
+    assert "looks like" not in error_of("llff", tmp_path)
     llff(tmp_path / "one/fern", EYES[:1])
     assert "at least two photos" in error_of("llff", tmp_path / "one")
     path = TREES["llff"](tmp_path / "poses") / "poses_bounds.npy"
@@ -258,19 +253,6 @@ def test_middlebury_2014(tmp_path: Path) -> None:
         assert (float(K[0, 2]), bool(valid[0, 0])) == (20.75, False)  # the file counts from the first pixel's middle
     middlebury_2014(tmp_path / "trainingH/Art")
     assert "give the folder of one size" in error_of("middlebury", tmp_path)
-
-
-def test_a_scene_description(tmp_path: Path) -> None:
-    for name in ("left.png", "right.png"):
-        write_photo(tmp_path / "mb_Art" / name, WIDTH, HEIGHT)
-    Image.fromarray(np.full((HEIGHT, WIDTH), 30, np.uint8)).save(tmp_path / "mb_Art/disparity.png")
-    facts = {"left": "left.png", "right": "right.png", "disparity": "disparity.png", "disparity_scale": 1 / 3}
-    lens = {"focal_px": FOCAL, "cx": 24.0, "cy": 18.0, "doffs_px": 2.0, "baseline_m": 0.16, "invalid": 0}
-    path = tmp_path / "mb_Art/scene.json"
-    path.write_text(json.dumps(facts | lens))
-    assert_pair(read_cases("middlebury", tmp_path)[0], 10.0, FOCAL * 0.16 / 12)
-    path.write_text(json.dumps(lens))
-    assert "scene.json: not a scene description" in error_of("middlebury", tmp_path)
 
 
 def test_booster(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from spackle.errors import reason_in_a_line
 from spackle.evaluation.rows import load_data
-from spackle.filters import greatest_around
+from spackle.filters import blurred, greatest_around
 from spackle.training.losses import hole_psnr
 
 OWN = "own"
@@ -110,23 +110,19 @@ def ssim_map(image: Tensor, truth: Tensor) -> Tensor:
 
     At the border the picture is mirrored to fill the window. `image` and `truth` are [H, W, 3] sRGB 0..1.
     """
-    x, y = (picture.double().permute(2, 0, 1).contiguous() for picture in (image, truth))
+    x, y = image.double(), truth.double()
     mean_x, mean_y, square_x, square_y, product = (_blur(moment) for moment in (x, y, x * x, y * y, x * y))
     variance_x, variance_y = square_x - mean_x**2, square_y - mean_y**2
     covariance = product - mean_x * mean_y
     likeness = (2 * mean_x * mean_y + C1) * (2 * covariance + C2)
-    return (likeness / ((mean_x**2 + mean_y**2 + C1) * (variance_x + variance_y + C2))).permute(1, 2, 0)
+    return likeness / ((mean_x**2 + mean_y**2 + C1) * (variance_x + variance_y + C2))
 
 
 def _blur(image: Tensor) -> Tensor:
-    """[3, H, W] under the window; pixels beyond the border are mirrored, the border's own among them."""
-    (_, height, width), reach = image.shape, WINDOW // 2
-    weights = torch.exp(-0.5 * (torch.arange(-reach, reach + 1, dtype=torch.float64) / SIGMA) ** 2)
-    shares = (weights / weights.sum()).tolist()
-    wide = torch.from_numpy(np.pad(image.numpy(), ((0, 0), (reach, reach), (reach, reach)), "symmetric"))
-    # Sums of slices: convolutions in float64 are slow.
-    tall = sum((wide[:, k : k + height] * share for k, share in enumerate(shares)), torch.zeros(()))
-    return sum((tall[..., k : k + width] * share for k, share in enumerate(shares)), torch.zeros(()))
+    """[H, W, 3] under the window; pixels beyond the border are mirrored, the border's own among them."""
+    reach = WINDOW // 2
+    wide = np.pad(image.numpy(), ((reach, reach), (reach, reach), (0, 0)), "symmetric")
+    return blurred(torch.from_numpy(wide), SIGMA)[reach:-reach, reach:-reach]
 
 
 def open_metrics(names: Sequence[str], device: str, download: bool) -> tuple[dict[str, Metric], dict[str, str]]:

@@ -42,9 +42,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes as Axes
 
 REPORT = "report.html"
-SMALLER = (720, 540, 400)  # where they would be too many bytes
-BUDGET = 7_500_000  # characters of all pictures of a page
-MOST = 8  # images of a page
+MOST = 8  # images of a page in their full size
 LEAST = 2  # of each evaluation, however many there are
 # A slider has the first of these that there are: all methods of all images would make a page too large.
 SHOWN = ("base", "spackle", TRUTH, "inpaint2d", "paper", "seeds", "direct-ft", "spackle-scene", "dense")
@@ -85,18 +83,21 @@ def make_report(sources: Sequence[Source], *, whole: bool = False) -> str:
 
     `sources` are one or more evaluations and benchmarks whose tables go together; `whole`: see `make_tables`.
     """
-    runs = [run for run, _ in sources]
+    runs, measured = [run for run, _ in sources], [source for source in sources if not source[0].timed]
+    count = max(LEAST, MOST // max(1, len(measured)))
+    many = max(1.0, count * len(measured) / MOST)  # whose pictures are smaller, so that the page is not larger
+    side = round(LARGE_SIDE / math.sqrt(many))
     text = resources.files("spackle.evaluation").joinpath(REPORT).read_text(encoding="utf-8")
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     environment.filters |= {"groups": groups, "bold": _bold}
     page = environment.from_string(text).render(
         title=f"Spackle: evaluation on {', '.join(dict.fromkeys(run.title for run in runs))}",
-        parts=_parts([(run, folder) for run, folder in sources if not run.timed]),
+        parts=[_part(run, folder, count, side) for run, folder in measured],
         tables=make_tables(runs, whole=whole),
         runs=runs,
         most=MOST,
         least=LEAST,
-        side=LARGE_SIDE,
+        side=side,
     )
     return UNPRINTABLE.sub("\N{REPLACEMENT CHARACTER}", page) + "\n"
 
@@ -106,25 +107,19 @@ def _bold(text: str) -> Markup:
     return Markup(re.sub(r"\*\*(.+?)\*\*", r"<strong>\1</strong>", str(escape(text))))
 
 
-def _parts(sources: Sequence[Source]) -> list[dict[str, Any]]:
-    """What the page has of each evaluation."""
-    count = max(LEAST, MOST // max(1, len(sources)))
-    rankings = [rank(run) for run, _ in sources]
-    picked = [_pick(*source, ranking, count) for source, ranking in zip(sources, rankings, strict=True)]
-    fits = iter(fitting([pictures for cases in picked for _, _, pictures in cases]))
-    return [
-        {
-            "run": run,
-            "paper_images": IMAGES.get(run.title),
-            "methods": [method_name(run, method) for method in run.methods],
-            "summary": figures_table(run, run.rows),
-            "plots": plots_of(run),
-            "ranking": ranking,
-            "cases": [_case(run, name, place, next(fits)) for name, place, _ in cases],
-            "remarks": [(row.image, row.value) for row in run.rows if row.metric == REMARK],
-        }
-        for (run, _), ranking, cases in zip(sources, rankings, picked, strict=True)
-    ]
+def _part(run: Run, folder: Path, count: int, side: int) -> dict[str, Any]:
+    """What the page has of an evaluation; so many images, whose pictures are so large at most."""
+    ranking = rank(run)
+    return {
+        "run": run,
+        "paper_images": IMAGES.get(run.title),
+        "methods": [method_name(run, method) for method in run.methods],
+        "summary": figures_table(run, run.rows),
+        "plots": plots_of(run),
+        "ranking": ranking,
+        "cases": _cases(run, folder, ranking, count, side),
+        "remarks": [(row.image, row.value) for row in run.rows if row.metric == REMARK],
+    }
 
 
 def figures_table(run: Run, rows: Iterable[Row]) -> Table:
@@ -150,21 +145,28 @@ def _percent(share: float) -> str:
     return "0 %" if share == 0 else f"{100 * share:.1f} %" if share >= 0.001 else f"{100 * share:.1g} %"
 
 
-def _pick(run: Run, folder: Path, ranking: Ranking | None, count: int) -> list[tuple[str, str, dict[str, bytes]]]:
-    """Images from the worst to the best, evenly between them: name, place in the ranking, WebP by method.
-
-    Those without pictures are left out.
-    """
+def _cases(run: Run, folder: Path, ranking: Ranking | None, count: int, side: int) -> list[dict[str, Any]]:
+    """Images from the worst to the best, evenly between them; without those that have no pictures."""
     names = ranking.names[::-1] if ranking else run.measured
     cases = []
     for place in evenly(len(names), count):
         name, last = names[place], len(names) - 1
         files = kept_pictures(run, folder, name)
-        wanted = [method for method in SHOWN if method in files][:MOST_SHOWN]
+        pictures = {shown: _small(files[shown], side) for shown in [one for one in SHOWN if one in files][:MOST_SHOWN]}
         position = {0: "worst", last: "best"}.get(place, f"{place + 1} of {len(names)}") if ranking and last else ""
-        if wanted:
-            cases.append((name, position, {method: files[method].read_bytes() for method in wanted}))
+        if pictures:
+            cases.append(_case(run, name, position, pictures))
     return cases
+
+
+def _small(path: Path, side: int) -> bytes:
+    """A picture as WebP, at most so many pixels wide and high."""
+    with Image.open(path) as image:
+        if max(image.size) <= side:
+            return path.read_bytes()
+        small = image.convert("RGB")
+    small.thumbnail((side, side))
+    return encode(small)
 
 
 def _case(run: Run, name: str, place: str, pictures: Mapping[str, bytes]) -> dict[str, Any]:
@@ -190,23 +192,6 @@ def _case(run: Run, name: str, place: str, pictures: Mapping[str, bytes]) -> dic
         "height": height,
         "table": figures_table(run, shown),
     }
-
-
-def fitting(cases: Sequence[Mapping[str, bytes]]) -> list[dict[str, bytes]]:
-    """The same pictures, all of them smaller where they are too many bytes together."""
-
-    def shrunk(data: bytes, side: int) -> bytes:
-        with Image.open(io.BytesIO(data)) as image:
-            small = image.convert("RGB")
-        small.thumbnail((side, side))
-        return encode(small)
-
-    fits = [dict(case) for case in cases]
-    for side in SMALLER:
-        if sum(len(data) * 4 // 3 for case in fits for data in case.values()) <= BUDGET:
-            break
-        fits = [{name: shrunk(data, side) for name, data in case.items()} for case in cases]
-    return fits
 
 
 # --- plots
