@@ -21,6 +21,8 @@ ELSEWHERE = {
     "security.md": "SECURITY.md",
     "comfyui.md": "integrations/comfyui/README.md",
     "weights.md": "src/spackle/weights/README.md",
+    "residual-card.md": "src/spackle/weights/residual.md",
+    "lite-card.md": "src/spackle/weights/lite.md",
 }
 CODE = {"python.md": "src/spackle/__init__.py", "commands.md": "src/spackle/cli/commands.py"}  # what a page is made of
 COMMANDS = ("predict", "view", "render", "export", "info", "demo", "weights get", "weights list", "weights make")
