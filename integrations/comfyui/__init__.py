@@ -1,6 +1,7 @@
 """Spackle's nodes for ComfyUI: copy or link this folder into ComfyUI/custom_nodes, and install Spackle beside ComfyUI.
 
-IMAGE is [B, H, W, 3] sRGB in 0..1 and MASK [B, H, W] in 0..1, as ComfyUI has them; depth is an IMAGE in greys.
+IMAGE is [B, H, W, 3] sRGB in 0..1 and MASK [B, H, W] in 0..1, as ComfyUI has them; depth is an IMAGE in greys. SPLAT is
+ComfyUI's own type of Gaussians: batches of N with linear scales, quaternions wxyz and spherical harmonics of sRGB.
 """
 
 from __future__ import annotations
@@ -20,7 +21,10 @@ from spackle.bases import BasePrediction
 from spackle.bases.depth_map import FAR_M, NEAR_M, RELATIVE, relative_depth
 from spackle.bases.open import OpenedBase, open_base
 from spackle.bases.settings import AUTO, AUTO_NETWORKS, BaseSettings
+from spackle.camera import Camera
 from spackle.camera_path import MAX_DISPARITY, TRAJECTORIES, trajectory_kind
+from spackle.color import linear_to_srgb, srgb_to_linear
+from spackle.formats.scene_files import SH_C0
 from spackle.gaussians import Gaussians
 from spackle.image import focal_length
 from spackle.views import PATH_FRAMES
@@ -135,12 +139,60 @@ class RenderView:
         return torch.stack([view.rgb for view in views]).cpu(), holes.cpu(), grey[..., None].expand(-1, -1, -1, 3).cpu()
 
 
+class ToSplat:
+    """The scene as ComfyUI's own nodes take it."""
+
+    CATEGORY, FUNCTION = "Spackle", "convert"
+    RETURN_TYPES: ClassVar = ("SPLAT",)
+
+    @classmethod
+    def INPUT_TYPES(cls) -> dict[str, Any]:
+        """Base and aux become one."""
+        return {"required": {"scene": ("SPACKLE_SCENE",)}}
+
+    def convert(self, scene: Scene) -> tuple[Any]:
+        """A batch of one, x right, y down, z forward from the photo's camera."""
+        from comfy_api.latest import Types  # ComfyUI's own
+
+        means, quats, scales, opacities, colors = (t.detach().float().cpu() for t in scene.gaussians.tensors)
+        harmonics = (linear_to_srgb(colors) - 0.5) / SH_C0
+        quats = torch.nn.functional.normalize(quats, dim=-1)
+        return (
+            Types.SPLAT(means[None], scales[None], quats[None], opacities[None, :, None], harmonics[None, :, None]),
+        )
+
+
+class FromSplat:
+    """The Gaussians of other nodes as a scene, whose holes may then be filled."""
+
+    CATEGORY, FUNCTION = "Spackle", "convert"
+    RETURN_TYPES: ClassVar = ("SPACKLE_SCENE",)
+
+    @classmethod
+    def INPUT_TYPES(cls) -> dict[str, Any]:
+        """The camera stands at the origin and looks along z; `fov` 0 is a 30 mm lens."""
+        side = {"min": 16, "max": 8192}
+        size = {"width": ("INT", {"default": 1280, **side}), "height": ("INT", {"default": 720, **side})}
+        fov = ("FLOAT", {"default": 0.0, "min": 0.0, "max": 170.0})
+        return {"required": {"splat": ("SPLAT",), **size, "fov": fov}}
+
+    def convert(self, splat: Any, width: int, height: int, fov: float) -> tuple[Scene]:
+        """The first of a batch, in the colours of degree 0."""
+        count = splat.positions.shape[1] if splat.counts is None else int(splat.counts[0])
+        parts = (splat.positions, splat.rotations, splat.scales, splat.opacities, splat.sh)
+        means, quats, scales, opacities, harmonics = (part[0, :count].detach().float().cpu() for part in parts)
+        colors = srgb_to_linear((0.5 + SH_C0 * harmonics[:, 0]).clamp(0, 1))
+        lens, _ = focal_length("splat", width, height, {}, focal_px=None, focal_mm=None, fov=fov or None)
+        base = Gaussians(means, quats, scales, opacities[:, 0], colors)
+        return (Scene(base, Gaussians.empty(), Camera.from_focal(lens, width, height)),)
+
+
 class SaveScene:
-    """Writes the scene into ComfyUI's output folder."""
+    """Writes the scene into ComfyUI's output folder; the image is the scene from the photo's own place."""
 
     CATEGORY, FUNCTION, OUTPUT_NODE = "Spackle", "save", True
-    RETURN_TYPES: ClassVar = ("STRING",)
-    RETURN_NAMES: ClassVar = ("file",)
+    RETURN_TYPES: ClassVar = ("STRING", "IMAGE")
+    RETURN_NAMES: ClassVar = ("file", "image")
 
     @classmethod
     def INPUT_TYPES(cls) -> dict[str, Any]:
@@ -154,7 +206,8 @@ class SaveScene:
         count = next(k for k in range(1, 100_000) if not (folder / f"{stem}_{k:05d}{format}").exists())
         file = folder / f"{stem}_{count:05d}{format}"
         scene.export(file)
-        return {"ui": {"text": [str(file)]}, "result": (str(file),)}
+        image = scene.render(scene.camera.even()).rgb.clamp(0, 1).cpu()[None]
+        return {"ui": {"text": [str(file)]}, "result": (str(file), image)}
 
 
 @functools.cache
@@ -164,8 +217,8 @@ def _output_folder() -> Path:
     return Path(folder_paths.get_output_directory())
 
 
-NODES = (LoadBase, PredictScene, CompleteScene, RenderView, SaveScene)
-TITLES = ("load base", "predict scene", "complete for a path", "render views", "save scene")
+NODES = (LoadBase, PredictScene, CompleteScene, RenderView, ToSplat, FromSplat, SaveScene)
+TITLES = ("load base", "predict scene", "complete for a path", "render views", "to splat", "from splat", "save scene")
 NODE_CLASS_MAPPINGS = {f"Spackle{node.__name__}": node for node in NODES}
 NODE_DISPLAY_NAME_MAPPINGS = {
     name: f"Spackle: {title}" for name, title in zip(NODE_CLASS_MAPPINGS, TITLES, strict=True)
