@@ -248,6 +248,9 @@ def _draw(figure: PaperFigure, runs: Sequence[tuple[Run, Path]], most: int) -> t
 
 def _cell(run: Run, image: str, name: str, pictures: dict[str, Image.Image], figure: PaperFigure) -> Cell:
     """A picture; where holes have no picture of their own, they are boxed, and shares of Gaussians are tags."""
+    if name == HOLE:  # white on the page's white: framed
+        width, height = pictures[name].size
+        ImageDraw.Draw(pictures[name]).rectangle((0, 0, width - 1, height - 1), outline="grey")
     if HOLE in figure.columns:
         return Cell(pictures[name])
     if name == "base":

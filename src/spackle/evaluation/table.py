@@ -103,7 +103,7 @@ def latex(table: Table, suffix: str = "") -> str:
     shape = "l" * table.words + "c" * (len(table.heads) - table.words)
     lines = [r"\begin{table*}[t]", r"\centering", r"\scriptsize", rf"\caption{{{tex(table.caption)}}}"]
     lines += [
-        rf"\label{{{table.label}{suffix}}}",
+        rf"\label{{{table.label}{suffix}}}\smallskip",
         r"\resizebox{\textwidth}{!}{",
         rf"\begin{{tabular}}{{{shape}}}",
         r"\toprule",

@@ -134,10 +134,12 @@ def _notes(spec: Mapping[str, Any], runs: Sequence[Run], cells: str) -> list[str
         foreign = not weights.startswith("given")
         notes.append(NOTES["recipe"].format(residual=weights) if foreign else f"Residual: {weights}.")
     notes += [f"{METRICS[name].title[:-2]}: {METRICS[name].definition}." for name in names]
+    measured = [(run.title, name, run.about.get("metrics", {}).get(name)) for run in runs for name in names]
+    states = [(title, METRICS[name].title[:-2], state) for title, name, state in measured]
+    for why in dict.fromkeys(why for *_, why in states if str(why).startswith(NOT_RUN)):
+        where, what = (", ".join(dict.fromkeys(one[k] for one in states if one[2] == why)) for k in (0, 1))
+        notes.append(f"{where}: {what} {why}.")
     for run in runs:
-        state = run.about.get("metrics", {})
-        idle = [name for name in names if str(state.get(name, "")).startswith(NOT_RUN)]
-        notes += [f"{run.title}: {METRICS[name].title[:-2]} {state[name]}." for name in idle]
         if passed := list(run.problems):
             more = f" and {len(passed) - 5} more" if len(passed) > 5 else ""
             listed = f"{', '.join(passed[:5])}{more}"
@@ -160,8 +162,12 @@ def _weights(run: Run) -> str:
 
 def _timed_notes(runs: Sequence[Run]) -> list[str]:
     """Where and how times were taken, what disturbed them, and how large the networks are."""
-    notes = []
-    for run in (run for run in runs if run.timed):
+    notes, runs = [], [run for run in runs if run.timed]
+    if cold := [row.image for run in runs for row in run.rows if row.metric == "warm" and not row.value]:
+        notes.append(NOTES["cold"].format(images=", ".join(cold)))
+    if loads := [load for run in runs for load in run.numbers("load")]:
+        notes.append(NOTES["load"].format(median=statistics.median(loads), least=min(loads), most=max(loads)))
+    for run in runs:
         base, hardware, versions = run.config["base"], run.config["hardware"], run.config["versions"]
         precision = next((row.value for row in run.rows if row.metric == f"{NOTE}precision"), None)
         network = f"{run.base}'s network in {precision} on {base['device']}; " if precision else ""
@@ -172,10 +178,6 @@ def _timed_notes(runs: Sequence[Run]) -> list[str]:
         named = ", ".join(f"{name} {version}" for name, version in versions.items())
         notes.append(f"Times: {network}renderer and residual on {run.config['device']}. Machine: {place}; {named}.")
         notes.append(NOTES["runs"].format(**run.config))
-        if cold := [row.image for row in run.rows if row.metric == "warm" and not row.value]:
-            notes.append(NOTES["cold"].format(images=", ".join(cold)))
-        if loads := run.numbers("load"):
-            notes.append(NOTES["load"].format(median=statistics.median(loads), least=min(loads), most=max(loads)))
         counted = {name: value / 1e6 for name, value in run.about["parameters"].items()}
         sizes = {"base": counted["base"], "used": counted["base_used"], "residual": counted["residual"]}
         sizes |= {"merged": counted["base"] + counted["residual"], "share": 1e8 * counted["share"]}
