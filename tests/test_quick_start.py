@@ -89,3 +89,24 @@ def test_the_python_of_the_quick_start_works_by_the_wheel(environment: Path, pla
     large, _, home = out.strip().partition(" ")
     assert (large, Path(home).is_relative_to(environment.parent)) == ("True", True)
     assert (place / "video.mp4").is_file()
+
+
+@pytest.mark.slow
+def test_programs_are_type_checked_by_the_wheel(environment: Path, tmp_path: Path) -> None:
+    pytest.importorskip("mypy")
+    program = Path(shutil.copy(Path(__file__).parent / "data" / "typed_program.py", tmp_path))
+    checker = [
+        sys.executable,
+        "-m",
+        "mypy",
+        "--strict",
+        "--no-error-summary",
+        "--python-executable",
+        environment / "python",
+    ]
+    done = subprocess.run([*checker, program], cwd=tmp_path, env=ALONE, capture_output=True, text=True, timeout=600)
+    found = re.findall(r"^typed_program\.py:(\d+): error: .*\[([a-z-]+)\]$", done.stdout, re.MULTILINE)
+    lines = enumerate(program.read_text(encoding="utf-8").splitlines(), 1)
+    wrong = [(str(number), words[1]) for number, line in lines if len(words := line.rsplit("  # ", 1)) == 2]
+    assert len(wrong) == 5
+    assert found == wrong, done.stdout

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from spackle.web.app import create_app as create_app
@@ -10,9 +10,11 @@ if TYPE_CHECKING:
 __all__ = ["create_app"]
 
 
-def __getattr__(name: str) -> Any:
-    if name != "create_app":
-        raise AttributeError(f"module 'spackle.web' has no attribute {name!r}")
-    from spackle.web.app import create_app  # FastAPI takes a second to load
+if not TYPE_CHECKING:
 
-    return create_app
+    def __getattr__(name: str) -> object:
+        if name != "create_app":
+            raise AttributeError(f"module 'spackle.web' has no attribute {name!r}")
+        from spackle.web.app import create_app  # FastAPI takes a second to load
+
+        return create_app
