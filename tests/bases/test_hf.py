@@ -27,8 +27,6 @@ from spackle.bases import NEAREST_M, hf
 from spackle.bases.depth_map import DepthMap
 from spackle.bases.hf import FARTHEST_M, HfBase, meaning_of, to_depth_map
 from spackle.bases.lift import lift
-from spackle.bases.open import open_base
-from spackle.bases.settings import DEPTH_ANYTHING, BaseSettings
 from spackle.color import srgb_to_linear
 from spackle.errors import InputError
 from spackle.image import DEFAULT_FOCAL_MM, Photo
@@ -127,12 +125,6 @@ def test_the_map_is_the_models_output_as_transformers_gives_it(
         torch.testing.assert_close(share, (expected / near).clamp(0, 1), rtol=1e-4, atol=1e-5)
     else:
         torch.testing.assert_close(found.depth, expected, rtol=1e-5, atol=0)
-
-
-def test_a_large_photo_is_seen_and_lifted_at_its_working_size(folders: Folders) -> None:
-    big = Photo(torch.rand(40, 1600, 3, generator=torch.Generator().manual_seed(0)), 1600.0, "EXIF", Path("photo.png"))
-    camera = load(folders["metric"]).predict(big).camera
-    assert (camera.width, camera.height, camera.focal[0]) == (1536, 38, pytest.approx(1536))
 
 
 def test_tips_sees_the_photo_stretched_as_pillow_does_it(folders: Folders) -> None:
@@ -431,20 +423,3 @@ def test_a_model_in_the_hubs_cache_needs_no_network(
         for name in ("owner/name", "owner/absent"):
             with pytest.raises(InputError, match=f"^hf:{name}: cannot be loaded .+$"):
                 HfBase.load(name)
-
-
-def test_auto_takes_depth_anything_before_lite(folders: Folders, shipped: Path, tmp_path: Path) -> None:
-    photo = photo_of()
-    assert open_base(BaseSettings()).predict(photo)[1].base == "lite"
-    with pytest.raises(InputError, match=r"no Depth Anything .*: give --base moge"):
-        open_base(BaseSettings("depth"))
-    file = tmp_path / "weights" / DEPTH_ANYTHING
-    shutil.copytree(folders["relative"], file.parent)
-    expected = load(folders["relative"]).predict(photo).gaussians
-    for name in ("auto", "depth"):
-        prediction, choice = open_base(BaseSettings(name, precision="fp32", device="cpu")).predict(photo)
-        assert choice.base == "depth"
-        assert torch.equal(prediction.gaussians.means, expected.means)
-    file.write_bytes(file.read_bytes()[:-1000])
-    choice = open_base(BaseSettings()).predict(photo)[1]
-    assert (choice.base, "cannot be loaded" in choice.failures[0]) == ("lite", True)

@@ -15,7 +15,7 @@ from weights import save_networks
 
 import spackle
 from spackle.bases import NEAREST_M
-from spackle.bases.lite import FARTHEST, INPUT_SCALES, SCALE, SHIPPED, LiteBase, LiteNet, load_networks
+from spackle.bases.lite import FARTHEST, INPUT_SCALES, SCALE, SHIPPED, LiteBase, LiteNet, load_networks, merged
 from spackle.errors import InputError
 from spackle.image import Photo
 
@@ -48,11 +48,11 @@ def test_depth_of_a_real_photo_beats_a_blind_guess() -> None:
 
 def test_a_mirrored_photo_has_mirrored_depth() -> None:
     rgb, *_ = motorcycle()
-    seen, mirrored = (shipped().inverse_depth(picture).log() for picture in (rgb, rgb.flip(1)))
-    assert float((mirrored - seen.flip(1)).abs().mean()) < 0.02
-    scales = [scale for scale in INPUT_SCALES if scale.mirrored]
-    seen, mirrored = (shipped().at_scales(picture, scales).mean(0) for picture in (rgb, rgb.flip(1)))
-    torch.testing.assert_close(mirrored, seen.flip(1), rtol=1e-3, atol=1e-4)
+    seen, mirrored = (shipped().at_scales(picture, INPUT_SCALES) for picture in (rgb, rgb.flip(1)))
+    tilt = [scale.tilt for scale in INPUT_SCALES]
+    assert float((merged(mirrored, tilt) - merged(seen, tilt).flip(1)).abs().mean()) < 0.02
+    both = torch.tensor([scale.mirrored for scale in INPUT_SCALES])
+    torch.testing.assert_close(mirrored[both], seen[both].flip(2), rtol=1e-3, atol=1e-4)
 
 
 def test_the_same_photo_gives_the_same_scene_and_its_colours() -> None:

@@ -22,7 +22,7 @@ import spackle
 from spackle.bases import BasePrediction, Progress
 from spackle.bases.depth_map import DepthMap, load_depth
 from spackle.bases.hf import HfBase
-from spackle.bases.lite import LiteBase
+from spackle.bases.lite import INPUT_SCALES, LiteBase
 from spackle.bases.moge.base import MogeBase
 from spackle.bases.open import BaseError, ResolvedBase, open_base
 from spackle.bases.photo_depth.layouts import load_photo_depth
@@ -36,6 +36,11 @@ from spackle.weights import PUBLISHED
 
 pytestmark = pytest.mark.usefixtures("shipped")
 NO_DEPTH, NO_SHARP = "no depth in the photo", "no SHARP weights here, no MoGe here"
+
+
+@pytest.fixture(autouse=True)
+def _lite_takes_one_look(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("spackle.bases.lite.INPUT_SCALES", INPUT_SCALES[:1])
 
 
 @pytest.fixture
@@ -99,6 +104,8 @@ def test_auto_takes_the_photos_depth_then_sharp_then_lite(
 
 
 def test_auto_takes_moge_before_depth_anything(tmp_path: Path, photo: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(InputError, match=r"no Depth Anything .*: give --base moge"):
+        pick(photo, name="depth")
     for name, base, place in (("depth", HfBase, DEPTH_ANYTHING), ("moge", MogeBase, PUBLISHED["depth"].file)):
         monkeypatch.setattr(base, "load", lambda path, name=name, **options: StandIn(name))
         file = tmp_path / "weights" / place

@@ -155,19 +155,15 @@ def test_sharp_file(tmp_path: Path, color_space: int) -> None:
     assert torch.equal(camera.world_to_camera, torch.eye(4))
 
 
-def test_older_sharp_file(tmp_path: Path) -> None:
-    after = "element intrinsic 4\nproperty float intrinsic\nelement extrinsic 12\nproperty float extrinsic\n"
-    turn, path = [0.0, 1.0, 0.0, 1.0, -1.0, 0.0, 0.0, 2.0, 0.0, 0.0, 1.0, 3.0], tmp_path / "a.ply"
-    for focal in (700.0, 0.0, math.nan):
-        tail = struct.pack("<16f", focal, 710, 320, 200, *turn)
-        path.write_bytes(ply(raw(random_gaussians(3), linear=True), GIVEN, after=after, tail=tail))
-        if focal == 700:
-            close(load_ply(path), random_gaussians(3))
-            assert camera_of(path).K.tolist() == [[700, 0, 160], [0, 710, 100], [0, 0, 1]]
-            assert camera_of(path).world_to_camera[:3].tolist() == [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]]
-        else:
-            with pytest.raises(InputError, match="stored camera"):
-                camera_of(path)
+@pytest.mark.parametrize(("name", "says"), [(b"image_size", "none that SHARP writes"), (b"intrinsic", "focal lengths")])
+def test_sharps_camera_that_makes_no_sense(tmp_path: Path, name: bytes, says: str) -> None:
+    path, tail = tmp_path / "a.ply", sharp_tail(0)
+    if name == b"intrinsic":
+        tail = tail[:64] + struct.pack("<f", 0.0) + tail[68:]
+    content = ply(raw(random_gaussians(3)), GIVEN, after=SHARP_AFTER, tail=tail)
+    path.write_bytes(content.replace(b"image_size", b"picture_size") if name == b"image_size" else content)
+    with pytest.raises(InputError, match=f"stored camera.*{says}"):
+        camera_of(path)
 
 
 def test_what_a_comment_keeps(tmp_path: Path) -> None:

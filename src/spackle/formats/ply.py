@@ -195,20 +195,10 @@ class PlyFile:
         if numbers := self._numbers("spackle_camera", 6, lowest=-math.inf):
             K[0, 0], K[1, 1], K[0, 2], K[1, 2], width, height = numbers
         elif "intrinsic" in (extras := self._extras()):
-            intrinsic, extrinsic = extras["intrinsic"], extras.get("extrinsic", matrix.ravel())
-            if len(intrinsic) == 9 and len(extras.get("image_size", ())) == 2:
-                K, (width, height) = intrinsic.reshape(3, 3), extras["image_size"]
-            elif len(intrinsic) == 4:  # older: fx, fy, width, height
-                K[0, 0], K[1, 1], width, height = intrinsic
-                K[:2, 2] = width / 2, height / 2
-            else:
-                problem = f"a camera of {len(intrinsic)} numbers is none of SHARP's: give the focal length"
-                raise InputError(f"{self.path}: {problem}")
-            if len(extrinsic) == 12:  # older: 3×4 with the rotation transposed
-                matrix[:3] = extrinsic.reshape(3, 4)
-                matrix[:3, :3] = matrix[:3, :3].T.copy()
-            elif len(extrinsic) == 16:
-                matrix = extrinsic.reshape(4, 4)
+            parts = [extras.get(name, np.empty(0)) for name in ("intrinsic", "extrinsic", "image_size")]
+            if [len(part) for part in parts] != [9, 16, 2]:
+                raise InputError(f"{self.path}: the stored camera is none that SHARP writes: give the focal length")
+            K, matrix, (width, height) = parts[0].reshape(3, 3), parts[1].reshape(4, 4), parts[2]
         else:
             return None
         width, height = (int(side) if float(side).is_integer() else 0 for side in (width, height))
