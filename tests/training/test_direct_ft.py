@@ -92,9 +92,9 @@ def test_the_first_views_are_those_of_the_dataset(place: Path) -> None:
 
 
 def test_the_loss_falls_and_nothing_but_the_decoder_changes(place: Path, tmp_path: Path) -> None:
-    options = ("data.views=1", "optim.steps=8", "optim.lr=2e-3", "optim.min_lr=2e-3", "optim.ema=0")
+    options = ("data.views=1", "optim.steps=6", "optim.lr=2e-3", "optim.min_lr=2e-3", "optim.ema=0")
     losses = losses_of(train(place, tmp_path / "out", *options))
-    assert sum(losses[-3:]) < 0.7 * sum(losses[:3])
+    assert sum(losses[-2:]) < 0.7 * sum(losses[:2])
     before, unused = weights_of(place / "sharp.safetensors"), "feature_model.decoder.fusions.4.resnet1."
     for name, tensor in weights_of(tmp_path / "out" / "last.safetensors").items():
         stays = not name.startswith(PARTS) or name.startswith(unused)

