@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import shutil
 import struct
 from collections.abc import Callable, Sequence
@@ -13,10 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from evaluation_data import write_pfm
 from numpy.typing import NDArray
 from photos import write_photo
-from PIL import Image
 
 from spackle.bases.depth_map import DepthMap
 from spackle.bases.settings import BaseSettings
@@ -31,6 +28,7 @@ from spackle.image import working_size
 
 Array = NDArray[Any]
 WIDTH, HEIGHT, FOCAL = 48, 36, 40.0
+DATA = Path(__file__).parents[1] / "data"
 POINTS = np.array([[x, y, 4 + 0.5 * x + 0.2 * y] for x in (-1.0, -0.3, 0.4, 1.1) for y in (-0.8, 0.0, 0.7)])
 
 
@@ -57,47 +55,14 @@ class Eye:
 EYES = [Eye((0, 0, 0)), Eye((0.4, 0, 0), -0.06), Eye((0, 0.5, 0.1), 0.05), Eye((0.9, 0, 0)), Eye((-0.5, 0.1, 0), 0.02)]
 
 
-def middlebury_2014(scene: Path, *, cx: float = 20.25, doffs: float = 3.5, truth: str = "disp0.pfm") -> Path:
-    """A plane with disparity 5 at quarter size; cx counts from the first pixel's centre."""
-    write_photo(scene / "im0.png", WIDTH, HEIGHT)
-    write_photo(scene / "im1.png", WIDTH, HEIGHT)
-    text = f"cam0=[{FOCAL} 0 {cx}; 0 {FOCAL} 17.5; 0 0 1]\ncam1=[{FOCAL} 0 {cx + doffs}; 0 {FOCAL} 17.5; 0 0 1]\n"
-    text += f"doffs={doffs}\nbaseline=193.001\nwidth={WIDTH}\nheight={HEIGHT}\nndisp=20\nisint=0\nvmin=1\nvmax=9\n"
-    (scene / "calib.txt").write_text(text)
-    disparity = np.full((HEIGHT, WIDTH), 5.0)
-    disparity[0, 0] = np.inf
-    if truth:
-        write_pfm(scene / truth, disparity)
-    return scene
+def stored(name: str, scene: Path) -> Path:
+    """A scene in its dataset's format: photos of `WIDTH` by `HEIGHT`; WildRGB-D's are the eyes', in a smaller world."""
+    return Path(shutil.copytree(DATA / "datasets" / name, scene))
 
 
-def booster(scene: Path) -> Path:
-    for name in ("camera_00/im0.png", "camera_00/im1.png", "camera_02/im0.png", "camera_02/im1.png"):
-        write_photo(scene / name, WIDTH, HEIGHT)
-    text = '<?xml version="1.0"?>\n<opencv_storage>\n'
-    for name, cx, shift in (("proj_matL", 22, 0), ("proj_matR", 25, -3200)):
-        data = f"{FOCAL:e} 0 {cx} {shift} 0 {FOCAL} 18 0 0 0 1 0"
-        text += f'<{name} type_id="opencv-matrix"><rows>3</rows><cols>4</cols><dt>d</dt><data>{data}</data></{name}>\n'
-    (scene / "calib_00-02.xml").write_text(text + "<baselineLR>8.0e+01</baselineLR>\n</opencv_storage>\n")
-    disparity = np.full((HEIGHT, WIDTH), 7.0, np.float32)
-    disparity[:2] = 0
-    np.save(scene / "disp_00.npy", disparity)
-    return scene
-
-
-def wildrgbd(scene: Path, scale: float = 0.15) -> Path:
-    """The world shrunk to what a hand holds."""
-    K = [FOCAL, 0, 0, 0, FOCAL, 0, WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5, 1]  # by columns; integers are pixel centres
-    lines = []
-    for number, eye in enumerate(EYES):
-        write_photo(scene / "rgb" / f"{number:05d}.png", WIDTH, HEIGHT)
-        pose = eye.to_world.copy()
-        pose[:3, 3] *= scale
-        lines.append(" ".join([str(number), *(f"{v:.9f}" for v in pose.ravel())]))
-        (scene / "depth").mkdir(exist_ok=True)
-        Image.fromarray(np.full((HEIGHT, WIDTH), 700, np.uint16)).save(scene / "depth" / f"{number:05d}.png")
-    (scene / "cam_poses.txt").write_text("\n".join(lines) + "\n")
-    (scene / "metadata").write_text(json.dumps({"w": WIDTH, "h": HEIGHT, "K": K, "fps": 30}))
+def middlebury_2014(scene: Path, truth: str = "disp0.pfm") -> Path:
+    """A plane with disparity 5 at quarter size."""
+    (stored("middlebury", scene) / "disp0.pfm").rename(scene / truth)
     return scene
 
 
@@ -106,7 +71,7 @@ def colmap(folder: Path, photos: Path, kind: str) -> None:
     for number in range(len(EYES)):
         write_photo(photos / f"DSC_{number:04d}.JPG", WIDTH, HEIGHT)
     folder.mkdir(parents=True)
-    for file in (Path(__file__).parents[1] / "data/colmap").glob(f"*{kind}"):
+    for file in (DATA / "colmap").glob(f"*{kind}"):
         shutil.copy(file, folder)
 
 
@@ -146,8 +111,8 @@ def llff(scene: Path, eyes: Sequence[Eye] = EYES, *, bounds: bool = True, sparse
 
 TREES: dict[str, Callable[[Path], Path]] = {
     "middlebury": lambda root: middlebury_2014(root / "Piano-perfect"),
-    "booster": lambda root: booster(root / "train/balanced/Bathroom"),
-    "wildrgbd": lambda root: wildrgbd(root / "apple/scenes/scene_000"),
+    "booster": lambda root: stored("booster", root / "train/balanced/Bathroom"),
+    "wildrgbd": lambda root: stored("wildrgbd", root / "apple/scenes/scene_000"),
     "eth3d": lambda root: eth3d(root / "courtyard"),
     "llff": lambda root: llff(root / "fern"),
     "tanks": lambda root: tanks(root / "Truck"),
@@ -244,8 +209,8 @@ def assert_pair(case: Case, disparity: float, z: float, x: int = 30, y: int = 9)
 
 def test_middlebury_2014(tmp_path: Path) -> None:
     for name, truth in (("Piano-perfect", "disp0.pfm"), ("Piano-imperfect", "disp0.pfm"), ("Art", "disp0GT.pfm")):
-        middlebury_2014(tmp_path / "trainingQ" / name, truth=truth)
-    middlebury_2014(tmp_path / "testQ/Djembe", truth="")
+        middlebury_2014(tmp_path / "trainingQ" / name, truth)
+    middlebury_2014(tmp_path / "testQ/Djembe", "none")
     found = read_cases("middlebury", tmp_path)
     assert [case.name for case in found] == ["Art", "Piano-perfect"]
     for case in found:
@@ -256,8 +221,8 @@ def test_middlebury_2014(tmp_path: Path) -> None:
 
 
 def test_booster(tmp_path: Path) -> None:
-    scene = booster(tmp_path / "train/balanced/Bathroom")
-    booster(tmp_path / "train/unbalanced/Bathroom")
+    scene = TREES["booster"](tmp_path)
+    stored("booster", tmp_path / "train/unbalanced/Bathroom")
     (scene / "camera_00/im0.png").write_bytes(b"no picture")  # is named in its turn, and spoils no other
     first, second = read_cases("booster", tmp_path)
     assert [first.name, second.name] == ["Bathroom/im0", "Bathroom/im1"]
@@ -271,12 +236,12 @@ def test_booster(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "make", "scale"),
     [
-        ("wildrgbd", lambda root: wildrgbd(root / "apple/scenes/scene_000"), 0.15),
-        ("eth3d", lambda root: eth3d(root / "courtyard"), 1.0),
-        ("tanks", lambda root: tanks(root / "Truck"), 1.0),
+        ("wildrgbd", TREES["wildrgbd"], 0.15),
+        ("eth3d", TREES["eth3d"], 1.0),
+        ("tanks", TREES["tanks"], 1.0),
         ("tanks", lambda root: tanks(root / "Truck", sparse="sparse", kind=".txt"), 1.0),
         ("tanks", lambda root: tanks(root / "Truck", sparse="dense/sparse"), 1.0),
-        ("llff", lambda root: llff(root / "fern"), 1.0),
+        ("llff", TREES["llff"], 1.0),
         ("llff", lambda root: llff(root / "fern", sparse=True), 1.0),
         ("llff", lambda root: llff(root / "llff_fern", sparse=True, bounds=False), 1.0),
     ],
