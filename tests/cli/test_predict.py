@@ -234,17 +234,18 @@ def test_several_photos_a_folder_and_a_pattern_share_a_run(tmp_path: Path) -> No
 
 def test_what_is_changed_or_damaged_in_a_folder_is_redone(tmp_path: Path) -> None:
     photos, out, depth = tmp_path / "photos", tmp_path / "out", write_depth(tmp_path / "d.npy")
-    for name in "abc":
+    names = "abc"
+    for name in names:
         write_photo(photos / f"{name}.png")
 
     def redone(map_: Path, *options: object, out: Path = out) -> str:
         """Whose scenes are new, which nobody says are done."""
         before = {path.parent.name: path.stat().st_mtime_ns for path in out.glob("*/scene.ply")}
         result = predicted(photos, map_, out, *options)
-        times = {name: (out / name / "scene.ply").stat().st_mtime_ns for name in "abc"}
-        new = "".join(name for name in "abc" if times[name] != before.get(name))
+        times = {name: (out / name / "scene.ply").stat().st_mtime_ns for name in names}
+        new = "".join(name for name in names if times[name] != before.get(name))
         done = [line for line in result.lines if line.endswith("done already (--overwrite does it again)")]
-        assert [line[0] for line in done] == [name for name in "abc" if name not in new]
+        assert [line[0] for line in done] == [name for name in names if name not in new]
         return new
 
     assert redone(depth) == "abc"
@@ -262,13 +263,17 @@ def test_what_is_changed_or_damaged_in_a_folder_is_redone(tmp_path: Path) -> Non
     (out / "b" / "scene.ply").write_bytes(data)
     assert redone(depth) == "ab"
     assert {name: hashes(out / name) for name in "abc"} == whole
-    assert redone(depth, "--disparity", "0.2") == redone(depth, "--overwrite", "--disparity", "0.2") == "abc"
+    names = "a"  # one shows what holds for all
+    for name in "bc":
+        (photos / f"{name}.png").unlink()
+    assert redone(depth, "--disparity", "0.2") == redone(depth, "--overwrite", "--disparity", "0.2") == "a"
     write_depth(depth, metres(far=7))
+    for options in ((), ("--stereo", "ou"), ("--format", "gif")):
+        assert redone(depth, *options) == "a"
     disparity = write_depth(tmp_path / "disp0.npy")
     for focal in (80, 90):
         calibration(tmp_path / "calib.txt", focal, 200, 0)
-        for map_, options in ((depth, ()), (disparity, ()), (depth, ("--stereo", "ou")), (depth, ("--format", "gif"))):
-            assert redone(map_, *options) == "abc"
+        assert redone(disparity) == "a"
 
 
 def test_two_runs_never_share_a_folder(tmp_path: Path, pair: tuple[Path, Path]) -> None:

@@ -104,7 +104,7 @@ def test_killed_workers_are_a_line_and_the_same_command_goes_on(
     assert done.code == code
     assert says in "\n".join(done.lines[-2:])
     assert ".lock" not in names_in(out)
-    assert predict(place, out, "--workers", 2).code == 1
+    assert predict(place, out).code == 1
     assert list(content(out)) == list(content(place / "alone"))
 
 

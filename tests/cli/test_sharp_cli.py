@@ -14,13 +14,13 @@ from stand_in import QUICK
 
 from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.base import load_network
-from spackle.bases.sharp.encoder import TINY
+from spackle.bases.sharp.encoder import MICRO
 from spackle.device import pick_dtype
 
 
 @pytest.fixture
-def weights(made: dict[str, Path]) -> Path:
-    return made["sharp"]
+def weights(tmp_path: Path) -> Path:
+    return write_tiny(tmp_path / "micro.safetensors", MICRO)
 
 
 @pytest.mark.parametrize("size", [(64, 48), (600, 80)])
@@ -33,7 +33,7 @@ def test_a_photo_alone_becomes_a_scene_a_video_and_a_report(
     assert names_in(tmp_path / "out" / "photo") == FILES
     report = report_of(tmp_path / "out" / "photo")
     native = pick_dtype("auto", torch.device("cpu")) == torch.bfloat16
-    expected = {"name": "sharp", "chosen": "--base sharp", "gaussians": gaussians_of(TINY)}
+    expected = {"name": "sharp", "chosen": "--base sharp", "gaussians": gaussians_of(MICRO)}
     expected |= {"precision": "bf16" if native else "fp32", "weights": weights.name, "usual_disparity": 0.3}
     assert report["base"].items() >= expected.items()
     if size == (64, 48):
@@ -44,13 +44,13 @@ def test_other_weights_do_a_folder_again_but_other_speed_does_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_photo(tmp_path / "photos" / "a.png")
-    weights = write_tiny(tmp_path / "w.pt")
+    weights = write_tiny(tmp_path / "w.pt", MICRO)
     arguments = ("predict", tmp_path / "photos", "-o", tmp_path / "out", "--base", "sharp", "-c", weights, *QUICK)
     assert run(*arguments).code == 0
     with monkeypatch.context() as patch:
         patch.setattr(SharpBase, "load", lambda *args, **options: pytest.fail("loaded"))
         assert run(*arguments, "--sharp", "windows=9", "--sharp", "compile=yes").err.count("done already") == 1
-    changed = tiny_weights()
+    changed = tiny_weights(MICRO)
     changed["prediction_head.texture_prediction_head.bias"] += 0.1
     torch.save(changed, weights)
     result = run(*arguments, "--precision", "fp32", "--sharp", "windows=1")

@@ -304,7 +304,7 @@ def test_photos_wait_and_go_on_after_a_restart(tmp_path: Path) -> None:
             assert {path.name for path in tmp_path.iterdir()} == {".lock"}
 
 
-@pytest.mark.parametrize("count", [20, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [9, pytest.param(200, marks=pytest.mark.slow)])
 def test_jobs_leave_no_thread_no_file_and_no_memory_behind(server: Served, count: int) -> None:
     def done(photos: int) -> list[int]:
         for k in range(photos):
