@@ -116,9 +116,7 @@ def multiplies_bf16(device: torch.device) -> bool:
     """Whether products of bfloat16 are native: AMX or AVX512-BF16 on a processor, Ampere or later on a GPU."""
     if device.type == "cuda":
         return torch.cuda.get_device_capability(device) >= (8, 0)
-    if device.type != "cpu":
-        return False
-    has: dict[str, bool] = getattr(torch.cpu, "get_capabilities", dict)()  # older torch cannot tell
+    has = torch.cpu.get_capabilities() if device.type == "cpu" else {}
     return bool(has.get("amx_bf16") or has.get("avx512_bf16"))
 
 

@@ -119,7 +119,7 @@ def load_photo(
         return _to_rgb(_upright(image), path), tags
 
     rgb, exif = read_image(path, read)
-    return _photo(rgb, exif, Path(path), keep_frame, focal_px, focal_mm, fov)
+    return _photo(rgb, exif, Path(path), keep_frame, focal_px=focal_px, focal_mm=focal_mm, fov=fov)
 
 
 def photo_of_picture(
@@ -148,20 +148,12 @@ def photo_of_picture(
         rgb = values.float() / 255 if values.dtype == torch.uint8 else values.float().clone()
         if not (torch.isfinite(rgb).all() and rgb.min() >= 0 and rgb.max() <= 1):
             raise InputError(f"{path}: colours from {rgb.min():g} to {rgb.max():g}: give floats from 0 to 1, or uint8")
-    return _photo(rgb, exif, path, keep_frame, focal_px, focal_mm, fov)
+    return _photo(rgb, exif, path, keep_frame, focal_px=focal_px, focal_mm=focal_mm, fov=fov)
 
 
-def _photo(
-    rgb: Tensor,
-    exif: dict[int, object],
-    path: Path,
-    keep_frame: bool,
-    focal_px: float | None,
-    focal_mm: float | None,
-    fov: float | None,
-) -> Photo:
+def _photo(rgb: Tensor, exif: dict[int, object], path: Path, keep_frame: bool, **given: float | None) -> Photo:
     height, width = rgb.shape[:2]
-    focal, source = focal_length(path, width, height, exif, focal_px=focal_px, focal_mm=focal_mm, fov=fov)
+    focal, source = focal_length(path, width, height, exif, **given)
     frame = None if keep_frame or source.startswith("--") else find_frame(rgb)
     return Photo(frame.inside(rgb, width, height) if frame else rgb, focal, source, path, frame)
 
@@ -172,9 +164,9 @@ def focal_length(
     height: int,
     exif: dict[int, object],
     *,
-    focal_px: float | None,
-    focal_mm: float | None,
-    fov: float | None,
+    focal_px: float | None = None,
+    focal_mm: float | None = None,
+    fov: float | None = None,
 ) -> tuple[float, str]:
     """The focal length in pixels and its source: an option as `load_photo` takes it, else EXIF, else a default lens.
 
