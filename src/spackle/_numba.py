@@ -1,4 +1,4 @@
-"""A typed door to numba, which ships no types of its own."""
+"""Typed decorators around numba, which ships no types of its own."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def inlined_kernel(function: Callable[..., R]) -> Callable[..., R]:
 
 
 def is_compiled(function: Callable[..., Any]) -> bool:
-    """Whether a kernel's machine code for this processor lies on disk, or can never lie there."""
+    """Whether a kernel's machine code for this processor is on disk, or cannot be kept there."""
     kept = _kept(function)
     processor = cpu_target.target_context.codegen().magic_tuple()
     return kept is None or any(key[1] == processor for key in kept._load_index())
@@ -67,6 +67,6 @@ def _surroundings(function: Callable[..., Any]) -> str:
 
 
 def _kept(compiled: Any) -> Any:
-    """What keeps a kernel's machine code on disk, as numba has it inside; None where it has not, or is switched off."""
+    """Numba's internal cache of a kernel's machine code on disk; None where numba has none or it is switched off."""
     file = getattr(getattr(compiled, "_cache", None), "_cache_file", None)
     return file if hasattr(file, "_source_stamp") else None

@@ -55,7 +55,7 @@ class DepthRange:
         return DepthRange(float(near), max(MIN_FOCUS_M, float(focus)))
 
     def towards(self, other: DepthRange, part: float) -> DepthRange:
-        """A part of the way to another range, on a logarithmic scale."""
+        """Interpolate to another range by `part` (0..1), on a logarithmic scale."""
         near, focus = (a * (b / a) ** part for a, b in ((self.near, other.near), (self.focus, other.focus)))
         return DepthRange(near, focus)
 
@@ -105,7 +105,7 @@ def trajectory(
 def view_at(
     kind: TrajectoryKind, camera: Camera, disparity: float, depth_range: DepthRange, index: int, frames: int
 ) -> Camera:
-    """One camera of `trajectory`, the rest of which is not made."""
+    """One camera of `trajectory`, without making the others."""
     eyes, target = _flight(kind, camera, disparity, depth_range, frames)
     return _looking(kind, camera, eyes[index], target)
 
@@ -165,7 +165,7 @@ def _flight(
 
 
 class PathError(ValueError):
-    """A camera path that cannot be flown, with the reason."""
+    """The keyframes or a scene allow no camera path; the message is the reason."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -179,7 +179,7 @@ class Keyframe:
     fov: float | None = None  # horizontal, degrees; None: the photo's
 
     def __post_init__(self) -> None:
-        """PathError where there is no such view."""
+        """PathError if the keyframe describes no view, for instance with the eye at the target."""
         numbers = (self.time, *self.eye, *self.target, *self.up, *([] if self.fov is None else [self.fov]))
         if not all(math.isfinite(number) for number in numbers):
             raise PathError("every number must be finite, not NaN or infinite")
@@ -202,7 +202,7 @@ class KeyframePath:
     unit: PathUnit = "metres"  # disparity: lengths are multiples of the offset that --disparity 1 means
 
     def __post_init__(self) -> None:
-        """PathError where the keys make no path."""
+        """PathError if the keyframes make no path: too few, or times that do not increase."""
         if len(self.keys) < 2:
             raise PathError(f"a path needs at least two keyframes, got {len(self.keys)}")
         for index, (one, other) in enumerate(zip(self.keys, self.keys[1:], strict=False)):

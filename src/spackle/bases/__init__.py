@@ -39,7 +39,7 @@ class Base(Protocol):
 
         Args:
             photo: at its full size. The prediction's camera has the working size (see `working_size`).
-            progress: called as the work advances, where it takes long.
+            progress: called with (steps done, number of steps), by bases whose work takes long.
         """
         ...
 
@@ -58,5 +58,5 @@ NEAREST_QUANTILE = 0.999  # trajectories take the 0.1 % nearest for the nearest 
 
 
 def nearest(values: Tensor) -> Tensor:
-    """[] what counts as the greatest of inverse depths [N], and belongs at `NEAREST_M`."""
+    """The inverse depth [], a high quantile of [N], that is placed at `NEAREST_M`."""
     return values.kthvalue(1 + round(NEAREST_QUANTILE * (len(values) - 1))).values

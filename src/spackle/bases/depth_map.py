@@ -1,4 +1,4 @@
-"""Depth maps that people have: metres in NumPy, PNG and PFM, Middlebury's disparities, and pictures in greys."""
+"""Read depth maps: metres in NumPy, PNG and PFM, Middlebury's disparities, and grey pictures."""
 
 from __future__ import annotations
 
@@ -173,8 +173,9 @@ def relative_depth(
 ) -> DepthMap:
     """Numbers [H, W] that are inverse depth (near-white) or depth (near-black), up to scale and shift, as metres.
 
-    Their 1 % and 99 % quantiles are put at `near` and `far`; NaN and inf are unknown. `step` is that of numbers which
-    were whole once. InputError, naming `path`, for one depth everywhere, or a senseless range.
+    Their 1 % and 99 % quantiles are put at `near` and `far`; NaN and inf are unknown. `step` is the quantisation step
+    of numbers that were stored as integers. InputError, naming `path`, if all depths are equal, or `near` and `far`
+    give no range.
     """
     if not 0 < near < far < LARGEST:
         raise InputError(f"--near {near:g}, --far {far:g}: give two distances in metres, the nearer one first")
@@ -204,13 +205,13 @@ def _check_metric(stored: Array, path: StrPath) -> None:
 
 
 def is_depth(metres: Tensor) -> Tensor:
-    """Where values are depths: positive with a finite inverse (a file with its bytes swapped is full of others)."""
+    """Mask of valid depths: positive, with a finite inverse (a file with swapped bytes has many that are not)."""
     return torch.isfinite(metres) & (metres > 0) & torch.isfinite(1 / metres)
 
 
 @dataclasses.dataclass(frozen=True)
 class Calibration:
-    """A rectified stereo pair: the left camera and the way back from disparity to depth."""
+    """A rectified stereo pair: the left camera, and the conversion from disparity to depth."""
 
     focal_px: float
     cx: float
@@ -227,7 +228,7 @@ class Calibration:
         return torch.tensor([[self.focal_px, 0.0, self.cx], [0.0, self.focal_px, self.cy], [0.0, 0.0, 1.0]])
 
     def check(self, path: StrPath) -> Calibration:
-        """Itself; InputError naming the file where the numbers make no sense."""
+        """Return this calibration; InputError, naming the file, if its numbers are impossible."""
         for name in ("focal_px", "baseline_m", "scale"):
             if not 1 / LARGEST <= getattr(self, name) <= LARGEST:
                 raise InputError(f"{path}: {name} must be a positive number below {LARGEST:g}")
@@ -239,7 +240,7 @@ class Calibration:
 
 
 def calibrations_beside(path: Path) -> tuple[Path, Path]:
-    """Where a map's calibration is looked for, whether it is there or not: scene.json, calib.txt."""
+    """Paths at which a map's calibration is searched for, existing or not: scene.json, calib.txt."""
     return path.with_name("scene.json"), path.with_name("calib.txt")
 
 
@@ -322,7 +323,7 @@ def _as_disparity(stored: Array, is_png: bool, lens: Calibration, path: StrPath)
 
 
 def grid_step(values: Array) -> float | None:
-    """The grid of whole numbers that all values lie on; None where one is not whole."""
+    """The step of the integer grid that all values lie on; None if a value is not an integer."""
     if values.max() > 1 << 53 or not np.array_equal(values, np.round(values)):
         return None
     distinct = np.unique(values.astype(np.int64))
@@ -370,7 +371,7 @@ def _png_values(image: Image.Image, path: StrPath, grey: bool) -> Array:
 
 
 def _read_npy(file: IO[bytes], path: StrPath) -> Array:
-    """One array, its header believed only as far as the bytes reach; nothing is unpickled."""
+    """Read one array of no more bytes than the file holds, whatever its header claims; nothing is unpickled."""
     old = np.lib.format.read_magic(file) == (1, 0)
     read_header = np.lib.format.read_array_header_1_0 if old else np.lib.format.read_array_header_2_0
     shape, fortran, dtype = read_header(file)

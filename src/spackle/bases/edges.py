@@ -1,4 +1,4 @@
-"""Depth edges: where a map has them, and where the photo says that they run on the photo's grid."""
+"""Depth edges: find them in a depth map, and move them to the photo's outlines on the photo's grid."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ def find_edges(inverse_depth: Floats, known: Bools, focal: tuple[float, float]) 
     The inverse depth of a plane is linear in the pixel, a crease bends it, a sphere curves it. Only a smeared edge
     rises from one slope to a peak and falls back to another: a peak that stands out from the slopes on both sides, that
     is steeper than any surface one sees much of (by the focal length, horizontal and vertical, in pixels of the map),
-    and that raises the depth by more than `EDGE` beyond what those slopes explain. The pixels from foot to foot of the
-    peak hang in the edge. Beside pixels that are not known [h, w] no edge is seen.
+    and that raises the depth by more than `EDGE` beyond what those slopes explain. The pixels between both feet of the
+    peak belong to the smeared edge. No edge is found beside unknown pixels (`known` [h, w] false).
     """
     step, across = _rows(inverse_depth, known, STEEPEST / focal[0])
     columns, below = _rows(np.ascontiguousarray(inverse_depth.T), np.ascontiguousarray(known.T), STEEPEST / focal[1])
@@ -115,7 +115,7 @@ HOLE, OPEN, SETTLED = 0, 1, 2  # what is known of a pixel's depth: nothing, no m
 
 @dataclasses.dataclass(frozen=True)
 class Sampled:
-    """A map's inverse depth on the photo's grid. Open pixels have what the map says, mixed as it may be."""
+    """A map's inverse depth on the photo's grid. Open pixels keep the map's value, even where it mixes two surfaces."""
 
     inverse_depth: Floats  # [H, W]
     state: NDArray[np.uint8]  # [H, W] HOLE, OPEN or SETTLED
@@ -127,8 +127,8 @@ def sample(inverse_depth: Floats, known: Bools, edges: Edges, height: int, width
     """Resample a map's inverse depth [h, w], where known [h, w], to height×width.
 
     Between four pixels of one surface the inverse depth is bilinear, so a plane stays a plane. Where an edge runs
-    between them, or one hangs in an edge, the photo's pixel stays open unless a sound pixel of the map is right there;
-    what that one says is continued along its surface. Where unknown pixels have more than half of the weight, the
+    between them, or one belongs to a smeared edge, the photo's pixel stays open unless it covers a valid pixel of the
+    map, whose depth is then extended along its surface. Where unknown pixels have more than half of the weight, the
     photo's pixel is a hole, unless it covers one that is known.
     """
     sound = known & (edges.step == 0)
@@ -147,7 +147,7 @@ def sample(inverse_depth: Floats, known: Bools, edges: Edges, height: int, width
 
 @kernel
 def _flattest(inverse_depth: Any, sound: Any, edge: Any) -> Any:
-    """The flattest slope within reach along the row: what a smeared edge leaves beside its foot is steeper."""
+    """The flattest slope within reach along the row, because the slope right beside a smeared edge is too steep."""
     height, width = inverse_depth.shape
     slope = np.zeros((height, width), np.float32)
     for y in range(height):
@@ -226,12 +226,14 @@ LEAN = 0.25  # how far a side's surface may be continued into an edge, relative 
 
 
 def settle(sampled: Sampled, rgb: Floats) -> Floats:
-    """Give every open pixel, and then every hole, the depth of the one that it is best connected to in the photo.
+    """Give every open pixel, then every hole, the depth of the known pixel that the cheapest path in the photo leads
+    to.
 
     A path over the image costs its length and the change of sRGB [H, W, 3] along it, so that a depth spreads within
-    things and stops at their outlines. In a smeared edge it costs the change of the smeared depth, too, and so ends in
-    the middle where the photo shows no outline; there a side is continued along its surface. In a hole a start nearer
-    than the hole's far side costs extra, because most holes are background that a second camera could not see.
+    things and stops at their outlines. In a smeared edge it also costs the change of the smeared depth, so that a path
+    ends in its middle if the photo shows no outline; there the depth of a side is extended along its surface. In a hole
+    a start nearer than the hole's far side costs extra, because most holes are background that a second camera could
+    not see.
 
     Returns:
         Inverse depth [H, W]; settled pixels as they were.
@@ -266,9 +268,9 @@ def color_change(rgb: Any, y: int, x: int, v: int, u: int) -> Any:
 
 @kernel
 def _spread(cost: Any, source: Any, depths: Any, steps: Any, far: Any, rgb: Any, pixels: Any) -> None:
-    """For each of some pixels the start, as y·W + x, that the cheapest path leads to, and what that costs.
+    """For each given pixel, the start (as y·W + x) that the cheapest path leads to, and that path's cost.
 
-    At first starts cost 0, the others infinitely much, and each is its own source.
+    Initially starts cost 0, all other pixels infinity, and each pixel is its own source.
     """
     height, width = depths.shape
     for sweep in range(2 * ROUNDS):

@@ -54,7 +54,7 @@ class HfBase:
     """Any depth model that transformers runs and whose output has a known meaning (see `meaning_of`), frozen."""
 
     def __init__(self, name: str, network: nn.Module, prepare: Prepare, meaning: Meaning, precision: str) -> None:
-        """Use a network that is loaded already; `precision` is what the report says."""
+        """Use a loaded network; `precision` is its name in the report."""
         self.name, self.network, self.prepare, self.meaning = name, network, prepare, meaning
         self.precision = precision
 
@@ -88,8 +88,8 @@ class HfBase:
     def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
         """Gaussians of the pixels of the photo at its working size, as `lift` makes them.
 
-        A model that sees the lens gives it where neither the photo's file nor a person does. InputError where the model
-        cannot work on this photo, what it says is no depth, or memory is short.
+        A model that sees the lens gives it where neither the photo's file nor a person does. InputError if the model
+        fails on this photo, its output is no depth, or memory is too small.
         """
         photo = resize_photo(photo)
         problem = f"{self.name} fails ({{reason}}): give another photo or model"

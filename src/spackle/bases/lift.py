@@ -1,6 +1,6 @@
 """A photo and its depth map, lifted: from the map as measured to surface-aligned Gaussians.
 
-On the way its steps and noise are smoothed, its edges sharpened and its gaps filled.
+The map's steps and noise are smoothed, its edges sharpened and its gaps filled.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def lift(rgb: Tensor, depth: DepthMap, camera: Camera, levels: int = LEVELS) -> 
         rgb: [H, W, 3] sRGB in 0..1.
         depth: any size of the same aspect ratio.
         camera: the photo's, at the world's origin.
-        levels: of tiles that share a Gaussian; 0 for one a pixel.
+        levels: number of tile sizes that share a Gaussian; 0 for a Gaussian a pixel.
 
     Raises:
         InputError: not one pixel has a depth.
@@ -95,7 +95,7 @@ DEVIATIONS = 2.0  # of the noise that a pixel may move
 def noise_level(inverse_depth: Floats, known: Bools) -> float:
     """Standard deviation of the noise of most pixels, relative to the inverse depth.
 
-    By both x and y the second difference is zero on planes and straight edges; the median leaves out the rest.
+    The second difference in both x and y is zero on planes and straight edges; the median ignores the rest.
     """
     if min(inverse_depth.shape) < 3:
         return 0.0
@@ -109,7 +109,7 @@ def noise_level(inverse_depth: Floats, known: Bools) -> float:
 
 
 def smoothed(inverse_depth: Floats, known: Bools, step: Floats | np.float32) -> Floats:
-    """The smoothest inverse depth [h, w] that its noise and the step of what was stored (a number, or [h, w]) allow.
+    """The smoothest inverse depth [h, w] that its noise and its quantisation step (a number, or [h, w]) allow.
 
     Noise of 0.3 % makes each Gaussian of a slanted surface face another way, and light shines through; whole
     disparities turn a slanted plane into a staircase with a gap at every step. A known pixel may move by half a step or

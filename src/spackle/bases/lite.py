@@ -57,7 +57,7 @@ class SameConv(nn.Conv2d):
 
 
 class MBConv(nn.Module):
-    """MBConv: wider by a 1×1, spatial mixing channel by channel, narrower by a 1×1; plus itself where it fits."""
+    """MBConv: a 1×1 convolution to more channels, a depthwise one, a 1×1 to fewer; plus the input if shapes agree."""
 
     def __init__(self, inputs: int, outputs: int, kernel: int, stride: int, expansion: int) -> None:
         super().__init__()
@@ -101,7 +101,7 @@ class Encoder(nn.Module):
 
 
 class Fuse(nn.Module):
-    """What coarser scales know, refined by the features of this one."""
+    """Features of the coarser scale, upsampled and refined by the features of this one."""
 
     def __init__(self, coarse: int, skip: int, outputs: int) -> None:
         super().__init__()
@@ -161,7 +161,7 @@ LAST = f"encoder.stages.{len(STAGES['lite2']) - 1}.0.project.bias"  # its length
 
 
 def load_networks(path: str | os.PathLike[str]) -> list[LiteNet]:
-    """The networks of a file, or the one whose plain tensors it holds, ready to be asked, in single precision.
+    """The networks of a file, or the one network whose plain tensors it holds, for inference in single precision.
 
     InputError for a missing or broken file or weights of another architecture.
     """
@@ -184,7 +184,7 @@ def _network(tensors: dict[str, Tensor], path: str | os.PathLike[str]) -> LiteNe
 
 
 def _unpacked(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """All tensors as floats; steps without a scale that fits are left out, and what they are for is then missing."""
+    """All tensors as floats; 8-bit tensors without a fitting scale are left out, so that they count as missing."""
     values: dict[str, Tensor] = {}
     for name, tensor in tensors.items():
         scale = tensors.get(name + SCALE)
@@ -203,7 +203,7 @@ FARTHEST = 60.0  # what is farther than the nearest things by this ratio is sky 
 
 @dataclasses.dataclass(frozen=True)
 class InputScale:
-    """A size at which a network sees a photo."""
+    """One input size: the resolution at which one of the networks sees a photo."""
 
     pixels: int  # of what the network sees of it, nearly
     network: int = 0  # which of the networks that a file has
@@ -259,7 +259,7 @@ class LiteBase:
         return dataclasses.replace(prediction, notes=notes, disparity=DISPARITY, uncovered=UNCOVERED)
 
     def inverse_depth(self, rgb: Tensor) -> Tensor:
-        """What the networks say of a photo [H, W, 3], sRGB in 0..1, at all `INPUT_SCALES`: the mean logarithm.
+        """The networks' inverse depth of a photo [H, W, 3], sRGB in 0..1: the mean logarithm over all `INPUT_SCALES`.
 
         Returns [h, w] float32 inverse depth up to a factor, on the processor; about 224×304, of the photo's shape.
         """
@@ -285,18 +285,18 @@ class LiteBase:
 
 
 def merged(outputs: Tensor, tilt: Sequence[bool]) -> Tensor:
-    """[h, w] the mean of outputs [n, h, w], but what is coarse in it is the mean of those that have a say in it."""
+    """Mean [h, w] of outputs [n, h, w], whose low frequencies are the mean of the chosen outputs alone."""
     cells = COARSE if outputs.shape[1] <= outputs.shape[2] else COARSE[::-1]
     coarse = interpolate(interpolate(outputs[None], size=cells, mode="area"), size=outputs.shape[1:], mode="bicubic")[0]
     return (outputs - coarse).mean(0) + coarse[torch.tensor(tilt)].mean(0)
 
 
 def network_size(height: int, width: int, pixels: int) -> tuple[int, int]:
-    """(height, width) of what the network sees of a photo: nearly its shape, nearly `pixels`."""
+    """(height, width) of the network's input: about the photo's aspect ratio, and about `pixels` pixels."""
     return scaled_size(height, width, math.sqrt(pixels / (height * width)))
 
 
 def scaled_size(height: int, width: int, scale: float) -> tuple[int, int]:
-    """(height, width) times nearly `scale`, as a network takes it."""
+    """(height, width) times about `scale`, rounded to a size that the network takes."""
     tall, wide = (max(STRIDE, round(side * scale / STRIDE) * STRIDE) for side in (height, width))
     return tall, wide

@@ -87,7 +87,9 @@ def _load_network(name: str, settings: BaseSettings) -> Base | None:
 
 
 def _lift(settings: BaseSettings, photo: Photo, depth: Depth) -> Base | None:
-    """Lifts by the depth of this call, the settings or the photo. The user's focal length replaces the map's."""
+    """Lifts the photo by the depth given for this call, in the settings, or inside the photo. The user's focal length
+    replaces the map's.
+    """
     source = settings.depth if depth is None else depth
     if source is None and photo.path.is_file():  # a photo that a program made has no file
         source = load_photo_depth(photo.path)
@@ -136,7 +138,7 @@ class OpenedBase:
         fingerprints: Mapping[str, str],
         loaded: dict[str, Base | None],
     ) -> None:
-        """`candidates` are as `ORDER`; `loaded` networks are not loaded again."""
+        """`candidates` are tried in order, see `ORDER`; `loaded` maps names to networks that are loaded already."""
         self.candidates, self.fingerprints = candidates, fingerprints
         self._settings, self._loaded = settings, loaded
         self._failed: dict[str, tuple[str, bool]] = {}  # for all photos: the reason, and whether memory was short
@@ -197,7 +199,7 @@ class OpenedBase:
         return prediction, ResolvedBase(name, why, tuple(failures), lasting, note if new else "")
 
     def load(self, photo: Photo, depth: Depth = None, name: str | None = None) -> Base | None:
-        """A candidate, the first where none is named, for a photo; None where this photo or this machine has none.
+        """The candidate of that name, or the first one, for a photo; None if this photo or machine has none.
 
         InputError where it cannot be loaded; BaseError where it is the only one, or its files have changed.
         """

@@ -1,4 +1,4 @@
-"""Which pixels share a Gaussian: a quadtree over the picture, cut where the lost detail is worth less than is saved."""
+"""Which pixels share a Gaussian: a quadtree over the picture, cut where lost detail costs less than Gaussians."""
 
 from __future__ import annotations
 
@@ -52,9 +52,9 @@ def grid_means(image: Tensor, height: int, width: int) -> Tensor:
 class Quadtree:
     """Blocks of 2×2, 4×4, … pixels, and what each would lose as one tile or as two halves.
 
-    Lost is the squared difference from tiles' means with smooth transitions, summed over pixels, mean of channels. A
-    block with a pixel that is not free, or a depth that leaves its plane, in it or within a block's side around it is
-    not for tiles: their Gaussians reach as far. Nor is a steep one.
+    A loss is the squared difference from bilinearly interpolated tile means, summed over pixels, mean of channels. No
+    block becomes a tile if it or its surroundings, as far as a block's side, hold a pixel that is not free or a depth
+    off its plane, because the Gaussian of a tile reaches that far. Steep blocks become none either.
     """
 
     def __init__(
@@ -67,8 +67,8 @@ class Quadtree:
             inverse_depth: [H, W].
             slope: [H, W, 2] of it by pixel x and y.
             free: [H, W] bool.
-            levels: how many sizes of blocks there are; 0 leaves every pixel for itself.
-            steepest: most that the inverse depth changes across a block, relative.
+            levels: number of block sizes; 0 gives every pixel its own Gaussian.
+            steepest: the greatest relative change of inverse depth across a tile.
         """
         self.shape = inverse_depth.shape
         self.lost: list[Tensor] = []  # [H/side, W/side, 3] for each level: of one tile, of flat and of tall halves
@@ -85,16 +85,16 @@ class Quadtree:
                 self.lost.append(torch.from_numpy(lost))
 
     def detail(self) -> float:
-        """The median deviation of pixels from what a tile of 2×2 would show, where there may be one."""
+        """The median deviation of pixels from their 2×2 tile, over blocks that may become tiles."""
         lost = self.lost[0][..., SQUARE] if self.lost else torch.empty(0)
         finite = lost[torch.isfinite(lost)]
         finite = finite[:: 1 + len(finite) // SAMPLE]
         return math.sqrt(float(finite.median()) / 4) if finite.numel() else 0.0
 
     def cut(self, worth: float) -> tuple[Tensor, list[Tiles]]:
-        """Tiles that together lose least, a tile or pixel itself counting as a loss of `worth`.
+        """The division into tiles and pixels of least total loss, in which each Gaussian costs `worth`.
 
-        Returns [H, W] bool, which pixels stay for themselves, and the tiles.
+        Returns [H, W] bool, the pixels with a Gaussian of their own, and the tiles.
         """
         single = torch.ones(self.shape, dtype=torch.bool)
         cost = torch.full(self.shape, worth)
@@ -149,7 +149,7 @@ def _measure(
 def _fits(
     row: int, column: int, side: int, steepest: Any, inverse_depth: Any, depth: Any, slope: Any, free: Any
 ) -> bool:
-    """Whether a block and what lies within a side of it is free, and in the block's plane."""
+    """Whether a block and its surroundings, one side wide, are free and lie in the block's plane."""
     height, width = inverse_depth.shape
     if (abs(slope[0]) + abs(slope[1])) * side > steepest * depth:
         return False

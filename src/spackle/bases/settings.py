@@ -95,7 +95,7 @@ class BaseSettings:
 
     @property
     def public_name(self) -> str:
-        """The name in published results: of a folder only the last part."""
+        """The name in published results: for a folder, its last part."""
         return self.named if self.folder is None else HF + self.folder.resolve().name
 
     @property
@@ -110,7 +110,7 @@ class BaseSettings:
 
     @property
     def files(self) -> dict[str, Path]:
-        """Existing weight files that decide the predictions, by the base's name; those in a folder by their own."""
+        """The weight files that decide the predictions, by the base's name; files of a folder by their own."""
         if self.folder is not None:
             return {file.name: file for p in HF_FILES for file in sorted(self.folder.glob(p)) if file.is_file()}
         names = AUTO_NETWORKS if self.named == AUTO else (self.named,)

@@ -40,7 +40,9 @@ GRAIN = 32
 
 @dataclasses.dataclass(frozen=True)
 class Layers:
-    """Both surfaces beside the depth steps of a map. Elsewhere `ring` and `alpha` are 0, and far is what is there."""
+    """Both surfaces beside the depth steps of a map. Elsewhere `ring` and `alpha` are 0, and the far layer holds the
+    pixel's own values.
+    """
 
     ring: NDArray[np.uint8]  # [H, W] pixels to the nearest step, 1 beside it; 0 beyond `REACH`
     alpha: Floats  # [H, W] share of a pixel that the near surface covers
@@ -50,7 +52,8 @@ class Layers:
 
 
 def find_layers(inverse_depth: Floats, slope: Floats, colors: Floats) -> Layers:
-    """Take the pixels beside depth steps apart, so that near and far colour mix by alpha to what the photo shows.
+    """Separate the pixels beside depth steps into a near and a far colour, whose mixture by alpha is the photo's
+    colour.
 
     A lens blurs a silhouette, so that a pixel or two on each side show both surfaces; and the map's step may lie a
     pixel or two beside the photo's outline. Both surfaces are continued across the step, their colours from pixels
@@ -115,7 +118,7 @@ def _survey(
     start: int, stop: int, image: Any, colors: Any, ring: Any, levels: Any,
     inside: Any, depth: Any, slope: Any, color: Any, texture: Any,
 ) -> None:  # fmt: skip
-    """Rows start..stop: both surfaces, their mean colours, and how far inside of the near one a pixel lies."""
+    """Rows start..stop: both surfaces, their mean colours, and each pixel's distance into the near one."""
     height, width = image.shape
     m = np.zeros((2, 9), np.float64)  # per side: weight, x, y, d, xx, yy, xy, xd, yd
     s = np.zeros((2, 7), np.float64)  # per side: weight, colour, its square
@@ -189,7 +192,7 @@ def _survey(
 
 @inlined_kernel
 def _share(colors: Any, color: Any, y: int, x: int) -> Any:
-    """Of a pixel the near colour's share in the likest mixture of both, how unlike that is, and how unlike they are."""
+    """The near colour's share in the mixture nearest to a pixel, its distance from it, and that of both colours."""
     apart, along, away = np.float32(0), np.float32(0), np.float32(0)
     for c in range(3):
         difference, own = color[0, y, x, c] - color[1, y, x, c], colors[y, x, c] - color[1, y, x, c]
@@ -236,11 +239,13 @@ def _match(start: int, stop: int, colors: Any, ring: Any, inside: Any, color: An
 
 @kernel
 def _unmix(colors: Any, ring: Any, inside: Any, alpha: Any, color: Any, texture: Any) -> None:
-    """Move both colours, in place, as little as makes them mix to the photo's, and no further than texture explains.
+    """Move both colours, in place, just so far that they mix to the photo's colour, and no further than texture
+    explains.
 
-    A pixel that they do not explain has the share of the likest mixture of them as they were; one that is like none, as
-    the shaded edge of a round thing, is all of the surface that it lies in. A camera that sharpens draws a fringe along
-    an outline, brighter than what lies behind a dark thing: that is the thing's, or it would stay on what lies behind.
+    A pixel that they do not explain gets the share of the nearest mixture of the unmoved colours; one far from any
+    mixture, such as the shaded edge of a round object, belongs to its own surface alone. A camera that sharpens draws a
+    fringe along an outline, brighter than the background of a dark object. The fringe is given to the object, or it
+    would stay on the background.
     """
     height, width = ring.shape
     rest = np.zeros(3, np.float32)

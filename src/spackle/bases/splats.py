@@ -52,15 +52,14 @@ UNTOUCHED = 2  # rings beside a step whose colours stay, as the border's do: cor
 def layered_gaussians(inverse_depth: Tensor, colors: Tensor, camera: Camera, levels: int = LEVELS) -> Gaussians:
     """At most 1.5 Gaussians a pixel, which blend to the photo from its camera.
 
-    First come those of single pixels in row-major order, on the surface that covers most of the pixel; then tiles of
-    up to 8×8 pixels, where the picture and the depth allow them; then the other surface of pixels that a depth step
-    divides; then the backing.
+    The order is: single pixels in row-major order, on the surface that covers most of the pixel; tiles of up to 8×8
+    pixels, where picture and depth allow them; the other surface of mixed pixels; the backing.
 
     Args:
         inverse_depth: [H, W], positive everywhere.
         colors: [H, W, 3] linear RGB.
         camera: the photo's.
-        levels: of tiles; 0 for a Gaussian a pixel and a backing one for 2×2.
+        levels: number of tile sizes; 0 for a Gaussian a pixel and a backing Gaussian for 2×2.
     """
     slope = surface_slope(inverse_depth)
     layers = find_layers(*(image.contiguous().numpy() for image in (inverse_depth, slope, colors)))
@@ -93,9 +92,11 @@ class _Samples(NamedTuple):
 
 
 def _fitted(samples: _Samples, colors: Tensor, single: Tensor, corrected: Tensor, tiles: Sequence[Tiles]) -> _Samples:
-    """Correct the colours of tiles and of some single pixels by how far their mixture is from `colors` there.
+    """Correct the colours of tiles and of some single pixels by the difference between `colors` and the blended
+    picture.
 
-    The photo's camera sees each pixel through the nearer Gaussians around. `corrected` [number of single pixels] bool.
+    The blended picture is what the photo's camera sees, nearer Gaussians first. `corrected` [number of single pixels]
+    bool.
     """
     fitted = samples.color.clone()
     order = samples.depth.argsort(descending=True, stable=True)
@@ -117,7 +118,7 @@ class _Surface(NamedTuple):
     opacity: Tensor  # [H, W]
 
     def instead(self, where: Tensor, other: _Surface) -> _Surface:
-        """The other one at some pixels [H, W]."""
+        """The surfaces with near and far exchanged at the given pixels [H, W]."""
         images = zip(other, self, strict=True)
         return _Surface(*(torch.where(where if a.ndim == 2 else where[..., None], a, b) for a, b in images))
 
@@ -146,7 +147,7 @@ class _Pixels(NamedTuple):
 
 
 def _split(layers: Layers, least: float, colors: Tensor) -> _Pixels:
-    """A pixel is mixed where either surface covers at least `least` of it; else one covers all."""
+    """A pixel is mixed if each surface covers at least `least` of it; else one surface covers all of it."""
     ring, alpha = torch.from_numpy(layers.ring), torch.from_numpy(layers.alpha)
     near = alpha >= 0.5
     mixed = torch.minimum(alpha, 1 - alpha) >= least
@@ -160,9 +161,10 @@ def _split(layers: Layers, least: float, colors: Tensor) -> _Pixels:
 
 
 def _backing(pixels: _Pixels, worth: float, levels: int) -> list[_Samples]:
-    """A wide Gaussian for each 2×2 pixels, behind the farthest of them and in its surface; one for more in flat places.
+    """A wide Gaussian for each 2×2 pixels, behind the farthest of them and along its surface; larger ones in flat
+    areas.
 
-    None is where only the rest of mixed pixels lies behind, or where pixels of both surfaces lie in one cell.
+    A cell has none if it holds pixels of both surfaces, or only the far part of mixed pixels lies behind it.
     """
     behind = pixels.mixed & pixels.near
     deepest = pixels.most.instead(behind, pixels.rest)
@@ -191,7 +193,9 @@ def _backing(pixels: _Pixels, worth: float, levels: int) -> list[_Samples]:
 
 
 def _receded(samples: _Samples, tiles: Tiles, slope_gap: float) -> _Samples:
-    """The backing behind the front, by so many of its sides along a slanted surface; `tiles` are of cells."""
+    """Place the backing behind the front, by the given number of its sides along a slanted surface; `tiles` are of
+    cells.
+    """
     reach = 2 * slope_gap * torch.tensor([tiles.width, tiles.height])
     gap = BACKING_GAP + (reach * samples.slope.abs()).sum(-1) / samples.depth
     recede = 1.0 - gap.clamp_max(MAX_BACKING_GAP)
@@ -221,7 +225,7 @@ REACH = np.float32(3.33)  # standard deviations at which an alpha becomes faint
 def blended_opacities(alpha: Floats, ring: NDArray[np.uint8]) -> Floats:
     """Opacities [H, W] of near Gaussians that cover alpha [H, W] of the pixels, neighbours' light included.
 
-    Of full opacity each; `ring` [H, W] is 0 where a pixel is of one surface alone.
+    All other Gaussians have full opacity; `ring` [H, W] is 0 where a pixel is of one surface alone.
     """
     result = alpha.copy()
     for _ in range(SWEEPS):

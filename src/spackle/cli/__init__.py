@@ -30,10 +30,10 @@ WIDTH = 80
 
 
 class Overview(TyperGroup):
-    """Commands whose help is one line each, below examples; those of RESEARCH come last."""
+    """The command group, which lists each command in one line below examples, those of RESEARCH last."""
 
     def format_help(self, ctx: typer.Context, formatter: object) -> None:  # type: ignore[override]
-        """Write it; whatever the terminal's height, 24 lines of 80 characters show all."""
+        """Write the help so that it fits into 24 lines of 80 characters."""
         write = formatter.write  # type: ignore[attr-defined]
         rows = [(name, command) for name in self.list_commands(ctx) if (command := self.get_command(ctx, name))]
         indent = max(len(name) for name, _ in rows) + 4
@@ -96,10 +96,10 @@ def _version(asked: bool) -> None:
 @app.callback()
 def everywhere(
     version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Which version this is.")
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
-    """What all commands have in common."""
+    """Options that come before any command."""
 
 
 def main() -> None:

@@ -59,11 +59,21 @@ def predict(
     depth_kind: DepthKindOption = "auto",
     near: Annotated[
         float | None,
-        typer.Option(hidden=True, metavar="METRES", help="Where a relative --depth begins.", show_default="1.5"),
+        typer.Option(
+            hidden=True,
+            metavar="METRES",
+            help="Distance in metres of the nearest part of a relative --depth.",
+            show_default="1.5",
+        ),
     ] = None,
     far: Annotated[
         float | None,
-        typer.Option(hidden=True, metavar="METRES", help="Where a relative --depth ends.", show_default="15"),
+        typer.Option(
+            hidden=True,
+            metavar="METRES",
+            help="Distance in metres of the farthest part of a relative --depth.",
+            show_default="15",
+        ),
     ] = None,
     calib: Annotated[
         Path | None, typer.Option(hidden=True, metavar="FILE", help="calib.txt of a disparity map that lies elsewhere.")
@@ -78,7 +88,7 @@ def predict(
         typer.Option(
             metavar="PATH|seeds|none",
             hidden=True,
-            help="Weights of the residual. seeds: without any; none: base alone. Default: shipped ones, else seeds.",
+            help="Weights of the residual. seeds: without any; none: holes stay open. Default: those that ship.",
         ),
     ] = None,
     fill: Annotated[
@@ -90,7 +100,8 @@ def predict(
     ] = "auto",
     render: Annotated[bool, typer.Option(help="Write a video.")] = True,
     keep_base: Annotated[
-        bool, typer.Option("--keep-base", hidden=True, help="Write base.ply, too: what the photo shows.")
+        bool,
+        typer.Option("--keep-base", hidden=True, help="Also write base.ply, the Gaussians of what the photo shows."),
     ] = False,
     depth_out: Annotated[
         str | None,
@@ -108,16 +119,18 @@ def predict(
     focal_mm: Annotated[float | None, typer.Option(help="Focal length in mm, 35 mm equivalent.")] = None,
     fov: FovOption = None,
     keep_frame: KeepFrameOption = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Of many photos: do again what is done.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Redo photos whose results exist.")] = False,
     workers: Annotated[
         int,
-        typer.Option(hidden=True, help="Photos at once, each in a process that holds the base's network itself."),
+        typer.Option(
+            hidden=True, help="Number of photos at once, each in a process with its own copy of the base's network."
+        ),
     ] = 1,
     threads: Annotated[
         int | None,
         typer.Option(
             hidden=True,
-            help="Threads of each worker; networks' last bits depend on them.",
+            help="Threads of each worker; the last bits of a network's output depend on their number.",
             show_default="the cores, shared evenly; with --ray 2",
         ),
     ] = None,
@@ -152,7 +165,8 @@ def render(
     scene: Annotated[Path, typer.Argument(metavar="SCENE", help="A 3D Gaussian scene.")],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="A folder, or name.mp4|webm|gif|webp.")],
     compare: Annotated[
-        bool, typer.Option("--compare", help="To the left what the photo shows, with its holes; to the right all.")
+        bool,
+        typer.Option("--compare", help="Show the base with its holes on the left, the completed scene on the right."),
     ] = False,
     path: PathOptions,
     focal_px: Annotated[float | None, typer.Option(help="Focal length in pixels of the video.")] = None,
@@ -255,19 +269,28 @@ def serve(
     port: Annotated[int, typer.Option(metavar="N", help="Listen at this port; 0: any that is free.")] = 8080,
     token: Annotated[
         str | None,
-        typer.Option(help="What a client must send.", show_default="a new one", envvar="SPACKLE_TOKEN"),
+        typer.Option(
+            help="The token that clients must send; default: a new one.",
+            show_default="a new one",
+            envvar="SPACKLE_TOKEN",
+        ),
     ] = None,
     workers: Annotated[
-        int, typer.Option(min=1, max=64, help="Photos at once, each in a process that holds the base's network itself.")
+        int,
+        typer.Option(
+            min=1, max=64, help="Number of photos at once, each in a process with its own copy of the base's network."
+        ),
     ] = 1,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="Folder for photos and scenes.")] = Path(
         "spackle-scenes"
     ),
-    keep: Annotated[float, typer.Option(min=0, metavar="DAYS", help="Remove a scene after so many days.")] = 7,
+    keep: Annotated[float, typer.Option(min=0, metavar="DAYS", help="Remove a scene after this number of days.")] = 7,
     quota: Annotated[
         float, typer.Option(min=0, metavar="GB", help="Remove the oldest scenes when all take more than this.")
     ] = 20,
-    waiting: Annotated[int, typer.Option(min=1, metavar="N", help="Photos that may wait; more are refused.")] = 32,
+    waiting: Annotated[
+        int, typer.Option(min=1, metavar="N", help="Number of photos that may wait; more are refused.")
+    ] = 32,
     base: Annotated[
         str, typer.Option(metavar="NAME", help="What turns photos into Gaussians, as `spackle predict` has it.")
     ] = "auto",

@@ -27,14 +27,19 @@ def dataset_build(
     photos: Annotated[
         Path, typer.Argument(metavar="FOLDER|COCO.json", help="Photos, with subfolders; or COCO annotations.")
     ],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="A folder; a build in it goes on.")],
+    output: Annotated[
+        Path,
+        typer.Option("-o", "--output", metavar="OUT", help="The dataset's folder; an unfinished build in it resumes."),
+    ],
     images: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Where a COCO JSON's photos lie; default: beside it.")
     ] = None,
     sample: Annotated[
         int | None, typer.Option(min=1, max=1_000_000, help="Number of photos, chosen at random; default: all.")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Of the choice and of the paths.")] = 0,
+    seed: Annotated[
+        int, typer.Option(min=0, max=2**31 - 1, help="Seed of the random choice of photos and camera paths.")
+    ] = 0,
     base: Annotated[
         str, typer.Option(help="What turns a photo into Gaussians: sharp, rgbd, depth, lite or hf:NAME.")
     ] = "sharp",
@@ -43,21 +48,23 @@ def dataset_build(
     ] = None,
     checkpoint: Annotated[Path | None, typer.Option("-c", "--checkpoint", help="Weights of the base.")] = None,
     precision: PrecisionOption = "auto",
-    views: Annotated[int, typer.Option(min=2, max=100, help="Views of a photo, its own among them.")] = 20,
+    views: Annotated[int, typer.Option(min=2, max=100, help="Number of views of each photo, its own included.")] = 20,
     trajectory: Annotated[
         SharpTrajectoryName | None, typer.Option(help="Camera path; default: drawn for each photo.")
     ] = None,
     disparity: Annotated[
-        tuple[float, float], typer.Option(metavar="LO HI", help="How far the camera moves, drawn between these.")
+        tuple[float, float],
+        typer.Option(metavar="LO HI", help="How far the camera moves: drawn between these two disparities."),
     ] = (0.1, 0.6),
     inpainter: Annotated[
         str, typer.Option(help="What completes the views: exemplar, lama, opencv, propainter; geometry; or none.")
     ] = "exemplar",
     inpainter_weights: Annotated[
-        Path | None, typer.Option(metavar="PATH", help="Its weights: propainter's folder, or a file of lama's.")
+        Path | None, typer.Option(metavar="PATH", help="Weights of the inpainter: propainter's folder, or lama's file.")
     ] = None,
     inpainter_side: Annotated[
-        int | None, typer.Option(help="Long side in pixels at which it works; default: propainter 640, lama 1024.")
+        int | None,
+        typer.Option(help="Long side in pixels at which the inpainter works; default: propainter 640, lama 1024."),
     ] = None,
     workers: Annotated[int, typer.Option(help="Processes; each holds its own base.")] = 1,
     ray: Annotated[
@@ -65,7 +72,7 @@ def dataset_build(
         typer.Option(metavar="ADDRESS", help="Workers on a Ray cluster: auto, local, HOST:PORT or ray://HOST:PORT."),
     ] = None,
     threads: Annotated[int, typer.Option(help="Threads of each process; SHARP's last bits depend on them.")] = 2,
-    shard_size: Annotated[int, typer.Option(min=1, max=1_000_000, help="Photos of a tar file.")] = 50,
+    shard_size: Annotated[int, typer.Option(min=1, max=1_000_000, help="Number of photos in a tar file.")] = 50,
     device: DeviceOption = "auto",
     verbose: VerboseOption = False,
 ) -> None:

@@ -25,7 +25,9 @@ NUMBER = re.compile(r"[\d.,]+")
 UNFIT = re.compile(r"[^\w.-]+")  # in the name of a folder
 
 # Options that both commands have.
-Limit = Annotated[int | None, typer.Option(min=1, max=1_000_000, help="So many images, spread over the dataset.")]
+Limit = Annotated[
+    int | None, typer.Option(min=1, max=1_000_000, help="Evaluate this number of images, spread over the dataset.")
+]
 _DATASET = typer.Option(
     metavar="NAME", help="middlebury, booster, wildrgbd, tanks, eth3d, llff: an unknown one lists all."
 )
@@ -43,13 +45,19 @@ Side = Annotated[
     typer.Option(min=16, max=8192, help="Long side of the views. [default: 1280; near-view: 1536]", show_default=False),
 ]
 Disparity = Annotated[
-    str, typer.Option(metavar="A,B,…", help="Of the large views, with commas or spaces; the paper's S1, S2, S3.")
+    str,
+    typer.Option(metavar="A,B,…", help="Disparities of the large views, with commas; default: the paper's S1, S2, S3."),
 ]
 Output = Annotated[
     Path | None,
-    typer.Option("-o", "--output", metavar="OUT", help="A folder; a run in it goes on. Default: named by the choices."),
+    typer.Option(
+        "-o",
+        "--output",
+        metavar="OUT",
+        help="Folder for the results, where an unfinished run resumes; default: by dataset and protocol.",
+    ),
 ]
-Html = Annotated[bool, typer.Option("--html", help="Write report.html there too: one page with all of it.")]
+Html = Annotated[bool, typer.Option("--html", help="Also write report.html, one page with all results.")]
 
 
 def evaluate(
@@ -61,19 +69,23 @@ def evaluate(
         str,
         typer.Option(
             metavar="A,B,…",
-            help="Of base, paper, spackle, spackle-scene, seeds, dense, inpaint2d, direct-ft; with commas.",
+            help="Methods, with commas: base, paper, spackle, spackle-scene, seeds, dense, inpaint2d, direct-ft.",
         ),
     ] = "base,paper,spackle",
     disparity: Disparity = "0.3,0.4,0.5",
     side: Side = None,
     second_views: Annotated[
-        str, typer.Option(metavar="all|nearest", help="Near-view: a photo's second photos, of its scene.")
+        str,
+        typer.Option(
+            metavar="all|nearest",
+            help="Which second photos a near view is compared with: all of the scene, or the nearest.",
+        ),
     ] = "all",
     metrics: Annotated[
         str | None,
         typer.Option(
             metavar="A,B,…",
-            help="Of clipiqa, niqe, musiq, psnr, ssim, distance, dists, lpips, or none; default: the protocol's.",
+            help="Metrics, with commas: clipiqa, niqe, musiq, psnr, ssim, distance, dists, lpips; or none.",
         ),
     ] = None,
     base: BaseName = "sharp",
@@ -82,7 +94,9 @@ def evaluate(
     sharp: SharpOption = None,
     residual: Residual = None,
     direct_ft: Annotated[Path | None, typer.Option(metavar="FILE", help="Weights of the method direct-ft.")] = None,
-    inpainter: Annotated[str, typer.Option(metavar="NAME", help="Of inpaint2d: exemplar, lama, opencv, …")] = "opencv",
+    inpainter: Annotated[
+        str, typer.Option(metavar="NAME", help="Inpainter of the method inpaint2d: exemplar, lama, opencv, …")
+    ] = "opencv",
     features: Annotated[Path | None, typer.Option(metavar="FILE.npz", help="SqueezeNet, for distance.")] = None,
     limit: Limit = None,
     download_metrics: Annotated[
@@ -132,7 +146,7 @@ def tables(
     results: Annotated[
         list[Path], typer.Argument(metavar="OUT...", help="Folders that `spackle evaluate` and `spackle bench` wrote.")
     ],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="T", help="A folder for the files.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="T", help="Folder for the files.")],
     html: Html = False,
 ) -> None:
     """Put several evaluations and benchmarks into the same tables: tables.md and tables.tex."""
@@ -146,8 +160,10 @@ def figures(
     results: Annotated[
         list[Path], typer.Argument(metavar="OUT...", help="Folders that `spackle evaluate --disparity 0.6` wrote.")
     ],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="F", help="A folder for the files.")],
-    rows: Annotated[int, typer.Option(min=1, max=100, help="Images in a figure, and at least one of each folder.")] = 6,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="F", help="Folder for the files.")],
+    rows: Annotated[
+        int, typer.Option(min=1, max=100, help="Number of images in a figure; each folder gives at least one.")
+    ] = 6,
 ) -> None:
     """Draw the paper's figures of views: PDF, PNG, and captions in figures.tex."""
     from spackle.evaluation.pictures import make_figures
@@ -168,10 +184,10 @@ def bench(
     sharp: SharpOption = None,
     residual: Residual = None,
     limit: Limit = None,
-    runs: Annotated[int, typer.Option(min=1, max=1000, help="How often everything behind the base is timed.")] = 5,
+    runs: Annotated[int, typer.Option(min=1, max=1000, help="Number of timed runs of everything after the base.")] = 5,
     base_runs: Annotated[
         int | None,
-        typer.Option(min=1, max=1000, help="How often the base is timed. [default: 1 for sharp, else as --runs]"),
+        typer.Option(min=1, max=1000, help="Number of timed runs of the base. [default: 1 for sharp, else as --runs]"),
     ] = None,
     device: DeviceOption = "auto",
     output: Output = None,

@@ -34,7 +34,7 @@ def show_info(path: Path, reporter: Reporter) -> None:
 
 
 def is_depth(path: Path) -> bool:
-    """Whether a file is a depth map by its name or, of a PNG, by having 16 bits in one channel."""
+    """Whether a file is a depth map, by its suffix or, for a PNG, by 16 bits in one channel."""
     if path.suffix.lower() != ".png":
         return path.suffix.lower() in SUFFIXES
     try:

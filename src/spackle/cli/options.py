@@ -22,14 +22,14 @@ SharpTrajectoryName = Literal["swipe", "shake", "rotate", "rotate-forward"]
 TrajectoryName = Literal[SharpTrajectoryName, "vertical", "orbit", "dolly-zoom"]
 PrecisionName = Literal["auto", "fp32", "bf16"]
 DepthKindName = Literal["auto", "metric", "disparity", "near-white", "near-black"]
-PrecisionOption = Annotated[PrecisionName, typer.Option(help="Of the base's network.")]
+PrecisionOption = Annotated[PrecisionName, typer.Option(help="Precision of the base's network.")]
 DeviceOption = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Where to compute.")]
 FovOption = Annotated[float | None, typer.Option(help="Horizontal field of view in degrees.")]
 HostOption = Annotated[
     str, typer.Option(metavar="H", help="Listen at this address: 0.0.0.0 lets the network in, whoever has the token.")
 ]
 KeepFrameOption = Annotated[
-    bool, typer.Option("--keep-frame", help="Leave a scan's margin or letterbox bars around a photo on it.")
+    bool, typer.Option("--keep-frame", help="Keep a scan's margin or letterbox bars, which are otherwise cut off.")
 ]
 DepthKindOption = Annotated[
     DepthKindName,
@@ -70,7 +70,7 @@ def _help_all(context: typer.Context, asked: bool) -> None:
 
 
 HelpAllOption = Annotated[
-    bool, typer.Option("--help-all", is_eager=True, callback=_help_all, help="Show this with all options.")
+    bool, typer.Option("--help-all", is_eager=True, callback=_help_all, help="Show this help with all options.")
 ]
 
 
@@ -104,15 +104,16 @@ def path_options(
     path: Annotated[
         Path | None,
         typer.Option(
-            "--path", metavar="FILE.json", hidden=True, help="A camera path of your own: keyframes, see docs/video.md."
+            "--path", metavar="FILE.json", hidden=True, help="Fly through the keyframes of a file, see docs/video.md."
         ),
     ] = None,
     cameras: Annotated[
-        Path | None, typer.Option(metavar="FILE.json", hidden=True, help="Exactly these views in place of a path.")
+        Path | None,
+        typer.Option(metavar="FILE.json", hidden=True, help="Complete exactly these views in place of a path."),
     ] = None,
     frames: Annotated[int | None, typer.Option(hidden=True, help="Frames of the path, in place of --seconds.")] = None,
     seconds: Annotated[
-        float | None, typer.Option(help="How long the video lasts.", show_default="4, or as --path has it")
+        float | None, typer.Option(help="Length of the video in seconds.", show_default="4, or as --path has it")
     ] = None,
     video_format: Annotated[
         Literal["mp4", "webm", "gif", "webp"] | None,
@@ -171,7 +172,7 @@ def path_options(
         ),
     ] = None,
 ) -> PathOptions:
-    """The way of the camera and the video of it, as one value.
+    """The options of camera path and video, as one value.
 
     Raises:
         InputError: --path or --cameras gives other views, to which an option would mean nothing.

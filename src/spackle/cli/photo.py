@@ -1,4 +1,4 @@
-"""The choices of `spackle predict`."""
+"""Options of `spackle predict`, and what they mean for the pipeline."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from spackle.video_frames import video_problem
 
 @dataclasses.dataclass(frozen=True)
 class PredictOptions:
-    """The choices of `spackle predict`."""
+    """Options of `spackle predict`, and what they mean for the pipeline."""
 
     scene: Options
     lens: Mapping[str, float | None]  # `focal_px`, `focal_mm` and `fov`, as `load_photo` takes them

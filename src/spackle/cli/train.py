@@ -20,9 +20,13 @@ def train(
             help="What to learn from, and how: quick, cpu, paper, reverse_view, direct_ft, or a YAML file.",
         ),
     ],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="A folder; a run in it goes on.")],
+    output: Annotated[
+        Path,
+        typer.Option("-o", "--output", metavar="OUT", help="Folder for the results; an unfinished run in it resumes."),
+    ],
     overrides: Annotated[
-        list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="In place of the recipe's: optim.steps=100.")
+        list[str] | None,
+        typer.Argument(metavar="[KEY=VALUE]...", help="Values that replace the recipe's, such as optim.steps=100."),
     ] = None,
     method: Annotated[
         Literal["residual", "direct-ft"],
@@ -31,7 +35,7 @@ def train(
     checkpoint: Annotated[
         Path | None, typer.Option("-c", "--checkpoint", metavar="FILE", help="Weights of SHARP, for direct-ft.")
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Start anew where OUT holds a run.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Delete a run in OUT and start anew.")] = False,
     verbose: VerboseOption = False,
 ) -> None:
     """Train the residual or SHARP itself: best.safetensors, last.safetensors, run.json, pictures and logs."""

@@ -29,7 +29,7 @@ def weights_get(
         typer.Option("-o", "--output", metavar="OUT", help="A folder, or a file name; default: the weights' folder."),
     ] = None,
     url: Annotated[str | None, typer.Option(help="Download from this mirror.")] = None,
-    force: Annotated[bool, typer.Option("--force", help="Download what is there already.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Download even if the file exists.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Download weights and check their SHA-256; a broken download goes on where it stopped."""

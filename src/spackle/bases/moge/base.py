@@ -1,4 +1,4 @@
-"""The moge base: MoGe-2's depth in metres, lifted as a measured one is, and its lens where nobody knows the photo's."""
+"""The moge base: MoGe-2's depth in metres, lifted like a measured one, and its lens if the photo's is unknown."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class MogeBase:
     name = "moge"
 
     def __init__(self, network: MogeNetwork, precision: str) -> None:
-        """Use a network that is loaded already, on its device; `precision` is what the report says."""
+        """Use a loaded network on its device; `precision` is its name in the report."""
         self.network, self.precision = network, precision
 
     @classmethod
@@ -63,8 +63,8 @@ class MogeBase:
     def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
         """Gaussians of the pixels of the photo at its working size, as `lift` makes them.
 
-        A person's focal length or the file's is kept; else MoGe's counts, or the default where MoGe's is no lens. The
-        sky goes behind all surfaces. InputError where the network sees no surface, or memory is short.
+        The user's or the file's focal length is kept; else MoGe's is taken, or the default if MoGe's is implausible.
+        The sky goes behind all surfaces. InputError where the network sees no surface, or memory is short.
         """
         photo = resize_photo(photo)
         least, most = self.network.config.num_tokens_range
@@ -105,7 +105,7 @@ class MogeBase:
 
 
 def to_view(output: MogeOutput, width: int, height: int, focal_px: float | None = None) -> MogeView:
-    """A network's output for a photo of that size in metres: its points go where a camera sees them in their pixels.
+    """A network's output for a photo of that size in metres: its points are shifted so that each projects to its pixel.
 
     The focal length in pixels of the photo is found along with the shift, unless it is given.
     """
@@ -124,15 +124,15 @@ def to_view(output: MogeOutput, width: int, height: int, focal_px: float | None 
 def focal_and_shift(points: Floats, places: Floats, focal: float | None = None) -> tuple[float, float]:
     """The focal length f and the shift s along z that let points [N, 3] project to their places [N, 2].
 
-    Minimises |f (x, y) / (z + s) - place|² by Gauss-Newton steps from s = 0, halved until they help; the best f for a
-    shift is known in closed form. f is in units of half the diagonal, as places are; a given f stays. f = 1 and s = 0
-    for fewer than two points.
+    Minimises |f (x, y) / (z + s) - place|² by Gauss-Newton steps from s = 0, each halved until the error falls; the
+    best f for a shift has a closed form. f is in units of half the diagonal, as places are; a given f stays. f = 1 and
+    s = 0 for fewer than two points.
     """
     if len(points) < 2:
         return focal or 1.0, 0.0
 
     def at(shift: float) -> tuple[float, Floats, Floats]:
-        """The focal length, the projections for f = 1, and what is off; [N, 2] each."""
+        """The focal length, the projections for f = 1 and the residuals, [N, 2] each."""
         with np.errstate(all="ignore"):  # a shift may put a point into the camera
             seen = points[:, :2] / (points[:, 2:] + shift)
             best = focal or float((seen * places).sum() / (seen * seen).sum())

@@ -1,7 +1,7 @@
 """MoGe-2 (Wang et al. 2025, arXiv 2507.02546): a DINOv2 backbone, a pyramid of features, and a pyramid for each output.
 
-Modules are named as in the checkpoint, whose `model_config` gives the sizes. What no published checkpoint uses (other
-norms, activations and resamplers, registers, ViT-g) is refused.
+Modules are named as in the checkpoint, whose `model_config` gives the sizes. Options that no published checkpoint uses
+(other norms, activations and resamplers, registers, ViT-g) are refused.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class PyramidConfig(BaseModel, strict=True, extra="forbid"):
 
 
 class MogeConfig(BaseModel, strict=True):
-    """The checkpoint's `model_config`; other keys do not count."""
+    """The checkpoint's `model_config`; other keys are ignored."""
 
     encoder: EncoderConfig
     neck: PyramidConfig
@@ -166,7 +166,7 @@ def resampler(kind: str, inputs: int, outputs: int) -> nn.Sequential:
 
 
 class Pyramid(nn.Module):
-    """Features from coarse to fine: each level adds its input to what the level before hands on."""
+    """Features from coarse to fine: each level adds its input to the upsampled output of the coarser one."""
 
     def __init__(self, config: PyramidConfig) -> None:
         super().__init__()
@@ -206,7 +206,7 @@ class MogeNetwork(nn.Module):
         self.scale_head = nn.Sequential(first, nn.ReLU(), second, nn.ReLU(), third)
 
     def forward(self, image: Tensor, tokens: int, size: tuple[int, int]) -> MogeOutput:
-        """Maps of the given size from an image [1, 3, H, W], sRGB in 0..1, that is seen as about so many tokens."""
+        """Maps of the given size from an image [1, 3, H, W], sRGB in 0..1, seen as about the given number of tokens."""
         levels, scale = self.features(image, tokens)
         x, y, z = self.decode(self.points_head, levels, size).unbind(-1)
         z = z.exp()
@@ -230,7 +230,7 @@ class MogeNetwork(nn.Module):
 
 
 def token_grid(height: int, width: int, tokens: int) -> tuple[int, int]:
-    """(rows, columns) of about so many tokens over a photo."""
+    """(rows, columns) of a grid of about the given number of tokens over a photo."""
     return max(1, round(math.sqrt(tokens / (width / height)))), max(1, round(math.sqrt(tokens * (width / height))))
 
 
@@ -245,9 +245,9 @@ def view_plane(rows: int, columns: int, aspect: float) -> Tensor:
 def load_network(path: str | os.PathLike[str], dtype: torch.dtype) -> MogeNetwork:
     """A frozen network from MoGe-2's model.pt, on the processor.
 
-    What residual blocks add is computed in `dtype`, float32 or bfloat16; the features that they add to are float32, for
-    eight bits would turn slanted surfaces into stairs.
-    InputError for a missing, broken or foreign file, or too little memory; nothing in the file is executed.
+    Residual blocks compute in `dtype`, float32 or bfloat16, and add to float32 features, because bfloat16's eight bits
+    would turn slanted surfaces into stairs. InputError for a missing, broken or foreign file, or too little memory;
+    nothing in the file is executed.
     """
     content, tensors = read_checkpoint(path, "model_config", ADVICE)
     try:
@@ -264,7 +264,7 @@ def load_network(path: str | os.PathLike[str], dtype: torch.dtype) -> MogeNetwor
 
 
 def set_precision(network: nn.Module, dtype: torch.dtype) -> None:
-    """Convert what is added to the features to `dtype`, in place, and kernels to channels-last."""
+    """Convert the residual blocks to `dtype`, in place, and kernels to channels-last."""
     for block in network.modules():
         if isinstance(block, (TransformerBlock, ConvBlock)):
             for layer in block.modules():

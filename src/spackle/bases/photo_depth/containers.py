@@ -16,7 +16,7 @@ from spackle.errors import reason_in_a_line
 
 
 class BrokenDepth(Exception):
-    """A photo has a depth map that cannot be used; the message completes "the depth map in the photo …"."""
+    """The depth map inside a photo cannot be used; the message completes "the depth map in the photo …"."""
 
 
 XMP, MORE_XMP = b"http://ns.adobe.com/xap/1.0/\0", b"http://ns.adobe.com/xmp/extension/\0"
@@ -29,7 +29,7 @@ _END = b"\xd9"
 
 
 def open_jpeg(data: bytes) -> JpegImageFile | None:
-    """A JPEG whose head is read; None where Pillow cannot."""
+    """A JPEG, opened with only its header read; None if Pillow cannot open it."""
     try:
         return JpegImageFile(io.BytesIO(data))
     except Exception:
@@ -43,7 +43,7 @@ def xmp_of(image: JpegImageFile | None) -> bytes:
 
 
 def extended_xmp_of(image: JpegImageFile) -> tuple[bytes, bool]:
-    """The XMP that did not fit into the main packet, as far as it is there, and whether that is all."""
+    """The extended XMP that did not fit into the main packet, as far as present, and whether it is complete."""
     if (named := _GUID.search(xmp_of(image))) is None:
         return b"", True
     parts = [body.removeprefix(MORE_XMP) for name, body in image.applist if name == "APP1" and MORE_XMP in body[:40]]
@@ -100,8 +100,8 @@ def find_depth_item(data: bytes) -> tuple[bool, str, str] | None:
     """The auxiliary depth map of the primary picture; None without any, or where the boxes are broken.
 
     Returns:
-        Whether there is one alone; its own rotation and mirroring, which a decoder applies; and those of the primary
-        picture if it has none of its own.
+        Whether there is exactly one; its own rotation and mirroring, which a decoder applies; and those of the primary
+        picture if it has none.
     """
     try:
         content = next(body for kind, body in _boxes(memoryview(data)) if kind == b"meta")

@@ -59,7 +59,7 @@ class Scale:
     highest: float | None = None  # None: the highest that the picture's format has
 
     def decode(self, codes: Array, full: int) -> tuple[Array, float | None]:
-        """Depth of codes [H, W] in metres, not above zero where unknown, and the step between codes in use."""
+        """Decode stored codes [H, W] to metres (0 or less: unknown), and the step between the codes that occur."""
         highest = full if self.highest is None else self.highest
         if not all(map(math.isfinite, (self.first, self.last, self.lowest, highest))) or highest <= self.lowest:
             raise BrokenDepth("does not say what its values mean: a number of its range makes no sense")
@@ -82,14 +82,14 @@ Lens = tuple[float, float, float, float, float, float]  # focal lengths, centre 
 
 
 def _turned(values: Tensor, turn: str) -> Tensor:
-    """[H, W] to [H, W] or [W, H] by the steps of a turn, see `containers.BY_ORIENTATION`."""
+    """[H, W] to [H, W] or [W, H] by a list of rotations and flips, see `containers.BY_ORIENTATION`."""
     for step in turn:
         values = values.T if step == "t" else values.flip(1 if step == "x" else 0)
     return values.contiguous()
 
 
 def _intrinsics(lens: Lens, width: int, height: int, turn: str) -> Tensor | None:
-    """[3, 3] for a width×height map, after its turn; None where the numbers cannot be this map's."""
+    """Intrinsics [3, 3] of a width×height map after its rotation; None if the numbers cannot belong to this map."""
     focal, center, size = np.array(lens).reshape(3, 2)
     if not np.isfinite(lens).all() or size.min() <= 0:
         return None
@@ -126,8 +126,8 @@ def load_photo_depth(path: StrPath) -> DepthMap | None:
     """The depth map inside a photo, upright as the photo itself is; None where it has none.
 
     Read are, in HEIC, an auxiliary depth image with Apple's XMP or HEVC's depth information; in JPEG,
-    Apple's auxiliary pictures, Android's Dynamic Depth and the older GDepth. `DepthMap.note` says what
-    it was and how far its metres are to be trusted. The picture itself is not decoded.
+    Apple's auxiliary pictures, Android's Dynamic Depth and the older GDepth. `DepthMap.note` says which format it had
+    and how reliable its metres are. The picture itself is not decoded.
 
     Raises:
         InputError: a missing file, or a photo whose depth map is broken or of another crop.
@@ -232,7 +232,7 @@ def _is_about(packet: bytes, space: str) -> bool:
 
 
 def describe(packet: bytes) -> tuple[Scale | None, Lens | None, str] | None:
-    """The scale (None without a range), the lens and the source that an XMP packet says; None of something else."""
+    """The depth scale (None without a range), lens and source stated by an XMP packet; None for another packet."""
     if not _is_about(packet, PIXELS):
         return None
     tree = parse_xmp(packet)
@@ -259,7 +259,7 @@ def _quantity(tree: Element) -> Quantity | None:
 
 
 def _apple_lens(tree: Element) -> Lens | None:
-    """The intrinsics, which are listed column by column; without them the map can do."""
+    """The intrinsics, listed column by column; None if missing, because the map is usable without them."""
     entries = [entry.text or "" for matrix in tree.iter(f"{DEPTH}IntrinsicMatrix") for entry in matrix.iter(RDF_ITEM)]
     size = [find(tree, f"{DEPTH}IntrinsicMatrixReference{side}") or "" for side in ("Width", "Height")]
     with contextlib.suppress(ValueError):
@@ -345,7 +345,7 @@ def _item(data: bytes, tree: Element, uri: str) -> bytes:
 
 
 def _android_lens(tree: Element) -> Lens | None:
-    """The one imaging model, in pixels; its centre may be in shares of the picture, as the specification has it."""
+    """The single imaging model, in pixels; its centre may be stored relative to the picture's size, as specified."""
     models = [node for node in tree.iter() if get(node, f"{MODEL}FocalLengthX") is not None]
     names = ("FocalLengthX", "FocalLengthY", "PrincipalPointX", "PrincipalPointY", "ImageWidth", "ImageHeight")
     try:
@@ -384,7 +384,7 @@ def _find_in_heif(data: bytes) -> CodedDepth | None:
 
 
 def _hevc_scale(stated: dict[str, Any]) -> tuple[Scale, str]:
-    """HEVC's range and its source, else a portrait's usual range."""
+    """The depth range that HEVC states and its source, else the usual range of portraits."""
     kind = stated.get("representation_type")
     first, last = (stated.get(name) for name in (("d_min", "d_max") if kind == 1 else ("z_near", "z_far")))
     if kind == 3:

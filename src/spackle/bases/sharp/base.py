@@ -51,7 +51,7 @@ class SharpBase:
     def __init__(
         self, network: SharpNetwork, *, windows: int | None = None, compiled: bool = False, weights: str = ""
     ) -> None:
-        """Use a network that is loaded already, on its device; `weights` is what the report calls it."""
+        """Use a loaded network on its device; `weights` is its name in the report."""
         check_windows("windows", windows)
         self.network = network
         self.windows = windows or usual_windows(self.device)
@@ -144,14 +144,14 @@ def check_windows(option: str, windows: int | None) -> None:
 
 
 def to_metric(output: SharpOutput, photo: Photo) -> Gaussians:
-    """Gaussians in metres, on the processor: the normalised space is x and y in -1..1 times z."""
+    """Gaussians in metres, on the processor, from normalised space, where x / z and y / z run from -1 to 1."""
     stretch = (photo.width / (2 * photo.focal_px), photo.height / (2 * photo.focal_px), 1.0)
     with own_arithmetic(output.deltas.device):
         return stretch_gaussians(_to_processor(compose(output.start, output.deltas)), stretch)
 
 
 def _to_processor(gaussians: Gaussians) -> Gaussians:
-    """The same on the processor; from a GPU in one copy, the only one that waits for it: five would wait five times."""
+    """The same on the processor; from a GPU in one copy, so that the processor waits only once."""
     if gaussians.means.device.type == "cpu":
         return gaussians
     flat = torch.cat([t.flatten() for t in gaussians.tensors]).to("cpu")
@@ -194,13 +194,13 @@ def load_network(path: str | os.PathLike[str], dtype: torch.dtype, device: torch
 
 
 def expected_shapes(config: SharpConfig) -> Shapes:
-    """Every name and shape that a checkpoint of this size has, 1,038 in the published one."""
+    """All tensor names and shapes of a checkpoint of this size: 1,038 in the published one."""
     with torch.device("meta"):
         return _shapes_of(SharpNetwork(config)) | unused_shapes(config)
 
 
 def unused_shapes(config: SharpConfig) -> Shapes:
-    """What a checkpoint holds and inference never reads: it is checked by name and shape, then dropped.
+    """Tensors of a checkpoint that inference never reads: checked by name and shape, then dropped.
 
     These are the transformers' classifiers, and the U-Net that maps two depths to a scale in training.
     """
@@ -238,14 +238,14 @@ def _shapes_of(module: nn.Module, prefix: str = "") -> Shapes:
 
 @dataclasses.dataclass(frozen=True)
 class Owner:
-    """The checkpoint that a decoder was trained on, and needs for all that was not trained."""
+    """The checkpoint that a decoder was trained on, and that holds the untrained rest."""
 
     path: Path  # where it lies; of one that a decoder's file names, the name alone
     sha256: str
 
     @property
     def places(self) -> tuple[str, str]:
-        """What it, or a link to it, is called beside a decoder: the link of `link_owner`, and its own name."""
+        """Names under which it is looked for beside a decoder: the link of `link_owner`, and its own name."""
         return f"trained-on-{one_line(Path(self.sha256).name)[:12]}.link", self.path.name
 
 
@@ -256,7 +256,7 @@ def decoder_bytes(decoder: nn.Module, owner: Owner) -> bytes:
 
 
 def link_owner(owner: Owner, folder: Path) -> None:
-    """Let decoders in a folder find their checkpoint; the link's name is one that nothing is ever written to."""
+    """Link a checkpoint beside its decoders, under a name that is never written to."""
     link = folder / owner.places[0]
     with contextlib.suppress(OSError):  # this place has no links: then a person puts the checkpoint there
         if link.is_symlink() and not link.exists():  # to where it lay once
@@ -266,7 +266,7 @@ def link_owner(owner: Owner, folder: Path) -> None:
 
 
 def owner_of(path: str | os.PathLike[str]) -> Owner | None:
-    """The checkpoint that a readable file with a decoder names; None for other files, InputError if it names none."""
+    """The checkpoint named by a decoder's file; None for other files, InputError if a decoder's file names none."""
     note = read_note(path, NOTE)
     if note is None:
         return None

@@ -20,7 +20,7 @@ STRIDE = 2  # pixels of the network's picture for each cell of Gaussians
 
 @dataclasses.dataclass(frozen=True)
 class SharpConfig:
-    """Widths and depths; whatever else there is about SHARP is the same in all sizes."""
+    """Widths and depths of one size of SHARP; everything else is the same in all sizes."""
 
     embed: int = 1024  # width of both vision transformers
     depth: int = 24  # their blocks
@@ -36,12 +36,12 @@ class SharpConfig:
 
     @property
     def side(self) -> int:
-        """Pixels of the side of the square picture that the network looks at."""
+        """Side in pixels of the network's square input."""
         return 4 * self.window
 
     @property
     def grid(self) -> int:
-        """Tokens of a window's side."""
+        """Number of tokens along a window's side."""
         return self.window // self.patch
 
 
@@ -68,7 +68,7 @@ def lower(x: Tensor, module: nn.Module) -> Tensor:
 
 
 def set_precision(network: nn.Module, dtype: torch.dtype) -> None:
-    """Convert what costs time to `dtype`, in place, and kernels to channels-last, which is fast on a processor."""
+    """Convert the expensive layers to `dtype`, in place, and kernels to channels-last, which is fast on a processor."""
     for module in network.modules():
         if isinstance(module, _HEAVY) and not isinstance(module, ExactConv):
             module.to(dtype)
@@ -82,7 +82,7 @@ MLP_RATIO = 4
 class VisionTransformer(nn.Module):
     """ViT with a class token, learned positions and scaled residuals (DINOv2's), without its classifier.
 
-    The stream of tokens stays in float32: each block adds little to much, which bfloat16 would round away.
+    Tokens stay in float32: each block adds small values to large ones, which bfloat16 would round away.
     """
 
     def __init__(self, config: SharpConfig) -> None:

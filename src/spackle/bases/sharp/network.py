@@ -43,9 +43,10 @@ class Residual(nn.Module):
 
 
 class GroupNorm(nn.GroupNorm):
-    """torch's, exact in float32 on a processor, where torch loses three digits over half a million pixels.
+    """torch's group norm, but exact on a processor, where torch's float32 sums lose three digits over half a million
+    pixels.
 
-    Sums of rows, then of those in float64, lose none.
+    Rows are summed first, and their sums in float64.
     """
 
     def forward(self, x: Tensor) -> Tensor:
@@ -73,7 +74,7 @@ def plain_residual(dim: int) -> Residual:
 
 
 def normed_residual(dim: int, out: int) -> Residual:
-    """The same with group norms, and half the width between them."""
+    """A residual block of two 3×3 convolutions with group norms, half as wide inside."""
     first, second = nn.Conv2d(dim, out // 2, 3, padding=1), nn.Conv2d(out // 2, out, 3, padding=1)
     norms = GroupNorm(GROUPS, dim), GroupNorm(GROUPS, out // 2)
     return Residual(norms[0], nn.ReLU(inplace=True), first, norms[1], nn.ReLU(inplace=True), second)
@@ -133,7 +134,7 @@ class SharpOutput:
 
 @dataclasses.dataclass(frozen=True)
 class DecoderInput:
-    """What encoder and depth network make of one picture: all that the Gaussian decoder goes by."""
+    """Outputs of the encoder and the depth network for one picture: the input of the Gaussian decoder."""
 
     start: InitialGaussians
     picture: Tensor  # [1, 5, side, side] float32 in -1..1: sRGB, and the disparity of both layers
@@ -156,8 +157,8 @@ class SharpNetwork(nn.Module):
     ) -> SharpOutput:
         """Predict from the photo, stretched to [1, 3, side, side] sRGB in 0..1, float32.
 
-        `disparity_factor` is the focal length over the width in the photo's pixels. So many windows as `batch` says go
-        through the transformer at once; `progress` gets the windows done and the number of all.
+        `disparity_factor` is the focal length over the width in the photo's pixels. `batch` windows go through the
+        transformer at once; `progress` gets the windows done and their number.
         """
         encoded = self.encode(image, disparity_factor, batch, progress)
         deltas: Tensor = self.gaussian_decoder()(encoded.picture, encoded.maps)
@@ -175,12 +176,12 @@ class SharpNetwork(nn.Module):
         return DecoderInput(start, torch.cat([image, start.disparity_map], dim=1) * 2 - 1, maps)
 
     def gaussian_decoder(self) -> GaussianDecoder:
-        """The rest, by itself: the same modules under the same names."""
+        """The Gaussian decoder alone: the same modules under the same names."""
         return GaussianDecoder(self.feature_model, self.prediction_head)
 
 
 class DepthNetwork(nn.Module):
-    """Two layers of disparity, in the way of Depth Pro."""
+    """Predicts two layers of disparity, as Depth Pro does."""
 
     def __init__(self, config: SharpConfig) -> None:
         super().__init__()
@@ -241,7 +242,7 @@ class PredictionHead(nn.Module):
 
 
 class GaussianDecoder(nn.Module):
-    """Both, as one module: the part of SHARP that may learn while the rest stays; 7,784,028 weights when published."""
+    """Feature network and heads as one module, which may be trained alone; 7,784,028 weights as published."""
 
     def __init__(self, feature_model: FeatureNetwork, prediction_head: PredictionHead) -> None:
         super().__init__()
@@ -249,7 +250,7 @@ class GaussianDecoder(nn.Module):
         self.prediction_head = prediction_head
 
     def let_learn(self) -> GaussianDecoder:
-        """Ask for gradients, but not of what the checkpoint has and nothing uses: 295,168 weights when published."""
+        """Ask for gradients, except of weights that nothing uses: 295,168 in the published checkpoint."""
         self.requires_grad_()
         coarsest: Fusion = self.feature_model.decoder.fusions[-1]  # type: ignore[assignment]
         coarsest.resnet1.requires_grad_(False)  # for finer features, and here there is nothing to add them to
@@ -288,7 +289,7 @@ class InitialGaussians:
 
 
 def make_start(image: Tensor, depth: Tensor) -> InitialGaussians:
-    """Where the Gaussians of a picture [1, 3, side, side] with depth layers [1, 2, side, side] begin."""
+    """The base values of a picture [1, 3, side, side] with depth layers [1, 2, side, side]."""
     factor = NEAREST / (depth.min().double() + SMALLEST_INVERSE)  # stays on its device: nobody waits for it
     disparity = 1.0 / (depth * factor).clamp_max(FARTHEST)
     return InitialGaussians(disparity, max_pool2d(disparity, STRIDE)[0], avg_pool2d(image, STRIDE)[0], 1.0 / factor)
@@ -355,7 +356,7 @@ class GraphedForward:
     def __call__(
         self, image: Tensor, disparity_factor: float, batch: int, progress: Progress | None = None
     ) -> SharpOutput:
-        """As the network's, always with the batch of the first call; there is no progress to see but its end."""
+        """As the network's forward, always with the batch of the first call; `progress` is called only at the end."""
         with torch.cuda.device(image.device):
             if self.graph is None:
                 self._capture(image, batch)
@@ -371,7 +372,7 @@ class GraphedForward:
     @torch.inference_mode(False)
     @torch.no_grad()
     def _capture(self, image: Tensor, batch: int) -> None:
-        """Record a forward over buffers that later calls may write to, in inference mode or not."""
+        """Record a forward into buffers that later calls may overwrite, with or without inference mode."""
         self.image, self.factor = image.clone(), image.new_ones(())
         side = torch.cuda.Stream()  # type: ignore[no-untyped-call]
         side.wait_stream(torch.cuda.current_stream())

@@ -75,7 +75,7 @@ def _load_block(first: int, count: int, quats: Any, scales: Any, stretch: Any, c
 
 @kernel
 def _sweep_block(columns: Any) -> None:
-    """Turn each pair of columns once. Always the whole block and no branches: this loop runs in vector registers."""
+    """Rotate each pair of columns once. Always the whole block and no branches: this loop runs in vector registers."""
     for i in range(BLOCK):
         a, b, c = _column(columns, 0, i), _column(columns, 1, i), _column(columns, 2, i)
         a, b = _turn(a, b)
