@@ -236,7 +236,7 @@ def test_sharp_needs_no_depth_and_a_path_is_spelled_either_way(made: dict[str, P
     assert config["base"]["weights"] == hashlib.sha256(weights.read_bytes()).hexdigest()
 
 
-def test_training_takes_each_view_once_and_judges_by_other_photos(whole: Path, copy: Path) -> None:
+def test_training_takes_each_view_once_and_judges_by_others(whole: Path, copy: Path) -> None:
     def sources(folder: Path, validation_views: int = 8) -> tuple[DataRecipe, list[Source]]:
         recipe = DataRecipe(pseudo=folder, validation_views=validation_views)
         parts = [find_sources(recipe, get_renderer(), validation=judges) for judges in (False, True)]

@@ -174,7 +174,7 @@ def test_a_lost_or_damaged_file_is_named(name: str, file: str, content: str | No
     assert says in error_of(name, tmp_path)
 
 
-def test_too_few_photos_odd_poses_and_lenses_that_bend_are_refused(tmp_path: Path) -> None:
+def test_too_few_photos_odd_poses_and_bent_lenses_are_refused(tmp_path: Path) -> None:
     assert "no such folder" in error_of("llff", tmp_path / "nowhere")
     assert "looks like" not in error_of("llff", tmp_path)
     llff(tmp_path / "one/fern", EYES[:1])

@@ -75,7 +75,7 @@ def test_without_pyiqa_each_of_its_metrics_says_so(why: str, tmp_path: Path, mon
     assert [state.startswith(f"not run: {why}") for state in states.values()] == [True, True]
 
 
-def test_variants_are_pinned_and_weights_not_downloaded_without_leave(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_variants_are_pinned_and_no_weights_are_downloaded(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: dict[str, Any] = {}
     seen: list[tuple[Tensor, ...]] = []
 
@@ -271,7 +271,7 @@ def test_large_views_from_files_to_tables(scenes: Path, tmp_path: Path, monkeypa
     assert all(word in text for word in ("(6 NaN)", "3/23", "PolyForm Noncommercial"))
 
 
-def test_metrics_are_added_to_a_finished_run_as_if_it_had_had_them(
+def test_metrics_are_added_to_a_finished_run_as_if_always_there(
     scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[str] = []
@@ -336,7 +336,7 @@ def test_a_broken_image_is_named_and_the_others_go_on(
     assert [row.value for row in load_run(tmp_path / "lacks").rows if row.metric == "remark"] == [remark]
 
 
-def test_a_run_goes_on_to_the_same_bytes_and_runs_share_their_tables(scenes: Path, tmp_path: Path) -> None:
+def test_a_run_goes_on_to_the_same_bytes_and_runs_share_tables(scenes: Path, tmp_path: Path) -> None:
     choices = ("--methods", "base,seeds", "--metrics", "none", "--disparity", "0.3 0.5")
     one, two, both = tmp_path / "one", tmp_path / "two", tmp_path / "both"
     assert evaluate(scenes, one, *choices).code == 0

@@ -35,7 +35,7 @@ def test_the_renderers_section_and_the_naive_renderers_picture() -> None:
     assert whole.limit_ms == pytest.approx((count * 56 + SIDE * SIDE * 20) / 2e6)
 
 
-def test_one_scene_for_a_video_takes_less_than_each_frame_by_itself() -> None:
+def test_one_scene_for_a_video_takes_less_than_each_by_itself() -> None:
     section = suite.video_section(1, box_before_wall(width=64, height=48).lift, CpuRenderer(), None, frames=4)
     found = rows_of(section)
     once, each = "the same, the photo's occlusion guard made once", "frame by frame over one scene"

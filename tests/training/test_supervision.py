@@ -243,7 +243,7 @@ def test_a_cut_out_stands_before_what_it_covers(seed: int, monkeypatch: pytest.M
 # Files --------------------------------------------------------------------------------------------
 
 
-def test_a_sample_comes_back_small_and_shows_the_same_unless_damaged(tmp_path: Path) -> None:
+def test_a_sample_comes_back_small_and_shows_the_same(tmp_path: Path) -> None:
     """With two Gaussians a pixel in sight, about as many as SHARP has on COCO's photos."""
     scene = box_before_wall(width=272, height=204, focal=226)
     view, base = shifted(scene.camera.resized(192, 144), 0.4), scene.base()

@@ -111,7 +111,7 @@ def test_a_run_leaves_weights_pictures_and_a_report(whole: Path, done: Run) -> N
         assert all(name in events.read_bytes() for name in (b"train/color", b"train/lr", b"validation/har_after"))
 
 
-def test_the_papers_architecture_learns_from_sharps_decoder_and_predicts(
+def test_the_papers_architecture_learns_from_sharps_and_predicts(
     place: Path, made: dict[str, Path], tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
@@ -129,7 +129,7 @@ def test_the_papers_architecture_learns_from_sharps_decoder_and_predicts(
     assert (refused.code, "give network=sharp-decoder" in refused.err) == (2, True), refused.err
 
 
-def test_ctrl_c_leaves_a_checkpoint_to_go_on_from_to_the_same_end(
+def test_ctrl_c_leaves_a_checkpoint_that_leads_to_the_same_end(
     place: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out, rate = tmp_path / "out", training.learning_rate
@@ -245,7 +245,7 @@ def test_a_gradient_that_is_no_number_names_what_made_it(place: Path, whole: Pat
 
 
 @pytest.mark.parametrize("name", ["unet", "sharp-decoder"])
-def test_gradients_reach_the_whole_network_and_neither_base_nor_features(name: str) -> None:
+def test_gradients_reach_the_whole_network_and_not_the_base(name: str) -> None:
     scene = box_before_wall(width=96, height=80)
     base = Gaussians(*(t.clone().requires_grad_() for t in scene.base().tensors))
     view = shifted(scene.camera, 0.3)
