@@ -138,6 +138,14 @@ def test_animations_decode_to_what_went_in(tmp_path: Path, name: str, least: flo
     assert os.listdir(tmp_path) == [name]
 
 
+def test_webp_keeps_no_old_blocks_in_what_changes_slowly(tmp_path: Path) -> None:
+    ramp = torch.linspace(0.2, 0.5, 96)[None, :, None].expand(64, 96, 3)
+    given = [ramp + 0.002 * k for k in range(20)]  # each frame half a step of 8 bits brighter than the last
+    save_video(iter(given), tmp_path / "a.webp", fps=12)
+    shown, _, _ = animation(tmp_path / "a.webp")
+    assert min(psnr(got, sent) for sent, got in zip(given, shown, strict=True)) > 45
+
+
 @pytest.mark.parametrize("name", ["a.gif", "a.webp"])
 def test_an_animation_says_how_often_it_plays(tmp_path: Path, name: str) -> None:
     # GIF counts repetitions, and says nothing where there is none; WebP counts showings.

@@ -59,8 +59,8 @@ _CUES_FIRST = {"cues_to_front": "1", "fflags": "+bitexact"}  # FFmpeg draws a tr
 VP9 = VideoFormat("libvpx-vp9", "webm", _VPX, _CUES_FIRST, "yuv420p", False, (0.001, 1000), 16_384)
 # Browsers show a picture of 10 ms or less for 100 ms; GIF counts hundredths of a second, WebP thousandths.
 GIF = VideoFormat("gif", "gif", {}, {}, "pal8", True, (0.01, 50), 65_535)
-# libwebp's own way to YUV is the best; it holds the compressed frames until the end.
-WEBP = VideoFormat("libwebp_anim", "webp", {"quality": "85"}, {}, "bgra", True, (0.01, 90), 16_383)
+# libwebp's own way to YUV is the best. Its encoder of animations would keep old blocks in surfaces that hardly change.
+WEBP = VideoFormat("libwebp", "webp", {"quality": "85"}, {}, "bgra", True, (0.01, 90), 16_383)
 FORMATS = {".mp4": H264, ".m4v": H264, ".mov": H264, ".webm": VP9, ".gif": GIF, ".webp": WEBP}
 
 
