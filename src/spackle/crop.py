@@ -38,15 +38,15 @@ class Crop:
 
     @property
     def slices(self) -> tuple[slice, slice]:
-        """To index [h, w, ...] with."""
+        """A pair of slices for an array [h, w, ...]."""
         return slice(self.top, self.bottom), slice(self.left, self.right)
 
     def moved(self, down: int, right: int) -> Crop:
-        """The same rectangle elsewhere."""
+        """The rectangle, translated."""
         return Crop(self.top + down, self.left + right, self.bottom + down, self.right + right)
 
     def grown(self, margin: int, step: int, height: int, width: int) -> Crop:
-        """With a margin, outwards to multiples of `step`, as far as the grid goes."""
+        """The rectangle with a margin, rounded outwards to multiples of `step` within the grid."""
         top, left = (max(place - margin, 0) // step * step for place in (self.top, self.left))
         far = ((self.bottom, height), (self.right, width))
         return Crop(top, left, *(min(-(-(place + margin) // step) * step, end) for place, end in far))
@@ -57,18 +57,18 @@ class Crop:
         return rows and self.left <= other.right and other.left <= self.right
 
     def union(self, other: Crop) -> Crop:
-        """The smallest that holds both."""
+        """The smallest rectangle that holds both."""
         top, left = min(self.top, other.top), min(self.left, other.left)
         return Crop(top, left, max(self.bottom, other.bottom), max(self.right, other.right))
 
 
 def crops_around(mask: Tensor, step: int, margin: int = MARGIN) -> list[tuple[Crop, Crop]]:
-    """Rectangles that hold all masked cells, and what has to be looked at for each; few and small.
+    """A few small rectangles that hold all masked cells, and the surroundings that the network needs for each.
 
     Args:
         mask: [h, w] bool.
-        step: the network's stride: what it looks at begins at multiples of it, so that its grids stay where they are.
-        margin: how far around the masked cells it looks.
+        step: the network's stride; crops begin at multiples of it, so that its coarse grids keep their places.
+        margin: number of cells around the masked ones that the network needs.
 
     Returns:
         Pairs (inner, outer): the inner ones cover each masked cell exactly once, or are the whole grid.
@@ -90,14 +90,14 @@ def crops_around(mask: Tensor, step: int, margin: int = MARGIN) -> list[tuple[Cr
 
 
 def _tight(cells: Mask, crop: Crop) -> Crop:
-    """Shrunk to its masked cells; there are some."""
+    """The rectangle shrunk to its masked cells, of which there is at least one."""
     rows, columns = (np.flatnonzero(cells[crop.slices].any(axis)) for axis in (1, 0))
     edges = (int(edge) for edge in (rows[0], columns[0], rows[-1] + 1, columns[-1] + 1))
     return Crop(*edges).moved(crop.top, crop.left)
 
 
 def _cut(blocks: Mask, crop: Crop, reach: int) -> list[Crop]:
-    """A rectangle that its masked blocks fill to all four sides, cut in two where later cuts save something."""
+    """Cut a rectangle, which its masked blocks touch on all four sides, into two wherever that saves cells."""
     own = crop.grown(reach, 1, *blocks.shape).area
     if own <= NEARLY * _least(blocks, crop, reach):
         return [crop]
@@ -114,7 +114,7 @@ def _cut(blocks: Mask, crop: Crop, reach: int) -> list[Crop]:
 
 
 def _least(blocks: Mask, crop: Crop, reach: int) -> int:
-    """Blocks that are looked at however a rectangle is cut."""
+    """A lower bound of the blocks that the network sees, however a rectangle is cut."""
     near = np.zeros_like(blocks)
     near[crop.slices] = blocks[crop.slices]
     return int(greatest_around(torch.from_numpy(near), reach).sum())

@@ -1,4 +1,4 @@
-"""Where arithmetic runs: the device and its memory, the precision, the threads of compiled kernels; for reports, too.
+"""Where arithmetic runs: device and memory, precision, threads of compiled kernels, and what reports say of them.
 
 Numba's own parallel loops need a threading layer that is unsafe to enter from two Python threads or after a fork; a
 plain thread pool is neither, and its kernels compile faster. The last bits of a network's output depend on the number
@@ -37,7 +37,7 @@ class MemoryShort(InputError):
 
 
 def pick_device(device: torch.device | str | None) -> torch.device:
-    """The device that a caller means: for None a CUDA device where there is one, else the processor.
+    """The torch device of that name; for None a CUDA device if there is one, else the processor.
 
     InputError for a device that is not there, or of a kind that networks do not run on here.
     """
@@ -59,7 +59,7 @@ def pick_device(device: torch.device | str | None) -> torch.device:
 
 
 def memory_is_short(error: BaseException) -> bool:
-    """Whether that is what an exception says, in one of torch's many ways."""
+    """Whether an exception reports a shortage of memory, in one of torch's many ways."""
     named = isinstance(error, (MemoryError, torch.OutOfMemoryError))
     return named or any(words in str(error) for words in _SHORTAGES)
 
@@ -125,7 +125,7 @@ _pool_lock = threading.Lock()
 
 
 def thread_count() -> int:
-    """As many threads as torch itself uses, so that one setting rules both."""
+    """Number of threads: torch's own, so that one setting rules both."""
     return torch.get_num_threads()
 
 
@@ -174,7 +174,7 @@ if hasattr(os, "register_at_fork"):
 
 
 def versions() -> dict[str, str]:
-    """Ours, and those of what computes."""
+    """Versions of Spackle and of the packages that compute."""
     ours = {"spackle": spackle.__version__, "python": platform.python_version(), "torch": torch.__version__}
     return ours | {name: version(name) for name in ("numba", "numpy")}
 
@@ -191,5 +191,5 @@ def hardware(device: torch.device) -> dict[str, Any]:
 
 
 def load_average() -> float | None:
-    """Of the machine over the last minute, where it tells."""
+    """The machine's load over the last minute; None if unknown."""
     return round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None

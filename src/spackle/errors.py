@@ -26,7 +26,7 @@ class InputError(ValueError):
 
 
 def reason_in_a_line(error: object) -> str:
-    """What somebody else's exception says, for the middle of a message of ours: at most 200 characters."""
+    """The text of a library's exception, at most 200 characters, for the middle of a message."""
     said = getattr(error, "strerror", None) or error  # the system's words, without its number and the file's name
     return one_line(" ".join(str(said).split()))[:200] or type(error).__name__
 
@@ -51,13 +51,13 @@ def reading(what: object, problem: str, *errors: type[Exception]) -> Iterator[No
 
 
 def one_line(text: str) -> str:
-    """What may go to a terminal or a log: names and comments of strangers can hold escape codes and line breaks."""
+    """A text without control characters, safe for a terminal or a log: names of files can hold escape codes."""
     line = " ".join(text.splitlines())
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
 
 
 def shown(value: object) -> str:
-    """A stranger's value for the middle of a message: at most 60 characters, however long or deep it is."""
+    """A value from a file, at most 60 characters of it, for the middle of a message."""
     return _SHORT.repr(value)[:60]
 
 
@@ -80,7 +80,7 @@ def renamed(**names: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
 
 @contextlib.contextmanager
 def short_messages() -> Iterator[None]:
-    """Leave the middle out of messages of more than 300 characters, as those about a value that a program gave."""
+    """Shorten messages of more than 300 characters, which can quote values of a program, by leaving out their middle."""
     try:
         yield
     except InputError as error:

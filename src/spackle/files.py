@@ -20,7 +20,7 @@ BLOCK = 1 << 20  # bytes of a file that are hashed at once
 
 
 def check_file(path: str | os.PathLike[str], kind: str) -> int:
-    """The size in bytes of a plain, non-empty file; InputError otherwise. `kind` names it in messages."""
+    """The size in bytes of a plain, non-empty file; InputError otherwise. `kind` is what messages call the file."""
     with reading(repr(str(path)), "cannot be read: {reason}", OSError, ValueError):
         if re.match(r"(https?|ftp|s3|gs):/", str(path)):  # a Path has lost the second slash
             raise InputError(f"{path}: an address, not a file: download it first and give the name of the {kind}")
@@ -92,7 +92,7 @@ def write_bytes(content: bytes, target: Target) -> None:
 
 
 def check_writable(path: str | os.PathLike[str]) -> Path:
-    """The file that a write to `path` would replace, links followed.
+    """Check that `path` can be written; returns the file that a write would replace, links followed.
 
     Worth calling before long work whose result goes there.
 
@@ -120,7 +120,7 @@ def write_json(content: Mapping[str, Any], path: Path, *, durable: bool = False)
 
 
 def files_in(folder: Path, endings: tuple[str, ...], *, below: bool = False) -> list[Path]:
-    """The files in a folder whose names end so, in any case; with `below` those in folders below it, too.
+    """The files in a folder whose names end in `suffixes`, in any case; with `below` also those in its subfolders.
 
     Sorted; what is hidden is left out. InputError where the folder cannot be read.
     """
@@ -142,7 +142,9 @@ def sha256_of(file: BinaryIO) -> str:
 
 
 def fingerprint(file: Path, kind: str) -> str:
-    """The digest of a file, or of gigabytes size and time of change; InputError (naming `kind`) if it is missing."""
+    """The digest of a file's content, or of size and modification time for gigabytes; InputError (naming `kind`) if
+    missing.
+    """
     size = check_file(file, kind)
     if size > MAX_HASHED:
         return f"{size} bytes of {file.stat().st_mtime_ns}"

@@ -48,7 +48,7 @@ def broadly_blurred(image: Tensor, sigma: float) -> Tensor:
 
 
 def _weighted_sum(values: Tensor, weights: Sequence[float], dim: int) -> Tensor:
-    """Of neighbours along a dimension, to both sides: many times faster on a processor than a thin convolution."""
+    """Weighted sum of neighbours along a dimension: on a processor many times faster than a thin convolution."""
     size = values.shape[dim]
     total = weights[0] * values
     for offset, weight in enumerate(weights[1:size], start=1):
@@ -60,7 +60,7 @@ def _weighted_sum(values: Tensor, weights: Sequence[float], dim: int) -> Tensor:
 def greatest_around(image: Tensor, reach: int) -> Tensor:
     """Of an image or mask [..., H, W] the greatest value up to `reach` rows and columns away from each pixel.
 
-    Of two windows one of up to twice their width is made: a processor's pooling looks at all pixels of each instead.
+    Windows are doubled step by step, where a processor's pooling would visit every pixel of each.
     """
     size = 2 * reach + 1
     image = pad(image, (reach,) * 4, value=0 if image.dtype == torch.bool else -math.inf)
@@ -75,7 +75,9 @@ def greatest_around(image: Tensor, reach: int) -> Tensor:
 
 
 def nearest_known(hole: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """[2, H, W] row and column of the nearest pixel outside of a hole [H, W], nearly always; far away without any."""
+    """Row and column [2, H, W] of the nearest pixel outside of a hole [H, W] (rarely the second nearest); far away if
+    there is none.
+    """
     near = np.where(hole, -FAR, np.indices(hole.shape)).astype(np.int32)
     _propagate_nearest(hole, near)
     return near
@@ -258,7 +260,7 @@ def _guess(width: int, coarse_depths: Any, coarse_values: Any, holes: Any, sampl
 
 @kernel
 def _relax(samples: Any, copy: Any, links: Any, bias: Any, sweeps: int) -> Any:
-    """Samples after Jacobi sweeps on the holes, the first of them; nothing flows across the image's border."""
+    """Samples after Jacobi sweeps on the holes, which come first; nothing flows across the image's border."""
     count, channels = len(links), samples.shape[1]
     old, new = samples, copy
     for _ in range(sweeps):

@@ -64,7 +64,7 @@ def _acquire(path: Path) -> BinaryIO:
 
 @contextlib.contextmanager
 def results_folder(path: Path, files: Sequence[str] = (), *, alone: bool = False) -> Iterator[None]:
-    """Create a folder for results; where the block puts nothing into it, it goes again.
+    """Create a folder for results; it is removed if the block leaves it empty.
 
     The block writes `files`: InputError before long work if it cannot. Deletes what a killed run left of them. With
     `alone` nobody else works in the folder during the block: InputError if somebody does.
@@ -106,7 +106,9 @@ def _alone_in(folder: Path) -> Iterator[None]:
 
 
 def mark(folder: Path) -> str:
-    """Mark a folder that the caller is `alone` in, until then; `check_mark` knows it again on another machine."""
+    """Mark a folder, which the caller holds `alone`, during the block, so that `check_mark` recognises it on another
+    machine.
+    """
     word = secrets.token_hex(8)
     (folder / LOCK).write_text(word)
     return word
@@ -126,8 +128,8 @@ def check_mark(folder: Path, word: str) -> None:
 def whole_set(folder: Path, last: str) -> Iterator[Path]:
     """Yield a new folder for a set of files; where the block succeeds, they take their places in `folder`.
 
-    Where it raises, an older set stays as it was. The file `last` vouches for the others, so that it leaves first and
-    comes last. The caller is `alone` there (`results_folder`).
+    Where it raises, an older set stays as it was. The file `last` states that the others are complete, so it is removed
+    first and put in place last. The caller is `alone` there (`results_folder`).
     """
     new = folder / NEW
     try:
@@ -145,7 +147,7 @@ def whole_set(folder: Path, last: str) -> Iterator[Path]:
 
 
 def file_records(folder: Path, files: Iterable[Path]) -> dict[str, dict[str, object]]:
-    """Bytes and SHA-256 of files in a folder, by name, for a report that vouches for them."""
+    """Bytes and SHA-256 of files in a folder, by name, for a report."""
     records: dict[str, dict[str, object]] = {}
     for path in files:
         with open(path, "rb") as file:
@@ -155,9 +157,9 @@ def file_records(folder: Path, files: Iterable[Path]) -> dict[str, dict[str, obj
 
 
 def as_recorded(folder: Path, report: str, records: object) -> bool:
-    """Whether a folder still holds the files that a report in it vouches for by `file_records`.
+    """Whether a folder still holds the files that a report lists by `file_records`.
 
-    Size and times tell; a file that is newer than the report, as in a copied folder, is read.
+    Sizes and times are compared; a file newer than the report, as in a copied folder, is read.
     """
     if not isinstance(records, Mapping) or not records:
         return False
@@ -174,7 +176,7 @@ def as_recorded(folder: Path, report: str, records: object) -> bool:
 
 
 def photo_digest(path: Path) -> str:
-    """What a photo holds; of a missing one "none": it has its turn later."""
+    """The digest of a photo; "none" for a missing one, which is reported when its turn comes."""
     with contextlib.suppress(InputError):
         return fingerprint(path, "photo")
     return "none"
@@ -203,7 +205,7 @@ def digest_of(value: object) -> str:
 
 
 def differences(old: Mapping[str, Any], new: Mapping[str, Any], where: str = "") -> list[str]:
-    """What two configurations disagree on, as "key: old -> new"."""
+    """The differences of two configurations, as "key: old -> new"."""
 
     def short(value: object) -> str:
         text = json.dumps(value)

@@ -128,7 +128,9 @@ def find_photos(given: Sequence[Path]) -> list[NamedPhoto]:
 
 
 def _workers_for(options: PredictOptions, photos: int) -> Workers:
-    """No more than photos, and together as many threads as torch has here; InputError for a number that cannot be."""
+    """The worker settings, with no more workers than photos and no more threads than torch has; InputError if
+    impossible.
+    """
     Workers(options.workers, 1 if options.threads is None else options.threads).check()
     count = min(options.workers, photos)
     share = max(1, thread_count() // count) if options.ray is None else THREADS_ON_RAY
@@ -143,7 +145,7 @@ def _predict_by_workers(
     total: int,
     reporter: Reporter,
 ) -> int:
-    """How many photos failed; what is said of each comes when it is done.
+    """Number of photos that failed; the lines about a photo are printed once it is done.
 
     KeyboardInterrupt once the photos at work are done, where Ctrl-C or SIGTERM came.
     """
@@ -170,7 +172,7 @@ def _predict_by_workers(
 
 
 class Predicted(NamedTuple):
-    """What became of a photo in a worker."""
+    """The result of a photo that a worker did."""
 
     photo: str
     failed: bool
@@ -192,7 +194,7 @@ class Predictor:
     def open(
         output: Path, options: PredictOptions, shared: str, single: bool, verbose: bool, word: str | None
     ) -> Predictor:
-        """For a worker; InputError for another folder than the one that was given the mark `word`."""
+        """Open a predictor; InputError if `output` is not the folder that was marked with `word`."""
         if word is not None:
             check_mark(output, word)
         return Predictor(output, options, shared, single, options.open(), verbose)
@@ -204,7 +206,7 @@ class Predictor:
         return {"spackle": spackle.__version__, **{kind: weights_digest(file) for kind, file in files.items()}}
 
     def inputs(self, photo: NamedPhoto) -> str:
-        """As `request`, also where a file is missing."""
+        """The digest of `request`, without an error if a file is missing."""
         with contextlib.suppress(InputError):  # `predict` names it
             return self.request(photo)
         return "none"
@@ -219,7 +221,7 @@ class Predictor:
         return digest_of([self.shared, *files])
 
     def make(self, photo: NamedPhoto) -> Predicted:
-        """As `predict`, for a worker."""
+        """Predict one photo in a worker, see `predict`."""
         notes = Notes(self.verbose)
         return Predicted(photo.path.name, not self.predict(photo, notes), notes.said)
 
@@ -239,7 +241,7 @@ class Predictor:
                 yield photo
 
     def predict(self, photo: NamedPhoto, reporter: Reporter) -> bool:
-        """Whether a photo's results could be made; logs why not. InputError if that holds for all photos."""
+        """Predict a photo; returns whether that succeeded, and logs why not. InputError if no photo can be predicted."""
         folder = self.output / photo.name
         try:
             options = self.options
@@ -265,7 +267,9 @@ class Predictor:
 
 
 def _shared_digest(options: PredictOptions, pipeline: Pipeline) -> str:
-    """A digest of what all photos share: version, options, and what their files hold; InputError for a missing file."""
+    """A digest of everything that all photos share: version, options, contents of their files; InputError for a missing
+    file.
+    """
     base, path, fill = options.scene.base, options.scene.path, options.scene.fill
     name = base.named if base.folder is None else "hf"  # its files tell, wherever they lie
     # Windows and compilation change last bits alone.
@@ -287,7 +291,7 @@ def _shared_files(options: Options) -> dict[str, Path]:
 
 @contextlib.contextmanager
 def compiled_ahead(renderer: Renderer, log: Callable[[str], None]) -> Iterator[None]:
-    """While the block runs, a second process compiles the kernels that are needed last, unless they are on disk.
+    """During the block a second process compiles the kernels that are needed last, unless they are on disk.
 
     Numba compiles one kernel at a time in a process, so a thread would not help.
     """
@@ -306,7 +310,7 @@ def compiled_ahead(renderer: Renderer, log: Callable[[str], None]) -> Iterator[N
 
 @torch.no_grad()
 def compile_kernels() -> None:
-    """Complete a small view, so that all kernels of this are compiled: first those that the other comes to last."""
+    """Complete a small view, which compiles all kernels of completion, in another order than the main process does."""
     torch.set_num_threads(1)
     camera = Camera.from_focal(SIDE, SIDE, SIDE)
     aside = torch.eye(4)

@@ -96,7 +96,7 @@ def render_scene(
     with results_folder(target.parent, [*names, target.name]), reporter.stage("video") as step:
 
         def frames() -> Iterator[Tensor]:
-            """The frames of the video, each also saved as a picture, where these are wanted."""
+            """The frames of the video, each also saved as a picture if pictures are wanted."""
             for index, camera in enumerate(cameras):
                 with torch.no_grad():
                     eyes = [maker.sized(eye) for eye in maker.eyes(camera)]
@@ -167,7 +167,7 @@ def export_scene(scene: Path, outputs: Sequence[Path], reporter: Reporter) -> No
 
 
 def _report_file(scene: SceneFile, output: Path, seconds: float, reporter: Reporter) -> None:
-    """One line about a file, and one about what its format could not hold."""
+    """Log one line about a file, and one about what its format cannot store."""
     before, size, count = os.path.getsize(scene.path), os.path.getsize(output), len(scene.gaussians)
     factor = f"{before / size:.1f} times smaller than" if size < before else f"{size / before:.1f} times the size of"
     if 0.95 < size / before < 1.05:
@@ -184,7 +184,7 @@ def _report_file(scene: SceneFile, output: Path, seconds: float, reporter: Repor
 def page_of(scene: Scene, path: Path) -> PageScene:
     """The scene of a file for the page; InputError, naming the file, if it cannot be seen.
 
-    People call a scene as its folder where every scene's file has the same name.
+    A scene's name: its folder's if its file is called like all scenes' files, else its file's.
     """
     place = path.absolute()
     name = place.parent.name if place.name in ("scene.ply", "base.ply") and place.parent.name else place.stem

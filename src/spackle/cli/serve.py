@@ -36,7 +36,7 @@ LOOPBACK = "127.0.0.1"
 
 
 class Place(NamedTuple):
-    """Where the app listens, and who is told."""
+    """Where the app listens, and whether a browser opens."""
 
     host: str
     port: int  # 0: any that is free
@@ -54,9 +54,9 @@ def view(
 ) -> None:
     """Show a scene or a photo, or an empty page, until somebody stops it.
 
-    Depth, calibration and `lens`, `focal_px` and `fov`, are of that photo alone, `usual`, disparity, keep_frame and
-    depth_kind, of all that the page sends; they live as long as this. InputError for a file that is neither, or an
-    option that cannot be used.
+    Depth, calibration and `lens` (`focal_px` and `fov`) belong to that photo alone; `usual` (disparity, keep_frame,
+    depth_kind) holds for all photos that the page sends. Scenes live until this returns. InputError for a file that is
+    neither, or an option that cannot be used.
     """
     PathOptions(disparity=usual["disparity"]).check()  # type: ignore[arg-type]
     name = "Spackle" if target is None else checked(target, settings, lens, bool(usual["keep_frame"]), reporter)
@@ -80,7 +80,7 @@ def view(
 def checked(
     target: Path, settings: BaseSettings, lens: Mapping[str, float | None], keep_frame: bool, reporter: Reporter
 ) -> str:
-    """What people call a photo or a scene; InputError before a page opens where it, or its depth, is no such file."""
+    """The name of a photo or scene on the page; InputError, before the page opens, if it or its depth is missing."""
     check_file(target, "photo or scene")
     settings.check()
     with reporter.stage("load"):
@@ -126,7 +126,7 @@ def listening(
 
 @contextlib.contextmanager
 def told_to(reporter: Reporter) -> Iterator[None]:
-    """What jobs and requests log goes to the terminal, requests only if it is to be verbose."""
+    """Log jobs to the terminal, and requests if `verbose`."""
     handler = logging.Handler()
     handler.emit = lambda record: reporter.log(handler.format(record))  # type: ignore[method-assign]
     LOG.addHandler(handler)
@@ -139,7 +139,7 @@ def told_to(reporter: Reporter) -> Iterator[None]:
 
 
 def listener_at(host: str, port: int) -> socket.socket:
-    """A socket that listens there; InputError, naming the option, where nothing can."""
+    """A listening socket; InputError, naming the option, if the address cannot be used."""
     if not 0 <= port <= 65535:
         raise InputError(f"--port {port}: must lie between 1 and 65535 (0: any that is free)")
     try:

@@ -87,7 +87,7 @@ class ClipCompleter:
 
     @torch.no_grad()
     def add(self, rgb: Tensor, prediction: BasePrediction) -> CompletedView:
-        """The next frame: `rgb` [H, W, 3], sRGB at the size of the prediction's camera, and its prediction.
+        """Complete the next frame: `rgb` [H, W, 3], sRGB at the size of the prediction's camera, and its prediction.
 
         ValueError where depths and focal length allow no path.
         """
@@ -122,7 +122,9 @@ class ClipCompleter:
     def _aligned(
         self, rgb: Tensor, prediction: BasePrediction
     ) -> tuple[Gaussians, OcclusionGuard, _Past, _Past | None]:
-        """The base with its depth aligned to the past, the frame's occlusion guard, what to keep, the shot's past."""
+        """The base with its depth aligned to the past, the frame's occlusion guard, the state to keep, and the shot's
+        past.
+        """
         seen = self.renderer.render(prediction.gaussians, prediction.camera)
         known = ~hole_mask(seen.alpha) & (seen.depth > 0)
         inverse_depth = torch.where(known, 1 / seen.depth.clamp_min(1e-6), 0.0)
@@ -142,7 +144,7 @@ class ClipCompleter:
 
 
 def _flicker(drawn: CompletedView, earlier: CompletedView, flow: Tensor) -> dict[str, float]:
-    """What can be told of FIGURES."""
+    """The figures of FIGURES that are known for this clip."""
     hole = drawn.hole
     was = sample(earlier.hole[..., None].float(), pixel_grid(flow) + flow)[..., 0]
     both, neither = hole & (was > 0.999), ~hole & (was < 0.001)

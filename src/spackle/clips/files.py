@@ -40,7 +40,7 @@ RATES = (Fraction(1, 1000), Fraction(1000))  # frames a second that an encoder t
 
 @dataclasses.dataclass(frozen=True)
 class Clip:
-    """What is known of a clip once it has been read through."""
+    """Facts about a clip, found by reading all of it."""
 
     path: Path
     width: int  # of an upright frame with square pixels
@@ -153,7 +153,7 @@ def _opened(path: str | os.PathLike[str]) -> Iterator[tuple[InputContainer, Vide
 def _decoded(
     path: str | os.PathLike[str], container: InputContainer, stream: VideoStream, first: int | None
 ) -> Iterator[av.VideoFrame]:
-    """Frames of one size; an error names the frame."""
+    """Decode frames, which must share one size; an error names the frame."""
     size, count, packets = None, 0, 0
     try:
         for packet in container.demux(stream):
@@ -232,7 +232,7 @@ class ClipWriter(VideoWriter):
 
 
 class _ClipEncoder(StreamEncoder):
-    """Frames are encoded as if they came evenly, and their packets moved to where they belong."""
+    """Frames are encoded at even times, and their packets then get the clip's times."""
 
     def __init__(self, path: Path, width: int, height: int, clip: Clip) -> None:
         self._even = min(max(clip.rate.limit_denominator(1001), RATES[0]), RATES[1])
@@ -249,7 +249,7 @@ class _ClipEncoder(StreamEncoder):
             self._held: av.Packet[AudioStream] | None = None
 
     def finish(self) -> None:
-        """The rest of the picture, and of the sound as long as that lasts."""
+        """Flush the encoder, and copy the sound up to the video's end."""
         self._write(self._stream.encode(None))
         self._copy_sound(self._clip.seconds)
         self.close()
@@ -273,14 +273,14 @@ class _ClipEncoder(StreamEncoder):
             self._container.mux(packet)
 
     def _time(self, index: int) -> Fraction:
-        """When a frame is shown; before the first, and after the last one, at the mean rate."""
+        """The time of a frame; before the first and after the last one at the mean rate."""
         times = self._clip.times
         if 0 <= index < len(times):
             return times[index]
         return times[0] + index / self._even if index < 0 else times[-1] + (index - len(times) + 1) / self._even
 
     def _copy_sound(self, until: Fraction) -> None:
-        """Sound of the clip as far as a time, packet by packet; a damaged rest is left out."""
+        """Copy the clip's sound up to a time, packet by packet; a damaged rest is left out."""
         while self._input is not None:
             try:
                 packet = self._held or next(self._sounds, None)

@@ -1,8 +1,8 @@
 """Frames of a clip that do not flicker: flow from frame to frame, colours propagated along it, aligned depth.
 
-The paper has no clips: each frame's completion knows nothing of the others. Here its aux Gaussians keep their places
-but take on the colours that stood there a frame ago, followed back by the motion of what is behind. What an earlier
-frame has seen there is the truth, and outlives what a completion made up. All blending is of linear light.
+The paper has no clips: each frame's completion knows nothing of the others. Here aux Gaussians keep their places, and
+take the colours of the frame before at the point from which the background moved there. Colours that an earlier frame
+saw count more, and last longer, than colours that completion made up. All blending is of linear light.
 """
 
 from __future__ import annotations
@@ -51,13 +51,13 @@ LEAST = 0.25  # a shift takes at most this away from the farthest
 
 @dataclasses.dataclass(frozen=True)
 class Track:
-    """Where a picture's content was in the one before."""
+    """Finds where a picture's content was in the picture before."""
 
     flow: Tensor  # [H, W, 2] pixels (x, y), from this picture's pixels to the earlier one's
     sure: Tensor  # [H, W] bool: found there, and found here again from there
 
     def same_shot(self, where: Tensor | None = None) -> bool:
-        """Whether enough of the picture, or of its pixels `where` [H, W] bool, was there before."""
+        """Whether enough of the picture, or of its pixels `where` [H, W], was visible in the frame before."""
         sure = self.sure if where is None else self.sure[where]
         return sure.numel() > 0 and float(sure.float().mean()) >= SAME_SHOT
 
@@ -84,17 +84,17 @@ def inside(uv: Tensor, height: int, width: int) -> Tensor:
 
 
 def sample(image: Tensor, uv: Tensor) -> Tensor:
-    """Bilinear values [h, w, C] of an image [H, W, C] at pixel positions [h, w, 2]; the border goes on outside."""
+    """Bilinear values [h, w, C] of an image [H, W, C] at pixel positions [h, w, 2], with edge padding."""
     grid = 2 * uv / uv.new_tensor([image.shape[1], image.shape[0]]) - 1
     found = grid_sample(image.permute(2, 0, 1)[None], grid[None], align_corners=False, padding_mode="border")
     return found[0].permute(1, 2, 0)
 
 
 def extend_flow(found: Track, inverse_depth: Tensor, known: Tensor, camera: Camera) -> Tensor:
-    """The flow [H, W, 2], guessed where nothing was seen: as the camera moved, and as the far rim differs from that.
+    """The flow [H, W, 2], extended into holes: the camera's motion plus the deviation of the far rim from it.
 
-    `found` stays as it is wherever it is sure and `known` [H, W] bool; `inverse_depth` [H, W] is positive everywhere,
-    in the holes that of what is to stand there; `camera` took the picture.
+    `found` is kept where it is reliable and `known` [H, W] is true; `inverse_depth` [H, W] is positive everywhere, in
+    holes that of the fill; `camera` took the picture.
     """
     trusted = known & found.sure
     if not bool(trusted.any()):
@@ -118,7 +118,7 @@ def _motions(inverse_depth: Tensor, camera: Camera) -> Tensor:
 
 
 def _thinned(chosen: Tensor, fewest: int) -> Tensor:
-    """Every fourth of the chosen pixels [H, W] each way, where those are enough; else all."""
+    """Every fourth of the chosen pixels [H, W] in each direction if these are enough, else all."""
     thin = torch.zeros_like(chosen)
     thin[::THINNING, ::THINNING] = chosen[::THINNING, ::THINNING]
     return thin if int(thin.sum()) >= fewest else chosen
@@ -145,7 +145,7 @@ def _fit(basis: Tensor, flow: Tensor, trusted: Tensor) -> Tensor:
 
 @dataclasses.dataclass(frozen=True)
 class FrameMemory:
-    """What is known of a view once its frame is done."""
+    """The state that is kept of a completed view."""
 
     view: Rendering  # completed
     light: Tensor  # [H, W, 3] linear: what was seen, and in the holes the light behind their veil
@@ -205,7 +205,7 @@ def propagate_colors(
 
 
 def _trust(hole: Tensor, share: Tensor, weight: Tensor) -> Tensor:
-    """[H, W] trust in a view's light: what is seen has 1, what fills a hole its past's weight or that of a guess."""
+    """Confidence [H, W] of a view's colours: 1 where seen, in holes that of the past or of a guess."""
     filled = torch.where(share < FAINT, 0.0, weight.clamp_min(GUESS))
     return torch.where(hole, filled, 1.0)
 
@@ -243,7 +243,9 @@ def _recall(past: FrameMemory, uv: Tensor, inverse_depth: Tensor) -> tuple[Tenso
 
 
 def _beside(change: Tensor, hole: Tensor, weight: Tensor, inverse_depth: Tensor) -> Tensor:
-    """The change [H, W, 3] of what is carried, spread over what is new, down to nothing at the rim: no seams."""
+    """The change [H, W, 3] of propagated pixels, spread over new ones and falling to 0 at the rim, so that no seam
+    shows.
+    """
     carried = weight > CARRIED
     known = ~hole | carried
     values = torch.where(carried[..., None], change, 0.0).permute(2, 0, 1)
@@ -254,7 +256,7 @@ def _beside(change: Tensor, hole: Tensor, weight: Tensor, inverse_depth: Tensor)
 
 
 def _recoloured(aux: Gaussians, camera: Camera, change: Tensor, share: Tensor) -> Gaussians:
-    """Aux Gaussians whose colours change as the pixels [H, W, 3] of their cells do, on the mean over their shares."""
+    """Aux Gaussians, recoloured by the change [H, W, 3] of their cells' pixels, averaged by their share in these."""
     weighted = torch.cat([change * share[..., None], share[..., None]], dim=-1)
     sums = avg_pool2d(weighted.permute(2, 0, 1)[None], CELL, ceil_mode=True)[0]
     mean = sums[:3] / sums[3:].clamp_min(1e-6)
@@ -288,15 +290,15 @@ class DepthAlignment:
         return torch.maximum(scaled + self.shift, LEAST * scaled)
 
     def after(self, first: DepthAlignment) -> DepthAlignment:
-        """This map, applied to what the other one gives."""
+        """The composition of this map after the other one."""
         return DepthAlignment(self.scale * first.scale, self.scale * first.shift + self.shift)
 
     def leaked(self) -> DepthAlignment:
-        """A little nearer to no map at all."""
+        """This map, moved a little towards the identity."""
         return DepthAlignment(self.scale**LEAK, LEAK * self.shift)
 
     def of_depth(self, depth: Tensor) -> Tensor:
-        """Mapped depth of any shape; what is not in front of the eye only scales."""
+        """Mapped depths of any shape; those behind the eye are only scaled."""
         front = depth > 0
         return torch.where(front, 1 / self.of(1 / depth.where(front, 1.0)), depth / self.scale)
 
@@ -310,7 +312,8 @@ class DepthAlignment:
 
 
 def align_depth(inverse_depth: Tensor, earlier: Tensor, found: Track) -> DepthAlignment:
-    """What brings a frame's inverse depth [H, W], 0 where unknown, to that of the one before, where both show the same.
+    """The map from a frame's inverse depth [H, W] (0: unknown) to that of the frame before, fitted where both show the
+    same.
 
     Robust least squares: what moves by itself, and where the two disagree in shape, is outvoted.
     """

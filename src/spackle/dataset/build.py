@@ -1,4 +1,4 @@
-"""`spackle dataset build`: photos to shards, in any number of runs with the same bytes at the end."""
+"""`spackle dataset build`: photos to shards, with the same bytes however often the build is interrupted."""
 
 from __future__ import annotations
 
@@ -65,14 +65,14 @@ class DatasetOptions:
         return Workers(self.workers, self.threads, self.ray, gpu)
 
     def open_inpainter(self) -> Inpainter | None:
-        """None where the targets are rendered or left open; InputError where a package or weights are missing."""
+        """The inpainter; None if targets are rendered or left open. InputError if a package or weights are missing."""
         if self.inpainter not in INPAINTERS:
             return None
         device = None if self.base.device == "auto" else self.base.device
         return get_inpainter(self.inpainter, InpainterOptions(self.inpainter_weights, self.inpainter_side, device))
 
     def check(self) -> None:
-        """InputError for options that contradict each other; inpainters check theirs themselves."""
+        """InputError for options that contradict each other; inpainters check their own options."""
         self.base.check(one=True)
         depth = self.base.depth
         if depth is None and not self.base.network:
@@ -111,7 +111,7 @@ class DatasetOptions:
 
 
 def configuration(options: DatasetOptions, photos: Sequence[PhotoFile], inpainter: Inpainter | None) -> dict[str, Any]:
-    """Everything that decides the shards' bytes, ready for JSON, without folders of this machine.
+    """The configuration: everything that decides the shards' bytes, ready for JSON, without paths of this machine.
 
     The number of threads is part of it, because SHARP's last bits depend on it; the number of workers is not.
     """
@@ -252,7 +252,7 @@ class _Build:
         reporter: Reporter,
         config: dict[str, Any],
     ) -> None:
-        """Begin in a folder, or take up an earlier run there; InputError where that is another dataset."""
+        """Start a build in a folder, or resume the one there; InputError if that is another dataset."""
         self.photos, self.output, self.options, self.reporter = photos, output, options, reporter
         self.config, self.size = config, options.shard_size
         if not (output / NAME).exists():
@@ -274,7 +274,7 @@ class _Build:
         self.seconds = dict.fromkeys(STAGES, 0.0)
 
     def run(self, ray: Any) -> str:
-        """Make what is missing, on a Ray cluster where `ray` is the package; "complete" or "stopped"."""
+        """Make the missing samples, on a Ray cluster if `ray` is the package; returns "complete" or "stopped"."""
         jobs = [photo for photo in self.photos if photo.index in self.missing]
         if ready := len(self.photos) - len(jobs):
             self.reporter.log(f"{self.output}: going on, {ready} of {len(self.photos)} photos are done")
@@ -298,7 +298,7 @@ class _Build:
         return "complete"
 
     def _part(self, index: int) -> Path:
-        """Where a photo's sample waits for its shard."""
+        """The file in which a photo's sample waits for its shard."""
         return self.output / PARTS / f"{self.photos[index].key}.tar"
 
     def _keep(self, result: Made) -> None:
@@ -353,7 +353,7 @@ class _Build:
         self.reporter.log(f"{counted(samples, 'photo')} in {counted(len(shards), 'shard')}, {total} -> {self.output}")
 
     def _portable(self, name: str, problem: str) -> str:
-        """A photo's problem without the folders of photos and depth maps, as these differ between machines."""
+        """A photo's problem without the folders of photos and depth maps, which differ between machines."""
         for photo in self.photos:
             problem = problem.replace(str(photo.path), photo.name)
         depth = self.options.base.depth

@@ -112,5 +112,5 @@ def preview_dataset(location: str, output: Path, photos: int, views: int, report
 
 
 def _spread(total: int, count: int) -> list[int]:
-    """Up to `count` places in 0..total, evenly."""
+    """Up to `count` indices below `total`, evenly spaced."""
     return sorted({round(place) for place in np.linspace(0, total - 1, min(count, total))})

@@ -32,7 +32,7 @@ class PhotoFile:
 
     @property
     def key(self) -> str:
-        """The first part of the names of the photo's files in the dataset."""
+        """The photo's number, with which the names of its files in the dataset begin."""
         return f"{self.index:06d}"
 
 

@@ -55,7 +55,7 @@ class DatasetView:
 def pack_sample(key: str, photo: Tensor, stack: ViewStack, targets: Tensor, facts: Mapping[str, Any]) -> bytes:
     """A photo as a stretch of a tar archive: KEY.json, KEY.photo.png, KEY.base.safetensors, then five files a view.
 
-    The archive's end is missing, and so are time, owner and machine. `photo` [h, w, 3] (at its working size) and
+    It has no end-of-archive mark, and no time, owner or machine. `photo` [h, w, 3] (at its working size) and
     `targets` [V, H, W, 3] are sRGB; `facts` go into the JSON and hold the mask's "threshold" and the "trajectory".
     """
     files: list[tuple[str, bytes]] = []
@@ -112,7 +112,7 @@ class PhotoGroup:
 
     @property
     def views(self) -> int:
-        """How many there are."""
+        """Number of views."""
         return len(self.holes)
 
     def view(self, index: int) -> DatasetView:

@@ -74,7 +74,7 @@ class Manifest(BaseModel, frozen=True, extra="ignore", strict=True):
 
     @property
     def digest(self) -> str:
-        """SHA-256 over everything that is in it."""
+        """SHA-256 of the dataset: of all that its manifest states."""
         return digest_of(self._content())
 
     def save(self, folder: Path) -> None:
@@ -89,7 +89,7 @@ class Manifest(BaseModel, frozen=True, extra="ignore", strict=True):
 
 
 def open_in(location: str | os.PathLike[str], name: str) -> IO[bytes]:
-    """Open a seekable file in a folder or at an fsspec address (s3://bucket/dataset); InputError if it cannot."""
+    """Open a seekable file in a folder or at an fsspec address (s3://bucket/dataset); InputError if that fails."""
     place = f"{str(location).rstrip('/')}/{name}"
     package = "an address needs a package (pip install fsspec), and its protocol perhaps another"
     with (

@@ -1,6 +1,6 @@
 """The views of a photo along a controlled camera path, and their completed targets (paper, appendix).
 
-Targets are painted by an inpainter, the same surface alike in all views; drawn from one completed scene; or left open.
+Targets are painted by an inpainter so that all views agree, drawn from one completed scene, or left open.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ COMPLETIONS = (*INPAINTERS, "geometry", "none")  # values of --inpainter
 def draw_path(
     kind: SharpTrajectory | None, disparity: tuple[float, float], seed: int, photo_sha256: str
 ) -> tuple[SharpTrajectory, float]:
-    """A photo's path and its disparity, drawn by seed and file alone; `kind` is kept where it is given."""
+    """A photo's path and disparity, drawn at random by seed and file content; `kind` fixes the path."""
     rng = np.random.default_rng(list(hashlib.sha256(f"{seed}:{photo_sha256}".encode()).digest()))
     drawn = SHARP_TRAJECTORIES[rng.integers(len(SHARP_TRAJECTORIES))]
     return kind or drawn, float(rng.uniform(*disparity))
@@ -91,7 +91,7 @@ def render_views(prediction: BasePrediction, cameras: Sequence[Camera], renderer
 def complete_views(views: ViewStack, completion: str, inpainter: Inpainter | None, renderer: Renderer) -> Tensor:
     """Targets [V, H, W, 3] sRGB: new colours in the holes, elsewhere the views bit for bit.
 
-    `completion` is one of `COMPLETIONS`; "none" leaves the holes to somebody else.
+    `completion` is one of `COMPLETIONS`; "none" leaves the holes open.
     """
     if completion == "none":
         return views.rgb
@@ -104,7 +104,7 @@ def complete_views(views: ViewStack, completion: str, inpainter: Inpainter | Non
 def render_completed(views: ViewStack, renderer: Renderer) -> tuple[Tensor, Tensor]:
     """Colours [V, H, W, 3] and inverse depth [V, H, W] of one completed scene, filled by seeds alone: all views agree.
 
-    The few pixels that are uncovered even then get those of pixels around.
+    The few pixels that are uncovered even then take colour and depth of their neighbours.
     """
     prediction = views.prediction
     aux = complete(prediction, views.cameras, exact=True, network=None, fill="network", renderer=renderer).aux
@@ -124,8 +124,8 @@ def render_completed(views: ViewStack, renderer: Renderer) -> tuple[Tensor, Tens
 def paint_in_turn(inpainter: Inpainter, views: ViewStack, renderer: Renderer) -> Tensor:
     """The views with their holes painted one after the other, the farthest from the photo first, so that all agree.
 
-    What the views before show is reprojected into a view's holes, and the inpainter paints the rest of them. Where the
-    surfaces lie in the holes, one completed scene says.
+    What the views before show is reprojected into a view's holes, and the inpainter paints the rest of them. One
+    completed scene gives the depth in the holes.
     """
     inverse_depths, targets = render_completed(views, renderer)[1], views.rgb.clone()
     painted: list[int] = []
@@ -157,9 +157,9 @@ def looked_up(points: Tensor, camera: Camera, rgb: Tensor, inverse_depth: Tensor
 
 
 def paint_video(inpainter: Inpainter, views: ViewStack) -> Tensor:
-    """The views with their holes painted, given as a flight along the path meets them.
+    """The views with their holes painted as one video, ordered along the path.
 
-    The first view, the photo's, stands where the detour is least.
+    The photo's own view is inserted where it lengthens the path least.
     """
     eyes = torch.stack([camera.position.double() for camera in views.cameras])
     others = list(range(1, len(eyes)))

@@ -51,7 +51,7 @@ Times = dict[tuple[str, str], Values]  # (task, stage) → milliseconds
 
 
 def bench(options: EvaluateOptions, runs: int, base_runs: int | None, output: Path, reporter: Reporter) -> str:
-    """Time a dataset, or go on with that; "complete", or "stopped" where Ctrl-C came.
+    """Time a dataset, or resume that; returns "complete", or "stopped" after Ctrl-C.
 
     Writes rows.jsonl, bench.md, bench.tex and images/ into `output`. The folder belongs to one machine: times of two do
     not go together. Everything behind the base is timed `runs` times, the base `base_runs` times (None: once for SHARP,
@@ -92,7 +92,7 @@ def bench(options: EvaluateOptions, runs: int, base_runs: int | None, output: Pa
 
 
 def time_case(case: Case, evaluation: Evaluation, config: Mapping[str, Any], warm: bool) -> list[Row]:
-    """All settings of an image; `warm`: something was predicted before in this process.
+    """Time all settings of an image; `warm` says whether this process has predicted before.
 
     Raises:
         InputError: a file that cannot be used, depth that the case lacks, or Gaussians that are not finite.
@@ -130,7 +130,7 @@ def time_case(case: Case, evaluation: Evaluation, config: Mapping[str, Any], war
 
 
 def view_figures(base: int, added: int, seconds: Mapping[str, Values]) -> list[tuple[str, float]]:
-    """Every figure of the tables that comes of a view's Gaussians and of the seconds of each run of `STAGES`.
+    """All figures of the tables that follow from a view's Gaussians and the seconds of each run of `STAGES`.
 
     Counts, milliseconds (medians of runs), shares (not percent), views a second; and each run's milliseconds.
     """
@@ -154,7 +154,8 @@ def view_figures(base: int, added: int, seconds: Mapping[str, Values]) -> list[t
 
 
 def count_parameters(residual: ResidualNet | None) -> dict[str, float]:
-    """Of SHARP as its checkpoint has it, 702.31 M; of that used by inference; of the residual; and its share.
+    """Parameters of SHARP's checkpoint (702.31 M), of its part that inference uses, and of the residual; the residual's
+    share.
 
     SHARP's are counted in the network, without weights. Inference needs neither SHARP's classifiers nor the part that
     aligns depths.
@@ -170,10 +171,12 @@ def count_parameters(residual: ResidualNet | None) -> dict[str, float]:
 
 
 def measure(runs: int, tasks: Mapping[str, Task], device: torch.device = CPU, *, warm: bool = False) -> Times:
-    """Milliseconds of each task (its stage "total") and of its stages, each of which it ends by calling its argument.
+    """Milliseconds of each task (stage "total") and of its stages; a task ends a stage by calling its argument with the
+    name.
 
     The tasks take turns, so a busy machine slows all of them alike. Laps of one name within a run add up. A stage ends
-    when the device has done its work. One run more, which compiles and warms up, comes first, unless they are `warm`.
+    when the device has done its work. An untimed run, which compiles and warms up, comes first, unless the tasks are
+    `warm`.
     """
 
     def now() -> float:
@@ -202,7 +205,7 @@ def measure(runs: int, tasks: Mapping[str, Task], device: torch.device = CPU, *,
 
 @dataclasses.dataclass(frozen=True)
 class _LappedRenderer:
-    """A `Renderer` whose renders are laps, told apart from the completion around them."""
+    """A `Renderer` that ends a stage before and after each render, to separate renders from completion."""
 
     renderer: Renderer
     lap: Lap
@@ -219,7 +222,7 @@ class _LappedRenderer:
 
 @torch.no_grad()
 def complete_in_laps(context: FillContext, camera: Camera, lap: Lap, method: str = "spackle") -> Gaussians:
-    """A view's aux Gaussians; laps "view", "photo", "completion" and, where there are holes, "rerender"."""
+    """A view's aux Gaussians; times the stages "view", "photo", "completion" and, for a view with holes, "rerender"."""
     context, prepared = context.placed, False
     before = context.renderer.render(context.base, camera)
     lap("view")

@@ -1,4 +1,4 @@
-"""What a dataset is to an evaluation: photos, what is known beside them, and both at the working size."""
+"""Evaluation cases: photos with the depth, cameras and second photos known for them, at the working size."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SHAPE_TOLERANCE = 0.01  # of the aspect ratio, between a photo and the camera th
 
 @dataclasses.dataclass(frozen=True)
 class SecondView:
-    """A true photo of the same scene from elsewhere."""
+    """A second photo of the same scene, taken from elsewhere."""
 
     name: str
     photo: Path
@@ -40,7 +40,7 @@ class Points:
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """An input photo, and what is known about it. Nothing is read before it is asked for."""
+    """An input photo, and the camera, depth and second photos known for it. Files are read on demand."""
 
     name: str  # no two of a dataset share it; slashes divide scene and view
     photo: Path
@@ -53,7 +53,7 @@ class Case:
 
 @dataclasses.dataclass(frozen=True)
 class EvalDataset:
-    """A dataset in its official folders."""
+    """The description of a dataset in its official layout."""
 
     name: str  # as it is typed
     title: str  # as the paper's tables have it
@@ -70,12 +70,12 @@ def has_any(folder: Path, *names: str) -> bool:
 
 
 def photo_files(folder: Path) -> list[Path]:
-    """The photos right in a folder, by name; none where there is no folder."""
+    """The photos directly in a folder, by name; none if there is no folder."""
     return files_in(folder, PHOTO_SUFFIXES) if folder.is_dir() else []
 
 
 class Viewpoint(NamedTuple):
-    """A view to look at."""
+    """A view to evaluate."""
 
     setting: str
     name: str
@@ -123,7 +123,7 @@ def load_case(case: Case, max_side: int = MAX_SIDE) -> LoadedCase:
 
 
 def _load_view(view: SecondView, max_side: int) -> Viewpoint:
-    """Its photo is read again when it is wanted: a scene may have hundreds of them."""
+    """Check a second view; its photo is read again on demand, because a scene may have hundreds."""
     stored = load_photo(view.photo)
     _check_shape(view.photo, stored, view.camera)
     camera = view.camera.resized(*working_size(stored.width, stored.height, max_side))
@@ -145,7 +145,7 @@ def _check_shape(path: Path, photo: Photo, camera: Camera) -> None:
 
 
 def known_depth(case: Case) -> DepthMap:
-    """A case's depth map; else its points as one with gaps, each in its pixel of the case's camera, the nearest first.
+    """A case's depth map; else one made of its points, each in its pixel of the case's camera, of several the nearest.
 
     Raises:
         InputError: the case has neither, or a file of it cannot be used.

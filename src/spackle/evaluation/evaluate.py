@@ -132,7 +132,7 @@ class EvaluateOptions:
 
 
 def split_words(text: str) -> tuple[str, ...]:
-    """ "a, b,c" as words; a word twice counts once."""
+    """ "a, b,c" as words, without repetitions."""
     return tuple(dict.fromkeys(word.strip() for word in text.split(",") if word.strip()))
 
 
@@ -165,7 +165,7 @@ class Evaluation:
         return self.base if network else open_loaded(RgbdBase(known_depth(loaded.case)))
 
     def context(self, prediction: BasePrediction) -> FillContext:
-        """A photo's base, and what fills the holes of its views."""
+        """The base of a photo, and the means to fill the holes of its views."""
         fill = self.renderer, self.network
         return FillContext(prediction.gaussians, prediction.camera, *fill, precision=self.options.base.precision)
 
@@ -300,7 +300,7 @@ def _log_missing(evaluation: Evaluation, reporter: Reporter) -> None:
 def measure_case(
     case: Case, evaluation: Evaluation, metrics: Sequence[str] = ()
 ) -> tuple[list[Row], dict[str, Tensor]]:
-    """An image's figures, those of `metrics` among them, and pictures [H, W, 3]: the photo, a view by each method.
+    """An image's figures, `metrics` included, and pictures [H, W, 3]: the photo, and a view by each method.
 
     InputError for a file that cannot be used or is missing; BaseError where no image can be worked on.
     """
@@ -318,7 +318,7 @@ def measure_case(
 
     @cache
     def direct_ft() -> tuple[Gaussians, float]:
-        """The other base, and what its cameras' paths are to be multiplied by."""
+        """The Gaussians of direct FT, and the factor on camera positions that its unit of length needs."""
         assert evaluation.direct is not None
         other = evaluation.direct.predict(loaded.full)[0]
         if alignment is None:
@@ -348,7 +348,7 @@ def measure_case(
 
 @torch.no_grad()
 def _align(loaded: LoadedCase, prediction: BasePrediction, evaluation: Evaluation, is_truth: bool) -> Alignment:
-    """The base's scale, by what it sees at the photo's own camera."""
+    """The scale between base and dataset, from the base's depth at the photo's own camera."""
     view = evaluation.renderer.render(prediction.gaussians, prediction.camera)
     return align(loaded.case, view.depth, ~hole_mask(view.alpha), base_is_truth=is_truth)
 

@@ -1,7 +1,7 @@
 """A folder of results: config.json, images/ with a file for each finished image, and at last rows.jsonl.
 
-config.json is what decides the renders; rows.jsonl vouches that all images are done. A killed run goes on. Metrics may
-be added to a finished one: then they alone are measured.
+config.json holds the options that decide the renders; rows.jsonl exists once all images are done. A killed run goes on.
+If metrics are added to a finished run, they alone are measured.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ Measure = Callable[[int, Case, Sequence[str]], tuple[list[Row], list[Path]]]
 
 
 def write_rows(rows: Iterable[Row], path: Path) -> None:
-    """One JSON object a line; whole or not at all."""
+    """Write rows, one JSON object a line; whole or not at all."""
     lines = (json.dumps(row._asdict(), allow_nan=False) + "\n" for row in rows)
     write_whole(path, "".join(lines).encode())
 
@@ -85,7 +85,7 @@ def open_folder(output: Path, config: Mapping[str, Any], about: Mapping[str, Any
 
 
 def image_file(output: Path, index: int, name: str, suffix: str) -> Path:
-    """One of an image's files: its rows (.json), or one of its pictures (.METHOD.webp)."""
+    """The path of an image's rows (.json), or of one of its pictures (.METHOD.webp)."""
     return output / IMAGES / f"{index:05d}-{re.sub(r'[^A-Za-z0-9.-]+', '_', name)[-80:]}{suffix}"
 
 
@@ -101,8 +101,8 @@ def measure_images(
 ) -> Run | None:
     """Measure the images that no earlier run in the folder has finished: all results; None where Ctrl-C came.
 
-    Of finished images only what is new of `metrics` is measured: of each who measures it, or that it is "not run", in
-    which case figures of an earlier run stay. An image that cannot be used gives one row, its problem, and is tried
+    Finished images are measured by new metrics alone. `metrics` maps each metric to who measures it, or to "not run",
+    which keeps the figures of an earlier run. An image that cannot be used gives one row, its problem, and is tried
     again by the next run.
 
     Raises:
@@ -189,11 +189,11 @@ def _load_part(path: Path, inputs: str) -> tuple[list[Row], dict[str, str]] | No
 
 
 def problem_of(case: Case, error: InputError, root: Path) -> str:
-    """Why a case is passed over, in one line that begins with its name: a photo may be the second one of several."""
+    """Why a case is skipped, in one line that begins with its name, because a photo may belong to several cases."""
     problem = from_root(str(error), root)
     return problem if problem.startswith(case.name) else f"{case.name}: {problem}"
 
 
 def from_root(problem: str, root: Path) -> str:
-    """A line about a file of a dataset, whose name does not say where that was unpacked."""
+    """A message about a dataset's file, with its path relative to the dataset's folder."""
     return " ".join(problem.replace(f"{root}/", "").splitlines())

@@ -26,7 +26,7 @@ from spackle.scene_fill.occlusion_guard import OcclusionGuard, push_behind
 
 
 class MethodView(NamedTuple):
-    """What a method makes of one view."""
+    """The view that a method renders, and its aux Gaussians."""
 
     rgb: Tensor  # [H, W, 3] sRGB 0..1
     alpha: Tensor | None  # [H, W]; None where the hole is not filled by anything in 3D
@@ -55,14 +55,14 @@ def make_method(
     inpainter: Inpainter | None = None,
     direct_ft: Callable[[], tuple[Gaussians, float]] | None = None,
 ) -> Fill:
-    """A method of `METHODS` on a photo's base.
+    """The fill function of a method of `METHODS` for a photo's base.
 
     Args:
         name: see `METHODS`.
         cameras: all views of a setting, which a method may complete together.
         context: the base, and what fills its views' holes.
         inpainter: of inpaint2d.
-        direct_ft: of direct-ft: the photo by the other base, and that one's unit of length in this one's.
+        direct_ft: for direct-ft, returns the fine-tuned base's Gaussians and its unit of length in this base's unit.
     """
     context = context.placed
     guard = context.photo_guard() if name in ("spackle", "seeds", "dense") else None
@@ -96,7 +96,7 @@ def make_method(
 
 
 def _paper_aux(context: FillContext, camera: Camera, before: Rendering) -> Gaussians:
-    """As eqs. 2 to 9 say."""
+    """Aux Gaussians by eqs. 2 to 9."""
     return complete_view(
         context.base,
         camera,

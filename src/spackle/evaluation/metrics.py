@@ -58,7 +58,7 @@ DEFAULT_METRICS = {
 
 
 def metric_name(figure: str) -> str | None:
-    """The metric that a figure of the image, the hole or its outside is of; None of counts and shares."""
+    """The metric that a figure (of image, hole or outside) belongs to; None for counts and shares."""
     name = figure.partition("_")[0]
     return name if name in METRICS else None
 
@@ -80,7 +80,7 @@ def psnr(image: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
 def sharpness(image: Tensor, truth: Tensor, mask: Tensor) -> float:
     """Mean magnitude of the grey gradient over the truth's: 1 is as sharp as the truth, 0 is fog.
 
-    It counts within `mask` [H, W] bool, 3 pixels from its border and farther; NaN where that is nothing. `image` and
+    It is measured inside `mask` [H, W], at least 3 pixels from its border; NaN if there is no such pixel. `image` and
     `truth` are [H, W, 3] sRGB 0..1.
     """
     inner = ~greatest_around(~mask, INNER // 2)
@@ -129,7 +129,7 @@ def open_metrics(names: Sequence[str], device: str, download: bool) -> tuple[dic
     """Load metrics by their names in `DEFINITIONS`; what is missing is no error.
 
     Args:
-        names: which ones; none leaves pyiqa alone.
+        names: metrics to load; pyiqa is imported only if there is one.
         device: "cpu" or "cuda".
         download: let pyiqa fetch weights that are not here; otherwise it is kept off the network while it looks.
 
@@ -185,7 +185,7 @@ def _quiet() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _off_the_network(attempts: list[str]) -> Iterator[None]:
-    """Refuse to look up any host, and note the attempts: every way to download begins with that."""
+    """Refuse and count look-ups of host names, with which every download begins."""
     lookup = socket.getaddrinfo
 
     def refuse(host: Any, *rest: Any, **more: Any) -> Any:

@@ -139,7 +139,7 @@ class Ranking(NamedTuple):
 
 
 def rank(run: Run) -> Ranking | None:
-    """By the method that matters: Spackle if it was run, else the last one. None where nothing was measured."""
+    """The order follows Spackle if it was run, else the last method. None where nothing was measured."""
     method = "spackle" if "spackle" in run.methods else run.methods[-1]
     for metric in ORDER[str(run.config["protocol"])]:
         if values := run.by_image(metric, method):
@@ -174,7 +174,7 @@ def ranked(values: Mapping[str, float], metric: str) -> list[str]:
 
 
 def evenly(count: int, most: int) -> list[int]:
-    """At most so many of so many, evenly, the first and the last among them."""
+    """At most `most` of `count` indices, evenly spaced, the first and the last included."""
     if count <= most:
         return list(range(count))
     return [math.floor(k * (count - 1) / max(1, most - 1) + 0.5) for k in range(most)]
@@ -184,7 +184,7 @@ def evenly(count: int, most: int) -> list[int]:
 
 
 class PaperFigure(NamedTuple):
-    """What the paper has a figure of."""
+    """The paper's figures."""
 
     name: str
     columns: Sequence[str]  # pictures; methods that no run has are left out, but for the needed one
@@ -261,7 +261,7 @@ def _cell(run: Run, image: str, name: str, pictures: dict[str, Image.Image], fig
 
 
 def hole_boxes(hole: Image.Image) -> Boxes:
-    """Squares, apart from each other, where holes and what is seen beside them share the place; from a white hole."""
+    """Boxes, apart from each other, where holes and seen pixels mix; in the given picture holes are white."""
     mask = torch.from_numpy(np.asarray(hole.convert("L")) > 127).float()
     height, width = mask.shape
     side = min(round(BOX * max(mask.shape)), *mask.shape)

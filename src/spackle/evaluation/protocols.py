@@ -1,4 +1,4 @@
-"""From which views a photo is looked at, the scale between its base and a dataset, and what is measured there."""
+"""The views of each protocol, the scale between base and dataset, and the measurements."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def large_views(prediction: BasePrediction, disparities: Sequence[float], side: 
 
 @dataclasses.dataclass(frozen=True)
 class Alignment:
-    """How long the base's unit is."""
+    """The length of the base's unit in the dataset's unit."""
 
     scale: float  # the dataset's lengths in one unit of the base: z_dataset = scale · z_base
     pixels: int  # with known depth, which it rests on; 0 where it comes from bounds, or nothing had to be measured
@@ -161,7 +161,7 @@ def to_base(view: Camera, photo: Camera, base: Camera, scale: float) -> Camera:
 
 
 def _depth_ratios(known: DepthMap, z_base: Tensor, seen: Tensor) -> Tensor:
-    """By the map's nearest pixel to each of the base's."""
+    """Ratios of dataset to base depth, by the map's pixel nearest to each of the base's."""
     (height, width), (rows, columns) = z_base.shape, known.depth.shape
     y = ((torch.arange(height) + 0.5) * rows / height).long()
     x = ((torch.arange(width) + 0.5) * columns / width).long()
@@ -170,7 +170,7 @@ def _depth_ratios(known: DepthMap, z_base: Tensor, seen: Tensor) -> Tensor:
 
 
 def _point_ratios(case: Case, points: Points, z_base: Tensor, seen: Tensor) -> Tensor:
-    """By the base's pixel that each point falls into."""
+    """Ratios of dataset to base depth, by the base's pixel that each point falls into."""
     assert case.camera is not None  # whose pixels the points are in
     height, width = z_base.shape
     cells = (points.uv * torch.tensor([width / case.camera.width, height / case.camera.height])).floor().long()
@@ -189,7 +189,7 @@ def _of_ratios(ratios: Tensor, source: Literal["depth", "points"]) -> Alignment 
 
 
 def _of_bounds(bounds: tuple[float, float], z: Tensor) -> Alignment:
-    """Rough: between what makes the nearest depths the same, and what makes the farthest the same."""
+    """A rough scale: the mean of those that match the nearest depths and the farthest depths."""
     near, far = (float(z.double().sort().values[round(q * (len(z) - 1))]) for q in BOUNDS_QUANTILES)
     low, high = math.log(bounds[0] / near), math.log(bounds[1] / far)
     return Alignment(math.exp((low + high) / 2), 0, abs(high - low) / 2, "bounds")
@@ -203,7 +203,7 @@ def measure_views(
     methods: Mapping[str, Callable[[Sequence[Camera]], Fill]],
     gauges: Gauges,
 ) -> tuple[list[Row], dict[str, Tensor]]:
-    """Every method on every view of a base; a method gets the cameras of one setting together.
+    """Measure every method on every view of a base; a method gets the cameras of one setting together.
 
     Returns:
         Rows, which take dataset and name from `image`; and pictures of the view with the largest hole, [H, W, 3]: its

@@ -108,7 +108,7 @@ def _bold(text: str) -> Markup:
 
 
 def _part(run: Run, folder: Path, count: int, side: int) -> dict[str, Any]:
-    """What the page has of an evaluation; so many images, whose pictures are so large at most."""
+    """The page's section of an evaluation, with a limited number of images and picture size."""
     ranking = rank(run)
     return {
         "run": run,
@@ -141,7 +141,7 @@ def figures_table(run: Run, rows: Iterable[Row]) -> Table:
 
 
 def _percent(share: float) -> str:
-    """With as many digits as it takes to see it."""
+    """A number with as many digits as show its value."""
     return "0 %" if share == 0 else f"{100 * share:.1f} %" if share >= 0.001 else f"{100 * share:.1g} %"
 
 
@@ -160,7 +160,7 @@ def _cases(run: Run, folder: Path, ranking: Ranking | None, count: int, side: in
 
 
 def _small(path: Path, side: int) -> bytes:
-    """A picture as WebP, at most so many pixels wide and high."""
+    """A picture as WebP, of at most the given width and height."""
     with Image.open(path) as image:
         if max(image.size) <= side:
             return path.read_bytes()
@@ -208,7 +208,7 @@ class Series(NamedTuple):
 
 
 class Plot(NamedTuple):
-    """A drawing below its title."""
+    """A plot and its title."""
 
     title: str
     alt: str  # for those who do not see it
@@ -217,7 +217,7 @@ class Plot(NamedTuple):
 
     @property
     def address(self) -> str:
-        """The drawing as a data address."""
+        """The plot as a data URL."""
         return f"data:image/svg+xml;base64,{base64.b64encode(self.svg).decode()}"
 
 
@@ -280,7 +280,7 @@ def holes_plot(run: Run) -> Plot | None:
     positive = [value for value in values if value > 0]
 
     def finish(axes: Axes) -> None:
-        """Decades; a hole of zero stands at the foot of the axis."""
+        """Set ticks at decades; holes of zero are drawn at the foot of the axis."""
         if len(positive) == len(values):
             axes.set_yscale("log")
         elif positive:
@@ -346,6 +346,6 @@ def scenes_plot(run: Run, metric: str) -> Plot | None:
 
 
 def _short(name: str) -> str:
-    """A name that fits beside its row: names differ at their ends as often as at their beginnings."""
+    """A name shortened in its middle, because names differ at their ends as often as at their beginnings."""
     name, half = UNPRINTABLE.sub("\N{REPLACEMENT CHARACTER}", name), LETTERS // 2
     return name if len(name) <= LETTERS else f"{name[: half - 1]}…{name[-half:]}"

@@ -26,7 +26,7 @@ Value = float | str | None
 
 
 def load_data(name: str) -> dict[str, Any]:
-    """A JSON file that lies beside this one."""
+    """The content of a JSON file beside this module."""
     content: dict[str, Any] = json.loads(resources.files("spackle.evaluation").joinpath(name).read_text("utf-8"))
     return content
 
@@ -50,7 +50,7 @@ class Row(NamedTuple):
 
 
 class Mean(NamedTuple):
-    """Of a figure over views."""
+    """A mean of a figure over views."""
 
     value: float | None  # None where no view gave a number
     bad: int  # views whose figure was not finite: they are left out, and counted
@@ -63,7 +63,7 @@ def mean(values: Sequence[Value], of: Callable[[list[float]], float] = statistic
 
 
 def pivot(rows: Iterable[Row], *columns: str) -> dict[tuple[str, ...], list[Value]]:
-    """The values of the rows that agree in these columns."""
+    """Group the values of rows by these columns."""
     groups: dict[tuple[str, ...], list[Value]] = {}
     for row in rows:
         groups.setdefault(tuple(getattr(row, column) for column in columns), []).append(row.value)
@@ -89,12 +89,12 @@ class Run:
 
     @property
     def label_suffix(self) -> str:
-        """What tells the LaTeX labels of this run's own tables from those of others."""
+        """The suffix that makes the LaTeX labels of this run's tables unique."""
         return f":{self.title}-{self.config['protocol']}".lower()
 
     @property
     def timed(self) -> bool:
-        """Whether it is a benchmark."""
+        """Whether the run is a benchmark."""
         return bool(self.config["kind"] == "bench")
 
     @property

@@ -47,7 +47,7 @@ TEXTS: dict[str, Text] = {
 
 
 def mark_best(values: Sequence[float | None], texts: Sequence[str], lower: bool) -> list[str]:
-    """The texts, the best one and what prints like it set off; none where all that have a value print alike."""
+    """The texts with the best value, and others that print alike, in bold; none if all print alike."""
     known = {value: text for value, text in zip(values, texts, strict=True) if value is not None}
     if len(set(known.values())) < 2:
         return list(texts)
@@ -56,7 +56,7 @@ def mark_best(values: Sequence[float | None], texts: Sequence[str], lower: bool)
 
 
 def groups(heads: Sequence[tuple[str, str]]) -> list[tuple[str, int]]:
-    """The upper level: a name, and over how many columns it stands."""
+    """The upper heads: each a name and the number of its columns."""
     return [(name, len(list(columns))) for name, columns in itertools.groupby(heads, key=lambda head: head[0])]
 
 

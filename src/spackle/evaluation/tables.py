@@ -96,7 +96,7 @@ def write_tables(tables: Sequence[Table], folder: Path, files: Sequence[str] = F
 
 
 def method_name(run: Run, method: str, title: str = "") -> str:
-    """What a row is called; the base's name is always in it, and a mark where the residual is not the paper's."""
+    """A row's name: with the base's name, and a mark if the residual is not the paper's."""
     if method == "base":
         return f"{run.base} alone"
     mark = RECIPE_MARK if method in RESIDUAL and run.config["residual"]["weights"] != "given" else ""
@@ -258,7 +258,7 @@ def _row_names(spec: Mapping[str, Any], run: Run) -> dict[str, str]:
 def _rows(
     label: str, spec: Mapping[str, Any], runs: Sequence[Run], dataset: str, columns: Sequence[Column]
 ) -> list[tuple[str, str, list[str]]]:
-    """Name, number of images and cells of our rows for a dataset, or that it was not run, and of the paper's."""
+    """For a dataset, name, number of images and cells of our rows (or "not run") and of the paper's."""
     rows = []
     for run in (run for run in runs if run.title == dataset):
         names = _row_names(spec, run)

@@ -46,7 +46,7 @@ EVERY = (slice(None, None, COARSE),) * 2  # the cells that have one
 
 @dataclasses.dataclass(frozen=True)
 class FillContext:
-    """A photo's base, and what fills the holes of its views."""
+    """The base of a photo, and the means to fill the holes of its views."""
 
     base: Gaussians
     photo_camera: Camera

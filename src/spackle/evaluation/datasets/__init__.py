@@ -82,7 +82,7 @@ def read_cases(name: str, root: Path) -> list[Case]:
 
 
 def _walk(root: Path, dataset: EvalDataset, budget: int) -> Iterator[Path]:
-    """Scenes in breadth-first order; what lies inside a scene is none."""
+    """Scene folders in breadth-first order; folders inside a scene are skipped."""
     level = [root]
     for depth in range(MAX_DEPTH + 1):
         below: list[Path] = []

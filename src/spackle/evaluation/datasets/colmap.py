@@ -1,4 +1,4 @@
-"""COLMAP models, text and binary: cameras, the points that each photo sees, and where they are."""
+"""Read COLMAP models, text and binary: cameras, points, and which points each photo sees."""
 
 from __future__ import annotations
 
@@ -173,7 +173,7 @@ def _cameras_txt(path: Path) -> Iterator[tuple[Any, ...]]:
 
 
 def _images_txt(path: Path) -> Iterator[tuple[list[float], int, str, Array]]:
-    """Two lines a photo; the second is empty where nothing was found in it."""
+    """Two lines a photo; the second is empty if no point was found in it."""
     lines = _lines(path)
     for line in lines:
         if not line.strip():

@@ -33,7 +33,7 @@ MIDDLE_DEPTH_M = 0.8  # objects are held before the phone; so second views are 4
 
 
 def _camera(K: Tensor, pose: Tensor, width: int, height: int, where: str) -> Camera:
-    """A float64 camera by its pose in the world; InputError where one of them cannot be."""
+    """A float64 camera with this pose in the world; InputError for an impossible lens or pose."""
     camera = checked_camera(K, pose, width, height, where, dtype=torch.float64, tolerance=POSE_TOLERANCE)
     return dataclasses.replace(camera, world_to_camera=torch.linalg.inv(pose))
 
@@ -207,7 +207,7 @@ def category_and_scene(folder: Path) -> str:
 
 
 def _with_depth(case: Case) -> Case:
-    """With the depth map of the same number."""
+    """The photos with the depth map of the same number."""
     at = case.photo.parent.parent / "depth" / case.photo.name
     if not at.is_file():
         raise InputError(f"{at}: no such depth map, but {case.photo} is there: unpack the scene again")

@@ -35,7 +35,9 @@ MOTORCYCLE_DOFFS, MOTORCYCLE_BASELINE = 31.086, 0.193001
 def _pair(
     name: str, left: Path, right: Path, lens: Calibration, size: tuple[int, int], depth: Callable[[], DepthMap]
 ) -> Case:
-    """The left photo, with the right one as its second view; `lens` counts from the first pixel's corner."""
+    """A case of the left photo, with the right one as its second view; `lens` counts pixels from the first one's
+    corner.
+    """
     for photo in (left, right):
         if not photo.exists():
             check_file(photo, "photo")  # raises; a photo that cannot be read is named in its turn
@@ -44,7 +46,7 @@ def _pair(
 
 
 def _cameras(lens: Calibration, size: tuple[int, int]) -> tuple[Camera, Camera]:
-    """Of the left and of the right photo, in the left one's frame."""
+    """The cameras of the left and the right photo, in the left one's frame."""
     K, pose = lens.K, torch.eye(4)
     K[0, 2] += lens.doffs_px
     pose[0, 3] = -lens.baseline_m
