@@ -178,6 +178,7 @@ class Scene:
         loop: int | None = None,
         overscan: float = OVERSCAN,
         format: str | None = None,
+        renderer: Renderer | None = None,
     ) -> None:
         """Write a video of a camera path, by default of 4 seconds; `loop` as in `spackle.formats.VideoWriter`.
 
@@ -189,12 +190,12 @@ class Scene:
             check_video(target, fps, loop)
             count = max(1, round(SECONDS * fps)) if frames is None else frames
             cameras = scene_path(self.base, self.camera, trajectory, self._reach(disparity), count, looped=True)
-            views = self.frames(camera.zoomed(1 + overscan) for camera in cameras)
+            views = self.frames((camera.zoomed(1 + overscan) for camera in cameras), renderer)
             save_video((view.rgb for view in views), target, fps, loop)
             return
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / f"video.{format or 'mp4'}"
-            self.save_video(path, trajectory, disparity, frames, fps, loop, overscan)
+            self.save_video(path, trajectory, disparity, frames, fps, loop, overscan, renderer=renderer)
             write_bytes(path.read_bytes(), target)
 
 

@@ -38,6 +38,7 @@ def clip_options(predict: PredictOptions) -> Options:
     unfit: list[tuple[str, object, bool, str]] = [  # option, value, whether it was given, why it is not for a clip
         ("cameras", path.cameras, path.cameras is not None, follows),
         ("path", path.path, path.path is not None, follows),
+        ("seconds", path.seconds, path.seconds is not None, "its video lasts as long; --frames N takes its first N"),
         ("mode", fill.mode, fill.mode != "scene", "each of its frames is one view"),
         ("fill", fill.fill, fill.fill in ("exemplar", "lama"), "its texture would flicker"),
         ("depth-out", predict.depth_out, predict.depth_out is not None, "its video is all that is written"),

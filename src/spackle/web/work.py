@@ -18,10 +18,9 @@ from rich.console import Console
 from spackle.bases.depth_map import DepthKind
 from spackle.bases.lite import LiteBase
 from spackle.bases.settings import AUTO, ROUGH, BaseSettings
-from spackle.camera_path import MAX_DISPARITY, OVERSCAN, TRAJECTORIES, TrajectoryKind
+from spackle.camera_path import MAX_DISPARITY, TRAJECTORIES, TrajectoryKind
 from spackle.errors import InputError
 from spackle.files import write_whole
-from spackle.formats import save_video
 from spackle.formats.html import as_json, single_html
 from spackle.formats.scene_files import scene_kind
 from spackle.image import PHOTO_SUFFIXES, read_image
@@ -131,8 +130,7 @@ class SceneWork:
             raise InputError(f"{job.name}: has no report: it was a scene already")
         if target.suffix == ".mp4":
             kind = next((kind for kind in TRAJECTORIES if kind == target.stem), options.trajectory)
-            cameras = (camera.zoomed(1 + OVERSCAN) for camera in scene.path(kind, frames=options.frames))
-            save_video((view.rgb for view in scene.frames(cameras, get_renderer(self.base.device))), target)
+            scene.save_video(target, kind, frames=options.frames, renderer=get_renderer(self.base.device))
         elif target.suffix == ".html":
             note = json.loads((job.results / PAGE).read_bytes())["note"]
             write_whole(target, single_html(scene.page(job.name, note)))
