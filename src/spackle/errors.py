@@ -80,7 +80,7 @@ def renamed(**names: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
 
 @contextlib.contextmanager
 def short_messages() -> Iterator[None]:
-    """Shorten messages of more than 300 characters, which can quote values of a program, by leaving out their middle."""
+    """Leave the middle out of messages of more than 300 characters, which can quote values of a program."""
     try:
         yield
     except InputError as error:

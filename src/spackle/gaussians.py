@@ -111,8 +111,7 @@ def quat_to_matrix(quats: Tensor) -> Tensor:
 def quat_from_matrix(rotation: Tensor) -> Tensor:
     """Unit quaternions [..., 4] (wxyz, w ≥ 0) of rotation matrices [..., 3, 3].
 
-    Each of the four components could be the one to divide by; the largest is taken, so that no
-    rotation is badly conditioned.
+    It divides by the largest of the four components, so that every rotation is well conditioned.
     """
     (m00, m01, m02), (m10, m11, m12), (m20, m21, m22) = (row.unbind(-1) for row in rotation.unbind(-2))
     w = torch.stack([1 + m00 + m11 + m22, m21 - m12, m02 - m20, m10 - m01], -1)

@@ -1,4 +1,4 @@
-"""Photos: any file that a person calls one, turned upright, in sRGB, with its focal length."""
+"""Photos: read from files of many formats, upright, in sRGB, with the focal length."""
 
 from __future__ import annotations
 
@@ -213,7 +213,7 @@ def resize_photo(photo: Photo, max_side: int = MAX_SIDE) -> Photo:
 def pad_edge(rgb: Tensor) -> Tensor:
     """A photo [H, W, 3] whose outermost pixels, `EDGE` of its long side, take the colour of the pixel just inside.
 
-    The last lines of a photo are often none of the picture: a scan's edge, or what resizing mixed in from outside. In a
+    The outermost lines often do not belong to the picture: a scan's edge, or what resizing mixed in from outside. In a
     view from the side they show as a line, and as streaks where the fill extends them.
     """
     height, width = rgb.shape[:2]
@@ -260,7 +260,7 @@ def focal_from_exif(tags: dict[int, object], width: int, height: int) -> float |
 
 
 class _BoundedFile(io.BufferedReader):
-    """Reads no more than is left: a PNG's chunk that claims 4 GB would be allocated before it is found cut off."""
+    """A file that reads no more than it holds: else a PNG chunk that claims 4 GB would be allocated."""
 
     def __init__(self, raw: io.FileIO) -> None:
         super().__init__(raw)
@@ -297,9 +297,9 @@ def read_image(path: str | os.PathLike[str], read: Callable[[Image.Image], T]) -
 
 
 def check_pixels(width: int, height: int, size: int, path: str | os.PathLike[str]) -> None:
-    """The bound of every decoder, before it allocates: 100 megapixels, and in a small file 32.
+    """Refuse a picture before a decoder allocates it: above 100 megapixels, or above 32 in a small file.
 
-    A file of `size` bytes below 1 MB thus takes at most 1.5 GB of memory, whatever size it announces. InputError
+    So a file below 1 MB takes at most 1.5 GB of memory, whatever size it announces. InputError
     beyond that.
     """
     most = min(MAX_PIXELS, max(SMALL_PIXELS, PIXELS_A_BYTE * size))

@@ -1,4 +1,4 @@
-"""Weights from a stranger's file into a network: strict about names, shapes and numbers, and nothing in a file is run.
+"""Load weights from an untrusted file into a network: names, shapes and numbers are checked, and no code in it is run.
 
 A file is safetensors, or what `torch.save` or TorchScript wrote, whatever its name: a zip archive of tensors, perhaps
 code, and a pickle that says where in a tree of objects each tensor stands. The code is not looked at, and the pickle is
@@ -59,8 +59,8 @@ def load_strict(
         network: to be filled.
         tensors: of the file, see `read_tensors`.
         path, advice: for messages: the file, and what to do about a wrong one.
-        unused: what the file has to hold beside the network's tensors.
-        prepare: converts the filled network in place while its numbers still lie on the disk.
+        unused: names and shapes of further tensors that the file must hold.
+        prepare: converts the filled network in place, while its tensors are still mapped from the disk.
 
     Raises:
         InputError: tensors that are missing, unknown, of another shape, or not finite.
@@ -81,7 +81,7 @@ def load_strict(
 
 
 def channels_last(network: nn.Module) -> None:
-    """Lay out kernels as is fast on a processor."""
+    """Convert kernels to channels-last, which is fast on a processor."""
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs lack it
 
 
@@ -127,8 +127,8 @@ def _some(names: list[str]) -> str:
 def read_tensors(path: str | os.PathLike[str], advice: str) -> dict[str, Tensor]:
     """The tensors of a file by name; numbers are read from the disk when they are used.
 
-    What else a file holds is left out. In TorchScript and in nested dicts a name is the path to the tensor, joined by
-    dots. `advice` says in messages what to do about a wrong file.
+    Other content of the file is ignored. In TorchScript and in nested dicts a name is the path to the tensor, joined by
+    dots. `advice` ends messages about a wrong file: what to do.
 
     Raises:
         InputError: a missing or broken file, or one of another kind.
@@ -143,7 +143,7 @@ def read_tensors(path: str | os.PathLike[str], advice: str) -> dict[str, Tensor]
 def read_checkpoint(path: str | os.PathLike[str], name: str, advice: str) -> tuple[object, dict[str, Tensor]]:
     """A value in the dict that `torch.save` wrote, such as a network's settings, and all its tensors by their path.
 
-    The value is a stranger's: plain numbers, words, lists and dicts, or inert stand-ins. InputError as `read_tensors`.
+    The value is untrusted: numbers, strings, lists and dicts, or inert stand-ins. InputError as `read_tensors`.
     """
     with _reading_weights(path, advice):
         root = _read_archive(path)
@@ -153,7 +153,7 @@ def read_checkpoint(path: str | os.PathLike[str], name: str, advice: str) -> tup
 
 
 def read_note(path: str | os.PathLike[str], name: str) -> str | None:
-    """What the metadata of a file that can be read says under a name; None where it has none, or is no safetensors."""
+    """The value of a key in a safetensors file's metadata; None without it, or for another format."""
     with open(path, "rb") as file:
         if file.read(9)[8:] != b"{":
             return None
@@ -169,7 +169,7 @@ def _reading_weights(path: str | os.PathLike[str], advice: str) -> Iterator[None
 
 
 def _read(path: str | os.PathLike[str]) -> dict[str, Tensor]:
-    """By the first bytes of a file: people rename files."""
+    """Read by the format that the first bytes show, because files get renamed."""
     with open(path, "rb") as file:
         head = file.read(9)
     if head.startswith(b"PK\x03\x04"):
@@ -189,7 +189,7 @@ def _read(path: str | os.PathLike[str]) -> dict[str, Tensor]:
 
 
 def _is_plain(value: object) -> bool:
-    """Whether it is a dense tensor on the processor without attributes, which could hide its methods."""
+    """Whether a value is a dense tensor on the processor without attributes, which could replace its methods."""
     if type(value) not in (Tensor, nn.Parameter) or vars(value):
         return False
     assert isinstance(value, Tensor)
@@ -214,13 +214,13 @@ def _read_archive(path: str | os.PathLike[str]) -> object:
 
 
 class _StandIn:
-    """In place of an object of any class, or of what any function makes: keeps the fields that it is given."""
+    """Stands for an object of any class, or for any function's result, and keeps the fields that it is given."""
 
     kind = ""  # of a subclass: module and name of what it stands for
     fields: dict[object, object]
 
     def __new__(cls, *arguments: Any) -> Any:
-        """An empty one; in place of torch's functions that make tensors and parameters, the tensor."""
+        """An empty stand-in; for torch's functions that make tensors and parameters, the tensor."""
         if cls.kind == "torch._utils _rebuild_tensor_v2" and isinstance(arguments[0], Tensor):
             storage, offset, shape, stride = arguments[:4]
             return storage.as_strided(shape, stride, offset)  # refuses what lies outside of the storage
@@ -250,7 +250,7 @@ class _Unpickler(pickle._Unpickler):  # in Python: the one in C takes whatever m
         return type("_StandIn", (_StandIn,), {"kind": f"{module} {name}"})
 
     def persistent_load(self, pid: Any) -> Tensor | None:
-        """The numbers of a storage, in a row; None for those of a kind that no network here has."""
+        """The numbers of a storage as a flat tensor; None for a type that no network here has."""
         _, storage, key, _, count = pid
         record = self._archive.getinfo(f"{self._folder}{key}")
         if storage.kind not in STORAGES:

@@ -7,7 +7,7 @@ patch at q for a cell p adds up colours, the depth and the tone of its centre, a
     cost = mean |I(p + o) - I(q + o)|²  +  (0.15 dz / σz)²  +  2 |L(p) - L(q)|²  +  0.05 (|p - q| / size)²
 
 over the offsets o of a patch, with colours I, the logarithm z of inverse depth and the tone L, which is the caller's
-guess, blurred. The mean counts a cell of the hole the less the deeper it lies.
+guess, blurred. In the mean a cell of the hole counts less the deeper it lies.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def match_patches(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> Patches
 
 @dataclasses.dataclass(frozen=True)
 class _Level:
-    """The picture at one size, h × w cells."""
+    """One level of the pyramid, h × w cells."""
 
     rgb: Floats  # [h, w, 3]; in the hole the latest votes, written in place
     traits: Floats  # [h, w, 4] tone and depth, each in roots of the cost
@@ -89,7 +89,7 @@ class _Level:
 
 
 def _pyramid(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> list[_Level]:
-    """The finest level first. The hole starts as what is mirrored at its rim, where that is the same surface."""
+    """Build the pyramid, the finest level first; there holes start as mirror images of the same surface at their rims."""
     depth = inverse_depth.clamp_min(1e-9).log()[..., None]
     depth = depth / max(float(depth[~hole].std(correction=0)) if bool((~hole).any()) else 0.0, LEAST_SPREAD)
     rgb, tone, levels = guess.clone(memory_format=torch.contiguous_format), guess, list[_Level]()
@@ -112,7 +112,7 @@ def _pyramid(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> list[_Level]
 
 @kernel
 def _mirror(rgb: Any, hole: Any, depth: Any, near: Any) -> None:
-    """In place: what lies as far beyond the nearest known cell as a cell lies before it, if its depth is alike."""
+    """Fill each hole cell, in place, with its mirror image at the nearest known cell, if both depths are alike."""
     height, width = hole.shape
     for y in range(height):
         for x in range(width):
@@ -124,7 +124,7 @@ def _mirror(rgb: Any, hole: Any, depth: Any, near: Any) -> None:
 
 
 def _match(level: _Level, coarse: Matches | None, number: int) -> Matches | None:
-    """Search and vote in turn, the level's colours in place; None where there is no hole, or no patch for it."""
+    """Alternate search and vote, changing the level's colours in place; None without a hole, or a patch for it."""
     usable = ~greatest_around(torch.from_numpy(level.hole), RADIUS).numpy()
     usable[:RADIUS] = usable[-RADIUS:] = False
     usable[:, :RADIUS] = usable[:, -RADIUS:] = False
@@ -162,7 +162,7 @@ def _match(level: _Level, coarse: Matches | None, number: int) -> Matches | None
 
 @kernel
 def _begin(cells: Any, refine: bool, coarse_numbers: Any, coarse: Any, valid: Any, pool: Any, places: Any) -> None:
-    """Matches of a level: its parent's, twice as far; or any."""
+    """First matches of a level: those of the coarser one, doubled, or random ones."""
     rows, columns = coarse_numbers.shape
     height, width = valid.shape[1:]
     for n in range(len(cells)):
@@ -180,7 +180,7 @@ def _begin(cells: Any, refine: bool, coarse_numbers: Any, coarse: Any, valid: An
 
 @kernel
 def _hash(value: Any) -> Any:
-    """A uint32 that looks random."""
+    """A pseudorandom uint32 from a hash of the arguments."""
     value = np.uint32(value)
     value ^= value >> np.uint32(16)
     value = np.uint32(value * np.uint32(0x7FEB352D))
@@ -214,7 +214,7 @@ def _cost(
     padded: Any, weights: Any, own: Any, sources: Any, traits: Any, offset: Any,
     y: int, x: int, m: int, v: int, u: int, bound: Any,
 ) -> Any:  # fmt: skip
-    """Of the patch of source m around (v, u) for the cell (y, x); infinite where it exceeds the bound."""
+    """The cost of source m's patch at (v, u) for the cell (y, x); infinite if it exceeds the bound."""
     cost = np.float32(0)
     for c in range(own.shape[2]):
         apart = own[y, x, c] - traits[m, v, u, c]
@@ -231,7 +231,7 @@ def _score(
     start: int, stop: int, cells: Any, places: Any,
     padded: Any, weights: Any, own: Any, sources: Any, traits: Any, offset: Any, costs: Any,
 ) -> None:  # fmt: skip
-    """The costs of the matches start..stop, since the colours have changed."""
+    """Recompute the costs of the matches start..stop after the colours have changed."""
     whole = np.float32(1e30)
     for n in range(start, stop):
         y, x = cells[n]
@@ -244,7 +244,9 @@ def _search(
     start: int, stop: int, cells: Any, numbers: Any, before: Any, worth: Any, valid: Any, pool: Any, jump: int,
     seed: Any, padded: Any, weights: Any, own: Any, sources: Any, traits: Any, offset: Any, places: Any, costs: Any,
 ) -> None:  # fmt: skip
-    """Better matches for the cells start..stop: their neighbours', any, and some ever nearer to the best."""
+    """Improve the matches of the cells start..stop: try neighbours' matches, a random one, and ones ever nearer to the
+    best.
+    """
     mirrors, height, width = valid.shape
     for n in range(start, stop):
         y, x = cells[n]
@@ -289,7 +291,7 @@ def _search(
 def _vote(
     start: int, stop: int, cells: Any, numbers: Any, places: Any, costs: Any, mean: Any, sources: Any, rgb: Any
 ) -> None:
-    """Colours of the cells start..stop: the mean of what all patches over them say, the better ones counting more."""
+    """Colours of the cells start..stop: the mean over all patches that cover them, better matches counting more."""
     height, width = numbers.shape
     for n in range(start, stop):
         y, x = cells[n]

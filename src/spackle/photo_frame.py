@@ -1,6 +1,6 @@
 """The uniform frame around a picture: a scan's margin, letterbox bars, a white mount.
 
-A false find costs part of the picture, so a frame has opposite sides of one colour that end at straight edges.
+A false detection cuts off part of the picture, so only opposite sides of one colour with straight inner edges count.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ EDGE_PX = 6  # length of a blurred edge, on which frame and picture are mixed
 
 @dataclasses.dataclass(frozen=True)
 class PhotoFrame:
-    """The widths of a frame's sides in pixels; 0 where there is none."""
+    """The widths of a frame's sides in pixels; 0 for a side without one."""
 
     left: float
     top: float
@@ -41,7 +41,7 @@ class PhotoFrame:
         return PhotoFrame(self.left * across, self.top * down, self.right * across, self.bottom * down)
 
     def inside(self, picture: Tensor, width: int, height: int) -> Tensor:
-        """What a picture [H, W, ...] of a width×height photo shows inside the frame, to the nearest pixel."""
+        """The part of a picture [H, W, ...] of a width×height photo inside the frame, to the nearest pixel."""
         rows, columns = picture.shape[:2]
         left, right = (round(side * columns / width) for side in (self.left, self.right))
         top, bottom = (round(side * rows / height) for side in (self.top, self.bottom))

@@ -177,7 +177,7 @@ def shared_report(
 
 
 def _warn_of_rougher(done: CompletedPhoto, folder: Path, base: BaseSettings, reporter: Reporter) -> None:
-    """Warn before rougher results replace those of a network whose weights are damaged or gone."""
+    """Warn if rougher results would replace those of a network whose weights are now damaged or missing."""
     before, now = earlier_report(folder).get("base"), done.choice.base
     better = before.get("name") if isinstance(before, dict) else None
     if base.named == AUTO and better in AUTO_NETWORKS and now in AUTO_NETWORKS[AUTO_NETWORKS.index(better) + 1 :]:
@@ -189,7 +189,7 @@ def _warn_of_rougher(done: CompletedPhoto, folder: Path, base: BaseSettings, rep
 
 
 def earlier_report(folder: Path) -> dict[str, Any]:
-    """An earlier run's report; empty without a whole one."""
+    """An earlier run's report; empty if there is none, or it is damaged."""
     try:
         report = json.loads((folder / REPORT).read_text(encoding="utf-8"))
     except (OSError, ValueError):

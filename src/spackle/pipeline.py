@@ -1,6 +1,6 @@
 """The way from a photo to a completed scene: base, camera path, fill. Read `complete_photo` and `Pipeline.complete`.
 
-The command line, Python, the page and the demo go this way; ComfyUI takes its last stage, `complete`.
+The command line, Python, the page and the demo use it; ComfyUI uses its last stage, `complete`.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ Mode = Literal["scene", "view"]  # one set of aux Gaussians for all views, or on
 
 @dataclasses.dataclass(frozen=True)
 class FillOptions:
-    """What fills the holes."""
+    """Options of the fill."""
 
     residual: str | None = None  # a file of weights, "seeds", "none", or None for the shipped weights if there are any
     fill: Fill = "auto"
@@ -49,7 +49,7 @@ class FillOptions:
 
     @property
     def texture(self) -> Fill:
-        """Where the texture comes from, "auto" resolved; "none": holes stay open, also where `residual` is "none".
+        """The fill with "auto" resolved; "none", which leaves holes open, also if `residual` is "none".
 
         In view mode "auto" takes the exemplar: to inpaint each view would take seconds a view.
         """
@@ -59,12 +59,12 @@ class FillOptions:
 
     @property
     def weights(self) -> str:
-        """For reports: "shipped", a file, "seeds" or "none"."""
+        """The weights' name in reports: "shipped", a file, "seeds" or "none"."""
         return "none" if self.texture == "none" else self.residual or ("shipped" if SHIPPED.is_file() else "seeds")
 
     @property
     def file(self) -> Path | None:
-        """Where the weights lie; None without a network."""
+        """The file of the weights; None without a network."""
         named = {"shipped": SHIPPED, "seeds": None, "none": None}
         return named[self.weights] if self.weights in named else Path(self.weights)
 
@@ -75,7 +75,7 @@ class FillOptions:
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What a photo becomes: its base, the camera path that it is completed for, what fills the holes."""
+    """All options for a photo: its base, the camera path that it is completed for, the fill."""
 
     base: BaseSettings = dataclasses.field(default_factory=BaseSettings)
     path: PathOptions = dataclasses.field(default_factory=PathOptions)
@@ -83,7 +83,7 @@ class Options:
 
     @property
     def give_geometry(self) -> bool:
-        """Whether a depth map or cameras are given: they are of the whole photo, so nothing of it may be cut off."""
+        """Whether a depth map or cameras are given: these belong to the whole photo, so no frame may be cut off."""
         return self.base.depth is not None or self.path.cameras is not None
 
 
@@ -190,20 +190,22 @@ class Pipeline:
         return fill_views(context, cameras if fill.texture != "none" else (), fill.mode, exact, progress)
 
     def _disparity(self, prediction: BasePrediction) -> float | None:
-        """How far the camera goes; None where views or keyframes say it."""
+        """The path's disparity; None if views or keyframes are given."""
         given = self.given_views is not None or self.keyframes is not None
         return None if given else self.options.path.reach(prediction.disparity)
 
 
 def move_in_words(prediction: BasePrediction) -> str:
-    """How far the camera goes, as `choose_move` found it."""
+    """The camera's move, as `choose_move` found it, in words."""
     reach, usual, invented = prediction.disparity, prediction.notes["usual_disparity"], prediction.notes["uncovered"]
     of, more = (f" of {usual:g}", f"; `--disparity {usual:g}` for more") if reach != usual else ("", "")
     return f"moves {reach:g}{of}: {invented:.1%} of the widest view is invented{more}"
 
 
 def _with_farthest_view(done: CompletedPhoto) -> CompletedPhoto:
-    """In view mode: with the aux Gaussians of the measured view that is farthest from the photo's, for one file."""
+    """In view mode, take the aux Gaussians of the measured view farthest from the photo's eye, because a file holds one
+    set.
+    """
     views, by_view = done.views, done.scene.by_view
     assert by_view is not None
     eye = done.prediction.camera.position.double()
@@ -235,7 +237,7 @@ def complete(
         network: residual weights, by default those that come with Spackle; None: the seeds alone fill the holes.
         fill: see `open_texture`; "none" leaves the holes open.
         renderer: the CPU's where None.
-        precision: of the network.
+        precision: number type of the network.
         progress: called with views done and their number.
     """
     chosen = shipped_network() if network == "shipped" else network
@@ -265,7 +267,7 @@ def fill_views(
 
 
 def resolved(fill: Fill) -> Fill:
-    """What "auto" means: "lama" where its weights have been downloaded, else "exemplar"."""
+    """The fill that "auto" stands for: "lama" if its weights have been downloaded, else "exemplar"."""
     if fill != "auto":
         return fill
     with contextlib.suppress(InputError):  # a machine without a home folder
@@ -274,9 +276,9 @@ def resolved(fill: Fill) -> Fill:
 
 
 def open_texture(fill: Fill) -> Texture | None:
-    """What gives the fill its texture: "lama" paints the widest views, "exemplar" takes it from the view itself.
+    """The texture function of a fill: "lama" paints the widest views, "exemplar" takes patches of the view itself.
 
-    "auto" is one of both, see `resolved`. "network" and "none" give None. InputError for "lama" without its weights.
+    "auto" is one of these, see `resolved`. "network" and "none" give None. InputError for "lama" without its weights.
     """
     chosen = resolved(fill)
     return _lama() if chosen == "lama" else exemplar_texture if chosen == "exemplar" else None

@@ -1,4 +1,4 @@
-"""Progress that suits where it is read: bars on a terminal, lines in a log. And the end of a long job on request."""
+"""Progress of long work: bars on a terminal, lines in a log. Also the end of long work at Ctrl-C."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ Step = Callable[[int, int], None]  # (done, of how many)
 
 @contextlib.contextmanager
 def timed(stage: str, seconds: dict[str, float]) -> Iterator[None]:
-    """Add the block's time to `seconds[stage]`."""
+    """Add the block's duration to `seconds[stage]`."""
     start = time.perf_counter()
     try:
         yield
@@ -77,26 +77,26 @@ class Reporter:
         self.seconds: dict[str, float] = {}  # of each stage so far
 
     def restarted(self) -> Reporter:
-        """The same, with no stage timed yet: for the next photo."""
+        """A reporter for the next photo: the same, with no stage timed yet."""
         other = copy.copy(self)
         other.seconds = {}
         return other
 
     def result(self, values: Mapping[str, object]) -> None:
-        """What has come out, for scripts that asked for it."""
+        """Print a result as JSON, if scripts asked for it."""
         if self.as_json:
             print(json.dumps(values, allow_nan=False, default=str), flush=True)  # paths are given as text
 
     def log(self, line: str) -> None:
-        """One line for everybody."""
+        """Print a line."""
         self.console.print(escape(one_line(line)), soft_wrap=True)
 
     def warn(self, line: str) -> None:
-        """One line for everybody, about what could not be done as asked."""
+        """Print a warning: a line about something that could not be done as asked."""
         self.log(line)
 
     def detail(self, line: str) -> None:
-        """One line for those who asked for more."""
+        """Print a line if `verbose`."""
         if self.verbose:
             self.log(line)
 
@@ -162,7 +162,7 @@ class Reporter:
 
 
 class LogReporter(Reporter):
-    """Tells the logger "spackle", and draws progress on one line of the standard error if asked to."""
+    """Reports to the logger "spackle", and draws progress on one line of the standard error if asked to."""
 
     def __init__(self, progress: bool = False) -> None:
         super().__init__()
@@ -181,7 +181,7 @@ class LogReporter(Reporter):
 
 
 class Notes(Reporter):
-    """Keeps what is said, in a process for which another one speaks."""
+    """Collects messages in a worker, for the main process to print."""
 
     def __init__(self, verbose: bool = False) -> None:
         super().__init__(verbose, Console(file=io.StringIO(), force_terminal=False))
@@ -196,9 +196,9 @@ class Notes(Reporter):
 
 @contextlib.contextmanager
 def asked_to_stop(alone: bool) -> Iterator[Callable[[], bool]]:
-    """Whether Ctrl-C or SIGTERM came, which then ends the run between two steps, where nothing is half done.
+    """Yields a function that says whether Ctrl-C or SIGTERM came, so that a run can end between two steps.
 
-    A second Ctrl-C ends it at once; not so under torchrun, which passes on what the terminal has sent already.
+    A second Ctrl-C ends the run at once, except under torchrun, which forwards the terminal's first one again.
     """
     asked: list[int] = []  # no Event: its lock would hold up a second signal that comes while it is set, for ever
     if threading.current_thread() is not threading.main_thread():  # signals are not for this one

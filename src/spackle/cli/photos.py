@@ -241,7 +241,7 @@ class Predictor:
                 yield photo
 
     def predict(self, photo: NamedPhoto, reporter: Reporter) -> bool:
-        """Predict a photo; returns whether that succeeded, and logs why not. InputError if no photo can be predicted."""
+        """Predict a photo; returns whether it succeeded, and logs why not. InputError if no photo can be predicted."""
         folder = self.output / photo.name
         try:
             options = self.options

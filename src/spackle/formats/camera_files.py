@@ -1,4 +1,4 @@
-"""JSON files of cameras: which views to render, or where the camera is at which time."""
+"""JSON files of cameras: views to render, or keyframes of a path."""
 
 from __future__ import annotations
 
@@ -137,7 +137,9 @@ def _keyframe(entry: Mapping[str, Any], where: str) -> Keyframe:
 def _read_json(
     path: str | os.PathLike[str], kind: str, name: str, *required: str
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """The content of a file, and its list `name` of objects that have what is required; InputError for another file."""
+    """The content of a JSON file and its list `name`, whose objects have the required keys; InputError for another
+    file.
+    """
     if check_file(path, kind) > MAX_BYTES:
         raise InputError(f"{path}: too long for a {kind} (at most {MAX_BYTES >> 20} MiB): is it the right file?")
     with reading(path, "not JSON: {reason}", ValueError, RecursionError), open(path, encoding="utf-8-sig") as file:

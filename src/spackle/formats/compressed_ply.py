@@ -33,7 +33,7 @@ _VERTEX_NAMES = ["packed_position", "packed_rotation", "packed_scale", "packed_c
 def encode_compressed_ply(scene: SceneFile) -> bytes:
     """Gaussians, in their axes, as a compressed PLY; the camera and the base's number are comments, as `save_ply`'s.
 
-    The base's stay before the others; within both, neighbours in space become neighbours in the file.
+    The base's Gaussians stay first; within base and aux, neighbours in space become neighbours in the file.
 
     Raises:
         ValueError: where a Gaussian is not finite.
@@ -72,7 +72,7 @@ def morton_order(means: Floats) -> NDArray[np.int64]:
 
 
 def _spread(bits: NDArray[np.uint32]) -> NDArray[np.uint32]:
-    """The ten lowest bits with two zeros before each."""
+    """Spread the ten lowest bits, with two zeros before each."""
     for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
         bits = (bits | bits << np.uint32(shift)) & np.uint32(mask)
     return bits
@@ -97,7 +97,7 @@ def _packed(shares: Floats, widths: tuple[int, ...]) -> NDArray[np.uint32]:
 
 
 def decode_compressed_ply(chunks: NDArray[Any], rows: NDArray[Any]) -> Columns:
-    """Gaussians of the two tables of a file, in its order; ValueError where these do not fit together."""
+    """Gaussians of the two tables of a file, in its order; ValueError if the tables do not fit together."""
     if missing := set(_CHUNK_NAMES[:12]) - set(chunks.dtype.names or ()):
         raise ValueError(f"its chunks have no {min(missing)}")
     if len(chunks) * CHUNK < len(rows):
@@ -115,7 +115,7 @@ def decode_compressed_ply(chunks: NDArray[Any], rows: NDArray[Any]) -> Columns:
 
 
 def _unpacked(words: NDArray[np.uint32], widths: tuple[int, ...]) -> Floats:
-    """Shares [N, k] of which `_packed` gives these words, whatever their higher bits."""
+    """The inverse of `_packed`: shares [N, k] of words, whose higher bits are ignored."""
     shifts = np.array([sum(widths[k + 1 :]) for k in range(len(widths))], np.uint32)
     masks = np.array([2**width - 1 for width in widths])
     codes = words[:, None] >> shifts & masks.astype(np.uint32)

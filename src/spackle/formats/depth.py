@@ -21,7 +21,7 @@ Metres = NDArray[np.float32]
 
 
 def check_depth_name(path: str | os.PathLike[str]) -> Callable[[Metres], bytes]:
-    """What encodes a depth map for a file of that name; InputError for a name that stands for none."""
+    """The encoder of a depth map for a file name; InputError for an unknown suffix."""
     if (encode := ENCODERS.get(Path(path).suffix.lower())) is None:
         raise InputError(f"{path}: not a name for a depth map: end it with {', '.join(ENCODERS)}")
     return encode

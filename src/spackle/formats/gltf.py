@@ -27,8 +27,8 @@ NEAR_PLANE = 0.01  # of the photo's camera; required, though nothing of ours dep
 def encode_glb(scene: SceneFile) -> bytes:
     """Gaussians, in their order, as binary glTF: y up, z backward, scales linear, colours sRGB as harmonics.
 
-    COLOR_0, linear as glTF's always is, lets viewers without the extension show points. The photo's camera becomes
-    a glTF camera; what that cannot say of it, and the base's number, go into `extras`.
+    COLOR_0, linear by glTF's definition, lets viewers without the extension show points. The photo's camera becomes a
+    glTF camera; its remaining parameters and the base's count go into `extras`.
 
     Raises:
         InputError: no Gaussians, or more than 4 GiB of them.
@@ -51,7 +51,7 @@ def encode_glb(scene: SceneFile) -> bytes:
 
 
 def _attributes(columns: Columns) -> dict[str, NDArray[Any]]:
-    """What each Gaussian has, in the file's order; all are multiples of four bytes."""
+    """The attributes of Gaussians, in the file's order; each has a multiple of four bytes."""
     linear = srgb_to_linear(torch.from_numpy(columns.srgb)).numpy()
     rgba = np.concatenate([linear, columns.opacities[:, None]], axis=1)
     return {

@@ -1,4 +1,4 @@
-"""A scene as the page takes it: its description, its Gaussians in 20 bytes each, and the page as one file."""
+"""A scene for the page: its description, its Gaussians in 20 bytes each, and the page as one file."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ SCRIPT = '<script src="viewer.js" defer></script>'
 
 @dataclasses.dataclass(frozen=True)
 class PageScene:
-    """A scene as the page takes it."""
+    """A scene for the page: description and packed Gaussians."""
 
     description: dict[str, object]  # what becomes JSON
     files: dict[str, bytes]  # the layers, by the names that the description gives them
@@ -54,8 +54,8 @@ def page_scene(
         base: what the photo shows.
         aux: what completion added; may be empty.
         camera: the photo's, at the world's origin.
-        disparity: how far it was completed: up to there the eye goes.
-        note: what a person should know of it; the part before the semicolon stays in sight.
+        disparity: how far the scene was completed, which limits the page's camera.
+        note: a remark for the user; the part before the semicolon is always shown.
 
     Raises:
         InputError: where no Gaussian stands in front of the camera.
@@ -84,7 +84,9 @@ def page_scene(
 
 
 def _path(kind: TrajectoryKind, camera: Camera, depths: DepthRange) -> dict[str, list[list[float]]]:
-    """Eyes at disparity 0, and what a disparity of 1 adds to them. Nine digits are plenty, and keep the page small."""
+    """Eye positions at disparity 0, and the change for a disparity of 1. Nine digits are plenty, and keep the page
+    small.
+    """
     still, wide = (
         torch.stack([each.position for each in trajectory(kind, camera.to("cpu", torch.float64), far, depths, SAMPLES)])
         for far in (0.0, 1.0)
@@ -99,8 +101,8 @@ def encode_layer(gaussians: Gaussians) -> tuple[bytes, float, float]:
 
     Planes of N bytes each: x, y, z with three planes each from the lower byte to the upper one, of float32's upper 24
     bits; the logarithms of the three scales; the index of the quaternion's largest part (wxyz), which is made
-    positive, and the other three parts, ±127 for ±1/√2; red, green, blue in sRGB; opacity. Without its last 8 bits a
-    centre is wrong by 2⁻¹⁶ of its distance to the photo's eye, which is a hundredth of a pixel, near and far alike.
+    positive, and the other three parts, ±127 for ±1/√2; red, green, blue in sRGB; opacity. Dropping the last 8 bits
+    moves a centre by 2⁻¹⁶ of its distance to the photo's eye: a hundredth of a pixel.
 
     Returns:
         The bytes [BYTES, N]; the logarithm of the scale that byte 0 stands for; what one step adds to it.
@@ -134,7 +136,7 @@ def _bytes(values: Tensor) -> NDArray[np.uint8]:
 
 
 def as_json(value: object) -> bytes:
-    """JSON in plain ASCII that means nothing to a reader of HTML, whatever names there are in it."""
+    """JSON in ASCII that is safe inside HTML, whatever names it holds."""
     text = json.dumps(value, allow_nan=False)
     for character in "<>&":
         text = text.replace(character, f"\\u{ord(character):04x}")

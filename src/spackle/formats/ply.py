@@ -56,9 +56,9 @@ def save_ply(
     """Write a binary PLY that viewers of 3D Gaussian splatting read.
 
     One `vertex` element of float32: x y z, normals of zero, f_dc from the sRGB colour, opacity as
-    logit, scales as logarithm, rot as unit quaternion wxyz. Row i depends on Gaussian i alone. Comments, for `PlyFile`,
-    keep the photo's camera, which stands at the world's origin, how many of the first Gaussians are the base's, and the
-    disparity that the scene was completed for, see `spackle.camera_path.max_offset`.
+    logit, scales as logarithm, rot as unit quaternion wxyz. Each row depends on its Gaussian alone. Comments, for
+    `PlyFile`, keep the photo's camera, which stands at the world's origin, how many of the first Gaussians are the
+    base's, and the disparity that the scene was completed for, see `spackle.camera_path.max_offset`.
 
     Raises:
         InputError: nothing can be written at `path`.
@@ -216,7 +216,7 @@ class PlyFile:
         return numbers[0] if numbers else None
 
     def scene(self) -> SceneFile:
-        """All of it; InputError as above."""
+        """Read camera, counts, disparity and Gaussians; InputError if one of them is invalid."""
         rest = sum(name.startswith("f_rest_") for element in self.elements for name, _ in element.fields)
         known = self.camera(), self.base_count(), self.disparity()
         return SceneFile(Path(self.path), self.gaussians(), *known, harmonics=rest)
@@ -244,7 +244,7 @@ class PlyFile:
         self._ascii = order == "="
 
     def _place_tables(self) -> None:
-        """Find where each table starts, and refuse a file that is too short; nothing has been allocated yet."""
+        """Find where each table starts, and refuse a file that is too short, before anything is allocated."""
         start, end = 0, self._data - self._ascii  # the last line needs no line break
         for element in self.elements:
             if "list" in dict(element.fields).values():
@@ -258,7 +258,7 @@ class PlyFile:
                 raise InputError(f"{self.path}: cut off: {announced}, but the file ends after {self._size} bytes")
 
     def _numbers(self, comment: str, count: int, lowest: float = 0, highest: float = math.inf) -> list[float] | None:
-        """The finite numbers of a comment of ours; None without it."""
+        """The finite numbers of one of Spackle's comments; None without it."""
         if (words := self.comments.get(comment)) is None:
             return None
         what = comment.removeprefix("spackle_")

@@ -39,7 +39,7 @@ class SceneFile:
 
     @property
     def untilted_camera(self) -> Camera | None:
-        """The camera where it stands at the world's origin, which is all that a comment of a PLY can say."""
+        """The camera if it stands at the world's origin, else None: a PLY's comment stores no pose."""
         return self.camera if self.camera is not None and at_origin(self.camera) else None
 
 
@@ -110,8 +110,8 @@ OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # of a quaterni
 def smallest_three(quats: Floats) -> tuple[NDArray[np.int64], Floats]:
     """Which component [N] of unit quaternions [N, 4] is largest, and the others [N, 3], in their order.
 
-    Of a quaternion and its opposite, which are one rotation, this takes the one whose largest component is positive:
-    the others, of at most √½ each, tell that component.
+    A quaternion and its opposite are one rotation; the one with a positive largest component is taken, which follows
+    from the other three, each of at most √½.
     """
     largest = np.abs(quats).argmax(axis=1)
     sign = np.where(np.take_along_axis(quats, largest[:, None], axis=1) < 0, np.float32(-1), np.float32(1))
@@ -119,7 +119,7 @@ def smallest_three(quats: Floats) -> tuple[NDArray[np.int64], Floats]:
 
 
 def from_smallest_three(largest: NDArray[Any], others: Floats) -> Floats:
-    """Unit quaternions [N, 4] of which `smallest_three` gives these."""
+    """The inverse of `smallest_three`: unit quaternions [N, 4]."""
     quats = np.empty((len(others), 4), np.float32)
     np.put_along_axis(quats, OTHERS[largest], others, axis=1)
     rest = np.sqrt(np.maximum(0, 1 - np.square(others).sum(axis=1)))
@@ -134,12 +134,12 @@ def as_shares(components: Floats) -> Floats:
 
 
 def from_shares(shares: Floats) -> Floats:
-    """Components of which `as_shares` gives these."""
+    """The inverse of `as_shares`."""
     return (shares - np.float32(0.5)) * np.float32(2**0.5)
 
 
 def fractions(codes: NDArray[Any], largest: int) -> Floats:
-    """Whole numbers up to `largest` as parts of it."""
+    """Integers from 0 to `largest` as floats in 0..1."""
     return codes.astype(np.float32) / np.float32(largest)
 
 
@@ -193,7 +193,7 @@ WRITTEN_ONLY = (".glb", ".html")
 
 
 def scene_kind(path: Path) -> str | None:
-    """The suffix of the format that a file begins as or, for other content, is named as; None for no scene."""
+    """The suffix of a file's format, by its first bytes, else by its name; None if it is no scene."""
     check_file(path, "scene")
     with open(path, "rb") as file:
         start = file.read(4)
@@ -217,13 +217,13 @@ def load_scene(path: Path) -> SceneFile:
 
 
 def function_named(name: str) -> Any:
-    """The function that a table names, of a module that is imported now."""
+    """Import the function that a table names."""
     module, _, function = name.partition(":")
     return getattr(import_module(module), function)
 
 
 def encoder_of(path: Path, more: Mapping[str, Encoder] | None = None) -> Encoder:
-    """What encodes a file of this name, of SCENE_ENCODERS and `more`; InputError for a name of no format."""
+    """The encoder for a file name, from SCENE_ENCODERS and `more`; InputError for an unknown suffix."""
     encoders: dict[str, str | Encoder] = {**SCENE_ENCODERS, **(more or {})}
     for suffix, encoder in encoders.items():
         if path.name.lower().endswith(suffix):

@@ -81,10 +81,10 @@ def encode_sog(scene: SceneFile) -> bytes:
 
 
 def codebook(values: Floats) -> tuple[Floats, NDArray[np.uint8]]:
-    """256 numbers [256] that stand for values [N, 3] with little square error, and which one each value takes.
+    """A codebook [256] for values [N, 3] with small squared error, and each value's code.
 
-    Codes lie as close as the cube root of how many values are near, the best there is for many codes; a quarter of
-    them is spread evenly, for what is rare. Where values differ in 256 places at most, each place has its own.
+    The density of codes follows the cube root of the values' density, which is optimal for many codes; a quarter of the
+    codes is spread evenly, for rare values. At most 256 different values get a code each.
     """
     low, high = float(values.min()), float(values.max())
     bins = np.minimum((values - low) * (BINS / max(high - low, 1e-30)), BINS - 1).astype(np.int32)
@@ -137,7 +137,7 @@ def decode_sog(data: bytes) -> Columns:
         count = int(meta["count"])
 
         def pixels(name: str) -> NDArray[np.uint8]:
-            """[N, 4], without what fills up the last row."""
+            """Pixels [N, 4] of a picture, without the padding of the last row."""
             with Image.open(io.BytesIO(member(name)), formats=["WEBP"]) as image:
                 if max(image.size) > LARGEST_SIDE or not 0 < count <= image.width * image.height:
                     raise ValueError(f"{name} has {image.width}×{image.height} pixels for {count:,} Gaussians")

@@ -58,8 +58,8 @@ _DETAILS += [_Detail(1 / 2, 5, 2, 4), _Detail(1 / 2, 4, 2, 4), _Detail(1 / 2, 4,
 def encode_spz(scene: SceneFile) -> bytes:
     """Gaussians, in their order, as an SPZ file of version 3: y up, z backward, as the format wants it.
 
-    Positions lie on a grid fine enough for what is near. What is then too far for it is drawn nearer and smaller
-    towards the origin, which from there looks the same; see `spz_grid`.
+    Positions are rounded to a grid that suits near Gaussians. Gaussians too far for the grid are scaled towards the
+    origin, from where they look the same; see `spz_grid`.
 
     Raises:
         InputError: more Gaussians than readers take.
@@ -81,7 +81,7 @@ def encode_spz(scene: SceneFile) -> bytes:
 
 
 def spz_grid(gaussians: Gaussians) -> tuple[int, int]:
-    """Fractional bits of an SPZ file's positions, and how many Gaussians lie beyond what these can say."""
+    """Fractional bits of an SPZ file's positions, and the number of Gaussians beyond the grid's range."""
     means = gaussians.means.detach().to("cpu").double().numpy()
     if not len(means):
         return 12, 0
@@ -94,7 +94,7 @@ def spz_grid(gaussians: Gaussians) -> tuple[int, int]:
 
 
 def _within(columns: Columns, bits: int) -> Columns:
-    """Far Gaussians drawn towards the origin, position and size alike, until the grid holds them."""
+    """Gaussians beyond the grid's range, scaled about the origin, in position and size, until they fit."""
     reach = np.abs(columns.means).max(axis=1, initial=0).astype(np.float64)
     factor = np.minimum(1, LARGEST / 2.0**bits / np.maximum(reach, 1e-30))[:, None]
     means, log_scales = columns.means * factor, columns.log_scales + np.log(factor)
@@ -102,7 +102,9 @@ def _within(columns: Columns, bits: int) -> Columns:
 
 
 def _finest(columns: Columns, bits: int) -> int:
-    """Index of the finest detail with which samples of the scene, deflated, keep to the limit; else of the coarsest."""
+    """Index of the finest rounding with which deflated samples of the scene stay within the size limit, else the
+    coarsest.
+    """
     count = len(columns.means)
     starts = np.unique(np.linspace(0, max(0, count - SAMPLE), SAMPLES).astype(np.int64))
     rows = np.concatenate([np.arange(start, min(start + SAMPLE, count)) for start in starts])
@@ -143,7 +145,9 @@ def _positions(columns: Columns, bits: int, share: float) -> NDArray[np.uint8]:
 
 
 def _rotations(quats: Floats, bits: int) -> NDArray[np.uint32]:
-    """[N] words of unit quaternions wxyz: which of xyzw is largest; sign and `bits` bits, of 9, of the others."""
+    """Unit quaternions wxyz as words [N]: the index of the largest of xyzw; sign and 9 bits of the others, rounded to
+    `bits`.
+    """
     largest, others = smallest_three(quats[:, [1, 2, 3, 0]])
     step = 2 ** (9 - bits)
     sizes = np.minimum(511, np.round(np.abs(others) * np.float32(511 * 2**0.5 / step)) * step).astype("<u4")

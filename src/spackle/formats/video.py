@@ -32,7 +32,7 @@ BT709, LIMITED_RANGE = 1, 1  # FFmpeg's numbers, the same for primaries, transfe
 
 @dataclasses.dataclass(frozen=True)
 class VideoFormat:
-    """What a kind of file can do, and how FFmpeg writes it."""
+    """The abilities of a video format, and its settings for FFmpeg."""
 
     codec: str
     container: str
@@ -65,10 +65,10 @@ FORMATS = {".mp4": H264, ".m4v": H264, ".mov": H264, ".webm": VP9, ".gif": GIF, 
 
 
 def check_video(path: str | os.PathLike[str], fps: float, loop: int | None = None) -> VideoFormat:
-    """The format that a name stands for.
+    """Check a video's name, rate and loop count; returns its format.
 
     Raises:
-        InputError: no video has such a name, or the format does not know such a rate or count.
+        InputError: an unknown suffix, or a rate or loop count that the format does not allow.
     """
     kind = FORMATS.get(Path(path).suffix.lower())
     if kind is None:
@@ -139,7 +139,7 @@ class VideoWriter:
         self.frames += 1
 
     def _wait(self) -> None:
-        """Until the last frame is encoded; raises what that did."""
+        """Wait until the last frame is encoded; raises the encoder's error."""
         if self._encoding is not None:
             self._encoding.result()
 
@@ -178,7 +178,7 @@ def save_video(
 
 
 class StreamEncoder:
-    """Frames to a video stream, which plays `plays` times: as the file says, or as often as it holds the packets."""
+    """Encodes frames into a video stream that plays `plays` times, by a number in the file or by repeated packets."""
 
     def __init__(self, kind: VideoFormat, path: Path, width: int, height: int, rate: Fraction, plays: int) -> None:
         self._kind, self._rate, self._count = kind, rate, 0
@@ -215,7 +215,7 @@ class StreamEncoder:
         self._count += 1
 
     def finish(self) -> None:
-        """What the encoder still holds, and the repetitions: the same packets again, later."""
+        """Write the packets that the encoder still holds, and repeat all packets at later times."""
         self._write(self._stream.encode(None))
         for repetition in range(1, self._plays):
             for packet in self._packets:
@@ -225,7 +225,7 @@ class StreamEncoder:
         self.close()
 
     def close(self) -> None:
-        """Complete the file, or let go of it; may be called twice."""
+        """Close the file; may be called twice."""
         self._container.close()
 
     def _write(self, packets: list[av.Packet[VideoStream]]) -> None:
@@ -235,6 +235,6 @@ class StreamEncoder:
                 self._packets.append(packet)
 
     def _ticks(self, packet: av.Packet[VideoStream], plays: int) -> int:
-        """How long so many showings take, in the packet's unit of time."""
+        """Duration of `plays` repetitions, in the packet's unit of time."""
         assert packet.time_base is not None
         return round(plays * self._count / self._rate / packet.time_base)

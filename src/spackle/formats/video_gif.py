@@ -19,7 +19,7 @@ DITHER = "sierra2_4a"  # error diffusion without the grid that an ordered patter
 
 
 class GifEncoder:
-    """Frames to a GIF. They wait, packed, in an unnamed file beside the result until all colours are known."""
+    """Frames to a GIF. They are stored, compressed, in a temporary file until all colours are known."""
 
     def __init__(self, path: Path, width: int, height: int, rate: Fraction, plays: int) -> None:
         self._path, self._size, self._rate, self._plays = path, (width, height), rate, plays
@@ -47,7 +47,7 @@ class GifEncoder:
         self.close()
 
     def close(self) -> None:
-        """Let the waiting frames go."""
+        """Discard the stored frames."""
         self._waiting.close()
 
     def _dithered(self) -> Iterator[av.VideoFrame]:
@@ -87,7 +87,7 @@ class Filter:
         self._inputs[source].push(None)
 
     def ready(self) -> Iterator[av.VideoFrame]:
-        """The frames that it can already give."""
+        """The frames that the filter has ready."""
         with contextlib.suppress(av.BlockingIOError, av.EOFError):
             while True:
                 frame = self._sink.pull()
@@ -95,7 +95,7 @@ class Filter:
                 yield frame
 
     def ended(self) -> Iterator[av.VideoFrame]:
-        """The rest, once the first input has ended."""
+        """The remaining frames, after the first input has ended."""
         self.end(0)
         return self.ready()
 

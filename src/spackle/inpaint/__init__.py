@@ -1,4 +1,4 @@
-"""All that fills the holes of pictures: one protocol, and the table where a name becomes an inpainter.
+"""Inpainters, which fill the holes of pictures: their protocol, and the table of their names.
 
 To add an inpainter, write a class in a file of its own (see `Inpainter`), add a line to `INPAINTERS`, and test it.
 """
@@ -28,14 +28,14 @@ INPAINTERS = {  # file and class, imported when the inpainter is asked for
 
 @dataclasses.dataclass(frozen=True)
 class InpainterOptions:
-    """What inpainters are made of; each takes what it needs."""
+    """Options of inpainters, of which each takes those that it needs."""
 
     weights: Path | None = None  # a file or a folder; where None, those that `spackle weights get` brought
     side: int | None = None  # pixels of the long side at which a network works; its own default where None
     device: str | None = None  # "cpu" or "cuda"; where None, CUDA if there is any
 
     def side_or(self, default: int) -> int:
-        """The side, or a network's default; InputError for one that cannot be."""
+        """The side, or a network's default; InputError for a side that is too small or too large."""
         if self.side is not None and not MIN_SIDE <= self.side <= MAX_SIDE:
             raise InputError(f"--inpainter-side must be between {MIN_SIDE} and {MAX_SIDE}, got {self.side}")
         return default if self.side is None else self.side

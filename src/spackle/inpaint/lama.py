@@ -44,10 +44,10 @@ class LamaInpainter:
     notice: ClassVar[str] = ""
 
     def __init__(self, options: InpainterOptions) -> None:
-        """Load the weights. What the network draws is enlarged from `options.side` to the crop's size.
+        """Load the weights. The network works at `options.side`; its picture is then enlarged to the crop's size.
 
         Raises:
-            InputError: a side that cannot be, no such device, or weights that are missing, damaged or others.
+            InputError: an invalid side or device, or weights that are missing, damaged or another network's.
         """
         self._side = options.side_or(SIDE)
         self._device = pick_device(options.device)
@@ -60,7 +60,7 @@ class LamaInpainter:
 
     @torch.no_grad()
     def paint(self, rgb: Tensor, hole: Tensor, inverse_depth: Tensor) -> Tensor:
-        """The network's colours in the holes, of each view by itself; depth says nothing to it.
+        """The network's colours in the holes, each view by itself; depth is ignored.
 
         Raises:
             InputError: too little memory, or no finite colours.
@@ -97,7 +97,7 @@ class LamaInpainter:
 def groups_of(hole: Tensor) -> list[tuple[Crop, Crop]]:
     """Rectangles around connected holes [H, W], and what the network sees of each.
 
-    Those that touch are one, and those that are cheaper to look at together.
+    Rectangles are merged if they touch, or if one crop for both has fewer pixels.
     """
 
     def seen(group: Crop) -> Crop:
@@ -129,8 +129,8 @@ def padded(x: Tensor) -> Tensor:
 def load_network(path: Path) -> LamaNetwork:
     """The network with the weights of a TorchScript file, which is not run, of `torch.save` or of safetensors.
 
-    Weights of another width or depth are LaMa's too. Half precision is widened. All names may begin with the path to
-    a generator; other networks' tensors beside it, such as a discriminator's, are ignored.
+    Weights of another width or depth are accepted. Half precision is widened. Names may begin with the path to the
+    generator; tensors of other networks, such as a discriminator, are ignored.
 
     Raises:
         InputError: a missing or broken file, or one of another network.
@@ -210,8 +210,8 @@ def _last_stage(blocks: int) -> int:
 class LamaNetwork(nn.Module):
     """Colours for the holes of a picture whose sides are multiples of 8, at least 16; for inference alone.
 
-    It runs in channels-last memory, its batch norms folded into the convolutions before them. A 3×3 convolution looks
-    at its input reflected at the sides, a layer's local features (a quarter) and distant ones together.
+    It runs in channels-last memory, its batch norms folded into the convolutions before them. Convolutions pad by
+    reflection; a layer has local features (a quarter) and global ones.
     """
 
     def __init__(self, tensors: Tensors) -> None:
@@ -254,7 +254,9 @@ class LamaNetwork(nn.Module):
 
 
 class FourierLayer(nn.Module):
-    """A fast Fourier convolution: what is near from all features, what is distant from near ones and the spectrum."""
+    """A fast Fourier convolution: local outputs come from all features, global ones from local features and the
+    spectrum.
+    """
 
     def __init__(self, tensors: Tensors, name: str) -> None:
         """Take the tensors whose names begin with `name`."""
@@ -281,7 +283,7 @@ class FourierLayer(nn.Module):
     def _spectral(self, x: Tensor) -> Tensor:
         """[B, h, w, D] to the same shape: a linear map of the whole picture's spectrum, rectified, between two others.
 
-        The spectrum's channels, each a real and an imaginary part, lie in memory as the published tensors count them.
+        Real and imaginary parts of the spectrum alternate in memory, in the channel order of the published tensors.
         """
         x = self.narrow(x).relu_()
         parts = torch.view_as_real(torch.fft.rfft2(x, dim=(1, 2), norm="ortho").contiguous())
@@ -291,14 +293,14 @@ class FourierLayer(nn.Module):
 
 
 def _affine(tensors: Tensors, norm: str) -> tuple[Tensor, Tensor]:
-    """A batch norm as factor and summand of each channel."""
+    """A batch norm as scale and offset of each channel."""
     mean, var, weight, bias = (tensors[f"{norm}.{key}"] for key in ("running_mean", "running_var", "weight", "bias"))
     scale = weight / torch.sqrt(var + EPSILON)
     return scale, bias - mean * scale
 
 
 def _folded(tensors: Tensors, conv: str, norm: str, *, transposed: bool = False) -> tuple[Tensor, Tensor]:
-    """Weight and bias of a convolution with the batch norm behind it."""
+    """Weight and bias of a convolution with its batch norm folded in."""
     scale, shift = _affine(tensors, norm)
     shape = (1, -1, 1, 1) if transposed else (-1, 1, 1, 1)
     bias = tensors.get(f"{conv}.bias")

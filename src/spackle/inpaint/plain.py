@@ -18,7 +18,7 @@ RADIUS = 5.0  # pixels around a hole's pixel that colour it
 
 
 class PlainInpainter:
-    """What inpainters without a network have in common."""
+    """Base class of inpainters without a network."""
 
     network: ClassVar[bool] = False
     video: ClassVar[bool] = False
@@ -51,10 +51,10 @@ def _painted(rgb: Tensor, hole: Tensor, inverse_depth: Tensor) -> Tensor:
 
 
 class OpenCV:
-    """The package: inpainting of flat pictures, and optical flow."""
+    """OpenCV's inpainting of pictures and optical flow."""
 
     def __init__(self, wanted_by: str) -> None:
-        """Find it; InputError where it is not installed, which says what needs it."""
+        """Import OpenCV; InputError, naming `wanted_by`, if it is not installed."""
         try:
             import cv2
         except ImportError as error:

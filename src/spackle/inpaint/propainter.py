@@ -1,7 +1,7 @@
 """ProPainter, the paper's inpainter (optional: pip install 'spackle-nvs[propainter]').
 
-It follows the flow of a video into the holes, and draws what no frame shows. Its networks are pytorchcv's, which
-fetches weights by itself for networks that it builds; so it is handed networks that have theirs.
+It propagates pixels along the optical flow into holes, and generates what no frame shows. Its networks are pytorchcv's,
+which would download weights by itself; so it is given networks with weights.
 """
 
 from __future__ import annotations
@@ -43,10 +43,11 @@ class PropainterInpainter:
     )
 
     def __init__(self, options: InpainterOptions) -> None:
-        """Find the package, and load the weights. What it draws is enlarged from `options.side` to the views' size.
+        """Find the package, and load the weights. The network works at `options.side`; its pictures are then enlarged
+        to the views' size.
 
         Raises:
-            InputError: a side that cannot be, no package, or weights that are missing, damaged or others.
+            InputError: an invalid side, a missing package, or weights that are missing, damaged or another network's.
         """
         self._side = options.side_or(SIDE)
         version = _package_version()
@@ -95,12 +96,12 @@ class PropainterInpainter:
 
 
 def padded(side: int) -> int:
-    """Pixels of a side that the networks can take."""
+    """Round a side in pixels to one that the networks take."""
     return max(MIN_SIDE, -(-side // MULTIPLE) * MULTIPLE)
 
 
 def dilated(holes: Tensor) -> Tensor:
-    """Holes [V, 1, h, w] with all that is at most DILATION steps away, up, down, left or right."""
+    """Holes [V, 1, h, w], dilated by DILATION steps to the four neighbours."""
     for _ in range(DILATION):
         holes = torch.maximum(max_pool2d(holes, (3, 1), 1, (1, 0)), max_pool2d(holes, (1, 3), 1, (0, 1)))
     return holes
