@@ -39,6 +39,7 @@ MODELS: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
     for name, entry in json.loads((Path(__file__).parents[1] / "data" / "depth_models.json").read_text()).items()
 }  # tiny ones of the published kinds: transformers' class, its settings, and those of its image processor
 RELATIVE = ("relative", "dpt")
+LIFT = "spackle.bases.lift.lift"
 Folders = dict[str, Path]  # of models, by their names in `MODELS`
 
 
@@ -79,7 +80,9 @@ def image_of(photo: Photo) -> Image.Image:
 def maps(monkeypatch: pytest.MonkeyPatch) -> list[DepthMap]:
     """The depth maps that are handed over to be lifted."""
     seen: list[DepthMap] = []
-    monkeypatch.setattr(hf, "lift", lambda rgb, depth, camera: (seen.append(depth), lift(rgb, depth, camera))[1])
+    monkeypatch.setattr(
+        "spackle.bases.lift.lift", lambda rgb, depth, camera: (seen.append(depth), lift(rgb, depth, camera))[1]
+    )
     return seen
 
 
@@ -87,7 +90,9 @@ def maps(monkeypatch: pytest.MonkeyPatch) -> list[DepthMap]:
 def test_each_kind_of_model_gives_gaussians_of_the_photo(
     name: str, folders: Folders, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(hf, "lift", functools.partial(lift, levels=0))  # each pixel has a Gaussian of its own
+    monkeypatch.setattr(
+        "spackle.bases.lift.lift", functools.partial(lift, levels=0)
+    )  # each pixel has a Gaussian of its own
     photo, base = photo_of(), load(folders[name])
     prediction = base.predict(photo)
     assert base.name == f"hf:{folders[name]}"

@@ -24,9 +24,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from spackle.bases.lift import lift
-from spackle.bases.moge import base as moge
-from spackle.bases.moge.base import SKY, MogeBase, MogeView, to_view
-from spackle.bases.moge.network import MogeOutput, load_network
+from spackle.bases.moge import SKY, MogeBase, MogeOutput, MogeView, load_network, to_view
 from spackle.bases.open import open_base
 from spackle.bases.settings import BaseSettings
 from spackle.errors import InputError
@@ -165,7 +163,7 @@ def test_predict_takes_a_checkpoint_and_a_clip_keeps_one_lens(
         return dataclasses.replace(output, points=output.points * torch.tensor([stretch, stretch, 1]))
 
     monkeypatch.setattr(MogeBase, "ask", ask)
-    monkeypatch.setattr(moge, "lift", lambda *given: (seen.append(given[2].focal[0]), lift(*given))[1])
+    monkeypatch.setattr("spackle.bases.lift.lift", lambda *given: (seen.append(given[2].focal[0]), lift(*given))[1])
     done = run("predict", write_clip(tmp_path / "clip.mp4", moving(3, 90, 160)), *words, "--residual", "none")
     assert (done.code, report_of(tmp_path / "clip")["focal_source"]) == (0, "MoGe"), done.err
     assert f"moves {report_of(tmp_path / 'clip')['disparity']:g}" in done.err

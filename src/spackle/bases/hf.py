@@ -20,11 +20,11 @@ from torch.nn.functional import interpolate
 
 from spackle.bases import NEAREST_M, BasePrediction, Progress, believed_lens, nearest
 from spackle.bases.depth_map import DepthMap
-from spackle.bases.lift import lift
+from spackle.bases.lift import lift_guess
 from spackle.camera import Camera
 from spackle.device import Precision, enough_memory, own_arithmetic, pick_device, pick_dtype
 from spackle.errors import InputError, reading, reason_in_a_line
-from spackle.image import Photo, pad_edge, resize_photo
+from spackle.image import Photo, resize_photo
 
 _HUB_NAME = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*", re.ASCII)
 _NEVER_USED = re.compile(r".*fusion_stage\.layers\.0\.residual_layer1\..*")  # for finer features; the published lack it
@@ -101,11 +101,7 @@ class HfBase:
             if believed_lens(focal, photo.width, photo.height):  # by Depth Pro, the only kind that gives one
                 camera, lens_source = Camera.from_focal(focal, photo.width, photo.height), "Depth Pro"
         depth = to_depth_map(raw, self.meaning, camera.focal[0] / photo.width, self.name, photo.path)
-        if progress:
-            progress(1, 2)
-        prediction = lift(pad_edge(photo.rgb), depth, camera)
-        if progress:
-            progress(2, 2)
+        prediction = lift_guess(photo, depth, camera, progress)
         relative = self.meaning == "relative disparity"
         scale = f"relative, scaled to {NEAREST_M:g}–{FARTHEST_M:g} m" if relative else "metric, by the model"
         notes = {**prediction.notes, "precision": self.precision, "depth_scale": scale}

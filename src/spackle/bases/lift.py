@@ -21,7 +21,7 @@ from spackle.bases.splats import layered_gaussians
 from spackle.camera import Camera
 from spackle.color import srgb_to_linear
 from spackle.errors import InputError
-from spackle.image import Photo, resize_photo
+from spackle.image import Photo, pad_edge, resize_photo
 
 
 class RgbdBase:
@@ -52,6 +52,16 @@ class RgbdBase:
             | ({"depth": depth.note} if depth.note else {})
         )
         return dataclasses.replace(prediction, notes=notes, lens_source="" if own is None else self.lens_source)
+
+
+def lift_guess(photo: Photo, depth: DepthMap, camera: Camera, progress: Progress | None) -> BasePrediction:
+    """A photo lifted by a network's depth, bad lines at its edge mended; the network was the first of two steps."""
+    if progress:
+        progress(1, 2)
+    prediction = lift(pad_edge(photo.rgb), depth, camera)
+    if progress:
+        progress(2, 2)
+    return prediction
 
 
 def lift(rgb: Tensor, depth: DepthMap, camera: Camera, levels: int = LEVELS) -> BasePrediction:

@@ -18,10 +18,10 @@ from torch.nn.functional import interpolate, pad, relu, relu6
 
 from spackle.bases import NEAREST_M, BasePrediction, Progress, nearest
 from spackle.bases.depth_map import DepthMap
-from spackle.bases.lift import lift
+from spackle.bases.lift import lift_guess
 from spackle.device import own_arithmetic, pick_device
 from spackle.errors import InputError
-from spackle.image import Photo, pad_edge, resize_photo
+from spackle.image import Photo, resize_photo
 from spackle.network_file import channels_last, load_strict, read_tensors
 
 STRIDE = 32  # both sides of the input are multiples of it
@@ -249,12 +249,8 @@ class LiteBase:
         inverse_depth = self.inverse_depth(photo.rgb)
         depth = NEAREST_M / (inverse_depth / nearest(inverse_depth.flatten())).clamp(1 / FARTHEST, 1)
         known = torch.ones_like(depth, dtype=torch.bool)
-        if progress:
-            progress(1, 2)
         depth_map = DepthMap(depth, known, None, None, "disparity", photo.path)
-        prediction = lift(pad_edge(photo.rgb), depth_map, photo.camera)
-        if progress:
-            progress(2, 2)
+        prediction = lift_guess(photo, depth_map, photo.camera, progress)
         notes = {**prediction.notes, "precision": "fp32", "depth_scale": f"relative, the nearest at {NEAREST_M:g} m"}
         return dataclasses.replace(prediction, notes=notes, disparity=DISPARITY, uncovered=UNCOVERED)
 
