@@ -89,7 +89,7 @@ class _Level:
 
 
 def _pyramid(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> list[_Level]:
-    """Build the pyramid, the finest level first; there holes start as mirror images of the same surface at their rims."""
+    """Build the pyramid, finest level first; there holes start as mirror images of the same surface."""
     depth = inverse_depth.clamp_min(1e-9).log()[..., None]
     depth = depth / max(float(depth[~hole].std(correction=0)) if bool((~hole).any()) else 0.0, LEAST_SPREAD)
     rgb, tone, levels = guess.clone(memory_format=torch.contiguous_format), guess, list[_Level]()

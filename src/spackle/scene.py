@@ -75,16 +75,16 @@ class Scene:
 
     @property
     def gaussians(self) -> Gaussians:
-        """Everything, the base first."""
+        """All Gaussians, the base's first."""
         return Gaussians.cat([self.base, self.aux])
 
     def _reach(self, disparity: float | None) -> float:
-        """How far a path goes: as the caller says, else as the scene was completed, else as usual."""
+        """The disparity of a path: the given one, else the scene's, else the usual one."""
         usual = USUAL_DISPARITY if self.disparity is None else self.disparity
         return usual if disparity is None else disparity
 
     def of_view(self, index: int) -> list[Gaussians]:
-        """The sets that a completed view is drawn with."""
+        """The sets of Gaussians with which a completed view is drawn."""
         return [self.base, self.aux if self.by_view is None else self.by_view[index]]
 
     @renamed(kind="trajectory")
@@ -95,9 +95,10 @@ class Scene:
         return scene_path(self.base, self.camera, trajectory, self._reach(disparity), frames)
 
     def along(self, keyframes: KeyframePath, frames: int | None = None, fps: float = 30) -> list[Camera]:
-        """Cameras through keyframes, see `spackle.formats.load_path`; without a number as many as they take at `fps`.
+        """Cameras through keyframes, see `spackle.formats.load_path`; by default as many as the path's seconds have at
+        `fps`.
 
-        ValueError for a path through a view that cannot be.
+        ValueError for keyframes between which a view is impossible.
         """
         count = frames or keyframes.frame_count(fps)
         return keyframes.cameras(self.camera.even(), count, DepthRange.of(self.base))
@@ -124,8 +125,7 @@ class Scene:
 
         Args:
             target: a path, or a file that is open for writing bytes.
-            disparity: how far the scene was completed, by default as `Scene.disparity` has it: so far `spackle view`
-                goes.
+            disparity: how far the scene was completed, which limits `spackle view`; by default `Scene.disparity`.
         """
         reach = self.disparity if disparity is None else disparity
         if isinstance(target, str | os.PathLike):
@@ -142,8 +142,8 @@ class Scene:
 
         Args:
             target: a path, or a file that is open for writing bytes.
-            format: "ply", "compressed.ply", "spz", "splat", "sog", "glb", or "html", a page of its own; by default as
-                the path ends.
+            format: "ply", "compressed.ply", "spz", "splat", "sog", "glb", or "html" (page and scene); by default the
+                path's suffix.
 
         Raises:
             InputError: an unknown format, or a scene too large for it.
@@ -155,7 +155,7 @@ class Scene:
         write_bytes(self._encoded(name or Path("scene")), target)
 
     def to_bytes(self, format: str) -> bytes:
-        """What `export` would write."""
+        """The bytes that `export` would write."""
         return self._encoded(Path(f"scene.{format}"))
 
     def _encoded(self, name: Path) -> bytes:
@@ -201,7 +201,7 @@ class Scene:
 
 @dataclasses.dataclass(frozen=True)
 class InlinePage:
-    """A page inside of a notebook."""
+    """The page, embedded in a notebook."""
 
     html: str
     height: int  # pixels

@@ -45,7 +45,7 @@ def render_batch(
     tiles: Sequence[Tensor | None],
     onto: Sequence[Rendering | None],
 ) -> list[Rendering]:
-    """`Renderer.render` of several views of one size: at once on a GPU, which is waited for once, else one by one."""
+    """Render several views of one size, see `Renderer.render`: in one batch on a GPU, else one by one."""
     if hasattr(renderer, "render_batch"):
         together: list[Rendering] = renderer.render_batch(scenes, cameras, tiles=tiles, onto=onto)
         return together
@@ -54,6 +54,6 @@ def render_batch(
 
 
 def device_of(renderer: Renderer) -> torch.device:
-    """Where a renderer computes: what lies there need not travel."""
+    """The device on which a renderer computes."""
     place: torch.device = getattr(renderer, "device", torch.device("cpu"))
     return place

@@ -1,7 +1,7 @@
 """Blending of tiles: front to back, in linear light.
 
-A tile's pixels lie in patches of sixteen, each of which fills a vector register. The functions of a pixel have no
-branches or calls, so that loops over them run in vector registers.
+A tile's pixels lie in patches of sixteen, each of which fills a vector register. Functions of a pixel have neither
+branches nor calls, so that loops over pixels run in vector registers.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def exp2(x: np.float32) -> np.float32:
 
 @kernel
 def alpha_of(power: np.float32) -> np.float32:
-    """A Gaussian's alpha where its opacity has fallen to 2^power: clamped, and 0 where too faint."""
+    """A Gaussian's alpha for an opacity of 2^power: clamped, and 0 if below the threshold."""
     alpha = min(exp2(max(power, LOWEST)), LIMIT)
     return alpha if alpha >= FAINT else ZERO
 
@@ -115,7 +115,7 @@ class TileLists(NamedTuple):
 
 @kernel
 def blend_patch(state: Array, offset: np.uint64, left: np.float32, top: np.float32, splat: Numbers) -> None:
-    """Draw one Gaussian into the patch whose first pixel is (left, top): this, and its centre, counted in the tile."""
+    """Draw one Gaussian into the patch whose first pixel is (left, top); all coordinates are relative to the tile."""
     x, y, slope, across, fall, peak, depth, red, green, blue = splat
     for lane in range(LANES):
         i = offset + np.uint64(lane)
@@ -136,7 +136,7 @@ def blend_patch(state: Array, offset: np.uint64, left: np.float32, top: np.float
 
 @kernel
 def span_of(center: np.float32, reach: np.float32) -> tuple[int, int]:
-    """Which of the tile's rows, or columns, first..last (exclusive), a Gaussian may reach from a centre in the tile."""
+    """The range first..last (exclusive) of the tile's rows or columns that a Gaussian may touch."""
     # Truncation rounds up where one is added; a call to ceil or floor would cost more than a patch.
     first = int(max(center - reach - SLACK, -ONE) + ONE)
     last = min(int(min(center + reach + SLACK, SIDE)) + 1, TILE)
@@ -145,7 +145,7 @@ def span_of(center: np.float32, reach: np.float32) -> tuple[int, int]:
 
 @kernel
 def patches_of(center: np.float32, reach: np.float32) -> tuple[int, int]:
-    """The same in patches."""
+    """The same range, in patches."""
     first, last = span_of(center, reach)
     return first // PATCH, (last + PATCH - 1) // PATCH
 
@@ -165,21 +165,21 @@ def blend_splat(state: Array, record: Array, left: int, top: int) -> None:
 
 @inlined_kernel
 def pixel_index(row: int, column: int) -> int:
-    """Where a plane keeps a pixel of the tile."""
+    """The index of a tile's pixel in a plane of sums."""
     patch = row // PATCH * PATCHES + column // PATCH
     return patch * LANES + row % PATCH * PATCH + column % PATCH
 
 
 @kernel
 def blend_splats(state: Array, records: Array, count: int, left: int, top: int) -> None:
-    """Draw the first Gaussians; a function of its own, because only so the constants stay in registers."""
+    """Draw the first Gaussians of a tile; a separate function, so that constants stay in registers."""
     for index in range(count):
         blend_splat(state, records[index], left, top)
 
 
 @kernel
 def is_full(state: Array) -> bool:
-    """Whether no pixel of the tile takes more light."""
+    """Whether every pixel of the tile has reached the transmittance limit."""
     for i in range(PLANE):  # noqa: SIM110 (numba has no generators)
         if state[i] > ZERO:
             return False
@@ -188,7 +188,7 @@ def is_full(state: Array) -> bool:
 
 @kernel
 def store_tile(state: Array, left: int, top: int, images: Arrays) -> None:
-    """Finish a tile's pixels and write those inside the image."""
+    """Compute a tile's final colours, depth and alpha, and write the pixels inside the image."""
     rgb, depth, alpha, linear = images
     rows, columns = min(TILE, depth.shape[0] - top), min(TILE, depth.shape[1] - left)
     if len(linear) > 0:
@@ -217,7 +217,7 @@ def store_color(state: Array, left: int, top: int, rows: int, columns: int, imag
 def blend_tiles(first: int, last: int, tiles: Array, lists: TileLists, records: Array, images: Arrays) -> None:
     """Draw tiles first..last of the list `tiles` [K] into images: rgb [H, W, 3], depth and alpha [H, W].
 
-    The colour before sRGB goes to the fourth, [H, W, 3], unless that is empty.
+    Linear colour goes to the fourth image, [H, W, 3], unless that is empty.
     """
     ids, starts = lists
     columns = (images[1].shape[1] + TILE - 1) // TILE
@@ -239,7 +239,7 @@ def blend_tiles(first: int, last: int, tiles: Array, lists: TileLists, records: 
 
 @kernel
 def fetch(records: Array, ids: Array, begin: int, count: int, near: Array) -> None:
-    """Bring records close: they lie anywhere, and waiting for all of them at once is shorter than for each in turn."""
+    """Prefetch records, which are scattered in memory, so that their cache misses overlap."""
     for n in range(count):
         record = records[ids[begin + n]]
         for field in range(RECORD):

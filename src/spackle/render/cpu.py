@@ -1,4 +1,4 @@
-"""The CPU renderer, differentiable by all tensors that it is given: project, sort, deal out to tiles, blend."""
+"""The CPU renderer, differentiable in all its inputs: project, sort, assign to tiles, blend."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class CpuRenderer:
 
 @dataclasses.dataclass(frozen=True)
 class Drawing:
-    """A finished drawing, and what its gradient needs to know."""
+    """A rendering, and the intermediate results that its gradient needs."""
 
     view: KernelCamera
     wanted: Array  # [rows, columns] bool, the tiles that were drawn
@@ -70,7 +70,7 @@ def draw(
 ) -> Drawing:
     """Draw sets of Gaussians as one, in the wanted tiles [rows, columns] bool, over a copy of `onto`.
 
-    The other tiles are black and empty where `onto` is None. The gradient needs the colour before sRGB (`keep_linear`).
+    The other tiles are black and empty where `onto` is None. The gradient needs the linear colour (`keep_linear`).
     """
     splats, lists = deal_out(sets, view, wanted)
     return blend(splats, lists, view, wanted, onto, keep_linear)
@@ -84,13 +84,13 @@ def touched_tiles(gaussians: Gaussians, camera: Camera) -> Tensor:
 
 
 def deal_out(sets: Sequence[Gaussians], view: KernelCamera, wanted: Array) -> tuple[Splats, TileLists]:
-    """All of drawing but the blending."""
+    """Project, sort and assign Gaussians to tiles: everything but blending."""
     splats, spans = project(sets, view, wanted)
     return splats, list_tiles(sort_by_depth(splats.keys, splats.ids, spans), splats.boxes, wanted)
 
 
 def as_array(tensor: Tensor) -> Array:
-    """A tensor's values as contiguous float32, without a copy where they are that already."""
+    """A tensor as a contiguous float32 array, without a copy if it is one already."""
     return tensor.detach().to(device="cpu", dtype=torch.float32).contiguous().numpy()
 
 
@@ -103,7 +103,7 @@ def wanted_tiles(view: KernelCamera, tiles: Tensor | None) -> Array:
 
 
 def project(sets: Sequence[Gaussians], view: KernelCamera, wanted: Array) -> tuple[Splats, Array]:
-    """Project sets one after the other, without joining them first, as far as they touch wanted tiles.
+    """Project several sets without joining them, and keep the Gaussians that touch wanted tiles.
 
     Returns:
         The splats, and the spans (start, count) [C, 2] of their keys and ids that are in use.
@@ -158,7 +158,7 @@ def even_spans(total: int, parts: int) -> Array:
 
 
 def starts_of(counts: Array) -> Array:
-    """Where each piece's items of each bucket begin: buckets in order, and pieces in order within one.
+    """Start positions of each piece's items in each bucket: buckets in order, and pieces in order within a bucket.
 
     Args:
         counts: [C, B] items of bucket b in piece c.
@@ -191,7 +191,7 @@ def scatter(first: int, last: int, spans: Array, items: Arrays, shift: int, posi
 
 
 def list_tiles(order: Array, boxes: Array, wanted: Array) -> TileLists:
-    """Deal the sorted Gaussians out to the tiles.
+    """Assign the sorted Gaussians to tiles.
 
     Args:
         order: [M] int32, visible Gaussians front to back.
@@ -214,7 +214,7 @@ def list_tiles(order: Array, boxes: Array, wanted: Array) -> TileLists:
 def count_entries(
     first: int, last: int, spans: Array, order: Array, boxes: Array, wanted: Array, sorted_boxes: Array, counts: Array
 ) -> None:
-    """Count the entries that pieces first..last of the order bring to each tile, and sort the boxes on the way."""
+    """Count the entries of each tile from pieces first..last of the order, and put their boxes into that order."""
     columns, flat = wanted.shape[1], wanted.reshape(-1)
     for piece in range(first, last):
         row_counts = counts[piece]
@@ -236,7 +236,7 @@ def count_entries(
 def write_entries(
     first: int, last: int, spans: Array, order: Array, sorted_boxes: Array, wanted: Array, positions: Array, ids: Array
 ) -> None:
-    """Write the entries that pieces first..last of the order, whose boxes are sorted, bring to each tile."""
+    """Write the entries of each tile from pieces first..last of the order, whose boxes are sorted."""
     columns, flat = wanted.shape[1], wanted.reshape(-1)
     for piece in range(first, last):
         places = positions[piece]

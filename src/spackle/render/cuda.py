@@ -35,7 +35,9 @@ class Material:
 
     @staticmethod
     def of(part: Gaussians, device: torch.device) -> Material:
-        """Bring a set there; what is not finite becomes a transparent point: to take it out would wait for the GPU."""
+        """Upload a set; Gaussians that are not finite become transparent, because removing them would synchronise with
+        the GPU.
+        """
         there = [tensor.to(device, torch.float32, non_blocking=True) for tensor in part.tensors]
         finite = torch.stack([t.detach().isfinite().unsqueeze(-1).flatten(1).all(1) for t in there]).all(0)
         usable = Gaussians(*(torch.where(finite if t.ndim == 1 else finite[:, None], t, 0) for t in there))
@@ -50,9 +52,9 @@ def upper_covariances(part: Gaussians) -> Tensor:
 
 
 class SetStore:
-    """The material of each set, which travels once; it goes when the set's means go.
+    """Cache of sets on the GPU, uploaded once; an entry is dropped with the set's means.
 
-    A set that asks for a gradient is not kept: it changes at every step.
+    A set that requires gradients is not cached, because it changes at every step.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -60,7 +62,7 @@ class SetStore:
         self._kept = WeakTensorKeyDictionary()
 
     def material(self, part: Gaussians) -> Material:
-        """The set on the GPU; brought there anew where PyTorch has changed it, or another tensor is in it."""
+        """The set on the GPU; uploaded again if a tensor has been replaced or changed in place."""
         if any(t.requires_grad or t.is_inference() for t in part.tensors):  # tensors of inference mode count no changes
             return Material.of(part, self.device)
         others, state = part.tensors[1:], [(t._version, t.data_ptr()) for t in part.tensors]
@@ -75,8 +77,8 @@ class SetStore:
 class GsplatRenderer:
     """Classic 3D Gaussian splatting by gsplat on an NVIDIA GPU; a `Renderer`.
 
-    Gaussians may lie on the processor or on the GPU: the images come back to where the first set lies. What asks for
-    no gradient is kept on the GPU as long as its tensors live: a scene travels there once.
+    Gaussians may lie on the processor or on the GPU: the images come back to where the first set lies. Sets without
+    gradients stay on the GPU as long as their tensors exist, so a scene is uploaded once.
     """
 
     def __init__(self, device: str | torch.device = "cuda") -> None:
@@ -148,7 +150,7 @@ class GsplatRenderer:
         eps2d: float,
         wanted: Sequence[Tensor | None],
     ) -> list[Rendering]:
-        """Images drawn where `wanted` [rows, columns] says; elsewhere they hold anything."""
+        """Images drawn in the tiles `wanted` [rows, columns]; other pixels are undefined."""
         width, height = cameras[0].width, cameras[0].height
         rows, columns = tile_grid(height, width)
         materials: list[Material] = []
@@ -189,14 +191,14 @@ class GsplatRenderer:
         ]
 
     def _matrices(self, cameras: Sequence[Camera]) -> Iterator[tuple[Tensor, Tensor]]:
-        """Of each camera extrinsics [1, 4, 4] and intrinsics [1, 3, 3]: one upload for all."""
+        """Extrinsics [1, 4, 4] and intrinsics [1, 3, 3] of each camera, in one upload."""
         numbers = [(*c.world_to_camera.flatten().tolist(), *c.K.flatten().tolist()) for c in cameras]
         there = torch.tensor(numbers, dtype=torch.float32).to(self.device, non_blocking=True)
         return zip(there[:, :16].reshape(-1, 1, 4, 4), there[:, 16:].reshape(-1, 1, 3, 3), strict=True)
 
 
 def load_gsplat(device: torch.device) -> ModuleType:
-    """The package, once its kernels are known to be there; see `GsplatRenderer` for what it raises."""
+    """Import gsplat and check its kernels; raises as `GsplatRenderer` says."""
     if device.type == "cuda" and not torch.cuda.is_available():
         raise InputError("--device cuda: PyTorch sees no NVIDIA GPU on this machine; use --device cpu")
     # Its kernels are built when this is first imported: compilers fail in many ways.
@@ -219,7 +221,7 @@ def load_gsplat(device: torch.device) -> ModuleType:
 
 
 def check_version(found: str) -> None:
-    """InputError for a gsplat that would not do."""
+    """InputError for an unsuitable version of gsplat."""
     numbers = [int(part) for part in found.split("+")[0].split(".") if part.isdigit()]
     low, high = ([int(part) for part in version.split(".")] for version in VERSIONS)
     if not low <= numbers < high:

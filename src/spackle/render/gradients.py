@@ -1,6 +1,6 @@
 """The gradient of a drawing: each tile is drawn again in chunks of Gaussians, then walked back to front.
 
-What its pixels say about a splat then goes to the Gaussian behind it.
+The gradients of splats are then propagated to the Gaussians.
 """
 
 from __future__ import annotations
@@ -89,10 +89,10 @@ class Draw(torch.autograd.Function):
 
 
 def pixel_sums(drawing: Drawing, gradients: Arrays, rows: Array, count: int) -> Array:
-    """What the pixels give to each Gaussian that wants gradients, a table [count, SUMS] float32.
+    """Sums over pixels for each Gaussian that needs gradients, a table [count, SUMS] float32.
 
-    Each tile writes sums of its own, which are added up in the order of the tiles: the result does not depend on which
-    thread was faster. `rows` [N] int32 are the table's rows that belong to the Gaussians, -1 for none.
+    Each tile writes its own sums, which are added in the order of tiles, whatever the threads.
+    `rows` [N] int32 are the table's rows of the Gaussians, -1 for none.
     """
     lists, records, images = drawing.lists, drawing.splats.records, drawing.images
     entry_rows = rows[lists.ids]
@@ -120,9 +120,9 @@ def set_gradients(fields: Sequence[Tensor], view: KernelCamera, table: Array) ->
 
 @kernel
 def replay_row(work: Array, offset: np.uint64, notes: Array, note: np.uint64, peak: np.float32, bell: Numbers) -> None:
-    """Draw one row, across which a Gaussian falls as `bell` says (how fast, from where), as `blend_patch` does.
+    """Draw one row as `blend_patch` does; `bell` holds the rate and centre of the Gaussian's fall-off along it.
 
-    Note alpha, 0 where nothing is drawn, and the light before it.
+    Store alpha (0 where nothing is drawn) and the transmittance before it.
     """
     across, center = bell
     for x in range(TILE):
@@ -139,7 +139,7 @@ def replay_row(work: Array, offset: np.uint64, notes: Array, note: np.uint64, pe
 
 @kernel
 def replay(work: Array, notes: Array, records: Array, ids: Array, left: int, top: int, first_notes: Array) -> int:
-    """Draw a chunk of Gaussians again; `first_notes` [CHUNK] gets where the notes of each begin.
+    """Draw a chunk of Gaussians again; `first_notes` [CHUNK] receives the start of each one's notes.
 
     Returns:
         How many were drawn before the tile was full.
@@ -163,7 +163,7 @@ def replay(work: Array, notes: Array, records: Array, ids: Array, left: int, top
 
 @kernel
 def pass_row(work: Array, offset: np.uint64, notes: Array, note: np.uint64, look: Numbers) -> None:
-    """Walk back past a row of a Gaussian, with its colour and depth in `look`, that wants no gradient."""
+    """Step back over a row of a Gaussian that needs no gradient; `look` holds its colour and depth."""
     red, green, blue, depth = look
     for x in range(TILE):
         i, n = offset + np.uint64(x), note + np.uint64(x)
@@ -177,7 +177,7 @@ def pass_row(work: Array, offset: np.uint64, notes: Array, note: np.uint64, look
 def gather_row(
     work: Array, offset: np.uint64, notes: Array, note: np.uint64, center: np.float32, look: Numbers
 ) -> tuple[np.float32, np.float32, np.float32, np.float32, np.float32, np.float32, np.float32]:
-    """Walk back past a row of a Gaussian, and add up what its pixels give to it: see SUMS, without dy."""
+    """Step back over a row of a Gaussian, and add up its pixels' sums (see SUMS, without dy)."""
     red, green, blue, depth = look
     sum_v, sum_vu, sum_vuu = ZERO, ZERO, ZERO
     sum_red, sum_green, sum_blue, sum_depth = ZERO, ZERO, ZERO, ZERO
@@ -208,7 +208,7 @@ def gather_row(
 def walk_back(
     work: Array, notes: Array, note: np.uint64, record: Array, left: int, top: int, wanted: bool, sums: Array
 ) -> None:
-    """Walk back past one Gaussian, whose notes begin at `note`; if it wants gradients, `sums` [SUMS] gets them."""
+    """Step back over one Gaussian, whose notes begin at `note`; its gradients, if needed, go to `sums` [SUMS]."""
     x, y, slope, _, fall, height, _, half_height, depth, red, green, blue = in_tile(record, left, top)
     look, (first, last) = (red, green, blue, depth), span_of(y, half_height)
     for row in range(first, last):
@@ -259,7 +259,7 @@ def backward_tile(room: Arrays, records: Array, ids: Array, wanted: Array, left:
     """The gradients of one tile, whose list is `ids` [n], for the entries that are wanted, [n] bool.
 
     Args:
-        room: [WORKSPACE], its gradients loaded; [NOTES], room for notes; [CHUNK], where each Gaussian's notes begin.
+        room: buffers: [WORKSPACE] with the gradients loaded, [NOTES] for notes, [CHUNK] for each Gaussian's first note.
         sums: [m, SUMS], one row for each wanted entry, in the list's order.
     """
     work, notes, first_notes = room
@@ -309,7 +309,7 @@ def backward_tiles(
 
 @kernel
 def collect_sums(first: int, last: int, share: int, rows: Array, sums: Array, table: Array) -> None:
-    """Add sums [M, SUMS] to their rows [M] of the table [G, SUMS], for rows first·share to last·share, in order."""
+    """Add sums [M, SUMS] to their rows [M] of the table [G, SUMS], in order, for the rows first·share to last·share."""
     for slot in range(len(rows)):
         row = rows[slot]
         if first * share <= row < last * share:
@@ -323,8 +323,8 @@ def project_backward(
 ) -> None:
     """Gradients of Gaussians start..stop of one set, by its five arrays; arithmetic is float64 as in `project_chunk`.
 
-    `table` [N, SUMS] is what the pixels give to each Gaussian of the set (see SUMS). All zeros mean that no pixel saw
-    it; the gradients are then left as they are.
+    `table` [N, SUMS] holds the sums over pixels for each Gaussian of the set (see SUMS). All zeros mean that no pixel
+    saw it; the gradients are then left as they are.
     """
     (means, quats, scales, opacities, _), lens, pose = scene, camera.lens, camera.pose
     means_grad, quats_grad, scales_grad, opacities_grad, colors_grad = gradients

@@ -1,4 +1,4 @@
-"""Projection of Gaussians to the image: one packed record, one tile box and one sort key each.
+"""Project Gaussians to the image: each gets a packed record, a box of tiles and a sort key.
 
 The arithmetic of a block of Gaussians runs in vector registers; they are packed one by one.
 """
@@ -70,7 +70,7 @@ class KernelCamera(NamedTuple):
 
 
 class Splats(NamedTuple):
-    """Gaussians on the image plane, in the order in which they came."""
+    """Projected Gaussians, in the order of the sets."""
 
     records: Array  # [N, RECORD] float32
     boxes: Array  # [N, 4] uint16, the tiles touched: columns from, to, rows from, to (exclusive)
@@ -80,14 +80,14 @@ class Splats(NamedTuple):
 
 @inlined_kernel
 def in_tile(record: Array, left: int, top: int) -> Numbers:
-    """A record's twelve numbers, the centre (X, Y) seen from the centre of a tile's first pixel (left, top)."""
+    """A record's twelve numbers, its centre (X, Y) relative to the centre of a tile's first pixel (left, top)."""
     x, y = record[X] - np.float32(left) - HALF, record[Y] - np.float32(top) - HALF
     shape = x, y, record[SLOPE], record[ACROSS], record[FALL], record[PEAK], record[HALF_WIDTH], record[HALF_HEIGHT]
     return *shape, record[DEPTH], record[RED], record[GREEN], record[BLUE]
 
 
 def count_before(wanted: Array) -> Array:
-    """How many tiles are wanted above and to the left of each corner, [rows + 1, columns + 1] int32."""
+    """The number of wanted tiles above and to the left of each corner, [rows + 1, columns + 1] int32."""
     return np.pad(wanted.astype(np.int32).cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0))).astype(np.int32)
 
 
@@ -95,12 +95,13 @@ def count_before(wanted: Array) -> Array:
 def project_chunk(
     start: int, stop: int, first: int, scene: Arrays, camera: KernelCamera, wanted_before: Array, splats: Splats
 ) -> int:
-    """Project Gaussians start..stop of a set's five arrays; its first one is number `first` of all.
+    """Project Gaussians start..stop of a set's five arrays; the set's first Gaussian has the index `first` among all
+    sets.
 
     A Gaussian that touches no wanted tile counts as invisible; see `count_before`.
 
     Returns:
-        How many are visible; their keys and ids lie from first + start on.
+        The number of visible ones; their keys and ids begin at first + start.
     """
     means, quats, scales, opacities, colors = scene
     found = first + start
@@ -118,7 +119,7 @@ def project_chunk(
 def measure_block(
     block: Array, means: Array, quats: Array, scales: Array, opacities: Array, camera: KernelCamera
 ) -> None:
-    """Do the arithmetic of up to BLOCK Gaussians, whether or not they are visible, which their boxes tell.
+    """Project up to BLOCK Gaussians; those that are invisible get an empty box.
 
     It is float64, which costs little here and keeps thin Gaussians exact; without a branch or a call, so that
     all of it runs in vector registers.
@@ -224,7 +225,7 @@ def spread(m: Numbers, eps2d: float) -> Numbers:
 
 @inlined_kernel
 def cover(center: float, extent: float, size: int) -> tuple[np.int32, np.int32]:
-    """The pixels first..last (exclusive) along one side of the image whose centres an extent may hold."""
+    """The pixels first..last (exclusive) along one axis whose centres may lie within an extent."""
     slack = 0.501  # half a pixel to its centre, and room for the blender's rounding
     # In this order NaN becomes 0, and every number one that an integer can hold.
     low = min(np.float64(size), max(0.0, center - extent - slack))
@@ -235,10 +236,10 @@ def cover(center: float, extent: float, size: int) -> tuple[np.int32, np.int32]:
 
 @kernel
 def pack_block(block: Array, colors: Array, first: int, found: int, wanted_before: Array, splats: Splats) -> int:
-    """Write the boxes of measured Gaussians first, first + 1, …, and what else there is of the visible ones.
+    """Write the boxes of the projected Gaussians first, first + 1, …, and records, keys and ids of the visible ones.
 
     Returns:
-        Where the next key belongs, `found` being where the first one does.
+        The position of the next key; `found` is that of the first one.
     """
     records, boxes, keys, ids = splats
     depth_bits = keys.view(np.float32)

@@ -1,4 +1,4 @@
-"""What every renderer backend promises, and what it returns."""
+"""The protocol of renderers, and the rendering that they return."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Rendering:
         return self.rgb, self.depth, self.alpha
 
     def to(self, device: torch.device) -> Rendering:
-        """The images on another device; in one copy, for each waits for a GPU."""
+        """The images on another device, in one copy, because each copy synchronises with a GPU."""
         if self.rgb.device == device:
             return self
         flat = torch.cat([image.flatten() for image in self.tensors]).to(device)
@@ -65,8 +65,8 @@ class Renderer(Protocol):
         """Draw Gaussians as a camera sees them.
 
         Args:
-            gaussians: one set, or several that are drawn together. Gradients reach the tensors that
-                ask for them; a set that asks for none costs none.
+            gaussians: one set, or several that are drawn together. Gradients are computed for tensors that require them
+                alone.
             camera: the view.
             eps2d: added to the diagonal of each projected covariance, in pixels² (SHARP: 0,
                 gsplat's default: 0.3).

@@ -1,4 +1,4 @@
-"""The renderer once more, in plain PyTorch: slow, of any dtype, and readable like a textbook.
+"""A reference renderer in plain PyTorch: slow, of any dtype, and written like a textbook.
 
 Every pixel looks at every Gaussian. Tests hold the fast renderers to it, values and gradients.
 """
@@ -17,7 +17,7 @@ from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, NEAR_PLANE, TRANSMITTA
 
 
 class ReferenceRenderer:
-    """Classic 3D Gaussian splatting, written down; a `Renderer` for small scenes."""
+    """Classic 3D Gaussian splatting by its definition; a `Renderer` for small scenes."""
 
     def render(
         self,
@@ -78,7 +78,7 @@ def project_covariances(gaussians: Gaussians, camera: Camera, eps2d: float) -> T
 
 
 def falloff(gaussians: Gaussians, camera: Camera, eps2d: float) -> Tensor:
-    """Each Gaussian's opacity, fallen off with the distance to each pixel, [N, H, W]; not yet clamped."""
+    """Each Gaussian's opacity times its fall-off at each pixel, [N, H, W]; not yet clamped."""
     uv, _ = camera.project(gaussians.means)  # [N, 2]
     covariances = project_covariances(gaussians, camera, eps2d)[:, :, :, None, None]  # [N, 2, 2, 1, 1]
     xx, xy, yy = covariances[:, 0, 0], covariances[:, 0, 1], covariances[:, 1, 1]

@@ -46,7 +46,7 @@ STEM_GAIN = 3.0  # the features are of order 0.3
 
 
 def padded(features: Tensor) -> Tensor:
-    """Features [B, C, h, w], completed so that each level's sides are twice the next one's."""
+    """Features [B, C, h, w], padded so that each level's sides are twice the next one's."""
     height, width = features.shape[-2:]
     return pad(features, (0, -width % STRIDE, 0, -height % STRIDE), mode="replicate")
 
@@ -158,7 +158,7 @@ def _initialise(network: UNet) -> None:
 
 
 def _scale(gain: float, *layers: Any) -> None:
-    """Random weights that multiply the size of what comes in by about `gain`, and no bias."""
+    """Random weights that scale their input's magnitude by about `gain`, and zero bias."""
     for layer in layers:
         taps = layer.in_channels if isinstance(layer, nn.ConvTranspose2d) else layer.weight[0].numel()
         nn.init.normal_(layer.weight, std=gain / math.sqrt(taps))
@@ -187,7 +187,7 @@ def load_residual(path: str | os.PathLike[str]) -> ResidualNet:
 
 
 def decoder_size(tensors: Mapping[str, Tensor]) -> SharpConfig:
-    """SHARP's size, published or tiny, by what a file holds of its decoder; the published one where that is nothing."""
+    """SHARP's size, published or tiny, by the shapes in a file; the published one if the file holds no decoder."""
     last = tensors.get("feature_model.fusion.out_conv.bias")
     width = FULL.gaussian_width if last is None else last.numel()
     return next((config for config in CONFIGS.values() if config.gaussian_width == width), FULL)

@@ -81,7 +81,7 @@ def seen_in_photo(
 
 
 def _place_in_photo(inverse_depth: Tensor, camera: Camera, photo_camera: Camera) -> tuple[Tensor, Tensor]:
-    """Where the cells' points lie: x and y [h, w, 2] in widths and heights of the photo, times z, and z [h, w, 1]."""
+    """The cells' points in the photo: (x, y) [h, w, 2] relative to its size, times z, and z [h, w, 1]."""
     rays, motion = _rays_in_photo(cell_centers(camera).double(), camera, photo_camera)
     points, lens = rays + inverse_depth[..., None] * motion[:3, 3], photo_camera.K.cpu().double()
     place, z = points[..., :2] * lens.diagonal()[:2] + points[..., 2:] * lens[:2, 2], points[..., 2:]
@@ -89,9 +89,9 @@ def _place_in_photo(inverse_depth: Tensor, camera: Camera, photo_camera: Camera)
 
 
 def _rays_in_photo(uv: Tensor, camera: Camera, photo_camera: Camera) -> tuple[Tensor, Tensor]:
-    """Rays [h, w, 3] of a view's cells in the photo's frame, and the motion [4, 4] from the view's frame to it.
+    """Rays [h, w, 3] of a view's cells in the photo's frame, and the transform [4, 4] from the view's frame to it.
 
-    A cell's point times its inverse depth is ray + shift · inverse depth, with the motion's shift; this spares
+    A cell's point times its inverse depth is ray + shift · inverse depth (shift of the transform), which saves
     divisions.
     """
     here, photo = (view.world_to_camera.cpu().double() for view in (camera, photo_camera))
@@ -100,7 +100,8 @@ def _rays_in_photo(uv: Tensor, camera: Camera, photo_camera: Camera) -> tuple[Te
 
 
 def placed_behind(filled: Tensor, chosen: Tensor, seen: Tensor, radius: int) -> Tensor:
-    """Filled inverse depth [h, w]; in the chosen cells ([h, w] bool) behind what is seen within `radius` cells.
+    """The filled inverse depth [h, w], moved behind all surfaces within `radius` cells in the chosen cells ([h, w]
+    bool).
 
     `seen` is the inverse depth [h, w] of what is seen, 0 where nothing is.
     """
@@ -121,10 +122,10 @@ def fill_around(
 
     Args:
         features: of the view.
-        across: [h, w] inverse depth, in holes that of all around.
+        across: [h, w] inverse depth, filled in holes from all sides.
         uv: [h, w, 2] pixels of the cells.
         known: [h, w] bool: cells to start from.
-        inside: [h, w] bool: cells whose points lie in the photo's frame; there what is behind is extended.
+        inside: [h, w] bool: cells whose points lie in the photo's frame, where the far surface is extended.
         camera, photo_camera: the view's and the photo's.
     """
     mask, bias, colors = features.mask, FAR_BIAS * inside, features.rgb.movedim(-1, 0)

@@ -58,10 +58,10 @@ def complete_view(
         renderer: ℛ.
         network: f_res, which runs on the device where it lies; None: the base values alone, as if its deltas were 0.
         threshold: τ_α.
-        least: so many Gaussians come in any case, where few cells are masked those of the least opaque cells; 64 in
-            the paper (training details), 0 where a view without holes shall stay as it is.
+        least: minimum number of Gaussians: if fewer cells are masked, the least opaque others are added; 64 in the
+            paper (training details), 0 to leave a view without holes as it is.
         rendering: ℛ(𝒢_base, v), where that is at hand.
-        photo: I as [H, W, 3] sRGB, for a network that `sees_photo`; where None, what the base shows of it.
+        photo: I as [H, W, 3] sRGB, for a network that `sees_photo`; if None, the base's rendering of it.
         precision: of the network; auto is bfloat16 where the hardware multiplies it natively.
     """
     view = renderer.render(base, camera) if rendering is None else rendering  # eqs. 2 and 3

@@ -20,20 +20,20 @@ SAME_EYE = 1e-9 * CELL  # the epipole's part of a cell's offset from it, below w
 def walk(
     uv: Tensor, values: Tensor, inverse_depth: Tensor, mask: Tensor, camera: Camera, eye: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Walk from each masked cell to both sides along its epipolar line, and take the farther surface.
+    """Walk from each masked cell in both directions along its epipolar line, and take the farther surface.
 
     Args:
         uv: [h, w, 2] pixels of the cells.
-        values: [h, w, c] what is looked up.
+        values: [h, w, c] to look up.
         inverse_depth: [h, w], positive.
         mask: [h, w] bool.
         camera: of the view.
-        eye: [3] position of the other camera, through whose image the lines go.
+        eye: [3] position of the other camera, whose image is the epipole.
 
     Returns:
         Values [h, w, c] at the far rim; values [h, w, c] as far beyond the rim as the cell is before it, if that is the
-        same surface, else those at the rim; cells [h, w] to the rim. Where no line meets anything, and outside of the
-        mask, both are the cell's own values, and the distance is 0.
+        same surface, else those at the rim; cells [h, w] to the rim. For a line that meets no surface, and outside of
+        the mask, both are the cell's own values, and the distance is 0.
     """
     eye = eye.double()
     # Where the view sees that eye: homogeneous, for it may lie at infinity.
@@ -79,7 +79,7 @@ def _walk(
 
 @kernel
 def _line(epipole: Any, u: float, v: float) -> Any:
-    """The unit vector x, y along a pixel's epipolar line; along the rows where both eyes are one."""
+    """The unit vector (x, y) along a pixel's epipolar line; along the row if both eyes coincide."""
     x, y = epipole[0] - epipole[2] * u, epipole[1] - epipole[2] * v
     length = np.sqrt(x * x + y * y)
     if length > SAME_EYE:

@@ -1,7 +1,7 @@
 """The residual network f_res (paper, section 3.3, eq. 5): features of a view's holes in, a delta for every cell out.
 
-It sees what the view shows, the base values, and what stands at a hole's far rim: along the epipolar line on which the
-hole opened, and in patches of the view that match.
+Its input is the rendered view, the base values, the colours at a hole's far rim along the epipolar line, and those of
+matching patches of the view.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ STRIDE = 16  # cells of the finest grid in one of an architecture's coarsest: fo
 
 @dataclasses.dataclass(frozen=True)
 class Rim:
-    """For each masked cell, what its line meets; elsewhere the cell itself."""
+    """Values at the far rim for each masked cell; elsewhere the cell's own."""
 
     rgb: Tensor  # [h, w, 3] sRGB at the far rim
     mirrored: Tensor  # [h, w, 3] sRGB as far beyond the rim as the cell is before it, if that is the same surface
@@ -59,15 +59,15 @@ class Rim:
 def find_rim(
     features: ViewFeatures, seeds: Seeds, camera: Camera, photo_camera: Camera, photo: Tensor | None = None
 ) -> tuple[Rim, Patches]:
-    """Walk from each masked cell to both sides along its epipolar line, and take the farther surface.
+    """Walk from each masked cell in both directions along its epipolar line, and take the farther surface.
 
-    What moves in front of what, moves along the lines through the epipole, where the view sees the photo's eye. So
-    that line leads from a hole to the surface that continues behind it, and structure at the rim continues along it
-    more often than not. Where a line meets nothing, or something much nearer than the seed, the seeds stay.
+    Between both views points move along lines through the epipole, the image of the photo's eye. So such a line leads
+    from a hole to the surface that was uncovered, and structure at the rim often continues along it. If a line meets no
+    surface, or one much nearer than the seed, the seed is kept.
 
-    Also returns patches of the view that match its masked cells: by the seeds' colours behind an object, by what is
-    mirrored beyond the photo's border, where the seeds mix all that reaches the border into a fog. The `photo`
-    [H, W, 3] sRGB is for a network that `sees_photo`.
+    Also returns patches of the view that match its masked cells: by the seeds' colours behind an object, by mirrored
+    colours beyond the photo's border, where seeds are blurred. The `photo` [H, W, 3] sRGB is for a network that
+    `sees_photo`.
     """
     rgb, depths = seeds.rgb.detach(), seeds.inverse_depth.detach()
     values = torch.cat([rgb, depths[..., None]], dim=-1)
@@ -131,7 +131,7 @@ def predict_deltas(
     A `local` network looks only around the masked cells, see `crops_around`.
 
     Args:
-        network: a `ResidualNet`, perhaps wrapped; its features travel to the device where it lies.
+        network: a `ResidualNet`, perhaps wrapped; its input is moved to its device.
         view, seeds, rim: features of one view.
         precision: of the convolutions; auto is bfloat16 where the hardware multiplies it natively.
         dense: deltas of all cells.

@@ -39,7 +39,7 @@ def hole_area_ratio(alpha: Tensor, threshold: float = MASK_THRESHOLD) -> float:
 
 @dataclasses.dataclass(frozen=True)
 class ViewFeatures:
-    """A view's cells, on the processor and detached from whatever made them. Grid: h × w = ceil(H/2) × ceil(W/2)."""
+    """A view's cells, on the processor and without gradients. Grid: h × w = ceil(H/2) × ceil(W/2)."""
 
     rgb: Tensor  # [h, w, 3] sRGB of the covered part of the cell, without the black behind it
     inverse_depth: Tensor  # [h, w] farthest covered pixel's 1/z; 0 in a cell without any
@@ -71,7 +71,7 @@ def _gather(
     start: int, stop: int, rgb: Any, depth: Any, alpha: Any, threshold: Any,
     colors: Any, inverse_depth: Any, opacity: Any, mask: Any,
 ) -> None:  # fmt: skip
-    """The rows start..stop of the cells: all of a row's light first, so that it runs in vector registers."""
+    """Gather the rows start..stop of the cells, a row's colours first, so that the loop runs in vector registers."""
     height, width = alpha.shape
     columns = inverse_depth.shape[1]
     light = np.empty(CHANNELS * width, np.float32)

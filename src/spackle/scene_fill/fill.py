@@ -1,7 +1,8 @@
-"""One scene for a whole path, or one view: the residual's cells behind guards, with texture and a second pass.
+"""Complete a whole path by one scene, or one view: the residual's cells, kept behind guards, with texture and a second
+pass.
 
-Base Gaussians are only read. The renderer draws and the network computes on the renderer's device, all else happens on
-the processor. The images of a view travel there once, and its new Gaussians back once.
+Base Gaussians are never changed. The renderer draws and the network computes on the renderer's device, all else happens
+on the processor. The images of a view travel there once, and its new Gaussians back once.
 """
 
 from __future__ import annotations
@@ -77,7 +78,7 @@ class FillContext:
         return dataclasses.replace(self, network=None, texture=None)
 
     def photo_guard(self) -> OcclusionGuard:
-        """What the photo shows: no aux Gaussian may stand in front of that."""
+        """The guard of the photo's view: no aux Gaussian may stand in front of its surfaces."""
         rendering = self.renderer.render(self.placed.base, self.photo_camera)
         return OcclusionGuard.of(rendering, self.photo_camera, self.threshold)
 
@@ -105,7 +106,7 @@ def fill_view(
     guards: Sequence[OcclusionGuard] | None = None,
     rendering: Rendering | None = None,
 ) -> FilledView:
-    """Complete one view by itself; it looks as if all were drawn at once, at the cost of what changes.
+    """Complete one view by itself; only the tiles that change are drawn again.
 
     Args:
         context: the photo's base, and what fills its holes.
@@ -129,16 +130,16 @@ def fill_scene(
 ) -> FilledScene:
     """Complete a whole path by one set of aux Gaussians, the same from every frame.
 
-    Views are visited from the widest inwards, spread over the path. Each sees what the earlier ones
-    added, and may add only behind what the photo, the widest views and the views before it show:
-    in its holes, and beneath their rims. What lies beneath a rim of one of the two widest views may be
-    what the other one shows in a hole, and fills better: it has to wait for both.
+    Views are visited from the widest inwards, spread over the path. Each view includes the Gaussians of earlier ones,
+    and adds its own, in its holes and beneath their rims, only behind the surfaces that the photo, the widest views and
+    earlier views show. Gaussians beneath the rims of the two widest views are added after both are completed, because
+    each of them may show, and fill better, what lies beneath a rim of the other.
 
     Args:
         context: the photo's base, and what fills its holes.
         cameras: the frames of a path, in their order; with `exact` any views.
-        exact: look at every view and complete it if it has a hole; else holes too small to see may stay open, and
-            every second frame of a long path is looked at.
+        exact: check every view and complete it if it has a hole; else holes too small to see may stay open, and every
+            second frame of a long path is checked.
         progress: called with (views visited, views that are visited in all).
     """
     if not cameras:
@@ -191,7 +192,7 @@ def fill_scene(
 def farthest_first(cameras: Sequence[Camera], photo_camera: Camera) -> list[int]:
     """An order that visits the widest view first and then always the one farthest from all visited.
 
-    Any beginning of it is spread evenly over the path.
+    Its first views, however many, are spread evenly over the path.
     """
     if not cameras:
         return []
@@ -216,7 +217,7 @@ def _fill(
     *,
     beneath: bool,
 ) -> tuple[list[Gaussians], list[Gaussians], Rendering]:
-    """What fills the holes of the view that the stage shows, what lies `beneath` their rims, and the view filled."""
+    """Gaussians for the holes of the stage's view, those `beneath` their rims, and the completed view."""
     aux, rims = [Gaussians.empty()], []
     for turn in range(PASSES):
         # What the network's blobs leave thin, the seeds close: it would only leave it thin again.
@@ -243,7 +244,7 @@ def _propose(
     camera: Camera,
     guards: Sequence[OcclusionGuard],
 ) -> tuple[Gaussians, Seeds]:
-    """One Gaussian for each masked cell, with a texture one for each pixel, all behind what the guards show.
+    """One Gaussian for each masked cell, or for each pixel with a texture, all behind the guards' surfaces.
 
     Also returns the seeds that extend beneath the rims.
     """
@@ -291,7 +292,7 @@ def _pixels(seeds: Seeds, deltas: Tensor | None, camera: Camera, colors: Tensor)
 
 
 def rim_underlay(mask: Tensor, seeds: Seeds, camera: Camera) -> Gaussians:
-    """Gaussians that extend the holes' seeds beneath the surfaces around the holes, behind all that is seen.
+    """Gaussians that extend the holes' seeds beneath the surfaces around the holes.
 
     From another view the rim of a hole moves, and a slit opens between what was seen and what filled the hole. This
     closes most such slits before they open: fewer views of a path are left to complete, and they show the same.
@@ -315,23 +316,23 @@ def rim_underlay(mask: Tensor, seeds: Seeds, camera: Camera) -> Gaussians:
 
 
 class _Stage:
-    """The base and what was added to it, on the renderer's device, and how the last camera saw them."""
+    """The base and the Gaussians added to it, on the renderer's device, and their last rendering."""
 
     def __init__(self, context: FillContext) -> None:
         self._renderer, self._device, self._sets = context.renderer, device_of(context.renderer), [context.base]
 
     def look(self, camera: Camera, rendering: Rendering | None = None) -> Rendering:
-        """What a camera sees, on the processor; `rendering` where it has been drawn already."""
+        """The rendering from a camera, on the processor; `rendering`, if given, is used."""
         drawn = self._renderer.render(self._sets, camera) if rendering is None else rendering.to(self._device)
         self._camera, self._drawn = camera, drawn
         return drawn.to(PROCESSOR)
 
     def add(self, *sets: Gaussians) -> None:
-        """More Gaussians, which the next look sees."""
+        """Add Gaussians, which the next `look` includes."""
         self._sets += [part.to(self._device) for part in sets]
 
     def look_again(self, new: Gaussians) -> Rendering:
-        """Add Gaussians, and look from the last camera: only tiles that they touch are drawn."""
+        """Add Gaussians, and render from the last camera: only tiles that they touch are drawn."""
         self.add(new)
         tiles = touched_tiles(new, self._camera)
         self._drawn = self._renderer.render(self._sets, self._camera, tiles=tiles, onto=self._drawn)

@@ -32,7 +32,7 @@ STEPS = 48  # candidate positions along the line of sight, even in inverse depth
 
 @dataclasses.dataclass(frozen=True)
 class OcclusionGuard:
-    """The farthest surface that a view shows near each pixel: nothing new may stand in front of it."""
+    """The farthest surface near each pixel of a view: no new Gaussian may stand in front of it."""
 
     camera: Camera
     depth: Tensor  # [H, W]; 0 where the view shows only holes
@@ -46,7 +46,7 @@ class OcclusionGuard:
 
 
 def push_behind(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) -> Gaussians:
-    """Slide each Gaussian away from the eye that wants it until no guard is blocked: see `free_factors`."""
+    """Move each Gaussian away from the eye of its view until it blocks no guard, see `free_factors`."""
     return moved_away(aux, eye, free_factors(aux, eye, guards))
 
 
@@ -61,13 +61,13 @@ def moved_away(aux: Gaussians, eye: Tensor, factors: Tensor) -> Gaussians:
 
 
 def free_factors(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) -> Tensor:
-    """Factors [N] ≥ 1 by which Gaussians have to move away from an eye until no guard is blocked; 0 where none does.
+    """Factors [N] ≥ 1 by which Gaussians must move away from an eye so as to block no guard; 0 if none suffices.
 
-    Far enough out everything is behind everything, so nearly all find a place.
+    Nearly all have one, because far away a Gaussian is behind every surface.
 
     Args:
         aux: N Gaussians in the world's frame.
-        eye: [3] position of the view that they were made for.
+        eye: [3] position of the camera that they were made for.
         guards: the views to protect.
     """
     if not len(aux) or not guards:
@@ -92,8 +92,8 @@ def free_factors(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) 
 def without_pits(depths: Tensor, cells: Tensor) -> Tensor:
     """Depths [n] of a view's chosen cells ([h, w] bool), none of them nearer than most cells of its neighbourhood.
 
-    A morphological closing. Each for itself, neighbours of one surface would be moved to different depths, and their
-    colours would scatter in every other view.
+    A morphological closing. Moved one by one, neighbours of one surface would end at different depths and look
+    scattered from other views.
     """
     reach = max(1, round(PIT * cells.shape[1]))
     grid = depths.new_zeros(cells.shape)
@@ -107,7 +107,9 @@ def _free_factors(
     first: int, last: int, eye: Any, rays: Any, quats: Any, scales: Any,
     lenses: Any, depths: Any, sizes: Any, starts: Any, factors: Any,
 ) -> None:  # fmt: skip
-    """For the Gaussians first..last the least of 1 / (1 − k / STEPS) that no guard blocks; 0 where there is none."""
+    """For the Gaussians first..last the least factor 1 / (1 − k / STEPS) with which they block no guard; 0 if there is
+    none.
+    """
     for n in range(first, last):
         factors[n] = 0
         covariance = _covariance(quats[n], scales[n])
@@ -148,7 +150,7 @@ def _blocks(
     lens: Any, guards: Any, start: int, height: int, width: int,
     x: float, y: float, z: float, covariance: Any, factor: float,
 ) -> bool:  # fmt: skip
-    """Whether a Gaussian would stand in front of what a view shows, anywhere in its reach."""
+    """Whether a Gaussian stands in front of a view's surface anywhere within its extent."""
     depth = lens[12] * x + lens[13] * y + lens[14] * z + lens[15]
     if not depth > 0:
         return False
@@ -175,7 +177,7 @@ def _blocks(
 
 @kernel
 def _reach(lens: Any, row: int, scale: float, tangent: float, covariance: Any) -> float:
-    """How far in pixels a Gaussian is seen from its centre, along the axis of a row of the extrinsics."""
+    """The extent in pixels of a Gaussian from its centre, along the image axis of a row of the extrinsics."""
     a = scale * (lens[row] - tangent * lens[12])
     b = scale * (lens[row + 1] - tangent * lens[13])
     c = scale * (lens[row + 2] - tangent * lens[14])

@@ -1,4 +1,4 @@
-"""Colours of what fills a hole: structure is the residual's, texture comes from patches or from an inpainter.
+"""Colours of filled holes: structure from the residual, texture from patches or an inpainter.
 
 The paper's network learns from an inpainter's pictures; one that learns from true views stays smooth where the truth is
 ambiguous.
@@ -35,7 +35,7 @@ STEPS = 2  # of `sharpened`
 
 @dataclasses.dataclass(frozen=True)
 class HoleView:
-    """A view with holes, and what the residual makes of them."""
+    """A view with holes, its seeds and patches, and the residual's structure in its holes."""
 
     rendering: Rendering
     features: ViewFeatures
@@ -61,7 +61,7 @@ def exemplar_texture(view: HoleView) -> Tensor:
 
 
 def painted_texture(painter: Inpainter, view: HoleView) -> Tensor:
-    """The picture that an inpainter makes of the view, structure and all."""
+    """The view with its holes painted by an inpainter, structure included."""
     hole = hole_mask(view.rendering.alpha)
     views = (view.rendering.rgb[None], hole[None], known_inverse_depth(view.rendering.depth, hole)[None])
     return from_cells(in_cells(painter.paint(*views)[0]))
@@ -70,8 +70,8 @@ def painted_texture(painter: Inpainter, view: HoleView) -> Tensor:
 def patch_blocks(patches: Patches, blocks: Tensor) -> Tensor:
     """A finer picture of which each cell is a block, [H, W, k, k, c], its hole filled with blocks from elsewhere in it.
 
-    A block is the mean of those that its cell's own match and its eight neighbours' say, the better ones counting
-    more. In `Patches.rgb` whole patches vote, and what is fine is lost.
+    A block is the mean of the blocks that the matches of its cell and of its eight neighbours give, better matches
+    counting more. `Patches.rgb`, in which whole patches vote, loses fine detail.
     """
     height, width = patches.mismatch.shape
     sources = torch.stack([blocks, blocks.flip(1, 3)])
@@ -96,7 +96,7 @@ def patch_blocks(patches: Patches, blocks: Tensor) -> Tensor:
 def _in_proportion(fine: Tensor, view: HoleView) -> Tensor:
     """Factors [h, w] of at most 1 that make texture [2h, 2w, 3] no stronger than that of the surface around a hole.
 
-    Strokes of what is lively elsewhere do not belong on a calm wall, even where they fit what is there.
+    Strong texture from elsewhere does not belong on a plain wall, even if its patches match the tone.
     """
     energy, hole = avg_pool2d(fine.square().sum(-1)[None], CELL)[0], view.features.mask.float()
     parts = torch.stack([energy * hole, hole, energy * (1 - hole), 1 - hole])
@@ -113,14 +113,14 @@ def _in_proportion(fine: Tensor, view: HoleView) -> Tensor:
 
 
 def _magnified(cells: Tensor, mask: Tensor) -> Tensor:
-    """A pixel's colours [2h, 2w, 3] between those of the cells [h, w, 3] around it, masked ones [h, w] alone."""
+    """Colours [h, w, 3] of masked cells ([h, w] bool), interpolated to pixels [2h, 2w, 3]."""
     both = torch.cat([cells * mask[..., None], mask[..., None]], dim=-1).permute(2, 0, 1)
     pixels = interpolate(both[None], scale_factor=CELL, mode="bilinear")[0].permute(1, 2, 0)
     return pixels[..., :3] / pixels[..., 3:].clamp_min(1e-6)
 
 
 def extended(view: HoleView) -> Tensor:
-    """Structure [h, w, 3] that beyond the photo's border begins as the nearest cell of the photo, if it is as far away.
+    """Structure [h, w, 3] that, beyond the photo's border, starts with the colour of the nearest cell of equal depth.
 
     Behind an object the nearest cell is the object's, and nothing is extended.
     """
