@@ -24,7 +24,7 @@ from photos import calibration, metres, picture, write_depth, write_photo
 from PIL import Image
 from scenes import random_gaussians
 from test_camera_files import CAMERAS, PATH
-from test_eval_datasets import EYES, booster, eth3d, llff, middlebury_2014, tanks, wildrgbd
+from test_eval_datasets import EYES, eth3d, llff, stored, tanks
 from test_network_file import WHOLE, WRITERS
 
 from spackle.bases.depth_map import load_depth
@@ -273,9 +273,9 @@ READERS: dict[str, Reader] = {
         ],
         _read_clip,
     ),
-    "middlebury": _tree("middlebury", lambda folder: middlebury_2014(folder / "a")),
-    "booster": _tree("booster", lambda folder: booster(folder / "a")),
-    "wildrgbd": _tree("wildrgbd", lambda folder: wildrgbd(folder / "scenes" / "a")),
+    "middlebury": _tree("middlebury", lambda folder: stored("middlebury", folder / "a")),
+    "booster": _tree("booster", lambda folder: stored("booster", folder / "a")),
+    "wildrgbd": _tree("wildrgbd", lambda folder: stored("wildrgbd", folder / "scenes" / "a")),
     "llff": _tree("llff", lambda folder: llff(folder / "fern", EYES[:2])),
     "colmap": _tree("tanks", lambda folder: tanks(folder / "Truck"), _text_model),
 }
