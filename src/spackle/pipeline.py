@@ -236,7 +236,7 @@ def complete(
         exact: the views are these and no others between them; for scene mode.
         network: residual weights, by default those that come with Spackle; None: the seeds alone fill the holes.
         fill: see `open_texture`; "none" leaves the holes open.
-        renderer: the CPU's where None.
+        renderer: if None, the CPU's.
         precision: number type of the network.
         progress: called with views done and their number.
     """

@@ -1,4 +1,4 @@
-"""The Python interface: a photo in whatever form a program holds it, a completed scene out."""
+"""The Python interface: a photo from a file, bytes, an array or a tensor becomes a completed scene."""
 
 from __future__ import annotations
 
@@ -48,17 +48,17 @@ class Spackle:
         device: str = "auto",
         renderer: Renderer | None = None,
     ) -> None:
-        """Choose what the scenes are made with.
+        """Choose base, fill and device.
 
         Args:
             base: as `--base` names it, or a loaded one, such as `SharpBase.load(weights)`. "auto" takes the best for
                 each photo: its depth, else SHARP or MoGe where weights have been downloaded, else lite, whose geometry
-                is rough. The logger "spackle" is told which, and warned of what cannot be used.
+                is rough. The choice, and candidates that fail, are logged to the logger "spackle".
             residual: a file of weights, a loaded network, "seeds" for none, or "none", which leaves the holes open;
                 None: the weights that come with Spackle.
-            fill: where texture comes from, see `spackle.pipeline.open_texture`; "none" leaves the holes open.
-            device: "auto", "cpu" or "cuda", of base and renderer.
-            renderer: the device's where None.
+            fill: source of the texture, see `spackle.pipeline.open_texture`; "none" leaves the holes open.
+            device: "auto", "cpu" or "cuda", for base and renderer.
+            renderer: if None, the device's.
 
         Raises:
             InputError: an unknown name, or weights that cannot be used.
@@ -136,15 +136,15 @@ def predict(
             metres (0, NaN or inf: unknown), or a loaded depth map.
         base, residual, fill, device, renderer: see `Spackle`.
         trajectory: the path that the scene is completed for, besides the views farthest to the left and to the right.
-        disparity: how far the path goes, see `spackle.camera_path.max_offset`; where None as far as the
-            photo bears it (see `choose_move`), at most 0.15 for lite, else 0.3.
-        depth_kind: what the numbers of a depth map's file are, see `spackle.load_depth`.
+        disparity: how far the path goes, see `spackle.camera_path.max_offset`; if None, chosen by the photo (see
+            `choose_move`), at most 0.15 for lite, else 0.3.
+        depth_kind: the meaning of a depth map's numbers, see `spackle.load_depth`.
         keep_frame: keep a uniform frame around a file's picture; it is otherwise cut off where neither depth nor a
             focal length is given.
         focal_px: focal length in pixels of the upright photo; by default the file's own, see `load_photo`.
         focal_mm: its 35 mm film equivalent, in its place.
         fov: horizontal field of view in degrees, in its place.
-        progress: show how far it is, on one line of the standard error.
+        progress: draw progress on one line of the standard error.
 
     Raises:
         InputError: a photo, a depth map, a name or weights that cannot be used; a base beside depth, or a lens for a
@@ -166,7 +166,7 @@ def predict(
 
 @contextlib.contextmanager
 def _photo(source: PhotoSource, **options: Any) -> Iterator[Photo]:
-    """A loaded photo; the block may read the file of a photo that came as bytes, which may hold its depth."""
+    """The loaded photo; one given as bytes has a temporary file during the block, from which its depth can be read."""
     if isinstance(source, Photo):
         yield source
     elif isinstance(source, Image.Image | np.ndarray | Tensor):
@@ -190,7 +190,7 @@ def _depth(source: DepthSource, kind: DepthKind) -> Iterator[Path | DepthMap]:
 
 @contextlib.contextmanager
 def _as_file(source: str | os.PathLike[str] | bytes | BinaryIO, kind: str) -> Iterator[Path]:
-    """A path to the source's bytes; messages call a temporary one "photo" or "depth"."""
+    """A path to the source's bytes; in messages a temporary file is called "photo" or "depth"."""
     if isinstance(source, str | os.PathLike):
         yield Path(source)
         return

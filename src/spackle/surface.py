@@ -32,8 +32,8 @@ def surface_gaussians(
 ) -> Gaussians:
     """One Gaussian for each sample of a surface, aligned with it.
 
-    Seen from `camera` each is a blob of `spread` pixels; from elsewhere it foreshortens as the
-    surface does, so that a plane stays closed from every side.
+    Seen from `camera` each is a blob of `spread` pixels; from elsewhere it foreshortens like the surface, so that a
+    plane has no gaps.
 
     Args:
         camera: the view in which the samples are given.
@@ -88,7 +88,7 @@ def surface_slope(inverse_depth: Tensor) -> Tensor:
 
 @kernel
 def _slopes(start: int, stop: int, image: Any, crease: Any, edge: Any, ragged: Any, slopes: Any) -> None:
-    """Rows start..stop of the slopes."""
+    """Compute rows start..stop of the slopes."""
     height, width = image.shape
     for y in range(start, stop):
         above, below = max(y - 1, 0), min(y + 1, height - 1)
@@ -105,7 +105,7 @@ def _slopes(start: int, stop: int, image: Any, crease: Any, edge: Any, ragged: A
 
 @kernel
 def _slope(here: Any, backward: Any, forward: Any, crease: Any, edge: Any, ragged: Any) -> Any:
-    """One axis's, of the differences to both sides."""
+    """The slope along one axis, from the differences to both neighbours."""
     smooth = abs(forward - backward) <= crease * here
     flatter = backward if abs(backward) < abs(forward) else forward
     slope = (forward + backward) / 2 if smooth else flatter

@@ -1,4 +1,4 @@
-"""A process that does one task after the other, tells how far it is, and ends with its parent."""
+"""A process that does one task after the other, reports progress, and ends with its parent."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Work = Callable[[Any, Tell], None]  # is pickled, as its tasks are; its InputErr
 
 
 class TaskProcess:
-    """A process, and how to talk with it."""
+    """A worker process and its connection."""
 
     def __init__(self, work: Work) -> None:
         spawn = multiprocessing.get_context("spawn")  # torch's threads do not survive a fork
@@ -38,7 +38,7 @@ class TaskProcess:
         self._process.join()
 
     def do(self, task: object, tell: Tell) -> str | None:
-        """None where the task is done, else a line that says why not."""
+        """Do a task; returns None if it succeeded, else a line that says why not."""
         try:
             self._pipe.send(task)
             while not isinstance(event := self._pipe.recv(), Ended):
@@ -50,7 +50,7 @@ class TaskProcess:
 
 
 class Ended:
-    """The last thing that is said of a task."""
+    """The last message about a task."""
 
     def __init__(self, error: str | None) -> None:
         self.error = error
@@ -74,7 +74,7 @@ def _serve(pipe: connection.Connection, work: Work) -> None:
 
 
 def end_with_parent() -> None:
-    """Wait until the parent process has gone, and end this one: it would wait for ever."""
+    """Wait until the parent process has ended, then end this one, which would wait for ever."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     connection.wait([parent.sentinel])

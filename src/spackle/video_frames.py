@@ -45,7 +45,7 @@ DUBOIS_RIGHT = ((-0.043, -0.088, -0.002), (0.378, 0.734, -0.018), (-0.072, -0.11
 
 @dataclasses.dataclass(frozen=True)
 class Stereo:
-    """How a view is seen by two eyes."""
+    """The two eyes of a stereo view, and the layout of their pictures."""
 
     layout: StereoLayout
     ipd: float  # between the eyes, in the scene's unit (metres where the base is metric)
@@ -87,7 +87,7 @@ class Stereo:
 
 
 def default_ipd(camera: Camera, depth_range: DepthRange) -> float:
-    """Eyes so far apart that the scene's whole depth takes 3 % of the picture's width as parallax.
+    """The distance of the eyes at which the scene's depth has a parallax of 3 % of the picture's width.
 
     parallax = fx · ipd · (1/near − 1/∞), so ipd = 0.03 · (W/fx) · z_near: no unit is needed, and things at arm's
     length are not torn apart. For a 30 mm lens and z_near = 1.8 m this is the human 65 mm.
@@ -119,7 +119,7 @@ def _halved(picture: Tensor, side: bool) -> Tensor:
 
 @dataclasses.dataclass(frozen=True)
 class VideoOptions:
-    """The choices that every video has."""
+    """Options of all videos."""
 
     format: VideoFormat | None = None  # mp4 where None
     fps: float | None = None  # 30 where None; a clip keeps its own, and takes none
@@ -148,7 +148,7 @@ class VideoOptions:
         return FORMATS[self.suffix].loop if self.loop is None else self.loop
 
     def check(self) -> None:
-        """InputError for a choice that no video can have."""
+        """InputError for options that no video can have."""
         self._blame(f"--fps {self.rate:g}", None)
         self._blame(f"--loop {self.loop}", self.loop)
         for option, value in {"--ipd": self.ipd, "--convergence": self.convergence}.items():
@@ -173,7 +173,7 @@ class VideoOptions:
             raise InputError(f"{option}: {str(error).removeprefix(f'{name}: ')}") from error
 
     def for_file(self, file: Path) -> VideoOptions:
-        """The options with the format that a file's name stands for; InputError where --format says something else."""
+        """The options with the format of a file's suffix; InputError if --format contradicts it."""
         suffix = file.suffix.lower()
         meant = "mp4" if suffix in (".m4v", ".mov") else cast(VideoFormat, suffix[1:])
         if self.format not in (None, meant):
@@ -191,7 +191,9 @@ class FrameMaker:
 
     @staticmethod
     def of(options: VideoOptions, gaussians: Gaussians, cameras: Sequence[Camera], source: Path) -> FrameMaker:
-        """For a scene along a path; measures on it what was not chosen; InputError (naming `source`) if it cannot."""
+        """The frame maker for a scene and a path, from which missing options are derived; InputError (naming `source`)
+        if impossible.
+        """
         try:
             stereo = _stereo(options, gaussians, cameras[0])
             depth = DepthColors.over(gaussians, cameras) if options.show == "depth" else None
@@ -208,7 +210,7 @@ class FrameMaker:
 
     @property
     def plain(self) -> bool:
-        """Whether a frame is what one view shows, at its own size."""
+        """Whether a frame is one view at its own size."""
         return self.stereo is None and self.depth is None and self.options.size is None
 
     @property
@@ -232,7 +234,7 @@ class FrameMaker:
         return pictures[0] if self.stereo is None else self.stereo.pack(*pictures)
 
     def sized(self, camera: Camera) -> Camera:
-        """A view at the size at which it is drawn: the video's, or without the margins."""
+        """A view at the size at which it is rendered: the video's size without margins."""
         if self.canvas is None:
             return camera
         width, height = self.canvas
@@ -250,7 +252,7 @@ class FrameMaker:
         return (width, height) if self.stereo is None else self.stereo.frame_size(width, height)
 
     def note(self, name: str, camera: Camera, frames: int) -> dict[str, object]:
-        """What a report says of the video: its file, for there may be others from earlier runs, and what it shows."""
+        """The report's entry of the video: its file, because a folder may hold older ones, and its properties."""
         width, height = self.frame_size(self.sized(camera))
         stereo: dict[str, object] | None = None
         if self.stereo is not None:
@@ -269,7 +271,7 @@ class FrameMaker:
 
 
 def _stereo(options: VideoOptions, gaussians: Gaussians, camera: Camera) -> Stereo | None:
-    """The eyes that were chosen, or that suit the scene."""
+    """The stereo view by the options, or with defaults that suit the scene."""
     if options.stereo is None:
         return None
     ipd, convergence = options.ipd, options.convergence
@@ -285,7 +287,7 @@ def _stereo(options: VideoOptions, gaussians: Gaussians, camera: Camera) -> Ster
 
 
 def cover(camera: Camera, width: int, height: int) -> Camera:
-    """The view on another grid with nothing squeezed: another aspect ratio cuts off two sides."""
+    """The view at another size without distortion: for another aspect ratio two sides are cut off."""
     scale = max(width / camera.width, height / camera.height)
     K = camera.zoomed(scale).K
     center = torch.tensor([camera.width / 2, camera.height / 2])
@@ -313,7 +315,7 @@ def with_margins(picture: Tensor, width: int, height: int, blurred: bool) -> Ten
 
 
 def video_problem(cameras: Sequence[Camera]) -> str | None:
-    """Why these views cannot be the frames of a video, or None."""
+    """The reason why these views cannot be the frames of a video, or None."""
     sizes = {(camera.width, camera.height) for camera in cameras}
     if len(sizes) > 1:
         return "the frames differ in size"

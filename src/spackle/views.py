@@ -1,4 +1,4 @@
-"""The views of a scene: the camera path that is asked for, the video along it, the views whose holes are filled."""
+"""The views of a scene: the camera path, the video along it, the views whose holes are filled."""
 
 from __future__ import annotations
 
@@ -47,14 +47,14 @@ def scene_path(
 ) -> list[Camera]:
     """Cameras around the photo's eye at the photo's size, both sides made even.
 
-    A path that is `looped`, as videos are, goes on from its last camera to the first, see `trajectory`.
+    A path that is `looped`, as for videos, continues from its last camera to the first, see `trajectory`.
     """
     return trajectory(kind, camera.even(), disparity, DepthRange.of(base), frames, looped)
 
 
 @dataclasses.dataclass(frozen=True)
 class PathOptions:
-    """Which way the camera goes, and the video along it."""
+    """Options of the camera path, and of the video along it."""
 
     trajectory: TrajectoryKind = "rotate-forward"
     disparity: float | None = None  # as the base has it where None
@@ -66,7 +66,7 @@ class PathOptions:
     overscan: float = OVERSCAN  # by which share the lens along a trajectory is longer than the photo's
 
     def check(self) -> None:
-        """InputError for a path that cannot be flown, views that are given twice, or a video that cannot be."""
+        """InputError for an impossible path or video, or views that are given twice."""
         if self.disparity is not None and not (math.isfinite(self.disparity) and 0 <= self.disparity <= MAX_DISPARITY):
             raise InputError(f"--disparity must be between 0 and {MAX_DISPARITY:g}, got {self.disparity:g}")
         if self.frames is not None and not 1 <= self.frames <= MAX_FRAMES:
@@ -102,7 +102,7 @@ class PathOptions:
             gaussians: the scene, whose depths set how far the path goes.
             camera: the photo's.
             keyframes: those of --path.
-            disparity: for options without one.
+            disparity: used if the options have none.
 
         Raises:
             PathError: the keyframes lead nowhere.
@@ -139,7 +139,7 @@ class PlannedViews:
         unseen: Sequence[Camera] = (),
         every: int = 1,
     ) -> PlannedViews:
-        """The views of a path through the eyes of its frames, others by their names, and those that no one looks at.
+        """The cameras of a path's frames for all eyes, further named views, and which of them are no frames.
 
         A scene is completed for one frame in `every`.
         """
@@ -174,9 +174,10 @@ def _possible_path(source: Path) -> Iterator[None]:
 
 @torch.no_grad()
 def choose_move(prediction: BasePrediction, renderer: Renderer, source: Path) -> BasePrediction:
-    """With the farthest move, up to the base's usual one, that uncovers no more of the widest views than it allows.
+    """The prediction with the farthest disparity, up to its usual one, at which the share of holes in the widest views
+    is allowed.
 
-    The notes say the base's usual disparity, and which share of the two widest views is holes (eq. 10, 11), by coarse
+    Its notes get the base's usual disparity and the share of holes in the two widest views (eqs. 10, 11), by coarse
     renders. InputError, naming `source`, the photo, where its depths and focal length allow no path.
     """
     gaussians, usual, allowed = prediction.gaussians, prediction.disparity, prediction.uncovered
@@ -211,7 +212,7 @@ def plan_views(
     given: list[Camera] | None = None,
     keyframes: KeyframePath | None = None,
 ) -> PlannedViews:
-    """The given views; or a path, and where its holes are measured: at its two extremes, or at its keyframes.
+    """Plan the given views; or a path, whose holes are measured at its two extremes or at its keyframes.
 
     InputError, naming `source`, the photo, where its depths and focal length allow no such path.
     """

@@ -41,11 +41,11 @@ R = TypeVar("R")
 
 
 class PhotoWorker(Protocol):
-    """Does one job after the other. A job is pickled, and its `path` names the photo in messages."""
+    """A worker, which does one job after the other. A job is pickled, and its `path` names the photo in messages."""
 
     @property
     def setup(self) -> Mapping[str, Any]:
-        """What decides its results besides the jobs, ready for JSON: the same on every machine."""
+        """The setup that decides results besides the jobs, ready for JSON: it must be the same on every machine."""
 
     def inputs(self, job: Any) -> object:
         """Digests of the files that a job reads, as they lie on this machine."""
@@ -106,7 +106,7 @@ def at_work(
 def at_work_here(
     workers: Workers, open_worker: Callable[[], PhotoWorker], jobs: Sequence[Any], stop: Callable[[], bool]
 ) -> Iterator[Iterator[Any]]:
-    """As `at_work`, on this machine; InputError also if a worker dies, unless `stop` says why."""
+    """Like `at_work`, on this machine; InputError also if a worker dies, unless `stop` says why."""
     if workers.count == 1 or len(jobs) < 2:
         with threads_of_torch(workers.threads):
             yield map(open_worker().make, jobs)
@@ -143,7 +143,7 @@ _open_worker: Callable[[], PhotoWorker]  # of a worker process; its errors belon
 
 
 def _start(threads: int, open_worker: Callable[[], PhotoWorker], numbers: Any) -> None:
-    """Begin as a worker, which leaves Ctrl-C to the main process and ends with it; `numbers` deal out the GPUs."""
+    """Start a worker process, which ignores Ctrl-C and ends with the main process; `numbers` assigns the GPUs."""
     global _open_worker
     _open_worker = functools.cache(open_worker)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -206,7 +206,9 @@ def _connect(ray: Any, address: str, cpus: int) -> None:
 
 
 def _silence(address: str) -> str | None:
-    """Why nobody answers, or None; a process of its own asks, as Ray tries for minutes and then ends its process."""
+    """Why no cluster answers, or None. A separate process asks, because Ray tries for minutes and then ends its
+    process.
+    """
     code = "import ray, sys; ray.init(sys.argv[1], log_to_driver=False)"
     words = [sys.executable, "-W", "ignore", "-c", code, address]
     try:
@@ -245,7 +247,7 @@ class RemoteWorker:
             os.chdir(folder)
 
     def begin(self, expected: Mapping[str, Any]) -> None:
-        """Set up; InputError if version or weights differ from the main process's."""
+        """Set the worker up; InputError if version or weights differ from the main process's."""
         try:
             self.worker = self.open_worker()
             setup = self.worker.setup
@@ -258,7 +260,7 @@ class RemoteWorker:
             )
 
     def make(self, job: Any, expected: object) -> Any:
-        """As `PhotoWorker.make`; InputError also if the node sees another photo or depth map."""
+        """Like `PhotoWorker.make`; InputError also if the node sees another photo or depth map."""
         if self.worker.inputs(job) != expected:
             raise InputError(
                 f"{job.path}: {self.node} does not find this photo or its depth map, or others in "
@@ -270,7 +272,7 @@ class RemoteWorker:
 def _results(
     ray: Any, workers: Workers, open_worker: Callable[[], PhotoWorker], jobs: Sequence[Any], log: Log
 ) -> Generator[Any, None, None]:
-    """As `at_work`, on the cluster; InputError also for a node unlike the others.
+    """Like `at_work`, on the cluster; InputError also for a node that differs from the main process.
 
     A worker that dies is logged and replaced, and its jobs are queued again; InputError after `RETRIES` deaths at one
     photo. Ray's `ActorPool` does not name the call that failed.
@@ -322,7 +324,7 @@ def _results(
 
 
 def _count_death(deaths: Counter[Path | None], photo: Path | None, workers: Workers, why: str, log: Log) -> None:
-    """Log a worker's death; InputError where it is one too many."""
+    """Log a worker's death; InputError after too many."""
     deaths[photo] += 1
     where = f"--ray {workers.ray}: as it started" if photo is None else f"{photo}: at this photo"
     if deaths[photo] > RETRIES:

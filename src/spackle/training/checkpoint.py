@@ -1,4 +1,4 @@
-"""What a run leaves in its folder: a checkpoint to resume from, always a whole one, and curves."""
+"""Files of a training run: the checkpoint, which is always complete, and curves."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Log = Callable[[str], None]
 
 @dataclasses.dataclass
 class Progress:
-    """How far a run has come, as plain numbers."""
+    """The progress of a run, as plain numbers."""
 
     step: int = 0  # steps done
     best: float | None = None  # of the task's aim, such as the loss; None before the first validation
@@ -39,7 +39,7 @@ class Progress:
     history: list[dict[str, float]] = dataclasses.field(default_factory=list)  # each validation's measures
 
     def validated(self, measures: dict[str, float], aim: str, min_delta: float) -> bool:
-        """Note a validation; whether its measure called `aim` is the best so far: the lower the better."""
+        """Record a validation; returns whether its measure `aim` is the lowest so far."""
         self.history.append({"step": self.step, **measures})
         best = math.inf if self.best is None else self.best
         if math.isfinite(measures[aim]) and measures[aim] < best - min_delta:
@@ -51,7 +51,7 @@ class Progress:
 
 @dataclasses.dataclass(frozen=True)
 class Checkpoint:
-    """Everything that the next step depends on; which samples come next follows from the step."""
+    """All state that the next step depends on; its samples follow from the step's number."""
 
     progress: Progress
     network: dict[str, Tensor]
@@ -81,7 +81,7 @@ def load_checkpoint(folder: Path) -> Checkpoint | None:
 
 
 def find_checkpoint(output: Path, method: str, recipe: AnyRecipe, digest: str, log: Log) -> Checkpoint | None:
-    """The checkpoint that a run goes on from, if any.
+    """The checkpoint from which a run resumes, if any.
 
     InputError where the folder holds another run, or its checkpoint cannot be read.
     """
@@ -110,7 +110,7 @@ def remove_run(output: Path) -> None:
 def open_logs(folder: Path, first: int, log: Log) -> AbstractContextManager[Any]:
     """A writer of TensorBoard's event files in a run's folder, None where TensorBoard is not installed.
 
-    What an earlier start logged after the step `first` is hidden.
+    Values that an earlier process logged after the step `first` are hidden.
     """
     try:
         with warnings.catch_warnings():

@@ -1,8 +1,8 @@
 """The paper's naive decoupled baseline ("Direct FT"): the base's own decoder learns what the residual would.
 
-The same targets and the same losses, but a fixed number of Gaussians: to fill a hole, some must leave what they
-showed before, which the paper calls capacity competition. Its implementation has losses at the input view on "the
-non-Spackle training path" alone ("Training Details and Loss Weights"): so each photo's own view is among a step's.
+Targets and losses are the residual's, but the number of Gaussians is fixed: to fill a hole, some must leave the
+surfaces that they showed, which the paper calls capacity competition. The paper has losses at the input view on "the
+non-Spackle training path" alone ("Training Details and Loss Weights"), so a step includes each photo's own view.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class TunableSharp:
 
     @staticmethod
     def load(path: str | os.PathLike[str], precision: torch.dtype, device: torch.device) -> TunableSharp:
-        """Read a checkpoint (see `load_network`), with the heavy arithmetic in float32 or bfloat16; nothing learns yet.
+        """Read a checkpoint (see `load_network`), frozen, with the heavy arithmetic in float32 or bfloat16.
 
         Raises:
             InputError: a missing, broken or foreign file, or too little memory: 2.8 GB while it is read.
@@ -61,14 +61,14 @@ class TunableSharp:
 
     @torch.no_grad()
     def encode(self, rgb: Tensor, photo_camera: Camera) -> DecoderInput:
-        """What the frozen part makes of a photo [H, W, 3], sRGB in 0..1, with a camera of the same size."""
+        """The output of the frozen part for a photo [H, W, 3], sRGB in 0..1, and a camera of the same size."""
         device = next(self.network.parameters()).device
         image = to_square(rgb.to(device), self.network.config.side)
         with own_arithmetic(device):
             return self.network.encode(image, photo_camera.focal[0] / photo_camera.width, usual_windows(device))
 
     def gaussians(self, decoder: nn.Module, encoded: DecoderInput, place: torch.device | str = "cpu") -> Gaussians:
-        """Gaussians in SHARP's normalised space, at a place, with gradients to a `GaussianDecoder`."""
+        """Gaussians in SHARP's normalised space, on a device, with gradients to a `GaussianDecoder`."""
         device = encoded.picture.device
         autocast = torch.autocast(device.type, self.precision, enabled=self.precision != torch.float32)
         with own_arithmetic(device):
@@ -78,12 +78,12 @@ class TunableSharp:
 
 
 def normalised_camera(camera: Camera, photo_camera: Camera) -> Camera:
-    """A camera that sees Gaussians of the normalised space as `camera`, in metres, sees the same ones in metres.
+    """A camera whose image of Gaussians in normalised space equals `camera`'s image of them in metres.
 
-    The way to metres, D = diag(W / 2fx, H / 2fy, 1) of the photo's camera, is not a rotation. On Gaussians it takes an
-    eigendecomposition (`stretch_gaussians`), whose gradient is not defined for round ones, as SHARP's are at first. A
-    renderer only ever applies the camera's matrix P, to centres as P x and to covariances as P Σ Pᵀ; so P D draws the
-    same picture, and every gradient exists.
+    The map to metres, D = diag(W / 2fx, H / 2fy, 1) of the photo's camera, is not a rotation. Applied to Gaussians it
+    needs an eigendecomposition (`stretch_gaussians`), whose gradient is undefined for round Gaussians, such as SHARP's
+    first ones. A renderer only ever applies the camera's matrix P, to centres as P x and to covariances as P Σ Pᵀ; so P
+    D draws the same picture, and every gradient exists.
     """
     fx, fy = photo_camera.focal
     matrix = camera.world_to_camera.double()  # the product rounded to float32 would move the picture
@@ -94,7 +94,7 @@ def normalised_camera(camera: Camera, photo_camera: Camera) -> Camera:
 def render_photo(decoder: nn.Module, base: TunableSharp, views: Sequence[DatasetView], renderer: Renderer) -> ViewBatch:
     """Predict a photo's Gaussians anew, and draw them in some of its views; InputError where memory is too small.
 
-    Only the decoder, which follows on `base`, gets gradients.
+    Only the decoder, which runs after `base`, gets gradients.
     """
     photo_camera = views[0].photo_camera
     advice = ["try optim.precision=bf16"] if base.precision == torch.float32 else []
@@ -105,7 +105,7 @@ def render_photo(decoder: nn.Module, base: TunableSharp, views: Sequence[Dataset
 
 
 class DirectFt(ViewTask):
-    """Items are photos, one at a time: SHARP's decoder keeps gigabytes for the gradient of each."""
+    """An item is a photo; items run one at a time, because each one's gradient takes gigabytes in SHARP's decoder."""
 
     name: ClassVar[str] = "direct-ft"
     at_once = 1
@@ -199,7 +199,7 @@ def _check_base(files: DatasetFiles, weights_sha256: str) -> None:
 
 
 def _find_owner(checkpoint: Path | None) -> Owner:
-    """The checkpoint that learns, checked by the published digest where it was downloaded."""
+    """The checkpoint to train, checked against the published digest if it was downloaded."""
     path = checkpoint or installed("sharp")
     if path is None:
         raise InputError(f"--method direct-ft: {MISSING['sharp']}")

@@ -1,13 +1,13 @@
 """The four terms of eq. 12 as pure functions, and two reported numbers: how far a filled hole is from the truth.
 
-They compare a completed view `rgb` [B, H, W, 3] sRGB 0..1 and its `alpha` [B, H, W] with the `target` [B, H, W, 3] in
-the `hole` [B, H, W] bool, and with `base_rgb` [B, H, W, 3], the same view of the base alone, outside of it. Each is a
-mean over an image's pixels inside or outside of the hole, then over the images of the batch: a small hole counts as
-much as a large one, and an image without such pixels gives 0, differentiable still. So the loss of a batch is the mean
-of the losses of its images, however processes divide them.
+In the `hole` [B, H, W] bool they compare a completed view `rgb` [B, H, W, 3] sRGB 0..1 and its `alpha` [B, H, W] with
+the `target` [B, H, W, 3]; outside of it with `base_rgb` [B, H, W, 3], the base's view. Each is a mean over an image's
+pixels inside or outside of the hole, then over the images of the batch: a small hole counts as much as a large one, and
+an image without such pixels gives 0, differentiable still. So the loss of a batch is the mean of the losses of its
+images, however processes divide them.
 
-The perceptual term and `hole_distance` look through a frozen network (paper, "Training Details and Loss Weights"): the
-paper's ResNet-50, or SqueezeNet 1.0, 3 MB and many times faster.
+The perceptual term and `hole_distance` compare features of a frozen network (paper, "Training Details and Loss
+Weights"): the paper's ResNet-50, or SqueezeNet 1.0, which has 3 MB and is many times faster.
 """
 
 from __future__ import annotations
@@ -134,7 +134,7 @@ def load_features(
     Args:
         name: which network; "none" gives None.
         path: ResNet-50 as torchvision publishes it (.pth); SqueezeNet 1.0 as .npz with `conv1.w`, `conv1.b`,
-            `fire2/conv1x1_1.w`, ... The classifier may be there, and is not used.
+            `fire2/conv1x1_1.w`, ... A classifier in the file is ignored.
         device: where the network is to run.
 
     Raises:
@@ -171,8 +171,8 @@ def _channels(numbers: tuple[float, ...], images: Tensor) -> Tensor:
 def color_loss(rgb: Tensor, target: Tensor, hole: Tensor, blur: float = 0.0) -> Tensor:
     """[] mean |rgb - target| over a hole's pixels and the channels.
 
-    With `blur`, a standard deviation in pixels, the difference is blurred within the hole first: low frequencies alone
-    count, and texture, which nobody can know, is left to the perceptual term.
+    With `blur`, a standard deviation in pixels, the difference is first blurred within the hole, so that only low
+    frequencies count; texture is left to the perceptual term.
     """
     apart = torch.where(hole[..., None], rgb - target, 0)
     if blur > 0:
@@ -207,10 +207,10 @@ def perceptual_loss(
 ) -> Tensor:
     """[] feature reconstruction and Gram statistics near the hole.
 
-    Near is the hole grown by a max-pool of `dilation`, an odd side in pixels; elsewhere the prediction is replaced by
-    the target. F and T are a layer's features [C, h, w] of prediction and target, both divided by the root mean square
-    of T (no gradient), so that every layer speaks in the same units; w [h, w] is the share of each cell that is near.
-    The loss is the sum over layers of
+    It covers the hole dilated by a max-pool of `dilation`, an odd side in pixels; elsewhere the target replaces the
+    prediction. F and T are a layer's features [C, h, w] of prediction and target, both divided by the root mean square
+    of T (no gradient), so that all layers have the same scale; w [h, w] is each cell's share of the dilated hole. The
+    loss is the sum over layers of
 
         sum(w |F - T|) / (C sum(w))  +  gram · mean |G(F) - G(T)|,    G(F) = (F w) F^T / sum(w),  [C, C].
 
@@ -261,7 +261,7 @@ def hole_distance(features: FeatureNet, rgb: Tensor, target: Tensor, hole: Tenso
     published LPIPS.
 
     Args:
-        features: the network to look with, `SqueezeNet` as a rule.
+        features: the feature network, usually `SqueezeNet`.
         rgb: [H, W, 3] the completed view, sRGB 0..1, which counts inside of the hole alone.
         target: [H, W, 3] the truth, finite everywhere.
         hole: [H, W] bool; without one the distance is NaN.
@@ -321,6 +321,6 @@ def _layer_terms(ours: Tensor, theirs: Tensor, weight: Tensor) -> tuple[Tensor, 
 
 
 def _gram(features: Tensor, weight: Tensor, area: Tensor) -> Tensor:
-    """[B, C, C] how channels go together, averaged over cells by weight."""
+    """Gram matrices [B, C, C], averaged over cells by weight."""
     together = (features * weight).flatten(2) @ features.flatten(2).mT
     return together / area.clamp_min(TINY)[:, None, None]

@@ -1,4 +1,4 @@
-"""What a training run is made of: values with bounds, read from YAML with `key=value` on top."""
+"""Recipes of training runs: values with bounds, read from YAML and overridden by `key=value`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ FREE = "free"
 
 
 def _as_number(value: object) -> object:
-    """YAML 1.1 takes 1e3 for text, which a person does not."""
+    """Read 1e3, which is text in YAML 1.1, as a number."""
     try:
         return float(value) if isinstance(value, str) else value
     except ValueError:
@@ -67,7 +67,7 @@ class RecipePart(BaseModel):
 
 
 class RgbdFolder(RecipePart):
-    """What one depth camera took: NAME.color.jpg and NAME.depth.png."""
+    """The frames of one depth camera: NAME.color.jpg and NAME.depth.png."""
 
     folder: Path
     focal_px: Annotated[float, Field(ge=1, le=1e6)]
@@ -75,7 +75,9 @@ class RgbdFolder(RecipePart):
 
 
 class Shares(RecipePart):
-    """How often a view comes from each source; they need not add up to 1. One without data counts as 0."""
+    """How often a view comes from each source; they need not add up to 1. The share of a source without data counts as
+    0.
+    """
 
     composites: Share = 0.66
     rgbd: Share = 0.12
@@ -145,7 +147,7 @@ class OptimRecipe(RecipePart):
 
 
 class RunRecipe(RecipePart):
-    """What has no part in what is learned, except for the seed and when to stop."""
+    """Values that do not change what is learned, except for the seed and the stopping rule."""
 
     seed: Seed = 0  # of the first weights and of the samples' order
     validate_every: Interval = 1000
@@ -157,14 +159,14 @@ class RunRecipe(RecipePart):
 
 
 class AnyRecipe(RecipePart):
-    """What every recipe has, whatever learns."""
+    """The values that all recipes have."""
 
     optim: OptimRecipe = OptimRecipe()
     run: RunRecipe = RunRecipe()
 
 
 class Recipe(AnyRecipe):
-    """All of a training run of the residual or of direct-ft."""
+    """The recipe of a run of the residual or of direct-ft."""
 
     data: DataRecipe = DataRecipe()
     loss: LossRecipe = LossRecipe()
@@ -189,7 +191,9 @@ R = TypeVar("R", bound=AnyRecipe)
 
 
 def differences(stored: Mapping[str, Any], recipe: RecipePart, above: str = "") -> list[str]:
-    """The keys, below `above`, in which a recipe and a stored one (as `model_dump` has it) are different runs."""
+    """The keys, prefixed by `above`, in which a recipe differs from a stored one (by `model_dump`) so that the runs
+    differ.
+    """
     fields, now = type(recipe).model_fields, recipe.model_dump(mode="json")
     keys = [above + name for name, value in stored.items() if name not in fields and value is not None]
     for name, field in fields.items():
@@ -202,7 +206,7 @@ def differences(stored: Mapping[str, Any], recipe: RecipePart, above: str = "") 
 
 
 def load_recipe(kind: type[R], path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> R:
-    """Read a recipe; what the file leaves out is as in `kind`.
+    """Read a recipe; missing values are `kind`'s defaults.
 
     Args:
         kind: `Recipe`, or another one.
@@ -256,7 +260,7 @@ def _set(content: Any, keys: Sequence[str], value: object) -> None:
 
 
 def _first_problem(kind: Any, error: ValidationError) -> str:
-    """The first wrong value's key, and what it takes."""
+    """A message about the first wrong value: its key, and what it must be."""
     first = error.errors()[0]
     key = ".".join(str(name)[:60] for name in first["loc"])
     message = first["msg"][0].lower() + first["msg"][1:]

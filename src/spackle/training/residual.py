@@ -1,6 +1,6 @@
 """The paper's own method: a residual network learns to complete cached samples, the base stays as it is.
 
-`ViewTask` is what it has in common with all that completes views: the loss of eq. 12, and what is measured.
+`ViewTask`, which direct FT shares, has the loss of eq. 12 and the measurements.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class ViewBatch:
 
 
 class ViewTask(Task):
-    """A task whose batches become completed views, with the loss of eq. 12."""
+    """A task that completes batches of views, with the loss of eq. 12."""
 
     measures = ("loss", "color", "alpha", "preserve", "perceptual", "hole_psnr", "seen_psnr", "har_before", "har_after")
 
@@ -105,7 +105,7 @@ class ViewTask(Task):
         }
 
     def facts(self, network: nn.Module) -> dict[str, Any]:
-        """For run.json: what is learned from, and how much of a whole network learns."""
+        """Facts for run.json: the sources, and the number of weights that learn."""
         return {
             "features": self.features.name if self.features else "none",
             "samples": {"train": self.items, "validation": self.validation_items, "digest": self.digest},
@@ -125,10 +125,10 @@ def parameters(network: nn.Module) -> dict[str, int]:
 def complete_samples(
     network: nn.Module | None, samples: Sequence[Sample], renderer: Renderer, precision: torch.dtype = torch.float32
 ) -> ViewBatch:
-    """Run the network on samples of one size, and render them with what it adds; None adds the base values alone.
+    """Run the network on samples of one size, and render them with its Gaussians; None takes the base values alone.
 
     The network, a `ResidualNet` by itself or wrapped, alone gets gradients; its convolutions compute in `precision`.
-    What needs a look at numbers is done before samples travel to the renderer's device, which is waited for once.
+    Steps that read numbers run before samples are moved to the renderer's device, so that it is waited for once.
     """
     device = device_of(renderer)
     cells = [training_cells(sample.features).flatten().nonzero()[:, 0] for sample in samples]
@@ -165,7 +165,7 @@ def training_cells(features: ViewFeatures, least: int = MIN_AUX) -> Tensor:
 
 
 def first_network(name: str, init: Path | None = None) -> ResidualNet:
-    """A network of an architecture to begin with: untrained, or from a file.
+    """The first network of a run: untrained, or from a file.
 
     The file holds such a network's weights, or for a "sharp-decoder" those of SHARP, which has no such stem and heads.
     InputError for a missing, broken or foreign file.
@@ -238,7 +238,9 @@ class ResidualTask(ViewTask):
 
     @torch.no_grad()
     def limits(self) -> dict[str, float]:
-        """Mean hole_psnr in dB of the validation samples: what there is to learn lies between the two."""
+        """Mean hole_psnr in dB of the validation samples, untrained and with the targets' own colours: the range to
+        learn.
+        """
         found: dict[str, list[float]] = {"untrained": [], "colours of the targets": []}
         for item in range(self.validation_items):
             (sample,) = self.batch(None, [item])

@@ -1,4 +1,4 @@
-"""What one training step looks at: a view with holes, its truth, crops of it small enough for a step, and their files.
+"""Training samples: views with holes and their truth, crops of them, and their files.
 
 Each view is made once and read many times: `make_samples` writes the crops of all views into a folder.
 """
@@ -52,7 +52,7 @@ P = TypeVar("P")
 
 @dataclasses.dataclass(frozen=True)
 class Sample:
-    """A view of frozen Gaussians with holes in it, and what it ought to look like. Nothing here wants gradients."""
+    """A view of frozen Gaussians with holes, and its target. Nothing here wants gradients."""
 
     camera: Camera
     base: Gaussians  # those that touch the tiles around the holes
@@ -76,7 +76,7 @@ class Sample:
 
     @functools.cached_property
     def features(self) -> ViewFeatures:
-        """What the view shows, in cells; of a sample on the processor."""
+        """The view's cells; for a sample on the processor."""
         return ViewFeatures.of(self.rendering)
 
     @property
@@ -116,9 +116,9 @@ class Sample:
         )._with_visible_base()
 
     def _with_visible_base(self) -> Sample:
-        """With the base Gaussians that show in tiles of interest: of all others no renderer draws anything there.
+        """The sample with only those base Gaussians that contribute to the tiles that matter.
 
-        Where they are more than `GAUSSIANS_A_PIXEL`, those that show most.
+        If there are more than `GAUSSIANS_A_PIXEL`, those that contribute most are kept.
         """
         with torch.enable_grad():  # the gradient of grey Gaussians' brightness says how much of each shows
             grey = torch.full_like(self.base.colors, 0.5).requires_grad_()
@@ -200,7 +200,7 @@ def _mapped(part: P, function: Callable[[Tensor], Tensor]) -> P:
 
 
 class Source(NamedTuple):
-    """A kind of views with holes and truth, of which a share of the samples is made."""
+    """A source of views with holes and truth, and its share of the samples."""
 
     share: float  # among all sources, which need not add up to 1
     view: Callable[[np.random.Generator, int], Sample]  # the view of a number; InputError for a file that is no use
@@ -209,7 +209,7 @@ class Source(NamedTuple):
 
 
 def digest_of_samples(data: DataRecipe, sources: Sequence[Source]) -> str:
-    """Twelve digits: the same samples have the same ones, wherever the files lie and however many are made."""
+    """Twelve digits that identify the samples' content, wherever the files are and however many are made."""
     facts = data.model_dump(mode="json")
     for name in ("photos", "stereo", "pseudo", "cache", "views", "validation_views"):
         facts.pop(name)
@@ -220,7 +220,7 @@ def digest_of_samples(data: DataRecipe, sources: Sequence[Source]) -> str:
 
 
 def short_digest(value: Any) -> str:
-    """Twelve hexadecimal digits that tell one recipe's data from another's."""
+    """Twelve hexadecimal digits that identify a recipe's data."""
     return hashlib.sha256(repr(value).encode()).hexdigest()[:12]
 
 
@@ -233,18 +233,18 @@ def make_samples(
     progress: Step,
     warn: Callable[[str], None],
 ) -> list[Path]:
-    """The files of all samples of a folder's first views, in order; what is missing is made, by each process a part.
+    """The sample files of a folder's first views, in order; the processes share the work of making missing ones.
 
-    Many recipes may share the folder. `seed` decides the views, of which there are fewer where the only source has no
-    more; `progress` is called with the views of this process that are there, of how many, and `warn` with the reason
-    for each view that gives no sample. InputError where nothing can be written, or no view has a hole to learn from.
+    Many recipes may share the folder. `seed` decides the views, fewer if the only source has no more. `progress` is
+    called with the views that this process has done and their number, `warn` with the reason for each view without a
+    sample. InputError where nothing can be written, or no view has a hole to learn from.
     """
     folder.mkdir(parents=True, exist_ok=True)
     views = _at_most(views, sources)
     shares = np.array([source.share for source in sources])
 
     def drawn(index: int) -> tuple[int, np.random.Generator]:
-        """Which source a view is of, and what else is drawn for it."""
+        """Draw a view's source, and the random numbers for it."""
         rng = np.random.default_rng([seed, index])
         return int(rng.choice(len(sources), p=shares / shares.sum())), rng
 
@@ -278,19 +278,19 @@ def make_samples(
 
 
 def disk_needed(data: DataRecipe, sources: Sequence[Source], folder: Path, views: int) -> int:
-    """Bytes at most that the samples of a folder's first views will take, beyond those that are there."""
+    """Maximum number of bytes that the missing samples of a folder's first views will take."""
     missing = sum(_crop_files(folder, index) is None for index in range(_at_most(views, sources)))
     return missing * data.crops * (data.cells**2 * int(CELL**2 * PIXEL_BYTES + CELL_BYTES) + HEADER_BYTES)
 
 
 def _at_most(views: int, sources: Sequence[Source]) -> int:
-    """So many views, or as many as the only source has."""
+    """The recipe's number of views, or fewer if the only source has fewer."""
     alone = sources[0].views if len(sources) == 1 else None
     return views if alone is None else min(views, alone)
 
 
 def _crop_files(folder: Path, index: int) -> list[Path] | None:
-    """The files of a view's crops; None where they are still to be made."""
+    """The files of a view's crops; None if they have not been made."""
     with contextlib.suppress(FileNotFoundError, ValueError):
         count = int((folder / f"{index:06d}.done").read_text())
         files = [folder / f"{index:06d}-{number}.safetensors" for number in range(count)]

@@ -1,7 +1,8 @@
 """Where views with holes and their truth come from: photos, RGB-D frames, stereo pairs, a pseudo-supervised dataset.
 
-`reverse_view` needs no inpainter: what a virtual camera cannot see of a photo is a hole in it, and it is the truth.
-Photos without depth become scenes: cut-outs of some stand at known depths in front of another (`composite`).
+`reverse_view` needs no inpainter: parts of a photo that a virtual camera cannot see are holes, and the photo is their
+truth.
+Photos without depth become scenes: cut-outs of photos at known depths before another photo (`composite`).
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ View = Callable[[np.random.Generator], Sample]
 
 
 def find_sources(data: DataRecipe, renderer: Renderer, *, validation: bool) -> list[Source]:
-    """Look for a recipe's files, to learn from or for `validation`: of a dataset these are other photos.
+    """Find a recipe's files, to learn from or for `validation`; for a dataset these are different photos.
 
     InputError for a folder that is missing or without such files, or no data.
     """
@@ -79,7 +80,7 @@ def find_sources(data: DataRecipe, renderer: Renderer, *, validation: bool) -> l
         photo_at = lru_cache(1)(dataset.__getitem__)  # its views follow on each other
 
         def stored(rng: np.random.Generator, index: int) -> Sample:
-            """A view, rendering and all; InputError for a damaged file."""
+            """A stored view with its rendering; InputError for a damaged file."""
             photo = photo_at(places[index][0])
             view = photo.view(places[index][1])
             return Sample.of(photo.base, view.rendering, view.camera, view.photo_camera, view.photo, view.target)
@@ -108,12 +109,12 @@ def find_files(folder: Path, key: str, endings: tuple[str, ...], what: str) -> l
 
 
 def reverse_view(prediction: BasePrediction, photo: Tensor, viewer: Camera, renderer: Renderer) -> Sample:
-    """Keep the Gaussians that a virtual camera sees, and look at them from the photo's own camera.
+    """Keep the Gaussians that a virtual camera sees, and render them at the photo's own camera.
 
-    The virtual camera plays the part of the photo's, and the photo that of the novel view.
+    The virtual camera takes the place of the photo's camera, and the photo that of the novel view.
 
     Args:
-        prediction: what `lift` makes of a photo without tiles: a Gaussian a pixel, the rest of mixed ones, the backing.
+        prediction: from `lift` without tiles: a Gaussian a pixel, the other surface of mixed pixels, the backing.
         photo: [H, W, 3] sRGB at the camera's size.
         viewer: the virtual camera.
         renderer: draws the views.
@@ -125,10 +126,10 @@ def reverse_view(prediction: BasePrediction, photo: Tensor, viewer: Camera, rend
 
 
 def seen_from(gaussians: Gaussians, viewer: Camera, depth: Tensor) -> Tensor:
-    """[N] bool: which Gaussians a camera sees, by their rendered `depth` [H, W] around their centres.
+    """[N] bool: the Gaussians that a camera sees, by the rendered `depth` [H, W] around their centres.
 
-    Around, because a blob is wider than a pixel: at an outline the nearer surface's depth bleeds over
-    the farther one, and on steep ground a pixel's depth is behind half of what lies in it.
+    Neighbouring pixels count, because a blob is wider than a pixel: at an outline the nearer depth bleeds over the
+    farther surface, and on a steep surface half of a pixel lies before its depth.
     """
     around = max_pool2d(depth[None, None], 3, stride=1, padding=1)[0, 0]
     uv, z = viewer.project(gaussians.means)
@@ -141,8 +142,8 @@ def seen_from(gaussians: Gaussians, viewer: Camera, depth: Tensor) -> Tensor:
 def with_backing(seen: Tensor, gaussians: Gaussians, camera: Camera) -> Tensor:
     """`seen` [N] of a lifted photo's Gaussians, a backing one counting as the farthest of the pixels around it.
 
-    A backing Gaussian lies behind its surface on purpose, so its own depth says nothing. The photo's pixels come first;
-    of all others those backing ones stand at the corners of pixels (see `spackle.bases.lift.lift`).
+    A backing Gaussian lies behind its surface by design, so its own depth is no criterion. Pixels' Gaussians come
+    first; of the others, backing ones are those at corners of pixels (see `spackle.bases.lift.lift`).
     """
     width, height = camera.width, camera.height
     uv, z = camera.project(gaussians.means)
@@ -189,9 +190,9 @@ def open_pseudo(location: str | os.PathLike[str]) -> DatasetFiles:
 
 
 def divided_photos(files: DatasetFiles, data: DataRecipe) -> tuple[list[int], list[int]]:
-    """The places of a dataset's photos to learn from and of those for validation, in an order of `data.seed`.
+    """Indices of a dataset's photos to learn from and of those for validation, shuffled by `data.seed`.
 
-    A photo is in one of the two with all of its views. InputError for a single photo.
+    All views of a photo are in the same part. InputError for a single photo.
     """
     photos, per_photo = len(files), len(files.samples[0][1].holes)
     if photos < 2:
@@ -230,7 +231,8 @@ def _chosen(rng: np.random.Generator, files: Sequence[Path]) -> Path:
 def load_frame(color: Path, unit_m: float) -> tuple[Tensor, DepthMap]:
     """A depth camera's photo NAME.color.jpg [H, W, 3] sRGB and its depth, which lies beside it.
 
-    `unit_m` is of the depth map's numbers, of which 0 and 65535 are unknown. InputError for a missing or broken file.
+    `unit_m` is the length of one unit of the depth map, in which 0 and 65535 are unknown. InputError for a missing or
+    broken file.
     """
     rgb = load_photo(color).rgb
     stored = load_depth(color.with_name(color.name.replace(".color.", ".depth.")).with_suffix(".png"))
@@ -337,7 +339,7 @@ def _tilt(rng: np.random.Generator, height: int, width: int, most: float) -> Ten
 
 
 def outline(rng: np.random.Generator, picture: Tensor) -> Tensor:
-    """An outline [H, W] in 0..1, soft over about a pixel as a camera's edges are."""
+    """A mask [H, W] in 0..1 of random shape, whose edge is soft over about a pixel, like a camera's."""
     height, width = picture.shape[:2]
     cloud = _noise(rng, height, width, rng.uniform(0.1, 0.35))
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
@@ -361,7 +363,7 @@ def outline(rng: np.random.Generator, picture: Tensor) -> Tensor:
 
 
 def _noise(rng: np.random.Generator, height: int, width: int, size: float) -> Tensor:
-    """Smooth noise [H, W] of about ±1; `size` is that of its features over the width."""
+    """Smooth noise [H, W] of about ±1; `size` is the size of its features relative to the width."""
     rows, columns = max(2, round(height / (size * width))), max(2, round(1 / size))
     coarse = torch.from_numpy(rng.standard_normal((1, 1, rows, columns)).astype(np.float32))
     return interpolate(coarse, size=(height, width), mode="bicubic", align_corners=True)[0, 0]

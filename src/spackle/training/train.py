@@ -1,7 +1,7 @@
 """The training loop, from top to bottom: batch, forward, losses, step, validate, save.
 
-A `Task` says what learns, and from what. Several processes that torchrun started train one network together. Whatever
-stops a run, it goes on from its last checkpoint.
+A `Task` defines the network, its data and its loss. Several processes that torchrun started train one network together.
+A run that was stopped in any way resumes from its last checkpoint.
 """
 
 from __future__ import annotations
@@ -64,9 +64,9 @@ V = TypeVar("V")
 
 
 class Task(Protocol):
-    """What learns, and from which items; they are counted from 0.
+    """A network to train, and the items that it learns from, numbered from 0.
 
-    To make one is quick, and refuses with an InputError what cannot be used. `prepare` gives it the rest of its values.
+    Its construction is quick, and raises InputError for unusable input. `prepare` sets the remaining attributes.
     """
 
     name: ClassVar[str]  # as `--method` and checkpoints have it
@@ -80,7 +80,9 @@ class Task(Protocol):
     validation_items: int
 
     def prepare(self, output: Path, reporter: Reporter) -> dict[str, Any]:
-        """Do the long work, in every process; returns facts for run.json. InputError for files that cannot be used."""
+        """Do the long preparations, in every process; returns facts for run.json. InputError for files that cannot be
+        used.
+        """
 
     def groups(self) -> list[dict[str, Any]]:
         """The optimiser's groups of weights; "lr_scale" in one is a factor on the learning rate."""
@@ -96,13 +98,13 @@ class Task(Protocol):
         """The loss [] of a batch, with gradients, and its terms []."""
 
     def measure(self, network: nn.Module, batch: Any) -> dict[str, list[float]]:
-        """How good a network is on a batch of validation items: each measure's values."""
+        """The measures of a network on a batch of validation items, with the values of each."""
 
     def picture(self, network: nn.Module) -> Tensor:
         """[H, W, 3] sRGB: a few validation items."""
 
     def names(self, step: int, items: Sequence[int]) -> list[str]:
-        """What a step's items are called, for a person who looks for a bad one."""
+        """Names of a step's items, to find a bad one."""
 
     def export(self, network: nn.Module, path: Path) -> None:
         """Write weights as the rest of the package reads them; InputError where that cannot be."""
@@ -115,9 +117,9 @@ def train(
 
     Args:
         recipe: what to do.
-        open_task: makes the task whose networks run on a device; refuses what cannot be used, before any long work.
+        open_task: makes the task for a device; raises InputError for unusable input, before any long work.
         output: a folder for all results.
-        reporter: the first process reports to it.
+        reporter: used by the first process.
         overwrite: start anew: an older run in `output` is deleted, its samples stay.
 
     Returns:
@@ -177,7 +179,7 @@ def _learn(
         return Checkpoint(progress, *states, facts["recipe"], task.digest, task.name)
 
     def ended() -> str:
-        """Why the run is at its end; empty where it goes on."""
+        """Why the run ends here; empty if it continues."""
         if progress.step >= optim.steps:
             return "steps"
         return "patience" if progress.stale >= run.patience else "stopped" if stopped else ""
@@ -282,7 +284,7 @@ def _learn(
 def validate(task: Task, network: nn.Module, device: torch.device) -> dict[str, float]:
     """Means of a task's measures over its validation items, the same in all processes, which share the items.
 
-    A measure that no item has is missing.
+    A measure without any value is left out.
     """
     totals, counts = dict.fromkeys(task.measures, 0.0), dict.fromkeys(task.measures, 0.0)
     mine, size = range(rank(), task.validation_items, rank_count()), task.at_once or task.items_a_step // rank_count()
@@ -295,7 +297,7 @@ def validate(task: Task, network: nn.Module, device: torch.device) -> dict[str, 
 
 
 def made_ahead(make: Callable[[K], V], keys: Iterable[K]) -> Generator[V, None, None]:
-    """The values of keys, in order; a thread makes the next one while one is used."""
+    """The values of keys, in order; a thread computes the next one while the current one is used."""
     with ThreadPoolExecutor(1, thread_name_prefix="batches") as worker:
         begun = deque[Future[V]]()
         for key in keys:
@@ -314,12 +316,12 @@ def learning_rate(step: int, optim: OptimRecipe) -> float:
 
 
 def ema_decay(step: int, decay: float) -> float:
-    """Share of the average that stays at a step."""
+    """The share of the old average that is kept at a step."""
     return min(decay, (step + 1) / (step + EMA_START))
 
 
 def samples_of_step(step: int, count: int, batch: int, seed: int, rank: int = 0, ranks: int = 1) -> list[int]:
-    """Which of `count` samples a process sees at a step: nothing but the arguments decides.
+    """The indices, below `count`, of a process's samples at a step, decided by the arguments alone.
 
     Every epoch is a permutation of all samples by `seed`; a batch may end one and begin the next. All `ranks` processes
     share the same global batch, which they divide evenly.
@@ -339,7 +341,7 @@ def _epoch(seed: int, epoch: int, count: int) -> NDArray[np.int64]:
 
 @contextlib.contextmanager
 def joined_ranks(kind: str) -> Iterator[torch.device]:
-    """Join the processes of this run, as torchrun's environment names them; yields this one's device of a kind.
+    """Join the processes of this run, by torchrun's environment variables; yields this process's device.
 
     "cuda" talks by nccl, "cpu" by gloo. InputError for variables that are no numbers, or others that cannot be reached.
     """
@@ -368,7 +370,7 @@ def rank_count() -> int:
 
 
 def wait_for_ranks() -> None:
-    """Until all have come here."""
+    """Wait until all processes have come here."""
     if rank_count() > 1:
         dist.barrier()
 

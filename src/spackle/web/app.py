@@ -65,16 +65,16 @@ def create_app(
 ) -> FastAPI:
     """An app for a server, or to mount in another app, which then says who may ask.
 
-    Its processes start at once and end with the app; where another app mounts it, `app.state.jobs.close()` ends them.
-    Photos that wait or are at work go on when an app next takes up the folder.
+    Its processes start at once and end with the app; if another app mounts it, call `app.state.jobs.close()` at the
+    end. Unfinished photos resume when an app next opens the folder.
 
     Args:
         folder: for photos and scenes; InputError where another server uses it.
-        work: what a process does with a photo.
+        work: the function of a worker process for a photo.
         workers: number of processes, each of which holds the base's network.
-        keep: what the folder may hold, and how many photos may wait.
-        access: who may ask.
-        limits: what a client may take.
+        keep: limits of the folder: age and size of scenes, and the number of waiting photos.
+        access: token and host that requests are checked against; None leaves that to the caller.
+        limits: upload size, connections and times of a client.
     """
     jobs = Jobs(folder, work, workers, keep)
     bases = work.bases if isinstance(work, SceneWork) else [AUTO]
@@ -104,7 +104,7 @@ def create_app(
 
     @app.post(SCENES, status_code=202, openapi_extra={"requestBody": {"content": {"multipart/form-data": UPLOAD}}})
     async def post_photo(request: Request, response: Response) -> SceneState:
-        """Send a photo. It waits until a process has time for it; the queue's end is 429."""
+        """Send a photo. The photo is queued; if the queue is full, the answer is 429."""
         with jobs.place() as new:
             try:
                 form = await asyncio.wait_for(request.form(max_files=2, max_fields=1), limits.upload)
@@ -120,14 +120,14 @@ def create_app(
 
     @app.get(SCENES + "/{id}")
     async def get_state(id: str) -> SceneState:
-        """How far a photo is, and which files there are."""
+        """The state of a photo and its files."""
         job = job_of(id)
         names = {name for folder in (job.folder, job.results) if folder.is_dir() for name in os.listdir(folder)}
         return job.model_copy(update={"files": sorted(names.intersection(FILES))})
 
     @app.delete(SCENES + "/{id}", status_code=204)
     async def delete(id: str) -> None:
-        """Forget a photo and its scene; work on it ends."""
+        """Delete a photo and its scene, and end work on it."""
         await run_in_threadpool(jobs.remove, job_of(id).id)
 
     @app.get(SCENES + "/{id}/events", response_class=EventSourceResponse)
@@ -142,7 +142,7 @@ def create_app(
 
     @app.get(SCENES + "/{id}/files/{file}", response_class=FileResponse)
     async def get_file(id: str, file: FileName | PagePart) -> FileResponse:
-        """A file of a scene that is done; one that the options left out is made now."""
+        """A file of a finished scene; a file that the options left out is made now."""
         job = job_of(id)
         path = (job.folder if file == PREVIEW else job.results) / file
         if not path.is_file():
@@ -173,7 +173,7 @@ def create_app(
 
 
 def accept(form: FormData, folder: Path, jobs: Jobs, bases: list[str]) -> Job:
-    """The job of a form's photo, which is decoded first; HTTPException for what is not taken."""
+    """Decode a form's photo and add its job; HTTPException if it is refused."""
     photo, depth, text = form.get("photo"), form.get("depth"), form.get("options") or "{}"
     if not isinstance(photo, UploadFile) or not isinstance(text, str):
         raise HTTPException(422, "send the photo as the file `photo`, and the options as the text `options`")
@@ -197,7 +197,7 @@ def accept(form: FormData, folder: Path, jobs: Jobs, bases: list[str]) -> Job:
 
 
 def _saved(upload: UploadFile, folder: Path, stem: str, name: str, suffixes: tuple[str, ...]) -> str:
-    """Keep an upload under a name of ours."""
+    """Store an upload under a safe name."""
     suffix = PurePosixPath(upload.filename or "").suffix.lower()
     if suffix not in suffixes:
         raise HTTPException(415, f"{name}: not a kind of file that is taken here: give {', '.join(suffixes)}")
@@ -209,7 +209,7 @@ def _saved(upload: UploadFile, folder: Path, stem: str, name: str, suffixes: tup
 
 
 def shown_name(given: str) -> str:
-    """The last part of a file's name in a form that no terminal, page or log can take for anything but a name."""
+    """The last part of a file's name, made safe to show in terminals, pages and logs."""
     last = re.split(r"[/\\]", given)[-1]
     name = "".join(character for character in last if character.isprintable()).strip()
     return name if len(name) <= MAX_NAME else f"{name[: MAX_NAME // 2]}…{name[-MAX_NAME // 2 :]}"

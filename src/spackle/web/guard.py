@@ -1,7 +1,7 @@
-"""Who may ask, and how much a client may take: the outermost layer of the app.
+"""The outermost layer of the app: checks access, and limits what a client may use.
 
 A page of a stranger can make a browser send requests to this machine, and by DNS rebinding even under the stranger's
-own name. Such a request gives itself away by its Host, its Origin or its Sec-Fetch-Site.
+own name. Such a request is recognised by its Host, Origin or Sec-Fetch-Site header.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ HEADERS = {
 
 
 class Limits(NamedTuple):
-    """Of a client; times in seconds."""
+    """Limits for a client; times in seconds."""
 
     upload: float = 300  # all of an upload
     send: float = 20  # for a piece of an answer: a client that never reads must not keep a file open
@@ -48,7 +48,7 @@ class Limits(NamedTuple):
 
 
 class Access(NamedTuple):
-    """Who may ask a server that listens by itself; an app that another app mounts leaves that to the other."""
+    """Access rules of a stand-alone server; a mounted app leaves access to the app that mounts it."""
 
     token: str | None  # as the first part of the path, or as Bearer; without one nothing is written
     names: frozenset[str] = frozenset({"localhost"})  # hosts, besides numeric addresses, which cannot be rebound
@@ -56,7 +56,7 @@ class Access(NamedTuple):
 
     @staticmethod
     def at(host: str, address: str, token: str | None) -> Access:
-        """Of a server that listens at `host`, whose numeric address is `address`."""
+        """The access rules of a server that listens at `host`, whose numeric address is `address`."""
         if is_loopback(address):
             return Access(token)
         machine = socket.gethostname().lower()
@@ -64,7 +64,7 @@ class Access(NamedTuple):
         return Access(token, frozenset({"localhost", machine, short, f"{short}.local", host.lower()}), False)
 
     def admitted(self, scope: Scope, headers: Headers) -> Scope:
-        """The request below the token in its path, or as it is; HTTPException where it has no right to ask."""
+        """Check a request, and strip the token from its path; HTTPException without a valid token."""
         hosts = headers.getlist("host")
         match = HOST.fullmatch(hosts[0].strip()) if len(hosts) == 1 else None
         if match is None or not self._is_own(match[1].lower()):
@@ -98,7 +98,7 @@ def is_loopback(address: str) -> bool:
 
 
 class Guard:
-    """Refuses, bounds, and says in every answer what a browser may do with it."""
+    """Middleware that refuses or limits requests, and sets security headers in every answer."""
 
     def __init__(self, app: ASGIApp, access: Access | None, limits: Limits) -> None:
         self.app, self.access, self.limits = app, access, limits

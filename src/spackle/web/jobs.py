@@ -1,4 +1,4 @@
-"""Jobs: photos that become scenes, each worker process at one of them, in a folder that survives the server."""
+"""Jobs: photos that become scenes, one for each worker process at a time, in a folder that survives the server."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ LOOK_S = 60.0  # between two looks for results that are too old
 
 
 class Keep(NamedTuple):
-    """What the folder may hold; the oldest jobs that have ended go first."""
+    """Limits of the folder; the oldest finished jobs are removed first."""
 
     seconds: float = 7 * 86400.0  # since a job ended
     size: float = 20e9  # bytes
@@ -38,7 +38,7 @@ class Keep(NamedTuple):
 
 
 class SceneState(BaseModel):
-    """A photo on its way to a scene."""
+    """The state of a photo, as clients see it."""
 
     id: str
     name: str
@@ -53,7 +53,7 @@ class SceneState(BaseModel):
 
 
 class Job(SceneState):
-    """What the server alone knows of it; RECORD holds all but the folder."""
+    """The state with fields for the server alone; RECORD stores all but the folder."""
 
     source: str  # below the job's folder, or elsewhere on this machine
     depth: str | None = None
@@ -72,11 +72,11 @@ class Job(SceneState):
 class Jobs:
     """The jobs in a folder, and the processes that work on them.
 
-    A `Job` is never changed: whatever happens to it puts another in its place.
+    A `Job` is immutable: each change replaces it by a new one.
 
     Args:
         folder: holds a folder for each job; InputError where another server uses it.
-        work: takes (job, file) and tells {stage, done, total} or {line}. Without a file it makes a scene of a photo;
+        work: takes (job, file) and reports {stage, done, total} or {line}. Without a file it makes a scene of a photo;
             with one it adds that file to a scene that is done.
         workers: number of processes for photos; one more adds files.
         keep: what the folder may hold.
@@ -97,7 +97,7 @@ class Jobs:
         threading.Thread(target=self._tidy_until_closed, daemon=True).start()
 
     def _take_up(self) -> None:
-        """What an earlier server left waits again; uploads that were not whole go."""
+        """Queue the unfinished jobs of an earlier server again, and delete incomplete uploads."""
         for folder in self.folder.iterdir():
             if folder.name.startswith(NEW):
                 shutil.rmtree(folder, ignore_errors=True)
@@ -121,7 +121,7 @@ class Jobs:
 
     @contextlib.contextmanager
     def place(self) -> Iterator[Path]:
-        """Hold a place in the queue while a photo is received into the folder that is yielded; 429 where it is full."""
+        """Reserve a place in the queue while a photo is received into the yielded folder; 429 if the queue is full."""
         with self._lock:
             waiting = self._receiving + sum(job.state == "queued" for job in self._jobs.values())
             if waiting >= self.keep.waiting:
@@ -139,7 +139,7 @@ class Jobs:
                 self._receiving -= 1
 
     def add(self, folder: Path, name: str, source: str, depth: str | None, options: dict[str, Any]) -> Job:
-        """The job of what lies in a folder of `place`; `source` and `depth` may lie elsewhere."""
+        """Add the job of a photo in a folder of `place`; `source` and `depth` may lie elsewhere."""
         id = folder.name.removeprefix(NEW)
         job = Job(id=id, name=name, source=source, depth=depth, options=options, folder=folder)
         job.save()
@@ -148,11 +148,11 @@ class Jobs:
         return job
 
     def make(self, job: Job, file: str) -> Future[str | None]:
-        """One more file of a scene that is done: None, or why it could not be made."""
+        """Make one more file of a finished scene; the future's result is None, or the reason for failure."""
         return self._files.submit(lambda: self._process().do((job, file), lambda event: None))
 
     def remove(self, id: str) -> None:
-        """Forget a job and its files; the process that works on it is killed."""
+        """Delete a job and its files, and kill the process that works on it."""
         with self._lock:
             job = self._jobs.pop(id, None)
             if process := self._running.pop(id, None):
@@ -161,7 +161,7 @@ class Jobs:
             shutil.rmtree(job.folder, ignore_errors=True)
 
     def close(self) -> None:
-        """Kill the processes; jobs go on when a server next takes up the folder."""
+        """Kill the processes; jobs resume when a server next opens the folder."""
         with self._lock:
             self._closed.set()
             for process in self._processes:
@@ -171,7 +171,7 @@ class Jobs:
         self._held.close()
 
     def _process(self) -> TaskProcess:
-        """The calling thread's own; another where it died."""
+        """The calling thread's process; a new one if the old one died."""
         process: TaskProcess | None = getattr(self._of_thread, "process", None)
         with self._lock:
             if process is None or not (process.alive or self._closed.is_set()):
@@ -181,7 +181,7 @@ class Jobs:
         return process
 
     def _run(self, id: str) -> None:
-        """Hand a photo to the thread's process, until the scene is there."""
+        """Give a photo to the thread's process, and wait for the scene."""
         process, start = self._process(), time.monotonic()
         with self._lock:
             if self._closed.is_set() or id not in self._jobs:
@@ -211,7 +211,7 @@ class Jobs:
             self._change(id, stage=event["stage"], share=event["done"] / total if total else None)
 
     def _end(self, id: str, error: str | None) -> None:
-        """Keep a job's end on the disk, and then tell it; the photo goes."""
+        """Record a job's end on the disk, then publish it; the photo is deleted."""
         with self._lock:
             if (job := self._jobs.get(id)) is None:
                 return

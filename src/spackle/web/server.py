@@ -1,4 +1,4 @@
-"""A server for the app, whose clients may be slow or silent."""
+"""A server for the app that bears slow and silent clients."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def server_of(app: FastAPI, silent: float = SILENT_S) -> uvicorn.Server:
 
 
 class PatientProtocol(H11Protocol):
-    """Closes a connection that leaves us waiting, though not one that waits for us."""
+    """Closes a connection on which the client is silent, though not one on which it waits for an answer."""
 
     silent = SILENT_S
 

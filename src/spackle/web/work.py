@@ -1,4 +1,4 @@
-"""What a worker process does: a photo or a scene to what the page shows and to the files that people download."""
+"""The work of a worker process: from a photo or scene to the page's data and the files for download."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ FORMATS = frozenset({"JPEG", "MPO", "PNG", "WEBP", "HEIF", "TIFF"})
 
 
 class SceneOptions(BaseModel):
-    """How a photo becomes a scene."""
+    """Options of a client for a scene."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -68,7 +68,7 @@ class SceneOptions(BaseModel):
 
 @dataclasses.dataclass
 class SceneWork:
-    """Does jobs, and keeps the last base loaded."""
+    """The worker's function, which keeps the last base loaded."""
 
     base: BaseSettings = dataclasses.field(default_factory=BaseSettings)
     usual: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # options of jobs that do not say otherwise
@@ -77,7 +77,7 @@ class SceneWork:
 
     @property
     def bases(self) -> list[str]:
-        """What a client may name: this one, auto, and those that need no download."""
+        """The bases that a client may choose: the server's own, auto, and those that need no download."""
         return list(dict.fromkeys([self.base.name, AUTO, *BaseSettings().files]))
 
     def __call__(self, task: tuple[Job, str | None], tell: Tell) -> None:
@@ -106,7 +106,7 @@ class SceneWork:
             raise InputError(teller.cleaned(str(error))) from error
 
     def _complete(self, job: Job, options: SceneOptions, teller: Teller) -> str:
-        """A photo to the files of `predict_photo`; what a person should know of the scene."""
+        """Make the files of `predict_photo` from a photo; returns a remark for the user."""
         settings = self.base
         if job.depth is not None:
             depth, kind = job.folder / job.depth, options.depth_kind
@@ -139,7 +139,7 @@ class SceneWork:
 
 
 class Teller(Reporter):
-    """Tells the server what a terminal would get, with the photo's own name in place of a path of this machine."""
+    """Reports to the server what a terminal would show, with the photo's name in place of a path."""
 
     def __init__(self, job: Job, tell: Tell, verbose: bool) -> None:
         super().__init__(verbose, Console(file=io.StringIO(), force_terminal=False))
@@ -155,16 +155,16 @@ class Teller(Reporter):
 
     @contextlib.contextmanager
     def stage(self, name: str) -> Iterator[Step]:
-        """As `Reporter.stage`; a total of 0 is unknown."""
+        """Like `Reporter.stage`; a total of 0 means unknown."""
         self._tell({"stage": name, "done": 0, "total": 0})
         with super().stage(name):
             yield lambda done, total: self._tell({"stage": name, "done": done, "total": total})
 
 
 def check_photo(path: Path, name: str, preview: Path) -> None:
-    """Decode all of a photo, and write a small JPEG of it, which the page shows meanwhile.
+    """Decode a photo completely, and write a small JPEG of it, which the page shows until the scene is ready.
 
-    InputError, which calls the file `name`, for what is no photo of a kind that is taken.
+    InputError, naming the file `name`, if it is no photo of an accepted format.
     """
 
     def decode(image: Image.Image) -> None:

@@ -1,4 +1,4 @@
-"""Weights that others publish: what is known of each file, and where it lies on this machine.
+"""Published weights: facts about each file, and its place on this machine.
 
 `published.json` holds the facts; to add a file, add an entry. `download.py` fetches one.
 """
@@ -33,7 +33,7 @@ class PublishedWeights:
 
     @property
     def address(self) -> str:
-        """Where the file is, on the mirror of the hub if one is named."""
+        """The file's address, on the hub's mirror if one is set."""
         mirror = os.environ.get("HF_ENDPOINT", "").rstrip("/")
         return mirror + self.url.removeprefix(HUB) if mirror and self.url.startswith(f"{HUB}/") else self.url
 
@@ -67,7 +67,7 @@ def installed(name: str) -> Path | None:
 
 
 def published_as(path: Path) -> PublishedWeights | None:
-    """The published weights that a file is by its name and size; None for a file of somebody's own."""
+    """The entry of published weights that matches a file's name and size; None for other files."""
     for entry in PUBLISHED.values():
         named = path.parts[-len(Path(entry.file).parts) :] == Path(entry.file).parts
         if named and os.path.isfile(path) and os.path.getsize(path) == entry.bytes:
@@ -76,7 +76,7 @@ def published_as(path: Path) -> PublishedWeights | None:
 
 
 def check_undamaged(path: Path) -> None:
-    """InputError where a file has the name and the size of published weights, and other bytes, or cannot be read."""
+    """InputError if a file with the name and size of published weights has another digest, or cannot be read."""
     entry = published_as(path)
     if entry is not None and file_digest(path) != entry.sha256:
         again = f"delete it and run `spackle weights get {entry.name}`"
@@ -84,13 +84,13 @@ def check_undamaged(path: Path) -> None:
 
 
 def weights_digest(path: Path) -> str:
-    """SHA-256 of weights: the published one where name and size are, which `check_undamaged` holds a file to."""
+    """SHA-256 of a weight file: the published one if name and size match, which `check_undamaged` verifies."""
     entry = published_as(path)
     return file_digest(path) if entry is None else entry.sha256
 
 
 def weights_digests(files: Mapping[str, Path]) -> str | dict[str, str] | None:
-    """`weights_digest` of a network's files: of each by its name where there are several, None where there are none."""
+    """`weights_digest` of a network's files: one digest, a dict by names for several files, None for none."""
     digests = {name: weights_digest(file) for name, file in files.items()}
     return digests if len(digests) > 1 else next(iter(digests.values()), None)
 

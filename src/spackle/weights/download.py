@@ -1,4 +1,4 @@
-"""A file whose size and SHA-256 are known, from a web server: whole or not there, and continued after a break."""
+"""Download a file of known size and SHA-256: complete or not at all, and resumed after an interruption."""
 
 from __future__ import annotations
 
@@ -26,17 +26,18 @@ Progress = Callable[[int, int], None]  # (bytes done, of how many)
 
 
 class Dropped(Exception):
-    """No connection, or no longer."""
+    """There is no connection, or it broke."""
 
 
 def download(url: str, path: str | os.PathLike[str], size: int, sha256: str, progress: Progress | None = None) -> None:
     """Fetch `url` (http or https, without a password) to `path` in a folder that exists.
 
-    A file that is there is replaced at the end; until then what has come lies in NAME.part. After a break, a kill or
-    Ctrl-C the next call asks for the rest only. `progress` gets the bytes done, those of earlier calls among them.
+    An existing file is replaced at the end; until then the received bytes are in NAME.part. After a break, a kill or
+    Ctrl-C the next call asks for the rest only. `progress` gets the bytes received so far, including those of earlier
+    calls.
 
     Raises:
-        InputError: the file cannot be had or not be written, is another one, or another process is at it.
+        InputError: the file cannot be fetched or written, has other content, or is being downloaded by another process.
     """
     check_url(url)
     target = check_writable(path)
@@ -76,10 +77,10 @@ def check_url(url: str) -> None:
 
 
 def _receive(url: str, part: Path, size: int, progress: Progress) -> None:
-    """Bring `part` to `size` bytes; a connection that breaks is tried again, one that never came about is not.
+    """Complete `part` to `size` bytes; a broken connection is retried, one that could not be opened is not.
 
     Raises:
-        InputError: the file cannot be had; what has come stays in `part`.
+        InputError: the file cannot be fetched; the received bytes stay in `part`.
         OSError: `part` cannot be written.
     """
     kept, pauses = _size(part), list(PAUSES)
@@ -99,7 +100,7 @@ def _size(part: Path) -> int:
 
 
 def _receive_rest(url: str, part: Path, size: int, progress: Progress) -> None:
-    """Ask for what `part` lacks, through the environment's proxies (https_proxy, no_proxy) and redirects."""
+    """Request the missing rest of `part`, through the environment's proxies (https_proxy, no_proxy) and redirects."""
     there = _size(part)
     headers = {"User-Agent": "spackle", "Accept-Encoding": "identity"}
     if 0 < there < size:
@@ -129,7 +130,7 @@ def _receive_rest(url: str, part: Path, size: int, progress: Progress) -> None:
 
 @contextlib.contextmanager
 def _network(url: str) -> Iterator[None]:
-    """Dropped where the server cannot be reached, InputError where it does not give the file."""
+    """Raises Dropped if the server cannot be reached, InputError if it does not give the file."""
     try:
         yield
     except HTTPError as error:
@@ -144,7 +145,7 @@ def _network(url: str) -> Iterator[None]:
 
 
 def _first_byte(url: str, response: HTTPResponse, there: int, size: int) -> int:
-    """Where in the file an answer begins: after the bytes that are there, or at 0 where the server gives the whole.
+    """The offset at which an answer begins: after the existing bytes, or 0 if the server sends the whole file.
 
     InputError where it is no file, or not one of `size` bytes.
     """
