@@ -1,4 +1,4 @@
-"""Photos that bring their depth along, written by the letter of each layout: HEIC, and JPEG in four ways.
+"""Photos that bring their depth along, by the letter of each layout: HEIC as files, and JPEG written in four ways.
 
 The photo's stored pixels are `picture()`, whatever its orientation. Maps are given as codes [H, W], whole
 numbers in the orientation of those pixels.
@@ -8,14 +8,16 @@ from __future__ import annotations
 
 import base64
 import dataclasses
+import functools
 import hashlib
 import io
 import struct
+import tarfile
+import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pillow_heif
 from numpy.typing import NDArray
 from photos import picture
 from PIL import Image, ImageOps
@@ -219,21 +221,14 @@ def dynamic_jpeg(
     return photo + b"\0" * padding + other + image + trailer
 
 
-# HEIF's rotations (anticlockwise quarter turns) and mirrorings (0: top and bottom) for each EXIF orientation.
-TURNS = {2: [(b"imir", 1)], 3: [(b"irot", 2)], 4: [(b"imir", 0)], 6: [(b"irot", 3)], 8: [(b"irot", 1)]}
-TURNS |= {5: [(b"irot", 1), (b"imir", 0)], 7: [(b"irot", 1), (b"imir", 1)]}
 HEVC = b"urn:mpeg:hevc:2015:auxid:2"
-# HEVC's depth representation information, as x265 writes it: the kind of numbers, and those.
-INFORMATION = {
-    "inverse, 0.5 to 8 m": bytes.fromhex("000000120000000e4e01b109c8f4c000008a60000120"),
-    "inverse, 3 to 2 m": bytes.fromhex("000000120000000e4e01b109c904e000008260000120"),
-    "disparity, 0.25 to 3": bytes.fromhex("000000130000000f4e01b10a351d980000104e00002020"),
-    "disparity, 0.5 to 3": bytes.fromhex("000000130000000f4e01b10a351e980000104e00002020"),
-    "depth, 0.5 to 8 m": bytes.fromhex("000000130000000f4e01b10ac63d300000229800004020"),
-    "depth, 1 to 2 m": bytes.fromhex("000000130000000f4e01b10ac63f300000209800004020"),
-    "uneven disparity, 0.25 to 3": bytes.fromhex("00000014000000104e01b10b3247660000041380000a5020"),
-    "": b"",
-}
+
+
+@functools.cache
+def heic_files() -> dict[str, bytes]:
+    """By name, what libheif encoded losslessly, and boxes of the letter of the standards were put around."""
+    with tarfile.open(Path(__file__).parent / "data" / "heic_portraits.tar.xz") as archive:
+        return {entry.name: archive.extractfile(entry).read() for entry in archive}  # type: ignore[union-attr]
 
 
 def heic(
@@ -245,70 +240,15 @@ def heic(
     information: str = "",
     own_turn: bool = False,
 ) -> bytes:
-    """A photo, an auxiliary image of some kind, and its XMP, encoded by libheif and put together here.
+    """A photo, an auxiliary image of some kind, and XMP behind them, as far as `heic_files` has them.
 
-    The orientation is written as HEIF's rotation and mirroring of the photo, with `own_turn` of the map too.
+    The orientation is HEIF's rotation and mirroring of the photo, with `own_turn` of the map too; `information` is
+    HEVC's depth representation information.
     """
-    turns = [box(name, bytes([value])) for name, value in TURNS.get(orientation, [])]
-    data, properties = _encoded_heif(picture())
-    items = [(data, properties + turns)]
-    if map_ is not None:
-        data, properties = _encoded_heif(map_)
-        auxiliary = full(b"auxC", kind + b"\0" + INFORMATION[information])
-        items.append((data, [*properties, auxiliary, *(turns if own_turn else [])]))
-    return _file(items) + (b"" if packet is None else box(b"free", packet))
-
-
-def _encoded_heif(values: Codes) -> tuple[bytes, list[bytes]]:
-    """What libheif makes of a picture, losslessly, and its properties as whole boxes."""
-    file = io.BytesIO()
-    pillow_heif.from_pillow(Image.fromarray(values)).save(file, quality=-1, chroma=444)
-    parts = dict(boxes(file.getvalue()))
-    properties = dict(boxes(dict(boxes(parts[b"meta"][4:]))[b"iprp"]))
-    return parts[b"mdat"], [box(kind, body) for kind, body in boxes(properties[b"ipco"]) if kind != b"colr"]
-
-
-def _file(items: list[tuple[bytes, list[bytes]]]) -> bytes:
-    """A HEIC of these items: the photo, and its auxiliary image if it is given."""
-    entries = associations = references = b""
-    stored: list[bytes] = []
-    for number, (_, properties) in enumerate(items, 1):
-        entries += full(b"infe", struct.pack(">HH4s", number, 0, b"hvc1") + b"\0", version=2)
-        indices = bytes(range(len(stored) + 1, len(stored) + 1 + len(properties)))
-        associations += struct.pack(">HB", number, len(indices)) + indices
-        stored += properties
-        if number > 1:
-            references = box(b"auxl", struct.pack(">HHH", 2, 1, 1))
-    meta = full(b"hdlr", b"\0\0\0\0pict" + bytes(13)) + full(b"pitm", struct.pack(">H", 1))
-    meta += full(b"iinf", struct.pack(">H", len(items)) + entries)
-    meta += full(b"iref", references) if references else b""
-    meta += box(b"iprp", box(b"ipco", b"".join(stored)) + full(b"ipma", struct.pack(">I", len(items)) + associations))
-    head = box(b"ftyp", b"heic\0\0\0\0mif1heic")
-    at = len(head) + 12 + len(meta) + 16 + 14 * len(items) + 8  # behind the heads of meta, iloc and mdat
-    places = b""
-    for number, (data, _) in enumerate(items, 1):
-        places += struct.pack(">HHHII", number, 0, 1, at, len(data))
-        at += len(data)
-    meta += full(b"iloc", struct.pack(">HH", 0x4400, len(items)) + places)
-    return head + full(b"meta", meta) + box(b"mdat", b"".join(data for data, _ in items))
-
-
-def box(kind: bytes, body: bytes) -> bytes:
-    return struct.pack(">I", 8 + len(body)) + kind + body
-
-
-def full(kind: bytes, body: bytes, version: int = 0) -> bytes:
-    return box(kind, struct.pack(">I", version << 24) + body)
-
-
-def boxes(data: bytes) -> list[tuple[bytes, bytes]]:
-    """(type, content) of each."""
-    found, at = [], 0
-    while at < len(data):
-        size, kind = struct.unpack_from(">I4s", data, at)
-        found.append((kind, data[at + 8 : at + size]))
-        at += size
-    return found
+    shown = "no map" if map_ is None else f"map {zlib.crc32(map_.tobytes()):08x}"
+    turned, known = " with its map" if own_turn else "", information or "no range"
+    file = heic_files()[f"{shown}, turned {orientation}{turned}, {kind.decode().rpartition(':')[2]}, {known}.heic"]
+    return file + (b"" if packet is None else struct.pack(">I4s", 8 + len(packet), b"free") + packet)
 
 
 def write(path: Path, data: bytes) -> Path:
