@@ -333,13 +333,6 @@ def test_a_photo_at_work_can_be_removed(server: Served) -> None:
     assert server.events(server.send().json["id"])[-1]["state"] == "done"
 
 
-def test_no_other_command_waits_for_the_server() -> None:
-    code = (
-        "import sys, spackle.cli.photos, spackle.scene; print([m for m in ('fastapi', 'uvicorn') if m in sys.modules])"
-    )
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
-
-
 def test_the_example_mounts_the_app(tmp_path: Path) -> None:
     """In an app of somebody else, with the real pipeline."""
     with socket.create_server(("127.0.0.1", 0)) as free:
