@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spackle.bases.moge import MogeConfig, MogeNetwork, MogeOutput
+from spackle.bases.moge.network import MogeConfig, MogeNetwork, MogeOutput
 from spackle.cli.weights import deterministic_weights
 
 

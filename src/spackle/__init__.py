@@ -17,7 +17,7 @@ if TYPE_CHECKING:  # for editors and type checkers
     from spackle.bases.depth_map import load_depth as load_depth
     from spackle.bases.hf import HfBase as HfBase
     from spackle.bases.lite import LiteBase as LiteBase
-    from spackle.bases.moge import MogeBase as MogeBase
+    from spackle.bases.moge.base import MogeBase as MogeBase
     from spackle.bases.sharp import SharpBase as SharpBase
     from spackle.camera import Camera as Camera
     from spackle.errors import InputError as InputError
@@ -49,7 +49,7 @@ _NAMES = {
     "spackle.bases.depth_map": ("DepthMap", "load_depth"),
     "spackle.bases.hf": ("HfBase",),
     "spackle.bases.lite": ("LiteBase",),
-    "spackle.bases.moge": ("MogeBase",),
+    "spackle.bases.moge.base": ("MogeBase",),
     "spackle.bases.sharp": ("SharpBase",),
     "spackle.camera": ("Camera",),
     "spackle.errors": ("InputError",),

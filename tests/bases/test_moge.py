@@ -24,7 +24,8 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from spackle.bases.lift import lift
-from spackle.bases.moge import SKY, MogeBase, MogeOutput, MogeView, load_network, to_view
+from spackle.bases.moge.base import SKY, MogeBase, MogeView, to_view
+from spackle.bases.moge.network import MogeOutput, load_network
 from spackle.bases.open import open_base
 from spackle.bases.settings import BaseSettings
 from spackle.errors import InputError

@@ -23,7 +23,7 @@ from spackle.bases import BasePrediction, Progress
 from spackle.bases.depth_map import DepthMap, load_depth
 from spackle.bases.hf import HfBase
 from spackle.bases.lite import INPUT_SCALES, LiteBase
-from spackle.bases.moge import MogeBase
+from spackle.bases.moge.base import MogeBase
 from spackle.bases.open import BaseError, ResolvedBase, open_base
 from spackle.bases.photo_depth.layouts import load_photo_depth
 from spackle.bases.settings import DEPTH_ANYTHING, KINDS, BaseSettings

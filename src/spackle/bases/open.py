@@ -19,7 +19,7 @@ from spackle.bases.depth_map import DepthMap, find_depth, load_depth
 from spackle.bases.hf import HfBase
 from spackle.bases.lift import RgbdBase
 from spackle.bases.lite import LiteBase
-from spackle.bases.moge import MogeBase
+from spackle.bases.moge.base import MogeBase
 from spackle.bases.photo_depth.layouts import load_photo_depth
 from spackle.bases.settings import AUTO, HF, NETWORKS, RGBD, ROUGH, BaseSettings, Depth
 from spackle.bases.sharp.base import SharpBase

@@ -1,6 +1,5 @@
-"""The moge base: MoGe-2's depth in metres, lifted like a measured one, and its lens if the photo's is unknown.
+"""MoGe-2 (Wang et al. 2025, arXiv 2507.02546): a DINOv2 backbone, a pyramid of features, and a pyramid for each output.
 
-MoGe-2 (Wang et al. 2025, arXiv 2507.02546) has a DINOv2 backbone, a pyramid of features, and a pyramid for each output.
 Modules are named as in the checkpoint, whose `model_config` gives the sizes. Options that no published checkpoint uses
 (other norms, activations and resamplers, registers, ViT-g) are refused.
 """
@@ -14,21 +13,13 @@ import os
 from collections.abc import Sequence
 from typing import Annotated, Literal
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from pydantic import BaseModel, Field, ValidationError, model_validator
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
-from spackle.bases import BasePrediction, Progress, believed_lens
-from spackle.bases.depth_map import DepthMap
-from spackle.bases.lift import lift_guess
 from spackle.bases.sharp.encoder import NORM_EPS, TransformerBlock
-from spackle.camera import Camera
-from spackle.device import Precision, enough_memory, own_arithmetic, pick_device, pick_dtype
 from spackle.errors import InputError, one_line, shown
-from spackle.image import Photo, resize_photo
 from spackle.network_file import channels_last, load_strict, read_checkpoint
 
 ADVICE = "give MoGe-2's model.pt as it was downloaded"
@@ -280,133 +271,3 @@ def set_precision(network: nn.Module, dtype: torch.dtype) -> None:
                 if isinstance(layer, (nn.Linear, nn.Conv2d)):
                     layer.to(dtype)
     channels_last(network)
-
-
-TOKENS = 1800  # that a photo is seen as, where the checkpoint's range has it
-SAMPLES = 64  # of a side of the map: so many points tell focal length and shift
-STEPS, STEP = 200, 1e-9  # of the search for the shift: how many, and the smallest, relative to 1 plus the shift
-SKY = 10.0  # the sky's distance, in units of the farthest surface's
-
-Floats = NDArray[np.float64]
-
-
-@dataclasses.dataclass(frozen=True)
-class MogeView:
-    """A photo's depth by MoGe, on a grid [h, w] over it."""
-
-    depth: Tensor  # [h, w] float32 z in metres, wherever the mask is
-    surface: Tensor  # [h, w] bool: the network's mask, false in the sky
-    focal_px: float  # in pixels of the photo
-    shift: float  # of the network's points along z
-
-
-class MogeBase:
-    """MoGe-2 (Wang et al. 2025), frozen."""
-
-    name = "moge"
-
-    def __init__(self, network: MogeNetwork, precision: str) -> None:
-        """Use a loaded network on its device; `precision` is its name in the report."""
-        self.network, self.precision = network, precision
-
-    @classmethod
-    def load(
-        cls, path: str | os.PathLike[str], *, precision: Precision = "auto", device: torch.device | str | None = None
-    ) -> MogeBase:
-        """Read MoGe-2's model.pt; bfloat16 at the precision auto where the hardware multiplies it natively.
-
-        InputError for a device that is not there, a foreign or broken file, or too little memory.
-        """
-        target = pick_device(device)
-        dtype = pick_dtype(precision, target)
-        with enough_memory():
-            return cls(load_network(path, dtype).to(target), "bf16" if dtype == torch.bfloat16 else "fp32")
-
-    def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
-        """Gaussians of the pixels of the photo at its working size, as `lift` makes them.
-
-        The user's or the file's focal length is kept; else MoGe's is taken, or the default if MoGe's is implausible.
-        The sky goes behind all surfaces. InputError where the network sees no surface, or memory is short.
-        """
-        photo = resize_photo(photo)
-        least, most = self.network.config.num_tokens_range
-        tokens = min(max(TOKENS, least), most)
-        rows, columns = token_grid(photo.height, photo.width, tokens)
-        size = min((FINEST * rows, FINEST * columns), (photo.height, photo.width))  # `lift` enlarges
-        known = not photo.focal_source.startswith("default")
-        with enough_memory():
-            output = self.ask(photo.rgb, tokens, size)
-        view = to_view(output, photo.width, photo.height, photo.focal_px if known else None)
-        camera, lens_source = photo.camera, ""
-        if not known and believed_lens(view.focal_px, photo.width, photo.height):
-            camera, lens_source = Camera.from_focal(view.focal_px, photo.width, photo.height), "MoGe"
-        elif not known:
-            view = to_view(output, photo.width, photo.height, photo.focal_px)
-        valid = view.surface & (view.depth > 0) & view.depth.isfinite()
-        if not valid.any():
-            raise InputError(f"{photo.path}: MoGe sees no surface in it: give another photo, or --base lite")
-        depth = torch.where(view.surface, view.depth.where(valid, 0.0), SKY * view.depth[valid].max())
-        depth_map = DepthMap(depth, valid | ~view.surface, None, None, "depth", photo.path)
-        prediction = lift_guess(photo, depth_map, camera, progress)
-        notes = {**prediction.notes, "precision": self.precision, "depth_scale": "metric, by the model"}
-        if not view.surface.all():
-            notes["sky"] = round(1 - float(view.surface.float().mean()), 4)
-        return dataclasses.replace(prediction, notes=notes, lens_source=lens_source)
-
-    @torch.no_grad()
-    def ask(self, rgb: Tensor, tokens: int, size: tuple[int, int]) -> MogeOutput:
-        """The network's output for a photo [H, W, 3], sRGB in 0..1, with maps of a size (h, w), on the processor."""
-        device = next(self.network.parameters()).device
-        with own_arithmetic(device):
-            output = self.network(rgb.float().permute(2, 0, 1)[None].to(device), tokens, size)
-        return MogeOutput(output.points.cpu(), output.mask_logits.cpu(), output.metric_scale.cpu())
-
-
-def to_view(output: MogeOutput, width: int, height: int, focal_px: float | None = None) -> MogeView:
-    """A network's output for a photo of that size in metres: its points are shifted so that each projects to its pixel.
-
-    The focal length in pixels of the photo is found along with the shift, unless it is given.
-    """
-    rows, columns = output.mask_logits.shape
-    half_diagonal = math.hypot(width, height) / 2
-    down, right = (torch.arange(SAMPLES) * n // SAMPLES for n in (rows, columns))
-    points = output.points[down][:, right].double()
-    plane = view_plane(rows, columns, width / height)[0].permute(1, 2, 0)[down][:, right].double()
-    chosen = (output.mask_logits[down][:, right] > 0) & points.isfinite().all(-1)
-    known = focal_px and focal_px / half_diagonal
-    focal, shift = focal_and_shift(points[chosen].numpy(), plane[chosen].numpy(), known)
-    depth = (output.points[..., 2] + shift) * output.metric_scale
-    return MogeView(depth, output.mask_logits > 0, focal * half_diagonal, shift)
-
-
-def focal_and_shift(points: Floats, places: Floats, focal: float | None = None) -> tuple[float, float]:
-    """The focal length f and the shift s along z that let points [N, 3] project to their places [N, 2].
-
-    Minimises |f (x, y) / (z + s) - place|² by Gauss-Newton steps from s = 0, each halved until the error falls; the
-    best f for a shift has a closed form. f is in units of half the diagonal, as places are; a given f stays. f = 1 and
-    s = 0 for fewer than two points.
-    """
-    if len(points) < 2:
-        return focal or 1.0, 0.0
-
-    def at(shift: float) -> tuple[float, Floats, Floats]:
-        """The focal length, the projections for f = 1 and the residuals, [N, 2] each."""
-        with np.errstate(all="ignore"):  # a shift may put a point into the camera
-            seen = points[:, :2] / (points[:, 2:] + shift)
-            best = focal or float((seen * places).sum() / (seen * seen).sum())
-            return best, seen, best * seen - places
-
-    shift = 0.0
-    for _ in range(STEPS):
-        best, seen, off = at(shift)
-        moved = -seen / (points[:, 2:] + shift)  # the derivative of `seen` by the shift
-        change = best * moved  # of what is off
-        if focal is None:
-            change += float((moved * (places - 2 * best * seen)).sum() / (seen * seen).sum()) * seen
-        step = -float((change * off).sum() / ((change * change).sum() or 1.0))
-        while abs(step) > STEP * (1 + abs(shift)) and not (at(shift + step)[2] ** 2).sum() < (off**2).sum():
-            step /= 2
-        shift += step
-        if not abs(step) > STEP * (1 + abs(shift)):
-            break
-    return at(shift)[0], shift
