@@ -92,8 +92,8 @@ def trajectory(
         disparity: the widest offset, in the units of `max_offset`.
         depth_range: depths of the base's Gaussians.
         frames: number of cameras.
-        looped: the frame after the last is the first: swipe comes back, slower at its ends, and the other paths, which
-            end where they began, stop a frame earlier.
+        looped: make a path that repeats without a jump: swipe returns, slower at its ends; the other paths, which are
+            closed, leave out their last frame.
 
     Raises:
         ValueError: an unknown path, a disparity out of 0..2, or no frame.
@@ -225,8 +225,8 @@ class KeyframePath:
     def cameras(self, camera: Camera, frames: int, depth_range: DepthRange) -> list[Camera]:
         """Views at equal steps in time, of the size of the photo's `camera`, whose eye is the origin.
 
-        Of an open path the first and the last key are the first and the last frame; of a closed one the frame
-        after the last would be the first again. `depth_range` gives the unit "disparity" its length.
+        An open path begins and ends at its first and last keys. A closed path stops one frame before it would reach the
+        first frame again. `depth_range` gives the unit "disparity" its length.
 
         Raises:
             PathError: between two keys the eye meets the target, or the view turns along its up.

@@ -40,7 +40,7 @@ def check_file(path: str | os.PathLike[str], kind: str) -> int:
 def atomic_path(path: str | os.PathLike[str], *, durable: bool = False) -> Iterator[Path]:
     """Yield a temporary name in the same folder; rename it to `path` where the block succeeds.
 
-    Where the block raises, the temporary file goes and an older file at `path` stays as it was. The
+    If the block raises, the temporary file is deleted and an older file at `path` is kept. The
     temporary name keeps the suffix, because some writers choose a format by it. Only a
     `durable` file is synced to the disk: a killed process leaves whole files, a power cut need not.
 
@@ -122,7 +122,7 @@ def write_json(content: Mapping[str, Any], path: Path, *, durable: bool = False)
 def files_in(folder: Path, endings: tuple[str, ...], *, below: bool = False) -> list[Path]:
     """The files in a folder whose names end in `suffixes`, in any case; with `below` also those in its subfolders.
 
-    Sorted; what is hidden is left out. InputError where the folder cannot be read.
+    Sorted; hidden files are left out. InputError where the folder cannot be read.
     """
     with reading(folder, "cannot read the folder: {reason}", OSError):
         os.scandir(folder).close()

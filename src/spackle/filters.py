@@ -111,17 +111,17 @@ def _propagate_nearest(hole: Any, near: Any) -> None:
 def far_fill(
     inverse_depth: Tensor, values: Tensor, known: Tensor, *, far_bias: Tensor | float = FAR_BIAS
 ) -> tuple[Tensor, Tensor]:
-    """Fill the unknown part of an inverse depth image and of the values that go with it.
+    """Fill the unknown part of an inverse depth image and of further values.
 
-    What a moving camera uncovers lies behind what covered it, so a hole between a near and a far
-    surface extends the far one. A fill from coarse to fine gives the first guess; at every resolution
-    a relaxation turns it into a membrane over the rim, in which a rim sample counts the less the nearer
-    it is than the fill: min(1, fill / sample)^far_bias. The work grows with the hole, not the image.
+    A moving camera uncovers what lies behind a surface, so a hole between a near and a far surface extends the far one.
+    A coarse-to-fine fill gives the first guess; at every resolution a relaxation turns it into a membrane over the rim.
+    In it a rim sample nearer than the fill has the weight min(1, fill / sample)^far_bias. The work grows with the hole,
+    not the image.
 
     Args:
         inverse_depth: [H, W], positive where known.
         values: [C, H, W], what is propagated along with it, colour for instance.
-        known: [H, W] bool. Elsewhere the input is ignored.
+        known: [H, W] bool. Values at unknown pixels are ignored.
         far_bias: one number, or one for each pixel [H, W]; 0 treats both sides of the rim alike.
 
     Returns:
@@ -166,7 +166,7 @@ def _coarsen(
     start: int, stop: int, depths: Any, values: Any, known: Any, bias: Any, reference: Any,
     coarse_depths: Any, coarse_values: Any, coarse_known: Any, coarse_bias: Any,
 ) -> None:  # fmt: skip
-    """Rows start..stop of means of 2×2 pixels over the known ones, the far ones counting most; flags; mean bias."""
+    """Rows start..stop of means over the known ones of 2×2 pixels, the far ones weighted most; flags; mean bias."""
     height, width = depths.shape
     channels = values.shape[2]
     weights = np.empty(4, np.float32)
@@ -287,7 +287,7 @@ def _relax(samples: Any, copy: Any, links: Any, bias: Any, sweeps: int) -> Any:
 
 @kernel
 def _conductance(here: Any, there: Any, bias: Any) -> Any:
-    """How much a sample of the rim counts: the less the nearer it is."""
+    """The weight of a rim sample, which falls the nearer the sample is."""
     if there <= here:
         return np.float32(1)
     ratio = max(here / max(there, np.float32(1e-12)), np.float32(1e-6))

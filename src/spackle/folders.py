@@ -66,8 +66,8 @@ def _acquire(path: Path) -> BinaryIO:
 def results_folder(path: Path, files: Sequence[str] = (), *, alone: bool = False) -> Iterator[None]:
     """Create a folder for results; it is removed if the block leaves it empty.
 
-    The block writes `files`: InputError before long work if it cannot. Deletes what a killed run left of them. With
-    `alone` nobody else works in the folder during the block: InputError if somebody does.
+    The block writes `files`: InputError before long work if it cannot. Temporary files that a killed run left are
+    deleted. With `alone` nobody else works in the folder during the block: InputError if somebody does.
     """
     missing = [folder for folder in (path, *path.parents) if not os.path.exists(folder)]
     try:
@@ -128,8 +128,8 @@ def check_mark(folder: Path, word: str) -> None:
 def whole_set(folder: Path, last: str) -> Iterator[Path]:
     """Yield a new folder for a set of files; where the block succeeds, they take their places in `folder`.
 
-    Where it raises, an older set stays as it was. The file `last` states that the others are complete, so it is removed
-    first and put in place last. The caller is `alone` there (`results_folder`).
+    If it raises, an older set is kept. The file `last` states that the others are complete, so it is removed
+    first and put in place last. The caller must hold the folder `alone`, see `results_folder`.
     """
     new = folder / NEW
     try:
@@ -183,7 +183,7 @@ def photo_digest(path: Path) -> str:
 
 
 def remove_half_written(*folders: Path, files: Sequence[str] | None = None) -> None:
-    """Delete what killed runs left of `files`; of any file if None, where the caller is `alone`."""
+    """Delete the temporary files that killed runs left for `files`; for any file if None, which needs `alone`."""
     for folder in folders:
         for file in folder.iterdir():
             match = LEFTOVER.fullmatch(file.name)

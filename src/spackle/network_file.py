@@ -111,7 +111,7 @@ def check_tensors(
 
 
 def check_finite(network: nn.Module, path: str | os.PathLike[str], advice: str) -> None:
-    """InputError where a network's numbers, which are those of a file, are not all finite."""
+    """InputError unless all numbers of a network that was read from a file are finite."""
     # A finite sum proves it at little cost; but a sum of finite numbers can overflow.
     broken = [name for name, t in network.state_dict().items() if not (t.sum().isfinite() or t.isfinite().all())]
     if broken:

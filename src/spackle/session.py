@@ -199,7 +199,7 @@ def _as_file(source: str | os.PathLike[str] | bytes | BinaryIO, kind: str) -> It
         content = read()
     if not isinstance(content, bytes | bytearray | memoryview):
         holds = "a path, bytes, a file opened in binary mode, or an array"
-        raise InputError(f"{kind}: {type(source).__name__} {shown(source)} is none that is known: give {holds}")
+        raise InputError(f"{kind}: {type(source).__name__} {shown(source)} is not accepted: give {holds}")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / kind
         path.write_bytes(content)

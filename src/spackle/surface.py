@@ -73,8 +73,8 @@ def surface_slope(inverse_depth: Tensor) -> Tensor:
     """Derivative of the inverse depth by pixel x and y, [H, W, 2], that never crosses a depth edge.
 
     The inverse depth of a plane is linear in the pixel, so both one-sided differences agree on a plane
-    however slanted. Where they do not, the flatter side is the surface and the other one an edge; where
-    even the flatter one is steep, the depth is ragged there and the pixel faces the camera.
+    however slanted. Otherwise the flatter side is the surface and the other one an edge; if even the flatter one is
+    steep, the depth is unreliable and the pixel faces the camera.
 
     Args:
         inverse_depth: [H, W] float32 or float64, positive everywhere. No gradient goes through.

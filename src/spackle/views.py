@@ -174,8 +174,8 @@ def _possible_path(source: Path) -> Iterator[None]:
 
 @torch.no_grad()
 def choose_move(prediction: BasePrediction, renderer: Renderer, source: Path) -> BasePrediction:
-    """The prediction with the farthest disparity, up to its usual one, at which the share of holes in the widest views
-    is allowed.
+    """The prediction with the farthest disparity, up to its usual one, at which holes in the widest views stay within
+    its limit.
 
     Its notes get the base's usual disparity and the share of holes in the two widest views (eqs. 10, 11), by coarse
     renders. InputError, naming `source`, the photo, where its depths and focal length allow no path.

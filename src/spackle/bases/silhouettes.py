@@ -205,7 +205,9 @@ def _share(colors: Any, color: Any, y: int, x: int) -> Any:
 
 @kernel
 def _match(start: int, stop: int, colors: Any, ring: Any, inside: Any, color: Any, texture: Any, alpha: Any) -> None:
-    """Rows start..stop: the outline shifted across its direction to where the photo has it, and what it covers."""
+    """Rows start..stop: shift the outline across its direction to the photo's outline, and compute each pixel's
+    coverage.
+    """
     height, width = ring.shape
     shifts = 2 * STEPS + 1
     costs = np.zeros(len(RAMPS) * shifts)

@@ -190,8 +190,8 @@ def export(
             "-o",
             "--output",
             metavar="FILE",
-            help="Ends in .ply, .compressed.ply, .spz, .splat, .sog, .glb or .html, which is a page with the scene "
-            "in it; give as many as you like.",
+            help="Output file, of the format of its suffix: .ply, .compressed.ply, .spz, .splat, .sog, .glb, or .html "
+            "(a page with the scene in it). Give as many as you like.",
         ),
     ],
     as_json: JsonOption = False,

@@ -127,7 +127,7 @@ def dataset_preview(
     location: DatasetArgument,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="A folder for the two files.")],
     photos: Annotated[int, typer.Option(min=1, help="Number of photos.")] = 3,
-    views: Annotated[int, typer.Option(min=1, help="Number of views of each.")] = 6,
+    views: Annotated[int, typer.Option(min=1, help="Number of views of each photo.")] = 6,
 ) -> None:
     """Write sheet.png (base, mask, target) and trajectory.mp4 (base beside target)."""
     from spackle.dataset.inspect import preview_dataset

@@ -270,7 +270,8 @@ def _recoloured(aux: Gaussians, camera: Camera, change: Tensor, share: Tensor) -
 def flicker(view: Tensor, earlier: Tensor, flow: Tensor, chosen: Tensor) -> float | None:
     """Mean absolute difference of a view [H, W, 3] from an earlier one, both sRGB, that is warped by a flow [H, W, 2].
 
-    The flow leads from the view's pixels to the earlier one's; pixels `chosen` [H, W] bool count, without any: None.
+    The flow leads from the view's pixels to the earlier view's. It is measured at the pixels `chosen` [H, W]; None if
+    there are none.
     """
     uv = pixel_grid(flow) + flow
     chosen = chosen & inside(uv, *chosen.shape)

@@ -314,7 +314,7 @@ class _Build:
             self.reporter.log(f"passed over: {result.problem}")
 
     def _write_shard(self, number: int) -> None:
-        """Write a shard whose photos are all done: first the file, then its entry; its parts go last."""
+        """Write a finished shard: first the file, then its entry; then its parts are deleted."""
         indices = range(number * self.size, min((number + 1) * self.size, len(self.photos)))
         if number in self.shards or not self.missing.isdisjoint(indices):
             return
@@ -333,7 +333,7 @@ class _Build:
         Manifest(config=self.config, shards=shards, complete=complete).save(self.output)
 
     def _finish(self, made: int, seconds: float) -> None:
-        """Write the last manifest and remove the rest; InputError, and nothing stays, if no photo gave a sample."""
+        """Write the final manifest and remove other files; InputError, leaving nothing, if no photo gave a sample."""
         shards = self.shards.values()
         samples = sum(len(shard.samples) for shard in shards)
         if samples:

@@ -1,4 +1,5 @@
-"""A photo with its views as a stretch of a tar archive, and back: the same bytes every time, as docs/dataset.md lists.
+"""Encode a photo with its views as part of a tar archive, and decode it: the same bytes every time, see
+docs/dataset.md.
 
 Colours, opacity and depth lose less than anybody sees, Gaussians less than 1e-3 of a pixel, masks and cameras nothing.
 """
@@ -53,7 +54,7 @@ class DatasetView:
 
 
 def pack_sample(key: str, photo: Tensor, stack: ViewStack, targets: Tensor, facts: Mapping[str, Any]) -> bytes:
-    """A photo as a stretch of a tar archive: KEY.json, KEY.photo.png, KEY.base.safetensors, then five files a view.
+    """A photo as part of a tar archive: KEY.json, KEY.photo.png, KEY.base.safetensors, then five files a view.
 
     It has no end-of-archive mark, and no time, owner or machine. `photo` [h, w, 3] (at its working size) and
     `targets` [V, H, W, 3] are sRGB; `facts` go into the JSON and hold the mask's "threshold" and the "trajectory".
@@ -95,7 +96,7 @@ class PhotoGroup:
 
     @staticmethod
     def of(key: str, data: bytes, where: str) -> PhotoGroup:
-        """Take apart the stretch of a shard that belongs to a photo; InputError where that cannot be."""
+        """Split a photo's part of a shard into its files; InputError if it is damaged."""
         files: dict[str, bytes] = {}
         with reading(where, "not a photo of a dataset, or damaged: {reason}"):
             at = 0

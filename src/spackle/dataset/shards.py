@@ -112,7 +112,7 @@ def load_manifest(location: str | os.PathLike[str]) -> Manifest:
         text = file.read()
         content = json.loads(text)
         if content["format"] != FORMAT:
-            raise InputError(f"{where}: format {content['format']!r} is not known here, which reads {FORMAT}")
+            raise InputError(f"{where}: format {content['format']!r} is unknown: this version reads {FORMAT}")
         recorded = content.pop("sha256")
         manifest = Manifest.model_validate_json(text)
         if not digest_of(content) == manifest.digest == recorded:
@@ -154,7 +154,7 @@ class DatasetFiles(Dataset[PhotoGroup]):
     """
 
     def __init__(self, location: str | os.PathLike[str]) -> None:
-        """Read the manifest in a folder or at an fsspec address; InputError without a finished dataset."""
+        """Open a dataset in a folder or at an fsspec address; InputError unless it is finished."""
         self.location = location
         self.manifest = load_manifest(location)
         if not self.manifest.complete:

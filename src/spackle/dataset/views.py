@@ -124,7 +124,7 @@ def render_completed(views: ViewStack, renderer: Renderer) -> tuple[Tensor, Tens
 def paint_in_turn(inpainter: Inpainter, views: ViewStack, renderer: Renderer) -> Tensor:
     """The views with their holes painted one after the other, the farthest from the photo first, so that all agree.
 
-    What the views before show is reprojected into a view's holes, and the inpainter paints the rest of them. One
+    Earlier views are reprojected into a view's holes, and the inpainter paints the rest. One
     completed scene gives the depth in the holes.
     """
     inverse_depths, targets = render_completed(views, renderer)[1], views.rgb.clone()

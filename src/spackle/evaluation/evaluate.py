@@ -286,7 +286,7 @@ def evaluate(options: EvaluateOptions, output: Path, reporter: Reporter, html: b
 
 
 def _log_missing(evaluation: Evaluation, reporter: Reporter) -> None:
-    """Log why metrics are not run, and pyiqa's terms where it measures."""
+    """Log why metrics are not run, and pyiqa's terms if it is used."""
     reasons: dict[str, list[str]] = {}
     for name, state in evaluation.metrics.items():
         if state.startswith(NOT_RUN):

@@ -176,7 +176,7 @@ def _measure_by(network: Callable[..., Any]) -> Metric:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """pyiqa and what it is made of print, log and warn while they load."""
+    """Silence pyiqa and its dependencies, which print, log and warn while they load."""
     output = io.StringIO()
     with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output), warnings.catch_warnings():
         warnings.simplefilter("ignore")

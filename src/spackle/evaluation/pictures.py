@@ -120,13 +120,13 @@ def encode(image: Image.Image) -> bytes:
 
 
 def kept_pictures(run: Run, folder: Path, image: str) -> dict[str, Path]:
-    """The files of an image's pictures that are there, by what they show: methods in their order, the truth, others."""
+    """The existing picture files of an image, by content: methods in their order, the truth, others."""
     files = {name: image_file(folder, run.images.index(image), image, f".{name}.webp") for name in (*METHODS, *OTHERS)}
     return {name: path for name, path in files.items() if path.is_file()}
 
 
 def column_title(run: Run, name: str) -> str:
-    """What a picture is called."""
+    """The title of a picture."""
     return name if name in OTHERS else f"base ({run.base})" if name == "base" else METHODS[name].title
 
 
@@ -247,7 +247,7 @@ def _draw(figure: PaperFigure, runs: Sequence[tuple[Run, Path]], most: int) -> t
 
 
 def _cell(run: Run, image: str, name: str, pictures: dict[str, Image.Image], figure: PaperFigure) -> Cell:
-    """A picture; where holes have no picture of their own, they are boxed, and shares of Gaussians are tags."""
+    """A picture with its marks: boxes around holes, and tags with shares of Gaussians."""
     if name == HOLE:  # white on the page's white: framed
         width, height = pictures[name].size
         ImageDraw.Draw(pictures[name]).rectangle((0, 0, width - 1, height - 1), outline="grey")

@@ -123,7 +123,7 @@ def _part(run: Run, folder: Path, count: int, side: int) -> dict[str, Any]:
 
 
 def figures_table(run: Run, rows: Iterable[Row]) -> Table:
-    """Means of rows of a run: a line for each method, and for each setting where there are several."""
+    """Means over a run: a line for each method, and for each of several settings."""
     values = pivot((row for row in rows if row.metric in COLUMNS), "setting", "method", "metric")
     settings = list(dict.fromkeys(setting for setting, *_ in values))
     keys = [key for key in COLUMNS if any(metric == key for *_, metric in values)]

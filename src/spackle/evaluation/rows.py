@@ -38,7 +38,7 @@ DISPARITIES = tuple(map(float, SETTINGS))
 
 
 class Row(NamedTuple):
-    """One figure. What is known of an image alone has no setting, view and method."""
+    """One figure. Figures of an image alone have no setting, view and method."""
 
     dataset: str  # as the paper's tables call it
     image: str

@@ -89,7 +89,7 @@ def make_tables(runs: Sequence[Run], *, whole: bool = False) -> list[Table]:
 
 
 def write_tables(tables: Sequence[Table], folder: Path, files: Sequence[str] = FILES, suffix: str = "") -> None:
-    """As a file of Markdown and one of LaTeX, whose labels end with `suffix`: a document may take in several."""
+    """A file of Markdown and one of LaTeX, whose labels end with `suffix`, so that a document can include several."""
     write_whole(folder / files[0], "\n".join(map(markdown, tables)).encode())
     head = "% needs \\usepackage{booktabs,graphicx}\n"
     write_whole(folder / files[1], (head + "\n".join(latex(table, suffix) for table in tables)).encode())
@@ -120,7 +120,9 @@ def _table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], settings: S
 
 
 def _notes(spec: Mapping[str, Any], runs: Sequence[Run], cells: str) -> list[str]:
-    """Views, bases, rows, whose weights the residual has, definitions, what is missing and why, terms of pyiqa."""
+    """Notes below a table: views, bases, rows, the residual's weights, definitions, missing figures and why, terms of
+    pyiqa.
+    """
     names = tuple(dict.fromkeys(name for name in (metric_name(column[2]) for column in spec["columns"]) if name))
     notes = [NOTES["swipe"].format(side=run.config["side"]) for run in runs if not run.near]
     for kind in dict.fromkeys(run.config["second_views"] for run in runs if run.near):
@@ -150,7 +152,7 @@ def _notes(spec: Mapping[str, Any], runs: Sequence[Run], cells: str) -> list[str
 
 
 def _weights(run: Run) -> str:
-    """What the residual's network has learned from."""
+    """The origin of the residual's weights."""
     residual = run.config["residual"]
     if not residual["sha256"]:
         return "the residual has no weights, its deltas are 0"
@@ -161,7 +163,7 @@ def _weights(run: Run) -> str:
 
 
 def _timed_notes(runs: Sequence[Run]) -> list[str]:
-    """Where and how times were taken, what disturbed them, and how large the networks are."""
+    """Notes on times: machine, method, disturbances, sizes of the networks."""
     notes, runs = [], [run for run in runs if run.timed]
     if cold := [row.image for run in runs for row in run.rows if row.metric == "warm" and not row.value]:
         notes.append(NOTES["cold"].format(images=", ".join(cold)))
@@ -207,7 +209,7 @@ def _cells(rows: Iterable[Row], columns: Sequence[Column], methods: Iterable[str
     values_of, dataset = pivot(rows, "method", "setting", "metric"), rows[0].dataset if rows else ""
 
     def find(method: str, setting: str, metric: str) -> Mean | None:
-        """Derived figures, too; what is known of images alone is all methods'."""
+        """A figure, also a derived one; figures of images alone hold for all methods."""
         if values := values_of.get((method, setting, metric)) or values_of.get(("", "", metric)):
             return mean(values, statistics.median if metric in TIMES else statistics.fmean)
         if metric == "aux_per_cell":
@@ -243,7 +245,7 @@ Layout = tuple[list[tuple[str, str]], list[list[Cells]]]  # heads and bodies of 
 
 
 def grouped(name: str, rows: Sequence[Cells]) -> list[Cells]:
-    """Rows whose first one is preceded by the name of all of them."""
+    """Rows below a line with their common name."""
     return [(EMPTY if k else name, *cells) for k, cells in enumerate(rows)]
 
 
@@ -334,7 +336,7 @@ def _expanded_table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], se
 
 
 def _stages_table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], settings: Sequence[str]) -> Layout:
-    """Where the time goes: a row for each setting and method, columns for the stages and what they come to."""
+    """The stages' times: a row for each setting and method, columns for the stages and their sums."""
     stages = [("", title, f"{name}_stage_ms", "tenths") for name, title in STAGES.items()]
     columns = [(title, metric, TEXTS[text]) for _, title, metric, text in (*stages, *spec["columns"])]
     bodies = []

@@ -151,8 +151,8 @@ class PlyFile:
         """The scene; colours become linear RGB.
 
         Properties may come in any order and type; spherical harmonics above degree 0 (f_rest) are ignored.
-        SHARP's `color_space` says whether colours are sRGB (0) or linear (1). Without it, a file with
-        SHARP's camera is linear, as SHARP reads it, and any other sRGB.
+        SHARP's `color_space` says whether colours are sRGB (0) or linear (1). Without it, a file with SHARP's camera is
+        read as linear, as SHARP does, any other as sRGB.
 
         Raises:
             InputError: no Gaussians, or some with NaN or inf. An infinite opacity logit is allowed: SHARP writes one

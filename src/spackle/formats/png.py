@@ -23,7 +23,7 @@ def thumbnail(picture: Tensor, side: int) -> Tensor:
 
 
 def sheet(rows: Sequence[Sequence[Tensor]], side: int, fill: float = 0.0) -> Tensor:
-    """[H, W, 3]: rows of pictures [h, w, 3], each at most `side` pixels long; `fill` follows narrower rows."""
+    """A picture [H, W, 3] of rows of pictures [h, w, 3] of at most `side` pixels, padded with `fill`."""
     shown = [torch.cat([thumbnail(picture.cpu(), side) for picture in row], dim=1) for row in rows]
     widest = max(row.shape[1] for row in shown)
     return torch.cat([pad(row, (0, 0, 0, widest - row.shape[1]), value=fill) for row in shown])

@@ -170,7 +170,7 @@ def save_video(
 ) -> None:
     """Write frames, sRGB [H, W, 3] in 0..1, in the format of the name; see `VideoWriter`.
 
-    `frames` may be a generator: a frame is encoded while the next one is made. Where it raises, no file is left.
+    `frames` may be a generator: a frame is encoded while the next one is made. If it raises, no file is left.
     """
     with VideoWriter(path, fps, loop) as writer:
         for frame in frames:

@@ -236,7 +236,9 @@ def walk_back(
 
 @kernel
 def load_gradients(work: Array, left: int, top: int, images: Arrays, gradients: Arrays) -> None:
-    """Turn the gradients by rgb, depth and alpha of a tile's pixels into those of the blended sums, 0 off the image."""
+    """From the gradients of a tile's rgb, depth and alpha to those of its blended sums, which are 0 outside of the
+    image.
+    """
     rgb, depth, alpha, linear = images
     rgb_grad, depth_grad, alpha_grad = gradients
     for i in range(GRADIENTS, GRADIENTS + 5 * PLANE):

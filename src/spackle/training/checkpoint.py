@@ -102,7 +102,7 @@ def find_checkpoint(output: Path, method: str, recipe: AnyRecipe, digest: str, l
 
 
 def remove_run(output: Path) -> None:
-    """Delete what a run has left; its samples stay."""
+    """Delete a run's files, except for its samples."""
     for path in (output / name for name in (*RESULTS, PICTURES, LOGS)):
         shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
 

@@ -77,7 +77,7 @@ def read_cases(name: str, root: Path) -> list[Case]:
         scene = posed_photos.category_and_scene(folder) if name == "wildrgbd" else folder.name
         other = scenes.setdefault(scene, folder)
         if other is not folder:
-            raise InputError(f"{folder}: {other} is called the same: give the folder of one size or part alone")
+            raise InputError(f"{folder}: {other} has the same scene name: give the folder of one size or part alone")
     return dataset.cases(scenes)
 
 

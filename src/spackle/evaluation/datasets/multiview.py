@@ -68,7 +68,7 @@ def make_cases(views: Sequence[Posed], wanted: Iterable[int] | None = None) -> l
 
     A second view is a near one, of at most three, if its eye is 5 % to 25 % of the photo's middle depth away and turned
     by at most 30°, and if it sees at least 30 % of the points that the photo sees; where no points are known, if each
-    camera has the middle of the other's view in its picture. A photo may have none.
+    camera has the middle of the other's view in its picture. A photo may have no near view.
 
     Args:
         views: all photos of a scene.
@@ -111,10 +111,10 @@ def _sees_the_same(view: Posed, other: Posed) -> bool:
 def spread(scenes: Sequence[str], frames: Callable[[str], Sequence[int]], count: int) -> dict[str, list[int]]:
     """At most `count` frames, as many from each scene as there is room for; the same on every machine.
 
-    Names alone seed the choice: the scenes are taken in the order of their hashed names, and `GROUP/REST` in
-    turns by group, so that no group is favoured. With more scenes than frames, the first scenes give one each.
-    With fewer, all give the same number, or all they have; within a scene the frames stand at equal distances,
-    from a start that the scene's name decides.
+    The choice depends on names alone: scenes are taken in the order of their hashed names, and `GROUP/REST` alternately
+    by group, so that no group is favoured. With more scenes than frames, each of the first scenes gives one. With fewer
+    scenes, all give the same number, or all they have; within a scene the frames are equally spaced, from a start that
+    the scene's name decides.
 
     Args:
         scenes: names, no two alike.

@@ -42,7 +42,7 @@ def _camera(K: Tensor, pose: Tensor, width: int, height: int, where: str) -> Cam
 
 
 def eth3d_cases(scenes: Mapping[str, Path]) -> list[Case]:
-    """The undistorted DSLR photos of the training scenes: a case for each.
+    """Cases of ETH3D: the undistorted DSLR photos of the training scenes.
 
     `SCENE/dslr_calibration_undistorted/{cameras,images,points3D}.txt` and `SCENE/images/dslr_images_undistorted/*.JPG`.
     The model is metric (it was aligned to laser scans); its sparse points give the scale. The dense truth is of the
@@ -75,7 +75,7 @@ def is_eth3d(folder: Path) -> bool:
 
 
 def tanks_cases(scenes: Mapping[str, Path]) -> list[Case]:
-    """`SCENE/images` with `SCENE/sparse/0`: what COLMAP, 3D Gaussian splatting and most of the field call a scene.
+    """Cases of scenes with `SCENE/images` and `SCENE/sparse/0`, the usual layout of COLMAP and 3D Gaussian splatting.
 
     `SCENE/sparse` without the 0, and `SCENE/dense/{images,sparse}`, are read too. The lens has to be nearly a pinhole's
     (`colmap image_undistorter` makes it one). The dataset's own archives have no such models, only `.log` poses
@@ -108,9 +108,9 @@ def llff_cases(scenes: Mapping[str, Path]) -> list[Case]:
     """Eight scenes with `poses_bounds.npy`, `sparse/0`, or both, and photos in `images_4`, `images` or `images_8`.
 
     Where there is a COLMAP model, its cameras and points are used (the poses were made from it), and the near and far
-    bounds only where it has no points. Its photos' names need not be the files': those are matched by name, else by
-    their order, as `poses_bounds.npy` always is. Lengths are arbitrary. Second views: see `make_cases`; without a
-    model, the middle depth is that of the bounds, half way in inverse depth.
+    bounds only where it has no points. Photos of the model are matched to files by name, else by order;
+    `poses_bounds.npy` always by order. Lengths are arbitrary. Second views: see `make_cases`; without a model, the
+    middle depth is that of the bounds, half way in inverse depth.
 
     The paper's 190,512 cells are those of `images_4` (1008×756); `images` (4032×3024) gives 1536×1152.
     """

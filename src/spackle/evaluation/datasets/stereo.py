@@ -84,7 +84,7 @@ def _depth_by(lens: Calibration, path: Path, read: Callable[[], NDArray[Any]]) -
 
 
 def pair_of_2014(folder: Path) -> Case:
-    """A folder in the format of Middlebury 2014: im0.png, im1.png, calib.txt, and disp0.pfm or disp0GT.pfm."""
+    """A case in the format of Middlebury 2014: im0.png, im1.png, calib.txt, and disp0.pfm or disp0GT.pfm."""
     calib = folder / "calib.txt"
     lens = _from_corner(read_calibration(calib))
     if lens.size is None or min(lens.size) < 1:
@@ -110,16 +110,16 @@ def middlebury_cases(scenes: Mapping[str, Path]) -> list[Case]:
     """One case for each scene; the second view is the true right photo.
 
     Scene folders: `im0.png` with `calib.txt` (2014 at full size, and MiddEval3 at full, half or quarter size), or a
-    `scene.json`, which describes any rectified pair. Of `Piano-perfect` and `Piano-imperfect` the first is taken. Test
-    scenes, which have no truth, are skipped. The paper's 23 are those of 2014. MiddEval3's three sizes have the same
-    names: give `trainingF`, `trainingH` or `trainingQ` alone.
+    `scene.json`, which describes any rectified pair. `Piano-perfect` is taken, and `Piano-imperfect` is skipped. Test
+    scenes, which have no truth, are skipped. The paper's 23 are those of 2014. MiddEval3's three sizes share names:
+    give `trainingF`, `trainingH` or `trainingQ` alone.
     """
     names = [name for name in scenes if name.replace("-imperfect", "-perfect") not in scenes.keys() - {name}]
     return [_middlebury_case(scenes[name]) for name in names]
 
 
 def _middlebury_case(folder: Path) -> Case:
-    """By a `scene.json`, whose principal point has pixel centres at half-integers; its lengths may be nominal."""
+    """A case by its `scene.json`, in which pixel centres are at half-integers; its lengths may be nominal."""
     path = folder / "scene.json"
     if not path.exists():
         return pair_of_2014(folder)
