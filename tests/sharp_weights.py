@@ -10,19 +10,19 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from spackle.bases.sharp.base import expected_shapes
-from spackle.bases.sharp.encoder import LAYERS, MICRO, STRIDE, TINY, SharpConfig
+from spackle.bases.sharp.encoder import LAYERS, MICRO, STRIDE, SharpConfig
 from spackle.bases.sharp.network import SharpNetwork
 from spackle.cli.weights import deterministic_weights
 
 DATA = Path(__file__).parent / "data"
 
 
-def tiny_weights(config: SharpConfig = TINY) -> dict[str, Tensor]:
+def tiny_weights(config: SharpConfig = MICRO) -> dict[str, Tensor]:
     """A whole state dict, with what inference never uses."""
     return deterministic_weights(expected_shapes(config))
 
 
-def write_tiny(path: Path, config: SharpConfig = TINY) -> Path:
+def write_tiny(path: Path, config: SharpConfig = MICRO) -> Path:
     """A checkpoint of a small network, .pt or .safetensors by the name."""
     if path.suffix == ".safetensors":
         save_file(tiny_weights(config), path)
@@ -34,7 +34,7 @@ def write_tiny(path: Path, config: SharpConfig = TINY) -> Path:
 def micro_network() -> SharpNetwork:
     """131,072 Gaussians from 512² pixels, in float32."""
     network = SharpNetwork(MICRO).eval().requires_grad_(False)
-    weights = deterministic_weights(expected_shapes(MICRO))
+    weights = tiny_weights()
     network.load_state_dict({name: weights[name] for name in network.state_dict()})
     return network
 

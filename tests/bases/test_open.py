@@ -28,7 +28,7 @@ from spackle.bases.open import BaseError, ResolvedBase, open_base
 from spackle.bases.photo_depth.layouts import load_photo_depth
 from spackle.bases.settings import DEPTH_ANYTHING, KINDS, BaseSettings
 from spackle.bases.sharp import SharpBase
-from spackle.bases.sharp.encoder import TINY
+from spackle.bases.sharp.encoder import MICRO
 from spackle.errors import InputError
 from spackle.image import Photo, load_photo
 from spackle.pipeline import FillOptions
@@ -86,7 +86,7 @@ def test_auto_takes_the_photos_depth_then_sharp_then_lite(
     tmp_path: Path, photo: Path, portrait: Path, sharp: Path
 ) -> None:
     prediction, choice = pick(photo)
-    assert (choice.base, choice.why, len(prediction.gaussians)) == ("sharp", NO_DEPTH, gaussians_of(TINY))
+    assert (choice.base, choice.why, len(prediction.gaussians)) == ("sharp", NO_DEPTH, gaussians_of(MICRO))
     assert prediction.notes["weights"] == SHARP_FILE
     sharp.unlink()
     choice = pick(photo)[1]

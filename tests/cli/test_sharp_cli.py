@@ -14,7 +14,7 @@ from stand_in import QUICK
 
 from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.base import load_network
-from spackle.bases.sharp.encoder import MICRO
+from spackle.bases.sharp.encoder import MICRO, TINY
 from spackle.device import pick_dtype
 
 
@@ -73,7 +73,7 @@ def test_anyone_can_make_weights_to_try_it_with(tmp_path: Path, suffix: str) -> 
     result = run("weights", "make", tmp_path / f"tiny{suffix}", "--size", "tiny")
     assert result.code == 0, result.err
     assert "show no scene" in result.err
-    network, weights = load_network(tmp_path / f"tiny{suffix}", torch.float32), tiny_weights()
+    network, weights = load_network(tmp_path / f"tiny{suffix}", torch.float32), tiny_weights(TINY)
     assert all(torch.equal(tensor, weights[name]) for name, tensor in network.state_dict().items())
     result = run("weights", "make", tmp_path / "three.bin", "--size", "tiny")
     assert result.code == 2
