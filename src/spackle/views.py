@@ -73,7 +73,7 @@ class PathOptions:
             raise InputError(f"--frames must be between 1 and {MAX_FRAMES}, got {self.frames}")
         if self.seconds is not None:
             if self.frames is not None:
-                raise InputError(f"--seconds {self.seconds:g}: --frames {self.frames} says it: leave one out")
+                raise InputError(f"--seconds {self.seconds:g}: --frames {self.frames} says how long: leave one out")
             if not 1 <= self.seconds * self.video.rate <= MAX_FRAMES:
                 raise InputError(f"--seconds must give 1 to {MAX_FRAMES} frames, got {self.seconds:g}")
         if self.cameras is not None and self.path is not None:
@@ -108,11 +108,11 @@ class PathOptions:
             PathError: the keyframes lead nowhere.
             ValueError: this scene allows no such path.
         """
+        given = self.frames or (self.seconds and round(self.seconds * self.video.rate))
         if keyframes is None:
-            count = self.frames or max(1, round((self.seconds or SECONDS) * self.video.rate))
+            count = given or max(1, round(SECONDS * self.video.rate))
             path = scene_path(gaussians, camera, self.trajectory, self.reach(disparity), count, looped=True)
             return [view.zoomed(1 + self.overscan) for view in path]
-        given = self.frames or (self.seconds and round(self.seconds * self.video.rate))
         count = given or keyframes.frame_count(self.video.rate)
         if count > MAX_FRAMES:
             raise PathError(f"{keyframes.seconds:g} s take {count} frames (at most {MAX_FRAMES}): give --frames")
