@@ -103,8 +103,8 @@ def test_a_mechanism_that_is_gone_is_an_error(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setitem(scoreboard.FILL, "gone", {"no_such_function": scoreboard.first})
     with pytest.raises(LookupError, match="no_such_function"), scoreboard.switched_off("gone", scoreboard.FILL):
         pass
-    with pytest.raises(LookupError, match="3 things"):
-        scoreboard.holders("STEEPEST")  # of edges, rims and tiles
+    with pytest.raises(LookupError, match="things of that name"):
+        scoreboard.holders("SWEEPS")  # of filters, maps and colours
 
 
 @pytest.mark.slow

@@ -17,8 +17,8 @@ from torch import Tensor
 
 from spackle import Photo, Scene, get_renderer, hole_mask
 from spackle import complete as complete_scene
-from spackle.bases import BasePrediction
-from spackle.bases.depth_map import FAR_M, NEAR_M, RELATIVE, relative_depth
+from spackle.bases import NEAREST_M, BasePrediction
+from spackle.bases.depth_map import FAR_M, RELATIVE, relative_depth
 from spackle.bases.open import OpenedBase, open_base
 from spackle.bases.settings import AUTO, AUTO_NETWORKS, BaseSettings
 from spackle.camera import Camera
@@ -65,7 +65,7 @@ class PredictScene:
         optional = {
             "depth": ("IMAGE",),
             "depth_kind": (list(RELATIVE),),
-            "near": ("FLOAT", {"default": NEAR_M, **metres}),
+            "near": ("FLOAT", {"default": NEAREST_M, **metres}),
             "far": ("FLOAT", {"default": FAR_M, **metres}),
             "fov": ("FLOAT", {"default": 0.0, "min": 0.0, "max": 170.0}),
         }
@@ -77,7 +77,7 @@ class PredictScene:
         base: OpenedBase,
         depth: Tensor | None = None,
         depth_kind: Any = RELATIVE[0],
-        near: float = NEAR_M,
+        near: float = NEAREST_M,
         far: float = FAR_M,
         fov: float = 0.0,
     ) -> tuple[Scene]:

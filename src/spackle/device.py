@@ -129,11 +129,15 @@ def thread_count() -> int:
     return torch.get_num_threads()
 
 
-def run_chunks(function: Callable[[int, int], object], total: int, grain: int) -> None:
+CHUNKS = 64  # of a task: enough for threads to share uneven ones
+
+
+def run_chunks(function: Callable[[int, int], object], total: int, grain: int | None = None) -> None:
     """Call `function(start, stop)` for chunks of at most `grain` of 0..total, in any order: writes must not overlap.
 
     A thread takes the next chunk when it is done with its last, so uneven chunks balance.
     """
+    grain = grain or max(-(-total // CHUNKS), 1)
     chunks = -(-total // grain)
     helpers = min(thread_count(), chunks) - 1
     starts = iter(range(0, total, grain))

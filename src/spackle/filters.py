@@ -23,7 +23,6 @@ MIN_TRUST = 1e-6  # a hole whose whole rim is near still gets its colour from th
 MAX_EXPONENT = 30.0  # keeps weights within single precision
 LIGHTEST, HEAVIEST = (np.float32(np.exp(sign * MAX_EXPONENT)) for sign in (-1, 1))
 AROUND = 4  # neighbours of a pixel
-GRAIN = 32  # coarse rows that a thread takes at a time
 
 Floats = NDArray[np.float32]
 Bools = NDArray[np.bool_]
@@ -150,7 +149,7 @@ def _fill_level(depths: Floats, values: Floats, known: Bools, bias: Floats) -> N
     coarse = (np.empty(size, np.float32), np.empty((*size, channels), np.float32))
     masks = (np.empty(size, np.bool_), np.empty(size, np.float32))
     fine = (depths, values, known, bias, reference)
-    run_chunks(lambda start, stop: _coarsen(start, stop, *fine, *coarse, *masks), size[0], GRAIN)
+    run_chunks(lambda start, stop: _coarsen(start, stop, *fine, *coarse, *masks), size[0])
     _fill_level(*coarse, *masks)
     holes, links, rim = _find_holes(known, count)
     flat, pixels = depths.reshape(-1), values.reshape(known.size, channels)

@@ -40,7 +40,6 @@ DEPTH_WEIGHT, TONE_WEIGHT, OFFSET_WEIGHT = 0.15, math.sqrt(2), 0.05
 LEAST_SPREAD = 0.05  # of z: a wall that faces the camera has no depth to tell its parts apart by
 SAME_SURFACE = 0.25  # standard deviations of z by which a mirrored start may lie before or behind its place
 FAINTEST_VOTE, LEAST_COST = 1e-6, 1e-8
-GRAIN = 256  # cells that a thread takes at a time
 
 Floats = NDArray[np.float32]
 Bools = NDArray[np.bool_]
@@ -143,7 +142,7 @@ def _match(level: _Level, coarse: Matches | None, number: int) -> Matches | None
     target = (padded, level.weights, level.traits, sources, traits, np.float32(OFFSET_WEIGHT / max(height, width) ** 2))
 
     def run(function: Callable[..., None], *given: Any) -> None:
-        run_chunks(lambda start, stop: function(start, stop, cells, *given), len(cells), GRAIN)
+        run_chunks(lambda start, stop: function(start, stop, cells, *given), len(cells))
 
     def vote(mean: float) -> None:
         run(_vote, numbers, places, costs, np.float32(max(mean, LEAST_COST)), sources, level.rgb)

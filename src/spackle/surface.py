@@ -15,10 +15,13 @@ from spackle.device import run_chunks
 from spackle.gaussians import Gaussians, quat_from_matrix
 
 EDGE = 0.03  # a relative jump of inverse depth between neighbours beyond this is a depth edge
-CREASE = 0.01  # where the two sides' slopes differ by more than this, only the flatter one counts
-RAGGED = 0.005  # steepest slope that one side alone is believed; more of it stands out as whiskers from the side
+CREASE = 0.01  # where the two sides' slopes differ by more than this, only the flatter one counts, if it is no more
 THICKNESS = 0.05  # third axis, in units of the smaller of the other two
-GRAIN = 64  # rows that a thread takes at a time
+# Of an opaque Gaussian. Not higher: a blob that would bring the transmittance below the renderer's stop (1e-4) is not
+# drawn at all, so behind a thin veil of alpha 0.9 one of opacity 0.999 would leave a hole that nothing can fill.
+OPACITY = np.float32(0.99)
+PIXEL_SPREAD = 0.5  # standard deviation of a Gaussian for one pixel, which a wider one backs
+BEHIND = 0.005  # relative distance behind a surface at which a Gaussian does not spill over it
 
 
 def surface_gaussians(
@@ -81,13 +84,13 @@ def surface_slope(inverse_depth: Tensor) -> Tensor:
     """
     image = inverse_depth.detach().cpu().contiguous().numpy()
     slopes = np.empty((*image.shape, 2), image.dtype)
-    bounds = tuple(image.dtype.type(bound) for bound in (CREASE, EDGE, RAGGED))
-    run_chunks(lambda start, stop: _slopes(start, stop, image, *bounds, slopes), len(image), GRAIN)
+    bounds = tuple(image.dtype.type(bound) for bound in (CREASE, EDGE))
+    run_chunks(lambda start, stop: _slopes(start, stop, image, *bounds, slopes), len(image))
     return torch.from_numpy(slopes).to(inverse_depth.device)
 
 
 @kernel
-def _slopes(start: int, stop: int, image: Any, crease: Any, edge: Any, ragged: Any, slopes: Any) -> None:
+def _slopes(start: int, stop: int, image: Any, crease: Any, edge: Any, slopes: Any) -> None:
     """Compute rows start..stop of the slopes."""
     height, width = image.shape
     for y in range(start, stop):
@@ -97,16 +100,16 @@ def _slopes(start: int, stop: int, image: Any, crease: Any, edge: Any, ragged: A
             # At a border the one difference that there is stands for both.
             ahead, behind = image[y, right] - here, here - image[y, left]
             forward, backward = ahead if right > x else behind, behind if left < x else ahead
-            slopes[y, x, 0] = _slope(here, backward, forward, crease, edge, ragged)
+            slopes[y, x, 0] = _slope(here, backward, forward, crease, edge)
             ahead, behind = image[below, x] - here, here - image[above, x]
             forward, backward = ahead if below > y else behind, behind if above < y else ahead
-            slopes[y, x, 1] = _slope(here, backward, forward, crease, edge, ragged)
+            slopes[y, x, 1] = _slope(here, backward, forward, crease, edge)
 
 
 @kernel
-def _slope(here: Any, backward: Any, forward: Any, crease: Any, edge: Any, ragged: Any) -> Any:
+def _slope(here: Any, backward: Any, forward: Any, crease: Any, edge: Any) -> Any:
     """The slope along one axis, from the differences to both neighbours."""
     smooth = abs(forward - backward) <= crease * here
     flatter = backward if abs(backward) < abs(forward) else forward
     slope = (forward + backward) / 2 if smooth else flatter
-    return slope if abs(slope) <= (edge if smooth else ragged) * here else 0 * here
+    return slope if abs(slope) <= (edge if smooth else crease) * here else 0 * here

@@ -163,9 +163,9 @@ def test_cheapest_paths_are_those_of_dijkstra(seed: int) -> None:
         far = far_fill(*map(torch.from_numpy, (expected, expected[None], sampled.state != HOLE)))[0].numpy()
 
         def step(p: Pixel, q: Pixel, state: int = state, far: np.ndarray = far) -> float:
-            cost = edges.COLOR_COST * float(np.abs(rgb[p] - rgb[q]).sum())
+            cost = edges.CHANGE_COST * float(np.abs(rgb[p] - rgb[q]).sum())
             if state == OPEN:
-                return cost + edges.DEPTH_COST * abs(float(expected[q] - expected[p]) / float(sampled.step[q]))
+                return cost + edges.CHANGE_COST * abs(float(expected[q] - expected[p]) / float(sampled.step[q]))
             near = max(0.0, 1 - float(far[q] / expected[p])) if sampled.state[p] > state else 0.0
             return cost + edges.NEAR_COST * near
 

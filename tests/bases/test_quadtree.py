@@ -12,11 +12,12 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, max_pool2d
 
 from spackle.bases.quadtree import BEND, LEVELS, Quadtree, Tiles
-from spackle.bases.splats import STEEPEST, layered_gaussians
+from spackle.bases.splats import layered_gaussians
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, extremes
 from spackle.color import srgb_to_linear
 from spackle.render import CpuRenderer
+from spackle.surface import EDGE
 
 CPU = CpuRenderer()
 
@@ -26,11 +27,11 @@ def ground(height: int = 27, width: int = 38) -> tuple[Tensor, Tensor, Tensor, T
     torch.manual_seed(1)
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     picture = (0.3 + 0.01 * x)[..., None] + 0.2 * torch.rand(height, width, 3) * (x + y > 36)[..., None]
-    inverse = 0.4 + 0.001 * x + 0.002 * y
+    inverse = 0.4 + 0.0004 * x + 0.0008 * y
     inverse[20, 6] *= 1 + 2 * float(BEND)
     free = torch.ones(height, width, dtype=torch.bool)
     free[3, 30] = free[26] = False
-    return picture, inverse, torch.tensor([0.001, 0.002]).expand(height, width, 2), free
+    return picture, inverse, torch.tensor([0.0004, 0.0008]).expand(height, width, 2), free
 
 
 def losses(picture: Tensor, height: int, width: int) -> Tensor:
@@ -44,7 +45,7 @@ def losses(picture: Tensor, height: int, width: int) -> Tensor:
 @pytest.mark.parametrize("level", [1, 2, 3])
 def test_blocks_lose_what_interpolated_means_miss(level: int) -> None:
     picture, inverse, slope, free = ground()
-    lost = Quadtree(picture, inverse, slope, free, LEVELS, STEEPEST).lost[level - 1]
+    lost = Quadtree(picture, inverse, slope, free, LEVELS, EDGE).lost[level - 1]
     side, (rows, columns) = 2**level, lost.shape[:2]
     assert (rows, columns) == (27 // side, 38 // side)
     whole = picture[: rows * side, : columns * side]
@@ -56,7 +57,7 @@ def test_blocks_lose_what_interpolated_means_miss(level: int) -> None:
         around = np.s_[max(top - side, 0) : top + 2 * side, max(left - side, 0) : left + 2 * side]
         center = depth[top : top + side, left : left + side].mean()
         y, x = np.indices(depth.shape)[(slice(None), *around)]
-        plane = center + 0.001 * (x - left - half + 0.5) + 0.002 * (y - top - half + 0.5)
+        plane = center + 0.0004 * (x - left - half + 0.5) + 0.0008 * (y - top - half + 0.5)
         off = (abs(depth[around] - plane) > float(BEND) * center).any()
         blocked[row, column] = bool(off) or not bool(free[around].all())
     assert bool(blocked.any())
@@ -68,7 +69,7 @@ def test_blocks_lose_what_interpolated_means_miss(level: int) -> None:
 @pytest.mark.parametrize("worth", [1e-6, 1e-3, 0.02, 10.0])
 def test_a_cut_covers_every_pixel_once_and_no_other_costs_less(worth: float) -> None:
     picture, inverse, slope, free = ground()
-    tree = Quadtree(picture, inverse, slope, free, LEVELS, STEEPEST)
+    tree = Quadtree(picture, inverse, slope, free, LEVELS, EDGE)
     single, tiles = tree.cut(worth)
     covered = single.long()
     for part in tiles:

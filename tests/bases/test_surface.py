@@ -10,7 +10,7 @@ from torch import Tensor
 
 from spackle.camera import Camera
 from spackle.gaussians import Gaussians, quat_to_matrix
-from spackle.surface import CREASE, EDGE, RAGGED, THICKNESS, surface_gaussians, surface_slope
+from spackle.surface import CREASE, EDGE, THICKNESS, surface_gaussians, surface_slope
 
 PROPERTY = settings(deadline=None, max_examples=40)
 SLOPES = st.floats(-0.01, 0.01)
@@ -78,7 +78,7 @@ def plain_slope(row: list[float]) -> list[float]:
         forward = row[k + 1] - here if k < last else row[last] - row[last - 1]
         slope, steepest = (backward + forward) / 2, EDGE
         if abs(forward - backward) > CREASE * here:
-            slope, steepest = backward if abs(backward) < abs(forward) else forward, RAGGED
+            slope, steepest = backward if abs(backward) < abs(forward) else forward, CREASE
         slopes.append(slope if abs(slope) <= steepest * here else 0.0)
     return slopes
 

@@ -14,8 +14,9 @@ from torch.nn.functional import max_pool2d
 from spackle.camera import Camera
 from spackle.render.protocol import Rendering
 from spackle.residual import CELL, ViewFeatures, make_seeds
-from spackle.residual.base_values import BEHIND, BLOB_CELLS, inside_photo
+from spackle.residual.base_values import BLOB_CELLS, inside_photo
 from spackle.residual.view_features import cell_centers
+from spackle.surface import BEHIND
 
 PHOTO = Camera.from_focal(150, 240, 160)
 VIEW = PHOTO.looking(torch.tensor([-1.2, 0.0, 0.0]), torch.tensor([0.3, 0.0, 4.0]))
@@ -79,13 +80,3 @@ def test_beyond_the_border_a_floor_stays_level_and_a_wall_a_wall() -> None:
         assert float((seeds.rgb - color).abs().mean(-1)[beyond & surface].mean()) < 0.12
     within = make_seeds(dataclasses.replace(features, inverse_depth=torch.ones_like(inverse_depth)), VIEW, VIEW)
     assert float((within.inverse_depth - 1).abs().max()) < 0.02  # a view of the photo's own frame has no border
-
-
-def test_what_is_nearer_than_the_border_is_not_extended() -> None:
-    features, _, _ = room()
-    near, edge = torch.zeros_like(features.mask), int((~features.mask[20]).nonzero().max())
-    near[20:28, edge - 10 : edge + 6] = True  # before the wall, and over the photo's border
-    red = torch.where(near[..., None], torch.tensor([0.9, 0.1, 0.1]), features.rgb)
-    inverse, alpha = torch.where(near, 0.22, features.inverse_depth), torch.where(near, 1.0, features.alpha)
-    seeds = make_seeds(ViewFeatures(red, inverse, alpha, features.mask & ~near), VIEW, PHOTO)
-    assert float((seeds.rgb[20:28, edge + 16 :] - WALL).abs().mean()) < 0.3  # of 0.53

@@ -17,7 +17,6 @@ from spackle.camera import Camera
 from spackle.gaussians import Gaussians
 from spackle.scene_fill import OcclusionGuard
 from spackle.scene_fill.occlusion_guard import (
-    CLEARANCE,
     MAX_REACH_PX,
     PIT,
     REACH,
@@ -55,7 +54,7 @@ def plain_push(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) ->
             for j, i in itertools.product(range(-down, down + 1), range(-across, across + 1)):
                 row_, column = math.floor(v + 2 * WINDOW_PX * j), math.floor(u + 2 * WINDOW_PX * i)
                 seen = guard.depth[min(max(row_, 0), height - 1), min(max(column, 0), width - 1)]
-                if float(z) < float(seen) * (1 + CLEARANCE):
+                if float(z) < float(seen):
                     return True
         return False
 

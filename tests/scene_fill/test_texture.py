@@ -24,8 +24,9 @@ from spackle.residual.complete import compose
 from spackle.residual.network import Rim, find_rim
 from spackle.scene_fill import FillContext, exemplar_texture, fill_scene, fill_view, painted_texture
 from spackle.scene_fill import texture as room
-from spackle.scene_fill.fill import FINE_SPREAD_PX, PAINTED_VIEWS
+from spackle.scene_fill.fill import OPPOSITE
 from spackle.scene_fill.texture import HoleView
+from spackle.surface import PIXEL_SPREAD
 
 
 @pytest.mark.parametrize("period", [4.0, 6.0, 8.0])  # pixels
@@ -39,7 +40,7 @@ def test_sharpened_blobs_make_up_for_their_overlap(period: float) -> None:
 
     def strength(colors: Tensor) -> float:
         grid = (uv, 1 / depths, torch.zeros_like(uv), 0.5 + colors)
-        blobs = compose(Seeds(*(field.flatten(0, 1) for field in grid)), None, camera, FINE_SPREAD_PX)
+        blobs = compose(Seeds(*(field.flatten(0, 1) for field in grid)), None, camera, PIXEL_SPREAD)
         shown, truth = (image[4:-4, 4:-4] for image in (CPU.render(blobs, camera).rgb, wanted))
         return float(((shown - shown.mean((0, 1))) * truth).sum() / truth.square().sum())
 
@@ -84,7 +85,7 @@ def test_a_painted_picture_is_asked_for_once_and_seen(size: tuple[int, int], thr
     painter.asked.clear()
     path = trajectory("rotate-forward", context.photo_camera, 0.4, DepthRange.of(context.base), 9)
     assert len(fill_scene(context, path, exact=True).aux)
-    assert len(painter.asked) == PAINTED_VIEWS  # the widest, and no others
+    assert len(painter.asked) == OPPOSITE  # the widest, and no others
 
 
 def hole_view() -> tuple[HoleView, FillContext, Camera]:
@@ -158,6 +159,6 @@ def test_blocks_are_those_of_the_matches_around_a_cell() -> None:
     for cell in subject.cells:
         over = np.abs(subject.cells - cell).max(1) <= 1
         moved = subject.places[over] + np.pad(cell - subject.cells[over], [(0, 0), (1, 0)])
-        weights = np.exp(-room.BLOCK_CHOICE * subject.costs[over] / subject.costs.mean()) + 1e-6
+        weights = np.exp(-subject.costs[over] / subject.costs.mean()) + 1e-6
         expected = np.average([sources[m][v, u] for m, v, u in moved], axis=0, weights=weights)
         np.testing.assert_allclose(found[tuple(cell)], expected, rtol=1e-4)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
+from spackle.bases import NEAREST_M
 from spackle.errors import InputError, reading, shown
 from spackle.files import check_file
 from spackle.image import MAX_PIXELS, check_pixels, read_image
@@ -36,7 +37,7 @@ LARGEST = 1e9  # in a calibration: single precision holds its square
 ASPECT_TOLERANCE = 0.01
 CALIBRATED_SIZE_TOLERANCE = 0.02
 MIN_DISTINCT = 16  # fewer values may share a divisor by chance
-NEAR_M, FAR_M = 1.5, 15.0  # where the nearest and the farthest of a relative map are put
+FAR_M = 15.0  # where the farthest of a relative map is put
 EXTREMES = (0.01, 0.99)  # quantiles that count as these
 STRETCH = 4.0  # what lies beyond goes on in the same way, up to this factor nearer or farther
 FILLED = 0.05  # a PNG whose values come this close to both ends of the 16 bits is a relative map, not millimetres
@@ -101,7 +102,7 @@ def load_depth(
     focal_px: float | None = None,
     calib: StrPath | None = None,
     kind: DepthKind = "auto",
-    near: float = NEAR_M,
+    near: float = NEAREST_M,
     far: float = FAR_M,
 ) -> DepthMap:
     """Read a depth map, a disparity map with its calibration, or a relative map.
@@ -169,7 +170,12 @@ def _depth_map(stored: Array, is_png: bool, lens: Calibration | None, path: Path
 
 
 def relative_depth(
-    stored: Array, kind: DepthKind, path: StrPath, near: float = NEAR_M, far: float = FAR_M, step: float | None = None
+    stored: Array,
+    kind: DepthKind,
+    path: StrPath,
+    near: float = NEAREST_M,
+    far: float = FAR_M,
+    step: float | None = None,
 ) -> DepthMap:
     """Numbers [H, W] that are inverse depth (near-white) or depth (near-black), up to scale and shift, as metres.
 

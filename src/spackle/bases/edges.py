@@ -15,9 +15,9 @@ from spackle.surface import EDGE
 
 STEEPEST = 5.0  # a surface at 79° to the image plane; only what is steeper may be a smeared edge
 REACH = 16  # pixels of the map from the steepest place to the end of what was smeared, at most
-FLAT = 0.1  # where the slope has fallen so far, in units of its peak, the surface is all but itself again
-SWELL = 0.25  # a rise of the slope by so much of the peak belongs to another edge
-STANDS_OUT = 0.7  # the slopes that an edge joins are at most that steep, in units of its peak
+# In units of its peak: where the slope has fallen so far, the surface is all but itself again; and a rise of the slope
+# by so much belongs to another edge.
+FLAT = 0.1
 
 Floats = NDArray[np.float32]
 Bools = NDArray[np.bool_]
@@ -65,8 +65,6 @@ def _rows(inverse_depth: Any, known: Any, steepest: float) -> Any:
             left, first = _foot(gaps, x, -1)
             right, last = _foot(gaps, x, 1)
             slope = max(left, right, np.float32(0))
-            if slope > STANDS_OUT * top:
-                continue
             start, end = row[first - 1], row[last]
             outer = 0.5 * (left + right) if min(left, right) >= 0 else slope
             rise = abs(end - start) - outer * (last - first + 1)
@@ -89,7 +87,7 @@ def _foot(gaps: Any, peak: int, way: int) -> Any:
     flattest, end, reach = top, peak, REACH
     for n in range(1, REACH + 1):
         k = peak + way * n
-        if n > reach or not sign * gaps[k] <= flattest + SWELL * top:
+        if n > reach or not sign * gaps[k] <= flattest + FLAT * top:
             break
         if sign * gaps[k] < flattest:
             flattest, end = max(sign * gaps[k], np.float32(0)), k
@@ -218,11 +216,8 @@ def _sample(
     return values, state, heights
 
 
-COLOR_COST = 35.0  # pixels of detour that a change from 0 to 1 in one channel is worth
-DEPTH_COST = 40.0  # and the way from one side of a smeared edge to the other
+CHANGE_COST = 35.0  # pixels of detour that a channel's change from 0 to 1 is worth, or the way across a smeared edge
 NEAR_COST = 300.0  # and a start of a hole's filling that is far too near
-ROUNDS = 4  # sweeps down and up; a path may turn as often
-LEAN = 0.25  # how far a side's surface may be continued into an edge, relative to its inverse depth
 
 
 def settle(sampled: Sampled, rgb: Floats) -> Floats:
@@ -254,7 +249,7 @@ def settle(sampled: Sampled, rgb: Floats) -> Floats:
         if state == OPEN:
             across, down = (slope.reshape(-1)[source] for slope in sampled.slope)
             lean = across * (pixels % width - source % width) + down * (pixels // width - source // width)
-            found = found + np.clip(lean, -LEAN * found, LEAN * found)
+            found = np.maximum(found + lean, 0.5 * found)
         depth.reshape(-1)[pixels] = found
     return depth
 
@@ -273,11 +268,11 @@ def _spread(cost: Any, source: Any, depths: Any, steps: Any, far: Any, rgb: Any,
     Initially starts cost 0, all other pixels infinity, and each pixel is its own source.
     """
     height, width = depths.shape
-    for sweep in range(2 * ROUNDS):
-        way = 1 if sweep % 2 else -1  # the neighbours that this sweep has already visited
-        changed = False
+    way, changed, before = -1, True, True
+    while changed or before:
+        before, changed = changed, False
         for i in range(len(pixels)):
-            n = pixels[i if way < 0 else len(pixels) - 1 - i]
+            n = pixels[i if way < 0 else len(pixels) - 1 - i]  # neighbours on that side are visited already
             y, x = n // width, n % width
             for k in range(4):
                 v, u = (y + way, x + k - 1) if k < 3 else (y, x + way)
@@ -285,12 +280,11 @@ def _spread(cost: Any, source: Any, depths: Any, steps: Any, far: Any, rgb: Any,
                     continue
                 length = 1.0 if v == y or u == x else 1.4142135
                 climb = abs(depths[y, x] - depths[v, u]) / max(steps[y, x], np.float32(1e-12))
-                total = cost[v, u] + length + COLOR_COST * color_change(rgb, y, x, v, u) + DEPTH_COST * climb
+                total = cost[v, u] + length + CHANGE_COST * (color_change(rgb, y, x, v, u) + climb)
                 if cost[v, u] == 0 and steps[y, x] == np.inf:
                     total += NEAR_COST * max(0.0, 1 - far[y, x] / depths[v, u])
-                if total < cost[y, x]:
+                if np.float32(total) < cost[y, x]:
                     cost[y, x] = total
                     source[n] = source[v * width + u]
                     changed = True
-        if not changed and sweep > 0:
-            break
+        way = -way

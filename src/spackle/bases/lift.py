@@ -22,6 +22,7 @@ from spackle.camera import Camera
 from spackle.color import srgb_to_linear
 from spackle.errors import InputError
 from spackle.image import Photo, pad_edge, resize_photo
+from spackle.surface import EDGE
 
 
 class RgbdBase:
@@ -98,7 +99,6 @@ def lift(rgb: Tensor, depth: DepthMap, camera: Camera, levels: int = LEVELS) -> 
 
 SWEEPS = 100  # enough for steps about 30 pixels apart
 LEAST_NOISE = 5e-4  # of the inverse depth; less leaves no gaps between the Gaussians
-MOST_NOISE = 0.03  # more is no noise but what the photo shows: leaves, meshes
 DEVIATIONS = 2.0  # of the noise that a pixel may move
 
 
@@ -124,10 +124,10 @@ def smoothed(inverse_depth: Floats, known: Bools, step: Floats | np.float32) -> 
     Noise of 0.3 % makes each Gaussian of a slanted surface face another way, and light shines through; whole
     disparities turn a slanted plane into a staircase with a gap at every step. A known pixel may move by half a step or
     by what noise explains, and goes to the mean of its neighbours on both sides. A neighbour three times as far away
-    belongs to another surface.
+    belongs to another surface. What is as rough as depth edges is no noise but what the photo shows: leaves, meshes.
     """
     noise = noise_level(inverse_depth, known)
-    reach = np.maximum(step / 2, DEVIATIONS * noise * (noise <= MOST_NOISE) * inverse_depth)
+    reach = np.maximum(step / 2, DEVIATIONS * noise * (noise <= EDGE) * inverse_depth)
     reach = np.where(reach >= LEAST_NOISE * inverse_depth, reach, 0).astype(np.float32)
     if not reach.any():
         return inverse_depth

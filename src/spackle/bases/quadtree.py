@@ -17,8 +17,6 @@ from spackle.device import run_chunks
 LEVELS = 3  # the largest tiles have 8×8 pixels
 BEND = np.float32(0.003)  # most that the inverse depth in and around a tile leaves its plane, relative
 SQUARE, FLAT, TALL = 0, 1, 2  # one tile for a block, or two halves of it: one above the other, or side by side
-SAMPLE = 100_000  # blocks that are enough for a median
-GRAIN = 16  # rows of blocks that a thread takes at a time
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,7 +86,6 @@ class Quadtree:
         """The median deviation of pixels from their 2×2 tile, over blocks that may become tiles."""
         lost = self.lost[0][..., SQUARE] if self.lost else torch.empty(0)
         finite = lost[torch.isfinite(lost)]
-        finite = finite[:: 1 + len(finite) // SAMPLE]
         return math.sqrt(float(finite.median()) / 4) if finite.numel() else 0.0
 
     def cut(self, worth: float) -> tuple[Tensor, list[Tiles]]:
@@ -124,7 +121,7 @@ def _sizes(side: int) -> tuple[tuple[int, int], ...]:
 
 
 def _measure_all(side: int, steepest: np.float32, lost: NDArray[np.float32], arrays: list[NDArray[Any]]) -> None:
-    run_chunks(lambda start, stop: _measure(start, stop, side, steepest, lost, *arrays), len(lost), GRAIN)
+    run_chunks(lambda start, stop: _measure(start, stop, side, steepest, lost, *arrays), len(lost))
 
 
 @kernel

@@ -11,31 +11,22 @@ from numpy.typing import NDArray
 from spackle._numba import inlined_kernel, kernel
 from spackle.bases.edges import Floats
 from spackle.device import run_chunks
-from spackle.surface import EDGE
+from spackle.surface import CREASE, EDGE
 
 REACH = 3  # pixels to either side of a step that may be mixtures
 STEADILY = 0.5  # of a difference on both sides of it, and it is a plane's
 WINDOW = 5  # pixels to each side in which both surfaces are looked at
-FALL = np.float32(3.0)  # pixels at which a sample's weight has fallen to 1/e
 PURE = np.array([1.0, 0.01, 0.15, 1.0], np.float32)  # weight of a colour on the rings around a step
 STEADY = np.array([1.0, 0.1, 0.5, 1.0], np.float32)  # and of a depth: round things fall off towards their rims
-RIM = 2  # rings of the near surface that are put on its plane
-UNEXPLAINED = np.float32(0.002)  # squared difference from the photo at which the outline does not explain a pixel
-UNMIXED = np.float32(0.006)  # and from the likest mixture of both colours at which it is none of them
+UNEXPLAINED = np.float32(0.002)  # squared difference from the photo at which a mixture does not explain a pixel
 FRINGE = np.float32(6.0)  # variances of the far colour beyond which a pixel has left it, away from the near colour
-STEEPEST = np.float32(0.006)  # slope of such a plane, relative to the inverse depth
 BLUR = np.float32(1.2)  # pixels over which the map's outline is smoothed
 SURE = np.float32(0.2)  # pixels that a pixel's centre lies on its own side of the map's outline, at least
-AROUND = 2  # pixels to each side that say together where the photo has the outline
 STEPS, STEP = 6, 0.33  # shifts that are tried to each side, and their size in pixels
-SHIFT_COST = 0.02  # of a shift by one step, in variances of the colours
+SHIFT_COST = 0.04  # of a shift by one step, in variances of the colours
 RAMPS = np.array([1.75, 0.8])  # pixels from nothing to all of a surface across an outline, as lenses blur it
-VARIED = 2.0  # a colour is known to this many times the variance of those that it is a mean of
-ASTRAY = 4.0  # and to so many times what it has that no mixture would
-NOISE = 4e-4  # and this much more
-OUTLIER = 0.5  # most that one pixel's share may be off, squared
-MARGIN, TEXTURE = np.float32(0.005), np.float32(1.5)  # a hidden colour leaves the mean so far, plus deviations
-GRAIN = 32
+ASTRAY = 4.0  # times the variance of a colour: what a pixel has that no mixture would
+TEXTURE = np.float32(1.5)  # deviations by which a hidden colour leaves the mean at most
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,9 +60,9 @@ def find_layers(inverse_depth: Floats, slope: Floats, colors: Floats) -> Layers:
     depth, slopes, color = (np.stack([image, image]) for image in (inverse_depth, slope, colors))
     alpha, inside, texture = (np.zeros((n, height, width), np.float32) for n in (1, 1, 2))
     found = (inside[0], depth, slopes, color, texture)
-    run_chunks(lambda a, b: _survey(a, b, inverse_depth, colors, ring, levels, *found), height, GRAIN)
+    run_chunks(lambda a, b: _survey(a, b, inverse_depth, colors, ring, levels, *found), height)
     looks = (colors, ring, inside[0], color, texture)
-    run_chunks(lambda a, b: _match(a, b, *looks, alpha[0]), height, GRAIN)
+    run_chunks(lambda a, b: _match(a, b, *looks, alpha[0]), height)
     _unmix(colors, ring, inside[0], alpha[0], color, texture)
     return Layers(ring, alpha[0], depth, slopes, color)
 
@@ -154,7 +145,7 @@ def _survey(
                         blurred += w * (1 - side)
                     if d > high + (high - middle) or d < low - (middle - low):
                         continue
-                    w = np.exp(-np.float32(dx * dx + dy * dy) / (FALL * FALL))
+                    w = np.exp(-np.float32(dx * dx + dy * dy) / np.float32(REACH * REACH))
                     r = ring[v, u]
                     if abs(d - level[side]) < np.float32(EDGE) * 2 * d:
                         wd = w * STEADY[r]
@@ -176,8 +167,7 @@ def _survey(
             far_in = np.float32(BLUR * np.log(part / (1 - part)) / 1.702)
             inside[y, x] = max(far_in, SURE) if near else min(far_in, -SURE)
             for side in range(2):
-                # What the map says is kept, but for near rims, which are ragged.
-                if (side == 0) != near or (near and ring[y, x] <= RIM):
+                if near or side == 0:  # what the map says is kept, but for near rims, which are ragged
                     at, across, down = _plane(m[side], level[side])
                     depth[side, y, x] = at
                     slope[side, y, x, 0], slope[side, y, x, 1] = across, down
@@ -217,16 +207,17 @@ def _match(start: int, stop: int, colors: Any, ring: Any, inside: Any, color: An
                 continue
             for k in range(len(costs)):
                 costs[k] = SHIFT_COST * (k % shifts - STEPS) ** 2
-            for v in range(max(y - AROUND, 0), min(y + AROUND + 1, height)):
-                for u in range(max(x - AROUND, 0), min(x + AROUND + 1, width)):
+            for v in range(max(y - REACH, 0), min(y + REACH + 1, height)):
+                for u in range(max(x - REACH, 0), min(x + REACH + 1, width)):
                     if ring[v, u] == 0:
                         continue
                     share, beside, apart = _share(colors, color, v, u)
-                    weight = apart / (VARIED * (texture[0, v, u] + texture[1, v, u] + ASTRAY * beside) + NOISE)
+                    varied = texture[0, v, u] + texture[1, v, u] + ASTRAY * beside
+                    weight = apart / max(varied, np.float32(1e-9))
                     for k in range(len(costs)):
                         a = 0.5 + (inside[v, u] + (k % shifts - STEPS) * STEP) / RAMPS[k // shifts]
                         off = min(max(a, 0.0), 1.0) - share
-                        costs[k] += weight * min(off * off, OUTLIER)
+                        costs[k] += weight * off * off
             best = 0
             for k in range(len(costs)):
                 if costs[k] < costs[best]:
@@ -267,7 +258,7 @@ def _unmix(colors: Any, ring: Any, inside: Any, alpha: Any, color: Any, texture:
                 missing = rest[c]
                 for side in range(2):
                     part = a if side == 0 else 1 - a
-                    limit = MARGIN + TEXTURE * np.sqrt(texture[side, y, x])
+                    limit = TEXTURE * np.sqrt(texture[side, y, x])
                     change = min(max(rest[c] * part * part / whole, -limit), limit)
                     moved = min(max(color[side, y, x, c] + change, np.float32(0)), np.float32(1))
                     missing -= part * (moved - color[side, y, x, c])
@@ -278,7 +269,7 @@ def _unmix(colors: Any, ring: Any, inside: Any, alpha: Any, color: Any, texture:
                 continue
             if left <= UNEXPLAINED:
                 continue
-            if beside <= UNMIXED and 0 < share < 1:
+            if beside <= UNEXPLAINED and 0 < share < 1:
                 alpha[y, x] = share
                 for c in range(3):
                     color[0, y, x, c], color[1, y, x, c] = pure[0, c], pure[1, c]
@@ -296,6 +287,6 @@ def _plane(m: Any, level: Any) -> Any:
     cxd, cyd = m[7] / m[0] - mx * md, m[8] / m[0] - my * md
     determinant = cxx * cyy - cxy * cxy
     across, down = (cxd * cyy - cyd * cxy) / determinant, (cyd * cxx - cxd * cxy) / determinant
-    limit = STEEPEST * md
+    limit = np.float32(CREASE) * md
     across, down = min(max(across, -limit), limit), min(max(down, -limit), limit)
     return np.float32(max(md - across * mx - down * my, 0.5 * md)), np.float32(across), np.float32(down)

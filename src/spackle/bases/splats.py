@@ -21,36 +21,24 @@ from spackle.camera import Camera
 from spackle.color import linear_to_srgb
 from spackle.device import run_chunks
 from spackle.gaussians import Gaussians
-from spackle.surface import surface_gaussians, surface_slope
+from spackle.surface import BEHIND, CREASE, EDGE, OPACITY, PIXEL_SPREAD, surface_gaussians, surface_slope
 
-SPREAD_PX = 0.5  # standard deviation of a pixel's Gaussian
-# Not higher: a blob that would bring the transmittance below the renderer's stop (1e-4) is not drawn at all, so
-# behind a thin veil of alpha 0.9 one of opacity 0.999 would leave a hole that nothing can fill.
-OPACITY = np.float32(0.99)
 # Blobs of half a pixel reproduce the photo sharply, but light passes between them. Blobs wide enough to
 # close the surface would blur it. So a coarse backing, one blob for 2×2 pixels or more, closes it from behind:
 # 2 dB sharper at the photo's camera than one layer of wider blobs.
-TILE_SPREAD = 0.55  # standard deviation of a tile's Gaussian, in its sides
-BACKING_SPREAD = 0.55  # of the backing's for 2×2 pixels
-RIM_BACKING_SPREAD = 0.42  # of those at a near surface's rim, beyond which they would be seen from beside
-LARGE_BACKING_SPREAD = 0.65  # and of its larger ones, which keep away from depth steps
-BACKING_GAP = 0.005  # the backing's distance behind the front, relative
-BACKING_SLOPE_GAP = 2.0  # and so many of its sides further along a slanted surface, so that none pokes through
-RIM_BACKING_SLOPE_GAP = 0.5  # at a near rim: what stands far behind it shows beyond it, as teeth, from beside
-MAX_BACKING_GAP = 0.2
+TILE_SPREAD = 0.55  # standard deviation of a tile's Gaussian, and of the backing's for 2×2 pixels, in its sides
+LARGE_BACKING_SPREAD = 0.65  # of the backing's larger ones, which keep away from depth steps
+RIM_BACKING_SPREAD = 0.42  # of the backing at a near surface's rim, beyond which it would be seen from beside
+BACKING_SIDES = 2  # along a slanted surface, by which the backing stands behind, so that none pokes through
 WORTH = 0.012  # the squared difference in sRGB that one Gaussian is worth, over the photo's detail
 LEAST_WORTH, MOST_WORTH = 1e-5, 2e-4
-STEEPEST = 0.06  # change of the inverse depth across a tile
-STEEPEST_BACKING = 0.01  # and across one of the backing, which stands the farther behind the steeper it is
 BACKING_SHARE = 0.02  # of a difference in the backing that shows
-LEAST_MIXED = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
-MOST = 1.5  # Gaussians a pixel
-FITS = 3  # corrections of the colours
-UNTOUCHED = 2  # rings beside a step whose colours stay, as the border's do: corrected ones show as ghosts from beside
+LEAST_MIXED = 0.05  # share of a pixel that a surface covers, to have a Gaussian there
+SWEEPS = 3  # corrections of the colours, and of opacities
 
 
 def layered_gaussians(inverse_depth: Tensor, colors: Tensor, camera: Camera, levels: int = LEVELS) -> Gaussians:
-    """At most 1.5 Gaussians a pixel, which blend to the photo from its camera.
+    """At most 2.25 Gaussians a pixel, and about one, which blend to the photo from its camera.
 
     The order is: single pixels in row-major order, on the surface that covers most of the pixel; tiles of up to 8×8
     pixels, where picture and depth allow them; the other surface of mixed pixels; the backing.
@@ -64,19 +52,16 @@ def layered_gaussians(inverse_depth: Tensor, colors: Tensor, camera: Camera, lev
     slope = surface_slope(inverse_depth)
     layers = find_layers(*(image.contiguous().numpy() for image in (inverse_depth, slope, colors)))
     ring = torch.from_numpy(layers.ring)
-    tree = Quadtree(linear_to_srgb(colors), inverse_depth, slope, _inner(ring == 0), levels, STEEPEST)
+    tree = Quadtree(linear_to_srgb(colors), inverse_depth, slope, _inner(ring == 0), levels, EDGE)
     worth = min(max(WORTH * tree.detail(), LEAST_WORTH), MOST_WORTH)
     single, tiles = tree.cut(worth)
     surface = _Surface(inverse_depth, slope, colors, torch.full_like(inverse_depth, float(OPACITY)))
     front = [surface.samples(part, TILE_SPREAD) for part in tiles]
-    for least in LEAST_MIXED:
-        pixels = _split(layers, least, colors)
-        rest = pixels.rest.pixels(pixels.mixed, camera)
-        parts = [pixels.most.pixels(single, camera), *front, rest, *_backing(pixels, worth, levels)]
-        samples = _Samples(*(torch.cat(tensors) for tensors in zip(*parts, strict=True)))
-        if len(samples.uv) <= MOST * single.numel():
-            break
-    corrected = _inner((ring == 0) | (ring > UNTOUCHED))[single]
+    pixels = _split(layers, colors)
+    rest = pixels.rest.pixels(pixels.mixed, camera)
+    parts = [pixels.most.pixels(single, camera), *front, rest, *_backing(pixels, worth, levels)]
+    samples = _Samples(*(torch.cat(tensors) for tensors in zip(*parts, strict=True)))
+    corrected = _inner(ring != 1)[single]  # beside a step and at the border it would show as a ghost from beside
     return surface_gaussians(camera, *_fitted(samples, colors, single, corrected, tiles))
 
 
@@ -101,7 +86,7 @@ def _fitted(samples: _Samples, colors: Tensor, single: Tensor, corrected: Tensor
     fitted = samples.color.clone()
     order = samples.depth.argsort(descending=True, stable=True)
     spots = torch.cat([samples.uv, samples.spread, samples.opacity[:, None]], dim=-1)[order].numpy()
-    for _ in range(FITS):
+    for _ in range(SWEEPS):
         missing = colors - mixture(spots, fitted[order], *single.shape)
         pixels = missing[single] * corrected[:, None]
         change = torch.cat([pixels, *(part.means(missing) for part in tiles)])
@@ -126,7 +111,7 @@ class _Surface(NamedTuple):
         """A Gaussian for each of some pixels [H, W], in row-major order."""
         uv = camera.pixel_centers()[where]
         depth, slope, color, opacity = (image[where] for image in self)
-        return _Samples(uv, depth, slope, torch.full_like(uv, SPREAD_PX), color, opacity)
+        return _Samples(uv, depth, slope, torch.full_like(uv, PIXEL_SPREAD), color, opacity)
 
     def samples(self, tiles: Tiles, spread: float, pixels: int = 1) -> _Samples:
         """An opaque Gaussian for each tile, `spread` of its sides wide; a cell of the surface is `pixels` wide."""
@@ -146,11 +131,11 @@ class _Pixels(NamedTuple):
     edge: Tensor  # [H, W] bool: a depth step is close
 
 
-def _split(layers: Layers, least: float, colors: Tensor) -> _Pixels:
-    """A pixel is mixed if each surface covers at least `least` of it; else one surface covers all of it."""
+def _split(layers: Layers, colors: Tensor) -> _Pixels:
+    """A pixel is mixed if each surface covers at least `LEAST_MIXED` of it; else one surface covers all of it."""
     ring, alpha = torch.from_numpy(layers.ring), torch.from_numpy(layers.alpha)
     near = alpha >= 0.5
-    mixed = torch.minimum(alpha, 1 - alpha) >= least
+    mixed = torch.minimum(alpha, 1 - alpha) >= LEAST_MIXED
     opacity = float(OPACITY) * blended_opacities(torch.where(mixed, alpha, near.float()).numpy(), layers.ring)
     surfaces = []
     for side, opaque in enumerate((torch.from_numpy(opacity), torch.full_like(alpha, float(OPACITY)))):
@@ -182,23 +167,19 @@ def _backing(pixels: _Pixels, worth: float, levels: int) -> list[_Samples]:
     has_near, has_far = (_cells(pixels.edge & side).any(-1) for side in (pixels.near, ~pixels.near))
     wanted = torch.where(has_far, ~has_near, ~_cells(behind).any(-1))
     flat = _inner(wanted & ~_cells(pixels.edge).any(-1))
-    tree = Quadtree(linear_to_srgb(color), at_center, 2 * slope, flat, levels, STEEPEST_BACKING)
+    tree = Quadtree(linear_to_srgb(color), at_center, 2 * slope, flat, levels, CREASE)
     single, tiles = tree.cut(worth / BACKING_SHARE)
     surface = _Surface(at_center, slope, color, torch.full_like(far, float(OPACITY)))
-    kinds = (~has_near, BACKING_SPREAD, BACKING_SLOPE_GAP), (has_near, RIM_BACKING_SPREAD, RIM_BACKING_SLOPE_GAP)
-    parts = [(part, LARGE_BACKING_SPREAD, BACKING_SLOPE_GAP) for part in tiles]
-    for where, spread, slope_gap in kinds:
-        parts.append((Tiles(1, 1, *(single & wanted & where).nonzero(as_tuple=True)), spread, slope_gap))
-    return [_receded(surface.samples(part, spread, pixels=2), part, gap) for part, spread, gap in parts]
+    parts = [(part, LARGE_BACKING_SPREAD) for part in tiles]
+    for where, spread in ((~has_near, TILE_SPREAD), (has_near, RIM_BACKING_SPREAD)):
+        parts.append((Tiles(1, 1, *(single & wanted & where).nonzero(as_tuple=True)), spread))
+    return [_receded(surface.samples(part, spread, pixels=2), part) for part, spread in parts]
 
 
-def _receded(samples: _Samples, tiles: Tiles, slope_gap: float) -> _Samples:
-    """Place the backing behind the front, by the given number of its sides along a slanted surface; `tiles` are of
-    cells.
-    """
-    reach = 2 * slope_gap * torch.tensor([tiles.width, tiles.height])
-    gap = BACKING_GAP + (reach * samples.slope.abs()).sum(-1) / samples.depth
-    recede = 1.0 - gap.clamp_max(MAX_BACKING_GAP)
+def _receded(samples: _Samples, tiles: Tiles) -> _Samples:
+    """Place the backing behind the front; `tiles` are of cells."""
+    reach = 2 * BACKING_SIDES * torch.tensor([tiles.width, tiles.height])
+    recede = 1 - BEHIND - (reach * samples.slope.abs()).sum(-1) / samples.depth
     return samples._replace(depth=samples.depth * recede, slope=samples.slope * recede[:, None])
 
 
@@ -216,10 +197,9 @@ def _cells(image: Tensor) -> Tensor:
     return grid.transpose(1, 2).flatten(2, 3)
 
 
-WEIGHTS = np.exp(-0.5 / SPREAD_PX**2 * np.array([2, 1, 2, 1, 0, 1, 2, 1, 2])).astype(np.float32)  # of 3×3 neighbours
-SWEEPS = 6  # of `blended_opacities`
+WEIGHTS = np.exp(-0.5 / PIXEL_SPREAD**2 * np.array([2, 1, 2, 1, 0, 1, 2, 1, 2])).astype(np.float32)  # of 3×3 neighbours
 FAINT, STOP = np.float32(1 / 255), np.float32(1e-4)  # the renderer's: alphas that it skips, light at which it stops
-REACH = np.float32(3.33)  # standard deviations at which an alpha becomes faint
+REACH = np.sqrt(-2 * np.log(FAINT))  # standard deviations at which an alpha becomes faint
 
 
 def blended_opacities(alpha: Floats, ring: NDArray[np.uint8]) -> Floats:

@@ -24,7 +24,7 @@ from spackle.weights import installed
 
 SIDE = 1024  # pixels of the long side at which it works
 MULTIPLE = 8  # of the sides of what the network is given
-SMALLEST = 16  # pixels of them: an eighth is reflected at its ends
+SMALLEST = 2 * MULTIPLE  # pixels of them: an eighth is reflected at its ends
 MARGIN = 128  # pixels around a group of holes that the network sees
 BLOCK = 16  # pixels of the grid on which groups are found
 LOCAL = 4  # one of so many channels is local in the blocks, the others are distant

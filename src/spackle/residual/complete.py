@@ -21,15 +21,14 @@ from spackle.render.protocol import Rendering
 from spackle.residual.base_values import Seeds, make_seeds
 from spackle.residual.network import DELTAS, ResidualNet, color_logit, find_rim, predict_deltas
 from spackle.residual.view_features import CELL, MASK_THRESHOLD, ViewFeatures, hole_mask
-from spackle.surface import surface_gaussians
+from spackle.surface import OPACITY, surface_gaussians
 
 SPREAD_PX = 1.3  # standard deviation; cells two pixels apart close to alpha 0.95 at the worst spot
-OPACITY = 0.99  # not higher, or the renderer's stop would skip the blob behind a thin veil
-# A delta of one moves the position by a pixel, and the colour and the opacity by one in the sigmoid's domain.
-INVERSE_DEPTH_GAIN = 0.1  # in units of the view's median inverse depth
+# A delta of one moves the position by a pixel, and the colour and the opacity by one in the sigmoid's domain; the
+# quaternion by so much, and the inverse depth by so many times the view's median.
+GAIN = 0.1
 LEAST_DEPTH = 1e-4  # and least inverse depth, so that no delta makes a distance infinite
-QUAT_GAIN = 0.1
-MIN_SCALE, MAX_SCALE = 0.25, 4.0  # bounds of the scale factor, which is 1, with slope 1, at zero
+MAX_SCALE = 4.0  # the scale factor, which is 1, with slope 1, at zero, lies between the inverse of this and this
 
 
 @torch.no_grad()
@@ -91,16 +90,16 @@ def compose(seeds: Seeds, deltas: Tensor | None, camera: Camera, spread_px: floa
         spread_px: standard deviation of a blob.
     """
     uv, inverse_depth, rgb = seeds.uv, seeds.inverse_depth, seeds.rgb
-    opacities = torch.full_like(inverse_depth, OPACITY)
+    opacities = torch.full_like(inverse_depth, float(OPACITY))
     if deltas is None:
         colors = srgb_to_linear(rgb)
         return surface_gaussians(camera, uv, inverse_depth, seeds.slope, spread_px, colors, opacities)
     shift, nearer, scale, turn, color, opacity = torch.split(deltas, DELTAS, dim=1)
-    inverse_depth = _shift_positive(inverse_depth, INVERSE_DEPTH_GAIN * nearer.squeeze(1), seeds.unit)
+    inverse_depth = _shift_positive(inverse_depth, GAIN * nearer.squeeze(1), seeds.unit)
     colors = srgb_to_linear(torch.sigmoid(color_logit(rgb) + color))
     opacities = torch.sigmoid(color_logit(opacities) + opacity.squeeze(1))
     surfels = surface_gaussians(camera, uv + shift, inverse_depth, seeds.slope, spread_px, colors, opacities)
-    scales, quats = surfels.scales * _scale_factor(scale), surfels.quats + QUAT_GAIN * turn
+    scales, quats = surfels.scales * _scale_factor(scale), surfels.quats + GAIN * turn
     return dataclasses.replace(surfels, quats=quats, scales=scales)
 
 
@@ -112,7 +111,7 @@ def _shift_positive(base: Tensor, delta: Tensor, unit: float) -> Tensor:
 
 def _scale_factor(delta: Tensor) -> Tensor:
     """A sigmoid between the bounds."""
-    low, high = MIN_SCALE, MAX_SCALE
+    low, high = 1 / MAX_SCALE, MAX_SCALE
     center = math.log((1 - low) / (high - 1))
     steepness = (high - low) / ((1 - low) * (high - 1))
     return low + (high - low) * torch.sigmoid(steepness * delta + center)

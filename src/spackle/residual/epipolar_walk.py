@@ -11,7 +11,7 @@ from torch import Tensor
 from spackle._numba import kernel
 from spackle.camera import Camera
 from spackle.device import run_chunks
-from spackle.residual.view_features import CELL, GRAIN
+from spackle.residual.view_features import CELL
 
 SAME_DEPTH = 1.1  # what is mirrored at the rim may differ from the rim in inverse depth by this factor
 SAME_EYE = 1e-9 * CELL  # the epipole's part of a cell's offset from it, below which there is no line
@@ -40,7 +40,7 @@ def walk(
     epipole = (camera.K.to(eye) @ camera.to_camera(eye)).detach().cpu().numpy()
     view = [image.contiguous().numpy() for image in (uv, values, inverse_depth, mask)]
     grids = (view[1].copy(), view[1].copy(), np.zeros(mask.shape, np.float32))
-    run_chunks(lambda start, stop: _walk(start, stop, *view, epipole, SAME_DEPTH, *grids), len(mask), GRAIN)
+    run_chunks(lambda start, stop: _walk(start, stop, *view, epipole, SAME_DEPTH, *grids), len(mask))
     far, mirrored, distance = map(torch.from_numpy, grids)
     return far, mirrored, distance
 

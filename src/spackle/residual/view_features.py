@@ -21,8 +21,7 @@ from spackle.render.protocol import Rendering
 MASK_THRESHOLD = 0.95  # τ_α: a pixel with less opacity is a hole (eq. 4)
 CELL = 2  # pixels along a cell's side
 CHANNELS = 3
-CLOSEST, FAINTEST = np.float32(1e-6), np.float32(1e-6)  # depth and summed opacity that are divided by, at least
-GRAIN = 16  # rows of cells that a thread takes at a time
+LEAST = 1e-6  # that is divided by, of depths and summed opacities
 PROCESSOR = torch.device("cpu")
 
 
@@ -56,7 +55,7 @@ class ViewFeatures:
         rgb, mask = np.empty((rows, CHANNELS * columns), np.float32), np.empty((rows, columns), np.bool_)
         inverse_depth, alpha = (np.empty((rows, columns), np.float32) for _ in range(2))
         cells, low = (rgb, inverse_depth, alpha, mask), np.float32(threshold)
-        run_chunks(lambda start, stop: _gather(start, stop, *view, low, *cells), rows, GRAIN)
+        run_chunks(lambda start, stop: _gather(start, stop, *view, low, *cells), rows)
         colors = rgb.reshape(rows, columns, CHANNELS)
         return ViewFeatures(*(torch.from_numpy(image) for image in (colors, inverse_depth, alpha, mask)))
 
@@ -88,12 +87,12 @@ def _gather(
                 if alpha[y, x] < threshold:
                     holes += 1
                 else:
-                    far = max(far, depth[y, x], CLOSEST)
+                    far = max(far, depth[y, x], np.float32(LEAST))
             inverse_depth[row, column] = np.float32(1) / far if holes < CELL * CELL else np.float32(0)
             opacity[row, column] = total / np.float32(CELL * CELL)
             mask[row, column] = holes > 0
             for c in range(CHANNELS):  # light comes multiplied by alpha
                 both = light[CHANNELS * left + c] + light[CHANNELS * right + c]
-                mean[CHANNELS * column + c] = both / max(total, FAINTEST)
+                mean[CHANNELS * column + c] = both / max(total, np.float32(LEAST))
         for k in range(CHANNELS * columns):
             colors[row, k] = encode_srgb(mean[k])

@@ -22,26 +22,25 @@ from spackle.filters import far_fill, greatest_around
 from spackle.gaussians import Gaussians
 from spackle.render import Renderer, device_of, touched_tiles
 from spackle.render.protocol import Rendering
-from spackle.residual.base_values import BEHIND, BLOB_CELLS, Seeds, make_seeds, placed_behind
+from spackle.residual.base_values import BLOB_CELLS, Seeds, make_seeds, placed_behind
 from spackle.residual.complete import compose
 from spackle.residual.network import ResidualNet, find_rim, predict_deltas
 from spackle.residual.view_features import CELL, MASK_THRESHOLD, PROCESSOR, ViewFeatures, hole_area_ratio
 from spackle.scene_fill.occlusion_guard import OcclusionGuard, free_factors, moved_away, push_behind, without_pits
 from spackle.scene_fill.texture import HoleView, Texture, exemplar_texture, in_cells, sharpened
-from spackle.surface import surface_slope
+from spackle.surface import BEHIND, PIXEL_SPREAD, surface_slope
 
 PASSES = 2  # a second look closes what the first one's blobs left thin
-CLOSED_HAR = 1e-4  # fewer holes than this need no second look
 WIDEST = 8  # views of a path whose content stays in front from the first
-OPPOSITE = 2  # views that are completed before anything goes beneath the rims of either
-PAINTED_VIEWS = 2  # of a scene that get the chosen texture, the exemplar's after them: they show nearly all holes
+# The two widest views, opposite ones, show nearly all holes: they alone get the chosen texture, the exemplar's comes
+# after them, and both are completed before anything goes beneath the rims of either.
+OPPOSITE = 2
 FLAT = 0.01  # sRGB: pixels that differ less from their cell's mean need no Gaussians of their own
 SEEDS_HAR = 0.01  # holes of a path's view that are smaller are the seeds' alone: nobody sees the network's work there
 FEW_HOLES = 1e-3  # so few are not seen in a frame of a path
 LEAST_VISITS = 24  # frames of a path that are looked at: so many, or half of them
-FINE_SPREAD_PX = 0.5  # standard deviation of one blob a pixel, which a wide one for its cell backs
-REACH_CELLS = 6  # how far beneath a rim an underlay goes
 COARSE = 3  # an underlay has one Gaussian for COARSE × COARSE cells, as much larger: what lies there is smooth
+REACH_CELLS = COARSE * BLOB_CELLS  # how far beneath a rim an underlay goes: as far as one of its Gaussians
 EVERY = (slice(None, None, COARSE),) * 2  # the cells that have one
 
 
@@ -117,7 +116,7 @@ def fill_view(
     guards = [context.photo_guard()] if guards is None else guards
     stage, device = _Stage(context.placed), context.base.means.device
     view = stage.look(camera, rendering)
-    aux, _, view = _fill(context.placed, stage, view, camera, guards, CLOSED_HAR, beneath=False)
+    aux, _, view = _fill(context.placed, stage, view, camera, guards, 0, beneath=False)
     return FilledView(Gaussians.cat(aux).to(device), view.to(device))
 
 
@@ -146,6 +145,7 @@ def fill_scene(
         return FilledScene(Gaussians.empty(context.base.means.device), {})
     placed, device, threshold = context.placed, context.base.means.device, context.threshold
     order, stage = farthest_first(cameras, context.photo_camera), _Stage(placed)
+    enough = 0 if exact else FEW_HOLES
     visited = order if exact else order[: max(LEAST_VISITS, len(order) // 2)]
     guards = {-1: context.photo_guard()}
     for index in reversed(order[:WIDEST]):  # the widest last: it is the first to be completed
@@ -164,13 +164,12 @@ def fill_scene(
     for count, index in enumerate(visited):
         camera, view = cameras[index], stage.look(cameras[index]) if count else view
         holes = hole_area_ratio(view.alpha, threshold)
-        if holes <= (0 if exact else FEW_HOLES):
+        if holes <= enough:
             pictures[index] = to_bytes(view.rgb)
         else:
             means = placed.seeds_alone if holes < SEEDS_HAR and not exact else placed
-            if filled >= PAINTED_VIEWS and means.texture is not None:
+            if filled >= OPPOSITE and means.texture is not None:
                 means = dataclasses.replace(means, texture=exemplar_texture)
-            enough = CLOSED_HAR if exact else FEW_HOLES
             new, rims, view = _fill(means, stage, view, camera, others(index), enough, beneath=len(cameras) > 1)
             aux += new
             waiting += [(index, part) for part in rims]
@@ -232,7 +231,7 @@ def _fill(
             break
         aux.append(new)
         view = stage.look_again(new)
-        if hole_area_ratio(view.alpha, context.threshold) < enough:
+        if hole_area_ratio(view.alpha, context.threshold) <= enough:
             break
     return aux, rims, view
 
@@ -287,7 +286,7 @@ def _pixels(seeds: Seeds, deltas: Tensor | None, camera: Camera, colors: Tensor)
     rise = (seeds.slope[:, None] * offsets).sum(-1).flatten()
     inverse_depth = (inverse_depth + rise).clamp_min(0.5 * inverse_depth)
     fine = Seeds((seeds.uv[:, None] + offsets).flatten(0, 1), inverse_depth, slope, rgb, seeds.unit)
-    pixels = compose(fine, repeated[0] if repeated else None, camera, FINE_SPREAD_PX)
+    pixels = compose(fine, repeated[0] if repeated else None, camera, PIXEL_SPREAD)
     return dataclasses.replace(pixels, colors=srgb_to_linear(colors.flatten(0, 2).clamp(0, 1)))
 
 

@@ -6,6 +6,7 @@ The paper composes a view's aux Gaussians with the base alone (eq. 8); one scene
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -18,14 +19,12 @@ from spackle.camera import Camera, beside
 from spackle.device import run_chunks
 from spackle.filters import greatest_around
 from spackle.gaussians import Gaussians
-from spackle.render.protocol import Rendering
+from spackle.render.protocol import ALPHA_MIN, Rendering
 from spackle.residual.view_features import MASK_THRESHOLD, PROCESSOR
 
 WINDOW_PX = 4  # radius of the guard's window: most aux Gaussians reach no farther than this
-REACH = 3.0  # a Gaussian is seen this many standard deviations from its centre
+REACH = math.sqrt(-2 * math.log(ALPHA_MIN))  # standard deviations from its centre to which a Gaussian is seen
 MAX_REACH_PX = 40.0  # nor is a huge one's reach looked into farther than this
-CLEARANCE = 0.002  # relative distance behind the surface that counts as behind
-GRAIN = 1024  # Gaussians that a thread takes at a time
 PIT = 0.027  # of a view's width: a nearer patch that is less than twice as wide is a pit
 STEPS = 48  # candidate positions along the line of sight, even in inverse depth
 
@@ -83,9 +82,7 @@ def free_factors(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) 
     starts = np.concatenate([[0], np.cumsum(sizes.prod(axis=1))])
     place, factors = beside(eye, aux.means).cpu().double().numpy(), np.empty(len(rays))
     views = (lenses, depths, sizes, starts)
-    run_chunks(
-        lambda first, last: _free_factors(first, last, place, rays, quats, scales, *views, factors), len(rays), GRAIN
-    )
+    run_chunks(lambda first, last: _free_factors(first, last, place, rays, quats, scales, *views, factors), len(rays))
     return torch.from_numpy(factors).to(aux.means)
 
 
@@ -170,7 +167,7 @@ def _blocks(
         row = min(max(int(np.floor(v + 2 * WINDOW_PX * j)), 0), height - 1)
         for i in range(-steps_u, steps_u + 1):
             column = min(max(int(np.floor(u + 2 * WINDOW_PX * i)), 0), width - 1)
-            if depth < guards[start + row * width + column] * (1.0 + CLEARANCE):
+            if depth < guards[start + row * width + column]:
                 return True
     return False
 

@@ -14,21 +14,17 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
-from spackle.filters import FAR_BIAS, blurred, distance_to, far_fill, nearest_known
+from spackle.filters import FAR_BIAS, blurred, broadly_blurred, distance_to, far_fill, nearest_known
 from spackle.inpaint import Inpainter, known_inverse_depth
-from spackle.patches import Patches
+from spackle.patches import FAINTEST_VOTE, LEAST_COST, TONE_CELLS, Patches
 from spackle.render.protocol import Rendering
 from spackle.residual.base_values import Seeds
 from spackle.residual.network import Rim
-from spackle.residual.view_features import CELL, ViewFeatures, hole_mask
+from spackle.residual.view_features import CELL, LEAST, ViewFeatures, hole_mask
 
-TEXTURE_PX = 3.0  # standard deviation: what this blur takes away is texture, what it leaves is structure
-TEXTURE_FADING = 0.12  # mismatch at which a third of the texture is left
-BLOCK_CHOICE, FAINTEST_VOTE = 3.0, 1e-6  # how strongly a block's vote depends on its cost; the least vote
-LEAST_COST = 1e-8
+TEXTURE_PX = 2.0  # standard deviation: what this blur takes away is texture, what it leaves is structure
+TEXTURE_FADING = 0.16  # mismatch at which a third of the texture is left
 EXTENDED_CELLS, SAME_DEPTH = 4.0, 0.05  # reach of the photo's own colours beyond its border; relative depth
-CALM_CELLS, COARSE = 4.0, 2  # standard deviation of the means that strengths of texture are compared by; cells in one
-LEAST_ENERGY = 1e-7
 OVERLAP_PX = 0.8  # standard deviation of what a pixel shows of the blobs: more than theirs, for votes blur as well
 STEPS = 2  # of `sharpened`
 
@@ -78,7 +74,7 @@ def patch_blocks(patches: Patches, blocks: Tensor) -> Tensor:
     matched = patches.matches[..., 0] >= 0
     y, x = matched.nonzero(as_tuple=True)
     costs = patches.mismatch.square()
-    limit = (costs[matched].mean() / BLOCK_CHOICE).clamp_min(LEAST_COST)
+    limit = costs[matched].mean().clamp_min(LEAST_COST)
     total, mass = torch.zeros_like(blocks[y, x]), torch.zeros_like(costs[y, x])
     for dy, dx in itertools.product((-1, 0, 1), repeat=2):
         v, u = (y + dy).clamp(0, height - 1), (x + dx).clamp(0, width - 1)
@@ -99,17 +95,13 @@ def _in_proportion(fine: Tensor, view: HoleView) -> Tensor:
     Strong texture from elsewhere does not belong on a plain wall, even if its patches match the tone.
     """
     energy, hole = avg_pool2d(fine.square().sum(-1)[None], CELL)[0], view.features.mask.float()
-    parts = torch.stack([energy * hole, hole, energy * (1 - hole), 1 - hole])
-    coarse = avg_pool2d(parts, COARSE, ceil_mode=True, count_include_pad=False)
-    own, masked, others, seen = blurred(coarse.permute(1, 2, 0), CALM_CELLS / COARSE).unbind(-1)
-    every = (slice(None, None, COARSE),) * 2
-    around = (others / seen.clamp_min(1e-6)).clamp_min(LEAST_ENERGY).log()
-    known, bias = ~view.features.mask[every], FAR_BIAS * ~view.rim.beyond[every]
+    parts = torch.stack([energy * hole, hole, energy * (1 - hole), 1 - hole], dim=-1)
+    own, masked, others, seen = broadly_blurred(parts, TONE_CELLS).clamp_min(LEAST).unbind(-1)
+    around, known = (others / seen).log(), ~view.features.mask
     if bool(known.any()):
-        around = far_fill(view.seeds.inverse_depth[every], around[None], known, far_bias=bias)[1][0]
-    share = (around.exp() / (own / masked.clamp_min(1e-6)).clamp_min(LEAST_ENERGY)).sqrt().clamp_max(1)
-    factors = interpolate(share[None, None], scale_factor=COARSE, mode="bilinear")[0, 0]
-    return factors[: hole.shape[0], : hole.shape[1]]
+        bias = FAR_BIAS * ~view.rim.beyond
+        around = far_fill(view.seeds.inverse_depth, around[None], known, far_bias=bias)[1][0]
+    return (around.exp() / (own / masked)).sqrt().clamp_max(1)
 
 
 def _magnified(cells: Tensor, mask: Tensor) -> Tensor:
