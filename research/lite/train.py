@@ -2,7 +2,7 @@
 
     python research/lite/train.py --recipe research/lite/lite.yaml -o OUT data.photos=PHOTOS data.stereo=PAIRS ...
 
-OUT gets what `spackle train` leaves; the same command goes on with a run.
+OUT gets what `spackle train` leaves; the same command resumes with a run.
 """
 
 from __future__ import annotations

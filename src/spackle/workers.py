@@ -135,7 +135,7 @@ def results_of(futures: Iterable[Future[R]], most: int = 1, stop: Callable[[], b
     except BrokenProcessPool as error:
         if not stop():
             raise InputError(
-                "a worker process died, most likely for want of memory: take fewer --workers; the same command goes on"
+                "a worker process died, most likely for want of memory: take fewer --workers; the same command resumes"
             ) from error
 
 
@@ -298,7 +298,7 @@ def _results(
             if not done:
                 raise InputError(
                     f"--ray {workers.ray}: no worker could start within {START_S:g} seconds: others keep the "
-                    "cluster busy, or its nodes have gone: start again when it has room; the same command goes on"
+                    "cluster busy, or its nodes have gone: start again when it has room; the same command resumes"
                 )
             worker, finished = calls.pop(done[0])
             try:
@@ -330,6 +330,6 @@ def _count_death(deaths: Counter[Path | None], photo: Path | None, workers: Work
     if deaths[photo] > RETRIES:
         raise InputError(
             f"{where} a worker died for the {deaths[photo]}th time ({why}): most likely for want of memory: "
-            "take fewer --workers on a node; the same command goes on"
+            "take fewer --workers on a node; the same command resumes"
         )
     log(f"{where} a worker died, and another takes its place ({why})")

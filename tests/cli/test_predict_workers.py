@@ -79,7 +79,7 @@ def test_two_workers_give_the_same_files_as_one_by_one_and_go_on(place: Path, tm
 
 @pytest.mark.parametrize(
     ("everybody", "code", "says"),
-    [(False, 2, "a worker process died"), (True, 130, "stopped; the same command goes on from here\ninterrupted")],
+    [(False, 2, "a worker process died"), (True, 130, "stopped; the same command resumes from here\ninterrupted")],
 )
 def test_killed_workers_are_a_line_and_the_same_command_goes_on(
     place: Path, tmp_path: Path, everybody: bool, code: int, says: str

@@ -297,7 +297,7 @@ def test_an_interrupted_get_says_that_it_goes_on(site: Site, weights: Path, monk
         patch.setattr(Reporter, "log", interrupt)
         result = get("sharp", "--url", site.url)
     assert result.code == 130
-    assert "goes on from there" in result.err
+    assert "resumes from there" in result.err
     gets("sharp", "--url", site.url)
     assert ranges(site)[1] is not None
 

@@ -166,7 +166,7 @@ def _predict_by_workers(
             if stop():
                 break
     if done < total:
-        reporter.log("stopped; the same command goes on from here")
+        reporter.log("stopped; the same command resumes from here")
         raise KeyboardInterrupt
     return failed
 

@@ -32,7 +32,7 @@ def weights_get(
     force: Annotated[bool, typer.Option("--force", help="Download even if the file exists.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Download weights and check their SHA-256; a broken download goes on where it stopped."""
+    """Download weights and check their SHA-256; a broken download resumes where it stopped."""
     from rich.filesize import decimal
 
     from spackle.folders import results_folder
@@ -78,7 +78,7 @@ def _fetch(entry: PublishedWeights, url: str, path: Path, reporter: Reporter) ->
         try:
             download(url, path, entry.bytes, entry.sha256, advance)
         except KeyboardInterrupt:
-            reporter.log(f"{entry.name}: what has come is kept; the same command goes on from there")
+            reporter.log(f"{entry.name}: what has come is kept; the same command resumes from there")
             raise
 
 

@@ -147,7 +147,7 @@ def _completion(options: DatasetOptions, inpainter: Inpainter | None) -> dict[st
 
 
 def build_dataset(source: Path, output: Path, options: DatasetOptions, reporter: Reporter) -> str:
-    """Build a dataset of a folder of photos or of COCO annotations, or go on with one.
+    """Build a dataset of a folder of photos or of COCO annotations, or resume that build.
 
     Returns:
         "complete", or "stopped" by Ctrl-C.
@@ -292,7 +292,7 @@ class _Build:
                         if stop():
                             break
         if self.missing:
-            self.reporter.log("stopped; the same command goes on from here")
+            self.reporter.log("stopped; the same command resumes from here")
             return "stopped"
         self._finish(len(jobs) - len(self.problems), total["wall"])
         return "complete"

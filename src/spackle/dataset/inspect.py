@@ -63,7 +63,7 @@ def problems(location: str | os.PathLike[str], manifest: Manifest, progress: Ste
     """Read every byte of a dataset: a line for each thing that is wrong. `progress` counts bytes."""
     done = 0
     if not manifest.complete:
-        yield "the dataset is not finished: the command that builds it goes on"
+        yield "the dataset is not finished: run the command that builds it again"
     for shard in manifest.shards:
         try:
             yield from (f"{shard.file}: {line}" for line in _shard_problems(location, shard))

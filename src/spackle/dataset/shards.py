@@ -158,7 +158,7 @@ class DatasetFiles(Dataset[PhotoGroup]):
         self.location = location
         self.manifest = load_manifest(location)
         if not self.manifest.complete:
-            raise InputError(f"{location}: not finished: the command that builds it goes on")
+            raise InputError(f"{location}: not finished: run the command that builds it again")
         self.samples = self.manifest.samples
 
     def __len__(self) -> int:

@@ -1,6 +1,6 @@
 """A folder of results: config.json, images/ with a file for each finished image, and at last rows.jsonl.
 
-config.json holds the options that decide the renders; rows.jsonl exists once all images are done. A killed run goes on.
+config.json holds the options that decide the renders; rows.jsonl exists once all images are done. A killed run resumes.
 If metrics are added to a finished run, they alone are measured.
 """
 
@@ -117,7 +117,7 @@ def measure_images(
     with reporter.stage("images") as step, asked_to_stop(alone=True) as stop:
         for index, case in enumerate(cases):
             if stop():
-                reporter.log("stopped; the same command goes on from here")
+                reporter.log("stopped; the same command resumes from here")
                 return None
             part = image_file(output, index, case.name, ".json")
             inputs = digest_of([digest(photo) for photo in (case.photo, *(second.photo for second in case.seconds))])

@@ -56,7 +56,7 @@ PATIENCE = timedelta(hours=24)  # making samples takes one process longer than a
 END = {
     "steps": "all steps are done",
     "patience": "no improvement any more",
-    "stopped": "stopped; the same command goes on from here",
+    "stopped": "stopped; the same command resumes from here",
 }
 R = TypeVar("R", bound=AnyRecipe)
 K = TypeVar("K")
@@ -113,7 +113,7 @@ class Task(Protocol):
 def train(
     recipe: R, open_task: Callable[[R, torch.device], Task], output: Path, reporter: Reporter, overwrite: bool = False
 ) -> str:
-    """Train, or go on with a run; as one of several processes where torchrun started them.
+    """Train, or resume a run; as one of several processes where torchrun started them.
 
     Args:
         recipe: what to do.
