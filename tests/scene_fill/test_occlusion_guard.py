@@ -25,6 +25,7 @@ from spackle.scene_fill.occlusion_guard import (
     push_behind,
     without_pits,
 )  # fmt: skip
+from spackle.surface import BEHIND
 
 PROPERTY = settings(deadline=None, max_examples=20)
 SEEDS = st.integers(0, 2**32 - 1)
@@ -54,7 +55,7 @@ def plain_push(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) ->
             for j, i in itertools.product(range(-down, down + 1), range(-across, across + 1)):
                 row_, column = math.floor(v + 2 * WINDOW_PX * j), math.floor(u + 2 * WINDOW_PX * i)
                 seen = guard.depth[min(max(row_, 0), height - 1), min(max(column, 0), width - 1)]
-                if float(z) < float(seen):
+                if float(z) < float(seen) * (1 + BEHIND):
                     return True
         return False
 

@@ -21,6 +21,7 @@ from spackle.filters import greatest_around
 from spackle.gaussians import Gaussians
 from spackle.render.protocol import ALPHA_MIN, Rendering
 from spackle.residual.view_features import MASK_THRESHOLD, PROCESSOR
+from spackle.surface import BEHIND
 
 WINDOW_PX = 4  # radius of the guard's window: most aux Gaussians reach no farther than this
 REACH = math.sqrt(-2 * math.log(ALPHA_MIN))  # standard deviations from its centre to which a Gaussian is seen
@@ -167,7 +168,7 @@ def _blocks(
         row = min(max(int(np.floor(v + 2 * WINDOW_PX * j)), 0), height - 1)
         for i in range(-steps_u, steps_u + 1):
             column = min(max(int(np.floor(u + 2 * WINDOW_PX * i)), 0), width - 1)
-            if depth < guards[start + row * width + column]:
+            if depth < guards[start + row * width + column] * (1 + BEHIND):
                 return True
     return False
 
