@@ -80,3 +80,13 @@ def test_beyond_the_border_a_floor_stays_level_and_a_wall_a_wall() -> None:
         assert float((seeds.rgb - color).abs().mean(-1)[beyond & surface].mean()) < 0.12
     within = make_seeds(dataclasses.replace(features, inverse_depth=torch.ones_like(inverse_depth)), VIEW, VIEW)
     assert float((within.inverse_depth - 1).abs().max()) < 0.02  # a view of the photo's own frame has no border
+
+
+def test_what_is_nearer_than_the_border_is_not_extended() -> None:
+    features, _, _ = room()
+    near, edge = torch.zeros_like(features.mask), int((~features.mask[20]).nonzero().max())
+    near[20:28, edge - 10 : edge + 6] = True  # before the wall, and over the photo's border
+    red = torch.where(near[..., None], torch.tensor([0.9, 0.1, 0.1]), features.rgb)
+    inverse, alpha = torch.where(near, 0.22, features.inverse_depth), torch.where(near, 1.0, features.alpha)
+    seeds = make_seeds(ViewFeatures(red, inverse, alpha, features.mask & ~near), VIEW, PHOTO)
+    assert float((seeds.rgb[20:28, edge + 16 :] - WALL).abs().mean()) < 0.3  # of 0.53

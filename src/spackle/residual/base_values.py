@@ -19,6 +19,7 @@ from spackle.residual.epipolar_walk import walk
 from spackle.residual.view_features import CELL, LEAST, ViewFeatures, cell_centers
 from spackle.surface import BEHIND, surface_slope
 
+AT_BORDER = 0.03  # of the photo's width: what ends farther inside is not extended beyond it
 BLOB_CELLS = 2  # cells as far as a blob reaches: it must not spill over what is seen so close by
 
 
@@ -128,13 +129,21 @@ def fill_around(
     if not bool(beyond.any()):
         return far_fill(features.inverse_depth, colors, known, far_bias=bias)
     rays, motion = _rays_in_photo(uv, camera, photo_camera)
-    depth = (rays[..., 2] + motion[2, 3] * across).clamp_min(LEAST)
-    far, _, steps = walk(uv, (across / depth)[..., None], across, mask, camera, photo_camera.position)
+    points, lens = rays + motion[:3, 3] * across[..., None], beside(photo_camera.K, uv)
+    depth = points[..., 2:].clamp_min(LEAST)
+    place = points[..., :2] / depth * lens.diagonal()[:2] + lens[:2, 2]
+    size = beside(torch.tensor([photo_camera.width, photo_camera.height]), place)
+    ends = torch.minimum(place, size - place).amin(-1) < AT_BORDER * photo_camera.width
+    values = torch.stack([across / depth[..., 0], ends.to(across)], dim=-1)
+
+    far, _, steps = walk(uv, values, across, mask, camera, photo_camera.position)
     away = 1 / far[..., 0].clamp_min(LEAST) - motion[2, 3]
-    traced = beyond & (steps > 0) & (away > 0) & (rays[..., 2] > 0)
+    hidden = beyond & (steps > 0) & (far[..., 1] == 0)  # by something nearer, beside which the photo is extended
+    traced = beyond & ~hidden & (steps > 0) & (away > 0) & (rays[..., 2] > 0)
     nearest = torch.where(known, features.inverse_depth, 0).amax()
     extended = torch.minimum((rays[..., 2] / away.clamp_min(LEAST)).clamp_min(LEAST), nearest)
 
+    bias = torch.where(hidden, FAR_BIAS, bias)
     filled, mixed = far_fill(features.inverse_depth, colors, known, far_bias=bias)
     filled = torch.where(traced, extended, filled)
     others = beyond & ~traced
