@@ -15,9 +15,8 @@ from spackle.surface import EDGE
 
 STEEPEST = 5.0  # a surface at 79° to the image plane; only what is steeper may be a smeared edge
 REACH = 16  # pixels of the map from the steepest place to the end of what was smeared, at most
-# In units of its peak: where the slope has fallen so far, the surface is all but itself again; and a rise of the slope
-# by so much belongs to another edge.
-FLAT = 0.1
+FLAT = 0.1  # where the slope has fallen so far, in units of its peak, the surface is all but itself again
+SWELL = 0.25  # a rise of the slope by so much of the peak belongs to another edge
 
 Floats = NDArray[np.float32]
 Bools = NDArray[np.bool_]
@@ -87,7 +86,7 @@ def _foot(gaps: Any, peak: int, way: int) -> Any:
     flattest, end, reach = top, peak, REACH
     for n in range(1, REACH + 1):
         k = peak + way * n
-        if n > reach or not sign * gaps[k] <= flattest + FLAT * top:
+        if n > reach or not sign * gaps[k] <= flattest + SWELL * top:
             break
         if sign * gaps[k] < flattest:
             flattest, end = max(sign * gaps[k], np.float32(0)), k
