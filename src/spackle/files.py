@@ -23,7 +23,8 @@ def check_file(path: str | os.PathLike[str], kind: str) -> int:
     """The size in bytes of a plain, non-empty file; InputError otherwise. `kind` is what messages call the file."""
     with reading(repr(str(path)), "cannot be read: {reason}", OSError, ValueError):
         if re.match(r"(https?|ftp|s3|gs):/", str(path)):  # a Path has lost the second slash
-            raise InputError(f"{path}: an address, not a file: download it first and give the name of the {kind}")
+            address = re.sub(":/+", "://", str(path), count=1)
+            raise InputError(f"{address}: an address, not a file: download it first and give the name of the {kind}")
         if not os.path.exists(path):
             raise InputError(f"{path}: no such {kind}: check the name")
         if not os.path.isfile(path):

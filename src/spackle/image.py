@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import math
+import numbers
 import os
 import warnings
 from collections.abc import Callable
@@ -67,11 +68,7 @@ class Photo:
 
     def check_shape(self) -> None:
         """InputError for a photo that is too small, or too narrow, to show a scene."""
-        short, long = sorted((self.width, self.height))
-        if short < LEAST_SIDE or long > MOST_ASPECT * short:
-            wanted = f"at least {LEAST_SIDE} pixels a side, and at most {MOST_ASPECT} times as long as wide"
-            size = f"{self.width}×{self.height}"
-            raise InputError(f"{self.path}: {size} is too small or too narrow: give a photo with {wanted}")
+        check_shape(self.width, self.height, self.path)
 
     @property
     def framed_size(self) -> tuple[int, int]:
@@ -296,6 +293,14 @@ def read_image(path: str | os.PathLike[str], read: Callable[[Image.Image], T]) -
             ) from None
 
 
+def check_shape(width: int, height: int, path: str | os.PathLike[str]) -> None:
+    """InputError for a photo of a size that shows no scene."""
+    short, long = sorted((width, height))
+    if short < LEAST_SIDE or long > MOST_ASPECT * short:
+        wanted = f"at least {LEAST_SIDE} pixels a side, and at most {MOST_ASPECT} times as long as wide"
+        raise InputError(f"{path}: {width}×{height} is too small or too narrow: give a photo with {wanted}")
+
+
 def check_pixels(width: int, height: int, size: int, path: str | os.PathLike[str]) -> None:
     """Refuse a picture before a decoder allocates it: above 100 megapixels, or above 32 in a small file.
 
@@ -316,8 +321,8 @@ def _check_focal(focal_px: float | None, focal_mm: float | None, fov: float | No
     if len(named) > 1:
         raise InputError(f"{' and '.join(named)} are given together: give one of them")
     for name, value in named.items():
-        if not (math.isfinite(value) and value > 0):
-            raise InputError(f"{name} must be a positive number, got {value}")
+        if not (isinstance(value, numbers.Real) and math.isfinite(value) and value > 0):
+            raise InputError(f"{name} must be a positive number, got {value!r}")
         if name == "--fov" and value >= 180:
             raise InputError(f"--fov must lie between 0 and 180 degrees, got {value}")
 

@@ -22,6 +22,7 @@ from spackle.camera_path import (
     TrajectoryKind,
     extremes,
     trajectory,
+    trajectory_kind,
 )
 from spackle.errors import InputError
 from spackle.formats.camera_files import load_cameras, load_path
@@ -67,6 +68,10 @@ class PathOptions:
 
     def check(self) -> None:
         """InputError for an impossible path or video, or views that are given twice."""
+        try:
+            trajectory_kind(self.trajectory)
+        except ValueError as error:
+            raise InputError(f"--trajectory: {error}") from error
         if self.disparity is not None and not (math.isfinite(self.disparity) and 0 <= self.disparity <= MAX_DISPARITY):
             raise InputError(f"--disparity must be between 0 and {MAX_DISPARITY:g}, got {self.disparity:g}")
         if self.frames is not None and not 1 <= self.frames <= MAX_FRAMES:

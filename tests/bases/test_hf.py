@@ -98,7 +98,7 @@ def test_each_kind_of_model_gives_gaussians_of_the_photo(
     assert base.name == f"hf:{folders[name]}"
     front = photo.width * photo.height
     colors = srgb_to_linear(photo.rgb).reshape(-1, 3)
-    assert float((prediction.gaussians.colors[:front] - colors).abs().mean()) < 0.006
+    assert float((prediction.gaussians.colors[:front] - colors).abs().mean()) < 0.008  # corrected beside steps
     assert prediction.gaussians.finite
     uv, z = prediction.camera.project(prediction.gaussians.means[:front])
     torch.testing.assert_close(uv, prediction.camera.pixel_centers().reshape(-1, 2), rtol=0, atol=1e-2)

@@ -73,7 +73,7 @@ PREDICT = [
 ]
 RENDER = [
     ("--focal-px inf", "--focal-px"),
-    ("--focal-px 9 --cameras views.json", "--focal-px"),
+    ("--fov 60 --cameras views.json", "--fov"),
     ("-o film.avi", "film.avi: not a kind of video"),
     ("-o a.gif --format webm", "--format webm"),
     ("-o a.mp4 --cameras sizes.json", "sizes.json"),
@@ -114,7 +114,8 @@ def test_options_that_cannot_be(place: Path, command: str, options: str, says: s
 def test_an_input_has_to_be_named(tmp_path: Path) -> None:
     refuses(run("predict"), "PHOTO")
     refuses(run("render", "-o", tmp_path / "out"), "SCENE")
-    refuses(run("predict", "https://example.com/a.jpg"), "a.jpg: an address, not a file: download it first")
+    address = "https://example.com/a.jpg"
+    refuses(run("predict", address), f"{address}: an address, not a file: download it first")
     refuses(run("predict", write_photo(tmp_path / "a.png"), "--base", "rgbd", "-o", tmp_path / "out"), "--depth")
 
 

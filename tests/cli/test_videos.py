@@ -85,7 +85,8 @@ def test_render_at_another_size_squeezes_nothing(
 def test_render_says_where_it_guesses_the_lens(tmp_path: Path, scene: Path) -> None:
     bare = damaged_scene(scene, tmp_path / "bare.ply", lambda head: re.sub("comment.*\n", "", head))
     assert "no camera stored" in rendered(bare, tmp_path, "--size", "64x48", *SHORT).lines[0]
-    assert len(rendered(bare, tmp_path, "--size", "64x48", "--focal-px", 55, *SHORT).lines) == 1
+    for lens in (("--focal-px", 55), ("--fov", 60)):
+        assert len(rendered(bare, tmp_path, "--size", "64x48", *lens, *SHORT).lines) == 1
 
 
 def test_compare_puts_the_base_beside_the_scene(tmp_path: Path, scene: Path) -> None:

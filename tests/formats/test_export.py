@@ -47,7 +47,7 @@ BOUNDS = {
 
 def encode(kind: str, gaussians: Gaussians, camera: Camera | None = None, base_count: int | None = None) -> bytes:
     path = Path(f"a.{kind}")
-    return encoder_of(path)(SceneFile(path, gaussians, camera, base_count))
+    return encoder_of(path)(SceneFile(path, gaussians, camera, base_count, 0.2))
 
 
 def read(kind: str, data: bytes) -> Gaussians:
@@ -127,8 +127,8 @@ def test_scenes_are_read_as_the_plainest_reader_does(tmp_path: Path, kind: str, 
     found, expected = load_scene(path), read(kind, path.read_bytes())
     for mine, plain in zip(found.gaussians.tensors, expected.tensors, strict=True):
         torch.testing.assert_close(mine, plain, rtol=1e-4, atol=2e-5 + 1e-7 * float(plain.abs().max()))
-    known = (3, 50.0) if kind == "compressed.ply" else (None, None)
-    assert (found.base_count, found.camera and found.camera.focal[0]) == known
+    known = (3, 50.0, 0.2) if kind == "compressed.ply" else (None, None, None)
+    assert (found.base_count, found.camera and found.camera.focal[0], found.disparity) == known
     renamed = path.rename(tmp_path / "other.bin") if kind != "splat" else path  # the content decides
     assert len(load_scene(renamed).gaussians) == len(gaussians)
     assert Scene.load(renamed).to_bytes(kind) == Scene.load(renamed).to_bytes(kind)

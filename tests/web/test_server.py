@@ -19,6 +19,7 @@ import numpy as np
 import pillow_heif
 import pytest
 from photos import metres
+from PIL import Image
 from web_client import PHOTO, QUICK, SCENES, Served, answer_of, eventually, form, post, request, saved, served
 
 from spackle.errors import InputError
@@ -78,7 +79,7 @@ def test_programs_learn_the_interface(server: Served) -> None:
 @pytest.mark.parametrize(
     ("options", "why"),
     [
-        ("{", "JSON"),
+        ("{", "options: Invalid JSON"),
         ('{"disparity": 3}', "disparity"),
         ('{"files": ["../../etc/passwd"]}', "files"),
         ('{"path": 1}', "path: Extra"),
@@ -176,6 +177,15 @@ def test_a_token_is_asked_for_on_every_request(server: Served, tmp_path: Path) -
 def test_a_photo_has_a_known_kind(server: Served, name: str) -> None:
     reply = server.send(name=name)
     assert (reply.status, "png" in reply.json["error"] or name == "") == (415, True), reply.body
+
+
+def test_one_photo_of_a_usable_size_is_asked_for(server: Served) -> None:
+    tiny = io.BytesIO()
+    Image.new("RGB", (1, 1)).save(tiny, "PNG")
+    reply = server.send(tiny.getvalue())
+    assert (reply.status, "photo.png: 1×1 is too small" in reply.json["error"]) == (415, True), reply.body
+    two = form().rsplit(b"--", 2)[0] + form(name="b.png")
+    assert server.ask(SCENES, "POST", two).status == 422
 
 
 def test_an_upload_is_bounded_while_it_comes(server: Served) -> None:

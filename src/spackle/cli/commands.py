@@ -94,8 +94,8 @@ def predict(
     fill: Annotated[
         Literal["auto", "network", "exemplar", "lama", "none"],
         typer.Option(
-            help="Texture of what fills the holes. lama: its inpainting (`spackle weights get lama`); exemplar: of the "
-            "photo itself; network: none. none: holes stay open. auto: lama if its weights are here, else exemplar."
+            help="Texture in the holes. lama: by LaMa (`spackle weights get lama`); exemplar: patches of the photo; "
+            "network: no texture; none: holes stay open; auto: lama if its weights are here, else exemplar."
         ),
     ] = "auto",
     render: Annotated[bool, typer.Option(help="Write a video.")] = True,
@@ -119,7 +119,9 @@ def predict(
     focal_mm: Annotated[float | None, typer.Option(help="Focal length in mm, 35 mm equivalent.")] = None,
     fov: FovOption = None,
     keep_frame: KeepFrameOption = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Redo photos whose results exist.")] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Of several photos, redo those whose results exist.")
+    ] = False,
     workers: Annotated[
         int,
         typer.Option(
@@ -170,6 +172,7 @@ def render(
     ] = False,
     path: PathOptions,
     focal_px: Annotated[float | None, typer.Option(help="Focal length in pixels of the video.")] = None,
+    fov: FovOption = None,
     device: DeviceOption = "auto",
     as_json: JsonOption = False,
     verbose: VerboseOption = False,
@@ -179,7 +182,7 @@ def render(
     from spackle.progress import Reporter
 
     path = dataclasses.replace(path, video=dataclasses.replace(path.video, compare=compare))
-    render_scene(scene, output, path, focal_px, device, Reporter(verbose, as_json=as_json))
+    render_scene(scene, output, path, {"focal_px": focal_px, "fov": fov}, device, Reporter(verbose, as_json=as_json))
 
 
 def export(

@@ -52,7 +52,9 @@ def scene_facts(path: Path) -> Facts:
     depths = scene.gaussians.means[:, 2].double().numpy()
     near, middle, far = np.quantile(depths, [EXTREMES[0], 0.5, EXTREMES[1]])
     facts["depth"] = f"{near:.3g} near, {middle:.3g} median, {far:.3g} far, in metres if its base was metric"
-    facts["camera"] = "none is stored: give --fov or --focal-px" if scene.camera is None else lens_of(scene.camera)
+    facts["camera"] = (
+        "none is stored: give --fov, and to `spackle render` --size" if scene.camera is None else lens_of(scene.camera)
+    )
     if scene.disparity is not None:
         facts["completed"] = f"for --disparity {scene.disparity:g}"
     if scene.harmonics:

@@ -95,8 +95,8 @@ def predict_all(given: Sequence[Path], output: Path, options: PredictOptions, re
         reporter.log(f"{failed} of {len(named)} photos failed")
     else:
         folder = output / (named[0].name if single else "NAME")
-        video = f"{folder / f'video{options.scene.path.video.suffix}'}, or " if options.render else ""
-        reporter.log(f"Look at {video}into the scene: spackle view {shlex.quote(str(folder / 'scene.ply'))}")
+        video = f" at {folder / f'video{options.scene.path.video.suffix}'}, or" if options.render else ""
+        reporter.log(f"Look{video} into the scene: spackle view {shlex.quote(str(folder / 'scene.ply'))}")
     return failed
 
 

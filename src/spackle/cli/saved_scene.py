@@ -7,7 +7,7 @@ import dataclasses
 import mimetypes
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import torch
@@ -38,11 +38,12 @@ PAGE: dict[str, Encoder] = {".html": lambda scene: single_html(page_of(Scene.of_
 
 
 def render_scene(
-    scene: Path, output: Path, path: PathOptions, focal_px: float | None, device: str, reporter: Reporter
+    scene: Path, output: Path, path: PathOptions, lens: Mapping[str, float | None], device: str, reporter: Reporter
 ) -> None:
     """Draw a scene along a path: the video `output`, or in the folder `output` STEM.mp4 (with --cameras also PNGs).
 
-    `focal_px`, in pixels of the video, replaces the stored lens. InputError for a file or option that cannot be used.
+    `lens` replaces the stored one: focal_px, in pixels of the video, or fov. InputError for a file or option that
+    cannot be used.
     """
     single = output.suffix.lower() in FORMATS
     if single:
@@ -51,8 +52,11 @@ def render_scene(
         raise InputError(f"{output}: not a kind of video that can be written: end it with {', '.join(FORMATS)}")
     path.check()
     compare = path.video.compare
-    if path.cameras is not None and focal_px is not None:
-        raise InputError(f"--focal-px: the views of --cameras {path.cameras} have lenses of their own: leave it out")
+    given_lens = [f"--{name.replace('_', '-')}" for name, value in lens.items() if value is not None]
+    if path.cameras is not None and given_lens:
+        raise InputError(
+            f"{given_lens[0]}: the views of --cameras {path.cameras} have lenses of their own: leave it out"
+        )
     renderer = get_renderer(device)
     with reporter.stage("load"):
         given, keyframes = path.load()
@@ -65,8 +69,8 @@ def render_scene(
         if given:
             cameras = given
         else:
-            camera = _photo_camera(loaded, path.video.size, focal_px)
-            if focal_px is not None or reach is None:  # the lens is given, or nothing is known of the scene
+            camera = _photo_camera(loaded, path.video.size, lens)
+            if given_lens or reach is None:  # the lens is given, or nothing is known of the scene
                 path = dataclasses.replace(path, overscan=0)
             try:
                 cameras = path.fly(base, camera, keyframes, USUAL_DISPARITY if reach is None else reach)
@@ -80,10 +84,10 @@ def render_scene(
                     f"{scene.name}: {far} goes beyond the {reach:g} that it was completed for: "
                     f"`spackle predict {far}` completes a photo so far"
                 )
-            if loaded.camera is None and focal_px is None:
+            if loaded.camera is None and not given_lens:
                 reporter.log(
                     f"{scene.name}: no camera stored, taking {DEFAULT_FOCAL_MM:g} mm at "
-                    f"{camera.width}×{camera.height} (--focal-px, --size)"
+                    f"{camera.width}×{camera.height} (--fov, --size)"
                 )
         maker = FrameMaker.of(path.video, base, cameras, scene)
     target = output if single else output / f"{scene.stem}{path.video.suffix}"
@@ -117,7 +121,8 @@ def render_scene(
     result = {"gaussians": len(gaussians), "frames": len(cameras), "seconds": seconds, "open": round(max(holes), 5)}
     if max(holes) > TOLERATED:
         mean = sum(holes) / len(holes)
-        reporter.log(f"{scene.name}: holes take up to {max(holes):.1%} of a frame, {mean:.1%} on average")
+        nearer = ": a smaller --disparity shows fewer" if not given and keyframes is None else ""
+        reporter.log(f"{scene.name}: holes take up to {max(holes):.1%} of a frame, {mean:.1%} on average{nearer}")
     if problem:
         reporter.log(f"{path.cameras}: {problem}: pictures only, no video")
         reporter.result({"folder": output, **result})
@@ -127,13 +132,13 @@ def render_scene(
         reporter.result({"file": target, **result})
 
 
-def _photo_camera(file: SceneFile, size: tuple[int, int] | None, focal_px: float | None) -> Camera:
+def _photo_camera(file: SceneFile, size: tuple[int, int] | None, lens: Mapping[str, float | None]) -> Camera:
     """The stored camera; another lens where one is given, and one of 30 mm where none is stored."""
     stored = file.camera
-    if stored is not None and focal_px is None:
+    if stored is not None and all(value is None for value in lens.values()):
         return stored
     width, height = size or ((stored.width, stored.height) if stored else DEFAULT_SIZE)
-    focal, _ = focal_length(file.path, width, height, {}, focal_px=focal_px, focal_mm=None, fov=None)
+    focal, _ = focal_length(file.path, width, height, {}, focal_mm=None, **lens)
     return Camera.from_focal(focal, width, height)
 
 

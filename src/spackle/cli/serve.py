@@ -89,6 +89,7 @@ def checked(
                 raise InputError(f"--depth {settings.depth}: {target.name} is a scene already: leave the option out")
             return str(page_of(Scene.load(target, **lens), target).description["name"])
         photo = load_photo(target, keep_frame=keep_frame or settings.depth is not None, **lens)
+        photo.check_shape()
         if settings.depth is not None:
             open_base(settings).load(photo)
         if settings.checkpoint is not None:

@@ -55,7 +55,7 @@ def encode_compressed_ply(scene: SceneFile) -> bytes:
         rows[:, 1] = largest.astype(np.uint32) << np.uint32(30) | _packed(as_shares(others), TURN_BITS)
         rows[:, 2] = _packed(sizes, PLACE_BITS)
         rows[:, 3] = _packed(np.concatenate([colors, columns.opacities[:, None]], axis=1), COLOR_BITS)
-    header = ply_header(*tables, camera=scene.untilted_camera, base_count=scene.base_count)
+    header = ply_header(*tables, camera=scene.untilted_camera, base_count=scene.base_count, disparity=scene.disparity)
     return header + chunks.tobytes() + rows.tobytes()
 
 

@@ -138,7 +138,9 @@ class PlyFile:
         with open(path, "rb") as file:
             head = file.read(MAX_HEADER_BYTES)
         if head.split(b"\n", 1)[0].rstrip() != b"ply":
-            raise InputError(f"{path}: not a PLY file: its first line must be 'ply'")
+            raise InputError(
+                f"{path}: not a PLY file: its first line must be 'ply' (`spackle predict` makes one of a photo)"
+            )
         end = re.search(rb"\n[ \t]*end_header[ \t\r]*\n", head)
         if end is None:
             raise InputError(f"{path}: the header has no end: the file is damaged or cut off")

@@ -97,6 +97,10 @@ def create_app(
     app.add_middleware(Guard, access=access, limits=limits)
     decoding = asyncio.Lock()  # a large photo takes a gigabyte
 
+    def with_files(job: Job) -> SceneState:
+        names = {name for folder in (job.folder, job.results) if folder.is_dir() for name in os.listdir(folder)}
+        return job.model_copy(update={"files": sorted(names.intersection(FILES))})
+
     def job_of(id: str) -> Job:
         if (job := jobs.get(id)) is None:
             raise HTTPException(404, "there is no such scene")
@@ -121,9 +125,7 @@ def create_app(
     @app.get(SCENES + "/{id}")
     async def get_state(id: str) -> SceneState:
         """The state of a photo and its files."""
-        job = job_of(id)
-        names = {name for folder in (job.folder, job.results) if folder.is_dir() for name in os.listdir(folder)}
-        return job.model_copy(update={"files": sorted(names.intersection(FILES))})
+        return with_files(job_of(id))
 
     @app.delete(SCENES + "/{id}", status_code=204)
     async def delete(id: str) -> None:
@@ -133,11 +135,14 @@ def create_app(
     @app.get(SCENES + "/{id}/events", response_class=EventSourceResponse)
     async def get_events(id: str) -> AsyncIterator[SceneState]:
         """Server-sent events: the state, now and whenever it changes, until the photo is done or failed."""
-        seen: SceneState | None = None
+        seen: Job | None = None
         while seen is None or seen.ended is None:
-            if (state := jobs.get(id)) is not seen:
-                seen = state or SceneState(id=id, name="", state="failed", error="there is no such scene", ended=0)
-                yield seen
+            if (state := jobs.get(id)) is None:
+                yield SceneState(id=id, name="", state="failed", error="there is no such scene", ended=0)
+                return
+            if state is not seen:
+                seen = state
+                yield with_files(state)
             await asyncio.sleep(PACE_S)
 
     @app.get(SCENES + "/{id}/files/{file}", response_class=FileResponse)
@@ -175,15 +180,17 @@ def create_app(
 def accept(form: FormData, folder: Path, jobs: Jobs, bases: list[str]) -> Job:
     """Decode a form's photo and add its job; HTTPException if it is refused."""
     photo, depth, text = form.get("photo"), form.get("depth"), form.get("options") or "{}"
-    if not isinstance(photo, UploadFile) or not isinstance(text, str):
-        raise HTTPException(422, "send the photo as the file `photo`, and the options as the text `options`")
+    if len(form.getlist("photo")) != 1 or not isinstance(photo, UploadFile) or not isinstance(text, str):
+        raise HTTPException(422, "send one photo as the file `photo`, and the options as the text `options`")
     name = shown_name(photo.filename or "")
     try:
         options = SceneOptions.model_validate_json(text)
         check_name("base", options.base or bases[0], bases)
     except ValidationError as error:
         first = error.errors()[0]
-        raise HTTPException(422, one_line(f"options: {'.'.join(map(str, first['loc']))}: {first['msg']}")) from error
+        raise HTTPException(
+            422, one_line(f"{'.'.join(map(str, ('options', *first['loc'])))}: {first['msg']}")
+        ) from error
     except InputError as error:
         raise HTTPException(422, str(error)) from error
     source, of_depth = _saved(photo, folder, "source", name, PHOTO_SUFFIXES), None

@@ -79,7 +79,10 @@ class Access(NamedTuple):
             return {**scope, "root_path": f"{root}/{first}"}
         may_ask = scope["method"] in ("GET", "HEAD") if self.token is None else path == "/healthz"
         if not may_ask and not self._is_token(headers.get("authorization", "").removeprefix("Bearer ")):
-            raise HTTPException(401, "this needs the token that the server said as it started")
+            closed = "this page takes no photos: it was opened without a token"
+            raise HTTPException(
+                401, "this needs the token that the server said as it started" if self.token else closed
+            )
         return scope
 
     def _is_own(self, name: str) -> bool:

@@ -23,7 +23,7 @@ from spackle.errors import InputError
 from spackle.files import write_whole
 from spackle.formats.html import as_json, single_html
 from spackle.formats.scene_files import scene_kind
-from spackle.image import PHOTO_SUFFIXES, read_image
+from spackle.image import PHOTO_SUFFIXES, check_shape, read_image
 from spackle.photo_results import REPORT, predict_photo
 from spackle.pipeline import Fill, FillOptions, Options, Pipeline
 from spackle.progress import Reporter, Step
@@ -170,6 +170,7 @@ def check_photo(path: Path, name: str, preview: Path) -> None:
     def decode(image: Image.Image) -> None:
         if image.format not in FORMATS:
             raise InputError(f"{path}: a {image.format} picture: give {', '.join(PHOTO_SUFFIXES)}")
+        check_shape(image.width, image.height, path)
         image.load()
         upright = ImageOps.exif_transpose(image)
         upright.thumbnail((SIDE, SIDE))
