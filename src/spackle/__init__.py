@@ -72,7 +72,7 @@ def __dir__() -> list[str]:
     return [*__all__, "__version__"]
 
 
-if not TYPE_CHECKING:  # to type checkers a misspelled name is an error
+if not TYPE_CHECKING:  # so that type checkers report misspelled names
 
     def __getattr__(name: str) -> object:
         if name not in _HOMES:

@@ -1,4 +1,4 @@
-"""Files: checked before they are read, written whole or not at all, and known again by their digests."""
+"""Files: checked before they are read, written whole or not at all, and recognised by their digests."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from typing import Any, BinaryIO
 
 from spackle.errors import InputError, reading, reason_in_a_line
 
-LEFTOVER = re.compile(r"\.(.+)\.[0-9a-f]{12}(\.\w+)")  # how `atomic_path` calls its temporary files
-MAX_HASHED = 200_000_000  # bytes of a file that is read to tell whether it has changed
+LEFTOVER = re.compile(r"\.(.+)\.[0-9a-f]{12}(\.\w+)")  # how `atomic_path` names its temporary files
+MAX_HASHED = 200_000_000  # bytes of the largest file that is hashed to tell whether it has changed
 BLOCK = 1 << 20  # bytes of a file that are hashed at once
 
 
 def check_file(path: str | os.PathLike[str], kind: str) -> int:
-    """The size in bytes of a plain, non-empty file; InputError otherwise. `kind` is what messages call the file."""
+    """The size in bytes of a plain, non-empty file; InputError otherwise. Messages call the file `kind`."""
     with reading(repr(str(path)), "cannot be read: {reason}", OSError, ValueError):
         if re.match(r"(https?|ftp|s3|gs):/", str(path)):  # a Path has lost the second slash
             address = re.sub(":/+", "://", str(path), count=1)
@@ -39,14 +39,14 @@ def check_file(path: str | os.PathLike[str], kind: str) -> int:
 
 @contextlib.contextmanager
 def atomic_path(path: str | os.PathLike[str], *, durable: bool = False) -> Iterator[Path]:
-    """Yield a temporary name in the same folder; rename it to `path` where the block succeeds.
+    """Yield a temporary name in the same folder; rename it to `path` if the block succeeds.
 
     If the block raises, the temporary file is deleted and an older file at `path` is kept. The
     temporary name keeps the suffix, because some writers choose a format by it. Only a
-    `durable` file is synced to the disk: a killed process leaves whole files, a power cut need not.
+    `durable` file is synced to the disk: without that, files survive a killed process, but maybe not a power cut.
 
     Raises:
-        InputError: where nothing can be written there, or the disk fills up.
+        InputError: the file cannot be written, or the disk fills up.
     """
     target = check_writable(path)
     stem = os.fsdecode(os.fsencode(target.stem)[:100]) if len(os.fsencode(target.stem)) > 100 else target.stem
@@ -57,7 +57,7 @@ def atomic_path(path: str | os.PathLike[str], *, durable: bool = False) -> Itera
             _sync(temporary)
         os.replace(temporary, target)
         if durable and os.name == "posix":
-            _sync(target.parent)  # its name, too
+            _sync(target.parent)  # for the file's name
     except OSError as error:
         if error.filename not in (None, str(temporary)):
             raise  # about another file, such as an input that the block reads
@@ -81,7 +81,7 @@ def write_whole(path: str | os.PathLike[str], content: bytes) -> None:
         temporary.write_bytes(content)
 
 
-Target = str | os.PathLike[str] | BinaryIO  # of a result: a path, or a file that is open for writing bytes
+Target = str | os.PathLike[str] | BinaryIO  # where a result goes: a path, or a file that is open for writing bytes
 
 
 def write_bytes(content: bytes, target: Target) -> None:
@@ -93,15 +93,15 @@ def write_bytes(content: bytes, target: Target) -> None:
 
 
 def check_writable(path: str | os.PathLike[str]) -> Path:
-    """Check that `path` can be written; returns the file that a write would replace, links followed.
+    """Check that `path` can be written; returns the path with its links resolved.
 
-    Worth calling before long work whose result goes there.
+    Call it before long work whose result goes there.
 
     Raises:
-        InputError: where the folder is missing or closed to us, or the name is taken by something
-            that is not a plain file (replacing /dev/null would be a surprise).
+        InputError: the folder is missing or not writable, or `path` exists and is not a plain file
+            (replacing /dev/null would be a surprise).
     """
-    # A name too long, a zero byte in it, a loop of links.
+    # Errors for a name that is too long or has a zero byte, and for a loop of links.
     with reading(repr(str(path)), "cannot write: {reason}", OSError, ValueError):
         target = Path(os.path.realpath(path))
         if target.exists() and not target.is_file():
@@ -121,9 +121,9 @@ def write_json(content: Mapping[str, Any], path: Path, *, durable: bool = False)
 
 
 def files_in(folder: Path, endings: tuple[str, ...], *, below: bool = False) -> list[Path]:
-    """The files in a folder whose names end in `suffixes`, in any case; with `below` also those in its subfolders.
+    """The files in a folder whose names end in one of `endings`, in any case; with `below` also in subfolders.
 
-    Sorted; hidden files are left out. InputError where the folder cannot be read.
+    Sorted; hidden files are left out. InputError if the folder cannot be read.
     """
     with reading(folder, "cannot read the folder: {reason}", OSError):
         os.scandir(folder).close()
@@ -143,8 +143,8 @@ def sha256_of(file: BinaryIO) -> str:
 
 
 def fingerprint(file: Path, kind: str) -> str:
-    """The digest of a file's content, or of size and modification time for gigabytes; InputError (naming `kind`) if
-    missing.
+    """The digest of a file's content, or for a large file its size and modification time; InputError (naming `kind`)
+    if it is missing.
     """
     size = check_file(file, kind)
     if size > MAX_HASHED:

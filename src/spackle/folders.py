@@ -1,4 +1,4 @@
-"""Folders for results: held by one run, filled with whole sets of files, and known again by their digests."""
+"""Folders for results: locked by one run, filled with complete sets of files, recognised by digests."""
 
 from __future__ import annotations
 
@@ -35,17 +35,17 @@ else:
 
 @contextlib.contextmanager
 def hold(path: Path) -> Iterator[None]:
-    """Hold the lock file `path` during the block; a killed process's lock is free.
+    """Lock the file `path` during the block; a killed process leaves it unlocked.
 
     Raises:
-        BlockingIOError: somebody else holds it.
+        BlockingIOError: another process has locked it.
         OSError: the file cannot be created, or the file system has no locks.
     """
     file = _acquire(path)
     try:
         yield
     finally:
-        with contextlib.suppress(OSError):  # Windows deletes no open file, and it may stay
+        with contextlib.suppress(OSError):  # Windows deletes no open file; the lock file may stay
             path.unlink()
         file.close()
 
@@ -55,7 +55,7 @@ def _acquire(path: Path) -> BinaryIO:
         with contextlib.ExitStack() as stack:
             file = stack.enter_context(open(path, "ab"))
             _lock(file)
-            # Its last holder may have removed it between these two steps: then what we hold has no name.
+            # Its last holder may have deleted it between these two steps: then we have locked a file without a name.
             with contextlib.suppress(FileNotFoundError):
                 if os.path.samestat(os.fstat(file.fileno()), os.stat(path)):
                     stack.pop_all()
@@ -66,8 +66,8 @@ def _acquire(path: Path) -> BinaryIO:
 def results_folder(path: Path, files: Sequence[str] = (), *, alone: bool = False) -> Iterator[None]:
     """Create a folder for results; it is removed if the block leaves it empty.
 
-    The block writes `files`: InputError before long work if it cannot. Temporary files that a killed run left are
-    deleted. With `alone` nobody else works in the folder during the block: InputError if somebody does.
+    InputError, before any long work, if the `files` of the block cannot be written. Temporary files that a killed run
+    left are deleted. `alone` locks the folder during the block; InputError if another run has locked it.
     """
     missing = [folder for folder in (path, *path.parents) if not os.path.exists(folder)]
     try:
@@ -82,13 +82,13 @@ def results_folder(path: Path, files: Sequence[str] = (), *, alone: bool = False
             yield
     finally:
         for folder in missing:
-            with contextlib.suppress(OSError):  # it holds something
+            with contextlib.suppress(OSError):  # it is not empty
                 folder.rmdir()
 
 
 @contextlib.contextmanager
 def _alone_in(folder: Path) -> Iterator[None]:
-    """Hold the folder's lock, which the kernel takes from a killed run."""
+    """Lock the folder during the block; the kernel frees the lock of a killed run."""
     with contextlib.ExitStack() as stack:
         try:
             while True:
@@ -106,8 +106,8 @@ def _alone_in(folder: Path) -> Iterator[None]:
 
 
 def mark(folder: Path) -> str:
-    """Mark a folder, which the caller holds `alone`, during the block, so that `check_mark` recognises it on another
-    machine.
+    """Write a mark into a folder that the caller has locked (`alone`), and return it, so that `check_mark` on another
+    machine can recognise the folder.
     """
     word = secrets.token_hex(8)
     (folder / LOCK).write_text(word)
@@ -115,7 +115,7 @@ def mark(folder: Path) -> str:
 
 
 def check_mark(folder: Path, word: str) -> None:
-    """InputError where `folder` is not the one that was given this mark."""
+    """InputError if `folder` does not contain this mark."""
     try:
         if (folder / LOCK).read_text() == word:
             return
@@ -126,15 +126,15 @@ def check_mark(folder: Path, word: str) -> None:
 
 @contextlib.contextmanager
 def whole_set(folder: Path, last: str) -> Iterator[Path]:
-    """Yield a new folder for a set of files; where the block succeeds, they take their places in `folder`.
+    """Yield a new folder for a set of files; if the block succeeds, the files move to `folder`.
 
-    If it raises, an older set is kept. The file `last` states that the others are complete, so it is removed
-    first and put in place last. The caller must hold the folder `alone`, see `results_folder`.
+    If it raises, an older set is kept. The presence of the file `last` means that the others are complete, so it is
+    deleted first and moved last. The caller must have locked the folder (`alone`), see `results_folder`.
     """
     new = folder / NEW
     try:
         with reading(new, "cannot write: {reason}", OSError):
-            if os.path.lexists(new):  # of a killed run
+            if os.path.lexists(new):  # left by a killed run
                 shutil.rmtree(new)
             new.mkdir()
         yield new
@@ -147,7 +147,7 @@ def whole_set(folder: Path, last: str) -> Iterator[Path]:
 
 
 def file_records(folder: Path, files: Iterable[Path]) -> dict[str, dict[str, object]]:
-    """Bytes and SHA-256 of files in a folder, by name, for a report."""
+    """Size in bytes and SHA-256 of files in a folder, by name, for a report."""
     records: dict[str, dict[str, object]] = {}
     for path in files:
         with open(path, "rb") as file:
@@ -157,7 +157,7 @@ def file_records(folder: Path, files: Iterable[Path]) -> dict[str, dict[str, obj
 
 
 def as_recorded(folder: Path, report: str, records: object) -> bool:
-    """Whether a folder still holds the files that a report lists by `file_records`.
+    """Whether a folder still holds the files that a report lists with their `file_records`.
 
     Sizes and times are compared; a file newer than the report, as in a copied folder, is read.
     """
@@ -176,14 +176,14 @@ def as_recorded(folder: Path, report: str, records: object) -> bool:
 
 
 def photo_digest(path: Path) -> str:
-    """The digest of a photo; "none" for a missing one, which is reported when its turn comes."""
+    """The digest of a photo; "none" if it is missing, which is reported when its turn comes."""
     with contextlib.suppress(InputError):
         return fingerprint(path, "photo")
     return "none"
 
 
 def remove_half_written(*folders: Path, files: Sequence[str] | None = None) -> None:
-    """Delete the temporary files that killed runs left for `files`; for any file if None, which needs `alone`."""
+    """Delete the temporary files that killed runs left for `files`; None: for any file, in locked folders."""
     for folder in folders:
         for file in folder.iterdir():
             match = LEFTOVER.fullmatch(file.name)
@@ -192,7 +192,7 @@ def remove_half_written(*folders: Path, files: Sequence[str] | None = None) -> N
 
 
 def make_folder(path: Path) -> None:
-    """Create a folder for results, or check that it can be written to; InputError where it cannot."""
+    """Create a folder for results, or check that it is writable; InputError if this is impossible."""
     with reading(path, "cannot create this output folder: {reason}; choose another with -o", OSError, ValueError):
         path.mkdir(parents=True, exist_ok=True)
     if not os.access(path, os.W_OK | os.X_OK):

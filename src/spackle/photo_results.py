@@ -1,4 +1,4 @@
-"""One photo to a folder: a scene, a video and a report. The command line and the server call `predict_photo`."""
+"""Write a photo's scene, video and report to a folder. The command line and the server call `predict_photo`."""
 
 from __future__ import annotations
 
@@ -43,12 +43,11 @@ def predict_photo(
     render: bool = True,
     request: str | None = None,
 ) -> None:
-    """One photo to `folder`: scene.ply, a video if it is to `render`, report.json, and views/ with --cameras.
+    """Predict one photo into `folder`: scene.ply, report.json, a video with `render`, and views/ with --cameras.
 
-    With `keep_base` also base.ply, the photo's own Gaussians, and with `depth_out` a file of that name, the photo's
-    depth. `lens` and `keep_frame` are as `load_photo` takes them;
-    the report holds the digest `request`. The files take their places once all are whole. InputError for a photo, a
-    depth map or a folder that cannot be used.
+    `keep_base` adds base.ply, the photo's own Gaussians, and `depth_out` a file of that name, the photo's depth.
+    `lens` and `keep_frame` are as for `load_photo`; the report stores the digest `request`. The files move to their
+    places once all are complete. InputError for a photo, a depth map or a folder that cannot be used.
     """
     reporter, options = reporter.restarted(), pipeline.options
     with reporter.stage("load"):
@@ -90,7 +89,7 @@ def predict_photo(
             "disparity": scene.disparity,
             "video": video,
             "hole_area_ratio": holes,
-            "request": request if done.choice.lasting else None,  # None: the next run does it again
+            "request": request if done.choice.lasting else None,  # None: the next run predicts the photo again
         }
         size = {"width": scene.camera.width, "height": scene.camera.height}
         frame = {} if photo.frame is None else {"frame_cut_off": dataclasses.asdict(photo.frame)}
@@ -112,7 +111,7 @@ def predict_photo(
 
 
 def save_views(done: CompletedPhoto, path: Path, renderer: Renderer, step: Step) -> None:
-    """The frames of the planned views, all of one size; InputError for a file that cannot be written."""
+    """Write the planned views, all of one size, as a video; InputError for a file that cannot be written."""
     views, video = done.views, done.views.maker.options
 
     def frames() -> Iterator[Tensor]:
@@ -130,7 +129,7 @@ def save_views(done: CompletedPhoto, path: Path, renderer: Renderer, step: Step)
 
 @torch.no_grad()
 def _save_pictures(done: CompletedPhoto, folder: Path, renderer: Renderer, step: Step) -> None:
-    """Each given view as PNG: 0000.png completed, 0000_base.png before, 0000_mask.png its holes (white)."""
+    """Write each given view as PNG: 0000.png completed, 0000_base.png before, 0000_mask.png its holes (white)."""
     for index, camera in enumerate(done.views.cameras[: done.views.stills]):
         before = renderer.render(done.scene.base, camera)
         save_png(renderer.render(done.scene.of_view(index), camera).rgb, folder / f"{index:04d}.png")
@@ -155,7 +154,7 @@ def _measure_holes(done: CompletedPhoto, renderer: Renderer) -> list[dict[str, A
 def shared_report(
     photo: Photo, prediction: BasePrediction, choice: ResolvedBase, pipeline: Pipeline, reporter: Reporter
 ) -> dict[str, Any]:
-    """What the reports of a photo and of a clip both hold, ready for JSON."""
+    """The fields that the reports of a photo and of a clip share, ready for JSON."""
     path, weights = pipeline.options.path, pipeline.options.fill.weights
     given = path.cameras or path.path
     reach = "photo" if "usual_disparity" in prediction.notes else f"default of {choice.base}"

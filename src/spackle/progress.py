@@ -1,4 +1,4 @@
-"""Progress of long work: bars on a terminal, lines in a log. Also the end of long work at Ctrl-C."""
+"""Progress of long work: bars on a terminal, lines in a log. Also ends long work at Ctrl-C."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def progress_line(name: str, shown: bool = True) -> Iterator[Step]:
 class Reporter:
     """Logs what is going on, and how long each stage took, to `console` (None: the standard error).
 
-    `verbose` logs details too; `as_json` prints each result for scripts, a line of JSON on the standard output.
+    `verbose` logs details, too; `as_json` prints each result as a line of JSON on the standard output, for scripts.
     """
 
     def __init__(self, verbose: bool = False, console: Console | None = None, *, as_json: bool = False) -> None:
@@ -77,7 +77,7 @@ class Reporter:
         self.seconds: dict[str, float] = {}  # of each stage so far
 
     def restarted(self) -> Reporter:
-        """A reporter for the next photo: the same, with no stage timed yet."""
+        """A copy of this reporter for the next photo, with no stage timed yet."""
         other = copy.copy(self)
         other.seconds = {}
         return other
@@ -118,7 +118,7 @@ class Reporter:
 
     @contextlib.contextmanager
     def steps(self, name: str, start: int, total: int) -> Iterator[Callable[[int, str], None]]:
-        """Many steps of equal length, from `start` on: yields a function of (done, a remark); in a log, a line each."""
+        """Report equal steps from `start` on; yields a function of (done, a remark). A log gets a line for each."""
         if self.console.is_terminal:
             with self._bars(MofNCompleteColumn(), TextColumn("{task.fields[remark]}")) as bars:
                 task = bars.add_task(name, total=total, completed=start, remark="")
@@ -134,13 +134,13 @@ class Reporter:
 
     @contextlib.contextmanager
     def transfer(self, name: str) -> Iterator[Step]:
-        """Bytes on their way: yields a function of (bytes, of how many); in a log, a line for each tenth."""
+        """Report a transfer; yields a function of (bytes done, of how many). A log gets a line for each tenth."""
         if self.console.is_terminal:
             with self._bars(DownloadColumn(), TransferSpeedColumn()) as bars:
                 task = bars.add_task(name, total=None)
 
                 def advance(done: int, total: int) -> None:
-                    if not 0 < bars.tasks[0].completed <= done:  # what was here before says nothing of the speed
+                    if not 0 < bars.tasks[0].completed <= done:  # bytes of earlier runs would distort the speed
                         bars.reset(task, total=total, completed=done)
                     bars.update(task, completed=done)
 
@@ -196,12 +196,12 @@ class Notes(Reporter):
 
 @contextlib.contextmanager
 def asked_to_stop(alone: bool) -> Iterator[Callable[[], bool]]:
-    """Yields a function that says whether Ctrl-C or SIGTERM came, so that a run can end between two steps.
+    """Yields a function that tells whether Ctrl-C or SIGTERM came, so that a run can end between two steps.
 
-    A second Ctrl-C ends the run at once, except under torchrun, which forwards the terminal's first one again.
+    A second Ctrl-C ends the run at once, except under torchrun, which sends the first Ctrl-C a second time.
     """
-    asked: list[int] = []  # no Event: its lock would hold up a second signal that comes while it is set, for ever
-    if threading.current_thread() is not threading.main_thread():  # signals are not for this one
+    asked: list[int] = []  # not an Event: a signal that arrives while an Event is set waits for its lock for ever
+    if threading.current_thread() is not threading.main_thread():  # only the main thread gets signals
         yield lambda: False
         return
 

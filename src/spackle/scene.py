@@ -1,4 +1,4 @@
-"""A photo's completed scene: drawn along a path, saved, exported, shown."""
+"""A photo's completed scene: render it along a path, save it, export it, show it."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Scene:
     aux: Gaussians  # what completion added
     camera: Camera  # the photo's
     by_view: tuple[Gaussians, ...] | None = None  # in view mode: the aux Gaussians of each completed view
-    disparity: float | None = None  # how far it was completed, where that is known
+    disparity: float | None = None  # disparity for which it was completed, if known
 
     def __repr__(self) -> str:
         size = f"{self.camera.width}×{self.camera.height}"
@@ -47,18 +47,18 @@ class Scene:
 
     @staticmethod
     def load(path: str | os.PathLike[str], *, focal_px: float | None = None, fov: float | None = None) -> Scene:
-        """Read a PLY of ours, of INRIA's, of SHARP's or PlayCanvas's, an SPZ, SOG or .splat; InputError for another.
+        """Read a PLY (ours, INRIA's, SHARP's or PlayCanvas's), SPZ, SOG or .splat file; InputError for any other.
 
         Args:
             path: the file.
-            focal_px: focal length in pixels; by default what is stored, else that of 30 mm.
-            fov: horizontal field of view in degrees, in its place.
+            focal_px: focal length in pixels; by default the stored one, else that of a 30 mm lens.
+            fov: horizontal field of view in degrees, instead of `focal_px`.
         """
         return Scene.of_file(load_scene(Path(path)), focal_px, fov)
 
     @staticmethod
     def of_file(file: SceneFile, focal_px: float | None = None, fov: float | None = None) -> Scene:
-        """What a file holds, in the frame of its camera; see `load`."""
+        """The scene in a loaded file, in the frame of its camera; see `load`."""
         gaussians, camera = file.gaussians, file.camera
         if camera is None or focal_px is not None or fov is not None:
             width, height = (camera.width, camera.height) if camera else DEFAULT_SIZE
@@ -84,38 +84,38 @@ class Scene:
         return usual if disparity is None else disparity
 
     def of_view(self, index: int) -> list[Gaussians]:
-        """The sets of Gaussians with which a completed view is drawn."""
+        """The sets of Gaussians from which a completed view is rendered."""
         return [self.base, self.aux if self.by_view is None else self.by_view[index]]
 
     @renamed(kind="trajectory")
     def path(
         self, trajectory: TrajectoryKind = "rotate-forward", disparity: float | None = None, frames: int = PATH_FRAMES
     ) -> list[Camera]:
-        """Cameras of a video around the photo's eye, both sides of the picture even."""
+        """Cameras of a video around the photo's camera position; width and height of the picture are even."""
         return scene_path(self.base, self.camera, trajectory, self._reach(disparity), frames)
 
     def along(self, keyframes: KeyframePath, frames: int | None = None, fps: float = 30) -> list[Camera]:
-        """Cameras through keyframes, see `spackle.formats.load_path`; by default as many as the path's seconds have at
-        `fps`.
+        """Cameras through keyframes (see `spackle.formats.load_path`); by default one for each frame of the path's
+        duration at `fps`.
 
-        ValueError for keyframes between which a view is impossible.
+        ValueError if a view between two keyframes is impossible.
         """
         count = frames or keyframes.frame_count(fps)
         return keyframes.cameras(self.camera.even(), count, DepthRange.of(self.base))
 
     def render(self, camera: Camera, renderer: Renderer | None = None) -> Rendering:
-        """One view of the whole scene."""
+        """Render one view of the whole scene."""
         with torch.no_grad():
             return (renderer or get_renderer()).render([self.base, self.aux], camera)
 
     def frames(self, cameras: Iterable[Camera], renderer: Renderer | None = None) -> Iterator[Rendering]:
-        """Views along a path, one after the other."""
+        """Render the views along a path, one after the other."""
         renderer = renderer or get_renderer()
         for camera in cameras:
             yield self.render(camera, renderer)
 
     def depth_map(self, renderer: Renderer | None = None) -> Tensor:
-        """Depth [H, W] of the base at the photo's camera, metres where the base is metric; 0 where it shows nothing."""
+        """Depth [H, W] of the base at the photo's camera, metres if the base is metric; 0 where it is empty."""
         with torch.no_grad():
             view = (renderer or get_renderer()).render(self.base, self.camera)
         return torch.where(hole_mask(view.alpha), 0, view.depth)
@@ -125,7 +125,7 @@ class Scene:
 
         Args:
             target: a path, or a file that is open for writing bytes.
-            disparity: how far the scene was completed, which limits `spackle view`; by default `Scene.disparity`.
+            disparity: that for which the scene was completed; it limits `spackle view`. Default: `Scene.disparity`.
         """
         reach = self.disparity if disparity is None else disparity
         if isinstance(target, str | os.PathLike):
@@ -134,7 +134,7 @@ class Scene:
             target.write(dataclasses.replace(self, disparity=reach).to_bytes("ply"))
 
     def page(self, name: str, note: str = "") -> PageScene:
-        """The scene for the page of `spackle view`, under a name, with a note as `page_scene` has it."""
+        """The scene for the page of `spackle view`, with a name and a note as in `page_scene`."""
         return page_scene(name, self.base, self.aux, self.camera, self.disparity, note)
 
     def export(self, target: Target, format: str | None = None) -> None:
@@ -164,7 +164,7 @@ class Scene:
         return encoder_of(name, {".html": page})(file)
 
     def show(self, height: int = 480) -> InlinePage:
-        """The page with the scene in it, `height` pixels high: the last value of a notebook's cell is shown."""
+        """A page with the scene, `height` pixels high; a notebook shows it if it is the last value of a cell."""
         return InlinePage(single_html(self.page("scene")).decode(), height)
 
     @renamed(kind="trajectory")
@@ -182,9 +182,9 @@ class Scene:
     ) -> None:
         """Write a video of a camera path, by default of 4 seconds; `loop` as in `spackle.formats.VideoWriter`.
 
-        The lens is longer than the photo's by the share `overscan`: most of what lies beyond the photo stays outside.
+        The focal length is 1 + `overscan` times the photo's, so that most of what lies beyond the photo is not seen.
         `target` is a path, or a file that is open for writing bytes; `format` is "mp4", "webm", "gif" or "webp", by
-        default as the path ends, and mp4 for an open file.
+        default the path's suffix, and mp4 for an open file.
         """
         if format is None and isinstance(target, str | os.PathLike):
             check_video(target, fps, loop)

@@ -51,14 +51,14 @@ class Spackle:
         """Choose base, fill and device.
 
         Args:
-            base: as `--base` names it, or a loaded one, such as `SharpBase.load(weights)`. "auto" takes the best for
-                each photo: its depth, else SHARP or MoGe where weights have been downloaded, else lite, whose geometry
+            base: a name as for `--base`, or a loaded base, such as `SharpBase.load(weights)`. "auto" takes the best for
+                each photo: its depth, else SHARP or MoGe if weights have been downloaded, else lite, whose geometry
                 is rough. The choice, and candidates that fail, are logged to the logger "spackle".
-            residual: a file of weights, a loaded network, "seeds" for none, or "none", which leaves the holes open;
-                None: the weights that come with Spackle.
-            fill: source of the texture, see `spackle.pipeline.open_texture`; "none" leaves the holes open.
+            residual: a weight file, a loaded network, "seeds" to fill without a network, or "none" to leave the holes
+                open; None takes the weights that come with Spackle.
+            fill: source of the texture in the holes, see `spackle.pipeline.open_texture`; "none" leaves the holes open.
             device: "auto", "cpu" or "cuda", for base and renderer.
-            renderer: if None, the device's.
+            renderer: None takes the device's own.
 
         Raises:
             InputError: an unknown name, or weights that cannot be used.
@@ -87,7 +87,7 @@ class Spackle:
         fov: float | None = None,
         progress: bool = False,
     ) -> Scene:
-        """A photo to a scene without holes along a camera path; see `spackle.predict`."""
+        """Turn a photo into a scene without holes along a camera path; see `spackle.predict`."""
         if depth is not None and self._given:
             raise InputError("predict takes the photo's depth, or a base that needs none, but not both")
         lens = {"focal_px": focal_px, "focal_mm": focal_mm, "fov": fov}
@@ -127,28 +127,28 @@ def predict(
     fov: float | None = None,
     progress: bool = False,
 ) -> Scene:
-    """A photo to a scene without holes along a camera path; for many photos keep a `Spackle`, which loads once.
+    """Turn a photo into a scene without holes along a camera path; for many photos keep a `Spackle`, which loads once.
 
     Args:
         photo: a path, the bytes of a file, an open file, a PIL picture, a loaded photo, or an array or tensor
             [H, W, 3] of sRGB, uint8 or floats in 0..1.
-        depth: of the photo: a path, bytes or an open file as `load_depth` reads them, an array or tensor [H, W] in
-            metres (0, NaN or inf: unknown), or a loaded depth map.
+        depth: the photo's depth: a path, bytes or an open file in a format of `load_depth`, an array or tensor [H, W]
+            in metres (0, NaN or inf: unknown), or a loaded depth map.
         base, residual, fill, device, renderer: see `Spackle`.
-        trajectory: the path that the scene is completed for, besides the views farthest to the left and to the right.
-        disparity: how far the path goes, see `spackle.camera_path.max_offset`; if None, chosen by the photo (see
+        trajectory: the path for which the scene is completed, in addition to the leftmost and rightmost views.
+        disparity: how far the path goes, see `spackle.camera_path.max_offset`; if None, chosen for the photo (see
             `choose_move`), at most 0.15 for lite, else 0.3.
         depth_kind: the meaning of a depth map's numbers, see `spackle.load_depth`.
-        keep_frame: keep a uniform frame around a file's picture; it is otherwise cut off where neither depth nor a
-            focal length is given.
-        focal_px: focal length in pixels of the upright photo; by default the file's own, see `load_photo`.
-        focal_mm: its 35 mm film equivalent, in its place.
-        fov: horizontal field of view in degrees, in its place.
+        keep_frame: keep a uniform frame around a file's picture; otherwise it is cropped if neither depth nor a focal
+            length is given.
+        focal_px: focal length in pixels of the upright photo; by default the one stored in the file, see `load_photo`.
+        focal_mm: focal length in mm, 35 mm film equivalent, instead of `focal_px`.
+        fov: horizontal field of view in degrees, instead of `focal_px`.
         progress: draw progress on one line of the standard error.
 
     Raises:
-        InputError: a photo, a depth map, a name or weights that cannot be used; a base beside depth, or a lens for a
-            photo that is loaded.
+        InputError: a photo, a depth map, a name or weights that cannot be used; `base` together with `depth`, or a
+            lens for a loaded photo.
     """
     return Spackle(base, residual=residual, fill=fill, device=device, renderer=renderer).predict(
         photo,
@@ -166,7 +166,7 @@ def predict(
 
 @contextlib.contextmanager
 def _photo(source: PhotoSource, **options: Any) -> Iterator[Photo]:
-    """The loaded photo; one given as bytes has a temporary file during the block, from which its depth can be read."""
+    """The loaded photo; one given as bytes has a temporary file during the block, so that its depth can be read."""
     if isinstance(source, Photo):
         yield source
     elif isinstance(source, Image.Image | np.ndarray | Tensor):
@@ -190,7 +190,7 @@ def _depth(source: DepthSource, kind: DepthKind) -> Iterator[Path | DepthMap]:
 
 @contextlib.contextmanager
 def _as_file(source: str | os.PathLike[str] | bytes | BinaryIO, kind: str) -> Iterator[Path]:
-    """A path to the source's bytes; in messages a temporary file is called "photo" or "depth"."""
+    """A path to the source's bytes; messages call a temporary file "photo" or "depth"."""
     if isinstance(source, str | os.PathLike):
         yield Path(source)
         return

@@ -16,7 +16,7 @@ from spackle.errors import InputError, reason_in_a_line
 DIED = "the process that worked on this died, most likely for want of memory"
 Event = Mapping[str, Any]
 Tell = Callable[[Event], None]
-Work = Callable[[Any, Tell], None]  # is pickled, as its tasks are; its InputError says why a task cannot be done
+Work = Callable[[Any, Tell], None]  # pickled, like its tasks; raises InputError if a task cannot be done
 
 
 class TaskProcess:
@@ -67,14 +67,14 @@ def _serve(pipe: connection.Connection, work: Work) -> None:
             return
         except InputError as problem:
             error = " ".join(str(problem).split())
-        except Exception as bug:  # or no memory: the next task may do
+        except Exception as bug:  # or too little memory: the next task may succeed
             traceback.print_exc()
             error = f"this went wrong: {type(bug).__name__}: {reason_in_a_line(bug)}"
         pipe.send(Ended(error))
 
 
 def end_with_parent() -> None:
-    """Wait until the parent process has ended, then end this one, which would wait for ever."""
+    """Wait until the parent process has ended, then end this one, which would otherwise wait for ever."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     connection.wait([parent.sentinel])

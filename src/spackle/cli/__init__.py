@@ -1,4 +1,4 @@
-"""The command line: one thin function a command, one file a group."""
+"""The command line: one thin function for each command, one file for each group."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ WIDTH = 80
 
 
 class Overview(TyperGroup):
-    """The command group, which lists each command in one line below examples, those of RESEARCH last."""
+    """The command group; its help shows examples, then one line for each command, those of RESEARCH last."""
 
     def format_help(self, ctx: typer.Context, formatter: object) -> None:  # type: ignore[override]
         """Write the help so that it fits into 24 lines of 80 characters."""
@@ -54,7 +54,7 @@ app = typer.Typer(
     help="One photo in, a 3D Gaussian scene out that survives a large camera move.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    rich_markup_mode=None,  # its panels leave a third of the width to the words
+    rich_markup_mode=None,  # its panels leave only a third of the width for the text
     # Names of options and of their choices may be typed with underscores.
     context_settings={
         "help_option_names": ["-h", "--help"],
@@ -104,27 +104,27 @@ def everywhere(
 
 def main() -> None:
     """Entry point: bad input is one line and exit code 2."""
-    # Read when torch is loaded. Its idle threads would otherwise spin: where other programs want the cores too,
-    # that makes completion three to five times slower.
+    # torch reads this as it is loaded. Its idle threads would otherwise spin, which makes completion three to five
+    # times slower if other programs use the cores, too.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    # Its collector would look again and again at the 200,000 objects of torch and numba, which stay.
+    # Python's collector would otherwise scan the 200,000 lasting objects of torch and numba again and again.
     gc.set_threshold(50_000)
-    if threading.current_thread() is threading.main_thread():  # SIGTERM ends it after every `finally`, too
+    if threading.current_thread() is threading.main_thread():  # let SIGTERM run every `finally`, too
         signal.signal(signal.SIGTERM, _end)
     try:
         code = app(standalone_mode=False)
         sys.stdout.flush()
     except InputError as error:
         _fail(str(error))
-    except TyperException as error:  # an unknown option, a number that is none
-        if type(error).__name__ == "NoArgsIsHelpError":  # the help, where nothing was asked for
+    except TyperException as error:  # an unknown option, or text in place of a number
+        if type(error).__name__ == "NoArgsIsHelpError":  # no arguments: print the help
             print(error.format_message(), file=sys.stderr)
             sys.exit(2)
         _fail(error.format_message())
     except OSError as error:
         if error.filename is not None:
             raise
-        with contextlib.suppress(OSError, ValueError):  # Python would try again as it ends
+        with contextlib.suppress(OSError, ValueError):  # Python would try to write again as it ends
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         _fail(f"cannot write to the standard output: {error.strerror or error}")
     if code == INTERRUPTED:
@@ -133,7 +133,7 @@ def main() -> None:
 
 
 def run() -> NoReturn:
-    """`main` as a process of its own, which ends at once: Python would take half a second to take torch apart."""
+    """Run `main` and end the process at once: Python would need half a second to tear down torch."""
     code: object = 0
     try:
         main()

@@ -1,4 +1,4 @@
-"""`spackle predict clip.mp4`: each frame seen from a camera that moves, its depth and its filled holes kept calm."""
+"""`spackle predict clip.mp4`: render each frame from a moving camera; depth and filled holes do not flicker."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from spackle.video_frames import VideoOptions
 from spackle.views import choose_move
 
 FILES = ("video.mp4", "report.json")
-# Frames are named by their numbers, so that a folder may hold a depth map for each: 000000.npy is the first one's.
+# Frames are named by their numbers, so that a folder may hold a depth map for each: 000000.npy for the first.
 NAME = "{:06d}"
 
 
 def clip_options(predict: PredictOptions) -> Options:
-    """The pipeline's options for a clip; InputError for an option that a clip has no use for."""
+    """The pipeline's options for a clip; InputError for an option that does not apply to a clip."""
     base, path, fill = predict.scene.base, predict.scene.path, predict.scene.fill
     video, plain = path.video, VideoOptions(format=path.video.format)
     follows = "its camera follows a trajectory, once through the clip"
@@ -59,7 +59,7 @@ def clip_options(predict: PredictOptions) -> Options:
             f"--depth {base.depth}: a clip takes a folder with a map for each frame: {NAME.format(0)}.npy and so on"
         )
     OpenCV("a clip, whose motion has to be followed,")
-    if fill.fill == "auto":  # and no inpainter is opened
+    if fill.fill == "auto":  # so that no inpainter is opened
         fill = dataclasses.replace(fill, fill="network")
     return dataclasses.replace(predict.scene, fill=fill)
 
@@ -67,7 +67,7 @@ def clip_options(predict: PredictOptions) -> Options:
 def predict_clip(
     path: Path, folder: Path, pipeline: Pipeline, lens: Mapping[str, float | None], reporter: Reporter
 ) -> None:
-    """One clip to `folder`: video.mp4 with as many frames, and report.json; `lens` as `load_photo` takes it.
+    """Predict one clip into `folder`: video.mp4 with as many frames, and report.json; `lens` as for `load_photo`.
 
     InputError for a clip, a frame, a depth map or a folder that cannot be used.
     """
@@ -101,12 +101,12 @@ def predict_clip(
                 with timed("base", completer.seconds):
                     prediction, choice = base.predict(photo, log=reporter.log)
                 if first is None:
-                    if completer.disparity is None:  # the first frame chooses for all
+                    if completer.disparity is None:  # the first frame's choice holds for all
                         prediction = choose_move(prediction, pipeline.renderer, photo.path)
                         completer.disparity = prediction.disparity
                         reporter.log(f"{path.name}: {move_in_words(prediction)}")
-                    first, base = (photo, prediction, choice), base.only(choice)  # which predicts all others, too
-                    if prediction.lens_source:  # by a network: a clip has one lens, so it holds for all other frames
+                    first, base = (photo, prediction, choice), base.only(choice)  # it predicts all other frames, too
+                    if prediction.lens_source:  # a network's estimate; a clip has one lens, so it holds for all frames
                         seen = prediction.camera.focal[0] * clip.width / prediction.camera.width
                         focal = seen, prediction.lens_source
                     if choice.note:
@@ -172,7 +172,7 @@ def predict_clip(
 
 
 def _complete(completer: ClipCompleter, photo: Photo, prediction: BasePrediction) -> CompletedView:
-    """A frame's completed view; InputError, naming the frame, where it cannot be."""
+    """A frame's completed view; InputError, naming the frame, if this is impossible."""
     try:
         view = completer.add(resize_photo(photo).rgb, prediction)
     except ValueError as error:

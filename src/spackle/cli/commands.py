@@ -1,4 +1,4 @@
-"""Options of `spackle predict`, `render`, `export`, `view`, `serve` and `demo`; the work is imported as they run."""
+"""Options of `spackle predict`, `render`, `export`, `view`, `serve` and `demo`; each imports its work as it runs."""
 
 from __future__ import annotations
 

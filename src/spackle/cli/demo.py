@@ -1,4 +1,4 @@
-"""`spackle demo`: a real photo, completed, and held against the true second photo."""
+"""`spackle demo`: complete a real photo, and compare it with the true second photo."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ MARGIN = 8  # pixels between the pictures of the comparison
 def run_demo(output: Path, reporter: Reporter) -> None:
     """Complete the photo, write scene, video and pictures, and print the comparison with the truth.
 
-    InputError where scikit-image is missing, or `output` cannot be written to.
+    InputError if scikit-image is missing, or `output` cannot be written to.
     """
     pair = load_motorcycle()
     pipeline = Pipeline.open(Options(BaseSettings("rgbd", pair.depth), PathOptions(disparity=DISPARITY, overscan=0)))
@@ -85,7 +85,7 @@ def run_demo(output: Path, reporter: Reporter) -> None:
 
 @torch.no_grad()
 def _compare_truth(prediction: BasePrediction, pair: StereoPair, renderer: Renderer, output: Path) -> dict[str, Any]:
-    """The view of the true right camera against the true right photo, beside 2D inpainting."""
+    """Compare the completed view of the true right camera, and 2D inpainting, with the true right photo."""
     from skimage.restoration import inpaint_biharmonic
 
     camera = pair.right_camera
@@ -134,7 +134,7 @@ def _table(scores: dict[str, Any]) -> Table:
 
 
 def _save_sheet(first: tuple[str, Tensor], rows: list[list[tuple[str, Tensor]]], path: Path) -> None:
-    """One picture on the left, rows of equally large pictures beside it, each with its name."""
+    """Save one picture on the left and rows of equally large pictures beside it, each labelled with its name."""
     height, width = (side + MARGIN for side in rows[0][0][1].shape[:2])
     sheet = Image.new("RGB", ((len(rows[0]) + 1) * width - MARGIN, len(rows) * height - MARGIN), "white")
     draw = ImageDraw.Draw(sheet)

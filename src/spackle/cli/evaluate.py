@@ -22,7 +22,7 @@ from spackle.errors import InputError
 # Of `--disparity 0.3 0.4 0.5` only the first number belongs to the option, see `_sorted_words`.
 EXTRA_WORDS = {"allow_extra_args": True}
 NUMBER = re.compile(r"[\d.,]+")
-UNFIT = re.compile(r"[^\w.-]+")  # in the name of a folder
+UNFIT = re.compile(r"[^\w.-]+")  # characters that a folder's name should not have
 
 # Options that both commands have.
 Limit = Annotated[
@@ -219,13 +219,13 @@ def bench(
 
 
 def _has_disparities(context: typer.Context) -> bool:
-    """Whether --disparity stands on the command line."""
+    """Whether --disparity was given on the command line."""
     source = context.get_parameter_source("disparity")
     return source is not None and source.name == "COMMANDLINE"
 
 
 def _sorted_words(context: typer.Context, folder: Path | None, disparity: str) -> tuple[Path, str]:
-    """The folder, and the disparities with numbers that follow as words; InputError for a word that belongs nowhere."""
+    """The folder, and the disparities with further numbers given as separate words; InputError for any other word."""
     words = [*([] if folder is None else [str(folder)]), *context.args]
     listed = _has_disparities(context)
     others = [word for word in words if not (listed and NUMBER.fullmatch(word))]

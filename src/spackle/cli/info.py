@@ -41,7 +41,7 @@ def is_depth(path: Path) -> bool:
         with Image.open(path) as image:
             return image.mode.startswith("I")
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
-        return False  # what is wrong with it is said where photos are read
+        return False  # the reader of photos reports what is wrong with it
 
 
 def scene_facts(path: Path) -> Facts:

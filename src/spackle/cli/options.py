@@ -17,7 +17,7 @@ if TYPE_CHECKING:  # torch takes seconds to load
 
 INTERRUPTED = 130  # what shells report of a command that Ctrl-C ended
 
-# As `TrajectoryKind` has them; names are normalised, so that rotate_forward is taken, too.
+# The names of `TrajectoryKind`; underscores are accepted, too: rotate_forward.
 SharpTrajectoryName = Literal["swipe", "shake", "rotate", "rotate-forward"]
 TrajectoryName = Literal[SharpTrajectoryName, "vertical", "orbit", "dolly-zoom"]
 PrecisionName = Literal["auto", "fp32", "bf16"]
@@ -75,7 +75,7 @@ HelpAllOption = Annotated[
 
 
 def sharp_speed(words: Sequence[str] | None) -> dict[str, Any]:
-    """`windows` and `compiled` of `BaseSettings` by what --sharp says; InputError for anything else."""
+    """`windows` and `compiled` of `BaseSettings` from the values of --sharp; InputError for other values."""
     speed: dict[str, Any] = {}
     for word in words or ():
         key, _, value = word.partition("=")
@@ -175,7 +175,7 @@ def path_options(
     """The options of camera path and video, as one value.
 
     Raises:
-        InputError: --path or --cameras gives other views, to which an option would mean nothing.
+        InputError: an option would have no effect, because --path or --cameras sets the views.
     """
     from spackle.camera_path import OVERSCAN
     from spackle.video_frames import VideoOptions, parse_size
@@ -199,7 +199,7 @@ def path_options(
 
 
 def with_path_options(command: Callable[..., None]) -> Callable[..., None]:
-    """The command with the options of `path_options` as its one parameter `path`, and --help-all."""
+    """Add --help-all and the options of `path_options`, which the command gets as its one parameter `path`."""
     declared, shared = (
         inspect.signature(function, eval_str=True, locals={"PathOptions": object}).parameters
         for function in (command, path_options)

@@ -21,14 +21,14 @@ class PredictOptions:
     render: bool = True  # write a video
     keep_base: bool = False  # write base.ply
     depth_out: str | None = None  # write the photo's depth, under this name
-    keep_frame: bool = False  # a uniform frame around a photo is part of it
-    overwrite: bool = False  # of many photos, do again what is done already
+    keep_frame: bool = False  # keep a uniform frame around a photo
+    overwrite: bool = False  # of several photos, redo those that are done
     workers: int = 1  # processes that share the photos
-    threads: int | None = None  # of each
-    ray: str | None = None  # the cluster where they are; this machine where None
+    threads: int | None = None  # of each worker
+    ray: str | None = None  # address of the cluster that runs the workers; None: this machine
 
     def open(self) -> Pipeline:
-        """What all photos share; InputError for an option that cannot be used, whatever the photo."""
+        """Open the pipeline for all photos; InputError for an option that cannot be used with any photo."""
         if self.depth_out is not None:
             check_depth_name(self.depth_out)
             if Path(self.depth_out).name != self.depth_out:

@@ -44,8 +44,8 @@ from spackle.surface import surface_gaussians
 from spackle.weights import installed, weights_digest
 from spackle.workers import Workers, at_work, cluster, threads_of_torch
 
-THREADS_ON_RAY = 2  # of a worker
-SIDE = 64  # pixels of the picture that the second process of a first use completes
+THREADS_ON_RAY = 2  # of each worker
+SIDE = 64  # side in pixels of the picture that `compile_kernels` completes
 
 
 class NamedPhoto(NamedTuple):
@@ -101,9 +101,9 @@ def predict_all(given: Sequence[Path], output: Path, options: PredictOptions, re
 
 
 def find_photos(given: Sequence[Path]) -> list[NamedPhoto]:
-    """Photos, and those of folders by name, each with the name of its results.
+    """The given photos, and the photos in given folders sorted by name, each with the name of its results.
 
-    A name that is no file may be a pattern, where no shell has resolved it. InputError for a folder without photos,
+    A name that is not a file may be a pattern that no shell has expanded. InputError for a folder without photos,
     and for two photos whose results would have the same name.
     """
     photos: list[Path] = []
@@ -145,9 +145,9 @@ def _predict_by_workers(
     total: int,
     reporter: Reporter,
 ) -> int:
-    """Number of photos that failed; the lines about a photo are printed once it is done.
+    """Predict photos by workers; returns how many failed. Messages about a photo are printed once it is done.
 
-    KeyboardInterrupt once the photos at work are done, where Ctrl-C or SIGTERM came.
+    If Ctrl-C or SIGTERM came, raises KeyboardInterrupt once the photos in progress are done.
     """
     if not left:
         return 0
@@ -172,7 +172,7 @@ def _predict_by_workers(
 
 
 class Predicted(NamedTuple):
-    """The result of a photo that a worker did."""
+    """A worker's result for a photo."""
 
     photo: str
     failed: bool
@@ -186,7 +186,7 @@ class Predictor:
     output: Path
     options: PredictOptions
     shared: str  # the main process's digest of what all photos share
-    single: bool  # there is one photo: it is done again, and its error is the command's
+    single: bool  # there is one photo: it is always redone, and its error ends the command
     pipeline: Pipeline
     verbose: bool
 
@@ -206,8 +206,8 @@ class Predictor:
         return {"spackle": spackle.__version__, **{kind: weights_digest(file) for kind, file in files.items()}}
 
     def inputs(self, photo: NamedPhoto) -> str:
-        """The digest of `request`, without an error if a file is missing."""
-        with contextlib.suppress(InputError):  # `predict` names it
+        """The digest of `request`; "none" if a file is missing."""
+        with contextlib.suppress(InputError):  # `predict` reports the error
             return self.request(photo)
         return "none"
 
@@ -271,8 +271,8 @@ def _shared_digest(options: PredictOptions, pipeline: Pipeline) -> str:
     file.
     """
     base, path, fill = options.scene.base, options.scene.path, options.scene.fill
-    name = base.named if base.folder is None else "hf"  # its files tell, wherever they lie
-    # Windows and compilation change last bits alone.
+    name = base.named if base.folder is None else "hf"  # the digests of its files identify it, wherever they lie
+    # Windows and compilation change only the last bits of results.
     base = dataclasses.replace(base, name=name, depth=None, calib=None, checkpoint=None, windows=None, compiled=False)
     path = dataclasses.replace(path, cameras=None, path=None)
     choices: list[object] = [dataclasses.asdict(base), dataclasses.asdict(path), fill.weights, fill.texture, fill.mode]
@@ -282,7 +282,7 @@ def _shared_digest(options: PredictOptions, pipeline: Pipeline) -> str:
 
 
 def _shared_files(options: Options) -> dict[str, Path]:
-    """The files that all photos share besides the base's, by what they are."""
+    """The files, apart from the base's, that all photos share, by kind."""
     path, fill = options.path, options.fill
     files = {"calibration": options.base.calib, "camera file": path.cameras, "path file": path.path}
     files |= {"weights": fill.file, "LaMa": installed("lama") if fill.texture == "lama" else None}

@@ -33,14 +33,14 @@ from spackle.scene import DEFAULT_SIZE, Scene
 from spackle.video_frames import FrameMaker, video_problem
 from spackle.views import PathOptions
 
-TOLERATED = 0.01  # fraction of a frame that may be holes without a line about it
+TOLERATED = 0.01  # fraction of a frame that may be holes before the log mentions it
 PAGE: dict[str, Encoder] = {".html": lambda scene: single_html(page_of(Scene.of_file(scene), scene.path))}
 
 
 def render_scene(
     scene: Path, output: Path, path: PathOptions, lens: Mapping[str, float | None], device: str, reporter: Reporter
 ) -> None:
-    """Draw a scene along a path: the video `output`, or in the folder `output` STEM.mp4 (with --cameras also PNGs).
+    """Render a scene along a path to the video `output`, or to STEM.mp4 (with --cameras also PNGs) in folder `output`.
 
     `lens` replaces the stored one: focal_px, in pixels of the video, or fov. InputError for a file or option that
     cannot be used.
@@ -64,7 +64,7 @@ def render_scene(
         gaussians, reach, base_count = loaded.gaussians, loaded.disparity, loaded.base_count
         if compare and (base_count is None or base_count >= len(gaussians)):
             raise InputError(f"{scene}: --compare needs a completed scene, such as the scene.ply of `spackle predict`")
-        base = gaussians.select(slice(0, base_count))  # whose depths set how far a path goes, as for `spackle predict`
+        base = gaussians.select(slice(0, base_count))  # its depths set how far a path goes, as for `spackle predict`
         parts = [base, gaussians] if compare else [gaussians]
         if given:
             cameras = given
@@ -133,7 +133,7 @@ def render_scene(
 
 
 def _photo_camera(file: SceneFile, size: tuple[int, int] | None, lens: Mapping[str, float | None]) -> Camera:
-    """The stored camera; another lens where one is given, and one of 30 mm where none is stored."""
+    """The stored camera; a given lens replaces the stored one, and 30 mm a missing one."""
     stored = file.camera
     if stored is not None and all(value is None for value in lens.values()):
         return stored
@@ -187,9 +187,9 @@ def _report_file(scene: SceneFile, output: Path, seconds: float, reporter: Repor
 
 
 def page_of(scene: Scene, path: Path) -> PageScene:
-    """The scene of a file for the page; InputError, naming the file, if it cannot be seen.
+    """The scene of a file for the page; InputError, naming the file, if it cannot be rendered.
 
-    A scene's name: its folder's if its file is called like all scenes' files, else its file's.
+    The page shows the folder's name for a file called scene.ply or base.ply, else the file's own name.
     """
     place = path.absolute()
     name = place.parent.name if place.name in ("scene.ply", "base.ply") and place.parent.name else place.stem

@@ -1,4 +1,4 @@
-"""`spackle view` and `spackle serve`: the app on this machine, with a photo or a scene in it, or for programs."""
+"""`spackle view` and `spackle serve`: run the app on this machine, to show a scene or photo, or for programs."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Place(NamedTuple):
     host: str
     port: int  # 0: any that is free
     token: str | None
-    browser: bool  # opens the page
+    browser: bool  # whether to open the page in one
 
 
 def view(
@@ -52,7 +52,7 @@ def view(
     place: Place,
     reporter: Reporter,
 ) -> None:
-    """Show a scene or a photo, or an empty page, until somebody stops it.
+    """Show a scene or a photo, or an empty page, until the user stops it.
 
     Depth, calibration and `lens` (`focal_px` and `fov`) belong to that photo alone; `usual` (disparity, keep_frame,
     depth_kind) holds for all photos that the page sends. Scenes live until this returns. InputError for a file that is
@@ -98,7 +98,7 @@ def checked(
 
 
 def serve(folder: Path, work: SceneWork, workers: int, keep: Keep, place: Place, reporter: Reporter) -> None:
-    """Complete photos for programs until somebody stops it; InputError for an option that cannot be used."""
+    """Complete photos for programs until the user stops it; InputError for an option that cannot be used."""
     work.base.check()
     with listening(folder, work, workers, keep, place, reporter) as (_, urls):
         reporter.log(f"token: {place.token}, as `Authorization: Bearer TOKEN` or in the page's address")
@@ -109,7 +109,7 @@ def serve(folder: Path, work: SceneWork, workers: int, keep: Keep, place: Place,
 def listening(
     folder: Path, work: SceneWork, workers: int, keep: Keep, place: Place, reporter: Reporter
 ) -> Iterator[tuple[Jobs, list[str]]]:
-    """Yields the app's jobs and the page's addresses, and then answers there until Ctrl-C or SIGTERM."""
+    """Yields the app's jobs and the page's addresses, and then answers requests until Ctrl-C or SIGTERM."""
     with asked_to_stop(alone=True) as stopped, listener_at(place.host, place.port) as listener, told_to(reporter):
         address, port = listener.getsockname()[:2]
         access = Access.at(place.host, address, place.token)
@@ -165,12 +165,12 @@ def announce(name: str, urls: list[str], place: Place, reporter: Reporter) -> No
         reporter.log(f"{name}: from other machines {urls[1]}")
     reporter.log(f"{name}: {urls[0]} (Ctrl-C ends)")
     reporter.result({"url": urls[0]})
-    # A browser of text would take the terminal away.
+    # A text browser would take over the terminal.
     screen = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"))
     if place.browser and sys.platform.startswith("linux") and not screen:
         reporter.log("no screen here: open that page yourself; from another machine through `ssh -L`")
     elif place.browser:
-        # Some browsers come back only when they are closed.
+        # Some browsers return only when they are closed.
         threading.Thread(target=webbrowser.open, args=(urls[0],), daemon=True, name="browser").start()
 
 
@@ -179,6 +179,6 @@ def address_in_network(host: str) -> str:
     if host not in ("0.0.0.0", "::", ""):
         return host
     with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.connect(("192.0.2.1", 9))  # an address of documentation: asking for the way there sends nothing
+        probe.connect(("192.0.2.1", 9))  # reserved for documentation; a UDP connect sends nothing
         return str(probe.getsockname()[0])
     return socket.gethostname()  # no network

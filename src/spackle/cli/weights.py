@@ -58,7 +58,7 @@ def weights_get(
 
 
 def _fetch(entry: PublishedWeights, url: str, path: Path, reporter: Reporter) -> None:
-    """Download weights; says whose they are once the first bytes come."""
+    """Download weights; prints their licence notice once the first bytes arrive."""
     from urllib.parse import urlsplit
 
     from spackle.weights.download import check_url, download
@@ -71,7 +71,7 @@ def _fetch(entry: PublishedWeights, url: str, path: Path, reporter: Reporter) ->
     with reporter.transfer(entry.name) as step:
 
         def advance(done: int, total: int) -> None:
-            for line in notice:  # once, and not before: where nothing comes, nothing needs a licence
+            for line in notice:  # once, when bytes arrive: without a download no licence applies
                 reporter.log(line)
             step(done, total)
 
@@ -138,7 +138,7 @@ def deterministic_weights(shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Te
 
 
 def lama_weights(*size: int) -> dict[str, Tensor]:
-    """`deterministic_weights` of LaMa's generator, of another width and depth where given; variances around one."""
+    """`deterministic_weights` for LaMa's generator, of the given width and depth if any; variances are around one."""
     from spackle.inpaint.lama import expected_shapes
 
     made = deterministic_weights(expected_shapes(*size))
@@ -156,7 +156,7 @@ def weights_list(as_json: JsonOption = False) -> None:
     reporter, folder = Reporter(as_json=as_json), weights_folder()
     for entry in PUBLISHED.values():
         file, state = folder / entry.file, "not here"
-        if os.path.isfile(file):  # its size alone is checked, which takes no time
+        if os.path.isfile(file):  # only its size is checked, which takes no time
             size = os.path.getsize(file)
             state = "whole" if size == entry.bytes else f"damaged, or your own: {size:,} bytes"
         facts = {"name": entry.name, "state": state, "file": file, "bytes": entry.bytes, "licence": entry.licence}

@@ -34,13 +34,13 @@ from spackle.web.work import PREVIEW, Download, FileName, SceneOptions, SceneWor
 
 PagePart = Literal["page.json", "base.splats", "aux.splats", "photo.jpg"]  # what the page draws
 SCENES = "/api/v1/scenes"
-FILES = [PREVIEW, *get_args(Download), *get_args(Video)]  # that a state lists
-DEPTH_SUFFIXES = (".npy", ".npz", ".png", ".pfm")  # of a photo, as `spackle predict --depth` takes them
-PACE_S = 0.1  # between two looks of a listener
+FILES = [PREVIEW, *get_args(Download), *get_args(Video)]  # files that a state lists
+DEPTH_SUFFIXES = (".npy", ".npz", ".png", ".pfm")  # of depth maps, as for `spackle predict --depth`
+PACE_S = 0.1  # seconds between two looks for news for a listener
 WORK, KEEP, LIMITS = SceneWork(), Keep(), Limits()
-MAX_NAME = 80  # characters that are shown
+MAX_NAME = 80  # characters of a name that are shown
 FILE = {"type": "string", "format": "binary"}
-UPLOAD: dict[str, Any] = {  # by hand: FastAPI would read a form that it knows before there is a place for the photo
+UPLOAD: dict[str, Any] = {  # by hand: FastAPI would read a declared form before the photo has its place
     "schema": {
         "type": "object",
         "required": ["photo"],
@@ -63,13 +63,13 @@ def create_app(
     access: Access | None = None,
     limits: Limits = LIMITS,
 ) -> FastAPI:
-    """An app for a server, or to mount in another app, which then says who may ask.
+    """An app for a server, or to mount in another app, which then controls access.
 
     Its processes start at once and end with the app; if another app mounts it, call `app.state.jobs.close()` at the
     end. Unfinished photos resume when an app next opens the folder.
 
     Args:
-        folder: for photos and scenes; InputError where another server uses it.
+        folder: for photos and scenes; InputError if another server uses it.
         work: the function of a worker process for a photo.
         workers: number of processes, each of which holds the base's network.
         keep: limits of the folder: age and size of scenes, and the number of waiting photos.
@@ -95,7 +95,7 @@ def create_app(
     )
     app.state.jobs = jobs
     app.add_middleware(Guard, access=access, limits=limits)
-    decoding = asyncio.Lock()  # a large photo takes a gigabyte
+    decoding = asyncio.Lock()  # one photo at a time: a large one takes a gigabyte
 
     def with_files(job: Job) -> SceneState:
         names = {name for folder in (job.folder, job.results) if folder.is_dir() for name in os.listdir(folder)}

@@ -1,7 +1,7 @@
 """The outermost layer of the app: checks access, and limits what a client may use.
 
-A page of a stranger can make a browser send requests to this machine, and by DNS rebinding even under the stranger's
-own name. Such a request is recognised by its Host, Origin or Sec-Fetch-Site header.
+A stranger's page can make a browser send requests to this machine, with DNS rebinding even under the stranger's own
+host name. Such a request is recognised by its Host, Origin or Sec-Fetch-Site header.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from spackle.errors import one_line
 LOG = logging.getLogger("spackle.web")
 HOST = re.compile(r"(\[[0-9a-f:.%]+\]|[0-9a-z._-]+)(?::\d{1,5})?", re.IGNORECASE)
 OWN_SITES = {"same-origin", "none"}  # none: typed by a person, or a bookmark
-# The page has its scripts and styles from us alone, sends nothing elsewhere and stands in no other page's frame.
+# The page loads scripts and styles from this server only, sends nothing elsewhere, and no page can frame it.
 HEADERS = {
     "Cache-Control": "no-store",  # a photo is private
     "Content-Security-Policy": "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; style-src 'self'; "
@@ -42,7 +42,7 @@ HEADERS = {
 class Limits(NamedTuple):
     """Limits for a client; times in seconds."""
 
-    upload: float = 300  # all of an upload
+    upload: float = 300  # for a whole upload
     send: float = 20  # for a piece of an answer: a client that never reads must not keep a file open
     upload_bytes: int = 200_000_000  # photo and depth map
 
@@ -50,9 +50,9 @@ class Limits(NamedTuple):
 class Access(NamedTuple):
     """Access rules of a stand-alone server; a mounted app leaves access to the app that mounts it."""
 
-    token: str | None  # as the first part of the path, or as Bearer; without one nothing is written
-    names: frozenset[str] = frozenset({"localhost"})  # hosts, besides numeric addresses, which cannot be rebound
-    local: bool = True  # for this machine alone
+    token: str | None  # first part of the path, or Bearer; without a token no photo is accepted
+    names: frozenset[str] = frozenset({"localhost"})  # accepted hosts; numeric ones cannot be rebound
+    local: bool = True  # only this machine can connect
 
     @staticmethod
     def at(host: str, address: str, token: str | None) -> Access:
@@ -69,7 +69,7 @@ class Access(NamedTuple):
         match = HOST.fullmatch(hosts[0].strip()) if len(hosts) == 1 else None
         if match is None or not self._is_own(match[1].lower()):
             raise HTTPException(403, "this server does not go by that Host name")
-        ours = {f"{scheme}://{hosts[0].strip().lower()}" for scheme in ("http", "https")}  # https: by a tunnel
+        ours = {f"{scheme}://{hosts[0].strip().lower()}" for scheme in ("http", "https")}  # https: through a tunnel
         sites = {site.strip().lower() for site in headers.getlist("sec-fetch-site")}
         if not {origin.strip().lower() for origin in headers.getlist("origin")} <= ours or not sites <= OWN_SITES:
             raise HTTPException(403, "asked by a page of another site")

@@ -1,4 +1,4 @@
-"""Jobs: photos that become scenes, one for each worker process at a time, in a folder that survives the server."""
+"""Jobs: photos that become scenes, one at a time in each worker process; their folder outlives the server."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from spackle.folders import results_folder
 from spackle.task_process import DIED, Event, TaskProcess, Work
 
 LOG = logging.getLogger("spackle.web")
-RECORD, NEW = "job.json", ".new-"  # a job's own file; how folders of uploads begin that are not whole yet
-ATTEMPTS = 2  # runs that a job may begin: one that takes the server down with it must not do so for ever
+RECORD, NEW = "job.json", ".new-"  # a job's own file; prefix of the folders of incomplete uploads
+ATTEMPTS = 2  # times that a job may start: one that brings the server down must not do so for ever
 ENDED_TWICE = "the server ended twice while it worked on this photo"
-LOOK_S = 60.0  # between two looks for results that are too old
+LOOK_S = 60.0  # seconds between two looks for results that are too old
 
 
 class Keep(NamedTuple):
@@ -75,7 +75,7 @@ class Jobs:
     A `Job` is immutable: each change replaces it by a new one.
 
     Args:
-        folder: holds a folder for each job; InputError where another server uses it.
+        folder: holds a folder for each job; InputError if another server uses it.
         work: takes (job, file) and reports {stage, done, total} or {line}. Without a file it makes a scene of a photo;
             with one it adds that file to a scene that is done.
         workers: number of processes for photos; one more adds files.
@@ -134,12 +134,12 @@ class Jobs:
             folder.mkdir()
             yield folder
         finally:
-            shutil.rmtree(folder, ignore_errors=True)  # it has another name where it was added
+            shutil.rmtree(folder, ignore_errors=True)  # `add` has renamed it if the photo was accepted
             with self._lock:
                 self._receiving -= 1
 
     def add(self, folder: Path, name: str, source: str, depth: str | None, options: dict[str, Any]) -> Job:
-        """Add the job of a photo in a folder of `place`; `source` and `depth` may lie elsewhere."""
+        """Add a job for a photo in a folder that `place` yielded; `source` and `depth` may lie elsewhere."""
         id = folder.name.removeprefix(NEW)
         job = Job(id=id, name=name, source=source, depth=depth, options=options, folder=folder)
         job.save()
@@ -196,7 +196,7 @@ class Jobs:
         except (OSError, InputError) as problem:
             error = f"{job.name}: cannot be kept here: {reason_in_a_line(problem)}"
         if error == DIED:
-            self._closed.wait(1)  # who ends all processes of a service may have met this one before us
+            self._closed.wait(1)  # the end of a whole service may reach this process before us
         self._running.pop(id, None)
         if not self._closed.is_set():
             self._pace = time.monotonic() - start
@@ -228,11 +228,11 @@ class Jobs:
 
     def _tidy_until_closed(self) -> None:
         while not self._closed.wait(LOOK_S):
-            with contextlib.suppress(OSError):  # a file that is written just now
+            with contextlib.suppress(OSError):  # a file is being written
                 self.tidy()
 
     def tidy(self) -> None:
-        """Remove what is too old, and the oldest while the folder is too large."""
+        """Remove jobs that are too old, and the oldest jobs while the folder is too large."""
         ended = [
             (job.ended, sum(file.stat().st_size for file in job.folder.rglob("*")), job.id)
             for job in [*self._jobs.values()]

@@ -40,9 +40,9 @@ Video = Literal[
     "dolly-zoom.mp4",
 ]  # fmt: skip
 FileName = Download | Video
-MADE: list[FileName] = ["scene.ply", "scene.spz", "scene.glb", "scene.html", "video.mp4", "report.json"]  # as usual
-PAGE, PREVIEW, SIDE = "page.json", "photo.jpg", 1280  # pixels of the long side of what stands for the photo
-# What Pillow may find in a file, whatever its name says: it knows formats that are read by other programs, too.
+MADE: list[FileName] = ["scene.ply", "scene.spz", "scene.glb", "scene.html", "video.mp4", "report.json"]  # by default
+PAGE, PREVIEW, SIDE = "page.json", "photo.jpg", 1280  # pixels of the preview's long side
+# The formats that Pillow may decode, whatever a file's name says: for some others it would start other programs.
 FORMATS = frozenset({"JPEG", "MPO", "PNG", "WEBP", "HEIF", "TIFF"})
 
 
@@ -71,7 +71,7 @@ class SceneWork:
     """The worker's function, which keeps the last base loaded."""
 
     base: BaseSettings = dataclasses.field(default_factory=BaseSettings)
-    usual: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # options of jobs that do not say otherwise
+    usual: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # default options of jobs
     verbose: bool = False
     opened: Pipeline | None = None
 
@@ -81,7 +81,7 @@ class SceneWork:
         return list(dict.fromkeys([self.base.name, AUTO, *BaseSettings().files]))
 
     def __call__(self, task: tuple[Job, str | None], tell: Tell) -> None:
-        """InputError for a photo, a depth map or a scene that cannot be used; no line of it holds a path of ours."""
+        """Do a task; InputError, without any path of this server, for a photo, depth map or scene that is unusable."""
         job, file = task
         options, teller = SceneOptions.model_validate({**self.usual, **job.options}), Teller(job, tell, self.verbose)
         ply, source, note = job.results / "scene.ply", job.folder / job.source, ""
@@ -116,7 +116,7 @@ class SceneWork:
         path = PathOptions(options.trajectory, options.disparity, frames=options.frames)
         chosen = Options(settings, path, FillOptions(fill=options.fill))
         if self.opened is None or self.opened.options.base != settings:
-            self.opened = None  # before another network is loaded
+            self.opened = None  # frees it before another network is loaded
             self.opened = Pipeline.open(chosen)
         pipeline = dataclasses.replace(self.opened, options=chosen)
         lens = options.model_dump(include={"focal_px", "focal_mm", "fov"})

@@ -29,7 +29,7 @@ class PublishedWeights:
     sha256: str  # 64 hexadecimal digits
     licence: str  # in a few words
     notice: Sequence[str]  # lines that a person sees before the download
-    option: str  # that names a copy elsewhere
+    option: str  # the option that names a copy in another place
 
     @property
     def address(self) -> str:
@@ -43,15 +43,15 @@ PUBLISHED = {name: PublishedWeights(name, **facts) for name, facts in _FACTS.ite
 
 
 def published_weights(name: str) -> PublishedWeights:
-    """The entry of that name; InputError where there is none."""
+    """The entry of that name; InputError if there is none."""
     check_name("weights", name, PUBLISHED)
     return PUBLISHED[name]
 
 
 def weights_folder() -> Path:
-    """Where downloaded weights lie: $SPACKLE_WEIGHTS, else spackle/weights in $XDG_CACHE_HOME or ~/.cache.
+    """The folder for downloaded weights: $SPACKLE_WEIGHTS, else spackle/weights in $XDG_CACHE_HOME or ~/.cache.
 
-    InputError where none is set, and there is no home.
+    InputError if neither variable is set and the user has no home folder.
     """
     with reading("downloaded weights", "there is no home folder for them: name one in SPACKLE_WEIGHTS", RuntimeError):
         if chosen := os.environ.get("SPACKLE_WEIGHTS"):
@@ -61,7 +61,7 @@ def weights_folder() -> Path:
 
 
 def installed(name: str) -> Path | None:
-    """The file of published weights in the folder of weights; None where it is not there."""
+    """The file of published weights in `weights_folder`; None if it is not there."""
     path = weights_folder() / published_weights(name).file
     return path if os.path.isfile(path) else None
 
@@ -90,13 +90,13 @@ def weights_digest(path: Path) -> str:
 
 
 def weights_digests(files: Mapping[str, Path]) -> str | dict[str, str] | None:
-    """`weights_digest` of a network's files: one digest, a dict by names for several files, None for none."""
+    """`weights_digest` of a network's files: a digest for one file, a dict by name for several, None without files."""
     digests = {name: weights_digest(file) for name, file in files.items()}
     return digests if len(digests) > 1 else next(iter(digests.values()), None)
 
 
 def file_digest(path: Path) -> str:
-    """SHA-256 of a file of weights, as 64 hexadecimal digits; InputError where it cannot be read."""
+    """SHA-256 of a file of weights, as 64 hexadecimal digits; InputError if it cannot be read."""
     check_file(path, "file of weights")
     with open(path, "rb") as file:
         return sha256_of(file)

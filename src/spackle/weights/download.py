@@ -20,7 +20,7 @@ from spackle.folders import hold
 
 TIMEOUT = 30.0  # seconds without a byte
 PAUSES = (1.0, 2.0, 4.0, 8.0)  # seconds before each further try of a connection that broke
-CHUNK = 1 << 18  # bytes at most that are taken at once
+CHUNK = 1 << 18  # most bytes that are read at once
 
 Progress = Callable[[int, int], None]  # (bytes done, of how many)
 
@@ -44,7 +44,7 @@ def download(url: str, path: str | os.PathLike[str], size: int, sha256: str, pro
     part, lock = (target.with_name(target.name + suffix) for suffix in (".part", ".lock"))
     try:
         with hold(lock):
-            for continued in (part.exists(), False):  # what an earlier call left may be of another file
+            for continued in (part.exists(), False):  # the part of an earlier call may be of another file
                 _receive(url, part, size, progress or (lambda done, total: None))
                 with open(part, "rb") as file:
                     found = sha256_of(file)
@@ -62,7 +62,7 @@ def download(url: str, path: str | os.PathLike[str], size: int, sha256: str, pro
 
 
 def check_url(url: str) -> None:
-    """InputError for anything but http:// and https://, such as file://, and for a password in it."""
+    """InputError unless `url` begins with http:// or https:// and has no password."""
     with contextlib.suppress(ValueError):  # a port that is no number
         parts = urlsplit(url)
         good = parts.scheme in ("http", "https") and parts.hostname and parts.port != 0
@@ -77,7 +77,7 @@ def check_url(url: str) -> None:
 
 
 def _receive(url: str, part: Path, size: int, progress: Progress) -> None:
-    """Complete `part` to `size` bytes; a broken connection is retried, one that could not be opened is not.
+    """Complete `part` to `size` bytes; retries a connection that broke, but not one that could not be opened.
 
     Raises:
         InputError: the file cannot be fetched; the received bytes stay in `part`.
@@ -100,7 +100,7 @@ def _size(part: Path) -> int:
 
 
 def _receive_rest(url: str, part: Path, size: int, progress: Progress) -> None:
-    """Request the missing rest of `part`, through the environment's proxies (https_proxy, no_proxy) and redirects."""
+    """Request the missing rest of `part`; follows redirects and the settings https_proxy and no_proxy."""
     there = _size(part)
     headers = {"User-Agent": "spackle", "Accept-Encoding": "identity"}
     if 0 < there < size:
@@ -110,7 +110,7 @@ def _receive_rest(url: str, part: Path, size: int, progress: Progress) -> None:
     with response:
         done = _first_byte(url, response, there, size)
         usage = shutil.disk_usage(part.parent)
-        if usage.total and (free := usage.free + there) < size:  # some network folders say 0 of 0
+        if usage.total and (free := usage.free + there) < size:  # some network folders report 0 bytes
             gigabytes = f"{size / 1e9:.1f} GB are needed, {free / 1e9:.1f} GB are free"
             raise InputError(f"{part.parent}: {gigabytes}: make room or choose another folder")
         with open(part, "ab") as file:
@@ -118,14 +118,14 @@ def _receive_rest(url: str, part: Path, size: int, progress: Progress) -> None:
             progress(done, size)
             while done < size:
                 with _network(url):
-                    block = response.read1(min(CHUNK, size - done))  # what is there: read() would lose it at a break
+                    block = response.read1(min(CHUNK, size - done))  # read() would lose what arrived before a break
                 if not block:
                     raise Dropped(f"the connection ended {size - done:,} bytes early")
                 file.write(block)
                 file.flush()
                 done += len(block)
                 progress(done, size)
-            os.fsync(file.fileno())  # the file's name will promise that it is whole
+            os.fsync(file.fileno())  # before the rename says that it is complete
 
 
 @contextlib.contextmanager
@@ -147,7 +147,7 @@ def _network(url: str) -> Iterator[None]:
 def _first_byte(url: str, response: HTTPResponse, there: int, size: int) -> int:
     """The offset at which an answer begins: after the existing bytes, or 0 if the server sends the whole file.
 
-    InputError where it is no file, or not one of `size` bytes.
+    InputError if the answer is not a file, or not one of `size` bytes.
     """
     rest = re.fullmatch(r"bytes (\d+)-\d+/(\d+)", response.headers["Content-Range"] or "")
     if response.status == 206 and rest and int(rest[1]) == there:
