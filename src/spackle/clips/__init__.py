@@ -1,1 +1,1 @@
-"""What only clips need: reading and writing, flow from frame to frame, aligned depth, colours that do not flicker."""
+"""Clips: reading and writing, flow from frame to frame, aligned depth, colours that do not flicker."""

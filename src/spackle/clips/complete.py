@@ -1,4 +1,4 @@
-"""A clip's frames in their order: each one's view completed, with the depth and the colours of the frame before."""
+"""Complete the view of each of a clip's frames in order, consistent with the depth and colours of the frame before."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from spackle.render.protocol import Rendering
 from spackle.residual import ResidualNet, hole_mask
 from spackle.scene_fill import FillContext, OcclusionGuard, fill_view
 
-FOLLOW = 0.05  # of the way to a new frame's depths, that is how far the path's go: a second or so to arrive
+FOLLOW = 0.05  # each frame moves the path's depths by this part towards the frame's own: they arrive in about a second
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,10 +39,10 @@ class CompletedView:
     camera: Camera
     gaussians: tuple[Gaussians, Gaussians]  # the base's, and aux
     view: Rendering  # of all of them
-    before: Rendering  # of the base's
+    before: Rendering  # of the base's alone
     alone: Rendering  # completed without the past
-    cut: bool = False  # nothing of the frame before was found again
-    flicker: dict[str, float] = dataclasses.field(default_factory=dict)  # what can be told of FIGURES
+    cut: bool = False  # whether the frame before belongs to another shot
+    flicker: dict[str, float] = dataclasses.field(default_factory=dict)  # those of FIGURES that are known
 
     @property
     def hole(self) -> Tensor:
@@ -50,38 +50,38 @@ class CompletedView:
         return hole_mask(self.before.alpha)
 
 
-# Mean change from the frame before along the motion found, in sRGB of 0..1: of what both frames show, and of holes in
-# both, completed each frame by itself and as drawn.
+# Mean change from the frame before, along the motion found, in sRGB of 0..1: of pixels that both bases cover ("seen"),
+# and of pixels that are holes in both, each frame completed by itself ("alone") or as finally drawn ("carried").
 FIGURES = ("seen", "alone", "carried")
 
 
 @dataclasses.dataclass(frozen=True)
 class _Past:
-    """What is kept of a frame for the next one."""
+    """The state that a frame leaves for the next one."""
 
     rgb: Tensor  # [H, W, 3] the input
-    inverse_depth: Tensor  # [H, W] as the base said it, 0 where unknown
+    inverse_depth: Tensor  # [H, W] as the base predicted it, 0 where unknown
     alignment: DepthAlignment
-    depths: DepthRange  # of the path
+    depths: DepthRange  # the path's
     memory: FrameMemory | None = None
     drawn: CompletedView | None = None
 
 
 @dataclasses.dataclass
 class ClipCompleter:
-    """Takes the frames in their order and completes the view of each; one frame is kept in memory."""
+    """Takes the frames in order and completes the view of each; only the last frame is kept in memory."""
 
     trajectory: TrajectoryKind
-    disparity: float | None  # as the base has it where None
-    frames: int  # of the clip, and so of the path
+    disparity: float | None  # None: the base's own
+    frames: int  # number of frames in the clip, and so on the path
     renderer: Renderer
     flow: Flow
     align: bool = True  # align the base's depth with that of the frame before
     fill: bool = True  # fill holes
     network: ResidualNet | None = None
     precision: Precision = "auto"
-    overscan: float = 0.0  # by which share the lens is longer than the photo's
-    seconds: dict[str, float] = dataclasses.field(default_factory=dict)  # spent on each stage
+    overscan: float = 0.0  # fraction by which the focal length is longer than the photo's
+    seconds: dict[str, float] = dataclasses.field(default_factory=dict)  # time spent on each stage
     _past: _Past | None = None
     _count: int = 0
 
@@ -89,7 +89,7 @@ class ClipCompleter:
     def add(self, rgb: Tensor, prediction: BasePrediction) -> CompletedView:
         """Complete the next frame: `rgb` [H, W, 3], sRGB at the size of the prediction's camera, and its prediction.
 
-        ValueError where depths and focal length allow no path.
+        ValueError if depths and focal length allow no path.
         """
         with timed("depth", self.seconds):
             base, guard, now, past = self._aligned(rgb, prediction)
@@ -102,7 +102,7 @@ class ClipCompleter:
             alone = before
             if self.fill:
                 parts = (base, prediction.camera, self.renderer, self.network)
-                # Texture is found anew in each frame: it would flicker.
+                # No texture: it would be found anew in each frame, and flicker.
                 context = FillContext(*parts, texture=None, precision=self.precision)
                 filled = fill_view(context, camera, [guard], before)
                 aux, alone = filled.aux, filled.rendering
@@ -122,8 +122,9 @@ class ClipCompleter:
     def _aligned(
         self, rgb: Tensor, prediction: BasePrediction
     ) -> tuple[Gaussians, OcclusionGuard, _Past, _Past | None]:
-        """The base with its depth aligned to the past, the frame's occlusion guard, the state to keep, and the shot's
-        past.
+        """Align the base's depth to the past.
+
+        Returns the aligned base, the frame's occlusion guard, the state to keep, and the past; None after a cut.
         """
         seen = self.renderer.render(prediction.gaussians, prediction.camera)
         known = ~hole_mask(seen.alpha) & (seen.depth > 0)
@@ -144,7 +145,7 @@ class ClipCompleter:
 
 
 def _flicker(drawn: CompletedView, earlier: CompletedView, flow: Tensor) -> dict[str, float]:
-    """The figures of FIGURES that are known for this clip."""
+    """Those of FIGURES that can be measured between this frame and the one before."""
     hole = drawn.hole
     was = sample(earlier.hole[..., None].float(), pixel_grid(flow) + flow)[..., 0]
     both, neither = hole & (was > 0.999), ~hole & (was < 0.001)

@@ -1,6 +1,6 @@
-"""Clips in: the frames of any video that FFmpeg decodes, upright, in sRGB, with their times.
+"""Read the frames of any video that FFmpeg decodes, upright, in sRGB, with their times; and write clips.
 
-And clips out: H.264 with the times of another clip's frames, and its sound.
+A written clip is H.264, with the frame times and the sound of the clip that it was made from.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from spackle.image import check_pixels
 SUFFIXES = {".mp4", ".m4v", ".mov", ".webm", ".mkv", ".avi", ".gif", ".mpg", ".mpeg", ".ts", ".mts", ".m2ts", ".wmv"}
 SUFFIXES |= {".flv", ".3gp", ".ogv"}
 UNSPECIFIED, BT601 = 2, 5  # FFmpeg's numbers of matrices
-HD_ROWS = 720  # a video that says nothing of its colours has BT.709's from this height on, as players take it
-LISTS = {"concat", "dash", "hls", "rtsp", "sdp", "webm_dash_manifest"}  # FFmpeg opens what they name
+HD_ROWS = 720  # a video that does not declare its colours is read as BT.709 from this height on, as players do
+LISTS = {"concat", "dash", "hls", "rtsp", "sdp", "webm_dash_manifest"}  # formats whose files make FFmpeg open others
 HDR = {16: "PQ", 18: "HLG"}  # FFmpeg's numbers of transfers
 DEFAULT_RATE = Fraction(25)
-CLOCK = Fraction(1, 90_000)  # seconds in which times are written
-RATES = (Fraction(1, 1000), Fraction(1000))  # frames a second that an encoder takes
+CLOCK = Fraction(1, 90_000)  # unit of written times, in seconds
+RATES = (Fraction(1, 1000), Fraction(1000))  # lowest and highest frame rate that an encoder takes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,24 +45,24 @@ class Clip:
     path: Path
     width: int  # of an upright frame with square pixels
     height: int
-    times: tuple[Fraction, ...]  # seconds of each frame, the first one's 0, rising
-    start: Fraction  # when the first frame is shown, by the file's clock
-    rate: Fraction  # frames a second, on the mean
-    audio: str | None  # the codec of its sound
-    hdr: str | None  # its transfer, where that is one for brighter screens
+    times: tuple[Fraction, ...]  # each frame's time in seconds, increasing from 0
+    start: Fraction  # the first frame's time by the file's clock
+    rate: Fraction  # mean number of frames a second
+    audio: str | None  # codec of the sound
+    hdr: str | None  # transfer function, if it is an HDR one: "PQ" or "HLG"
 
     def __len__(self) -> int:
         return len(self.times)
 
     @property
     def seconds(self) -> Fraction:
-        """How long it is: the last frame stays as long as the one before it."""
+        """The clip's length: the last frame lasts as long as the one before it."""
         last = self.times[-1] - self.times[-2] if len(self) > 1 else 1 / self.rate
         return self.times[-1] + last
 
 
 def is_clip(path: Path) -> bool:
-    """Whether a name is a video's; a GIF with a single picture is a photo."""
+    """Whether a file is a video, by its suffix; a GIF with a single frame is a photo."""
     if path.suffix.lower() not in SUFFIXES or os.path.isdir(path):
         return False
     if path.suffix.lower() != ".gif":
@@ -72,23 +72,23 @@ def is_clip(path: Path) -> bool:
             pictures = (packet for packet in container.demux(video=0) if packet.size)
             return next(pictures, None) is not None and next(pictures, None) is not None
     except (av.FFmpegError, ValueError, IndexError):
-        return False  # what is wrong with it is said where photos are read
+        return False  # reading it as a photo then reports what is wrong
 
 
 def read_clip(
     path: str | os.PathLike[str], first: int | None = None, progress: Callable[[int, int], None] | None = None
 ) -> Clip:
-    """Decode a clip from beginning to end, so that what is wrong with its last frame is known at once.
+    """Decode a clip from beginning to end, so that damage in any frame is reported at once.
 
-    `first` is how many frames count, all where None; `progress` is called with (frames read, frames that the file says
-    there are). InputError for what is no clip, or cut off, damaged, without a picture, or of unknown coding.
+    Only the first `first` frames are read, all if None. `progress` is called with (frames read, number of frames that
+    the file states). InputError if the file is no clip, cut off, damaged, without video, or of an unknown codec.
     """
     check_file(path, "clip")
     try:
         return _read_clip(path, first, progress)
     except InputError as error:
         line, cause = str(error), error.__cause__
-    # Another error: the first one's traceback holds the decoder, whose threads would stay as long as somebody has it.
+    # A new error: the first one's traceback refers to the decoder, whose threads would live as long as the error.
     raise InputError(line) from (cause and cause.with_traceback(None))
 
 
@@ -116,7 +116,7 @@ def _read_clip(path: str | os.PathLike[str], first: int | None, progress: Callab
 
 
 def clip_frames(clip: Clip) -> Iterator[Tensor]:
-    """The frames of a clip, [H, W, 3] float32 sRGB in 0..1; InputError where the file has changed since it was read."""
+    """The frames of a clip, [H, W, 3] float32 sRGB in 0..1; InputError if the file has become shorter meanwhile."""
     with _opened(clip.path) as (container, stream):
         aspect, count = stream.sample_aspect_ratio or Fraction(1), 0
         reformatter = VideoReformatter()
@@ -129,9 +129,9 @@ def clip_frames(clip: Clip) -> Iterator[Tensor]:
 
 @contextlib.contextmanager
 def _opened(path: str | os.PathLike[str]) -> Iterator[tuple[InputContainer, VideoStream]]:
-    """The file and its moving picture."""
+    """Open a file, and find its video stream."""
     try:
-        container = av.open(str(path), metadata_errors="replace")  # a strict one stays open where it raises
+        container = av.open(str(path), metadata_errors="replace")  # in strict mode, the file stays open after an error
     except (av.FFmpegError, ValueError) as error:
         reason = reason_in_a_line(error)
         raise InputError(f"{path}: not a video, or damaged at its beginning or end ({reason})") from error
@@ -153,7 +153,7 @@ def _opened(path: str | os.PathLike[str]) -> Iterator[tuple[InputContainer, Vide
 def _decoded(
     path: str | os.PathLike[str], container: InputContainer, stream: VideoStream, first: int | None
 ) -> Iterator[av.VideoFrame]:
-    """Decode frames, which must share one size; an error names the frame."""
+    """Decode frames, which must all have the same size; an error names the frame."""
     size, count, packets = None, 0, 0
     try:
         for packet in container.demux(stream):
@@ -181,12 +181,12 @@ def _decoded(
 
 
 def _picture(frame: av.VideoFrame, aspect: Fraction, reformatter: VideoReformatter) -> Tensor:
-    """[H, W, 3] of a frame: FFmpeg converts from its matrix and range; then it is turned upright."""
+    """A frame as [H, W, 3]: FFmpeg converts it from its colour matrix and range; then it is turned upright."""
     width, height = _square_size(frame, aspect)
     matrix = frame.colorspace
     if matrix == UNSPECIFIED:
         matrix = BT709 if frame.height >= HD_ROWS else BT601
-    # Not `frame.reformat`: each frame would start threads of its own.
+    # Not `frame.reformat`, which would start new threads for each frame.
     rgb = reformatter.reformat(frame, width, height, "rgb24", src_colorspace=matrix).to_ndarray()
     turned = np.ascontiguousarray(np.rot90(rgb, _quarters(frame)))
     return torch.from_numpy(turned).float().div_(255)
@@ -198,13 +198,13 @@ def _quarters(frame: av.VideoFrame) -> int:
 
 
 def _square_size(frame: av.VideoFrame, aspect: Fraction) -> tuple[int, int]:
-    """Width and height with square pixels, of pixels that are `aspect` times as wide as high: a side grows."""
+    """A frame's size in square pixels, enlarged along one side; its own pixels are `aspect` times as wide as high."""
     wide, high = max(aspect, Fraction(1)), max(1 / aspect, Fraction(1))
     return max(1, round(frame.width * wide)), max(1, round(frame.height * high))
 
 
 def _rising(ticks: list[Fraction | None], rate: Fraction) -> tuple[Fraction, ...]:
-    """Times from zero on; where the file has none, or one that does not rise, a frame follows at the mean rate."""
+    """Increasing times from zero; a frame whose time is missing or does not increase follows at the mean rate."""
     times: list[Fraction] = []
     start = ticks[0] or Fraction(0)
     for tick in ticks:
@@ -215,10 +215,10 @@ def _rising(ticks: list[Fraction | None], rate: Fraction) -> tuple[Fraction, ...
 
 
 class ClipWriter(VideoWriter):
-    """Writes as many frames as a clip has, at its times, with its sound; the file appears when the block ends well."""
+    """Writes as many frames as a clip has, at its times, with its sound; the file appears if the block succeeds."""
 
     def __init__(self, path: str | os.PathLike[str], clip: Clip) -> None:
-        """Prepare to write an .mp4; InputError where no file can be written."""
+        """Prepare to write an .mp4; InputError if no file can be written there."""
         super().__init__(path)
         self.clip = clip
 
@@ -232,7 +232,7 @@ class ClipWriter(VideoWriter):
 
 
 class _ClipEncoder(StreamEncoder):
-    """Frames are encoded at even times, and their packets then get the clip's times."""
+    """Encodes frames at evenly spaced times, and then gives their packets the clip's times."""
 
     def __init__(self, path: Path, width: int, height: int, clip: Clip) -> None:
         self._even = min(max(clip.rate.limit_denominator(1001), RATES[0]), RATES[1])
@@ -273,14 +273,14 @@ class _ClipEncoder(StreamEncoder):
             self._container.mux(packet)
 
     def _time(self, index: int) -> Fraction:
-        """The time of a frame; before the first and after the last one at the mean rate."""
+        """The time of a frame; times before the first and after the last frame follow at the mean rate."""
         times = self._clip.times
         if 0 <= index < len(times):
             return times[index]
         return times[0] + index / self._even if index < 0 else times[-1] + (index - len(times) + 1) / self._even
 
     def _copy_sound(self, until: Fraction) -> None:
-        """Copy the clip's sound up to a time, packet by packet; a damaged rest is left out."""
+        """Copy the clip's sound up to a time, packet by packet; stop at the first damaged packet."""
         while self._input is not None:
             try:
                 packet = self._held or next(self._sounds, None)

@@ -1,8 +1,8 @@
-"""Frames of a clip that do not flicker: flow from frame to frame, colours propagated along it, aligned depth.
+"""Keep a clip's frames from flickering: flow from frame to frame, colours propagated along it, aligned depth.
 
-The paper has no clips: each frame's completion knows nothing of the others. Here aux Gaussians keep their places, and
-take the colours of the frame before at the point from which the background moved there. Colours that an earlier frame
-saw count more, and last longer, than colours that completion made up. All blending is of linear light.
+The paper has no clips: it would complete each frame independently. Here each frame's aux Gaussians keep their
+positions, and take colours from the frame before, at the points from which the background moved. Colours that an
+earlier frame saw count more, and last longer, than colours that completion made up. All blending is in linear light.
 """
 
 from __future__ import annotations
@@ -23,47 +23,47 @@ from spackle.render import Renderer, touched_tiles
 from spackle.render.protocol import Rendering
 from spackle.residual.view_features import CELL, hole_mask
 
-# Of two sRGB pictures [H, W, 3]: how far from each pixel of the first its content lies in the second, [H, W, 2].
+# Given two sRGB images [H, W, 3], the offset [H, W, 2] from each pixel of the first to its content in the second.
 Flow = Callable[[Tensor, Tensor], Tensor]
 
-RETURN_PX, RETURN_SHARE = 1.0, 0.05  # there and back again must end this near, plus this share of the way
-ALIKE = 0.1  # mean difference of sRGB between what is taken for the same thing
-SAME_SHOT = 0.3  # share of a picture that must be found again in the one before, or this is another shot
-THINNING = 4  # every fourth pixel each way is enough for six numbers
-ROUNDS = 8  # of reweighting
-FIT_PX = 0.5  # how far a pixel may be off the camera's motion and count half
+RETURN_PX, RETURN_SHARE = 1.0, 0.05  # flow there and back must end within so many pixels, plus this part of its length
+ALIKE = 0.1  # largest mean sRGB difference between two pixels that count as the same content
+SAME_SHOT = 0.3  # fraction of a frame that must be found again in the one before, else it starts another shot
+THINNING = 4  # every fourth pixel along each axis is enough to fit six numbers
+ROUNDS = 8  # rounds of reweighting
+FIT_PX = 0.5  # a pixel whose flow differs this much from the camera's motion counts half
 
-KEEP = 0.98  # of the trust in a colour, from frame to frame: what was seen outlives fifty frames
-GUESS = 0.9  # trust in what a completion made up; what was seen has 1
-NEARER = 0.1  # a past that stood this much nearer, relatively, is something else
-CARRIED = 0.5  # more weight than this on the past, and the pixel counts as carried
-THIN = 0.05  # least share of a pixel's light that is divided by
-FAINT = 0.25  # what has a smaller share of a pixel is too uncertain to be remembered
-MAX_GAIN = 2.0  # of the exposure, between two frames
+KEEP = 0.98  # factor on the trust in a colour from frame to frame: a colour that was seen lasts over fifty frames
+GUESS = 0.9  # trust in a colour that completion made up; a colour that was seen has 1
+NEARER = 0.1  # a past pixel that was nearer by this relative difference belongs to another surface
+CARRIED = 0.5  # a pixel with more weight than this on the past counts as propagated
+THIN = 0.05  # lower bound of a share of a pixel's light, for safe division
+FAINT = 0.25  # a contribution with a smaller share of a pixel is too uncertain to be remembered
+MAX_GAIN = 2.0  # largest change of exposure between two frames
 
-LEAK = 0.95  # of the correction, from frame to frame: flicker goes, what changes slowly stays as the base has it
-FEWEST = 64  # followed pixels that a fit needs
-OFF = 0.02  # of the median inverse depth: a pixel that is off by this much counts half
-NO_SHIFT = 0.01  # weight of the wish for no shift, against all pixels: where depths are alike, scale explains all
-MAX_SCALE = 2.0  # between two frames
-LEAST = 0.25  # a shift takes at most this away from the farthest
+LEAK = 0.95  # part of the correction that is kept from frame to frame: flicker vanishes, slow changes stay the base's
+FEWEST = 64  # number of tracked pixels that a fit needs
+OFF = 0.02  # of the median inverse depth: a pixel with this error counts half
+NO_SHIFT = 0.01  # weight of a penalty on shift, relative to all pixels: if all depths are alike, only the scale changes
+MAX_SCALE = 2.0  # largest scale between two frames
+LEAST = 0.25  # a shift leaves at least this fraction of an inverse depth
 
 
 @dataclasses.dataclass(frozen=True)
 class Track:
-    """Finds where a picture's content was in the picture before."""
+    """Where a frame's content was in an earlier frame."""
 
-    flow: Tensor  # [H, W, 2] pixels (x, y), from this picture's pixels to the earlier one's
-    sure: Tensor  # [H, W] bool: found there, and found here again from there
+    flow: Tensor  # [H, W, 2] pixels (x, y), from this frame's pixels to the earlier one's
+    sure: Tensor  # [H, W] bool: the flow there and back agree, and the colours too
 
     def same_shot(self, where: Tensor | None = None) -> bool:
-        """Whether enough of the picture, or of its pixels `where` [H, W], was visible in the frame before."""
+        """Whether enough of the frame, or of its pixels `where` [H, W], was visible in the earlier one."""
         sure = self.sure if where is None else self.sure[where]
         return sure.numel() > 0 and float(sure.float().mean()) >= SAME_SHOT
 
 
 def track(picture: Tensor, earlier: Tensor, flow: Flow) -> Track:
-    """Follow a picture [H, W, 3] back into an earlier one of its size."""
+    """Track a frame [H, W, 3] back into an earlier one of the same size."""
     back, forth = flow(picture, earlier), flow(earlier, picture)
     target = pixel_grid(back) + back
     gap = (back + sample(forth, target)).norm(dim=-1)
@@ -73,13 +73,13 @@ def track(picture: Tensor, earlier: Tensor, flow: Flow) -> Track:
 
 
 def pixel_grid(image: Tensor) -> Tensor:
-    """Centres of the pixels of an image [H, W, ...]: [H, W, 2] as (x, y)."""
+    """Pixel centres [H, W, 2] of an image [H, W, ...], as (x, y)."""
     rows, columns = (torch.arange(n, device=image.device) + 0.5 for n in image.shape[:2])
     return torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=-1)
 
 
 def inside(uv: Tensor, height: int, width: int) -> Tensor:
-    """[...] bool: which pixel positions [..., 2] lie between the outermost pixels' centres."""
+    """[...] bool: whether a position [..., 2], in pixels, lies between the outermost pixels' centres."""
     return ((uv >= 0.5) & (uv <= uv.new_tensor([width, height]) - 0.5)).all(-1)
 
 
@@ -91,10 +91,10 @@ def sample(image: Tensor, uv: Tensor) -> Tensor:
 
 
 def extend_flow(found: Track, inverse_depth: Tensor, known: Tensor, camera: Camera) -> Tensor:
-    """The flow [H, W, 2], extended into holes: the camera's motion plus the deviation of the far rim from it.
+    """The flow [H, W, 2], extended into holes: the camera's motion, plus the far rim's deviation from that motion.
 
-    `found` is kept where it is reliable and `known` [H, W] is true; `inverse_depth` [H, W] is positive everywhere, in
-    holes that of the fill; `camera` took the picture.
+    The flow of `found` is kept where it is reliable and `known` [H, W] is true. `inverse_depth` [H, W] is positive
+    everywhere, and in holes it is the fill's. `camera` is the frame's.
     """
     trusted = known & found.sure
     if not bool(trusted.any()):
@@ -107,7 +107,7 @@ def extend_flow(found: Track, inverse_depth: Tensor, known: Tensor, camera: Came
 
 
 def _motions(inverse_depth: Tensor, camera: Camera) -> Tensor:
-    """The flow of each of the camera's six small motions, [H, W, 2, 6]: translation first (Longuet-Higgins, 1980)."""
+    """The flow [H, W, 2, 6] of six small camera motions, translations before rotations (Longuet-Higgins, 1980)."""
     fx, fy = camera.focal
     center = camera.K[:2, 2].to(inverse_depth)
     x, y = ((pixel_grid(inverse_depth) - center) / inverse_depth.new_tensor([fx, fy])).unbind(-1)
@@ -118,14 +118,14 @@ def _motions(inverse_depth: Tensor, camera: Camera) -> Tensor:
 
 
 def _thinned(chosen: Tensor, fewest: int) -> Tensor:
-    """Every fourth of the chosen pixels [H, W] in each direction if these are enough, else all."""
+    """Every fourth of the chosen pixels [H, W] along each axis, if these are at least `fewest`; else all."""
     thin = torch.zeros_like(chosen)
     thin[::THINNING, ::THINNING] = chosen[::THINNING, ::THINNING]
     return thin if int(thin.sum()) >= fewest else chosen
 
 
 def _fit(basis: Tensor, flow: Tensor, trusted: Tensor) -> Tensor:
-    """The six numbers of the motion that most of the picture follows; moving objects are outvoted."""
+    """The six numbers of the motion that most of the image follows; moving objects are outvoted."""
     chosen = _thinned(trusted, 6)
     rows, wanted = basis[chosen].double(), flow[chosen].double()
     size = rows.flatten(0, 1).norm(dim=0).clamp_min(1e-12)  # so that one small ridge suits all columns
@@ -148,9 +148,9 @@ class FrameMemory:
     """The state that is kept of a completed view."""
 
     view: Rendering  # completed
-    light: Tensor  # [H, W, 3] linear: what was seen, and in the holes the light behind their veil
-    inverse_depth: Tensor  # [H, W] of the same, positive
-    trust: Tensor  # [H, W] in 0..1: 1 where it was seen, about KEEP^n where that was n frames ago
+    light: Tensor  # [H, W, 3] linear: the view's light; in holes only that of the aux Gaussians
+    inverse_depth: Tensor  # [H, W] of the same surfaces, positive
+    trust: Tensor  # [H, W] in 0..1: 1 if the base shows it, about KEEP^n if it did n frames ago
 
 
 def propagate_colors(
@@ -162,20 +162,20 @@ def propagate_colors(
     past: FrameMemory | None,
     flow: Flow,
 ) -> tuple[Gaussians, FrameMemory, Tensor | None]:
-    """Give the aux Gaussians of a frame the colours that the view before showed in its holes.
+    """Give the aux Gaussians of a frame the colours that the previous view showed in the frame's holes.
 
     Args:
         base: the frame's own Gaussians.
-        aux: what completes them in this view, made without the past.
+        aux: the Gaussians that complete this view, made without the past.
         camera: the view.
-        renderer: draws the view again.
-        views: the view of the base alone, and with `aux`.
-        past: of the view before; None at the start. A view of another shot is ignored, see `Track.same_shot`.
-        flow: finds the motion between two pictures.
+        renderer: renders the view again.
+        views: renderings of the base alone, and with `aux`.
+        past: memory of the previous view; None at the start. A view of another shot is ignored, see `Track.same_shot`.
+        flow: finds the motion between two images.
 
     Returns:
-        The aux Gaussians, what is known of the view with them, and the flow [H, W, 2] into the view before, holes
-        included; None without one.
+        The recoloured aux Gaussians, the memory of the view, and the flow [H, W, 2] into the previous view, holes
+        included; the flow is None if there is no previous view of this shot.
     """
     before, own = views
     hole = hole_mask(before.alpha)
@@ -189,7 +189,7 @@ def propagate_colors(
     if not bool(hole.any()):
         return aux, start, motion
     recalled, weight = _recall(past, pixel_grid(motion) + motion, inverse_depth)
-    # How much brighter the frame is than the one before, where both show the same.
+    # How much brighter the frame is than the one before, measured where both show the same surfaces.
     same = found.sure & ~hole
     was = sample(past.light, pixel_grid(made_up) + found.flow)[same]
     gain = made_up[same].mean(0) / was.mean(0).clamp_min(1e-4)
@@ -198,20 +198,20 @@ def propagate_colors(
     fresh = made_up + _beside(recalled - made_up, hole, weight, inverse_depth)
     blended = (fresh + weight[..., None] * (recalled - fresh)).clamp(0, 1)
     light = torch.where(hole[..., None], blended, made_up)
-    # In what is faint, a cell's own colour is all noise: no change can be told from it.
+    # The colour of a faint cell is all noise: no change can be measured against it.
     changed = _recoloured(aux, camera, light - made_up, torch.where(hole & (share >= FAINT), share, 0.0))
     view = renderer.render([base, changed], camera, tiles=touched_tiles(aux, camera), onto=own)
     return changed, FrameMemory(view, light, inverse_depth, _trust(hole, share, weight)), motion
 
 
 def _trust(hole: Tensor, share: Tensor, weight: Tensor) -> Tensor:
-    """Confidence [H, W] of a view's colours: 1 where seen, in holes that of the past or of a guess."""
+    """Confidence [H, W] in a view's colours: 1 where the base shows them; in holes the past's or a guess's."""
     filled = torch.where(share < FAINT, 0.0, weight.clamp_min(GUESS))
     return torch.where(hole, filled, 1.0)
 
 
 def behind(before: Rendering, own: Rendering, hole: Tensor) -> tuple[Tensor, Tensor]:
-    """Linear light [H, W, 3] and inverse depth [H, W] of a view; in holes those of what was added to the base."""
+    """Linear light [H, W, 3] and inverse depth [H, W] of a view; in holes only the added Gaussians' light and depth."""
     share = (own.alpha - before.alpha).clamp_min(THIN)
     there, now = srgb_to_linear(before.rgb), srgb_to_linear(own.rgb)
     added = ((now - there) / share[..., None]).clamp(0, 1)
@@ -223,7 +223,7 @@ def behind(before: Rendering, own: Rendering, hole: Tensor) -> tuple[Tensor, Ten
 
 
 def _recall(past: FrameMemory, uv: Tensor, inverse_depth: Tensor) -> tuple[Tensor, Tensor]:
-    """Past light [H, W, 3] at uv [H, W, 2] without pixels of nearer things, and how far it is trusted, [H, W]."""
+    """Past light [H, W, 3] at pixels uv [H, W, 2], without pixels of nearer surfaces, and the trust in it [H, W]."""
     height, width = past.trust.shape
     corner = (uv - 0.5).floor()
     part = uv - 0.5 - corner
@@ -243,9 +243,7 @@ def _recall(past: FrameMemory, uv: Tensor, inverse_depth: Tensor) -> tuple[Tenso
 
 
 def _beside(change: Tensor, hole: Tensor, weight: Tensor, inverse_depth: Tensor) -> Tensor:
-    """The change [H, W, 3] of propagated pixels, spread over new ones and falling to 0 at the rim, so that no seam
-    shows.
-    """
+    """Spread the change [H, W, 3] of propagated pixels over new ones; it falls to 0 at the rim, so no seam shows."""
     carried = weight > CARRIED
     known = ~hole | carried
     values = torch.where(carried[..., None], change, 0.0).permute(2, 0, 1)
@@ -256,7 +254,7 @@ def _beside(change: Tensor, hole: Tensor, weight: Tensor, inverse_depth: Tensor)
 
 
 def _recoloured(aux: Gaussians, camera: Camera, change: Tensor, share: Tensor) -> Gaussians:
-    """Aux Gaussians, recoloured by the change [H, W, 3] of their cells' pixels, averaged by their share in these."""
+    """Recolour aux Gaussians by the change [H, W, 3], averaged over each one's cell with the weights `share` [H, W]."""
     weighted = torch.cat([change * share[..., None], share[..., None]], dim=-1)
     sums = avg_pool2d(weighted.permute(2, 0, 1)[None], CELL, ceil_mode=True)[0]
     mean = sums[:3] / sums[3:].clamp_min(1e-6)
@@ -268,9 +266,9 @@ def _recoloured(aux: Gaussians, camera: Camera, change: Tensor, share: Tensor) -
 
 
 def flicker(view: Tensor, earlier: Tensor, flow: Tensor, chosen: Tensor) -> float | None:
-    """Mean absolute difference of a view [H, W, 3] from an earlier one, both sRGB, that is warped by a flow [H, W, 2].
+    """Mean absolute difference between a view [H, W, 3] and an earlier one warped by a flow [H, W, 2], both sRGB.
 
-    The flow leads from the view's pixels to the earlier view's. It is measured at the pixels `chosen` [H, W]; None if
+    The flow leads from the view's pixels to the earlier view's. The mean is over the pixels `chosen` [H, W]; None if
     there are none.
     """
     uv = pixel_grid(flow) + flow
@@ -280,22 +278,22 @@ def flicker(view: Tensor, earlier: Tensor, flow: Tensor, chosen: Tensor) -> floa
 
 @dataclasses.dataclass(frozen=True)
 class DepthAlignment:
-    """An affine map of inverse depth, seen from the photo's eye: scale · 1/z + shift."""
+    """An affine map of inverse depth in the photo's camera: scale · 1/z + shift."""
 
     scale: float = 1.0
     shift: float = 0.0  # 1/m
 
     def of(self, inverse_depth: Tensor) -> Tensor:
-        """The mapped inverse depth; what is positive stays so."""
+        """The mapped inverse depth; positive values stay positive."""
         scaled = self.scale * inverse_depth
         return torch.maximum(scaled + self.shift, LEAST * scaled)
 
     def after(self, first: DepthAlignment) -> DepthAlignment:
-        """The composition of this map after the other one."""
+        """The composition that applies `first`, then this map."""
         return DepthAlignment(self.scale * first.scale, self.scale * first.shift + self.shift)
 
     def leaked(self) -> DepthAlignment:
-        """This map, moved a little towards the identity."""
+        """A map a little nearer to the identity than this one."""
         return DepthAlignment(self.scale**LEAK, LEAK * self.shift)
 
     def of_depth(self, depth: Tensor) -> Tensor:
@@ -304,7 +302,7 @@ class DepthAlignment:
         return torch.where(front, 1 / self.of(1 / depth.where(front, 1.0)), depth / self.scale)
 
     def of_gaussians(self, gaussians: Gaussians) -> Gaussians:
-        """Gaussians of a camera at the world's origin, moved along its rays: it sees them as before."""
+        """Move Gaussians along the rays of a camera at the world's origin, which sees them as before."""
         if self == DepthAlignment():
             return gaussians
         z = gaussians.means[:, 2]
@@ -313,10 +311,9 @@ class DepthAlignment:
 
 
 def align_depth(inverse_depth: Tensor, earlier: Tensor, found: Track) -> DepthAlignment:
-    """The map from a frame's inverse depth [H, W] (0: unknown) to that of the frame before, fitted where both show the
-    same.
+    """Fit the map from a frame's inverse depth [H, W] (0: unknown) to the earlier frame's, where both show the same.
 
-    Robust least squares: what moves by itself, and where the two disagree in shape, is outvoted.
+    Robust least squares: moving objects, and places where the two depths differ in shape, are outvoted.
     """
     was = sample(earlier[..., None], pixel_grid(earlier) + found.flow)[..., 0]
     chosen = _thinned(found.sure & (inverse_depth > 0) & (was > 0), FEWEST)

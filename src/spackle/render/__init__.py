@@ -1,4 +1,4 @@
-"""Renderers: Gaussians and a camera in, an image, its depth and its opacity out."""
+"""Renderers: turn Gaussians and a camera into an image, its depth and its opacity."""
 
 import logging
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ def get_renderer(device: str = "auto") -> Renderer:
     """The renderer for a device: "cpu", "cuda", or "auto" for the best one on this machine.
 
     Raises:
-        InputError: an unknown device, or a renderer that cannot run here.
+        InputError: the device is unknown, or its renderer cannot run here.
     """
     if device not in ("auto", "cpu", "cuda"):
         raise InputError(f"--device {device}: unknown device; use auto, cpu or cuda")

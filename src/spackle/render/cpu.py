@@ -44,7 +44,7 @@ class CpuRenderer:
         onto = onto if tiles is not None else None
         inputs = [t for part in sets for t in part.tensors] + list(onto.tensors if onto else ())
         if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
-            # By its name: who only draws never loads what finds gradients.
+            # Imported by name, so that rendering alone never loads the gradient code.
             drawn: Rendering = import_module("spackle.render.gradients").draw(sets, view, wanted, onto)
             return drawn
         return draw(sets, view, wanted, onto).rendering()
@@ -61,7 +61,7 @@ class Drawing:
     images: Arrays  # float32: rgb [H, W, 3] sRGB, depth [H, W], alpha [H, W], and the colour before sRGB or [0, 0, 3]
 
     def rendering(self) -> Rendering:
-        """The images as tensors of the same memory."""
+        """The images as tensors, which share their memory."""
         return Rendering(*(torch.from_numpy(image) for image in self.images[:3]))
 
 
@@ -70,27 +70,27 @@ def draw(
 ) -> Drawing:
     """Draw sets of Gaussians as one, in the wanted tiles [rows, columns] bool, over a copy of `onto`.
 
-    The other tiles are black and empty where `onto` is None. The gradient needs the linear colour (`keep_linear`).
+    If `onto` is None, the other tiles are black and empty. The gradient needs the linear colour (`keep_linear`).
     """
     splats, lists = deal_out(sets, view, wanted)
     return blend(splats, lists, view, wanted, onto, keep_linear)
 
 
 def touched_tiles(gaussians: Gaussians, camera: Camera) -> Tensor:
-    """[ceil(H/16), ceil(W/16)] bool: the tiles whose pixels can change when these Gaussians come or go."""
+    """[ceil(H/16), ceil(W/16)] bool: tiles whose pixels can change when these Gaussians are added or removed."""
     view = KernelCamera.of(camera, 0.0)
     _, lists = deal_out([gaussians], view, wanted_tiles(view, None))
     return torch.from_numpy(np.diff(lists.starts) > 0).reshape(view.tiles)
 
 
 def deal_out(sets: Sequence[Gaussians], view: KernelCamera, wanted: Array) -> tuple[Splats, TileLists]:
-    """Project, sort and assign Gaussians to tiles: everything but blending."""
+    """Project and sort Gaussians, and assign them to tiles: everything except blending."""
     splats, spans = project(sets, view, wanted)
     return splats, list_tiles(sort_by_depth(splats.keys, splats.ids, spans), splats.boxes, wanted)
 
 
 def as_array(tensor: Tensor) -> Array:
-    """A tensor as a contiguous float32 array, without a copy if it is one already."""
+    """A tensor as a contiguous float32 array; not copied if it already is one on the CPU."""
     return tensor.detach().to(device="cpu", dtype=torch.float32).contiguous().numpy()
 
 
@@ -106,7 +106,7 @@ def project(sets: Sequence[Gaussians], view: KernelCamera, wanted: Array) -> tup
     """Project several sets without joining them, and keep the Gaussians that touch wanted tiles.
 
     Returns:
-        The splats, and the spans (start, count) [C, 2] of their keys and ids that are in use.
+        The splats, and the spans (start, count) [C, 2] of the keys and ids that are in use.
     """
     n, before, first = sum(len(part) for part in sets), count_before(wanted), 0
     records, boxes = np.empty((n, RECORD), np.float32), np.empty((n, 4), np.uint16)
@@ -124,7 +124,7 @@ def project(sets: Sequence[Gaussians], view: KernelCamera, wanted: Array) -> tup
 
 
 def sort_by_depth(keys: Array, ids: Array, spans: Array) -> Array:
-    """Order Gaussians front to back; those of equal depth stay in the order in which they came.
+    """Sort Gaussians front to back; Gaussians of equal depth keep their order.
 
     Args:
         keys: [N] uint32, the bits of positive floats; overwritten.
@@ -132,7 +132,7 @@ def sort_by_depth(keys: Array, ids: Array, spans: Array) -> Array:
         spans: [C, 2] int64, the pieces (start, count) of keys and ids that are in use.
 
     Returns:
-        [M] int32, the ids in order of their keys, M being the sum of the counts.
+        [M] int32, the ids in order of their keys; M is the sum of the counts.
     """
     total = int(spans[:, 1].sum())
     items, others = (keys, ids), (np.empty(total, np.uint32), np.empty(total, np.int32))
@@ -144,7 +144,7 @@ def sort_by_depth(keys: Array, ids: Array, spans: Array) -> Array:
 
 
 def _sort_digit(items: Arrays, spans: Array, shift: int, into: Arrays) -> None:
-    """Sort (keys, ids) by the digit at bit `shift` alone, keeping the order of equal ones."""
+    """Sort (keys, ids) only by the digit at bit `shift`; items with equal digits keep their order."""
     counts = np.zeros((len(spans), BUCKETS), np.int64)
     run_chunks(lambda a, b: count_digits(a, b, spans, items[0], shift, counts), len(spans), 1)
     positions = starts_of(counts)
@@ -158,10 +158,10 @@ def even_spans(total: int, parts: int) -> Array:
 
 
 def starts_of(counts: Array) -> Array:
-    """Start positions of each piece's items in each bucket: buckets in order, and pieces in order within a bucket.
+    """Start position of each piece's items in each bucket; buckets are in order, and so are pieces within a bucket.
 
     Args:
-        counts: [C, B] items of bucket b in piece c.
+        counts: [C, B], the number of items of bucket b in piece c.
     """
     flat = counts.T.reshape(-1)
     return np.ascontiguousarray((np.cumsum(flat) - flat).reshape(counts.shape[::-1]).T)
@@ -169,7 +169,7 @@ def starts_of(counts: Array) -> Array:
 
 @kernel
 def count_digits(first: int, last: int, spans: Array, keys: Array, shift: int, counts: Array) -> None:
-    """Count the digits of the keys of pieces first..last."""
+    """For each of the pieces first..last, count how often each digit occurs in its keys."""
     for piece in range(first, last):
         row = counts[piece]
         for i in range(spans[piece, 0], spans[piece, 0] + spans[piece, 1]):
@@ -178,7 +178,7 @@ def count_digits(first: int, last: int, spans: Array, keys: Array, shift: int, c
 
 @kernel
 def scatter(first: int, last: int, spans: Array, items: Arrays, shift: int, positions: Array, into: Arrays) -> None:
-    """Move the (keys, ids) of pieces first..last to their places."""
+    """Move the (keys, ids) of pieces first..last to their sorted positions."""
     (keys, ids), (sorted_keys, sorted_ids) = items, into
     for piece in range(first, last):
         row = positions[piece]
@@ -195,7 +195,7 @@ def list_tiles(order: Array, boxes: Array, wanted: Array) -> TileLists:
 
     Args:
         order: [M] int32, visible Gaussians front to back.
-        boxes: [N, 4] uint16, the tiles each one touches.
+        boxes: [N, 4] uint16, the tiles that each Gaussian touches.
         wanted: [rows, columns] bool, the tiles to make lists for; the others' lists stay empty.
     """
     parts = thread_count()
@@ -214,17 +214,17 @@ def list_tiles(order: Array, boxes: Array, wanted: Array) -> TileLists:
 def count_entries(
     first: int, last: int, spans: Array, order: Array, boxes: Array, wanted: Array, sorted_boxes: Array, counts: Array
 ) -> None:
-    """Count the entries of each tile from pieces first..last of the order, and put their boxes into that order."""
+    """Count each tile's entries in pieces first..last of the order, and store the Gaussians' boxes in that order."""
     columns, flat = wanted.shape[1], wanted.reshape(-1)
     for piece in range(first, last):
         row_counts = counts[piece]
         for place in range(spans[piece, 0], spans[piece, 0] + spans[piece, 1]):
-            k = np.uint64(place)  # unsigned numbers need no look at whether they count from an array's end
+            k = np.uint64(place)  # unsigned, so that no check for negative indices is compiled
             i = np.uint64(order[k])
             left, right, top, bottom = boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3]
             sorted_boxes[k, 0], sorted_boxes[k, 1], sorted_boxes[k, 2], sorted_boxes[k, 3] = left, right, top, bottom
-            # Read back on purpose: of bounds that it cannot keep in registers the compiler makes plain loops, and
-            # vectors for two tiles cost more.
+            # The bounds are read back on purpose: with bounds in memory the compiler emits scalar loops, and vector
+            # code costs more for a box of a few tiles.
             for row in range(sorted_boxes[k, 2], sorted_boxes[k, 3]):
                 for column in range(sorted_boxes[k, 0], sorted_boxes[k, 1]):
                     tile = np.uint64(row * columns + column)
@@ -236,7 +236,7 @@ def count_entries(
 def write_entries(
     first: int, last: int, spans: Array, order: Array, sorted_boxes: Array, wanted: Array, positions: Array, ids: Array
 ) -> None:
-    """Write the entries of each tile from pieces first..last of the order, whose boxes are sorted."""
+    """Write each tile's entries from pieces first..last of the order; `sorted_boxes` are in that order."""
     columns, flat = wanted.shape[1], wanted.reshape(-1)
     for piece in range(first, last):
         places = positions[piece]

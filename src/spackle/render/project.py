@@ -1,6 +1,6 @@
 """Project Gaussians to the image: each gets a packed record, a box of tiles and a sort key.
 
-The arithmetic of a block of Gaussians runs in vector registers; they are packed one by one.
+The arithmetic runs on a block of Gaussians in vector registers; records are then packed one by one.
 """
 
 from __future__ import annotations
@@ -17,29 +17,29 @@ from spackle.render.protocol import ALPHA_MIN, NEAR_PLANE, TILE, tile_grid
 Numbers = Array | tuple[Any, ...]
 Arrays = tuple[Array, ...]
 
-# A record is what the blender needs, in three quarters of a cache line. Along a row of pixels at distance dy
-# from the centre, a Gaussian's alpha is 2^(PEAK - FALL·dy² - ACROSS·(x - X - SLOPE·dy)²): no square of this
-# form is ever negative.
+# A record holds what blending needs, in three quarters of a cache line. In a row of pixels at distance dy from the
+# centre, a Gaussian's alpha is 2^(PEAK - FALL·dy² - ACROSS·(x - X - SLOPE·dy)²). In this form, rounding cannot make the
+# quadratic form negative.
 X, Y, SLOPE, ACROSS, FALL, PEAK, HALF_WIDTH, HALF_HEIGHT, DEPTH, RED, GREEN, BLUE = range(12)
 RECORD = 12  # floats in a record
 
-BLUR_CLAMP = 0.3  # how far beyond the border, in half-images, the projection is still linearised in place
+BLUR_CLAMP = 0.3  # a centre farther outside, in half image sizes, is linearised at this distance from the border
 
-# What is measured of a block of Gaussians is one flat buffer of planes, because the compiler then knows that they do
-# not overlap: first the record's, then the box of tiles touched. All are float32, which holds a box exactly.
+# Results for a block of Gaussians go into one flat buffer of planes, because the compiler then knows that these do not
+# overlap: first the record's fields, then the box of tiles touched. All are float32, which represents boxes exactly.
 LEFT, RIGHT, TOP, BOTTOM = range(DEPTH + 1, DEPTH + 5)
-BLOCK = 256  # Gaussians: the buffer stays in the first-level cache
+BLOCK = 256  # Gaussians; with so many the buffer stays in the first-level cache
 BUFFER = (BOTTOM + 1) * BLOCK
 
 ROOT_HALF_BITS = np.int32(0x3F3504F3)  # of the square root of a half
 LN_2 = math.log(2.0)
-# ln((1 + t) / (1 - t)) is 2t + 2t³/3 + 2t⁵/5 + …; what is left out is below float64's last digit for t² < 0.0295.
+# ln((1 + t) / (1 - t)) = 2t + 2t³/3 + 2t⁵/5 + …; the omitted terms are below float64's last digit for t² < 0.0295.
 L3, L5, L7, L9, L11, L13, L15, L17, L19 = (2.0 / k for k in range(3, 20, 2))
 
 ONCE, TWICE, THRICE = np.uint64(1), np.uint64(2), np.uint64(3)
 LOG2_E = math.log2(math.e)
 LOG_FAINT = math.log(ALPHA_MIN)
-FINITE = 1e30  # larger values would overflow float32 further on
+FINITE = 1e30  # larger values would overflow float32 later
 
 
 class KernelCamera(NamedTuple):
@@ -80,7 +80,7 @@ class Splats(NamedTuple):
 
 @inlined_kernel
 def in_tile(record: Array, left: int, top: int) -> Numbers:
-    """A record's twelve numbers, its centre (X, Y) relative to the centre of a tile's first pixel (left, top)."""
+    """A record's twelve numbers, with (X, Y) relative to the centre of a tile's first pixel, (left, top)."""
     x, y = record[X] - np.float32(left) - HALF, record[Y] - np.float32(top) - HALF
     shape = x, y, record[SLOPE], record[ACROSS], record[FALL], record[PEAK], record[HALF_WIDTH], record[HALF_HEIGHT]
     return *shape, record[DEPTH], record[RED], record[GREEN], record[BLUE]
@@ -101,14 +101,14 @@ def project_chunk(
     A Gaussian that touches no wanted tile counts as invisible; see `count_before`.
 
     Returns:
-        The number of visible ones; their keys and ids begin at first + start.
+        The number of visible Gaussians; their keys and ids begin at first + start.
     """
     means, quats, scales, opacities, colors = scene
     found = first + start
     block = np.empty(BUFFER, np.float32)
     for begin in range(start, stop, BLOCK):
         end = min(begin + BLOCK, stop)
-        # Only of flat arrays does the compiler know how far apart a Gaussian's numbers lie.
+        # Flat arrays, because only then does the compiler know the stride between a Gaussian's numbers.
         shapes = means[begin:end].reshape(-1), quats[begin:end].reshape(-1), scales[begin:end].reshape(-1)
         measure_block(block, *shapes, opacities[begin:end], camera)
         found = pack_block(block, colors[begin:end].reshape(-1), first + begin, found, wanted_before, splats)
@@ -119,10 +119,10 @@ def project_chunk(
 def measure_block(
     block: Array, means: Array, quats: Array, scales: Array, opacities: Array, camera: KernelCamera
 ) -> None:
-    """Project up to BLOCK Gaussians; those that are invisible get an empty box.
+    """Project up to BLOCK Gaussians; invisible Gaussians get an empty box.
 
-    It is float64, which costs little here and keeps thin Gaussians exact; without a branch or a call, so that
-    all of it runs in vector registers.
+    Arithmetic is float64, which costs little here and keeps thin Gaussians exact. There are neither branches nor
+    calls, so that all of it runs in vector registers.
 
     Args:
         block: [BUFFER], the result; an invisible Gaussian's RIGHT is 0.
@@ -150,7 +150,7 @@ def measure_block(
         fall, across = 0.5 * LOG2_E * narrow, 0.5 * LOG2_E * cyy / det
         left, right = cover(u, half_width, camera.width)
         top, bottom = cover(v, half_height, camera.height)
-        # Written so that NaN fails each test.
+        # Each comparison is written so that it is false for NaN.
         sound = (z >= NEAR_PLANE) & (z < FINITE) & (opacity >= ALPHA_MIN) & (opacity < FINITE)
         sound &= (det > 0.0) & (det < FINITE) & (cxx < FINITE) & (cyy < FINITE)
         sound &= (across < FINITE) & (fall < FINITE)
@@ -172,13 +172,13 @@ def measure_block(
 
 @inlined_kernel
 def covariance(x: float, y: float, nearness: float, quat: Numbers, scale: Numbers, camera: KernelCamera) -> Numbers:
-    """The projected covariance (xx, xy, yy) and its determinant, of a Gaussian at (x, y, 1) / nearness."""
+    """The projected covariance (xx, xy, yy) and its determinant, for a Gaussian at (x, y, 1) / nearness."""
     return spread(factor(jacobian(x, y, nearness, camera.lens), camera.pose, rotation(quat), scale), camera.eps2d)
 
 
 @inlined_kernel
 def jacobian(x: float, y: float, nearness: float, lens: Array) -> Numbers:
-    """(a, b, c, d) of the projection's Jacobian J, with rows (a, 0, b) and (0, c, d), at (x, y, 1) / nearness."""
+    """The projection's Jacobian J at (x, y, 1) / nearness, as (a, b, c, d): its rows are (a, 0, b) and (0, c, d)."""
     a, c = lens[0] * nearness, lens[1] * nearness
     return a, -a * min(lens[5], max(lens[4], x)), c, -c * min(lens[7], max(lens[6], y))
 
@@ -187,7 +187,7 @@ def jacobian(x: float, y: float, nearness: float, lens: Array) -> Numbers:
 def rotation(quat: Numbers) -> Numbers:
     """The matrix R of a quaternion (wxyz) of any length, row by row."""
     qw, qx, qy, qz = np.float64(quat[0]), np.float64(quat[1]), np.float64(quat[2]), np.float64(quat[3])
-    two = 2.0 / max(qw * qw + qx * qx + qy * qy + qz * qz, 1e-24)  # 2/‖q‖² makes the rotation a unit one
+    two = 2.0 / max(qw * qw + qx * qx + qy * qy + qz * qz, 1e-24)  # 2/‖q‖² normalises the quaternion
     r00, r01, r02 = 1 - two * (qy * qy + qz * qz), two * (qx * qy - qw * qz), two * (qx * qz + qw * qy)
     r10, r11, r12 = two * (qx * qy + qw * qz), 1 - two * (qx * qx + qz * qz), two * (qy * qz - qw * qx)
     r20, r21, r22 = two * (qx * qz - qw * qy), two * (qy * qz + qw * qx), 1 - two * (qx * qx + qy * qy)
@@ -209,10 +209,10 @@ def factor(j: Numbers, pose: Array, r: Numbers, scale: Numbers) -> Numbers:
 
 @inlined_kernel
 def spread(m: Numbers, eps2d: float) -> Numbers:
-    """The covariance M Mᵀ + eps2d (xx, xy, yy) and its determinant.
+    """The covariance M Mᵀ + eps2d·I as (xx, xy, yy), and its determinant.
 
-    The determinant of M Mᵀ is the squared cross product of M's rows (Cauchy–Binet), which does not cancel where a
-    Gaussian is seen edge-on.
+    The determinant of M Mᵀ is the squared cross product of M's rows (Cauchy–Binet). In this form it suffers no
+    cancellation for a Gaussian seen edge-on.
     """
     m0, m1, m2, n0, n1, n2 = m
     cxx = m0 * m0 + m1 * m1 + m2 * m2
@@ -225,9 +225,9 @@ def spread(m: Numbers, eps2d: float) -> Numbers:
 
 @inlined_kernel
 def cover(center: float, extent: float, size: int) -> tuple[np.int32, np.int32]:
-    """The pixels first..last (exclusive) along one axis whose centres may lie within an extent."""
-    slack = 0.501  # half a pixel to its centre, and room for the blender's rounding
-    # In this order NaN becomes 0, and every number one that an integer can hold.
+    """The pixels first..last (exclusive) along one axis whose centres may lie within `extent` of `center`."""
+    slack = 0.501  # half a pixel, from its edge to its centre, and room for rounding in blending
+    # In this order of min and max, NaN becomes 0, and the result always fits into an integer.
     low = min(np.float64(size), max(0.0, center - extent - slack))
     high = min(np.float64(size), max(0.0, center + extent + slack))
     first = np.int32(low)
@@ -236,15 +236,17 @@ def cover(center: float, extent: float, size: int) -> tuple[np.int32, np.int32]:
 
 @kernel
 def pack_block(block: Array, colors: Array, first: int, found: int, wanted_before: Array, splats: Splats) -> int:
-    """Write the boxes of the projected Gaussians first, first + 1, …, and records, keys and ids of the visible ones.
+    """Write the boxes of the projected Gaussians numbered `first`, `first` + 1, ….
+
+    For the visible ones also write records, keys and ids; their first key goes to position `found`.
 
     Returns:
-        The position of the next key; `found` is that of the first one.
+        The position of the next key.
     """
     records, boxes, keys, ids = splats
     depth_bits = keys.view(np.float32)
     for k in range(len(colors) // 3):
-        # Unsigned numbers need no look at whether they count from an array's end.
+        # Unsigned, so that no check for negative indices is compiled.
         i, i3, out, place = np.uint64(k), np.uint64(3 * k), np.uint64(first + k), np.uint64(found)
         right = np.uint32(block[i + np.uint64(RIGHT * BLOCK)])
         boxes[out, 0], boxes[out, 1] = 0, 0
@@ -276,7 +278,7 @@ def touches(left: np.uint32, right: np.uint32, top: np.uint32, bottom: np.uint32
 
 @inlined_kernel
 def natural_log(x: np.float32) -> float:
-    """The logarithm of a positive number, to float64's last digits."""
+    """The logarithm of a positive number, accurate to float64's last digits."""
     bits = np.float32(x).view(np.int32)
     exponent = (bits - ROOT_HALF_BITS) >> MANTISSA
     m = np.float64(np.int32(bits - (exponent << MANTISSA)).view(np.float32))  # from sqrt(1/2) to sqrt(2)

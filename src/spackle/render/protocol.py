@@ -31,7 +31,7 @@ class Rendering:
         return self.rgb, self.depth, self.alpha
 
     def to(self, device: torch.device) -> Rendering:
-        """The images on another device, in one copy, because each copy synchronises with a GPU."""
+        """The images on another device, moved in one copy, because each copy synchronises with the GPU."""
         if self.rgb.device == device:
             return self
         flat = torch.cat([image.flatten() for image in self.tensors]).to(device)
@@ -39,13 +39,13 @@ class Rendering:
         return Rendering(*(part.view(image.shape) for part, image in zip(parts, self.tensors, strict=True)))
 
     def detach(self) -> Rendering:
-        """The same values cut off from autograd."""
+        """The same values, detached from autograd."""
         return Rendering(*(image.detach() for image in self.tensors))
 
 
 ALPHA_MAX = 0.999  # one Gaussian's largest alpha (released gsplat; its main branch has 0.99)
 ALPHA_MIN = 1.0 / 255.0  # fainter contributions are skipped
-TRANSMITTANCE_STOP = 1e-4  # a pixel is full when less light than this passes
+TRANSMITTANCE_STOP = 1e-4  # a pixel is full when its transmittance falls to this
 NEAR_PLANE = 0.01  # Gaussians nearer than this are not drawn
 TILE = 16  # pixels along a tile's side
 
@@ -65,15 +65,15 @@ class Renderer(Protocol):
         """Draw Gaussians as a camera sees them.
 
         Args:
-            gaussians: one set, or several that are drawn together. Gradients are computed for tensors that require them
-                alone.
+            gaussians: one set, or several that are drawn together. Gradients are computed only for tensors that
+                require them.
             camera: the view.
             eps2d: added to the diagonal of each projected covariance, in pixels² (SHARP: 0,
                 gsplat's default: 0.3).
-            tiles: [ceil(H/16), ceil(W/16)] bool, the tiles to draw; all where None. No other tile
-                is touched.
-            onto: where `tiles` is given, the rendering whose other tiles are kept bit for bit; black,
-                empty tiles where None.
+            tiles: [ceil(H/16), ceil(W/16)] bool, the tiles to draw; all if None. No other tile is
+                touched.
+            onto: if `tiles` is given, the rendering from which all other tiles are copied bit for bit; if
+                None, these are black and empty.
         """
         ...
 
@@ -84,19 +84,19 @@ def tile_grid(height: int, width: int) -> tuple[int, int]:
 
 
 def check_tiles(tiles: Tensor, height: int, width: int) -> None:
-    """ValueError where the chosen tiles are not those of an image of this size."""
+    """ValueError if the grid of tiles does not fit an image of this size."""
     if tuple(tiles.shape) != (grid := tile_grid(height, width)):
         raise ValueError(f"tiles has shape {tuple(tiles.shape)}, expected {grid}: one for each {TILE}×{TILE} pixels")
 
 
 def tile_mask(tiles: Tensor, height: int, width: int) -> Tensor:
-    """[H, W] bool: the pixels of the chosen tiles, [rows, columns] bool; ValueError for tiles of another size."""
+    """[H, W] bool: the pixels of the chosen tiles [rows, columns]; ValueError if the grid does not fit the image."""
     check_tiles(tiles, height, width)
     return tiles.repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)[:height, :width]
 
 
 def paste(rendering: Rendering, tiles: Tensor, onto: Rendering | None) -> Rendering:
-    """Keep the chosen tiles of a rendering, [rows, columns] bool, and the rest of `onto`, or black."""
+    """Combine the chosen tiles of a rendering, [rows, columns] bool, with the rest of `onto`, black if None."""
     mask = tile_mask(tiles, *rendering.alpha.shape)
     others = onto.tensors if onto is not None else tuple(torch.zeros_like(image) for image in rendering.tensors)
     masks = (mask[..., None], mask, mask)

@@ -1,6 +1,6 @@
 """A reference renderer in plain PyTorch: slow, of any dtype, and written like a textbook.
 
-Every pixel looks at every Gaussian. Tests hold the fast renderers to it, values and gradients.
+Every pixel evaluates every Gaussian. Tests compare the fast renderers' values and gradients with it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, NEAR_PLANE, TRANSMITTA
 
 
 class ReferenceRenderer:
-    """Classic 3D Gaussian splatting by its definition; a `Renderer` for small scenes."""
+    """Classic 3D Gaussian splatting, computed straight from its definition; a `Renderer` for small scenes."""
 
     def render(
         self,
@@ -48,7 +48,7 @@ def blend(gaussians: Gaussians, camera: Camera, eps2d: float) -> Rendering:
     alphas = falloff(gaussians, camera, eps2d)
     alphas = torch.where(alphas > ALPHA_MAX, ALPHA_MAX, alphas)
     alphas = torch.where(alphas >= ALPHA_MIN, alphas, 0)
-    after = torch.cumprod(1 - alphas, dim=0)  # [N, H, W] light that passes each Gaussian and those before it
+    after = torch.cumprod(1 - alphas, dim=0)  # [N, H, W] transmittance after each Gaussian
     before = torch.cat([torch.ones_like(after[:1]), after[:-1]]) if len(after) else after
     weights = torch.where(after > TRANSMITTANCE_STOP, alphas * before, 0)
     z = camera.to_camera(gaussians.means)[:, 2]
@@ -61,8 +61,8 @@ def blend(gaussians: Gaussians, camera: Camera, eps2d: float) -> Rendering:
 def project_covariances(gaussians: Gaussians, camera: Camera, eps2d: float) -> Tensor:
     """Image-space covariances J W Σ Wᵀ Jᵀ + eps2d·I, [N, 2, 2].
 
-    J is the projection's Jacobian at the centre; for centres far outside the image, where it would
-    explode, it is taken at the border of 1.3 images instead, as gsplat does.
+    J is the projection's Jacobian at the centre. For centres far outside the image, where it would explode, it is
+    evaluated at the border of a frame 1.3 times the image's size instead, as in gsplat.
     """
     x, y, z = camera.to_camera(gaussians.means).unbind(-1)
     (fx, fy), K = camera.focal, camera.K.to(x)

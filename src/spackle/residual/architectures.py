@@ -1,6 +1,7 @@
 """The architectures of f_res, and their weight files.
 
-`UNet` is small where a view has few holes. `SharpDecoder` is the paper's: "replicates the baseline architecture".
+`UNet` takes little time if a view has few holes. `SharpDecoder` is the paper's, which "replicates the baseline
+architecture".
 """
 
 from __future__ import annotations
@@ -38,21 +39,21 @@ from spackle.residual.network import (
 )
 
 SHIPPED = Path(__file__).parent.parent / "weights" / "residual.safetensors"
-NOTE = "spackle.residual"  # in a file's metadata: the architecture's name; older files, all of them UNet's, lack it
+NOTE = "spackle.residual"  # metadata key of the architecture's name; older files lack it, and all hold a UNet
 WIDTHS = (48, 80, 128, 256, 256)  # channels of the U-Net from the finest grid to the coarsest
-COARSE_BLOCKS = 3  # residual blocks at the coarsest grid, where context is wide and cheap
-STEM_WIDTH = 48  # channels of the decoder's stem, which has the 0.24 M parameters that the paper's 8.02 M leave
-STEM_GAIN = 3.0  # the features are of order 0.3
+COARSE_BLOCKS = 3  # residual blocks on the coarsest grid, where they see far and cost little
+STEM_WIDTH = 48  # channels of the decoder's stem: its 0.24 M parameters complete the paper's 8.02 M
+STEM_GAIN = 3.0  # because the features are of order 0.3
 
 
 def padded(features: Tensor) -> Tensor:
-    """Features [B, C, h, w], padded so that each level's sides are twice the next one's."""
+    """Pad features [B, C, h, w] so that each side can be halved exactly at every level of the network."""
     height, width = features.shape[-2:]
     return pad(features, (0, -width % STRIDE, 0, -height % STRIDE), mode="replicate")
 
 
 class ResidualBlock(nn.Module):
-    """x + conv(act(conv(act(x)))), starting as the identity; no norm, for its statistics would depend on the crop."""
+    """x + conv(act(conv(act(x)))), initially the identity; no norms, because their statistics depend on the crop."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -61,13 +62,13 @@ class ResidualBlock(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """[B, C, h, w] to the same shape."""
-        # In place where no gradient needs what was there: at this size fresh memory costs as much as the arithmetic.
+        # In place if no gradient needs the old values: at this size, allocation costs as much as the arithmetic.
         out: Tensor = self.second(self.first(torch.relu(x)).relu_())
         return out.add_(x)
 
 
 class UNet(ResidualNet):
-    """Encoder of a view's features, decoder, and SHARP's two heads: 8.02 M parameters."""
+    """An encoder for a view's features, a decoder, and two heads like SHARP's: 8.02 M parameters."""
 
     name, sees_photo, local = "unet", False, True
 
@@ -97,20 +98,20 @@ class UNet(ResidualNet):
             fine = interpolate(up(x), scale_factor=2, mode="bilinear", align_corners=False)
             x = decode(fine.add_(skip))
         heads = torch.cat([self.geometry(x), self.texture(x)], dim=1)[..., :height, :width]
-        # The last outputs say how much of the known colours to take.
+        # The last outputs are the weights of the known colours.
         deltas, shares = torch.split(heads, [DELTA_CHANNELS, len(KNOWN_COLORS)], dim=1)
         copied = sum(shares[:, k : k + 1] * features[:, colors] for k, colors in enumerate(KNOWN_COLORS))
         return torch.cat([deltas[:, : COLOR.start], deltas[:, COLOR] + copied, deltas[:, COLOR.stop :]], dim=1)
 
 
 class SharpDecoder(ResidualNet):
-    """SHARP's Gaussian decoder on features of a view instead of a photo: 8.02 M parameters, 7.78 M of them SHARP's own.
+    """SHARP's Gaussian decoder, applied to features of a view: 8.02 M parameters, 7.78 M of them in SHARP's layers.
 
-    A stem takes the place of SHARP's encoder. Where SHARP's decoder looks at its picture and at two layers of
-    disparity, this one looks at the base values, and at the depth that the view shows.
+    A stem replaces SHARP's encoder. SHARP's decoder also receives the photo and two layers of disparity; this one
+    receives the base values' colours and depth, and the view's depth, instead.
     """
 
-    name, sees_photo, local = "sharp-decoder", True, False  # group norms compare a cell with all others
+    name, sees_photo, local = "sharp-decoder", True, False  # group norms make a cell depend on all others
 
     def __init__(self, config: SharpConfig = FULL) -> None:
         super().__init__()
@@ -123,7 +124,7 @@ class SharpDecoder(ResidualNet):
         self.texture = ExactConv(config.feature_width, TEXTURE_CHANNELS, 1)
         for name, layer in self.feature_model.named_modules():
             if isinstance(layer, (nn.Conv2d, nn.ConvTranspose2d)):
-                _scale(0.0 if name.endswith(("residual.3", "residual.5")) else 1.0, layer)  # blocks are the identity
+                _scale(0.0 if name.endswith(("residual.3", "residual.5")) else 1.0, layer)  # blocks: identity
         _scale(STEM_GAIN, self.stem)
         _scale(math.sqrt(2), *self.down, *self.maps)
         _scale(0.0, self.geometry, self.texture)
@@ -136,7 +137,7 @@ class SharpDecoder(ResidualNet):
         for to_map, down in itertools.zip_longest(self.maps, self.down):
             maps.append(to_map(x))
             x = torch.relu(down(x)) if down is not None else x
-        # Depths as SHARP has disparities, in -1..1: tanh(log(d) / 2) = (d - 1) / (d + 1).
+        # Depths scaled to -1..1, as SHARP scales disparities: tanh(log(d) / 2) = (d - 1) / (d + 1).
         depths = torch.tanh(features[:, [VIEW_DEPTH, SEED_DEPTH]] / 2)
         picture = torch.cat([2 * features[:, SEED_RGB], depths], dim=1)
         pixels = interpolate(picture, scale_factor=2, mode="nearest")
@@ -149,7 +150,7 @@ def _head(width: int, channels: int) -> nn.Sequential:
 
 
 def _initialise(network: UNet) -> None:
-    """Numbers of order one at every scale, blocks that start as the identity, and heads that start at zero."""
+    """Initialise weights: activations of order one at every scale, blocks as the identity, heads at zero."""
     for name, module in network.named_modules():
         if isinstance(module, nn.Conv2d):
             zero = name.endswith("second") or name in ("geometry.2", "texture.2")
@@ -158,7 +159,7 @@ def _initialise(network: UNet) -> None:
 
 
 def _scale(gain: float, *layers: Any) -> None:
-    """Random weights that scale their input's magnitude by about `gain`, and zero bias."""
+    """Set random weights that scale the input's magnitude by about `gain`, and zero biases."""
     for layer in layers:
         taps = layer.in_channels if isinstance(layer, nn.ConvTranspose2d) else layer.weight[0].numel()
         nn.init.normal_(layer.weight, std=gain / math.sqrt(taps))
@@ -167,18 +168,18 @@ def _scale(gain: float, *layers: Any) -> None:
 
 
 def open_residual(name: str, config: SharpConfig = FULL) -> ResidualNet:
-    """An untrained network of an architecture, of SHARP's size where it has one."""
+    """An untrained network of the named architecture; `config` is the size of a `SharpDecoder`."""
     return UNet() if name == UNet.name else SharpDecoder(config)
 
 
 @functools.cache
 def shipped_network() -> ResidualNet | None:
-    """The network with the weights that come with the package; None if a build has none."""
+    """The network with the weights that ship with the package; None if this build has no weights."""
     return load_residual(SHIPPED) if SHIPPED.is_file() else None
 
 
 def load_residual(path: str | os.PathLike[str]) -> ResidualNet:
-    """Read a network; InputError for a missing or broken file, or weights of another architecture than it says."""
+    """Read a network; InputError if the file is missing or broken, or its weights do not fit its architecture."""
     advice = "give the residual's weights, 'seeds' or 'none'"
     tensors, name = read_tensors(path, advice), read_note(path, NOTE) or UNet.name
     if name not in (UNet.name, SharpDecoder.name):
@@ -187,7 +188,7 @@ def load_residual(path: str | os.PathLike[str]) -> ResidualNet:
 
 
 def decoder_size(tensors: Mapping[str, Tensor]) -> SharpConfig:
-    """SHARP's size, published or tiny, by the shapes in a file; the published one if the file holds no decoder."""
+    """SHARP's size, published or tiny, found from a file's tensor shapes; the published size if it holds no decoder."""
     last = tensors.get("feature_model.fusion.out_conv.bias")
     width = FULL.gaussian_width if last is None else last.numel()
     return next((config for config in CONFIGS.values() if config.gaussian_width == width), FULL)

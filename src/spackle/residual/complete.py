@@ -1,6 +1,6 @@
-"""One view completed as the paper does it: eqs. 2 to 7 in one pass.
+"""Complete one view as the paper does: eqs. 2 to 7 in one pass.
 
-Eq. 8, the union with the base, is `Gaussians.cat([base, aux])`; rendering that is eq. 9.
+The union with the base (eq. 8) is `Gaussians.cat([base, aux])`; eq. 9 is its rendering.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from spackle.residual.network import DELTAS, ResidualNet, color_logit, find_rim,
 from spackle.residual.view_features import CELL, MASK_THRESHOLD, ViewFeatures, hole_mask
 from spackle.surface import OPACITY, surface_gaussians
 
-SPREAD_PX = 1.3  # standard deviation; cells two pixels apart close to alpha 0.95 at the worst spot
-# A delta of one moves the position by a pixel, and the colour and the opacity by one in the sigmoid's domain; the
-# quaternion by so much, and the inverse depth by so many times the view's median.
+SPREAD_PX = 1.3  # standard deviation: blobs two pixels apart reach alpha 0.95 even midway between them
+# A delta of one moves the position by a pixel, and changes colour and opacity by one in the sigmoid's domain. It
+# changes the quaternion by GAIN, and the inverse depth by GAIN times the view's median.
 GAIN = 0.1
-LEAST_DEPTH = 1e-4  # and least inverse depth, so that no delta makes a distance infinite
-MAX_SCALE = 4.0  # the scale factor, which is 1, with slope 1, at zero, lies between the inverse of this and this
+LEAST_DEPTH = 1e-4  # least inverse depth, in medians of the view, so that no delta makes a distance infinite
+MAX_SCALE = 4.0  # the scale factor lies between 1 / MAX_SCALE and MAX_SCALE; at delta 0 its value and slope are 1
 
 
 @torch.no_grad()
@@ -45,23 +45,23 @@ def complete_view(
     photo: Tensor | None = None,
     precision: Precision = "auto",
 ) -> Gaussians:
-    """𝒢̃_aug of a view (eq. 7): one Gaussian for each masked cell, on top of the base, which is only read.
+    """𝒢̃_aug of a view (eq. 7): one Gaussian for each masked cell; the base is not changed.
 
-    A cell of the grid is masked as its first pixel is, so that there are about HAR × grid of them, as in the paper's
+    A cell counts as masked if its first pixel is masked. So there are about HAR × grid masked cells, as in the paper's
     tables.
 
     Args:
-        base: N Gaussians in the world's frame, 𝒢_base.
+        base: 𝒢_base, N Gaussians in the world's frame.
         camera: the view v.
-        photo_camera: that of the base's photo.
+        photo_camera: the camera of the photo from which the base was predicted.
         renderer: ℛ.
-        network: f_res, which runs on the device where it lies; None: the base values alone, as if its deltas were 0.
+        network: f_res, which runs on the device that holds its weights; None: the base values alone (deltas of 0).
         threshold: τ_α.
-        least: minimum number of Gaussians: if fewer cells are masked, the least opaque others are added; 64 in the
-            paper (training details), 0 to leave a view without holes as it is.
-        rendering: ℛ(𝒢_base, v), where that is at hand.
-        photo: I as [H, W, 3] sRGB, for a network that `sees_photo`; if None, the base's rendering of it.
-        precision: of the network; auto is bfloat16 where the hardware multiplies it natively.
+        least: minimum number of Gaussians: if fewer cells are masked, the `least` least opaque cells are used. The
+            paper has 64 (training details); 0 leaves a view without holes as it is.
+        rendering: ℛ(𝒢_base, v), if it is already available.
+        photo: I as [H, W, 3] sRGB, for a network that `sees_photo`; if None, the base's rendering of it is used.
+        precision: the network's; auto is bfloat16 if the hardware multiplies it natively.
     """
     view = renderer.render(base, camera) if rendering is None else rendering  # eqs. 2 and 3
     features = ViewFeatures.of(view, threshold)
@@ -81,7 +81,7 @@ def complete_view(
 
 
 def compose(seeds: Seeds, deltas: Tensor | None, camera: Camera, spread_px: float = SPREAD_PX) -> Gaussians:
-    """Aux Gaussians [n] of flat seeds; deltas of None or zero give the seeds themselves.
+    """Aux Gaussians [n] from flat seeds; with deltas of None or zero, they have the seeds' own values.
 
     Args:
         seeds: flat, as `Seeds.select` gives them: fields [n, ...].
@@ -104,13 +104,13 @@ def compose(seeds: Seeds, deltas: Tensor | None, camera: Camera, spread_px: floa
 
 
 def _shift_positive(base: Tensor, delta: Tensor, unit: float) -> Tensor:
-    """softplus(softplus⁻¹(base) + delta), both in multiples of `unit`."""
+    """softplus(softplus⁻¹(base) + delta), with base and result in multiples of `unit`."""
     relative = (base / unit).clamp_min(LEAST_DEPTH)
     return unit * softplus(relative + torch.log(-torch.expm1(-relative)) + delta).clamp_min(LEAST_DEPTH)
 
 
 def _scale_factor(delta: Tensor) -> Tensor:
-    """A sigmoid between the bounds."""
+    """Scale factor for a delta: a sigmoid from 1 / MAX_SCALE to MAX_SCALE."""
     low, high = 1 / MAX_SCALE, MAX_SCALE
     center = math.log((1 - low) / (high - 1))
     steepness = (high - low) / ((1 - low) * (high - 1))

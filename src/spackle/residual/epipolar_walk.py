@@ -1,4 +1,4 @@
-"""Walks from the cells of a hole along their epipolar lines to its far rim, and the values found there."""
+"""Walk from the cells of a hole along their epipolar lines to the hole's far rim, and read the values there."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from spackle.camera import Camera
 from spackle.device import run_chunks
 from spackle.residual.view_features import CELL
 
-SAME_DEPTH = 1.1  # what is mirrored at the rim may differ from the rim in inverse depth by this factor
-SAME_EYE = 1e-9 * CELL  # the epipole's part of a cell's offset from it, below which there is no line
+SAME_DEPTH = 1.1  # factor by which the inverse depth of a cell mirrored at the rim may differ from the rim's
+SAME_EYE = 1e-9 * CELL  # a shorter offset between cell and epipole (homogeneous) gives no direction
 
 
 def walk(
@@ -24,19 +24,19 @@ def walk(
 
     Args:
         uv: [h, w, 2] pixels of the cells.
-        values: [h, w, c] to look up.
+        values: [h, w, c], to be looked up at the rim.
         inverse_depth: [h, w], positive.
         mask: [h, w] bool.
         camera: of the view.
-        eye: [3] position of the other camera, whose image is the epipole.
+        eye: [3] position of the other camera; its projection into the view is the epipole.
 
     Returns:
-        Values [h, w, c] at the far rim; values [h, w, c] as far beyond the rim as the cell is before it, if that is the
-        same surface, else those at the rim; cells [h, w] to the rim. For a line that meets no surface, and outside of
-        the mask, both are the cell's own values, and the distance is 0.
+        Values [h, w, c] at the far rim; values [h, w, c] at the cell's mirror image beyond the rim, if that is on the
+        same surface, else the values at the rim; distance [h, w] to the rim in cells. For a line that meets no surface,
+        and outside of the mask, both values are the cell's own, and the distance is 0.
     """
     eye = eye.double()
-    # Where the view sees that eye: homogeneous, for it may lie at infinity.
+    # The eye's projection into the view: homogeneous, because it may lie at infinity.
     epipole = (camera.K.to(eye) @ camera.to_camera(eye)).detach().cpu().numpy()
     view = [image.contiguous().numpy() for image in (uv, values, inverse_depth, mask)]
     grids = (view[1].copy(), view[1].copy(), np.zeros(mask.shape, np.float32))
@@ -50,7 +50,7 @@ def _walk(
     start: int, stop: int, uv: Any, rgb: Any, depths: Any, mask: Any, epipole: Any, same: float,
     found: Any, mirrored: Any, distance: Any,
 ) -> None:  # fmt: skip
-    """The masked cells of the rows start..stop."""
+    """Walk from the masked cells of the rows start..stop."""
     height, width = depths.shape
     for y in range(start, stop):
         for x in range(width):
@@ -79,7 +79,7 @@ def _walk(
 
 @kernel
 def _line(epipole: Any, u: float, v: float) -> Any:
-    """The unit vector (x, y) along a pixel's epipolar line; along the row if both eyes coincide."""
+    """The unit vector (x, y) along a pixel's epipolar line; (1, 0) if both eyes coincide."""
     x, y = epipole[0] - epipole[2] * u, epipole[1] - epipole[2] * v
     length = np.sqrt(x * x + y * y)
     if length > SAME_EYE:
@@ -89,7 +89,7 @@ def _line(epipole: Any, u: float, v: float) -> Any:
 
 @kernel
 def _steps_to_rim(mask: Any, y: int, x: int, dy: float, dx: float) -> int:
-    """Steps of one cell to the first that is not masked; 0 where the picture ends before."""
+    """Number of one-cell steps to the first unmasked cell; 0 if the image ends before."""
     height, width = mask.shape
     k = 1
     while True:

@@ -1,7 +1,7 @@
-"""The residual network f_res (paper, section 3.3, eq. 5): features of a view's holes in, a delta for every cell out.
+"""The residual network f_res (paper, section 3.3, eq. 5) turns a view's features into a delta for every cell.
 
-Its input is the rendered view, the base values, the colours at a hole's far rim along the epipolar line, and those of
-matching patches of the view.
+Its input is the rendered view, the base values, the colours at a hole's far rim along the epipolar line, and the
+colours of matching patches of the view.
 """
 
 from __future__ import annotations
@@ -21,39 +21,39 @@ from spackle.residual.base_values import Seeds, inside_photo, seen_in_photo
 from spackle.residual.epipolar_walk import walk
 from spackle.residual.view_features import ViewFeatures
 
-ALIKE = 1.4  # factor by which the inverse depths of a line's far rim and of the seed there may differ
+ALIKE = 1.4  # a far rim whose inverse depth exceeds the seed's by more than this factor is ignored
 
 # Channels of the features.
 VIEW_DEPTH, SEED_DEPTH, SEED_RGB = 3, 6, slice(7, 10)
 VIEW_CHANNELS = SEED_RGB.stop  # rendered colour 3, depth, opacity, mask, seed depth, seed colour 3
-FAR_RIM = slice(VIEW_CHANNELS, VIEW_CHANNELS + 3)  # what turns the seed's colour into that of the far rim
-MIRRORED = slice(FAR_RIM.stop, FAR_RIM.stop + 3)  # and into the one mirrored at the rim
-EXEMPLAR = slice(MIRRORED.stop + 1, MIRRORED.stop + 4)  # after the distance to the rim: and into the patches'
-RIM_CHANNELS = EXEMPLAR.stop + 1  # and the patch distance
-PHOTO = slice(RIM_CHANNELS, RIM_CHANNELS + 3)  # where it is given: the photo's colour at the cell's point
-KNOWN_COLORS = (FAR_RIM, MIRRORED, EXEMPLAR)  # what a network may copy
+FAR_RIM = slice(VIEW_CHANNELS, VIEW_CHANNELS + 3)  # the far rim's colour minus the seed's, both as logits
+MIRRORED = slice(FAR_RIM.stop, FAR_RIM.stop + 3)  # likewise, for the colour mirrored at the rim
+EXEMPLAR = slice(MIRRORED.stop + 1, MIRRORED.stop + 4)  # likewise, for patches; after the rim's distance
+RIM_CHANNELS = EXEMPLAR.stop + 1  # number of channels with the patch distance, which is the last
+PHOTO = slice(RIM_CHANNELS, RIM_CHANNELS + 3)  # if given: the photo's colour at the cell's point
+KNOWN_COLORS = (FAR_RIM, MIRRORED, EXEMPLAR)  # colours that a network may copy
 # Channels of the deltas, as in SHARP: geometry (pixel, inverse depth), texture (scales, quaternion, colour, opacity).
 DELTAS = [2, 1, 3, 4, 3, 1]
 GEOMETRY_CHANNELS, TEXTURE_CHANNELS, DELTA_CHANNELS = sum(DELTAS[:2]), sum(DELTAS[2:]), sum(DELTAS)
 COLOR = slice(10, 13)
 COLOR_MARGIN = 1.0 / 512  # keeps the inverse sigmoid finite, below 8-bit resolution
 
-TYPICAL_DISTANCE = 16.0  # of a cell to the rim
+TYPICAL_DISTANCE = 16.0  # from a cell to the rim, in cells
 TYPICAL_MISMATCH = 0.1
-STRIDE = 16  # cells of the finest grid in one of an architecture's coarsest: four halvings
+STRIDE = 16  # cells along the side of one cell of an architecture's coarsest grid: four halvings
 
 
 @dataclasses.dataclass(frozen=True)
 class Rim:
-    """Values at the far rim for each masked cell; elsewhere the cell's own."""
+    """Values at the far rim for each masked cell; elsewhere the cell's own values."""
 
     rgb: Tensor  # [h, w, 3] sRGB at the far rim
-    mirrored: Tensor  # [h, w, 3] sRGB as far beyond the rim as the cell is before it, if that is the same surface
+    mirrored: Tensor  # [h, w, 3] sRGB at the cell's mirror image beyond the rim, if on the same surface; else `rgb`
     distance: Tensor  # [h, w] cells to the rim; 0 elsewhere
-    exemplar: Tensor  # [h, w, 3] sRGB of patches elsewhere in the view that match; their tone is the seeds'
-    mismatch: Tensor  # [h, w] patch distance: root of their mean squared difference; 0 elsewhere
-    beyond: Tensor  # [h, w] bool: masked cells whose points lie outside of the photo's frame
-    photo: Tensor | None = None  # [h, w, 3] sRGB, where asked for: see `seen_in_photo`; outside of it the seed's
+    exemplar: Tensor  # [h, w, 3] sRGB of matching patches elsewhere in the view, with the seeds' tone
+    mismatch: Tensor  # [h, w] patch distance: root mean squared difference of a match; 0 elsewhere
+    beyond: Tensor  # [h, w] bool: masked cells whose points project outside of the photo
+    photo: Tensor | None = None  # [h, w, 3] sRGB of the photo, if requested (see `seen_in_photo`); outside, the seed's
 
 
 def find_rim(
@@ -61,18 +61,18 @@ def find_rim(
 ) -> tuple[Rim, Patches]:
     """Walk from each masked cell in both directions along its epipolar line, and take the farther surface.
 
-    Between both views points move along lines through the epipole, the image of the photo's eye. So such a line leads
-    from a hole to the surface that was uncovered, and structure at the rim often continues along it. If a line meets no
-    surface, or one much nearer than the seed, the seed is kept.
+    Between the photo and the view, points move along lines through the epipole, the projection of the photo's eye. So
+    such a line leads from a hole to the surface that was uncovered, and structure at the rim often continues along it.
+    If a line meets no surface, or one much nearer than the seed, the seed is kept.
 
-    Also returns patches of the view that match its masked cells: by the seeds' colours behind an object, by mirrored
-    colours beyond the photo's border, where seeds are blurred. The `photo` [H, W, 3] sRGB is for a network that
-    `sees_photo`.
+    Also returns patches of the view that match its masked cells. Behind an object they are matched by the seeds'
+    colours; beyond the photo's border, where seeds are blurred, by the mirrored colours. The `photo` [H, W, 3] sRGB is
+    for a network that `sees_photo`.
     """
     rgb, depths = seeds.rgb.detach(), seeds.inverse_depth.detach()
     values = torch.cat([rgb, depths[..., None]], dim=-1)
     far, near, steps = walk(seeds.uv.detach(), values, depths, features.mask, camera, photo_camera.position)
-    in_front = (features.mask & (far[..., 3] > ALIKE * depths))[..., None]  # what stands there does not continue behind
+    in_front = (features.mask & (far[..., 3] > ALIKE * depths))[..., None]  # a nearer surface does not continue here
     far, near = (torch.where(in_front, rgb, met[..., :3]) for met in (far, near))
     beyond = features.mask & ~inside_photo(seeds.inverse_depth, camera, photo_camera)
     tone = torch.where(features.mask[..., None], rgb, features.rgb)
@@ -84,12 +84,12 @@ def find_rim(
 
 
 def network_input(view: ViewFeatures, seeds: Seeds, rim: Rim) -> Tensor:
-    """Features [1, 21, h, w], 24 with the photo, centred around zero; depths as log inverse depth over the median."""
+    """Features [1, 21, h, w] (24 with the photo), centred around zero; depths as log (inverse depth / its median)."""
     view_depth = torch.where(view.inverse_depth > 0, (view.inverse_depth / seeds.unit).clamp_min(1e-4).log(), 0.0)
     seed_depth = (seeds.inverse_depth / seeds.unit).clamp_min(1e-4).log()
     maps = [view_depth, view.alpha, view.mask.to(view.alpha), seed_depth]
     grids = (seeds.rgb, rim.rgb, rim.mirrored, rim.exemplar, rim.distance[..., None], rim.mismatch[..., None])
-    *colors, distance, mismatch = (grid[view.mask] for grid in grids)  # elsewhere the rim is the cell itself
+    *colors, distance, mismatch = (grid[view.mask] for grid in grids)  # elsewhere all differences are 0
     seed, near, mirrored, patches = map(color_logit, colors)
     distance, mismatch = (distance / TYPICAL_DISTANCE).log1p(), mismatch / TYPICAL_MISMATCH
     at_rim = torch.cat([near - seed, mirrored - seed, distance, patches - seed, mismatch], dim=-1)
@@ -101,19 +101,19 @@ def network_input(view: ViewFeatures, seeds: Seeds, rim: Rim) -> Tensor:
 
 
 def color_logit(value: Tensor) -> Tensor:
-    """sigmoid⁻¹ of colours or opacities, kept off 0 and 1."""
+    """sigmoid⁻¹ of colours or opacities, clamped away from 0 and 1."""
     return torch.logit(value.clamp(COLOR_MARGIN, 1 - COLOR_MARGIN / 2))
 
 
 class ResidualNet(nn.Module):
-    """f_res, of one of the `architectures`: features of `network_input` to deltas [B, 14, h, w]; any h and w.
+    """f_res, in one of the `architectures`: maps features of `network_input` to deltas [B, 14, h, w], for any h and w.
 
     Its last layers start at zero, so an untrained network returns the seeds unchanged.
     """
 
-    name: ClassVar[str]  # in recipes and weight files
-    sees_photo: ClassVar[bool]  # its features come with the photo
-    local: ClassVar[bool]  # it says of a cell the same in every crop that shows enough around it
+    name: ClassVar[str]  # its name in recipes and weight files
+    sees_photo: ClassVar[bool]  # whether its features include the photo
+    local: ClassVar[bool]  # whether a cell's deltas are the same in every crop with enough context around it
 
 
 @torch.no_grad()
@@ -126,15 +126,15 @@ def predict_deltas(
     *,
     dense: bool = False,
 ) -> Tensor:
-    """Deltas [h, w, 14] float32 of a view's masked cells, on the processor; 0 elsewhere.
+    """Deltas [h, w, 14] float32 of a view's masked cells, on the CPU; 0 elsewhere.
 
-    A `local` network looks only around the masked cells, see `crops_around`.
+    A `local` network runs only on crops around the masked cells, see `crops_around`.
 
     Args:
         network: a `ResidualNet`, perhaps wrapped; its input is moved to its device.
-        view, seeds, rim: features of one view.
-        precision: of the convolutions; auto is bfloat16 where the hardware multiplies it natively.
-        dense: deltas of all cells.
+        view, seeds, rim: one view's features, seeds and rim.
+        precision: precision of the convolutions; auto is bfloat16 if the hardware multiplies it natively.
+        dense: return the deltas of all cells.
     """
     device = next(network.parameters()).device
     dtype = pick_dtype(precision, device)
@@ -142,7 +142,7 @@ def predict_deltas(
     whole = (Crop(0, 0, *view.mask.shape),) * 2
     field = view.alpha.new_zeros(*view.mask.shape, DELTA_CHANNELS)
     features = network_input(view, seeds, rim)
-    # Around all crops: autocast converts the weights once.
+    # One autocast block around all crops, so that the weights are converted once.
     with own_arithmetic(device), torch.autocast(device.type, dtype, enabled=dtype != torch.float32):
         for inner, outer in crops_around(chosen, STRIDE) if getattr(network, "local", True) else [whole]:
             part = features[(..., *outer.slices)].contiguous(memory_format=torch.channels_last).to(device)

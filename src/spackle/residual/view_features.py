@@ -1,4 +1,4 @@
-"""What a rendered view shows: its mask (paper, eq. 4), the share of its holes (eqs. 10 and 11), the input of f_res.
+"""Features of a rendered view: its mask (paper, eq. 4), its hole-area ratio (eqs. 10 and 11), and the input of f_res.
 
 The input is a grid with one cell for each 2×2 pixels (section 3.3).
 """
@@ -18,36 +18,36 @@ from spackle.device import run_chunks
 from spackle.render.blend import decode_srgb, encode_srgb
 from spackle.render.protocol import Rendering
 
-MASK_THRESHOLD = 0.95  # τ_α: a pixel with less opacity is a hole (eq. 4)
+MASK_THRESHOLD = 0.95  # τ_α: a pixel with lower opacity is a hole (eq. 4)
 CELL = 2  # pixels along a cell's side
 CHANNELS = 3
-LEAST = 1e-6  # that is divided by, of depths and summed opacities
+LEAST = 1e-6  # lower bound of depths and summed opacities, for safe division
 PROCESSOR = torch.device("cpu")
 
 
 def hole_mask(alpha: Tensor, threshold: float = MASK_THRESHOLD) -> Tensor:
-    """M_v(p) = 1[A_v(p) < τ_α] (eq. 4): [H, W] bool, true where nothing was seen."""
+    """M_v(p) = 1[A_v(p) < τ_α] (eq. 4): [H, W] bool, true in holes."""
     return alpha < threshold
 
 
 def hole_area_ratio(alpha: Tensor, threshold: float = MASK_THRESHOLD) -> float:
-    """HAR = 1 − coverage (eqs. 10 and 11): the share of hole pixels."""
+    """HAR = 1 − coverage (eqs. 10 and 11): the fraction of hole pixels."""
     hole = hole_mask(alpha, threshold)
-    return int(np.count_nonzero(hole.cpu().numpy())) / hole.numel()  # of what counts bits, numpy is the fastest by far
+    return int(np.count_nonzero(hole.cpu().numpy())) / hole.numel()  # numpy counts bools fastest by far
 
 
 @dataclasses.dataclass(frozen=True)
 class ViewFeatures:
-    """A view's cells, on the processor and without gradients. Grid: h × w = ceil(H/2) × ceil(W/2)."""
+    """A view's cells, on the CPU and without gradients. Grid: h × w = ceil(H/2) × ceil(W/2)."""
 
-    rgb: Tensor  # [h, w, 3] sRGB of the covered part of the cell, without the black behind it
-    inverse_depth: Tensor  # [h, w] farthest covered pixel's 1/z; 0 in a cell without any
+    rgb: Tensor  # [h, w, 3] sRGB, linear mean over the cell divided by its opacity, so without the black background
+    inverse_depth: Tensor  # [h, w] 1/z of the farthest covered pixel; 0 in a cell without covered pixels
     alpha: Tensor  # [h, w] mean opacity
-    mask: Tensor  # [h, w] bool: some pixel of the cell is a hole
+    mask: Tensor  # [h, w] bool: at least one pixel of the cell is a hole
 
     @staticmethod
     def of(rendering: Rendering, threshold: float = MASK_THRESHOLD) -> ViewFeatures:
-        """Gather the cells of a rendering; an odd last row or column is repeated."""
+        """Reduce a rendering to cells; an odd last row or column is repeated."""
         rendering = rendering.to(PROCESSOR).detach()
         images = (rendering.rgb.flatten(1), rendering.depth, rendering.alpha)
         view = [image.float().contiguous().numpy() for image in images]
@@ -61,7 +61,7 @@ class ViewFeatures:
 
 
 def cell_centers(camera: Camera) -> Tensor:
-    """[ceil(H/2), ceil(W/2), 2] in pixels."""
+    """Centres of a view's cells, [ceil(H/2), ceil(W/2), 2], in pixels."""
     return camera.even().pixel_centers(stride=CELL)
 
 
@@ -70,7 +70,7 @@ def _gather(
     start: int, stop: int, rgb: Any, depth: Any, alpha: Any, threshold: Any,
     colors: Any, inverse_depth: Any, opacity: Any, mask: Any,
 ) -> None:  # fmt: skip
-    """Gather the rows start..stop of the cells, a row's colours first, so that the loop runs in vector registers."""
+    """Compute the rows start..stop of the cells; colours are decoded a row at a time, so that the loop vectorises."""
     height, width = alpha.shape
     columns = inverse_depth.shape[1]
     light = np.empty(CHANNELS * width, np.float32)
@@ -91,7 +91,7 @@ def _gather(
             inverse_depth[row, column] = np.float32(1) / far if holes < CELL * CELL else np.float32(0)
             opacity[row, column] = total / np.float32(CELL * CELL)
             mask[row, column] = holes > 0
-            for c in range(CHANNELS):  # light comes multiplied by alpha
+            for c in range(CHANNELS):  # the rendered light is already multiplied by alpha
                 both = light[CHANNELS * left + c] + light[CHANNELS * right + c]
                 mean[CHANNELS * column + c] = both / max(total, np.float32(LEAST))
         for k in range(CHANNELS * columns):

@@ -1,7 +1,7 @@
-"""Beyond the paper, which completes each view by itself: one scene that is consistent along a path.
+"""One scene that is consistent along a whole path; the paper completes each view by itself.
 
-`fill` builds on `spackle.residual` and says in which order views are completed, `occlusion_guard` keeps aux Gaussians
-behind what the photo and other views show, and `texture` gives colours for each pixel.
+`fill` builds on `spackle.residual` and chooses the order in which views are completed, `occlusion_guard` keeps aux
+Gaussians behind the surfaces that the photo and other views show, and `texture` gives a colour to each pixel.
 """
 
 from spackle.scene_fill.fill import FillContext, FilledScene, FilledView, fill_scene, fill_view

@@ -1,8 +1,8 @@
-"""Complete a whole path by one scene, or one view: the residual's cells, kept behind guards, with texture and a second
-pass.
+"""Complete one view, or a whole path with one scene.
 
-Base Gaussians are never changed. The renderer draws and the network computes on the renderer's device, all else happens
-on the processor. The images of a view travel there once, and its new Gaussians back once.
+To the residual's cells this adds occlusion guards, texture and a second pass. Base Gaussians are never changed. The
+renderer and the network run on the renderer's device, everything else on the CPU. Each rendering is copied to the CPU
+once, and its new Gaussians are copied back once.
 """
 
 from __future__ import annotations
@@ -30,35 +30,35 @@ from spackle.scene_fill.occlusion_guard import OcclusionGuard, free_factors, mov
 from spackle.scene_fill.texture import HoleView, Texture, exemplar_texture, in_cells, sharpened
 from spackle.surface import BEHIND, PIXEL_SPREAD, surface_slope
 
-PASSES = 2  # a second look closes what the first one's blobs left thin
-WIDEST = 8  # views of a path whose content stays in front from the first
-# The two widest views, opposite ones, show nearly all holes: they alone get the chosen texture, the exemplar's comes
-# after them, and both are completed before anything goes beneath the rims of either.
+PASSES = 2  # a second pass closes the places that the first one's blobs left thin
+WIDEST = 8  # widest views of a path: they guard their surfaces from the start
+# The two widest views, on opposite sides, show nearly all holes. They alone get the chosen texture; later views get
+# the exemplar's. Both are completed before anything is added beneath the rims of either.
 OPPOSITE = 2
 FLAT = 0.01  # sRGB: pixels that differ less from their cell's mean need no Gaussians of their own
-SEEDS_HAR = 0.01  # holes of a path's view that are smaller are the seeds' alone: nobody sees the network's work there
-FEW_HOLES = 1e-3  # so few are not seen in a frame of a path
-LEAST_VISITS = 24  # frames of a path that are looked at: so many, or half of them
-COARSE = 3  # an underlay has one Gaussian for COARSE × COARSE cells, as much larger: what lies there is smooth
-REACH_CELLS = COARSE * BLOB_CELLS  # how far beneath a rim an underlay goes: as far as one of its Gaussians
-EVERY = (slice(None, None, COARSE),) * 2  # the cells that have one
+SEEDS_HAR = 0.01  # in a path's view with a smaller HAR the seeds alone fill: the network's work would go unnoticed
+FEW_HOLES = 1e-3  # a smaller HAR is invisible in a frame of a path
+LEAST_VISITS = 24  # at least this many frames of a path are checked, or half of them if that is more
+COARSE = 3  # an underlay is smooth: one Gaussian, COARSE times as large, for COARSE × COARSE cells
+REACH_CELLS = COARSE * BLOB_CELLS  # how far an underlay extends beneath a rim: the reach of one of its Gaussians
+EVERY = (slice(None, None, COARSE),) * 2  # the cells that have an underlay's Gaussian
 
 
 @dataclasses.dataclass(frozen=True)
 class FillContext:
-    """The base of a photo, and the means to fill the holes of its views."""
+    """The base of a photo, and everything that is needed to fill the holes of its views."""
 
     base: Gaussians
     photo_camera: Camera
     renderer: Renderer
     network: ResidualNet | None = None  # None: deltas of zero, so the seeds alone fill the holes
-    texture: Texture | None = exemplar_texture  # None: colours as the network or the seeds have them
+    texture: Texture | None = exemplar_texture  # None: the colours of the network or the seeds
     threshold: float = MASK_THRESHOLD
-    precision: Precision = "auto"  # of the network: auto is bfloat16 where the hardware multiplies it natively
+    precision: Precision = "auto"  # the network's: auto is bfloat16 if the hardware multiplies it natively
 
     @functools.cached_property
     def placed(self) -> FillContext:
-        """The same with base and network on the renderer's device."""
+        """The same context, with base and network on the renderer's device."""
         device = device_of(self.renderer)
         if self.base.means.device.type == device.type:
             return self
@@ -67,13 +67,13 @@ class FillContext:
 
     @functools.cached_property
     def photo(self) -> Tensor | None:
-        """[H, W, 3] sRGB: the photo as the base shows it, for a network that sees it."""
+        """[H, W, 3] sRGB: the base rendered at the photo's camera, for a network that `sees_photo`; else None."""
         seen = self.network is not None and self.network.sees_photo
         return self.renderer.render(self.placed.base, self.photo_camera).rgb if seen else None
 
     @property
     def seeds_alone(self) -> FillContext:
-        """The same without network and texture."""
+        """The same context, without network and texture."""
         return dataclasses.replace(self, network=None, texture=None)
 
     def photo_guard(self) -> OcclusionGuard:
@@ -95,7 +95,7 @@ class FilledScene:
     """One set of aux Gaussians for all views."""
 
     aux: Gaussians
-    pictures: Mapping[int, Tensor]  # [H, W, 3] uint8 of the completed views that were drawn in passing, by their index
+    pictures: Mapping[int, Tensor]  # [H, W, 3] uint8 by index: completed views that were rendered anyway
 
 
 @torch.no_grad()
@@ -110,8 +110,8 @@ def fill_view(
     Args:
         context: the photo's base, and what fills its holes.
         camera: the view.
-        guards: views whose content must stay in front; the photo's alone where None.
-        rendering: the base from this view, where that is at hand.
+        guards: views whose surfaces must stay in front; only the photo's if None.
+        rendering: the base rendered from this view, if it is already available.
     """
     guards = [context.photo_guard()] if guards is None else guards
     stage, device = _Stage(context.placed), context.base.means.device
@@ -127,19 +127,19 @@ def fill_scene(
     exact: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> FilledScene:
-    """Complete a whole path by one set of aux Gaussians, the same from every frame.
+    """Complete a whole path by one set of aux Gaussians, which all frames share.
 
-    Views are visited from the widest inwards, spread over the path. Each view includes the Gaussians of earlier ones,
-    and adds its own, in its holes and beneath their rims, only behind the surfaces that the photo, the widest views and
-    earlier views show. Gaussians beneath the rims of the two widest views are added after both are completed, because
-    each of them may show, and fill better, what lies beneath a rim of the other.
+    Views are visited from the widest inwards, spread over the path. Each view is rendered with the Gaussians of earlier
+    ones, and adds its own in its holes and beneath the holes' rims, always behind the surfaces that the photo, the
+    widest views and earlier views show. Gaussians beneath the rims of the two widest views are added after both are
+    completed, because each of them may show, and fill better, what lies beneath a rim of the other.
 
     Args:
         context: the photo's base, and what fills its holes.
-        cameras: the frames of a path, in their order; with `exact` any views.
-        exact: check every view and complete it if it has a hole; else holes too small to see may stay open, and every
-            second frame of a long path is checked.
-        progress: called with (views visited, views that are visited in all).
+        cameras: the frames of a path in order; with `exact`, any views.
+        exact: check every view, and complete it if it has any hole. Otherwise holes too small to see may stay open, and
+            only half of a long path's frames are checked.
+        progress: called with (views visited so far, total number of views to visit).
     """
     if not cameras:
         return FilledScene(Gaussians.empty(context.base.means.device), {})
@@ -148,12 +148,12 @@ def fill_scene(
     enough = 0 if exact else FEW_HOLES
     visited = order if exact else order[: max(LEAST_VISITS, len(order) // 2)]
     guards = {-1: context.photo_guard()}
-    for index in reversed(order[:WIDEST]):  # the widest last: it is the first to be completed
+    for index in reversed(order[:WIDEST]):  # the widest last: it is completed first
         view = stage.look(cameras[index])
         guards[index] = OcclusionGuard.of(view, cameras[index], threshold)
     pictures, filled = dict[int, Tensor](), 0
     aux = [Gaussians.empty()]
-    waiting: list[tuple[int, Gaussians]] = []  # a view, and what lies beneath its rims
+    waiting: list[tuple[int, Gaussians]] = []  # a view's index, and the Gaussians beneath its rims
 
     def others(index: int) -> list[OcclusionGuard]:
         return [guard for of, guard in guards.items() if of != index]
@@ -189,9 +189,9 @@ def fill_scene(
 
 
 def farthest_first(cameras: Sequence[Camera], photo_camera: Camera) -> list[int]:
-    """An order that visits the widest view first and then always the one farthest from all visited.
+    """Indices of the views: the widest first, then always the one farthest from all earlier ones.
 
-    Its first views, however many, are spread evenly over the path.
+    So the first n views are spread evenly over the path, for any n.
     """
     if not cameras:
         return []
@@ -216,10 +216,10 @@ def _fill(
     *,
     beneath: bool,
 ) -> tuple[list[Gaussians], list[Gaussians], Rendering]:
-    """Gaussians for the holes of the stage's view, those `beneath` their rims, and the completed view."""
+    """Gaussians in the holes of the stage's view, Gaussians beneath their rims if `beneath`, and the completed view."""
     aux, rims = [Gaussians.empty()], []
     for turn in range(PASSES):
-        # What the network's blobs leave thin, the seeds close: it would only leave it thin again.
+        # The seeds close what the network's blobs left thin: the network would only leave it thin again.
         means = context.seeds_alone if turn else context
         features = ViewFeatures.of(view, context.threshold)
         if not bool(features.mask.any()):
@@ -243,9 +243,9 @@ def _propose(
     camera: Camera,
     guards: Sequence[OcclusionGuard],
 ) -> tuple[Gaussians, Seeds]:
-    """One Gaussian for each masked cell, or for each pixel with a texture, all behind the guards' surfaces.
+    """One Gaussian for each masked cell and, with a texture, one for each pixel, all behind the guards' surfaces.
 
-    Also returns the seeds that extend beneath the rims.
+    Also returns the seeds, from which `rim_underlay` continues beneath the rims.
     """
     mask, seeds = features.mask, make_seeds(features, camera, context.photo_camera)
     chosen, eye, deltas, picture, beyond, parts = seeds.select(mask), camera.position, None, None, None, []
@@ -267,19 +267,19 @@ def _propose(
         index = rough.nonzero()[:, 0]
         pixels = _pixels(chosen.select(index), None if deltas is None else deltas[index], camera, blobs[index])
         parts.append(moved_away(pixels, eye, factors[index].repeat_interleave(CELL**2)))
-        # As a lifted photo has them: behind the pixels' Gaussians one for each cell.
+        # As in a lifted photo, each cell has one Gaussian behind those of its pixels.
         cells = dataclasses.replace(cells, colors=srgb_to_linear(wanted.clamp(0, 1)).mean((1, 2)))
         factors = factors / (1 - BEHIND)
     parts.append(moved_away(cells, eye, factors))
     inverse_depth = seeds.inverse_depth.clone()
-    if beyond is not None:  # beyond the photo's border nothing beneath the rim covers what was moved away
+    if beyond is not None:  # beyond the photo's border, what lies beneath the rim must follow what was moved away
         moved = beyond & (factors > 0)
         inverse_depth[mask] = torch.where(moved, 1 / (depths * factors), inverse_depth[mask])
     return Gaussians.cat(parts), dataclasses.replace(seeds, inverse_depth=inverse_depth)
 
 
 def _pixels(seeds: Seeds, deltas: Tensor | None, camera: Camera, colors: Tensor) -> Gaussians:
-    """Gaussians [4n] for the pixels of n cells: flat seeds [n], deltas [n, 14], or None, and sRGB [n, 2, 2, 3]."""
+    """Gaussians [4n] for the pixels of n cells, from flat seeds [n], deltas [n, 14] or None, and sRGB [n, 2, 2, 3]."""
     offsets = torch.tensor([[-0.5, -0.5], [0.5, -0.5], [-0.5, 0.5], [0.5, 0.5]])
     fields = (seeds.inverse_depth, seeds.slope, seeds.rgb, *([] if deltas is None else [deltas]))
     inverse_depth, slope, rgb, *repeated = (field.repeat_interleave(len(offsets), 0) for field in fields)
@@ -293,19 +293,19 @@ def _pixels(seeds: Seeds, deltas: Tensor | None, camera: Camera, colors: Tensor)
 def rim_underlay(mask: Tensor, seeds: Seeds, camera: Camera) -> Gaussians:
     """Gaussians that extend the holes' seeds beneath the surfaces around the holes.
 
-    From another view the rim of a hole moves, and a slit opens between what was seen and what filled the hole. This
-    closes most such slits before they open: fewer views of a path are left to complete, and they show the same.
+    From another view the rim of a hole moves, and a slit opens between the visible surface and the hole's filling. The
+    underlay closes most such slits in advance: fewer views of a path remain to be completed, and they agree.
 
     Args:
         mask: [h, w] bool: the cells of the view's holes.
-        seeds: of all cells.
+        seeds: the seeds of all cells.
         camera: the view.
     """
     rim = (greatest_around(mask, REACH_CELLS) & ~mask)[EVERY]
     if not bool(rim.any()) or bool(rim.all()):
         return Gaussians.empty()
     coarse, rgb = far_fill(seeds.inverse_depth[EVERY], seeds.rgb[EVERY].permute(2, 0, 1), ~rim)
-    # At the rim, behind all that is seen or filled as far around as a blob reaches.
+    # Beneath the rim, behind all visible or filled surfaces within a blob's reach.
     depth, chosen = seeds.inverse_depth.clone(), mask.new_zeros(mask.shape)
     depth[EVERY], chosen[EVERY] = coarse, rim
     placed = placed_behind(depth, chosen, seeds.inverse_depth, COARSE * BLOB_CELLS)[EVERY]
@@ -315,13 +315,13 @@ def rim_underlay(mask: Tensor, seeds: Seeds, camera: Camera) -> Gaussians:
 
 
 class _Stage:
-    """The base and the Gaussians added to it, on the renderer's device, and their last rendering."""
+    """The base, the Gaussians added to it, and their last rendering, all on the renderer's device."""
 
     def __init__(self, context: FillContext) -> None:
         self._renderer, self._device, self._sets = context.renderer, device_of(context.renderer), [context.base]
 
     def look(self, camera: Camera, rendering: Rendering | None = None) -> Rendering:
-        """The rendering from a camera, on the processor; `rendering`, if given, is used."""
+        """The rendering from a camera, copied to the CPU; `rendering`, if given, is used instead of a new one."""
         drawn = self._renderer.render(self._sets, camera) if rendering is None else rendering.to(self._device)
         self._camera, self._drawn = camera, drawn
         return drawn.to(PROCESSOR)
@@ -331,7 +331,7 @@ class _Stage:
         self._sets += [part.to(self._device) for part in sets]
 
     def look_again(self, new: Gaussians) -> Rendering:
-        """Add Gaussians, and render from the last camera: only tiles that they touch are drawn."""
+        """Add Gaussians, and render from the last camera again; only the tiles that they touch are redrawn."""
         self.add(new)
         tiles = touched_tiles(new, self._camera)
         self._drawn = self._renderer.render(self._sets, self._camera, tiles=tiles, onto=self._drawn)

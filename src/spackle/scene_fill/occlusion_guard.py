@@ -1,6 +1,6 @@
-"""Keeping aux Gaussians behind what the photo and other views already show.
+"""Keep aux Gaussians behind the surfaces that the photo and other views already show.
 
-The paper composes a view's aux Gaussians with the base alone (eq. 8); one scene for many views needs this.
+The paper composes a view's aux Gaussians with the base alone (eq. 8); one scene for many views needs these guards.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from spackle.residual.view_features import MASK_THRESHOLD, PROCESSOR
 from spackle.surface import BEHIND
 
 WINDOW_PX = 4  # radius of the guard's window: most aux Gaussians reach no farther than this
-REACH = math.sqrt(-2 * math.log(ALPHA_MIN))  # standard deviations from its centre to which a Gaussian is seen
-MAX_REACH_PX = 40.0  # nor is a huge one's reach looked into farther than this
+REACH = math.sqrt(-2 * math.log(ALPHA_MIN))  # standard deviations from its centre within which a Gaussian is visible
+MAX_REACH_PX = 40.0  # a huge Gaussian is checked no farther from its centre than this
 PIT = 0.027  # of a view's width: a nearer patch that is less than twice as wide is a pit
-STEPS = 48  # candidate positions along the line of sight, even in inverse depth
+STEPS = 48  # candidate positions along the line of sight, evenly spaced in inverse depth
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,14 +46,14 @@ class OcclusionGuard:
 
 
 def push_behind(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) -> Gaussians:
-    """Move each Gaussian away from the eye of its view until it blocks no guard, see `free_factors`."""
+    """Move each Gaussian away from its view's eye until it hides no guarded surface, see `free_factors`."""
     return moved_away(aux, eye, free_factors(aux, eye, guards))
 
 
 def moved_away(aux: Gaussians, eye: Tensor, factors: Tensor) -> Gaussians:
-    """N Gaussians scaled about the eye [3] by factors [N], without those of factor 0.
+    """Scale N Gaussians about the eye [3] by factors [N]; those with factor 0 are left out.
 
-    This moves and grows a Gaussian without changing how that eye sees it.
+    This moves and enlarges a Gaussian, which looks the same from that eye.
     """
     eye, factor = beside(eye, aux.means), factors[:, None]
     moved = dataclasses.replace(aux, means=eye + factor * (aux.means - eye), scales=aux.scales * factor)
@@ -61,13 +61,13 @@ def moved_away(aux: Gaussians, eye: Tensor, factors: Tensor) -> Gaussians:
 
 
 def free_factors(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) -> Tensor:
-    """Factors [N] ≥ 1 by which Gaussians must move away from an eye so as to block no guard; 0 if none suffices.
+    """Factors [N] ≥ 1 by which Gaussians must move away from an eye to hide no guarded surface; 0 if none suffices.
 
-    Nearly all have one, because far away a Gaussian is behind every surface.
+    Nearly every Gaussian has such a factor: moved far enough away, it lies behind every surface.
 
     Args:
         aux: N Gaussians in the world's frame.
-        eye: [3] position of the camera that they were made for.
+        eye: [3] position of the camera for which they were made.
         guards: the views to protect.
     """
     if not len(aux) or not guards:
@@ -88,10 +88,10 @@ def free_factors(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) 
 
 
 def without_pits(depths: Tensor, cells: Tensor) -> Tensor:
-    """Depths [n] of a view's chosen cells ([h, w] bool), none of them nearer than most cells of its neighbourhood.
+    """Depths [n] of a view's chosen cells ([h, w] bool), after a morphological closing that removes narrow near spots.
 
-    A morphological closing. Moved one by one, neighbours of one surface would end at different depths and look
-    scattered from other views.
+    Neighbouring Gaussians of one surface, moved one by one, would end at different depths and look scattered from other
+    views.
     """
     reach = max(1, round(PIT * cells.shape[1]))
     grid = depths.new_zeros(cells.shape)
@@ -105,8 +105,9 @@ def _free_factors(
     first: int, last: int, eye: Any, rays: Any, quats: Any, scales: Any,
     lenses: Any, depths: Any, sizes: Any, starts: Any, factors: Any,
 ) -> None:  # fmt: skip
-    """For the Gaussians first..last the least factor 1 / (1 − k / STEPS) with which they block no guard; 0 if there is
-    none.
+    """For the Gaussians first..last, find the least factor 1 / (1 − k / STEPS) at which they hide no guarded surface.
+
+    The factor is 0 if there is none.
     """
     for n in range(first, last):
         factors[n] = 0
@@ -148,7 +149,7 @@ def _blocks(
     lens: Any, guards: Any, start: int, height: int, width: int,
     x: float, y: float, z: float, covariance: Any, factor: float,
 ) -> bool:  # fmt: skip
-    """Whether a Gaussian stands in front of a view's surface anywhere within its extent."""
+    """Whether a Gaussian lies in front of a view's surface anywhere within its extent."""
     depth = lens[12] * x + lens[13] * y + lens[14] * z + lens[15]
     if not depth > 0:
         return False
@@ -161,7 +162,7 @@ def _blocks(
     reach_v = _reach(lens, 8, lens[1] * factor / depth, tan_v, covariance)
     if u < -reach_u or v < -reach_v or u > width + reach_u or v > height + reach_v:
         return False
-    # Windows of the guard, side by side, cover the reach.
+    # Adjacent windows of the guard cover the reach.
     steps_u = int(np.ceil(max(reach_u - WINDOW_PX, 0.0) / (2 * WINDOW_PX)))
     steps_v = int(np.ceil(max(reach_v - WINDOW_PX, 0.0) / (2 * WINDOW_PX)))
     for j in range(-steps_v, steps_v + 1):
@@ -175,7 +176,7 @@ def _blocks(
 
 @kernel
 def _reach(lens: Any, row: int, scale: float, tangent: float, covariance: Any) -> float:
-    """The extent in pixels of a Gaussian from its centre, along the image axis of a row of the extrinsics."""
+    """A Gaussian's extent in pixels from its centre, along the image axis that `row` of the extrinsics belongs to."""
     a = scale * (lens[row] - tangent * lens[12])
     b = scale * (lens[row + 1] - tangent * lens[13])
     c = scale * (lens[row + 2] - tangent * lens[14])

@@ -1,7 +1,7 @@
 """Colours of filled holes: structure from the residual, texture from patches or an inpainter.
 
-The paper's network learns from an inpainter's pictures; one that learns from true views stays smooth where the truth is
-ambiguous.
+The paper's network learns texture from an inpainter's images. A network that learns from true views predicts smooth
+colours where the truth is ambiguous, so texture is added here.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from spackle.residual.base_values import Seeds
 from spackle.residual.network import Rim
 from spackle.residual.view_features import CELL, LEAST, ViewFeatures, hole_mask
 
-TEXTURE_PX = 2.0  # standard deviation: what this blur takes away is texture, what it leaves is structure
-TEXTURE_FADING = 0.16  # mismatch at which a third of the texture is left
-EXTENDED_CELLS, SAME_DEPTH = 4.0, 0.05  # reach of the photo's own colours beyond its border; relative depth
-OVERLAP_PX = 0.8  # standard deviation of what a pixel shows of the blobs: more than theirs, for votes blur as well
-STEPS = 2  # of `sharpened`
+TEXTURE_PX = 2.0  # standard deviation of a blur: what it removes is texture, what remains is structure
+TEXTURE_FADING = 0.16  # mismatch at which the texture has faded to 1/e
+EXTENDED_CELLS, SAME_DEPTH = 4.0, 0.05  # reach of the rim's colours beyond the photo's border; relative depth
+OVERLAP_PX = 0.8  # standard deviation of blobs' blur in the image: wider than a blob, because votes blur as well
+STEPS = 2  # Jacobi steps of `sharpened`
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,15 +37,15 @@ class HoleView:
     features: ViewFeatures
     seeds: Seeds  # of all cells
     rim: Rim
-    patches: Patches  # that match the masked cells
-    structure: Tensor  # [h, w, 3] sRGB of all cells, the masked ones as the residual fills them
+    patches: Patches  # matching patches for the masked cells
+    structure: Tensor  # [h, w, 3] sRGB of all cells; masked cells have the residual's colours
 
 
-Texture = Callable[[HoleView], Tensor]  # colours [2h, 2w, 3] sRGB of the view's pixels; those of masked cells count
+Texture = Callable[[HoleView], Tensor]  # colours [2h, 2w, 3] sRGB of the view's pixels; only masked cells are used
 
 
 def exemplar_texture(view: HoleView) -> Tensor:
-    """High frequencies of the view itself over the residual's structure."""
+    """The residual's structure, with high frequencies copied from elsewhere in the view."""
     features, patches = view.features, view.patches
     pixels = in_cells(view.rendering.rgb)
     painted = from_cells(patch_blocks(patches, pixels))
@@ -57,17 +57,17 @@ def exemplar_texture(view: HoleView) -> Tensor:
 
 
 def painted_texture(painter: Inpainter, view: HoleView) -> Tensor:
-    """The view with its holes painted by an inpainter, structure included."""
+    """The view with its holes painted by an inpainter, which replaces the residual's structure too."""
     hole = hole_mask(view.rendering.alpha)
     views = (view.rendering.rgb[None], hole[None], known_inverse_depth(view.rendering.depth, hole)[None])
     return from_cells(in_cells(painter.paint(*views)[0]))
 
 
 def patch_blocks(patches: Patches, blocks: Tensor) -> Tensor:
-    """A finer picture of which each cell is a block, [H, W, k, k, c], its hole filled with blocks from elsewhere in it.
+    """Fill the holes of an image given as one block per cell, [H, W, k, k, c], with blocks from elsewhere in the image.
 
-    A block is the mean of the blocks that the matches of its cell and of its eight neighbours give, better matches
-    counting more. `Patches.rgb`, in which whole patches vote, loses fine detail.
+    A filled block is the mean of the blocks proposed by the matches of its cell and of the eight neighbours, weighted
+    towards better matches. `Patches.rgb`, in which whole patches vote, loses fine detail.
     """
     height, width = patches.mismatch.shape
     sources = torch.stack([blocks, blocks.flip(1, 3)])
@@ -79,7 +79,7 @@ def patch_blocks(patches: Patches, blocks: Tensor) -> Tensor:
     for dy, dx in itertools.product((-1, 0, 1), repeat=2):
         v, u = (y + dy).clamp(0, height - 1), (x + dx).clamp(0, width - 1)
         source, row, column = patches.matches[v, u].long().unbind(-1)
-        votes = (v == y + dy) & (u == x + dx) & matched[v, u]  # and then its patch lies within its source
+        votes = (v == y + dy) & (u == x + dx) & matched[v, u]  # a matched cell's patch lies within its source
         weight = votes * ((-costs[v, u] / limit).exp() + FAINTEST_VOTE)
         block = sources[source.clamp_min(0), (row - dy).clamp(0, height - 1), (column - dx).clamp(0, width - 1)]
         total += weight[:, None, None, None] * block
@@ -90,9 +90,9 @@ def patch_blocks(patches: Patches, blocks: Tensor) -> Tensor:
 
 
 def _in_proportion(fine: Tensor, view: HoleView) -> Tensor:
-    """Factors [h, w] of at most 1 that make texture [2h, 2w, 3] no stronger than that of the surface around a hole.
+    """Factors [h, w] ≤ 1 that make the texture `fine` [2h, 2w, 3] no stronger than that of the surface around a hole.
 
-    Strong texture from elsewhere does not belong on a plain wall, even if its patches match the tone.
+    Strong texture from elsewhere does not belong on a plain wall, even if its patches match the wall's tone.
     """
     energy, hole = avg_pool2d(fine.square().sum(-1)[None], CELL)[0], view.features.mask.float()
     parts = torch.stack([energy * hole, hole, energy * (1 - hole), 1 - hole], dim=-1)
@@ -105,16 +105,17 @@ def _in_proportion(fine: Tensor, view: HoleView) -> Tensor:
 
 
 def _magnified(cells: Tensor, mask: Tensor) -> Tensor:
-    """Colours [h, w, 3] of masked cells ([h, w] bool), interpolated to pixels [2h, 2w, 3]."""
+    """Interpolate colours [h, w, 3] to pixels [2h, 2w, 3], from the masked cells ([h, w] bool) alone."""
     both = torch.cat([cells * mask[..., None], mask[..., None]], dim=-1).permute(2, 0, 1)
     pixels = interpolate(both[None], scale_factor=CELL, mode="bilinear")[0].permute(1, 2, 0)
     return pixels[..., :3] / pixels[..., 3:].clamp_min(1e-6)
 
 
 def extended(view: HoleView) -> Tensor:
-    """Structure [h, w, 3] that, beyond the photo's border, starts with the colour of the nearest cell of equal depth.
+    """Structure [h, w, 3] that, just beyond the photo's border, has the colour of the nearest visible cell.
 
-    Behind an object the nearest cell is the object's, and nothing is extended.
+    With distance it fades to `structure`. The colour is used only if that cell has the same depth, and never behind an
+    object, because there the nearest cell is the object's.
     """
     features = view.features
     near = nearest_known(features.mask.numpy())
@@ -125,9 +126,9 @@ def extended(view: HoleView) -> Tensor:
 
 
 def sharpened(wanted: Tensor) -> Tensor:
-    """Colours [H, W, c] of blobs that show the wanted ones [H, W, c] where they overlap, by Jacobi steps.
+    """Colours [H, W, c] of blobs whose overlap shows the wanted colours [H, W, c], found by Jacobi steps.
 
-    A pixel shows about the mean of the blobs around it under their profile, a Gaussian of OVERLAP_PX.
+    A pixel shows about a weighted mean of the blobs around it; the weight is a Gaussian of OVERLAP_PX.
     """
     colors = wanted
     for _ in range(STEPS):
@@ -136,7 +137,7 @@ def sharpened(wanted: Tensor) -> Tensor:
 
 
 def in_cells(picture: Tensor) -> Tensor:
-    """The pixels of each cell, [h, w, 2, 2, c] of [H, W, c]; an odd last row or column is repeated."""
+    """Group an image's pixels [H, W, c] by cell: [h, w, 2, 2, c]; an odd last row or column is repeated."""
     for dim in (0, 1):
         if picture.shape[dim] % CELL:
             picture = torch.cat([picture, picture.narrow(dim, -1, 1)], dim=dim)
@@ -145,5 +146,5 @@ def in_cells(picture: Tensor) -> Tensor:
 
 
 def from_cells(blocks: Tensor) -> Tensor:
-    """The picture [2h, 2w, c] of pixels [h, w, 2, 2, c]."""
+    """The image [2h, 2w, c] of pixels grouped by cell, [h, w, 2, 2, c]."""
     return blocks.transpose(1, 2).flatten(2, 3).flatten(0, 1)
