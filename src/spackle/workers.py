@@ -1,6 +1,6 @@
-"""Photos shared by processes, here or on a Ray cluster: each sets up once, and results come as they are made.
+"""Divide jobs between processes, on this machine or a Ray cluster; each process sets up once.
 
-Ray (optional: pip install 'spackle-nvs[ray]') gives the same results as the processes of this machine.
+Ray (optional: pip install 'spackle-nvs[ray]') gives the same results as local processes.
 """
 
 from __future__ import annotations
@@ -31,40 +31,40 @@ from spackle.errors import InputError, reason_in_a_line
 from spackle.folders import differences
 from spackle.task_process import end_with_parent
 
-QUEUED = 2  # jobs of a worker: the one it works on, and the next; results that are not yet taken use memory
+QUEUED = 2  # jobs per worker: the current one and the next; more would hold more uncollected results in memory
 MAX_WORKERS = 1024
-ANSWER_S = 30.0  # for a Ray cluster to answer
-START_S = 600.0  # for a worker to start where there is none, on a cluster that has room for it
-RETRIES = 3  # of a photo whose worker died
+ANSWER_S = 30.0  # how long a Ray cluster may take to answer
+START_S = 600.0  # how long the first worker may take to start on a cluster that has room for it
+RETRIES = 3  # how often a photo is tried again after its worker died
 Log = Callable[[str], None]
 R = TypeVar("R")
 
 
 class PhotoWorker(Protocol):
-    """A worker, which does one job after the other. A job is pickled, and its `path` names the photo in messages."""
+    """Does one job after the other. Jobs are pickled; messages name a job's photo by its `path`."""
 
     @property
     def setup(self) -> Mapping[str, Any]:
-        """The setup that decides results besides the jobs, ready for JSON: it must be the same on every machine."""
+        """Everything but the job that affects results, ready for JSON; it must be the same on every machine."""
 
     def inputs(self, job: Any) -> object:
         """Digests of the files that a job reads, as they lie on this machine."""
 
     def make(self, job: Any) -> Any:
-        """The result, which is pickled; InputError where no job can be done."""
+        """Do a job and return its result, which is pickled; InputError if no job can be done."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Workers:
-    """The number of processes, and where they work."""
+    """How many processes work, and where."""
 
     count: int = 1
-    threads: int = 2  # of each
-    ray: str | None = None  # address of their cluster; this machine where None
-    gpu: bool = False  # each takes one, on a cluster that has any; on this machine they share what there is
+    threads: int = 2  # threads per process
+    ray: str | None = None  # address of a Ray cluster; None: this machine
+    gpu: bool = False  # on a cluster with GPUs each worker takes one; on this machine the workers share them
 
     def check(self) -> None:
-        """InputError for a number out of bounds."""
+        """InputError if a number is out of bounds."""
         for name, value in (("--workers", self.count), ("--threads", self.threads)):
             if not 1 <= value <= MAX_WORKERS:
                 raise InputError(f"{name} must be between 1 and {MAX_WORKERS}, got {value}")
@@ -72,7 +72,7 @@ class Workers:
 
 @contextlib.contextmanager
 def threads_of_torch(count: int) -> Iterator[None]:
-    """Compute with this number of threads during the block."""
+    """Let torch use this number of threads inside the `with` block."""
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:
@@ -89,10 +89,10 @@ def at_work(
     log: Log,
     stop: Callable[[], bool],
 ) -> AbstractContextManager[Iterator[Any]]:
-    """Results as they come, in any order: from this process with one worker, from several, or on the cluster `ray`.
+    """Yield results as they arrive, in any order, from the cluster `ray`; if that is None, from this machine.
 
-    Each process calls `open_worker`, which is pickled, once. InputError where no job can be done. Where SIGTERM, of
-    which `stop` tells, ends the processes of this machine, the results end, too.
+    A single worker runs in this process. Each process calls `open_worker`, which is pickled, once. InputError if no job
+    can be done. If SIGTERM ends this machine's processes and `stop` returns True, the results end without an error.
     """
     if ray is None:
         return at_work_here(workers, open_worker, jobs, stop)
@@ -106,14 +106,14 @@ def at_work(
 def at_work_here(
     workers: Workers, open_worker: Callable[[], PhotoWorker], jobs: Sequence[Any], stop: Callable[[], bool]
 ) -> Iterator[Iterator[Any]]:
-    """Like `at_work`, on this machine; InputError also if a worker dies, unless `stop` says why."""
+    """Like `at_work`, on this machine; InputError also if a worker dies, unless `stop` returns True."""
     if workers.count == 1 or len(jobs) < 2:
         with threads_of_torch(workers.threads):
             yield map(open_worker().make, jobs)
         return
     count = min(workers.count, len(jobs))
     spawn = multiprocessing.get_context("spawn")  # torch's threads do not survive a fork
-    numbers = spawn.SimpleQueue()  # each process takes one
+    numbers = spawn.SimpleQueue()  # each process takes one number
     for number in range(count):
         numbers.put(number)
     start = workers.threads, open_worker, numbers if workers.gpu else None
@@ -125,7 +125,7 @@ def at_work_here(
 
 
 def results_of(futures: Iterable[Future[R]], most: int = 1, stop: Callable[[], bool] = lambda: False) -> Iterator[R]:
-    """Results as they come, of at most `most` futures at a time; no more once SIGTERM came to all processes."""
+    """Yield results as they arrive, with at most `most` futures pending; SIGTERM to all processes ends them."""
     left, pending = iter(futures), set[Future[R]]()
     try:
         while pending := pending | set(itertools.islice(left, most - len(pending))):
@@ -139,11 +139,11 @@ def results_of(futures: Iterable[Future[R]], most: int = 1, stop: Callable[[], b
             ) from error
 
 
-_open_worker: Callable[[], PhotoWorker]  # of a worker process; its errors belong to a job's result
+_open_worker: Callable[[], PhotoWorker]  # set in each worker process; a job calls it and reports its errors
 
 
 def _start(threads: int, open_worker: Callable[[], PhotoWorker], numbers: Any) -> None:
-    """Start a worker process, which ignores Ctrl-C and ends with the main process; `numbers` assigns the GPUs."""
+    """Set up a worker process: it ignores Ctrl-C, ends with the main process, and gets a GPU by `numbers`."""
     global _open_worker
     _open_worker = functools.cache(open_worker)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -162,14 +162,14 @@ def _make(job: Any) -> Any:
 
 @contextlib.contextmanager
 def cluster(workers: Workers) -> Iterator[Any]:
-    """The package, connected to the cluster of --ray; None without --ray. A cluster of our own ends with the block.
+    """The `ray` package, connected to the cluster of --ray; None without --ray. `local` clusters end with the block.
 
-    InputError where Ray is not installed, nothing answers at the address, or there is too little room.
+    InputError if Ray is not installed, nothing answers at the address, or the cluster is too small.
     """
     if workers.ray is None:
         yield None
         return
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # it would report to its makers
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # otherwise Ray reports usage to its makers
     try:
         import ray as package
     except ImportError as error:
@@ -184,20 +184,20 @@ def cluster(workers: Workers) -> Iterator[Any]:
 
 
 def _connect(ray: Any, address: str, cpus: int) -> None:
-    """Connect to a cluster, or start one of our own (`local`) with this number of CPUs."""
+    """Connect to a cluster; `local` starts one on this machine with this number of CPUs."""
     local: dict[str, Any] = {"num_cpus": cpus, "include_dashboard": False} if address == "local" else {}
     reason = None if local else _silence(address)
     if reason is None:
         before = signal.getsignal(signal.SIGTERM)
         try:
             ray.init(address, log_to_driver=False, logging_level=logging.ERROR, **local)
-            with contextlib.suppress(AttributeError):  # of each death it prints a page, and we say a line
+            with contextlib.suppress(AttributeError):  # Ray prints a page for each dead worker; we log a line
                 ray._private.worker._worker_logs_enabled = False
             return
         except (OSError, RuntimeError, ValueError) as error:
             reason = reason_in_a_line(error)
         finally:
-            if threading.current_thread() is threading.main_thread():  # where Ray takes SIGTERM for itself
+            if threading.current_thread() is threading.main_thread():  # only there does Ray replace the SIGTERM handler
                 signal.signal(signal.SIGTERM, before)
     raise InputError(
         f"--ray {address}: no cluster: {reason}: is one running there (`ray start --head`), "
@@ -206,8 +206,9 @@ def _connect(ray: Any, address: str, cpus: int) -> None:
 
 
 def _silence(address: str) -> str | None:
-    """Why no cluster answers, or None. A separate process asks, because Ray tries for minutes and then ends its
-    process.
+    """The reason why no cluster answers; None if one does.
+
+    A separate process connects, because Ray tries for minutes and then ends the process it runs in.
     """
     code = "import ray, sys; ray.init(sys.argv[1], log_to_driver=False)"
     words = [sys.executable, "-W", "ignore", "-c", code, address]
@@ -220,7 +221,7 @@ def _silence(address: str) -> str | None:
 
 
 def _check_room(workers: Workers, nodes: Sequence[Mapping[str, Any]]) -> None:
-    """Refuse a cluster that is too small, for which Ray would wait for ever; busy CPUs count as room."""
+    """InputError if a cluster is too small: Ray would wait for ever. Busy CPUs count as free."""
     alive = [node["Resources"] for node in nodes if node["Alive"]]
     cpus, gpus = workers.threads, gpus_of(workers, nodes)
     room = sum(int(min(has.get("CPU", 0) // cpus, has.get("GPU", 0) // gpus if gpus else 1e9)) for has in alive)
@@ -233,21 +234,21 @@ def _check_room(workers: Workers, nodes: Sequence[Mapping[str, Any]]) -> None:
 
 
 def gpus_of(workers: Workers, nodes: Sequence[Mapping[str, Any]]) -> int:
-    """GPUs of each worker: 1 if it can use one and any node has one, else 0."""
+    """The number of GPUs per worker: 1 if workers can use one and any node has one, else 0."""
     return int(workers.gpu and any(node["Alive"] and node["Resources"].get("GPU", 0) >= 1 for node in nodes))
 
 
 class RemoteWorker:
-    """A `PhotoWorker` on a node, which has to see the same files as the main process."""
+    """A `PhotoWorker` on a cluster node; the node must see the same files as the main process."""
 
     def __init__(self, open_worker: Callable[[], PhotoWorker], threads: int, folder: str) -> None:
         self.open_worker, self.node = open_worker, f"node {socket.gethostname()}"
         torch.set_num_threads(threads)
-        with contextlib.suppress(OSError):  # without this folder of the main process, its relative paths fail later
+        with contextlib.suppress(OSError):  # if the node lacks the main process's folder, relative paths fail later
             os.chdir(folder)
 
     def begin(self, expected: Mapping[str, Any]) -> None:
-        """Set the worker up; InputError if version or weights differ from the main process's."""
+        """Set up the worker; InputError if its version or weights differ from the main process's."""
         try:
             self.worker = self.open_worker()
             setup = self.worker.setup
@@ -260,7 +261,7 @@ class RemoteWorker:
             )
 
     def make(self, job: Any, expected: object) -> Any:
-        """Like `PhotoWorker.make`; InputError also if the node sees another photo or depth map."""
+        """Like `PhotoWorker.make`; InputError also if the photo or depth map has other content on this node."""
         if self.worker.inputs(job) != expected:
             raise InputError(
                 f"{job.path}: {self.node} does not find this photo or its depth map, or others in "
@@ -272,16 +273,16 @@ class RemoteWorker:
 def _results(
     ray: Any, workers: Workers, open_worker: Callable[[], PhotoWorker], jobs: Sequence[Any], log: Log
 ) -> Generator[Any, None, None]:
-    """Like `at_work`, on the cluster; InputError also for a node that differs from the main process.
+    """Like `at_work`, on the cluster; InputError also if a node's setup differs from the main process's.
 
-    A worker that dies is logged and replaced, and its jobs are queued again; InputError after `RETRIES` deaths at one
-    photo. Ray's `ActorPool` does not name the call that failed.
+    When a worker dies, the death is logged, a new worker starts, and the lost jobs are queued again; more than
+    `RETRIES` deaths at one photo raise InputError. Ray's `ActorPool` would not tell which call failed.
     """
-    here, queue, deaths = open_worker(), deque(jobs), Counter[Path | None]()  # deaths by photo; None as workers start
+    here, queue, deaths = open_worker(), deque(jobs), Counter[Path | None]()  # deaths by photo; key None: during start
     gpus = gpus_of(workers, ray.nodes())
     kind = ray.remote(num_cpus=workers.threads, num_gpus=gpus, max_restarts=0)(RemoteWorker)
-    queued: dict[Any, list[Any]] = {}  # of each worker that has started; it works on the first
-    calls: dict[Any, tuple[Any, Any]] = {}  # worker and job of each awaited answer; no job as it starts
+    queued: dict[Any, list[Any]] = {}  # jobs of each started worker; it works on the first
+    calls: dict[Any, tuple[Any, Any]] = {}  # worker and job of each pending call; job None: the worker is starting
     missing = min(workers.count, len(jobs))
     try:
         while queue or any(queued.values()):
@@ -305,8 +306,8 @@ def _results(
                 answer = ray.get(done[0])
             except ray.exceptions.RayTaskError as error:
                 raise error.cause from error
-            except ray.exceptions.RayError as error:  # the process has died, or its node
-                ray.kill(worker)  # it may only be out of reach
+            except ray.exceptions.RayError as error:  # the process or its node has died
+                ray.kill(worker)  # it may be alive but unreachable
                 calls = {call: pair for call, pair in calls.items() if pair[0] is not worker}
                 lost = queued.pop(worker, [])
                 queue.extendleft(reversed(lost))
@@ -324,7 +325,7 @@ def _results(
 
 
 def _count_death(deaths: Counter[Path | None], photo: Path | None, workers: Workers, why: str, log: Log) -> None:
-    """Log a worker's death; InputError after too many."""
+    """Log a worker's death; InputError after more than `RETRIES` at one photo."""
     deaths[photo] += 1
     where = f"--ray {workers.ray}: as it started" if photo is None else f"{photo}: at this photo"
     if deaths[photo] > RETRIES:

@@ -1,4 +1,4 @@
-"""`spackle dataset build`: photos to shards, with the same bytes however often the build is interrupted."""
+"""`spackle dataset build`: photos to shards, whose bytes are the same however often the build is interrupted."""
 
 from __future__ import annotations
 
@@ -30,29 +30,29 @@ from spackle.residual import MASK_THRESHOLD
 from spackle.weights import weights_digest, weights_digests
 from spackle.workers import Workers, at_work, cluster
 
-MAX_PHOTOS = 1_000_000  # six digits name a photo
-PARTS = "parts"  # in the output: samples that are in no shard yet
+MAX_PHOTOS = 1_000_000  # a photo's key has six digits
+PARTS = "parts"  # folder in the output for samples that are not in a shard yet
 STAGES = ("load", "base", "render", "inpaint", "encode", "write")
 
 
 @dataclasses.dataclass(frozen=True)
 class DatasetOptions:
-    """The options of `spackle dataset build`; the command line keeps its numbers within their bounds."""
+    """The options of `spackle dataset build`; the command line checks the bounds of its numbers."""
 
     base: BaseSettings
-    images: Path | None = None  # folder of the photos of a COCO JSON
-    sample: int | None = None  # number of photos; all where None
-    seed: int = 0  # of the choice of photos, and of the paths
-    views: int = 20  # of a photo, its own among them, as in the paper
-    trajectory: SharpTrajectory | None = None  # drawn for each photo where None
+    images: Path | None = None  # folder of the photos that a COCO JSON names
+    sample: int | None = None  # number of photos; None: all
+    seed: int = 0  # for the choice of photos and paths
+    views: int = 20  # per photo, including its own view, as in the paper
+    trajectory: SharpTrajectory | None = None  # None: drawn for each photo
     disparity: tuple[float, float] = (0.1, 0.6)  # drawn between these, see `spackle.camera_path.max_offset`
-    inpainter: str = "exemplar"  # of `COMPLETIONS`
-    inpainter_weights: Path | None = None  # a file or a folder, for one with a network
-    inpainter_side: int | None = None  # long side in pixels at which its network works
+    inpainter: str = "exemplar"  # one of `COMPLETIONS`
+    inpainter_weights: Path | None = None  # a file or folder, if the inpainter has a network
+    inpainter_side: int | None = None  # long side in pixels of the images that the inpainter's network gets
     workers: int = 1  # processes
-    ray: str | None = None  # address of their cluster; this machine where None
-    threads: int = 2  # of each
-    shard_size: int = 50  # photos
+    ray: str | None = None  # address of a Ray cluster; None: this machine
+    threads: int = 2  # threads per process
+    shard_size: int = 50  # photos per shard
 
     @property
     def inpaints_by_network(self) -> bool:
@@ -65,21 +65,21 @@ class DatasetOptions:
         return Workers(self.workers, self.threads, self.ray, gpu)
 
     def open_inpainter(self) -> Inpainter | None:
-        """The inpainter; None if targets are rendered or left open. InputError if a package or weights are missing."""
+        """Open the inpainter; None if none paints the targets. InputError if a package or weights are missing."""
         if self.inpainter not in INPAINTERS:
             return None
         device = None if self.base.device == "auto" else self.base.device
         return get_inpainter(self.inpainter, InpainterOptions(self.inpainter_weights, self.inpainter_side, device))
 
     def check(self) -> None:
-        """InputError for options that contradict each other; inpainters check their own options."""
+        """InputError if options contradict each other; inpainters check their own options."""
         self.base.check(one=True)
         depth = self.base.depth
         if depth is None and not self.base.network:
             raise InputError(
                 f"--base {self.base.name} needs the photos' depth: give --depth FOLDER; {', '.join(NETWORKS)} need none"
             )
-        if isinstance(depth, Path) and not depth.is_dir():  # one map for all photos would be wrong for all but one
+        if isinstance(depth, Path) and not depth.is_dir():  # a single map would fit one photo only
             raise InputError(f"--depth {depth}: no such folder: a dataset takes one with a depth map for each photo")
         check_name("--inpainter", self.inpainter, COMPLETIONS)
         for option, value in (("weights", self.inpainter_weights), ("side", self.inpainter_side)):
@@ -94,7 +94,7 @@ class DatasetOptions:
         self.processes.check()
 
     def depth_of(self, photo: PhotoFile) -> Path | None:
-        """A photo's depth map in --depth, below the photo's subfolder; None without --depth; InputError if missing."""
+        """A photo's depth map in --depth or the photo's subfolder of it; None without --depth; InputError if missing."""
         folder = self.base.depth
         if not isinstance(folder, Path):
             return None
@@ -106,14 +106,14 @@ class DatasetOptions:
         try:
             depth = self.depth_of(photo)
             return [photo.name, photo.sha256, *([fingerprint(depth, "depth map")] if depth else [])]
-        except InputError:  # the build names it later
+        except InputError:  # the build reports it later
             return [photo.name, photo.sha256, "none"]
 
 
 def configuration(options: DatasetOptions, photos: Sequence[PhotoFile], inpainter: Inpainter | None) -> dict[str, Any]:
-    """The configuration: everything that decides the shards' bytes, ready for JSON, without paths of this machine.
+    """Everything that determines the shards' bytes, ready for JSON, without paths of this machine.
 
-    The number of threads is part of it, because SHARP's last bits depend on it; the number of workers is not.
+    This includes the number of threads, on which SHARP's last bits depend, but not the number of workers.
     """
     base = options.base
     inputs = digest_of([options.inputs_of(photo) for photo in photos])
@@ -147,16 +147,16 @@ def _completion(options: DatasetOptions, inpainter: Inpainter | None) -> dict[st
 
 
 def build_dataset(source: Path, output: Path, options: DatasetOptions, reporter: Reporter) -> str:
-    """Build a dataset of a folder of photos or of COCO annotations, or resume that build.
+    """Build a dataset from a folder of photos or from COCO annotations, or resume that build.
 
     Returns:
         "complete", or "stopped" by Ctrl-C.
 
     Raises:
-        InputError: options, photos or folders that cannot be used; another dataset in `output`.
+        InputError: options, photos or folders cannot be used, or `output` holds another dataset.
     """
     options.check()
-    maker = Maker(options)  # fails before long work
+    maker = Maker(options)  # raises its errors before any long work
     if maker.inpainter is not None and maker.inpainter.notice:
         reporter.log(maker.inpainter.notice)
     with cluster(options.processes) as ray:
@@ -175,33 +175,33 @@ def build_dataset(source: Path, output: Path, options: DatasetOptions, reporter:
 
 @dataclasses.dataclass(frozen=True)
 class Made:
-    """The sample of a photo, or the reason why there is none."""
+    """The sample of a photo, or the reason why it has none."""
 
     index: int
     seconds: dict[str, float]  # of each stage
-    sample: bytes | None = None  # a stretch of a tar archive
+    sample: bytes | None = None  # the photo's part of a tar archive
     problem: str | None = None
 
 
 class Maker:
-    """A `PhotoWorker` that makes the sample of one photo after the other: its base, views and targets."""
+    """A `PhotoWorker` that makes photos' samples: base, views and targets."""
 
     def __init__(self, options: DatasetOptions) -> None:
-        """Open base and inpainter, whose networks are loaded with the first photo; InputError where that fails."""
+        """Open base and inpainter; InputError if that fails. Their networks are loaded with the first photo."""
         self.options, self.base = options, open_base(options.base)
         self.renderer, self.inpainter = get_renderer(options.base.device), options.open_inpainter()
 
     @property
     def setup(self) -> dict[str, Any]:
-        """The manifest's configuration without the photos."""
+        """The manifest's configuration, without the photos."""
         return configuration(self.options, (), self.inpainter)
 
     def inputs(self, photo: PhotoFile) -> list[str]:
-        """Digests of a photo and of its depth map on this machine."""
+        """Name and digests of a photo and of its depth map, as this machine has them."""
         return [photo_digest(photo.path), *self.options.inputs_of(photo)]
 
     def make(self, photo: PhotoFile) -> Made:
-        """A photo's sample; BaseError if no photo can give one."""
+        """Make a photo's sample; BaseError if the base would fail for every photo."""
         seconds: dict[str, float] = {}
         try:
             return Made(photo.index, seconds, sample=self._sample(photo, seconds))
@@ -252,7 +252,7 @@ class _Build:
         reporter: Reporter,
         config: dict[str, Any],
     ) -> None:
-        """Start a build in a folder, or resume the one there; InputError if that is another dataset."""
+        """Start a build in a folder, or resume it; InputError if the folder holds another dataset."""
         self.photos, self.output, self.options, self.reporter = photos, output, options, reporter
         self.config, self.size = config, options.shard_size
         if not (output / NAME).exists():
@@ -265,12 +265,12 @@ class _Build:
         remove_half_written(output, output / PARTS)
         sizes = {path.name: path.stat().st_size for path in output.iterdir() if path.is_file()}
         self.shards = {int(s.file[6:-4]): s for s in manifest.shards if sizes.get(s.file) == s.size}
-        self.missing = {  # photos by their index
+        self.missing = {  # indices of photos
             index
             for index in range(len(photos))
             if index // self.size not in self.shards and not self._part(index).is_file()
         }
-        self.problems: dict[int, str] = {}  # of photos that give no sample
+        self.problems: dict[int, str] = {}  # why photos have no sample, by index
         self.seconds = dict.fromkeys(STAGES, 0.0)
 
     def run(self, ray: Any) -> str:
@@ -298,11 +298,11 @@ class _Build:
         return "complete"
 
     def _part(self, index: int) -> Path:
-        """The file in which a photo's sample waits for its shard."""
+        """The file that holds a photo's sample until its shard is written."""
         return self.output / PARTS / f"{self.photos[index].key}.tar"
 
     def _keep(self, result: Made) -> None:
-        """Write a photo's sample where it waits for its shard, or log why there is none."""
+        """Write a photo's sample to its `_part`, or log why there is none."""
         if result.sample is not None:
             with timed("write", self.seconds):
                 write_whole(self._part(result.index), result.sample)
@@ -314,7 +314,7 @@ class _Build:
             self.reporter.log(f"passed over: {result.problem}")
 
     def _write_shard(self, number: int) -> None:
-        """Write a finished shard: first the file, then its entry; then its parts are deleted."""
+        """If all photos of a shard are done, write its file, then its entry in the manifest; then delete its parts."""
         indices = range(number * self.size, min((number + 1) * self.size, len(self.photos)))
         if number in self.shards or not self.missing.isdisjoint(indices):
             return
@@ -333,12 +333,12 @@ class _Build:
         Manifest(config=self.config, shards=shards, complete=complete).save(self.output)
 
     def _finish(self, made: int, seconds: float) -> None:
-        """Write the final manifest and remove other files; InputError, leaving nothing, if no photo gave a sample."""
+        """Write the final manifest and remove the parts; if there is no sample, delete everything and raise InputError."""
         shards = self.shards.values()
         samples = sum(len(shard.samples) for shard in shards)
         if samples:
             self._save(complete=True)
-        for file in (self.output / PARTS).iterdir():  # of shards that an earlier run had finished
+        for file in (self.output / PARTS).iterdir():  # left by a run that was killed after writing their shard
             file.unlink(missing_ok=True)
         (self.output / PARTS).rmdir()
         if not samples:
@@ -353,10 +353,10 @@ class _Build:
         self.reporter.log(f"{counted(samples, 'photo')} in {counted(len(shards), 'shard')}, {total} -> {self.output}")
 
     def _portable(self, name: str, problem: str) -> str:
-        """A photo's problem without the folders of photos and depth maps, which differ between machines."""
+        """The error message about a photo, without the paths of folders, which differ between machines."""
         for photo in self.photos:
             problem = problem.replace(str(photo.path), photo.name)
         depth = self.options.base.depth
-        if isinstance(depth, Path) and depth.name:  # "." and "/" stand anywhere
+        if isinstance(depth, Path) and depth.name:  # "." and "/" would be found anywhere
             problem = problem.replace(str(depth), "--depth")
         return problem if problem.startswith(f"{name}: ") else f"{name}: {problem}"

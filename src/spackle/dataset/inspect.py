@@ -1,4 +1,4 @@
-"""`spackle dataset info`, `verify` and `preview`: what a dataset holds, whether it is whole, what it looks like."""
+"""`spackle dataset info`, `verify` and `preview`: a dataset's contents, its integrity, and its images."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from spackle.formats.png import sheet
 from spackle.progress import Reporter, Step, counted
 
 SHEET, VIDEO = "sheet.png", "trajectory.mp4"
-THUMBNAIL = 192  # pixels along its longer side
+THUMBNAIL = 192  # pixels of a thumbnail's longer side
 FPS = 8
 
 
 def show_info(location: str, console: Console) -> None:
-    """Print counts, sizes, holes and configuration."""
+    """Print a dataset's counts, sizes, holes and configuration."""
     manifest = load_manifest(location)
     samples = manifest.samples
     lines = [
@@ -47,7 +47,7 @@ def show_info(location: str, console: Console) -> None:
 
 
 def verify_dataset(location: str, reporter: Reporter) -> int:
-    """Read every byte; returns how many things are wrong, after a line for each. InputError without a manifest."""
+    """Read every byte and log each problem; returns the number of problems. InputError without a manifest."""
     manifest = load_manifest(location)
     count = 0
     with reporter.stage("verify") as step:
@@ -60,7 +60,7 @@ def verify_dataset(location: str, reporter: Reporter) -> int:
 
 
 def problems(location: str | os.PathLike[str], manifest: Manifest, progress: Step) -> Iterator[str]:
-    """Read every byte of a dataset: a line for each thing that is wrong. `progress` counts bytes."""
+    """Read every byte of a dataset and yield a line for each problem. `progress` counts bytes."""
     done = 0
     if not manifest.complete:
         yield "the dataset is not finished: run the command that builds it again"
@@ -74,7 +74,7 @@ def problems(location: str | os.PathLike[str], manifest: Manifest, progress: Ste
 
 
 def _shard_problems(location: str | os.PathLike[str], shard: ShardEntry) -> Iterator[str]:
-    """Compare each sample with its digest, and the rest with the end of an archive; InputError for no such file."""
+    """Check a shard's size, the digest of each sample, and the end of the archive; InputError if it cannot be read."""
     with open_in(location, shard.file) as file, reading(shard.file, "cannot be read: {reason}", OSError):
         size = file.seek(0, os.SEEK_END)
         if size != shard.size:
@@ -90,9 +90,9 @@ def _shard_problems(location: str | os.PathLike[str], shard: ShardEntry) -> Iter
 
 
 def preview_dataset(location: str, output: Path, photos: int, views: int, reporter: Reporter) -> None:
-    """Write a sheet (base, mask and target of some views of some photos) and a video of one path, base beside target.
+    """Write a sheet (base, mask and target of some views of some photos) and a video along one path, base beside target.
 
-    InputError for a dataset that is unfinished or damaged, or a folder that cannot be written to.
+    InputError if the dataset is unfinished or damaged, or the folder cannot be written to.
     """
     files = DatasetFiles(location)
     if not len(files):
@@ -105,7 +105,7 @@ def preview_dataset(location: str, output: Path, photos: int, views: int, report
             masks = [view.mask[..., None].expand(-1, -1, 3).float() for view in chosen]
             rows += [[view.rendering.rgb for view in chosen], masks, [view.target for view in chosen]]
         save_png(sheet(rows, THUMBNAIL, fill=1.0), output / SHEET)
-        # The path without the photo's own view, which comes before it.
+        # View 0 is the photo's own, which is not on the path.
         path = (groups[0].view(index) for index in range(1, groups[0].views))
         save_video((torch.cat([view.rendering.rgb, view.target], dim=1) for view in path), output / VIDEO, fps=FPS)
     reporter.log(f"{SHEET} and {VIDEO} -> {output}")

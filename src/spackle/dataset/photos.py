@@ -1,4 +1,4 @@
-"""The photos of a dataset: those of a folder, or those that COCO's annotations name."""
+"""The photos of a dataset: from a folder, or named by COCO annotations."""
 
 from __future__ import annotations
 
@@ -16,36 +16,36 @@ from spackle.image import PHOTO_SUFFIXES, load_photo
 from spackle.progress import Step
 
 SUFFIXES = (*PHOTO_SUFFIXES, ".gif", ".bmp")
-MIN_SIDE = 32  # pixels: a smaller picture has no depth that anybody could see
+MIN_SIDE = 32  # pixels: no depth can be recognised in smaller images
 MAX_JSON_BYTES = 1 << 30
-NAMED = 5  # missing files that the log names
+NAMED = 5  # how many missing files the log names
 
 
 @dataclasses.dataclass(frozen=True)
 class PhotoFile:
     """A photo of a dataset."""
 
-    index: int  # its place among the photos
+    index: int  # its number in the dataset
     path: Path
     name: str  # relative to its folder, with slashes
     sha256: str  # of the file
 
     @property
     def key(self) -> str:
-        """The photo's number, with which the names of its files in the dataset begin."""
+        """The photo's number as text; its files in the dataset have names that begin with it."""
         return f"{self.index:06d}"
 
 
 def find_photos(source: Path, folder: Path | None, log: Callable[[str], None]) -> tuple[Path, list[str]]:
-    """The folder of the photos, and their names in it, sorted.
+    """Find a dataset's photos; returns their folder, and their sorted names relative to it.
 
     Args:
-        source: a folder with its subfolders, or a COCO file `{"images": [{"file_name": …}, …]}`.
-        folder: where the COCO file's photos lie; None: beside it.
-        log: gets a line where photos that the COCO file names are missing.
+        source: a folder, whose subfolders are included, or a COCO file `{"images": [{"file_name": …}, …]}`.
+        folder: where the COCO file's photos are; None: beside the file.
+        log: receives a line if photos that the COCO file names are missing.
 
     Raises:
-        InputError: no photo, or no such file.
+        InputError: there is no photo, or no such file.
     """
     if not os.path.isdir(source):
         return _named_by_coco(source, folder, log)
@@ -68,7 +68,7 @@ def _named_by_coco(source: Path, folder: Path | None, log: Callable[[str], None]
     root = source.parent if folder is None else folder
     if not os.path.isdir(root):
         raise InputError(f"{root}: no such folder, and the photos of {source.name} should be in it")
-    for name in names:  # stays in its folder
+    for name in names:  # names must not lead out of the folder
         if not isinstance(name, str) or not name or "\0" in name or name.startswith("/") or ".." in Path(name).parts:
             raise InputError(f"{source}: {str(name)[:60]!r} is no file name of an image")
     unique = sorted({Path(name).as_posix() for name in names})
@@ -84,21 +84,20 @@ def _named_by_coco(source: Path, folder: Path | None, log: Callable[[str], None]
 def choose(
     root: Path, names: Sequence[str], count: int | None, seed: int, warn: Callable[[str], None], progress: Step
 ) -> list[PhotoFile]:
-    """The photos of a dataset, sorted by name: all, or a random subset of `count`.
+    """Choose a dataset's photos, sorted by name: all, or a random subset of `count`.
 
-    The subset depends on names, contents and seed alone. `warn` names each photo that is skipped, because it cannot be
-    read, is too small or is a copy of another one; the next one takes its place. InputError where fewer than `count`
-    are left.
+    The subset depends on names, contents and seed alone. Photos that cannot be read, are too small or are copies of
+    others are skipped and reported to `warn`; others take their place. InputError if fewer than `count` are usable.
     """
     wanted = len(names) if count is None else count
     order = names if count is None else sorted(names, key=lambda n: hashlib.sha256(f"{seed}:{n}".encode()).digest())
-    chosen: dict[str, str] = {}  # name by SHA-256
+    chosen: dict[str, str] = {}  # names by SHA-256 of the files
     for name in order:
         if len(chosen) == wanted:
             break
         path = root / name
         try:
-            photo = load_photo(path)  # from its first to its last pixel
+            photo = load_photo(path)  # decodes all pixels, to find damage
             if min(photo.width, photo.height) < MIN_SIDE:
                 size = f"{photo.width}×{photo.height}"
                 raise InputError(f"{path}: {size} pixels are too few (at least {MIN_SIDE} each way)")

@@ -1,7 +1,7 @@
-"""Encode a photo with its views as part of a tar archive, and decode it: the same bytes every time, see
-docs/dataset.md.
+"""Encode a photo with its views as part of a tar archive, and decode it; see docs/dataset.md.
 
-Colours, opacity and depth lose less than anybody sees, Gaussians less than 1e-3 of a pixel, masks and cameras nothing.
+The same sample always has the same bytes. The loss in colours, opacity and depth is invisible, and that in Gaussians
+less than 1e-3 of a pixel; masks and cameras are exact.
 """
 
 from __future__ import annotations
@@ -32,19 +32,19 @@ from spackle.gaussians import Gaussians
 from spackle.image import check_pixels
 from spackle.render.protocol import Rendering
 
-COMPRESSION = 1  # zlib's: 6 takes three times as long and saves a tenth
+COMPRESSION = 1  # zlib's level: 6 takes three times as long and saves a tenth
 DEEPEST = 65535
 SMALLEST_SCALE = 1e-30
-END = bytes(2 * tarfile.BLOCKSIZE)  # of an archive
+END = bytes(2 * tarfile.BLOCKSIZE)  # the end-of-archive mark
 
 
 @dataclasses.dataclass(frozen=True)
 class DatasetView:
-    """One view of a photo: what the paper's training sample holds (appendix, "Dataset")."""
+    """One view of a photo: a training sample of the paper (appendix, "Dataset")."""
 
-    key: str  # of the photo in its dataset
-    index: int  # of the view; 0 is the photo's own
-    kind: str  # of the camera path
+    key: str  # the photo's key in its dataset
+    index: int  # the view's number; 0 is the photo's own view
+    kind: str  # the kind of camera path
     photo: Tensor  # [h, w, 3] sRGB at its working size
     photo_camera: Camera
     camera: Camera  # the view's
@@ -54,10 +54,11 @@ class DatasetView:
 
 
 def pack_sample(key: str, photo: Tensor, stack: ViewStack, targets: Tensor, facts: Mapping[str, Any]) -> bytes:
-    """A photo as part of a tar archive: KEY.json, KEY.photo.png, KEY.base.safetensors, then five files a view.
+    """A photo as part of a tar archive: KEY.json, KEY.photo.png, KEY.base.safetensors, then five files per view.
 
-    It has no end-of-archive mark, and no time, owner or machine. `photo` [h, w, 3] (at its working size) and
-    `targets` [V, H, W, 3] are sRGB; `facts` go into the JSON and hold the mask's "threshold" and the "trajectory".
+    The bytes have no end-of-archive mark and record no time, owner or machine. `photo` [h, w, 3] (at its working size)
+    and `targets` [V, H, W, 3] are sRGB; `facts` are written into the JSON and must have the mask's "threshold" and the
+    "trajectory".
     """
     files: list[tuple[str, bytes]] = []
     views: list[dict[str, Any]] = []
@@ -86,13 +87,13 @@ def pack_sample(key: str, photo: Tensor, stack: ViewStack, targets: Tensor, fact
 
 @dataclasses.dataclass(frozen=True)
 class PhotoGroup:
-    """The files of a photo, not decoded yet."""
+    """The encoded files of a photo."""
 
     key: str
     files: Mapping[str, bytes]
-    facts: Mapping[str, Any]  # KEY.json
+    facts: Mapping[str, Any]  # the contents of KEY.json
     holes: tuple[float, ...]  # HAR of each view (paper, eq. 11)
-    where: str  # for messages
+    where: str  # the source, for messages
 
     @staticmethod
     def of(key: str, data: bytes, where: str) -> PhotoGroup:
@@ -100,7 +101,7 @@ class PhotoGroup:
         files: dict[str, bytes] = {}
         with reading(where, "not a photo of a dataset, or damaged: {reason}"):
             at = 0
-            while at < len(data):  # plain members as `pack_sample` writes them: no links, nothing sparse
+            while at < len(data):  # `pack_sample` writes plain files only: no links or sparse files
                 member = tarfile.TarInfo.frombuf(data[at : at + tarfile.BLOCKSIZE], "utf-8", "strict")
                 begin = at + tarfile.BLOCKSIZE
                 if member.type != tarfile.REGTYPE or not 0 <= member.size <= len(data) - begin:
@@ -117,7 +118,7 @@ class PhotoGroup:
         return len(self.holes)
 
     def view(self, index: int) -> DatasetView:
-        """Decode one view; InputError where a file of it is missing or damaged."""
+        """Decode one view; InputError if one of its files is missing or damaged."""
         with reading(f"{self.where}: view {index}", "cannot be read: {reason}"):
             facts = self.facts["views"][index]
             rgb, target = (decode_rgb(self._file(index, kind)) for kind in ("rgb", "target"))
@@ -143,7 +144,7 @@ class PhotoGroup:
 
     @functools.cached_property
     def base(self) -> Gaussians:
-        """The photo's Gaussians; InputError where they are missing or damaged."""
+        """Decode the photo's Gaussians; InputError if they are missing or damaged."""
         with reading(f"{self.where}: Gaussians", "cannot be read: {reason}"):
             return decode_gaussians(self.files[f"{self.key}.base.safetensors"])
 
@@ -162,17 +163,17 @@ def _camera_facts(camera: Camera) -> dict[str, Any]:
 
 
 def encode_rgb(rgb: Tensor) -> bytes:
-    """sRGB [H, W, 3] in 0..1 as PNG."""
+    """Encode sRGB [H, W, 3] in 0..1 as PNG."""
     return _png(to_bytes(rgb).numpy())
 
 
 def decode_rgb(data: bytes) -> Tensor:
-    """[H, W, 3] in 0..1."""
+    """Decode a PNG to sRGB [H, W, 3] in 0..1."""
     return torch.from_numpy(_pixels(data, 3)).float() / 255
 
 
 def encode_alpha(alpha: Tensor, mask: Tensor, threshold: float) -> bytes:
-    """Opacity [H, W] in 0..1 as PNG, times 65535; `mask`'s pixels stay below `threshold`, and the others do not."""
+    """Encode opacity [H, W] in 0..1 as 16-bit PNG, so that exactly the pixels of `mask` stay below `threshold`."""
     codes = (alpha.detach().cpu().double() * DEEPEST).round().clamp(0, DEEPEST)
     last = math.ceil(threshold * DEEPEST) - 1  # the greatest code below the threshold
     codes = torch.where(mask.cpu(), codes.clamp_max(last), codes.clamp_min(last + 1))
@@ -180,12 +181,12 @@ def encode_alpha(alpha: Tensor, mask: Tensor, threshold: float) -> bytes:
 
 
 def decode_alpha(data: bytes) -> Tensor:
-    """[H, W] in 0..1."""
+    """Decode opacity [H, W] in 0..1."""
     return torch.from_numpy(_pixels(data, 2).astype(np.float64) / DEEPEST).float()
 
 
 def encode_depth(depth: Tensor, alpha: Tensor) -> tuple[bytes, tuple[float, float]]:
-    """Expected z [H, W] as PNG, in logarithmic steps, and the (near, far) that `decode_depth` needs."""
+    """Encode expected z [H, W] as PNG, in logarithmic steps; also returns (near, far), which `decode_depth` needs."""
     z = depth.detach().cpu().double().numpy()
     known = (alpha.detach().cpu().numpy() > 0) & np.isfinite(z) & (z > 0)
     near, far = (float(z[known].min()), float(z[known].max())) if known.any() else (1.0, 1.0)
@@ -196,14 +197,14 @@ def encode_depth(depth: Tensor, alpha: Tensor) -> tuple[bytes, tuple[float, floa
 
 
 def decode_depth(data: bytes, near: float, far: float) -> Tensor:
-    """[H, W], 0 where nothing is known."""
+    """Decode expected z [H, W]; 0 means unknown."""
     codes = _pixels(data, 2).astype(np.float64)
     z = near * np.exp((codes - 1) / (DEEPEST - 1) * math.log(far / near))
     return torch.from_numpy(np.where(codes > 0, z, 0.0)).float()
 
 
 def encode_gaussians(gaussians: Gaussians) -> bytes:
-    """Gaussians as safetensors, 34 bytes each."""
+    """Encode Gaussians as safetensors, 34 bytes each."""
     means, quats, scales, opacities, colors = (t.detach().cpu().float() for t in gaussians.tensors)
     logs = scales.double().clamp_min(SMALLEST_SCALE).log()
     low, high = (float(logs.min()), float(logs.max())) if len(means) else (0.0, 0.0)
@@ -220,7 +221,7 @@ def encode_gaussians(gaussians: Gaussians) -> bytes:
 
 
 def decode_gaussians(data: bytes) -> Gaussians:
-    """What `encode_gaussians` wrote, as float32; of strangers' bytes any exception."""
+    """Decode what `encode_gaussians` wrote, to float32; other bytes may raise any exception."""
     arrays = load(data)
     low, high = arrays["scale_logs"].tolist()
     scales = np.exp(low + arrays["scales"].astype(np.float64) / DEEPEST * max(high - low, 1e-12))
@@ -239,7 +240,7 @@ def _png(pixels: NDArray[Any]) -> bytes:
 
 
 def _pixels(data: bytes, axes: int) -> NDArray[Any]:
-    """The pixels of a PNG."""
+    """Decode a PNG to an array with this number of axes."""
     with Image.open(io.BytesIO(data), formats=["PNG"]) as image:
         check_pixels(*image.size, len(data), "a picture")
         pixels = np.array(image)

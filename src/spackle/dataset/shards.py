@@ -1,4 +1,4 @@
-"""A dataset's shards and manifest in a folder or at an address (optional: pip install fsspec), written and read."""
+"""Write and read a dataset's shards and manifest, in a folder or at a URL (optional: pip install fsspec)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from spackle.files import atomic_path
 from spackle.folders import digest_of
 
 NAME = "manifest.json"
-FORMAT = 1  # of shards and manifest; a reader of another one refuses
+FORMAT = 1  # version of shards and manifest; others are refused
 Bytes = Annotated[int, Field(ge=0, le=1 << 40)]
 Share = Annotated[float, Field(ge=0, le=1)]
 
@@ -27,27 +27,27 @@ class SampleEntry(BaseModel, frozen=True, extra="forbid", strict=True):
     """A photo in a shard."""
 
     key: str = Field(pattern="^[0-9A-Za-z]+$")
-    photo: str  # its name in its folder
-    offset: Bytes  # of its first byte in the shard
+    photo: str  # its name, relative to the folder of photos
+    offset: Bytes  # position of its first byte in the shard
     size: Bytes
     sha256: str  # of those bytes
     holes: tuple[Share, ...]  # HAR of each view
 
 
 class ShardEntry(BaseModel, frozen=True, extra="forbid", strict=True):
-    """One tar file."""
+    """A shard: one tar file."""
 
     file: str = Field(pattern=r"^shard-[0-9]{6}\.tar$")
     size: Bytes
     sha256: str
     samples: tuple[SampleEntry, ...]
-    passed_over: tuple[str, ...] = ()  # photos that gave no sample, and why
+    passed_over: tuple[str, ...] = ()  # messages about photos without a sample
 
 
 class Manifest(BaseModel, frozen=True, extra="ignore", strict=True):
     """A dataset, finished or not."""
 
-    config: dict[str, Any]  # everything that decides what is in it
+    config: dict[str, Any]  # everything that determines the contents
     shards: tuple[ShardEntry, ...]
     complete: bool
 
@@ -59,26 +59,26 @@ class Manifest(BaseModel, frozen=True, extra="ignore", strict=True):
 
     @property
     def samples(self) -> list[tuple[ShardEntry, SampleEntry]]:
-        """All photos in their order."""
+        """All samples in order, each with its shard."""
         return [(shard, sample) for shard in self.shards for sample in shard.samples]
 
     @property
     def views(self) -> int:
-        """Views of all photos."""
+        """The number of views of all photos."""
         return sum(len(sample.holes) for _, sample in self.samples)
 
     @property
     def size(self) -> int:
-        """Bytes of all shards."""
+        """The number of bytes of all shards."""
         return sum(shard.size for shard in self.shards)
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the dataset: of all that its manifest states."""
+        """SHA-256 of the manifest, which identifies the dataset."""
         return digest_of(self._content())
 
     def save(self, folder: Path) -> None:
-        """Write manifest.json, whole or not at all."""
+        """Write manifest.json atomically."""
         text = json.dumps(self._content() | {"sha256": self.digest}, indent=1, sort_keys=True, allow_nan=False)
         with atomic_path(folder / NAME, durable=True) as temporary:
             temporary.write_text(text + "\n", encoding="utf-8")
@@ -106,7 +106,7 @@ def open_in(location: str | os.PathLike[str], name: str) -> IO[bytes]:
 
 
 def load_manifest(location: str | os.PathLike[str]) -> Manifest:
-    """Read the manifest of a dataset; InputError where it is missing, damaged, or of another format."""
+    """Read the manifest of a dataset; InputError if it is missing, damaged, or of another format."""
     where = f"{str(location).rstrip('/')}/{NAME}"
     with open_in(location, NAME) as file, reading(where, "damaged, or no manifest of a dataset: {reason}"):
         text = file.read()
@@ -121,9 +121,9 @@ def load_manifest(location: str | os.PathLike[str]) -> Manifest:
 
 
 def write_shard(parts: Sequence[tuple[str, Path]], target: Path, passed_over: Sequence[str] = ()) -> ShardEntry:
-    """Write a tar file of (key, file) samples to the disk, whole or not at all.
+    """Write samples, given as (key, file), to a tar file, atomically.
 
-    InputError for a damaged part or a full disk.
+    InputError if a part is damaged or the disk is full.
     """
     samples: list[SampleEntry] = []
     whole, offset = hashlib.sha256(), 0
@@ -148,13 +148,13 @@ def write_shard(parts: Sequence[tuple[str, Path]], target: Path, passed_over: Se
 
 
 class DatasetFiles(Dataset[PhotoGroup]):
-    """The photos of a dataset, in any order: a `Dataset` of torch, whose items are not decoded yet.
+    """The photos of a dataset as a torch `Dataset` with random access; its items are encoded.
 
-    A DataLoader with `batch_size=None` shuffles them and reads ahead, a DistributedSampler divides them between ranks.
+    A DataLoader with `batch_size=None` can shuffle and prefetch them, a DistributedSampler divide them between ranks.
     """
 
     def __init__(self, location: str | os.PathLike[str]) -> None:
-        """Open a dataset in a folder or at an fsspec address; InputError unless it is finished."""
+        """Open a dataset in a folder or at a URL for fsspec; InputError unless it is finished."""
         self.location = location
         self.manifest = load_manifest(location)
         if not self.manifest.complete:
@@ -166,7 +166,7 @@ class DatasetFiles(Dataset[PhotoGroup]):
         return len(self.samples)
 
     def __getitem__(self, index: int) -> PhotoGroup:
-        """The files of a photo, checked by their digest; InputError where they are damaged."""
+        """The files of a photo, checked by their digest; InputError if they are damaged."""
         shard, sample = self.samples[index]
         where = f"{self.location}/{shard.file}"
         with open_in(self.location, shard.file) as file, reading(where, "cannot be read: {reason}", OSError):

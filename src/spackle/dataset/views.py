@@ -1,6 +1,7 @@
 """The views of a photo along a controlled camera path, and their completed targets (paper, appendix).
 
-Targets are painted by an inpainter so that all views agree, drawn from one completed scene, or left open.
+Targets are painted by an inpainter so that all views agree, or rendered from one completed scene; or the holes stay
+open.
 """
 
 from __future__ import annotations
@@ -24,17 +25,17 @@ from spackle.render import Renderer
 from spackle.residual import hole_mask
 from spackle.scene_fill.fill import farthest_first
 
-APART = 1e-3  # eyes nearer than this to each other, in units of the path's width, show the same
-SPARE = 6  # frames of a path that may coincide with others
-SAME_SURFACE = 0.03  # depths that differ less, relative to each other, are of one surface
-LEAST = 1e-6  # inverse depth that is divided by
+APART = 1e-3  # two views are the same if their eyes are closer than this times the maximum offset
+SPARE = 6  # extra frames of a path that are tried because some may coincide
+SAME_SURFACE = 0.03  # relative difference below which two depths belong to one surface
+LEAST = 1e-6  # the smallest inverse depth to divide by
 COMPLETIONS = (*INPAINTERS, "geometry", "none")  # values of --inpainter
 
 
 def draw_path(
     kind: SharpTrajectory | None, disparity: tuple[float, float], seed: int, photo_sha256: str
 ) -> tuple[SharpTrajectory, float]:
-    """A photo's path and disparity, drawn at random by seed and file content; `kind` fixes the path."""
+    """Draw a photo's path and disparity at random, by seed and file content; `kind` fixes the kind of path."""
     rng = np.random.default_rng(list(hashlib.sha256(f"{seed}:{photo_sha256}".encode()).digest()))
     drawn = SHARP_TRAJECTORIES[rng.integers(len(SHARP_TRAJECTORIES))]
     return kind or drawn, float(rng.uniform(*disparity))
@@ -43,10 +44,10 @@ def draw_path(
 def path_cameras(
     kind: SharpTrajectory, disparity: float, camera: Camera, depth_range: DepthRange, views: int
 ) -> list[Camera]:
-    """The photo's own view (`camera`, of the views' size), then others along the path: `views` in all, no two alike.
+    """The photo's own view (`camera`, of the views' size), then others along the path: `views` different ones in all.
 
-    Frames at the photo's eye and at the end of a closed path repeat others, so the path gets more frames instead.
-    ValueError for a path that cannot be, or on which the camera does not move.
+    Frames at the photo's eye and at the end of a closed path repeat others, so the path is sampled with more frames.
+    ValueError if the path is impossible, or the camera does not move on it.
     """
 
     def distance(one: Camera, other: Camera) -> float:
@@ -63,7 +64,7 @@ def path_cameras(
             break
     if len(cameras) < views:
         raise ValueError(f"{kind} at a disparity of {disparity:g} has no {views} different views")
-    while len(cameras) > views:  # without the one nearest to the photo's
+    while len(cameras) > views:  # drop the view nearest to the photo's
         del cameras[1 + int(np.argmin([distance(view, camera) for view in cameras[1:]]))]
     return cameras
 
@@ -89,7 +90,7 @@ def render_views(prediction: BasePrediction, cameras: Sequence[Camera], renderer
 
 
 def complete_views(views: ViewStack, completion: str, inpainter: Inpainter | None, renderer: Renderer) -> Tensor:
-    """Targets [V, H, W, 3] sRGB: new colours in the holes, elsewhere the views bit for bit.
+    """Targets [V, H, W, 3] sRGB: new colours in the holes; elsewhere the views, bit for bit.
 
     `completion` is one of `COMPLETIONS`; "none" leaves the holes open.
     """
@@ -102,9 +103,9 @@ def complete_views(views: ViewStack, completion: str, inpainter: Inpainter | Non
 
 @torch.no_grad()
 def render_completed(views: ViewStack, renderer: Renderer) -> tuple[Tensor, Tensor]:
-    """Colours [V, H, W, 3] and inverse depth [V, H, W] of one completed scene, filled by seeds alone: all views agree.
+    """Colours [V, H, W, 3] and inverse depth [V, H, W] of one scene completed by seeds, so that all views agree.
 
-    The few pixels that are uncovered even then take colour and depth of their neighbours.
+    Pixels that the completed scene still leaves uncovered take the colour and depth of their neighbours.
     """
     prediction = views.prediction
     aux = complete(prediction, views.cameras, exact=True, network=None, fill="network", renderer=renderer).aux
@@ -122,10 +123,10 @@ def render_completed(views: ViewStack, renderer: Renderer) -> tuple[Tensor, Tens
 
 @torch.no_grad()
 def paint_in_turn(inpainter: Inpainter, views: ViewStack, renderer: Renderer) -> Tensor:
-    """The views with their holes painted one after the other, the farthest from the photo first, so that all agree.
+    """Paint the views' holes one view after the other, the farthest from the photo first, so that all agree.
 
-    Earlier views are reprojected into a view's holes, and the inpainter paints the rest. One
-    completed scene gives the depth in the holes.
+    Views that were painted before are reprojected into a view's holes, and the inpainter paints the rest. The depth in
+    the holes comes from one completed scene.
     """
     inverse_depths, targets = render_completed(views, renderer)[1], views.rgb.clone()
     painted: list[int] = []
@@ -147,7 +148,7 @@ def paint_in_turn(inpainter: Inpainter, views: ViewStack, renderer: Renderer) ->
 
 
 def looked_up(points: Tensor, camera: Camera, rgb: Tensor, inverse_depth: Tensor) -> tuple[Tensor, Tensor]:
-    """Colours [n, 3] of points [n, 3] in a view [H, W, 3] with inverse depth [H, W]; [n] bool: whether it sees them."""
+    """Colours [n, 3] of points [n, 3] in a view [H, W, 3] with inverse depth [H, W]; [n] bool: which ones it sees."""
     uv, z = camera.project(points)
     place = 2 * uv / uv.new_tensor([camera.width, camera.height]) - 1
     images = torch.cat([rgb, inverse_depth[..., None]], -1).permute(2, 0, 1)
@@ -157,9 +158,9 @@ def looked_up(points: Tensor, camera: Camera, rgb: Tensor, inverse_depth: Tensor
 
 
 def paint_video(inpainter: Inpainter, views: ViewStack) -> Tensor:
-    """The views with their holes painted as one video, ordered along the path.
+    """Paint the views' holes as one video, whose frames are ordered along the path.
 
-    The photo's own view is inserted where it lengthens the path least.
+    The photo's own view is inserted at the position that lengthens the path least.
     """
     eyes = torch.stack([camera.position.double() for camera in views.cameras])
     others = list(range(1, len(eyes)))

@@ -1,4 +1,4 @@
-"""Files of a training run: the checkpoint, which is always complete, and curves."""
+"""Files of a training run: the checkpoint, which is written atomically, and TensorBoard curves."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ class Progress:
     """The progress of a run, as plain numbers."""
 
     step: int = 0  # steps done
-    best: float | None = None  # of the task's aim, such as the loss; None before the first validation
+    best: float | None = None  # lowest value of the task's `aim`, such as the loss; None before the first validation
     best_step: int = 0
-    stale: int = 0  # validations since then
-    seconds: float = 0.0  # of all its starts together
-    history: list[dict[str, float]] = dataclasses.field(default_factory=list)  # each validation's measures
+    stale: int = 0  # validations since `best_step`
+    seconds: float = 0.0  # in total, over all restarts
+    history: list[dict[str, float]] = dataclasses.field(default_factory=list)  # the measures of each validation
 
     def validated(self, measures: dict[str, float], aim: str, min_delta: float) -> bool:
-        """Record a validation; returns whether its measure `aim` is the lowest so far."""
+        """Record a validation; returns whether its measure `aim` is lower than the best by more than `min_delta`."""
         self.history.append({"step": self.step, **measures})
         best = math.inf if self.best is None else self.best
         if math.isfinite(measures[aim]) and measures[aim] < best - min_delta:
@@ -51,19 +51,19 @@ class Progress:
 
 @dataclasses.dataclass(frozen=True)
 class Checkpoint:
-    """All state that the next step depends on; its samples follow from the step's number."""
+    """All state that the next step depends on; the step's number determines its samples."""
 
     progress: Progress
     network: dict[str, Tensor]
     average: dict[str, Tensor]
     optimizer: dict[str, Any]
     recipe: dict[str, Any]
-    digest: str  # of the samples
+    digest: str  # identifies the samples
     method: str = "residual"  # older checkpoints do not name one
 
 
 def save_checkpoint(checkpoint: Checkpoint, folder: Path) -> None:
-    """Write checkpoint.pt; InputError where it cannot be written, or the disk is full: then the one before it stays."""
+    """Write checkpoint.pt; InputError if that fails, as on a full disk: then the previous checkpoint remains."""
     buffer = io.BytesIO()  # torch's own writer hides that a disk is full
     torch.save({**vars(checkpoint), "progress": dataclasses.asdict(checkpoint.progress)}, buffer)
     with atomic_path(folder / CHECKPOINT, durable=True) as temporary:
@@ -71,7 +71,7 @@ def save_checkpoint(checkpoint: Checkpoint, folder: Path) -> None:
 
 
 def load_checkpoint(folder: Path) -> Checkpoint | None:
-    """The checkpoint of a folder, if any; InputError for one that cannot be read."""
+    """The checkpoint in a folder, if any; InputError if it cannot be read."""
     path = folder / CHECKPOINT
     if not path.exists():
         return None
@@ -83,7 +83,7 @@ def load_checkpoint(folder: Path) -> Checkpoint | None:
 def find_checkpoint(output: Path, method: str, recipe: AnyRecipe, digest: str, log: Log) -> Checkpoint | None:
     """The checkpoint from which a run resumes, if any.
 
-    InputError where the folder holds another run, or its checkpoint cannot be read.
+    InputError if the folder holds a different run, or its checkpoint cannot be read.
     """
     checkpoint = load_checkpoint(output)
     if checkpoint is None:
@@ -108,14 +108,14 @@ def remove_run(output: Path) -> None:
 
 
 def open_logs(folder: Path, first: int, log: Log) -> AbstractContextManager[Any]:
-    """A writer of TensorBoard's event files in a run's folder, None where TensorBoard is not installed.
+    """A writer of TensorBoard's event files in a run's folder; None if TensorBoard is not installed.
 
     Values that an earlier process logged after the step `first` are hidden.
     """
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of protobuf's, about itself
-            import tensorboard  # noqa: F401  # torch's own import of it fails with other words
+            warnings.simplefilter("ignore")  # protobuf warns about its own version
+            import tensorboard  # noqa: F401  # checked here: torch's import would raise another message
             from torch.utils.tensorboard import SummaryWriter
     except ImportError:
         log("no TensorBoard logs: pip install 'spackle-nvs[train]'")

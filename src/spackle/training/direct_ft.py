@@ -1,8 +1,8 @@
-"""The paper's naive decoupled baseline ("Direct FT"): the base's own decoder learns what the residual would.
+"""The paper's naive decoupled baseline ("Direct FT"): the base's own decoder is trained in place of the residual.
 
-Targets and losses are the residual's, but the number of Gaussians is fixed: to fill a hole, some must leave the
-surfaces that they showed, which the paper calls capacity competition. The paper has losses at the input view on "the
-non-Spackle training path" alone ("Training Details and Loss Weights"), so a step includes each photo's own view.
+Targets and losses are the residual's, but the number of Gaussians is fixed: to fill a hole, some Gaussians must leave
+the surfaces that they showed. The paper calls this capacity competition. Only "the non-Spackle training path" has
+losses at the input view ("Training Details and Loss Weights"), so a step here includes each photo's own view.
 """
 
 from __future__ import annotations
@@ -38,22 +38,22 @@ from spackle.training.samples import short_digest
 from spackle.training.sources import divided_photos, open_pseudo
 from spackle.weights import check_undamaged, installed, weights_digest
 
-VIEWS_AT_ONCE = 4  # of a photo in a step: they share a pass through the encoder, which costs more than all the rest
+VIEWS_AT_ONCE = 4  # views of a photo in a step: they share one pass through the encoder, the most expensive part
 
 
 @dataclasses.dataclass(frozen=True)
 class TunableSharp:
-    """A network whose decoder, `network.gaussian_decoder()`, keeps float32 weights that small steps can move."""
+    """SHARP with a trainable decoder, `network.gaussian_decoder()`: in float32, so that small steps change it."""
 
     network: SharpNetwork
-    precision: torch.dtype  # of the heavy arithmetic: what is frozen is stored in it, the decoder converted on the fly
+    precision: torch.dtype  # of convolutions and products: frozen weights are stored in it, the decoder is autocast
 
     @staticmethod
     def load(path: str | os.PathLike[str], precision: torch.dtype, device: torch.device) -> TunableSharp:
-        """Read a checkpoint (see `load_network`), frozen, with the heavy arithmetic in float32 or bfloat16.
+        """Read a checkpoint (see `load_network`) and freeze it; `precision` is float32 or bfloat16.
 
         Raises:
-            InputError: a missing, broken or foreign file, or too little memory: 2.8 GB while it is read.
+            InputError: the file is missing, broken or foreign, or less than the 2.8 GB to read it are free.
         """
         network = load_network(path, torch.float32)
         set_precision(network.monodepth_model, precision)
@@ -61,14 +61,14 @@ class TunableSharp:
 
     @torch.no_grad()
     def encode(self, rgb: Tensor, photo_camera: Camera) -> DecoderInput:
-        """The output of the frozen part for a photo [H, W, 3], sRGB in 0..1, and a camera of the same size."""
+        """Run the frozen encoder on a photo [H, W, 3], sRGB in 0..1, with a camera of the same size."""
         device = next(self.network.parameters()).device
         image = to_square(rgb.to(device), self.network.config.side)
         with own_arithmetic(device):
             return self.network.encode(image, photo_camera.focal[0] / photo_camera.width, usual_windows(device))
 
     def gaussians(self, decoder: nn.Module, encoded: DecoderInput, place: torch.device | str = "cpu") -> Gaussians:
-        """Gaussians in SHARP's normalised space, on a device, with gradients to a `GaussianDecoder`."""
+        """Gaussians in SHARP's normalised space, on device `place`; gradients reach `decoder`, a `GaussianDecoder`."""
         device = encoded.picture.device
         autocast = torch.autocast(device.type, self.precision, enabled=self.precision != torch.float32)
         with own_arithmetic(device):
@@ -78,23 +78,23 @@ class TunableSharp:
 
 
 def normalised_camera(camera: Camera, photo_camera: Camera) -> Camera:
-    """A camera whose image of Gaussians in normalised space equals `camera`'s image of them in metres.
+    """A camera that sees Gaussians in normalised space as `camera` sees the same Gaussians in metres.
 
-    The map to metres, D = diag(W / 2fx, H / 2fy, 1) of the photo's camera, is not a rotation. Applied to Gaussians it
-    needs an eigendecomposition (`stretch_gaussians`), whose gradient is undefined for round Gaussians, such as SHARP's
-    first ones. A renderer only ever applies the camera's matrix P, to centres as P x and to covariances as P Σ Pᵀ; so P
-    D draws the same picture, and every gradient exists.
+    The map from normalised space to metres, D = diag(W / 2fx, H / 2fy, 1) of the photo's camera, is not a rotation.
+    Applying it to Gaussians takes an eigendecomposition (`stretch_gaussians`), whose gradient is undefined for round
+    Gaussians, such as SHARP's initial ones. A renderer uses the camera's matrix P only as P x for centres and P Σ Pᵀ
+    for covariances, so a camera with the matrix P D renders the same image, and all gradients exist.
     """
     fx, fy = photo_camera.focal
-    matrix = camera.world_to_camera.double()  # the product rounded to float32 would move the picture
+    matrix = camera.world_to_camera.double()  # rounding the product to float32 would shift the image
     stretch = matrix.new_tensor([photo_camera.width / (2 * fx), photo_camera.height / (2 * fy), 1.0, 1.0])
     return dataclasses.replace(camera, world_to_camera=matrix * stretch)
 
 
 def render_photo(decoder: nn.Module, base: TunableSharp, views: Sequence[DatasetView], renderer: Renderer) -> ViewBatch:
-    """Predict a photo's Gaussians anew, and draw them in some of its views; InputError where memory is too small.
+    """Predict a photo's Gaussians and render them in the given views; InputError if memory runs out.
 
-    Only the decoder, which runs after `base`, gets gradients.
+    Only the decoder, which runs after the frozen encoder of `base`, gets gradients.
     """
     photo_camera = views[0].photo_camera
     advice = ["try optim.precision=bf16"] if base.precision == torch.float32 else []
@@ -105,15 +105,15 @@ def render_photo(decoder: nn.Module, base: TunableSharp, views: Sequence[Dataset
 
 
 class DirectFt(ViewTask):
-    """An item is a photo; items run one at a time, because each one's gradient takes gigabytes in SHARP's decoder."""
+    """Its items are photos, run one at a time, because a photo's gradient in SHARP's decoder takes gigabytes."""
 
     name: ClassVar[str] = "direct-ft"
     at_once = 1
 
     def __init__(self, recipe: Recipe, device: torch.device, checkpoint: Path | None = None) -> None:
-        """Find a checkpoint (None: the downloaded one) and a dataset that belong together; load no network yet.
+        """Check that checkpoint (None: the downloaded one) and dataset match; no network is loaded yet.
 
-        InputError for a recipe, checkpoint or dataset that cannot be used.
+        InputError if the recipe, the checkpoint or the dataset cannot be used.
         """
         super().__init__(recipe, device)
         if recipe.optim.batch % VIEWS_AT_ONCE:
@@ -149,7 +149,7 @@ class DirectFt(ViewTask):
         return {**facts, "checkpoint": {"file": self.owner.path.name, "sha256": self.owner.sha256}}
 
     def batch(self, step: int | None, items: Sequence[int]) -> list[DatasetView]:
-        """Views of one photo: in a step its own and others at random, for validation all; InputError for a bad file."""
+        """Views of a photo: its own and random others, or all for validation (step None); InputError for a bad file."""
         (item,) = items
         group = self.files[(self.validation if step is None else self.learned)[item]]
         drawn = range(group.views) if step is None else drawn_views([self.recipe.run.seed, step, item], group.views)
@@ -160,7 +160,7 @@ class DirectFt(ViewTask):
 
     @torch.no_grad()
     def picture(self, network: nn.Module) -> Tensor:
-        """[H, W, 3] sRGB: of some photos their own view and the one with the largest hole, a row each."""
+        """[H, W, 3] sRGB: for some photos, a row for the own view and one for the view with the largest hole."""
         rows: list[tuple[Tensor, ...]] = []
         for place in self.validation[:: max(1, 2 * self.validation_items // PICTURED)][: PICTURED // 2]:
             group = self.files[place]
@@ -172,19 +172,19 @@ class DirectFt(ViewTask):
         return [self.files.samples[self.learned[item]][1].photo for item in items]
 
     def export(self, network: nn.Module, path: Path) -> None:
-        """The decoder in full precision, for `spackle predict --base sharp -c`, and a link to its checkpoint."""
+        """Write the decoder in float32, for `spackle predict --base sharp -c`, and a link to its checkpoint."""
         write_whole(path, decoder_bytes(network, self.owner))
         link_owner(self.owner, path.parent)
 
 
 def drawn_views(seed: Sequence[int], views: int) -> list[int]:
-    """`VIEWS_AT_ONCE` views of a photo: its own, 0, and others at random; all of them where there are fewer."""
+    """Numbers of `VIEWS_AT_ONCE` of a photo's views: its own, 0, and random others; all if it has fewer."""
     others = 1 + np.random.default_rng(seed).permutation(views - 1)[: VIEWS_AT_ONCE - 1]
     return [0, *sorted(others.tolist())]
 
 
 def _check_base(files: DatasetFiles, weights_sha256: str) -> None:
-    """InputError for a dataset of another base or of other weights than those that learn."""
+    """InputError if a dataset was made with another base, or with other weights than those to train."""
     base = files.manifest.config.get("base", {})
     if base.get("name") != "sharp":
         raise InputError(
@@ -199,11 +199,11 @@ def _check_base(files: DatasetFiles, weights_sha256: str) -> None:
 
 
 def _find_owner(checkpoint: Path | None) -> Owner:
-    """The checkpoint to train, checked against the published digest if it was downloaded."""
+    """The checkpoint to train; a downloaded one is checked against the published digest."""
     path = checkpoint or installed("sharp")
     if path is None:
         raise InputError(f"--method direct-ft: {MISSING['sharp']}")
-    read_tensors(path, "give SHARP's checkpoint")  # refuses what is none, and reads no numbers yet
+    read_tensors(path, "give SHARP's checkpoint")  # refuses files that are no checkpoint, without reading the weights
     if owner_of(path) is not None:
         raise InputError(f"-c {path}: a decoder that was trained already: give the checkpoint that it was trained on")
     check_undamaged(path)

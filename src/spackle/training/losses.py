@@ -1,13 +1,13 @@
-"""The four terms of eq. 12 as pure functions, and two reported numbers: how far a filled hole is from the truth.
+"""The four terms of eq. 12 as pure functions, and two measures of how far a filled hole is from the truth.
 
-In the `hole` [B, H, W] bool they compare a completed view `rgb` [B, H, W, 3] sRGB 0..1 and its `alpha` [B, H, W] with
-the `target` [B, H, W, 3]; outside of it with `base_rgb` [B, H, W, 3], the base's view. Each is a mean over an image's
-pixels inside or outside of the hole, then over the images of the batch: a small hole counts as much as a large one, and
-an image without such pixels gives 0, differentiable still. So the loss of a batch is the mean of the losses of its
-images, however processes divide them.
+Inside the `hole` [B, H, W] bool, a completed view `rgb` [B, H, W, 3] sRGB 0..1 and its `alpha` [B, H, W] are compared
+with the `target` [B, H, W, 3]; outside, with the base's view `base_rgb` [B, H, W, 3]. Each term is a mean over the
+pixels of an image inside or outside the hole, then over the images of the batch: a small hole counts as much as a large
+one, and an image without such pixels gives a differentiable 0. So the loss of a batch is the mean of its images'
+losses, however processes divide them.
 
 The perceptual term and `hole_distance` compare features of a frozen network (paper, "Training Details and Loss
-Weights"): the paper's ResNet-50, or SqueezeNet 1.0, which has 3 MB and is many times faster.
+Weights"): the paper's ResNet-50, or SqueezeNet 1.0, which takes 3 MB and is many times faster.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from spackle.filters import blurred, greatest_around
 from spackle.network_file import load_strict, read_tensors
 from spackle.training.recipe import LossRecipe
 
-ALPHA_FLOOR = 1e-3  # under the 1/255 that a splat must have to be drawn: no gradient that can reach one is lost
-NO_LENGTH = 1e-10  # of a feature vector, LPIPS' own: such a vector points nowhere
-TINY = 1e-6  # keeps divisions finite: by the RMS of features that are all zero, by the area of no hole
-IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of sRGB 0..1, as torchvision takes it
+ALPHA_FLOOR = 1e-3  # below 1/255, the least alpha that is rendered: the clamp removes no gradient of a visible splat
+NO_LENGTH = 1e-10  # the least length that a feature vector is divided by, as in LPIPS
+TINY = 1e-6  # avoids division by zero: by the RMS of all-zero features, and by the area of an empty hole
+IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of sRGB 0..1, as in torchvision
 CAFFE_MEAN = (104.0, 117.0, 123.0)  # of BGR 0..255
-# Inputs and squeezed channels of fire2 to fire9.
+# The input channels and squeezed channels of fire2 to fire9.
 SQUEEZED = dict(enumerate([(96, 16), (128, 16), (128, 32), (256, 32), (256, 48), (384, 48), (384, 64), (512, 64)], 2))
 
 
@@ -40,14 +40,14 @@ SQUEEZED = dict(enumerate([(96, 16), (128, 16), (128, 32), (256, 32), (256, 48),
 
 
 class FeatureNet(nn.Module):
-    """[B, 3, H, W] sRGB 0..1 to four feature maps [B, C, h, w], fine to coarse; gradients go to the images alone."""
+    """Maps [B, 3, H, W] sRGB 0..1 to four feature maps [B, C, h, w], fine to coarse; only the images get gradients."""
 
     name: str  # in reports
-    head: str  # how the classifier's names begin, which a file may hold and nothing here uses
+    head: str  # prefix of the classifier's tensors, which are ignored if a file has them
 
 
 class Bottleneck(nn.Module):
-    """ResNet's block: [B, inside, h, w] to [B, 4 width, h / stride, w / stride], with torchvision's names."""
+    """ResNet's block: maps [B, inside, h, w] to [B, 4 width, h / stride, w / stride]; names as in torchvision."""
 
     def __init__(self, inside: int, width: int, stride: int) -> None:
         super().__init__()
@@ -65,9 +65,9 @@ class Bottleneck(nn.Module):
 
 
 class ResNet50(FeatureNet):
-    """The paper's feature extractor, with torchvision's names; sides of images are 32 pixels or more.
+    """The paper's feature extractor, with torchvision's names, for images of at least 32 pixels a side.
 
-    Gives the ends of layer1 to layer4: 256, 512, 1024, 2048 channels at 1/4, 1/8, 1/16, 1/32.
+    Returns the outputs of layer1 to layer4: 256, 512, 1024, 2048 channels at 1/4, 1/8, 1/16, 1/32 of the image's size.
     """
 
     name, head = "resnet50", "fc."
@@ -88,7 +88,7 @@ class ResNet50(FeatureNet):
 
 
 class Fire(nn.Module):
-    """SqueezeNet's block: [B, inside, h, w] to [B, 8 squeeze, h, w], with the names of its weight file."""
+    """SqueezeNet's block: maps [B, inside, h, w] to [B, 8 squeeze, h, w]; names as in its weight file."""
 
     def __init__(self, inside: int, squeeze: int) -> None:
         super().__init__()
@@ -102,10 +102,10 @@ class Fire(nn.Module):
 
 
 class SqueezeNet(FeatureNet):
-    """SqueezeNet 1.0 as Caffe computes it; sides of images are 35 pixels or more.
+    """SqueezeNet 1.0 as Caffe computes it, for images of at least 35 pixels a side.
 
-    Gives conv1, fire4, fire8, fire9: 96, 256, 512, 512 channels at 1/2, 1/4, 1/8, 1/16. Its first convolution is not
-    padded: cells lie up to 5 pixels further in than an even division of the image would have them.
+    Returns the outputs of conv1, fire4, fire8, fire9: 96, 256, 512, 512 channels at 1/2, 1/4, 1/8, 1/16. The first
+    convolution has no padding, so cells lie up to 5 pixels further inwards than if the image were divided evenly.
     """
 
     name, head = "squeezenet", "conv10."
@@ -120,7 +120,7 @@ class SqueezeNet(FeatureNet):
         maps = {1: self.conv1(255 * images.flip(1) - _channels(CAFFE_MEAN, images)).relu()}
         for number in SQUEEZED:
             x = maps[number - 1]
-            if number in (2, 5, 9):  # Caffe's pooling: a window that stands half over the edge counts too
+            if number in (2, 5, 9):  # Caffe's pooling includes windows that extend beyond the edge
                 x = F.max_pool2d(x, 3, 2, ceil_mode=True)
             maps[number] = self.get_submodule(f"fire{number}")(x)
         return [maps[number] for number in (1, 4, 8, 9)]
@@ -129,16 +129,16 @@ class SqueezeNet(FeatureNet):
 def load_features(
     name: Literal["resnet50", "squeezenet", "none"], path: Path | None, device: torch.device | str = "cpu"
 ) -> FeatureNet | None:
-    """A frozen network from a file on this machine; nothing in the file is run.
+    """Load a frozen network from a local file; no code in the file is run.
 
     Args:
         name: which network; "none" gives None.
-        path: ResNet-50 as torchvision publishes it (.pth); SqueezeNet 1.0 as .npz with `conv1.w`, `conv1.b`,
+        path: for ResNet-50 torchvision's .pth file; for SqueezeNet 1.0 an .npz with `conv1.w`, `conv1.b`,
             `fire2/conv1x1_1.w`, ... A classifier in the file is ignored.
-        device: where the network is to run.
+        device: where the network runs.
 
     Raises:
-        InputError: a missing, broken or foreign file.
+        InputError: the file is missing, broken, or no such network.
     """
     if name == "none":
         return None
@@ -152,7 +152,7 @@ def load_features(
 
 
 def _read_npz(path: Path, advice: str) -> dict[str, Tensor]:
-    """The tensors of an .npz, `fire2/conv1x1_1.w` as `fire2.conv1x1_1.weight`."""
+    """The tensors of an .npz, with names changed like `fire2/conv1x1_1.w` to `fire2.conv1x1_1.weight`."""
     check_file(path, "weight file")
     broken = reading(path, f"not a file of weights ({{reason}}): {advice}")
     with broken, open(path, "rb") as file, np.load(file, allow_pickle=False) as arrays:
@@ -161,7 +161,7 @@ def _read_npz(path: Path, advice: str) -> dict[str, Tensor]:
 
 
 def _channels(numbers: tuple[float, ...], images: Tensor) -> Tensor:
-    """[3, 1, 1] on the images' device."""
+    """Three channel values as a tensor [3, 1, 1] on the images' device."""
     return torch.tensor(numbers, dtype=images.dtype).to(images.device, non_blocking=True)[:, None, None]
 
 
@@ -171,8 +171,8 @@ def _channels(numbers: tuple[float, ...], images: Tensor) -> Tensor:
 def color_loss(rgb: Tensor, target: Tensor, hole: Tensor, blur: float = 0.0) -> Tensor:
     """[] mean |rgb - target| over a hole's pixels and the channels.
 
-    With `blur`, a standard deviation in pixels, the difference is first blurred within the hole, so that only low
-    frequencies count; texture is left to the perceptual term.
+    `blur` is the standard deviation in pixels with which the difference is first blurred within the hole: then only low
+    frequencies count, and the perceptual term alone decides on texture.
     """
     apart = torch.where(hole[..., None], rgb - target, 0)
     if blur > 0:
@@ -184,14 +184,14 @@ def color_loss(rgb: Tensor, target: Tensor, hole: Tensor, blur: float = 0.0) -> 
 def alpha_loss(alpha: Tensor, hole: Tensor) -> Tensor:
     """[] mean -log(max(alpha, 0.001)) over a hole: cross entropy towards 1.
 
-    The clamp holds the gradient under 1000 and costs nothing: a splat under 1/255 is not drawn.
+    The clamp keeps the gradient below 1000; it has no other effect, because a splat below 1/255 is not rendered.
     """
     opaque = torch.where(hole, alpha, 1).clamp_min(ALPHA_FLOOR)
     return _mean_of_images(-opaque.log(), hole)
 
 
 def preserve_loss(rgb: Tensor, base_rgb: Tensor, hole: Tensor) -> Tensor:
-    """[] mean |rgb - base_rgb| over pixels outside of the hole, and channels; no gradient goes to `base_rgb`."""
+    """[] mean |rgb - base_rgb| over the pixels outside the hole and the channels; `base_rgb` gets no gradient."""
     return color_loss(rgb, base_rgb.detach(), ~hole)
 
 
@@ -205,19 +205,19 @@ def perceptual_loss(
     size: int | None = 512,
     gram: float = 1.0,
 ) -> Tensor:
-    """[] feature reconstruction and Gram statistics near the hole.
+    """[] differences of features and of their Gram matrices near the hole.
 
-    It covers the hole dilated by a max-pool of `dilation`, an odd side in pixels; elsewhere the target replaces the
+    The hole is first dilated by a max-pool of `dilation`, an odd side in pixels; outside it the target replaces the
     prediction. F and T are a layer's features [C, h, w] of prediction and target, both divided by the root mean square
-    of T (no gradient), so that all layers have the same scale; w [h, w] is each cell's share of the dilated hole. The
-    loss is the sum over layers of
+    of T (no gradient), so that all layers have the same scale; w [h, w] is the fraction of each cell that the dilated
+    hole covers. The loss is the sum over layers of
 
         sum(w |F - T|) / (C sum(w))  +  gram · mean |G(F) - G(T)|,    G(F) = (F w) F^T / sum(w),  [C, C].
 
     `size` is the longer side of the images that the network sees; None leaves them as they are.
     """
     near = greatest_around(hole, dilation // 2)
-    if near.device.type == "cpu" and not near.any():  # a GPU would be waited for
+    if near.device.type == "cpu" and not near.any():  # reading this from a GPU would wait for it
         return rgb[:0].sum()  # 0, and a gradient of zeros, without the network
     ours = features(_resized(torch.where(near[..., None], rgb, target), size))
     with torch.no_grad():
@@ -235,9 +235,9 @@ def total_loss(
     recipe: LossRecipe,
     features: FeatureNet | None = None,
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """The weighted sum that is minimised, eq. 12: the loss [], and its terms by name, each [], unweighted and detached.
+    """The weighted sum of eq. 12, which is minimised, and its terms by name, unweighted and detached; all are [].
 
-    Without `features` the perceptual term is left out, whatever network the recipe names.
+    If `features` is None, the perceptual term is left out, whatever network the recipe names.
     """
     terms = {
         "color": color_loss(rgb, target, hole, recipe.color_blur),
@@ -255,16 +255,16 @@ def total_loss(
 def hole_distance(features: FeatureNet, rgb: Tensor, target: Tensor, hole: Tensor) -> float:
     """Perceptual distance inside a hole, like LPIPS without its learned weights; 0 is equal, lower is better.
 
-    For each layer the feature vectors of both images are scaled to unit length along the channels; the squared
-    difference (0 to 2 a cell, for features that are not negative) is averaged over the cells by the share of each that
-    is hole, not dilated, and the layers are summed. Numbers of different networks do not compare, nor do they with
-    published LPIPS.
+    For each layer, the feature vectors of both images are scaled to unit length along the channels. Their squared
+    difference (0 to 2 per cell, because features are not negative) is averaged over the cells, weighted by the fraction
+    of each that the undilated hole covers; the layers are summed. Distances by different networks are not comparable,
+    nor are they comparable with published LPIPS.
 
     Args:
         features: the feature network, usually `SqueezeNet`.
-        rgb: [H, W, 3] the completed view, sRGB 0..1, which counts inside of the hole alone.
+        rgb: [H, W, 3] the completed view, sRGB 0..1, used only inside the hole.
         target: [H, W, 3] the truth, finite everywhere.
-        hole: [H, W] bool; without one the distance is NaN.
+        hole: [H, W] bool; the distance is NaN if it is empty.
     """
     if not hole.any():
         return math.nan
@@ -280,7 +280,7 @@ def hole_distance(features: FeatureNet, rgb: Tensor, target: Tensor, hole: Tenso
 def hole_psnr(rgb: Tensor, target: Tensor, hole: Tensor) -> float:
     """-10 log10 of the mean squared difference over a hole's pixels and the channels, in dB; higher is better.
 
-    `rgb` and `target` are [H, W, 3] sRGB 0..1, `hole` is [H, W] bool. Infinite for equal pictures, NaN without a hole.
+    `rgb` and `target` are [H, W, 3] sRGB 0..1, `hole` is [H, W] bool. Infinite for equal images, NaN for an empty hole.
     """
     if not hole.any():
         return math.nan
@@ -289,18 +289,18 @@ def hole_psnr(rgb: Tensor, target: Tensor, hole: Tensor) -> float:
 
 
 def covered(mask: Tensor, features: Tensor) -> Tensor:
-    """[B, 1, h, w] the share, 0..1, that a mask [B, H, W] has of each cell of a feature map [B, C, h, w]."""
+    """[B, 1, h, w] the fraction, 0..1, of each cell of a feature map [B, C, h, w] that a mask [B, H, W] covers."""
     height, width = features.shape[-2:]
     return F.adaptive_avg_pool2d(mask[:, None].to(features.dtype), (height, width))
 
 
 def _mean_of_images(values: Tensor, where: Tensor) -> Tensor:
-    """[] of values [B, H, W] that are 0 outside of a mask: the mean over each image's mask, then over the images."""
+    """[] mean of values [B, H, W], 0 outside the mask `where`: over each image's mask, then over the images."""
     return (values.sum((1, 2)) / where.sum((1, 2)).clamp_min(1)).mean()
 
 
 def _resized(images: Tensor, size: int | None) -> Tensor:
-    """[B, H, W, 3] as [B, 3, h, w], the longer side `size`."""
+    """Resize [B, H, W, 3] to [B, 3, h, w], whose longer side is `size`; None keeps the size."""
     images = images.movedim(-1, 1)
     height, width = images.shape[-2:]
     if size is None or size == max(height, width):
@@ -311,7 +311,7 @@ def _resized(images: Tensor, size: int | None) -> Tensor:
 
 
 def _layer_terms(ours: Tensor, theirs: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """The feature and the Gram term of one layer: [B, C, h, w] twice, and [B, 1, h, w] how much each cell counts."""
+    """The feature term and the Gram term of a layer, from features [B, C, h, w] and cell weights [B, 1, h, w]."""
     rms = (theirs.square().mean(dim=(1, 2, 3), keepdim=True) + TINY**2).sqrt()
     ours, theirs = ours / rms, theirs / rms
     area = weight.sum(dim=(1, 2, 3))  # [B], 0 without a hole
@@ -321,6 +321,6 @@ def _layer_terms(ours: Tensor, theirs: Tensor, weight: Tensor) -> tuple[Tensor, 
 
 
 def _gram(features: Tensor, weight: Tensor, area: Tensor) -> Tensor:
-    """Gram matrices [B, C, C], averaged over cells by weight."""
+    """Gram matrices [B, C, C]: means over the cells, weighted by `weight`."""
     together = (features * weight).flatten(2) @ features.flatten(2).mT
     return together / area.clamp_min(TINY)[:, None, None]

@@ -1,4 +1,4 @@
-"""Recipes of training runs: values with bounds, read from YAML and overridden by `key=value`."""
+"""Recipes of training runs: settings with bounds, read from YAML and overridden by `key=value`."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from spackle.weights import installed
 
 PACKAGED = Path(__file__).parent / "recipes"
 MAX_BYTES = 1 << 16
-LEAST_SIDE = 36  # pixels that the feature networks need
-# Marks keys that may differ when a run is resumed: how long it is, how often it validates, where its files lie. The
-# samples themselves are told apart by their digest.
+LEAST_SIDE = 36  # pixels a side that the feature networks need at least
+# Marks keys that may change when a run resumes: its length, how often it validates, where its files lie. Whether the
+# samples are the same is decided by their digest.
 FREE = "free"
 
 
 def _as_number(value: object) -> object:
-    """Read 1e3, which is text in YAML 1.1, as a number."""
+    """Convert text such as 1e3, which YAML 1.1 does not read as a number."""
     try:
         return float(value) if isinstance(value, str) else value
     except ValueError:
@@ -47,7 +47,7 @@ def _ascending(value: tuple[float, float]) -> tuple[float, float]:
 
 Whole = Annotated[int, BeforeValidator(_as_number)]
 Share = Annotated[float, Field(ge=0, le=1e6)]
-Count = Annotated[Whole, Field(ge=1, le=1_000_000)]  # six digits name a sample's file
+Count = Annotated[Whole, Field(ge=1, le=1_000_000)]  # file names of samples have six digits
 Beta = Annotated[float, Field(ge=0, lt=1)]
 Disparity = Annotated[float, Field(ge=0, le=MAX_DISPARITY)]
 Interval = Annotated[Whole, Field(ge=1), FREE]  # steps
@@ -56,7 +56,7 @@ Seed = Annotated[Whole, Field(ge=0, le=2**31 - 2)]
 
 
 class RecipePart(BaseModel):
-    """A section of a recipe; an empty one has its defaults."""
+    """A section of a recipe; an empty section keeps the defaults."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -75,15 +75,13 @@ class RgbdFolder(RecipePart):
 
 
 class Shares(RecipePart):
-    """How often a view comes from each source; they need not add up to 1. The share of a source without data counts as
-    0.
-    """
+    """The share of views from each source; shares need not add up to 1, and a source without data gets none."""
 
     composites: Share = 0.66
     rgbd: Share = 0.12
-    stereo: Share = 0.10  # reverse_view of the left photo
-    pairs: Share = 0.12  # the true right photo
-    pseudo: Annotated[Share, FREE] = 1.0  # renderings with completed targets; some checkpoints lack it
+    stereo: Share = 0.10  # `reverse_view` of the left photo
+    pairs: Share = 0.12  # the right photo as the target
+    pseudo: Annotated[Share, FREE] = 1.0  # renderings with completed targets; absent from older checkpoints
 
 
 class DataRecipe(RecipePart):
@@ -94,18 +92,18 @@ class DataRecipe(RecipePart):
     stereo: Place = None  # a folder of scenes, each with a scene.json
     pseudo: Place = None  # a dataset that `spackle dataset build` made
     shares: Shares = Shares()
-    # How far the virtual camera goes, from and to.
+    # The least and the greatest disparity of the virtual camera.
     disparity: Annotated[tuple[Disparity, Disparity], AfterValidator(_ascending)] = (0.1, 0.6)
     views: Count = 20_000  # the paper's: 1,000 photos, 20 views of each
-    crops: Annotated[Whole, Field(ge=1, le=100)] = 3  # of a view, at most
-    cells: Annotated[Whole, Field(ge=16, le=768)] = 96  # along a crop's side, of 2×2 pixels
+    crops: Annotated[Whole, Field(ge=1, le=100)] = 3  # at most, per view
+    cells: Annotated[Whole, Field(ge=16, le=768)] = 96  # cells of 2×2 pixels along a crop's side
     validation_views: Count = 100
-    cache: Place = None  # a folder for the samples; inside the output where None
-    seed: Seed = 0  # of the samples alone: runs with other seeds share them
+    cache: Place = None  # a folder for the samples; None: inside the output
+    seed: Seed = 0  # for the samples alone: runs that differ only in run.seed share them
 
 
 class LossRecipe(RecipePart):
-    """The four terms of eq. 12 and the perceptual one's network (paper, "Training Details and Loss Weights")."""
+    """The weights of eq. 12's terms, and the perceptual term's network (paper, "Training Details and Loss Weights")."""
 
     color: Share = 10.0
     alpha: Share = 0.5
@@ -113,10 +111,10 @@ class LossRecipe(RecipePart):
     preserve: Share = 5.0
     features: Literal["resnet50", "squeezenet", "none"] = "resnet50"
     features_path: Place = None
-    # Pixels of the longer side of what the feature network sees; None: the crop's own.
+    # Longer side in pixels to which crops are resized for the feature network; None: not resized.
     feature_size: Annotated[Whole, Field(ge=64, le=4096)] | None = 512
     dilation: Annotated[Whole, Field(ge=1, le=1001), AfterValidator(_odd)] = 21  # pixels
-    color_blur: Annotated[float, Field(ge=0, le=64)] = 0.0  # pixels; above 0 the colour term sees low frequencies alone
+    color_blur: Annotated[float, Field(ge=0, le=64)] = 0.0  # pixels; if > 0 only low frequencies count
     gram: Share = 1.0  # weight of the perceptual term's Gram statistics
 
     @property
@@ -132,12 +130,12 @@ class OptimRecipe(RecipePart):
     min_lr: Annotated[float, Field(ge=0, le=1)] = 1.6e-5
     warmup: Annotated[Whole, Field(ge=0)] = 10_000  # steps
     steps: Interval = 100_000
-    batch: Annotated[Whole, Field(ge=1, le=100_000)] = 16  # crops of a step, of all processes together
+    batch: Annotated[Whole, Field(ge=1, le=100_000)] = 16  # crops per step, over all processes
     betas: tuple[Beta, Beta] = (0.9, 0.999)
     weight_decay: Annotated[float, Field(ge=0, le=10)] = 1e-4
-    clip: Annotated[float, Field(gt=0)] = 1.0  # the gradient's largest norm
+    clip: Annotated[float, Field(gt=0)] = 1.0  # the gradient's maximum norm
     ema: Beta = 0.999  # decay of the averaged weights, which are validated and exported; 0: no average
-    precision: Precision = "auto"  # of the network; auto: bf16 where the hardware multiplies it natively
+    precision: Precision = "auto"  # of the network; auto: bf16 if the hardware supports it natively
 
     @model_validator(mode="after")
     def _falls(self) -> OptimRecipe:
@@ -147,32 +145,32 @@ class OptimRecipe(RecipePart):
 
 
 class RunRecipe(RecipePart):
-    """Values that do not change what is learned, except for the seed and the stopping rule."""
+    """Settings of the run; only the seed and the stopping rule affect what is learned."""
 
-    seed: Seed = 0  # of the first weights and of the samples' order
+    seed: Seed = 0  # for initial weights and the order of samples
     validate_every: Interval = 1000
     save_every: Interval = 1000
     log_every: Interval = 50
     patience: Interval = 10  # validations without improvement before the run ends
-    min_delta: Annotated[float, Field(ge=0), FREE] = 1e-4  # a smaller improvement is none
-    device: Annotated[Literal["auto", "cpu", "cuda"], FREE] = "auto"  # of the networks; the renderer draws where it can
+    min_delta: Annotated[float, Field(ge=0), FREE] = 1e-4  # smaller improvements do not count
+    device: Annotated[Literal["auto", "cpu", "cuda"], FREE] = "auto"  # of the networks; the renderer picks its own
 
 
 class AnyRecipe(RecipePart):
-    """The values that all recipes have."""
+    """The sections that all recipes have."""
 
     optim: OptimRecipe = OptimRecipe()
     run: RunRecipe = RunRecipe()
 
 
 class Recipe(AnyRecipe):
-    """The recipe of a run of the residual or of direct-ft."""
+    """The recipe of a training run of the residual or of direct-ft."""
 
     data: DataRecipe = DataRecipe()
     loss: LossRecipe = LossRecipe()
-    # Of the residual. A checkpoint of another does not fit, and older ones lack the key.
+    # The residual's architecture. Free because older checkpoints lack the key; weights of another one fail to load.
     network: Annotated[Literal["unet", "sharp-decoder"], FREE] = "unet"
-    init: Path | None = None  # weights to start from; for sharp-decoder also SHARP's own
+    init: Path | None = None  # weights to start from; sharp-decoder also takes SHARP's own
 
     @model_validator(mode="after")
     def _has_features(self) -> Recipe:
@@ -191,9 +189,7 @@ R = TypeVar("R", bound=AnyRecipe)
 
 
 def differences(stored: Mapping[str, Any], recipe: RecipePart, above: str = "") -> list[str]:
-    """The keys, prefixed by `above`, in which a recipe differs from a stored one (by `model_dump`) so that the runs
-    differ.
-    """
+    """The keys, prefixed by `above`, in which a recipe differs from a `model_dump` of another; no `FREE` ones."""
     fields, now = type(recipe).model_fields, recipe.model_dump(mode="json")
     keys = [above + name for name, value in stored.items() if name not in fields and value is not None]
     for name, field in fields.items():
@@ -206,16 +202,16 @@ def differences(stored: Mapping[str, Any], recipe: RecipePart, above: str = "") 
 
 
 def load_recipe(kind: type[R], path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> R:
-    """Read a recipe; missing values are `kind`'s defaults.
+    """Read a recipe; values that it lacks are the defaults of `kind`.
 
     Args:
-        kind: `Recipe`, or another one.
+        kind: the class of the recipe, such as `Recipe`.
         path: a YAML file, or the name of a packaged one such as "cpu". Relative paths in it are relative to the
             working directory.
-        overrides: `key=value` each, such as optim.steps=100 or data.rgbd.0.folder=kitchen; values are YAML.
+        overrides: texts `key=value`, such as optim.steps=100 or data.rgbd.0.folder=kitchen; values are YAML.
 
     Raises:
-        InputError: a missing or broken file; an unknown key or a value out of bounds, named with the file.
+        InputError: the file is missing or broken, or has an unknown key or a value out of bounds, which is named.
     """
     names = sorted(file.stem for file in PACKAGED.glob("*.yaml"))
     if os.fspath(path) in names and not os.path.isfile(path):
@@ -249,7 +245,7 @@ def _parse(text: str, where: object) -> Any:
 
 
 def _set(content: Any, keys: Sequence[str], value: object) -> None:
-    """Put a value into nested dictionaries and lists; missing dictionaries are made."""
+    """Set a value in nested dictionaries and lists; missing dictionaries are created."""
     for key, following in zip(keys, [*keys[1:], None], strict=True):
         index = int(key) if isinstance(content, list) else key
         if following is None:
@@ -260,7 +256,7 @@ def _set(content: Any, keys: Sequence[str], value: object) -> None:
 
 
 def _first_problem(kind: Any, error: ValidationError) -> str:
-    """A message about the first wrong value: its key, and what it must be."""
+    """A message about the first invalid value: its key, and what it must be."""
     first = error.errors()[0]
     key = ".".join(str(name)[:60] for name in first["loc"])
     message = first["msg"][0].lower() + first["msg"][1:]

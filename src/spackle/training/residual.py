@@ -1,6 +1,6 @@
-"""The paper's own method: a residual network learns to complete cached samples, the base stays as it is.
+"""The paper's own method: a residual network learns to complete cached samples; the base does not change.
 
-`ViewTask`, which direct FT shares, has the loss of eq. 12 and the measurements.
+`ViewTask`, which direct FT also uses, computes the loss of eq. 12 and the measures.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ from spackle.training.samples import Sample, digest_of_samples, disk_needed, loa
 from spackle.training.sources import find_sources
 from spackle.training.train import Task, rank
 
-MIN_AUX = 64  # aux Gaussians of a view, however small its holes (paper, "Training Details and Loss Weights")
+MIN_AUX = 64  # least number of aux Gaussians in a view (paper, "Training Details and Loss Weights")
 PICTURED = 6  # views in the picture
 PICTURE_SIDE = 512  # pixels of a picture's longer side
-CACHE = "cache"  # in the output, where the recipe names no other folder
+CACHE = "cache"  # in the output, unless the recipe names another folder
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,7 +50,7 @@ class ViewBatch:
 
     rgb: Tensor  # [B, H, W, 3] sRGB of base and aux Gaussians, with gradients
     alpha: Tensor  # [B, H, W] likewise
-    base_rgb: Tensor  # [B, H, W, 3] of the base alone
+    base_rgb: Tensor  # [B, H, W, 3] sRGB of the base alone
     target: Tensor  # [B, H, W, 3]
     hole: Tensor  # [B, H, W] bool
 
@@ -69,7 +69,7 @@ class ViewTask(Task):
     measures = ("loss", "color", "alpha", "preserve", "perceptual", "hole_psnr", "seen_psnr", "har_before", "har_after")
 
     def __init__(self, recipe: Recipe, device: torch.device) -> None:
-        """Load the feature network; InputError where it cannot be read."""
+        """Load the feature network; InputError if it cannot be read."""
         self.recipe, self.device, self.renderer = recipe, device, get_renderer()
         self.precision = pick_dtype(recipe.optim.precision, device)
         features = recipe.loss.features if recipe.loss.perceptual else "none"
@@ -77,10 +77,10 @@ class ViewTask(Task):
 
     @abc.abstractmethod
     def complete(self, network: nn.Module, batch: Any) -> ViewBatch:
-        """The views of a batch, completed."""
+        """Complete the views of a batch."""
 
     def total(self, views: ViewBatch) -> tuple[Tensor, dict[str, Tensor]]:
-        """The recipe's loss [] of completed views, and its terms [] unweighted, on the task's device."""
+        """The loss [] of completed views, and its unweighted terms [], computed on the task's device."""
         tensors = {name: tensor.to(self.device) for name, tensor in vars(views).items()}
         return total_loss(**tensors, recipe=self.recipe.loss, features=self.features)
 
@@ -88,8 +88,10 @@ class ViewTask(Task):
         return self.total(self.complete(network, batch))
 
     def measure(self, network: nn.Module, batch: Any) -> dict[str, list[float]]:
-        """Of each view: loss and its terms; hole_psnr and seen_psnr in dB, inside of the hole against the target and
-        outside of it against the base, where they are not infinite; har_before and har_after, the share of hole pixels.
+        """Measure each view.
+
+        These are the loss and its terms (means over the batch); hole_psnr and seen_psnr in dB, if finite: inside the
+        hole against the target, and outside against the base; har_before and har_after, the share of hole pixels.
         """
         views = self.complete(network, batch)
         loss, terms = self.total(views)
@@ -105,7 +107,7 @@ class ViewTask(Task):
         }
 
     def facts(self, network: nn.Module) -> dict[str, Any]:
-        """Facts for run.json: the sources, and the number of weights that learn."""
+        """Facts for run.json: the feature network, the samples, the trained weights, the precision."""
         return {
             "features": self.features.name if self.features else "none",
             "samples": {"train": self.items, "validation": self.validation_items, "digest": self.digest},
@@ -115,7 +117,7 @@ class ViewTask(Task):
 
 
 def parameters(network: nn.Module) -> dict[str, int]:
-    """How many weights of a network learn and how many stay, for run.json."""
+    """How many weights of a network are trained and how many are frozen, for run.json."""
     counts = {"learn": 0, "stay": 0}
     for weight in network.parameters():
         counts["learn" if weight.requires_grad else "stay"] += weight.numel()
@@ -125,10 +127,10 @@ def parameters(network: nn.Module) -> dict[str, int]:
 def complete_samples(
     network: nn.Module | None, samples: Sequence[Sample], renderer: Renderer, precision: torch.dtype = torch.float32
 ) -> ViewBatch:
-    """Run the network on samples of one size, and render them with its Gaussians; None takes the base values alone.
+    """Run the network on samples of one size, and render them with its Gaussians; without one, with the seeds.
 
-    The network, a `ResidualNet` by itself or wrapped, alone gets gradients; its convolutions compute in `precision`.
-    Steps that read numbers run before samples are moved to the renderer's device, so that it is waited for once.
+    Gradients reach only the network, a `ResidualNet` or a wrapper of one; its convolutions compute in `precision`.
+    Steps that read values run before the samples move to the renderer's device, so that the host waits for it once.
     """
     device = device_of(renderer)
     cells = [training_cells(sample.features).flatten().nonzero()[:, 0] for sample in samples]
@@ -154,7 +156,7 @@ def complete_samples(
 
 
 def training_cells(features: ViewFeatures, least: int = MIN_AUX) -> Tensor:
-    """[h, w] bool: the masked cells, and where they are fewer than `least` the most transparent others."""
+    """[h, w] bool: the masked cells; if they are fewer than `least`, the most transparent others are added."""
     missing = least - int(features.mask.sum())
     if missing <= 0:
         return features.mask
@@ -165,10 +167,10 @@ def training_cells(features: ViewFeatures, least: int = MIN_AUX) -> Tensor:
 
 
 def first_network(name: str, init: Path | None = None) -> ResidualNet:
-    """The first network of a run: untrained, or from a file.
+    """The network that a run starts from: untrained, or from a file.
 
-    The file holds such a network's weights, or for a "sharp-decoder" those of SHARP, which has no such stem and heads.
-    InputError for a missing, broken or foreign file.
+    The file holds weights of the same network; for "sharp-decoder" it may also be SHARP's checkpoint, whose decoder is
+    taken and whose stem and heads are not. InputError if the file is missing, broken or foreign.
     """
     if init is None:
         return open_residual(name)
@@ -185,12 +187,12 @@ def first_network(name: str, init: Path | None = None) -> ResidualNet:
 
 
 class ResidualTask(ViewTask):
-    """Items are samples, of one size; all of a step go through the network together."""
+    """Its items are samples of one size; a step's samples go through the network together."""
 
     name: ClassVar[str] = "residual"
 
     def __init__(self, recipe: Recipe, device: torch.device) -> None:
-        """Find a recipe's files, make no sample yet; InputError where they cannot be used."""
+        """Find a recipe's files, without making samples; InputError if they cannot be used."""
         super().__init__(recipe, device)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(recipe.run.seed)
@@ -199,7 +201,7 @@ class ResidualTask(ViewTask):
         self.digest, self.items_a_step = digest_of_samples(recipe.data, self.sources[0]), recipe.optim.batch
 
     def prepare(self, output: Path, reporter: Reporter) -> dict[str, Any]:
-        """Make the samples that are missing; InputError also where the disk is too full for them."""
+        """Make the missing samples; InputError also if the disk lacks room for them."""
         data, skipped = self.recipe.data, Counter[str]()
 
         def skip(reason: str) -> None:
@@ -209,7 +211,7 @@ class ResidualTask(ViewTask):
 
         folder = data.cache or output / CACHE
         make_folder(folder)
-        # Other seeds, other views, and of a dataset other photos: no view is in both.
+        # No view is in both parts: their seeds differ, and they use different photos of a dataset.
         parts = (
             ("validation", self.sources[True], 2 * data.seed + 1, data.validation_views),
             ("train", self.sources[False], 2 * data.seed, data.views),
@@ -238,8 +240,8 @@ class ResidualTask(ViewTask):
 
     @torch.no_grad()
     def limits(self) -> dict[str, float]:
-        """Mean hole_psnr in dB of the validation samples, untrained and with the targets' own colours: the range to
-        learn.
+        """The range in which training can improve: mean hole_psnr in dB of the validation samples, without a network
+        and with the seeds in the targets' own colours.
         """
         found: dict[str, list[float]] = {"untrained": [], "colours of the targets": []}
         for item in range(self.validation_items):
@@ -253,7 +255,7 @@ class ResidualTask(ViewTask):
         return {name: sum(decibels) / len(decibels) for name, decibels in found.items()}
 
     def batch(self, step: int | None, items: Sequence[int]) -> list[Sample]:
-        """Samples; InputError where one cannot be read."""
+        """Read samples; InputError if one cannot be read."""
         files = self.validation if step is None else self.learned
         return [load_sample(files[item]) for item in items]
 
@@ -262,7 +264,7 @@ class ResidualTask(ViewTask):
 
     @torch.no_grad()
     def picture(self, network: nn.Module) -> Tensor:
-        """[H, W, 3] sRGB, a row for each of some samples."""
+        """[H, W, 3] sRGB, a row for each of some samples: base, without a network, with it, target."""
         items = range(0, self.validation_items, max(1, self.validation_items // PICTURED))[:PICTURED]
         batch = self.batch(None, items)
         done, plain = self.complete(network, batch), self.complete(None, batch)
@@ -272,6 +274,6 @@ class ResidualTask(ViewTask):
         return [self.learned[item].name for item in items]
 
     def export(self, network: nn.Module, path: Path) -> None:
-        """Weights in half precision, for `spackle predict --residual`."""
+        """Write the weights in half precision, for `spackle predict --residual`."""
         tensors = {name: tensor.detach().half().cpu().contiguous() for name, tensor in network.state_dict().items()}
         write_whole(path, save(tensors, {NOTE: self.recipe.network}))

@@ -35,39 +35,39 @@ from spackle.residual.view_features import CELL, ViewFeatures, cell_centers, hol
 from spackle.training.recipe import DataRecipe
 from spackle.training.train import rank, rank_count, wait_for_ranks
 
-REACH_PX = 16  # aux Gaussians of a hole reach no farther than this beyond it
-# Of a sample's file: half precision is enough for most of it, and eight bits are for sRGB of a pixel or a cell.
+REACH_PX = 16  # aux Gaussians of a hole extend at most this far beyond it
+# How a file stores tensors: `EXACT` ones in their own precision, `EIGHT_BITS` in eight bits, others in half precision.
 EXACT = ("camera.K", "camera.world_to_camera", "base.means", "rendering.alpha", "seeds.inverse_depth")
 RIM_COLORS = ("rim.rgb", "rim.mirrored", "rim.exemplar", "rim.photo")
 EIGHT_BITS = ("target", "rendering.rgb", "seeds.rgb", "base.opacities", "base.colors", *RIM_COLORS)
-PARTS = ("base", "rendering", "rim", "seeds")  # of a sample, each a dataclass of tensors
-GAUSSIANS_A_PIXEL = 1.35  # of the base in a crop, at most
-# A crop's file has per pixel so many Gaussians of 26 bytes, 8-bit colours of rendering and target, alpha in float32 and
-# depth in float16; per cell 8-bit colours of seed and rim, 5 times 3 of them, and 13 bytes of their other fields.
+PARTS = ("base", "rendering", "rim", "seeds")  # the fields of a sample that are dataclasses of tensors
+GAUSSIANS_A_PIXEL = 1.35  # the most base Gaussians that a crop keeps, per pixel
+# Sizes in a crop's file. Per pixel: `GAUSSIANS_A_PIXEL` Gaussians of 26 bytes, 8-bit colours of rendering and target,
+# alpha in float32 and depth in float16. Per cell: 5 colours of seed and rim in 8 bits, and 13 bytes for other fields.
 PIXEL_BYTES, CELL_BYTES, HEADER_BYTES = 26 * GAUSSIANS_A_PIXEL + 2 * 3 + 4 + 2, 5 * 3 + 13, 4096
-HOLE_SHARE = (0.02, 0.85)  # of a crop's pixels, for the crop to teach something
-SAMPLES_VERSION = 7  # goes up whenever the same recipe would make other samples
+HOLE_SHARE = (0.02, 0.85)  # a crop is used if its share of hole pixels lies between these
+SAMPLES_VERSION = 7  # increases whenever the same recipe would give different samples
 P = TypeVar("P")
 
 
 @dataclasses.dataclass(frozen=True)
 class Sample:
-    """A view of frozen Gaussians with holes, and its target. Nothing here wants gradients."""
+    """A view of frozen Gaussians with holes, and its target. No tensor requires gradients."""
 
     camera: Camera
-    base: Gaussians  # those that touch the tiles around the holes
+    base: Gaussians  # only Gaussians that touch the tiles around the holes
     rendering: Rendering  # of the whole base
     seeds: Seeds  # a grid, one for each 2×2 pixels
-    rim: Rim  # likewise
+    rim: Rim  # the same grid
     target: Tensor  # [H, W, 3] sRGB
 
     @staticmethod
     def of(
         base: Gaussians, rendering: Rendering, camera: Camera, photo_camera: Camera, photo: Tensor, target: Tensor
     ) -> Sample:
-        """A whole view: frozen Gaussians, their rendering from `camera`, and the truth `target` [H, W, 3] sRGB.
+        """A sample of a whole view: frozen Gaussians, their rendering by `camera`, and the `target` [H, W, 3] sRGB.
 
-        `photo_camera` is that of the base's `photo` [h, w, 3] sRGB.
+        `photo_camera` is the camera of the base's `photo` [h, w, 3] sRGB.
         """
         rendering, features = rendering.detach(), ViewFeatures.of(rendering)
         seeds = make_seeds(features, camera, photo_camera)
@@ -76,12 +76,12 @@ class Sample:
 
     @functools.cached_property
     def features(self) -> ViewFeatures:
-        """The view's cells; for a sample on the processor."""
+        """The view's cells; the sample must be on the CPU."""
         return ViewFeatures.of(self.rendering)
 
     @property
     def hole(self) -> Tensor:
-        """[H, W] bool, Q of the paper's loss."""
+        """[H, W] bool: the hole, Q in the paper's loss."""
         return hole_mask(self.rendering.alpha)
 
     @property
@@ -91,13 +91,13 @@ class Sample:
         return max_pool2d(near[None, None].float(), TILE, ceil_mode=True)[0, 0] > 0
 
     def to(self, device: torch.device) -> Sample:
-        """The same on another device, except for the camera, whose numbers are read by the host."""
+        """The sample on another device; its camera stays on the CPU, where its values are read."""
         move = functools.partial(Tensor.to, device=device, non_blocking=device.type != "cpu")
         parts = {name: _mapped(getattr(self, name), move) for name in PARTS}
         return dataclasses.replace(self, **parts, target=move(self.target))
 
     def crop(self, row: int, column: int, height: int, width: int) -> Sample:
-        """The part of a view whose upper left cell is (row, column), height × width cells."""
+        """The part of a view with the upper left cell (row, column), height × width cells large."""
         top, left = CELL * row, CELL * column
         pixels = (slice(top, top + CELL * height), slice(left, left + CELL * width))
         cells = (slice(row, row + height), slice(column, column + width))
@@ -116,11 +116,11 @@ class Sample:
         )._with_visible_base()
 
     def _with_visible_base(self) -> Sample:
-        """The sample with only those base Gaussians that contribute to the tiles that matter.
+        """Drop the base Gaussians that contribute nothing to `tiles`.
 
-        If there are more than `GAUSSIANS_A_PIXEL`, those that contribute most are kept.
+        If more than `GAUSSIANS_A_PIXEL` remain, the ones that contribute most are kept.
         """
-        with torch.enable_grad():  # the gradient of grey Gaussians' brightness says how much of each shows
+        with torch.enable_grad():  # the gradient with respect to a Gaussian's colour is what it contributes
             grey = torch.full_like(self.base.colors, 0.5).requires_grad_()
             scene = dataclasses.replace(self.base, colors=grey)
             drawn = CpuRenderer().render(scene, self.camera, tiles=self.tiles)
@@ -132,13 +132,13 @@ class Sample:
 
 
 def random_crops(sample: Sample, rng: np.random.Generator, count: int, cells: int) -> list[Sample]:
-    """Up to `count` square crops of `cells` cells around hole cells of a view."""
+    """Up to `count` square crops around hole cells of a view, `cells` cells a side."""
     rows, columns = sample.camera.height // CELL, sample.camera.width // CELL  # whole cells only
     if min(rows, columns) < cells:
         return []
     where = sample.features.mask[:rows, :columns].nonzero()
     crops: list[Sample] = []
-    for _ in range(2 * count):  # a second chance for each
+    for _ in range(2 * count):  # two tries for each crop
         if not len(where) or len(crops) == count:
             break
         row, column = where[rng.integers(len(where))].tolist()
@@ -152,7 +152,7 @@ def random_crops(sample: Sample, rng: np.random.Generator, count: int, cells: in
 
 
 def save_sample(sample: Sample, path: Path) -> None:
-    """Write a sample, whole or not at all; `disk_needed` knows how large it can be."""
+    """Write a sample atomically; `disk_needed` has an upper bound of its size."""
     camera = sample.camera
     tensors = {
         "camera.K": camera.K,
@@ -163,10 +163,10 @@ def save_sample(sample: Sample, path: Path) -> None:
     for part in PARTS:
         tensors |= {f"{part}.{name}": value for name, value in vars(getattr(sample, part)).items()}
     tensors["seeds.unit"] = torch.tensor(sample.seeds.unit, dtype=torch.float64)
-    del tensors["seeds.uv"]  # the camera's
+    del tensors["seeds.uv"]  # they follow from the camera
     tensors["base.colors"] = linear_to_srgb(sample.base.colors)
     tensors |= {name: to_bytes(tensors[name]) for name in EIGHT_BITS}
-    quats = sample.base.quats  # of any length: the largest component becomes 127
+    quats = sample.base.quats  # not normalised: the largest component becomes 127
     tensors["base.quats"] = (127 * quats / quats.abs().amax(-1, keepdim=True)).round().to(torch.int8)
     halved = [name for name, tensor in tensors.items() if tensor.dtype == torch.float32 and name not in EXACT]
     tensors |= {name: tensors[name].half() for name in halved}
@@ -174,7 +174,7 @@ def save_sample(sample: Sample, path: Path) -> None:
 
 
 def load_sample(path: str | os.PathLike[str]) -> Sample:
-    """Read a sample; InputError for a missing or broken file."""
+    """Read a sample; InputError if its file is missing or broken."""
     with reading(path, "no training sample, or damaged: delete it, and it is made anew"):
         parts: dict[str, dict[str, Any]] = {}
         for name, tensor in load_file(path).items():
@@ -194,7 +194,7 @@ def load_sample(path: str | os.PathLike[str]) -> Sample:
 
 
 def _mapped(part: P, function: Callable[[Tensor], Tensor]) -> P:
-    """A dataclass with a function applied to its tensors."""
+    """Apply a function to the tensors of a dataclass."""
     tensors = {name: value for name, value in vars(part).items() if isinstance(value, Tensor)}
     return dataclasses.replace(part, **{name: function(value) for name, value in tensors.items()})  # type: ignore[type-var]
 
@@ -202,14 +202,14 @@ def _mapped(part: P, function: Callable[[Tensor], Tensor]) -> P:
 class Source(NamedTuple):
     """A source of views with holes and truth, and its share of the samples."""
 
-    share: float  # among all sources, which need not add up to 1
-    view: Callable[[np.random.Generator, int], Sample]  # the view of a number; InputError for a file that is no use
-    names: Sequence[str]  # of the source and of its files, relative to their folder
-    views: int | None = None  # how many it has, numbered from 0; None: drawn, without end
+    share: float  # weight among all sources; weights need not add up to 1
+    view: Callable[[np.random.Generator, int], Sample]  # makes the numbered view; InputError for an unusable file
+    names: Sequence[str]  # the names of the source and of its files, relative to their folder
+    views: int | None = None  # number of views, numbered from 0; None: any number, drawn at random
 
 
 def digest_of_samples(data: DataRecipe, sources: Sequence[Source]) -> str:
-    """Twelve digits that identify the samples' content, wherever the files are and however many are made."""
+    """Twelve digits that identify the samples' content; paths and the number of samples do not affect them."""
     facts = data.model_dump(mode="json")
     for name in ("photos", "stereo", "pseudo", "cache", "views", "validation_views"):
         facts.pop(name)
@@ -233,22 +233,23 @@ def make_samples(
     progress: Step,
     warn: Callable[[str], None],
 ) -> list[Path]:
-    """The sample files of a folder's first views, in order; the processes share the work of making missing ones.
+    """Make the missing samples of a folder's first `views` views; returns the files of all of them, in order.
 
-    Many recipes may share the folder. `seed` decides the views, fewer if the only source has no more. `progress` is
-    called with the views that this process has done and their number, `warn` with the reason for each view without a
-    sample. InputError where nothing can be written, or no view has a hole to learn from.
+    The processes of a run share the work, and several recipes may share the folder. `seed` determines the views; if
+    there is one source, it may have fewer. `progress` is called with the number of views that this process has done and
+    the number of its views; `warn` with the reason if a view cannot be made. InputError if nothing can be written, or
+    no view gave a sample.
     """
     folder.mkdir(parents=True, exist_ok=True)
     views = _at_most(views, sources)
     shares = np.array([source.share for source in sources])
 
     def drawn(index: int) -> tuple[int, np.random.Generator]:
-        """Draw a view's source, and the random numbers for it."""
+        """Draw a view's source; returns it and the generator for the view's other random numbers."""
         rng = np.random.default_rng([seed, index])
         return int(rng.choice(len(sources), p=shares / shares.sum())), rng
 
-    places, counts = list[tuple[int, int]](), [0] * len(sources)  # of each view: its source, and its number there
+    places, counts = list[tuple[int, int]](), [0] * len(sources)  # each view's source and its number there
     for index in range(views):
         choice = drawn(index)[0]
         places.append((choice, counts[choice]))
@@ -265,7 +266,7 @@ def make_samples(
                 warn(str(error))
             for number, crop in enumerate(crops):
                 save_sample(crop, folder / f"{index:06d}-{number}.safetensors")
-            write_whole(folder / f"{index:06d}.done", f"{len(crops)}\n".encode())  # last: it vouches for the crops
+            write_whole(folder / f"{index:06d}.done", f"{len(crops)}\n".encode())  # last: the crops are complete
         progress(done, len(mine))
     wait_for_ranks()
     files = [file for index in range(views) for file in _crop_files(folder, index) or ()]
@@ -278,19 +279,19 @@ def make_samples(
 
 
 def disk_needed(data: DataRecipe, sources: Sequence[Source], folder: Path, views: int) -> int:
-    """Maximum number of bytes that the missing samples of a folder's first views will take."""
+    """The most bytes that the missing samples of a folder's first `views` views can take."""
     missing = sum(_crop_files(folder, index) is None for index in range(_at_most(views, sources)))
     return missing * data.crops * (data.cells**2 * int(CELL**2 * PIXEL_BYTES + CELL_BYTES) + HEADER_BYTES)
 
 
 def _at_most(views: int, sources: Sequence[Source]) -> int:
-    """The recipe's number of views, or fewer if the only source has fewer."""
+    """`views`, or the number of views of the only source if that has fewer."""
     alone = sources[0].views if len(sources) == 1 else None
     return views if alone is None else min(views, alone)
 
 
 def _crop_files(folder: Path, index: int) -> list[Path] | None:
-    """The files of a view's crops; None if they have not been made."""
+    """The files of a view's crops; None if the crops have not been made."""
     with contextlib.suppress(FileNotFoundError, ValueError):
         count = int((folder / f"{index:06d}.done").read_text())
         files = [folder / f"{index:06d}-{number}.safetensors" for number in range(count)]

@@ -1,8 +1,8 @@
-"""Where views with holes and their truth come from: photos, RGB-D frames, stereo pairs, a pseudo-supervised dataset.
+"""Sources of views with holes and their truth: photos, RGB-D frames, stereo pairs, a pseudo-supervised dataset.
 
-`reverse_view` needs no inpainter: parts of a photo that a virtual camera cannot see are holes, and the photo is their
-truth.
-Photos without depth become scenes: cut-outs of photos at known depths before another photo (`composite`).
+`reverse_view` needs no inpainter: the parts of a photo that a virtual camera cannot see become holes, and the photo is
+their truth. Photos without depth are combined into scenes: cut-outs at known depths in front of another photo
+(`composite`).
 """
 
 from __future__ import annotations
@@ -34,22 +34,22 @@ from spackle.render import Renderer
 from spackle.training.recipe import DataRecipe
 from spackle.training.samples import Sample, Source
 
-TOLERANCE = 0.02  # how far behind what the virtual camera sees a Gaussian may lie and still count as seen, relative
-CORNER = 0.25  # pixels; centres of pixels are half of one from their corners
-FRAMES = 24  # of a path, one of which is the virtual camera
-NO_TARGETS = {  # inpainters whose pictures teach nothing
+TOLERANCE = 0.02  # a Gaussian counts as seen up to this far behind the visible surface, relative to its depth
+CORNER = 0.25  # pixels: a centre closer than this to a pixel's corner is at the corner
+FRAMES = 24  # frames of a path; one of them is the virtual camera
+NO_TARGETS = {  # inpainters whose results teach nothing, and why
     "none": "leaves the holes open",
     "geometry": "draws what the untrained residual draws",
 }
 
-Draw = Callable[[np.random.Generator], tuple[Tensor, DepthMap, Camera]]  # a photo [H, W, 3] sRGB with depth
+Draw = Callable[[np.random.Generator], tuple[Tensor, DepthMap, Camera]]  # draws a photo [H, W, 3] sRGB with depth
 View = Callable[[np.random.Generator], Sample]
 
 
 def find_sources(data: DataRecipe, renderer: Renderer, *, validation: bool) -> list[Source]:
-    """Find a recipe's files, to learn from or for `validation`; for a dataset these are different photos.
+    """Find a recipe's files, for training or for `validation`; a dataset has different photos for each.
 
-    InputError for a folder that is missing or without such files, or no data.
+    InputError if the recipe names no data, or a folder that is missing or lacks such files.
     """
     shares, sources = data.shares, list[Source]()
 
@@ -66,7 +66,7 @@ def find_sources(data: DataRecipe, renderer: Renderer, *, validation: bool) -> l
         add("composites", shares.composites, data.photos, photos, reverse(partial(composite_photo, photos=photos)))
     frames = [find_files(camera.folder, "data.rgbd", (".color.jpg",), "NAME.color.jpg") for camera in data.rgbd]
     for camera, files in zip(data.rgbd, frames, strict=True):
-        share = shares.rgbd * len(files) / sum(map(len, frames))  # every frame counts alike
+        share = shares.rgbd * len(files) / sum(map(len, frames))  # every frame is equally likely
         draw = partial(frame_photo, frames=files, focal_px=camera.focal_px, unit_m=camera.unit_m)
         add("rgbd", share, camera.folder, files, reverse(draw))
     if data.stereo is not None:
@@ -77,10 +77,10 @@ def find_sources(data: DataRecipe, renderer: Renderer, *, validation: bool) -> l
         dataset = open_pseudo(data.pseudo)
         split = divided_photos(dataset, data)
         places = [(photo, view) for photo in split[validation] for view in views_with_holes(dataset, photo)]
-        photo_at = lru_cache(1)(dataset.__getitem__)  # its views follow on each other
+        photo_at = lru_cache(1)(dataset.__getitem__)  # cached, because the views of a photo follow each other
 
         def stored(rng: np.random.Generator, index: int) -> Sample:
-            """A stored view with its rendering; InputError for a damaged file."""
+            """A stored view as a sample; InputError if its file is damaged."""
             photo = photo_at(places[index][0])
             view = photo.view(places[index][1])
             return Sample.of(photo.base, view.rendering, view.camera, view.photo_camera, view.photo, view.target)
@@ -96,7 +96,7 @@ def find_sources(data: DataRecipe, renderer: Renderer, *, validation: bool) -> l
 
 
 def find_files(folder: Path, key: str, endings: tuple[str, ...], what: str) -> list[Path]:
-    """All files below a folder whose names end so, in order; InputError for no folder, or no such file in it."""
+    """All files below a folder with one of these endings, sorted; InputError if there is no folder or no such file."""
     if not os.path.isdir(folder):
         raise InputError(f"{folder}: no such folder, but {key} names it: give {key}=FOLDER")
     files = files_in(folder, endings, below=True)
@@ -111,10 +111,10 @@ def find_files(folder: Path, key: str, endings: tuple[str, ...], what: str) -> l
 def reverse_view(prediction: BasePrediction, photo: Tensor, viewer: Camera, renderer: Renderer) -> Sample:
     """Keep the Gaussians that a virtual camera sees, and render them at the photo's own camera.
 
-    The virtual camera takes the place of the photo's camera, and the photo that of the novel view.
+    In the sample, the virtual camera acts as the input camera, and the photo as the novel view.
 
     Args:
-        prediction: from `lift` without tiles: a Gaussian a pixel, the other surface of mixed pixels, the backing.
+        prediction: from `lift` with levels=0: one Gaussian per pixel, the other surface of mixed pixels, the backing.
         photo: [H, W, 3] sRGB at the camera's size.
         viewer: the virtual camera.
         renderer: draws the views.
@@ -126,10 +126,10 @@ def reverse_view(prediction: BasePrediction, photo: Tensor, viewer: Camera, rend
 
 
 def seen_from(gaussians: Gaussians, viewer: Camera, depth: Tensor) -> Tensor:
-    """[N] bool: the Gaussians that a camera sees, by the rendered `depth` [H, W] around their centres.
+    """[N] bool: the Gaussians that a camera sees, judged by its rendered `depth` [H, W] around their centres.
 
-    Neighbouring pixels count, because a blob is wider than a pixel: at an outline the nearer depth bleeds over the
-    farther surface, and on a steep surface half of a pixel lies before its depth.
+    The greatest depth of 3×3 pixels counts, because Gaussians are wider than a pixel: at an outline the nearer depth
+    bleeds over the farther surface, and on a steep surface a pixel holds more than one depth.
     """
     around = max_pool2d(depth[None, None], 3, stride=1, padding=1)[0, 0]
     uv, z = viewer.project(gaussians.means)
@@ -140,10 +140,10 @@ def seen_from(gaussians: Gaussians, viewer: Camera, depth: Tensor) -> Tensor:
 
 
 def with_backing(seen: Tensor, gaussians: Gaussians, camera: Camera) -> Tensor:
-    """`seen` [N] of a lifted photo's Gaussians, a backing one counting as the farthest of the pixels around it.
+    """Extend `seen` [N] to the backing: a backing Gaussian counts as seen if the farthest pixel around it does.
 
-    A backing Gaussian lies behind its surface by design, so its own depth is no criterion. Pixels' Gaussians come
-    first; of the others, backing ones are those at corners of pixels (see `spackle.bases.lift.lift`).
+    Backing Gaussians lie behind their surface by design, so their own depth does not decide. The Gaussians of a lifted
+    photo begin with one per pixel; among the others, the backing is at corners of pixels (`spackle.bases.lift.lift`).
     """
     width, height = camera.width, camera.height
     uv, z = camera.project(gaussians.means)
@@ -159,9 +159,9 @@ def with_backing(seen: Tensor, gaussians: Gaussians, camera: Camera) -> Tensor:
 def random_reverse_view(
     rng: np.random.Generator, draw: Draw, disparity: tuple[float, float], renderer: Renderer
 ) -> Sample:
-    """`reverse_view` of a photo from a random frame of a random path."""
+    """`reverse_view` of a random photo, with a random frame of a random path as the virtual camera."""
     rgb, depth, camera = draw(rng)
-    prediction = lift(rgb, depth, camera, levels=0)  # a tile is seen as a whole, and a hole's outline is not a tile's
+    prediction = lift(rgb, depth, camera, levels=0)  # no tiles: they are seen or hidden as a whole
     kind = SHARP_TRAJECTORIES[rng.integers(len(SHARP_TRAJECTORIES))]
     reach = DepthRange.of(prediction.gaussians)
     viewer = trajectory(kind, camera, rng.uniform(*disparity), reach, FRAMES)[rng.integers(FRAMES)]
@@ -169,14 +169,14 @@ def random_reverse_view(
 
 
 def right_view(rng: np.random.Generator, folders: Sequence[Path], renderer: Renderer) -> Sample:
-    """The left photo of a stereo pair seen from the right camera, whose photo is the truth."""
+    """The lifted left photo of a random stereo pair, rendered at the right camera; the right photo is the truth."""
     left, right, depth, camera, beside = load_pair(_chosen(rng, folders))
     base = lift(left, depth, camera).gaussians
     return Sample.of(base, renderer.render(base, beside), beside, camera, left, right)
 
 
 def open_pseudo(location: str | os.PathLike[str]) -> DatasetFiles:
-    """A pseudo-supervised dataset (appendix, "Dataset"); InputError for one that is not finished or teaches nothing."""
+    """Open a pseudo-supervised dataset (appendix, "Dataset"); InputError if it is unfinished or teaches nothing."""
     files = DatasetFiles(location)
     name = files.manifest.config.get("inpainter", {}).get("name")
     if name in NO_TARGETS:
@@ -190,9 +190,9 @@ def open_pseudo(location: str | os.PathLike[str]) -> DatasetFiles:
 
 
 def divided_photos(files: DatasetFiles, data: DataRecipe) -> tuple[list[int], list[int]]:
-    """Indices of a dataset's photos to learn from and of those for validation, shuffled by `data.seed`.
+    """Indices of a dataset's photos for training, and of those for validation, shuffled by `data.seed`.
 
-    All views of a photo are in the same part. InputError for a single photo.
+    Training and validation share no photo. InputError if the dataset has a single photo.
     """
     photos, per_photo = len(files), len(files.samples[0][1].holes)
     if photos < 2:
@@ -203,7 +203,7 @@ def divided_photos(files: DatasetFiles, data: DataRecipe) -> tuple[list[int], li
 
 
 def views_with_holes(files: DatasetFiles, photo: int) -> list[int]:
-    """Those of a photo's views that have a hole."""
+    """The numbers of a photo's views that have a hole."""
     return [view for view, hole in enumerate(files.samples[photo][1].holes) if hole > 0]
 
 
@@ -213,13 +213,13 @@ def views_with_holes(files: DatasetFiles, photo: int) -> list[int]:
 def frame_photo(
     rng: np.random.Generator, frames: Sequence[Path], focal_px: float, unit_m: float
 ) -> tuple[Tensor, DepthMap, Camera]:
-    """One of a depth camera's photos: see `load_frame`."""
+    """A random photo of a depth camera, its depth and its camera; see `load_frame`."""
     rgb, depth = load_frame(_chosen(rng, frames), unit_m)
     return rgb, depth, Camera.from_focal(focal_px, rgb.shape[1], rgb.shape[0])
 
 
 def left_photo(rng: np.random.Generator, folders: Sequence[Path]) -> tuple[Tensor, DepthMap, Camera]:
-    """The left photo of a stereo pair: see `load_pair`."""
+    """The left photo of a random stereo pair, its depth and its camera; see `load_pair`."""
     left, _, depth, camera, _ = load_pair(_chosen(rng, folders))
     return left, depth, camera
 
@@ -229,21 +229,21 @@ def _chosen(rng: np.random.Generator, files: Sequence[Path]) -> Path:
 
 
 def load_frame(color: Path, unit_m: float) -> tuple[Tensor, DepthMap]:
-    """A depth camera's photo NAME.color.jpg [H, W, 3] sRGB and its depth, which lies beside it.
+    """Read a depth camera's photo NAME.color.jpg, [H, W, 3] sRGB, and its depth in NAME.depth.png.
 
-    `unit_m` is the length of one unit of the depth map, in which 0 and 65535 are unknown. InputError for a missing or
-    broken file.
+    `unit_m` is the length of one unit of the depth file, where 0 and 65535 mean unknown. InputError if a file is
+    missing or broken.
     """
     rgb = load_photo(color).rgb
     stored = load_depth(color.with_name(color.name.replace(".color.", ".depth.")).with_suffix(".png"))
     stored.check_shape(rgb.shape[0], rgb.shape[1], color)
-    return rgb, dataclasses.replace(stored, depth=stored.depth * (unit_m / 0.001))  # it was read as millimetres
+    return rgb, dataclasses.replace(stored, depth=stored.depth * (unit_m / 0.001))  # `load_depth` assumes mm
 
 
 def load_pair(folder: Path) -> tuple[Tensor, Tensor, DepthMap, Camera, Camera]:
-    """A stereo pair: left and right photo [H, W, 3] sRGB, the left one's depth, both cameras.
+    """Read a stereo pair: left and right photo [H, W, 3] sRGB, depth of the left one, left and right camera.
 
-    InputError for a file that is missing or broken.
+    InputError if a file is missing or broken.
     """
     scene = folder / "scene.json"
     with reading(folder, "no stereo pair: needs a scene.json that names the photos and the lens ({reason})"):
@@ -265,19 +265,19 @@ def load_pair(folder: Path) -> tuple[Tensor, Tensor, DepthMap, Camera, Camera]:
 
 # Photos without depth -----------------------------------------------------------------------------
 
-COMPOSITE_SIZE = (336, 448)  # height, width; half of them stand upright
-FOCAL_MM = (20.0, 50.0)  # lenses of photos that do not tell theirs
+COMPOSITE_SIZE = (336, 448)  # height, width; swapped in half of the composites
+FOCAL_MM = (20.0, 50.0)  # the range of focal lengths, 35 mm equivalent
 BACKGROUND_M = (3.0, 8.0)  # depth of the farthest plane
-NEARER = (1.15, 4.0)  # a cut-out's inverse depth over that of what it covers
+NEARER = (1.15, 4.0)  # ratio of a cut-out's inverse depth to the largest that it covers
 NEAREST_M = 0.7
 OBJECTS = (1, 4)
-AREA = (0.01, 0.35)  # share of the frame that a cut-out may take
+AREA = (0.01, 0.35)  # share of the image that a cut-out may cover
 
 Photos = Callable[[np.random.Generator], Tensor]  # a random photo, [H, W, 3] sRGB
 
 
 def composite_photo(rng: np.random.Generator, photos: Sequence[Path]) -> tuple[Tensor, DepthMap, Camera]:
-    """A composite, and the camera that took it."""
+    """A random composite, its depth, and a camera with a random focal length."""
     height, width = COMPOSITE_SIZE if rng.random() < 0.5 else COMPOSITE_SIZE[::-1]
     rgb, inverse_depth = composite(rng, lambda rng: load_photo(_chosen(rng, photos)).rgb, height, width)
     focal = film_to_pixels(rng.uniform(*FOCAL_MM), width, height)
@@ -287,7 +287,7 @@ def composite_photo(rng: np.random.Generator, photos: Sequence[Path]) -> tuple[T
 
 
 def composite(rng: np.random.Generator, photos: Photos, height: int, width: int) -> tuple[Tensor, Tensor]:
-    """A picture [H, W, 3] sRGB of several photos, and its inverse depth [H, W] in 1/m, known exactly."""
+    """An image [H, W, 3] sRGB composed of several photos, and its exact inverse depth [H, W] in 1/m."""
     rgb = random_crop(rng, photos(rng), height, width)
     inverse_depth = _background(rng, height, width)
     for _ in range(rng.integers(OBJECTS[0], OBJECTS[1] + 1)):
@@ -307,7 +307,7 @@ def composite(rng: np.random.Generator, photos: Photos, height: int, width: int)
 
 
 def random_crop(rng: np.random.Generator, photo: Tensor, height: int, width: int) -> Tensor:
-    """A part of a photo [h, w, 3] at a random scale, by chance mirrored, [height, width, 3]."""
+    """[height, width, 3]: a random part of a photo [h, w, 3] at a random scale, mirrored half of the time."""
     rows, columns = photo.shape[:2]
     smallest = max(height / rows, width / columns)
     scale = smallest * rng.uniform(1.0, 1.5)
@@ -319,7 +319,7 @@ def random_crop(rng: np.random.Generator, photo: Tensor, height: int, width: int
 
 
 def _background(rng: np.random.Generator, height: int, width: int) -> Tensor:
-    """A wall, and by chance the ground in front of it or a second wall beside it."""
+    """Inverse depth [H, W] of a wall, at random with the ground in front of it or a second wall beside it."""
     far = 1.0 / rng.uniform(*BACKGROUND_M)
     plane = far * (1 + _tilt(rng, height, width, 0.3))
     if rng.random() < 0.5:  # the ground: inverse depth grows linearly below the horizon
@@ -332,20 +332,20 @@ def _background(rng: np.random.Generator, height: int, width: int) -> Tensor:
 
 
 def _tilt(rng: np.random.Generator, height: int, width: int, most: float) -> Tensor:
-    """A linear ramp [H, W] of random direction, within ±most."""
+    """A linear ramp [H, W] of random direction, with values within ±`most`."""
     y, x = torch.meshgrid(torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij")
     a, b = (rng.uniform(-most, most) / 2 for _ in range(2))
     return a * x + b * y
 
 
 def outline(rng: np.random.Generator, picture: Tensor) -> Tensor:
-    """A mask [H, W] in 0..1 of random shape, whose edge is soft over about a pixel, like a camera's."""
+    """A mask [H, W] in 0..1 of random shape; its edge is about a pixel wide, as in a camera's image."""
     height, width = picture.shape[:2]
     cloud = _noise(rng, height, width, rng.uniform(0.1, 0.35))
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     cy, cx = rng.uniform(0.1, 1.0) * height, rng.uniform(0.0, 1.0) * width
     kind = rng.random()
-    if kind < 0.35:  # what resembles the colour at a point: outlines that follow those of real things
+    if kind < 0.35:  # pixels similar to a point's colour: outlines follow those of real objects
         smooth = avg_pool2d(picture.permute(2, 0, 1)[None], 9, stride=1, padding=4, count_include_pad=False)[0]
         color = smooth[:, min(int(cy), height - 1), min(int(cx), width - 1)]
         unlike = ((smooth - color[:, None, None]) ** 2).sum(0) / rng.uniform(0.01, 0.04)
@@ -354,7 +354,7 @@ def outline(rng: np.random.Generator, picture: Tensor) -> Tensor:
     elif kind < 0.75:  # a blob
         ry, rx = (rng.uniform(0.08, 0.4) * side for side in (height, width))
         field = 1 - ((x - cx) / rx) ** 2 - ((y - cy) / ry) ** 2 + rng.uniform(0.0, 0.8) * cloud
-    else:  # a bar: poles, legs and frames
+    else:  # a bar, like poles, legs and frames
         angle = rng.uniform(-0.4, 0.4) + (math.pi / 2 if rng.random() < 0.25 else 0.0)
         across = ((x - cx) * math.cos(angle) + (y - cy) * math.sin(angle)).abs()
         field = 1 - across / (rng.uniform(0.008, 0.06) * width) + 0.2 * cloud
@@ -363,7 +363,7 @@ def outline(rng: np.random.Generator, picture: Tensor) -> Tensor:
 
 
 def _noise(rng: np.random.Generator, height: int, width: int, size: float) -> Tensor:
-    """Smooth noise [H, W] of about ±1; `size` is the size of its features relative to the width."""
+    """Smooth noise [H, W] of about ±1, with features of `size` times the width."""
     rows, columns = max(2, round(height / (size * width))), max(2, round(1 / size))
     coarse = torch.from_numpy(rng.standard_normal((1, 1, rows, columns)).astype(np.float32))
     return interpolate(coarse, size=(height, width), mode="bicubic", align_corners=True)[0, 0]

@@ -1,7 +1,7 @@
 """The training loop, from top to bottom: batch, forward, losses, step, validate, save.
 
-A `Task` defines the network, its data and its loss. Several processes that torchrun started train one network together.
-A run that was stopped in any way resumes from its last checkpoint.
+A `Task` defines the network, its data and its loss. Processes started by torchrun train one network together. A run
+that ended in any way resumes from its last checkpoint.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ from spackle.training.checkpoint import (
 )
 from spackle.training.recipe import AnyRecipe, OptimRecipe
 
-EMA_START = 10  # the average forgets the first, bad weights this quickly: decay (s + 1) / (s + 10)
-PATIENCE = timedelta(hours=24)  # making samples takes one process longer than another
+EMA_START = 10  # early decay is (step + 1) / (step + 10), so that the average soon forgets the initial weights
+PATIENCE = timedelta(hours=24)  # how long a process waits for another, which may take longer to make samples
 END = {
     "steps": "all steps are done",
     "patience": "no improvement any more",
@@ -66,71 +66,69 @@ V = TypeVar("V")
 class Task(Protocol):
     """A network to train, and the items that it learns from, numbered from 0.
 
-    Its construction is quick, and raises InputError for unusable input. `prepare` sets the remaining attributes.
+    Construction is quick and raises InputError for unusable input; `prepare` sets the remaining attributes.
     """
 
-    name: ClassVar[str]  # as `--method` and checkpoints have it
-    aim: ClassVar[str] = "loss"  # the measure that chooses the best weights: the lower the better
-    at_once: ClassVar[int | None] = None  # items that go through the network together; None: all of a process's step
-    digest: str  # of everything that decides what is learned from, but not of where it lies
-    items_a_step: int  # of all processes together
-    network: nn.Module  # its weights that ask for gradients learn, in place
-    measures: Sequence[str]  # names of what `measure` finds
-    items: int  # to learn from; an epoch has each once
+    name: ClassVar[str]  # the name in `--method` and in checkpoints
+    aim: ClassVar[str] = "loss"  # the measure by which the best weights are chosen; lower is better
+    at_once: ClassVar[int | None] = None  # items in one pass through the network; None: all items of the process's step
+    digest: str  # identifies the training data by content, not by paths
+    items_a_step: int  # over all processes
+    network: nn.Module  # weights with requires_grad are trained in place
+    measures: Sequence[str]  # names of the values that `measure` returns
+    items: int  # number of items to learn from; an epoch has each once
     validation_items: int
 
     def prepare(self, output: Path, reporter: Reporter) -> dict[str, Any]:
-        """Do the long preparations, in every process; returns facts for run.json. InputError for files that cannot be
-        used.
-        """
+        """Do the long preparations, in every process; returns facts for run.json. InputError for unusable files."""
 
     def groups(self) -> list[dict[str, Any]]:
-        """The optimiser's groups of weights; "lr_scale" in one is a factor on the learning rate."""
+        """The optimiser's groups of weights; a group's "lr_scale" is a factor on the learning rate."""
         return [{"params": [weight for weight in self.network.parameters() if weight.requires_grad]}]
 
     def batch(self, step: int | None, items: Sequence[int]) -> Any:
-        """Items that a step learns from, or validation items (None), by nothing but the arguments; in any thread.
+        """Load items of a training step, or of validation (None); InputError if one cannot be read.
 
-        InputError for one that cannot be read.
+        The result depends on the arguments alone; any thread may call this.
         """
 
     def loss(self, network: nn.Module, batch: Any) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss [] of a batch, with gradients, and its terms []."""
 
     def measure(self, network: nn.Module, batch: Any) -> dict[str, list[float]]:
-        """The measures of a network on a batch of validation items, with the values of each."""
+        """Measure a network on a batch of validation items: the values of each measure, by its name."""
 
     def picture(self, network: nn.Module) -> Tensor:
-        """[H, W, 3] sRGB: a few validation items."""
+        """[H, W, 3] sRGB: what the network does on a few validation items."""
 
     def names(self, step: int, items: Sequence[int]) -> list[str]:
-        """Names of a step's items, to find a bad one."""
+        """Names of a step's items, for messages about a bad one."""
 
     def export(self, network: nn.Module, path: Path) -> None:
-        """Write weights as the rest of the package reads them; InputError where that cannot be."""
+        """Write the weights in the format that the package reads; InputError if that fails."""
 
 
 def train(
     recipe: R, open_task: Callable[[R, torch.device], Task], output: Path, reporter: Reporter, overwrite: bool = False
 ) -> str:
-    """Train, or resume a run; as one of several processes where torchrun started them.
+    """Train a network, or resume a run; under torchrun, as one of several processes.
 
     Args:
-        recipe: what to do.
-        open_task: makes the task for a device; raises InputError for unusable input, before any long work.
+        recipe: the settings of the run.
+        open_task: creates the task on a device; raises InputError for unusable input before any long work.
         output: a folder for all results.
         reporter: used by the first process.
-        overwrite: start anew: an older run in `output` is deleted, its samples stay.
+        overwrite: start anew: delete an older run in `output`, but keep its samples.
 
     Returns:
-        Why the run ended: "steps" (all are done), "patience" (nothing improved) or "stopped" (by a signal).
+        Why the run ended: "steps" (all are done), "patience" (no improvement) or "stopped" (by a signal).
 
     Raises:
-        InputError: a file or folder that cannot be used, a loss that is not finite.
+        InputError: a file or folder cannot be used, or the loss is not finite.
     """
     kind = pick_device(None if recipe.run.device == "auto" else recipe.run.device).type
     with joined_ranks(kind) as device, contextlib.ExitStack() as stack:
-        if rank() == 0:  # which alone writes
+        if rank() == 0:  # the only process that writes
             stack.enter_context(results_folder(output, RESULTS, alone=True))
         else:
             reporter = Reporter(console=Console(quiet=True))
@@ -139,7 +137,7 @@ def train(
             raise InputError(f"optim.batch={recipe.optim.batch} cannot be divided between {rank_count()} processes")
         checkpoint = None if overwrite else find_checkpoint(output, task.name, recipe, task.digest, reporter.log)
         facts = task.prepare(output, reporter)
-        wait_for_ranks()  # nobody looks for checkpoints any more
+        wait_for_ranks()  # all processes have looked for a checkpoint, so an old run may be deleted
         with reading(output, "cannot write: {reason}", OSError):
             if overwrite and rank() == 0:
                 remove_run(output)
@@ -157,7 +155,7 @@ def _learn(
     device: torch.device,
     reporter: Reporter,
 ) -> tuple[str, int]:
-    """Why the run ended, and at which step."""
+    """Run the training loop; returns why it ended, and at which step."""
     optim, run = recipe.optim, recipe.run
     network: nn.Module = task.network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     average = copy.deepcopy(network).requires_grad_(False)
@@ -179,7 +177,7 @@ def _learn(
         return Checkpoint(progress, *states, facts["recipe"], task.digest, task.name)
 
     def ended() -> str:
-        """Why the run ends here; empty if it continues."""
+        """Why the run ends now; empty if it continues."""
         if progress.step >= optim.steps:
             return "steps"
         return "patience" if progress.stale >= run.patience else "stopped" if stopped else ""
@@ -189,7 +187,7 @@ def _learn(
             write_json(_without_nan({**facts, "ended": ended, **dataclasses.asdict(progress)}), folder / RUN)
 
     def parts(step: int) -> list[list[int]]:
-        """This process's items of a step, as they go through the network."""
+        """This process's items of a step, divided into passes through the network."""
         items = samples_of_step(step, task.items, task.items_a_step, run.seed, rank(), rank_count())
         size = task.at_once or len(items)
         return [items[start : start + size] for start in range(0, len(items), size)]
@@ -210,7 +208,7 @@ def _learn(
         while not ended():
             step = progress.step
 
-            # Forward and backward: a step's parts add up their gradients, its last one joins those of the processes.
+            # Forward and backward: gradients add up over a step's parts; the last part averages them over processes.
             optimizer.zero_grad(set_to_none=True)
             sums: dict[str, Tensor] = {}
             for number, part in enumerate(split := parts(step), 1):
@@ -252,7 +250,7 @@ def _learn(
                 tell(progress.step, f"loss {numbers['loss']:.4f}")
                 recent = []
 
-            # Validate the averaged weights, keep them where they are the best so far, and draw what they do
+            # Validate the averaged weights, keep them if they are the best so far, and write a picture of their results
             if progress.step % run.validate_every == 0 or last:
                 measures = validate(task, average, device)
                 best = progress.validated(measures, task.aim, run.min_delta)
@@ -274,7 +272,7 @@ def _learn(
             # Save
             if rank() == 0 and (progress.step % run.save_every == 0 or ended()):
                 task.export(average, folder / LAST)
-                save_checkpoint(state(), folder)  # at the end: a run that is killed before it exports again
+                save_checkpoint(state(), folder)  # after the export: a run killed in between exports again
                 report()
     report(ended())
     return ended(), progress.step
@@ -282,9 +280,9 @@ def _learn(
 
 @torch.no_grad()
 def validate(task: Task, network: nn.Module, device: torch.device) -> dict[str, float]:
-    """Means of a task's measures over its validation items, the same in all processes, which share the items.
+    """Means of a task's measures over its validation items, which the processes share; all get the same means.
 
-    A measure without any value is left out.
+    Measures without a value are left out.
     """
     totals, counts = dict.fromkeys(task.measures, 0.0), dict.fromkeys(task.measures, 0.0)
     mine, size = range(rank(), task.validation_items, rank_count()), task.at_once or task.items_a_step // rank_count()
@@ -297,7 +295,7 @@ def validate(task: Task, network: nn.Module, device: torch.device) -> dict[str, 
 
 
 def made_ahead(make: Callable[[K], V], keys: Iterable[K]) -> Generator[V, None, None]:
-    """The values of keys, in order; a thread computes the next one while the current one is used."""
+    """Yield `make(key)` for each key, in order; a thread computes the next value while the current one is used."""
     with ThreadPoolExecutor(1, thread_name_prefix="batches") as worker:
         begun = deque[Future[V]]()
         for key in keys:
@@ -308,7 +306,7 @@ def made_ahead(make: Callable[[K], V], keys: Iterable[K]) -> Generator[V, None, 
 
 
 def learning_rate(step: int, optim: OptimRecipe) -> float:
-    """Linear warm-up, then a cosine down to `min_lr` ("Training Details and Loss Weights"); steps count from 0."""
+    """The rate at a step, from 0: linear warm-up, then a cosine to `min_lr` ("Training Details and Loss Weights")."""
     if step < optim.warmup:
         return optim.lr * (step + 1) / optim.warmup
     done = min(1.0, (step - optim.warmup) / max(1, optim.steps - optim.warmup))
@@ -316,15 +314,15 @@ def learning_rate(step: int, optim: OptimRecipe) -> float:
 
 
 def ema_decay(step: int, decay: float) -> float:
-    """The share of the old average that is kept at a step."""
+    """The factor of the old average at a step; the new weights get the rest."""
     return min(decay, (step + 1) / (step + EMA_START))
 
 
 def samples_of_step(step: int, count: int, batch: int, seed: int, rank: int = 0, ranks: int = 1) -> list[int]:
-    """The indices, below `count`, of a process's samples at a step, decided by the arguments alone.
+    """The indices, below `count`, of a process's samples at a step; they depend on the arguments alone.
 
-    Every epoch is a permutation of all samples by `seed`; a batch may end one and begin the next. All `ranks` processes
-    share the same global batch, which they divide evenly.
+    Every epoch is a permutation of all samples, chosen by `seed`; a batch may extend into the next epoch. The `ranks`
+    processes divide the global batch evenly.
     """
     share = batch // ranks
     first = step * batch + rank * share
@@ -341,9 +339,10 @@ def _epoch(seed: int, epoch: int, count: int) -> NDArray[np.int64]:
 
 @contextlib.contextmanager
 def joined_ranks(kind: str) -> Iterator[torch.device]:
-    """Join the processes of this run, by torchrun's environment variables; yields this process's device.
+    """Join the processes of this run by torchrun's environment variables; yields this process's device.
 
-    "cuda" talks by nccl, "cpu" by gloo. InputError for variables that are no numbers, or others that cannot be reached.
+    `kind` "cuda" communicates by NCCL, "cpu" by Gloo. InputError if a variable is not a number, or the other processes
+    cannot be reached.
     """
     local = 0
     if "WORLD_SIZE" in os.environ:
@@ -351,7 +350,7 @@ def joined_ranks(kind: str) -> Iterator[torch.device]:
             local = int(os.environ.get("LOCAL_RANK", "0"))
             dist.init_process_group("nccl" if kind == "cuda" else "gloo", timeout=PATIENCE)
     if kind == "cuda":
-        torch.cuda.set_device(local)  # of renderers and features, too, which name no number
+        torch.cuda.set_device(local)  # also for renderers and features, which use the current device
     try:
         yield torch.device(kind, local) if kind == "cuda" else torch.device(kind)
     finally:
@@ -360,24 +359,24 @@ def joined_ranks(kind: str) -> Iterator[torch.device]:
 
 
 def rank() -> int:
-    """This process among those that train together, from 0; the first one writes and reports."""
+    """The number of this process among those that train together; process 0 writes and reports."""
     return dist.get_rank() if dist.is_initialized() else 0
 
 
 def rank_count() -> int:
-    """How many processes train together."""
+    """The number of processes that train together."""
     return dist.get_world_size() if dist.is_initialized() else 1
 
 
 def wait_for_ranks() -> None:
-    """Wait until all processes have come here."""
+    """Wait until all processes have reached this call."""
     if rank_count() > 1:
         dist.barrier()
 
 
 def sum_of_ranks(numbers: Mapping[str, float], device: torch.device) -> dict[str, float]:
-    """Each number's sum over the processes, the same in all of them."""
-    # In float64: what is compared and decided upon must not depend on how many processes there are.
+    """The sum of each number over the processes; all get the same result."""
+    # In float64, so that decisions do not depend on the number of processes.
     tensor = torch.tensor(list(numbers.values()), dtype=torch.float64, device=device)
     if rank_count() > 1:
         dist.all_reduce(tensor)
@@ -385,7 +384,7 @@ def sum_of_ranks(numbers: Mapping[str, float], device: torch.device) -> dict[str
 
 
 def _without_nan(value: Any) -> Any:
-    """The value with None for what is not finite, which JSON does not know."""
+    """Replace numbers that are not finite, which JSON lacks, by None."""
     if isinstance(value, dict):
         return {key: _without_nan(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
