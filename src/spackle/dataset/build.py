@@ -94,7 +94,7 @@ class DatasetOptions:
         self.processes.check()
 
     def depth_of(self, photo: PhotoFile) -> Path | None:
-        """A photo's depth map in --depth or the photo's subfolder of it; None without --depth; InputError if missing."""
+        """A photo's depth map, in the photo's subfolder of --depth if there is one; None without --depth."""
         folder = self.base.depth
         if not isinstance(folder, Path):
             return None
@@ -333,7 +333,7 @@ class _Build:
         Manifest(config=self.config, shards=shards, complete=complete).save(self.output)
 
     def _finish(self, made: int, seconds: float) -> None:
-        """Write the final manifest and remove the parts; if there is no sample, delete everything and raise InputError."""
+        """Write the final manifest and remove the parts; without samples, delete everything and raise InputError."""
         shards = self.shards.values()
         samples = sum(len(shard.samples) for shard in shards)
         if samples:

@@ -1,4 +1,4 @@
-"""`spackle bench`: what Spackle costs in Gaussians and in time on a dataset, in the paper's tables of efficiency."""
+"""`spackle bench`: count the added Gaussians and time the stages on a dataset, for the paper's efficiency tables."""
 
 from __future__ import annotations
 
@@ -37,29 +37,29 @@ from spackle.residual import ResidualNet
 from spackle.scene_fill import FillContext
 
 FILES = ("bench.md", "bench.tex")
-# Of an evaluation's configuration.
+# The keys that a benchmark's configuration takes from an evaluation's.
 SHARED = ("dataset", "title", "terms", "images", "side", "disparities", "base", "residual", "device")
 TOTAL = "total"
 MS = 1000.0
 CPU = torch.device("cpu")
-TIMED = ("paper", "spackle")  # methods
+TIMED = ("paper", "spackle")  # the methods that are timed
 
 Lap = Callable[[str], None]
 Task = Callable[[Lap], Any]
-Values = npt.NDArray[np.float64]  # one a run
+Values = npt.NDArray[np.float64]  # one value per run
 Times = dict[tuple[str, str], Values]  # (task, stage) → milliseconds
 
 
 def bench(options: EvaluateOptions, runs: int, base_runs: int | None, output: Path, reporter: Reporter) -> str:
     """Time a dataset, or resume that; returns "complete", or "stopped" after Ctrl-C.
 
-    Writes rows.jsonl, bench.md, bench.tex and images/ into `output`. The folder belongs to one machine: times of two do
-    not go together. Everything behind the base is timed `runs` times, the base `base_runs` times (None: once for SHARP,
-    which takes long, else `runs` times).
+    Writes rows.jsonl, bench.md, bench.tex and images/ into `output`. A folder holds the times of one machine only. The
+    base is timed `base_runs` times (None: once for SHARP, which is slow, else `runs` times), all later stages `runs`
+    times.
 
     Raises:
-        InputError: options, a dataset or a folder that cannot be used; another benchmark in `output`; too little
-            memory for the base.
+        InputError: options, dataset or folder cannot be used, `output` holds another benchmark, or memory is too small
+            for the base.
     """
     evaluation, slow = open_evaluation(options), options.base.named == "sharp"
     config: dict[str, Any] = {"kind": "bench", "protocol": "bench", "methods": list(TIMED)}
@@ -68,7 +68,7 @@ def bench(options: EvaluateOptions, runs: int, base_runs: int | None, output: Pa
     config["base"] |= {"device": options.device.type if options.base.network else "cpu"}
     config |= {"hardware": hardware(options.device), "versions": versions()}
     about = {"parameters": count_parameters(evaluation.network)}
-    timed: list[str] = []  # an image of this process, after which it is warm
+    timed: list[str] = []  # images timed by this process, which is warm after the first
 
     def time_next(index: int, case: Case, metrics: Sequence[str]) -> tuple[list[Row], list[Path]]:
         rows = time_case(case, evaluation, config, bool(timed))
@@ -92,18 +92,18 @@ def bench(options: EvaluateOptions, runs: int, base_runs: int | None, output: Pa
 
 
 def time_case(case: Case, evaluation: Evaluation, config: Mapping[str, Any], warm: bool) -> list[Row]:
-    """Time all settings of an image; `warm` says whether this process has predicted before.
+    """Time all settings of an image; `warm`: whether this process has predicted before.
 
     Raises:
-        InputError: a file that cannot be used, depth that the case lacks, or Gaussians that are not finite.
-        BaseError: no image can be worked on.
+        InputError: a file cannot be used, the case lacks depth, or Gaussians are not finite.
+        BaseError: the base would fail for every image.
     """
     load, options, device = load_average(), evaluation.options, device_of(evaluation.renderer)
     loaded = load_case(case, options.max_side)
     opened = evaluation.open(loaded)
-    opened.load(loaded.full)  # before the clock starts
+    opened.load(loaded.full)  # not timed
     latest: dict[str, BasePrediction] = {}
-    # Compiling kernels is a small part of SHARP's first prediction on a processor, which takes a minute.
+    # SHARP's first prediction on a CPU counts: it takes a minute, of which compiling kernels is a small part.
     counts = warm or (options.base.named == "sharp" and config["base"]["device"] == "cpu")
     predict = {"": lambda _: latest.update(base=opened.predict(loaded.full)[0])}
     seconds = measure(config["base_runs"], predict, device, warm=counts)["", TOTAL] / MS
@@ -121,7 +121,7 @@ def time_case(case: Case, evaluation: Evaluation, config: Mapping[str, Any], war
     for view in large_views(prediction, options.disparities, options.max_side):
         times = measure(config["runs"], {method: partial(complete, view, method) for method in TIMED}, device)
         for method, count in added.items():
-            # A method may lack a stage, and a view without holes is not rendered again.
+            # A method may lack a stage: a view without holes is not rendered again.
             stages = {name: times.get((method, name), none) / MS for name in STAGES} | {"base": seconds}
             row = Row(config["title"], case.name, view.setting, view.name, method, "", None)
             figures = view_figures(len(context.base), count, stages)
@@ -130,9 +130,10 @@ def time_case(case: Case, evaluation: Evaluation, config: Mapping[str, Any], war
 
 
 def view_figures(base: int, added: int, seconds: Mapping[str, Values]) -> list[tuple[str, float]]:
-    """All figures of the tables that follow from a view's Gaussians and the seconds of each run of `STAGES`.
+    """The table figures that follow from a view's numbers of Gaussians and the seconds of `STAGES` in each run.
 
-    Counts, milliseconds (medians of runs), shares (not percent), views a second; and each run's milliseconds.
+    These are counts, milliseconds (medians over runs), shares (not percent), views per second, and the milliseconds of
+    each run.
     """
     stages = {name: MS * float(np.median(seconds[name])) for name in STAGES}
     before, extra = (sum(stages[name] for name in names) for names in (BASE_PATH, EXTRA))
@@ -154,10 +155,9 @@ def view_figures(base: int, added: int, seconds: Mapping[str, Values]) -> list[t
 
 
 def count_parameters(residual: ResidualNet | None) -> dict[str, float]:
-    """Parameters of SHARP's checkpoint (702.31 M), of its part that inference uses, and of the residual; the residual's
-    share.
+    """Count parameters: SHARP's checkpoint (702.31 M), its part used in inference, the residual, the residual's share.
 
-    SHARP's are counted in the network, without weights. Inference needs neither SHARP's classifiers nor the part that
+    SHARP's are counted in a network without weights. Inference needs neither SHARP's classifiers nor the part that
     aligns depths.
     """
     with torch.device("meta"):
@@ -171,12 +171,11 @@ def count_parameters(residual: ResidualNet | None) -> dict[str, float]:
 
 
 def measure(runs: int, tasks: Mapping[str, Task], device: torch.device = CPU, *, warm: bool = False) -> Times:
-    """Milliseconds of each task (stage "total") and of its stages; a task ends a stage by calling its argument with the
-    name.
+    """Milliseconds of each task (stage "total") and of its stages, in each run.
 
-    The tasks take turns, so a busy machine slows all of them alike. Laps of one name within a run add up. A stage ends
-    when the device has done its work. An untimed run, which compiles and warms up, comes first, unless the tasks are
-    `warm`.
+    A task gets a function and calls it with a stage's name when the stage ends; stages of the same name within a run
+    add up. A stage ends when the device has done its work. The tasks take turns, so that a busy machine slows all of
+    them alike. Unless they are `warm`, an untimed run comes first, which compiles and warms up.
     """
 
     def now() -> float:
@@ -205,7 +204,7 @@ def measure(runs: int, tasks: Mapping[str, Task], device: torch.device = CPU, *,
 
 @dataclasses.dataclass(frozen=True)
 class _LappedRenderer:
-    """A `Renderer` that ends a stage before and after each render, to separate renders from completion."""
+    """A `Renderer` that ends a stage before and after each render, so that rendering is timed apart from completion."""
 
     renderer: Renderer
     lap: Lap
@@ -222,7 +221,7 @@ class _LappedRenderer:
 
 @torch.no_grad()
 def complete_in_laps(context: FillContext, camera: Camera, lap: Lap, method: str = "spackle") -> Gaussians:
-    """A view's aux Gaussians; times the stages "view", "photo", "completion" and, for a view with holes, "rerender"."""
+    """A view's aux Gaussians; calls `lap` after the stages "view", "photo", "completion" and (if holes) "rerender"."""
     context, prepared = context.placed, False
     before = context.renderer.render(context.base, camera)
     lap("view")

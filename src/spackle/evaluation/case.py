@@ -1,4 +1,4 @@
-"""Evaluation cases: photos with the depth, cameras and second photos known for them, at the working size."""
+"""Evaluation cases: photos with their known depth, cameras and second photos, at the working size."""
 
 from __future__ import annotations
 
@@ -17,37 +17,37 @@ from spackle.evaluation.rows import NEAR
 from spackle.files import files_in
 from spackle.image import MAX_SIDE, PHOTO_SUFFIXES, Photo, load_photo, resize_photo, working_size
 
-SHAPE_TOLERANCE = 0.01  # of the aspect ratio, between a photo and the camera that is said to be its
+SHAPE_TOLERANCE = 0.01  # relative difference of aspect ratio that is accepted between a photo and its camera
 
 
 @dataclasses.dataclass(frozen=True)
 class SecondView:
-    """A second photo of the same scene, taken from elsewhere."""
+    """A second photo of the same scene, from another viewpoint."""
 
     name: str
     photo: Path
-    camera: Camera  # on any grid of the photo's shape; the world is the input photo's camera, in the dataset's lengths
-    near: bool = True  # one of the few that look at the same from beside the input photo
+    camera: Camera  # of the photo's aspect ratio; in the input photo's frame and the dataset's unit
+    near: bool = True  # among the few whose viewpoint is close to the input photo's
 
 
 @dataclasses.dataclass(frozen=True)
 class Points:
-    """Some pixels of the input photo whose depth is known."""
+    """Points of the input photo with known depth."""
 
-    uv: Tensor  # [n, 2] pixels of the case's camera, centres at half-integers
-    z: Tensor  # [n] depth along the optical axis, lengths as the dataset has them
+    uv: Tensor  # [n, 2] in pixels of the case's camera, pixel centres at half-integers
+    z: Tensor  # [n] depth along the optical axis, in the dataset's unit
 
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """An input photo, and the camera, depth and second photos known for it. Files are read on demand."""
+    """An input photo with its known camera, depth and second photos. Files are read on demand."""
 
-    name: str  # no two of a dataset share it; slashes divide scene and view
+    name: str  # unique in the dataset; slashes separate scene and view
     photo: Path
-    camera: Camera | None = None  # on any grid of the photo's shape; None where only the photo itself tells its lens
-    depth: Callable[[], DepthMap] | None = None  # of the stored photo's size or shape, lengths as the dataset has them
+    camera: Camera | None = None  # of the photo's aspect ratio; None: the photo tells its lens itself
+    depth: Callable[[], DepthMap] | None = None  # of the photo's aspect ratio, in the dataset's unit
     points: Callable[[], Points] | None = None
-    bounds: tuple[float, float] | None = None  # nearest and farthest depth of the view, where no more is known
+    bounds: tuple[float, float] | None = None  # nearest and farthest depth, if nothing else is known
     seconds: tuple[SecondView, ...] = ()
 
 
@@ -55,13 +55,13 @@ class Case:
 class EvalDataset:
     """The description of a dataset in its official layout."""
 
-    name: str  # as it is typed
-    title: str  # as the paper's tables have it
-    terms: str  # of use, in a few words
-    expected: str  # which files are looked for, for messages
+    name: str  # the name for --dataset
+    title: str  # the name in the paper's tables
+    terms: str  # terms of use, in a few words
+    expected: str  # the files of a scene, for messages
     is_scene: Callable[[Path], bool]
-    cases: Callable[[Mapping[str, Path]], list[Case]]  # of all scenes by name; InputError for a missing or damaged file
-    skip: Sequence[str] = ()  # folders that are skipped: no truth, or the same photos again
+    cases: Callable[[Mapping[str, Path]], list[Case]]  # from scene names to folders; InputError for bad files
+    skip: Sequence[str] = ()  # names of folders without ground truth, or with the same photos again
 
 
 def has_any(folder: Path, *names: str) -> bool:
@@ -70,7 +70,7 @@ def has_any(folder: Path, *names: str) -> bool:
 
 
 def photo_files(folder: Path) -> list[Path]:
-    """The photos directly in a folder, by name; none if there is no folder."""
+    """The photos directly in a folder, sorted by name; none if there is no folder."""
     return files_in(folder, PHOTO_SUFFIXES) if folder.is_dir() else []
 
 
@@ -80,7 +80,7 @@ class Viewpoint(NamedTuple):
     setting: str
     name: str
     camera: Camera
-    truth: Callable[[], Tensor] | None = None  # reads [H, W, 3] sRGB 0..1, of the camera's size
+    truth: Callable[[], Tensor] | None = None  # reads the true view [H, W, 3] sRGB 0..1, of the camera's size
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,20 +88,20 @@ class LoadedCase:
     """A case whose photos have been read."""
 
     case: Case
-    full: Photo  # the input as it is stored, with the dataset's focal length: for bases that look at all its pixels
+    full: Photo  # the input at its stored size, with the dataset's focal length; what bases get
     photo: Photo  # the input at the working size
-    camera: Camera  # of `photo`, at the world's origin: the dataset's, or the photo's own where that has none
-    seconds: tuple[Viewpoint, ...]  # with cameras in the input photo's frame and the dataset's lengths
-    lacks: tuple[str, ...] = ()  # why second photos of the case are not among them
+    camera: Camera  # of `photo`, at the world's origin: from the dataset, or else from the photo
+    seconds: tuple[Viewpoint, ...]  # with cameras in the input photo's frame and the dataset's unit
+    lacks: tuple[str, ...] = ()  # why some of the case's second photos are missing from `seconds`
 
 
 def load_case(case: Case, max_side: int = MAX_SIDE) -> LoadedCase:
-    """Read the photos of a case and bring them, and their cameras, to `working_size`.
+    """Read the photos of a case and resize them and their cameras to `working_size`.
 
     Views have even sides, so a second photo with an odd side loses its last row or column.
 
     Raises:
-        InputError: the photo, or each of the second photos, is missing, no image, or of another shape than its camera.
+        InputError: the photo, or every second photo, is missing, no image, or differs from its camera in aspect ratio.
     """
     full = load_photo(case.photo)
     if case.camera is not None:
@@ -123,7 +123,7 @@ def load_case(case: Case, max_side: int = MAX_SIDE) -> LoadedCase:
 
 
 def _load_view(view: SecondView, max_side: int) -> Viewpoint:
-    """Check a second view; its photo is read again on demand, because a scene may have hundreds."""
+    """Check a second view; its photo is not kept but read again on demand, because a scene may have hundreds."""
     stored = load_photo(view.photo)
     _check_shape(view.photo, stored, view.camera)
     camera = view.camera.resized(*working_size(stored.width, stored.height, max_side))
@@ -136,7 +136,7 @@ def _load_view(view: SecondView, max_side: int) -> Viewpoint:
 
 
 def _check_shape(path: Path, photo: Photo, camera: Camera) -> None:
-    """InputError unless the photo has the shape that its camera was calibrated for."""
+    """InputError unless the photo has the aspect ratio for which its camera was calibrated."""
     if abs(photo.width * camera.height / (photo.height * camera.width) - 1) > SHAPE_TOLERANCE:
         raise InputError(
             f"{path}: {photo.width}×{photo.height} pixels upright, but its calibration is for "
@@ -145,7 +145,7 @@ def _check_shape(path: Path, photo: Photo, camera: Camera) -> None:
 
 
 def known_depth(case: Case) -> DepthMap:
-    """A case's depth map; else one made of its points, each in its pixel of the case's camera, of several the nearest.
+    """A case's depth map; if it has none, a map of its points: a pixel of the case's camera gets its nearest point.
 
     Raises:
         InputError: the case has neither, or a file of it cannot be used.
@@ -157,7 +157,7 @@ def known_depth(case: Case) -> DepthMap:
     points, camera = case.points(), case.camera
     column, row = points.uv.floor().long().unbind(-1)
     inside = (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height) & (points.z > 0)
-    order = points.z[inside].argsort(descending=True, stable=True)  # what is written last stays
+    order = points.z[inside].argsort(descending=True, stable=True)  # the nearest is written last
     depth = torch.zeros(camera.height, camera.width)
     depth[row[inside][order], column[inside][order]] = points.z[inside][order].float()
     if not bool((depth > 0).any()):

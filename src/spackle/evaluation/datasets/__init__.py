@@ -1,4 +1,4 @@
-"""The paper's six evaluation datasets, and their scenes below a folder."""
+"""The paper's six evaluation datasets, and the search for their scenes in a folder."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FACTS = load_data("datasets.json")  # in the order of the paper's tables
 
 
 def _called(folder: Path, dataset: str) -> bool:
-    """Whether a folder has the name of a dataset's scene."""
+    """Whether a folder's name contains the name of one of a dataset's scenes."""
     return not set(FACTS[dataset]["scenes"]).isdisjoint(re.split(r"[_\-. ]", folder.name.lower()))
 
 
@@ -48,26 +48,26 @@ DATASETS = {
     name: EvalDataset(name, facts["title"], facts["terms"], facts["expected"], *_READERS[name], facts.get("skip", ()))
     for name, facts in FACTS.items()
 }
-MAX_DEPTH = 4  # of a scene below the root; the deepest official one is root/train/balanced/SCENE
-MAX_FOLDERS = 100_000  # opened in search of scenes; WildRGB-D has 23,000 of them
-GUESS_FOLDERS = 300  # opened to guess what a folder is instead
+MAX_DEPTH = 4  # of scenes below the root; the deepest official layout is root/train/balanced/SCENE
+MAX_FOLDERS = 100_000  # how many folders are searched for scenes; WildRGB-D has 23,000
+GUESS_FOLDERS = 300  # how many folders are searched to guess which dataset it is instead
 
 
 def read_cases(name: str, root: Path) -> list[Case]:
-    """All inputs of a dataset at or below `root`, in an order that depends on names alone.
+    """All cases of a dataset at or below `root`, in an order that depends on names alone.
 
     Raises:
-        InputError: no such folder, no scene of the dataset in it (the message names what was expected), two scenes of
-            one name, or a scene whose files are missing or damaged.
+        InputError: there is no such folder, no scene of the dataset in it (the message names the expected files), two
+            scenes have the same name, or a scene's files are missing or damaged.
     """
     dataset = DATASETS[name]
     if not root.is_dir():
         raise InputError(f"{root}: no such folder: give the one that {name} was unpacked in")
-    if root.name in ("", ".."):  # a scene is called like its folder
+    if root.name in ("", ".."):  # a scene is named after its folder
         root = root.resolve()
     folders = sorted(_walk(root, dataset, MAX_FOLDERS), key=lambda folder: (folder.name, folder.as_posix()))
     if not folders:
-        # The dataset that has most scenes there, after a short look; of equals the later one has the plainer marks.
+        # Guess the dataset with most scenes there. Later datasets have more distinctive files, so they win ties.
         counts = {one.name: sum(1 for _ in _walk(root, one, GUESS_FOLDERS)) for one in reversed(DATASETS.values())}
         likely = max(counts, key=lambda name: counts[name])
         hint = f"; this looks like {likely}" if counts[likely] else ""
@@ -91,7 +91,7 @@ def _walk(root: Path, dataset: EvalDataset, budget: int) -> Iterator[Path]:
                 yield folder
             elif depth < MAX_DEPTH and budget > 0:
                 budget -= 1
-                with contextlib.suppress(OSError), os.scandir(folder) as entries:  # no right to look into it
+                with contextlib.suppress(OSError), os.scandir(folder) as entries:  # the folder may be unreadable
                     names = [entry.name for entry in entries if entry.is_dir() and not entry.name.startswith(".")]
                     below += [folder / name for name in sorted(names) if name not in dataset.skip]
         level = below

@@ -1,4 +1,4 @@
-"""Read COLMAP models, text and binary: cameras, points, and which points each photo sees."""
+"""Read COLMAP models, text or binary: cameras, points, and which points each photo sees."""
 
 from __future__ import annotations
 
@@ -21,36 +21,36 @@ from spackle.gaussians import quat_to_matrix
 
 Array = NDArray[Any]
 
-# A lens that bends the corner by more than this part of the long side is refused. What is less is left alone: photos
-# that stand close to each other are bent alike, so a 1 % bend moves a pixel against its twin by a few percent of the
-# shift between the two.
+# Lenses that distort the corner by more than this fraction of the long side are refused. Smaller distortion is ignored:
+# it is nearly the same in photos from close viewpoints, so 1 % of it changes the shift between corresponding pixels by
+# a few percent only.
 MAX_BEND = 0.02
-MAX_ERROR_PX = 2.0  # of a point's reprojection, on average over its photos
-# Name and number of parameters by COLMAP's model id; the others' lenses are too far from a pinhole's.
+MAX_ERROR_PX = 2.0  # the greatest accepted reprojection error of a point, a mean over its photos
+# Name and number of parameters by COLMAP's model id; other models are too far from a pinhole.
 MODELS = {0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8)}
-POINT_2D = np.dtype([("uv", "<f8", (2,)), ("id", "<i8")])  # id -1: matched with nothing
+POINT_2D = np.dtype([("uv", "<f8", (2,)), ("id", "<i8")])  # id -1: no point
 
 
 @dataclasses.dataclass(frozen=True)
 class ColmapView:
     """A photo of a model."""
 
-    name: str  # with its folder, as the model has it
-    camera: Camera  # world of the model; float64; COLMAP's pixels have their centres at half-integers, as ours
-    uv: Array  # [n, 2] where points were found
-    ids: Array  # [n] which points
+    name: str  # the name in the model, with folders
+    camera: Camera  # in the model's world, float64; pixel centres at half-integers, as in COLMAP
+    uv: Array  # [n, 2] pixel positions of points
+    ids: Array  # [n] ids of these points
 
 
 @dataclasses.dataclass(frozen=True)
 class Model:
     """A sparse reconstruction."""
 
-    views: tuple[ColmapView, ...]  # by name
-    ids: Array  # [m] of the reliable points, ascending
-    xyz: Array  # [m, 3] world
+    views: tuple[ColmapView, ...]  # sorted by name
+    ids: Array  # [m] ids of the reliable points, ascending
+    xyz: Array  # [m, 3] positions in the world
 
     def points(self, view: ColmapView) -> Points:
-        """The reliable points that a view sees, with their depth in front of it."""
+        """The reliable points that a view sees, with their depth in it."""
         _, seen, known = np.intersect1d(view.ids, self.ids, assume_unique=True, return_indices=True)
         z = view.camera.to_camera(torch.from_numpy(self.xyz[known]))[:, 2]
         front = z > 0
@@ -58,7 +58,7 @@ class Model:
 
 
 def model_folder(scene: Path) -> Path:
-    """Where a scene's model is: sparse/0, sparse, or the same in dense/, as COLMAP's undistorter leaves it."""
+    """The folder of a scene's model: sparse/0, sparse, or these in dense/, where COLMAP's undistorter puts it."""
     for place in (scene / name for name in ("sparse/0", "sparse", "dense/sparse/0", "dense/sparse")):
         if any((place / f"cameras{end}").is_file() for end in (".bin", ".txt")):
             return place
@@ -66,10 +66,10 @@ def model_folder(scene: Path) -> Path:
 
 
 def read_model(folder: Path) -> Model:
-    """Read cameras, images and points3D, binary where there is cameras.bin.
+    """Read cameras, images and points3D; the binary files if there is a cameras.bin.
 
     Raises:
-        InputError: a file that is missing or damaged, or a lens that is no pinhole's.
+        InputError: a file is missing or damaged, or a lens is too far from a pinhole.
     """
     damaged = "not a COLMAP file ({reason}): it is damaged or cut off"
     binary = (folder / "cameras.bin").is_file()
@@ -103,7 +103,7 @@ def _lens(path: Path, model: int | str, width: int, height: int, parameters: lis
         raise InputError(f"{path}: a lens of {shown(parameters)}: the file is damaged")
     corner = np.array([max(cx, width - cx) / fx, max(cy, height - cy) / fy])
     square = float(corner @ corner)
-    # k1, k2 bend along the radius; p1, p2 by at most three times as much as they would there.
+    # k1, k2 distort radially; p1, p2 shift a point at radius r by at most 3 (|p1| + |p2|) r².
     radial = sum(abs(k) * square ** (n + 1) for n, k in enumerate(bend[:2])) * float(np.hypot(*corner))
     tangential = 3 * sum(map(abs, bend[2:])) * square
     if (radial + tangential) * max(fx, fy) > MAX_BEND * max(width, height):
@@ -119,7 +119,7 @@ def _view(path: Path, lens: Camera, name: str, pose: list[float], observed: Arra
     matrix = torch.eye(4, dtype=torch.float64)
     matrix[:3, :3], matrix[:3, 3] = quat_to_matrix(quaternion), shift
     seen = observed[observed["id"] >= 0]
-    _, first = np.unique(seen["id"], return_index=True)  # a point may have been found twice in a photo
+    _, first = np.unique(seen["id"], return_index=True)  # a photo may see a point twice
     seen = seen[first]
     camera = checked_camera(lens.K, matrix, lens.width, lens.height, where, dtype=torch.float64)
     return ColmapView(name, camera, seen["uv"].copy(), seen["id"].copy())
@@ -129,18 +129,18 @@ def _view(path: Path, lens: Camera, name: str, pose: list[float], observed: Arra
 
 
 def _cameras_bin(path: Path) -> Iterator[tuple[Any, ...]]:
-    """Key, model, width, height, parameters."""
+    """Yield key, model, width, height, parameters."""
     data = path.read_bytes()
     (count,), at = struct.unpack_from("<Q", data), 8
     for _ in range(count):
         key, model, width, height = struct.unpack_from("<iiQQ", data, at)
-        number = MODELS[model][1] if model in MODELS else 0  # another's length is unknown, and it is refused
+        number = MODELS[model][1] if model in MODELS else 0  # the length of other models is unknown; they are refused
         yield key, model, width, height, list(struct.unpack_from(f"<{number}d", data, at + 24))
         at += 24 + 8 * number
 
 
 def _images_bin(path: Path) -> Iterator[tuple[list[float], int, str, Array]]:
-    """Quaternion wxyz and translation, camera, name, POINT_2D [n]."""
+    """Yield quaternion wxyz with translation, camera, name, POINT_2D [n]."""
     data = path.read_bytes()
     (count,), at = struct.unpack_from("<Q", data), 8
     for _ in range(count):
@@ -153,7 +153,7 @@ def _images_bin(path: Path) -> Iterator[tuple[list[float], int, str, Array]]:
 
 
 def _points_bin(path: Path) -> Iterator[tuple[float, ...]]:
-    """Key, x, y, z, error in pixels."""
+    """Yield key, x, y, z, error in pixels."""
     data = path.read_bytes()
     (count,), at = struct.unpack_from("<Q", data), 8
     for _ in range(count):
@@ -173,7 +173,7 @@ def _cameras_txt(path: Path) -> Iterator[tuple[Any, ...]]:
 
 
 def _images_txt(path: Path) -> Iterator[tuple[list[float], int, str, Array]]:
-    """Two lines a photo; the second is empty if no point was found in it."""
+    """Like `_images_bin`: each photo has two lines, of which the second is empty if the photo sees no point."""
     lines = _lines(path)
     for line in lines:
         if not line.strip():

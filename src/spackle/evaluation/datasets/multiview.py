@@ -1,4 +1,4 @@
-"""Photos of one scene with their poses: a choice of them, their second views, and the cases that they make."""
+"""Posed photos of one scene: a choice of them, their second views, and their cases."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from spackle.errors import InputError
 from spackle.evaluation.case import Case, Points, SecondView
 from spackle.evaluation.datasets.colmap import Model
 
-MAX_NEAR = 3  # second views of a photo that count as near
-BASELINES = (0.05, 0.25)  # of the photo's middle depth; a rectified pair of Middlebury's has 0.05 to 0.2
-MAX_TURN = 30.0  # degrees between the optical axes
-MIN_SHARED = 0.3  # of the points that a photo sees, where points are known
+MAX_NEAR = 3  # at most, second views of a photo that count as near
+BASELINES = (0.05, 0.25)  # of the eyes, over the photo's middle depth; Middlebury's pairs have 0.05 to 0.2
+MAX_TURN = 30.0  # the greatest angle between the optical axes, in degrees
+MIN_SHARED = 0.3  # the least fraction of the photo's points that a near view sees too
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,18 +34,18 @@ class Posed:
 
     name: str
     photo: Path
-    camera: Camera  # world of the scene, float64
-    depth: float  # in the middle of what it sees; nan where that is not known
-    ids: NDArray[Any] | None = None  # of the points that it sees
-    points: Callable[[], Points] | None = None  # of these, where they are in the photo
+    camera: Camera  # in the scene's world, float64
+    depth: float  # middle depth of what it sees; NaN if unknown
+    ids: NDArray[Any] | None = None  # ids of the points that it sees
+    points: Callable[[], Points] | None = None  # their positions in the photo
     bounds: tuple[float, float] | None = None  # nearest and farthest depth
 
 
 def posed_by(scene: Path, model: Model, photos: Sequence[Path], names: Sequence[str] | None = None) -> list[Posed]:
-    """The views of a scene's model with their photo files, in the same order; called like the files without `names`.
+    """Join the views of a scene's model with their photo files, in the same order; `names` default to the files'.
 
     Raises:
-        InputError: a single view.
+        InputError: there is only one view.
     """
     check_two(scene, len(model.views))
     posed = []
@@ -58,21 +58,21 @@ def posed_by(scene: Path, model: Model, photos: Sequence[Path], names: Sequence[
 
 
 def check_two(scene: Path, count: int) -> None:
-    """InputError where a scene has no second photo."""
+    """InputError if a scene has fewer than two photos."""
     if count < 2:
         raise InputError(f"{scene}: at least two photos with a pose are needed, {count} found: unpack the whole scene")
 
 
 def make_cases(views: Sequence[Posed], wanted: Iterable[int] | None = None) -> list[Case]:
-    """Photos as cases, all other photos as their second views, in the case's frame and the nearest eye first.
+    """Make cases of photos: all other photos are second views, in the case's frame, with the nearest eye first.
 
-    A second view is a near one, of at most three, if its eye is 5 % to 25 % of the photo's middle depth away and turned
-    by at most 30°, and if it sees at least 30 % of the points that the photo sees; where no points are known, if each
-    camera has the middle of the other's view in its picture. A photo may have no near view.
+    At most three second views, the nearest that qualify, count as near. Such a view's eye is 5 % to 25 % of the photo's
+    middle depth away, it is turned by at most 30°, and it sees at least 30 % of the photo's points. If points are
+    unknown, each camera must instead see the middle of the other's view. A photo may have no near view.
 
     Args:
         views: all photos of a scene.
-        wanted: indices of the photos that become cases; all where None.
+        wanted: indices of the photos that become cases; None: all.
     """
     poses = torch.stack([view.camera.world_to_camera for view in views])
     eyes = torch.stack([view.camera.position for view in views]).numpy()
@@ -100,7 +100,7 @@ def _at(lens: Camera, world_to_camera: Tensor) -> Camera:
 def _sees_the_same(view: Posed, other: Posed) -> bool:
     if view.ids is not None and other.ids is not None:
         return len(np.intersect1d(view.ids, other.ids, assume_unique=True)) >= MIN_SHARED * max(1, len(view.ids))
-    for one, two in ((view.camera, other), (other.camera, view)):  # the middle of each picture, in the other one
+    for one, two in ((view.camera, other), (other.camera, view)):  # does one see the middle of the other's image?
         size = torch.tensor([two.camera.width, two.camera.height], dtype=torch.float64)
         uv, z = one.project(two.camera.unproject(size / 2, torch.tensor(two.depth, dtype=torch.float64)))
         if not bool((z > 0) & (uv >= 0).all() & (uv <= torch.tensor([one.width, one.height])).all()):
@@ -109,27 +109,27 @@ def _sees_the_same(view: Posed, other: Posed) -> bool:
 
 
 def spread(scenes: Sequence[str], frames: Callable[[str], Sequence[int]], count: int) -> dict[str, list[int]]:
-    """At most `count` frames, as many from each scene as there is room for; the same on every machine.
+    """Choose at most `count` frames, spread evenly over the scenes; the same on every machine.
 
-    The choice depends on names alone: scenes are taken in the order of their hashed names, and `GROUP/REST` alternately
-    by group, so that no group is favoured. With more scenes than frames, each of the first scenes gives one. With fewer
-    scenes, all give the same number, or all they have; within a scene the frames are equally spaced, from a start that
-    the scene's name decides.
+    The choice depends on names alone. Scenes are taken in the order of their hashed names; scenes named `GROUP/REST`
+    are taken from the groups in turn, so that no group is favoured. With more scenes than frames, each of the first
+    scenes gives one frame. With fewer scenes, all give the same number, or all that they have; within a scene the
+    frames are equally spaced, from a start that depends on the scene's name.
 
     Args:
-        scenes: names, no two alike.
-        frames: a scene's frames in their order; asked only for scenes that are used.
-        count: how many frames are wanted in all.
+        scenes: unique names.
+        frames: returns a scene's frames in order; called only for scenes that are used.
+        count: the total number of frames.
 
     Returns:
-        Scenes in the order of `scenes`, each with its frames in their order; those that are not used are left out.
+        The scenes that are used, in the order of `scenes`, each with its frames in order.
     """
     groups: dict[str, list[str]] = {}
     for scene in sorted(scenes, key=_hash):
         groups.setdefault(scene.partition("/")[0] if "/" in scene else "", []).append(scene)
     order = [(turn, _hash(group), scene) for group, names in groups.items() for turn, scene in enumerate(names)]
     held = {scene: frames(scene) for _, _, scene in sorted(order)[:count]}
-    rounds = range(max(map(len, held.values()), default=0))  # in each, every scene that has more gives one
+    rounds = range(max(map(len, held.values()), default=0))  # in each round, every scene with frames left gives one
     turns = (scene for turn in rounds for scene in held if turn < len(held[scene]))
     shares = collections.Counter(itertools.islice(turns, count))
     picked: dict[str, list[int]] = {}

@@ -1,4 +1,4 @@
-"""Photos with poses: ETH3D, Tanks and Temples, LLFF and WildRGB-D."""
+"""Datasets of posed photos: ETH3D, Tanks and Temples, LLFF and WildRGB-D."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from spackle.evaluation.rows import IMAGES
 from spackle.formats.camera_files import checked_camera
 
 ETH3D_MODEL = "dslr_calibration_undistorted"
-LLFF_PHOTOS = ("images_4", "images", "images_8")  # the first that is there
+LLFF_PHOTOS = ("images_4", "images", "images_8")  # the first that exists is used
 LLFF_BOUNDS = "poses_bounds.npy"
 MAX_POSES_BYTES = 1 << 24
-POSE_TOLERANCE = 0.05  # of published poses' rotations, see `checked_camera`
-MIDDLE_DEPTH_M = 0.8  # objects are held before the phone; so second views are 4 to 20 cm beside
+POSE_TOLERANCE = 0.05  # for the rotations of published poses, see `checked_camera`
+MIDDLE_DEPTH_M = 0.8  # objects are held in front of the phone; second views are thus 4 to 20 cm away
 
 
 def _camera(K: Tensor, pose: Tensor, width: int, height: int, where: str) -> Camera:
-    """A float64 camera with this pose in the world; InputError for an impossible lens or pose."""
+    """A float64 camera from `K` and a camera-to-world pose; InputError if the lens or the pose is impossible."""
     camera = checked_camera(K, pose, width, height, where, dtype=torch.float64, tolerance=POSE_TOLERANCE)
     return dataclasses.replace(camera, world_to_camera=torch.linalg.inv(pose))
 
@@ -45,8 +45,9 @@ def eth3d_cases(scenes: Mapping[str, Path]) -> list[Case]:
     """Cases of ETH3D: the undistorted DSLR photos of the training scenes.
 
     `SCENE/dslr_calibration_undistorted/{cameras,images,points3D}.txt` and `SCENE/images/dslr_images_undistorted/*.JPG`.
-    The model is metric (it was aligned to laser scans); its sparse points give the scale. The dense truth is of the
-    distorted photos, and not used. Second views: see `make_cases`. The paper's 454 images are the 13 training scenes'.
+    The model is metric, because it was aligned to laser scans; its sparse points give the scale. The dense ground truth
+    belongs to the distorted photos and is not used. For second views see `make_cases`. The 13 training scenes have the
+    paper's 454 images.
     """
     return [case for scene in scenes.values() for case in _photos_of(scene)]
 
@@ -56,7 +57,7 @@ def _photos_of(scene: Path) -> list[Case]:
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder: unpack the scene's dslr_undistorted archive")
     model, photos = read_model(folder), []
-    for view in model.views:  # named by its folder: dslr_images_undistorted/DSC_0286.JPG
+    for view in model.views:  # the name includes a folder: dslr_images_undistorted/DSC_0286.JPG
         places = [scene / "images" / view.name, scene / view.name, scene / "images" / Path(view.name).name]
         photo = next((place for place in places if place.is_file()), None)
         if photo is None:
@@ -67,7 +68,7 @@ def _photos_of(scene: Path) -> list[Case]:
 
 
 def is_eth3d(folder: Path) -> bool:
-    """Whether this is a scene of ETH3D."""
+    """Whether a folder is a scene of ETH3D."""
     return has_any(folder, ETH3D_MODEL, "dslr_calibration_jpg", "images/dslr_images_undistorted")
 
 
@@ -75,15 +76,15 @@ def is_eth3d(folder: Path) -> bool:
 
 
 def tanks_cases(scenes: Mapping[str, Path]) -> list[Case]:
-    """Cases of scenes with `SCENE/images` and `SCENE/sparse/0`, the usual layout of COLMAP and 3D Gaussian splatting.
+    """Cases of scenes with `SCENE/images` and `SCENE/sparse/0`, the usual layout for COLMAP and 3D Gaussian splatting.
 
-    `SCENE/sparse` without the 0, and `SCENE/dense/{images,sparse}`, are read too. The lens has to be nearly a pinhole's
-    (`colmap image_undistorter` makes it one). The dataset's own archives have no such models, only `.log` poses
-    without lenses, which are not read. Lengths are arbitrary.
+    `SCENE/sparse` without the 0, and `SCENE/dense/{images,sparse}`, are read too. The lens must be close to a pinhole;
+    `colmap image_undistorter` makes it one. The dataset's own archives have no such models, only `.log` poses without
+    lenses, which are not read. The unit of length is arbitrary.
 
-    512 photos are taken from all scenes by `spread`: evenly, and by names alone; second views come from all photos,
-    see `make_cases`. The paper's 331,776 cells are those of 1920×1080, the size of most scenes' frames; those of
-    2048×1080 give 1536×810, and the 980×545 that came with 3D Gaussian splatting stay as they are.
+    `spread` takes 512 photos evenly from all scenes, by names alone; second views come from all photos, see
+    `make_cases`. The paper's 331,776 cells correspond to 1920×1080, the size of most scenes' frames. Frames of
+    2048×1080 become 1536×810; the 980×545 photos published with 3D Gaussian splatting keep their size.
     """
     read = {name: _tanks_views(scene) for name, scene in scenes.items()}
     picked = spread(list(scenes), lambda name: range(len(read[name])), IMAGES["Tanks"])
@@ -107,12 +108,12 @@ def _tanks_views(scene: Path) -> list[Posed]:
 def llff_cases(scenes: Mapping[str, Path]) -> list[Case]:
     """Eight scenes with `poses_bounds.npy`, `sparse/0`, or both, and photos in `images_4`, `images` or `images_8`.
 
-    Where there is a COLMAP model, its cameras and points are used (the poses were made from it), and the near and far
-    bounds only where it has no points. Photos of the model are matched to files by name, else by order;
-    `poses_bounds.npy` always by order. Lengths are arbitrary. Second views: see `make_cases`; without a model, the
-    middle depth is that of the bounds, half way in inverse depth.
+    If there is a COLMAP model, from which the poses were made, its cameras and points are used, and the near and far
+    bounds only if it has no points. Photos of the model are matched to files by name, else by order; rows of
+    `poses_bounds.npy` always by order. The unit of length is arbitrary. For second views see `make_cases`; without a
+    model, the middle depth is half way between the bounds in inverse depth.
 
-    The paper's 190,512 cells are those of `images_4` (1008×756); `images` (4032×3024) gives 1536×1152.
+    The paper's 190,512 cells correspond to `images_4` (1008×756); `images` (4032×3024) would give 1536×1152.
     """
     return [case for scene in scenes.values() for case in make_cases(_llff_views(scene))]
 
@@ -138,7 +139,7 @@ def _llff_views(scene: Path) -> list[Posed]:
 
 
 def _read_bounds(path: Path, count: int) -> NDArray[Any]:
-    """[count, 17]: for each photo by name a 3×5 matrix and its nearest and farthest depth."""
+    """[count, 17]: for each photo, sorted by name, a 3×5 matrix, the nearest and the farthest depth."""
     with reading(path, "not LLFF's table ({reason}): expected finite floats, [photos, 17]"):
         table: NDArray[Any] = np.load(path, allow_pickle=False)
         if table.ndim != 2 or table.shape[1] != 17 or table.dtype.kind != "f" or not np.isfinite(table).all():
@@ -151,7 +152,7 @@ def _read_bounds(path: Path, count: int) -> NDArray[Any]:
 
 
 def _camera_of_row(row: NDArray[Any], where: str) -> Camera:
-    """A row of `poses_bounds.npy`: columns down, right, backwards, the eye, and (height, width, focal length)."""
+    """The camera of a `poses_bounds.npy` row: columns down, right, backwards, eye, (height, width, focal length)."""
     matrix = torch.from_numpy(np.asarray(row[:15], np.float64).reshape(3, 5))
     down, right, backwards, eye, lens = matrix.unbind(1)
     height, width, focal = (float(number) for number in lens)
@@ -162,7 +163,7 @@ def _camera_of_row(row: NDArray[Any], where: str) -> Camera:
 
 
 def _match(scene: Path, names: Sequence[str], photos: Sequence[Path]) -> list[Path]:
-    """The file of each photo of the model; its suffix may differ (JPEG made of PNG)."""
+    """The file of each photo of the model; suffixes may differ, as in a JPEG made from a PNG."""
     stems = {photo.stem: photo for photo in photos}
     if all(Path(name).stem in stems for name in names):
         return [stems[Path(name).stem] for name in names]
@@ -178,16 +179,16 @@ def _match(scene: Path, names: Sequence[str], photos: Sequence[Path]) -> list[Pa
 
 
 def wildrgbd_cases(scenes: Mapping[str, Path]) -> list[Case]:
-    """Phone videos around objects, with the depth of the phone's laser.
+    """Cases of phone videos around objects, with depth from the phone's laser scanner.
 
     `CATEGORY/scenes/SCENE/` has `rgb/00000.png`, `depth/00000.png` (mm), `metadata` and `cam_poses.txt`.
 
-    `metadata` is JSON: w, h, and K column by column, its pixel centres at whole numbers, as the dataset's own tool
-    takes it. `cam_poses.txt` has a line for each frame: its number and 16 numbers, camera to world, OpenCV.
+    `metadata` is JSON with w, h, and K column by column, for pixel centres at integers, as in the dataset's own tool.
+    `cam_poses.txt` has a line for each frame: its number and the 16 numbers of camera-to-world, OpenCV convention.
 
-    512 frames are taken by `spread`, in turns over the categories: with 512 scenes or more, one of each. Second views
-    come from all frames of the scene, see `make_cases`, the middle depth taken as 0.8 m. At 640×480, upright or not,
-    the photos stay as they are: the paper's 76,800 cells.
+    `spread` takes 512 frames, from the categories in turn; with 512 scenes or more, one from each scene used. Second
+    views come from all frames of the scene, see `make_cases`, which gets 0.8 m as the middle depth. Photos of 640×480
+    or 480×640 keep their size and have the paper's 76,800 cells.
     """
     read: dict[str, list[Posed]] = {}
 
@@ -200,14 +201,14 @@ def wildrgbd_cases(scenes: Mapping[str, Path]) -> list[Case]:
 
 
 def category_and_scene(folder: Path) -> str:
-    """CATEGORY/SCENE, wherever the root is."""
+    """The name CATEGORY/SCENE of a scene's folder, wherever the root is."""
     folder = folder.absolute()
     above = folder.parent.parent if folder.parent.name == "scenes" else folder.parent
     return f"{above.name}/{folder.name}"
 
 
 def _with_depth(case: Case) -> Case:
-    """The photos with the depth map of the same number."""
+    """Add to a case the depth map with its photo's number; InputError if there is none."""
     at = case.photo.parent.parent / "depth" / case.photo.name
     if not at.is_file():
         raise InputError(f"{at}: no such depth map, but {case.photo} is there: unpack the scene again")

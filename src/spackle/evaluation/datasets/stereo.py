@@ -1,4 +1,4 @@
-"""Rectified pairs: Middlebury, Booster and the Motorcycle inside scikit-image, with disparities as depth."""
+"""Rectified pairs with depth from disparities: Middlebury, Booster, and the Motorcycle in scikit-image."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from spackle.evaluation.case import Case, SecondView, has_any, photo_files
 from spackle.files import check_file
 from spackle.image import read_image
 
-# Middlebury and Booster calibrate with tools that put (0, 0) into the middle of the first pixel; here it is that
-# pixel's corner. (Middlebury's smaller sizes have the big one's principal point divided plainly, so there it is known
-# to half a pixel only; the pair does not notice, because both cameras move alike.)
+# Middlebury's and Booster's calibration has (0, 0) in the middle of the first pixel; here it is that pixel's corner.
+# (For Middlebury's smaller sizes the principal point was divided without regard to this, so it is known to half a pixel
+# only; this does not affect the pair, because both cameras are shifted alike.)
 HALF_PIXEL = 0.5
-TRUTHS = ("disp0GT.pfm", "disp0.pfm")  # of MiddEval3, and of 2014 as it was published
-# Middlebury's calibration of the Motorcycle at a quarter of its size, as scikit-image ships it.
+TRUTHS = ("disp0GT.pfm", "disp0.pfm")  # the names in MiddEval3, and in the 2014 dataset
+# Middlebury's calibration of the Motorcycle at a quarter of its size, as in scikit-image.
 MOTORCYCLE_FOCAL, MOTORCYCLE_CX, MOTORCYCLE_CY = 994.978, 311.193, 254.877
 MOTORCYCLE_DOFFS, MOTORCYCLE_BASELINE = 31.086, 0.193001
 
@@ -35,12 +35,10 @@ MOTORCYCLE_DOFFS, MOTORCYCLE_BASELINE = 31.086, 0.193001
 def _pair(
     name: str, left: Path, right: Path, lens: Calibration, size: tuple[int, int], depth: Callable[[], DepthMap]
 ) -> Case:
-    """A case of the left photo, with the right one as its second view; `lens` counts pixels from the first one's
-    corner.
-    """
+    """A case of the left photo, with the right one as second view; in `lens`, (0, 0) is the first pixel's corner."""
     for photo in (left, right):
         if not photo.exists():
-            check_file(photo, "photo")  # raises; a photo that cannot be read is named in its turn
+            check_file(photo, "photo")  # raises; unreadable photos are reported when they are evaluated
     cameras = _cameras(lens, size)
     return Case(name, left, cameras[0], depth=depth, seconds=(SecondView("right", right, cameras[1]),))
 
@@ -54,7 +52,7 @@ def _cameras(lens: Calibration, size: tuple[int, int]) -> tuple[Camera, Camera]:
 
 
 def _picture_size(path: Path) -> tuple[int, int] | None:
-    """(width, height) from a picture's header; None where it cannot be read, InputError where it is missing."""
+    """(width, height) from an image's header; None if it cannot be read, InputError if the file is missing."""
     try:
         return read_image(path, lambda image: (image.width, image.height))
     except InputError:
@@ -68,11 +66,11 @@ def _from_corner(lens: Calibration) -> Calibration:
 
 
 def _depth_by(lens: Calibration, path: Path, read: Callable[[], NDArray[Any]]) -> Callable[[], DepthMap]:
-    """Reads z = focal · baseline / (disparity + doffs) of disparities in pixels; those not above 0 are unknown."""
+    """A reader of z = focal · baseline / (disparity + doffs), from disparities in pixels; those ≤ 0 are unknown."""
 
     def depth() -> DepthMap:
         stored = read()
-        with np.errstate(all="ignore"):  # what is not known may be anything
+        with np.errstate(all="ignore"):  # unknown disparities may have any value
             reach = float(lens.K[0, 0]) * lens.baseline_m
             z = torch.from_numpy((reach / (stored + lens.doffs_px)).astype(np.float32))
         valid = torch.from_numpy(np.isfinite(stored) & (stored > 0)) & torch.isfinite(z) & (z > 0)
@@ -84,7 +82,7 @@ def _depth_by(lens: Calibration, path: Path, read: Callable[[], NDArray[Any]]) -
 
 
 def pair_of_2014(folder: Path) -> Case:
-    """A case in the format of Middlebury 2014: im0.png, im1.png, calib.txt, and disp0.pfm or disp0GT.pfm."""
+    """A case from a folder as in Middlebury 2014: im0.png, im1.png, calib.txt, and disp0.pfm or disp0GT.pfm."""
     calib = folder / "calib.txt"
     lens = _from_corner(read_calibration(calib))
     if lens.size is None or min(lens.size) < 1:
@@ -102,24 +100,24 @@ def pair_of_2014(folder: Path) -> Case:
 
 
 def is_middlebury(folder: Path) -> bool:
-    """Whether this is a scene, and no photos of one of Booster's cameras."""
+    """Whether a folder is a scene, and not the photos of one of Booster's cameras."""
     return has_any(folder, "scene.json") or (has_any(folder, "im0.png") and not folder.name.startswith("camera_"))
 
 
 def middlebury_cases(scenes: Mapping[str, Path]) -> list[Case]:
     """One case for each scene; the second view is the true right photo.
 
-    Scene folders: `im0.png` with `calib.txt` (2014 at full size, and MiddEval3 at full, half or quarter size), or a
-    `scene.json`, which describes any rectified pair. `Piano-perfect` is taken, and `Piano-imperfect` is skipped. Test
-    scenes, which have no truth, are skipped. The paper's 23 are those of 2014. MiddEval3's three sizes share names:
-    give `trainingF`, `trainingH` or `trainingQ` alone.
+    A scene's folder has `im0.png` with `calib.txt` (2014 at full size; MiddEval3 at full, half or quarter size), or a
+    `scene.json`, which describes any rectified pair. `X-imperfect` is skipped if there is `X-perfect`; test scenes are
+    skipped, because they have no ground truth. The paper's 23 scenes are those of 2014. MiddEval3's three sizes have
+    the same scene names: give only `trainingF`, `trainingH` or `trainingQ`.
     """
     names = [name for name in scenes if name.replace("-imperfect", "-perfect") not in scenes.keys() - {name}]
     return [_middlebury_case(scenes[name]) for name in names]
 
 
 def _middlebury_case(folder: Path) -> Case:
-    """A case by its `scene.json`, in which pixel centres are at half-integers; its lengths may be nominal."""
+    """A case from `scene.json`, with pixel centres at half-integers and lengths that may be nominal, or as of 2014."""
     path = folder / "scene.json"
     if not path.exists():
         return pair_of_2014(folder)
@@ -128,7 +126,7 @@ def _middlebury_case(folder: Path) -> Case:
         facts = json.loads(read_text(path))
         left, right, truth = (folder / str(facts[key]) for key in ("left", "right", "disparity"))
     size, depth = _picture_size(left), partial(load_depth, truth, calib=path)
-    # A photo that is damaged is named in its turn.
+    # A damaged photo is reported when it is evaluated.
     return _pair(folder.name, left, right, lens, size, depth) if size else Case(folder.name, left, depth=depth)
 
 
@@ -136,12 +134,12 @@ def _middlebury_case(folder: Path) -> Case:
 
 
 def booster_cases(scenes: Mapping[str, Path]) -> list[Case]:
-    """Stereo at 12 megapixels of scenes with glass and mirrors: each photo of a left camera (one a light) is a case.
+    """Cases of 12-megapixel stereo scenes with glass and mirrors: one for each left photo, that is, for each light.
 
-    `train/balanced/SCENE/camera_00/im*.png` at 4112×3008, the right photo of the same name in `camera_02`, one
-    `disp_00.npy` and one `calib_00-02.xml` (OpenCV: proj_matL, proj_matR, baselineLR in millimetres) for all lights.
-    The test scenes have no truth, and the unbalanced ones another right camera: both are skipped.
-    At the working size the photos are 1536×1124: the paper's 431,616 cells.
+    Left photos are `train/balanced/SCENE/camera_00/im*.png` of 4112×3008 pixels; right photos have the same names in
+    `camera_02`. One `disp_00.npy` and one `calib_00-02.xml` (OpenCV: proj_matL, proj_matR, baselineLR in millimetres)
+    serve all lights. Test scenes, which have no ground truth, and unbalanced ones, whose right camera differs, are
+    skipped. At the working size the photos have 1536×1124 pixels and the paper's 431,616 cells.
     """
     return [case for scene in scenes.values() for case in _lights_of(scene)]
 
@@ -151,12 +149,12 @@ def _lights_of(scene: Path) -> list[Case]:
     if not photos:
         raise InputError(f"{scene / 'camera_00'}: no photos: expected im0.png and more; unpack the scene again")
     names = [f"{scene.name}/{photo.stem}" for photo in photos]
-    size = next((size for photo in photos if (size := _picture_size(photo))), None)  # all of a scene are of one size
+    size = next((size for photo in photos if (size := _picture_size(photo))), None)  # a scene's photos have one size
     lens, truth = _read_opencv(scene / "calib_00-02.xml"), scene / "disp_00.npy"
     if not truth.is_file():
         raise InputError(f"{truth}: no such disparity map: give train/balanced; Booster's test scenes have none")
     depth, rights = _depth_by(lens, truth, lambda: read_array(truth)[0]), scene / "camera_02"
-    if size is None:  # each is named in its turn
+    if size is None:  # unreadable photos are reported when they are evaluated
         return [Case(name, p, depth=depth) for name, p in zip(names, photos, strict=True)]
     return [_pair(name, p, rights / p.name, lens, size, depth) for name, p in zip(names, photos, strict=True)]
 
@@ -179,7 +177,7 @@ def _read_opencv(path: Path) -> Calibration:
 
 @dataclass(frozen=True)
 class StereoPair:
-    """A photo with its measured depth, and what a second camera truly saw."""
+    """A photo with measured depth, and the photo of a second camera."""
 
     left: Tensor  # [H, W, 3] sRGB
     right: Tensor  # [H, W, 3] sRGB
@@ -189,7 +187,7 @@ class StereoPair:
 
 
 def load_motorcycle() -> StereoPair:
-    """Middlebury's Motorcycle inside scikit-image; InputError where that is not installed."""
+    """Load Middlebury's Motorcycle from scikit-image; InputError if that is not installed."""
     try:
         from skimage.data import stereo_motorcycle
     except ImportError as error:
