@@ -121,7 +121,7 @@ def check_mark(folder: Path, word: str) -> None:
             return
     except (OSError, ValueError):
         pass
-    raise InputError(f"{folder}: not this command's folder for results: it must lie on a disk that all nodes share")
+    raise InputError(f"{folder}: this node sees another folder here: it must lie on a disk that all nodes share")
 
 
 @contextlib.contextmanager

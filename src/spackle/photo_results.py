@@ -103,8 +103,8 @@ def predict_photo(
         write_json(report, new / REPORT)
     before, after = (sum(view[key] for view in holes) / len(holes) for key in ("before", "after"))
     reporter.log(
-        f"{path.name}: {len(scene.aux):,} aux Gaussians ({report['aux']['share']:.1%}, "
-        f"{report['residual']['weights']}), holes {before:.2%} -> {after:.3%}, "
+        f"{path.name}: {len(scene.aux):,} aux Gaussians ({report['aux']['share']:.1%} of the base's number, "
+        f"residual weights: {report['residual']['weights']}), holes {before:.2%} -> {after:.3%}, "
         f"{report['seconds']['total']:.1f} s -> {folder}"
     )
     reporter.result({"folder": folder, **report})
@@ -182,7 +182,7 @@ def _warn_of_rougher(done: CompletedPhoto, folder: Path, base: BaseSettings, rep
     if base.named == AUTO and better in AUTO_NETWORKS and now in AUTO_NETWORKS[AUTO_NETWORKS.index(better) + 1 :]:
         file = base.files.get(str(better))
         reporter.log(
-            f"{done.photo.path.name}: warning: {folder} was made by {better} and is made again by {now}: "
+            f"{done.photo.path.name}: warning: {folder} was made by {better}, and the rougher {now} now replaces it: "
             f"{done.choice.why}{'' if file is None else f' ({file})'}"
         )
 

@@ -198,8 +198,8 @@ class Pipeline:
 def move_in_words(prediction: BasePrediction) -> str:
     """The camera's move, as `choose_move` found it, in words."""
     reach, usual, invented = prediction.disparity, prediction.notes["usual_disparity"], prediction.notes["uncovered"]
-    of, more = (f" of {usual:g}", f"; `--disparity {usual:g}` for more") if reach != usual else ("", "")
-    return f"moves {reach:g}{of}: {invented:.1%} of the widest view is invented{more}"
+    of, more = (f" of {usual:g}", f"; `--disparity {usual:g}` moves farther") if reach != usual else ("", "")
+    return f"camera moves by disparity {reach:g}{of}: {invented:.1%} of the widest view is invented{more}"
 
 
 def _with_farthest_view(done: CompletedPhoto) -> CompletedPhoto:

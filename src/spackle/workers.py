@@ -264,8 +264,8 @@ class RemoteWorker:
         """Like `PhotoWorker.make`; InputError also if the photo or depth map has other content on this node."""
         if self.worker.inputs(job) != expected:
             raise InputError(
-                f"{job.path}: {self.node} does not find this photo or its depth map, or others in "
-                "their place: they must lie at the same paths on every node, on a disk that all share"
+                f"{job.path}: {self.node} does not find this photo or its depth map, or finds other "
+                "files in their place: they must lie at the same paths on every node, on a disk that all share"
             )
         return self.worker.make(job)
 

@@ -35,7 +35,7 @@ from spackle.pipeline import FillOptions
 from spackle.weights import PUBLISHED
 
 pytestmark = pytest.mark.usefixtures("shipped")
-NO_DEPTH, NO_SHARP = "no depth in the photo", "no SHARP weights here, no MoGe here"
+NO_DEPTH, NO_SHARP = "no depth in the photo", "no SHARP weights here, no MoGe weights here"
 
 
 @pytest.fixture(autouse=True)
@@ -228,7 +228,7 @@ def test_damaged_weights_fail_once_for_all_photos(photo: Path, sharp: Path, monk
     sharp.write_bytes(content[::-1])
     said, log, base = "SHA-256 is not the published one", list[str](), open_base(BaseSettings())
     choices = [base.predict(load_photo(photo), log=log.append)[1] for _ in range(2)]
-    assert [choice.why for choice in choices] == [f"{NO_DEPTH}, SHARP cannot be used, no MoGe here"] * 2
+    assert [choice.why for choice in choices] == [f"{NO_DEPTH}, SHARP cannot be used, no MoGe weights here"] * 2
     assert (len(log), said in log[0], said in choices[0].failures[0]) == (1, True, True)
     assert choices[0].lasting
     for settings in ({"name": "sharp"}, {"checkpoint": sharp}):

@@ -26,7 +26,7 @@ from spackle.errors import InputError
 from spackle.formats import PlyFile
 from spackle.image import Photo
 
-NO_DEPTH, NO_MODEL = "no depth in the photo", "no MoGe here"
+NO_DEPTH, NO_MODEL = "no depth in the photo", "no MoGe weights here"
 
 
 @pytest.fixture(autouse=True)
@@ -189,8 +189,8 @@ def test_disparity_of_the_person_else_of_the_photo(tmp_path: Path) -> None:
     depth = ("--depth", write_depth(tmp_path / "d.npy"))
     for options, far, said in (
         (("--disparity", 0.25), 0.25, ""),
-        (depth, 0.07, "moves 0.07 of 0.3: 11.9% of the widest view is invented; `--disparity 0.3` for more"),
-        ((), 0.14, "moves 0.14 of 0.15: "),
+        (depth, 0.07, "disparity 0.07 of 0.3: 11.9% of the widest view is invented; `--disparity 0.3` moves farther"),
+        ((), 0.14, "moves by disparity 0.14 of 0.15: "),
     ):
         result = predict(tmp_path, photo, *options)
         report = report_of(tmp_path / "out" / "photo")

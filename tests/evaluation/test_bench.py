@@ -136,7 +136,7 @@ def test_points_suffice_and_the_first_prediction_does_not_count(scenes: Path, mo
     points = Points(known.valid.nonzero().flip(-1) + 0.5, known.depth[known.valid])
     found = bench.time_case(dataclasses.replace(case, depth=None, points=lambda: points), tools, config, True)
     assert next(row.value for row in found if row.metric == "base_gaussians")
-    with pytest.raises(InputError, match="no depth map and no points"):
+    with pytest.raises(InputError, match="neither a depth map nor points"):
         bench.time_case(dataclasses.replace(case, depth=None), tools, config, True)
     monkeypatch.setattr(RgbdBase, "predict", lambda *words: predictions.append(words) or predict(*words))
     for warm, calls in ((False, 2), (True, 1)):
@@ -170,7 +170,7 @@ def test_from_files_to_tables(scenes: Path, tmp_path: Path) -> None:
     [
         ((), "Missing option '--dataset'"),
         (("one", "--dataset", "middlebury", "--runs", "0"), "Invalid value for '--runs'"),
-        (("one", "two", "--dataset", "middlebury"), "two: a word of no option"),
+        (("one", "two", "--dataset", "middlebury"), "two: belongs to no option"),
         (("--dataset", "middlebury", "--base", "rgbd", "gone"), "gone: no such folder"),
     ],
 )

@@ -35,7 +35,7 @@ Stage = Callable[[str], AbstractContextManager[Progress]]
 ORDER = {  # of `auto`: what a candidate is called in reports and the log, and the reason to go on where there is none
     RGBD: ("the depth in the photo", "no depth in the photo"),
     "sharp": ("SHARP", "no SHARP weights here"),
-    "moge": ("MoGe", "no MoGe here"),
+    "moge": ("MoGe", "no MoGe weights here"),
     "depth": ("Depth Anything", ""),  # of an earlier download, which few have
     "lite": ("lite", ""),
 }

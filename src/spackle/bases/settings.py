@@ -39,7 +39,7 @@ def _download(name: str) -> str:
     return f"`spackle weights get {name}` ({decimal(PUBLISHED[name].bytes)}, {PUBLISHED[name].licence})"
 
 
-ROUGH = f"rough geometry; for better: --depth FILE, {_download('depth')}, or {_download('sharp')}"
+ROUGH = f"rough geometry; give --depth FILE for better geometry, or run {_download('depth')}, or {_download('sharp')}"
 DEPTH_ANYTHING = "depth-anything-v2-small/model.safetensors"  # where `weights get depth` put it once
 MISSING = {  # what to do without the weights of a base
     "sharp": f"no weights of SHARP on this machine: {_download('sharp')} downloads them, -c FILE takes a local copy",

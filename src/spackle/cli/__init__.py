@@ -45,7 +45,7 @@ class Overview(TyperGroup):
             for name, command in rows:
                 if (name in RESEARCH) == wanted:
                     write(f"  {name:<{indent - 2}}{command.get_short_help_str(WIDTH - indent)}\n")
-        write("\n-h after a command shows what it takes; --install-completion completes words in this shell.\n")
+        write("\n-h after a command lists its options; --install-completion completes words in this shell.\n")
 
 
 app = typer.Typer(
@@ -63,26 +63,24 @@ app = typer.Typer(
 )
 
 
-app.command(short_help="Photos, or a clip, to completed scenes and videos")(commands.predict)
-app.command(short_help="Look at a scene, or at a photo that becomes one")(commands.view)
-app.command(short_help="The same for programs: an HTTP interface")(commands.serve)
-app.command(short_help="A saved scene to a video")(commands.render)
-app.command(short_help="A scene for other viewers, or as one page to send")(commands.export)
-app.command(short_help="What a scene, photo, depth map or clip is")(commands.info)
-app.command(short_help="The Middlebury Motorcycle, against its true second photo")(commands.demo)
-app.add_typer(weights.weights, name="weights", short_help="Weights that others publish: fetch them, list them")
-app.command(short_help="Train the residual or SHARP's decoder")(train.train)
-app.command(context_settings=evaluate.EXTRA_WORDS, short_help="Measure on a dataset, in the paper's protocols")(
+app.command(short_help="Turn photos, or a clip, into completed scenes and videos")(commands.predict)
+app.command(short_help="View a scene, or a photo that becomes one, in the browser")(commands.view)
+app.command(short_help="Complete photos for programs, over HTTP")(commands.serve)
+app.command(short_help="Render a saved scene as a video")(commands.render)
+app.command(short_help="Write a scene for other viewers, or as one page to send")(commands.export)
+app.command(short_help="Describe a scene, photo, depth map or clip")(commands.info)
+app.command(short_help="Complete one photo and compare with its true second view")(commands.demo)
+app.add_typer(weights.weights, name="weights", short_help="Download or list weights that others publish")
+app.command(short_help="Train the residual network or SHARP's decoder")(train.train)
+app.command(context_settings=evaluate.EXTRA_WORDS, short_help="Evaluate on a dataset by the paper's protocols")(
     evaluate.evaluate
 )
-app.command(short_help="Several evaluations in the same tables")(evaluate.tables)
-app.command(short_help="The paper's figures, from several evaluations")(evaluate.figures)
-app.command(context_settings=evaluate.EXTRA_WORDS, short_help="What Spackle costs, in Gaussians and in time")(
+app.command(short_help="Merge several evaluations into the same tables")(evaluate.tables)
+app.command(short_help="Draw the paper's figures from several evaluations")(evaluate.figures)
+app.command(context_settings=evaluate.EXTRA_WORDS, short_help="Measure what Spackle costs, in Gaussians and in time")(
     evaluate.bench
 )
-app.add_typer(
-    dataset.dataset, name="dataset", short_help="Photos to views with holes and completed targets, to train on"
-)
+app.add_typer(dataset.dataset, name="dataset", short_help="Build training data: views with holes and completed targets")
 
 
 def _version(asked: bool) -> None:

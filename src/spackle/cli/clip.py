@@ -38,13 +38,13 @@ def clip_options(predict: PredictOptions) -> Options:
     unfit: list[tuple[str, object, bool, str]] = [  # option, value, whether it was given, why it is not for a clip
         ("cameras", path.cameras, path.cameras is not None, follows),
         ("path", path.path, path.path is not None, follows),
-        ("seconds", path.seconds, path.seconds is not None, "its video lasts as long; --frames N takes its first N"),
+        ("seconds", path.seconds, path.seconds is not None, "its video is as long; --frames N takes its first N"),
         ("mode", fill.mode, fill.mode != "scene", "each of its frames is one view"),
         ("fill", fill.fill, fill.fill in ("exemplar", "lama"), "its texture would flicker"),
         ("depth-out", predict.depth_out, predict.depth_out is not None, "its video is all that is written"),
-        ("no-render", "", not predict.render, "its video is all that there is to write"),
+        ("no-render", "", not predict.render, "its video is all that is written"),
         *(
-            (field.name, "", getattr(video, field.name) != getattr(plain, field.name), "its video is as the clip is")
+            (field.name, "", getattr(video, field.name) != getattr(plain, field.name), "its video follows the clip")
             for field in dataclasses.fields(plain)
         ),
         ("format", video.format, video.suffix != ".mp4", "it becomes an mp4, with its sound"),
@@ -89,7 +89,7 @@ def predict_clip(
         )
         focal = focal_length(path, clip.width, clip.height, {}, **lens)
         if clip.hdr:
-            reporter.log(f"{path.name}: its {clip.hdr} colours are taken as they are, so they may look pale")
+            reporter.log(f"{path.name}: its {clip.hdr} colours are not converted, so they may look pale")
         base, frames = pipeline.base, list[dict[str, Any]]()
         first: tuple[Photo, BasePrediction, ResolvedBase] | None = None
         with reporter.stage("frames") as step, ClipWriter(new / FILES[0], clip) as writer:
@@ -130,7 +130,7 @@ def predict_clip(
                 )
                 step(index + 1, len(clip))
         if clip.audio and not writer.sound:
-            reporter.log(f"{path.name}: its sound ({clip.audio}) does not go into an mp4: left out")
+            reporter.log(f"{path.name}: its sound ({clip.audio}) cannot be stored in an mp4 and is left out")
         assert first is not None
         camera = first[1].camera
         flicker = {name: [frame[name] for frame in frames if name in frame] for name in FIGURES}

@@ -33,7 +33,8 @@ if TYPE_CHECKING:  # torch takes seconds to load
 def predict(
     *,
     photos: Annotated[
-        list[Path], typer.Argument(metavar="PHOTO...", help="Photos and folders of photos, or a clip; *.jpg, too.")
+        list[Path],
+        typer.Argument(metavar="PHOTO...", help="Photos, folders of photos, patterns such as *.jpg; or one clip."),
     ],
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="OUT", help="Results go to OUT/PHOTO_NAME/.")
@@ -42,18 +43,18 @@ def predict(
         str,
         typer.Option(
             metavar="NAME",
-            help="What turns the photo into Gaussians. rgbd: its depth; sharp: Apple's network; moge: MoGe-2, metric "
-            "depth and the lens; lite: rough depth by networks that come along; hf:OWNER/NAME or hf:FOLDER: a depth "
-            "model of transformers. auto: the depth that is given or in the photo, else sharp or moge, if `spackle "
-            "weights get` brought them, else lite.",
+            help="What turns the photo into Gaussians. rgbd: its depth map; sharp: Apple's network; moge: MoGe-2, with "
+            "metric depth and the lens; lite: small networks that come with Spackle, of rough depth; hf:OWNER/NAME or "
+            "hf:FOLDER: a depth model of transformers. auto: a depth map that is given or in the photo, else sharp "
+            "or moge if `spackle weights get` has downloaded them, else lite.",
         ),
     ] = "auto",
     depth: Annotated[
         Path | None,
         typer.Option(
             metavar="PATH_OR_FOLDER",
-            help="Depth of the photo: .npy, .npz, .pfm (metres), 16-bit .png (mm), Middlebury disparity, or a picture "
-            "in greys with --depth-kind.",
+            help="Depth of the photo: .npy, .npz, .pfm (metres), 16-bit .png (mm), Middlebury disparity, or a grey "
+            "picture with --depth-kind.",
         ),
     ] = None,
     depth_kind: DepthKindOption = "auto",
@@ -76,11 +77,12 @@ def predict(
         ),
     ] = None,
     calib: Annotated[
-        Path | None, typer.Option(hidden=True, metavar="FILE", help="calib.txt of a disparity map that lies elsewhere.")
+        Path | None, typer.Option(hidden=True, metavar="FILE", help="calib.txt of a disparity map, if not beside it.")
     ] = None,
     checkpoint: CheckpointOption = None,
     precision: Annotated[
-        PrecisionName, typer.Option(hidden=True, help="Of sharp and hf; auto: bf16 where the hardware multiplies it.")
+        PrecisionName,
+        typer.Option(hidden=True, help="Precision of the base's network; auto: bf16 if the hardware multiplies it."),
     ] = "auto",
     sharp: SharpOption = None,
     residual: Annotated[
@@ -88,7 +90,7 @@ def predict(
         typer.Option(
             metavar="PATH|seeds|none",
             hidden=True,
-            help="Weights of the residual. seeds: without any; none: holes stay open. Default: those that ship.",
+            help="Weights of the residual. seeds: fill without weights; none: holes stay open. Default: Spackle's own.",
         ),
     ] = None,
     fill: Annotated[
@@ -106,7 +108,7 @@ def predict(
     depth_out: Annotated[
         str | None,
         typer.Option(
-            metavar="NAME", hidden=True, help="Write the photo's depth, too: depth.png (mm), .npy or .exr (m)."
+            metavar="NAME", hidden=True, help="Also write the photo's depth: depth.png (mm), .npy or .exr (m)."
         ),
     ] = None,
     path: PathOptions,
@@ -120,12 +122,12 @@ def predict(
     fov: FovOption = None,
     keep_frame: KeepFrameOption = False,
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Of several photos, redo those whose results exist.")
+        bool, typer.Option("--overwrite", help="With several photos, redo those whose results exist.")
     ] = False,
     workers: Annotated[
         int,
         typer.Option(
-            hidden=True, help="Number of photos at once, each in a process with its own copy of the base's network."
+            hidden=True, help="Number of processes that share the photos, each with its own copy of the base's network."
         ),
     ] = 1,
     threads: Annotated[
@@ -133,18 +135,19 @@ def predict(
         typer.Option(
             hidden=True,
             help="Threads of each worker; the last bits of a network's output depend on their number.",
-            show_default="the cores, shared evenly; with --ray 2",
+            show_default="the cores, shared evenly; 2 with --ray",
         ),
     ] = None,
     ray: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", hidden=True, help="Workers on a Ray cluster, as `dataset build`.")
+        str | None,
+        typer.Option(metavar="ADDRESS", hidden=True, help="Start workers on a Ray cluster, see `dataset build -h`."),
     ] = None,
     as_json: JsonOption = False,
     verbose: VerboseOption = False,
 ) -> None:
-    """Turn photos into completed 3D scenes: scene.ply, video.mp4 and report.json each.
+    """Turn photos into completed 3D scenes: scene.ply, video.mp4 and report.json for each.
 
-    A photo alone is enough. A depth map, or what `spackle weights get depth` or `sharp` fetches, gives better geometry.
+    A photo alone is enough. A depth map, or weights from `spackle weights get depth` or `sharp`, give better geometry.
     """
     from spackle.bases.settings import BaseSettings
     from spackle.cli.photo import PredictOptions
@@ -177,7 +180,7 @@ def render(
     as_json: JsonOption = False,
     verbose: VerboseOption = False,
 ) -> None:
-    """Draw a saved scene along a camera path."""
+    """Render a saved scene along a camera path."""
     from spackle.cli.saved_scene import render_scene
     from spackle.progress import Reporter
 
@@ -193,8 +196,8 @@ def export(
             "-o",
             "--output",
             metavar="FILE",
-            help="Output file, of the format of its suffix: .ply, .compressed.ply, .spz, .splat, .sog, .glb, or .html "
-            "(a page with the scene in it). Give as many as you like.",
+            help="Output file; its suffix is the format: .ply, .compressed.ply, .spz, .splat, .sog, .glb, or .html "
+            "(a page with the scene in it). May be given several times.",
         ),
     ],
     as_json: JsonOption = False,
@@ -221,7 +224,7 @@ def info(
 def view(
     target: Annotated[
         Path | None,
-        typer.Argument(metavar="SCENE_OR_PHOTO", help="A scene, or a photo to complete; none: an empty page."),
+        typer.Argument(metavar="SCENE_OR_PHOTO", help="A scene, or a photo to complete; without it the page is empty."),
     ] = None,
     base: Annotated[
         str, typer.Option(metavar="NAME", help="What turns photos into Gaussians, as `spackle predict` has it.")
@@ -232,8 +235,8 @@ def view(
     disparity: Annotated[
         float | None,
         typer.Option(
-            help="How far photos are completed: 0 to 2; 0.3 is large.",
-            show_default="what the photo bears, up to 0.15 with lite, else 0.3",
+            help="How far to the side photos are completed, as a disparity from 0 to 2; 0.3 is large.",
+            show_default="chosen for each photo, at most 0.15 with lite, else 0.3",
         ),
     ] = None,
     focal_px: Annotated[float | None, typer.Option(help="Focal length in pixels.")] = None,
@@ -247,14 +250,14 @@ def view(
         bool,
         typer.Option(
             "--token/--no-token",
-            help="Put a secret into the page's address. Without it everybody on this machine can look, and nobody can "
-            "send a photo.",
+            help="Put a secret token into the page's address. With --no-token everybody on this machine can open the "
+            "page, but nobody can send it a photo.",
         ),
     ] = True,
     as_json: JsonOption = False,
     verbose: VerboseOption = False,
 ) -> None:
-    """Look at a scene, or complete photos and look at them, on a page of this machine. Ctrl-C ends it."""
+    """View a scene, or complete photos and view them, on a page in the browser. Ctrl-C ends it."""
     from spackle.bases.settings import BaseSettings
     from spackle.cli import serve as app
     from spackle.progress import Reporter
@@ -273,7 +276,7 @@ def serve(
     token: Annotated[
         str | None,
         typer.Option(
-            help="The token that clients must send; default: a new one.",
+            help="The token that clients must send.",
             show_default="a new one",
             envvar="SPACKLE_TOKEN",
         ),
@@ -281,7 +284,9 @@ def serve(
     workers: Annotated[
         int,
         typer.Option(
-            min=1, max=64, help="Number of photos at once, each in a process with its own copy of the base's network."
+            min=1,
+            max=64,
+            help="Number of processes that share the photos, each with its own copy of the base's network.",
         ),
     ] = 1,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="Folder for photos and scenes.")] = Path(
@@ -289,10 +294,10 @@ def serve(
     ),
     keep: Annotated[float, typer.Option(min=0, metavar="DAYS", help="Remove a scene after this number of days.")] = 7,
     quota: Annotated[
-        float, typer.Option(min=0, metavar="GB", help="Remove the oldest scenes when all take more than this.")
+        float, typer.Option(min=0, metavar="GB", help="Remove the oldest scenes when all together take more.")
     ] = 20,
     waiting: Annotated[
-        int, typer.Option(min=1, metavar="N", help="Number of photos that may wait; more are refused.")
+        int, typer.Option(min=1, metavar="N", help="Number of photos that may wait; further ones are refused.")
     ] = 32,
     base: Annotated[
         str, typer.Option(metavar="NAME", help="What turns photos into Gaussians, as `spackle predict` has it.")
@@ -302,7 +307,7 @@ def serve(
     as_json: JsonOption = False,
     verbose: VerboseOption = False,
 ) -> None:
-    """Complete photos for programs, by an HTTP interface with a page (see docs/http.md). Ctrl-C ends it."""
+    """Complete photos for programs, over HTTP, with a page for people (see docs/http.md). Ctrl-C ends it."""
     from spackle.bases.settings import BaseSettings
     from spackle.cli import serve as app
     from spackle.progress import Reporter

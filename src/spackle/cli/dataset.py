@@ -15,7 +15,7 @@ from spackle.cli.options import (
     VerboseOption,
 )
 
-dataset = typer.Typer(help="Photos to views with holes and completed targets, to train on.", no_args_is_help=True)
+dataset = typer.Typer(help="Build and inspect training data: views with holes, and targets.", no_args_is_help=True)
 
 
 DatasetArgument = Annotated[str, typer.Argument(metavar="DATASET", help="A folder, or an address (s3://…).")]
@@ -32,7 +32,7 @@ def dataset_build(
         typer.Option("-o", "--output", metavar="OUT", help="The dataset's folder; an unfinished build in it resumes."),
     ],
     images: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Where a COCO JSON's photos lie; default: beside it.")
+        Path | None, typer.Option(metavar="FOLDER", help="Folder of a COCO JSON's photos; default: the JSON's.")
     ] = None,
     sample: Annotated[
         int | None, typer.Option(min=1, max=1_000_000, help="Number of photos, chosen at random; default: all.")
@@ -44,17 +44,17 @@ def dataset_build(
         str, typer.Option(help="What turns a photo into Gaussians: sharp, rgbd, depth, lite or hf:NAME.")
     ] = "sharp",
     depth: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Depth maps named as the photos, for --base rgbd.")
+        Path | None, typer.Option(metavar="FOLDER", help="Depth maps with the photos' names, for --base rgbd.")
     ] = None,
     checkpoint: Annotated[Path | None, typer.Option("-c", "--checkpoint", help="Weights of the base.")] = None,
     precision: PrecisionOption = "auto",
     views: Annotated[int, typer.Option(min=2, max=100, help="Number of views of each photo, its own included.")] = 20,
     trajectory: Annotated[
-        SharpTrajectoryName | None, typer.Option(help="Camera path; default: drawn for each photo.")
+        SharpTrajectoryName | None, typer.Option(help="Camera path; default: a random one for each photo.")
     ] = None,
     disparity: Annotated[
         tuple[float, float],
-        typer.Option(metavar="LO HI", help="How far the camera moves: drawn between these two disparities."),
+        typer.Option(metavar="LO HI", help="Range of disparities from which the camera's move is drawn at random."),
     ] = (0.1, 0.6),
     inpainter: Annotated[
         str, typer.Option(help="What completes the views: exemplar, lama, opencv, propainter; geometry; or none.")
@@ -66,12 +66,12 @@ def dataset_build(
         int | None,
         typer.Option(help="Long side in pixels at which the inpainter works; default: propainter 640, lama 1024."),
     ] = None,
-    workers: Annotated[int, typer.Option(help="Processes; each holds its own base.")] = 1,
+    workers: Annotated[int, typer.Option(help="Number of processes, each with its own base.")] = 1,
     ray: Annotated[
         str | None,
         typer.Option(metavar="ADDRESS", help="Workers on a Ray cluster: auto, local, HOST:PORT or ray://HOST:PORT."),
     ] = None,
-    threads: Annotated[int, typer.Option(help="Threads of each process; SHARP's last bits depend on them.")] = 2,
+    threads: Annotated[int, typer.Option(help="Threads of each process; they change SHARP's last bits.")] = 2,
     shard_size: Annotated[int, typer.Option(min=1, max=1_000_000, help="Number of photos in a tar file.")] = 50,
     device: DeviceOption = "auto",
     verbose: VerboseOption = False,

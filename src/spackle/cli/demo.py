@@ -124,7 +124,7 @@ def _ssim(image: Tensor, truth: Tensor, where: Tensor) -> float:
 
 def _table(scores: dict[str, Any]) -> Table:
     title = f"True right camera: {scores['har_before']:.1%} holes before, {scores['har_after']:.2%} after"
-    table = Table(title=title, caption="sharpness: gradients over the true photo's; PSNR prefers fog")
+    table = Table(title=title, caption="sharpness: gradients relative to the true photo's; PSNR prefers blur")
     for header in ("against the true photo", "hole: PSNR", "SSIM", "sharpness", "outside"):
         table.add_column(header, justify="left" if header.startswith("against") else "right")
     for name, psnr in scores["psnr"].items():

@@ -29,7 +29,7 @@ Limit = Annotated[
     int | None, typer.Option(min=1, max=1_000_000, help="Evaluate this number of images, spread over the dataset.")
 ]
 _DATASET = typer.Option(
-    metavar="NAME", help="middlebury, booster, wildrgbd, tanks, eth3d, llff: an unknown one lists all."
+    metavar="NAME", help="middlebury, booster, wildrgbd, tanks, eth3d, llff; an unknown name lists all."
 )
 Folder = Annotated[
     Path | None, typer.Argument(metavar="FOLDER", help="Where the dataset was unpacked.", show_default=False)
@@ -97,7 +97,9 @@ def evaluate(
     inpainter: Annotated[
         str, typer.Option(metavar="NAME", help="Inpainter of the method inpaint2d: exemplar, lama, opencv, …")
     ] = "opencv",
-    features: Annotated[Path | None, typer.Option(metavar="FILE.npz", help="SqueezeNet, for distance.")] = None,
+    features: Annotated[
+        Path | None, typer.Option(metavar="FILE.npz", help="SqueezeNet's weights, for the metric distance.")
+    ] = None,
     limit: Limit = None,
     download_metrics: Annotated[
         bool, typer.Option("--download-metrics", help="Let pyiqa fetch weights (some are not for commercial use).")
@@ -134,7 +136,7 @@ def evaluate(
     )
     if options.near and _has_disparities(context):
         raise InputError(
-            f"--disparity {disparity}: --protocol near-view looks from where the true second photos were taken: "
+            f"--disparity {disparity}: --protocol near-view renders the views of the true second photos: "
             "leave one of them out"
         )
     results = output or Path(f"evaluation-{dataset}-{protocol}")
@@ -231,8 +233,8 @@ def _sorted_words(context: typer.Context, folder: Path | None, disparity: str) -
     others = [word for word in words if not (listed and NUMBER.fullmatch(word))]
     others = others or words[:1]  # a folder may be named by a number
     if not others:
-        raise InputError("FOLDER missing: name it after the command")
+        raise InputError("FOLDER is missing: name the dataset's folder after the command")
     if len(others) > 1:
-        raise InputError(f"{others[-1]}: a word of no option: lists are given with commas: --methods A,B")
+        raise InputError(f"{others[-1]}: belongs to no option: separate list items with commas: --methods A,B")
     words.remove(others[0])
     return Path(others[0]), ",".join((disparity, *words))

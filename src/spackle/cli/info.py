@@ -47,13 +47,13 @@ def is_depth(path: Path) -> bool:
 def scene_facts(path: Path) -> Facts:
     scene = load_scene(path)
     count, base = len(scene.gaussians), scene.base_count
-    parts = "no border of base and aux is stored" if base is None else f"{base:,} base, {count - base:,} aux"
+    parts = "the file does not tell base from aux" if base is None else f"{base:,} base, {count - base:,} aux"
     facts: Facts = {"kind": f"scene ({scene_kind(path)})", "Gaussians": f"{count:,} ({parts})"}
     depths = scene.gaussians.means[:, 2].double().numpy()
     near, middle, far = np.quantile(depths, [EXTREMES[0], 0.5, EXTREMES[1]])
-    facts["depth"] = f"{near:.3g} near, {middle:.3g} median, {far:.3g} far, in metres if its base was metric"
+    facts["depth"] = f"{near:.3g} near, {middle:.3g} median, {far:.3g} far, in metres if the scene's base was metric"
     facts["camera"] = (
-        "none is stored: give --fov, and to `spackle render` --size" if scene.camera is None else lens_of(scene.camera)
+        "none is stored: give --fov, and --size to `spackle render`" if scene.camera is None else lens_of(scene.camera)
     )
     if scene.disparity is not None:
         facts["completed"] = f"for --disparity {scene.disparity:g}"

@@ -26,23 +26,21 @@ PrecisionOption = Annotated[PrecisionName, typer.Option(help="Precision of the b
 DeviceOption = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Where to compute.")]
 FovOption = Annotated[float | None, typer.Option(help="Horizontal field of view in degrees.")]
 HostOption = Annotated[
-    str, typer.Option(metavar="H", help="Listen at this address: 0.0.0.0 lets the network in, whoever has the token.")
+    str, typer.Option(metavar="H", help="Listen here; 0.0.0.0 admits everybody in the network who has the token.")
 ]
 KeepFrameOption = Annotated[
-    bool, typer.Option("--keep-frame", help="Keep a scan's margin or letterbox bars, which are otherwise cut off.")
+    bool, typer.Option("--keep-frame", help="Keep a scan's margin or letterbox bars, which are otherwise cropped.")
 ]
 DepthKindOption = Annotated[
     DepthKindName,
     typer.Option(
         hidden=True,
-        help="What the numbers of --depth are. metric: metres, in a 16-bit PNG millimetres; disparity: of a calibrated "
-        "pair; near-white: relative, as MiDaS, Depth Anything and ComfyUI write it; near-black: the other way round. "
-        "auto: metric, or a disparity with its calibration beside it.",
+        help="What the numbers in --depth mean. metric: metres, or millimetres in a 16-bit PNG; disparity: that of a "
+        "calibrated pair; near-white: relative depth, near is bright, as MiDaS, Depth Anything and ComfyUI write it; "
+        "near-black: relative, near is dark. auto: metric, or a disparity map with its calibration beside it.",
     ),
 ]
-JsonOption = Annotated[
-    bool, typer.Option("--json", help="For scripts: print each result, and an error, as a line of JSON.")
-]
+JsonOption = Annotated[bool, typer.Option("--json", help="For scripts: print each result or error as a line of JSON.")]
 VerboseOption = Annotated[bool, typer.Option("-v", "--verbose", help="Say how long each stage takes.")]
 CheckpointOption = Annotated[
     Path | None, typer.Option("-c", "--checkpoint", metavar="FILE", help="Weights of sharp (or auto), moge or lite.")
@@ -52,8 +50,8 @@ SharpOption = Annotated[
     typer.Option(
         "--sharp",
         metavar="KEY=VALUE",
-        help="Speed of SHARP. windows=N: so many of its 35 at once, 1 takes the least memory (default: 5, on a GPU "
-        "all); compile=yes: through torch.compile, minutes once, for many photos.",
+        help="Speed of SHARP. windows=N: N of its 35 windows at once; 1 takes the least memory (default: 5, on a GPU "
+        "all). compile=yes: use torch.compile, which takes minutes once and pays off for many photos.",
         hidden=True,
     ),
 ]
@@ -97,8 +95,8 @@ def path_options(
     disparity: Annotated[
         float | None,
         typer.Option(
-            help="How far the camera moves: 0 to 2; 0.3 is large.",
-            show_default="as the scene has it; predict: what the photo bears, up to 0.15 with lite, else 0.3",
+            help="How far the camera moves to the side, as a disparity from 0 to 2; 0.3 is large.",
+            show_default="the saved scene's; predict: chosen for the photo, at most 0.15 with lite, else 0.3",
         ),
     ] = None,
     path: Annotated[
@@ -109,15 +107,15 @@ def path_options(
     ] = None,
     cameras: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.json", hidden=True, help="Complete exactly these views in place of a path."),
+        typer.Option(metavar="FILE.json", hidden=True, help="Complete exactly these views instead of a path."),
     ] = None,
-    frames: Annotated[int | None, typer.Option(hidden=True, help="Frames of the path, in place of --seconds.")] = None,
+    frames: Annotated[int | None, typer.Option(hidden=True, help="Number of frames, instead of --seconds.")] = None,
     seconds: Annotated[
-        float | None, typer.Option(help="Length of the video in seconds.", show_default="4, or as --path has it")
+        float | None, typer.Option(help="Length of the video in seconds.", show_default="4, or the duration of --path")
     ] = None,
     video_format: Annotated[
         Literal["mp4", "webm", "gif", "webp"] | None,
-        typer.Option("--format", help="Kind of video.", show_default="mp4"),
+        typer.Option("--format", help="Video format.", show_default="mp4"),
     ] = None,
     fps: Annotated[float | None, typer.Option(help="Frames a second.", show_default="30", hidden=True)] = None,
     loop: Annotated[
@@ -134,7 +132,7 @@ def path_options(
         typer.Option(
             metavar="SHARE",
             hidden=True,
-            help="Draw with a lens longer by this share, so that most of what lies beyond the photo stays outside.",
+            help="Lengthen the lens by this fraction, so that most of what lies beyond the photo is not seen.",
             show_default="0.05; 0 with --path and --cameras",
         ),
     ] = None,
@@ -145,21 +143,21 @@ def path_options(
     fit: Annotated[
         Literal["pad", "blur", "crop"],
         typer.Option(
-            hidden=True, help="A view of another aspect ratio than --size: with black or blurred margins, or cut off."
+            hidden=True, help="How a view fits another aspect ratio in --size: black or blurred margins, or cropped."
         ),
     ] = "pad",
     show: Annotated[
         Literal["color", "depth"],
-        typer.Option(hidden=True, help="The scene's colours, or its depth as colours (near is bright)."),
+        typer.Option(hidden=True, help="Show the scene's colours, or its depth as colours (near is bright)."),
     ] = "color",
     stereo: Annotated[
         Literal["sbs", "sbs-half", "ou", "ou-half", "anaglyph"] | None,
-        typer.Option(hidden=True, help="Two eyes: side by side, over-under, or for red-cyan glasses."),
+        typer.Option(hidden=True, help="Stereo video: side by side, over-under, or for red-cyan glasses."),
     ] = None,
     ipd: Annotated[
         float | None,
         typer.Option(
-            metavar="METRES", hidden=True, help="Distance of the two eyes.", show_default="as suits the scene's depth"
+            metavar="METRES", hidden=True, help="Distance of the two eyes.", show_default="chosen for the scene's depth"
         ),
     ] = None,
     convergence: Annotated[
@@ -167,8 +165,8 @@ def path_options(
         typer.Option(
             metavar="METRES",
             hidden=True,
-            help="Depth at which the screen stands.",
-            show_default="what the path looks at",
+            help="Depth of what appears at the screen.",
+            show_default="that of what the path looks at",
         ),
     ] = None,
 ) -> PathOptions:

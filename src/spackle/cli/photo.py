@@ -32,13 +32,13 @@ class PredictOptions:
         if self.depth_out is not None:
             check_depth_name(self.depth_out)
             if Path(self.depth_out).name != self.depth_out:
-                raise InputError(f"--depth-out {self.depth_out}: goes beside scene.ply: give a name without a folder")
+                raise InputError(f"--depth-out {self.depth_out}: is put beside scene.ply: give a name without a folder")
         pipeline, path = Pipeline.open(self.scene), self.scene.path
         if not self.render:
             for option in ("format", "fps", "loop"):
                 if (value := getattr(path.video, option)) is not None:
                     raise InputError(
-                        f"--{option} {value}: is for the video, and --no-render writes none: leave one of them out"
+                        f"--{option} {value}: applies to the video, and --no-render writes none: leave one of them out"
                     )
         elif pipeline.given_views and (problem := video_problem(pipeline.given_views)):
             raise InputError(f"{path.cameras}: {problem}, so they make no video: add --no-render for pictures only")

@@ -65,7 +65,7 @@ def predict_all(given: Sequence[Path], output: Path, options: PredictOptions, re
     single = len(given) == len(named) == 1 and not os.path.isdir(given[0])
     if clips := [photo.path for photo in named if is_clip(photo.path)]:
         if not single:
-            raise InputError(f"{clips[0]}: is a clip: give it alone, as each of its frames needs the one before")
+            raise InputError(f"{clips[0]}: is a clip: give it alone, without other photos or clips")
         pipeline = Pipeline.open(clip_options(options))
         check_file(clips[0], "clip")
         folder = output / named[0].name
@@ -117,7 +117,7 @@ def find_photos(given: Sequence[Path]) -> list[NamedPhoto]:
     stems = Counter(photo.stem.casefold() for photo in photos)
     names = Counter(photo.name.casefold() for photo in photos)
     if twice := [photo for photo in photos if names[photo.name.casefold()] > 1]:
-        raise InputError(f"{twice[1]}: {twice[0]} has the same name: give them in two runs, with an -o of its own each")
+        raise InputError(f"{twice[1]}: {twice[0]} has the same name: process them in two runs, each with its own -o")
 
     def name(photo: Path) -> str:
         stem = photo.stem.casefold()

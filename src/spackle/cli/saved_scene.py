@@ -54,9 +54,7 @@ def render_scene(
     compare = path.video.compare
     given_lens = [f"--{name.replace('_', '-')}" for name, value in lens.items() if value is not None]
     if path.cameras is not None and given_lens:
-        raise InputError(
-            f"{given_lens[0]}: the views of --cameras {path.cameras} have lenses of their own: leave it out"
-        )
+        raise InputError(f"{given_lens[0]}: the views of --cameras {path.cameras} have their own lenses: leave it out")
     renderer = get_renderer(device)
     with reporter.stage("load"):
         given, keyframes = path.load()
@@ -82,12 +80,12 @@ def render_scene(
                 far = f"--disparity {path.disparity:g}"
                 reporter.log(
                     f"{scene.name}: {far} goes beyond the {reach:g} that it was completed for: "
-                    f"`spackle predict {far}` completes a photo so far"
+                    f"`spackle predict {far}` completes a photo that far"
                 )
             if loaded.camera is None and not given_lens:
                 reporter.log(
-                    f"{scene.name}: no camera stored, taking {DEFAULT_FOCAL_MM:g} mm at "
-                    f"{camera.width}×{camera.height} (--fov, --size)"
+                    f"{scene.name}: no camera stored; using {DEFAULT_FOCAL_MM:g} mm at "
+                    f"{camera.width}×{camera.height} (--fov and --size change it)"
                 )
         maker = FrameMaker.of(path.video, base, cameras, scene)
     target = output if single else output / f"{scene.stem}{path.video.suffix}"
@@ -156,7 +154,7 @@ def export_scene(scene: Path, outputs: Sequence[Path], reporter: Reporter) -> No
             if targets.count(target) > 1:
                 raise InputError(f"{output}: named twice: give each output once")
         if os.path.realpath(scene) in map(str, targets):
-            raise InputError(f"{scene}: is the scene itself, and would be lost: give the output another name")
+            raise InputError(f"{scene}: is the scene itself, which would be overwritten: give the output another name")
         loaded = load_scene(scene)
         if rest := loaded.harmonics:
             reporter.log(
@@ -181,7 +179,9 @@ def _report_file(scene: SceneFile, output: Path, seconds: float, reporter: Repor
     bits, far = spz_grid(scene.gaussians) if output.name.lower().endswith(".spz") else (0, 0)
     if far:
         reach = f"{LARGEST / 2**bits:,.0f} m"
-        reporter.log(f"{output}: {far:,} Gaussians beyond {reach} were drawn nearer, as the photo's eye sees them")
+        reporter.log(
+            f"{output}: {far:,} Gaussians beyond {reach} were moved nearer, which does not change the photo's own view"
+        )
     seconds = round(seconds, 3)
     reporter.result({"file": output, "gaussians": count, "bytes": size, "seconds": seconds, "drawn_nearer": far})
 
@@ -198,4 +198,4 @@ def page_of(scene: Scene, path: Path) -> PageScene:
     except InputError as error:
         raise InputError(f"{path}: {str(error).removeprefix(f'{name}: ')}") from error
     except ValueError as error:
-        raise InputError(f"{path}: cannot be looked at: {error}: give the lens with --fov") from error
+        raise InputError(f"{path}: cannot be viewed: {error}: give the lens with --fov") from error

@@ -101,7 +101,7 @@ def serve(folder: Path, work: SceneWork, workers: int, keep: Keep, place: Place,
     """Complete photos for programs until the user stops it; InputError for an option that cannot be used."""
     work.base.check()
     with listening(folder, work, workers, keep, place, reporter) as (_, urls):
-        reporter.log(f"token: {place.token}, as `Authorization: Bearer TOKEN` or in the page's address")
+        reporter.log(f"token: {place.token}; send it as `Authorization: Bearer TOKEN` or in the page's address")
         announce("HTTP interface, and its page", urls, place, reporter)
 
 
@@ -114,7 +114,7 @@ def listening(
         address, port = listener.getsockname()[:2]
         access = Access.at(place.host, address, place.token)
         if not access.local and place.token is None:
-            raise InputError(f"--host {place.host}: others could send photos: leave --no-token out")
+            raise InputError(f"--host {place.host}: without a token others could send photos: leave --no-token out")
         app = create_app(folder, work, workers=workers, keep=keep, access=access)
         here = {"0.0.0.0": LOOPBACK, "::": "::1"}.get(address, address)
         addresses = [here] if access.local else [here, address_in_network(place.host)]
@@ -142,16 +142,16 @@ def told_to(reporter: Reporter) -> Iterator[None]:
 def listener_at(host: str, port: int) -> socket.socket:
     """A listening socket; InputError, naming the option, if the address cannot be used."""
     if not 0 <= port <= 65535:
-        raise InputError(f"--port {port}: must lie between 1 and 65535 (0: any that is free)")
+        raise InputError(f"--port {port}: must lie between 1 and 65535 (0: any free port)")
     try:
         family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
         return socket.create_server(address, family=family, backlog=128)
     except (OSError, UnicodeError) as error:
         reason = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else reason_in_a_line(error)
         if isinstance(error, socket.gaierror | UnicodeError) or error.errno == errno.EADDRNOTAVAIL:
-            line = f"--host {host}: no address of this machine: {reason}: leave it out, or give 0.0.0.0 for all of them"
+            line = f"--host {host}: not an address of this machine: {reason}: leave it out, or give 0.0.0.0 for all"
         else:
-            line = f"--port {port}: cannot listen at {host}: {reason}: give another, or none"
+            line = f"--port {port}: cannot listen at {host}: {reason}: give another port, or 0 for any free one"
         raise InputError(line) from error
 
 
@@ -168,7 +168,7 @@ def announce(name: str, urls: list[str], place: Place, reporter: Reporter) -> No
     # A text browser would take over the terminal.
     screen = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"))
     if place.browser and sys.platform.startswith("linux") and not screen:
-        reporter.log("no screen here: open that page yourself; from another machine through `ssh -L`")
+        reporter.log("no screen here: open that page yourself, from another machine through `ssh -L`")
     elif place.browser:
         # Some browsers return only when they are closed.
         threading.Thread(target=webbrowser.open, args=(urls[0],), daemon=True, name="browser").start()

@@ -17,7 +17,7 @@ def train(
         typer.Option(
             "--recipe",
             metavar="RECIPE",
-            help="What to learn from, and how: quick, cpu, paper, reverse_view, direct_ft, or a YAML file.",
+            help="Training data and settings: quick, cpu, paper, reverse_view, direct_ft, or a YAML file.",
         ),
     ],
     output: Annotated[
@@ -30,7 +30,7 @@ def train(
     ] = None,
     method: Annotated[
         Literal["residual", "direct-ft"],
-        typer.Option(help="What learns: the residual, or (direct-ft) SHARP's decoder, for comparison."),
+        typer.Option(help="What to train: the residual network, or (direct-ft) SHARP's decoder, for comparison."),
     ] = "residual",
     checkpoint: Annotated[
         Path | None, typer.Option("-c", "--checkpoint", metavar="FILE", help="Weights of SHARP, for direct-ft.")

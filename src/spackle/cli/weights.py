@@ -18,12 +18,12 @@ if TYPE_CHECKING:  # torch takes seconds to load
     from spackle.progress import Reporter
     from spackle.weights import PublishedWeights
 
-weights = typer.Typer(help="Weights that others publish: fetch them, list them.", no_args_is_help=True)
+weights = typer.Typer(help="Download or list weights that others publish.", no_args_is_help=True)
 
 
 @weights.command("get")
 def weights_get(
-    name: Annotated[str, typer.Argument(help="Which weights: depth, which is MoGe-2; sharp, lama or features.")],
+    name: Annotated[str, typer.Argument(help="Which weights: depth (MoGe-2), sharp, lama or features.")],
     output: Annotated[
         Path | None,
         typer.Option("-o", "--output", metavar="OUT", help="A folder, or a file name; default: the weights' folder."),
@@ -52,8 +52,8 @@ def weights_get(
     else:
         with reporter.stage("check"):
             if file_digest(path) != entry.sha256:
-                raise InputError(f"{path}: damaged, or your own: it has not the SHA-256 {entry.sha256}: give --force")
-        reporter.log(f"{summary}, there already and intact: {path}")
+                raise InputError(f"{path}: damaged, or your own: SHA-256 is not {entry.sha256}: --force replaces it")
+        reporter.log(f"{summary}, already downloaded and intact: {path}")
     reporter.result({"name": name, "file": path, "bytes": entry.bytes, "sha256": entry.sha256, "downloaded": new})
 
 
@@ -78,7 +78,7 @@ def _fetch(entry: PublishedWeights, url: str, path: Path, reporter: Reporter) ->
         try:
             download(url, path, entry.bytes, entry.sha256, advance)
         except KeyboardInterrupt:
-            reporter.log(f"{entry.name}: what has come is kept; the same command resumes from there")
+            reporter.log(f"{entry.name}: the bytes received so far are kept; the same command resumes from there")
             raise
 
 
@@ -87,10 +87,10 @@ def weights_make(
     output: Annotated[Path, typer.Argument(metavar="FILE", help="A name that ends in .pt or .safetensors.")],
     size: Annotated[
         Literal["full", "tiny", "micro", "lama"],
-        typer.Option(help="SHARP's published size, two for tests, or LaMa's."),
+        typer.Option(help="SHARP in its published size or two test sizes, or LaMa."),
     ] = "full",
 ) -> None:
-    """Make random weights of SHARP's or LaMa's shape, the same each time, to try everything without theirs."""
+    """Make random weights in SHARP's or LaMa's shapes, the same each time, to try all commands without a download."""
     suffix = output.suffix.lower()
     if suffix not in (".pt", ".safetensors"):
         raise InputError(f"{output}: give a name that ends in .pt or .safetensors")
@@ -147,7 +147,7 @@ def lama_weights(*size: int) -> dict[str, Tensor]:
 
 @weights.command("list")
 def weights_list(as_json: JsonOption = False) -> None:
-    """Say which weights are known, and which of them are here."""
+    """List the published weights, and say which are on this machine."""
     from rich.filesize import decimal
 
     from spackle.progress import Reporter

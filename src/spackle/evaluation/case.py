@@ -153,7 +153,7 @@ def known_depth(case: Case) -> DepthMap:
     if case.depth is not None:
         return case.depth()
     if case.points is None or case.camera is None:
-        raise InputError(f"{case.name}: has no depth map and no points, of which --base rgbd takes either")
+        raise InputError(f"{case.name}: has neither a depth map nor points: --base rgbd needs one of them")
     points, camera = case.points(), case.camera
     column, row = points.uv.floor().long().unbind(-1)
     inside = (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height) & (points.z > 0)

@@ -226,6 +226,6 @@ def check_version(found: str) -> None:
     low, high = ([int(part) for part in version.split(".")] for version in VERSIONS)
     if not low <= numbers < high:
         raise InputError(
-            f"--device cuda: gsplat {found} does not build here or draws otherwise: {INSTALL} takes one from "
-            f"{VERSIONS[0]} on and before {VERSIONS[1]}; or use --device cpu"
+            f"--device cuda: gsplat {found} does not build here or renders differently: {INSTALL} installs a "
+            f"version from {VERSIONS[0]} up to, but not including, {VERSIONS[1]}; or use --device cpu"
         )

@@ -113,7 +113,7 @@ def create_app(
             try:
                 form = await asyncio.wait_for(request.form(max_files=2, max_fields=1), limits.upload)
             except asyncio.TimeoutError:
-                raise HTTPException(408, "the photo came too slowly") from None
+                raise HTTPException(408, "the photo arrived too slowly") from None
             try:
                 async with decoding:
                     job = await run_in_threadpool(accept, form, new, jobs, bases)
@@ -154,7 +154,7 @@ def create_app(
             if job.state != "done":
                 raise HTTPException(409, job.error or "this scene is not done yet")
             if file in get_args(PagePart):
-                raise HTTPException(404, "there was no photo: it was a scene already")
+                raise HTTPException(404, "this file exists only for photos, and a scene was opened")
             if error := await asyncio.shield(asyncio.wrap_future(jobs.make(job, file))):
                 raise HTTPException(404, error)
         return FileResponse(path, filename=PurePosixPath(job.name).stem + path.suffix)
@@ -207,7 +207,7 @@ def _saved(upload: UploadFile, folder: Path, stem: str, name: str, suffixes: tup
     """Store an upload under a safe name."""
     suffix = PurePosixPath(upload.filename or "").suffix.lower()
     if suffix not in suffixes:
-        raise HTTPException(415, f"{name}: not a kind of file that is taken here: give {', '.join(suffixes)}")
+        raise HTTPException(415, f"{name}: this kind of file is not accepted: give {', '.join(suffixes)}")
     if not upload.size:
         raise HTTPException(400, f"{name}: the file is empty")
     with (folder / f"{stem}{suffix}").open("xb") as file:
@@ -227,4 +227,4 @@ async def refused(request: Request, error: Any) -> JSONResponse:
 
 
 async def unknown(request: Request, error: Any) -> JSONResponse:
-    return JSONResponse({"error": "there is nothing of that name"}, 404)
+    return JSONResponse({"error": "there is nothing with that name"}, 404)

@@ -68,11 +68,11 @@ class Access(NamedTuple):
         hosts = headers.getlist("host")
         match = HOST.fullmatch(hosts[0].strip()) if len(hosts) == 1 else None
         if match is None or not self._is_own(match[1].lower()):
-            raise HTTPException(403, "this server does not go by that Host name")
+            raise HTTPException(403, "this server does not have that Host name")
         ours = {f"{scheme}://{hosts[0].strip().lower()}" for scheme in ("http", "https")}  # https: through a tunnel
         sites = {site.strip().lower() for site in headers.getlist("sec-fetch-site")}
         if not {origin.strip().lower() for origin in headers.getlist("origin")} <= ours or not sites <= OWN_SITES:
-            raise HTTPException(403, "asked by a page of another site")
+            raise HTTPException(403, "the request comes from a page of another site")
         root, path = scope["root_path"], scope["path"]
         first = path.removeprefix(root).split("/")[1] if path.count("/") > 1 else ""
         if self._is_token(first):
@@ -81,7 +81,7 @@ class Access(NamedTuple):
         if not may_ask and not self._is_token(headers.get("authorization", "").removeprefix("Bearer ")):
             closed = "this page takes no photos: it was opened without a token"
             raise HTTPException(
-                401, "this needs the token that the server said as it started" if self.token else closed
+                401, "this needs the token that the server printed when it started" if self.token else closed
             )
         return scope
 

@@ -43,11 +43,11 @@ class SceneState(BaseModel):
     id: str
     name: str
     state: Literal["queued", "running", "done", "failed"] = "queued"
-    stage: str | None = Field(default=None, description="What is done now.")
-    share: float | None = Field(default=None, description="How much of the stage is done, 0 to 1, where it is known.")
-    line: str | None = Field(default=None, description="What was said last.")
+    stage: str | None = Field(default=None, description="The stage in progress.")
+    share: float | None = Field(default=None, description="Fraction of the stage that is done, 0 to 1, if known.")
+    line: str | None = Field(default=None, description="The latest log message.")
     error: str | None = Field(default=None, description="Why it failed, in a line.")
-    files: list[str] = Field(default=[], description="What lies there; of a scene that is done more can be had.")
+    files: list[str] = Field(default=[], description="Existing files; a finished scene can make more.")
     created: float = Field(default_factory=time.time, description="Seconds since 1970.")
     ended: float | None = None
 
@@ -194,7 +194,7 @@ class Jobs:
             job.save()
             error = process.do((job, None), lambda event: self._tell(id, event))
         except (OSError, InputError) as problem:
-            error = f"{job.name}: cannot be kept here: {reason_in_a_line(problem)}"
+            error = f"{job.name}: cannot be stored here: {reason_in_a_line(problem)}"
         if error == DIED:
             self._closed.wait(1)  # the end of a whole service may reach this process before us
         self._running.pop(id, None)

@@ -51,19 +51,19 @@ class SceneOptions(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    base: str | None = Field(None, max_length=80, description="One of the server's bases; the server's own where null.")
-    depth_kind: DepthKind = Field("auto", description="What the numbers of the depth map are.")
+    base: str | None = Field(None, max_length=80, description="One of the server's bases; null: its default.")
+    depth_kind: DepthKind = Field("auto", description="What the numbers in the depth map mean.")
     disparity: float | None = Field(None, ge=0, le=MAX_DISPARITY, description="How far the camera moves; 0.3 is large.")
     trajectory: TrajectoryKind = Field("rotate-forward", description="Camera path of the video.")
     frames: int = Field(
-        round(SECONDS * DEFAULT_FPS), ge=1, le=MAX_FRAMES, description="Frames of the video, 30 a second."
+        round(SECONDS * DEFAULT_FPS), ge=1, le=MAX_FRAMES, description="Number of frames of the video, 30 per second."
     )
-    fill: Fill = Field("auto", description="Texture of what fills the holes.")
+    fill: Fill = Field("auto", description="Source of the texture in the holes.")
     focal_px: float | None = Field(None, gt=0, description="Focal length in pixels of the photo.")
     focal_mm: float | None = Field(None, gt=0, description="Focal length in mm, 35 mm equivalent.")
     fov: float | None = Field(None, gt=0, lt=180, description="Horizontal field of view in degrees.")
     keep_frame: bool = Field(False, description="Keep a uniform frame around the picture.")
-    files: list[FileName] = Field(MADE, description="What is made before the job is done.")
+    files: list[FileName] = Field(MADE, description="Files to make before the job is done.")
 
 
 @dataclasses.dataclass
@@ -127,7 +127,7 @@ class SceneWork:
 
     def _make(self, target: Path, scene: Scene, job: Job, options: SceneOptions) -> None:
         if target.name == REPORT:
-            raise InputError(f"{job.name}: has no report: it was a scene already")
+            raise InputError(f"{job.name}: has no report, because it was opened as a scene")
         if target.suffix == ".mp4":
             kind = next((kind for kind in TRAJECTORIES if kind == target.stem), options.trajectory)
             scene.save_video(target, kind, frames=options.frames, renderer=get_renderer(self.base.device))

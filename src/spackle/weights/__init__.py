@@ -53,7 +53,9 @@ def weights_folder() -> Path:
 
     InputError if neither variable is set and the user has no home folder.
     """
-    with reading("downloaded weights", "there is no home folder for them: name one in SPACKLE_WEIGHTS", RuntimeError):
+    with reading(
+        "downloaded weights", "there is no home folder for them: name a folder in SPACKLE_WEIGHTS", RuntimeError
+    ):
         if chosen := os.environ.get("SPACKLE_WEIGHTS"):
             return Path(chosen).expanduser()
         cache = Path(os.environ.get("XDG_CACHE_HOME", ""))
@@ -80,7 +82,7 @@ def check_undamaged(path: Path) -> None:
     entry = published_as(path)
     if entry is not None and file_digest(path) != entry.sha256:
         again = f"delete it and run `spackle weights get {entry.name}`"
-        raise InputError(f"{path}: damaged, for its SHA-256 is not the published one: {again}")
+        raise InputError(f"{path}: damaged, because its SHA-256 is not the published one: {again}")
 
 
 def weights_digest(path: Path) -> str:

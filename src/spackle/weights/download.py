@@ -53,7 +53,7 @@ def download(url: str, path: str | os.PathLike[str], size: int, sha256: str, pro
                     return
                 part.unlink()
                 if not continued:
-                    raise InputError(f"{url}: what came has not the SHA-256 {sha256}: take another address")
+                    raise InputError(f"{url}: wrong content, not the SHA-256 {sha256}: give another address")
     except BlockingIOError as error:
         raise InputError(f"{path}: another process is downloading this file: wait until it is done") from error
     except OSError as error:
@@ -70,8 +70,8 @@ def check_url(url: str) -> None:
             return
     if "@" in url:
         raise InputError(
-            "an address with a user name or password in it (not shown): spackle logs in nowhere, nor by ~/.netrc: "
-            "give an address that works without"
+            "an address with a user name or password in it (not shown): spackle does not log in, not even with "
+            "~/.netrc: give an address that needs no login"
         )
     raise InputError(f"{url!r}: not an address to download from: give one that begins with https:// or http://")
 
@@ -90,7 +90,7 @@ def _receive(url: str, part: Path, size: int, progress: Progress) -> None:
         except Dropped as error:
             done = _size(part)
             if not pauses or done == kept:
-                remark = f" (what has come is kept: {done:,} bytes)" if done else ""
+                remark = f" ({done:,} bytes have arrived and are kept)" if done else ""
                 raise InputError(f"{url}: {error}{remark}") from error
             time.sleep(pauses.pop(0))
 
@@ -155,7 +155,7 @@ def _first_byte(url: str, response: HTTPResponse, there: int, size: int) -> int:
     elif response.status == 200 and response.headers.get_content_type() != "text/html":
         done, total = 0, size if response.length is None else response.length
     else:
-        raise InputError(f"{url}: the server answers with something else than a file: check the address in a browser")
+        raise InputError(f"{url}: the server's answer is not a file: check the address in a browser")
     if total != size:
-        raise InputError(f"{url}: another file: {total:,} bytes, {size:,} were published: give another address")
+        raise InputError(f"{url}: another file: {total:,} bytes, the published one has {size:,}: give another address")
     return done
