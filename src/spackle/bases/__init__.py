@@ -1,4 +1,4 @@
-"""What every base promises; `settings` says what may be named, and `open` opens it."""
+"""The interface of every base; `settings` lists the bases that `--base` can name, and `open` opens them."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from spackle.gaussians import Gaussians
 from spackle.image import Photo, film_to_pixels
 
 Progress = Callable[[int, int], None]  # (steps done, of how many)
-USUAL_DISPARITY = 0.3  # how far a camera goes where neither a person nor the base says; the paper's S1
-UNCOVERED = 0.125  # of the widest views, where nobody says how far a camera goes; more, and the fill meets the eye
+USUAL_DISPARITY = 0.3  # how far a camera goes if neither the user nor the base decides it; the paper's S1
+UNCOVERED = 0.125  # share of the widest views that may be holes if the user sets no disparity; more is conspicuous
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,9 +24,9 @@ class BasePrediction:
     gaussians: Gaussians
     camera: Camera  # the photo's, at its working size
     notes: dict[str, float | int | str]  # for the report: what was measured, filled or assumed
-    lens_source: str = ""  # who gave the camera's lens, where it is not the photo's file or a person
-    disparity: float = USUAL_DISPARITY  # how far a camera goes at most where nobody says: so far this geometry is right
-    uncovered: float = UNCOVERED  # share of the widest views that may be holes, where nobody says how far it goes
+    lens_source: str = ""  # where the focal length comes from, if not from the photo's file or the user
+    disparity: float = USUAL_DISPARITY  # limit of the move if the user sets none: up to here the geometry is right
+    uncovered: float = UNCOVERED  # share of the widest views that may be holes, if the user sets no disparity
 
 
 class Base(Protocol):
@@ -44,19 +44,19 @@ class Base(Protocol):
         ...
 
 
-SEEN_LENSES_MM = (10.0, 600.0)  # 35 mm equivalents that a network is believed to see in a photo: 130° to 4°
+SEEN_LENSES_MM = (10.0, 600.0)  # 35 mm equivalents between which a network's estimate is believed: 130° to 4°
 
 
 def believed_lens(focal_px: float, width: int, height: int) -> bool:
-    """Whether a photo of that size may have the focal length that a network sees in it."""
+    """Whether a focal length that a network estimates is plausible for a photo of this size."""
     shortest, longest = (film_to_pixels(mm, width, height) for mm in SEEN_LENSES_MM)
     return shortest <= focal_px <= longest
 
 
-NEAREST_M = 1.5  # an arm's length and a half
-NEAREST_QUANTILE = 0.999  # trajectories take the 0.1 % nearest for the nearest depth; beyond are specks
+NEAREST_M = 1.5  # where the nearest surface of relative depth is placed: an arm's length and a half
+NEAREST_QUANTILE = 0.999  # trajectories use this quantile as the nearest depth, too; anything nearer is specks
 
 
 def nearest(values: Tensor) -> Tensor:
-    """The inverse depth [], a high quantile of [N], that is placed at `NEAREST_M`."""
+    """The inverse depth [] that is placed at `NEAREST_M`: a high quantile of `values` [N]."""
     return values.kthvalue(1 + round(NEAREST_QUANTILE * (len(values) - 1))).values

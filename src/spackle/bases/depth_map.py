@@ -33,15 +33,15 @@ RELATIVE: tuple[DepthKind, ...] = ("near-white", "near-black")
 SUFFIXES = (".npy", ".npz", ".png", ".pfm")
 MAX_TEXT_BYTES = 1 << 16  # a calibration is a few lines
 PNG_UNIT_M = 0.001
-LARGEST = 1e9  # in a calibration: single precision holds its square
+LARGEST = 1e9  # largest number in a calibration; its square still fits single precision
 ASPECT_TOLERANCE = 0.01
 CALIBRATED_SIZE_TOLERANCE = 0.02
 MIN_DISTINCT = 16  # fewer values may share a divisor by chance
-FAR_M = 15.0  # where the farthest of a relative map is put
-EXTREMES = (0.01, 0.99)  # quantiles that count as these
-STRETCH = 4.0  # what lies beyond goes on in the same way, up to this factor nearer or farther
+FAR_M = 15.0  # where the farthest surface of a relative map is placed
+EXTREMES = (0.01, 0.99)  # quantiles that count as the extremes
+STRETCH = 4.0  # values beyond these quantiles are mapped alike, up to this factor nearer or farther
 FILLED = 0.05  # a PNG whose values come this close to both ends of the 16 bits is a relative map, not millimetres
-GREY = 8  # of 255: the channels of a picture in greys differ by less, whatever compressed it
+GREY = 8  # of 255: the channels of a grey picture differ by less, even after lossy compression
 WHICH = "give --depth-kind near-white (as MiDaS, Depth Anything and ComfyUI write it), near-black or metric"
 
 
@@ -51,15 +51,15 @@ class DepthMap:
 
     depth: Tensor  # [H, W] float32 z in metres; 0 where not valid
     valid: Tensor  # [H, W] bool
-    K: Tensor | None  # [3, 3] intrinsics in pixels of this map, as the calibration says them
+    K: Tensor | None  # [3, 3] intrinsics in pixels of this map, from its calibration
     quantum: float | None  # step of integer values: metres of depth, or 1/m of inverse depth
     quantity: Quantity  # what was stored, hence the unit of `quantum`
     path: Path
-    note: str = ""  # for the report: what a photo's own depth map was
+    note: str = ""  # for the report: the kind of depth map that was inside a photo
 
     @property
     def range_in_words(self) -> str:
-        """How near and how far it is, in metres."""
+        """The range of the depths, in words."""
         near, middle, far = np.quantile(self.depth[self.valid].numpy(), [EXTREMES[0], 0.5, EXTREMES[1]])
         return f"{near:.3g} m near, {middle:.3g} m median, {far:.3g} m far"
 
@@ -73,8 +73,8 @@ class DepthMap:
             )
 
     def with_focal(self, focal_px: float) -> DepthMap:
-        """The map of another lens: replaces the focal length of `K`, in pixels of the map."""
-        if self.K is None or self.quantity == "depth" or self.note:  # metres that depend on no lens
+        """The map with another focal length, in pixels of the map; depths that come from disparity are scaled along."""
+        if self.K is None or self.quantity == "depth" or self.note:  # these metres do not depend on the lens
             return dataclasses.replace(self, K=None)
         # depth = baseline · focal / disparity
         K, ratio = self.K.clone(), focal_px / float(self.K[0, 0])
@@ -84,10 +84,10 @@ class DepthMap:
 
 
 def find_depth(depth: Path, photo: Path) -> Path:
-    """The depth map of a photo: the file, or the one in a folder that has the photo's name; InputError without any."""
+    """A photo's depth map: the file `depth`, or a file with the photo's name in the folder `depth`; else InputError."""
     if not os.path.isdir(depth):
         return depth
-    for name in (photo.name, photo.stem):  # a.jpg.npy before a.npy, which a.png may mean too
+    for name in (photo.name, photo.stem):  # a.jpg.npy before a.npy, which may belong to a.png
         for suffix in SUFFIXES:
             candidate = depth / f"{name}{suffix}"
             if os.path.isfile(candidate) and candidate.resolve() != photo.resolve():
@@ -110,23 +110,23 @@ def load_depth(
     Depth: `.npy`, `.npz` (one array, or the key `depth`) and `.pfm` in metres, with 0, NaN and inf for
     unknown; 16-bit `.png` in millimetres, with 0 and 65535 for unknown. The content decides the format.
 
-    Disparity d, turned into depth = baseline · focal / (d + doffs), inf (in a PNG also 0) for unknown:
-    where `calib` is given, where a `scene.json` in the same folder names the file as its `disparity`,
-    or where the file's name starts with "disp" and a Middlebury `calib.txt` lies beside it.
+    Disparity d becomes depth = baseline · focal / (d + doffs), with inf (in a PNG also 0) for unknown. A file holds
+    disparity if `calib` is given, if a `scene.json` in the same folder names the file as its `disparity`, or if the
+    file's name starts with "disp" and a Middlebury `calib.txt` lies beside it.
 
-    Relative: the same formats, and any picture in greys; see `relative_depth`.
+    Relative: the same formats, and any grey picture; see `relative_depth`.
 
     Args:
         path: the file.
         focal_px: replaces the calibration's focal length, in pixels of the map.
         calib: a Middlebury `calib.txt` or a `scene.json`.
-        kind: what the numbers are; auto: metric, or disparity as above, and no relative map.
+        kind: what the numbers are; auto means disparity under the conditions above, else metric, never relative.
         near: metres at which a relative map begins.
-        far: metres at which it ends.
+        far: metres at which a relative map ends.
 
     Raises:
-        InputError: a missing, broken, too large, misshapen, negative or entirely unknown map; with the kind auto one
-            that looks relative.
+        InputError: the map is missing, broken, too large, misshapen, negative or entirely unknown, or it looks
+            relative and `kind` is auto.
     """
     check_file(path, "depth map")
     if kind in RELATIVE:
@@ -146,7 +146,7 @@ def load_depth(
 
 
 def depth_of_array(stored: Array, path: Path, kind: DepthKind = "auto") -> DepthMap:
-    """The depth map of an array [H, W]: metres with 0, NaN and inf for unknown, or relative; `path` is for messages."""
+    """A depth map from an array [H, W] of metres (0, NaN, inf: unknown) or relative values; `path` is for messages."""
     if stored.ndim != 2 or not stored.size or stored.dtype.kind not in "fiu":
         raise InputError(f"{path}: an array of {stored.dtype} {shown(stored.shape)}: give [height, width] in metres")
     return relative_depth(stored, kind, path) if kind in RELATIVE else _depth_map(stored, False, None, path)
@@ -158,12 +158,12 @@ def _depth_map(stored: Array, is_png: bool, lens: Calibration | None, path: Path
         raise InputError(f"{path}: {negative} of {values.size} values are negative: mark unknown pixels with 0 or NaN")
     quantity: Quantity = "depth" if lens is None else "disparity"
     depth, valid, unit = _as_disparity(stored, is_png, lens, path) if lens else _as_depth(stored, is_png, path)
-    with np.errstate(over="ignore"):  # too far for float32 becomes inf, hence unknown
+    with np.errstate(over="ignore"):  # a depth too large for float32 becomes inf, hence unknown
         metres = torch.from_numpy(depth.astype(np.float32))
     known = torch.from_numpy(valid) & is_depth(metres)
     if not known.any():
         raise InputError(f"{path}: all-invalid: not one of {values.size} pixels has a {quantity}")
-    integers = stored.dtype.kind in "iu" or lens is not None  # whole metres as floats mean nothing
+    integers = stored.dtype.kind in "iu" or lens is not None  # floats that happen to be whole metres have no step
     step = grid_step(values[known.numpy()]) if integers else None
     quantum = None if step is None else step * unit
     return DepthMap(metres.where(known, 0.0), known, None if lens is None else lens.K, quantum, quantity, path)
@@ -177,11 +177,11 @@ def relative_depth(
     far: float = FAR_M,
     step: float | None = None,
 ) -> DepthMap:
-    """Numbers [H, W] that are inverse depth (near-white) or depth (near-black), up to scale and shift, as metres.
+    """Convert inverse depth (near-white) or depth (near-black) [H, W], known up to scale and shift, to metres.
 
-    Their 1 % and 99 % quantiles are put at `near` and `far`; NaN and inf are unknown. `step` is the quantisation step
-    of numbers that were stored as integers. InputError, naming `path`, if all depths are equal, or `near` and `far`
-    give no range.
+    The 1 % and 99 % quantiles are mapped to `near` and `far`; NaN and inf are unknown. `step` is the quantisation step
+    of numbers that were stored as integers. InputError, naming `path`, if nearly all depths are equal, or unless
+    0 < `near` < `far`.
     """
     if not 0 < near < far < LARGEST:
         raise InputError(f"--near {near:g}, --far {far:g}: give two distances in metres, the nearer one first")
@@ -204,14 +204,14 @@ def relative_depth(
 
 
 def _check_metric(stored: Array, path: StrPath) -> None:
-    """InputError for a PNG that holds no millimetres."""
+    """InputError if a PNG's values fill the range of 16 bits, as those of a relative map do and millimetres do not."""
     known = stored[(stored > 0) & (stored < 65535)]
     if known.size and known.min() < FILLED * 65535 and known.max() > (1 - FILLED) * 65535:
         raise InputError(f"{path}: its values fill the range of 16 bits, as those of a relative map do: {WHICH}")
 
 
 def is_depth(metres: Tensor) -> Tensor:
-    """Mask of valid depths: positive, with a finite inverse (a file with swapped bytes has many that are not)."""
+    """Mask of valid depths: positive, with a finite inverse, which many values of a byte-swapped file lack."""
     return torch.isfinite(metres) & (metres > 0) & torch.isfinite(1 / metres)
 
 
@@ -226,7 +226,7 @@ class Calibration:
     baseline_m: float
     scale: float = 1.0  # disparity in pixels = stored value · scale
     invalid: float = math.inf  # stored value for "unknown"
-    size: tuple[int, int] | None = None  # (width, height) that the numbers are for
+    size: tuple[int, int] | None = None  # (width, height) of the image that the numbers describe
 
     @property
     def K(self) -> Tensor:
@@ -283,7 +283,7 @@ def _read_calib(path: StrPath) -> Calibration:
 
 
 def _read_scene(path: StrPath, disparity: str | None) -> Calibration | None:
-    """A `scene.json`; None where it is about another file than `disparity`."""
+    """Read a `scene.json`; None if it describes another file than `disparity`."""
     needs = "needs focal_px, cx, cy, doffs_px and baseline_m as JSON numbers"
     with reading(path, f"not a scene description: {needs}"):
         scene = json.loads(read_text(path))
@@ -295,7 +295,7 @@ def _read_scene(path: StrPath, disparity: str | None) -> Calibration | None:
 
 
 def read_text(path: StrPath, kind: str = "calibration", at_most: int = MAX_TEXT_BYTES) -> str:
-    """A short text file; InputError where it is missing, or has more than `at_most` bytes."""
+    """Read a short text file; InputError if it is missing, or has more than `at_most` bytes."""
     if check_file(path, kind) > at_most:
         raise InputError(f"{path}: too long for a {kind}: give another file")
     return Path(path).read_text(encoding="utf-8", errors="replace")
@@ -323,7 +323,7 @@ def _as_disparity(stored: Array, is_png: bool, lens: Calibration, path: StrPath)
     valid = np.isfinite(stored) & (stored != lens.invalid)
     if is_png:
         valid &= stored > 0
-    with np.errstate(all="ignore"):  # what comes out infinite is marked by the caller
+    with np.errstate(all="ignore"):  # the caller marks infinite results
         depth = lens.baseline_m * lens.focal_px / (stored.astype(np.float64) * lens.scale + lens.doffs_px)
     return depth, valid & np.isfinite(depth), lens.scale / (lens.baseline_m * lens.focal_px)
 
@@ -337,9 +337,9 @@ def grid_step(values: Array) -> float | None:
 
 
 def read_array(path: StrPath, *, grey: bool = False) -> tuple[Array, bool]:
-    """The stored numbers [H, W] of any format, and whether they come from a PNG; InputError where it is none.
+    """The stored numbers [H, W] of a depth map, and whether it is a PNG; InputError for an unknown format.
 
-    With `grey` any other picture is read, too, and three equal channels count as one.
+    With `grey`, other picture formats are read too, and three nearly equal channels count as one.
     """
     readers = {b"\x93NUMPY": _read_npy, b"PK\x03\x04": _read_npz, b"Pf": _read_pfm, b"PF": _read_pfm}
     with reading(path, "cannot be decoded ({reason}): the file is damaged or cut off"), open(path, "rb") as file:
@@ -377,7 +377,7 @@ def _png_values(image: Image.Image, path: StrPath, grey: bool) -> Array:
 
 
 def _read_npy(file: IO[bytes], path: StrPath) -> Array:
-    """Read one array of no more bytes than the file holds, whatever its header claims; nothing is unpickled."""
+    """Read one array, but no more bytes than the file holds, whatever its header claims; nothing is unpickled."""
     old = np.lib.format.read_magic(file) == (1, 0)
     read_header = np.lib.format.read_array_header_1_0 if old else np.lib.format.read_array_header_2_0
     shape, fortran, dtype = read_header(file)
@@ -398,7 +398,7 @@ def _read_npz(file: IO[bytes], path: StrPath) -> Array:
 
 
 def _read_pfm(file: IO[bytes], path: StrPath) -> Array:
-    """Rows from the bottom up; the sign of the scale gives the byte order, its size means nothing."""
+    """PFM stores rows from the bottom up; the sign of its scale gives the byte order, the magnitude is ignored."""
     kind, size, scale = (file.readline(64).split() for _ in range(3))
     if kind == [b"PF"]:
         raise InputError(f"{path}: a PFM with three channels is not a depth map: give one channel (Pf)")

@@ -14,9 +14,9 @@ from spackle.filters import far_fill
 from spackle.surface import EDGE
 
 STEEPEST = 5.0  # a surface at 79° to the image plane; only what is steeper may be a smeared edge
-REACH = 16  # pixels of the map from the steepest place to the end of what was smeared, at most
-FLAT = 0.1  # where the slope has fallen so far, in units of its peak, the surface is all but itself again
-SWELL = 0.25  # a rise of the slope by so much of the peak belongs to another edge
+REACH = 16  # most pixels of the map from a smeared edge's steepest place to its end
+FLAT = 0.1  # a smeared edge ends where its slope has fallen to about this share of its peak
+SWELL = 0.25  # a renewed rise of the slope by this share of the peak belongs to another edge
 
 Floats = NDArray[np.float32]
 Bools = NDArray[np.bool_]
@@ -26,19 +26,20 @@ Bools = NDArray[np.bool_]
 class Edges:
     """The depth edges of a map."""
 
-    step: Floats  # [h, w] height in inverse depth of the smeared edge that a pixel hangs in; 0 where it hangs in none
-    across: Bools  # [h, w] an edge runs between a pixel and the one to the right
-    down: Bools  # [h, w] an edge runs between a pixel and the one below
+    step: Floats  # [h, w] height, in inverse depth, of the smeared edge that a pixel lies in; 0 if it lies in none
+    across: Bools  # [h, w] an edge runs between a pixel and the one to its right
+    down: Bools  # [h, w] an edge runs between a pixel and the one below it
 
 
 def find_edges(inverse_depth: Floats, known: Bools, focal: tuple[float, float]) -> Edges:
-    """Depth edges along the rows and the columns of inverse depth [h, w], sharp ones and smeared ones.
+    """Find sharp and smeared depth edges along the rows and the columns of inverse depth [h, w].
 
-    The inverse depth of a plane is linear in the pixel, a crease bends it, a sphere curves it. Only a smeared edge
-    rises from one slope to a peak and falls back to another: a peak that stands out from the slopes on both sides, that
-    is steeper than any surface one sees much of (by the focal length, horizontal and vertical, in pixels of the map),
-    and that raises the depth by more than `EDGE` beyond what those slopes explain. The pixels between both feet of the
-    peak belong to the smeared edge. No edge is found beside unknown pixels (`known` [h, w] false).
+    The inverse depth of a plane is linear in the pixel, a crease bends it, a sphere curves it. Only at an edge does its
+    slope rise to a peak and fall again. A peak is an edge if it exceeds the slopes on both sides, if it is steeper than
+    any surface that fills much of a photo (which depends on `focal`, horizontal and vertical, in pixels of the map),
+    and if it changes the inverse depth by more than the share `EDGE` beyond what those slopes explain. The pixels
+    between the two feet of the peak belong to the smeared edge. No edge is found beside unknown pixels (`known` [h, w]
+    false).
     """
     step, across = _rows(inverse_depth, known, STEEPEST / focal[0])
     columns, below = _rows(np.ascontiguousarray(inverse_depth.T), np.ascontiguousarray(known.T), STEEPEST / focal[1])
@@ -47,11 +48,11 @@ def find_edges(inverse_depth: Floats, known: Bools, focal: tuple[float, float]) 
 
 @kernel
 def _rows(inverse_depth: Any, known: Any, steepest: float) -> Any:
-    """Heights of smeared edges and the edges to the right, by rows."""
+    """Find the edges along rows: `step` and `across` of `Edges`."""
     height, width = inverse_depth.shape
     step = np.zeros((height, width), np.float32)
     across = np.zeros((height, width), np.bool_)
-    gaps = np.empty(width + 1, np.float32)  # gaps[x] lies between x - 1 and x; NaN beside the unknown
+    gaps = np.empty(width + 1, np.float32)  # gaps[x]: the change from x - 1 to x; NaN beside unknown pixels
     for y in range(height):
         row = inverse_depth[y]
         gaps[0] = gaps[width] = np.nan
@@ -78,7 +79,7 @@ def _rows(inverse_depth: Any, known: Any, steepest: float) -> Any:
 
 @kernel
 def _foot(gaps: Any, peak: int, way: int) -> Any:
-    """The slope on one side of an edge, −1 where nothing is known there, and the edge's outermost gap."""
+    """The slope beside an edge on one side (−1 if it is unknown), and the edge's outermost gap on that side."""
     if np.isnan(gaps[peak + way]):
         return np.float32(-1), peak
     sign = np.float32(1 if gaps[peak] > 0 else -1)
@@ -92,10 +93,10 @@ def _foot(gaps: Any, peak: int, way: int) -> Any:
             flattest, end = max(sign * gaps[k], np.float32(0)), k
         if flattest == 0:
             break
-        if 2 * sign * gaps[k] < top:  # a smeared edge ends about twice as far out as it is half as steep
+        if 2 * sign * gaps[k] < top:  # a smeared edge ends about twice as far out as where it is half as steep
             reach = min(reach, 2 * n + 1)
-    # Where the next edge is close, what the foot is short of is little beside what a thin thing would lose;
-    # and a peak with nothing beside it is sharp, though a round thing's rim falls off towards it.
+    # If another edge is close, ending this one a little early is better than cutting into a thin object between them.
+    # And a peak without steep gaps beside it is a sharp edge, even if a round object's rim curves towards it.
     crowded = abs(gaps[end + way]) > FLAT * top
     foot = peak
     while (end - foot) * way > 1:
@@ -106,8 +107,8 @@ def _foot(gaps: Any, peak: int, way: int) -> Any:
     return flattest, foot
 
 
-SLOPE_REACH = 3  # pixels of the map beside an edge in which its side's slope is sought
-HOLE, OPEN, SETTLED = 0, 1, 2  # what is known of a pixel's depth: nothing, no more than its two sides, all
+SLOPE_REACH = 3  # pixels of the map beside an edge within which the slope of that side is sought
+HOLE, OPEN, SETTLED = 0, 1, 2  # a pixel's depth is unknown, that of one of an edge's two sides, or known
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,17 +117,17 @@ class Sampled:
 
     inverse_depth: Floats  # [H, W]
     state: NDArray[np.uint8]  # [H, W] HOLE, OPEN or SETTLED
-    step: Floats  # [H, W] height of the edge that an open pixel hangs in
-    slope: tuple[Floats, Floats]  # [H, W] each: change of the inverse depth by pixel x and y, as flat as it is near
+    step: Floats  # [H, W] height of the edge that an open pixel lies in
+    slope: tuple[Floats, Floats]  # [H, W] each: change of the inverse depth by pixel x and y, the flattest nearby
 
 
 def sample(inverse_depth: Floats, known: Bools, edges: Edges, height: int, width: int) -> Sampled:
     """Resample a map's inverse depth [h, w], where known [h, w], to height×width.
 
-    Between four pixels of one surface the inverse depth is bilinear, so a plane stays a plane. Where an edge runs
-    between them, or one belongs to a smeared edge, the photo's pixel stays open unless it covers a valid pixel of the
-    map, whose depth is then extended along its surface. Where unknown pixels have more than half of the weight, the
-    photo's pixel is a hole, unless it covers one that is known.
+    Between four map pixels of one surface the inverse depth is interpolated bilinearly, so a plane stays a plane. If an
+    edge runs between them, or one of them lies in a smeared edge, the photo's pixel stays open; but if it covers a map
+    pixel outside of smeared edges, it gets that pixel's depth, extended along its surface. If unknown map pixels have
+    more than half of the weight, the photo's pixel is a hole, unless it covers such a map pixel.
     """
     sound = known & (edges.step == 0)
     across = _flattest(inverse_depth, sound, edges.across)
@@ -144,7 +145,7 @@ def sample(inverse_depth: Floats, known: Bools, edges: Edges, height: int, width
 
 @kernel
 def _flattest(inverse_depth: Any, sound: Any, edge: Any) -> Any:
-    """The flattest slope within reach along the row, because the slope right beside a smeared edge is too steep."""
+    """The flattest slope near each pixel along its row, because the slope right beside a smeared edge is too steep."""
     height, width = inverse_depth.shape
     slope = np.zeros((height, width), np.float32)
     for y in range(height):
@@ -202,35 +203,34 @@ def _sample(
                 if steps[r, c] == 0 and away < closest:
                     here, closest = np.float32(plane), away
             if mass < 0.5 * total:
-                if closest < 0.5 + 1e-6:  # the only one that is known of those that the photo's pixel covers
+                if closest < 0.5 + 1e-6:  # the photo's pixel covers this known map pixel
                     values[y, x], state[y, x] = here, SETTLED
                 continue
             state[y, x] = SETTLED
             if not between and step == 0:
                 values[y, x] = max(bilinear, 0.5 * low) if count == 4 else planes / mass
-            elif closest < 0.5 + 1e-6:  # no pixel of the photo is closer to that pixel of the map
+            elif closest < 0.5 + 1e-6:  # no other pixel of the photo is closer to that map pixel
                 values[y, x] = here
             else:
                 values[y, x], state[y, x], heights[y, x] = mixed / mass, OPEN, max(step, high - low)
     return values, state, heights
 
 
-CHANGE_COST = 35.0  # pixels of detour that a channel's change from 0 to 1 is worth, or the way across a smeared edge
-NEAR_COST = 300.0  # and a start of a hole's filling that is far too near
+CHANGE_COST = 35.0  # cost, in pixels of path, of a channel's change from 0 to 1, or of crossing a smeared edge
+NEAR_COST = 300.0  # and of filling a hole from a pixel that is far too near
 
 
 def settle(sampled: Sampled, rgb: Floats) -> Floats:
-    """Give every open pixel, then every hole, the depth of the known pixel that the cheapest path in the photo leads
-    to.
+    """Give every open pixel, then every hole pixel, the depth of the known pixel to which its cheapest path leads.
 
-    A path over the image costs its length and the change of sRGB [H, W, 3] along it, so that a depth spreads within
-    things and stops at their outlines. In a smeared edge it also costs the change of the smeared depth, so that a path
-    ends in its middle if the photo shows no outline; there the depth of a side is extended along its surface. In a hole
-    a start nearer than the hole's far side costs extra, because most holes are background that a second camera could
-    not see.
+    A path over the photo costs its length plus the change of sRGB [H, W, 3] along it, so that depth spreads within
+    objects and stops at their outlines. In a smeared edge the change of the smeared depth is added, so that the paths
+    from both sides meet in its middle if the photo shows no outline; the depth of each side is extended along its
+    surface. In a hole, a start pixel nearer than the hole's far side costs extra, because most holes are background
+    that is hidden from a second camera.
 
     Returns:
-        Inverse depth [H, W]; settled pixels as they were.
+        Inverse depth [H, W]; settled pixels are unchanged.
     """
     depth, hole = sampled.inverse_depth.copy(), sampled.state == HOLE
     for state in (OPEN, HOLE):
@@ -262,16 +262,16 @@ def color_change(rgb: Any, y: int, x: int, v: int, u: int) -> Any:
 
 @kernel
 def _spread(cost: Any, source: Any, depths: Any, steps: Any, far: Any, rgb: Any, pixels: Any) -> None:
-    """For each given pixel, the start (as y·W + x) that the cheapest path leads to, and that path's cost.
+    """Find, in place, each given pixel's cheapest path: its cost, and the start that it leads to, as y·W + x.
 
-    Initially starts cost 0, all other pixels infinity, and each pixel is its own source.
+    At first each start has cost 0, every other pixel has infinite cost, and each pixel is its own source.
     """
     height, width = depths.shape
     way, changed, before = -1, True, True
     while changed or before:
         before, changed = changed, False
         for i in range(len(pixels)):
-            n = pixels[i if way < 0 else len(pixels) - 1 - i]  # neighbours on that side are visited already
+            n = pixels[i if way < 0 else len(pixels) - 1 - i]  # the neighbours tried below are already visited
             y, x = n // width, n % width
             for k in range(4):
                 v, u = (y + way, x + k - 1) if k < 3 else (y, x + way)

@@ -1,6 +1,6 @@
-"""Gaussians of a photo whose every pixel has a depth: one for each or for a tile, two at silhouettes, and a backing.
+"""Turn a photo with a depth at every pixel into Gaussians: one a pixel or tile, two at silhouettes, and a backing.
 
-Together they blend to what the photo shows.
+Together they blend to the photo.
 """
 
 from __future__ import annotations
@@ -24,30 +24,30 @@ from spackle.gaussians import Gaussians
 from spackle.surface import BEHIND, CREASE, EDGE, OPACITY, PIXEL_SPREAD, surface_gaussians, surface_slope
 
 # Blobs of half a pixel reproduce the photo sharply, but light passes between them. Blobs wide enough to
-# close the surface would blur it. So a coarse backing, one blob for 2×2 pixels or more, closes it from behind:
-# 2 dB sharper at the photo's camera than one layer of wider blobs.
-TILE_SPREAD = 0.55  # standard deviation of a tile's Gaussian, and of the backing's for 2×2 pixels, in its sides
-LARGE_BACKING_SPREAD = 0.65  # of the backing's larger ones, which keep away from depth steps
-RIM_BACKING_SPREAD = 0.42  # of the backing at a near surface's rim, beyond which it would be seen from beside
-BACKING_SIDES = 2  # along a slanted surface, by which the backing stands behind, so that none pokes through
-WORTH = 0.012  # the squared difference in sRGB that one Gaussian is worth, over the photo's detail
+# close the surface would blur it. So a coarse backing, one blob for 2×2 pixels or more, closes it from behind.
+# At the photo's camera this is 2 dB sharper than one layer of wider blobs.
+TILE_SPREAD = 0.55  # standard deviation, in units of the side, of a tile's Gaussian and of a 2×2 one in the backing
+LARGE_BACKING_SPREAD = 0.65  # the same for the backing's larger Gaussians, which lie away from depth steps
+RIM_BACKING_SPREAD = 0.42  # the same for the backing at a near surface's rim; wider, it would show past the rim
+BACKING_SIDES = 2  # the backing recedes by the depth change over this many of its sides, to not poke through
+WORTH = 0.012  # squared sRGB difference that justifies one Gaussian, in units of the photo's detail
 LEAST_WORTH, MOST_WORTH = 1e-5, 2e-4
-BACKING_SHARE = 0.02  # of a difference in the backing that shows
-LEAST_MIXED = 0.05  # share of a pixel that a surface covers, to have a Gaussian there
-SWEEPS = 3  # corrections of the colours, and of opacities
+BACKING_SHARE = 0.02  # share of a difference in the backing that shows through
+LEAST_MIXED = 0.05  # least share of a pixel that a surface must cover to have a Gaussian there
+SWEEPS = 3  # iterations that correct colours, and those that correct opacities
 
 
 def layered_gaussians(inverse_depth: Tensor, colors: Tensor, camera: Camera, levels: int = LEVELS) -> Gaussians:
-    """At most 2.25 Gaussians a pixel, and about one, which blend to the photo from its camera.
+    """Gaussians, about one and at most 2.25 per pixel, that blend to the photo when seen from its camera.
 
-    The order is: single pixels in row-major order, on the surface that covers most of the pixel; tiles of up to 8×8
+    Their order is: single pixels in row-major order, on the surface that covers most of the pixel; tiles of up to 8×8
     pixels, where picture and depth allow them; the other surface of mixed pixels; the backing.
 
     Args:
         inverse_depth: [H, W], positive everywhere.
         colors: [H, W, 3] linear RGB.
         camera: the photo's.
-        levels: number of tile sizes; 0 for a Gaussian a pixel and a backing Gaussian for 2×2.
+        levels: number of tile sizes; 0 gives one Gaussian per pixel and one backing Gaussian per 2×2 pixels.
     """
     slope = surface_slope(inverse_depth)
     layers = find_layers(*(image.contiguous().numpy() for image in (inverse_depth, slope, colors)))
@@ -61,7 +61,7 @@ def layered_gaussians(inverse_depth: Tensor, colors: Tensor, camera: Camera, lev
     rest = pixels.rest.pixels(pixels.mixed, camera)
     parts = [pixels.most.pixels(single, camera), *front, rest, *_backing(pixels, worth, levels)]
     samples = _Samples(*(torch.cat(tensors) for tensors in zip(*parts, strict=True)))
-    corrected = _inner(ring != 1)[single]  # beside a step and at the border it would show as a ghost from beside
+    corrected = _inner(ring != 1)[single]  # beside a step or at the border it would show as a ghost in other views
     return surface_gaussians(camera, *_fitted(samples, colors, single, corrected, tiles))
 
 
@@ -77,11 +77,10 @@ class _Samples(NamedTuple):
 
 
 def _fitted(samples: _Samples, colors: Tensor, single: Tensor, corrected: Tensor, tiles: Sequence[Tiles]) -> _Samples:
-    """Correct the colours of tiles and of some single pixels by the difference between `colors` and the blended
-    picture.
+    """Correct the colours of tiles and of some single pixels by how much the blended picture differs from `colors`.
 
-    The blended picture is what the photo's camera sees, nearer Gaussians first. `corrected` [number of single pixels]
-    bool.
+    The blended picture is what the photo's camera sees. `corrected` [number of single pixels] bool chooses the single
+    pixels.
     """
     fitted = samples.color.clone()
     order = samples.depth.argsort(descending=True, stable=True)
@@ -95,7 +94,7 @@ def _fitted(samples: _Samples, colors: Tensor, single: Tensor, corrected: Tensor
 
 
 class _Surface(NamedTuple):
-    """A surface in each pixel."""
+    """One surface for each pixel."""
 
     depth: Tensor  # [H, W] inverse
     slope: Tensor  # [H, W, 2]
@@ -103,18 +102,21 @@ class _Surface(NamedTuple):
     opacity: Tensor  # [H, W]
 
     def instead(self, where: Tensor, other: _Surface) -> _Surface:
-        """The surfaces with near and far exchanged at the given pixels [H, W]."""
+        """These surfaces, replaced by `other` at the pixels `where` [H, W] bool."""
         images = zip(other, self, strict=True)
         return _Surface(*(torch.where(where if a.ndim == 2 else where[..., None], a, b) for a, b in images))
 
     def pixels(self, where: Tensor, camera: Camera) -> _Samples:
-        """A Gaussian for each of some pixels [H, W], in row-major order."""
+        """A Gaussian for each of the pixels `where` [H, W] bool, in row-major order."""
         uv = camera.pixel_centers()[where]
         depth, slope, color, opacity = (image[where] for image in self)
         return _Samples(uv, depth, slope, torch.full_like(uv, PIXEL_SPREAD), color, opacity)
 
     def samples(self, tiles: Tiles, spread: float, pixels: int = 1) -> _Samples:
-        """An opaque Gaussian for each tile, `spread` of its sides wide; a cell of the surface is `pixels` wide."""
+        """An opaque Gaussian for each tile, with `spread` of its sides as standard deviations.
+
+        A cell of the surface, in which tiles are measured, is `pixels` pixels wide.
+        """
         depth, slope, color = (tiles.means(image) for image in (self.depth, self.slope, self.color))
         opacity = torch.full_like(depth, float(OPACITY))
         sides = torch.tensor([tiles.width, tiles.height]) * (spread * pixels)
@@ -127,12 +129,12 @@ class _Pixels(NamedTuple):
     most: _Surface  # the one that covers most of a pixel
     rest: _Surface  # the other one, where `mixed`
     mixed: Tensor  # [H, W] bool
-    near: Tensor  # [H, W] bool: `most` is the near one of both
+    near: Tensor  # [H, W] bool: `most` is the nearer of the two
     edge: Tensor  # [H, W] bool: a depth step is close
 
 
 def _split(layers: Layers, colors: Tensor) -> _Pixels:
-    """A pixel is mixed if each surface covers at least `LEAST_MIXED` of it; else one surface covers all of it."""
+    """The surfaces of each pixel: two if each covers at least `LEAST_MIXED` of it (mixed), else one covers it all."""
     ring, alpha = torch.from_numpy(layers.ring), torch.from_numpy(layers.alpha)
     near = alpha >= 0.5
     mixed = torch.minimum(alpha, 1 - alpha) >= LEAST_MIXED
@@ -146,10 +148,10 @@ def _split(layers: Layers, colors: Tensor) -> _Pixels:
 
 
 def _backing(pixels: _Pixels, worth: float, levels: int) -> list[_Samples]:
-    """A wide Gaussian for each 2×2 pixels, behind the farthest of them and along its surface; larger ones in flat
-    areas.
+    """A wide Gaussian behind each cell of 2×2 pixels, along its farthest pixel's surface; larger ones in flat areas.
 
-    A cell has none if it holds pixels of both surfaces, or only the far part of mixed pixels lies behind it.
+    A cell has none if it holds pixels of both surfaces, or if its farthest surface is only the far part of mixed
+    pixels.
     """
     behind = pixels.mixed & pixels.near
     deepest = pixels.most.instead(behind, pixels.rest)
@@ -158,7 +160,7 @@ def _backing(pixels: _Pixels, worth: float, levels: int) -> list[_Samples]:
         return []
     far, pick = cells.min(dim=-1)
     slope = _cells(deepest.slope).gather(2, pick[..., None, None].expand(*pick.shape, 1, 2)).squeeze(2)
-    # The cell's centre lies half a pixel from the farthest pixel's.
+    # The cell's centre lies half a pixel from the farthest pixel's centre.
     offset = torch.stack([0.5 - pick % 2, 0.5 - pick // 2], dim=-1)
     at_center = (far + (slope * offset).sum(-1)).clamp_min(0.5 * far.min())
     # Its colour is the mean of the pixels on that surface.
@@ -177,14 +179,14 @@ def _backing(pixels: _Pixels, worth: float, levels: int) -> list[_Samples]:
 
 
 def _receded(samples: _Samples, tiles: Tiles) -> _Samples:
-    """Place the backing behind the front; `tiles` are of cells."""
+    """Move the backing behind the front Gaussians; `tiles` are measured in cells of 2×2 pixels."""
     reach = 2 * BACKING_SIDES * torch.tensor([tiles.width, tiles.height])
     recede = 1 - BEHIND - (reach * samples.slope.abs()).sum(-1) / samples.depth
     return samples._replace(depth=samples.depth * recede, slope=samples.slope * recede[:, None])
 
 
 def _inner(free: Tensor) -> Tensor:
-    """[H, W] bool without the picture's border, beyond which the Gaussians of tiles would reach."""
+    """[H, W] bool: the mask, false on the image's border, where a tile's Gaussian would reach beyond the image."""
     inner = torch.zeros_like(free)
     inner[1:-1, 1:-1] = free[1:-1, 1:-1]
     return inner
@@ -198,14 +200,14 @@ def _cells(image: Tensor) -> Tensor:
 
 
 WEIGHTS = np.exp(-0.5 / PIXEL_SPREAD**2 * np.array([2, 1, 2, 1, 0, 1, 2, 1, 2])).astype(np.float32)  # of 3×3 neighbours
-FAINT, STOP = np.float32(1 / 255), np.float32(1e-4)  # the renderer's: alphas that it skips, light at which it stops
+FAINT, STOP = np.float32(1 / 255), np.float32(1e-4)  # the alpha that the renderer skips, the transmittance that stops it
 REACH = np.sqrt(-2 * np.log(FAINT))  # standard deviations at which an alpha becomes faint
 
 
 def blended_opacities(alpha: Floats, ring: NDArray[np.uint8]) -> Floats:
-    """Opacities [H, W] of near Gaussians that cover alpha [H, W] of the pixels, neighbours' light included.
+    """Opacities [H, W] with which near Gaussians and their neighbours together cover the share alpha [H, W] of pixels.
 
-    All other Gaussians have full opacity; `ring` [H, W] is 0 where a pixel is of one surface alone.
+    All other Gaussians have full opacity; `ring` [H, W] is 0 where a pixel shows one surface alone.
     """
     result = alpha.copy()
     for _ in range(SWEEPS):
@@ -215,7 +217,7 @@ def blended_opacities(alpha: Floats, ring: NDArray[np.uint8]) -> Floats:
 
 @kernel
 def _thin(alpha: Any, ring: Any, result: Any) -> None:
-    """One sweep, in place."""
+    """Correct the opacities `result` once, in place."""
     height, width = alpha.shape
     for y in range(height):
         for x in range(width):
@@ -245,7 +247,7 @@ def mixture(spots: Floats, colors: Tensor, height: int, width: int) -> Tensor:
 
 @kernel
 def _mix(start: int, stop: int, spots: Any, colors: Any, image: Any) -> None:
-    """Rows start..stop, nearest first."""
+    """Blend rows start..stop, nearest Gaussians first."""
     width = image.shape[1]
     half = np.float32(0.5)
     passes = np.ones((stop - start, width), np.float32)
