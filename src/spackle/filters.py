@@ -1,4 +1,4 @@
-"""Filters of pictures: blur, the greatest value in a window, a distance transform, and values propagated into holes."""
+"""Image filters: blur, the greatest value in a window, a distance transform, and values propagated into holes."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from torch.nn.functional import avg_pool2d, interpolate, pad
 from spackle._numba import kernel
 from spackle.device import run_chunks
 
-FAR = 1 << 14  # cells to a place that is not there
+FAR = 1 << 14  # distance in cells to the nearest known pixel if there is none
 FAR_BIAS = 80.0  # how sharply the far side of a rim wins: a sample 5 % nearer than the fill counts 1/50
 SWEEPS = 12  # relaxation sweeps at each resolution; more gain nothing
 
-MIN_TRUST = 1e-6  # a hole whose whole rim is near still gets its colour from there
+MIN_TRUST = 1e-6  # least weight of a rim sample, so that a hole with only a near rim still gets its colour
 MAX_EXPONENT = 30.0  # keeps weights within single precision
 LIGHTEST, HEAVIEST = (np.float32(np.exp(sign * MAX_EXPONENT)) for sign in (-1, 1))
 AROUND = 4  # neighbours of a pixel
@@ -29,7 +29,7 @@ Bools = NDArray[np.bool_]
 
 
 def blurred(image: Tensor, sigma: float) -> Tensor:
-    """A picture [..., H, W, C] under a Gaussian of `sigma` pixels; what lies beyond the border has no weight."""
+    """Blur a picture [..., H, W, C] with a Gaussian of `sigma` pixels; nothing beyond the border has weight."""
     weights = [math.exp(-0.5 * (offset / sigma) ** 2) for offset in range(math.ceil(3 * sigma) + 1)]
     for dim in (-2, -3):
         mass = _weighted_sum(image.new_ones(image.shape[dim]), weights, 0)
@@ -38,7 +38,7 @@ def blurred(image: Tensor, sigma: float) -> Tensor:
 
 
 def broadly_blurred(image: Tensor, sigma: float) -> Tensor:
-    """About `blurred` for a picture [H, W, C] and many pixels: means of squares are blurred, and magnified again."""
+    """Approximate `blurred` of a picture [H, W, C] for a large `sigma`: reduce the picture, blur it, and enlarge it."""
     step = max(int(sigma / 2), 1)
     means = avg_pool2d(image.movedim(-1, 0)[None], step, ceil_mode=True, count_include_pad=False)[0]
     coarse = blurred(means.movedim(0, -1), sigma / step).movedim(-1, 0)
@@ -47,7 +47,7 @@ def broadly_blurred(image: Tensor, sigma: float) -> Tensor:
 
 
 def _weighted_sum(values: Tensor, weights: Sequence[float], dim: int) -> Tensor:
-    """Weighted sum of neighbours along a dimension: on a processor many times faster than a thin convolution."""
+    """Weighted sum of neighbours along a dimension; on a CPU this is many times faster than a thin convolution."""
     size = values.shape[dim]
     total = weights[0] * values
     for offset, weight in enumerate(weights[1:size], start=1):
@@ -57,9 +57,9 @@ def _weighted_sum(values: Tensor, weights: Sequence[float], dim: int) -> Tensor:
 
 
 def greatest_around(image: Tensor, reach: int) -> Tensor:
-    """Of an image or mask [..., H, W] the greatest value up to `reach` rows and columns away from each pixel.
+    """For each pixel the greatest value of an image or mask [..., H, W] within `reach` rows and columns.
 
-    Windows are doubled step by step, where a processor's pooling would visit every pixel of each.
+    Window sizes are doubled step by step; pooling on a CPU would visit every pixel of every window.
     """
     size = 2 * reach + 1
     image = pad(image, (reach,) * 4, value=0 if image.dtype == torch.bool else -math.inf)
@@ -74,8 +74,9 @@ def greatest_around(image: Tensor, reach: int) -> Tensor:
 
 
 def nearest_known(hole: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """Row and column [2, H, W] of the nearest pixel outside of a hole [H, W] (rarely the second nearest); far away if
-    there is none.
+    """For each pixel the row and column [2, H, W] of the nearest (rarely the second nearest) outside of a hole [H, W].
+
+    The place is far away if there is no such pixel.
     """
     near = np.where(hole, -FAR, np.indices(hole.shape)).astype(np.int32)
     _propagate_nearest(hole, near)
@@ -83,14 +84,14 @@ def nearest_known(hole: NDArray[np.bool_]) -> NDArray[np.int32]:
 
 
 def distance_to(near: NDArray[np.int32]) -> Tensor:
-    """[H, W] pixels from each pixel to the one that `nearest_known` gives, [2, H, W]."""
+    """The distance [H, W] in pixels from each pixel to its place in `near` [2, H, W], as `nearest_known` gives it."""
     row, column = torch.from_numpy(near - np.indices(near.shape[1:], np.int32)).float()
     return torch.hypot(row, column)
 
 
 @kernel
 def _propagate_nearest(hole: Any, near: Any) -> None:
-    """Each cell takes its neighbours' nearest cell if that is nearer: four sweeps, each the other way around."""
+    """Each cell takes its neighbours' nearest cell if that is nearer; four sweeps alternate in direction."""
     height, width = hole.shape
     for turn in range(4):
         for i in range(height):
@@ -114,24 +115,24 @@ def far_fill(
 
     A moving camera uncovers what lies behind a surface, so a hole between a near and a far surface extends the far one.
     A coarse-to-fine fill gives the first guess; at every resolution a relaxation turns it into a membrane over the rim.
-    In it a rim sample nearer than the fill has the weight min(1, fill / sample)^far_bias. The work grows with the hole,
-    not the image.
+    In the relaxation, a rim sample nearer than the fill has the weight min(1, fill / sample)^far_bias. The work grows
+    with the hole, not the image.
 
     Args:
         inverse_depth: [H, W], positive where known.
-        values: [C, H, W], what is propagated along with it, colour for instance.
+        values: [C, H, W] further values to propagate, such as colours.
         known: [H, W] bool. Values at unknown pixels are ignored.
         far_bias: one number, or one for each pixel [H, W]; 0 treats both sides of the rim alike.
 
     Returns:
-        Inverse depth [H, W] and values [C, H, W], float32, on the input's device; known pixels as they were.
+        Inverse depth [H, W] and values [C, H, W], float32, on the input's device; known pixels are unchanged.
 
     Raises:
         ValueError: nothing is known.
     """
     if not bool(known.any()):
         raise ValueError("nothing to fill from: no pixel is known")
-    # Pixel by pixel what belongs together lies together: the hole's pixels are scattered through memory.
+    # The values of a pixel lie side by side in memory, because the hole's pixels are scattered.
     depths = inverse_depth.detach().cpu().float().clone(memory_format=torch.contiguous_format)
     others = values.detach().cpu().float().permute(1, 2, 0).clone(memory_format=torch.contiguous_format)
     bias = torch.as_tensor(far_bias, dtype=torch.float32).cpu().expand(inverse_depth.shape).contiguous()
@@ -140,11 +141,11 @@ def far_fill(
 
 
 def _fill_level(depths: Floats, values: Floats, known: Bools, bias: Floats) -> None:
-    """Fill one level's inverse depths [H, W] and values [H, W, C] in place: from the next coarser one, then relaxed."""
+    """Fill a level's inverse depths [H, W] and values [H, W, C] in place from the next coarser level, then relax."""
     count, channels = known.size - np.count_nonzero(known), values.shape[-1]
     if count == 0:
         return
-    reference = np.float32(torch.from_numpy(depths[known]).median() if bias.any() else 1)  # the lower one
+    reference = np.float32(torch.from_numpy(depths[known]).median() if bias.any() else 1)  # of two, the lower
     size = [-(-side // 2) for side in known.shape]
     coarse = (np.empty(size, np.float32), np.empty((*size, channels), np.float32))
     masks = (np.empty(size, np.bool_), np.empty(size, np.float32))
@@ -153,7 +154,7 @@ def _fill_level(depths: Floats, values: Floats, known: Bools, bias: Floats) -> N
     _fill_level(*coarse, *masks)
     holes, links, rim = _find_holes(known, count)
     flat, pixels = depths.reshape(-1), values.reshape(known.size, channels)
-    samples = np.empty((count + len(rim), 1 + channels), np.float32)  # of the holes, and after those of the rim
+    samples = np.empty((count + len(rim), 1 + channels), np.float32)  # first of the holes, then of the rim
     _guess(known.shape[1], *coarse, holes, samples)
     samples[count:, 0], samples[count:, 1:] = flat[rim], pixels[rim]
     samples = _relax(samples, samples.copy(), links, bias.ravel()[holes], SWEEPS)
@@ -165,7 +166,7 @@ def _coarsen(
     start: int, stop: int, depths: Any, values: Any, known: Any, bias: Any, reference: Any,
     coarse_depths: Any, coarse_values: Any, coarse_known: Any, coarse_bias: Any,
 ) -> None:  # fmt: skip
-    """Rows start..stop of means over the known ones of 2×2 pixels, the far ones weighted most; flags; mean bias."""
+    """Rows start..stop of the coarser level: means of each 2×2's known pixels, far ones weighted most; flags; bias."""
     height, width = depths.shape
     channels = values.shape[2]
     weights = np.empty(4, np.float32)
@@ -208,7 +209,10 @@ def _far_weight(relative: Any, bias: Any) -> Any:
 
 @kernel
 def _find_holes(known: Any, count: int) -> Any:
-    """Flat positions of the holes [n], links [n, 4] to neighbours (holes, then the rim; itself outside), the rim."""
+    """Flat positions of hole pixels [n], numbers of their neighbours [n, 4], and flat positions of rim pixels.
+
+    Neighbours are numbered holes first, then the rim; beyond the image a pixel is its own neighbour.
+    """
     height, width = known.shape
     holes, links = np.empty(count, np.int32), np.empty((count, AROUND), np.int32)
     rim = np.empty(min(AROUND * count, height * width - count), np.int32)
@@ -238,11 +242,11 @@ def _find_holes(known: Any, count: int) -> Any:
 
 @kernel
 def _guess(width: int, coarse_depths: Any, coarse_values: Any, holes: Any, samples: Any) -> None:
-    """Samples [holes, 1 + C] of the coarser level, interpolated bilinearly."""
+    """Write the holes' samples [n, 1 + C], interpolated bilinearly from the coarser level."""
     rows, columns, channels = coarse_values.shape
     for n in range(len(holes)):
         y, x = holes[n] // width, holes[n] % width
-        # A fine pixel lies a quarter of a coarse one beside its parent's centre.
+        # A fine pixel's centre lies a quarter of a coarse pixel from its parent's centre.
         y0, x0 = (y - 1) // 2, (x - 1) // 2
         fy = np.float32(0.75) if y % 2 == 0 else np.float32(0.25)
         fx = np.float32(0.75) if x % 2 == 0 else np.float32(0.25)
@@ -286,7 +290,7 @@ def _relax(samples: Any, copy: Any, links: Any, bias: Any, sweeps: int) -> Any:
 
 @kernel
 def _conductance(here: Any, there: Any, bias: Any) -> Any:
-    """The weight of a rim sample, which falls the nearer the sample is."""
+    """The weight of a rim sample `there` for the fill `here`: 1, or less the nearer the sample is."""
     if there <= here:
         return np.float32(1)
     ratio = max(here / max(there, np.float32(1e-12)), np.float32(1e-6))

@@ -1,13 +1,13 @@
-"""PatchMatch: a hole is filled from the picture itself, from coarse to fine.
+"""PatchMatch: fill a hole from the picture itself, from coarse to fine.
 
-Each cell of a hole searches for a patch of the known part that matches what is around it (Barnes et al. 2009). All
-patches over a cell vote for its colour. Both steps alternate from coarse to fine (Wexler et al. 2007). The cost of a
-patch at q for a cell p adds up colours, the depth and the tone of its centre, and how far away it is:
+Each cell of a hole searches for a patch of the known part that matches its surroundings (Barnes et al. 2009). All
+patches that cover a cell vote for its colour. Both steps alternate from coarse to fine (Wexler et al. 2007). The cost
+of the patch at q for a cell p sums the differences in colour, in centre depth and in centre tone, and the distance:
 
     cost = mean |I(p + o) - I(q + o)|²  +  (0.15 dz / σz)²  +  2 |L(p) - L(q)|²  +  0.05 (|p - q| / size)²
 
-over the offsets o of a patch, with colours I, the logarithm z of inverse depth and the tone L, which is the caller's
-guess, blurred. In the mean a cell of the hole counts less the deeper it lies.
+The mean runs over the offsets o of a patch; a cell of the hole counts less in it the deeper it lies in the hole. I are
+the colours, z is the logarithm of inverse depth, and the tone L is the caller's guess, blurred.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ RADIUS = 3  # patches have 7×7 cells
 SIDE = 2 * RADIUS + 1
 COARSEST = 48  # cells of the short side; no level is smaller
 ROUNDS = 6  # of search and vote at each level
-JUMPS = (4, 1)  # cells to the neighbours whose matches are tried, one search after the other
+JUMPS = (4, 1)  # distances in cells of the neighbours whose matches are tried, in successive searches
 MIRRORS = 2  # sources: the picture, and the picture mirrored left to right
 TONE_CELLS = 4.0  # standard deviation of the blur that makes the tone
-FADING = 0.8  # weight of a cell in a patch, for each cell that it lies deeper in the hole
-FAINTEST_CELL = np.float32(1e-30)  # weight of the deepest: still far from what float32 rounds to nothing
+FADING = 0.8  # factor on a cell's weight in a patch for each cell that it lies deeper in the hole
+FAINTEST_CELL = np.float32(1e-30)  # least weight of a cell: far above what float32 rounds to zero
 DEPTH_WEIGHT, TONE_WEIGHT, OFFSET_WEIGHT = 0.15, math.sqrt(2), 0.05
-LEAST_SPREAD = 0.05  # of z: a wall that faces the camera has no depth to tell its parts apart by
-SAME_SURFACE = 0.25  # standard deviations of z by which a mirrored start may lie before or behind its place
+LEAST_SPREAD = 0.05  # least σz, for walls that face the camera, whose depth hardly varies
+SAME_SURFACE = 0.25  # standard deviations of z by which a cell and its mirror image may differ
 FAINTEST_VOTE, LEAST_COST = 1e-6, 1e-8
 
 Floats = NDArray[np.float32]
@@ -62,7 +62,7 @@ def match_patches(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> Patches
     """Fill a hole by patches of the known part; the result is the same for any number of threads.
 
     Args:
-        guess: [H, W, 3] sRGB; in the hole smooth colours, whose blur is the tone that a patch should have.
+        guess: [H, W, 3] sRGB; in the hole, smooth colours; blurred, they are the tone that a patch should have.
         hole: [H, W] bool.
         inverse_depth: [H, W], positive everywhere.
     """
@@ -82,13 +82,13 @@ class _Level:
     """One level of the pyramid, h × w cells."""
 
     rgb: Floats  # [h, w, 3]; in the hole the latest votes, written in place
-    traits: Floats  # [h, w, 4] tone and depth, each in roots of the cost
+    traits: Floats  # [h, w, 4] tone and depth, scaled so that squared differences are costs
     hole: Bools  # [h, w]
     weights: Floats  # [h + 6, w + 6] of a cell in a patch; 0 beyond the picture
 
 
 def _pyramid(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> list[_Level]:
-    """Build the pyramid, finest level first; there holes start as mirror images of the same surface."""
+    """Build the pyramid, finest level first; its holes are initialised with mirror images of the same surface."""
     depth = inverse_depth.clamp_min(1e-9).log()[..., None]
     depth = depth / max(float(depth[~hole].std(correction=0)) if bool((~hole).any()) else 0.0, LEAST_SPREAD)
     rgb, tone, levels = guess.clone(memory_format=torch.contiguous_format), guess, list[_Level]()
@@ -123,7 +123,7 @@ def _mirror(rgb: Any, hole: Any, depth: Any, near: Any) -> None:
 
 
 def _match(level: _Level, coarse: Matches | None, number: int) -> Matches | None:
-    """Alternate search and vote, changing the level's colours in place; None without a hole, or a patch for it."""
+    """Alternate search and vote, changing the level's colours in place; None if there is no hole, or no patch."""
     usable = ~greatest_around(torch.from_numpy(level.hole), RADIUS).numpy()
     usable[:RADIUS] = usable[-RADIUS:] = False
     usable[:, :RADIUS] = usable[:, -RADIUS:] = False
@@ -149,7 +149,7 @@ def _match(level: _Level, coarse: Matches | None, number: int) -> Matches | None
         padded[RADIUS:-RADIUS, RADIUS:-RADIUS] = level.rgb
 
     if coarse is not None:
-        vote(1.0)  # of costs that are all zero
+        vote(1.0)  # all costs are still zero
     for turn in range(ROUNDS):
         run(_score, places, *target, costs)
         for jump in JUMPS:
@@ -161,7 +161,7 @@ def _match(level: _Level, coarse: Matches | None, number: int) -> Matches | None
 
 @kernel
 def _begin(cells: Any, refine: bool, coarse_numbers: Any, coarse: Any, valid: Any, pool: Any, places: Any) -> None:
-    """First matches of a level: those of the coarser one, doubled, or random ones."""
+    """Initialise a level's matches: the coarser level's, with doubled coordinates, or random ones."""
     rows, columns = coarse_numbers.shape
     height, width = valid.shape[1:]
     for n in range(len(cells)):
@@ -170,7 +170,7 @@ def _begin(cells: Any, refine: bool, coarse_numbers: Any, coarse: Any, valid: An
         places[n, 0], places[n, 1], places[n, 2] = 0, pick[0], pick[1]
         k = coarse_numbers[min(y // 2, rows - 1), min(x // 2, columns - 1)] if refine else -1
         if k >= 0:
-            # A mirrored picture's cells begin at the other side.
+            # The columns of a mirrored picture count from the other side.
             m, side = coarse[k, 0], width - 2 * columns if coarse[k, 0] else 0
             row, column = 2 * coarse[k, 1] + y % 2, 2 * coarse[k, 2] + x % 2 + side
             if 0 <= row < height and 0 <= column < width and valid[m, row, column]:
@@ -179,7 +179,7 @@ def _begin(cells: Any, refine: bool, coarse_numbers: Any, coarse: Any, valid: An
 
 @kernel
 def _hash(value: Any) -> Any:
-    """A pseudorandom uint32 from a hash of the arguments."""
+    """A pseudorandom uint32: a hash of the argument."""
     value = np.uint32(value)
     value ^= value >> np.uint32(16)
     value = np.uint32(value * np.uint32(0x7FEB352D))
@@ -243,9 +243,7 @@ def _search(
     start: int, stop: int, cells: Any, numbers: Any, before: Any, worth: Any, valid: Any, pool: Any, jump: int,
     seed: Any, padded: Any, weights: Any, own: Any, sources: Any, traits: Any, offset: Any, places: Any, costs: Any,
 ) -> None:  # fmt: skip
-    """Improve the matches of the cells start..stop: try neighbours' matches, a random one, and ones ever nearer to the
-    best.
-    """
+    """Improve the matches of cells start..stop: try neighbours' matches, a random one, and some ever closer ones."""
     mirrors, height, width = valid.shape
     for n in range(start, stop):
         y, x = cells[n]
@@ -290,7 +288,7 @@ def _search(
 def _vote(
     start: int, stop: int, cells: Any, numbers: Any, places: Any, costs: Any, mean: Any, sources: Any, rgb: Any
 ) -> None:
-    """Colours of the cells start..stop: the mean over all patches that cover them, better matches counting more."""
+    """Set the colours of cells start..stop to the mean of all patches that cover them; better matches count more."""
     height, width = numbers.shape
     for n in range(start, stop):
         y, x = cells[n]
@@ -302,7 +300,7 @@ def _vote(
                 k = numbers[y + dy, x + dx]
                 if k < 0:
                     continue
-                # A patch lies within its source, so this is there.
+                # A patch lies within its source, so these indices are valid.
                 m, v, u = places[k, 0], places[k, 1] - dy, places[k, 2] - dx
                 weight = np.float32(np.exp(-costs[k] / mean)) + np.float32(FAINTEST_VOTE)
                 red += weight * sources[m, v, u, 0]

@@ -10,8 +10,8 @@ import dataclasses
 import numpy as np
 from torch import Tensor
 
-NARROWEST, WIDEST = 2, 0.25  # of a side: pixels, and the share of the photo's width or height
-NOISE, STEP = 9 / 255, 20 / 255  # the largest mean difference from the frame's colour in it, the least beyond its edge
+NARROWEST, WIDEST = 2, 0.25  # of a frame's side: in pixels, and as a share of the photo's width or height
+NOISE, STEP = 9 / 255, 20 / 255  # from the frame's colour: largest mean difference in it, least beyond it
 STRAIGHT = 0.8  # share of the edge that has the step
 EDGE_PX = 6  # length of a blurred edge, on which frame and picture are mixed
 
@@ -32,12 +32,12 @@ class PhotoFrame:
 
     @property
     def note(self) -> str:
-        """For the log."""
+        """A line for the log."""
         widths = ", ".join(f"{width:g}" for width in self.widths)
         return f"a frame ({widths} pixels: left, top, right, bottom) is cut off"
 
     def scaled(self, across: float, down: float) -> PhotoFrame:
-        """In pixels of a photo resized by these factors."""
+        """The same frame, in pixels of a photo resized by these factors."""
         return PhotoFrame(self.left * across, self.top * down, self.right * across, self.bottom * down)
 
     def inside(self, picture: Tensor, width: int, height: int) -> Tensor:
@@ -59,7 +59,7 @@ def find_frame(rgb: Tensor) -> PhotoFrame | None:
     ]
     plain = [int((lines.mean(1) <= NOISE).cumprod().sum()) for lines in differences]
     for side, lines in enumerate(differences):
-        before, after = plain[1 - side % 2], plain[3 - side % 2]  # of the lines' pixels lie in the neighbours' frames
+        before, after = plain[1 - side % 2], plain[3 - side % 2]  # pixels at a line's ends, in the adjacent sides
         edge = (lines[plain[side] :, before : lines.shape[1] - after] > STEP)[:EDGE_PX].mean(1)
         if plain[side] >= NARROWEST and edge.max(initial=0.0) >= STRAIGHT:
             widths[side] = plain[side] + int((edge >= 0.95 * edge.max()).argmax()) + 1

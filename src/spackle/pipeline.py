@@ -1,6 +1,6 @@
-"""The way from a photo to a completed scene: base, camera path, fill. Read `complete_photo` and `Pipeline.complete`.
+"""The pipeline from a photo to a completed scene: base, camera path, fill. See `complete_photo`, `Pipeline.complete`.
 
-The command line, Python, the page and the demo use it; ComfyUI uses its last stage, `complete`.
+The command line, the Python API, the web page and the demo use it; ComfyUI uses its last stage, `complete`.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from spackle.views import PathOptions, PlannedViews, choose_move, plan_views
 from spackle.weights import installed
 
 Shipped = Literal["shipped"]  # the weights that come with the package, if it has any
-Fill = Literal["auto", "network", "exemplar", "lama", "none"]  # of the texture in holes
+Fill = Literal["auto", "network", "exemplar", "lama", "none"]  # source of the texture in holes
 Mode = Literal["scene", "view"]  # one set of aux Gaussians for all views, or one for each
 
 
@@ -49,9 +49,9 @@ class FillOptions:
 
     @property
     def texture(self) -> Fill:
-        """The fill with "auto" resolved; "none", which leaves holes open, also if `residual` is "none".
+        """The fill, with "auto" resolved; if `residual` is "none", the fill is "none" too, which leaves holes open.
 
-        In view mode "auto" takes the exemplar: to inpaint each view would take seconds a view.
+        In view mode "auto" means "exemplar", because inpainting would take seconds for each view.
         """
         if self.residual == "none":
             return "none"
@@ -83,7 +83,7 @@ class Options:
 
     @property
     def give_geometry(self) -> bool:
-        """Whether a depth map or cameras are given: these belong to the whole photo, so no frame may be cut off."""
+        """Whether a depth map or cameras are given: these belong to the whole photo, so no border may be cropped."""
         return self.base.depth is not None or self.path.cameras is not None
 
 
@@ -96,12 +96,12 @@ class CompletedPhoto:
     choice: ResolvedBase
     views: PlannedViews
     scene: Scene  # its disparity is None for given views and keyframes
-    pictures: Mapping[int, Tensor]  # [H, W, 3] uint8 of views that completion has drawn as they are, by index
+    pictures: Mapping[int, Tensor]  # [H, W, 3] uint8 of completed views, by index, as far as completion rendered them
     saved_view: str | None = None  # in view mode: the view that `scene.aux` belongs to
 
 
 def complete_photo(photo: Photo, options: Options = Options(), reporter: Reporter | None = None) -> CompletedPhoto:
-    """A photo to its completed scene; for many photos keep a `Pipeline`, which loads networks once.
+    """Complete a photo's scene; for many photos keep a `Pipeline`, which loads networks once.
 
     Raises:
         InputError: an option, the photo, or its depth map cannot be used.
@@ -132,7 +132,7 @@ class Pipeline:
         return Pipeline(options, open_base(options.base), network, renderer, given_views, keyframes)
 
     def complete(self, photo: Photo, reporter: Reporter) -> CompletedPhoto:
-        """A photo at its full size to its completed scene; InputError for a photo or depth map that cannot be used."""
+        """Complete the scene of a photo at its full size; InputError if the photo or its depth map cannot be used."""
         prediction, choice = self.predict(photo, reporter)
         views = plan_views(prediction, self.options.path, photo.path, self.given_views, self.keyframes)
         with reporter.stage("complete") as step:
@@ -147,7 +147,7 @@ class Pipeline:
         return done if scene.by_view is None else _with_farthest_view(done)
 
     def predict(self, photo: Photo, reporter: Reporter) -> tuple[BasePrediction, ResolvedBase]:
-        """The photo's Gaussians, and the base that made them; says which one, the focal length and the move."""
+        """The photo's Gaussians, and the base that made them; logs the base, the focal length and the move."""
         photo.check_shape()
         name = photo.path.name
         if photo.frame is not None:
@@ -196,7 +196,7 @@ class Pipeline:
 
 
 def move_in_words(prediction: BasePrediction) -> str:
-    """The camera's move, as `choose_move` found it, in words."""
+    """The camera's move that `choose_move` has chosen, in words."""
     reach, usual, invented = prediction.disparity, prediction.notes["usual_disparity"], prediction.notes["uncovered"]
     of, more = (f" of {usual:g}", f"; `--disparity {usual:g}` moves farther") if reach != usual else ("", "")
     return f"camera moves by disparity {reach:g}{of}: {invented:.1%} of the widest view is invented{more}"
@@ -230,15 +230,15 @@ def complete(
     """Fill the holes of all views: in scene mode with one set of aux Gaussians, see `fill_scene`.
 
     Args:
-        prediction: of a base.
+        prediction: a base's result.
         cameras: the views.
         mode: "view" fills each view by itself, and leaves `Scene.aux` empty.
-        exact: the views are these and no others between them; for scene mode.
+        exact: in scene mode, only these views will be shown, and none between them.
         network: residual weights, by default those that come with Spackle; None: the seeds alone fill the holes.
         fill: see `open_texture`; "none" leaves the holes open.
         renderer: if None, the CPU's.
         precision: number type of the network.
-        progress: called with views done and their number.
+        progress: called with the number of views done, and that of all views.
     """
     chosen = shipped_network() if network == "shipped" else network
     texture, drawer = open_texture(fill), renderer or get_renderer()
@@ -253,7 +253,7 @@ def fill_views(
     exact: bool,
     progress: Callable[[int, int], None] | None,
 ) -> tuple[Scene, Mapping[int, Tensor]]:
-    """The scene, and pictures [H, W, 3] uint8 of the views that completion has drawn as they are, by their index."""
+    """The scene, and pictures [H, W, 3] uint8 of completed views, by index, as far as completion rendered them."""
     base, camera = context.base, context.photo_camera
     if mode == "scene" or not cameras:
         filled = fill_scene(context, cameras, exact, progress)

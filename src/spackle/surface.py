@@ -15,10 +15,10 @@ from spackle.device import run_chunks
 from spackle.gaussians import Gaussians, quat_from_matrix
 
 EDGE = 0.03  # a relative jump of inverse depth between neighbours beyond this is a depth edge
-CREASE = 0.01  # where the two sides' slopes differ by more than this, only the flatter one counts, if it is no more
+CREASE = 0.01  # if the slopes of both sides differ by more, only the flatter one counts, if it is no more than this
 THICKNESS = 0.05  # third axis, in units of the smaller of the other two
 # Of an opaque Gaussian. Not higher: a blob that would bring the transmittance below the renderer's stop (1e-4) is not
-# drawn at all, so behind a thin veil of alpha 0.9 one of opacity 0.999 would leave a hole that nothing can fill.
+# drawn at all, so a blob of opacity 0.999 behind a veil of alpha 0.9 would leave a hole that nothing can fill.
 OPACITY = np.float32(0.99)
 PIXEL_SPREAD = 0.5  # standard deviation of a Gaussian for one pixel, which a wider one backs
 BEHIND = 0.005  # relative distance behind a surface at which a Gaussian does not spill over it
@@ -97,7 +97,7 @@ def _slopes(start: int, stop: int, image: Any, crease: Any, edge: Any, slopes: A
         above, below = max(y - 1, 0), min(y + 1, height - 1)
         for x in range(width):
             here, left, right = image[y, x], max(x - 1, 0), min(x + 1, width - 1)
-            # At a border the one difference that there is stands for both.
+            # At a border, the only difference that exists is used for both sides.
             ahead, behind = image[y, right] - here, here - image[y, left]
             forward, backward = ahead if right > x else behind, behind if left < x else ahead
             slopes[y, x, 0] = _slope(here, backward, forward, crease, edge)

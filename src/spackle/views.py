@@ -32,7 +32,7 @@ from spackle.render.protocol import Renderer
 from spackle.residual.view_features import hole_area_ratio
 from spackle.video_frames import FrameMaker, VideoOptions
 
-PATH_FRAMES, MAX_FRAMES = 60, 10_000  # of a path: as usual, and at most
+PATH_FRAMES, MAX_FRAMES = 60, 10_000  # of a path: the default, and the most
 SECONDS = 4.0  # of a video along a trajectory
 MAX_OVERSCAN = 0.5
 MEASURED_KEYFRAMES = 16  # keyframes at most whose holes are reported
@@ -46,7 +46,7 @@ def scene_path(
     frames: int = PATH_FRAMES,
     looped: bool = False,
 ) -> list[Camera]:
-    """Cameras around the photo's eye at the photo's size, both sides made even.
+    """The cameras of a path around the photo's camera, of the photo's size with both sides made even.
 
     A path that is `looped`, as for videos, continues from its last camera to the first, see `trajectory`.
     """
@@ -58,13 +58,13 @@ class PathOptions:
     """Options of the camera path, and of the video along it."""
 
     trajectory: TrajectoryKind = "rotate-forward"
-    disparity: float | None = None  # as the base has it where None
+    disparity: float | None = None  # None: as the base has it
     cameras: Path | None = None  # exactly these views in place of a trajectory
     path: Path | None = None  # keyframes in place of a trajectory
-    frames: int | None = None  # as many as the seconds take where None
-    seconds: float | None = None  # of the video; 4, or the keyframes' own, where None
+    frames: int | None = None  # None: as many as the seconds take
+    seconds: float | None = None  # of the video; None: 4, or the keyframes' own
     video: VideoOptions = dataclasses.field(default_factory=VideoOptions)
-    overscan: float = OVERSCAN  # by which share the lens along a trajectory is longer than the photo's
+    overscan: float = OVERSCAN  # share by which a trajectory's focal length exceeds the photo's
 
     def check(self) -> None:
         """InputError for an impossible path or video, or views that are given twice."""
@@ -126,7 +126,7 @@ class PathOptions:
 
 @dataclasses.dataclass(frozen=True)
 class PlannedViews:
-    """The views whose holes are filled, and the frames that are made of them."""
+    """The views whose holes are filled, and the video frames that they make up."""
 
     cameras: list[Camera]
     measured: dict[str, int]  # name → index: views whose holes are reported
@@ -144,11 +144,11 @@ class PlannedViews:
         unseen: Sequence[Camera] = (),
         every: int = 1,
     ) -> PlannedViews:
-        """The cameras of a path's frames for all eyes, further named views, and which of them are no frames.
+        """Plan a path's frames, for one eye or two, with `unseen` further views to fill, and `others` to measure.
 
         A scene is completed for one frame in `every`.
         """
-        middles = path if stills and maker.stereo else []  # the pictures show what is between the eyes
+        middles = path if stills and maker.stereo else []  # pictures are taken midway between the eyes
         eyes = [maker.eyes(camera) for camera in path]
         cameras = [*middles, *(eye for pair in eyes for eye in pair), *unseen, *others.values()]
         first, each = len(middles), len(eyes[0])
@@ -161,14 +161,14 @@ class PlannedViews:
 
 
 COARSE_PX = 240  # long side of the pictures that show what a move uncovers
-MOVE_STEP = 0.01  # of the disparities that a photo may choose
-LEAST_MOVE = 0.04  # less is no parallax
-LOOKS = 3  # at moves between none and the base's usual one
+MOVE_STEP = 0.01  # step of the disparities that are chosen among
+LEAST_MOVE = 0.04  # the smallest disparity; less shows no parallax
+LOOKS = 3  # disparities tried, at most, between 0 and the base's usual one
 
 
 @contextlib.contextmanager
 def _possible_path(source: Path) -> Iterator[None]:
-    """InputError, naming the photo, where its depths and focal length allow no camera path."""
+    """InputError, naming the photo, if its depths and focal length allow no camera path."""
     try:
         yield
     except PathError:
@@ -182,8 +182,8 @@ def choose_move(prediction: BasePrediction, renderer: Renderer, source: Path) ->
     """The prediction with the farthest disparity, up to its usual one, at which holes in the widest views stay within
     its limit.
 
-    Its notes get the base's usual disparity and the share of holes in the two widest views (eqs. 10, 11), by coarse
-    renders. InputError, naming `source`, the photo, where its depths and focal length allow no path.
+    Its notes get the base's usual disparity and the share of holes in the two widest views (eqs. 10, 11), measured in
+    coarse renderings. InputError, naming `source`, the photo, if its depths and focal length allow no path.
     """
     gaussians, usual, allowed = prediction.gaussians, prediction.disparity, prediction.uncovered
     with _possible_path(source):
@@ -194,7 +194,7 @@ def choose_move(prediction: BasePrediction, renderer: Renderer, source: Path) ->
         ends = extremes(camera, disparity, depths)
         return sum(hole_area_ratio(renderer.render(gaussians, end).alpha) for end in ends) / len(ends)
 
-    near, far = (0.0, 0.0), (usual, uncovered(usual))  # disparity and holes: within what is allowed, and beyond it
+    near, far = (0.0, 0.0), (usual, uncovered(usual))  # (disparity, holes): allowed, and too many
     if far[1] <= allowed:
         near = far
     for _ in range(LOOKS if near[0] < usual else 0):
@@ -217,9 +217,9 @@ def plan_views(
     given: list[Camera] | None = None,
     keyframes: KeyframePath | None = None,
 ) -> PlannedViews:
-    """Plan the given views; or a path, whose holes are measured at its two extremes or at its keyframes.
+    """Plan the given views, or else a path, whose holes are measured at its two extremes or at its keyframes.
 
-    InputError, naming `source`, the photo, where its depths and focal length allow no such path.
+    InputError, naming `source`, the photo, if its depths and focal length allow no such path.
     """
     gaussians, camera = prediction.gaussians, prediction.camera
     if given:
@@ -229,7 +229,7 @@ def plan_views(
             cameras = path.fly(gaussians, camera, keyframes, prediction.disparity)
             reach, depths = path.reach(prediction.disparity), DepthRange.of(gaussians)
             others = _measured(reach, camera.even(), depths, keyframes)
-            # What a longer lens leaves out is filled all the same: other programs draw the scene with the photo's.
+            # What the longer lens leaves out is filled too, because other programs render with the photo's lens.
             upright = keyframes is None and path.trajectory in ("shake", "rotate", "vertical")
             unseen = trajectory("rotate", camera.even(), reach, depths, frames=5)[:4:2] if upright else []
     except PathError as error:

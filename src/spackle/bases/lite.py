@@ -271,7 +271,7 @@ class LiteBase:
         return torch.cat([interpolate(output, size=finest, mode="bilinear")[0] for output in outputs]).cpu()
 
     def _ask(self, picture: Tensor, scale: InputScale) -> Tensor:
-        """[h/2, w/2] log inverse depth of a photo [1, 3, H, W] that is seen at (h, w)."""
+        """[h/2, w/2] log inverse depth of a photo [1, 3, H, W], which the network receives resized to (h, w)."""
         size = network_size(picture.shape[2], picture.shape[3], scale.pixels)
         seen = interpolate(picture, size=size, mode="bicubic", antialias=True).clamp(0, 1)
         ways = torch.cat([seen, seen.flip(-1)]) if scale.mirrored else seen

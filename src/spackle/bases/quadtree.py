@@ -1,4 +1,4 @@
-"""Which pixels share a Gaussian: a quadtree over the picture, cut where lost detail costs less than Gaussians."""
+"""Decide which pixels share a Gaussian, by a quadtree cut where lost detail costs less than more Gaussians."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from spackle._numba import kernel
 from spackle.device import run_chunks
 
 LEVELS = 3  # the largest tiles have 8×8 pixels
-BEND = np.float32(0.003)  # most that the inverse depth in and around a tile leaves its plane, relative
+BEND = np.float32(0.003)  # largest relative deviation of the inverse depth in and around a tile from the tile's plane
 SQUARE, FLAT, TALL = 0, 1, 2  # one tile for a block, or two halves of it: one above the other, or side by side
 
 
@@ -29,30 +29,30 @@ class Tiles:
     columns: Tensor  # [N]
 
     def means(self, image: Tensor) -> Tensor:
-        """[N, ...]: an image's [H, W, ...] mean in each."""
+        """[N, ...]: the mean of an image [H, W, ...] in each rectangle."""
         flat, width = image.flatten(0, 1), image.shape[1]
         first = self.rows * (self.height * width) + self.columns * self.width
         total = sum(flat[first + (y * width + x)] for y in range(self.height) for x in range(self.width))
         return cast("Tensor", total) / (self.height * self.width)
 
     def centers(self) -> Tensor:
-        """[N, 2] in pixels, as (x, y)."""
+        """[N, 2]: the centres of the rectangles in pixels, as (x, y)."""
         return torch.stack([(self.columns + 0.5) * self.width, (self.rows + 0.5) * self.height], dim=-1)
 
 
 def grid_means(image: Tensor, height: int, width: int) -> Tensor:
-    """[H/height, W/width, ...]: an image's mean in each whole rectangle of a grid."""
+    """[H/height, W/width, ...]: the mean of an image [H, W, ...] in each whole rectangle of a grid."""
     rows, columns = image.shape[0] // height * height, image.shape[1] // width * width
     tall = sum(image[y:rows:height, :columns] for y in range(height))
     return cast("Tensor", sum(cast("Tensor", tall)[:, x::width] for x in range(width))) / (height * width)
 
 
 class Quadtree:
-    """Blocks of 2×2, 4×4, … pixels, and what each would lose as one tile or as two halves.
+    """Blocks of 2×2, 4×4, … pixels, and the detail that each would lose as one tile or as two halves.
 
-    A loss is the squared difference from bilinearly interpolated tile means, summed over pixels, mean of channels. No
-    block becomes a tile if it or its surroundings, as far as a block's side, hold a pixel that is not free or a depth
-    off its plane, because the Gaussian of a tile reaches that far. Steep blocks become none either.
+    A loss is the squared difference between pixels and bilinearly interpolated tile means, summed over pixels and
+    averaged over channels. A block becomes no tile if any pixel in it, or within one block side around it, is not free
+    or lies off the block's plane, because a tile's Gaussian reaches that far. Steep blocks become no tiles either.
     """
 
     def __init__(
@@ -61,15 +61,15 @@ class Quadtree:
         """Measure all blocks.
 
         Args:
-            picture: [H, W, 3], as it is compared: sRGB.
+            picture: [H, W, 3] sRGB, in which losses are measured.
             inverse_depth: [H, W].
-            slope: [H, W, 2] of it by pixel x and y.
-            free: [H, W] bool.
+            slope: [H, W, 2] derivative of the inverse depth by pixel x and y.
+            free: [H, W] bool: the pixels that may share a Gaussian.
             levels: number of block sizes; 0 gives every pixel its own Gaussian.
             steepest: the greatest relative change of inverse depth across a tile.
         """
         self.shape = inverse_depth.shape
-        self.lost: list[Tensor] = []  # [H/side, W/side, 3] for each level: of one tile, of flat and of tall halves
+        self.lost: list[Tensor] = []  # [H/side, W/side, 3] for each level: as one tile, as flat and as tall halves
         for level in range(1, levels + 1):
             side = 2**level
             rows, columns = (n // side for n in self.shape)
@@ -89,9 +89,9 @@ class Quadtree:
         return math.sqrt(float(finite.median()) / 4) if finite.numel() else 0.0
 
     def cut(self, worth: float) -> tuple[Tensor, list[Tiles]]:
-        """The division into tiles and pixels of least total loss, in which each Gaussian costs `worth`.
+        """The division into tiles and single pixels of least total cost: their losses, plus `worth` for each Gaussian.
 
-        Returns [H, W] bool, the pixels with a Gaussian of their own, and the tiles.
+        Returns [H, W] bool, which is true for single pixels, and the tiles.
         """
         single = torch.ones(self.shape, dtype=torch.bool)
         cost = torch.full(self.shape, worth)
@@ -129,7 +129,7 @@ def _measure(
     start: int, stop: int, side: int, steepest: Any, lost: Any,
     picture: Any, square: Any, flat: Any, tall: Any, inverse_depth: Any, depths: Any, slopes: Any, free: Any,
 ) -> None:  # fmt: skip
-    """Rows start..stop of the blocks."""
+    """Measure the losses of the block rows start..stop."""
     for row in range(start, stop):
         for column in range(lost.shape[1]):
             if not _fits(row, column, side, steepest, inverse_depth, depths[row, column], slopes[row, column], free):

@@ -200,7 +200,7 @@ def _cells(image: Tensor) -> Tensor:
 
 
 WEIGHTS = np.exp(-0.5 / PIXEL_SPREAD**2 * np.array([2, 1, 2, 1, 0, 1, 2, 1, 2])).astype(np.float32)  # of 3×3 neighbours
-FAINT, STOP = np.float32(1 / 255), np.float32(1e-4)  # the alpha that the renderer skips, the transmittance that stops it
+FAINT, STOP = np.float32(1 / 255), np.float32(1e-4)  # alpha that the renderer skips, transmittance that stops it
 REACH = np.sqrt(-2 * np.log(FAINT))  # standard deviations at which an alpha becomes faint
 
 

@@ -1,4 +1,4 @@
-"""What a stranger's JPEG, HEIF or XMP holds beside the picture, read within bounds."""
+"""Read what an untrusted JPEG, HEIF or XMP holds beside the picture, within limits on its size."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MAX_MARKERS = 10_000
 MAX_PICTURES = 64
 _GUID = re.compile(rb"HasExtendedXMP\s*(?:=\s*[\"']|>\s*)([0-9A-Fa-f]{32})")
 _PICTURES = 0xB002
-_MARKER = re.compile(rb"\xff([^\x00\xd0-\xd7\xff])")  # in compressed data all others are data or restarts
+_MARKER = re.compile(rb"\xff([^\x00\xd0-\xd7\xff])")  # the others occur in compressed data, as data or restarts
 _END = b"\xd9"
 
 
@@ -37,7 +37,7 @@ def open_jpeg(data: bytes) -> JpegImageFile | None:
 
 
 def xmp_of(image: JpegImageFile | None) -> bytes:
-    """The main XMP packet; empty where there is none."""
+    """The main XMP packet; empty if there is none."""
     segments = [] if image is None else image.applist
     return next((body[len(XMP) :] for name, body in segments if name == "APP1" and body.startswith(XMP)), b"")
 
@@ -57,7 +57,7 @@ def extended_xmp_of(image: JpegImageFile) -> tuple[bytes, bool]:
 
 
 def end_of_picture(data: bytes) -> int | None:
-    """The first byte behind the JPEG that the file begins with; None where it has no end."""
+    """The position after the end of the JPEG at the file's beginning; None if the JPEG has no end."""
     at = 2
     for _ in range(MAX_MARKERS):
         if (found := _MARKER.search(data, at)) is None:
@@ -69,7 +69,7 @@ def end_of_picture(data: bytes) -> int | None:
 
 
 def further_pictures(image: JpegImageFile) -> list[tuple[int, int]]:
-    """(begin, end) of the pictures that the Multi-Picture Format lists behind the first, wherever the file ends."""
+    """(begin, end) of the pictures that the Multi-Picture Format lists after the first, even beyond the file's end."""
     try:  # the offsets count from the list's byte order mark
         starts = [
             (image.info["mpoffset"] + entry["DataOffset"], entry["Size"]) for entry in (image._getmp() or {})[_PICTURES]
@@ -80,15 +80,15 @@ def further_pictures(image: JpegImageFile) -> list[tuple[int, int]]:
 
 
 def xmp_packets(data: bytes) -> Iterator[bytes]:
-    """The XMP packets that stand unpacked in a file."""
+    """The XMP packets that are stored uncompressed in a file."""
     for part in data.split(b"<x:xmpmeta", MAX_PICTURES)[1:]:
         body, end, _ = part.partition(b"</x:xmpmeta>")
         yield b"<x:xmpmeta" + body + end
 
 
 # Turns are steps: t swaps rows and columns, x left and right, y top and bottom.
-BY_ORIENTATION = {2: "x", 3: "xy", 4: "y", 5: "t", 6: "tx", 7: "txy", 8: "ty"}  # how EXIF's gets upright
-# `irot` holds so many quarter turns anticlockwise, `imir` 0 where top and bottom change places.
+BY_ORIENTATION = {2: "x", 3: "xy", 4: "y", 5: "t", 6: "tx", 7: "txy", 8: "ty"}  # steps that make EXIF's upright
+# `irot` holds the number of anticlockwise quarter turns; `imir` is 0 if top and bottom are swapped.
 _TURNS = {b"irot": ("", "ty", "xy", "tx"), b"imir": ("y", "x")}
 _DEPTH_TYPES = {b"urn:mpeg:hevc:2015:auxid:2", b"urn:mpeg:avc:2015:auxid:2"}
 _DEPTH_TYPES |= {b"urn:mpeg:mpegB:cicp:systems:auxiliary:depth"}
@@ -97,11 +97,11 @@ Boxes = Iterator[tuple[bytes, memoryview]]
 
 
 def find_depth_item(data: bytes) -> tuple[bool, str, str] | None:
-    """The auxiliary depth map of the primary picture; None without any, or where the boxes are broken.
+    """Find the auxiliary depth map of the primary picture; None if there is none, or if the boxes are broken.
 
     Returns:
-        Whether there is exactly one; its own rotation and mirroring, which a decoder applies; and those of the primary
-        picture if it has none.
+        Whether there is exactly one such map; the map's own rotation and mirroring, which a decoder applies; and, if
+        the map has none, those of the primary picture.
     """
     try:
         content = next(body for kind, body in _boxes(memoryview(data)) if kind == b"meta")
@@ -111,7 +111,7 @@ def find_depth_item(data: bytes) -> tuple[bool, str, str] | None:
     except (*_MALFORMED, StopIteration):
         return None
     depth = [item for item in auxiliary if _is_depth(properties.get(item, ()))]
-    if len(depth) != 1:  # of several, which one the decoder picks is unknown
+    if len(depth) != 1:  # if there are several, it is unknown which one a decoder picks
         return (False, "", "") if depth else None
     own, of_primary = (_turn(properties.get(item, ())) for item in (depth[0], primary))
     # Apple rotates the picture and leaves the map as the sensor saw it.
@@ -119,7 +119,7 @@ def find_depth_item(data: bytes) -> tuple[bool, str, str] | None:
 
 
 def _boxes(body: memoryview) -> Boxes:
-    """(type, content) of boxes in a row."""
+    """(type, content) of consecutive boxes."""
     at = 0
     while at + 8 <= len(body):
         size, kind = struct.unpack_from(">I4s", body, at)
@@ -162,7 +162,7 @@ def _is_depth(properties: Iterable[tuple[bytes, memoryview]]) -> bool:
 
 
 def _turn(properties: Iterable[tuple[bytes, memoryview]]) -> str | None:
-    """Rotations and mirrorings, in the order in which they apply; None where there is not one."""
+    """Rotations and mirrorings, in the order in which they apply; None if there are none."""
     turns = [_TURNS[kind][body[0] % len(_TURNS[kind])] for kind, body in properties if kind in _TURNS and body]
     return "".join(turns) if turns else None
 
@@ -172,7 +172,7 @@ RDF_ITEM = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}li"
 
 
 def parse_xmp(packet: bytes) -> Element:
-    """The root of a packet's elements; BrokenDepth where the text is no XML, or hostile."""
+    """The root element of a packet; BrokenDepth if the text is not XML, or looks hostile."""
     try:
         text = packet.strip(b"\0").decode("utf-8-sig")
         if "<!DOCTYPE" in text:
@@ -185,7 +185,7 @@ def parse_xmp(packet: bytes) -> Element:
 
 
 def get(node: Element, name: str) -> str | None:
-    """A property of this very element, an attribute or a child element, by "{namespace}name"."""
+    """A property of this element itself, stored as an attribute or a child element named "{namespace}name"."""
     text = node.get(name)
     text = node.findtext(name) if text is None else text
     return None if text is None else text.strip()
@@ -197,7 +197,7 @@ def find(tree: Element, name: str) -> str | None:
 
 
 def number(tree: Element, name: str) -> float | None:
-    """A property, see `find`, as a finite number; BrokenDepth where it is something else."""
+    """A property, see `find`, as a finite number; BrokenDepth if it is anything else."""
     if (text := find(tree, name)) is None:
         return None
     try:

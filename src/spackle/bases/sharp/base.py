@@ -1,4 +1,4 @@
-"""The SHARP base: a photo alone to 1,179,648 metric Gaussians, by Apple's checkpoint or with a decoder trained anew."""
+"""The SHARP base: predicts 1,179,648 metric Gaussians from a photo alone, by Apple's weights or a retrained decoder."""
 
 from __future__ import annotations
 
@@ -223,7 +223,7 @@ def unused_shapes(config: SharpConfig) -> Shapes:
 
 
 def _level(dim_in: int, dim_out: int) -> nn.Sequential:
-    """Two residual blocks behind a change of size, which has no parameters."""
+    """A parameter-free resize, followed by two residual blocks."""
     first = normed_residual(dim_in, dim_out)
     first.shortcut = nn.Conv2d(dim_in, dim_out, 1)
     return nn.Sequential(nn.Identity(), first, normed_residual(dim_out, dim_out))
