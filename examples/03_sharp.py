@@ -3,7 +3,7 @@
 python examples/03_sharp.py sharp.pt out photo.jpg...
 
 `spackle weights get sharp` downloads Apple's weights, for research only. `spackle weights make sharp.pt` makes random
-ones, which show no scene and take as long.
+weights: their scenes are meaningless, but their times are those of Apple's.
 """
 
 import sys

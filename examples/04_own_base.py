@@ -14,14 +14,14 @@ from spackle.bases.lift import lift
 
 
 class Street:
-    """A depth that falls from 20 m at the top of the picture to 2 m at its foot: put your own network here."""
+    """A depth that falls from 20 m at the top of the picture to 2 m at the bottom: put your own network here."""
 
     name = "street"
 
     def predict(
         self, photo: spackle.Photo, progress: Callable[[int, int], None] | None = None
     ) -> spackle.BasePrediction:
-        """Gaussians of everything that the photo shows."""
+        """Turn the photo into Gaussians."""
         metres = torch.linspace(20, 2, photo.height)[:, None].repeat(1, photo.width)
         depth = spackle.DepthMap(metres, metres > 0, None, None, "depth", photo.path)
         return lift(photo.rgb, depth, photo.camera)

@@ -16,12 +16,12 @@ from spackle.scene_fill.texture import painted_texture
 
 
 class MeanColor(PlainInpainter):
-    """Every hole gets the mean of what is seen: put a diffusion model here."""
+    """Fill every hole with the mean of the visible colours: put a diffusion model here."""
 
     name, version = "mean", "1"
 
     def paint(self, rgb: Tensor, hole: Tensor, inverse_depth: Tensor) -> Tensor:
-        """Colours [V, H, W, 3] of views whose holes [V, H, W] are filled."""
+        """The views' colours [V, H, W, 3], with their holes [V, H, W] filled."""
         return torch.where(hole[..., None], rgb[~hole].mean(dim=0), rgb)
 
 

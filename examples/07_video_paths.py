@@ -19,7 +19,7 @@ def main(file: Path, out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
     scene = spackle.Scene.load(file)
     scene.save_video(out / "swipe.mp4", "swipe", frames=48, fps=24)
-    scene.save_video(out / "loop.webp", "rotate", frames=24, fps=12)  # for ever
+    scene.save_video(out / "loop.webp", "rotate", frames=24, fps=12)  # repeats for ever
 
     (out / "path.json").write_text(json.dumps(KEYFRAMES))
     cameras = scene.along(load_path(out / "path.json"), frames=24)

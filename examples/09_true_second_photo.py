@@ -1,4 +1,4 @@
-"""How near is a completed view to a photo that a second camera truly took?
+"""How close is a completed view to the photo that a second camera took from there?
 
 python examples/09_true_second_photo.py out
 

@@ -2,7 +2,7 @@
 
 python examples/10_gradients.py out
 
-Training a residual network is this, with a network in place of the colours and many photos.
+Training a residual network works the same way, with many photos, and a network in place of the colours.
 """
 
 import dataclasses

@@ -1,8 +1,8 @@
-"""An app of your own that completes photos under /spackle, beside what else it does.
+"""An app of your own that completes photos under /spackle, beside its other pages.
 
 python examples/11_server.py folder 8000
 
-Mounted like this, everybody who reaches the port may send photos: your app decides who does.
+In this example everybody who reaches the port may send photos: control access in your app.
 """
 
 import contextlib
@@ -17,7 +17,7 @@ from spackle.web import create_app
 
 
 def app(folder: Path) -> FastAPI:
-    """Your app, and Spackle's page and HTTP interface below it."""
+    """Your app, with Spackle's page and HTTP interface mounted below it."""
     scenes = create_app(folder)
 
     @contextlib.asynccontextmanager

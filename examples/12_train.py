@@ -2,7 +2,8 @@
 
 python examples/12_train.py photos out
 
-Three or more photos take a few minutes on two cores. The guides on dataset and training have the options for real runs.
+Give three or more photos; they take a few minutes on two cores. The dataset and training guides list the options for
+real runs.
 """
 
 import subprocess
@@ -16,7 +17,7 @@ SHORT = ["optim.steps=40", "optim.warmup=5", "optim.batch=4", "run.validate_ever
 
 
 def run(*words: object) -> None:
-    """A command of the command line."""
+    """Run a `spackle` command."""
     subprocess.run([sys.executable, "-m", "spackle", *map(str, words)], check=True)
 
 

@@ -1,4 +1,4 @@
-"""A notebook: editors run each part between the `# %%` lines as a cell; `jupytext` makes an .ipynb of the file."""
+"""A notebook: editors run each part between the `# %%` lines as a cell; `jupytext` converts the file to .ipynb."""
 
 # %% [markdown]
 # # A photo as a scene
