@@ -279,6 +279,6 @@ def _tensors(root: object) -> dict[str, Tensor]:
             fields = {name: child for name, child in fields.items() if isinstance(name, str)}
             nodes += len(fields)
             if nodes > MAX_NODES or len(path) > MAX_PATH:
-                raise ValueError("its objects are too many or too deep, or hold themselves")
+                raise ValueError("its objects are too many or too deep, or contain themselves")
             waiting += [(f"{path}.{name}" if path else name, child) for name, child in fields.items()]
     return found

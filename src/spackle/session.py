@@ -92,7 +92,7 @@ class Spackle:
             raise InputError("predict takes the photo's depth, or a base that needs none, but not both")
         lens = {"focal_px": focal_px, "focal_mm": focal_mm, "fov": fov}
         if isinstance(photo, Photo) and lens != dict.fromkeys(lens):
-            raise InputError("a loaded photo has a lens: give focal_px, focal_mm or fov to load_photo")
+            raise InputError("a loaded photo has its lens already: give focal_px, focal_mm or fov to load_photo")
         pipeline, options = self._pipeline, self._pipeline.options
         options = dataclasses.replace(options, path=PathOptions(trajectory, disparity))
         options.path.check()

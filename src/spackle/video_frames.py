@@ -198,7 +198,7 @@ class FrameMaker:
             stereo = _stereo(options, gaussians, cameras[0])
             depth = DepthColors.over(gaussians, cameras) if options.show == "depth" else None
         except ValueError as error:
-            raise InputError(f"{source}: no such video: {error}") from error
+            raise InputError(f"{source}: this video is impossible: {error}") from error
         maker = FrameMaker(options, stereo, depth)
         width, height = maker.frame_size(maker.sized(cameras[0]))
         if max(width, height) > MAX_VIDEO_SIDE:

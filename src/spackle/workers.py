@@ -201,7 +201,7 @@ def _connect(ray: Any, address: str, cpus: int) -> None:
                 signal.signal(signal.SIGTERM, before)
     raise InputError(
         f"--ray {address}: no cluster: {reason}: is one running there (`ray start --head`), "
-        "and does it want RAY_AUTH_MODE=token in the environment?"
+        "and does it need RAY_AUTH_MODE=token in the environment?"
     )
 
 
@@ -298,7 +298,7 @@ def _results(
             done, _ = ray.wait(list(calls), timeout=None if queued else START_S)
             if not done:
                 raise InputError(
-                    f"--ray {workers.ray}: no worker could start within {START_S:g} seconds: others keep the "
+                    f"--ray {workers.ray}: no worker could start within {START_S:g} seconds: other jobs keep the "
                     "cluster busy, or its nodes have gone: start again when it has room; the same command resumes"
                 )
             worker, finished = calls.pop(done[0])

@@ -155,7 +155,7 @@ def test_sharp_file(tmp_path: Path, color_space: int) -> None:
     assert torch.equal(camera.world_to_camera, torch.eye(4))
 
 
-@pytest.mark.parametrize(("name", "says"), [(b"image_size", "none that SHARP writes"), (b"intrinsic", "focal lengths")])
+@pytest.mark.parametrize(("name", "says"), [(b"image_size", "not as SHARP writes it"), (b"intrinsic", "focal lengths")])
 def test_sharps_camera_that_makes_no_sense(tmp_path: Path, name: bytes, says: str) -> None:
     path, tail = tmp_path / "a.ply", sharp_tail(0)
     if name == b"intrinsic":

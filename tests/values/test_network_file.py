@@ -128,7 +128,7 @@ STORAGE = b"(X\x07\x00\x00\x00storagectorch\nFloatStorage\nX\x01\x00\x00\x000X\x
 TENSOR = b"ctorch._utils\n_rebuild_tensor_v2\n(" + STORAGE + b"K\x00(%s(%stR"
 NAME = b"X\x01\x00\x00\x00a"
 PICKLES = [  # and what is said of them
-    (b"\x80\x02}q\x00" + NAME + b"h\x00s.", "hold themselves"),
+    (b"\x80\x02}q\x00" + NAME + b"h\x00s.", "contain themselves"),
     (b"\x80\x02}q\x00" + 60 * (b"}(" + NAME + b"h\x00X\x01\x00\x00\x00bh\x00uq\x00") + b".", "too many"),
     (b"\x80\x02}" + NAME + TENSOR % (b"J\xff\xff\xff\x7ft", b"K\x01t") + b"s.", "out of bounds"),
     (b"\x80\x02}" + NAME + TENSOR % (b"K\x02t", b"K\x04t") + b"s.", "out of bounds"),

@@ -265,7 +265,9 @@ def _find_calibration(path: Path, calib: StrPath | None) -> Calibration | None:
     if stem.startswith("disp") and text.is_file():
         return _read_calib(text)
     if stem.startswith("disp") or stem.endswith(("disp", "disparity")):
-        raise InputError(f"{path}: a disparity map by its name: give its calibration with --calib, or rename it")
+        raise InputError(
+            f"{path}: its name says that it is a disparity map: give its calibration with --calib, or rename it"
+        )
     return None
 
 
@@ -368,7 +370,7 @@ def _png_values(image: Image.Image, path: StrPath, grey: bool) -> Array:
     if grey and image.mode != "L" and not image.mode.startswith("I"):
         channels = np.asarray(image.convert("RGB")).astype(np.int16)
         if np.ptp(channels, axis=-1).max() >= GREY:
-            raise InputError(f"{path}: a map in colours does not say which is near: give it in greys")
+            raise InputError(f"{path}: a colour picture does not tell near from far: give a grey one")
         return channels[..., 1].astype(np.uint8)
     if image.mode != "L" and not image.mode.startswith("I"):
         raise InputError(f"{path}: a PNG with mode {image.mode} holds no millimetres: {WHICH}")
@@ -392,7 +394,7 @@ def _read_npz(file: IO[bytes], path: StrPath) -> Array:
     with zipfile.ZipFile(file) as archive:
         names = archive.namelist()
         if len(names) != 1 and "depth.npy" not in names:
-            raise InputError(f"{path}: holds {len(names)} arrays and none is called depth: name one so")
+            raise InputError(f"{path}: holds {len(names)} arrays and none is called depth: name one of them depth")
         with archive.open("depth.npy" if "depth.npy" in names else names[0]) as member:
             return _read_npy(member, path)
 

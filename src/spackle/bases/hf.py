@@ -150,7 +150,7 @@ def to_depth_map(raw: Tensor, meaning: Meaning, focal: float, name: str, photo: 
     low, high = (float(extreme) for extreme in raw[known].aminmax()) if known.any() else (math.nan, math.nan)
     if not high > max(0, low + FLAT * max(abs(low), abs(high))):
         why = "its weights are broken or need --precision fp32, or the photo is empty"
-        raise InputError(f"{photo}: {name} predicts {low:g} to {high:g}, which is no depth: {why}")
+        raise InputError(f"{photo}: {name} predicts {low:g} to {high:g}, which cannot be depth: {why}")
     if meaning == "metres":
         depth = raw
     elif meaning == "relative disparity":

@@ -121,7 +121,7 @@ class BaseSettings:
         """InputError for an unknown base, an option that it cannot use, or `auto` where `one` base must be named."""
         if one and self.name == AUTO:
             known = ", ".join((RGBD, *NETWORKS))
-            raise InputError(f"--base {AUTO}: results must say what they are of: name one of {known}")
+            raise InputError(f"--base {AUTO}: results must name their base: choose one of {known}")
         if self.name == HF:
             raise InputError(f"--base {HF} names no model: give owner/name of the hub, or a folder")
         if not self.name.startswith(HF):
@@ -145,7 +145,7 @@ class BaseSettings:
         check_name("--depth-kind", self.depth_kind, DEPTH_KINDS)
         for option in ("--calib", *READING):
             if (value := options[option]) is not None and self.depth is None:
-                raise InputError(f"{option} {value}: says how to read a depth map: give that with --depth")
+                raise InputError(f"{option} {value}: says how to read a depth map: give the map with --depth")
             if value is not None and option in ("--near", "--far") and self.depth_kind not in RELATIVE:
                 raise InputError(f"{option} {value}: is for a relative map: add --depth-kind {' or '.join(RELATIVE)}")
         if self.named in MISSING and not self.files:

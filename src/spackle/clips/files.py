@@ -105,7 +105,7 @@ def _read_clip(path: str | os.PathLike[str], first: int | None, progress: Callab
             if progress:
                 progress(len(ticks), max(len(ticks), first or stream.frames))
     if frame is None:
-        raise InputError(f"{path}: there is not one frame in it: give another clip")
+        raise InputError(f"{path}: it has no frames: give another clip")
     width, height = _square_size(frame, aspect)
     if _quarters(frame) % 2:
         width, height = height, width
@@ -137,7 +137,7 @@ def _opened(path: str | os.PathLike[str]) -> Iterator[tuple[InputContainer, Vide
         raise InputError(f"{path}: not a video, or damaged at its beginning or end ({reason})") from error
     with container:
         if LISTS & set(container.format.name.split(",")):
-            raise InputError(f"{path}: is a list of other files, not a video: give one of those")
+            raise InputError(f"{path}: is a list of other files, not a video: give one of these files")
         pictures = [s for s in container.streams.video if not s.disposition & Disposition.attached_pic]
         if not pictures:
             what = "has sound but no moving picture" if container.streams.audio else "has no moving picture"
@@ -161,7 +161,9 @@ def _decoded(
             for frame in packet.decode():
                 shape = (frame.width, frame.height, frame.rotation)
                 if size not in (None, shape):
-                    raise InputError(f"{path}: frame {count} has another size than those before: cut the clip there")
+                    raise InputError(
+                        f"{path}: frame {count} has another size than the frames before it: cut the clip there"
+                    )
                 size = shape
                 yield frame
                 count += 1

@@ -345,7 +345,7 @@ class _Build:
             for name in (NAME, *(shard.file for shard in shards)):
                 (self.output / name).unlink(missing_ok=True)
             why = min(line for shard in shards for line in shard.passed_over)
-            raise InputError(f"{self.output}: none of {len(self.photos)} photos gave a sample, such as {why}")
+            raise InputError(f"{self.output}: none of {len(self.photos)} photos gave a sample; for example {why}")
         if made:
             stages = ", ".join(f"{stage} {self.seconds[stage] / made:.2f}" for stage in STAGES)
             self.reporter.log(f"{3600 * made / seconds:,.0f} photos an hour; seconds a photo: {stages}")

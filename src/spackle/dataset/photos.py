@@ -67,14 +67,14 @@ def _named_by_coco(source: Path, folder: Path | None, log: Callable[[str], None]
         raise InputError(f"{source}: names no images")
     root = source.parent if folder is None else folder
     if not os.path.isdir(root):
-        raise InputError(f"{root}: no such folder, and the photos of {source.name} should be in it")
+        raise InputError(f"{root}: no such folder, but the photos of {source.name} should be in it")
     for name in names:  # names must not lead out of the folder
         if not isinstance(name, str) or not name or "\0" in name or name.startswith("/") or ".." in Path(name).parts:
-            raise InputError(f"{source}: {str(name)[:60]!r} is no file name of an image")
+            raise InputError(f"{source}: {str(name)[:60]!r} is not the file name of an image")
     unique = sorted({Path(name).as_posix() for name in names})
     present = [name for name in unique if os.path.isfile(root / name)]
     if not present:
-        raise InputError(f"{source}: none of its {len(unique)} images is in {root}: name their folder")
+        raise InputError(f"{source}: none of its {len(unique)} images is in {root}: give their folder with --images")
     if missing := sorted(set(unique) - set(present)):
         listed = ", ".join((*missing[:NAMED], *(["…"] if len(missing) > NAMED else [])))
         log(f"{len(missing)} images that {source} names are not in {root}: {listed}")

@@ -110,13 +110,13 @@ class EvaluateOptions:
             if METRICS[metric].truth and not self.near:
                 raise InputError(f"--metrics {metric}: needs a true second view: add --protocol near-view")
         if not self.methods:
-            raise InputError(f"--methods: none is given: choose of {', '.join(METHODS)}")
+            raise InputError(f"--methods: none is given: choose from {', '.join(METHODS)}")
         self.opened.check(one=True)
         if self.residual == "none":
             raise InputError("--residual none: there would be nothing to evaluate: add --methods base instead")
         if "direct-ft" in self.methods:
             if self.base.name != "sharp":
-                raise InputError("--methods direct-ft: is a SHARP that was trained further: add --base sharp")
+                raise InputError("--methods direct-ft: is SHARP with further training: add --base sharp")
             if self.direct_ft is None:
                 made = "which `spackle train --method direct-ft` made"
                 raise InputError(f"--methods direct-ft: no weights: give --direct-ft FILE, {made}")
@@ -190,7 +190,7 @@ def open_evaluation(options: EvaluateOptions) -> Evaluation:
     if options.near and not any(case.seconds for case in cases):
         raise InputError(f"{options.root}: {dataset.name}: has no second photos: take --protocol large-view")
     if not base.network and not any(case.depth or case.points for case in cases):
-        problem = "has no depth of any kind, which --base rgbd takes"
+        problem = "has no depth of any kind, which --base rgbd needs"
         raise InputError(f"{options.root}: {dataset.name}: {problem}: take {', '.join(NETWORKS)}")
     network, direct, features, inpainter = fill.load(), None, None, None
     if "inpaint2d" in options.methods:

@@ -123,7 +123,7 @@ def align(case: Case, z_base: Tensor, seen: Tensor, *, base_is_truth: bool = Fal
         return _of_bounds(case.bounds, z_base[seen])
     sources = {"depth map": case.depth, "points": case.points, "bounds": case.bounds}
     has = ", ".join(name for name, value in sources.items() if value is not None)
-    reason = f"its {has} and the base's depth share under {MIN_PIXELS} pixels" if has else "no depth of it is known"
+    reason = f"its {has} and the base's depth share under {MIN_PIXELS} pixels" if has else "none of its depth is known"
     raise InputError(f"{case.name}: {reason}: the base's scale cannot be found, leave its second views out")
 
 

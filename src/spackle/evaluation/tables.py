@@ -80,7 +80,7 @@ def make_tables(runs: Sequence[Run], *, whole: bool = False) -> list[Table]:
     of["cost"] = of["bench"] + [run for run in of["large"] if ("bench", run.title, run.base) not in seen]
     settings = next((run.settings for run in runs if not run.near), SETTINGS)
     if any(run.settings != settings for run in runs if not run.near):
-        raise InputError("the results have different disparities: make their tables apart")
+        raise InputError("the results have different disparities: make a separate table for each")
     return [
         _table(label, spec, of[spec["of"]], [NEAR] if spec["of"] == "near" else settings)
         for label, spec in TABLES.items()

@@ -199,7 +199,7 @@ class PlyFile:
         elif "intrinsic" in (extras := self._extras()):
             parts = [extras.get(name, np.empty(0)) for name in ("intrinsic", "extrinsic", "image_size")]
             if [len(part) for part in parts] != [9, 16, 2]:
-                raise InputError(f"{self.path}: the stored camera is none that SHARP writes: give the focal length")
+                raise InputError(f"{self.path}: the stored camera is not as SHARP writes it: give the focal length")
             K, matrix, (width, height) = parts[0].reshape(3, 3), parts[1].reshape(4, 4), parts[2]
         else:
             return None

@@ -209,7 +209,7 @@ def load_scene(path: Path) -> SceneFile:
     if kind not in SCENE_DECODERS:
         ply: SceneFile = import_module("spackle.formats.ply").PlyFile(path).scene()
         return ply
-    with reading(path, f"cannot be read as {kind}: {{reason}}: the file is damaged, or of another program"):
+    with reading(path, f"cannot be read as {kind}: {{reason}}: the file is damaged, or from another program"):
         columns = function_named(SCENE_DECODERS[kind])(path.read_bytes())
         if not len(columns.means):
             raise ValueError("it holds no Gaussians")

@@ -116,7 +116,7 @@ def _package_version() -> str:
             raise InputError("inpainter propainter needs a package: pip install 'spackle-nvs[propainter]'") from error
         raise InputError(
             f"inpainter propainter: torchvision cannot be imported ({reason_in_a_line(error)}): "
-            f"install the one that was built for torch {torch.__version__}, from where this torch came"
+            f"install the one that was built for torch {torch.__version__}, from the same source"
         ) from error
     return str(pytorchcv.__version__)
 
@@ -169,6 +169,6 @@ def give_weights(network: nn.Module, name: str, file: Path) -> None:
     found = read_tensors(file, advice)
     published = re.search(r"-\d{4}-([0-9a-f]{8})\.pth$", file.name)  # the first digits of its SHA-1
     if published and not hashlib.sha1(file.read_bytes(), usedforsecurity=False).hexdigest().startswith(published[1]):
-        raise InputError(f"{file}: damaged, for its SHA-1 is not the one in its name: {advice}")
+        raise InputError(f"{file}: damaged, because its SHA-1 is not the one in its name: {advice}")
     ours = network.state_dict().keys()
     load_strict(network, {key: tensor for key, tensor in found.items() if key in ours}, file, advice)

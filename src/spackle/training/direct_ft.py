@@ -143,7 +143,7 @@ class DirectFt(ViewTask):
         self.network = self.base.network.gaussian_decoder().let_learn()
         facts = self.facts(self.base.network)
         reporter.log(
-            f"{self.items} photos to learn from, {self.validation_items} to be judged by; "
+            f"{self.items} training photos, {self.validation_items} validation photos; "
             f"{facts['parameters']['learn']:,} weights of SHARP learn, {facts['parameters']['stay']:,} stay"
         )
         return {**facts, "checkpoint": {"file": self.owner.path.name, "sha256": self.owner.sha256}}
@@ -188,7 +188,7 @@ def _check_base(files: DatasetFiles, weights_sha256: str) -> None:
     base = files.manifest.config.get("base", {})
     if base.get("name") != "sharp":
         raise InputError(
-            f"{files.location}: built with --base {base.get('name')}, so its holes are not SHARP's, which is to learn: "
+            f"{files.location}: built with --base {base.get('name')}, but SHARP must learn its own holes: "
             "build one with --base sharp"
         )
     if base.get("weights") != weights_sha256:

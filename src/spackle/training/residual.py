@@ -230,12 +230,12 @@ class ResidualTask(ViewTask):
                 for name, of, seed, views in parts
             )
         if skipped:
-            reporter.log(f"{skipped.total()} views were passed over, for {len(skipped)} reasons (above)")
+            reporter.log(f"{skipped.total()} views were passed over, for {len(skipped)} reasons (see above)")
         self.items, self.validation_items = len(self.learned), len(self.validation)
-        reporter.log(f"{self.items} samples to learn from, {self.validation_items} to be judged by")
+        reporter.log(f"{self.items} training samples, {self.validation_items} validation samples")
         limits = self.limits() if rank() == 0 else {}  # for run.json, which the first process writes
         for name, decibels in limits.items():
-            reporter.log(f"{decibels:.2f} dB in the holes of the latter: {name}")
+            reporter.log(f"{decibels:.2f} dB in the holes of the validation samples: {name}")
         return {**self.facts(self.network), "hole_psnr": limits}
 
     @torch.no_grad()

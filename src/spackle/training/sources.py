@@ -196,7 +196,9 @@ def divided_photos(files: DatasetFiles, data: DataRecipe) -> tuple[list[int], li
     """
     photos, per_photo = len(files), len(files.samples[0][1].holes)
     if photos < 2:
-        raise InputError(f"{data.pseudo}: a single photo, but one must learn and another judge: build it with more")
+        raise InputError(
+            f"{data.pseudo}: a single photo, but training and validation need one each: build it with more"
+        )
     order = [int(place) for place in np.random.default_rng(data.seed).permutation(photos)]
     held = min(max(1, data.validation_views // per_photo), photos // 2)
     return order[held:][: max(1, data.views // per_photo)], order[:held]

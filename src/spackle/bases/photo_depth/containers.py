@@ -126,7 +126,7 @@ def _boxes(body: memoryview) -> Boxes:
         head = 16 if size == 1 else 8
         size = struct.unpack_from(">Q", body, at + 8)[0] if size == 1 else size or len(body) - at
         if not head <= size <= len(body) - at:
-            raise ValueError("a box beyond its box")
+            raise ValueError("a box that ends beyond its parent")
         yield kind, body[at + head : at + size]
         at += size
 
@@ -205,5 +205,5 @@ def number(tree: Element, name: str) -> float | None:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise BrokenDepth(f"has {text[:40]!r} for {name.rpartition('}')[2]}, which is no number")
+        raise BrokenDepth(f"has {text[:40]!r} for {name.rpartition('}')[2]}, which is not a number")
     return value

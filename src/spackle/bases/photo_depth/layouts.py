@@ -307,7 +307,7 @@ def _coded(node: Element, space: str, picture: bytes, layout: str, lens: Lens | 
     known = unit in _UNITS_M or diopters
     near, far = (value * _UNITS_M.get(unit, 1.0) for value in (near, far))
     if style not in ("rangeinverse", "rangelinear"):
-        raise BrokenDepth(f"has the format {style[:40]!r}: RangeInverse and RangeLinear are read")
+        raise BrokenDepth(f"has the format {style[:40]!r}: only RangeInverse and RangeLinear are read")
     inverse = style == "rangeinverse"
     if near == far or min(near, far) < 0 or (near > far) != diopters or (inverse and min(near, far) == 0):
         raise BrokenDepth(f"announces near {near:g} and far {far:g}, between which nothing can lie")
@@ -341,7 +341,7 @@ def _item(data: bytes, tree: Element, uri: str) -> bytes:
         end = begin + length if length else len(data)  # 0: to the end of the file
         if begin > 0 and end <= len(data) and data.startswith(_PICTURE_STARTS, begin):
             return data[begin:end]
-    raise BrokenDepth("is cut off, or not where the photo's directory of items has it")
+    raise BrokenDepth("is cut off, or not where the photo's directory of items says")
 
 
 def _android_lens(tree: Element) -> Lens | None:

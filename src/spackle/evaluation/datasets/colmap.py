@@ -94,7 +94,7 @@ def read_model(folder: Path) -> Model:
 def _lens(path: Path, model: int | str, width: int, height: int, parameters: list[float]) -> Camera:
     known = next((m for key, m in MODELS.items() if model in (key, m[0])), None)
     if known is None or len(parameters) != known[1]:
-        raise InputError(f"{path}: lens model {model} is no pinhole: undistort the photos with COLMAP first")
+        raise InputError(f"{path}: lens model {model} is not a pinhole: undistort the photos with COLMAP first")
     single = known[0].startswith(("SIMPLE", "RADIAL"))
     fx, fy, cx, cy, *bend = [parameters[0], *parameters] if single else parameters
     K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
@@ -115,7 +115,7 @@ def _view(path: Path, lens: Camera, name: str, pose: list[float], observed: Arra
     quaternion, shift = torch.tensor(pose[:4], dtype=torch.float64), torch.tensor(pose[4:], dtype=torch.float64)
     where = f"{path}: the pose of {name}"
     if len(shift) != 3 or not 1e-6 < float(quaternion.norm()) < LARGEST:
-        raise InputError(f"{where} is no rotation: the file is damaged")
+        raise InputError(f"{where} is not a rotation: the file is damaged")
     matrix = torch.eye(4, dtype=torch.float64)
     matrix[:3, :3], matrix[:3, 3] = quat_to_matrix(quaternion), shift
     seen = observed[observed["id"] >= 0]
