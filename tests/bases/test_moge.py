@@ -167,7 +167,7 @@ def test_predict_takes_a_checkpoint_and_a_clip_keeps_one_lens(
     monkeypatch.setattr("spackle.bases.lift.lift", lambda *given: (seen.append(given[2].focal[0]), lift(*given))[1])
     done = run("predict", write_clip(tmp_path / "clip.mp4", moving(3, 90, 160)), *words, "--residual", "none")
     assert (done.code, report_of(tmp_path / "clip")["focal_source"]) == (0, "MoGe"), done.err
-    assert f"moves {report_of(tmp_path / 'clip')['disparity']:g}" in done.err
+    assert f"moves by disparity {report_of(tmp_path / 'clip')['disparity']:g}" in done.err
     assert seen == pytest.approx([1.3 * HALF] * 3, rel=1e-5)
 
 

@@ -182,7 +182,7 @@ def test_no_photos_is_a_line(tmp_path: Path) -> None:
     Image.fromarray(picture(72, 54)).save(tmp_path / "photos" / "0.png")
     done = build(tmp_path, tmp_path / "out")
     assert (done.code, len(done.lines)) == (2, 3)  # a.png, 0.png, and what it comes to
-    assert "none of 1 photos gave a sample, such as 0.png: no depth map in --depth: " in done.lines[-1]
+    assert "none of 1 photos gave a sample; for example 0.png: no depth map in --depth: " in done.lines[-1]
     assert not (tmp_path / "out").exists()
 
 

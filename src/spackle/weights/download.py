@@ -157,5 +157,5 @@ def _first_byte(url: str, response: HTTPResponse, there: int, size: int) -> int:
     else:
         raise InputError(f"{url}: the server's answer is not a file: check the address in a browser")
     if total != size:
-        raise InputError(f"{url}: another file: {total:,} bytes, the published one has {size:,}: give another address")
+        raise InputError(f"{url}: another file: {total:,} bytes, {size:,} were published: give another address")
     return done
