@@ -1,4 +1,4 @@
-"""`spackle evaluate` and `spackle tables`: datasets into rows, tables, contact sheets and a page."""
+"""`spackle evaluate` and `spackle tables`: evaluate datasets; write rows, tables, contact sheets and an HTML page."""
 
 from __future__ import annotations
 
@@ -44,29 +44,29 @@ from spackle.training.losses import load_features
 from spackle.weights import weights_digest, weights_digests
 
 BASE = BaseSettings("sharp")
-LARGE_SIDE = 1280  # of the paper's large views: its added Gaussians are (1280 / 1536)² of HAR × grid at 1536
-MAX_DISPARITIES = 6  # columns of a table
+LARGE_SIDE = 1280  # long side of the paper's large views: its added Gaussians are (1280 / 1536)² of HAR × grid at 1536
+MAX_DISPARITIES = 6  # at most; each takes columns of a table
 SECOND_VIEWS = ("all", "nearest")
 
 
 @dataclasses.dataclass(frozen=True)
 class EvaluateOptions:
-    """The choices of `spackle evaluate`."""
+    """The options of `spackle evaluate`."""
 
     dataset: str
     root: Path
     protocol: str = "large-view"
     methods: Sequence[str] = ("base", "paper", "spackle")
     disparities: Sequence[float] = DISPARITIES  # of the large views
-    metrics: Sequence[str] | None = None  # the protocol's where None
-    base: BaseSettings = BASE  # the paper's; its precision and device are the residual's, too
-    residual: str | None = None  # a file, "seeds", or None for the shipped weights if any
+    metrics: Sequence[str] | None = None  # None: all metrics of the protocol
+    base: BaseSettings = BASE  # the paper's; its precision and device also apply to the residual
+    residual: str | None = None  # a file, or "seeds"; None: the shipped weights, if any
     direct_ft: Path | None = None  # weights of the method direct-ft
     inpainter: str = "opencv"  # of the method inpaint2d
     features: Path | None = None  # SqueezeNet's weights, for the metric distance
-    second_views: str = "all"  # of `SECOND_VIEWS`, that a photo is compared with in near-view
-    side: int | None = None  # long side of the views; the paper's where None: 1280 for large views, 1536 for near ones
-    limit: int | None = None  # so many images, spread over the dataset
+    second_views: str = "all"  # one of `SECOND_VIEWS`: which second photos near-view uses
+    side: int | None = None  # long side of the views; None: the paper's, 1280 for large views, 1536 for near ones
+    limit: int | None = None  # the number of images, spread over the dataset
     download: bool = False  # pyiqa may fetch weights
 
     @property
@@ -75,7 +75,7 @@ class EvaluateOptions:
 
     @property
     def max_side(self) -> int:
-        """Long side of the views, in pixels."""
+        """The long side of the views, in pixels."""
         return self.side or (MAX_SIDE if self.near else LARGE_SIDE)
 
     @property
@@ -86,17 +86,17 @@ class EvaluateOptions:
 
     @property
     def device(self) -> torch.device:
-        """Where networks run."""
+        """The device of networks."""
         return pick_device(None if self.base.device == "auto" else self.base.device)
 
     @property
     def opened(self) -> BaseSettings:
-        """The base's settings, without a precision that is the residual's alone."""
+        """The base's settings; bases that take no precision get none, and it then applies to the residual alone."""
         alone = self.base.named in ("rgbd", "lite")
         return dataclasses.replace(self.base, precision="auto") if alone else self.base
 
     def check(self) -> None:
-        """InputError for an option that cannot be used, whatever the images."""
+        """InputError if an option cannot be used; the images are not looked at."""
         check_name("--dataset", self.dataset, DATASETS)
         check_name("--protocol", self.protocol, DEFAULT_METRICS)
         for method in self.methods:
@@ -125,19 +125,19 @@ class EvaluateOptions:
         if not 1 <= len(self.disparities) <= MAX_DISPARITIES:
             raise InputError(f"--disparity: give one to {MAX_DISPARITIES} numbers, got {len(self.disparities)}")
         for value in self.disparities:
-            if not 0 < value <= MAX_DISPARITY:  # NaN, too
+            if not 0 < value <= MAX_DISPARITY:  # also refuses NaN
                 raise InputError(f"--disparity {value:g}: must be above 0 and up to {MAX_DISPARITY:g}")
         if len(set(self.disparities)) < len(self.disparities):
             raise InputError("--disparity: the same number twice: leave one out")
 
 
 def split_words(text: str) -> tuple[str, ...]:
-    """ "a, b,c" as words, without repetitions."""
+    """Split "a, b,c" into words, and drop repetitions."""
     return tuple(dict.fromkeys(word.strip() for word in text.split(",") if word.strip()))
 
 
 def parse_disparities(text: str) -> tuple[float, ...]:
-    """ "0.3,0.4" or "0.3 0.4" as numbers; InputError for anything else."""
+    """Read "0.3,0.4" or "0.3 0.4" as numbers; InputError for other text."""
     try:
         return tuple(float(word) for word in split_words(",".join(text.split())))
     except ValueError as error:
@@ -146,7 +146,7 @@ def parse_disparities(text: str) -> tuple[float, ...]:
 
 @dataclasses.dataclass(frozen=True)
 class Evaluation:
-    """A dataset's cases, and what they share."""
+    """A dataset's cases, and what all of them are evaluated with."""
 
     options: EvaluateOptions
     cases: Sequence[Case]
@@ -156,29 +156,29 @@ class Evaluation:
     inpainter: Inpainter | None  # of the method inpaint2d
     renderer: Renderer
     gauges: Gauges
-    config: dict[str, Any]  # everything that decides renders, ready for JSON; nothing of where files lie
-    metrics: dict[str, str]  # of each wanted metric who measures it, or why nobody
+    config: dict[str, Any]  # everything that determines the renders, ready for JSON, without paths
+    metrics: dict[str, str]  # for each wanted metric, who measures it, or why it is not run
 
     def open(self, loaded: LoadedCase) -> OpenedBase:
-        """The base of a case: the network, or the case's own depth or points; InputError where it lacks those."""
+        """The base of a case: a network, or else the case's depth or points; InputError if it has neither."""
         network = self.options.base.network
         return self.base if network else open_loaded(RgbdBase(known_depth(loaded.case)))
 
     def context(self, prediction: BasePrediction) -> FillContext:
-        """The base of a photo, and the means to fill the holes of its views."""
+        """Join a photo's base Gaussians with what fills the holes of its views."""
         fill = self.renderer, self.network
         return FillContext(prediction.gaussians, prediction.camera, *fill, precision=self.options.base.precision)
 
 
 def open_evaluation(options: EvaluateOptions) -> Evaluation:
-    """Check the options and load what all images share; networks of a base are loaded with the first image.
+    """Check the options and load what all images share; a base's networks are loaded with the first image.
 
-    InputError for an option, a dataset, weights or a package that cannot be used.
+    InputError if an option, the dataset, weights or a package cannot be used.
     """
     options.check()
     base, dataset, fill, wanted = options.base, DATASETS[options.dataset], FillOptions(options.residual), options.wanted
     cases, limit = read_cases(dataset.name, options.root), options.limit
-    if limit is not None and limit < len(cases):  # evenly over their order
+    if limit is not None and limit < len(cases):  # evenly spaced
         cases = [cases[(2 * k + 1) * len(cases) // (2 * limit)] for k in range(limit)]
     every = options.near and options.second_views == "all"
     cases = [
@@ -226,7 +226,7 @@ def open_evaluation(options: EvaluateOptions) -> Evaluation:
             "weights": weights_digests(base.files),
             "precision": base.precision,
         },
-        "device": device_of(renderer).type,  # of the renderer, the residual and networks of bases
+        "device": device_of(renderer).type,  # where renderer, residual and the base's network run
         "methods": list(options.methods),
         "residual": {
             "weights": "seeds" if fill.file is None else "shipped" if options.residual is None else "given",
@@ -245,11 +245,11 @@ def open_evaluation(options: EvaluateOptions) -> Evaluation:
 
 
 def evaluate(options: EvaluateOptions, output: Path, reporter: Reporter, html: bool = False) -> str:
-    """Evaluate a dataset, or resume that: "complete", or "stopped" by Ctrl-C.
+    """Evaluate a dataset, or resume that; returns "complete", or "stopped" after Ctrl-C.
 
-    Writes rows.jsonl, tables.md, tables.tex, worst.png, best.png and images/ into `output`, and report.html with
-    `html`. InputError for options, a dataset or a folder that cannot be used, for another evaluation in `output`, and
-    for too little memory.
+    Writes rows.jsonl, tables.md, tables.tex, worst.png, best.png and images/ into `output`, and with `html` also
+    report.html. InputError if options, dataset or folder cannot be used, if `output` holds another evaluation, or if
+    memory is too small.
     """
     if html:
         check_matplotlib("--html")
@@ -286,7 +286,7 @@ def evaluate(options: EvaluateOptions, output: Path, reporter: Reporter, html: b
 
 
 def _log_missing(evaluation: Evaluation, reporter: Reporter) -> None:
-    """Log why metrics are not run, and pyiqa's terms if it is used."""
+    """Log why metrics are not run, and pyiqa's licence if it is used."""
     reasons: dict[str, list[str]] = {}
     for name, state in evaluation.metrics.items():
         if state.startswith(NOT_RUN):
@@ -300,9 +300,9 @@ def _log_missing(evaluation: Evaluation, reporter: Reporter) -> None:
 def measure_case(
     case: Case, evaluation: Evaluation, metrics: Sequence[str] = ()
 ) -> tuple[list[Row], dict[str, Tensor]]:
-    """An image's figures, `metrics` included, and pictures [H, W, 3]: the photo, and a view by each method.
+    """Measure an image: its rows, which include `metrics`, and images [H, W, 3], see `measure_views`, and the photo.
 
-    InputError for a file that cannot be used or is missing; BaseError where no image can be worked on.
+    InputError if a file is missing or cannot be used; BaseError if the base would fail for every image.
     """
     options = evaluation.options
     loaded = load_case(case, options.max_side)
@@ -318,7 +318,7 @@ def measure_case(
 
     @cache
     def direct_ft() -> tuple[Gaussians, float]:
-        """The Gaussians of direct FT, and the factor on camera positions that its unit of length needs."""
+        """The Gaussians of direct FT, and the factor by which camera positions are multiplied for their unit."""
         assert evaluation.direct is not None
         other = evaluation.direct.predict(loaded.full)[0]
         if alignment is None:
@@ -348,20 +348,20 @@ def measure_case(
 
 @torch.no_grad()
 def _align(loaded: LoadedCase, prediction: BasePrediction, evaluation: Evaluation, is_truth: bool) -> Alignment:
-    """The scale between base and dataset, from the base's depth at the photo's own camera."""
+    """Find the scale between base and dataset, from the base's depth at the photo's own camera."""
     view = evaluation.renderer.render(prediction.gaussians, prediction.camera)
     return align(loaded.case, view.depth, ~hole_mask(view.alpha), base_is_truth=is_truth)
 
 
 def merge_tables(folders: Sequence[Path], output: Path, reporter: Reporter, html: bool = False) -> None:
-    """Write the tables of several finished evaluations and benchmarks into `output`, and report.html with `html`.
+    """Write joint tables of finished evaluations and benchmarks into `output`, with `html` also report.html.
 
-    InputError for a folder without results, results that do not go together, or an output that cannot be written to.
+    InputError if a folder has no results, results do not go together, or the output cannot be written to.
     """
     if html:
         check_matplotlib("--html")
     runs = [load_run(folder) for folder in folders]
-    tables = make_tables(runs, whole=True)  # what does not go together is refused before anything is written
+    tables = make_tables(runs, whole=True)  # raises for results that do not go together, before anything is written
     files = (*FILES, *([REPORT] if html else []))
     with results_folder(output, files, alone=True):
         write_tables(tables, output)

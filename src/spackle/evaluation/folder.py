@@ -1,7 +1,7 @@
-"""A folder of results: config.json, images/ with a file for each finished image, and at last rows.jsonl.
+"""A folder of results: config.json, images/ with a file for each finished image, and finally rows.jsonl.
 
-config.json holds the options that decide the renders; rows.jsonl exists once all images are done. A killed run resumes.
-If metrics are added to a finished run, they alone are measured.
+config.json holds the options that determine the renders; rows.jsonl exists once all images are done. A killed run
+resumes. If metrics are added to a finished run, only these are measured.
 """
 
 from __future__ import annotations
@@ -34,20 +34,20 @@ from spackle.progress import Reporter, asked_to_stop
 
 CONFIG, ROWS, IMAGES = "config.json", "rows.jsonl", "images"
 FORMAT = 3
-KINDS = {"evaluate": "an evaluation", "bench": "a benchmark"}  # of a configuration: the command, and what it makes
+KINDS = {"evaluate": "an evaluation", "bench": "a benchmark"}  # by the "kind" in a configuration
 DAMAGED = "not of `spackle evaluate` or `spackle bench` ({reason}): run it again"
-# Place, image, and metrics to measure, to the image's rows and the files that it wrote.
+# From index, case and the metrics to measure, to the case's rows and the files that it wrote.
 Measure = Callable[[int, Case, Sequence[str]], tuple[list[Row], list[Path]]]
 
 
 def write_rows(rows: Iterable[Row], path: Path) -> None:
-    """Write rows, one JSON object a line; whole or not at all."""
+    """Write rows atomically, one JSON object per line."""
     lines = (json.dumps(row._asdict(), allow_nan=False) + "\n" for row in rows)
     write_whole(path, "".join(lines).encode())
 
 
 def load_run(folder: Path) -> Run:
-    """The finished results in a folder; InputError where there are none, or a file of it is damaged."""
+    """Read the finished results in a folder; InputError if there are none, or a file is damaged."""
     if not (folder / ROWS).is_file():
         state = "not finished: run its command again" if (folder / CONFIG).is_file() else "no results"
         raise InputError(f"{folder}: {state}: {ROWS} is missing")
@@ -60,14 +60,14 @@ def load_run(folder: Path) -> Run:
         if config.pop("format") != FORMAT:
             raise ValueError("of another version")
         run = Run(config, rows, config.pop("about"))
-        _ = (run.title, run.base, run.timed, run.methods, run.settings)  # all are there
+        _ = (run.title, run.base, run.timed, run.methods, run.settings)  # raises if one is missing
     return run
 
 
 def open_folder(output: Path, config: Mapping[str, Any], about: Mapping[str, Any]) -> None:
-    """Make a folder for this configuration (its "kind" is in `KINDS`); InputError if it holds another one.
+    """Make a folder for this configuration (its "kind" is in `KINDS`); InputError if it has another one.
 
-    `about` is kept for readers, and need not be the same.
+    `about` is stored for readers; a run may resume with another one.
     """
     make_folder(output / IMAGES)
     remove_half_written(output, output / IMAGES)
@@ -85,7 +85,7 @@ def open_folder(output: Path, config: Mapping[str, Any], about: Mapping[str, Any
 
 
 def image_file(output: Path, index: int, name: str, suffix: str) -> Path:
-    """The path of an image's rows (.json), or of one of its pictures (.METHOD.webp)."""
+    """The path of the file with an image's rows (.json), or with one of its pictures (.METHOD.webp)."""
     return output / IMAGES / f"{index:05d}-{re.sub(r'[^A-Za-z0-9.-]+', '_', name)[-80:]}{suffix}"
 
 
@@ -99,21 +99,21 @@ def measure_images(
     reporter: Reporter,
     metrics: Mapping[str, str] | None = None,
 ) -> Run | None:
-    """Measure the images that no earlier run in the folder has finished: all results; None where Ctrl-C came.
+    """Measure the images that earlier runs in the folder have not finished; returns all results, None after Ctrl-C.
 
-    Finished images are measured by new metrics alone. `metrics` maps each metric to who measures it, or to "not run",
-    which keeps the figures of an earlier run. An image that cannot be used gives one row, its problem, and is tried
-    again by the next run.
+    For finished images only new metrics are measured. `metrics` maps each metric to who measures it, or to "not run",
+    which keeps the figures of an earlier run. An image that cannot be used gives one row, which names the problem, and
+    the next run tries it again.
 
     Raises:
-        BaseError: no image can be worked on.
-        InputError: not one image gave figures, or another configuration's results are in the folder.
+        BaseError: the base would fail for every image.
+        InputError: no image gave figures, or the folder holds results of another configuration.
     """
     open_folder(output, config, about)
     measurable = {name: state for name, state in (metrics or {}).items() if not state.startswith(NOT_RUN)}
     rows: list[Row] = []
-    measured: list[dict[str, str]] = []  # of each image that gave figures, by whom
-    begun, digest = False, functools.cache(photo_digest)  # a photo may be the second one of many
+    measured: list[dict[str, str]] = []  # for each image with figures, who measured its metrics
+    begun, digest = False, functools.cache(photo_digest)  # cached: a photo may be a second photo of many cases
     with reporter.stage("images") as step, asked_to_stop(alone=True) as stop:
         for index, case in enumerate(cases):
             if stop():
@@ -130,7 +130,7 @@ def measure_images(
                 begun, start = True, time.perf_counter()
                 try:
                     new, files = measure(index, case, due)
-                except BaseError:  # no other image would fare better; too little memory is one, too
+                except BaseError:  # every other image would fail too, as when memory is too small
                     raise
                 except InputError as error:
                     problem = problem_of(case, error, root)
@@ -161,7 +161,7 @@ def measure_images(
 
 
 def with_metrics(old: Sequence[Row], new: Sequence[Row], names: Sequence[str]) -> list[Row]:
-    """An image's rows with new figures of some metrics, in the order that one run for all of them gives."""
+    """Replace an image's figures of the metrics `names` by new ones; rows are ordered as if measured in one run."""
     order = [*METRICS]
 
     def about(row: Row) -> str | None:
@@ -177,7 +177,7 @@ def with_metrics(old: Sequence[Row], new: Sequence[Row], names: Sequence[str]) -
 
 
 def _load_part(path: Path, inputs: str) -> tuple[list[Row], dict[str, str]] | None:
-    """An image's rows by an earlier run, and its metrics; None where they are not whole, or photos have changed."""
+    """Rows and metrics of an image from an earlier run; None if they are incomplete, or photos have changed."""
     try:
         content = json.loads(path.read_text("utf-8"))
         whole = not content["files"] or as_recorded(path.parent, path.name, content["files"])
@@ -189,11 +189,11 @@ def _load_part(path: Path, inputs: str) -> tuple[list[Row], dict[str, str]] | No
 
 
 def problem_of(case: Case, error: InputError, root: Path) -> str:
-    """Why a case is skipped, in one line that begins with its name, because a photo may belong to several cases."""
+    """Why a case is skipped, in one line; it begins with the case's name, because several cases may share a photo."""
     problem = from_root(str(error), root)
     return problem if problem.startswith(case.name) else f"{case.name}: {problem}"
 
 
 def from_root(problem: str, root: Path) -> str:
-    """A message about a dataset's file, with its path relative to the dataset's folder."""
+    """Make the paths in a message relative to the dataset's folder, and put it into one line."""
     return " ".join(problem.replace(f"{root}/", "").splitlines())

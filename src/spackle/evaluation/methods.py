@@ -1,4 +1,4 @@
-"""What is compared (methods.json): ways to views of a photo from elsewhere, all on top of one base prediction."""
+"""The methods compared (methods.json), which render new viewpoints of a photo from the same base prediction."""
 
 from __future__ import annotations
 
@@ -26,25 +26,25 @@ from spackle.scene_fill.occlusion_guard import OcclusionGuard, push_behind
 
 
 class MethodView(NamedTuple):
-    """The view that a method renders, and its aux Gaussians."""
+    """A view rendered by a method, and its aux Gaussians."""
 
     rgb: Tensor  # [H, W, 3] sRGB 0..1
-    alpha: Tensor | None  # [H, W]; None where the hole is not filled by anything in 3D
-    aux: Gaussians | None  # added for it; None where there are none by nature
+    alpha: Tensor | None  # [H, W]; None if the hole is filled in 2D
+    aux: Gaussians | None  # added for the view; None if the method has no aux Gaussians
 
 
-Fill = Callable[[Camera, Rendering], MethodView]  # of a view and the base's rendering of it
+Fill = Callable[[Camera, Rendering], MethodView]  # from a view's camera and the base's rendering of it
 
 
 class MethodFacts(NamedTuple):
     title: str  # in tables
     says: str  # in notes
-    color: str  # in plots: Okabe and Ito's, which the colour-blind tell apart
-    form: str  # of a plot's dots
+    color: str  # in plots; the palette of Okabe and Ito, for colour-blind readers
+    form: str  # the shape of markers in plots
 
 
 METHODS = {name: MethodFacts(**facts) for name, facts in load_data("methods.json").items()}
-LEAST_AUX = 64  # that the paper keeps in each view (training details)
+LEAST_AUX = 64  # the least number of aux Gaussians per view in the paper (training details)
 RESIDUAL = ("paper", "spackle", "spackle-scene", "dense")  # methods that run the residual network
 
 
@@ -55,20 +55,20 @@ def make_method(
     inpainter: Inpainter | None = None,
     direct_ft: Callable[[], tuple[Gaussians, float]] | None = None,
 ) -> Fill:
-    """The fill function of a method of `METHODS` for a photo's base.
+    """Make the function by which a method of `METHODS` fills the views of a photo's base.
 
     Args:
         name: see `METHODS`.
-        cameras: all views of a setting, which a method may complete together.
-        context: the base, and what fills its views' holes.
-        inpainter: of inpaint2d.
-        direct_ft: for direct-ft, returns the fine-tuned base's Gaussians and its unit of length in this base's unit.
+        cameras: of all views of a setting, because a method may complete them together.
+        context: the base, and what fills the holes of its views.
+        inpainter: for inpaint2d.
+        direct_ft: for direct-ft; the fine-tuned base's Gaussians, and the factor for camera positions in their unit.
     """
     context = context.placed
     guard = context.photo_guard() if name in ("spackle", "seeds", "dense") else None
 
     def on_top(aux_of: Callable[[Camera, Rendering], Gaussians]) -> Fill:
-        """A view with aux Gaussians on top of the base."""
+        """A method that renders the base and the aux Gaussians of `aux_of` together."""
 
         def fill(camera: Camera, before: Rendering) -> MethodView:
             aux = aux_of(camera, before)
@@ -86,7 +86,7 @@ def make_method(
     if name == "spackle-scene":
         scene = fill_scene(context, cameras, exact=True).aux
         return on_top(lambda camera, before: scene)
-    if name in ("spackle", "seeds"):  # each view by itself (paper, section 3.4)
+    if name in ("spackle", "seeds"):  # views are completed one by one (paper, section 3.4)
         return partial(_per_view, context if name == "spackle" else context.seeds_alone, guard)
     if name == "inpaint2d":
         assert inpainter is not None
@@ -96,7 +96,7 @@ def make_method(
 
 
 def _paper_aux(context: FillContext, camera: Camera, before: Rendering) -> Gaussians:
-    """Aux Gaussians by eqs. 2 to 9."""
+    """Aux Gaussians by the paper's eqs. 2 to 9."""
     return complete_view(
         context.base,
         camera,
@@ -119,7 +119,7 @@ def _per_view(context: FillContext, guard: OcclusionGuard | None, camera: Camera
 
 @torch.no_grad()
 def _dense_aux(context: FillContext, guard: OcclusionGuard | None, camera: Camera, before: Rendering) -> Gaussians:
-    """One for every 2×2 cell, hole or not: the ablation of the mask-guided seeds (tab:mask_guided_init)."""
+    """An aux Gaussian for every 2×2 cell, hole or not: the ablation of mask-guided seeds (tab:mask_guided_init)."""
     assert guard is not None
     network, photo_camera = context.network, context.photo_camera
     features = ViewFeatures.of(before)
@@ -132,14 +132,14 @@ def _dense_aux(context: FillContext, guard: OcclusionGuard | None, camera: Camer
 
 
 def _inpaint_2d(inpainter: Inpainter, camera: Camera, before: Rendering) -> MethodView:
-    """The base's render with its hole inpainted as a flat picture."""
+    """The base's rendering with its hole inpainted in 2D."""
     hole = hole_mask(before.alpha)
     flat = (before.rgb, hole, known_inverse_depth(before.depth, hole))
     return MethodView(inpainter.paint(*(image[None] for image in flat))[0], None, None)
 
 
 def _direct_ft(renderer: Renderer, base: Gaussians, unit: float, camera: Camera, before: Rendering) -> MethodView:
-    """The paper's naive decoupled framework: another base, trained on completed views, by itself."""
+    """The paper's naive decoupled framework: render a base that was fine-tuned on completed views; no aux Gaussians."""
     pose = camera.world_to_camera.clone()
     pose[:3, 3] *= unit
     drawn = renderer.render(base, dataclasses.replace(camera, world_to_camera=pose))

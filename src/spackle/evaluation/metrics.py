@@ -1,6 +1,6 @@
-"""The metrics of a picture (metrics.json): ours, and published ones by way of pyiqa.
+"""Image metrics (metrics.json): our own, and published ones through pyiqa.
 
-pyiqa is optional (pip install 'spackle-nvs[eval]') and not for commercial use.
+pyiqa is optional (pip install 'spackle-nvs[eval]'), and its licence forbids commercial use.
 """
 
 from __future__ import annotations
@@ -26,31 +26,31 @@ from spackle.training.losses import hole_psnr
 OWN = "own"
 NOTICE = "pyiqa: PolyForm Noncommercial licence 1.0.0; several of the networks that it fetches are for research only"
 NOT_INSTALLED = "pyiqa is not installed: pip install 'spackle-nvs[eval]'"
-WINDOW, SIGMA = 11, 1.5  # of SSIM, in pixels (Wang et al. 2004)
+WINDOW, SIGMA = 11, 1.5  # SSIM's window, in pixels (Wang et al. 2004)
 GREY = torch.tensor([0.299, 0.587, 0.114])
-INNER = 7  # side of the square around each pixel of a mask that must lie in it, for its sharpness to count
-C1, C2 = 0.01**2, 0.03**2  # its constants K1 = 0.01, K2 = 0.03, for values in 0..1
+INNER = 7  # pixels; sharpness uses pixels of a mask whose surrounding square of this side lies in the mask
+C1, C2 = 0.01**2, 0.03**2  # SSIM's constants K1 = 0.01, K2 = 0.03, for values in 0..1
 
-Metric = Callable[[Tensor, Tensor | None], float]  # (picture, truth), [H, W, 3] sRGB 0..1 each, to a score
+Metric = Callable[[Tensor, Tensor | None], float]  # from (image, truth), each [H, W, 3] sRGB 0..1, to a score
 
 
 @dataclasses.dataclass(frozen=True)
 class Figure:
     """A metric of a view."""
 
-    title: str  # with the direction that is better
-    definition: str  # exactly, for captions
-    lower: bool  # is better
+    title: str  # with an arrow for the better direction
+    definition: str  # the exact definition, for captions
+    lower: bool  # whether lower is better
     digits: int = 4
-    truth: bool = False  # needs a true second view
-    options: dict[str, Any] | None = None  # of pyiqa, pinned whatever another release has for defaults; None: ours
+    truth: bool = False  # whether it needs a true second view
+    options: dict[str, Any] | None = None  # for pyiqa, all explicit, because defaults may change; None: our own metric
 
     def text(self, value: float) -> str:
         return f"{value:.{self.digits}f}"
 
 
 METRICS = {name: Figure(**facts) for name, facts in load_data("metrics.json").items()}
-DEFINITIONS = {name: figure for name, figure in METRICS.items() if figure.options is not None}  # pyiqa's
+DEFINITIONS = {name: figure for name, figure in METRICS.items() if figure.options is not None}  # pyiqa's metrics
 DEFAULT_METRICS = {
     "large-view": [name for name, figure in METRICS.items() if not figure.truth],
     "near-view": [name for name, figure in METRICS.items() if figure.truth],
@@ -58,27 +58,27 @@ DEFAULT_METRICS = {
 
 
 def metric_name(figure: str) -> str | None:
-    """The metric that a figure (of image, hole or outside) belongs to; None for counts and shares."""
+    """The metric of a figure such as "psnr", "psnr_hole" or "psnr_outside"; None for counts and shares."""
     name = figure.partition("_")[0]
     return name if name in METRICS else None
 
 
 def reduction(before: float, after: float) -> float:
-    """1 − after / before, the relative decrease of the HAR (paper, eq. 11); NaN without any hole.
+    """1 − after / before: the relative decrease of the HAR (paper, eq. 11); NaN if there was no hole.
 
-    The paper's numbers (tab:controlled_disocclusion), and ours, are the reduction of a dataset's mean HAR.
+    The paper (tab:controlled_disocclusion) and we compute it from a dataset's mean HAR.
     """
     return 1 - after / before if before > 0 else math.nan
 
 
 def psnr(image: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
-    """`hole_psnr` in float64 over the pixels of `mask` [H, W], all where None: in dB, higher is better."""
+    """PSNR in dB, in float64, over the pixels of `mask` [H, W] (None: all); see `hole_psnr`. Higher is better."""
     everywhere = torch.ones(image.shape[:2], dtype=torch.bool)
     return hole_psnr(image.double(), truth.double(), everywhere if mask is None else mask)
 
 
 def sharpness(image: Tensor, truth: Tensor, mask: Tensor) -> float:
-    """Mean magnitude of the grey gradient over the truth's: 1 is as sharp as the truth, 0 is fog.
+    """Ratio of the mean gradient magnitude in grey to the truth's: 1 is as sharp as the truth, 0 has no detail.
 
     It is measured inside `mask` [H, W], at least 3 pixels from its border; NaN if there is no such pixel. `image` and
     `truth` are [H, W, 3] sRGB 0..1.
@@ -89,17 +89,17 @@ def sharpness(image: Tensor, truth: Tensor, mask: Tensor) -> float:
 
 
 def ssim_average(similarity: Tensor, mask: Tensor | None = None) -> float:
-    """Structural similarity (Wang et al. 2004) from its map; 1 is equal, higher is better.
+    """Average a map of structural similarity (Wang et al. 2004); 1 is equal, higher is better.
 
-    Without a mask the average runs over the pixels whose window lies within the picture, as published. A mask may reach
-    the picture's border, where much of a hole is.
+    Without a mask, pixels count whose window lies within the image, as published. With a mask, all of its pixels count,
+    also at the image's border, where much of a hole is.
 
     Args:
-        similarity: [H, W, 3], see `ssim_map`.
+        similarity: [H, W, 3], from `ssim_map`.
         mask: [H, W] bool, the pixels that count.
 
     Returns:
-        The average over pixels and channels; NaN where no pixel counts.
+        The average over pixels and channels; NaN if no pixel counts.
     """
     edge = WINDOW // 2
     return float((similarity[edge:-edge, edge:-edge] if mask is None else similarity[mask]).mean())
@@ -108,7 +108,7 @@ def ssim_average(similarity: Tensor, mask: Tensor | None = None) -> float:
 def ssim_map(image: Tensor, truth: Tensor) -> Tensor:
     """SSIM at each pixel and channel, [H, W, 3] float64, under a Gaussian window of 11 pixels with σ 1.5.
 
-    At the border the picture is mirrored to fill the window. `image` and `truth` are [H, W, 3] sRGB 0..1.
+    At the border the image is mirrored to fill the window. `image` and `truth` are [H, W, 3] sRGB 0..1.
     """
     x, y = image.double(), truth.double()
     mean_x, mean_y, square_x, square_y, product = (_blur(moment) for moment in (x, y, x * x, y * y, x * y))
@@ -119,22 +119,22 @@ def ssim_map(image: Tensor, truth: Tensor) -> Tensor:
 
 
 def _blur(image: Tensor) -> Tensor:
-    """[H, W, 3] under the window; pixels beyond the border are mirrored, the border's own among them."""
+    """Blur [H, W, 3] with the window; the image is mirrored at its border, and border pixels are repeated."""
     reach = WINDOW // 2
     wide = np.pad(image.numpy(), ((reach, reach), (reach, reach), (0, 0)), "symmetric")
     return blurred(torch.from_numpy(wide), SIGMA)[reach:-reach, reach:-reach]
 
 
 def open_metrics(names: Sequence[str], device: str, download: bool) -> tuple[dict[str, Metric], dict[str, str]]:
-    """Load metrics by their names in `DEFINITIONS`; what is missing is no error.
+    """Load metrics by their names in `DEFINITIONS`; a missing package or missing weights are no error.
 
     Args:
-        names: metrics to load; pyiqa is imported only if there is one.
+        names: metrics to load; pyiqa is imported only if there are any.
         device: "cpu" or "cuda".
-        download: let pyiqa fetch weights that are not here; otherwise it is kept off the network while it looks.
+        download: let pyiqa download missing weights; if False, its network access is blocked while it loads.
 
     Returns:
-        The metrics that can be measured here, and for each name pyiqa's version, or why it is "not run".
+        The metrics that were loaded; and for each name pyiqa's version, or the reason why it is "not run".
     """
     metrics: dict[str, Metric] = {}
     states: dict[str, str] = {}
@@ -143,7 +143,7 @@ def open_metrics(names: Sequence[str], device: str, download: bool) -> tuple[dic
     try:
         with _quiet():
             import pyiqa
-    except Exception as error:  # torchvision, which pyiqa needs, may not be the one of the installed torch
+    except Exception as error:  # pyiqa needs torchvision, which may not match the installed torch
         absent = isinstance(error, ModuleNotFoundError) and error.name == "pyiqa"
         why = NOT_INSTALLED if absent else f"pyiqa cannot be imported: {reason_in_a_line(error)}"
         return metrics, dict.fromkeys(names, f"not run: {why}")
@@ -154,7 +154,7 @@ def open_metrics(names: Sequence[str], device: str, download: bool) -> tuple[dic
                 options: dict[str, Any] = DEFINITIONS[name].options or {}
                 metrics[name] = _measure_by(pyiqa.create_metric(name, device=torch.device(device), **options))
                 states[name] = f"pyiqa {getattr(pyiqa, '__version__', 'unknown')}"
-        except Exception as error:  # whatever a stranger's package raises is one line of the report
+        except Exception as error:  # a foreign package may raise anything; the report gets one line
             why = f"pyiqa cannot load it: {reason_in_a_line(error)}"
             if attempts:
                 why = "weights: not on this machine (--download-metrics lets pyiqa fetch them)"
@@ -163,7 +163,7 @@ def open_metrics(names: Sequence[str], device: str, download: bool) -> tuple[dic
 
 
 def _measure_by(network: Callable[..., Any]) -> Metric:
-    """A metric that gives one number; NaN is passed on for the caller to count."""
+    """Make a metric of a pyiqa network; it returns one number, which may be NaN."""
 
     def measure(picture: Tensor, truth: Tensor | None = None) -> float:
         images = [image.clamp(0, 1).permute(2, 0, 1)[None].float() for image in (picture, truth) if image is not None]
@@ -176,7 +176,7 @@ def _measure_by(network: Callable[..., Any]) -> Metric:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Silence pyiqa and its dependencies, which print, log and warn while they load."""
+    """Suppress what pyiqa and its dependencies print, log and warn while they load."""
     output = io.StringIO()
     with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output), warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -185,7 +185,7 @@ def _quiet() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _off_the_network(attempts: list[str]) -> Iterator[None]:
-    """Refuse and count look-ups of host names, with which every download begins."""
+    """Block lookups of host names, with which every download begins, and record them in `attempts`."""
     lookup = socket.getaddrinfo
 
     def refuse(host: Any, *rest: Any, **more: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Pictures of an evaluation: those that it keeps, contact sheets, and the paper's figures (`spackle figures`)."""
+"""Pictures of an evaluation: the stored ones, contact sheets, and the paper's figures (`spackle figures`)."""
 
 from __future__ import annotations
 
@@ -29,42 +29,42 @@ from spackle.progress import Reporter
 
 WORST, BEST = "worst.png", "best.png"
 SHEET_CELL, SHEET_FONT, CASES = 320, 14, 6  # pixels, pixels, rows of a contact sheet
-# Images are ordered by the first of these that was measured for the method in question.
+# Images are ranked by the first of these metrics that was measured for a method.
 ORDER = {"near-view": ("distance", "lpips", "psnr_hole"), "large-view": ("clipiqa", "musiq", "har", "har_before")}
 NAMES = {"psnr_hole": "PSNR in the hole ↑", "har": "HAR ↓", "har_before": "the base's HAR ↓"}
-LARGE_SIDE = 960  # pixels of a kept picture's longer side at most
-QUALITY = 85  # of WebP
+LARGE_SIDE = 960  # the most pixels on a stored picture's longer side
+QUALITY = 85  # WebP quality
 RED = "#e3191c"
 OTHERS = (TRUTH, INPUT, HOLE)
-UP = ("psnr_hole", "clipiqa", "musiq")  # higher is better
+UP = ("psnr_hole", "clipiqa", "musiq")  # metrics of `ORDER` for which higher is better
 CAPTIONS = "figures.tex"
-DPI, WIDTH = 400, 5.5  # inches: the text of the paper's pages
-POINTS = 7  # height of letters
-MOST_BOXES, BOX = 2, 0.22  # in a picture; side of one, of the picture's longer side
-LEAST_SCORE = 0.02  # share of holes in a box, times that of the rest
+DPI, WIDTH = 400, 5.5  # dots per inch, and the paper's text width in inches
+POINTS = 7  # font size
+MOST_BOXES, BOX = 2, 0.22  # boxes in a picture at most; side of a box over the longer side
+LEAST_SCORE = 0.02  # the least product of the shares of hole and seen pixels in a box
 
-Boxes = Sequence[tuple[float, float, float, float]]  # left, top, right, bottom, as shares of the picture
+Boxes = Sequence[tuple[float, float, float, float]]  # left, top, right, bottom, as fractions of the picture
 
 
 class Cell(NamedTuple):
-    """A picture of a grid."""
+    """A picture in a grid."""
 
     picture: Image.Image
-    tag: str = ""  # in its top right corner
-    boxes: Boxes = ()  # drawn around what is to be looked at
+    tag: str = ""  # text in the top right corner
+    boxes: Boxes = ()  # red boxes around details
 
 
 def draw_grid(
     titles: Sequence[str], rows: Sequence[tuple[str, Sequence[Cell]]], cell: int, font: int, heading: str = ""
 ) -> Image.Image:
-    """Rows of pictures below the titles of their columns; a row's caption stands above it.
+    """Draw rows of pictures below the titles of their columns; each row has its caption above it.
 
     Args:
-        titles: of the columns.
-        rows: captions, and as many pictures as there are columns.
+        titles: titles of the columns.
+        rows: for each row its caption and a picture for each column.
         cell: width of a picture in pixels.
         font: height of letters in pixels.
-        heading: a line above all.
+        heading: a line above everything.
     """
     gap, line = max(4, font // 3), round(1.5 * font)
     shown = [[_as_wide(one.picture, cell) for one in cells] for _, cells in rows]
@@ -107,26 +107,26 @@ def _as_wide(picture: Image.Image, width: int) -> Image.Image:
 
 
 def save_picture(picture: Tensor, path: Path) -> None:
-    """[H, W, 3] sRGB 0..1 as WebP, smaller where it is large."""
+    """Write [H, W, 3] sRGB 0..1 as WebP, reduced to `LARGE_SIDE` if it is larger."""
     with atomic_path(path) as temporary:
         temporary.write_bytes(encode(Image.fromarray(to_bytes(thumbnail(picture, LARGE_SIDE)).numpy())))
 
 
 def encode(image: Image.Image) -> bytes:
-    """As WebP; the same picture gives the same bytes."""
+    """Encode an image as WebP; the same image gives the same bytes."""
     file = io.BytesIO()
     image.save(file, format="WEBP", quality=QUALITY, method=4)
     return file.getvalue()
 
 
 def kept_pictures(run: Run, folder: Path, image: str) -> dict[str, Path]:
-    """The existing picture files of an image, by content: methods in their order, the truth, others."""
+    """The stored pictures of an image, by method name; then "truth", "input" and "hole"."""
     files = {name: image_file(folder, run.images.index(image), image, f".{name}.webp") for name in (*METHODS, *OTHERS)}
     return {name: path for name, path in files.items() if path.is_file()}
 
 
 def column_title(run: Run, name: str) -> str:
-    """The title of a picture."""
+    """The title of a column of pictures."""
     return name if name in OTHERS else f"base ({run.base})" if name == "base" else METHODS[name].title
 
 
@@ -134,12 +134,12 @@ class Ranking(NamedTuple):
     """Images from best to worst."""
 
     names: list[str]
-    criterion: str  # what they were ordered by
+    criterion: str  # the metric and method by which they are ranked
     values: dict[str, float]
 
 
 def rank(run: Run) -> Ranking | None:
-    """The order follows Spackle if it was run, else the last method. None where nothing was measured."""
+    """Rank a run's images by Spackle if it was run, else by the last method; None if nothing was measured."""
     method = "spackle" if "spackle" in run.methods else run.methods[-1]
     for metric in ORDER[str(run.config["protocol"])]:
         if values := run.by_image(metric, method):
@@ -149,7 +149,7 @@ def rank(run: Run) -> Ranking | None:
 
 
 def write_sheets(run: Run, folder: Path) -> None:
-    """best.png and worst.png: six images by each method, and the truth; none where nothing was measured."""
+    """Write best.png and worst.png: six images by each method, and the truth; nothing if nothing was measured."""
     ranking = rank(run)
     if ranking is None:
         return
@@ -168,13 +168,13 @@ def write_sheets(run: Run, folder: Path) -> None:
 
 
 def ranked(values: Mapping[str, float], metric: str) -> list[str]:
-    """Images from best to worst."""
+    """Names of images from best to worst."""
     sign = -1 if metric in UP else 1
     return sorted(values, key=lambda name: (sign * values[name], name))
 
 
 def evenly(count: int, most: int) -> list[int]:
-    """At most `most` of `count` indices, evenly spaced, the first and the last included."""
+    """At most `most` of `count` indices, evenly spaced, including the first and the last."""
     if count <= most:
         return list(range(count))
     return [math.floor(k * (count - 1) / max(1, most - 1) + 0.5) for k in range(most)]
@@ -184,10 +184,10 @@ def evenly(count: int, most: int) -> list[int]:
 
 
 class PaperFigure(NamedTuple):
-    """The paper's figures."""
+    """A figure like one of the paper's."""
 
     name: str
-    columns: Sequence[str]  # pictures; methods that no run has are left out, but for the needed one
+    columns: Sequence[str]  # names of pictures; methods that no run has are left out
     needs: str
     caption: str
 
@@ -197,12 +197,12 @@ TITLES = {INPUT: "Input", HOLE: "Occluded regions", "direct-ft": "Direct FT"}
 
 
 def make_figures(folders: Sequence[Path], rows: int, output: Path, reporter: Reporter) -> None:
-    """Draw figures of the images of large-view evaluations, as PDF and PNG, and their captions for LaTeX.
+    """Draw figures from large-view evaluations as PDF and PNG, and write their captions for LaTeX.
 
-    Of each image the view with its largest hole is shown, at most `rows` images in all and at least one of each run.
+    An image is shown by its view with the largest hole. A figure has at most `rows` images, but at least one per run.
 
     Raises:
-        InputError: a folder without results, or with none of large views whose pictures are there.
+        InputError: a folder has no results, or no large-view evaluation has its pictures.
     """
     runs = [(run, folder) for run, folder in ((load_run(folder), folder) for folder in folders) if not run.timed]
     runs = [(run, folder) for run, folder in runs if not run.near]
@@ -227,7 +227,7 @@ def make_figures(folders: Sequence[Path], rows: int, output: Path, reporter: Rep
 
 
 def _draw(figure: PaperFigure, runs: Sequence[tuple[Run, Path]], most: int) -> tuple[Image.Image, str] | None:
-    """The figure and its LaTeX; None where no image has all pictures."""
+    """Draw a figure; returns it and its LaTeX, None if no image has all pictures."""
     columns = [name for name in figure.columns if name in (INPUT, HOLE) or any(name in run.methods for run, _ in runs)]
     rows = []
     for run, folder in runs:
@@ -247,8 +247,8 @@ def _draw(figure: PaperFigure, runs: Sequence[tuple[Run, Path]], most: int) -> t
 
 
 def _cell(run: Run, image: str, name: str, pictures: dict[str, Image.Image], figure: PaperFigure) -> Cell:
-    """A picture with its marks: boxes around holes, and tags with shares of Gaussians."""
-    if name == HOLE:  # white on the page's white: framed
+    """A picture with its marks: boxes around holes for the base, the share of added Gaussians for methods."""
+    if name == HOLE:  # framed, because it may be white on a white page
         width, height = pictures[name].size
         ImageDraw.Draw(pictures[name]).rectangle((0, 0, width - 1, height - 1), outline="grey")
     if HOLE in figure.columns:
@@ -261,11 +261,11 @@ def _cell(run: Run, image: str, name: str, pictures: dict[str, Image.Image], fig
 
 
 def hole_boxes(hole: Image.Image) -> Boxes:
-    """Boxes, apart from each other, where holes and seen pixels mix; in the given picture holes are white."""
+    """Disjoint boxes where hole pixels (white) and seen pixels mix most evenly."""
     mask = torch.from_numpy(np.asarray(hole.convert("L")) > 127).float()
     height, width = mask.shape
     side = min(round(BOX * max(mask.shape)), *mask.shape)
-    share = avg_pool2d(mask[None], side, stride=1)[0]  # by the upper left corners of squares
+    share = avg_pool2d(mask[None], side, stride=1)[0]  # for each position of a square's upper left corner
     score, boxes = share * (1 - share), list[tuple[float, float, float, float]]()
     while len(boxes) < MOST_BOXES and float(score.max()) > LEAST_SCORE:
         y, x = divmod(int(score.argmax()), score.shape[1])
@@ -275,7 +275,7 @@ def hole_boxes(hole: Image.Image) -> Boxes:
 
 
 def _latex(figure: PaperFigure, runs: Sequence[Run], bases: str, ours: str) -> str:
-    """A figure over both columns, with its caption."""
+    """LaTeX for a figure across both columns, with its caption."""
     settings = dict.fromkeys(max(run.settings, key=float) for run in runs)
     weights = dict.fromkeys(run.config["residual"]["weights"] for run in runs)
     says = {"shipped": "The residual has the weights that ship with Spackle, which the paper's recipe did not make."}

@@ -1,4 +1,4 @@
-"""The views of each protocol, the scale between base and dataset, and the measurements."""
+"""The views of both protocols, the scale between base and dataset, and the measurements."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ from spackle.residual import CELL, hole_area_ratio, hole_mask
 from spackle.scene_fill import FillContext
 from spackle.training.losses import FeatureNet, hole_distance
 
-MIN_PIXELS = 8  # fewer give no scale
-MAD_TO_SIGMA = 1.4826  # of a normal distribution
-BOUNDS_QUANTILES = (0.001, 0.999)  # what LLFF's near and far are, of the points in a view
-TRUTH, INPUT, HOLE = "truth", "input", "hole"  # among the pictures of an image
+MIN_PIXELS = 8  # the least number of pixels for a scale
+MAD_TO_SIGMA = 1.4826  # for a normal distribution
+BOUNDS_QUANTILES = (0.001, 0.999)  # the quantiles of point depths that LLFF's near and far are
+TRUTH, INPUT, HOLE = "truth", "input", "hole"  # names of pictures beside the methods
 
 
 @dataclasses.dataclass(frozen=True)
 class Gauges:
-    """What is measured besides holes and counts."""
+    """The metrics to measure, besides holes and counts."""
 
-    metrics: Sequence[str]  # of `METRICS`
-    published: Mapping[str, Metric]  # those of them that pyiqa measures, where it can
-    features: FeatureNet | None  # for "distance"
+    metrics: Sequence[str]  # names in `METRICS`
+    published: Mapping[str, Metric]  # those of pyiqa that were loaded
+    features: FeatureNet | None  # for the metric "distance"
 
     def measure(self, rgb: Tensor, truth: Tensor | None, hole: Tensor) -> Iterator[tuple[str, float | str]]:
-        """Figures of a picture [H, W, 3], by their names; a metric that failed gives NaN and a remark.
+        """Measure an image [H, W, 3]; yields names and values. A metric that fails gives NaN and a remark.
 
-        Metrics of a truth are left out where there is none; `hole` [H, W] is the base's.
+        Metrics that need a truth are left out if there is none; `hole` [H, W] is the base's hole.
         """
         places: dict[str, Tensor | None] = {"": None, "_hole": hole, "_outside": ~hole}
         for name in self.metrics:
@@ -50,7 +50,7 @@ class Gauges:
             if name in self.published:
                 try:
                     yield name, self.published[name](rgb, truth if METRICS[name].truth else None)
-                except Exception as error:  # a stranger's package on an odd picture: the figure is missing, and shows
+                except Exception as error:  # a foreign package may fail on an unusual image; the report names it
                     yield name, math.nan
                     yield REMARK, f"{name} failed: {reason_in_a_line(error)}"
             elif truth is not None and name == "psnr":
@@ -63,14 +63,14 @@ class Gauges:
 
 
 def large_views(prediction: BasePrediction, disparities: Sequence[float], side: int) -> list[Viewpoint]:
-    """The paper's controlled rendering (section 4.1); it says which disparities, but not which views.
+    """The views of the paper's controlled rendering (section 4.1), which states disparities but not the views.
 
     Here they are the two ends of the `swipe` path at each disparity m: the eye moves sideways by m · ‖(W/f, H/f)‖ ·
-    z_near, once to the left and once to the right, and looks at the focus point. The lens stays the photo's; the long
-    side is at most `side`, and both sides of the picture are even, as the paper's dense counts have it.
+    z_near, once to the left and once to the right, and looks at the focus point. The lens is the photo's; the long side
+    is at most `side`, and both sides are even, as the paper's counts of dense grids imply.
 
     Raises:
-        InputError: no Gaussian stands in front of the camera, or a disparity that no path has.
+        InputError: no Gaussian is in front of the camera, or there is no path with such a disparity.
     """
     try:
         camera, reach = prediction.camera, DepthRange.of(prediction.gaussians)
@@ -86,29 +86,29 @@ def large_views(prediction: BasePrediction, disparities: Sequence[float], side: 
 
 @dataclasses.dataclass(frozen=True)
 class Alignment:
-    """The length of the base's unit in the dataset's unit."""
+    """The scale between the base's and the dataset's unit of length."""
 
-    scale: float  # the dataset's lengths in one unit of the base: z_dataset = scale · z_base
-    pixels: int  # with known depth, which it rests on; 0 where it comes from bounds, or nothing had to be measured
-    spread: float  # of single pixels around the scale, relative: a robust standard deviation
+    scale: float  # z_dataset = scale · z_base
+    pixels: int  # pixels with known depth that were compared; 0 if the source is "bounds" or "same"
+    spread: float  # relative deviation of pixels from the scale: a robust standard deviation
     source: Literal["depth", "points", "bounds", "same"]
 
 
 def align(case: Case, z_base: Tensor, seen: Tensor, *, base_is_truth: bool = False) -> Alignment:
-    """The median of z_dataset / z_base over the pixels where both are known.
+    """Find the scale as the median of z_dataset / z_base over the pixels where both are known.
 
-    The dataset's depth map is asked first, then its points, then its bounds. A metric base and a metric dataset are
-    aligned too: what a network calls a metre rarely is one. Only a base that was made from the dataset's own depth
-    needs no scale.
+    The dataset's depth map is used; without one its points; without points its bounds. A metric base and a metric
+    dataset are aligned too, because a network's metres are rarely exact. Only a base that was made from the dataset's
+    own depth needs no scale.
 
     Args:
-        case: whose lengths are wanted.
-        z_base: [H, W] the base's depth at the input camera, any size of the photo's shape.
-        seen: [H, W] bool, where that depth means something.
-        base_is_truth: the base lifted the dataset's own depth map.
+        case: the case, in the dataset's unit.
+        z_base: [H, W] the base's depth at the input camera, at any size with the photo's aspect ratio.
+        seen: [H, W] bool, where that depth is valid.
+        base_is_truth: whether the base is the dataset's own depth map, lifted.
 
     Raises:
-        InputError: nothing is known about the case's depth, or too little of it where the base sees something.
+        InputError: no depth of the case is known, or too little of it where the base's depth is valid.
     """
     if base_is_truth:
         return Alignment(1.0, 0, 0.0, "same")
@@ -128,25 +128,26 @@ def align(case: Case, z_base: Tensor, seen: Tensor, *, base_is_truth: bool = Fal
 
 
 def to_base(view: Camera, photo: Camera, base: Camera, scale: float) -> Camera:
-    """A second view's camera, as the base's world has it.
+    """Transform a second view's camera into the base's world.
 
-    A base with another principal point or focal length than the dataset's shears the scene: the same pixel at the same
-    depth is another point. The returned camera sees the base's points where `view` sees the dataset's: exactly where
-    the two look the same way, as in rectified pairs, or their lenses agree; else up to a skew of the pixel grid.
+    If the base's principal point or focal length differs from the dataset's, the base's scene is sheared: the same
+    pixel at the same depth is another point. The returned camera projects the base's points to the pixels where `view`
+    projects the dataset's. This is exact if the two cameras look in the same direction, as in rectified pairs, or if
+    the lenses agree; otherwise it is exact up to a skew of the pixel grid.
 
     Args:
-        view: in the input photo's frame and the dataset's lengths.
+        view: in the input photo's frame and the dataset's unit.
         photo: the dataset's camera of the input photo.
-        base: the base's camera of the input photo (`BasePrediction.camera`), on any grid of the photo's shape.
+        base: the base's camera of the input photo (`BasePrediction.camera`), at any size with the photo's aspect ratio.
         scale: see `Alignment`.
 
     Returns:
-        The camera on the grid of `view`, in the base's frame and units.
+        The camera, with the image size of `view`, in the base's frame and unit.
     """
     K, pose = view.K.double(), view.world_to_camera.double()
-    # The base's point of a pixel, times this and the scale, is the dataset's.
+    # Maps the base's point at a pixel, up to the scale, to the dataset's point.
     shear = torch.linalg.solve(photo.K.double(), base.resized(photo.width, photo.height).K.double())
-    # Into an upper triangle with a positive diagonal times a rotation.
+    # RQ decomposition: an upper triangular matrix with positive diagonal times a rotation.
     flip = torch.eye(3, dtype=torch.float64).flip(0)
     rotation, lens = torch.linalg.qr((flip @ (K @ pose[:3, :3] @ shear)).T)
     lens, rotation = flip @ lens.T @ flip, flip @ rotation.T
@@ -156,12 +157,12 @@ def to_base(view: Camera, photo: Camera, base: Camera, scale: float) -> Camera:
     matrix[:3, :3] = rotation
     matrix[:3, 3] = torch.linalg.solve(lens, K @ pose[:3, 3]) / scale
     lens = lens / lens[2, 2]
-    lens[0, 1] = 0.0  # the skew: a Camera has none
+    lens[0, 1] = 0.0  # drop the skew, which a Camera cannot have
     return Camera(lens.to(view.K), matrix.to(view.world_to_camera), view.width, view.height)
 
 
 def _depth_ratios(known: DepthMap, z_base: Tensor, seen: Tensor) -> Tensor:
-    """Ratios of dataset to base depth, by the map's pixel nearest to each of the base's."""
+    """Ratios of dataset depth to base depth; each pixel of the base uses the map's nearest pixel."""
     (height, width), (rows, columns) = z_base.shape, known.depth.shape
     y = ((torch.arange(height) + 0.5) * rows / height).long()
     x = ((torch.arange(width) + 0.5) * columns / width).long()
@@ -170,8 +171,8 @@ def _depth_ratios(known: DepthMap, z_base: Tensor, seen: Tensor) -> Tensor:
 
 
 def _point_ratios(case: Case, points: Points, z_base: Tensor, seen: Tensor) -> Tensor:
-    """Ratios of dataset to base depth, by the base's pixel that each point falls into."""
-    assert case.camera is not None  # whose pixels the points are in
+    """Ratios of dataset depth to base depth; each point uses the base's pixel that it falls into."""
+    assert case.camera is not None  # the points are in its pixels
     height, width = z_base.shape
     cells = (points.uv * torch.tensor([width / case.camera.width, height / case.camera.height])).floor().long()
     inside = ((cells >= 0) & (cells < torch.tensor([width, height]))).all(1)
@@ -189,7 +190,7 @@ def _of_ratios(ratios: Tensor, source: Literal["depth", "points"]) -> Alignment 
 
 
 def _of_bounds(bounds: tuple[float, float], z: Tensor) -> Alignment:
-    """A rough scale: the mean of those that match the nearest depths and the farthest depths."""
+    """A rough scale: the geometric mean of the scales that match the nearest depth and the farthest depth."""
     near, far = (float(z.double().sort().values[round(q * (len(z) - 1))]) for q in BOUNDS_QUANTILES)
     low, high = math.log(bounds[0] / near), math.log(bounds[1] / far)
     return Alignment(math.exp((low + high) / 2), 0, abs(high - low) / 2, "bounds")
@@ -203,11 +204,11 @@ def measure_views(
     methods: Mapping[str, Callable[[Sequence[Camera]], Fill]],
     gauges: Gauges,
 ) -> tuple[list[Row], dict[str, Tensor]]:
-    """Measure every method on every view of a base; a method gets the cameras of one setting together.
+    """Measure every method on every view of a base; a method gets all cameras of a setting at once.
 
     Returns:
-        Rows, which take dataset and name from `image`; and pictures of the view with the largest hole, [H, W, 3]: its
-        hole (white), the view by each method, the truth last where there is one.
+        Rows, with dataset and image as in the row `image`; and pictures [H, W, 3] of the view with the largest hole:
+        the hole (white), the view by each method, and last the truth, if there is one.
     """
     rows: list[Row] = []
     remarks: dict[Row, None] = {}
@@ -223,9 +224,9 @@ def measure_views(
             shown = {HOLE: hole.cpu()[..., None].expand(-1, -1, 3).float()}
             for name, fill in fills.items():
                 rgb, alpha, aux = fill(view.camera, before)
-                shown[name] = rgb = rgb.cpu()  # where the truth is
+                shown[name] = rgb = rgb.cpu()  # the truth is on the CPU
                 figures: list[tuple[str, float | str]] = [("har_before", share)]
-                if alpha is not None:  # of what is left open (paper, eq. 11 and 10)
+                if alpha is not None:  # HAR after completion, and coverage (paper, eqs. 11 and 10)
                     open_share = hole_area_ratio(alpha)
                     figures += [("har", open_share), ("coverage", 1 - open_share)]
                 if aux is not None:

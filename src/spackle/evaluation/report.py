@@ -1,6 +1,6 @@
-"""An evaluation on one page for a browser: tables, plots and pictures; it fetches nothing (template: report.html).
+"""An evaluation as one self-contained HTML page with tables, plots and pictures (template: report.html).
 
-The plots are SVG files that matplotlib draws: holes against the move, Gaussians against holes, scene by scene.
+matplotlib draws the plots as SVG: holes against disparity, added Gaussians against holes, and figures of scenes.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes as Axes
 
 REPORT = "report.html"
-MOST = 8  # images of a page in their full size
-LEAST = 2  # of each evaluation, however many there are
-# A slider has the first of these that there are: all methods of all images would make a page too large.
+MOST = 8  # how many images a page shows at full size
+LEAST = 2  # the least number of images of each evaluation
+# A slider shows the first `MOST_SHOWN` of these that exist; all methods would make the page too large.
 SHOWN = ("base", "spackle", TRUTH, "inpaint2d", "paper", "seeds", "direct-ft", "spackle-scene", "dense")
 MOST_SHOWN = 6
-# Of a method, in this order, where they were measured.
+# The columns of a method's figures, in this order; a column is left out if it was not measured.
 COLUMNS: dict[str, tuple[str, Callable[[float], str]]] = {
     "psnr_hole": ("PSNR in the hole ↑", "{:.2f}".format),
     "ssim_hole": ("SSIM in the hole ↑", "{:.4f}".format),
@@ -57,35 +57,35 @@ COLUMNS: dict[str, tuple[str, Callable[[float], str]]] = {
 }
 Source = tuple[Run, Path]  # an evaluation, and the folder with its pictures
 RC: Any = {
-    "svg.fonttype": "none",  # the letters stay text
-    "svg.hashsalt": "spackle",  # the same plot gives the same bytes
-    "text.parse_math": False,  # a $ in a scene's name is a $
+    "svg.fonttype": "none",  # keep text as text
+    "svg.hashsalt": "spackle",  # makes bytes reproducible
+    "text.parse_math": False,  # a $ in a scene's name is no formula
     "font.family": "sans-serif",
     "font.size": 9,
     "axes.grid": True,
     "grid.color": "#d5d9de",
     "lines.markersize": 5,
 }
-WIDTH, HEIGHT = 4.6, 3.4  # inches of a plot, about a phone's width
-ROW = 0.21  # inches of a scene's row
-DOTS, SCENES = 1000, 30  # at most in a plot: pages stay small, rows legible
-LETTERS = 14  # of a scene's name
-# Characters that neither HTML nor XML may hold; names of files may.
+WIDTH, HEIGHT = 4.6, 3.4  # size of a plot in inches, about as wide as a phone
+ROW = 0.21  # height of a scene's row in inches
+DOTS, SCENES = 1000, 30  # at most in a plot, for small pages and legible rows
+LETTERS = 14  # at most, in a scene's name
+# Characters that file names may have, but HTML and XML may not.
 UNPRINTABLE = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff\ufffe\uffff]")
-SCENE_FIGURES = {  # titles of the plot and of its axis
+SCENE_FIGURES = {  # titles of the plot and of its x axis
     "psnr_hole": ("PSNR in the hole, scene by scene", "PSNR (dB), higher is better"),
     "distance": ("Distance in the hole, scene by scene", "distance (0 to 8), lower is better"),
 }
 
 
 def make_report(sources: Sequence[Source], *, whole: bool = False) -> str:
-    """A report as HTML: one file that needs nothing else, the same bytes for the same results.
+    """Make a report as a self-contained HTML page; the same results give the same bytes.
 
-    `sources` are one or more evaluations and benchmarks whose tables go together; `whole`: see `make_tables`.
+    `sources`: evaluations and benchmarks with joint tables; `whole`: see `make_tables`.
     """
     runs, measured = [run for run, _ in sources], [source for source in sources if not source[0].timed]
     count = max(LEAST, MOST // max(1, len(measured)))
-    many = max(1.0, count * len(measured) / MOST)  # whose pictures are smaller, so that the page is not larger
+    many = max(1.0, count * len(measured) / MOST)  # with more images than `MOST`, their pictures are smaller
     side = round(LARGE_SIDE / math.sqrt(many))
     text = resources.files("spackle.evaluation").joinpath(REPORT).read_text(encoding="utf-8")
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
@@ -103,12 +103,12 @@ def make_report(sources: Sequence[Source], *, whole: bool = False) -> str:
 
 
 def _bold(text: str) -> Markup:
-    """What stands between ** is bold."""
+    """Make text between ** bold."""
     return Markup(re.sub(r"\*\*(.+?)\*\*", r"<strong>\1</strong>", str(escape(text))))
 
 
 def _part(run: Run, folder: Path, count: int, side: int) -> dict[str, Any]:
-    """The page's section of an evaluation, with a limited number of images and picture size."""
+    """The page's section on an evaluation, with `count` images of at most `side` pixels a side."""
     ranking = rank(run)
     return {
         "run": run,
@@ -123,7 +123,7 @@ def _part(run: Run, folder: Path, count: int, side: int) -> dict[str, Any]:
 
 
 def figures_table(run: Run, rows: Iterable[Row]) -> Table:
-    """Means over a run: a line for each method, and for each of several settings."""
+    """Means of figures over a run's images: a row for each method, grouped by setting if there are several."""
     values = pivot((row for row in rows if row.metric in COLUMNS), "setting", "method", "metric")
     settings = list(dict.fromkeys(setting for setting, *_ in values))
     keys = [key for key in COLUMNS if any(metric == key for *_, metric in values)]
@@ -141,12 +141,12 @@ def figures_table(run: Run, rows: Iterable[Row]) -> Table:
 
 
 def _percent(share: float) -> str:
-    """A number with as many digits as show its value."""
+    """A share in percent, with enough digits to be above 0."""
     return "0 %" if share == 0 else f"{100 * share:.1f} %" if share >= 0.001 else f"{100 * share:.1g} %"
 
 
 def _cases(run: Run, folder: Path, ranking: Ranking | None, count: int, side: int) -> list[dict[str, Any]]:
-    """Images from the worst to the best, evenly between them; without those that have no pictures."""
+    """`count` images, evenly spaced from the worst to the best; images without pictures are left out."""
     names = ranking.names[::-1] if ranking else run.measured
     cases = []
     for place in evenly(len(names), count):
@@ -160,7 +160,7 @@ def _cases(run: Run, folder: Path, ranking: Ranking | None, count: int, side: in
 
 
 def _small(path: Path, side: int) -> bytes:
-    """A picture as WebP, of at most the given width and height."""
+    """A picture as WebP, reduced to at most `side` pixels a side."""
     with Image.open(path) as image:
         if max(image.size) <= side:
             return path.read_bytes()
@@ -170,7 +170,7 @@ def _small(path: Path, side: int) -> bytes:
 
 
 def _case(run: Run, name: str, place: str, pictures: Mapping[str, bytes]) -> dict[str, Any]:
-    """An image: its pictures one over the other, and the figures of the view that they show."""
+    """The page's entry on an image: its pictures for the slider, and the figures of the view that they show."""
     setting, view = run.largest_hole(name)
     shown = [row for row in run.rows if (row.image, row.setting, row.view) == (name, setting, view)]
     hole = next((float(row.value) for row in shown if row.metric == "har_before" and row.value is not None), None)
@@ -198,20 +198,20 @@ def _case(run: Run, name: str, place: str, pictures: Mapping[str, bytes]) -> dic
 
 
 class Series(NamedTuple):
-    """Points of one method."""
+    """The points of one method in a plot."""
 
     title: str
-    method: str  # of `METHODS`
+    method: str  # a name in `METHODS`
     points: Sequence[tuple[float, float]]
     hollow: bool = False
-    line: str = "none"  # or "-", "--"
+    line: str = "none"  # or "-" or "--", as in matplotlib
 
 
 class Plot(NamedTuple):
-    """A plot and its title."""
+    """A plot with title and texts."""
 
     title: str
-    alt: str  # for those who do not see it
+    alt: str  # text for readers who cannot see it
     svg: bytes
     note: str
 
@@ -221,17 +221,17 @@ class Plot(NamedTuple):
         return f"data:image/svg+xml;base64,{base64.b64encode(self.svg).decode()}"
 
 
-Finish = Callable[["Axes"], object]  # sets scales and ticks
+Finish = Callable[["Axes"], object]  # sets the scales and ticks of a plot
 
 
 def check_matplotlib(option: str) -> None:
-    """InputError where matplotlib is not installed."""
+    """InputError if matplotlib is not installed."""
     if importlib.util.find_spec("matplotlib") is None:
         raise InputError(f"{option}: needs matplotlib: pip install 'spackle-nvs[eval]'")
 
 
 def plots_of(run: Run) -> list[Plot]:
-    """The plots of an evaluation that its figures allow."""
+    """The plots of an evaluation for which it has figures."""
     scenes = [scenes_plot(run, metric) for metric in SCENE_FIGURES] if run.near else []
     made = [*([] if run.near else [holes_plot(run)]), overhead_plot(run), *scenes]
     return [plot for plot in made if plot]
@@ -240,12 +240,12 @@ def plots_of(run: Run) -> list[Plot]:
 def _draw(
     title: str, series: Sequence[Series], x: str, y: str, finish: Finish, note: str = "", height: float = HEIGHT
 ) -> Plot:
-    """Series on axes with the titles `x` and `y`, as an SVG file `height` inches high: the same bytes for the same."""
+    """Plot series as an SVG file `height` inches high, with axes titled `x` and `y`; equal input gives equal bytes."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
     with rc_context(RC), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a name has letters that matplotlib's font lacks; the browser's has them
+        warnings.simplefilter("ignore")  # matplotlib warns about letters that its font lacks; the browser has them
         figure = Figure(figsize=(WIDTH, height), layout="constrained")
         axes = figure.subplots()
         for one in series:
@@ -262,7 +262,7 @@ def _draw(
 
 
 def holes_plot(run: Run) -> Plot | None:
-    """HAR against disparity, before and after, and the paper's; None where nothing was measured."""
+    """HAR against disparity, before and after completion, with the paper's; None if nothing was measured."""
 
     def means(rows: Iterable[Row], metric: str, method: str) -> list[tuple[float, float]]:
         chosen = (row for row in rows if (row.method, row.metric, row.dataset) == (method, metric, run.title))
@@ -280,7 +280,7 @@ def holes_plot(run: Run) -> Plot | None:
     positive = [value for value in values if value > 0]
 
     def finish(axes: Axes) -> None:
-        """Set ticks at decades; holes of zero are drawn at the foot of the axis."""
+        """Set a logarithmic y axis; if a HAR is zero, the axis becomes linear near zero to show it."""
         if len(positive) == len(values):
             axes.set_yscale("log")
         elif positive:
@@ -294,7 +294,7 @@ def holes_plot(run: Run) -> Plot | None:
 
 
 def overhead_plot(run: Run) -> Plot | None:
-    """Added Gaussians against the size of the hole: a dot for each image and view; None where none were counted."""
+    """Added Gaussians against the size of the hole, a dot for each image and view; None if none were counted."""
     values, series, count = pivot(run.rows, "metric", "method", "image", "setting", "view"), list[Series](), 0
     adding = [name for name in run.methods if name != "base" and any(key[:2] == ("aux_share", name) for key in values)]
     for method in adding:
@@ -323,7 +323,7 @@ def overhead_plot(run: Run) -> Plot | None:
 
 
 def scenes_plot(run: Run, metric: str) -> Plot | None:
-    """A figure of each scene by each method, in the order of Spackle, or else of the last method."""
+    """A figure of each scene by each method; scenes are ranked by Spackle if it was run, else by the last method."""
     values = {method: by_image for method in run.methods if (by_image := run.by_image(metric, method))}
     if not values:
         return None
@@ -346,6 +346,6 @@ def scenes_plot(run: Run, metric: str) -> Plot | None:
 
 
 def _short(name: str) -> str:
-    """A name shortened in its middle, because names differ at their ends as often as at their beginnings."""
+    """Shorten a name in its middle, because names may differ at the end as well as at the beginning."""
     name, half = UNPRINTABLE.sub("\N{REPLACEMENT CHARACTER}", name), LETTERS // 2
     return name if len(name) <= LETTERS else f"{name[: half - 1]}…{name[-half:]}"

@@ -1,4 +1,4 @@
-"""What is measured, and the paper's own figures (paper.json): one row a figure; tables are pivots of rows."""
+"""Measured figures and the paper's own ones (paper.json), one row per figure; tables are pivots of rows."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib import resources
 from typing import Any, NamedTuple
 
-NEAR = "near"  # the setting of views from where a second photo was taken
-PROBLEM, REMARK, NOTE = "problem", "remark", "note."  # metrics whose values are text; a note's name follows
-# Stages of a view in the order of the work, as the tables call them.
+NEAR = "near"  # the setting of views at the viewpoints of second photos
+PROBLEM, REMARK, NOTE = "problem", "remark", "note."  # metrics with text as values; "note." precedes a note's name
+# The stages of a view, in order, with their names in the tables.
 STAGES = {
     "base": "photo to base Gaussians",
     "view": "render of the view",
@@ -20,8 +20,8 @@ STAGES = {
     "completion": "mask, seeds, network, placing",
     "rerender": "re-render with the aux Gaussians",
 }
-BASE_PATH = ("base", "view")  # from the photo to a picture without Spackle
-EXTRA = ("photo", "completion", "rerender")  # what Spackle adds to it
+BASE_PATH = ("base", "view")  # the stages from the photo to a view without Spackle
+EXTRA = ("photo", "completion", "rerender")  # the stages that Spackle adds
 Value = float | str | None
 
 
@@ -32,38 +32,38 @@ def load_data(name: str) -> dict[str, Any]:
 
 
 PAPER = load_data("paper.json")
-IMAGES: dict[str, int] = PAPER["images"]  # of each dataset, in the order of the tables
+IMAGES: dict[str, int] = PAPER["images"]  # the number of images of each dataset, in the order of the tables
 SETTINGS: list[str] = PAPER["settings"]  # S1, S2, S3
 DISPARITIES = tuple(map(float, SETTINGS))
 
 
 class Row(NamedTuple):
-    """One figure. Figures of an image alone have no setting, view and method."""
+    """One figure. If it describes an image as a whole, setting, view and method are empty."""
 
-    dataset: str  # as the paper's tables call it
+    dataset: str  # its name in the paper's tables
     image: str
     setting: str  # "0.3" (a disparity), or "near"
     view: str
     method: str
     metric: str
-    value: Value  # None where the figure is not finite; text of a problem, a remark or a note
+    value: Value  # None if the figure is not finite; text for a problem, a remark or a note
 
 
 class Mean(NamedTuple):
-    """A mean of a figure over views."""
+    """The mean of a figure over views."""
 
-    value: float | None  # None where no view gave a number
-    bad: int  # views whose figure was not finite: they are left out, and counted
+    value: float | None  # None if no view has a finite figure
+    bad: int  # the number of views that were left out because their figure is not finite
 
 
 def mean(values: Sequence[Value], of: Callable[[list[float]], float] = statistics.fmean) -> Mean:
-    """The mean of the finite values, or another figure of them, such as `statistics.median`."""
+    """The mean of the finite values; `of` may be another statistic, such as `statistics.median`."""
     known = [float(value) for value in values if value is not None]
     return Mean(of(known) if known else None, len(values) - len(known))
 
 
 def pivot(rows: Iterable[Row], *columns: str) -> dict[tuple[str, ...], list[Value]]:
-    """Group the values of rows by these columns."""
+    """Group the values of rows by the rows' entries in these columns."""
     groups: dict[tuple[str, ...], list[Value]] = {}
     for row in rows:
         groups.setdefault(tuple(getattr(row, column) for column in columns), []).append(row.value)
@@ -72,7 +72,7 @@ def pivot(rows: Iterable[Row], *columns: str) -> dict[tuple[str, ...], list[Valu
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """A dataset under a protocol, or its benchmark."""
+    """The results of an evaluation or a benchmark of one dataset."""
 
     config: Mapping[str, Any]
     rows: Sequence[Row]
@@ -80,7 +80,7 @@ class Run:
 
     @property
     def title(self) -> str:
-        """The dataset's."""
+        """The dataset's title."""
         return str(self.config["title"])
 
     @property
@@ -107,12 +107,12 @@ class Run:
 
     @property
     def settings(self) -> list[str]:
-        """Disparities, or "near"."""
+        """The settings: disparities as text, or "near"."""
         return [NEAR] if self.near else [f"{disparity:g}" for disparity in self.config["disparities"]]
 
     @property
     def problems(self) -> dict[str, str]:
-        """Images without figures, and why."""
+        """Images without figures, each with the reason."""
         return {row.image: str(row.value) for row in self.rows if row.metric == PROBLEM}
 
     @property
@@ -122,24 +122,24 @@ class Run:
 
     @property
     def measured(self) -> list[str]:
-        """The images that gave figures."""
+        """The images with figures."""
         problems = self.problems
         return [image for image in self.images if image not in problems]
 
     def numbers(self, metric: str, setting: str = "", method: str = "") -> list[float]:
-        """A figure's finite values at a setting by a method; without both, what is known of each image."""
+        """A figure's finite values at a setting by a method; by default, of figures of whole images."""
         key = setting, method, metric
         values = (row.value for row in self.rows if (row.setting, row.method, row.metric) == key)
         return [float(value) for value in values if value is not None]
 
     def by_image(self, metric: str, method: str) -> dict[str, float]:
-        """Means of a figure over each image's views; without those where no view has a number."""
+        """The mean of a figure over each image's views; images without a finite value are left out."""
         rows = (row for row in self.rows if (row.method, row.metric) == (method, metric))
         means = {image: mean(values).value for (image,), values in pivot(rows, "image").items()}
         return {image: value for image, value in means.items() if value is not None}
 
     def largest_hole(self, image: str) -> tuple[str, str]:
-        """Setting and view of an image in which the base leaves most open: the one that is shown."""
+        """Setting and view of the image's view with the largest hole in the base, which is the one that is shown."""
         holes = [row for row in self.rows if (row.image, row.metric) == (image, "har_before")]
         shown = max(holes, key=lambda row: float(row.value or 0))
         return shown.setting, shown.view
@@ -147,7 +147,7 @@ class Run:
 
 @functools.cache
 def paper_rows(label: str) -> tuple[Row, ...]:
-    """A table's figures in our units: shares where the paper has percent. Near views where it has one setting."""
+    """The figures of a table of the paper; percent become shares. Tables with a single setting are of near views."""
     rows = []
     for table in (table for table in PAPER["tables"] if table["label"] == label):
         metrics = table["metrics"]
@@ -161,16 +161,16 @@ def paper_rows(label: str) -> tuple[Row, ...]:
 
 
 def setting_title(setting: str, pattern: str = "{}") -> str:
-    """ "S1" for "0.3", or by the pattern "{}: disparity {}"; other disparities than the paper's have no such name."""
+    """The title of a setting: "S1" for "0.3", or by a pattern such as "{}: disparity {}"; of others "disparity 0.6"."""
     return pattern.format(f"S{SETTINGS.index(setting) + 1}", setting) if setting in SETTINGS else f"disparity {setting}"
 
 
 def datasets(runs: Sequence[Run]) -> list[str]:
-    """Titles: the paper's in its order, whether they were run or not, then others."""
+    """Titles of datasets: all of the paper's in its order, then others that were run."""
     return list(dict.fromkeys([*IMAGES, *(run.title for run in runs)]))
 
 
 def images_text(run: Run) -> str:
-    """How many of the paper's images were measured."""
+    """The number of measured images, such as "12/23" if the paper has 23."""
     wanted = IMAGES.get(run.title)
     return f"{len(run.measured)}" if wanted is None else f"{len(run.measured)}/{wanted}"

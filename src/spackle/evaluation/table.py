@@ -1,4 +1,4 @@
-"""A table as values, and its forms: Markdown and LaTeX here, HTML by report.html."""
+"""A table of texts, and its output as Markdown and LaTeX; report.html writes HTML."""
 
 from __future__ import annotations
 
@@ -7,32 +7,32 @@ import itertools
 import re
 from collections.abc import Callable, Sequence
 
-EMPTY = ""  # not run, or nothing that could be
-NOT_RUN = "not run"  # of a whole row
-BEST = "**"  # around a cell's text
+EMPTY = ""  # a cell without a figure
+NOT_RUN = "not run"  # the name of an empty row
+BEST = "**"  # put around the text of the best cell
 Cells = Sequence[str]
 Text = Callable[[float], str]
 
 
 @dataclasses.dataclass(frozen=True)
 class Table:
-    """Cells under heads of one or two levels."""
+    """Cells under column heads of one or two levels."""
 
-    label: str  # as in the paper's source, where the paper has it
+    label: str  # the label in the paper's source, if the paper has the table
     title: str
     caption: str
-    heads: Sequence[tuple[str, str]]  # of each column: what it has in common with its neighbours, or "", and its own
-    bodies: Sequence[Sequence[Cells]]  # rows, in groups with a rule between them
-    words: int = 1  # columns of text on the left; where there are two, the first one names a group in its first row
+    heads: Sequence[tuple[str, str]]  # for each column: its group's head, or "", and its own head
+    bodies: Sequence[Sequence[Cells]]  # groups of rows, with a rule between groups
+    words: int = 1  # text columns on the left; of two, the first has a group's name in its first row
     notes: Sequence[str] = ()
 
 
 def _ratio(value: float) -> str:
-    """Four digits, as in the paper; what would round to nothing keeps its first two."""
+    """Four decimals, as in the paper; a value that would round to zero keeps two significant digits."""
     return f"{value:.1e}" if 0 < value < 0.5e-4 else f"{value:.4f}"
 
 
-# Small overheads keep two digits: the question is whether they are below one percent.
+# Overheads below 10 % have two decimals, because the question is whether they are below 1 %.
 TEXTS: dict[str, Text] = {
     "count": "{:,.0f}".format,
     "hundredths": "{:,.2f}".format,
@@ -47,7 +47,7 @@ TEXTS: dict[str, Text] = {
 
 
 def mark_best(values: Sequence[float | None], texts: Sequence[str], lower: bool) -> list[str]:
-    """The texts with the best value, and others that print alike, in bold; none if all print alike."""
+    """Make the text of the best value bold, and all equal texts; none if all texts are equal."""
     known = {value: text for value, text in zip(values, texts, strict=True) if value is not None}
     if len(set(known.values())) < 2:
         return list(texts)
@@ -56,12 +56,12 @@ def mark_best(values: Sequence[float | None], texts: Sequence[str], lower: bool)
 
 
 def groups(heads: Sequence[tuple[str, str]]) -> list[tuple[str, int]]:
-    """The upper heads: each a name and the number of its columns."""
+    """The upper heads: for each, its name and the number of its columns."""
     return [(name, len(list(columns))) for name, columns in itertools.groupby(heads, key=lambda head: head[0])]
 
 
 def markdown(table: Table) -> str:
-    """For a page of Markdown; a group's head is put before the heads of its columns."""
+    """A table in Markdown; a group's head is put before the heads of its columns."""
     head = [f"{group}: {column}" if group else column for group, column in table.heads]
     lines = [f"**{table.title}** (`{table.label}`). {table.caption}", "", _row(head), "|" + "---|" * len(head)]
     lines += [_row(cells) for rows in table.bodies for cells in rows]
@@ -70,7 +70,7 @@ def markdown(table: Table) -> str:
 
 
 def plain(table: Table) -> list[str]:
-    """Lines for a terminal, without title and notes: words on the left, figures under each other."""
+    """A table as lines for a terminal, without title and notes; text is left-aligned, figures right-aligned."""
     heads = [head.replace("\N{NO-BREAK SPACE}", " ") for _, head in table.heads]
     rows = [heads, *(cells for rows in table.bodies for cells in rows)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
@@ -89,17 +89,17 @@ SIGNS = {
     "±": r"$\pm$", "−": "$-$", "–": "--", "…": r"\ldots{}", "σ": r"$\sigma$", "<": "$<$", ">": "$>$", "≥": r"$\geq$",
     "†": r"$\dagger$", "‡": r"$\ddagger$", "→": r"$\to$",
 }  # fmt: skip
-LAST_LETTER = "\u017f"  # that pdfLaTeX has in its usual fonts; a scene may be called in other letters
+LAST_LETTER = "\u017f"  # the last letter that pdfLaTeX's usual fonts have; names of scenes may have others
 
 
 def tex(text: str) -> str:
-    """Plain text for LaTeX; what stands between ** is bold."""
+    """Escape text for LaTeX; text between ** becomes bold."""
     safe = "".join(SIGNS.get(sign, sign if " " <= sign <= LAST_LETTER else "?") for sign in text)
     return re.sub(r"\*\*(.+?)\*\*", r"\\textbf{\1}", safe)
 
 
 def latex(table: Table, suffix: str = "") -> str:
-    """For LaTeX with booktabs and graphicx, the label ending with `suffix`; the notes stand below the table."""
+    """A table in LaTeX, for booktabs and graphicx; its label ends with `suffix`, and notes are below the table."""
     shape = "l" * table.words + "c" * (len(table.heads) - table.words)
     lines = [r"\begin{table*}[t]", r"\centering", r"\scriptsize", rf"\caption{{{tex(table.caption)}}}"]
     lines += [

@@ -1,6 +1,6 @@
-"""The paper's six tables, and two of ours, as pivots of rows; the paper's figures in rows beside ours.
+"""The paper's six tables and two more, as pivots of rows; the paper's figures have rows beside ours.
 
-tables.json has their titles, captions, columns (group, title, metric, and how a figure is written) and notes.
+tables.json has their titles, captions, columns (group, title, metric, number format) and notes.
 """
 
 from __future__ import annotations
@@ -39,35 +39,35 @@ from spackle.files import write_whole
 FILES = ("tables.md", "tables.tex")
 TABLES, NOTES = load_data("tables.json").values()
 EFFICIENCY, EXPANDED = "tab:efficiency_gaussian_overhead", "tab:expanded_efficiency_gaussian_overhead"
-FROM_PAPER = " (paper)"  # ends the method of the paper's rows
-# Relative decreases: of which method (None: the row's own) which figure, and by which of the row's it is replaced.
+FROM_PAPER = " (paper)"  # the end of the method's name in the paper's rows
+# Relative decreases: the reference method (None: the row's own), its figure, and the row's figure that replaces it.
 REDUCED: dict[str, tuple[str | None, str, str]] = {
     "reduction": (None, "har_before", "har"),
     "aux_reduction": ("dense", "aux", "aux"),
 }
-TIMES = ("base_ms", "spackle_ms", "overhead", "base_fps", "spackle_fps")  # medians, where all others are means
-ODD = {("Middlebury", "0.3", metric) for metric in ("base_ms", "overhead", "base_fps")}  # figures that do not agree
+TIMES = ("base_ms", "spackle_ms", "overhead", "base_fps", "spackle_fps")  # their medians are shown, means of others
+ODD = {("Middlebury", "0.3", metric) for metric in ("base_ms", "overhead", "base_fps")}  # contradictory figures
 ODD_MARK, RECIPE_MARK = NOTES["odd"][0], NOTES["recipe"][0]
 
 
 class Column(NamedTuple):
-    """A figure of one setting."""
+    """A column: a figure at a setting."""
 
     group: str
     title: str
     setting: str
     metric: str
     text: Callable[[float], str]
-    lower: bool | None = None  # is better; None: no best one is set off
+    lower: bool | None = None  # whether lower is better; None: do not mark the best
 
 
 def make_tables(runs: Sequence[Run], *, whole: bool = False) -> list[Table]:
-    """The tables that the runs have figures for; with `whole` all of the paper's.
+    """Make the tables for which the runs have figures; with `whole`, all of the paper's.
 
-    Gaussians are counted, and times taken, from benchmarks; datasets without one have the counts of their large views.
+    Counts of Gaussians and times come from benchmarks; for datasets without one, counts come from their large views.
 
     Raises:
-        InputError: a dataset twice with one protocol and base, or different disparities.
+        InputError: two runs have the same dataset, protocol and base, or runs differ in their disparities.
     """
     seen: set[tuple[str, str, str]] = set()
     for run in runs:
@@ -89,14 +89,14 @@ def make_tables(runs: Sequence[Run], *, whole: bool = False) -> list[Table]:
 
 
 def write_tables(tables: Sequence[Table], folder: Path, files: Sequence[str] = FILES, suffix: str = "") -> None:
-    """A file of Markdown and one of LaTeX, whose labels end with `suffix`, so that a document can include several."""
+    """Write tables as Markdown and as LaTeX; labels end with `suffix`, so that a document can include several files."""
     write_whole(folder / files[0], "\n".join(map(markdown, tables)).encode())
     head = "% needs \\usepackage{booktabs,graphicx}\n"
     write_whole(folder / files[1], (head + "\n".join(latex(table, suffix) for table in tables)).encode())
 
 
 def method_name(run: Run, method: str, title: str = "") -> str:
-    """A row's name: with the base's name, and a mark if the residual is not the paper's."""
+    """The name of a method's row: with the base's name, and a mark unless the residual's weights were given."""
     if method == "base":
         return f"{run.base} alone"
     mark = RECIPE_MARK if method in RESIDUAL and run.config["residual"]["weights"] != "given" else ""
@@ -120,8 +120,8 @@ def _table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], settings: S
 
 
 def _notes(spec: Mapping[str, Any], runs: Sequence[Run], cells: str) -> list[str]:
-    """Notes below a table: views, bases, rows, the residual's weights, definitions, missing figures and why, terms of
-    pyiqa.
+    """Notes below a table: views, bases, rows, the residual's weights, definitions, reasons for missing figures, and
+    pyiqa's licence.
     """
     names = tuple(dict.fromkeys(name for name in (metric_name(column[2]) for column in spec["columns"]) if name))
     notes = [NOTES["swipe"].format(side=run.config["side"]) for run in runs if not run.near]
@@ -152,7 +152,7 @@ def _notes(spec: Mapping[str, Any], runs: Sequence[Run], cells: str) -> list[str
 
 
 def _weights(run: Run) -> str:
-    """The origin of the residual's weights."""
+    """A text about the origin of the residual's weights."""
     residual = run.config["residual"]
     if not residual["sha256"]:
         return "the residual has no weights, its deltas are 0"
@@ -163,7 +163,7 @@ def _weights(run: Run) -> str:
 
 
 def _timed_notes(runs: Sequence[Run]) -> list[str]:
-    """Notes on times: machine, method, disturbances, sizes of the networks."""
+    """Notes on times: machine, method, other load, sizes of the networks."""
     notes, runs = [], [run for run in runs if run.timed]
     if cold := [row.image for run in runs for row in run.rows if row.metric == "warm" and not row.value]:
         notes.append(NOTES["cold"].format(images=", ".join(cold)))
@@ -191,7 +191,7 @@ def _timed_notes(runs: Sequence[Run]) -> list[str]:
 
 
 def _columns(spec: Mapping[str, Any], settings: Iterable[str], over: str = "") -> list[Column]:
-    """A table's columns at each setting, whose name stands above them by the pattern `over`."""
+    """A table's columns at each setting; if the pattern `over` is given, it makes the head of each setting."""
     columns = []
     for setting in settings:
         for group, title, figure, *text in spec["columns"]:
@@ -204,12 +204,12 @@ def _columns(spec: Mapping[str, Any], settings: Iterable[str], over: str = "") -
 
 
 def _cells(rows: Iterable[Row], columns: Sequence[Column], methods: Iterable[str]) -> list[list[str]]:
-    """A row of figures for each method, the best of a column set off."""
+    """A row of texts for each method; the best of a column is marked."""
     rows = list(rows)
     values_of, dataset = pivot(rows, "method", "setting", "metric"), rows[0].dataset if rows else ""
 
     def find(method: str, setting: str, metric: str) -> Mean | None:
-        """A figure, also a derived one; figures of images alone hold for all methods."""
+        """A figure, possibly a derived one; figures of whole images are valid for all methods."""
         if values := values_of.get((method, setting, metric)) or values_of.get(("", "", metric)):
             return mean(values, statistics.median if metric in TIMES else statistics.fmean)
         if metric == "aux_per_cell":
@@ -223,7 +223,7 @@ def _cells(rows: Iterable[Row], columns: Sequence[Column], methods: Iterable[str
         return None
 
     def text(figure: Mean | None, column: Column, method: str) -> str:
-        """Views without a finite value are counted behind it; the paper's percentages are printed as it has them."""
+        """Write a figure, and after it the number of views without one; the paper's percentages keep their digits."""
         if figure is None:
             return EMPTY
         paper = method.endswith(FROM_PAPER)
@@ -245,12 +245,12 @@ Layout = tuple[list[tuple[str, str]], list[list[Cells]]]  # heads and bodies of 
 
 
 def grouped(name: str, rows: Sequence[Cells]) -> list[Cells]:
-    """Rows below a line with their common name."""
+    """Prepend a column with the rows' common name, which only the first row shows."""
     return [(EMPTY if k else name, *cells) for k, cells in enumerate(rows)]
 
 
 def _row_names(spec: Mapping[str, Any], run: Run) -> dict[str, str]:
-    """The methods of a run that a table shows (all, those named by it, or those having a figure), and their names."""
+    """A run's methods that a table shows (all, those named in it, or those with a certain figure), with their names."""
     if "rows" in spec:
         return {name: method_name(run, name, title) for name, title in spec["rows"].items() if name in run.methods}
     having = {row.method for row in run.rows if row.metric == spec["having"]} - {"base"} if "having" in spec else None
@@ -260,7 +260,7 @@ def _row_names(spec: Mapping[str, Any], run: Run) -> dict[str, str]:
 def _rows(
     label: str, spec: Mapping[str, Any], runs: Sequence[Run], dataset: str, columns: Sequence[Column]
 ) -> list[tuple[str, str, list[str]]]:
-    """For a dataset, name, number of images and cells of our rows (or "not run") and of the paper's."""
+    """A dataset's rows, ours (or "not run") and then the paper's: name, number of images, and cells of each."""
     rows = []
     for run in (run for run in runs if run.title == dataset):
         names = _row_names(spec, run)
@@ -275,7 +275,7 @@ def _rows(
 
 
 def _dataset_table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], settings: Sequence[str]) -> Layout:
-    """For each dataset a row for each method, and the paper's rows; the columns repeat for each disparity."""
+    """A table with rows for each dataset's methods and the paper's; its columns are repeated for each disparity."""
     columns = _columns(spec, settings, "" if settings == [NEAR] else "{}: disparity {}")
     heads = [("", "Dataset"), ("", "Method"), ("", "n"), *((column.group, column.title) for column in columns)]
     of = {dataset: _rows(label, spec, runs, dataset, columns) for dataset in datasets(runs)}
@@ -283,7 +283,7 @@ def _dataset_table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], set
 
 
 def _near_table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], settings: Sequence[str]) -> Layout:
-    """A row for each method, columns for each dataset."""
+    """A table with a row for each method, and columns for each dataset."""
     columns, titles = _columns(spec, settings), datasets(runs)
     ours: dict[str, dict[str, list[str]]] = {}
     theirs: dict[str, dict[str, list[str]]] = {}
@@ -300,11 +300,11 @@ def _near_table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], settin
 
 
 def _overhead_table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], settings: Sequence[str]) -> Layout:
-    """Added Gaussians of each dataset and on average, and medians of the datasets' median times."""
+    """A table of added Gaussians for each dataset and on average, and of medians of the datasets' median times."""
     counts = _columns(spec, settings, "{}: disparity {}")
     of = {dataset: _rows(EXPANDED, spec, runs, dataset, counts) for dataset in datasets(runs)}
     bodies = [grouped(dataset, [(name, *cells) for name, _, cells in rows]) for dataset, rows in of.items()]
-    pools: dict[str, list[Row]] = {}  # of each row's name the figures of each dataset
+    pools: dict[str, list[Row]] = {}  # for each row's name, the figures of all datasets
     for run in runs:
         for method, name in _row_names(spec, run).items():
             for (by, setting, metric), values in pivot(run.rows, "method", "setting", "metric").items():
@@ -324,7 +324,7 @@ def _overhead_table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], se
 
 
 def _expanded_table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], settings: Sequence[str]) -> Layout:
-    """Counts, times and rates, a row for each setting and method."""
+    """A table of counts, times and rates, with a row for each setting and method."""
     bodies = []
     for dataset in datasets(runs):
         rows: list[Cells] = []
@@ -336,7 +336,7 @@ def _expanded_table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], se
 
 
 def _stages_table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], settings: Sequence[str]) -> Layout:
-    """The stages' times: a row for each setting and method, columns for the stages and their sums."""
+    """A table of the stages' times, with a row for each setting and method, and columns for stages and sums."""
     stages = [("", title, f"{name}_stage_ms", "tenths") for name, title in STAGES.items()]
     columns = [(title, metric, TEXTS[text]) for _, title, metric, text in (*stages, *spec["columns"])]
     bodies = []
