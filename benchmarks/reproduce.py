@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import os
 import shlex
 import subprocess
 import sys
@@ -243,8 +244,10 @@ def run(out: Path, line: str) -> None:
     print(f"$ {line}", flush=True)
     began, words = time.monotonic(), shlex.split(line)
     with (out / "log.txt").open("a") as log:
-        program = Path(sys.executable).parent / words[0]
-        if subprocess.run([program, *words[1:]], cwd=out, stdout=log, stderr=log).returncode:
+        programs = Path(sys.executable).parent
+        environment = os.environ | {"PATH": f"{programs}{os.pathsep}{os.environ['PATH']}"}  # torchrun starts spackle
+        command = [programs / words[0], *words[1:]]
+        if subprocess.run(command, cwd=out, stdout=log, stderr=log, env=environment).returncode:
             sys.exit(f"this command failed: {out / 'log.txt'} says why")
     print(f"  {time.monotonic() - began:.0f} s", flush=True)
 
