@@ -8,8 +8,8 @@ import math
 import torch
 from torch import Tensor
 
-SHORTEST_LOOK = 1e-6  # an eye and a target nearer than this, against their distance from the origin, are one
-LEAST_TILT = 1e-3  # radians between the view and its up
+SHORTEST_LOOK = 1e-6  # eye and target coincide if their distance, relative to that from the origin, is smaller
+LEAST_TILT = 1e-3  # least angle in radians between the viewing direction and up
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Camera:
 
     @staticmethod
     def from_focal(focal_px: float, width: int, height: int) -> Camera:
-        """The photo's own camera: at the world's origin, principal point in the middle."""
+        """A photo's own camera: at the world's origin, with the principal point in the middle."""
         if not (math.isfinite(focal_px) and focal_px > 0):
             raise ValueError(f"focal length must be positive, got {focal_px} px")
         K = torch.tensor([[focal_px, 0.0, width / 2], [0.0, focal_px, height / 2], [0.0, 0.0, 1.0]])
@@ -60,7 +60,7 @@ class Camera:
         )
 
     def resized(self, width: int, height: int) -> Camera:
-        """The same view on another pixel grid: intrinsics scale with each axis."""
+        """The same view on another pixel grid: the intrinsics are scaled along each axis."""
         factors = torch.tensor([width / self.width, height / self.height, 1.0]).to(self.K)
         return dataclasses.replace(self, K=self.K * factors[:, None], width=width, height=height)
 
@@ -76,13 +76,13 @@ class Camera:
         return self.resized(self.width + self.width % 2, self.height + self.height % 2)
 
     def zoomed(self, factor: float) -> Camera:
-        """The same view through a lens that is longer by a factor."""
+        """The same view with a focal length that is longer by a factor."""
         K = self.K.clone()
         K[:2, :2] *= factor
         return dataclasses.replace(self, K=K)
 
     def looking(self, eye: Tensor, target: Tensor) -> Camera:
-        """The same lens at `eye` [3], turned to `target` [3], with the world's y axis pointing down; see `look_at`."""
+        """The same lens at `eye` [3], turned to `target` [3], so that the world's y axis points down; see `look_at`."""
         return dataclasses.replace(self, world_to_camera=look_at(eye, target).to(self.world_to_camera))
 
     def to_camera(self, points: Tensor) -> Tensor:
@@ -106,17 +106,17 @@ class Camera:
         return (local - matrix[:3, 3]) @ matrix[:3, :3]
 
     def pixel_centers(self, stride: int = 1) -> Tensor:
-        """Centres of stride×stride cells in pixels, [H/stride, W/stride, 2] as (x, y)."""
+        """Centres of cells of stride×stride pixels, [H/stride, W/stride, 2] as (x, y), in pixels."""
         ys = (torch.arange(self.height // stride) + 0.5) * stride
         xs = (torch.arange(self.width // stride) + 0.5) * stride
         return torch.stack(torch.meshgrid(xs, ys, indexing="xy"), dim=-1)
 
 
 def look_at(eye: Tensor, target: Tensor, up: Tensor | None = None) -> Tensor:
-    """world_to_camera [4, 4], float64, of an eye [3] that looks at a target [3], with `up` [3] (None: -y) upwards.
+    """world_to_camera [4, 4], float64, for an eye [3] that looks at a target [3]; `up` [3] (None: -y) points upwards.
 
     Raises:
-        ValueError: eye and target coincide, or up has no length, or lies along the view.
+        ValueError: eye and target coincide, or `up` has no length or lies along the viewing direction.
     """
     eye, target = eye.double(), target.double()
     forward, down = target - eye, eye.new_tensor([0.0, 1.0, 0.0])
@@ -138,5 +138,5 @@ def look_at(eye: Tensor, target: Tensor, up: Tensor | None = None) -> Tensor:
 
 
 def beside(numbers: Tensor, other: Tensor) -> Tensor:
-    """A small tensor in the type and on the device of another; a GPU is not waited for on the way to it."""
+    """Convert a small tensor to the dtype and device of another one, without waiting for a GPU when copying to it."""
     return numbers.to(other, non_blocking=other.device.type != "cpu")

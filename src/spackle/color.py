@@ -1,6 +1,6 @@
-"""Colours: the transfer between sRGB, which photos and screens use, and linear RGB, in which light adds up.
+"""Convert between sRGB, which photos and screens use, and linear RGB, in which light adds up.
 
-And depth as colours: inverse depth, near bright, on one scale for a whole video.
+`DepthColors` shows inverse depth as colours, near ones bright, on one scale for a whole video.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ def linear_to_srgb(linear: Tensor) -> Tensor:
     return torch.where(linear <= 0.0031308, linear * 12.92, power)
 
 
-MEASURED, LOOKS = 50_000, 60  # Gaussians and views that are looked at for the scale: torch's quantile stops at 16 M
+MEASURED, LOOKS = 50_000, 60  # Gaussians and views that are sampled for the scale: torch's quantile takes at most 16 M
 FARTHEST, NEAREST = 0.002, 0.998  # quantiles of inverse depth at the ends of the scale
-UNKNOWN_GREY = 0.5  # grey, which the map does not hold
-# Seventeen colours at equal steps of matplotlib's inferno (CC0): even in lightness, and told apart by the colour-blind.
+UNKNOWN_GREY = 0.5  # a grey, which does not occur in the colour map
+# Seventeen evenly spaced colours of matplotlib's inferno (CC0): lightness is even, and the colour-blind can read it.
 INFERNO = (
     *((0.001, 0.000, 0.014), (0.042, 0.028, 0.141), (0.129, 0.047, 0.291), (0.238, 0.037, 0.396)),
     *((0.342, 0.062, 0.429), (0.441, 0.099, 0.432), (0.541, 0.135, 0.415), (0.640, 0.171, 0.381)),
@@ -44,17 +44,17 @@ INFERNO = (
 
 @dataclasses.dataclass(frozen=True)
 class DepthColors:
-    """A scale of colours between two depths; what lies beyond has the colour of the end."""
+    """A scale of colours between two depths; depths beyond have the colour of the scale's end."""
 
-    near: float  # the brightest
-    far: float  # the darkest
+    near: float  # depth of the brightest colour
+    far: float  # depth of the darkest colour
 
     @staticmethod
     def over(gaussians: Gaussians, cameras: Sequence[Camera]) -> DepthColors:
-        """The scale for all of these views: what lies within their frames, but for 0.2 % at either end.
+        """The scale for a set of views: it spans the depths that they show, except for 0.2 % at either end.
 
         Raises:
-            ValueError: no view has anything in its frame.
+            ValueError: no view shows anything of the scene.
         """
         step = max(1, len(gaussians) // MEASURED)
         means = gaussians.means.detach()[::step].cpu()
@@ -77,15 +77,15 @@ class DepthColors:
 
 
 def _inverse_in_frame(means: Tensor, camera: Camera) -> Tensor:
-    """1/z of the points [N, 3] within a view's frame."""
+    """1/z of those of the points [N, 3] that a view shows."""
     uv, z = camera.to("cpu").project(means)
     inside = (z > 0.01) & (uv >= 0).all(dim=-1) & (uv < uv.new_tensor([camera.width, camera.height])).all(dim=-1)
     return 1 / z[inside]
 
 
 def to_bytes(image: Tensor) -> Tensor:
-    """Values in 0..1 of any shape as uint8 on the CPU, rounded; outside values are clamped, NaN is 0; uint8 stays."""
+    """Round values in 0..1 to uint8 on the CPU; values outside are clamped, NaN becomes 0, and uint8 stays as it is."""
     if image.dtype == torch.uint8:
         return image.detach().cpu()
-    scaled = image.detach().float().mul(255)  # a copy: what follows is in place
+    scaled = image.detach().float().mul(255)  # a copy, so that the next operations may be in place
     return scaled.nan_to_num_(0.0).clamp_(0, 255).round_().to("cpu", torch.uint8)

@@ -1,4 +1,4 @@
-"""Photos: read from files of many formats, upright, in sRGB, with the focal length."""
+"""Read photos from files of many formats, upright, in sRGB, with their focal length."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from spackle.photo_frame import PhotoFrame, find_frame
 
 T = TypeVar("T")
 
-PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".heic", ".heif", ".tif", ".tiff")  # looked for in folders
-MAX_PIXELS = 100_000_000  # a bigger picture would take more than a gigabyte as float32
-SMALL_PIXELS, PIXELS_A_BYTE = 32_000_000, 32  # a strongly compressed photo has 20 pixels in a byte
-LEAST_SIDE, MOST_ASPECT = 32, 8  # pixels, and long side over short side: there is no scene in less, or in a stripe
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".heic", ".heif", ".tif", ".tiff")  # of photos in a folder
+MAX_PIXELS = 100_000_000  # a larger image would take more than a gigabyte as float32
+SMALL_PIXELS, PIXELS_A_BYTE = 32_000_000, 32  # a strongly compressed photo has 20 pixels for each byte
+LEAST_SIDE, MOST_ASPECT = 32, 8  # pixels; long side over short side: a smaller or narrower photo shows no scene
 MAX_SIDE = 1536  # long side of the working size
 EDGE = 0.005  # of the long side: see `pad_edge`
-DEFAULT_FOCAL_MM = 30.0  # 35 mm equivalent, where nothing else is known; SHARP's choice
+DEFAULT_FOCAL_MM = 30.0  # 35 mm equivalent, used if nothing is known; SHARP's choice
 FILM_DIAGONAL_MM = math.hypot(36, 24)
-PHONE_FOCAL_MM, PHONE_FACTOR = 10.0, 8.4  # a shorter real lens sits on a small sensor: SHARP's crude rule
-LENSES = (0.01, 10_000.0)  # focal lengths that are believed, in long sides of the photo: 178° to 0.006°
-PLAUSIBLE_MM = (3.0, 3000.0)  # 35 mm equivalents outside this come from a broken tag
+PHONE_FOCAL_MM, PHONE_FACTOR = 10.0, 8.4  # a shorter lens is taken to have a small sensor: SHARP's crude rule
+LENSES = (0.01, 10_000.0)  # range of accepted focal lengths, in long sides of the photo: 178° to 0.006°
+PLAUSIBLE_MM = (3.0, 3000.0)  # a 35 mm equivalent outside this range comes from a broken tag
 
 _EXIF_IFD = 0x8769
 _FOCAL_LENGTH, _FOCAL_35MM = 0x920A, 0xA405
@@ -46,13 +46,13 @@ _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # inch, cm, mm, µm
 
 @dataclasses.dataclass(frozen=True)
 class Photo:
-    """An upright picture and the lens that took it."""
+    """An upright image and the focal length with which it was taken."""
 
     rgb: Tensor  # [H, W, 3] float32 sRGB in 0..1
     focal_px: float  # in pixels of `rgb`
     focal_source: str  # "--focal-px", "--focal-mm", "--fov", "EXIF" or "default 30 mm"
     path: Path
-    frame: PhotoFrame | None = None  # that was cut off, in pixels of `rgb`
+    frame: PhotoFrame | None = None  # the border that was cropped, in pixels of `rgb`
 
     def __repr__(self) -> str:
         lens = f"focal length {self.focal_px:.4g} px ({self.focal_source})"
@@ -67,18 +67,18 @@ class Photo:
         return int(self.rgb.shape[1])
 
     def check_shape(self) -> None:
-        """InputError for a photo that is too small, or too narrow, to show a scene."""
+        """InputError if the photo is too small or too narrow to show a scene."""
         check_shape(self.width, self.height, self.path)
 
     @property
     def framed_size(self) -> tuple[int, int]:
-        """(width, height) of the file's picture, of a photo at its full size."""
+        """(width, height) before the border was cropped; of a photo at full size, this is the file's image size."""
         left, top, right, bottom = self.frame.widths if self.frame else (0, 0, 0, 0)
         return round(self.width + left + right), round(self.height + top + bottom)
 
     @property
     def camera(self) -> Camera:
-        """The photo's own camera, at the world's origin; a frame that was cut off has moved the principal point."""
+        """The photo's own camera, at the world's origin; cropping a border shifts the principal point."""
         left, top, right, bottom = self.frame.widths if self.frame else (0, 0, 0, 0)
         camera = Camera.from_focal(self.focal_px, self.width, self.height)
         return camera.cropped((left - right) / 2, (top - bottom) / 2, self.width, self.height)
@@ -92,26 +92,26 @@ def load_photo(
     fov: float | None = None,
     keep_frame: bool = True,
 ) -> Photo:
-    """Read a JPEG, PNG, WebP, HEIC, TIFF or any other picture that Pillow opens.
+    """Read a JPEG, PNG, WebP, HEIC, TIFF or any other image that Pillow opens.
 
-    EXIF orientation is applied, an embedded colour profile converted to sRGB, transparency laid over
-    white; of an animation the first frame counts. Without a given focal length EXIF's is taken, then
-    a 30 mm lens.
+    EXIF orientation is applied, colours are converted from an embedded profile to sRGB, and transparent pixels are laid
+    over white; of an animation the first frame is read. If no focal length is given, EXIF's is taken, else that of a
+    30 mm lens.
 
     Args:
         path: the file.
         focal_px: focal length in pixels of the upright photo.
         focal_mm: focal length as its 35 mm film equivalent, by the diagonal.
         fov: horizontal field of view in degrees.
-        keep_frame: otherwise a uniform frame around the picture is cut off, unless a focal length is given.
+        keep_frame: whether to keep a uniform border; otherwise it is cropped, unless a focal length is given.
 
     Raises:
-        InputError: a missing, broken or too large file, or a senseless focal length.
+        InputError: the file is missing, broken or too large, or the focal length is invalid.
     """
     _check_focal(focal_px, focal_mm, fov)
 
     def read(image: Image.Image) -> tuple[Tensor, dict[int, object]]:
-        tags = _exif(image)  # first: a TIFF's are gone once its pixels are loaded
+        tags = _exif(image)  # before loading: a TIFF loses its tags once its pixels are loaded
         image.load()
         return _to_rgb(_upright(image), path), tags
 
@@ -127,7 +127,7 @@ def photo_of_picture(
     fov: float | None = None,
     keep_frame: bool = True,
 ) -> Photo:
-    """A picture that a program holds, by PIL or as [H, W, 3] sRGB: uint8, or floats in 0..1; else as `load_photo`."""
+    """A photo from an image in memory, PIL's or [H, W, 3] sRGB as uint8 or floats in 0..1; see `load_photo`."""
     _check_focal(focal_px, focal_mm, fov)
     path, exif = Path("photo"), dict[int, object]()
     if isinstance(picture, Image.Image):
@@ -165,10 +165,10 @@ def focal_length(
     focal_mm: float | None = None,
     fov: float | None = None,
 ) -> tuple[float, str]:
-    """The focal length in pixels and its source: an option as `load_photo` takes it, else EXIF, else a default lens.
+    """The focal length in pixels and its source: one of `load_photo`'s options, else EXIF, else a default lens.
 
     Raises:
-        InputError: a senseless one; `path` names the photo in the message.
+        InputError: the focal length is invalid; the message names the photo, `path`.
     """
     _check_focal(focal_px, focal_mm, fov)
     if focal_px is not None:
@@ -191,7 +191,7 @@ def focal_length(
 
 
 def resize_photo(photo: Photo, max_side: int = MAX_SIDE) -> Photo:
-    """The photo at its working size (see `working_size`), by Lanczos; the focal length scales along."""
+    """The photo at its working size (see `working_size`), resized by Lanczos; the focal length is scaled too."""
     width, height = working_size(photo.width, photo.height, max_side)
     if (width, height) == (photo.width, photo.height):
         return photo
@@ -208,10 +208,10 @@ def resize_photo(photo: Photo, max_side: int = MAX_SIDE) -> Photo:
 
 
 def pad_edge(rgb: Tensor) -> Tensor:
-    """A photo [H, W, 3] whose outermost pixels, `EDGE` of its long side, take the colour of the pixel just inside.
+    """Replace a photo's [H, W, 3] outermost pixels, `EDGE` of its long side, by the pixels just inside of them.
 
-    The outermost lines often do not belong to the picture: a scan's edge, or what resizing mixed in from outside. In a
-    view from the side they show as a line, and as streaks where the fill extends them.
+    The outermost lines often do not belong to the image: they are a scan's edge, or were mixed with outside colours by
+    resizing. In a view from the side they would show as a line, and as streaks where the fill extends them.
     """
     height, width = rgb.shape[:2]
     edge = min(round(EDGE * max(height, width)), (min(height, width) - 1) // 2)
@@ -226,14 +226,14 @@ def working_size(width: int, height: int, max_side: int = MAX_SIDE) -> tuple[int
 
 
 def film_to_pixels(focal_mm: float, width: int, height: int) -> float:
-    """A 35 mm film equivalent in pixels: the diagonals of film and photo correspond."""
+    """Convert a 35 mm equivalent focal length to pixels: the diagonals of film and photo correspond."""
     return focal_mm * math.hypot(width, height) / FILM_DIAGONAL_MM
 
 
 def focal_from_exif(tags: dict[int, object], width: int, height: int) -> float | None:
     """Focal length in pixels of a width×height photo from EXIF tags (number → value), or None.
 
-    In order of trust: the 35 mm equivalent; the lens with the sensor's pixel pitch; the lens alone.
+    The most trusted tags are used: the 35 mm equivalent; else the lens with the sensor's pixel pitch; else the lens.
     """
 
     def plausible(mm: float) -> bool:
@@ -248,7 +248,7 @@ def focal_from_exif(tags: dict[int, object], width: int, height: int) -> float |
     density, unit = _number(tags.get(_PLANE_X_RESOLUTION)), _number(tags.get(_PLANE_UNIT))
     if density is not None and density > 0:
         recorded = max(_number(tags.get(_PIXEL_X)) or 0, _number(tags.get(_PIXEL_Y)) or 0)
-        shrunk = max(width, height) / recorded if recorded > 0 else 1.0  # resized since it was taken
+        shrunk = max(width, height) / recorded if recorded > 0 else 1.0  # if the photo was resized
         pixels = lens * density / _UNIT_MM.get(int(unit or 2), 25.4) * shrunk
         if plausible(pixels / film_to_pixels(1.0, width, height)):
             return pixels
@@ -257,7 +257,7 @@ def focal_from_exif(tags: dict[int, object], width: int, height: int) -> float |
 
 
 class _BoundedFile(io.BufferedReader):
-    """A file that reads no more than it holds: else a PNG chunk that claims 4 GB would be allocated."""
+    """A file that never tries to read beyond its end: else a PNG chunk that claims 4 GB would be allocated."""
 
     def __init__(self, raw: io.FileIO) -> None:
         super().__init__(raw)
@@ -268,15 +268,14 @@ class _BoundedFile(io.BufferedReader):
 
 
 def read_image(path: str | os.PathLike[str], read: Callable[[Image.Image], T]) -> T:
-    """Open a picture of at most 100 megapixels and return what `read` makes of it, its pixels not yet loaded.
+    """Open an image of at most 100 megapixels, and return the result of `read`, which gets it before pixels are loaded.
 
     Raises:
-        InputError: whatever goes wrong. A decoder at work on a stranger's bytes raises anything, so
-            everything is caught.
+        InputError: for any failure. A decoder can raise any exception on untrusted bytes, so all are caught.
     """
     check_file(path, "photo")
     with reading(path, "cannot be decoded ({reason}): the file is damaged or cut off"), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # broken EXIF, 90 megapixels: not worth a line
+        warnings.simplefilter("ignore")  # about broken EXIF or 90 megapixels: not worth reporting
         if "HEIF" not in Image.OPEN:
             import pillow_heif
 
@@ -294,7 +293,7 @@ def read_image(path: str | os.PathLike[str], read: Callable[[Image.Image], T]) -
 
 
 def check_shape(width: int, height: int, path: str | os.PathLike[str]) -> None:
-    """InputError for a photo of a size that shows no scene."""
+    """InputError if a photo of this size is too small or too narrow to show a scene."""
     short, long = sorted((width, height))
     if short < LEAST_SIDE or long > MOST_ASPECT * short:
         wanted = f"at least {LEAST_SIDE} pixels a side, and at most {MOST_ASPECT} times as long as wide"
@@ -302,10 +301,10 @@ def check_shape(width: int, height: int, path: str | os.PathLike[str]) -> None:
 
 
 def check_pixels(width: int, height: int, size: int, path: str | os.PathLike[str]) -> None:
-    """Refuse a picture before a decoder allocates it: above 100 megapixels, or above 32 in a small file.
+    """InputError, before a decoder allocates memory, for an image above 100 megapixels, or above 32 in a small file.
 
-    So a file below 1 MB takes at most 1.5 GB of memory, whatever size it announces. InputError
-    beyond that.
+    So a file below 1 MB takes at most 1.5 GB of memory, whatever image size it announces. `size` is the file's, in
+    bytes.
     """
     most = min(MAX_PIXELS, max(SMALL_PIXELS, PIXELS_A_BYTE * size))
     if width * height > most:
@@ -330,12 +329,12 @@ def _check_focal(focal_px: float | None, focal_mm: float | None, fov: float | No
 def _upright(image: Image.Image) -> Image.Image:
     try:
         return ImageOps.exif_transpose(image)
-    except Exception:  # unreadable EXIF says nothing about the orientation
+    except Exception:  # unreadable EXIF gives no orientation
         return image
 
 
 def _exif(image: Image.Image) -> dict[int, object]:
-    """The tags of the main and the EXIF directory; none where they are broken."""
+    """The tags of the main directory and the EXIF directory; none if they are broken."""
     try:
         exif = image.getexif()
         return {**exif, **exif.get_ifd(_EXIF_IFD)}
@@ -352,7 +351,7 @@ def _number(value: object) -> float | None:
 
 
 def _to_rgb(image: Image.Image, path: str | os.PathLike[str]) -> Tensor:
-    """[H, W, 3] float32 sRGB in 0..1 of a picture in any mode."""
+    """Convert an image of any mode to [H, W, 3] float32 sRGB in 0..1."""
     if image.mode in ("F", "I") or image.mode.startswith("I;16"):  # one channel with more than 8 bits
         values = np.asarray(image)
         if image.mode == "F" or values.min() < 0 or values.max() > 65535:
@@ -370,13 +369,13 @@ def _to_rgb(image: Image.Image, path: str | os.PathLike[str]) -> Tensor:
 
 
 def _to_srgb(image: Image.Image, profile: bytes | None) -> Image.Image:
-    """Convert from an embedded colour profile; ignores a broken or unfitting one."""
+    """Convert from an embedded colour profile, which is ignored if it is broken or does not fit the image."""
     if not profile:
         return image
     try:
         source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
         if "sRGB" in ImageCms.getProfileDescription(source):
-            return image  # the detour would only round
+            return image  # a conversion would only round
         target = ImageCms.createProfile("sRGB")
         converted = ImageCms.profileToProfile(image, source, target, outputMode="RGB")
     except (ImageCms.PyCMSError, OSError, ValueError, TypeError):

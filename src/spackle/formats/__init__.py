@@ -1,4 +1,4 @@
-"""Files in and out: scenes, videos, pictures and cameras."""
+"""Read and write files of scenes, videos, images and cameras."""
 
 from spackle.formats.camera_files import load_cameras, load_path
 from spackle.formats.ply import PlyFile, load_ply, save_ply

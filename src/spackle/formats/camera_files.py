@@ -19,8 +19,8 @@ from spackle.files import check_file
 MAX_BYTES = 64 << 20
 MAX_FRAMES = 10_000  # cameras or keyframes
 MAX_SIZE = 16_384
-LARGEST = 1e9  # in a camera: single precision holds its square
-MAX_NUMBER = 1e6  # in a path: a thousand kilometres, eleven days
+LARGEST = 1e9  # largest number in a camera: float32 can represent its square
+MAX_NUMBER = 1e6  # largest number in a path: a thousand kilometres, or eleven days
 RIGID_TOLERANCE = 1e-3
 ZERO_TOLERANCE = 1e-6
 
@@ -32,7 +32,8 @@ def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
     K is in pixels. A frame may carry its own width and height.
 
     Raises:
-        InputError: not such a file, no frame or more than 10,000, or a camera that cannot be, see `checked_camera`.
+        InputError: the file has another content, no frame or more than 10,000, or an impossible camera, see
+            `checked_camera`.
     """
     content, frames = _read_json(path, "camera file", "frames", "K", "world_to_camera")
     size = {side: content.get(side) for side in ("width", "height")}
@@ -40,13 +41,13 @@ def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
 
 
 def camera_of(facts: Mapping[str, Any], where: str) -> Camera:
-    """A camera from what JSON says of it; InputError, beginning with `where`, if it cannot be."""
+    """A camera from its entry in a JSON file; InputError, beginning with `where`, if the camera is impossible."""
     K, pose = (_matrix(facts.get(name), n, f"{where}: {name}") for name, n in (("K", 3), ("world_to_camera", 4)))
     return checked_camera(K, pose, facts.get("width"), facts.get("height"), where)
 
 
 def _matrix(rows: object, n: int, where: str) -> Tensor:
-    """A list of n lists of n numbers as float64 [n, n]."""
+    """Convert a list of n lists of n numbers to float64 [n, n]; InputError for anything else."""
     lists = rows if isinstance(rows, list) else []
     numbers = [value for row in lists if isinstance(row, list) and len(row) == n for value in row]
     if len(lists) != n or len(numbers) != n * n or not all(type(value) in (int, float) for value in numbers):
@@ -67,11 +68,13 @@ def checked_camera(
     dtype: torch.dtype = torch.float32,
     tolerance: float = RIGID_TOLERANCE,
 ) -> Camera:
-    """A camera of float64 matrices [3, 3] and [4, 4]; a rotation's product with its transpose is 1 to `tolerance`.
+    """Check float64 matrices [3, 3] and [4, 4], and return a camera of them, in `dtype`.
+
+    The rotation times its transpose must equal the identity within `tolerance`.
 
     Raises:
-        InputError: beginning with `where`: K without positive focal lengths, with skew or a last row other than
-            0 0 1; world_to_camera that is not a rotation and a translation; a size outside 1..16384.
+        InputError: beginning with `where`: K has no positive focal lengths, or has skew, or a last row other than
+            0 0 1; world_to_camera is not a rotation and a translation; the size is outside 1..16384.
     """
     sizes = [n for n in (width, height) if isinstance(n, int) and not isinstance(n, bool) and 1 <= n <= MAX_SIZE]
     if len(sizes) != 2:
@@ -98,13 +101,13 @@ def checked_camera(
 def load_path(path: str | os.PathLike[str]) -> KeyframePath:
     """Read `{"keyframes": [{"time": s, "eye": [x, y, z], "target": [x, y, z]}, …]}`.
 
-    A keyframe may carry "up" [x, y, z] and "fov" in degrees, the file "closed" and "unit", as in `KeyframePath`.
-    The world is the photo's camera (OpenCV: x right, y down, z forward).
+    A keyframe may also have "up" [x, y, z] and "fov" in degrees; the file may have "closed" and "unit", as in
+    `KeyframePath`. The world is the photo's camera (OpenCV: x right, y down, z forward).
 
     Raises:
-        InputError: not such a file, or not a path: fewer than two keyframes or more than 10,000, times that do not
-            increase, a number that is not finite or beyond a million, an eye at its target, an up along the view,
-            a fov outside 1..170 degrees, or a name that is unknown or there twice.
+        InputError: the file has another content, or gives no path: fewer than two keyframes or more than 10,000, times
+            that do not increase, a number that is not finite or beyond a million, an eye at its target, an up along
+            the view, a fov outside 1..170 degrees, or a name that is unknown or given twice.
     """
     content, entries = _read_json(path, "path file", "keyframes", "time", "eye", "target")
     _check_names(content, ["keyframes", "closed", "unit"], str(path))
@@ -127,7 +130,7 @@ def _keyframe(entry: Mapping[str, Any], where: str) -> Keyframe:
         if not isinstance(numbers, list) or len(numbers) != (1 if single else 3):
             raise InputError(f'{where}: "{name}" must be a list of three numbers')
         for number in numbers:
-            if type(number) not in (int, float) or not -MAX_NUMBER <= number <= MAX_NUMBER:  # NaN is not, either
+            if type(number) not in (int, float) or not -MAX_NUMBER <= number <= MAX_NUMBER:  # true for NaN too
                 raise InputError(f'{where}: "{name}" must hold finite numbers, at most a million, not {shown(number)}')
         given[name] = float(value) if single else tuple(map(float, numbers))
     with reading(where, "{reason}", PathError):
@@ -137,8 +140,9 @@ def _keyframe(entry: Mapping[str, Any], where: str) -> Keyframe:
 def _read_json(
     path: str | os.PathLike[str], kind: str, name: str, *required: str
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """The content of a JSON file and its list `name`, whose objects have the required keys; InputError for another
-    file.
+    """Read a JSON file: returns its content, and its list `name`, whose objects have the required keys.
+
+    InputError if the file has another content.
     """
     if check_file(path, kind) > MAX_BYTES:
         raise InputError(f"{path}: too long for a {kind} (at most {MAX_BYTES >> 20} MiB): is it the right file?")
@@ -162,7 +166,7 @@ def _check_names(entry: Mapping[str, Any], known: Sequence[str], where: str) -> 
 
 
 def _names_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """An object of JSON; ValueError where a name is there twice."""
+    """A JSON object as a dict; ValueError if a name is given twice."""
     found: dict[str, Any] = {}
     for name, value in pairs:
         if name in found:

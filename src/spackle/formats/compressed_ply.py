@@ -1,4 +1,4 @@
-"""Compressed PLY, PlayCanvas's format: 16 bytes a Gaussian, each within the bounds of its 256 neighbours."""
+"""Compressed PLY, PlayCanvas's format: 16 bytes for each Gaussian, quantised within the bounds of its chunk of 256."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from spackle.formats.scene_files import (
 )
 
 CHUNK = 256  # Gaussians that share bounds
-LARGEST_LOG_SCALE = 20  # what readers expect at most, in either direction
-GRID_BITS = 10  # of each coordinate when neighbours are looked for
+LARGEST_LOG_SCALE = 20  # largest absolute value that readers expect
+GRID_BITS = 10  # bits of each coordinate in Morton order
 
 _CHUNK_NAMES = [
     *(f"{end}_{prefix}{axis}" for prefix in ("", "scale_") for end in ("min", "max") for axis in "xyz"),
@@ -31,12 +31,12 @@ _VERTEX_NAMES = ["packed_position", "packed_rotation", "packed_scale", "packed_c
 
 
 def encode_compressed_ply(scene: SceneFile) -> bytes:
-    """Gaussians, in their axes, as a compressed PLY; the camera and the base's number are comments, as `save_ply`'s.
+    """Encode a scene as a compressed PLY, in its own axes, with the same comments as `save_ply`.
 
     The base's Gaussians stay first; within base and aux, neighbours in space become neighbours in the file.
 
     Raises:
-        ValueError: where a Gaussian is not finite.
+        ValueError: a Gaussian is not finite.
     """
     columns, count, border = Columns.of(scene.gaussians), len(scene.gaussians), scene.base_count or 0
     order = np.concatenate([morton_order(columns.means[:border]), border + morton_order(columns.means[border:])])
@@ -60,10 +60,10 @@ def encode_compressed_ply(scene: SceneFile) -> bytes:
 
 
 def morton_order(means: Floats) -> NDArray[np.int64]:
-    """[N] an order of points [N, 3] along Morton's curve, which keeps neighbours together."""
+    """Indices [N] that order points [N, 3] along Morton's curve, which keeps neighbours together."""
     if not len(means):
         return np.zeros(0, np.int64)
-    # By logarithms: else one that is far away would put all the near ones into one cell.
+    # Of logarithms: otherwise a single distant point would put all near ones into one cell.
     places = np.sign(means) * np.log1p(np.abs(means.astype(np.float64)))
     low = places.min(axis=0)
     span = np.maximum(places.max(axis=0) - low, 1e-30)
@@ -72,24 +72,24 @@ def morton_order(means: Floats) -> NDArray[np.int64]:
 
 
 def _spread(bits: NDArray[np.uint32]) -> NDArray[np.uint32]:
-    """Spread the ten lowest bits, with two zeros before each."""
+    """Spread the ten lowest bits, with two zeros between neighbouring ones."""
     for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
         bits = (bits | bits << np.uint32(shift)) & np.uint32(mask)
     return bits
 
 
 def _normalised(values: Floats, starts: NDArray[np.int64]) -> tuple[Floats, Floats]:
-    """Values [N, 3] as shares 0..1 of their chunk's bounds, and the bounds [chunks, 6]: least, greatest."""
+    """Values [N, 3] as fractions 0..1 of their chunk's bounds, and the bounds [chunks, 6]: minima, then maxima."""
     low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
     rows = np.arange(len(values)) // CHUNK
-    wide = low.astype(np.float64)  # the ends may be farther apart than a float32 can say
+    wide = low.astype(np.float64)  # the bounds' difference may overflow float32
     span = np.maximum(high - wide, 1e-30)
     shares = (values - wide[rows]) / span[rows]
     return shares.astype(np.float32), np.concatenate([low, high], axis=1)
 
 
 def _packed(shares: Floats, widths: tuple[int, ...]) -> NDArray[np.uint32]:
-    """[N] words of shares 0..1 [N, k], each rounded to its number of bits, the first one highest."""
+    """Pack fractions 0..1 [N, k] into words [N], each rounded to its number of bits; the first has the highest bits."""
     word = np.zeros(len(shares), np.uint32)
     for column, width in zip(shares.T, widths, strict=True):
         word = word << np.uint32(width) | np.round(column * np.float32(2**width - 1)).astype(np.uint32)
@@ -97,7 +97,7 @@ def _packed(shares: Floats, widths: tuple[int, ...]) -> NDArray[np.uint32]:
 
 
 def decode_compressed_ply(chunks: NDArray[Any], rows: NDArray[Any]) -> Columns:
-    """Gaussians of the two tables of a file, in its order; ValueError if the tables do not fit together."""
+    """Decode Gaussians, in the file's order, from its two tables; ValueError if the tables do not fit together."""
     if missing := set(_CHUNK_NAMES[:12]) - set(chunks.dtype.names or ()):
         raise ValueError(f"its chunks have no {min(missing)}")
     if len(chunks) * CHUNK < len(rows):
@@ -115,7 +115,7 @@ def decode_compressed_ply(chunks: NDArray[Any], rows: NDArray[Any]) -> Columns:
 
 
 def _unpacked(words: NDArray[np.uint32], widths: tuple[int, ...]) -> Floats:
-    """The inverse of `_packed`: shares [N, k] of words, whose higher bits are ignored."""
+    """The inverse of `_packed`: unpack words [N] into fractions 0..1 [N, k]; higher bits are ignored."""
     shifts = np.array([sum(widths[k + 1 :]) for k in range(len(widths))], np.uint32)
     masks = np.array([2**width - 1 for width in widths])
     codes = words[:, None] >> shifts & masks.astype(np.uint32)
@@ -124,8 +124,8 @@ def _unpacked(words: NDArray[np.uint32], widths: tuple[int, ...]) -> Floats:
 
 
 def _between(shares: Floats, chunks: NDArray[Any], names: list[str]) -> Floats:
-    """Values [N, 3] of shares of their chunk's bounds: three least, three greatest."""
+    """The inverse of `_normalised`; `names` are the properties with the chunks' bounds: three minima, three maxima."""
     bounds = np.stack([chunks[name] for name in names], axis=1).astype(np.float64)
     low, high = np.split(bounds[np.arange(len(shares)) // CHUNK], 2, axis=1)
-    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is counted later
+    with np.errstate(over="ignore", invalid="ignore"):  # values that are not finite are counted later
         return (low + shares * (high - low)).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Depth maps out: NumPy, 16-bit PNG or OpenEXR."""
+"""Write depth maps as NumPy arrays, 16-bit PNG or OpenEXR."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ Metres = NDArray[np.float32]
 
 
 def check_depth_name(path: str | os.PathLike[str]) -> Callable[[Metres], bytes]:
-    """The encoder of a depth map for a file name; InputError for an unknown suffix."""
+    """The encoder of depth maps for a file name's suffix; InputError for an unknown suffix."""
     if (encode := ENCODERS.get(Path(path).suffix.lower())) is None:
         raise InputError(f"{path}: not a name for a depth map: end it with {', '.join(ENCODERS)}")
     return encode
 
 
 def save_depth(depth: Tensor, path: str | os.PathLike[str]) -> None:
-    """Write metres [H, W], 0 where nobody knows: .npy and .exr as float32, .png as millimetres in 16 bits."""
+    """Write depth in metres [H, W], 0 where unknown: .npy and .exr as float32, .png as millimetres in 16 bits."""
     write_whole(path, check_depth_name(path)(depth.cpu().numpy().astype(np.float32)))
 
 
@@ -44,7 +44,7 @@ def _png(depth: Metres) -> bytes:
 
 
 def _exr(depth: Metres) -> bytes:
-    """Scan lines of one channel Y of float32, without compression (the file format's documentation, openexr.com)."""
+    """Encode scan lines of one float32 channel Y, without compression (file layout: openexr.com)."""
     height, width = depth.shape
     window = struct.pack("<4i", 0, 0, width - 1, height - 1)
     attributes: list[tuple[bytes, bytes, Any]] = [

@@ -1,4 +1,4 @@
-"""glTF's KHR_gaussian_splatting in one .glb file."""
+"""Write glTF's extension KHR_gaussian_splatting, as a single .glb file."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from spackle.formats.scene_files import Columns, SceneFile
 
 EXTENSION = "KHR_gaussian_splatting"
 LARGEST_FILE = 2**32 - 1  # bytes that a .glb can announce
-ROW = 64  # bytes a Gaussian
+ROW = 64  # bytes for each Gaussian
 FLOAT, UNSIGNED_SHORT, ARRAY_BUFFER, POINTS = 5126, 5123, 34962, 0
 UNMOVED = np.eye(4).ravel().tolist()
-NEAR_PLANE = 0.01  # of the photo's camera; required, though nothing of ours depends on it
+NEAR_PLANE = 0.01  # of the photo's camera; glTF requires one, but Spackle does not use it
 
 
 def encode_glb(scene: SceneFile) -> bytes:
-    """Gaussians, in their order, as binary glTF: y up, z backward, scales linear, colours sRGB as harmonics.
+    """Encode a scene as binary glTF, in the same order: y up, z backward, linear scales, sRGB colours as harmonics.
 
     COLOR_0, linear by glTF's definition, lets viewers without the extension show points. The photo's camera becomes a
-    glTF camera; its remaining parameters and the base's count go into `extras`.
+    glTF camera; parameters that glTF cannot express, and the base's count, go into `extras`.
 
     Raises:
-        InputError: no Gaussians, or more than 4 GiB of them.
-        ValueError: where a Gaussian is not finite.
+        InputError: there are no Gaussians, or more than 4 GiB of them.
+        ValueError: a Gaussian is not finite.
     """
     count = len(scene.gaussians)
     if count == 0:
@@ -51,7 +51,7 @@ def encode_glb(scene: SceneFile) -> bytes:
 
 
 def _attributes(columns: Columns) -> dict[str, NDArray[Any]]:
-    """The attributes of Gaussians, in the file's order; each has a multiple of four bytes."""
+    """The Gaussians' attributes, in the file's order; each has a multiple of four bytes."""
     linear = srgb_to_linear(torch.from_numpy(columns.srgb)).numpy()
     rgba = np.concatenate([linear, columns.opacities[:, None]], axis=1)
     return {
@@ -65,7 +65,7 @@ def _attributes(columns: Columns) -> dict[str, NDArray[Any]]:
 
 
 def _description(arrays: dict[str, NDArray[Any]], camera: Camera | None, base_count: int | None) -> dict[str, Any]:
-    """The JSON part."""
+    """The file's JSON part."""
     views, accessors, offset = [], [], 0
     for index, array in enumerate(arrays.values()):
         views.append({"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": ARRAY_BUFFER})
@@ -75,7 +75,7 @@ def _description(arrays: dict[str, NDArray[Any]], camera: Camera | None, base_co
             accessor |= {"componentType": UNSIGNED_SHORT, "normalized": True}
         accessors.append(accessor)
         offset += array.nbytes
-    means = arrays["POSITION"]  # glTF wants the bounds of this one
+    means = arrays["POSITION"]  # glTF requires the bounds of this attribute
     accessors[0] |= {"min": means.min(axis=0).tolist(), "max": means.max(axis=0).tolist()}
     kernel = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
     primitive = {"mode": POINTS, "attributes": {name: index for index, name in enumerate(arrays)}}
@@ -100,6 +100,6 @@ def _description(arrays: dict[str, NDArray[Any]], camera: Camera | None, base_co
         nodes.append({"name": "photo", "camera": 0} | ({} if pose == UNMOVED else {"matrix": pose}))
         (fx, fy), width, height = camera.focal, camera.width, camera.height
         lens = {"yfov": 2 * math.atan2(height, 2 * fy), "aspectRatio": width * fy / (height * fx), "znear": NEAR_PLANE}
-        extras = {"K": camera.K.tolist(), "width": width, "height": height}  # where the middle lies glTF cannot say
+        extras = {"K": camera.K.tolist(), "width": width, "height": height}  # glTF has no principal point
         description["cameras"] = [{"type": "perspective", "perspective": lens, "extras": extras}]
     return description

@@ -1,4 +1,4 @@
-"""A scene for the page: its description, its Gaussians in 20 bytes each, and the page as one file."""
+"""Prepare a scene for the viewer's web page: a description, Gaussians of 20 bytes each, and the page as one file."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from spackle.errors import InputError
 from spackle.formats.scene_files import smallest_three
 from spackle.gaussians import Gaussians
 
-SAMPLES = 121  # of a path, between which the page goes straight
-USUAL, FOREIGN = 0.3, 0.6  # disparities that a scene is good for if nobody says: a completed one, one of others
+SAMPLES = 121  # positions along a path, between which the page interpolates linearly
+USUAL, FOREIGN = 0.3, 0.6  # disparity limit if none is stored: of a completed scene, of another program's scene
 LEAST, MOST = 0.01, 1.0
-BYTES = 20  # planes: 9 of centres, 3 of scales, 4 of rotations, 3 of colours, 1 of opacity
-SMALLEST_SCALE, LARGEST_SCALE = 1e-7, 1e5  # an outlier beyond must not cost the others their precision
-BLOCK = 1 << 16  # so many Gaussians at a time stay in the cache
+BYTES = 20  # byte planes: 9 of centres, 3 of scales, 4 of rotations, 3 of colours, 1 of opacity
+SMALLEST_SCALE, LARGEST_SCALE = 1e-7, 1e5  # scales are clamped, so that outliers do not cost the others precision
+BLOCK = 1 << 16  # Gaussians that are packed at a time, so few that they stay in the cache
 
 STYLE = '<link rel="stylesheet" href="viewer.css">'
 SCRIPT = '<script src="viewer.js" defer></script>'
@@ -35,30 +35,30 @@ SCRIPT = '<script src="viewer.js" defer></script>'
 
 @dataclasses.dataclass(frozen=True)
 class PageScene:
-    """A scene for the page: description and packed Gaussians."""
+    """A scene for the page: its description, and its packed Gaussians."""
 
-    description: dict[str, object]  # what becomes JSON
-    files: dict[str, bytes]  # the layers, by the names that the description gives them
+    description: dict[str, object]  # to be written as JSON
+    files: dict[str, bytes]  # the layers, by their file names in the description
 
 
 def page_scene(
     name: str, base: Gaussians, aux: Gaussians, camera: Camera, disparity: float | None = None, note: str = ""
 ) -> PageScene:
-    """A scene for the page.
+    """Prepare a scene for the page.
 
-    The description's `paths` hold, for each trajectory, eye positions [SAMPLES, 3] in metres: the eye stands at
-    still + disparity · moving, since what goes sideways grows with the disparity and what goes forward does not.
+    The description's `paths` hold two lists of eye positions [SAMPLES, 3] in metres for each trajectory. The eye is at
+    still + disparity · moving, because sideways motion grows with the disparity and forward motion does not.
 
     Args:
-        name: what the page calls it.
-        base: what the photo shows.
-        aux: what completion added; may be empty.
+        name: the scene's name on the page.
+        base: the base's Gaussians.
+        aux: the Gaussians that completion added; may be empty.
         camera: the photo's, at the world's origin.
-        disparity: how far the scene was completed, which limits the page's camera.
+        disparity: the disparity for which the scene was completed; it limits the page's camera.
         note: a remark for the user; the part before the semicolon is always shown.
 
     Raises:
-        InputError: where no Gaussian stands in front of the camera.
+        InputError: no Gaussian lies in front of the camera.
     """
     if not bool((base.means[:, 2] > 0).any()):
         raise InputError(f"{name}: no Gaussian stands in front of the photo's camera: nothing can be shown")
@@ -84,8 +84,9 @@ def page_scene(
 
 
 def _path(kind: TrajectoryKind, camera: Camera, depths: DepthRange) -> dict[str, list[list[float]]]:
-    """Eye positions at disparity 0, and the change for a disparity of 1. Nine digits are plenty, and keep the page
-    small.
+    """Eye positions at disparity 0 (`still`), and their change for a disparity of 1 (`moving`).
+
+    They are rounded to nine digits, which are precise enough and keep the page small.
     """
     still, wide = (
         torch.stack([each.position for each in trajectory(kind, camera.to("cpu", torch.float64), far, depths, SAMPLES)])
@@ -97,15 +98,15 @@ def _path(kind: TrajectoryKind, camera: Camera, depths: DepthRange) -> dict[str,
 
 @torch.no_grad()
 def encode_layer(gaussians: Gaussians) -> tuple[bytes, float, float]:
-    """Pack N Gaussians for the page, one byte plane after the other: planes compress well.
+    """Pack N Gaussians for the page as byte planes, which compress well.
 
-    Planes of N bytes each: x, y, z with three planes each from the lower byte to the upper one, of float32's upper 24
-    bits; the logarithms of the three scales; the index of the quaternion's largest part (wxyz), which is made
-    positive, and the other three parts, ±127 for ±1/√2; red, green, blue in sRGB; opacity. Dropping the last 8 bits
-    moves a centre by 2⁻¹⁶ of its distance to the photo's eye: a hundredth of a pixel.
+    Planes of N bytes each: x, y, z as the upper 24 bits of a float32, three planes each, lowest byte first; the
+    logarithms of the three scales; the index of the quaternion's largest component (wxyz), which is made positive, and
+    the other three components, ±127 for ±1/√2; red, green, blue in sRGB; opacity. Rounding off the last 8 bits moves a
+    centre by 2⁻¹⁶ of its distance to the photo's eye: a hundredth of a pixel.
 
     Returns:
-        The bytes [BYTES, N]; the logarithm of the scale that byte 0 stands for; what one step adds to it.
+        The bytes [BYTES, N]; the logarithm of the scale for byte 0; the logarithm's increase for each step.
     """
     means, quats, scales, opacities, colors = (t.detach().to("cpu", torch.float32) for t in gaussians.tensors)
     low, step = _scale_range(scales)
@@ -131,12 +132,12 @@ def _scale_range(scales: Tensor) -> tuple[float, float]:
 
 
 def _bytes(values: Tensor) -> NDArray[np.uint8]:
-    """[rows, C] rounded to [C, rows] in 0..255."""
+    """Values [rows, C], rounded, clamped to 0..255 and transposed to [C, rows]."""
     return values.round().clamp(0, 255).to(torch.uint8).T.numpy()
 
 
 def as_json(value: object) -> bytes:
-    """JSON in ASCII that is safe inside HTML, whatever names it holds."""
+    """JSON in ASCII that is safe inside HTML, whatever strings it contains."""
     text = json.dumps(value, allow_nan=False)
     for character in "<>&":
         text = text.replace(character, f"\\u{ord(character):04x}")
@@ -144,7 +145,7 @@ def as_json(value: object) -> bytes:
 
 
 def single_html(scene: PageScene) -> bytes:
-    """The page with a scene in it, which opens from a disk or a mail; nothing is ever fetched."""
+    """The page with a scene embedded, which opens from a disk or an e-mail and never fetches anything."""
     page, css, js = (page_file(name).decode() for name in ("index.html", "viewer.css", "viewer.js"))
     held = {name: base64.b64encode(gzip.compress(data, 6, mtime=0)).decode() for name, data in scene.files.items()}
     data = as_json({"description": scene.description, "files": held}).decode()

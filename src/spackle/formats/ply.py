@@ -1,4 +1,4 @@
-"""Gaussians as PLY: INRIA's layout out; INRIA's, SHARP's and PlayCanvas's in, the header before any table."""
+"""Gaussians as PLY: writes INRIA's layout; reads INRIA's, SHARP's and PlayCanvas's, and checks the header first."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ _TYPES = "char uchar short ushort int uint float double int8 uint8 int16 uint16 
 _CODES = dict(zip(_TYPES.split(), ["i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"] * 2, strict=True))
 _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 
-SMALLEST_OPACITY, LARGEST_OPACITY = 1e-12, 1 - 2.0**-24  # keep the logit finite
+SMALLEST_OPACITY, LARGEST_OPACITY = 1e-12, 1 - 2.0**-24  # bounds that keep the logit finite
 
-# One block fits the cache, and torch computes so few numbers in one thread. Blocks are always full: so a row's
-# bits depend neither on the rows after it nor on the number of threads.
+# A block fits the cache, and is so small that torch computes it in one thread. Blocks are padded to full size, so that
+# a row's bits depend neither on the rows after it nor on the number of threads.
 BLOCK = 8192
 
 _READ = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2"]
@@ -55,13 +55,13 @@ def save_ply(
 ) -> None:
     """Write a binary PLY that viewers of 3D Gaussian splatting read.
 
-    One `vertex` element of float32: x y z, normals of zero, f_dc from the sRGB colour, opacity as
-    logit, scales as logarithm, rot as unit quaternion wxyz. Each row depends on its Gaussian alone. Comments, for
-    `PlyFile`, keep the photo's camera, which stands at the world's origin, how many of the first Gaussians are the
-    base's, and the disparity that the scene was completed for, see `spackle.camera_path.max_offset`.
+    The one element, `vertex`, is float32: x y z, normals of zero, f_dc from the sRGB colour, opacity as logit, scales
+    as logarithms, rot as unit quaternion wxyz. Each row depends only on its Gaussian. Comments, which `PlyFile` reads,
+    keep the photo's camera (at the world's origin), the number of base Gaussians, which come first, and the disparity
+    for which the scene was completed, see `spackle.camera_path.max_offset`.
 
     Raises:
-        InputError: nothing can be written at `path`.
+        InputError: `path` cannot be written.
         ValueError: a Gaussian is not finite.
     """
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
@@ -69,14 +69,14 @@ def save_ply(
 
 
 def encode_ply(scene: SceneFile) -> bytes:
-    """A scene as `save_ply` writes it; ValueError where a Gaussian is not finite."""
+    """Encode a scene as `save_ply` does; ValueError if a Gaussian is not finite."""
     return b"".join(_written(scene.gaussians, scene.untilted_camera, scene.base_count, scene.disparity))
 
 
 def _written(
     gaussians: Gaussians, camera: Camera | None, base_count: int | None, disparity: float | None
 ) -> Iterator[bytes]:
-    """The header and the rows, BLOCK at a time."""
+    """The header, then the rows, BLOCK at a time."""
     vertex = ("vertex", len(gaussians), "float", _WRITTEN)
     yield ply_header(vertex, camera=camera, base_count=base_count, disparity=disparity)
     gaussians = gaussians.detach().to("cpu", torch.float32)
@@ -98,7 +98,7 @@ def ply_header(
     base_count: int | None = None,
     disparity: float | None = None,
 ) -> bytes:
-    """The header of a binary file: of each table its name, number of rows, type and properties; comments as given."""
+    """The header of a binary file; each table is (name, number of rows, type, properties)."""
     lines = ["ply", "format binary_little_endian 1.0"]
     if camera is not None:
         numbers = [*camera.focal, *camera.K[:2, 2].tolist(), camera.width, camera.height]
@@ -122,19 +122,19 @@ class Element:
     name: str
     count: int
     fields: list[tuple[str, str]] = dataclasses.field(default_factory=list)  # (name, NumPy type or "list")
-    start: int = -1  # bytes behind the header, or lines in an ASCII file; -1 from the first list on
+    start: int = -1  # offset after the header, in bytes, or in lines of an ASCII file; -1 from the first list on
 
 
 class PlyFile:
-    """The header of a PLY file, and its tables up to the first one with lists, whose rows have no fixed size.
+    """A PLY file's header, and its tables up to the first one with lists, which has no fixed row size.
 
-    InputError where it is no PLY file, has an endless or broken header, or is too short for its tables.
+    InputError if the file is no PLY file, has an endless or broken header, or is too short for its tables.
     """
 
     def __init__(self, path: StrPath) -> None:
         self.path, self._size = path, check_file(path, "PLY file")
         self.elements: list[Element] = []
-        self.comments: dict[str, list[str]] = {}  # first word → the others
+        self.comments: dict[str, list[str]] = {}  # first word → the other words
         with open(path, "rb") as file:
             head = file.read(MAX_HEADER_BYTES)
         if head.split(b"\n", 1)[0].rstrip() != b"ply":
@@ -150,15 +150,15 @@ class PlyFile:
             self._place_tables()
 
     def gaussians(self) -> Gaussians:
-        """The scene; colours become linear RGB.
+        """Read the scene; colours become linear RGB.
 
-        Properties may come in any order and type; spherical harmonics above degree 0 (f_rest) are ignored.
-        SHARP's `color_space` says whether colours are sRGB (0) or linear (1). Without it, a file with SHARP's camera is
-        read as linear, as SHARP does, any other as sRGB.
+        Properties may have any order and type; spherical harmonics above degree 0 (f_rest) are ignored.
+        SHARP's `color_space` states whether colours are sRGB (0) or linear (1). Without it, a file with SHARP's camera
+        is read as linear, as SHARP does, and any other file as sRGB.
 
         Raises:
-            InputError: no Gaussians, or some with NaN or inf. An infinite opacity logit is allowed: SHARP writes one
-                for an opacity of 1.
+            InputError: there are no Gaussians, or some contain NaN or inf. An infinite opacity logit is allowed: SHARP
+                writes one for an opacity of 1.
         """
         vertex, extras = self._vertex(), self._extras()
         if chunks := [element for element in self.elements if element.name == "chunk"]:
@@ -171,7 +171,7 @@ class PlyFile:
         parts = [torch.empty(vertex.count, columns.stop - columns.start) for columns in _SLICES]
         table, broken = np.zeros((len(_READ), BLOCK), np.float32), 0
         for index, rows in enumerate(self._blocks(vertex)):
-            with np.errstate(over="ignore", invalid="ignore"):  # too large for float32 becomes inf, which is counted
+            with np.errstate(over="ignore", invalid="ignore"):  # numbers beyond float32 become inf, and are counted
                 for k, name in enumerate(_READ):
                     table[k, : len(rows)] = rows[name]
                 table[7:10] = np.exp(table[7:10])
@@ -189,9 +189,9 @@ class PlyFile:
         return Gaussians(means, quats, scales, opacities[:, 0], colors)
 
     def camera(self) -> Camera | None:
-        """The photo's camera, which SHARP stores after the Gaussians and `save_ply` in a comment; None in other files.
+        """The photo's camera, which SHARP stores after the Gaussians and `save_ply` in a comment.
 
-        InputError for a camera that makes no sense.
+        None for files without a camera; InputError if the camera is invalid.
         """
         K, matrix = np.eye(3), np.eye(4)
         if numbers := self._numbers("spackle_camera", 6, lowest=-math.inf):
@@ -208,12 +208,18 @@ class PlyFile:
         return checked_camera(torch.from_numpy(K), torch.from_numpy(matrix), width, height, where)
 
     def base_count(self) -> int | None:
-        """How many of the first Gaussians are the base's; None in other files, InputError for more than there are."""
+        """The number of base Gaussians, which come first.
+
+        None for files of other programs; InputError if the file states more Gaussians than it contains.
+        """
         numbers = self._numbers("spackle_base", 1, highest=self._vertex().count)
         return int(numbers[0]) if numbers else None
 
     def disparity(self) -> float | None:
-        """How far the scene was completed; None in other files, InputError for no such number."""
+        """The disparity for which the scene was completed.
+
+        None if the file does not state it; InputError if the stored value is not a valid number.
+        """
         numbers = self._numbers("spackle_disparity", 1)
         return numbers[0] if numbers else None
 
@@ -246,7 +252,7 @@ class PlyFile:
         self._ascii = order == "="
 
     def _place_tables(self) -> None:
-        """Find where each table starts, and refuse a file that is too short, before anything is allocated."""
+        """Find where each table starts; refuse a file that is too short before anything is allocated."""
         start, end = 0, self._data - self._ascii  # the last line needs no line break
         for element in self.elements:
             if "list" in dict(element.fields).values():
@@ -260,7 +266,7 @@ class PlyFile:
                 raise InputError(f"{self.path}: cut off: {announced}, but the file ends after {self._size} bytes")
 
     def _numbers(self, comment: str, count: int, lowest: float = 0, highest: float = math.inf) -> list[float] | None:
-        """The finite numbers of one of Spackle's comments; None without it."""
+        """The finite numbers in one of Spackle's comments; None if the file does not have this comment."""
         if (words := self.comments.get(comment)) is None:
             return None
         what = comment.removeprefix("spackle_")
@@ -271,7 +277,7 @@ class PlyFile:
         return numbers
 
     def _vertex(self) -> Element:
-        """The vertices; InputError where they are not Gaussians of a fixed size."""
+        """The element with the vertices; InputError if they are not Gaussians, or have no fixed size."""
         named = [element for element in self.elements if element.name == "vertex"]
         if len(named) != 1:
             raise InputError(f"{self.path}: holds {len(named)} elements called vertex: not a Gaussian scene")
@@ -285,13 +291,13 @@ class PlyFile:
         return named[0]
 
     def _extras(self) -> dict[str, NDArray[np.float64]]:
-        """The numbers of the small tables by their properties' names, such as SHARP's camera."""
+        """The numbers in small tables, such as SHARP's camera, by their properties' names."""
         tables = [e for e in self.elements if e.name != "vertex" and e.start >= 0 and e.fields]
         small = [(e, rows) for e in tables if e.count <= MAX_EXTRA_ROWS for rows in self._blocks(e)]
         return {name: rows[name].astype(np.float64) for element, rows in small for name, _ in element.fields}
 
     def _blocks(self, element: Element) -> Iterator[NDArray[Any]]:
-        """The rows of a table, BLOCK at a time, as structured arrays; InputError where they are no numbers."""
+        """The rows of a table, BLOCK at a time, as structured arrays; InputError if they are not numbers."""
         broken = reading(self.path, f"{element.name!r} is broken: {{reason}}", ValueError)
         with open(self.path, "rb") as file, broken:
             file.seek(self._data + (0 if self._ascii else element.start))

@@ -1,4 +1,4 @@
-"""Scene files: what they store, and the formats that a scene is written in and read from."""
+"""Scene files: their content, and the formats in which scenes are written and read."""
 
 from __future__ import annotations
 
@@ -21,36 +21,36 @@ from spackle.gaussians import Gaussians
 Floats = NDArray[np.float32]
 
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 √π)
-SMALLEST_SCALE, LARGEST_SCALE = 1e-37, 1e37  # keep the logarithm, and float32 after it, finite
+SMALLEST_SCALE, LARGEST_SCALE = 1e-37, 1e37  # bounds that keep a scale and its logarithm finite in float32
 _FLIP = np.array([1, 1, -1, -1], np.float32)
 SMALLEST_QUAT = 1e-12  # a shorter quaternion has no direction
 
 
 @dataclasses.dataclass(frozen=True)
 class SceneFile:
-    """What a scene's file holds; most formats have room for Gaussians alone."""
+    """The content of a scene's file; most formats store only Gaussians."""
 
     path: Path
     gaussians: Gaussians
     camera: Camera | None = None  # the photo's
     base_count: int | None = None
-    disparity: float | None = None  # how far it was completed
-    harmonics: int = 0  # numbers of each Gaussian above degree 0, which are left out
+    disparity: float | None = None  # the disparity for which it was completed
+    harmonics: int = 0  # number of coefficients above degree 0 of each Gaussian, which are left out
 
     @property
     def untilted_camera(self) -> Camera | None:
-        """The camera if it stands at the world's origin, else None: a PLY's comment stores no pose."""
+        """The camera if `at_origin`, else None: a PLY's comment stores no pose."""
         return self.camera if self.camera is not None and at_origin(self.camera) else None
 
 
 def at_origin(camera: Camera) -> bool:
-    """Whether a camera stands at the world's origin and looks along z."""
+    """Whether a camera is at the world's origin and looks along z."""
     return torch.equal(camera.world_to_camera, torch.eye(4).to(camera.world_to_camera))
 
 
 @dataclasses.dataclass(frozen=True)
 class Columns:
-    """N Gaussians as NumPy columns, float32, in the units that files share and the axes of their scene."""
+    """N Gaussians as float32 NumPy columns, in the units that file formats share, and in the axes of their scene."""
 
     means: Floats  # [N, 3]
     quats: Floats  # [N, 4] unit length, wxyz
@@ -61,25 +61,25 @@ class Columns:
     @staticmethod
     @torch.no_grad()
     def of(gaussians: Gaussians) -> Columns:
-        """Columns of a scene: colours clamped to what a screen shows, quaternions without direction made (1, 0, 0, 0).
+        """Columns of a scene; colours are clamped to 0..1, and quaternions of length 0 become (1, 0, 0, 0).
 
         Raises:
             ValueError: a Gaussian is not finite.
         """
         means, quats, scales, opacities, colors = (t.detach().to("cpu", torch.float32) for t in gaussians.tensors)
         for name, tensor in zip(vars(gaussians), (means, quats, scales.clamp(-1, 1), opacities, colors), strict=True):
-            if not torch.isfinite(tensor).all():  # a scale may be infinite: it becomes the largest
+            if not torch.isfinite(tensor).all():  # a scale may be infinite: it is clamped to the largest one
                 raise ValueError(f"{name} of these Gaussians are not all finite")
-        quats = quats / quats.abs().amax(-1, keepdim=True).clamp_min(1.0)  # their squares may be too large
+        quats = quats / quats.abs().amax(-1, keepdim=True).clamp_min(1.0)  # their squares may overflow
         norm = torch.linalg.vector_norm(quats, dim=-1, keepdim=True)
         unit = torch.where(norm < SMALLEST_QUAT, torch.tensor([1.0, 0, 0, 0]), quats / norm.clamp_min(SMALLEST_QUAT))
-        # NumPy's logarithm: torch's, split among threads, waits for them at every block of a PLY.
+        # NumPy's logarithm: torch's would be split among threads, and wait for them at every block of a PLY.
         log_scales = np.log(np.clip(scales.numpy(), SMALLEST_SCALE, LARGEST_SCALE))
         srgb = linear_to_srgb(colors).numpy()
         return Columns(means.numpy(), unit.numpy(), log_scales, opacities.clamp(0, 1).numpy(), srgb)
 
     def gaussians(self) -> Gaussians:
-        """The scene; ValueError where a Gaussian is not finite."""
+        """The scene as Gaussians; ValueError if one is not finite."""
         with np.errstate(over="ignore", invalid="ignore"):
             columns = self.means, self.quats, np.exp(self.log_scales), self.opacities, self.srgb
         count = len(self.means)
@@ -91,27 +91,27 @@ class Columns:
 
     @property
     def harmonics(self) -> Floats:
-        """[N, 3] coefficients of the constant spherical harmonic, which gives the sRGB colour."""
+        """[N, 3] coefficients of the constant spherical harmonic that give the sRGB colours."""
         return (self.srgb - np.float32(0.5)) / np.float32(SH_C0)
 
     def flipped(self) -> Columns:
-        """Half a turn about x: y up, z backward, as OpenGL and glTF have it."""
+        """Turn by 180° about x, to y up and z backward, as in OpenGL and glTF."""
         means, quats = self.means * _FLIP[1:], self.quats * _FLIP
         return dataclasses.replace(self, means=means, quats=quats)
 
     def select(self, rows: NDArray[np.int64] | slice) -> Columns:
-        """The Gaussians that an index or a slice picks."""
+        """The Gaussians that an index array or a slice selects."""
         return Columns(*(getattr(self, field.name)[rows] for field in dataclasses.fields(self)))
 
 
-OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # of a quaternion, beside each component
+OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # row k: a quaternion's components other than k
 
 
 def smallest_three(quats: Floats) -> tuple[NDArray[np.int64], Floats]:
-    """Which component [N] of unit quaternions [N, 4] is largest, and the others [N, 3], in their order.
+    """The index [N] of the largest component of unit quaternions [N, 4], and the other components [N, 3], in order.
 
-    A quaternion and its opposite are one rotation; the one with a positive largest component is taken, which follows
-    from the other three, each of at most √½.
+    A quaternion and its negative are the same rotation; the one whose largest component is positive is taken. That
+    component follows from the other three, which are at most √½.
     """
     largest = np.abs(quats).argmax(axis=1)
     sign = np.where(np.take_along_axis(quats, largest[:, None], axis=1) < 0, np.float32(-1), np.float32(1))
@@ -128,7 +128,7 @@ def from_smallest_three(largest: NDArray[Any], others: Floats) -> Floats:
 
 
 def as_shares(components: Floats) -> Floats:
-    """Components of `smallest_three` as shares 0..1 of their range."""
+    """Components of `smallest_three` as fractions 0..1 of their range."""
     shares: Floats = np.clip(components * np.float32(0.5**0.5) + np.float32(0.5), 0, 1)
     return shares
 
@@ -147,9 +147,9 @@ SPLAT_ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 
 
 
 def encode_splat(scene: SceneFile) -> bytes:
-    """Gaussians, in their order and axes, as a .splat file of antimatter15's viewer: 32 bytes each, and nothing else.
+    """Encode a scene, in its order and axes, as a .splat file of antimatter15's viewer: only 32 bytes per Gaussian.
 
-    Colours, opacities and rotations are rounded to bytes. ValueError where a Gaussian is not finite.
+    Colours, opacities and rotations are rounded to bytes. ValueError if a Gaussian is not finite.
     """
     columns = Columns.of(scene.gaussians)
     rows = np.empty(len(scene.gaussians), SPLAT_ROW)
@@ -160,7 +160,7 @@ def encode_splat(scene: SceneFile) -> bytes:
 
 
 def decode_splat(data: bytes) -> Columns:
-    """Gaussians of a .splat file; ValueError where it ends within one."""
+    """Decode a .splat file; ValueError if it ends within a Gaussian."""
     rows = np.frombuffer(data, SPLAT_ROW)
     with np.errstate(divide="ignore", invalid="ignore"):
         log_scales = np.log(np.clip(rows["scales"], SMALLEST_SCALE, LARGEST_SCALE))
@@ -169,8 +169,8 @@ def decode_splat(data: bytes) -> Columns:
 
 
 Encoder = Callable[[SceneFile], bytes]
-# The module and the function that encodes a format, imported when a file is first written in it. A new format is one
-# file and one line here; the first end that fits a name counts.
+# The module and function that encode each format, imported when a file is first written in it. A new format takes one
+# file and one line here. The first suffix that matches a name is used.
 SCENE_ENCODERS = {
     ".compressed.ply": "spackle.formats.compressed_ply:encode_compressed_ply",
     ".ply": "spackle.formats.ply:encode_ply",
@@ -181,19 +181,19 @@ SCENE_ENCODERS = {
 }
 
 
-# What reads a format, as in SCENE_ENCODERS; .ply and .compressed.ply are read by `PlyFile`.
+# The function that decodes each format, as in SCENE_ENCODERS; .ply and .compressed.ply are read by `PlyFile`.
 SCENE_DECODERS = {
     ".spz": "spackle.formats.spz:decode_spz",
     ".splat": "spackle.formats.scene_files:decode_splat",
     ".sog": "spackle.formats.sog:decode_sog",
 }
 SCENE_SUFFIXES = (".ply", *SCENE_DECODERS)
-STARTS = {b"ply": ".ply", b"\x1f\x8b": ".spz", b"PK": ".sog"}  # a .splat has no beginning of its own
+STARTS = {b"ply": ".ply", b"\x1f\x8b": ".spz", b"PK": ".sog"}  # a .splat has no signature
 WRITTEN_ONLY = (".glb", ".html")
 
 
 def scene_kind(path: Path) -> str | None:
-    """The suffix of a file's format, by its first bytes, else by its name; None if it is no scene."""
+    """The suffix of a file's format, found from its first bytes, else from its name; None if it is no scene."""
     check_file(path, "scene")
     with open(path, "rb") as file:
         start = file.read(4)
@@ -202,7 +202,7 @@ def scene_kind(path: Path) -> str | None:
 
 
 def load_scene(path: Path) -> SceneFile:
-    """Read a scene in any format of SCENE_SUFFIXES; InputError for another file, and for a damaged one."""
+    """Read a scene in any format of SCENE_SUFFIXES; InputError if the file has another format or is damaged."""
     kind = scene_kind(path)
     if kind in WRITTEN_ONLY:
         raise InputError(f"{path}: {kind} files are written, not read: give the scene.ply that it was made of")
@@ -217,13 +217,13 @@ def load_scene(path: Path) -> SceneFile:
 
 
 def function_named(name: str) -> Any:
-    """Import the function that a table names."""
+    """Import a function by its name in a table, "module:function"."""
     module, _, function = name.partition(":")
     return getattr(import_module(module), function)
 
 
 def encoder_of(path: Path, more: Mapping[str, Encoder] | None = None) -> Encoder:
-    """The encoder for a file name, from SCENE_ENCODERS and `more`; InputError for an unknown suffix."""
+    """The encoder for a file name's suffix, from SCENE_ENCODERS and `more`; InputError for an unknown suffix."""
     encoders: dict[str, str | Encoder] = {**SCENE_ENCODERS, **(more or {})}
     for suffix, encoder in encoders.items():
         if path.name.lower().endswith(suffix):

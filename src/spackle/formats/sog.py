@@ -1,4 +1,4 @@
-"""SOG 2, PlayCanvas's format: Gaussians as lossless WebP pictures, zipped into one file."""
+"""SOG 2, PlayCanvas's format: Gaussians as lossless WebP images, zipped into one file."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ from spackle.formats.scene_files import (
     smallest_three,
 )
 
-LARGEST_SIDE = 16_380  # of a WebP picture, in fours
-LARGEST_MEMBER = 1 << 28  # bytes of a picture's file that are read
+LARGEST_SIDE = 16_380  # largest multiple of four that a WebP image's side can have
+LARGEST_MEMBER = 1 << 28  # bytes; a larger file in the archive is refused
 CODES = 256  # entries of a codebook
-BINS = 1 << 16  # values that building a codebook tells apart
-EVEN = 0.25  # of the codes lie at equal distances
+BINS = 1 << 16  # bins into which values are sorted to build a codebook
+EVEN = 0.25  # fraction of the codes that are spaced evenly
 EFFORT = {"lossless": True, "exact": True, "quality": 25, "method": 1}  # exact: colours stay where opacity is 0
 EPOCH = (1980, 1, 1, 0, 0, 0)  # the archive's bytes do not depend on when it was made
 
 
 def encode_sog(scene: SceneFile) -> bytes:
-    """Gaussians, in their order and axes, as a bundled SOG file.
+    """Encode a scene as a bundled SOG file, in its own order and axes.
 
-    Positions have 16 bits on an axis, logarithmically spaced from 0; scales and colours are looked up in codebooks.
+    Positions have 16 bits for each axis, spaced logarithmically from 0; scales and colours are looked up in codebooks.
 
     Raises:
-        InputError: no Gaussians, or more than pictures can hold.
-        ValueError: where a Gaussian is not finite.
+        InputError: there are no Gaussians, or more than the images can hold.
+        ValueError: a Gaussian is not finite.
     """
     count = len(scene.gaussians)
     if count == 0:
@@ -74,7 +74,7 @@ def encode_sog(scene: SceneFile) -> bytes:
     }
     files = {name: _webp(np.concatenate(parts, axis=1), width) for name, parts in pictures.items()}
     buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:  # nothing is packed twice
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:  # WebP is compressed already
         for name, content in {"meta.json": json.dumps(meta, allow_nan=False).encode(), **files}.items():
             archive.writestr(zipfile.ZipInfo(name, EPOCH), content)
     return buffer.getvalue()
@@ -84,7 +84,7 @@ def codebook(values: Floats) -> tuple[Floats, NDArray[np.uint8]]:
     """A codebook [256] for values [N, 3] with small squared error, and each value's code.
 
     The density of codes follows the cube root of the values' density, which is optimal for many codes; a quarter of the
-    codes is spread evenly, for rare values. At most 256 different values get a code each.
+    codes is spread evenly, for rare values. If there are at most 256 different values, each gets its own code.
     """
     low, high = float(values.min()), float(values.max())
     bins = np.minimum((values - low) * (BINS / max(high - low, 1e-30)), BINS - 1).astype(np.int32)
@@ -104,7 +104,7 @@ def codebook(values: Floats) -> tuple[Floats, NDArray[np.uint8]]:
 
 
 def _means(means: Floats) -> tuple[NDArray[np.uint16], Floats, Floats]:
-    """Positions [N, 3] as 0..65535 between their logarithms' bounds, and these bounds [3] each."""
+    """Quantise the logarithms of positions [N, 3] to 0..65535 within their bounds; returns these too, [3] each."""
     logs = np.copysign(np.log1p(np.abs(means)), means)
     low, high = logs.min(axis=0), logs.max(axis=0)
     span = np.maximum(high - low, np.float32(1e-30))
@@ -112,7 +112,7 @@ def _means(means: Floats) -> tuple[NDArray[np.uint16], Floats, Floats]:
 
 
 def _webp(rgba: NDArray[np.uint8], width: int) -> bytes:
-    """Pixels [N, 4], row by row, as a picture; the last row is filled up with black."""
+    """Encode pixels [N, 4], row by row, as an image; unused pixels at the end are black."""
     height = math.ceil(len(rgba) / width / 4) * 4
     pixels = np.zeros((height * width, 4), np.uint8)
     pixels[:, 3] = 255
@@ -123,7 +123,7 @@ def _webp(rgba: NDArray[np.uint8], width: int) -> bytes:
 
 
 def decode_sog(data: bytes) -> Columns:
-    """Gaussians of a bundled SOG file of version 2; any error for a damaged one, ValueError for another version."""
+    """Decode a bundled SOG file of version 2; any error if it is damaged, ValueError for another version."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
 
         def member(name: str) -> bytes:
@@ -137,7 +137,7 @@ def decode_sog(data: bytes) -> Columns:
         count = int(meta["count"])
 
         def pixels(name: str) -> NDArray[np.uint8]:
-            """Pixels [N, 4] of a picture, without the padding of the last row."""
+            """Pixels [N, 4] of an image, without the padding at its end."""
             with Image.open(io.BytesIO(member(name)), formats=["WEBP"]) as image:
                 if max(image.size) > LARGEST_SIDE or not 0 < count <= image.width * image.height:
                     raise ValueError(f"{name} has {image.width}×{image.height} pixels for {count:,} Gaussians")
@@ -155,7 +155,7 @@ def decode_sog(data: bytes) -> Columns:
         np.array(meta[key]["codebook"], np.float32).reshape(CODES)[codes[:, :3]]
         for key, codes in (("scales", scales), ("sh0", sh0))
     )
-    with np.errstate(over="ignore"):  # what is not finite is counted later
+    with np.errstate(over="ignore"):  # values that are not finite are counted later
         means = np.copysign(np.expm1(np.abs(logs)), logs)
     turns = from_smallest_three(largest, from_shares(fractions(quats[:, :3], 255)))
     srgb = np.clip(harmonics * np.float32(SH_C0) + np.float32(0.5), 0, 1)

@@ -1,4 +1,4 @@
-"""SPZ, Niantic's compressed format, deflated: version 3 out, 20 bytes a Gaussian, versions 2 and 3 in."""
+"""SPZ, Niantic's compressed format: writes version 3 (20 bytes for each Gaussian, then deflated), reads 2 and 3."""
 
 from __future__ import annotations
 
@@ -25,30 +25,30 @@ from spackle.gaussians import Gaussians
 
 MAGIC, VERSION = 0x5053474E, 3
 HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, degree of harmonics, fractional bits, flags, reserved
-ROW = 20  # bytes a Gaussian
-LARGEST = 2**23 - 1  # of a coordinate, which has 24 bits
-FEWEST_BITS, MOST_BITS = 1, 23  # of them behind the point
-NEAR_STEPS = 2048  # a near Gaussian's distance is at least so many steps of the grid
-NEAR_SHARE = 0.01  # of all Gaussians lie nearer than what counts as near
+ROW = 20  # bytes for each Gaussian
+LARGEST = 2**23 - 1  # largest value of a coordinate, which has 24 bits
+FEWEST_BITS, MOST_BITS = 1, 23  # fractional bits of a coordinate
+NEAR_STEPS = 2048  # the near distance is at least so many steps of the grid
+NEAR_SHARE = 0.01  # the near distance is this quantile of the Gaussians' distances
 COLOR_SCALE = 0.15  # colours are stored with room below 0 and above 1
-HARMONICS = (0, 9, 24, 45)  # numbers of a Gaussian above degree 0, by the degree
+HARMONICS = (0, 9, 24, 45)  # numbers that each Gaussian has above degree 0, by the degree
 GZIP, WINDOW = 16, 15
-EFFORT = 5  # 6 takes twice the time for 1 % less
-MAX_COUNT = 10_000_000  # what the format's own library reads
+EFFORT = 5  # 6 takes twice the time for files 1 % smaller
+MAX_COUNT = 10_000_000  # most Gaussians that the format's own library reads
 
-# What deflates well is what repeats. Bits that nobody sees are therefore rounded away, and the finest of these
-# degrees is taken with which a file keeps to 1/8 of the PLY.
-LIMIT = 8.5  # bytes a Gaussian; the PLY has 68
-SMALL = 1 << 14  # bytes, which are few enough for any scene
-SAMPLE, SAMPLES = 1 << 13, 8  # Gaussians in a row that are tried first, and at how many places
+# Repeated bytes deflate well. Bits too fine to be visible are therefore rounded away, at the finest of the levels
+# in _DETAILS with which a file has at most 1/8 of the PLY's size.
+LIMIT = 8.5  # bytes for each Gaussian; the PLY has 68
+SMALL = 1 << 14  # bytes; a file up to this size is never rounded more
+SAMPLE, SAMPLES = 1 << 13, 8  # the levels are first tried on so many consecutive Gaussians at so many places
 SAMPLED_LIMIT = 8.7  # short pieces deflate a little worse than the whole
 
 
 class _Detail(NamedTuple):
-    position: float  # a step, in standard deviations of the Gaussian's middle axis
-    quat_bits: int  # of each of the three smaller components, of 9
-    scale_step: int  # of the logarithm, in sixteenths
-    opacity_step: int  # in 255ths
+    position: float  # step in standard deviations of the Gaussian's middle axis
+    quat_bits: int  # bits that are kept, of 9, of each of the three smaller components
+    scale_step: int  # step of a scale's logarithm, in sixteenths
+    opacity_step: int  # step in 255ths
 
 
 _DETAILS = [_Detail(1 / 16, 9, 1, 1), _Detail(1 / 8, 7, 1, 1), _Detail(1 / 4, 6, 1, 2), _Detail(1 / 4, 5, 2, 2)]
@@ -56,14 +56,14 @@ _DETAILS += [_Detail(1 / 2, 5, 2, 4), _Detail(1 / 2, 4, 2, 4), _Detail(1 / 2, 4,
 
 
 def encode_spz(scene: SceneFile) -> bytes:
-    """Gaussians, in their order, as an SPZ file of version 3: y up, z backward, as the format wants it.
+    """Encode a scene as an SPZ file of version 3, in the same order, with y up and z backward as the format requires.
 
-    Positions are rounded to a grid that suits near Gaussians. Gaussians too far for the grid are scaled towards the
-    origin, from where they look the same; see `spz_grid`.
+    Positions are rounded to a grid that suits near Gaussians, see `spz_grid`. Gaussians beyond the grid's range are
+    scaled towards the origin, from which they look the same.
 
     Raises:
-        InputError: more Gaussians than readers take.
-        ValueError: where a Gaussian is not finite.
+        InputError: there are more Gaussians than readers accept.
+        ValueError: a Gaussian is not finite.
     """
     count = len(scene.gaussians)
     if count > MAX_COUNT:
@@ -81,7 +81,7 @@ def encode_spz(scene: SceneFile) -> bytes:
 
 
 def spz_grid(gaussians: Gaussians) -> tuple[int, int]:
-    """Fractional bits of an SPZ file's positions, and the number of Gaussians beyond the grid's range."""
+    """The number of fractional bits of an SPZ file's positions, and of Gaussians beyond the grid's range."""
     means = gaussians.means.detach().to("cpu").double().numpy()
     if not len(means):
         return 12, 0
@@ -94,7 +94,7 @@ def spz_grid(gaussians: Gaussians) -> tuple[int, int]:
 
 
 def _within(columns: Columns, bits: int) -> Columns:
-    """Gaussians beyond the grid's range, scaled about the origin, in position and size, until they fit."""
+    """Scale Gaussians beyond the grid's range about the origin, in position and size, until they fit."""
     reach = np.abs(columns.means).max(axis=1, initial=0).astype(np.float64)
     factor = np.minimum(1, LARGEST / 2.0**bits / np.maximum(reach, 1e-30))[:, None]
     means, log_scales = columns.means * factor, columns.log_scales + np.log(factor)
@@ -102,9 +102,7 @@ def _within(columns: Columns, bits: int) -> Columns:
 
 
 def _finest(columns: Columns, bits: int) -> int:
-    """Index of the finest rounding with which deflated samples of the scene stay within the size limit, else the
-    coarsest.
-    """
+    """Index of the finest level of rounding at which deflated samples keep to the size limit, else of the coarsest."""
     count = len(columns.means)
     starts = np.unique(np.linspace(0, max(0, count - SAMPLE), SAMPLES).astype(np.int64))
     rows = np.concatenate([np.arange(start, min(start + SAMPLE, count)) for start in starts])
@@ -117,12 +115,12 @@ def _finest(columns: Columns, bits: int) -> int:
 
 
 def _sections(columns: Columns, bits: int, detail: _Detail) -> list[bytes]:
-    """Positions, opacities, colours, scales, rotations, in the file's order."""
+    """The bytes of positions, opacities, colours, scales and rotations, in the file's order."""
     scales = np.round((columns.log_scales + 10) * np.float32(16 / detail.scale_step)) * detail.scale_step
     scales = np.clip(scales, 0, 255).astype(np.uint8)
     colors = (columns.srgb - np.float32(0.5)) * np.float32(COLOR_SCALE * 255 / SH_C0) + np.float32(127.5)
     step = detail.opacity_step
-    ball = (scales == scales[:, :1]).all(axis=1, keepdims=True)  # it looks the same however it is turned
+    ball = (scales == scales[:, :1]).all(axis=1, keepdims=True)  # a sphere looks the same however it is turned
     quats = np.where(ball, np.array([1, 0, 0, 0], np.float32), columns.quats)
     return [
         _positions(columns, bits, detail.position).tobytes(),
@@ -134,7 +132,7 @@ def _sections(columns: Columns, bits: int, detail: _Detail) -> list[bytes]:
 
 
 def _positions(columns: Columns, bits: int, share: float) -> NDArray[np.uint8]:
-    """[N, 9] bytes: 24-bit fixed point, rounded to the power of two below `share` of the middle axis."""
+    """[N, 9] bytes: 24-bit fixed point; the step is the largest power of two up to `share` times the middle axis."""
     a, b, c = columns.log_scales.T
     middle = np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c))
     exponent = np.floor(middle / np.float32(np.log(2)) + np.float32(np.log2(share) + bits))
@@ -145,8 +143,9 @@ def _positions(columns: Columns, bits: int, share: float) -> NDArray[np.uint8]:
 
 
 def _rotations(quats: Floats, bits: int) -> NDArray[np.uint32]:
-    """Unit quaternions wxyz as words [N]: the index of the largest of xyzw; sign and 9 bits of the others, rounded to
-    `bits`.
+    """Pack unit quaternions wxyz into words [N].
+
+    A word holds the index of the largest of xyzw, then sign and 9 bits of each other component, rounded to `bits`.
     """
     largest, others = smallest_three(quats[:, [1, 2, 3, 0]])
     step = 2 ** (9 - bits)
@@ -158,15 +157,16 @@ def _rotations(quats: Floats, bits: int) -> NDArray[np.uint32]:
 
 
 def _deflated(data: bytes) -> bytes:
-    """One gzip member, always the same bytes for the same data."""
+    """Compress to one gzip member; the same data always gives the same bytes."""
     deflater = zlib.compressobj(EFFORT, zlib.DEFLATED, GZIP + WINDOW, 9)
     return deflater.compress(data) + deflater.flush()
 
 
 def decode_spz(data: bytes) -> Columns:
-    """Gaussians of an SPZ file, y down, z forward; harmonics above degree 0 are left out.
+    """Decode the Gaussians of an SPZ file, with y down and z forward; harmonics above degree 0 are left out.
 
-    ValueError, or zlib's error, for another version and a damaged file; no more is inflated than the header announces.
+    Raises ValueError, or zlib's error, for another version or a damaged file. Never inflates more than the header
+    announces.
     """
     inflater = zlib.decompressobj(GZIP + WINDOW)
     head = inflater.decompress(data, HEADER.size)
@@ -186,7 +186,7 @@ def decode_spz(data: bytes) -> Columns:
         fields = words >> np.array([20, 10, 0], np.uint32)
         sizes = (fields & 511).astype(np.float32) / np.float32(511 * 2**0.5)
         xyzw = from_smallest_three(words[:, 0] >> 30, np.where(fields & 512, -sizes, sizes))
-    else:  # w is the component that follows from the others
+    else:  # w is always the component that is computed from the others
         xyzw = from_smallest_three(np.full(count, 3), fractions(turns, 255) * 2 - 1)
     means, log_scales = (fixed / 2.0**bits).astype(np.float32), fractions(scales, 16) - 10
     opacities = fractions(alphas[:, 0], 255)

@@ -1,4 +1,4 @@
-"""Videos out: the file's suffix decides between H.264, VP9, GIF and animated WebP."""
+"""Write videos: the file's suffix selects H.264, VP9, GIF or animated WebP."""
 
 from __future__ import annotations
 
@@ -25,50 +25,50 @@ from spackle.color import to_bytes
 from spackle.errors import InputError
 from spackle.files import atomic_path, check_writable
 
-MAX_REPEATS = 1000  # of a file that has to hold every repetition
+MAX_REPEATS = 1000  # for files that store every repetition
 MAX_PLAYS = 65_535  # GIF's and WebP's counters have 16 bits
 BT709, LIMITED_RANGE = 1, 1  # FFmpeg's numbers, the same for primaries, transfer and matrix
 
 
 @dataclasses.dataclass(frozen=True)
 class VideoFormat:
-    """The abilities of a video format, and its settings for FFmpeg."""
+    """A video format's limits, and its settings for FFmpeg."""
 
     codec: str
     container: str
-    options: dict[str, str]  # of the encoder
-    container_options: dict[str, str]  # the index goes to the front: the video plays while it loads
-    pixels: str  # yuv420p is tagged as BT.709 and needs even sides
-    counts: bool  # the file says how often it plays (0: for ever); others hold every repetition
-    fps: tuple[float, float]
+    options: dict[str, str]  # the encoder's
+    container_options: dict[str, str]  # these put the index at the front, so that the video plays while it loads
+    pixels: str  # pixel format; yuv420p is tagged as BT.709 and needs even sides
+    counts: bool  # whether the file states how often it plays (0: for ever); otherwise it stores every repetition
+    fps: tuple[float, float]  # lowest and highest rate
     max_side: int
 
     @property
     def loop(self) -> int:
-        """How often a file plays by default."""
+        """How often a file plays by default; 0: for ever."""
         return 0 if self.counts else 1
 
 
-# x264's faster code for macroblock trees reads memory that nothing wrote to: the same frames give other bytes.
+# Without cpu-independent, x264's code for macroblock trees reads uninitialised memory: equal frames give other bytes.
 _X264 = {"crf": "17", "preset": "veryfast", "x264-params": "cpu-independent=1"}
-# VP9 at crf 24 comes near x264's 17; cpu-used 4 costs little quality and saves most of the time.
+# VP9 at crf 24 comes close to x264 at 17; cpu-used 4 costs little quality and saves most of the time.
 _VPX = {"crf": "24", "b": "0", "deadline": "good", "cpu-used": "4", "row-mt": "1"}
 _FAST_START = {"movflags": "+faststart"}
 H264 = VideoFormat("libx264", "mp4", _X264, _FAST_START, "yuv420p", False, (0.001, 1000), 16_384)
-_CUES_FIRST = {"cues_to_front": "1", "fflags": "+bitexact"}  # FFmpeg draws a track's number else
+_CUES_FIRST = {"cues_to_front": "1", "fflags": "+bitexact"}  # else FFmpeg chooses a random track number
 VP9 = VideoFormat("libvpx-vp9", "webm", _VPX, _CUES_FIRST, "yuv420p", False, (0.001, 1000), 16_384)
-# Browsers show a picture of 10 ms or less for 100 ms; GIF counts hundredths of a second, WebP thousandths.
+# Browsers show a frame of 10 ms or less for 100 ms; GIF counts time in 1/100 s, WebP in 1/1000 s.
 GIF = VideoFormat("gif", "gif", {}, {}, "pal8", True, (0.01, 50), 65_535)
-# libwebp's own way to YUV is the best. Its encoder of animations would keep old blocks in surfaces that hardly change.
+# libwebp's own conversion to YUV is the best. Its animation encoder would keep old blocks where little changes.
 WEBP = VideoFormat("libwebp", "webp", {"quality": "85"}, {}, "bgra", True, (0.01, 90), 16_383)
 FORMATS = {".mp4": H264, ".m4v": H264, ".mov": H264, ".webm": VP9, ".gif": GIF, ".webp": WEBP}
 
 
 def check_video(path: str | os.PathLike[str], fps: float, loop: int | None = None) -> VideoFormat:
-    """Check a video's name, rate and loop count; returns its format.
+    """Check a video's name, rate and loop count, and return its format.
 
     Raises:
-        InputError: an unknown suffix, or a rate or loop count that the format does not allow.
+        InputError: the suffix is unknown, or the format does not allow the rate or loop count.
     """
     kind = FORMATS.get(Path(path).suffix.lower())
     if kind is None:
@@ -87,13 +87,12 @@ W = TypeVar("W", bound="VideoWriter")
 
 
 class VideoWriter:
-    """Writes frames to a video, which appears when the `with` block ends well.
+    """Writes frames to a video, which appears if the `with` block ends without error.
 
-    .mp4, .m4v, .mov (H.264) and .webm (VP9) are yuv420p in the BT.709 colours that the file declares, with
-    the index first, so that they play while they load; an odd width or height grows by one: the last column
-    or row is repeated. .gif has one palette for all frames, .webp is lossy, both keep odd sizes. A frame is encoded
-    while the next one is made; until the end GIF keeps all of them in an unnamed temporary file, and WebP the
-    compressed video in memory.
+    .mp4, .m4v, .mov (H.264) and .webm (VP9) are yuv420p in BT.709 colours, which the file declares. Their index comes
+    first, so that they play while they load. An odd width or height grows by one: the last column or row is repeated.
+    .gif has one palette for all frames, .webp is lossy; both keep odd sizes. A frame is encoded while the next one is
+    made. Until the end, GIF keeps all frames in an unnamed temporary file, and WebP the compressed video in memory.
     """
 
     _encoder: Any  # StreamEncoder, or GifEncoder
@@ -102,13 +101,13 @@ class VideoWriter:
         """Prepare to write.
 
         Args:
-            path: its suffix decides the format.
-            fps: frames a second; at most 50 for GIF and 90 for WebP, or browsers slow down.
-            loop: how often the frames are shown. GIF and WebP count, 0 means for ever, their default; the
-                others hold every repetition, 1 by default.
+            path: its suffix selects the format.
+            fps: frames a second; at most 50 for GIF and 90 for WebP, because browsers slow faster ones down.
+            loop: how often the frames are shown. GIF and WebP store the number; 0, the default, means for ever. The
+                others store every repetition, 1 by default.
 
         Raises:
-            InputError: where no such file can be written.
+            InputError: no such file can be written.
         """
         self._kind = check_video(path, fps, loop)
         check_writable(path)
@@ -168,7 +167,7 @@ class VideoWriter:
 def save_video(
     frames: Iterable[Tensor], path: str | os.PathLike[str], fps: float = 30, loop: int | None = None
 ) -> None:
-    """Write frames, sRGB [H, W, 3] in 0..1, in the format of the name; see `VideoWriter`.
+    """Write frames, sRGB [H, W, 3] in 0..1, in the format that the file name's suffix selects; see `VideoWriter`.
 
     `frames` may be a generator: a frame is encoded while the next one is made. If it raises, no file is left.
     """
@@ -178,12 +177,12 @@ def save_video(
 
 
 class StreamEncoder:
-    """Encodes frames into a video stream that plays `plays` times, by a number in the file or by repeated packets."""
+    """Encodes frames into a video that plays `plays` times: the file stores this number, or repeats all packets."""
 
     def __init__(self, kind: VideoFormat, path: Path, width: int, height: int, rate: Fraction, plays: int) -> None:
         self._kind, self._rate, self._count = kind, rate, 0
         self._plays = 1 if kind.counts else plays
-        self._packets: list[av.Packet[VideoStream]] = []  # compressed, and held only where they are needed again
+        self._packets: list[av.Packet[VideoStream]] = []  # compressed; kept only if they must be repeated
         try:
             av.Codec(kind.codec, "w")
         except ValueError as error:  # PyAV's UnknownCodecError is one
@@ -202,7 +201,7 @@ class StreamEncoder:
             context.colorspace = context.color_primaries = context.color_trc = BT709
 
     def add(self, rgb: NDArray[np.uint8]) -> None:
-        """Append [H, W, 3]; in yuv420p an odd side grows by one."""
+        """Append a frame [H, W, 3]; in yuv420p an odd side grows by one."""
         colors: dict[str, Any] = {}
         if self._kind.pixels == "yuv420p":
             rgb = np.pad(rgb, [(0, rgb.shape[0] % 2), (0, rgb.shape[1] % 2), (0, 0)], mode="edge")
@@ -215,7 +214,7 @@ class StreamEncoder:
         self._count += 1
 
     def finish(self) -> None:
-        """Write the packets that the encoder still holds, and repeat all packets at later times."""
+        """Write the packets that the encoder still holds, and repeat all packets as often as needed."""
         self._write(self._stream.encode(None))
         for repetition in range(1, self._plays):
             for packet in self._packets:
@@ -235,6 +234,6 @@ class StreamEncoder:
                 self._packets.append(packet)
 
     def _ticks(self, packet: av.Packet[VideoStream], plays: int) -> int:
-        """Duration of `plays` repetitions, in the packet's unit of time."""
+        """Duration of `plays` repetitions, in the packet's time unit."""
         assert packet.time_base is not None
         return round(plays * self._count / self._rate / packet.time_base)

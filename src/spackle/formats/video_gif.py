@@ -1,4 +1,4 @@
-"""GIF with one palette for the whole video, so that no colour flickers."""
+"""Write GIFs with one palette for the whole video, so that no colour flickers."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ import numpy as np
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
-DITHER = "sierra2_4a"  # error diffusion without the grid that an ordered pattern shows
+DITHER = "sierra2_4a"  # error diffusion, which shows no grid as ordered dithering does
 
 
 class GifEncoder:
-    """Frames to a GIF. They are stored, compressed, in a temporary file until all colours are known."""
+    """Encodes frames as a GIF. Until all colours are known, they are stored, compressed, in a temporary file."""
 
     def __init__(self, path: Path, width: int, height: int, rate: Fraction, plays: int) -> None:
         self._path, self._size, self._rate, self._plays = path, (width, height), rate, plays
@@ -28,7 +28,7 @@ class GifEncoder:
         self._colors = Filter("palettegen", "", [self._size], 1 / rate)
 
     def add(self, rgb: NDArray[np.uint8]) -> None:
-        """Append [H, W, 3]."""
+        """Append a frame [H, W, 3]."""
         self._colors.push(0, _picture(rgb), self._count)
         self._packed.write(rgb.tobytes())
         self._count += 1
@@ -68,7 +68,7 @@ class GifEncoder:
 
 
 class Filter:
-    """One of FFmpeg's filters, with pictures of these sizes as its inputs."""
+    """One of FFmpeg's filters; each input takes frames of one of the `sizes` (width, height)."""
 
     def __init__(self, name: str, options: str, sizes: list[tuple[int, int]], tick: Fraction) -> None:
         self._graph, self._tick, pixels = av.filter.Graph(), tick, av.VideoFormat("bgra")

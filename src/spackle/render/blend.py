@@ -1,7 +1,7 @@
 """Blending of tiles: front to back, in linear light.
 
-A tile's pixels lie in patches of sixteen, each of which fills a vector register. Functions of a pixel have neither
-branches nor calls, so that loops over pixels run in vector registers.
+A tile's pixels are stored in patches of sixteen, each of which fills a vector register. Per-pixel functions have
+neither branches nor calls, so that loops over pixels run in vector registers.
 """
 
 from __future__ import annotations
@@ -15,31 +15,31 @@ from spackle._numba import MANTISSA, ONE, ZERO, Array, inlined_kernel, kernel
 from spackle.render.project import RECORD, Arrays, Numbers, in_tile
 from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_STOP
 
-# Constants of the pixels' functions are float32 throughout: a Python float would widen a whole expression to float64.
+# Constants of per-pixel functions are float32 throughout: a Python float would widen a whole expression to float64.
 LIMIT = np.float32(ALPHA_MAX)
 FAINT = np.float32(ALPHA_MIN)
 LOWEST = np.float32(-60.0)
 ROUND = np.float32(1.5 * 2.0**23)  # adding this rounds a small float to an integer in its low bits
 ROUND_BITS = np.int32(0x4B400000)
-KNEE = np.float32(0.0031308)  # where sRGB turns from a line into a power
+KNEE = np.float32(0.0031308)  # linear value at which sRGB changes from a line to a power
 LINE = np.float32(12.92)
 
 
 def _power_series(function: Any, low: float, high: float, degree: int) -> list[np.float32]:
-    """Coefficients of a near-minimax polynomial on low..high, lowest power first."""
+    """Coefficients, lowest power first, of a near-minimax polynomial for a function on low..high."""
     fit = Chebyshev.interpolate(function, degree, [low, high])
     return [np.float32(c) for c in fit.convert(kind=Polynomial).coef]
 
 
-# 2^x on -½..½, to 1e-7.
+# 2^x on -½..½, with an error of 1e-7.
 E0, E1, E2, E3, E4, E5 = _power_series(np.exp2, -0.5, 0.5, 5)
-# sRGB's power in t, where the fourth root of the linear value is MIDDLE + SPREAD·t, to 2e-7.
+# sRGB's power as a polynomial in t, where the fourth root of the linear value is MIDDLE + SPREAD·t; error 2e-7.
 _root = float(KNEE) ** 0.25
 MIDDLE, SPREAD = np.float32((1 + _root) / 2), np.float32((1 - _root) / 2)
 S0, S1, S2, S3, S4, S5, S6, S7, S8 = _power_series(
     lambda t: 1.055 * ((1 + _root) / 2 + (1 - _root) / 2 * t) ** (5 / 3) - 0.055, -1.0, 1.0, 8
 )
-# Its inverse is y²·q^1.6, where q is the fourth root of y, to a few 1e-8 of itself.
+# The inverse of that power is y²·q^1.6, where q is the fourth root of y; relative error of a few 1e-8.
 ENCODED_KNEE = np.float32(0.04045)
 _low_root = ((float(ENCODED_KNEE) + 0.055) / 1.055) ** 0.25
 D0, D1, D2, D3, D4, D5 = _power_series(lambda q: q**1.6, _low_root, 1.0, 5)
@@ -57,7 +57,7 @@ def exp2(x: np.float32) -> np.float32:
 
 @kernel
 def alpha_of(power: np.float32) -> np.float32:
-    """A Gaussian's alpha for an opacity of 2^power: clamped, and 0 if below the threshold."""
+    """A Gaussian's alpha, 2^power: clamped from above, and 0 if below the threshold."""
     alpha = min(exp2(max(power, LOWEST)), LIMIT)
     return alpha if alpha >= FAINT else ZERO
 
@@ -83,34 +83,34 @@ def decode_srgb(encoded: np.float32) -> np.float32:
 
 @kernel
 def srgb_slope(linear: np.float32, encoded: np.float32) -> np.float32:
-    """The derivative of `encode_srgb`, whose value is known: 0 where it clamps."""
+    """The derivative of `encode_srgb` at `linear`, given its value `encoded` there; 0 where it clamps."""
     slope = LINE if linear <= KNEE else (encoded + np.float32(0.055)) / (np.float32(2.4) * linear)
     return slope if ZERO <= linear <= ONE else ZERO
 
 
 # A tile's state is one flat buffer of six planes: light (the transmittance, 0 once a pixel is full), red,
-# green, blue, depth, alpha. One buffer, because the compiler then knows that the planes do not overlap.
-# Alpha has a sum of its own: as 1 - light a faint one would lose digits, and depth, its quotient, too.
+# green, blue, depth, alpha. It is one buffer, because the compiler then knows that the planes do not overlap. Alpha is
+# summed separately: computed as 1 - light, a small alpha would lose digits, and so would depth, which is divided by it.
 PLANE = TILE * TILE
 STATE = 6 * PLANE
 
-# A plane is its patches one after the other, of PATCH × PATCH pixels each: most Gaussians are small, and touch
-# about two thirds as many of these as rows of the tile.
+# A plane stores its patches of PATCH × PATCH pixels one after the other. Most Gaussians are small: the patches that one
+# touches are about two thirds as many as the tile's rows that it touches.
 PATCH = 4
-PATCHES = TILE // PATCH  # along a tile's side
+PATCHES = TILE // PATCH  # number of patches along a tile's side
 LANES = PATCH * PATCH
 
 STOP = np.float32(TRANSMITTANCE_STOP)
-SLACK = np.float32(1e-3)  # pixels; room for rounding
+SLACK = np.float32(1e-3)  # pixels, allowance for rounding
 SIDE = np.float32(TILE)
-CHECK_EVERY = 16  # Gaussians that are fetched at once, and between two looks at whether the whole tile is full
+CHECK_EVERY = 16  # Gaussians that are fetched at once; after each batch the whole tile is checked for being full
 
 
 class TileLists(NamedTuple):
-    """Which Gaussians each tile draws, front to back."""
+    """The list of Gaussians that each tile draws, front to back."""
 
     ids: Array  # [E] int32, the lists one after the other
-    starts: Array  # [T + 1] int64, where each tile's list begins
+    starts: Array  # [T + 1] int64, the start of each tile's list
 
 
 @kernel
@@ -136,8 +136,8 @@ def blend_patch(state: Array, offset: np.uint64, left: np.float32, top: np.float
 
 @kernel
 def span_of(center: np.float32, reach: np.float32) -> tuple[int, int]:
-    """The range first..last (exclusive) of the tile's rows or columns that a Gaussian may touch."""
-    # Truncation rounds up where one is added; a call to ceil or floor would cost more than a patch.
+    """The range first..last (exclusive) of a tile's rows or columns that a Gaussian may touch."""
+    # Adding one before or after truncation rounds up; a call to ceil or floor would cost more than drawing a patch.
     first = int(max(center - reach - SLACK, -ONE) + ONE)
     last = min(int(min(center + reach + SLACK, SIDE)) + 1, TILE)
     return first, last
@@ -145,7 +145,7 @@ def span_of(center: np.float32, reach: np.float32) -> tuple[int, int]:
 
 @kernel
 def patches_of(center: np.float32, reach: np.float32) -> tuple[int, int]:
-    """The same range, in patches."""
+    """The range of patches, first..last (exclusive), along one axis of a tile that a Gaussian may touch."""
     first, last = span_of(center, reach)
     return first // PATCH, (last + PATCH - 1) // PATCH
 
@@ -165,14 +165,14 @@ def blend_splat(state: Array, record: Array, left: int, top: int) -> None:
 
 @inlined_kernel
 def pixel_index(row: int, column: int) -> int:
-    """The index of a tile's pixel in a plane of sums."""
+    """The index of a tile's pixel in a plane."""
     patch = row // PATCH * PATCHES + column // PATCH
     return patch * LANES + row % PATCH * PATCH + column % PATCH
 
 
 @kernel
 def blend_splats(state: Array, records: Array, count: int, left: int, top: int) -> None:
-    """Draw the first Gaussians of a tile; a separate function, so that constants stay in registers."""
+    """Draw the first `count` records into a tile; this is a separate function so that constants stay in registers."""
     for index in range(count):
         blend_splat(state, records[index], left, top)
 
@@ -206,7 +206,7 @@ def store_tile(state: Array, left: int, top: int, images: Arrays) -> None:
 
 @kernel
 def store_color(state: Array, left: int, top: int, rows: int, columns: int, image: Array) -> None:
-    """Write the three planes of colour to an image [H, W, 3]."""
+    """Write the three colour planes to an image [H, W, 3]."""
     for row in range(rows):
         for column in range(columns):
             for channel in range(3):
@@ -239,7 +239,7 @@ def blend_tiles(first: int, last: int, tiles: Array, lists: TileLists, records: 
 
 @kernel
 def fetch(records: Array, ids: Array, begin: int, count: int, near: Array) -> None:
-    """Prefetch records, which are scattered in memory, so that their cache misses overlap."""
+    """Copy records, which are scattered in memory, to `near` in one go, so that their cache misses overlap."""
     for n in range(count):
         record = records[ids[begin + n]]
         for field in range(RECORD):

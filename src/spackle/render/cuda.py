@@ -1,4 +1,4 @@
-"""The GPU renderer: gsplat behind the same protocol."""
+"""The GPU renderer: gsplat with the interface of `Renderer`."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from spackle.gaussians import Gaussians, quat_to_matrix
 from spackle.render.project import FINITE
 from spackle.render.protocol import NEAR_PLANE, TILE, Rendering, check_tiles, paste, tile_grid
 
-VERSIONS = ("1.5.3", "1.6")  # of gsplat, from and before: others do not build, or have another largest alpha
+VERSIONS = ("1.5.3", "1.6")  # gsplat >= the first, < the second: others do not build, or have another largest alpha
 INSTALL = "pip install 'spackle-nvs[cuda]'"
-MOST_ENTRIES = 2**31 - 1  # of tile lists, which gsplat's rasteriser counts in int32
+MOST_ENTRIES = 2**31 - 1  # in the tile lists, because gsplat's rasteriser counts them in int32
 
 
 @dataclasses.dataclass(frozen=True)
 class Material:
-    """A set on the GPU, float32."""
+    """A set of Gaussians on the GPU, as gsplat needs it, in float32."""
 
     means: Tensor  # [N, 3]
     covariances: Tensor  # [N, 6]
@@ -35,8 +35,9 @@ class Material:
 
     @staticmethod
     def of(part: Gaussians, device: torch.device) -> Material:
-        """Upload a set; Gaussians that are not finite become transparent, because removing them would synchronise with
-        the GPU.
+        """Upload a set.
+
+        Gaussians that are not finite become transparent; removing them would synchronise with the GPU.
         """
         there = [tensor.to(device, torch.float32, non_blocking=True) for tensor in part.tensors]
         finite = torch.stack([t.detach().isfinite().unsqueeze(-1).flatten(1).all(1) for t in there]).all(0)
@@ -45,14 +46,14 @@ class Material:
 
 
 def upper_covariances(part: Gaussians) -> Tensor:
-    """[N, 6], Σ's xx, xy, xz, yy, yz, zz, by products of numbers: autocast and TF32 round products of matrices."""
+    """[N, 6]: xx, xy, xz, yy, yz, zz of Σ, without matrix products, which autocast and TF32 would round."""
     x, y, z = (quat_to_matrix(part.quats) * part.scales[:, None, :]).unbind(1)
     pairs = ((x, x), (x, y), (x, z), (y, y), (y, z), (z, z))
     return torch.stack([(a * b).sum(-1) for a, b in pairs], dim=-1)
 
 
 class SetStore:
-    """Cache of sets on the GPU, uploaded once; an entry is dropped with the set's means.
+    """Cache of sets that have been uploaded to the GPU; an entry lives as long as the set's means.
 
     A set that requires gradients is not cached, because it changes at every step.
     """
@@ -63,12 +64,12 @@ class SetStore:
 
     def material(self, part: Gaussians) -> Material:
         """The set on the GPU; uploaded again if a tensor has been replaced or changed in place."""
-        if any(t.requires_grad or t.is_inference() for t in part.tensors):  # tensors of inference mode count no changes
+        if any(t.requires_grad or t.is_inference() for t in part.tensors):  # inference tensors have no version counter
             return Material.of(part, self.device)
         others, state = part.tensors[1:], [(t._version, t.data_ptr()) for t in part.tensors]
         kept = self._kept.get(part.means)  # type: ignore[no-untyped-call]
         if kept is None or kept[1] != state or any(a is not b for a, b in zip(kept[0], others, strict=True)):
-            with torch.inference_mode(False):  # who asks next may want gradients of something drawn with it
+            with torch.inference_mode(False):  # a later caller may need gradients of a drawing with it
                 kept = self._kept[part.means] = others, state, Material.of(part, self.device)
         material: Material = kept[2]
         return material
@@ -77,15 +78,15 @@ class SetStore:
 class GsplatRenderer:
     """Classic 3D Gaussian splatting by gsplat on an NVIDIA GPU; a `Renderer`.
 
-    Gaussians may lie on the processor or on the GPU: the images come back to where the first set lies. Sets without
-    gradients stay on the GPU as long as their tensors exist, so a scene is uploaded once.
+    Gaussians may lie on the CPU or on the GPU: the images are returned on the first set's device. Sets without
+    gradients stay on the GPU as long as their tensors exist, so a scene is uploaded only once.
     """
 
     def __init__(self, device: str | torch.device = "cuda") -> None:
         """Load gsplat.
 
         Raises:
-            InputError: no GPU, no gsplat, or one that cannot be built here.
+            InputError: there is no GPU or no gsplat, or gsplat's kernels cannot be built here.
         """
         self.device = torch.device(device)
         self._gsplat = load_gsplat(self.device)
@@ -117,10 +118,10 @@ class GsplatRenderer:
         tiles: Sequence[Tensor | None] | None = None,
         onto: Sequence[Rendering | None] | None = None,
     ) -> list[Rendering]:
-        """`render` of several views of one size, whose results it gives bit for bit; waits for the GPU once.
+        """Render several views of one size, with the same bits as `render`, but waiting for the GPU only once.
 
         Raises:
-            ValueError: tiles that are not those of the view, or views of several sizes.
+            ValueError: a grid of tiles does not fit the view, or the views differ in size.
             MemoryShort: the GPU's memory is too small.
         """
         width, height = cameras[0].width, cameras[0].height
@@ -150,11 +151,11 @@ class GsplatRenderer:
         eps2d: float,
         wanted: Sequence[Tensor | None],
     ) -> list[Rendering]:
-        """Images drawn in the tiles `wanted` [rows, columns]; other pixels are undefined."""
+        """Draw the images in the tiles `wanted` [rows, columns]; other pixels are undefined."""
         width, height = cameras[0].width, cameras[0].height
         rows, columns = tile_grid(height, width)
         materials: list[Material] = []
-        seen: list[Any] = []  # of each set the number of its view, radii [N, 2], means2d [N, 2], depths, conics [N, 3]
+        seen: list[Any] = []  # for each set: its view's number, radii [N, 2], means2d [N, 2], depths, conics [N, 3]
         for k, (parts, (view, lens)) in enumerate(zip(scenes, self._matrices(cameras), strict=True)):
             for part in parts:
                 if not len(part):  # gsplat 1.5.3 divides by the number of Gaussians
@@ -198,10 +199,10 @@ class GsplatRenderer:
 
 
 def load_gsplat(device: torch.device) -> ModuleType:
-    """Import gsplat and check its kernels; raises as `GsplatRenderer` says."""
+    """Import gsplat and check its kernels; raises the errors of `GsplatRenderer`."""
     if device.type == "cuda" and not torch.cuda.is_available():
         raise InputError("--device cuda: PyTorch sees no NVIDIA GPU on this machine; use --device cpu")
-    # Its kernels are built when this is first imported: compilers fail in many ways.
+    # gsplat's kernels are built at its first import: compilers fail in many ways.
     with reading("--device cuda", "gsplat's kernels cannot be built here: {reason}; use --device cpu"):
         try:
             import gsplat

@@ -1,6 +1,7 @@
-"""The gradient of a drawing: each tile is drawn again in chunks of Gaussians, then walked back to front.
+"""The gradient of a rendering.
 
-The gradients of splats are then propagated to the Gaussians.
+Each tile is drawn again in chunks of Gaussians, and these are then visited back to front, which gives the gradients of
+splats. Those are propagated to the Gaussians.
 """
 
 from __future__ import annotations
@@ -25,37 +26,37 @@ from spackle.render.protocol import ALPHA_MIN, TILE, Rendering, tile_mask
 
 FIELDS = 5  # tensors in a set of Gaussians
 
-# What the pixels of a tile give to one Gaussian. With u = x - centre and v = ∂L/∂ln(alpha), sums of v,
+# Sums over a tile's pixels for one Gaussian. With u = x - centre and v = ∂L/∂ln(alpha), these are the sums of v,
 # v·u, v·u², v·dy, v·dy², v·u·dy, then the gradients of red, green, blue and depth.
 SUMS = 10
 
-# The workspace is one flat buffer of planes, as in `blend`, but with the pixels row by row: the light that is
-# left, what lies behind the Gaussian in hand, the gradients of red, green, blue, depth and alpha.
+# The workspace is one flat buffer of planes, as in `blend`, but with pixels in row order: the transmittance, the
+# contribution of everything behind the current Gaussian, and the gradients of red, green, blue, depth and alpha.
 BEHIND = 1 * PLANE
 GRADIENTS = 2 * PLANE
 WORKSPACE = 7 * PLANE
 
-# The alphas and light of a chunk of Gaussians are noted down on the way forth, for the way back; small
-# enough for the second-level cache.
+# While a chunk of Gaussians is drawn forward, its alphas and transmittances are noted for the backward pass. The notes
+# fit into the second-level cache.
 CHUNK = 128  # Gaussians
 NOTE = 2 * TILE  # floats for one row of one Gaussian
 NOTES = CHUNK * TILE * NOTE
-INVISIBLE = np.float32(math.log2(ALPHA_MIN) - 1e-3)  # a row that peaks below this shows nothing
+INVISIBLE = np.float32(math.log2(ALPHA_MIN) - 1e-3)  # a row whose largest alpha is 2^x for a smaller x draws nothing
 
 
 def draw(sets: Sequence[Gaussians], view: KernelCamera, wanted: Array, onto: Rendering | None) -> Rendering:
-    """Draw as `spackle.render.cpu.draw`, with gradients for the tensors that ask for them."""
+    """Draw like `spackle.render.cpu.draw`, with gradients for the tensors that require them."""
     under = [None] * 3 if onto is None else [image.float() for image in onto.tensors]
     fields = [t.to(device="cpu", dtype=torch.float32) for part in sets for t in part.tensors]
     return Rendering(*Draw.apply(view, wanted, *under, *fields))  # type: ignore[no-untyped-call]
 
 
 class Draw(torch.autograd.Function):
-    """Draw sets of Gaussians, given as a flat row of tensors, over the three images of `onto`."""
+    """Draws sets of Gaussians, given as a flat sequence of tensors, over the three images of `onto`."""
 
     @staticmethod
     def forward(ctx: Any, view: KernelCamera, wanted: Array, *tensors: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-        """Draw; `tensors` are rgb, depth and alpha of `onto` (or None), then the five of each set, all float32."""
+        """Draw; `tensors` are rgb, depth and alpha of `onto` (or three None), then five for each set, all float32."""
         under, fields = tensors[:3], [t for t in tensors[3:] if t is not None]
         sets = [Gaussians(*fields[k : k + FIELDS]) for k in range(0, len(fields), FIELDS)]
         onto = None if under[0] is None else Rendering(*under)  # type: ignore[arg-type]
@@ -67,11 +68,11 @@ class Draw(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        """From the gradients of the three images to those of the tensors that asked for one."""
-        fields = ctx.saved_tensors[3:]  # PyTorch refuses where somebody has changed these or the images
+        """Turn the gradients of the three images into those of the tensors that require them."""
+        fields = ctx.saved_tensors[3:]  # PyTorch raises an error if these or the images have been changed in place
         needs = ctx.needs_input_grad[2:]
         drawn = tile_mask(torch.from_numpy(ctx.drawing.wanted), *gradients[1].shape)
-        under = [  # nothing where tiles were drawn over the image beneath
+        under = [  # no gradient where tiles were drawn over the image beneath
             torch.where(mask, 0, gradient) if need else None
             for mask, gradient, need in zip((drawn[..., None], drawn, drawn), gradients, needs, strict=False)
         ]
@@ -89,10 +90,10 @@ class Draw(torch.autograd.Function):
 
 
 def pixel_sums(drawing: Drawing, gradients: Arrays, rows: Array, count: int) -> Array:
-    """Sums over pixels for each Gaussian that needs gradients, a table [count, SUMS] float32.
+    """Sums over pixels for each Gaussian that needs gradients: a table [count, SUMS] float32.
 
-    Each tile writes its own sums, which are added in the order of tiles, whatever the threads.
-    `rows` [N] int32 are the table's rows of the Gaussians, -1 for none.
+    Each tile writes its own sums; they are added in the order of tiles, so the result does not depend on the threads.
+    `rows` [N] int32 holds each Gaussian's row in the table, -1 if it needs no gradients.
     """
     lists, records, images = drawing.lists, drawing.splats.records, drawing.images
     entry_rows = rows[lists.ids]
@@ -112,7 +113,7 @@ def pixel_sums(drawing: Drawing, gradients: Arrays, rows: Array, count: int) -> 
 
 
 def set_gradients(fields: Sequence[Tensor], view: KernelCamera, table: Array) -> list[Tensor | None]:
-    """The gradients of one set's five tensors."""
+    """The gradients of one set's five tensors, from its sums over pixels."""
     scene, gradients = tuple(as_array(t) for t in fields), tuple(np.zeros(t.shape, np.float32) for t in fields)
     run_chunks(lambda a, b: project_backward(a, b, scene, view, table, gradients), len(table), PROJECT_GRAIN)
     return [torch.from_numpy(g) for g in gradients]
@@ -120,9 +121,9 @@ def set_gradients(fields: Sequence[Tensor], view: KernelCamera, table: Array) ->
 
 @kernel
 def replay_row(work: Array, offset: np.uint64, notes: Array, note: np.uint64, peak: np.float32, bell: Numbers) -> None:
-    """Draw one row as `blend_patch` does; `bell` holds the rate and centre of the Gaussian's fall-off along it.
+    """Draw one row as `blend_patch` does; `bell` holds the rate and the centre of the Gaussian's fall-off in the row.
 
-    Store alpha (0 where nothing is drawn) and the transmittance before it.
+    Note each pixel's alpha (0 if nothing is drawn there) and the transmittance before the Gaussian.
     """
     across, center = bell
     for x in range(TILE):
@@ -139,10 +140,10 @@ def replay_row(work: Array, offset: np.uint64, notes: Array, note: np.uint64, pe
 
 @kernel
 def replay(work: Array, notes: Array, records: Array, ids: Array, left: int, top: int, first_notes: Array) -> int:
-    """Draw a chunk of Gaussians again; `first_notes` [CHUNK] receives the start of each one's notes.
+    """Draw a chunk of Gaussians again; `first_notes` [CHUNK] receives the start of each Gaussian's notes.
 
     Returns:
-        How many were drawn before the tile was full.
+        The number of Gaussians that were drawn before the tile was full.
     """
     note = np.uint64(0)
     for k in range(len(ids)):
@@ -177,7 +178,7 @@ def pass_row(work: Array, offset: np.uint64, notes: Array, note: np.uint64, look
 def gather_row(
     work: Array, offset: np.uint64, notes: Array, note: np.uint64, center: np.float32, look: Numbers
 ) -> tuple[np.float32, np.float32, np.float32, np.float32, np.float32, np.float32, np.float32]:
-    """Step back over a row of a Gaussian, and add up its pixels' sums (see SUMS, without dy)."""
+    """Step back over a row of a Gaussian, and return the sums over its pixels (those of SUMS without dy)."""
     red, green, blue, depth = look
     sum_v, sum_vu, sum_vuu = ZERO, ZERO, ZERO
     sum_red, sum_green, sum_blue, sum_depth = ZERO, ZERO, ZERO, ZERO
@@ -190,7 +191,7 @@ def gather_row(
         alpha, light, behind = notes[n], notes[n + np.uint64(TILE)], work[i + np.uint64(BEHIND)]
         weight = alpha * light
         work[i + np.uint64(BEHIND)] = behind + weight * value
-        # More alpha shows more of this one and less of what lies behind; at the clamp nothing moves.
+        # A larger alpha shows more of this Gaussian and less of what lies behind; at the clamp the gradient is 0.
         slope = alpha * (light * value - behind / (ONE - alpha))
         v = slope if alpha < LIMIT else ZERO
         u = np.float32(x) - center
@@ -236,8 +237,9 @@ def walk_back(
 
 @kernel
 def load_gradients(work: Array, left: int, top: int, images: Arrays, gradients: Arrays) -> None:
-    """From the gradients of a tile's rgb, depth and alpha to those of its blended sums, which are 0 outside of the
-    image.
+    """Turn the gradients of a tile's rgb, depth and alpha into those of its blended sums.
+
+    They are 0 for pixels outside of the image.
     """
     rgb, depth, alpha, linear = images
     rgb_grad, depth_grad, alpha_grad = gradients
@@ -258,10 +260,11 @@ def load_gradients(work: Array, left: int, top: int, images: Arrays, gradients: 
 
 @kernel
 def backward_tile(room: Arrays, records: Array, ids: Array, wanted: Array, left: int, top: int, sums: Array) -> None:
-    """The gradients of one tile, whose list is `ids` [n], for the entries that are wanted, [n] bool.
+    """Compute the gradients of one tile with the list `ids` [n], for the entries that are `wanted` [n] bool.
 
     Args:
-        room: buffers: [WORKSPACE] with the gradients loaded, [NOTES] for notes, [CHUNK] for each Gaussian's first note.
+        room: three buffers: [WORKSPACE] with the gradients loaded, [NOTES] for notes, [CHUNK] for the start of each
+            Gaussian's notes.
         sums: [m, SUMS], one row for each wanted entry, in the list's order.
     """
     work, notes, first_notes = room
@@ -293,11 +296,11 @@ def backward_tiles(
     first: int, last: int, tiles: Array, lists: TileLists, wanted: Array, records: Array,
     images: Arrays, gradients: Arrays, slots: Array, sums: Array,
 ) -> None:  # fmt: skip
-    """The gradients of tiles first..last of the list `tiles` [K], for the entries that are wanted, [E] bool.
+    """Compute the gradients of tiles first..last of the list `tiles` [K], for the entries that are `wanted` [E] bool.
 
     Args:
-        slots: [T + 1] int64, where each tile's rows in `sums` begin.
-        sums: [M, SUMS] float32, zeros.
+        slots: [T + 1] int64, the start of each tile's rows in `sums`.
+        sums: [M, SUMS] float32, initially zeros.
     """
     room = np.empty(WORKSPACE, np.float32), np.empty(NOTES, np.float32), np.empty(CHUNK, np.uint64)
     columns = (images[1].shape[1] + TILE - 1) // TILE
@@ -311,7 +314,7 @@ def backward_tiles(
 
 @kernel
 def collect_sums(first: int, last: int, share: int, rows: Array, sums: Array, table: Array) -> None:
-    """Add sums [M, SUMS] to their rows [M] of the table [G, SUMS], in order, for the rows first·share to last·share."""
+    """Add `sums` [M, SUMS], in order, to the table [G, SUMS] at `rows` [M], for rows first·share to last·share only."""
     for slot in range(len(rows)):
         row = rows[slot]
         if first * share <= row < last * share:
@@ -323,10 +326,10 @@ def collect_sums(first: int, last: int, share: int, rows: Array, sums: Array, ta
 def project_backward(
     start: int, stop: int, scene: Arrays, camera: KernelCamera, table: Array, gradients: Arrays
 ) -> None:
-    """Gradients of Gaussians start..stop of one set, by its five arrays; arithmetic is float64 as in `project_chunk`.
+    """Compute the gradients of Gaussians start..stop of one set, in float64 as `project_chunk` does.
 
-    `table` [N, SUMS] holds the sums over pixels for each Gaussian of the set (see SUMS). All zeros mean that no pixel
-    saw it; the gradients are then left as they are.
+    `scene` and `gradients` are the set's five arrays and theirs. `table` [N, SUMS] holds the sums over pixels for each
+    Gaussian of the set (see SUMS). A row of zeros means that no pixel shows the Gaussian: its gradients are left as is.
     """
     (means, quats, scales, opacities, _), lens, pose = scene, camera.lens, camera.pose
     means_grad, quats_grad, scales_grad, opacities_grad, colors_grad = gradients
@@ -351,7 +354,7 @@ def project_backward(
 
 @kernel
 def splat_backward(row: Array, factors: Numbers, eps2d: float, factor_grad: Array) -> tuple[float, float]:
-    """From sums over pixels to the gradients of the factor M, and of the centre, which are returned.
+    """Turn sums over pixels into the gradients of the factor M, written to `factor_grad`, and of the centre, returned.
 
     For a pixel at d from the centre, ∂ln(alpha)/∂centre = p and ∂ln(alpha)/∂Σ = ½ p pᵀ with p = Σ⁻¹ d.
     In the blender's terms p = (A·u, D·dy - k·A·u), with A = Σyy/det, D = 1/Σyy and the slope k = Σxy/Σyy.
@@ -373,13 +376,13 @@ def splat_backward(row: Array, factors: Numbers, eps2d: float, factor_grad: Arra
 def factor_backward(
     j: Numbers, pose: Array, r: Numbers, scale: Array, factor_grad: Array, grads: Arrays, scale_grad: Array
 ) -> None:
-    """From the gradient of the factor M = J W R S to those of the Jacobian J and the rotation R, and to the scales'."""
+    """Turn the gradient of the factor M = J W R S into those of the Jacobian J, the rotation R and the scales."""
     jacobian_grad, rotation_grad = grads
     jacobian_grad[:, :] = 0.0
     for k in range(3):
         scale_grad[k] = 0.0
         for b in range(3):
-            # (J W) is two rows; its column b meets the axis' component b.
+            # J W has two rows; its column b is multiplied by the axis' component b.
             h0, h1 = j[0] * pose[0, b] + j[1] * pose[2, b], j[2] * pose[1, b] + j[3] * pose[2, b]
             along, axis = h0 * factor_grad[0, k] + h1 * factor_grad[1, k], r[3 * b + k]
             scale_grad[k] += along * axis
@@ -391,7 +394,7 @@ def factor_backward(
 
 @kernel
 def quat_backward(quat: Array, r: Array, grad: Array) -> None:
-    """From the gradient of a rotation matrix to that of the quaternion before normalisation."""
+    """Turn the gradient of a rotation matrix into that of the quaternion before normalisation."""
     w, x, y, z = np.float64(quat[0]), np.float64(quat[1]), np.float64(quat[2]), np.float64(quat[3])
     norm = 1.0 / max(math.sqrt(w * w + x * x + y * y + z * z), 1e-12)
     w, x, y, z = w * norm, x * norm, y * norm, z * norm
@@ -408,7 +411,7 @@ def quat_backward(quat: Array, r: Array, grad: Array) -> None:
 def point_backward(
     local: Array, lens: Array, jacobian_grad: Array, u_grad: float, v_grad: float, depth_grad: float
 ) -> tuple[float, float, float]:
-    """The gradient of the centre in the camera's space, from its pixel, its Jacobian and its depth."""
+    """The gradient of the centre in camera space, from the gradients of its pixel, its Jacobian and its depth."""
     x, y, z = local
     tx, ty = min(lens[5], max(lens[4], x / z)), min(lens[7], max(lens[6], y / z))
     fx, fy = lens[0] / z, lens[1] / z
