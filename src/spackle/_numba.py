@@ -17,15 +17,15 @@ Array = NDArray[Any]  # what kernels take
 
 # Constants of float32 kernels: a Python float would widen a whole expression to float64.
 ZERO, HALF, ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
-MANTISSA = np.int32(23)  # bits of a float32 behind its point
+MANTISSA = np.int32(23)  # bits of a float32's mantissa
 
-# Fused multiply-adds are welcome. Reordered sums, and the promise that no NaN or infinity occurs, are
-# not: the first would break bits that must repeat, the second the tests that keep bad values out.
+# Fused multiply-adds are allowed. Reordered sums are not, because results must be the same bit for bit; nor is the
+# assumption that no NaN or infinity occurs, because kernels test for these.
 _FASTMATH = {"contract", "nsz", "afn"}
 
 
 def kernel(function: Callable[..., R]) -> Callable[..., R]:
-    """Compile a function at its first call, keep the machine code on disk, and run it without the GIL."""
+    """Compile a function at its first call, cache the machine code on disk, and run it without the GIL."""
     return _compiled(function, _FASTMATH)
 
 
@@ -35,12 +35,12 @@ def reordering_kernel(function: Callable[..., R]) -> Callable[..., R]:
 
 
 def inlined_kernel(function: Callable[..., R]) -> Callable[..., R]:
-    """A `kernel` that becomes part of the loops that call it, which only then run in vector registers."""
+    """A `kernel` that is inlined into the loops that call it, because only then do these run in vector registers."""
     return _compiled(function, _FASTMATH, forceinline=True)
 
 
 def is_compiled(function: Callable[..., Any]) -> bool:
-    """Whether a kernel's machine code for this processor is on disk, or cannot be kept there."""
+    """Whether a kernel's machine code for this CPU is cached on disk; true also if it cannot be cached."""
     kept = _kept(function)
     processor = cpu_target.target_context.codegen().magic_tuple()
     return kept is None or any(key[1] == processor for key in kept._load_index())
@@ -56,7 +56,7 @@ def _compiled(function: Callable[..., R], fastmath: set[str], **more: Any) -> Ca
 
 
 def _surroundings(function: Callable[..., Any]) -> str:
-    """A hash of the numbers and kernels in a function's module: numba itself looks at the function's file alone."""
+    """A hash of the numbers and kernels that a function's module uses; numba itself checks only the function's file."""
     seen = []
     for name, value in sorted(function.__globals__.items()):
         if isinstance(value, Dispatcher):
@@ -67,6 +67,6 @@ def _surroundings(function: Callable[..., Any]) -> str:
 
 
 def _kept(compiled: Any) -> Any:
-    """Numba's internal cache of a kernel's machine code on disk; None where numba has none or it is switched off."""
+    """Numba's internal disk cache of a kernel's machine code; None if numba has none, or if the cache is off."""
     file = getattr(getattr(compiled, "_cache", None), "_cache_file", None)
     return file if hasattr(file, "_source_stamp") else None

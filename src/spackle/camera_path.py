@@ -17,23 +17,23 @@ from spackle.gaussians import Gaussians
 
 SharpTrajectory = Literal["swipe", "shake", "rotate", "rotate-forward"]
 TrajectoryKind = Literal[SharpTrajectory, "vertical", "orbit", "dolly-zoom"]
-# SHARP's own, as the paper has them: data and training draw from these alone.
+# SHARP's own trajectories, which the paper uses: data and training draw only from these.
 SHARP_TRAJECTORIES: tuple[SharpTrajectory, ...] = get_args(SharpTrajectory)
 TRAJECTORIES: tuple[TrajectoryKind, ...] = get_args(TrajectoryKind)
 PathUnit = Literal["metres", "disparity"]
 UNITS: tuple[PathUnit, ...] = get_args(PathUnit)
 
-NEAR_QUANTILE = 0.001  # z_near: sets how far the eye may go
-FOCUS_QUANTILE = 0.1  # depth that the camera keeps looking at
-MIN_FOCUS_M = 2.0  # a nearer focus would turn the camera too much
-MAX_DISPARITY = 2.0  # wider moves leave nothing of the photo in view
-OVERSCAN = 0.05  # a completed scene is drawn by a lens that much longer: what lies beyond the photo is mostly outside
+NEAR_QUANTILE = 0.001  # depth quantile of z_near, in proportion to which the eye moves
+FOCUS_QUANTILE = 0.1  # quantile of the depth at which the camera looks
+MIN_FOCUS_M = 2.0  # metres; a nearer focus would turn the camera too much
+MAX_DISPARITY = 2.0  # with wider moves nothing of the photo is in view
+OVERSCAN = 0.05  # completed scenes have a focal length longer by this fraction, which hides most of what is beyond the photo
 MAX_ZOOM = 0.15  # forward motion of rotate-forward, in units of z_near
 
-MIN_FOV, MAX_FOV = 1.0, 170.0  # degrees; beyond, a picture of a plane is no use
-UP = (0.0, -1.0, 0.0)  # by default the photo's
-LEAST_STEP = 1e-6  # seconds between two keys
-STILL = 1e-100  # slopes below it are none; their inverse would overflow
+MIN_FOV, MAX_FOV = 1.0, 170.0  # degrees; beyond, a planar image is useless
+UP = (0.0, -1.0, 0.0)  # the photo's up, the default
+LEAST_STEP = 1e-6  # least time between two keys, in seconds
+STILL = 1e-100  # smaller slopes count as 0, because their inverse would overflow
 Array = NDArray[np.float64]
 
 
@@ -46,22 +46,22 @@ class DepthRange:
 
     @staticmethod
     def of(gaussians: Gaussians) -> DepthRange:
-        """Measure the depths of Gaussians in front of the photo's camera, which is the world's."""
+        """Measure the depths of the Gaussians in front of the photo's camera, which is at the world's origin."""
         z = gaussians.means[:, 2].detach().double().cpu().numpy()
         z = z[z > 0]
         if z.size == 0:
             raise ValueError("no Gaussian stands in front of the camera")
-        near, focus = np.quantile(z, [NEAR_QUANTILE, FOCUS_QUANTILE])  # torch's stops at 16 M values
+        near, focus = np.quantile(z, [NEAR_QUANTILE, FOCUS_QUANTILE])  # torch's quantile takes at most 16 M values
         return DepthRange(float(near), max(MIN_FOCUS_M, float(focus)))
 
     def towards(self, other: DepthRange, part: float) -> DepthRange:
-        """Interpolate to another range by `part` (0..1), on a logarithmic scale."""
+        """Move towards another range by `part` (0..1), on a logarithmic scale."""
         near, focus = (a * (b / a) ** part for a, b in ((self.near, other.near), (self.focus, other.focus)))
         return DepthRange(near, focus)
 
 
 def trajectory_kind(name: str) -> TrajectoryKind:
-    """A trajectory by its name, or by its old spelling with `_`. ValueError for an unknown one."""
+    """A trajectory by its name, or by its old spelling with `_`; ValueError for an unknown name."""
     kind = name.replace("_", "-")
     if kind not in TRAJECTORIES:
         raise ValueError(f"unknown trajectory {name!r}: choose one of {', '.join(TRAJECTORIES)}")
@@ -86,17 +86,18 @@ def trajectory(
 
     Args:
         kind: swipe (left to right), shake (left-right, then up-down), rotate (a circle), rotate-forward (left-right
-            while moving in and out), vertical (up-down, less in a wide picture), orbit (left-right at one distance from
-            the focus point), or dolly-zoom (back, while the lens keeps the size of what stands at the focus point).
+            while moving forward and back), vertical (up-down, less in a wide image), orbit (left-right at a constant
+            distance from the focus point), or dolly-zoom (backward, while zooming in so that objects at the focus
+            point keep their size).
         camera: the photo's camera at the world's origin.
         disparity: the widest offset, in the units of `max_offset`.
         depth_range: depths of the base's Gaussians.
         frames: number of cameras.
-        looped: make a path that repeats without a jump: swipe returns, slower at its ends; the other paths, which are
-            closed, leave out their last frame.
+        looped: make a path that repeats without a jump: swipe also returns, slower at its ends; the other paths, which
+            are closed, leave out their last frame.
 
     Raises:
-        ValueError: an unknown path, a disparity out of 0..2, or no frame.
+        ValueError: an unknown path, a disparity outside 0..2, or less than one frame.
     """
     eyes, target = _flight(kind, camera, disparity, depth_range, frames, looped)
     return [_looking(kind, camera, eye, target) for eye in eyes]
@@ -111,7 +112,7 @@ def view_at(
 
 
 def extremes(camera: Camera, disparity: float, depth_range: DepthRange) -> tuple[Camera, Camera]:
-    """The leftmost and the rightmost view at a disparity: where holes are widest."""
+    """The leftmost and the rightmost view at a disparity, in which holes are widest."""
     left, right = trajectory("swipe", camera, disparity, depth_range, frames=2)
     return left, right
 
@@ -129,7 +130,7 @@ def _flight(
     frames: int,
     looped: bool = False,
 ) -> tuple[Tensor, Tensor]:
-    """Eye positions [frames, 3] and what they look at, [3]."""
+    """Eye positions [frames, 3], and the point [3] at which all of them look."""
     kind = trajectory_kind(kind)
     if not 0 <= disparity <= MAX_DISPARITY:
         raise ValueError(f"disparity must be between 0 and {MAX_DISPARITY:g}, got {disparity:g}")
@@ -151,7 +152,7 @@ def _flight(
     elif kind == "rotate":
         xyz = [side * turn.sin(), side * turn.cos(), zero]
     elif kind == "vertical":
-        flat = min(1.0, camera.height / camera.width)  # who looks up in a wide picture soon stands beneath its floor
+        flat = min(1.0, camera.height / camera.width)  # in a wide photo a lowered eye is soon beneath the floor
         xyz = [zero, flat * side * turn.sin(), zero]
     elif kind == "orbit":
         angle = math.atan2(side, focus) * turn.sin()
@@ -165,21 +166,21 @@ def _flight(
 
 
 class PathError(ValueError):
-    """The keyframes or a scene allow no camera path; the message is the reason."""
+    """The keyframes, or the scene, allow no camera path; the message is the reason."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Keyframe:
-    """Where the camera is at one time, in the frame of the photo's camera (x right, y down, z forward)."""
+    """The camera at one time, in the coordinates of the photo's camera (x right, y down, z forward)."""
 
     time: float  # seconds
     eye: tuple[float, float, float]
-    target: tuple[float, float, float]  # what it looks at
-    up: tuple[float, float, float] = UP  # what is up in the picture, roughly
-    fov: float | None = None  # horizontal, degrees; None: the photo's
+    target: tuple[float, float, float]  # the point at which it looks
+    up: tuple[float, float, float] = UP  # direction that is roughly upwards in the image
+    fov: float | None = None  # horizontal field of view in degrees; None: the photo's
 
     def __post_init__(self) -> None:
-        """PathError if the keyframe describes no view, for instance with the eye at the target."""
+        """PathError if the keyframe describes no view, for instance if the eye is at the target."""
         numbers = (self.time, *self.eye, *self.target, *self.up, *([] if self.fov is None else [self.fov]))
         if not all(math.isfinite(number) for number in numbers):
             raise PathError("every number must be finite, not NaN or infinite")
@@ -194,15 +195,15 @@ class KeyframePath:
 
     Each coordinate of eye, target and up, and the logarithm of the focal length, is a monotone cubic in time
     (Fritsch and Butland): it passes through every key exactly, and between two keys it stays between their
-    values. A camera that is the same at two keys in a row stands still between them.
+    values. If two consecutive keys have the same camera, the camera stands still between them.
     """
 
     keys: tuple[Keyframe, ...]  # at least two, times increasing
-    closed: bool = False  # goes on from the last key to the first, in the mean time between keys
-    unit: PathUnit = "metres"  # disparity: lengths are multiples of the offset that --disparity 1 means
+    closed: bool = False  # whether the path returns from the last key to the first, in the mean time between keys
+    unit: PathUnit = "metres"  # "disparity": lengths are multiples of the offset for --disparity 1
 
     def __post_init__(self) -> None:
-        """PathError if the keyframes make no path: too few, or times that do not increase."""
+        """PathError if the keyframes make no path: there are too few, or their times do not increase."""
         if len(self.keys) < 2:
             raise PathError(f"a path needs at least two keyframes, got {len(self.keys)}")
         for index, (one, other) in enumerate(zip(self.keys, self.keys[1:], strict=False)):
@@ -214,22 +215,22 @@ class KeyframePath:
 
     @property
     def seconds(self) -> float:
-        """From the first key to the last, or back to the first."""
+        """Duration from the first key to the last; of a closed path, back to the first."""
         span = self.keys[-1].time - self.keys[0].time
         return span * len(self.keys) / (len(self.keys) - 1) if self.closed else span
 
     def frame_count(self, fps: float) -> int:
-        """How many frames the path takes, both ends included unless it is closed."""
+        """The path's number of frames, with both ends unless it is closed."""
         return max(1, round(self.seconds * fps) + (not self.closed))
 
     def cameras(self, camera: Camera, frames: int, depth_range: DepthRange) -> list[Camera]:
-        """Views at equal steps in time, of the size of the photo's `camera`, whose eye is the origin.
+        """Views at equal time steps; they have the size of the photo's `camera`, whose eye is the origin.
 
-        An open path begins and ends at its first and last keys. A closed path stops one frame before it would reach the
-        first frame again. `depth_range` gives the unit "disparity" its length.
+        An open path begins at its first key and ends at its last. A closed path stops one frame before it would reach
+        the first frame again. `depth_range` determines the length of the unit "disparity".
 
         Raises:
-            PathError: between two keys the eye meets the target, or the view turns along its up.
+            PathError: between two keys the eye meets the target, or the viewing direction becomes parallel to up.
         """
         steps = frames if self.closed else max(1, frames - 1)
         return self.at([self.keys[0].time + k * self.seconds / steps for k in range(frames)], camera, depth_range)
@@ -239,7 +240,7 @@ class KeyframePath:
         return self.at([key.time for key in self.keys], camera, depth_range)
 
     def at(self, times: list[float], camera: Camera, depth_range: DepthRange) -> list[Camera]:
-        """Views at these times in seconds; `cameras` says more."""
+        """Views at these times in seconds; see `cameras`."""
         length = max_offset(camera, 1.0, depth_range) if self.unit == "disparity" else 1.0
         fx = camera.focal[0]
         focals = [
@@ -270,9 +271,9 @@ def _look_at(*vectors: Sequence[float] | Array) -> Tensor:
 
 
 def interpolate(times: Array, values: Array, wanted: Array, period: float | None = None) -> Array:
-    """Monotone cubics [M, C] at `wanted` [M] through `values` [K, C] at increasing `times` [K].
+    """Evaluate monotone cubics at times `wanted` [M]: they pass through `values` [K, C] at increasing `times` [K].
 
-    With a period the values repeat: the first comes again at times[0] + period.
+    Returns [M, C]. With a period, the values repeat: the first one recurs at times[0] + period.
     """
     if period is not None:
         times = np.concatenate([times[-1:] - period, times, times[:2] + period])
@@ -286,12 +287,12 @@ def interpolate(times: Array, values: Array, wanted: Array, period: float | None
     a, b = values[segment], values[segment + 1]
     bend = (1 - u) ** 2 * u * tangents[segment] - u**2 * (1 - u) * tangents[segment + 1]
     mixed = np.where(u < 0.5, a + (3 - 2 * u) * u**2 * (b - a), b - (1 + 2 * u) * (1 - u) ** 2 * (b - a))
-    bounded: Array = np.clip(mixed + step * bend, np.minimum(a, b), np.maximum(a, b))  # the last digit may be over
+    bounded: Array = np.clip(mixed + step * bend, np.minimum(a, b), np.maximum(a, b))  # rounding may exceed the bounds
     return bounded
 
 
 def _inner_tangents(steps: Array, slopes: Array) -> Array:
-    """[K − 2, C]: the weighted harmonic mean of the slopes on both sides, 0 where they disagree in sign."""
+    """Tangents [K − 2, C]: the weighted harmonic mean of the slopes on both sides, 0 if their signs differ."""
     before, after = slopes[:-1], slopes[1:]
     first, second = steps[1:] * 2 + steps[:-1], steps[1:] + 2 * steps[:-1]
     agree = (before * after > 0) & (np.minimum(np.abs(before), np.abs(after)) > STILL)

@@ -1,4 +1,4 @@
-"""Rectangles of a grid of pixels or cells, and a few small ones that hold all masked cells."""
+"""Rectangles of a grid of pixels or cells; `crops_around` covers all masked cells with a few small ones."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from spackle.filters import greatest_around
 
 Mask = NDArray[np.bool_]
 
-# How far around the masked cells the residual network looks. What a delta depends on reaches 205 cells far, but fades:
-# with the shipped weights, what lies beyond 64 cells changes it by less than a hundredth of what bfloat16 rounds away;
-# beyond 48, by a tenth; beyond 32, by as much. See tests/residual/test_crops.py.
+# How many cells around the masked ones the residual network gets. A delta's receptive field reaches 205 cells, but its
+# influence fades: with the shipped weights, cells beyond 64 change a delta by less than 1/100 of bfloat16's rounding
+# error; cells beyond 48 by 1/10 of it; cells beyond 32 by as much as it. See tests/residual/test_crops.py.
 MARGIN = 48
-WHOLE = 0.8  # crops that cover more than this share are not worth the trouble
-NEARLY = 1.1  # of what has to be looked at in any case: no cut saves much
-CALL_BLOCKS = 8  # what a crop costs by itself, in blocks of 16×16 cells
+WHOLE = 0.8  # if crops cover more than this fraction of the grid, the whole grid is used instead
+NEARLY = 1.1  # a rectangle with up to this multiple of the least possible area is not cut, because that saves little
+CALL_BLOCKS = 8  # fixed cost of a crop, in blocks of 16×16 cells
 
 
 @dataclasses.dataclass(frozen=True)
 class Crop:
-    """A rectangle of cells; the last row and column are exclusive."""
+    """A rectangle of cells; `bottom` and `right` are exclusive."""
 
     top: int
     left: int
@@ -33,7 +33,7 @@ class Crop:
 
     @property
     def area(self) -> int:
-        """In cells."""
+        """The number of cells."""
         return (self.bottom - self.top) * (self.right - self.left)
 
     @property
@@ -52,26 +52,27 @@ class Crop:
         return Crop(top, left, *(min(-(-(place + margin) // step) * step, end) for place, end in far))
 
     def touches(self, other: Crop) -> bool:
-        """Whether they overlap, or there is no cell between them."""
+        """Whether the two rectangles overlap or adjoin."""
         rows = self.top <= other.bottom and other.top <= self.bottom
         return rows and self.left <= other.right and other.left <= self.right
 
     def union(self, other: Crop) -> Crop:
-        """The smallest rectangle that holds both."""
+        """The smallest rectangle that contains both."""
         top, left = min(self.top, other.top), min(self.left, other.left)
         return Crop(top, left, max(self.bottom, other.bottom), max(self.right, other.right))
 
 
 def crops_around(mask: Tensor, step: int, margin: int = MARGIN) -> list[tuple[Crop, Crop]]:
-    """A few small rectangles that hold all masked cells, and the surroundings that the network needs for each.
+    """A few small rectangles that together contain all masked cells, each also with the context that the network needs.
 
     Args:
         mask: [h, w] bool.
-        step: the network's stride; crops begin at multiples of it, so that its coarse grids keep their places.
+        step: the network's stride; outer rectangles begin at multiples of it, so that coarse grids stay aligned.
         margin: number of cells around the masked ones that the network needs.
 
     Returns:
-        Pairs (inner, outer): the inner ones cover each masked cell exactly once, or are the whole grid.
+        Pairs (inner, outer), where outer includes the margin. The inner rectangles cover each masked cell exactly once;
+        or there is one pair, with the whole grid twice.
     """
     cells: Mask = mask.cpu().numpy()
     whole = Crop(0, 0, *cells.shape)
@@ -90,14 +91,14 @@ def crops_around(mask: Tensor, step: int, margin: int = MARGIN) -> list[tuple[Cr
 
 
 def _tight(cells: Mask, crop: Crop) -> Crop:
-    """The rectangle shrunk to its masked cells, of which there is at least one."""
+    """Shrink a rectangle to its masked cells, of which there must be at least one."""
     rows, columns = (np.flatnonzero(cells[crop.slices].any(axis)) for axis in (1, 0))
     edges = (int(edge) for edge in (rows[0], columns[0], rows[-1] + 1, columns[-1] + 1))
     return Crop(*edges).moved(crop.top, crop.left)
 
 
 def _cut(blocks: Mask, crop: Crop, reach: int) -> list[Crop]:
-    """Cut a rectangle, which its masked blocks touch on all four sides, into two wherever that saves cells."""
+    """Cut a rectangle in two, recursively, wherever that saves work; its masked blocks touch all four of its sides."""
     own = crop.grown(reach, 1, *blocks.shape).area
     if own <= NEARLY * _least(blocks, crop, reach):
         return [crop]
@@ -114,14 +115,14 @@ def _cut(blocks: Mask, crop: Crop, reach: int) -> list[Crop]:
 
 
 def _least(blocks: Mask, crop: Crop, reach: int) -> int:
-    """A lower bound of the blocks that the network sees, however a rectangle is cut."""
+    """A lower bound for the number of blocks that the network must process, however a rectangle is cut."""
     near = np.zeros_like(blocks)
     near[crop.slices] = blocks[crop.slices]
     return int(greatest_around(torch.from_numpy(near), reach).sum())
 
 
 def _row_halves(inside: Mask) -> NDArray[np.int64]:
-    """Top, left, bottom and right of the masked blocks above and below each cut between rows, [cuts, 2, 4]."""
+    """Bounds [cuts, 2, 4] of the masked blocks above and below each cut between rows: top, left, bottom, right."""
     height, width = inside.shape
     row, filled = np.arange(height), inside.any(1)
     left = np.where(filled, inside.argmax(1), width)

@@ -1,8 +1,8 @@
-"""Where arithmetic runs: device and memory, precision, threads of compiled kernels, and what reports say of them.
+"""Device, memory, precision and threads of computations, and the facts about them for reports.
 
-Numba's own parallel loops need a threading layer that is unsafe to enter from two Python threads or after a fork; a
-plain thread pool is neither, and its kernels compile faster. The last bits of a network's output depend on the number
-of threads, because sums run in another order.
+Numba's own parallel loops need a threading layer that is unsafe to enter from two Python threads or after a fork. A
+plain thread pool is safe in both cases, and kernels for it compile faster. The last bits of a network's output depend
+on the number of threads, because it changes the order of sums.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ import torch
 import spackle
 from spackle.errors import InputError
 
-# How torch says that memory is short, beside the exceptions that it has for it.
+# Words in the messages with which torch reports a shortage of memory, if it does not raise a dedicated exception.
 _SHORTAGES = (
     "DefaultCPUAllocator",
     "not enough memory",
-    "allocate memory",  # the system, when a file is to be mapped; and torch
+    "allocate memory",  # from the system, when a file is mapped; and from torch
     "out of memory",  # CUDA outside torch's allocator
     "_ALLOC_FAILED",  # cuBLAS and cuDNN
 )
 
 
 class MemoryShort(InputError):
-    """There was too little memory; the next time there may be enough."""
+    """There was too little memory; a later attempt may succeed."""
 
 
 def pick_device(device: torch.device | str | None) -> torch.device:
-    """The torch device of that name; for None a CUDA device if there is one, else the processor.
+    """The torch device of this name; for None, a CUDA device if there is one, else the CPU.
 
-    InputError for a device that is not there, or of a kind that networks do not run on here.
+    InputError if the device does not exist, or is neither a CPU nor a CUDA device.
     """
     present = torch.cuda.is_available()
     if device is None:
@@ -78,16 +78,16 @@ def enough_memory(*advice: str, what: str = "for the network") -> Iterator[None]
 
 @contextmanager
 def own_arithmetic(device: torch.device) -> Iterator[None]:
-    """Compute in the types that the tensors have, whatever the caller has set for networks of their own.
+    """Compute in the tensors' own dtypes, whatever the caller has set for other networks.
 
-    Autocast would round to sixteen bits, TF32 drops thirteen bits of each float32 in a GPU's convolutions. Its switches
-    hold for the whole process, so other threads see them too until they are set back.
+    Autocast would round to sixteen bits; TF32 would drop thirteen bits of each float32 in a GPU's convolutions. TF32's
+    switches hold for the whole process, so other threads are affected too until the switches are restored.
     """
     with torch.autocast("cpu", enabled=False), torch.autocast("cuda", enabled=False):
         if device.type != "cuda":
             yield
             return
-        # The older allow_tf32 cannot be read where the caller has used these newer switches.
+        # Not the older allow_tf32, which cannot be read if the caller has used these newer switches.
         switches = torch.backends.cuda.matmul, torch.backends.cudnn.conv  # type: ignore[attr-defined]  # its stubs
         before = [switch.fp32_precision for switch in switches]
         try:
@@ -104,7 +104,7 @@ PRECISIONS = ("auto", "fp32", "bf16")
 
 
 def pick_dtype(precision: Precision, device: torch.device) -> torch.dtype:
-    """The type that --precision means on a device; ValueError for an unknown precision."""
+    """The dtype for a value of --precision on a device; ValueError for an unknown precision."""
     if precision not in PRECISIONS:
         raise ValueError(f"precision {precision!r} is none of {', '.join(PRECISIONS)}")
     if precision == "auto":
@@ -113,7 +113,7 @@ def pick_dtype(precision: Precision, device: torch.device) -> torch.dtype:
 
 
 def multiplies_bf16(device: torch.device) -> bool:
-    """Whether products of bfloat16 are native: AMX or AVX512-BF16 on a processor, Ampere or later on a GPU."""
+    """Whether the hardware multiplies bfloat16 natively: CPUs with AMX or AVX512-BF16, GPUs from Ampere on."""
     if device.type == "cuda":
         return torch.cuda.get_device_capability(device) >= (8, 0)
     has = torch.cpu.get_capabilities() if device.type == "cpu" else {}
@@ -125,17 +125,18 @@ _pool_lock = threading.Lock()
 
 
 def thread_count() -> int:
-    """Number of threads: torch's own, so that one setting rules both."""
+    """Number of threads: torch's own, so that one setting controls both."""
     return torch.get_num_threads()
 
 
-CHUNKS = 64  # of a task: enough for threads to share uneven ones
+CHUNKS = 64  # chunks of a task: so many that uneven ones balance among threads
 
 
 def run_chunks(function: Callable[[int, int], object], total: int, grain: int | None = None) -> None:
-    """Call `function(start, stop)` for chunks of at most `grain` of 0..total, in any order: writes must not overlap.
+    """Call `function(start, stop)` for chunks of 0..total, each at most `grain` long, in any order, on several threads.
 
-    A thread takes the next chunk when it is done with its last, so uneven chunks balance.
+    Writes of different chunks must not overlap. A thread takes the next chunk when it has finished one, so uneven
+    chunks balance.
     """
     grain = grain or max(-(-total // CHUNKS), 1)
     chunks = -(-total // grain)
@@ -168,7 +169,7 @@ def _executor() -> ThreadPoolExecutor:
 
 
 def _forget_pool() -> None:
-    """A forked child has none of its parent's threads, and starts its own."""
+    """Drop the pool in a forked child, which has none of its parent's threads."""
     global _pool, _pool_lock
     _pool, _pool_lock = None, threading.Lock()
 
@@ -178,13 +179,13 @@ if hasattr(os, "register_at_fork"):
 
 
 def versions() -> dict[str, str]:
-    """Versions of Spackle and of the packages that compute."""
+    """Versions of Spackle, Python and the numerical packages."""
     ours = {"spackle": spackle.__version__, "python": platform.python_version(), "torch": torch.__version__}
     return ours | {name: version(name) for name in ("numba", "numpy")}
 
 
 def hardware(device: torch.device) -> dict[str, Any]:
-    """Processor, cores and threads, and the GPU where that is the device."""
+    """The CPU, its cores, the number of threads, and the GPU if that is the device."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:  # not a Linux

@@ -1,4 +1,4 @@
-"""The one exception that means "your input, not our bug"."""
+"""`InputError`, the one exception for bad input, and helpers for its messages."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from typing import ParamSpec, TypeVar
 P = ParamSpec("P")
 R = TypeVar("R")
 
-LONGEST = 300  # characters of a message
+LONGEST = 300  # most characters of a message
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother = 2, 60, 60
 
 
 class InputError(ValueError):
-    """Bad input from a person: the message names the file or value, what is wrong and what to do.
+    """Bad input from a user: the message names the file or value, what is wrong and what to do.
 
     The command line prints the message as one line and exits with code 2.
     """
@@ -27,19 +27,19 @@ class InputError(ValueError):
 
 def reason_in_a_line(error: object) -> str:
     """The text of a library's exception, at most 200 characters, for the middle of a message."""
-    said = getattr(error, "strerror", None) or error  # the system's words, without its number and the file's name
+    said = getattr(error, "strerror", None) or error  # the system's text, without error number and file name
     return one_line(" ".join(str(said).split()))[:200] or type(error).__name__
 
 
 @contextlib.contextmanager
 def reading(what: object, problem: str, *errors: type[Exception]) -> Iterator[None]:
-    """Turn what a library raises in the block into the InputError "{what}: {problem}".
+    """Turn an exception that a library raises in the block into the InputError "{what}: {problem}".
 
     Args:
-        what: the file that is read, or what else the message is about.
-        problem: what is wrong and what to do; "{reason}" in it becomes what the library says.
-        errors: types that mean bad input; by default every exception, as a stranger's bytes can raise anything.
-            An InputError passes as it is.
+        what: the file that is read, or another subject of the message.
+        problem: what is wrong and what to do; "{reason}" in it is replaced by the library's message.
+        errors: exceptions that mean bad input; by default all, because untrusted bytes can raise any exception.
+            An InputError passes unchanged.
     """
     caught = errors or (Exception,)
     try:
@@ -51,18 +51,18 @@ def reading(what: object, problem: str, *errors: type[Exception]) -> Iterator[No
 
 
 def one_line(text: str) -> str:
-    """A text without control characters, safe for a terminal or a log: names of files can hold escape codes."""
+    """A text without control characters, safe for a terminal or a log: file names can contain escape codes."""
     line = " ".join(text.splitlines())
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
 
 
 def shown(value: object) -> str:
-    """A value from a file, at most 60 characters of it, for the middle of a message."""
+    """A value from a file, shortened to 60 characters, for the middle of a message."""
     return _SHORT.repr(value)[:60]
 
 
 def renamed(**names: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Let a function take arguments by the names that they had in the release before, with a DeprecationWarning."""
+    """Decorator: accept arguments under their names in the previous release, with a DeprecationWarning."""
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
         @functools.wraps(function)
@@ -80,7 +80,7 @@ def renamed(**names: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
 
 @contextlib.contextmanager
 def short_messages() -> Iterator[None]:
-    """Leave the middle out of messages of more than 300 characters, which can quote values of a program."""
+    """Shorten an InputError's message of more than 300 characters in the middle: it may quote a program's values."""
     try:
         yield
     except InputError as error:
@@ -91,7 +91,7 @@ def short_messages() -> Iterator[None]:
 
 
 def check_name(option: str, name: str, known: Iterable[str]) -> None:
-    """Raise InputError for an unknown name, and name the nearest known one."""
+    """InputError if a name is unknown; the message suggests the most similar known name."""
     names = list(known)
     if name in names:
         return

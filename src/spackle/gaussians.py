@@ -1,4 +1,4 @@
-"""3D Gaussians as one value: five tensors that travel together."""
+"""A set of 3D Gaussians as one object with five tensors."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch import Tensor
 class Gaussians:
     """A set of N anisotropic 3D Gaussians, without a batch axis.
 
-    The world is OpenCV's: x right, y down, z forward, in metres where the base is metric.
+    World axes are OpenCV's: x right, y down, z forward; units are metres if the base is metric.
     """
 
     means: Tensor  # [N, 3] centres
@@ -43,7 +43,7 @@ class Gaussians:
 
     @staticmethod
     def empty(device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> Gaussians:
-        """A set with N = 0."""
+        """A set without Gaussians."""
         shapes: list[tuple[int, ...]] = [(0, 3), (0, 4), (0, 3), (0,), (0, 3)]
         return Gaussians(*(torch.empty(s, device=device, dtype=dtype) for s in shapes))
 
@@ -58,21 +58,21 @@ class Gaussians:
         return Gaussians(*(t.to(device=device, dtype=dtype) for t in self.tensors))
 
     def detach(self) -> Gaussians:
-        """The same values cut off from autograd."""
+        """The same values, detached from autograd."""
         return Gaussians(*(t.detach() for t in self.tensors))
 
     def select(self, index: Tensor | slice) -> Gaussians:
-        """Keep the Gaussians that a boolean mask [N], an index tensor [M] or a slice picks."""
+        """The Gaussians that a boolean mask [N], an index tensor [M] or a slice selects."""
         return Gaussians(*(t[index] for t in self.tensors))
 
     def transform(self, matrix: Tensor) -> Gaussians:
         """Apply a similarity (rotation, uniform scale, translation).
 
         Args:
-            matrix: [4, 4], maps old world coordinates to new ones.
+            matrix: [4, 4], which maps old world coordinates to new ones.
 
         Raises:
-            ValueError: where the upper left 3×3 block is not a proper rotation times a scale.
+            ValueError: the upper left 3×3 block is not a proper rotation times a scale.
         """
         matrix = matrix.to(device=self.means.device, dtype=torch.float64)
         linear = matrix[:3, :3]
@@ -98,7 +98,7 @@ class Gaussians:
 
 
 def quat_to_matrix(quats: Tensor) -> Tensor:
-    """Rotation matrices [..., 3, 3] of quaternions [..., 4] (wxyz), normalised here."""
+    """Rotation matrices [..., 3, 3] of quaternions [..., 4] (wxyz), which need not be normalised."""
     w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -111,7 +111,7 @@ def quat_to_matrix(quats: Tensor) -> Tensor:
 def quat_from_matrix(rotation: Tensor) -> Tensor:
     """Unit quaternions [..., 4] (wxyz, w ≥ 0) of rotation matrices [..., 3, 3].
 
-    It divides by the largest of the four components, so that every rotation is well conditioned.
+    The largest of the four components is used as divisor, so that the result is well conditioned for every rotation.
     """
     (m00, m01, m02), (m10, m11, m12), (m20, m21, m22) = (row.unbind(-1) for row in rotation.unbind(-2))
     w = torch.stack([1 + m00 + m11 + m22, m21 - m12, m02 - m20, m10 - m01], -1)
@@ -126,7 +126,7 @@ def quat_from_matrix(rotation: Tensor) -> Tensor:
 
 
 def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
-    """Hamilton product of quaternions (wxyz), broadcast over leading axes: first b, then a."""
+    """Hamilton product of quaternions (wxyz), broadcast over leading axes: the rotation by b, followed by that by a."""
     aw, ax, ay, az = a.unbind(-1)
     bw, bx, by, bz = b.unbind(-1)
     return torch.stack(

@@ -1,8 +1,8 @@
-"""Load weights from an untrusted file into a network: names, shapes and numbers are checked, and no code in it is run.
+"""Load weights from an untrusted file: names, shapes and numbers are checked, and no code in the file is run.
 
-A file is safetensors, or what `torch.save` or TorchScript wrote, whatever its name: a zip archive of tensors, perhaps
-code, and a pickle that says where in a tree of objects each tensor stands. The code is not looked at, and the pickle is
-read with inert stand-ins for all classes and functions in it.
+A file is safetensors, or was written by `torch.save` or TorchScript, whatever its name. The latter two write a zip
+archive of tensors, possibly code, and a pickle that places each tensor in a tree of objects. The code is ignored, and
+the pickle is read with inert stand-ins for all classes and functions in it.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from spackle.errors import InputError, one_line, reading
 from spackle.files import check_file
 
 Network = TypeVar("Network", bound=nn.Module)
-Shapes = dict[str, tuple[int, ...]]  # of tensors, by name
+Shapes = dict[str, tuple[int, ...]]  # tensors' shapes by name
 
-NAMED = 3  # how many of the names that differ are spelled out
-MAX_PICKLE = 4_000_000  # bytes; those of a thousand tensors are a tenth of that
-MAX_NODES = 100_000  # of the tree: an object that stands at several places counts at each
-MAX_PATH = 1000  # letters of the names from the tree's root
+NAMED = 3  # number of differing names that a message lists
+MAX_PICKLE = 4_000_000  # bytes; a pickle for a thousand tensors has a tenth of that
+MAX_NODES = 100_000  # nodes of the tree; an object that occurs in several places counts each time
+MAX_PATH = 1000  # characters of a path from the tree's root
 STORAGES = {
     "torch FloatStorage": torch.float32,
     "torch HalfStorage": torch.float16,
@@ -51,19 +51,19 @@ def load_strict(
     unused: Shapes | None = None,
     prepare: Callable[[nn.Module], object] | None = None,
 ) -> Network:
-    """Fill a network, which may lie on the meta device, with exactly the tensors that it has, and freeze it.
+    """Fill a network, which may be on the meta device, with a file's tensors, which must match exactly, and freeze it.
 
-    Its weights are float32; its constants, such as counts, stay as they are. Nothing shares memory with the file.
+    Weights become float32; integer tensors, such as counts, stay as they are. Nothing shares memory with the file.
 
     Args:
-        network: to be filled.
-        tensors: of the file, see `read_tensors`.
+        network: the network to fill.
+        tensors: the file's tensors, see `read_tensors`.
         path, advice: for messages: the file, and what to do about a wrong one.
-        unused: names and shapes of further tensors that the file must hold.
+        unused: names and shapes of further tensors that the file must contain.
         prepare: converts the filled network in place, while its tensors are still mapped from the disk.
 
     Raises:
-        InputError: tensors that are missing, unknown, of another shape, or not finite.
+        InputError: tensors are missing, unknown, of another shape, or not finite.
     """
     ours = network.state_dict()
     used = {name: tuple(tensor.shape) for name, tensor in ours.items() if tensor.is_floating_point()}
@@ -81,7 +81,7 @@ def load_strict(
 
 
 def channels_last(network: nn.Module) -> None:
-    """Convert kernels to channels-last, which is fast on a processor."""
+    """Convert kernels to channels-last, which is fast on a CPU."""
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs lack it
 
 
@@ -92,7 +92,7 @@ def check_tensors(
     advice: str,
     ignored: Collection[str] = (),
 ) -> None:
-    """InputError unless a file holds floats of exactly these names and shapes, beside names that are `ignored`."""
+    """InputError unless a file has float tensors of exactly these names and shapes; further names may be `ignored`."""
     kinds = {
         "missing": sorted(expected.keys() - found.keys()),
         "unknown": sorted(found.keys() - expected.keys() - set(ignored)),
@@ -111,8 +111,8 @@ def check_tensors(
 
 
 def check_finite(network: nn.Module, path: str | os.PathLike[str], advice: str) -> None:
-    """InputError unless all numbers of a network that was read from a file are finite."""
-    # A finite sum proves it at little cost; but a sum of finite numbers can overflow.
+    """InputError unless all numbers of a network from a file are finite."""
+    # A finite sum proves that all numbers are finite, and is cheap; as finite numbers may overflow, others are checked.
     broken = [name for name, t in network.state_dict().items() if not (t.sum().isfinite() or t.isfinite().all())]
     if broken:
         raise InputError(f"{path}: holds numbers that are not finite ({_some(broken)}): {advice}")
@@ -125,13 +125,13 @@ def _some(names: list[str]) -> str:
 
 
 def read_tensors(path: str | os.PathLike[str], advice: str) -> dict[str, Tensor]:
-    """The tensors of a file by name; numbers are read from the disk when they are used.
+    """The tensors of a file by name; their numbers are read from the disk when they are used.
 
-    Other content of the file is ignored. In TorchScript and in nested dicts a name is the path to the tensor, joined by
-    dots. `advice` ends messages about a wrong file: what to do.
+    Other content of the file is ignored. In TorchScript and in nested dicts, a name is the path to the tensor, joined
+    by dots. `advice` ends messages about a wrong file, and tells what to do.
 
     Raises:
-        InputError: a missing or broken file, or one of another kind.
+        InputError: the file is missing or broken, or holds no weights.
     """
     with _reading_weights(path, advice):
         tensors = _read(path)
@@ -141,9 +141,10 @@ def read_tensors(path: str | os.PathLike[str], advice: str) -> dict[str, Tensor]
 
 
 def read_checkpoint(path: str | os.PathLike[str], name: str, advice: str) -> tuple[object, dict[str, Tensor]]:
-    """A value in the dict that `torch.save` wrote, such as a network's settings, and all its tensors by their path.
+    """One value of the dict in a `torch.save` file, such as a network's settings, and all the dict's tensors by path.
 
-    The value is untrusted: numbers, strings, lists and dicts, or inert stand-ins. InputError as `read_tensors`.
+    The value is untrusted; it consists of numbers, strings, lists, dicts and inert stand-ins. Raises InputError like
+    `read_tensors`.
     """
     with _reading_weights(path, advice):
         root = _read_archive(path)
@@ -153,7 +154,7 @@ def read_checkpoint(path: str | os.PathLike[str], name: str, advice: str) -> tup
 
 
 def read_note(path: str | os.PathLike[str], name: str) -> str | None:
-    """The value of a key in a safetensors file's metadata; None without it, or for another format."""
+    """The value of a key in a safetensors file's metadata; None if the key is missing or the format is another."""
     with open(path, "rb") as file:
         if file.read(9)[8:] != b"{":
             return None
@@ -169,7 +170,7 @@ def _reading_weights(path: str | os.PathLike[str], advice: str) -> Iterator[None
 
 
 def _read(path: str | os.PathLike[str]) -> dict[str, Tensor]:
-    """Read by the format that the first bytes show, because files get renamed."""
+    """Read the tensors; the first bytes tell the format, because files get renamed."""
     with open(path, "rb") as file:
         head = file.read(9)
     if head.startswith(b"PK\x03\x04"):
@@ -180,16 +181,16 @@ def _read(path: str | os.PathLike[str]) -> dict[str, Tensor]:
     if not head.startswith(b"\x80"):
         raise ValueError("it is neither safetensors nor PyTorch's")
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # about kinds of tensors that are refused
+        warnings.simplefilter("ignore")  # about kinds of tensors that are refused below
         try:
-            loaded = torch.load(path, map_location="cpu", weights_only=True)  # as PyTorch wrote before 1.6
+            loaded = torch.load(path, map_location="cpu", weights_only=True)  # the format of PyTorch before 1.6
         except pickle.UnpicklingError as error:
             raise ValueError("a bare pickle that holds more than tensors; nothing in it was run") from error
     return {name: x for name, x in loaded.items() if isinstance(name, str) and _is_plain(x)}
 
 
 def _is_plain(value: object) -> bool:
-    """Whether a value is a dense tensor on the processor without attributes, which could replace its methods."""
+    """Whether a value is a dense CPU tensor without extra attributes (attributes could replace its methods)."""
     if type(value) not in (Tensor, nn.Parameter) or vars(value):
         return False
     assert isinstance(value, Tensor)
@@ -197,7 +198,7 @@ def _is_plain(value: object) -> bool:
 
 
 def _read_archive(path: str | os.PathLike[str]) -> object:
-    """What was saved."""
+    """The root of the tree of objects in a zip archive."""
     with zipfile.ZipFile(path) as archive:
         names = [name for name in archive.namelist() if name.count("/") == 1 and name.endswith("/data.pkl")]
         if len(names) != 1:
@@ -207,23 +208,23 @@ def _read_archive(path: str | os.PathLike[str]) -> object:
             raise ValueError("its pickle is too large for a network")
         if f"{root}byteorder" in archive.namelist() and archive.read(f"{root}byteorder") != b"little":
             raise ValueError("its numbers are not little-endian")
-        summed = any(record.CRC for record in archive.infolist())  # torch.save can be told to leave the sums out
+        summed = any(record.CRC for record in archive.infolist())  # torch.save can omit checksums
         if summed and (damaged := archive.testzip()) is not None:
             raise ValueError(f"damaged at {damaged}")
         return _Unpickler(archive.read(names[0]), archive, path, f"{root}data/").load()
 
 
 class _StandIn:
-    """Stands for an object of any class, or for any function's result, and keeps the fields that it is given."""
+    """Replaces an object of any class, or the result of any function, and stores the fields that it is given."""
 
-    kind = ""  # of a subclass: module and name of what it stands for
+    kind = ""  # in a subclass: module and name of the class or function that it replaces
     fields: dict[object, object]
 
     def __new__(cls, *arguments: Any) -> Any:
-        """An empty stand-in; for torch's functions that make tensors and parameters, the tensor."""
+        """An empty stand-in; or a tensor, if `kind` is one of torch's functions that rebuild tensors and parameters."""
         if cls.kind == "torch._utils _rebuild_tensor_v2" and isinstance(arguments[0], Tensor):
             storage, offset, shape, stride = arguments[:4]
-            return storage.as_strided(shape, stride, offset)  # refuses what lies outside of the storage
+            return storage.as_strided(shape, stride, offset)  # raises an error beyond the storage
         if cls.kind == "torch._utils _rebuild_parameter":
             return arguments[0]
         made: _StandIn = super().__new__(cls)
@@ -238,8 +239,8 @@ class _StandIn:
             self.fields.update(state)
 
 
-class _Unpickler(pickle._Unpickler):  # in Python: the one in C takes whatever memory a pickle asks for
-    """Reads a pickle of plain values, `_StandIn` and tensors: no class or function in it is looked up."""
+class _Unpickler(pickle._Unpickler):  # the one in Python: the one in C allocates whatever memory a pickle asks for
+    """Reads a pickle as plain values, `_StandIn` and tensors; no class or function in it is looked up."""
 
     def __init__(self, data: bytes, archive: zipfile.ZipFile, path: str | os.PathLike[str], folder: str) -> None:
         super().__init__(io.BytesIO(data))
@@ -250,7 +251,7 @@ class _Unpickler(pickle._Unpickler):  # in Python: the one in C takes whatever m
         return type("_StandIn", (_StandIn,), {"kind": f"{module} {name}"})
 
     def persistent_load(self, pid: Any) -> Tensor | None:
-        """The numbers of a storage as a flat tensor; None for a type that no network here has."""
+        """The numbers of a storage as a flat tensor; None for a type that is not in STORAGES."""
         _, storage, key, _, count = pid
         record = self._archive.getinfo(f"{self._folder}{key}")
         if storage.kind not in STORAGES:
@@ -261,13 +262,13 @@ class _Unpickler(pickle._Unpickler):  # in Python: the one in C takes whatever m
             raise ValueError(f"storage {str(key)[:20]} is packed or has not the {size} bytes that its tensor needs")
         with open(self._path, "rb") as file:
             file.seek(record.header_offset + 26)
-            name, more = struct.unpack("<2H", file.read(4))  # lengths of what stands before the numbers
+            name, more = struct.unpack("<2H", file.read(4))  # lengths of the fields before the numbers
         start = record.header_offset + 30 + name + more
         return numbers.set_(self._mapped[start : start + size])
 
 
 def _tensors(root: object) -> dict[str, Tensor]:
-    """All tensors in a tree of objects and dicts by their path, joined by dots."""
+    """All tensors in a tree of objects and dicts, by their paths, joined by dots."""
     found: dict[str, Tensor] = {}
     waiting, nodes = [("", root)], 0
     while waiting:

@@ -1,4 +1,4 @@
-"""The frames of a video: their size and format, one eye or two, in colours or as depth."""
+"""Make the frames of a video: their size and format, for one eye or two, in colour or as depth."""
 
 from __future__ import annotations
 
@@ -26,30 +26,30 @@ VideoFormat = Literal["mp4", "webm", "gif", "webp"]
 Show = Literal["color", "depth"]
 StereoLayout = Literal["sbs", "sbs-half", "ou", "ou-half", "anaglyph"]
 LAYOUTS: tuple[StereoLayout, ...] = get_args(StereoLayout)
-PARALLAX = 0.03  # of the picture's width, between the nearest thing and infinity: comfortable on a desk or a wall
+PARALLAX = 0.03  # of the image's width, between z_near and infinity: comfortable on a monitor or a projection
 Fit = Literal["pad", "blur", "crop"]
-PRESETS = {"16:9": (1920, 1080), "9:16": (1080, 1920), "1:1": (1080, 1080)}  # of --size
-ALIKE = 0.01  # an aspect ratio that differs by less is cropped to, without stripes
-BLURRED_PX, BLURRED_LIGHT = 12, 0.6  # pixels that a margin's picture is blurred to, and how bright it is
-GAP = 6  # pixels between two pictures that are compared
+PRESETS = {"16:9": (1920, 1080), "9:16": (1080, 1920), "1:1": (1080, 1080)}  # names that --size accepts
+ALIKE = 0.01  # if aspect ratios differ by less, the view is cropped, so that there are no thin margins
+BLURRED_PX, BLURRED_LIGHT = 12, 0.6  # long side to which the image is reduced for blurred margins; their brightness
+GAP = 6  # pixels between the two images of --compare
 MAX_VIDEO_SIDE = 8192
 MAX_IPD = 1e6
 DEFAULT_FPS = 30
-COVERED = 0.5  # less opaque pixels have no depth that a person would call one
+COVERED = 0.5  # opacity below which a pixel counts as having no depth
 
 # E. Dubois, "A projection method to generate anaglyph stereo images", ICASSP 2001: least squares over the spectra
-# of a display and of red-cyan glasses, in linear light. Rows: what R, G and B take of the eye's R, G and B.
+# of a display and of red-cyan glasses, in linear light. Rows: weights of the eye's R, G and B in the result's R, G, B.
 DUBOIS_LEFT = ((0.456, 0.500, 0.176), (-0.040, -0.038, -0.016), (-0.015, -0.021, -0.005))
 DUBOIS_RIGHT = ((-0.043, -0.088, -0.002), (0.378, 0.734, -0.018), (-0.072, -0.113, 1.226))
 
 
 @dataclasses.dataclass(frozen=True)
 class Stereo:
-    """The two eyes of a stereo view, and the layout of their pictures."""
+    """The two eyes of a stereo view, and the layout of their images."""
 
     layout: StereoLayout
-    ipd: float  # between the eyes, in the scene's unit (metres where the base is metric)
-    convergence: float  # depth without parallax, where the screen is; inf: parallel axes
+    ipd: float  # distance between the eyes, in the scene's unit (metres if the base is metric)
+    convergence: float  # depth without parallax, which appears at the screen; inf: principal points are not shifted
 
     def __post_init__(self) -> None:
         if self.layout not in LAYOUTS:
@@ -58,18 +58,19 @@ class Stereo:
             raise ValueError(f"no stereo with eyes {self.ipd:g} apart and a screen at {self.convergence:g}")
 
     def eyes(self, camera: Camera) -> tuple[Camera, Camera]:
-        """The left and the right eye of a view: moved along its x axis, never turned.
+        """The cameras of the left and the right eye: the view's, moved along its x axis, not turned.
 
-        Parallel cameras whose principal points are shifted show what is `convergence` deep at the same place.
-        Turning them inwards instead would squeeze each picture into a trapezium, and shift its rows.
+        The cameras are parallel; their principal points are shifted so that points at depth `convergence` appear at the
+        same position in both images. Turning the cameras inwards instead would distort each image to a trapezium, and
+        shift its rows.
         """
         return _moved(camera, -self.ipd / 2, self.convergence), _moved(camera, self.ipd / 2, self.convergence)
 
     def pack(self, left: Tensor, right: Tensor) -> Tensor:
-        """Two pictures [H, W, 3], sRGB, as one frame.
+        """Combine the eyes' images [H, W, 3], sRGB, in one frame.
 
         sbs [H, 2W, 3] has the left eye on the left, ou [2H, W, 3] has it on top; their half variants squeeze the
-        frame to [H, W, 3] (an odd side grows by one); anaglyph is for glasses that are red on the left.
+        frame to [H, W, 3] (an odd side grows by one); anaglyph is for glasses with the red filter on the left eye.
         """
         if self.layout == "anaglyph":
             return anaglyph(left, right)
@@ -78,7 +79,7 @@ class Stereo:
         return torch.cat(pictures, dim=1 if side else 0)
 
     def frame_size(self, width: int, height: int) -> tuple[int, int]:
-        """Width and height of a frame of views of this size."""
+        """Width and height of a frame, for eyes' images of this size."""
         if self.layout in ("sbs", "sbs-half"):
             return 2 * (width if self.layout == "sbs" else (width + 1) // 2), height
         if self.layout in ("ou", "ou-half"):
@@ -87,16 +88,16 @@ class Stereo:
 
 
 def default_ipd(camera: Camera, depth_range: DepthRange) -> float:
-    """The distance of the eyes at which the scene's depth has a parallax of 3 % of the picture's width.
+    """The distance between the eyes for which the scene's depth has a parallax of 3 % of the image's width.
 
-    parallax = fx · ipd · (1/near − 1/∞), so ipd = 0.03 · (W/fx) · z_near: no unit is needed, and things at arm's
-    length are not torn apart. For a 30 mm lens and z_near = 1.8 m this is the human 65 mm.
+    parallax = fx · ipd · (1/near − 1/∞), so ipd = 0.03 · (W/fx) · z_near. So the scene's unit does not matter, and
+    objects at arm's length do not get too much parallax. For a 30 mm lens and z_near = 1.8 m this is the human 65 mm.
     """
     return PARALLAX * camera.width / camera.focal[0] * depth_range.near
 
 
 def anaglyph(left: Tensor, right: Tensor) -> Tensor:
-    """Red-cyan [..., 3] of two sRGB pictures [..., 3], mixed in linear light by Dubois' matrices."""
+    """A red-cyan image [..., 3] of two sRGB images [..., 3], mixed in linear light by Dubois' matrices."""
     one, other = srgb_to_linear(left), srgb_to_linear(right)
     mixed = one @ one.new_tensor(DUBOIS_LEFT).T + other @ other.new_tensor(DUBOIS_RIGHT).T
     return linear_to_srgb(mixed)
@@ -110,7 +111,7 @@ def _moved(camera: Camera, right: float, convergence: float) -> Camera:
 
 
 def _halved(picture: Tensor, side: bool) -> Tensor:
-    """Half the width or the height; pixels are averaged in linear light."""
+    """Halve an image's width (if `side`) or height; pixels are averaged in linear light."""
     height, width = picture.shape[:2]
     size = (height, (width + 1) // 2) if side else ((height + 1) // 2, width)
     light = srgb_to_linear(picture).permute(2, 0, 1)[None]
@@ -119,22 +120,22 @@ def _halved(picture: Tensor, side: bool) -> Tensor:
 
 @dataclasses.dataclass(frozen=True)
 class VideoOptions:
-    """Options of all videos."""
+    """Options that all videos share."""
 
-    format: VideoFormat | None = None  # mp4 where None
-    fps: float | None = None  # 30 where None; a clip keeps its own, and takes none
-    loop: int | None = None  # the format's where None: gif and webp for ever, the others once
-    size: tuple[int, int] | None = None  # width and height of one eye's picture; the photo's where None
-    fit: Fit = "pad"  # a view of another aspect ratio: with black or blurred margins, or cut off
+    format: VideoFormat | None = None  # None: mp4
+    fps: float | None = None  # None: 30; for a clip it must be None, because a clip keeps its own rate
+    loop: int | None = None  # None: the format's default, which is for ever for gif and webp, once for the others
+    size: tuple[int, int] | None = None  # width and height of one eye's image; None: the photo's
+    fit: Fit = "pad"  # how a view with another aspect ratio is fitted: black margins, blurred margins, or cropping
     show: Show = "color"
     stereo: StereoLayout | None = None
-    ipd: float | None = None  # as `default_ipd` has it where None
-    convergence: float | None = None  # the focus depth where None
-    compare: bool = False  # to the left what the photo shows, with its holes; to the right the completed scene
+    ipd: float | None = None  # None: `default_ipd`
+    convergence: float | None = None  # None: the focus depth
+    compare: bool = False  # whether a frame shows the base with its holes on the left, the completed scene on the right
 
     @property
     def suffix(self) -> str:
-        """What the file's name ends with."""
+        """The file name's suffix."""
         return f".{self.format or 'mp4'}"
 
     @property
@@ -148,7 +149,7 @@ class VideoOptions:
         return FORMATS[self.suffix].loop if self.loop is None else self.loop
 
     def check(self) -> None:
-        """InputError for options that no video can have."""
+        """InputError if no video can have these options."""
         self._blame(f"--fps {self.rate:g}", None)
         self._blame(f"--loop {self.loop}", self.loop)
         for option, value in {"--ipd": self.ipd, "--convergence": self.convergence}.items():
@@ -166,14 +167,14 @@ class VideoOptions:
             )
 
     def _blame(self, option: str, loop: int | None) -> None:
-        """InputError that names an option for what the format refuses."""
+        """InputError, naming `option`, if the format does not allow the rate or `loop`."""
         try:
             check_video(name := f"video{self.suffix}", self.rate, loop)
         except InputError as error:
             raise InputError(f"{option}: {str(error).removeprefix(f'{name}: ')}") from error
 
     def for_file(self, file: Path) -> VideoOptions:
-        """The options with the format of a file's suffix; InputError if --format contradicts it."""
+        """The options, with the format set by a file's suffix; InputError if --format contradicts it."""
         suffix = file.suffix.lower()
         meant = "mp4" if suffix in (".m4v", ".mov") else cast(VideoFormat, suffix[1:])
         if self.format not in (None, meant):
@@ -183,7 +184,7 @@ class VideoOptions:
 
 @dataclasses.dataclass(frozen=True)
 class FrameMaker:
-    """Draws a frame of a video: one picture or two, in colours or as depth."""
+    """Makes frames of a video from renderings: one image or two, in colour or as depth."""
 
     options: VideoOptions
     stereo: Stereo | None = None
@@ -191,8 +192,9 @@ class FrameMaker:
 
     @staticmethod
     def of(options: VideoOptions, gaussians: Gaussians, cameras: Sequence[Camera], source: Path) -> FrameMaker:
-        """The frame maker for a scene and a path, from which missing options are derived; InputError (naming `source`)
-        if impossible.
+        """The frame maker for a scene and a path, from which missing options are derived.
+
+        InputError, naming `source`, if no such video is possible.
         """
         try:
             stereo = _stereo(options, gaussians, cameras[0])
@@ -210,21 +212,21 @@ class FrameMaker:
 
     @property
     def plain(self) -> bool:
-        """Whether a frame is one view at its own size."""
+        """Whether a frame is just one colour view at its own size."""
         return self.stereo is None and self.depth is None and self.options.size is None
 
     @property
     def canvas(self) -> tuple[int, int] | None:
-        """Width and height of one eye's picture, both even, where they are chosen."""
+        """Width and height of one eye's image, both even, if --size is given; else None."""
         size = self.options.size
         return size and (size[0] + size[0] % 2, size[1] + size[1] % 2)
 
     def eyes(self, camera: Camera) -> tuple[Camera, ...]:
-        """The view itself, or what the left and the right eye see."""
+        """The view itself, or the cameras of its left and right eye."""
         return (camera,) if self.stereo is None else self.stereo.eyes(camera)
 
     def frame(self, views: Sequence[Rendering]) -> Tensor:
-        """One frame [H, W, 3], sRGB, of the renderings of `eyes`, or of the base and the scene that are compared."""
+        """One frame [H, W, 3], sRGB, from the renderings of `eyes`; with `compare`, from those of base and scene."""
         pictures = [v.rgb if self.depth is None else self.depth(v.depth, v.alpha >= COVERED) for v in views]
         if self.canvas is not None:
             pictures = [with_margins(picture, *self.canvas, self.options.fit == "blur") for picture in pictures]
@@ -234,7 +236,7 @@ class FrameMaker:
         return pictures[0] if self.stereo is None else self.stereo.pack(*pictures)
 
     def sized(self, camera: Camera) -> Camera:
-        """A view at the size at which it is rendered: the video's size without margins."""
+        """A view at the size in which it is rendered: that of one eye's image, without margins."""
         if self.canvas is None:
             return camera
         width, height = self.canvas
@@ -245,18 +247,18 @@ class FrameMaker:
         return camera.resized(*(max(1, round(scale * side)) for side in (camera.width, camera.height)))
 
     def frame_size(self, camera: Camera) -> tuple[int, int]:
-        """Width and height of a frame of a view of this size; the file's, too, where these are even."""
+        """Width and height of a frame for a view of this size; the file has the same if both are even."""
         width, height = self.canvas or (camera.width, camera.height)
         if self.options.compare:
             return 2 * width + GAP, height
         return (width, height) if self.stereo is None else self.stereo.frame_size(width, height)
 
     def note(self, name: str, camera: Camera, frames: int) -> dict[str, object]:
-        """The report's entry of the video: its file, because a folder may hold older ones, and its properties."""
+        """The report's entry for the video: its properties and file name, because a folder may contain older videos."""
         width, height = self.frame_size(self.sized(camera))
         stereo: dict[str, object] | None = None
         if self.stereo is not None:
-            convergence = self.stereo.convergence if math.isfinite(self.stereo.convergence) else None  # as JSON can
+            convergence = self.stereo.convergence if math.isfinite(self.stereo.convergence) else None  # JSON has no inf
             stereo = {"layout": self.stereo.layout, "ipd": self.stereo.ipd, "convergence": convergence}
         return {
             "file": name,
@@ -271,7 +273,7 @@ class FrameMaker:
 
 
 def _stereo(options: VideoOptions, gaussians: Gaussians, camera: Camera) -> Stereo | None:
-    """The stereo view by the options, or with defaults that suit the scene."""
+    """The stereo view that the options ask for, with defaults that suit the scene; None without --stereo."""
     if options.stereo is None:
         return None
     ipd, convergence = options.ipd, options.convergence
@@ -287,7 +289,7 @@ def _stereo(options: VideoOptions, gaussians: Gaussians, camera: Camera) -> Ster
 
 
 def cover(camera: Camera, width: int, height: int) -> Camera:
-    """The view at another size without distortion: for another aspect ratio two sides are cut off."""
+    """The view at another size, scaled without distortion; if the aspect ratio differs, two sides are cropped."""
     scale = max(width / camera.width, height / camera.height)
     K = camera.zoomed(scale).K
     center = torch.tensor([camera.width / 2, camera.height / 2])
@@ -296,7 +298,7 @@ def cover(camera: Camera, width: int, height: int) -> Camera:
 
 
 def with_margins(picture: Tensor, width: int, height: int, blurred: bool) -> Tensor:
-    """A picture [h, w, 3] in the middle of another [height, width, 3], whose margins are black or a blur of it."""
+    """Centre an image [h, w, 3] in one of [height, width, 3], with margins that are black or blurred from the image."""
     h, w = picture.shape[:2]
     if (w, h) == (width, height):
         return picture
@@ -325,7 +327,7 @@ def video_problem(cameras: Sequence[Camera]) -> str | None:
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """WxH, or one of `PRESETS`, to (width, height); InputError for anything else."""
+    """Parse WxH, or one of `PRESETS`, as (width, height); InputError for anything else."""
     if text in PRESETS:
         return PRESETS[text]
     match = re.fullmatch(r"([0-9]{1,5})[xX×]([0-9]{1,5})", text)
