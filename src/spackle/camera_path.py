@@ -27,7 +27,7 @@ NEAR_QUANTILE = 0.001  # depth quantile of z_near, in proportion to which the ey
 FOCUS_QUANTILE = 0.1  # quantile of the depth at which the camera looks
 MIN_FOCUS_M = 2.0  # metres; a nearer focus would turn the camera too much
 MAX_DISPARITY = 2.0  # with wider moves nothing of the photo is in view
-OVERSCAN = 0.05  # completed scenes have a focal length longer by this fraction, which hides most of what is beyond the photo
+OVERSCAN = 0.05  # relative gain in focal length for completed scenes: it hides most of what is beyond the photo
 MAX_ZOOM = 0.15  # forward motion of rotate-forward, in units of z_near
 
 MIN_FOV, MAX_FOV = 1.0, 170.0  # degrees; beyond, a planar image is useless
