@@ -1,4 +1,4 @@
-"""The hf base: a depth model of transformers looks at the photo, and its depth is lifted as a measured one is.
+"""The hf base: a depth model of the transformers library predicts depth, which is lifted like a measured map.
 
 Optional: pip install 'spackle-nvs[hf]'.
 """
@@ -27,13 +27,13 @@ from spackle.errors import InputError, reading, reason_in_a_line
 from spackle.image import Photo, resize_photo
 
 _HUB_NAME = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*", re.ASCII)
-_NEVER_USED = re.compile(r".*fusion_stage\.layers\.0\.residual_layer1\..*")  # for finer features; the published lack it
+_NEVER_USED = re.compile(r".*fusion_stage\.layers\.0\.residual_layer1\..*")  # for finer features; never published
 
 Meaning = Literal["metres", "relative disparity", "canonical disparity"]  # the last: focal length / width / metres
-Window = tuple[float, ...]  # the photo in a padded picture: top, bottom, left, right, in its sides
+Window = tuple[float, ...]  # the photo in a padded picture: top, bottom, left, right, as shares of its sides
 Prepare = Callable[[Tensor], tuple[Tensor, Window]]  # [H, W, 3] sRGB in 0..1 to pixel values [1, 3, h, w]
 WHOLE: Window = (0.0, 1.0, 0.0, 1.0)
-MEANINGS: dict[str, Meaning] = {  # by `model_type` of config.json; two kinds of model have both: see `meaning_of`
+MEANINGS: dict[str, Meaning] = {  # by `model_type` of config.json; two kinds may also be metric: see `meaning_of`
     "depth_anything": "relative disparity",
     "depth_pro": "canonical disparity",
     "dpt": "relative disparity",
@@ -41,13 +41,13 @@ MEANINGS: dict[str, Meaning] = {  # by `model_type` of config.json; two kinds of
     "tipsv2_dpt": "metres",
     "zoedepth": "metres",
 }
-# These have image processors for torchvision alone, which resize to one size, with or without antialiasing.
+# The image processors of these models exist for torchvision only; they resize to one size, antialiased or not.
 ANTIALIAS = {"depth_pro": False, "tipsv2_dpt": True}
-# Relative disparity knows neither its unit nor its zero. Its zero is put at FARTHEST_M and its greatest values at
+# Relative disparity has no known unit and no known zero. Its zero is put at FARTHEST_M and its greatest values at
 # NEAREST_M: their ratio of 20 gives a clear parallax, and one step of the network's noise far away is not yet a depth
 # edge. The smallest value is not stretched to FARTHEST_M: a wall seen from the front would become a valley.
 FARTHEST_M = 30.0
-FLAT = 1e-5  # relative spread below which all pixels say the same
+FLAT = 1e-5  # relative spread below which all pixels count as equal
 
 
 class HfBase:
@@ -60,10 +60,10 @@ class HfBase:
 
     @staticmethod
     def load(model: str, *, device: str | None = None, precision: Precision = "auto", name: str = "") -> HfBase:
-        """Read a model in a folder, or owner/name of the hub, whose cache is asked first; nothing in it is executed.
+        """Read a model from a folder, or as owner/name from the hub's cache, else the hub; none of its code is run.
 
-        The products of matrices are bf16 at the precision auto where the hardware multiplies it natively. The base's
-        name is hf:MODEL where none is given. InputError for a device, package, model or file that is missing, broken or
+        At the precision auto, matrix products are bf16 if the hardware multiplies it natively. The base's name is
+        hf:MODEL unless `name` is given. InputError for a device, package, model or file that is missing, broken or
         unknown, and for too little memory; ValueError for an unknown precision.
         """
         target = pick_device(device)
@@ -88,8 +88,8 @@ class HfBase:
     def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
         """Gaussians of the pixels of the photo at its working size, as `lift` makes them.
 
-        A model that sees the lens gives it where neither the photo's file nor a person does. InputError if the model
-        fails on this photo, its output is no depth, or memory is too small.
+        If neither the photo's file nor the user gives the focal length, a model that predicts it does. InputError if
+        the model fails on this photo, its output is no depth, or memory is short.
         """
         photo = resize_photo(photo)
         problem = f"{self.name} fails ({{reason}}): give another photo or model"
@@ -111,7 +111,7 @@ class HfBase:
 
     @torch.no_grad()
     def _ask(self, rgb: Tensor) -> tuple[Tensor, float | None]:
-        """The network's numbers [h, w] float32 on the processor, and the horizontal field of view if it gives one."""
+        """The network's output [h, w] float32 on the CPU, and the horizontal field of view if it predicts one."""
         pixels, window = self.prepare(rgb)
         device = next(self.network.parameters()).device
         with own_arithmetic(device):
@@ -125,7 +125,7 @@ class HfBase:
 
 
 def meaning_of(settings: Mapping[str, Any], name: str) -> Meaning:
-    """What a model's output is, by its config.json; InputError where that is unknown: a guess could be wrong."""
+    """What a model's output means, by its config.json; InputError if that is unknown, because a guess may be wrong."""
     kind, stated = str(settings.get("model_type")), str(settings.get("depth_estimation_type", "relative"))
     if kind not in MEANINGS:
         known = ", ".join(MEANINGS)
@@ -139,12 +139,13 @@ def meaning_of(settings: Mapping[str, Any], name: str) -> Meaning:
 
 
 def to_depth_map(raw: Tensor, meaning: Meaning, focal: float, name: str, photo: Path) -> DepthMap:
-    """A model's output [h, w] float32 in metres; pixels without a positive finite depth are not valid.
+    """Convert a model's output [h, w] float32 to metres; pixels without a positive finite depth are not valid.
 
-    Canonical disparity depends on `focal`, the photo's in its widths; `name` and `photo` are for messages.
+    Canonical disparity depends on `focal`, the photo's focal length over its width; `name` and `photo` are for
+    messages.
 
     Raises:
-        InputError: no finite numbers, none above zero, or the same one everywhere.
+        InputError: the output has no finite number, none above zero, or the same one everywhere.
     """
     known = torch.isfinite(raw)
     low, high = (float(extreme) for extreme in raw[known].aminmax()) if known.any() else (math.nan, math.nan)
@@ -164,7 +165,7 @@ def to_depth_map(raw: Tensor, meaning: Meaning, focal: float, name: str, photo: 
 
 
 def _transformers() -> Any:
-    os.environ.setdefault("DISABLE_SAFETENSORS_CONVERSION", "1")  # it would ask the hub to convert what has none
+    os.environ.setdefault("DISABLE_SAFETENSORS_CONVERSION", "1")  # else it asks the hub to convert other formats
     try:
         import transformers
         import transformers.utils.logging as logs
@@ -172,21 +173,21 @@ def _transformers() -> Any:
         if isinstance(error, ModuleNotFoundError) and error.name in ("transformers", "huggingface_hub"):
             raise InputError("depth models need a package: pip install 'spackle-nvs[hf]'") from error
         raise InputError(f"transformers cannot be imported ({reason_in_a_line(error)}): install it again") from error
-    logs.set_verbosity(logs.CRITICAL)  # what matters is raised
+    logs.set_verbosity(logs.CRITICAL)  # problems that matter are raised
     logs.disable_progress_bar()
     return transformers
 
 
 def _read(transformers: Any, source: str, name: str, *, from_hub: bool) -> tuple[nn.Module, Prepare, Meaning]:
-    """A network from safetensors, in float32, and how to ask it; no code of its own runs. OSError without a file."""
+    """A float32 network from safetensors, its preprocessing and meaning; no code of it runs. OSError: missing file."""
     files = {"local_files_only": not from_hub, "trust_remote_code": False}
     settings, _ = transformers.PretrainedConfig.get_config_dict(source, **files)
-    meaning, kind = meaning_of(settings, name), str(settings["model_type"])  # before the weights come
+    meaning, kind = meaning_of(settings, name), str(settings["model_type"])  # before weights are loaded
     if kind in ANTIALIAS:
         prepare = _stretched(transformers.ImageProcessingMixin.get_image_processor_dict(source, **files)[0], kind)
-    else:  # Pillow's, everywhere: torchvision's differ from it in the last digits, and do not fit every torch
+    else:  # always Pillow's: torchvision's results differ in the last digits, and it does not fit every torch
         prepare = _processed(transformers.AutoImageProcessor.from_pretrained(source, backend="pil", **files), kind)
-    # Half precision is widened: only products of matrices gain by it. Other shapes are let pass to be named.
+    # Half precision is widened, because only matrix products gain by it. Mismatched shapes are reported below.
     options = {"dtype": torch.float32, "use_safetensors": True, "ignore_mismatched_sizes": True}
     network, info = transformers.AutoModelForDepthEstimation.from_pretrained(
         source, weights_only=True, output_loading_info=True, **options, **files
@@ -209,7 +210,7 @@ def _lower_linear(network: nn.Module, dtype: torch.dtype) -> None:
 
 
 def _processed(processor: Any, kind: str) -> Prepare:
-    """The input that an image processor of transformers makes."""
+    """Preprocessing by an image processor of transformers."""
 
     def prepare(rgb: Tensor) -> tuple[Tensor, Window]:
         image = Image.fromarray((rgb * 255).round().to(torch.uint8).numpy())
@@ -221,7 +222,7 @@ def _processed(processor: Any, kind: str) -> Prepare:
         for side, whole, inside in zip(rgb.shape[:2], pixels.shape[2:], bare, strict=True):
             if kind == "zoedepth":  # reflects the photo beyond its borders, and resizes both together
                 margin, whole, inside = int(math.sqrt(side / 2) * 3), side + 2 * int(math.sqrt(side / 2) * 3), side
-            else:  # centred in a picture whose sides are multiples
+            else:  # centred in a picture that is padded to multiples of a size
                 margin = (whole - inside) // 2
             window += (margin / whole, (margin + inside) / whole)
         return pixels, window
@@ -230,7 +231,7 @@ def _processed(processor: Any, kind: str) -> Prepare:
 
 
 def _stretched(settings: Mapping[str, Any], kind: str) -> Prepare:
-    """The input that preprocessor_config.json asks for: stretched to one size, bilinear, and normalised."""
+    """Preprocessing by preprocessor_config.json: stretch the photo bilinearly to one size, and normalise it."""
     size = int(settings["size"]["height"]), int(settings["size"]["width"])
     if settings.get("resample", 2) != Image.Resampling.BILINEAR or not (1 <= min(size) <= max(size) <= 4096):
         raise ValueError(f"an input of {size[1]}×{size[0]}, or resized otherwise than bilinear")

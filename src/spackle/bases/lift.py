@@ -1,4 +1,4 @@
-"""A photo and its depth map, lifted: from the map as measured to surface-aligned Gaussians.
+"""Lift a photo and its depth map to surface-aligned Gaussians.
 
 The map's steps and noise are smoothed, its edges sharpened and its gaps filled.
 """
@@ -56,7 +56,7 @@ class RgbdBase:
 
 
 def lift_guess(photo: Photo, depth: DepthMap, camera: Camera, progress: Progress | None) -> BasePrediction:
-    """A photo lifted by a network's depth, bad lines at its edge mended; the network was the first of two steps."""
+    """Lift a photo, its outermost lines replaced, by a network's depth; for `progress` the network was step 1 of 2."""
     if progress:
         progress(1, 2)
     prediction = lift(pad_edge(photo.rgb), depth, camera)
@@ -66,16 +66,16 @@ def lift_guess(photo: Photo, depth: DepthMap, camera: Camera, progress: Progress
 
 
 def lift(rgb: Tensor, depth: DepthMap, camera: Camera, levels: int = LEVELS) -> BasePrediction:
-    """A photo and its depth to Gaussians, see `layered_gaussians`.
+    """Lift a photo and its depth to Gaussians, see `layered_gaussians`.
 
     Args:
         rgb: [H, W, 3] sRGB in 0..1.
         depth: any size of the same aspect ratio.
         camera: the photo's, at the world's origin.
-        levels: number of tile sizes that share a Gaussian; 0 for a Gaussian a pixel.
+        levels: number of sizes of tiles whose pixels share a Gaussian; 0 gives every pixel its own.
 
     Raises:
-        InputError: not one pixel has a depth.
+        InputError: no pixel has a depth.
     """
     rgb = rgb.detach().float().contiguous()
     values = depth.depth.detach().float()
@@ -97,15 +97,15 @@ def lift(rgb: Tensor, depth: DepthMap, camera: Camera, levels: int = LEVELS) -> 
     return BasePrediction(gaussians, camera, notes)
 
 
-SWEEPS = 100  # enough for steps about 30 pixels apart
-LEAST_NOISE = 5e-4  # of the inverse depth; less leaves no gaps between the Gaussians
-DEVIATIONS = 2.0  # of the noise that a pixel may move
+SWEEPS = 100  # of smoothing; enough for steps about 30 pixels apart
+LEAST_NOISE = 5e-4  # relative to the inverse depth; less noise leaves no gaps between the Gaussians
+DEVIATIONS = 2.0  # standard deviations of the noise by which a value may change
 
 
 def noise_level(inverse_depth: Floats, known: Bools) -> float:
     """Standard deviation of the noise of most pixels, relative to the inverse depth.
 
-    The second difference in both x and y is zero on planes and straight edges; the median ignores the rest.
+    The second difference by y and then by x is zero on planes and straight edges; the median ignores the rest.
     """
     if min(inverse_depth.shape) < 3:
         return 0.0
@@ -139,7 +139,7 @@ def smoothed(inverse_depth: Floats, known: Bools, step: Floats | np.float32) -> 
 
 @kernel
 def _relax(depths: Any, low: Any, high: Any, apart: Any) -> None:
-    """Sweeps, in place."""
+    """Smooth `depths` in place, within `low` and `high`."""
     height, width = depths.shape
     for _ in range(SWEEPS):
         for y in range(height):

@@ -1,6 +1,6 @@
 """The lite base: rough depth from the photo alone, by two small networks that come with the package.
 
-Each is an EfficientNet-Lite's features and a small decoder.
+Each consists of an EfficientNet-Lite encoder and a small decoder.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ STAGES = {
 STEM = 32
 TAPS = (0, 1, 2, 4, 6)  # stages whose features the decoder sees: 1/2, 1/4, 1/8, 1/16 and 1/32 of the input
 DECODER = (24, 40, 64, 96, 160)  # its channels at those scales
-MEAN, STD = 127.0 / 255, 128.0 / 255  # the input that the features were learned on
+MEAN, STD = 127.0 / 255, 128.0 / 255  # normalisation of the input with which the encoder was pretrained
 
 
 class SameConv(nn.Conv2d):
-    """A convolution with TensorFlow's "same" padding for sides that the stride divides; batch norm is in its bias."""
+    """A convolution with TensorFlow's "same" padding for sides that the stride divides; batch norm is folded in."""
 
     def __init__(self, inputs: int, outputs: int, kernel: int, stride: int = 1, groups: int = 1) -> None:
         super().__init__(inputs, outputs, kernel, stride, groups=groups)
@@ -118,7 +118,7 @@ class Fuse(nn.Module):
 
 
 class LiteNet(nn.Module):
-    """A photo to its inverse depth, up to a factor."""
+    """Predicts a photo's inverse depth, up to a factor."""
 
     def __init__(self, size: Size = "lite2") -> None:
         super().__init__()
@@ -136,7 +136,7 @@ class LiteNet(nn.Module):
     def forward(self, rgb: Tensor) -> Tensor:
         """[B, 3, H, W] sRGB in 0..1, sides multiples of 32, to log inverse depth [B, H/2, W/2] up to a constant."""
         *finer, coarsest = self.encoder(rgb)
-        # Where in the picture something stands says much about how far it is.
+        # The place of an object in the picture says much about its distance.
         x = self.top(torch.cat([coarsest, _places(coarsest)], dim=1))
         x = x + self.context(coarsest.mean(dim=(2, 3), keepdim=True))
         x = x + self.spread(relu(x))
@@ -155,15 +155,16 @@ def _places(x: Tensor) -> Tensor:
     return grid.expand(batch, -1, -1, -1)
 
 
-ADVICE = "give lite's weights"  # where a file is something else
-SCALE = "/scale"  # behind the name of weights in eight bits: what one step of them is, for each output
-LAST = f"encoder.stages.{len(STAGES['lite2']) - 1}.0.project.bias"  # its length tells the sizes of networks apart
+ADVICE = "give lite's weights"  # if a file holds something else
+SCALE = "/scale"  # suffix to the name of 8-bit weights, for their quantisation step in each output channel
+LAST = f"encoder.stages.{len(STAGES['lite2']) - 1}.0.project.bias"  # its length tells which size a network has
 
 
 def load_networks(path: str | os.PathLike[str]) -> list[LiteNet]:
-    """The networks of a file, or the one network whose plain tensors it holds, for inference in single precision.
+    """Load the networks of a file for inference in single precision.
 
-    InputError for a missing or broken file or weights of another architecture.
+    Names of tensors begin with their network's number, unless the file holds a single network. InputError for a missing
+    or broken file, or for weights of another architecture.
     """
     tensors = _unpacked(read_tensors(path, ADVICE))
     if LAST in tensors:
@@ -196,23 +197,23 @@ def _unpacked(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
 
 
 SHIPPED = Path(__file__).parents[1] / "weights" / "lite.safetensors"
-DISPARITY = 0.15  # farther, what stands leans and poles bend: docs/lab/lite.md
-UNCOVERED = 0.075  # of the widest views: beyond, the eye meets what is made up before anything else
-FARTHEST = 60.0  # what is farther than the nearest things by this ratio is sky to it
+DISPARITY = 0.15  # beyond this, upright objects lean and poles bend: docs/lab/lite.md
+UNCOVERED = 0.075  # share of the widest views that may be holes: with more, invented parts catch the eye first
+FARTHEST = 60.0  # depths are limited to this multiple of the nearest one, as if beyond were sky
 
 
 @dataclasses.dataclass(frozen=True)
 class InputScale:
     """One input size: the resolution at which one of the networks sees a photo."""
 
-    pixels: int  # of what the network sees of it, nearly
-    network: int = 0  # which of the networks that a file has
-    mirrored: bool = True  # whether it sees the mirror image, too
-    tilt: bool = True  # whether it has a say in how the whole lies, and not in outlines alone
+    pixels: int  # of the network's input, approximately
+    network: int = 0  # index of the network in the file
+    mirrored: bool = True  # whether the network sees the mirror image, too
+    tilt: bool = True  # whether its output contributes low frequencies, too, and not outlines alone
 
 
-# One after the other; both have learned from up to 256×320. Small shows them more of a thing at once, large its
-# outlines: the mean of what they say errs less than the best alone. The largest costs most, its mirror gains nothing.
+# Both networks were trained at up to 256×320. A small input shows them more of an object at once, a large one its
+# outlines: the mean output errs less than the best alone. The largest costs most, and mirroring it gains nothing.
 INPUT_SCALES = (
     InputScale(64 * 96),
     InputScale(96 * 128),
@@ -221,11 +222,11 @@ INPUT_SCALES = (
     InputScale(256 * 320),
     InputScale(448 * 608, mirrored=False, tilt=False),
 )
-COARSE = (3, 4)  # how the whole lies is what is left of an output in so many cells, the longer side having more
+COARSE = (3, 4)  # an output's low frequencies are its means in so many cells, with more along the longer side
 
 
 class LiteBase:
-    """Small networks' depth, lifted as a measured one is: plausible parallax, not measurement."""
+    """Lifts the depth that small networks estimate: plausible parallax, not measurement."""
 
     name = "lite"
 
@@ -235,10 +236,9 @@ class LiteBase:
 
     @classmethod
     def load(cls, path: Path | None = None, *, device: str | None = None) -> LiteBase:
-        """Read the networks in a file that lite's training wrote, the package's own by default.
+        """Read the networks from a file that lite's training wrote; by default the package's own.
 
-        The device is cpu or a CUDA one; where None, CUDA if it is there. InputError for a file or device that cannot
-        be used.
+        The device is cpu or a CUDA one; None: CUDA if available. InputError for a file or device that cannot be used.
         """
         target = pick_device(device)
         return cls(load_networks(path or SHIPPED), target)
@@ -257,14 +257,14 @@ class LiteBase:
     def inverse_depth(self, rgb: Tensor) -> Tensor:
         """The networks' inverse depth of a photo [H, W, 3], sRGB in 0..1: the mean logarithm over all `INPUT_SCALES`.
 
-        Returns [h, w] float32 inverse depth up to a factor, on the processor; about 224×304, of the photo's shape.
+        Returns [h, w] float32 inverse depth up to a factor, on the CPU: about 224×304, in the photo's aspect ratio.
         """
         scales = [scale for scale in INPUT_SCALES if scale.network < len(self.networks)]
         return merged(self.at_scales(rgb, scales), [scale.tilt for scale in scales]).exp()
 
     @torch.no_grad()
     def at_scales(self, rgb: Tensor, scales: Sequence[InputScale]) -> Tensor:
-        """[n, h, w] the logarithm of inverse depth of a photo [H, W, 3] at each of n scales, as fine as the last."""
+        """[n, h, w] log inverse depth of a photo [H, W, 3] from n input scales, at the resolution of the last one."""
         picture = rgb.float().permute(2, 0, 1)[None].to(self.device)
         outputs = [self._ask(picture, scale)[None, None] for scale in scales]
         finest = outputs[-1].shape[2:]
@@ -281,7 +281,7 @@ class LiteBase:
 
 
 def merged(outputs: Tensor, tilt: Sequence[bool]) -> Tensor:
-    """Mean [h, w] of outputs [n, h, w], whose low frequencies are the mean of the chosen outputs alone."""
+    """Mean [h, w] of outputs [n, h, w]; its low frequencies come only from the outputs for which `tilt` is true."""
     cells = COARSE if outputs.shape[1] <= outputs.shape[2] else COARSE[::-1]
     coarse = interpolate(interpolate(outputs[None], size=cells, mode="area"), size=outputs.shape[1:], mode="bicubic")[0]
     return (outputs - coarse).mean(0) + coarse[torch.tensor(tilt)].mean(0)
@@ -293,6 +293,6 @@ def network_size(height: int, width: int, pixels: int) -> tuple[int, int]:
 
 
 def scaled_size(height: int, width: int, scale: float) -> tuple[int, int]:
-    """(height, width) times about `scale`, rounded to a size that the network takes."""
+    """(height, width) times about `scale`, rounded to a size that the network accepts."""
     tall, wide = (max(STRIDE, round(side * scale / STRIDE) * STRIDE) for side in (height, width))
     return tall, wide

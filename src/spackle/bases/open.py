@@ -1,8 +1,8 @@
-"""The one path from a base's settings to a photo's Gaussians.
+"""Open a base by its settings, and turn photos into Gaussians with it.
 
 `auto` tries the depth in the photo's file, then the networks whose weights are here: SHARP, MoGe, Depth Anything, lite.
 It falls back to the next candidate when one fails, and logs why. The focal length comes from the user, else from
-the depth map's calibration, else from the photo's file, else from a network that sees the lens, else it is the default.
+the depth map's calibration, else from the photo's file, else from a network that estimates it, else by default.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from spackle.weights import check_undamaged
 LOG = logging.getLogger("spackle")
 Log = Callable[[str], None]
 Stage = Callable[[str], AbstractContextManager[Progress]]
-ORDER = {  # of `auto`: what a candidate is called in reports and the log, and the reason to go on where there is none
+ORDER = {  # candidates of `auto`: the name in reports and the log, and the reason that is given if it is missing
     RGBD: ("the depth in the photo", "no depth in the photo"),
     "sharp": ("SHARP", "no SHARP weights here"),
     "moge": ("MoGe", "no MoGe weights here"),
@@ -45,7 +45,7 @@ NO_DEPTH = (
 
 
 class BaseError(InputError):
-    """The base of all photos cannot be used: trying another photo or another base is pointless."""
+    """The base cannot be used for any photo: trying another photo or another base is pointless."""
 
 
 def open_base(settings: BaseSettings) -> OpenedBase:
@@ -60,7 +60,7 @@ def open_base(settings: BaseSettings) -> OpenedBase:
 
 
 def open_loaded(base: Base) -> OpenedBase:
-    """A base that a program has loaded."""
+    """Wrap a base that the calling program has loaded."""
     return OpenedBase({base.name: ("loaded", "")}, BaseSettings(), {}, {base.name: base})
 
 
@@ -69,7 +69,7 @@ def _fingerprints(settings: BaseSettings) -> dict[str, str]:
 
 
 def _load_network(name: str, settings: BaseSettings) -> Base | None:
-    """A network, None if it is not installed."""
+    """Load the network of a base; None if its weights are not on this machine."""
     device, precision = None if settings.device == "auto" else settings.device, settings.precision
     if name.startswith(HF):
         return HfBase.load(name.removeprefix(HF), device=device, precision=precision)
@@ -87,8 +87,9 @@ def _load_network(name: str, settings: BaseSettings) -> Base | None:
 
 
 def _lift(settings: BaseSettings, photo: Photo, depth: Depth) -> Base | None:
-    """Lifts the photo by the depth given for this call, in the settings, or inside the photo. The user's focal length
-    replaces the map's.
+    """The base that lifts a photo by its depth: from this call, the settings, or the photo's file; None without depth.
+
+    The user's focal length replaces the map's.
     """
     source = settings.depth if depth is None else depth
     if source is None and photo.path.is_file():  # a photo that a program made has no file
@@ -118,9 +119,9 @@ class ResolvedBase:
 
     base: str
     why: str
-    failures: tuple[str, ...] = ()  # of better candidates: which one, and its error
+    failures: tuple[str, ...] = ()  # of candidates tried before: each one's name and error
     lasting: bool = True  # False: memory was short, so the same files may get another base next time
-    note: str = ""  # for the user, if `auto` chose and made another choice for earlier photos
+    note: str = ""  # for the user, if `auto` chose this base for the first time
 
 
 @contextlib.contextmanager
@@ -138,11 +139,11 @@ class OpenedBase:
         fingerprints: Mapping[str, str],
         loaded: dict[str, Base | None],
     ) -> None:
-        """`candidates` are tried in order, see `ORDER`; `loaded` maps names to networks that are loaded already."""
+        """`candidates` are tried in their order (see `ORDER`); `loaded` maps names to networks already loaded."""
         self.candidates, self.fingerprints = candidates, fingerprints
         self._settings, self._loaded = settings, loaded
         self._failed: dict[str, tuple[str, bool]] = {}  # for all photos: the reason, and whether memory was short
-        self._notes: set[str] = set()  # on earlier photos' choices
+        self._notes: set[str] = set()  # given for earlier photos
 
     def predict(
         self, photo: Photo, depth: Depth = None, *, log: Log = LOG.warning, stage: Stage = _untimed
@@ -157,7 +158,7 @@ class OpenedBase:
 
         Raises:
             InputError: this photo or its depth cannot be used.
-            BaseError: no photo can be worked on.
+            BaseError: the base cannot be used for any photo.
         """
         reasons, failures, lasting = list[str](), list[str](), True
         with contextlib.ExitStack() as stages:
@@ -199,9 +200,9 @@ class OpenedBase:
         return prediction, ResolvedBase(name, why, tuple(failures), lasting, note if new else "")
 
     def load(self, photo: Photo, depth: Depth = None, name: str | None = None) -> Base | None:
-        """The candidate of that name, or the first one, for a photo; None if this photo or machine has none.
+        """Load the candidate `name`, or the first one; None if the photo has no depth, or the machine no weights.
 
-        InputError where it cannot be loaded; BaseError where it is the only one, or its files have changed.
+        InputError if it cannot be loaded; this is a BaseError if it is the only candidate or its files have changed.
         """
         name = name or next(iter(self.candidates))
         if name == RGBD and name not in self._loaded:

@@ -1,4 +1,4 @@
-"""What `--base` may name, and a person's options for it."""
+"""The bases that `--base` can name, and the user's options for them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ AUTO, RGBD = "auto", "rgbd"
 HF = "hf:"  # a folder, or owner/name of the hub, follows
 AUTO_NETWORKS = ("sharp", "moge", "depth", "lite")  # in the order that `auto` tries them
 NETWORKS = (*AUTO_NETWORKS, "hf:NAME_OR_FOLDER")
-READING = ("--depth-kind", "--near", "--far")  # of a depth map
+READING = ("--depth-kind", "--near", "--far")  # how to read a depth map
 NOT_SHARP = "lifted; not SHARP, so not the paper's base"
 KINDS = {  # the description below tables, and the options that only some bases take
     RGBD: (f"the dataset's own depth, map or points, {NOT_SHARP}", ("--depth", "--calib", *READING)),
@@ -32,7 +32,7 @@ KINDS = {  # the description below tables, and the options that only some bases 
 }
 HF_FILES: tuple[str, ...] = ("config.json", "preprocessor_config.json", "processor_config.json")
 HF_FILES += ("model.safetensors", "model-*.safetensors", "model.safetensors.index.json")
-Depth = Path | DepthMap | None  # of a photo; a path may be a folder of depth maps named as the photos
+Depth = Path | DepthMap | None  # of a photo; a path may be a folder of depth maps named like the photos
 
 
 def _download(name: str) -> str:
@@ -40,8 +40,8 @@ def _download(name: str) -> str:
 
 
 ROUGH = f"rough geometry; give --depth FILE for better geometry, or run {_download('depth')}, or {_download('sharp')}"
-DEPTH_ANYTHING = "depth-anything-v2-small/model.safetensors"  # where `weights get depth` put it once
-MISSING = {  # what to do without the weights of a base
+DEPTH_ANYTHING = "depth-anything-v2-small/model.safetensors"  # where an earlier `weights get depth` put it
+MISSING = {  # what to do if a base's weights are missing
     "sharp": f"no weights of SHARP on this machine: {_download('sharp')} downloads them, -c FILE takes a local copy",
     "moge": f"no weights of MoGe on this machine: {_download('depth')} downloads them, -c FILE takes a local copy",
     "depth": "no Depth Anything of an earlier download on this machine: give --base moge, whose weights "
@@ -50,7 +50,7 @@ MISSING = {  # what to do without the weights of a base
 
 
 def _weights_here(name: str) -> Path | None:
-    """The weights of a base where they are expected; None where they are not there."""
+    """The file with a base's weights on this machine; None if it is not there."""
     places = {"sharp": PUBLISHED["sharp"].file, "moge": PUBLISHED["depth"].file, "depth": DEPTH_ANYTHING}
     try:
         file = weights_folder() / places[name] if name in places else lite.SHIPPED if name == "lite" else None
@@ -67,24 +67,24 @@ class BaseSettings:
     depth: Depth = None
     calib: Path | None = None  # calibration of a disparity map
     depth_kind: DepthKind = "auto"  # what the numbers of a depth map are
-    near: float | None = None  # metres at which a relative depth map begins; as `load_depth` has it where None
-    far: float | None = None  # and at which it ends
+    near: float | None = None  # metres at which a relative depth map begins; None: `load_depth`'s default
+    far: float | None = None  # and metres at which it ends
     checkpoint: Path | None = None  # weights of SHARP, MoGe or lite
     precision: Precision = "auto"  # of the network
-    windows: int | None = None  # that SHARP computes at once; 1 takes the least memory
+    windows: int | None = None  # how many SHARP computes at once; 1 takes the least memory
     compiled: bool = False
     device: str = "auto"
 
     @property
     def named(self) -> str:
-        """The base's name, where `auto` with a depth map means `rgbd`, and with a checkpoint `sharp`."""
+        """The base's name; `auto` becomes `rgbd` if a depth map is given, else `sharp` if a checkpoint is given."""
         if self.name != AUTO:
             return self.name
         return RGBD if self.depth is not None else AUTO if self.checkpoint is None else "sharp"
 
     @property
     def network(self) -> bool:
-        """Whether it predicts from the photo alone; otherwise it needs the photo's depth."""
+        """Whether the base predicts from the photo alone; otherwise it needs the photo's depth."""
         return self.named != RGBD
 
     @property
@@ -95,7 +95,7 @@ class BaseSettings:
 
     @property
     def public_name(self) -> str:
-        """The name in published results: for a folder, its last part."""
+        """The base's name in published results; of a folder, only the last part."""
         return self.named if self.folder is None else HF + self.folder.resolve().name
 
     @property
@@ -110,7 +110,7 @@ class BaseSettings:
 
     @property
     def files(self) -> dict[str, Path]:
-        """The weight files that decide the predictions, by the base's name; files of a folder by their own."""
+        """The files that the predictions depend on: weights by the base's name, or a folder's files by their names."""
         if self.folder is not None:
             return {file.name: file for p in HF_FILES for file in sorted(self.folder.glob(p)) if file.is_file()}
         names = AUTO_NETWORKS if self.named == AUTO else (self.named,)
@@ -118,7 +118,7 @@ class BaseSettings:
         return {name: file for name, file in found.items() if file is not None}
 
     def check(self, *, one: bool = False) -> None:
-        """InputError for an unknown base, an option that it cannot use, or `auto` where `one` base must be named."""
+        """InputError for an unknown base, for an option that it cannot use, and with `one` for the base `auto`."""
         if one and self.name == AUTO:
             known = ", ".join((RGBD, *NETWORKS))
             raise InputError(f"--base {AUTO}: results must name their base: choose one of {known}")

@@ -1,1 +1,1 @@
-"""MoGe-2: a network from one photo to metric depth and the lens, written anew in plain PyTorch."""
+"""MoGe-2, a network that predicts metric depth and focal length from one photo, reimplemented in plain PyTorch."""

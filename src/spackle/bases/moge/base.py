@@ -1,4 +1,4 @@
-"""The moge base: MoGe-2's depth in metres, lifted like a measured one, and its lens if the photo's is unknown."""
+"""The moge base: lifts MoGe-2's depth in metres, and takes its focal length if the photo's is unknown."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from spackle.device import Precision, enough_memory, own_arithmetic, pick_device
 from spackle.errors import InputError
 from spackle.image import Photo, resize_photo
 
-TOKENS = 1800  # that a photo is seen as, where the checkpoint's range has it
-SAMPLES = 64  # of a side of the map: so many points tell focal length and shift
-STEPS, STEP = 200, 1e-9  # of the search for the shift: how many, and the smallest, relative to 1 plus the shift
+TOKENS = 1800  # for a photo, limited to the checkpoint's range
+SAMPLES = 64  # points along each side of the map, from which focal length and shift are found
+STEPS, STEP = 200, 1e-9  # of the search for the shift: the most, and the smallest, relative to 1 plus the shift
 SKY = 10.0  # the sky's distance, in units of the farthest surface's
 
 Floats = NDArray[np.float64]
@@ -30,9 +30,9 @@ Floats = NDArray[np.float64]
 
 @dataclasses.dataclass(frozen=True)
 class MogeView:
-    """A photo's depth by MoGe, on a grid [h, w] over it."""
+    """MoGe's depth of a photo, on a grid [h, w] over it."""
 
-    depth: Tensor  # [h, w] float32 z in metres, wherever the mask is
+    depth: Tensor  # [h, w] float32 z in metres, also where `surface` is false
     surface: Tensor  # [h, w] bool: the network's mask, false in the sky
     focal_px: float  # in pixels of the photo
     shift: float  # of the network's points along z
@@ -51,9 +51,9 @@ class MogeBase:
     def load(
         cls, path: str | os.PathLike[str], *, precision: Precision = "auto", device: torch.device | str | None = None
     ) -> MogeBase:
-        """Read MoGe-2's model.pt; bfloat16 at the precision auto where the hardware multiplies it natively.
+        """Read MoGe-2's model.pt; the precision auto means bfloat16 if the hardware multiplies it natively.
 
-        InputError for a device that is not there, a foreign or broken file, or too little memory.
+        InputError for a missing device, a foreign or broken file, or too little memory.
         """
         target = pick_device(device)
         dtype = pick_dtype(precision, target)
@@ -64,7 +64,7 @@ class MogeBase:
         """Gaussians of the pixels of the photo at its working size, as `lift` makes them.
 
         The user's or the file's focal length is kept; else MoGe's is taken, or the default if MoGe's is implausible.
-        The sky goes behind all surfaces. InputError where the network sees no surface, or memory is short.
+        The sky goes behind all surfaces. InputError if the network sees no surface, or memory is short.
         """
         photo = resize_photo(photo)
         least, most = self.network.config.num_tokens_range
@@ -93,7 +93,7 @@ class MogeBase:
 
     @torch.no_grad()
     def ask(self, rgb: Tensor, tokens: int, size: tuple[int, int]) -> MogeOutput:
-        """The network's output for a photo [H, W, 3], sRGB in 0..1, with maps of a size (h, w), on the processor."""
+        """The network's output, on the CPU, for a photo [H, W, 3], sRGB in 0..1, with maps of `size` (h, w)."""
         device = next(self.network.parameters()).device
         with own_arithmetic(device):
             output = self.network(rgb.float().permute(2, 0, 1)[None].to(device), tokens, size)
@@ -101,7 +101,7 @@ class MogeBase:
 
 
 def to_view(output: MogeOutput, width: int, height: int, focal_px: float | None = None) -> MogeView:
-    """A network's output for a photo of that size in metres: its points are shifted so that each projects to its pixel.
+    """Convert the output for a width×height photo to metres, shifting the points so that each projects to its pixel.
 
     The focal length in pixels of the photo is found along with the shift, unless it is given.
     """
@@ -121,8 +121,8 @@ def focal_and_shift(points: Floats, places: Floats, focal: float | None = None) 
     """The focal length f and the shift s along z that let points [N, 3] project to their places [N, 2].
 
     Minimises |f (x, y) / (z + s) - place|² by Gauss-Newton steps from s = 0, each halved until the error falls; the
-    best f for a shift has a closed form. f is in units of half the diagonal, as places are; a given f stays. f = 1 and
-    s = 0 for fewer than two points.
+    best f for a shift has a closed form. f is in units of half the diagonal, as places are; a given f is kept. Fewer
+    than two points give f = 1 and s = 0.
     """
     if len(points) < 2:
         return focal or 1.0, 0.0
@@ -138,7 +138,7 @@ def focal_and_shift(points: Floats, places: Floats, focal: float | None = None) 
     for _ in range(STEPS):
         best, seen, off = at(shift)
         moved = -seen / (points[:, 2:] + shift)  # the derivative of `seen` by the shift
-        change = best * moved  # of what is off
+        change = best * moved  # the derivative of `off` by the shift
         if focal is None:
             change += float((moved * (places - 2 * best * seen)).sum() / (seen * seen).sum()) * seen
         step = -float((change * off).sum() / ((change * change).sum() or 1.0))

@@ -25,9 +25,9 @@ from spackle.network_file import channels_last, load_strict, read_checkpoint
 ADVICE = "give MoGe-2's model.pt as it was downloaded"
 BACKBONES = {"dinov2_vits14": (384, 12, 6), "dinov2_vitb14": (768, 12, 12), "dinov2_vitl14": (1024, 24, 16)}
 PATCH = 14  # pixels of a token's side
-GRID = 37  # tokens of a side that the positions were learned on
+GRID = 37  # tokens along a side for which the positions were learned
 LEVELS = 5  # of a pyramid, each twice as fine as the one before
-FINEST = 2 ** (LEVELS - 1)  # pixels of an output for each token's side
+FINEST = 2 ** (LEVELS - 1)  # output pixels along a token's side
 conv3 = functools.partial(nn.Conv2d, kernel_size=3, padding=1, padding_mode="replicate")
 
 Count = Annotated[int, Field(ge=0, le=64)]
@@ -43,10 +43,10 @@ class EncoderConfig(BaseModel, strict=True):
 
 
 class PyramidConfig(BaseModel, strict=True, extra="forbid"):
-    """The neck or a head: channels and numbers of each level, coarse to fine."""
+    """The neck or a head: channels and numbers of blocks of each level, coarse to fine."""
 
     dim_in: Annotated[list[Width], PerLevel]
-    dim_out: Annotated[list[Width | None], PerLevel] | None  # None: a level gives its features as they are
+    dim_out: Annotated[list[Width | None], PerLevel] | None  # None: a level outputs its features as they are
     dim_res_blocks: Annotated[list[Width], PerLevel]
     num_res_blocks: Annotated[list[Count], PerLevel]
     dim_times_res_block_hidden: Literal[1] = 1
@@ -57,7 +57,7 @@ class PyramidConfig(BaseModel, strict=True, extra="forbid"):
 
     @property
     def outputs(self) -> list[int]:
-        """Channels that come out of each level."""
+        """Output channels of each level."""
         return [out or width for out, width in zip(self.dim_out or [None] * LEVELS, self.dim_res_blocks, strict=True)]
 
 
@@ -87,10 +87,10 @@ class MogeConfig(BaseModel, strict=True):
 
 @dataclasses.dataclass(frozen=True)
 class MogeOutput:
-    """What the network says of a photo, on a grid [h, w] over it; float32."""
+    """The network's output for a photo, on a grid [h, w] over it; float32."""
 
     points: Tensor  # [h, w, 3] x right, y down, z forward, up to the metric scale and a shift along z
-    mask_logits: Tensor  # [h, w] above 0: there is a surface, and not the sky
+    mask_logits: Tensor  # [h, w] above 0 for a surface, else sky
     metric_scale: Tensor  # [] metres for each unit of the points
 
 
@@ -101,17 +101,17 @@ class DinoBackbone(nn.Module):
         super().__init__()
         self.cls_token = nn.Parameter(torch.zeros(1, 1, width))
         self.pos_embed = nn.Parameter(torch.zeros(1, 1 + GRID**2, width))
-        self.mask_token = nn.Parameter(torch.zeros(1, width))  # of training alone
+        self.mask_token = nn.Parameter(torch.zeros(1, width))  # used in training alone
         self.patch_embed = nn.ModuleDict({"proj": nn.Conv2d(3, width, PATCH, stride=PATCH)})
         self.blocks = nn.ModuleList(TransformerBlock(width, heads) for _ in range(depth))
         self.norm = nn.LayerNorm(width, eps=NORM_EPS)
 
     def forward(self, image: Tensor, layers: Sequence[int]) -> list[Tensor]:
-        """Normalised tokens [1, 1 + T, C] after some blocks, the class token first, of an image [1, 3, 14·h, 14·w]."""
+        """Normalised tokens [1, 1 + T, C] (class token first) after the blocks `layers`; image [1, 3, 14·h, 14·w]."""
         patches, positions = self.patch_embed["proj"](image), self.pos_embed
         rows, columns = patches.shape[2:]
         if (rows, columns) != (GRID, GRID):
-            # DINOv2 resizes by a factor of (n + 0.1) / 37, by which positions are a little off the grid's.
+            # DINOv2 resizes by a factor of (n + 0.1) / 37, which puts positions a little off the grid.
             factors = ((rows + 0.1) / GRID, (columns + 0.1) / GRID)
             grid = positions[:, 1:].reshape(1, GRID, GRID, -1).permute(0, 3, 1, 2)
             grid = interpolate(grid, scale_factor=factors, mode="bicubic", align_corners=False)
@@ -125,7 +125,7 @@ class DinoBackbone(nn.Module):
 
 
 class DinoEncoder(nn.Module):
-    """An image to features [1, C, h, w] and the class token [1, C']."""
+    """Encodes an image to features [1, C, h, w] and the class token [1, C']."""
 
     def __init__(self, config: EncoderConfig) -> None:
         super().__init__()
@@ -146,7 +146,7 @@ class DinoEncoder(nn.Module):
 
 
 class ConvBlock(nn.Module):
-    """Two convolutions, added to what comes in [1, C, h, w] in float32."""
+    """Two convolutions, whose output is added to the input [1, C, h, w] in float32."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -159,7 +159,7 @@ class ConvBlock(nn.Module):
 
 
 def resampler(kind: str, inputs: int, outputs: int) -> nn.Sequential:
-    """Doubles the size."""
+    """Layers that double the size of feature maps."""
     if kind == "conv_transpose":
         return nn.Sequential(nn.ConvTranspose2d(inputs, outputs, 2, stride=2), conv3(outputs, outputs))
     return nn.Sequential(nn.Upsample(scale_factor=2, mode="bilinear", align_corners=False), conv3(inputs, outputs))
@@ -182,7 +182,7 @@ class Pyramid(nn.Module):
         self.resamplers = nn.ModuleList(map(resampler, config.resamplers, widths[:-1], widths[1:]))
 
     def forward(self, inputs: Sequence[Tensor]) -> list[Tensor]:
-        """The outputs of all levels [1, C, 2^l·h, 2^l·w] from an input of the same size for each."""
+        """The outputs of all levels [1, C, 2^l·h, 2^l·w] from one input of the same size for each level."""
         outputs: list[Tensor] = []
         carried: Tensor | None = None
         for level, x in enumerate(inputs):
@@ -193,7 +193,7 @@ class Pyramid(nn.Module):
 
 
 class MogeNetwork(nn.Module):
-    """A photo to points, mask and metric scale."""
+    """Predicts points, mask and metric scale from a photo."""
 
     def __init__(self, config: MogeConfig) -> None:
         super().__init__()
@@ -206,7 +206,7 @@ class MogeNetwork(nn.Module):
         self.scale_head = nn.Sequential(first, nn.ReLU(), second, nn.ReLU(), third)
 
     def forward(self, image: Tensor, tokens: int, size: tuple[int, int]) -> MogeOutput:
-        """Maps of the given size from an image [1, 3, H, W], sRGB in 0..1, seen as about the given number of tokens."""
+        """Maps of `size` (h, w) from an image [1, 3, H, W], sRGB in 0..1, which is encoded as about `tokens` tokens."""
         levels, scale = self.features(image, tokens)
         x, y, z = self.decode(self.points_head, levels, size).unbind(-1)
         z = z.exp()
@@ -225,7 +225,7 @@ class MogeNetwork(nn.Module):
 
     @staticmethod
     def decode(head: Pyramid, levels: Sequence[Tensor], size: tuple[int, int]) -> Tensor:
-        """[h, w, C] of the size (h, w): a head's finest output, resized."""
+        """A head's finest output, resized to `size` (h, w): [h, w, C]."""
         return interpolate(head(levels)[-1], size=size, mode="bilinear", align_corners=False)[0].permute(1, 2, 0)
 
 
@@ -235,7 +235,7 @@ def token_grid(height: int, width: int, tokens: int) -> tuple[int, int]:
 
 
 def view_plane(rows: int, columns: int, aspect: float) -> Tensor:
-    """[1, 2, rows, columns]: x and y of each cell's centre from the photo's, in halves of its diagonal."""
+    """[1, 2, rows, columns]: x and y of each cell's centre, from the photo's centre, in units of half its diagonal."""
     x, y = (((2 * torch.arange(n, dtype=torch.float64) + 1) / n - 1) for n in (columns, rows))
     diagonal = math.hypot(1, aspect)
     grid = torch.meshgrid(x * (aspect / diagonal), y / diagonal, indexing="xy")
@@ -243,7 +243,7 @@ def view_plane(rows: int, columns: int, aspect: float) -> Tensor:
 
 
 def load_network(path: str | os.PathLike[str], dtype: torch.dtype) -> MogeNetwork:
-    """A frozen network from MoGe-2's model.pt, on the processor.
+    """A frozen network from MoGe-2's model.pt, on the CPU.
 
     Residual blocks compute in `dtype`, float32 or bfloat16, and add to float32 features, because bfloat16's eight bits
     would turn slanted surfaces into stairs. InputError for a missing, broken or foreign file, or too little memory;

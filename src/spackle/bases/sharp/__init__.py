@@ -1,4 +1,4 @@
-"""SHARP: Apple's network from one photo to Gaussians, written anew for speed and for processors."""
+"""SHARP, Apple's network that predicts Gaussians from one photo, reimplemented for speed, and for CPUs."""
 
 from spackle.bases.sharp.base import SharpBase
 

@@ -39,8 +39,8 @@ LOG = logging.getLogger("spackle")
 Forward = Callable[[Tensor, float, int, Progress | None], SharpOutput]  # as `SharpNetwork.forward`
 WINDOWS_AT_ONCE = 5  # enough to keep two cores or a small GPU at their peak
 ADVICE = "give SHARP's checkpoint as it was downloaded"
-NOTE = "spackle.gaussian_decoder"  # in the metadata of a decoder's file: JSON, for safetensors shuffles several notes
-PARTS = ("feature_model.", "prediction_head.")  # how the names of a decoder's tensors begin
+NOTE = "spackle.gaussian_decoder"  # a decoder file's only metadata key, as JSON: safetensors shuffles several keys
+PARTS = ("feature_model.", "prediction_head.")  # prefixes of the names of a decoder's tensors
 
 
 class SharpBase:
@@ -56,8 +56,8 @@ class SharpBase:
         self.network = network
         self.windows = windows or usual_windows(self.device)
         self.weights = weights
-        self.compiled = compiled  # as long as nothing comes between
-        self.compile_problem = ""  # what came
+        self.compiled = compiled  # false once compilation has failed
+        self.compile_problem = ""  # why it failed
         self._translation: Forward | None = None
 
     @staticmethod
@@ -73,17 +73,17 @@ class SharpBase:
 
         Args:
             path: Apple's .pt file, a safetensors file with the same names, or the decoder that
-                `spackle train --method direct-ft` wrote, which names the checkpoint for the rest.
-            precision: of the heavy arithmetic; auto is bf16 where the hardware multiplies it natively.
-            windows: of the 35 of a photo, how many go through the transformer at once; None: 5 on a processor, all on
-                a GPU. The last bits depend on it.
-            compiled: let `torch.compile` translate the network with the first photo, which takes minutes, and replay
-                it as one CUDA graph on a GPU. Where that fails, a warning says why, and the network runs as it is.
-            device: cpu or a CUDA device; where None, CUDA if it is there.
+                `spackle train --method direct-ft` wrote, which names the checkpoint that has the other weights.
+            precision: of the heavy arithmetic; auto is bf16 if the hardware multiplies it natively.
+            windows: how many of a photo's 35 windows go through the transformer at once; None: 5 on a CPU, all on a
+                GPU. The last bits of the result depend on it.
+            compiled: let `torch.compile` compile the network at the first photo, which takes minutes, and on a GPU
+                replay it as one CUDA graph. If that fails, a warning says why, and the network runs uncompiled.
+            device: cpu or a CUDA device; None: CUDA if available.
 
         Raises:
-            InputError: a device that is not there, a file that is not SHARP's weights, windows that cannot be, or too
-                little memory. Nothing in the file is executed.
+            InputError: the device is missing, the file does not hold SHARP's weights, `windows` is out of range, or
+                memory is short. Nothing in the file is executed.
             ValueError: an unknown precision.
         """
         check_windows("windows", windows)  # before anything is read
@@ -93,18 +93,18 @@ class SharpBase:
 
     @property
     def device(self) -> torch.device:
-        """Where the network lies."""
+        """The device that holds the network."""
         return next(self.network.parameters()).device
 
     @property
     def precision(self) -> str:
-        """What the heavy arithmetic runs in: fp32 or bf16."""
+        """The number type of the heavy arithmetic: fp32 or bf16."""
         return "bf16" if self.network.feature_model.fusion.out_conv.weight.dtype == torch.bfloat16 else "fp32"
 
     def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
-        """Two layers of Gaussians in metres, the nearer first, in row-major order; InputError where memory is short.
+        """Two layers of Gaussians in metres, the nearer first, in row-major order; InputError if memory is short.
 
-        `progress` is called with windows done and their number.
+        `progress` is called with the number of windows done, and that of all windows.
         """
         advice = [] if self.windows == 1 else ["try --sharp windows=1"]
         with enough_memory(*advice):
@@ -115,7 +115,7 @@ class SharpBase:
 
     @torch.no_grad()
     def infer(self, photo: Photo, progress: Progress | None = None) -> SharpOutput:
-        """What the network says about a photo; `to_metric` makes Gaussians of it."""
+        """The network's output for a photo; `to_metric` turns it into Gaussians."""
         image = to_square(photo.rgb.to(self.device, non_blocking=True), self.network.config.side)
         with own_arithmetic(self.device):
             factor = photo.focal_px / photo.width
@@ -123,7 +123,7 @@ class SharpBase:
                 try:
                     self._translation = self._translation or compile_forward(self.network)
                     return self._translation(image, factor, self.windows, progress)
-                except RuntimeError as error:  # no compiler, or one that cannot do it
+                except RuntimeError as error:  # no compiler, or one that fails
                     if memory_is_short(error):
                         raise
                     self.compiled, self._translation, self.compile_problem = False, None, reason_in_a_line(error)
@@ -133,25 +133,25 @@ class SharpBase:
 
 
 def usual_windows(device: torch.device) -> int:
-    """How many windows go through the transformer at once, where nobody says it."""
+    """The default for the number of windows that go through the transformer at once."""
     return WINDOWS_AT_ONCE if device.type == "cpu" else WINDOWS
 
 
 def check_windows(option: str, windows: int | None) -> None:
-    """InputError for a number of windows that cannot be; `option` is what the person calls it."""
+    """InputError if the number of windows is out of range; `option` is its name in the message."""
     if windows is not None and not 1 <= windows <= WINDOWS:
         raise InputError(f"{option} must be between 1 and {WINDOWS}, got {windows}")
 
 
 def to_metric(output: SharpOutput, photo: Photo) -> Gaussians:
-    """Gaussians in metres, on the processor, from normalised space, where x / z and y / z run from -1 to 1."""
+    """Convert Gaussians from normalised space, where x / z and y / z run from -1 to 1, to metres, on the CPU."""
     stretch = (photo.width / (2 * photo.focal_px), photo.height / (2 * photo.focal_px), 1.0)
     with own_arithmetic(output.deltas.device):
         return stretch_gaussians(_to_processor(compose(output.start, output.deltas)), stretch)
 
 
 def _to_processor(gaussians: Gaussians) -> Gaussians:
-    """The same on the processor; from a GPU in one copy, so that the processor waits only once."""
+    """The same Gaussians on the CPU; from a GPU in a single copy, so that the CPU waits only once."""
     if gaussians.means.device.type == "cpu":
         return gaussians
     flat = torch.cat([t.flatten() for t in gaussians.tensors]).to("cpu")
@@ -160,7 +160,7 @@ def _to_processor(gaussians: Gaussians) -> Gaussians:
 
 
 def to_square(rgb: Tensor, side: int) -> Tensor:
-    """[H, W, 3] sRGB to [1, 3, side, side], bilinear with the corner pixels on the corners, as SHARP was trained."""
+    """Resize [H, W, 3] sRGB to [1, 3, side, side], bilinearly with aligned corner pixels, as SHARP was trained."""
     image = rgb.permute(2, 0, 1)[None].contiguous()
     return interpolate(image, size=(side, side), mode="bilinear", align_corners=True)
 
@@ -171,8 +171,8 @@ def to_square(rgb: Tensor, side: int) -> Tensor:
 def load_network(path: str | os.PathLike[str], dtype: torch.dtype, device: torch.device | str = "cpu") -> SharpNetwork:
     """A frozen network from Apple's .pt file, or a safetensors file with the same names, on a device.
 
-    The size, published or tiny, is told from the shapes. A file with a trained Gaussian decoder alone stands for the
-    checkpoint that it names, with that decoder in it. The heavy arithmetic is in `dtype`, float32 or bfloat16.
+    The size, published or tiny, follows from the shapes. If a file holds only a trained Gaussian decoder, the other
+    weights come from the checkpoint that it names. The heavy arithmetic is in `dtype`, float32 or bfloat16.
 
     Raises:
         InputError: a missing, broken or foreign file, or too little memory. Nothing in the file is executed.
@@ -212,7 +212,7 @@ def unused_shapes(config: SharpConfig) -> Shapes:
     with torch.device("meta"):
         into = nn.Sequential(nn.Conv2d(2, width, 3), nn.GroupNorm(GROUPS, width))
         down = nn.ModuleList(_level(width << n, width << n + 1) for n in range(4))
-        # All but the first also see what the encoder made at their size.
+        # All but the first also take the encoder's output of their size.
         up = nn.ModuleList(_level(width << (5 - n if n else 4), width << 3 - n) for n in range(4))
         norms = nn.GroupNorm(GROUPS, 2 * width), nn.GroupNorm(GROUPS, width)
         out = nn.Sequential(norms[0], nn.ReLU(), nn.Conv2d(2 * width, width, 1), norms[1])
@@ -238,9 +238,9 @@ def _shapes_of(module: nn.Module, prefix: str = "") -> Shapes:
 
 @dataclasses.dataclass(frozen=True)
 class Owner:
-    """The checkpoint that a decoder was trained on, and that holds the untrained rest."""
+    """The checkpoint that a decoder was trained on, which holds the weights that were not trained."""
 
-    path: Path  # where it lies; of one that a decoder's file names, the name alone
+    path: Path  # its path; if it was read from a decoder's file, the file name alone
     sha256: str
 
     @property
@@ -250,16 +250,16 @@ class Owner:
 
 
 def decoder_bytes(decoder: nn.Module, owner: Owner) -> bytes:
-    """A safetensors file of a `GaussianDecoder` in float32: weights that have not changed come back bit for bit."""
+    """A `GaussianDecoder` as a safetensors file in float32, which restores unchanged weights bit for bit."""
     tensors = {name: tensor.detach().float().cpu().contiguous() for name, tensor in decoder.state_dict().items()}
     return save(tensors, {NOTE: json.dumps({"checkpoint": owner.path.name, "sha256": owner.sha256})})
 
 
 def link_owner(owner: Owner, folder: Path) -> None:
-    """Link a checkpoint beside its decoders, under a name that is never written to."""
+    """Put a link to a checkpoint beside its decoders, under a name that nothing else writes to."""
     link = folder / owner.places[0]
-    with contextlib.suppress(OSError):  # this place has no links: then a person puts the checkpoint there
-        if link.is_symlink() and not link.exists():  # to where it lay once
+    with contextlib.suppress(OSError):  # no links here: then the user must put the checkpoint there
+        if link.is_symlink() and not link.exists():  # the checkpoint has moved
             link.unlink()
         if not link.exists():
             link.symlink_to(owner.path.absolute())
@@ -276,9 +276,9 @@ def owner_of(path: str | os.PathLike[str]) -> Owner | None:
 
 
 def _with_owner(decoder: Mapping[str, Tensor], path: str | os.PathLike[str], owner: Owner) -> dict[str, Tensor]:
-    """The tensors of the checkpoint beside a decoder's file, with the decoder's in place of its own.
+    """The tensors of the checkpoint beside a decoder's file, with the decoder's tensors in place of its own.
 
-    InputError: it is not there, cannot be read or has changed, or the decoder is another network's.
+    InputError if the checkpoint is missing, unreadable or changed, or if the decoder belongs to another network.
     """
     beside = Path(path).absolute().parent
     home = next((beside / name for name in owner.places if os.path.isfile(beside / name)), None)

@@ -32,7 +32,7 @@ class SharpConfig:
     gaussian_width: int = 128  # channels of the Gaussian decoder
     feature_width: int = 32  # channels that the Gaussians are predicted from
     patch: int = 16  # pixels of a token's side; the decoders count on 16
-    window: int = 384  # pixels of a transformer's picture, a multiple of 8 tokens
+    window: int = 384  # side in pixels of a transformer's input, a multiple of 8 tokens
 
     @property
     def side(self) -> int:
@@ -54,10 +54,10 @@ _HEAVY = (nn.Linear, nn.Conv2d, nn.ConvTranspose2d, nn.GroupNorm)
 
 
 class ExactConv(nn.Conv2d):
-    """A convolution that stays in float32: cheap, and next to the pixels that come in or the Gaussians that go out."""
+    """A convolution that stays in float32, as it is cheap and directly reads pixels or writes what makes Gaussians."""
 
     def forward(self, x: Tensor) -> Tensor:
-        with torch.autocast(x.device.type, enabled=False):  # the decoder learns under it
+        with torch.autocast(x.device.type, enabled=False):  # the decoder is trained under autocast
             return super().forward(x.float())
 
 
@@ -68,7 +68,7 @@ def lower(x: Tensor, module: nn.Module) -> Tensor:
 
 
 def set_precision(network: nn.Module, dtype: torch.dtype) -> None:
-    """Convert the expensive layers to `dtype`, in place, and kernels to channels-last, which is fast on a processor."""
+    """Convert the expensive layers to `dtype`, in place, and kernels to channels-last, which is fast on a CPU."""
     for module in network.modules():
         if isinstance(module, _HEAVY) and not isinstance(module, ExactConv):
             module.to(dtype)
@@ -111,7 +111,7 @@ class VisionTransformer(nn.Module):
 
 
 class TransformerBlock(nn.Module):
-    """DINOv2's: self-attention, then a perceptron, scaled by channel and added to tokens [B, T, C] in float32."""
+    """DINOv2's block: self-attention, then an MLP, each scaled by channel and added to float32 tokens [B, T, C]."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
@@ -138,14 +138,14 @@ class TransformerBlock(nn.Module):
         return projected
 
 
-# Windows a side over the picture at its full size, which overlap by a quarter, and at half of it, by a half.
-# A quarter of it is one window.
+# Windows along a side: of the picture at full size, overlapping by a quarter, and at half its size, by a half.
+# At a quarter of its size, the picture is one window.
 FULL_WINDOWS, HALF_WINDOWS = 5, 3
 WINDOWS = FULL_WINDOWS**2 + HALF_WINDOWS**2 + 1
 
 
 class SlidingPyramid(nn.Module):
-    """Feature maps of five scales, [1, C, side/2, …] to [1, C, side/32, …]."""
+    """Encodes a picture to feature maps of five scales, [1, C, side/2, …] to [1, C, side/32, …]."""
 
     def __init__(self, config: SharpConfig) -> None:
         super().__init__()
@@ -180,11 +180,11 @@ class SlidingPyramid(nn.Module):
         ]
 
     def _encode(self, windows: Tensor, batch: int, progress: Progress | None) -> tuple[Tensor, list[Tensor]]:
-        """Features of all windows, and the tapped ones of the full size's, a few windows at a time."""
+        """Features of all windows, and tapped features of the full-size windows, `batch` windows at a time."""
         found: list[list[Tensor]] = [[] for _ in range(1 + len(self.taps))]
         for start in range(0, len(windows), batch):
             features, tapped = self.patch_encoder(windows[start : start + batch], self.taps)
-            kept = max(0, FULL_WINDOWS**2 - start)  # taps are wanted of the full size alone
+            kept = max(0, FULL_WINDOWS**2 - start)  # only full-size windows need taps
             for into, part in zip(found, [features, *(tap[:kept] for tap in tapped)], strict=True):
                 into.append(lower(part, self.fuse_lowres))
             if progress:
@@ -201,7 +201,7 @@ def cut(image: Tensor, window: int, count: int) -> Tensor:
 
 
 def merge(maps: Tensor, trim: int) -> Tensor:
-    """The inverse of `cut` for feature maps [n², C, G, G]: each gives up `trim` cells where it meets a neighbour."""
+    """The inverse of `cut` for feature maps [n², C, G, G]: each loses `trim` cells at a side with a neighbour."""
     count = int(len(maps) ** 0.5)
     size = maps.shape[-1]
     spans = [slice(trim if i else 0, size - trim if i < count - 1 else size) for i in range(count)]

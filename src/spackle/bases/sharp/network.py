@@ -1,6 +1,6 @@
-"""SHARP (Apple, 2025): one picture to two layers of Gaussians, by decoders of dense prediction (Ranftl 2021).
+"""SHARP (Apple, 2025): predicts two layers of Gaussians from one picture, with DPT's decoders (Ranftl 2021).
 
-Modules are named as in the checkpoint. `torch.compile` may translate a network's forward, and a CUDA graph replay it.
+Modules are named as in the checkpoint. `torch.compile` can compile a network's forward, and a CUDA graph replay it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ GROUPS = 8  # of the group norms
 
 
 class Residual(nn.Module):
-    """x plus what a few layers make of it."""
+    """x plus the output of a few layers for x."""
 
     def __init__(self, *layers: nn.Module) -> None:
         super().__init__()
@@ -43,10 +43,9 @@ class Residual(nn.Module):
 
 
 class GroupNorm(nn.GroupNorm):
-    """torch's group norm, but exact on a processor, where torch's float32 sums lose three digits over half a million
-    pixels.
+    """torch's group norm, but exact on a CPU, where torch's float32 sums over half a million pixels lose three digits.
 
-    Rows are summed first, and their sums in float64.
+    Each row is summed first, and the sums of the rows are added in float64.
     """
 
     def forward(self, x: Tensor) -> Tensor:
@@ -68,7 +67,7 @@ class GroupNorm(nn.GroupNorm):
 
 
 def plain_residual(dim: int) -> Residual:
-    """Two 3×3 convolutions behind rectifiers. The first must leave x alone; the second may work in place."""
+    """A residual block of two 3×3 convolutions, each after a ReLU, of which only the second may work in place."""
     first, second = (nn.Conv2d(dim, dim, 3, padding=1) for _ in range(2))
     return Residual(nn.ReLU(), first, nn.ReLU(inplace=True), second)
 
@@ -81,7 +80,7 @@ def normed_residual(dim: int, out: int) -> Residual:
 
 
 class Fusion(nn.Module):
-    """Adds finer features to coarser ones, and doubles the size where asked."""
+    """Adds finer features to coarser ones, and with `doubles` doubles the size."""
 
     def __init__(self, dim: int, doubles: bool) -> None:
         super().__init__()
@@ -91,14 +90,14 @@ class Fusion(nn.Module):
         self.out_conv = nn.Conv2d(dim, dim, 1)
 
     def forward(self, coarse: Tensor, fine: Tensor | None = None) -> Tensor:
-        """[1, C, H, W] each, to the same or twice the size."""
+        """Fuse features [1, C, H, W] into features of the same or twice the size."""
         x = coarse if fine is None else coarse + self.resnet1(fine)
         out: Tensor = self.out_conv(self.deconv(self.resnet2(x)))
         return out
 
 
 class Decoder(nn.Module):
-    """Fuses feature maps from coarse to fine into one of the finest size."""
+    """Fuses feature maps, from coarse to fine, into one map of the finest size."""
 
     def __init__(self, dims: Sequence[int], width: int) -> None:
         super().__init__()
@@ -108,9 +107,9 @@ class Decoder(nn.Module):
         self.fusions = nn.ModuleList(Fusion(width, doubles=level > 0) for level in range(len(dims)))
 
     def forward(self, maps: Sequence[Tensor], features: Tensor | None = None) -> Tensor:
-        """Maps from fine to coarse, [1, dims[i], H/2^i, W/2^i], to [1, width, H, W].
+        """Fuse maps, listed from fine to coarse, [1, dims[i], H/2^i, W/2^i], into [1, width, H, W].
 
-        The coarsest are added to `features`; SHARP has none, and leaves out the layers that would add to them.
+        The coarsest map is added to `features`; SHARP has none, so the layers for this addition are skipped.
         """
         for level in reversed(range(len(maps))):
             projected = self.convs[level](maps[level])
@@ -120,13 +119,13 @@ class Decoder(nn.Module):
         return features
 
 
-DISPARITY_RANGE = (1e-4, 1e4)  # what the depth head says is clamped to it
+DISPARITY_RANGE = (1e-4, 1e4)  # the depth head's output is clamped to it
 HIDDEN = 32  # channels before the last layer of the depth head
 
 
 @dataclasses.dataclass(frozen=True)
 class SharpOutput:
-    """What the network says about one picture."""
+    """The network's output for one picture."""
 
     start: InitialGaussians  # Gaussians on the two surfaces
     deltas: Tensor  # [14, 2, side/2, side/2] float32, to be applied to them
@@ -142,7 +141,7 @@ class DecoderInput:
 
 
 class SharpNetwork(nn.Module):
-    """The whole network but for what inference never uses (see `unused_shapes`)."""
+    """The whole network, except the parts that inference never uses (see `unused_shapes`)."""
 
     def __init__(self, config: SharpConfig) -> None:
         super().__init__()
@@ -158,7 +157,7 @@ class SharpNetwork(nn.Module):
         """Predict from the photo, stretched to [1, 3, side, side] sRGB in 0..1, float32.
 
         `disparity_factor` is the focal length over the width in the photo's pixels. `batch` windows go through the
-        transformer at once; `progress` gets the windows done and their number.
+        transformer at once; `progress` gets the number of windows done, and that of all windows.
         """
         encoded = self.encode(image, disparity_factor, batch, progress)
         deltas: Tensor = self.gaussian_decoder()(encoded.picture, encoded.maps)
@@ -171,7 +170,7 @@ class SharpNetwork(nn.Module):
         depth_network: DepthNetwork = self.monodepth_model.monodepth_predictor  # type: ignore[assignment]
         maps = depth_network.encoder(image * 2 - 1, batch, progress)
         disparity = depth_network.disparity(maps)
-        # What PyTorch makes of a number over a tensor, for a tensor over a tensor too: the same bits.
+        # PyTorch computes number / tensor in this way; written out, a tensor as the factor gives the same bits.
         start = make_start(image, disparity.clamp(*DISPARITY_RANGE).reciprocal() * disparity_factor)
         return DecoderInput(start, torch.cat([image, start.disparity_map], dim=1) * 2 - 1, maps)
 
@@ -207,7 +206,7 @@ GEOMETRY, TEXTURE = 3, 11  # delta channels: offset; scale 3, quaternion 4, colo
 
 
 class FeatureNetwork(nn.Module):
-    """Features for the deltas from the pyramid, the picture and its disparity."""
+    """Computes features for the deltas from the pyramid, the picture and its disparity."""
 
     def __init__(self, config: SharpConfig) -> None:
         super().__init__()
@@ -227,7 +226,7 @@ class FeatureNetwork(nn.Module):
 
 
 class PredictionHead(nn.Module):
-    """Features to deltas."""
+    """Computes deltas from features."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -242,7 +241,7 @@ class PredictionHead(nn.Module):
 
 
 class GaussianDecoder(nn.Module):
-    """Feature network and heads as one module, which may be trained alone; 7,784,028 weights as published."""
+    """Feature network and heads as one module, which can be trained alone; 7,784,028 weights as published."""
 
     def __init__(self, feature_model: FeatureNetwork, prediction_head: PredictionHead) -> None:
         super().__init__()
@@ -250,10 +249,10 @@ class GaussianDecoder(nn.Module):
         self.prediction_head = prediction_head
 
     def let_learn(self) -> GaussianDecoder:
-        """Ask for gradients, except of weights that nothing uses: 295,168 in the published checkpoint."""
+        """Enable gradients, except for unused weights: 295,168 in the published checkpoint."""
         self.requires_grad_()
         coarsest: Fusion = self.feature_model.decoder.fusions[-1]  # type: ignore[assignment]
-        coarsest.resnet1.requires_grad_(False)  # for finer features, and here there is nothing to add them to
+        coarsest.resnet1.requires_grad_(False)  # it takes finer features, which the coarsest level does not get
         return self
 
     def forward(self, picture: Tensor, maps: list[Tensor]) -> Tensor:
@@ -271,9 +270,9 @@ NEAREST, FARTHEST = 1.0, 100.0  # depths are scaled so that the nearest is 1, an
 FARTHEST_INVERSE = 1e-3  # added to inverse depth, which keeps depth finite
 SMALLEST_INVERSE = 1e-6
 COLOR_MARGIN = 0.01  # keeps the inverse sigmoid of a colour finite
-MAX_SCALE = 10.0  # of a Gaussian, relative to where it starts
+MAX_SCALE = 10.0  # largest scale of a Gaussian, relative to its initial scale
 
-# How much a delta of one moves an attribute, before the sigmoid where there is one.
+# How much a delta of one changes an attribute, before the sigmoid if there is one.
 XY_GAIN = Z_GAIN = 0.001
 COLOR_GAIN = 0.1
 
@@ -285,12 +284,12 @@ class InitialGaussians:
     disparity_map: Tensor  # [1, 2, side, side] of the scaled depths, an input of the feature network
     disparity: Tensor  # [2, side/2, side/2] of the nearest pixel in each cell
     color: Tensor  # [3, side/2, side/2] sRGB, the cell's mean
-    unscale: Tensor  # float64 without an axis: multiplies means and scales to undo the scaling of the depths
+    unscale: Tensor  # [] float64: multiplies means and scales to undo the scaling of the depths
 
 
 def make_start(image: Tensor, depth: Tensor) -> InitialGaussians:
-    """The base values of a picture [1, 3, side, side] with depth layers [1, 2, side, side]."""
-    factor = NEAREST / (depth.min().double() + SMALLEST_INVERSE)  # stays on its device: nobody waits for it
+    """The initial Gaussians of a picture [1, 3, side, side] with depth layers [1, 2, side, side]."""
+    factor = NEAREST / (depth.min().double() + SMALLEST_INVERSE)  # stays on its device, so that the CPU need not wait
     disparity = 1.0 / (depth * factor).clamp_max(FARTHEST)
     return InitialGaussians(disparity, max_pool2d(disparity, STRIDE)[0], avg_pool2d(image, STRIDE)[0], 1.0 / factor)
 
@@ -305,7 +304,7 @@ def compose(start: InitialGaussians, deltas: Tensor) -> Gaussians:
     inverse = softplus(_inverse_softplus(start.disparity) + Z_GAIN * deltas[2])
     z = 1.0 / (inverse + FARTHEST_INVERSE)
     means = torch.stack([z * (x + XY_GAIN * deltas[0]), z * (y[:, None] + XY_GAIN * deltas[1]), z])
-    # A cell's width at that depth, times a factor between 0 and MAX_SCALE: 1 at zero, and so is its slope.
+    # A cell's width at that depth, times a factor between 0 and MAX_SCALE, which has value 1 and slope 1 at zero.
     slope, shift = MAX_SCALE / (MAX_SCALE - 1), -math.log(MAX_SCALE - 1)
     scales = (2.0 / width) * z * (MAX_SCALE * torch.sigmoid(slope * deltas[3:6] + shift))
     quats = torch.cat([deltas[6:7] + 1, deltas[7:10]])
@@ -332,11 +331,11 @@ WARM_UPS = 2  # calls before a capture, in which libraries choose their kernels 
 
 
 def compile_forward(network: SharpNetwork, backend: str = "inductor") -> SharpNetwork | GraphedForward:
-    """The forward of a network, sharing its weights, that `torch.compile` translates when it is first asked.
+    """A network's forward, with the same weights, which `torch.compile` compiles at the first call.
 
-    It takes a C++ compiler on a processor and Triton on a GPU; a RuntimeError at the first call says what is missing.
-    All 48 blocks of the two transformers are one translation; values differ from the network's by rounding. The
-    `backend` "eager" translates nothing.
+    This needs a C++ compiler on a CPU and Triton on a GPU; a RuntimeError at the first call says what is missing. All
+    48 blocks of the two transformers share one compilation; values differ from the network's by rounding. The `backend`
+    "eager" compiles nothing.
     """
     twin = copy.deepcopy(network, {id(weight): weight for weight in network.parameters()})
     depth: DepthNetwork = twin.monodepth_model.monodepth_predictor  # type: ignore[assignment]
@@ -356,7 +355,7 @@ class GraphedForward:
     def __call__(
         self, image: Tensor, disparity_factor: float, batch: int, progress: Progress | None = None
     ) -> SharpOutput:
-        """As the network's forward, always with the batch of the first call; `progress` is called only at the end."""
+        """The network's forward, always with the batch of the first call; `progress` is called only at the end."""
         with torch.cuda.device(image.device):
             if self.graph is None:
                 self._capture(image, batch)
@@ -381,6 +380,6 @@ class GraphedForward:
                 self.network(self.image, self.factor, batch)
         torch.cuda.current_stream().wait_stream(side)
         graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph, stream=side):  # by itself it takes that of the first device it was used on
+        with torch.cuda.graph(graph, stream=side):  # by default the stream would be the first device's
             self.output: SharpOutput = self.network(self.image, self.factor, batch)
         self.graph = graph

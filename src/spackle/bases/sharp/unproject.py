@@ -1,4 +1,4 @@
-"""Gaussians stretched along the axes of the world, as SHARP's are on their way to metres."""
+"""Stretch Gaussians along the axes of the world, which converts SHARP's to metres."""
 
 from __future__ import annotations
 
@@ -15,20 +15,21 @@ from spackle.gaussians import Gaussians
 SWEEPS = 4  # after three, the cosine between two columns was 3e-3 at worst; after four, 1e-15
 UPRIGHT = 0.5  # squared sine of the angle between two columns below which the shorter one is noise
 BLOCK = 64  # Gaussians whose columns lie side by side in the first-level cache
-LEAST = 1e-300  # keeps 0/0 out, and is below every square of a float32
+LEAST = 1e-300  # avoids 0/0, and is smaller than the square of any positive float32
 GRAIN = 256 * BLOCK  # Gaussians that a thread takes at a time
 
 
 def stretch_gaussians(gaussians: Gaussians, stretch: tuple[float, float, float]) -> Gaussians:
-    """Map N Gaussians on the processor by D = diag(stretch), which turns and reshapes each one.
+    """Map N Gaussians on the CPU by D = diag(stretch), which turns and reshapes each one.
 
-    A covariance R S² Rᵀ becomes M Mᵀ with M = D R S. Rotations of M from the right leave that as it is; once they have
-    made M's columns orthogonal (one-sided Jacobi), the columns' lengths are the new scales and their directions the new
-    axes. The covariance itself is never formed: it would square the ratio of the scales, and lose the small ones.
+    A covariance R S² Rᵀ becomes M Mᵀ with M = D R S. Rotating M from the right does not change M Mᵀ. Such rotations
+    make M's columns orthogonal (one-sided Jacobi); then the columns' lengths are the new scales, and their directions
+    the new axes. The covariance itself is never formed: it would square the ratio of the scales, and lose the small
+    ones.
 
     Returns:
         N Gaussians with descending scales and unit quats with w ≥ 0 (a zero one counts as no rotation); opacities and
-        colors are the same tensors; the rest is cut off from autograd.
+        colors are the same tensors; the others are detached from autograd.
     """
     means, quats, scales = (t.detach() for t in gaussians.tensors[:3])
     source = quats.contiguous().numpy(), scales.contiguous().numpy()
@@ -43,7 +44,7 @@ def stretch_gaussians(gaussians: Gaussians, stretch: tuple[float, float, float])
 def stretch_chunk(
     start: int, stop: int, quats: Any, scales: Any, stretch: Any, new_quats: Any, new_scales: Any
 ) -> None:
-    """Stretch Gaussians start..stop of quats [N, 4], scales [N, 3] in float64, block by block, into two like arrays."""
+    """Stretch Gaussians start..stop (quats [N, 4], scales [N, 3]) in float64, block by block, into two such arrays."""
     columns = np.zeros((9, BLOCK))
     for first in range(start, stop, BLOCK):
         count = min(BLOCK, stop - first)
@@ -75,7 +76,7 @@ def _load_block(first: int, count: int, quats: Any, scales: Any, stretch: Any, c
 
 @kernel
 def _sweep_block(columns: Any) -> None:
-    """Rotate each pair of columns once. Always the whole block and no branches: this loop runs in vector registers."""
+    """Rotate each pair of columns once, for the whole block and without branches, so that the loop is vectorised."""
     for i in range(BLOCK):
         a, b, c = _column(columns, 0, i), _column(columns, 1, i), _column(columns, 2, i)
         a, b = _turn(a, b)
@@ -124,7 +125,7 @@ def _store_block(first: int, count: int, columns: Any, new_quats: Any, new_scale
 
 @kernel
 def _other_axes(a: Any, b: Any) -> Any:
-    """The second and third axis of a right-handed frame: b straightened, or any where b has no direction."""
+    """The other axes of a right-handed frame that begins with a: b made orthogonal, or any if b has no direction; c."""
     c = _cross(a, b)
     if not _dot(c, c) > UPRIGHT:
         x, y, z = abs(a[0]), abs(a[1]), abs(a[2])
