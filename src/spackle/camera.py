@@ -52,7 +52,7 @@ class Camera:
         return -self.world_to_camera[:3, :3].T @ self.world_to_camera[:3, 3]
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Camera:
-        """Move or convert the matrices."""
+        """The same camera with its matrices on another device or in another dtype."""
         return dataclasses.replace(
             self,
             K=self.K.to(device=device, dtype=dtype),
@@ -91,7 +91,7 @@ class Camera:
         return points @ matrix[:3, :3].T + matrix[:3, 3]
 
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """World points [..., 3] to pixel coordinates [..., 2] and depth z [...]."""
+        """Project world points [..., 3] to pixel coordinates [..., 2] and depth z [...]."""
         local = self.to_camera(points)
         z = local[..., 2]
         K = beside(self.K, points)
@@ -99,7 +99,7 @@ class Camera:
         return uv, z
 
     def unproject(self, uv: Tensor, depth: Tensor) -> Tensor:
-        """Pixels [..., 2] at depth z [...] to world points [..., 3]."""
+        """Unproject pixels [..., 2] at depth z [...] to world points [..., 3]."""
         K, matrix = beside(self.K, uv), beside(self.world_to_camera, uv)
         xy = (uv - K[:2, 2]) / torch.stack([K[0, 0], K[1, 1]]) * depth[..., None]
         local = torch.cat([xy, depth[..., None]], dim=-1)

@@ -106,7 +106,7 @@ def trajectory(
 def view_at(
     kind: TrajectoryKind, camera: Camera, disparity: float, depth_range: DepthRange, index: int, frames: int
 ) -> Camera:
-    """One camera of `trajectory`, without making the others."""
+    """One camera of `trajectory`, computed without the others."""
     eyes, target = _flight(kind, camera, disparity, depth_range, frames)
     return _looking(kind, camera, eyes[index], target)
 
@@ -236,7 +236,7 @@ class KeyframePath:
         return self.at([self.keys[0].time + k * self.seconds / steps for k in range(frames)], camera, depth_range)
 
     def key_cameras(self, camera: Camera, depth_range: DepthRange) -> list[Camera]:
-        """The views of the keys themselves."""
+        """The views at the keys."""
         return self.at([key.time for key in self.keys], camera, depth_range)
 
     def at(self, times: list[float], camera: Camera, depth_range: DepthRange) -> list[Camera]:

@@ -16,13 +16,13 @@ from spackle.gaussians import Gaussians
 
 
 def srgb_to_linear(srgb: Tensor) -> Tensor:
-    """IEC 61966-2-1 decoding, elementwise; values outside 0..1 are clamped to it."""
+    """Decode sRGB (IEC 61966-2-1) elementwise; values are clamped to 0..1 first."""
     srgb = srgb.clamp(0, 1)
     return torch.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
 def linear_to_srgb(linear: Tensor) -> Tensor:
-    """IEC 61966-2-1 encoding, elementwise; values outside 0..1 are clamped to it."""
+    """Encode as sRGB (IEC 61966-2-1) elementwise; values are clamped to 0..1 first."""
     linear = linear.clamp(0, 1)
     # The inner clamp keeps the gradient of the unused branch finite at zero.
     power = 1.055 * linear.clamp_min(0.0031308) ** (1 / 2.4) - 0.055
@@ -77,7 +77,7 @@ class DepthColors:
 
 
 def _inverse_in_frame(means: Tensor, camera: Camera) -> Tensor:
-    """1/z of those of the points [N, 3] that a view shows."""
+    """Inverse depths 1/z of the points in `means` [N, 3] that lie within a view's image."""
     uv, z = camera.to("cpu").project(means)
     inside = (z > 0.01) & (uv >= 0).all(dim=-1) & (uv < uv.new_tensor([camera.width, camera.height])).all(dim=-1)
     return 1 / z[inside]

@@ -128,7 +128,7 @@ def read_tensors(path: str | os.PathLike[str], advice: str) -> dict[str, Tensor]
     """The tensors of a file by name; their numbers are read from the disk when they are used.
 
     Other content of the file is ignored. In TorchScript and in nested dicts, a name is the path to the tensor, joined
-    by dots. `advice` ends messages about a wrong file, and tells what to do.
+    by dots. Messages about a wrong file end with `advice`.
 
     Raises:
         InputError: the file is missing or broken, or holds no weights.

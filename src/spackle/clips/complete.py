@@ -34,7 +34,7 @@ FOLLOW = 0.05  # each frame moves the path's depths by this part towards the fra
 
 @dataclasses.dataclass(frozen=True)
 class CompletedView:
-    """The completed view of a frame."""
+    """A frame's completed view."""
 
     camera: Camera
     gaussians: tuple[Gaussians, Gaussians]  # the base's, and aux
@@ -46,7 +46,7 @@ class CompletedView:
 
     @property
     def hole(self) -> Tensor:
-        """[H, W] bool: not covered by the base."""
+        """[H, W] bool: pixels that the base does not cover."""
         return hole_mask(self.before.alpha)
 
 

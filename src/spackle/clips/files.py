@@ -195,7 +195,7 @@ def _picture(frame: av.VideoFrame, aspect: Fraction, reformatter: VideoReformatt
 
 
 def _quarters(frame: av.VideoFrame) -> int:
-    """How many quarter turns, counter-clockwise, bring a frame upright."""
+    """The number of counter-clockwise quarter turns that bring a frame upright."""
     return round(frame.rotation / 90) % 4
 
 
@@ -257,7 +257,7 @@ class _ClipEncoder(StreamEncoder):
         self.close()
 
     def close(self) -> None:
-        """Write the index."""
+        """Close both files; this writes the index."""
         super().close()
         if self._input is not None:
             self._input.close()

@@ -84,7 +84,7 @@ def inside(uv: Tensor, height: int, width: int) -> Tensor:
 
 
 def sample(image: Tensor, uv: Tensor) -> Tensor:
-    """Bilinear values [h, w, C] of an image [H, W, C] at pixel positions [h, w, 2], with edge padding."""
+    """Sample an image [H, W, C] bilinearly at pixel positions [h, w, 2], with edge padding: [h, w, C]."""
     grid = 2 * uv / uv.new_tensor([image.shape[1], image.shape[0]]) - 1
     found = grid_sample(image.permute(2, 0, 1)[None], grid[None], align_corners=False, padding_mode="border")
     return found[0].permute(1, 2, 0)

@@ -64,7 +64,7 @@ def alpha_of(power: np.float32) -> np.float32:
 
 @kernel
 def encode_srgb(linear: np.float32) -> np.float32:
-    """Linear light to sRGB, both clamped to 0..1."""
+    """Convert linear light to sRGB, both clamped to 0..1."""
     value = min(max(linear, ZERO), ONE)
     t = (np.sqrt(np.sqrt(value)) - MIDDLE) / SPREAD
     curve = S0 + t * (S1 + t * (S2 + t * (S3 + t * (S4 + t * (S5 + t * (S6 + t * (S7 + t * S8)))))))
@@ -73,7 +73,7 @@ def encode_srgb(linear: np.float32) -> np.float32:
 
 @kernel
 def decode_srgb(encoded: np.float32) -> np.float32:
-    """sRGB to linear light, both clamped to 0..1."""
+    """Convert sRGB to linear light, both clamped to 0..1."""
     value = min(max(encoded, ZERO), ONE)
     y = (value + np.float32(0.055)) / np.float32(1.055)
     q = np.sqrt(np.sqrt(y))

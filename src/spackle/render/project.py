@@ -185,7 +185,7 @@ def jacobian(x: float, y: float, nearness: float, lens: Array) -> Numbers:
 
 @inlined_kernel
 def rotation(quat: Numbers) -> Numbers:
-    """The matrix R of a quaternion (wxyz) of any length, row by row."""
+    """The rotation matrix R, row by row, of a quaternion (wxyz) of any length."""
     qw, qx, qy, qz = np.float64(quat[0]), np.float64(quat[1]), np.float64(quat[2]), np.float64(quat[3])
     two = 2.0 / max(qw * qw + qx * qx + qy * qy + qz * qz, 1e-24)  # 2/‖q‖² normalises the quaternion
     r00, r01, r02 = 1 - two * (qy * qy + qz * qz), two * (qx * qy - qw * qz), two * (qx * qz + qw * qy)

@@ -36,7 +36,7 @@ class ReferenceRenderer:
 
 
 def front_to_back(gaussians: Gaussians, camera: Camera) -> Gaussians:
-    """The Gaussians that are finite and not behind the near plane, sorted by depth."""
+    """The finite Gaussians at or beyond the near plane, sorted by depth."""
     finite = [t.detach().isfinite().unsqueeze(-1).flatten(1).all(dim=1) for t in gaussians.tensors]
     z = camera.to_camera(gaussians.means.detach())[:, 2]
     gaussians = gaussians.select(torch.stack(finite).all(dim=0) & (z >= NEAR_PLANE))
@@ -44,7 +44,7 @@ def front_to_back(gaussians: Gaussians, camera: Camera) -> Gaussians:
 
 
 def blend(gaussians: Gaussians, camera: Camera, eps2d: float) -> Rendering:
-    """Blend Gaussians that are sorted front to back, at every pixel."""
+    """Blend Gaussians, sorted front to back, at every pixel."""
     alphas = falloff(gaussians, camera, eps2d)
     alphas = torch.where(alphas > ALPHA_MAX, ALPHA_MAX, alphas)
     alphas = torch.where(alphas >= ALPHA_MIN, alphas, 0)

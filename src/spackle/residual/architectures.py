@@ -61,7 +61,7 @@ class ResidualBlock(nn.Module):
         self.second = nn.Conv2d(channels, channels, 3, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:
-        """[B, C, h, w] to the same shape."""
+        """Map [B, C, h, w] to the same shape."""
         # In place if no gradient needs the old values: at this size, allocation costs as much as the arithmetic.
         out: Tensor = self.second(self.first(torch.relu(x)).relu_())
         return out.add_(x)

@@ -77,14 +77,14 @@ class FillContext:
         return dataclasses.replace(self, network=None, texture=None)
 
     def photo_guard(self) -> OcclusionGuard:
-        """The guard of the photo's view: no aux Gaussian may stand in front of its surfaces."""
+        """The guard of the photo's view: no aux Gaussian may lie in front of the surfaces that it shows."""
         rendering = self.renderer.render(self.placed.base, self.photo_camera)
         return OcclusionGuard.of(rendering, self.photo_camera, self.threshold)
 
 
 @dataclasses.dataclass(frozen=True)
 class FilledView:
-    """The aux Gaussians of one view, and the view with them."""
+    """The aux Gaussians of one view, and its rendering with them."""
 
     aux: Gaussians
     rendering: Rendering
@@ -243,7 +243,9 @@ def _propose(
     camera: Camera,
     guards: Sequence[OcclusionGuard],
 ) -> tuple[Gaussians, Seeds]:
-    """One Gaussian for each masked cell and, with a texture, one for each pixel, all behind the guards' surfaces.
+    """One Gaussian for each masked cell, all behind the guards' surfaces.
+
+    With a texture, a cell whose pixels differ also has one for each pixel.
 
     Also returns the seeds, from which `rim_underlay` continues beneath the rims.
     """

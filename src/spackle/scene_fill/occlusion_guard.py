@@ -32,7 +32,7 @@ STEPS = 48  # candidate positions along the line of sight, evenly spaced in inve
 
 @dataclasses.dataclass(frozen=True)
 class OcclusionGuard:
-    """The farthest surface near each pixel of a view: no new Gaussian may stand in front of it."""
+    """The farthest surface near each pixel of a view; no new Gaussian may lie in front of it."""
 
     camera: Camera
     depth: Tensor  # [H, W]; 0 where the view shows only holes
@@ -127,7 +127,7 @@ def _free_factors(
 
 @kernel
 def _covariance(quat: Any, scale: Any) -> Any:
-    """Σ = R S Sᵀ Rᵀ as its six numbers xx, yy, zz, xy, xz, yz."""
+    """The covariance Σ = R S Sᵀ Rᵀ as (xx, yy, zz, xy, xz, yz)."""
     length = max(np.sqrt(quat[0] ** 2 + quat[1] ** 2 + quat[2] ** 2 + quat[3] ** 2), 1e-12)
     w, x, y, z = quat[0] / length, quat[1] / length, quat[2] / length, quat[3] / length
     a, b, c = scale[0] ** 2, scale[1] ** 2, scale[2] ** 2
