@@ -239,7 +239,7 @@ SLOPE = torch.linspace(2, 5, 96).expand(1, 64, 96).contiguous()
 @pytest.mark.parametrize(
     ("depth", "meaning", "words"),
     [
-        (torch.zeros(1, 64, 96), "metres", "predicts 0 to 0, which is no depth"),
+        (torch.zeros(1, 64, 96), "metres", "predicts 0 to 0, which cannot be depth"),
         (torch.full((1, 64, 96), 3.0), "relative disparity", "predicts 3 to 3"),
         (torch.full((1, 64, 96), math.nan), "metres", "predicts nan to nan"),
         (-SLOPE, "metres", "predicts -5 to -2"),

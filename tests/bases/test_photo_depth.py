@@ -284,7 +284,7 @@ def test_maps_that_are_damaged_or_do_not_say_what_they_mean(tmp_path: Path) -> N
     for data, why in (
         (portraits.heic(codes(), information=uneven), "uneven size"),
         (portraits.heic(codes(), information="inverse, 3 to 2 m"), "near 3 and far 2"),
-        (portraits.heic(codes(), apple_xmp(ends=("nan", 3))), "'nan' for FloatMinValue, which is no number"),
+        (portraits.heic(codes(), apple_xmp(ends=("nan", 3))), "'nan' for FloatMinValue, which is not a number"),
         (portraits.apple_jpeg(codes(), apple_xmp(ends=(2, 2))), "announces a disparity from 2 to 2"),
         (portraits.heic(codes(), apple_xmp(ends=(-1e308, 1.1e308))), "no pixel with a depth|makes no sense"),
         (portraits.apple_jpeg(codes(), apple_xmp(ends=(1e-320, 1e-310))), "no pixel with a depth"),

@@ -125,7 +125,7 @@ def test_results_that_must_name_their_base_refuse_auto(tmp_path: Path, stereo: P
         run("evaluate", *root),
         run("bench", *root),
     ):
-        refuses(result, "--base auto: results must say what they are of")
+        refuses(result, "--base auto: results must name their base")
     refuses(
         build(tmp_path, "--base", "rgbd"), "give --depth FOLDER; sharp, moge, depth, lite, hf:NAME_OR_FOLDER need none"
     )

@@ -188,7 +188,7 @@ def test_too_few_photos_odd_poses_and_bent_lenses_are_refused(tmp_path: Path) ->
     cameras.write_bytes(lens(2, FOCAL, WIDTH / 2, HEIGHT / 2, 0.4))
     assert "bends the corners by over 2%: undistort" in error_of("tanks", tmp_path / "tanks")
     cameras.write_bytes(lens(5, *[1.0] * 8))
-    assert "lens model 5 is no pinhole" in error_of("tanks", tmp_path / "tanks")
+    assert "lens model 5 is not a pinhole" in error_of("tanks", tmp_path / "tanks")
 
 
 def assert_pair(case: Case, disparity: float, z: float, x: int = 30, y: int = 9) -> tuple[torch.Tensor, torch.Tensor]:

@@ -156,7 +156,7 @@ def test_a_step_has_the_own_view_and_a_photo_teaches_or_judges(place: Path) -> N
     [
         (["data.pseudo=null"], "data: --method direct-ft learns from data.pseudo"),
         (["data.photos={place}/photos"], "samples of other sources have Gaussians that cannot change"),
-        (["data.pseudo={place}/rgbd"], "rgbd: built with --base rgbd, so its holes are not SHARP's"),
+        (["data.pseudo={place}/rgbd"], "rgbd: built with --base rgbd, but SHARP must learn its own holes"),
         (["data.pseudo={place}/geometry"], "built with --inpainter geometry, which draws what the untrained residual"),
         (["-c", "{place}/other.safetensors"], "data: built with other weights of SHARP (SHA-256 "),
         (["-c", "{place}/whole/best.safetensors"], "best.safetensors: a decoder that was trained already"),
