@@ -112,7 +112,7 @@ class PathOptions:
             disparity: used if the options have none.
 
         Raises:
-            PathError: the keyframes lead nowhere.
+            PathError: the keyframes give no usable path.
             ValueError: this scene allows no such path.
         """
         given = self.frames or (self.seconds and round(self.seconds * self.video.rate))

@@ -179,7 +179,10 @@ def _transformers() -> Any:
 
 
 def _read(transformers: Any, source: str, name: str, *, from_hub: bool) -> tuple[nn.Module, Prepare, Meaning]:
-    """A float32 network from safetensors, its preprocessing and meaning; no code of it runs. OSError: missing file."""
+    """A float32 network from safetensors, its preprocessing, and the meaning of its output.
+
+    No code of the model runs. OSError if a file is missing.
+    """
     files = {"local_files_only": not from_hub, "trust_remote_code": False}
     settings, _ = transformers.PretrainedConfig.get_config_dict(source, **files)
     meaning, kind = meaning_of(settings, name), str(settings["model_type"])  # before weights are loaded

@@ -121,11 +121,11 @@ def noise_level(inverse_depth: Floats, known: Bools) -> float:
 def smoothed(inverse_depth: Floats, known: Bools, step: Floats | np.float32) -> Floats:
     """The smoothest inverse depth [h, w] that its noise and its quantisation step (a number, or [h, w]) allow.
 
-    Noise of 0.3 % makes each Gaussian of a slanted surface face another way, and light shines through; whole
-    disparities turn a slanted plane into a staircase with a gap at every step. Each known value is replaced by the mean
-    of its neighbours on both sides, but changes by at most half a step or what noise explains. A neighbour that differs
-    by more than three times that belongs to another surface. Roughness as large as depth edges is not noise but
-    content, such as leaves or meshes.
+    Noise of 0.3 % makes each Gaussian of a slanted surface face another way, and light shines through;
+    disparities in whole numbers turn a slanted plane into a staircase with a gap at every step. Each known value is
+    replaced by the mean of its neighbours on both sides, but changes by at most half a step or what noise explains. A
+    neighbour that differs by more than three times that belongs to another surface. Roughness as large as depth edges
+    is not noise but content, such as leaves or meshes.
     """
     noise = noise_level(inverse_depth, known)
     reach = np.maximum(step / 2, DEVIATIONS * noise * (noise <= EDGE) * inverse_depth)

@@ -204,7 +204,7 @@ FARTHEST = 60.0  # depths are limited to this multiple of the nearest one, as if
 
 @dataclasses.dataclass(frozen=True)
 class InputScale:
-    """One input size: the resolution at which one of the networks sees a photo."""
+    """One input size: the resolution at which one of the networks receives a photo."""
 
     pixels: int  # of the network's input, approximately
     network: int = 0  # index of the network in the file

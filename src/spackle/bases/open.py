@@ -115,7 +115,7 @@ def _lift(settings: BaseSettings, photo: Photo, depth: Depth) -> Base | None:
 
 @dataclasses.dataclass(frozen=True)
 class ResolvedBase:
-    """The base that a photo got, and why."""
+    """The base that was used for a photo, and why."""
 
     base: str
     why: str
@@ -152,7 +152,7 @@ class OpenedBase:
 
         Args:
             photo: at its full size.
-            depth: of this photo, in place of the settings'; for rgbd only.
+            depth: this photo's depth, used instead of the settings'; for rgbd only.
             log: gets a line for each candidate that fails.
             stage: times the stages "prepare", in which a base is loaded, and "base", in which it predicts.
 

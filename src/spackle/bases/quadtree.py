@@ -1,4 +1,4 @@
-"""Decide which pixels share a Gaussian, by a quadtree cut where lost detail costs less than more Gaussians."""
+"""A quadtree that decides which pixels share a Gaussian, by weighing lost detail against the number of Gaussians."""
 
 from __future__ import annotations
 

@@ -118,7 +118,7 @@ class BaseSettings:
         return {name: file for name, file in found.items() if file is not None}
 
     def check(self, *, one: bool = False) -> None:
-        """InputError for an unknown base, for an option that it cannot use, and with `one` for the base `auto`."""
+        """InputError for an unknown base, for an option that it cannot use, and, with `one`, for the base `auto`."""
         if one and self.name == AUTO:
             known = ", ".join((RGBD, *NETWORKS))
             raise InputError(f"--base {AUTO}: results must name their base: choose one of {known}")

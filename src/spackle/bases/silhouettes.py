@@ -1,4 +1,4 @@
-"""Silhouettes in two layers: how much of a pixel beside a depth step the near surface covers, and both colours."""
+"""Silhouettes in two layers: both surfaces' colours beside a depth step, and the near one's coverage of each pixel."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from spackle.device import run_chunks
 from spackle.surface import CREASE, EDGE
 
 REACH = 3  # pixels to either side of a step that may be mixtures
-STEADILY = 0.5  # of a difference on both sides of it, and it is a plane's
-WINDOW = 5  # pixels to each side in which both surfaces are looked at
+STEADILY = 0.5  # a difference is a plane's if the next ones on both sides exceed this share of it
+WINDOW = 5  # pixels to each side from which both surfaces are estimated
 PURE = np.array([1.0, 0.01, 0.15, 1.0], np.float32)  # weight of a colour on the rings around a step
-STEADY = np.array([1.0, 0.1, 0.5, 1.0], np.float32)  # and of a depth: round things fall off towards their rims
+STEADY = np.array([1.0, 0.1, 0.5, 1.0], np.float32)  # and of a depth: round objects curve away at their rims
 UNEXPLAINED = np.float32(0.002)  # squared difference from the photo at which a mixture does not explain a pixel
-FRINGE = np.float32(6.0)  # variances of the far colour beyond which a pixel has left it, away from the near colour
+FRINGE = np.float32(6.0)  # a fringe differs from the far colour by more variances, away from the near colour
 BLUR = np.float32(1.2)  # pixels over which the map's outline is smoothed
-SURE = np.float32(0.2)  # pixels that a pixel's centre lies on its own side of the map's outline, at least
+SURE = np.float32(0.2)  # least distance in pixels of a pixel's centre from the map's outline, on its own side
 STEPS, STEP = 6, 0.33  # shifts that are tried to each side, and their size in pixels
 SHIFT_COST = 0.04  # of a shift by one step, in variances of the colours
-RAMPS = np.array([1.75, 0.8])  # pixels from nothing to all of a surface across an outline, as lenses blur it
-ASTRAY = 4.0  # times the variance of a colour: what a pixel has that no mixture would
-TEXTURE = np.float32(1.5)  # deviations by which a hidden colour leaves the mean at most
+RAMPS = np.array([1.75, 0.8])  # pixels from no to full coverage across an outline that a lens blurs
+ASTRAY = 4.0  # weight of a pixel's distance from all mixtures, as part of the variance
+TEXTURE = np.float32(1.5)  # standard deviations by which a hidden colour may differ from the mean
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Layers:
     ring: NDArray[np.uint8]  # [H, W] pixels to the nearest step, 1 beside it; 0 beyond `REACH`
     alpha: Floats  # [H, W] share of a pixel that the near surface covers
     depth: Floats  # [2, H, W] inverse depth of the near and the far surface
-    slope: Floats  # [2, H, W, 2] of it by pixel x and y
+    slope: Floats  # [2, H, W, 2] derivative of the inverse depth by pixel x and y
     color: Floats  # [2, H, W, 3] linear RGB
 
 
@@ -47,12 +47,12 @@ def find_layers(inverse_depth: Floats, slope: Floats, colors: Floats) -> Layers:
     colour.
 
     A lens blurs a silhouette, so that a pixel or two on each side show both surfaces; and the map's step may lie a
-    pixel or two beside the photo's outline. Both surfaces are continued across the step, their colours from pixels
-    that are pure; the outline is shifted to where the photo has it.
+    pixel or two beside the photo's outline. Both surfaces are continued across the step, with colours from pixels that
+    show one surface alone; the map's outline is shifted to the photo's.
 
     Args:
         inverse_depth: [H, W].
-        slope: [H, W, 2] of it by pixel x and y.
+        slope: [H, W, 2] derivative of the inverse depth by pixel x and y.
         colors: [H, W, 3] linear RGB of the photo.
     """
     height, width = inverse_depth.shape
@@ -82,7 +82,7 @@ def _rings(image: Any) -> Any:
                 high, low = max(image[y, x], image[v, u]), min(image[y, x], image[v, u])
                 if high - low <= EDGE * low:
                     continue
-                # On a steep plane, as the ground towards the horizon, the depth goes on falling on both sides.
+                # On a steep plane, such as the ground towards the horizon, the change continues on both sides.
                 jump = image[v, u] - image[y, x]
                 before = image[y, x] - image[y - k, x - 1 + k] if (y if k else x) > 0 else jump
                 after = image[v + k, u + 1 - k] - image[v, u] if (v + 1 < height if k else u + 1 < width) else jump
@@ -109,7 +109,7 @@ def _survey(
     start: int, stop: int, image: Any, colors: Any, ring: Any, levels: Any,
     inside: Any, depth: Any, slope: Any, color: Any, texture: Any,
 ) -> None:  # fmt: skip
-    """Rows start..stop: both surfaces, their mean colours, and each pixel's distance into the near one."""
+    """Estimate both surfaces, their mean colours, and each pixel's distance into the near one, in rows start..stop."""
     height, width = image.shape
     m = np.zeros((2, 9), np.float64)  # per side: weight, x, y, d, xx, yy, xy, xd, yd
     s = np.zeros((2, 7), np.float64)  # per side: weight, colour, its square
@@ -167,7 +167,7 @@ def _survey(
             far_in = np.float32(BLUR * np.log(part / (1 - part)) / 1.702)
             inside[y, x] = max(far_in, SURE) if near else min(far_in, -SURE)
             for side in range(2):
-                if near or side == 0:  # what the map says is kept, but for near rims, which are ragged
+                if near or side == 0:  # the map's depth is kept, except at near rims, which are ragged
                     at, across, down = _plane(m[side], level[side])
                     depth[side, y, x] = at
                     slope[side, y, x, 0], slope[side, y, x, 1] = across, down
@@ -182,7 +182,10 @@ def _survey(
 
 @inlined_kernel
 def _share(colors: Any, color: Any, y: int, x: int) -> Any:
-    """The near colour's share in the mixture nearest to a pixel, its distance from it, and that of both colours."""
+    """The near colour's share in the mixture closest to a pixel, and two squared distances.
+
+    They are those from the pixel to that mixture, and between both colours.
+    """
     apart, along, away = np.float32(0), np.float32(0), np.float32(0)
     for c in range(3):
         difference, own = color[0, y, x, c] - color[1, y, x, c], colors[y, x, c] - color[1, y, x, c]
@@ -195,9 +198,7 @@ def _share(colors: Any, color: Any, y: int, x: int) -> Any:
 
 @kernel
 def _match(start: int, stop: int, colors: Any, ring: Any, inside: Any, color: Any, texture: Any, alpha: Any) -> None:
-    """Rows start..stop: shift the outline across its direction to the photo's outline, and compute each pixel's
-    coverage.
-    """
+    """Shift the map's outline sideways to the photo's, and compute each pixel's coverage, in rows start..stop."""
     height, width = ring.shape
     shifts = 2 * STEPS + 1
     costs = np.zeros(len(RAMPS) * shifts)
@@ -232,13 +233,12 @@ def _match(start: int, stop: int, colors: Any, ring: Any, inside: Any, color: An
 
 @kernel
 def _unmix(colors: Any, ring: Any, inside: Any, alpha: Any, color: Any, texture: Any) -> None:
-    """Move both colours, in place, just so far that they mix to the photo's colour, and no further than texture
-    explains.
+    """Change both colours in place just enough to mix to the photo's colour, but no more than texture explains.
 
-    A pixel that they do not explain gets the share of the nearest mixture of the unmoved colours; one far from any
-    mixture, such as the shaded edge of a round object, belongs to its own surface alone. A camera that sharpens draws a
-    fringe along an outline, brighter than the background of a dark object. The fringe is given to the object, or it
-    would stay on the background.
+    A pixel that this does not explain gets the share of the closest mixture of the unchanged colours; a pixel far from
+    any mixture, such as the shaded edge of a round object, belongs to its own surface alone. A camera that sharpens its
+    images draws a fringe along an outline; around a dark object it is brighter than the background. The fringe is
+    assigned to the object, because otherwise it would remain on the background.
     """
     height, width = ring.shape
     rest = np.zeros(3, np.float32)
@@ -279,7 +279,7 @@ def _unmix(colors: Any, ring: Any, inside: Any, alpha: Any, color: Any, texture:
 
 @kernel
 def _plane(m: Any, level: Any) -> Any:
-    """Inverse depth and slope of the plane of weighted moments; the mean where there is too little to see a slope."""
+    """Inverse depth and slope of the plane fitted to weighted moments; `level` and zero slope without any weight."""
     if m[0] < 1e-6:
         return np.float32(level), np.float32(0), np.float32(0)
     mx, my, md = m[1] / m[0], m[2] / m[0], m[3] / m[0]

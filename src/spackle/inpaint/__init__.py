@@ -28,11 +28,11 @@ INPAINTERS = {  # file and class, imported when the inpainter is asked for
 
 @dataclasses.dataclass(frozen=True)
 class InpainterOptions:
-    """Options of inpainters, of which each takes those that it needs."""
+    """Options of all inpainters; each inpainter uses those that it needs."""
 
-    weights: Path | None = None  # a file or a folder; where None, those that `spackle weights get` brought
-    side: int | None = None  # pixels of the long side at which a network works; its own default where None
-    device: str | None = None  # "cpu" or "cuda"; where None, CUDA if there is any
+    weights: Path | None = None  # a file or a folder; None: those that `spackle weights get` has downloaded
+    side: int | None = None  # pixels of the long side at which a network works; None: its own default
+    device: str | None = None  # "cpu" or "cuda"; None: CUDA if available
 
     def side_or(self, default: int) -> int:
         """The side, or a network's default; InputError for a side that is too small or too large."""
@@ -48,14 +48,14 @@ class Inpainter(Protocol):
     version: str  # another version may give other pixels
     network: ClassVar[bool]  # takes weights and a side, and uses a GPU
     video: ClassVar[bool]  # makes the views agree with each other; else it paints each by itself
-    notice: ClassVar[str]  # a line that people read before it is used, such as its licence; empty where there is none
+    notice: ClassVar[str]  # a line to show before the inpainter is used, such as its licence; may be empty
     files: Mapping[str, Path]  # its weights, by the names that a manifest gives them
 
     def __init__(self, options: InpainterOptions) -> None:
-        """Find what it needs; InputError where that is missing."""
+        """Find the packages and weights that it needs; InputError if they are missing."""
 
     def paint(self, rgb: Tensor, hole: Tensor, inverse_depth: Tensor) -> Tensor:
-        """New colours in the holes of V views of one scene, ordered as a camera that flies past would see them.
+        """Paint the holes of V views of one scene, ordered as a moving camera would see them.
 
         Args:
             rgb: [V, H, W, 3] sRGB in 0..1.
@@ -63,7 +63,7 @@ class Inpainter(Protocol):
             inverse_depth: [V, H, W] 1/z of what the views show; 0 where it is unknown.
 
         Returns:
-            [V, H, W, 3] sRGB in 0..1, outside of the holes `rgb` bit for bit.
+            [V, H, W, 3] sRGB in 0..1, equal to `rgb` bit for bit outside of the holes.
         """
         ...
 
@@ -82,5 +82,5 @@ def get_inpainter(name: str, options: InpainterOptions) -> Inpainter:
 
 
 def known_inverse_depth(depth: Tensor, hole: Tensor) -> Tensor:
-    """`inverse_depth` for `Inpainter.paint` of renderings with depth [V, H, W]: 0 in the holes and where depth is 0."""
+    """The `inverse_depth` of `Inpainter.paint`, from rendered depth [V, H, W]: 0 in holes and where the depth is 0."""
     return torch.where(~hole & (depth > 0), 1 / depth.clamp_min(1e-6), 0.0)

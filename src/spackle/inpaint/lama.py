@@ -1,7 +1,7 @@
 """LaMa: large holes in one pass of a network that sees the whole picture at once (Suvorov et al., WACV 2022).
 
-The network looks at a rectangle around each group of holes, reduced where that is large. Its published weights are
-fetched by `spackle weights get lama`.
+The network receives a rectangle around each group of holes, reduced if it is large. `spackle weights get lama`
+downloads its published weights.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from spackle.network_file import Shapes, check_finite, check_tensors, read_tenso
 from spackle.weights import installed
 
 SIDE = 1024  # pixels of the long side at which it works
-MULTIPLE = 8  # of the sides of what the network is given
-SMALLEST = 2 * MULTIPLE  # pixels of them: an eighth is reflected at its ends
+MULTIPLE = 8  # which divides both sides of the network's input
+SMALLEST = 2 * MULTIPLE  # least pixels of a side: features of an eighth of it are padded by reflection
 MARGIN = 128  # pixels around a group of holes that the network sees
 BLOCK = 16  # pixels of the grid on which groups are found
-LOCAL = 4  # one of so many channels is local in the blocks, the others are distant
+LOCAL = 4  # in the blocks, one of so many channels is local, the others are global
 EPSILON = 1e-5  # of batch norms
 WIDTH, BLOCKS = 64, 18  # of "big-lama"
 FIRST = "model.1.ffc.convl2l.weight"
@@ -36,7 +36,7 @@ Tensors = Mapping[str, Tensor]
 
 
 class LamaInpainter:
-    """Paints each view by itself, sharp, and different from view to view."""
+    """Paints each view by itself: sharp, but different from view to view."""
 
     name = "lama"
     network: ClassVar[bool] = True
@@ -60,10 +60,10 @@ class LamaInpainter:
 
     @torch.no_grad()
     def paint(self, rgb: Tensor, hole: Tensor, inverse_depth: Tensor) -> Tensor:
-        """The network's colours in the holes, each view by itself; depth is ignored.
+        """Paint the holes of each view by itself with the network's colours; depth is ignored.
 
         Raises:
-            InputError: too little memory, or no finite colours.
+            InputError: memory is short, or the network's colours are not finite.
         """
         painted = rgb.clone()
         for view, mask, target in zip(rgb, hole, painted, strict=True):
@@ -75,14 +75,14 @@ class LamaInpainter:
         return painted
 
     def _draw(self, rgb: Tensor, hole: Tensor) -> Tensor:
-        """The network's picture [h, w, 3] for one with holes [h, w]."""
+        """The picture [h, w, 3] that the network makes of one with holes [h, w]."""
         height, width = hole.shape
         colors = torch.where(hole[..., None], 0.0, rgb).permute(2, 0, 1)[None].to(self._device)
         mask = hole[None, None].to(self._device)
         small = working_size(width, height, self._side)[::-1]
         if small != (height, width):
             known = F.adaptive_avg_pool2d((~mask).to(colors), small)
-            mask = known < 0.999  # a pixel that lies in a hole with any part of it
+            mask = known < 0.999  # a pixel is masked if any part of it lies in a hole
             colors = F.adaptive_avg_pool2d(colors, small)
         shortage = enough_memory("lower --inpainter-side", what=f"for LaMa at {max(small)} pixels")
         with shortage, own_arithmetic(self._device):
@@ -95,7 +95,7 @@ class LamaInpainter:
 
 
 def groups_of(hole: Tensor) -> list[tuple[Crop, Crop]]:
-    """Rectangles around connected holes [H, W], and what the network sees of each.
+    """Rectangles around groups of holes [H, W], each with the larger crop that the network receives.
 
     Rectangles are merged if they touch, or if one crop for both has fewer pixels.
     """
@@ -127,13 +127,13 @@ def padded(x: Tensor) -> Tensor:
 
 
 def load_network(path: Path) -> LamaNetwork:
-    """The network with the weights of a TorchScript file, which is not run, of `torch.save` or of safetensors.
+    """Load the network from a file of TorchScript, which is not run, of `torch.save` or of safetensors.
 
     Weights of another width or depth are accepted. Half precision is widened. Names may begin with the path to the
     generator; tensors of other networks, such as a discriminator, are ignored.
 
     Raises:
-        InputError: a missing or broken file, or one of another network.
+        InputError: the file is missing or broken, or holds another network.
     """
     found = read_tensors(path, ADVICE)
     before = (name.removesuffix(FIRST) for name in found if name.endswith(FIRST))
@@ -208,7 +208,7 @@ def _last_stage(blocks: int) -> int:
 
 
 class LamaNetwork(nn.Module):
-    """Colours for the holes of a picture whose sides are multiples of 8, at least 16; for inference alone.
+    """Predicts colours for the holes of a picture whose sides are multiples of 8, at least 16; for inference alone.
 
     It runs in channels-last memory, its batch norms folded into the convolutions before them. Convolutions pad by
     reflection; a layer has local features (a quarter) and global ones.
@@ -229,7 +229,7 @@ class LamaNetwork(nn.Module):
             for stage in _up_stages(blocks)
         )
         last = f"model.{_last_stage(blocks)}"
-        # 3 output channels leave a processor's registers empty: the 7 rows of each become channels and are added up.
+        # 3 output channels use a CPU's registers poorly, so the kernel's 7 rows become channels, which are summed.
         weight = tensors[f"{last}.weight"].permute(2, 0, 1, 3).flatten(0, 1)[:, :, None]
         self.rows = _conv(weight, tensors[f"{last}.bias"].repeat(7) / 7)
         self.eval().requires_grad_(False)
@@ -239,7 +239,7 @@ class LamaNetwork(nn.Module):
         return self.logits(torch.cat([torch.where(hole, 0.0, rgb), hole.to(rgb)], 1)).sigmoid_()
 
     def logits(self, x: Tensor) -> Tensor:
-        """[B, 3, H, W] before the sigmoid, of colours that are 0 in the holes and a channel that is 1 there."""
+        """[B, 3, H, W] before the sigmoid, from [B, 4, H, W]: colours, 0 in the holes, and a mask, 1 in the holes."""
         x = self.first(_reflected(x.contiguous(memory_format=torch.channels_last), 3)).relu_()
         for conv in self.down:
             x = conv(_reflected(x, 1)).relu_()
@@ -281,7 +281,7 @@ class FourierLayer(nn.Module):
         return torch.cat([near, far], 1).relu_()
 
     def _spectral(self, x: Tensor) -> Tensor:
-        """[B, h, w, D] to the same shape: a linear map of the whole picture's spectrum, rectified, between two others.
+        """[B, h, w, D] to the same shape: two linear maps, and between them one with a ReLU on the picture's spectrum.
 
         Real and imaginary parts of the spectrum alternate in memory, in the channel order of the published tensors.
         """
@@ -308,7 +308,7 @@ def _folded(tensors: Tensors, conv: str, norm: str, *, transposed: bool = False)
 
 
 def _conv(weight: Tensor, bias: Tensor, *, stride: int = 1, transposed: bool = False) -> nn.Module:
-    """A convolution with these numbers; a transposed one doubles the sides."""
+    """A convolution with this weight and bias; a transposed one doubles the sides."""
     one, other, height, width = weight.shape
     conv: nn.Conv2d | nn.ConvTranspose2d
     if transposed:

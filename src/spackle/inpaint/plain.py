@@ -27,13 +27,13 @@ class PlainInpainter:
 
 
 class ExemplarInpainter(PlainInpainter):
-    """Each view by itself, with texture from the view: PatchMatch over colours that come from the far rim."""
+    """Paints each view by itself, with its own texture: PatchMatch, which starts from the colours of the far rim."""
 
     name = "exemplar"
     version = "1"
 
     def __init__(self, options: InpainterOptions) -> None:
-        """Take no option."""
+        """Ignore the options."""
 
     def paint(self, rgb: Tensor, hole: Tensor, inverse_depth: Tensor) -> Tensor:
         """The views [V, H, W, 3] with their holes [V, H, W] painted; see `Inpainter.paint`."""
@@ -64,19 +64,19 @@ class OpenCV:
         self._flow = self._cv2.DISOpticalFlow_create(self._cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
 
     def inpaint(self, rgb: Tensor, mask: Tensor, radius: float) -> Tensor:
-        """Telea's filling of a mask [H, W] bool in sRGB [H, W, 3]: [H, W, 3], of 8 bits a channel."""
+        """Fill a mask [H, W] bool in sRGB [H, W, 3] by Telea's method: [H, W, 3], with 8 bits a channel."""
         filled = self._cv2.inpaint(_bytes(rgb).numpy(), mask.to(torch.uint8).numpy(), radius, self._cv2.INPAINT_TELEA)
         return torch.from_numpy(filled).float() / 255
 
     def flow(self, picture: Tensor, other: Tensor) -> Tensor:
-        """Dense inverse search (Kroeger et al., 2016): how far from each pixel its content lies in another picture.
+        """Dense inverse search (Kroeger et al., 2016): the displacement of each pixel's content in another picture.
 
         Args:
             picture: [H, W, 3] sRGB in 0..1.
             other: [H, W, 3], likewise.
 
         Returns:
-            [H, W, 2] (x, y) in pixels; zero where a side is too short to look for motion.
+            [H, W, 2] (x, y) in pixels; zero if a side is too short to search for motion.
         """
         height, width = picture.shape[:2]
         if min(height, width) < 16:  # the search works on patches of 8 pixels, at several sizes
@@ -90,17 +90,17 @@ def _bytes(rgb: Tensor) -> Tensor:
 
 
 class OpencvInpainter(PlainInpainter):
-    """Telea's method on each view by itself: quick, blind to depth, and different from view to view."""
+    """Paints each view by itself by Telea's method: quick, but depth is ignored, and views differ from each other."""
 
     name = "opencv"
 
     def __init__(self, options: InpainterOptions) -> None:
-        """Find the package; InputError where it is not installed."""
+        """Find the package; InputError if it is not installed."""
         self._opencv = OpenCV("inpainter opencv:")
         self.version = f"telea {RADIUS:g}, cv2 {self._opencv.version}"
 
     def paint(self, rgb: Tensor, hole: Tensor, inverse_depth: Tensor) -> Tensor:
-        """Each view by itself, with 8 bits a channel in the holes."""
+        """Paint each view by itself; colours in the holes have 8 bits a channel."""
         painted = []
         for view, mask in zip(rgb, hole, strict=True):
             filled = self._opencv.inpaint(view, mask, RADIUS) if bool(mask.any()) else view

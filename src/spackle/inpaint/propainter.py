@@ -1,7 +1,7 @@
 """ProPainter, the paper's inpainter (optional: pip install 'spackle-nvs[propainter]').
 
-It propagates pixels along the optical flow into holes, and generates what no frame shows. Its networks are pytorchcv's,
-which would download weights by itself; so it is given networks with weights.
+It propagates pixels along the optical flow into holes, and generates what no frame shows. Its networks are pytorchcv's;
+as that package would download weights by itself, it is given networks that have their weights.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from spackle.image import working_size
 from spackle.inpaint import MIN_SIDE, InpainterOptions
 from spackle.network_file import load_strict, read_tensors
 
-NETWORKS = ("raft_things", "propainter_rfc", "propainter")  # flow, its completion, colours; so their files begin
+NETWORKS = ("raft_things", "propainter_rfc", "propainter")  # flow, its completion, colours; prefixes of file names
 SOURCE = "https://github.com/osmr/imgclsmob/releases/tag/v0.0.570"
 SIDE = 640  # pixels of the long side at which it works; it was trained on 432×240
-MULTIPLE = 8  # of the sides of what the networks are given
-DILATION = 4  # pixels around a hole that count as hole, the authors' choice: its rim is a mixture
+MULTIPLE = 8  # which divides both sides of the networks' input
+DILATION = 4  # pixels around a hole that count as hole, because its rim is a mixture; the authors' choice
 ITERATIONS = 20  # of the flow, the authors' choice
 
 
@@ -58,17 +58,17 @@ class PropainterInpainter:
 
     @torch.no_grad()
     def paint(self, rgb: Tensor, hole: Tensor, inverse_depth: Tensor) -> Tensor:
-        """The colours of the completed video, whose frames the views are, in the holes.
+        """Complete the views as the frames of one video, and take its colours in the holes.
 
         Raises:
-            InputError: too little memory, or no finite colours.
+            InputError: memory is short, or the colours are not finite.
         """
         if not bool(hole.any()):
             return rgb
         height, width = hole.shape[1:]
         small = working_size(width, height, self._side)[::-1]
         frames = F.interpolate(rgb.permute(0, 3, 1, 2), small, mode="bicubic", antialias=True)
-        holes = F.interpolate(hole[:, None].float(), small, mode="area") > 0  # a thin one is not lost
+        holes = F.interpolate(hole[:, None].float(), small, mode="area") > 0  # thin holes are kept
         with enough_memory("lower --inpainter-side", what=f"for ProPainter at {self._side} pixels"):
             filled = self._fill(frames.clamp(0, 1), holes.float()).to(rgb)
         if not bool(filled.isfinite().all()):
@@ -77,11 +77,11 @@ class PropainterInpainter:
         return torch.where(hole[..., None], painted, rgb)
 
     def _fill(self, frames: Tensor, holes: Tensor) -> Tensor:
-        """Frames [V, 3, h, w] in 0..1, drawn anew in and around the holes [V, 1, h, w], which are 1."""
+        """Frames [V, 3, h, w] in 0..1, repainted in and around the holes [V, 1, h, w], where `holes` is 1."""
         from pytorchcv.models.propainter_stream import ProPainterIterator, TensorSequencer
 
         count, _, height, width = frames.shape
-        turns = [*range(count), *[0] * (count == 1)]  # a video has two frames
+        turns = [*range(count), *[0] * (count == 1)]  # a video needs two frames
         margin = (0, padded(width) - width, 0, padded(height) - height)
         frames, holes = (F.pad(x[turns].to(self._device), margin, mode="replicate") for x in (frames, holes))
         video = ProPainterIterator(
@@ -96,7 +96,7 @@ class PropainterInpainter:
 
 
 def padded(side: int) -> int:
-    """Round a side in pixels to one that the networks take."""
+    """Round a side in pixels up to one that the networks accept."""
     return max(MIN_SIDE, -(-side // MULTIPLE) * MULTIPLE)
 
 
@@ -138,7 +138,7 @@ def weight_files(folder: Path | None) -> dict[str, Path]:
     """The file of each of `NETWORKS` in a folder: NAME.pth, NAME-….pth as it is published, or .safetensors.
 
     Raises:
-        InputError: there is no such folder, or not one file of each.
+        InputError: the folder is missing, or does not hold exactly one file of each.
     """
     wanted = f"{', '.join(NETWORKS)}: one .pth file of each, unpacked from {SOURCE}"
     if folder is None:
@@ -163,7 +163,7 @@ def give_weights(network: nn.Module, name: str, file: Path) -> None:
     As in the package that publishes them, tensors that the network does not have are ignored.
 
     Raises:
-        InputError: a missing or broken file, or one of another network.
+        InputError: the file is missing or broken, or holds another network.
     """
     advice = f"unpack the file of {name} from {SOURCE} again"
     found = read_tensors(file, advice)

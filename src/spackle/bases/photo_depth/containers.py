@@ -43,7 +43,7 @@ def xmp_of(image: JpegImageFile | None) -> bytes:
 
 
 def extended_xmp_of(image: JpegImageFile) -> tuple[bytes, bool]:
-    """The extended XMP that did not fit into the main packet, as far as present, and whether it is complete."""
+    """The extended XMP, which did not fit into the main packet, as far as it is present, and whether it is complete."""
     if (named := _GUID.search(xmp_of(image))) is None:
         return b"", True
     parts = [body.removeprefix(MORE_XMP) for name, body in image.applist if name == "APP1" and MORE_XMP in body[:40]]
@@ -192,7 +192,7 @@ def get(node: Element, name: str) -> str | None:
 
 
 def find(tree: Element, name: str) -> str | None:
-    """A property of this element or the first one below that has it."""
+    """A property of this element, or of the first element below it that has the property."""
     return next((value for node in tree.iter() if (value := get(node, name)) is not None), None)
 
 

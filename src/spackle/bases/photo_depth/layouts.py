@@ -44,13 +44,13 @@ from spackle.image import DEFAULT_FOCAL_MM, LENSES, check_pixels, film_to_pixels
 Array = NDArray[Any]
 
 _EXIF_IFD, _ORIENTATION = 0x8769, 0x0112
-PLAUSIBLE_M = (0.3, 30.0)  # a scene's middle, where the file does not say its unit
-USUAL_M = 3.0
+PLAUSIBLE_M = (0.3, 30.0)  # median depths beyond these are rescaled if the file states no unit
+USUAL_M = 3.0  # the median after rescaling
 
 
 @dataclasses.dataclass(frozen=True)
 class Scale:
-    """Codes to values, along a straight line."""
+    """A linear map from codes to values."""
 
     quantity: Quantity
     first: float  # value of the lowest code: metres of depth, or 1/m of disparity
@@ -74,11 +74,11 @@ class Scale:
             values = self.first + slope * (codes.astype(np.float64) - self.lowest)
             if self.quantity == "depth":
                 return values, step
-            # Not above zero is the horizon and what noise has pushed beyond it: far, but not unknown.
+            # Values not above zero are the horizon, or were pushed beyond it by noise: far, but not unknown.
             return 1 / np.maximum(values, abs(slope) / 2), step
 
 
-Lens = tuple[float, float, float, float, float, float]  # focal lengths, centre and size of a picture: x, y in pixels
+Lens = tuple[float, float, float, float, float, float]  # a picture's focal length, centre and size: x, y in pixels
 
 
 def _turned(values: Tensor, turn: str) -> Tensor:
@@ -109,28 +109,28 @@ def _intrinsics(lens: Lens, width: int, height: int, turn: str) -> Tensor | None
 
 @dataclasses.dataclass(frozen=True)
 class CodedDepth:
-    """A depth map as it lies in the file."""
+    """A depth map as the file stores it."""
 
     codes: Array  # [H, W] whole numbers
     full: int  # the highest code of the picture's format
     scale: Scale
-    source: str  # whose layout, of what quantity, how far to be trusted: for the report
+    source: str  # for the report: layout, quantity and accuracy
     lens: Lens | None = None
-    turned: str = ""  # what the decoder has done to the codes, but not to the lens
-    turn: str = ""  # what is still to do to get to the photo as Pillow opens it
+    turned: str = ""  # the turn that the decoder has applied to the codes, but not to the lens
+    turn: str = ""  # the turn that is still needed to match the photo as Pillow opens it
     along_ray: bool = False  # distances from the eye instead of z
     unit_known: bool = True
 
 
 def load_photo_depth(path: StrPath) -> DepthMap | None:
-    """The depth map inside a photo, upright as the photo itself is; None where it has none.
+    """The depth map inside a photo, upright as the photo itself is; None if it has none.
 
-    Read are, in HEIC, an auxiliary depth image with Apple's XMP or HEVC's depth information; in JPEG,
-    Apple's auxiliary pictures, Android's Dynamic Depth and the older GDepth. `DepthMap.note` says which format it had
-    and how reliable its metres are. The picture itself is not decoded.
+    In HEIC this reads an auxiliary depth image with Apple's XMP or HEVC's depth information; in JPEG, Apple's auxiliary
+    pictures, Android's Dynamic Depth and the older GDepth. `DepthMap.note` says which format it was and how reliable
+    the metres are. The picture itself is not decoded.
 
     Raises:
-        InputError: a missing file, or a photo whose depth map is broken or of another crop.
+        InputError: the file is missing, or the photo's depth map is broken or shows another crop.
     """
     check_file(path, "photo")
     try:
@@ -139,7 +139,7 @@ def load_photo_depth(path: StrPath) -> DepthMap | None:
             jpeg = start.startswith(b"\xff\xd8\xff")
             data = start + file.read() if jpeg or start.endswith(b"ftyp") else b""
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # what Pillow thinks of a stranger's bytes is not worth a line
+            warnings.simplefilter("ignore")  # Pillow's warnings about untrusted bytes are of no use
             coded = _find_in_jpeg(data) if jpeg else _find_in_heif(data) if data else None
             return None if coded is None else _depth_map(coded, path)
     except BrokenDepth as error:
@@ -161,7 +161,7 @@ def _depth_map(coded: CodedDepth, path: StrPath) -> DepthMap:
         own = Camera.from_focal(focal, photo_width, photo_height).resized(width, height)
         camera = own if K is None else Camera(K, torch.eye(4), width, height)
         rays = camera.unproject(camera.pixel_centers(), torch.ones(height, width))
-        depth, quantum = depth / rays.square().sum(-1).sqrt(), None  # from the way to a point to its z
+        depth, quantum = depth / rays.square().sum(-1).sqrt(), None  # from the distance along a ray to z
     note = f"portrait depth of the photo ({coded.source}"
     known = depth[is_depth(depth)]
     middle = float(known.median()) if len(known) and not coded.unit_known else USUAL_M
@@ -190,7 +190,7 @@ def _photo_header(image: Image.Image) -> tuple[int, int, str, float]:
 
 @contextlib.contextmanager
 def _decoding() -> Iterator[None]:
-    """BrokenDepth for whatever a decoder raises over a stranger's bytes."""
+    """Turn every exception of a decoder into BrokenDepth."""
     try:
         yield
     except Exception as error:
@@ -207,7 +207,7 @@ def _read_codes(picture: bytes) -> tuple[Array, int]:
 
 
 def _find_in_jpeg(data: bytes) -> CodedDepth | None:
-    """Apple's depth map among the further pictures, told from the others by its XMP, or else Android's."""
+    """Apple's depth map, recognised among the further pictures by its XMP, or else Android's; None without either."""
     if (image := open_jpeg(data)) is None:  # whoever decodes the photo will say what is wrong
         return None
     for begin, end in further_pictures(image):
@@ -232,7 +232,7 @@ def _is_about(packet: bytes, space: str) -> bool:
 
 
 def describe(packet: bytes) -> tuple[Scale | None, Lens | None, str] | None:
-    """The depth scale (None without a range), lens and source stated by an XMP packet; None for another packet."""
+    """The depth scale (None without a range), lens and source stated by an XMP packet; None if it describes none."""
     if not _is_about(packet, PIXELS):
         return None
     tree = parse_xmp(packet)
@@ -250,7 +250,7 @@ def describe(packet: bytes) -> tuple[Scale | None, Lens | None, str] | None:
 def _quantity(tree: Element) -> Quantity | None:
     native, kind = find(tree, f"{PIXELS}NativeFormat"), find(tree, f"{PIXELS}AuxiliaryImageType")
     if native is not None:
-        if native.isascii() and native.isdigit() and len(native) <= 10:  # four characters, written as the number
+        if native.isascii() and native.isdigit() and len(native) <= 10:  # four characters, written as one number
             native = int(native).to_bytes(5, "big")[1:].decode("latin-1")
         return _FORMATS.get(native)
     if find(tree, f"{PIXELS}AuxiliaryImageSubType") is not None:  # the mattes: they too are of type "depth"
@@ -275,7 +275,7 @@ _PICTURE_STARTS = (b"\xff\xd8\xff", b"\x89PNG")
 
 
 def _find_android(data: bytes, main: bytes, extended: bytes, complete: bool) -> CodedDepth | None:
-    """The depth map that a JPEG's XMP, the main packet and its `complete` extension, holds or points to."""
+    """The depth map that a JPEG's XMP (the main packet and its extension) holds or points to; None without one."""
     if not any(_is_about(packet, space) for space in (GDEPTH, MAP) for packet in (main, extended)):
         return None
     if not complete:
@@ -288,7 +288,7 @@ def _find_android(data: bytes, main: bytes, extended: bytes, complete: bool) -> 
         if uri is not None and (get(node, f"{MAP}ItemSemantic") or "Depth").lower() == "depth":
             return _coded(node, MAP, _item(data, tree, uri), "Dynamic Depth", _android_lens(tree))
     text = find(tree, f"{GDEPTH}Data")
-    if text is None:  # editors that drop the extended XMP leave the rest behind: a photo whose depth is gone has none
+    if text is None:  # editors may drop the extended XMP, and the depth with it, but leave the rest
         return None
     squeezed = "".join(text.split())
     with _decoding():
@@ -297,12 +297,12 @@ def _find_android(data: bytes, main: bytes, extended: bytes, complete: bool) -> 
 
 
 def _coded(node: Element, space: str, picture: bytes, layout: str, lens: Lens | None) -> CodedDepth:
-    """A picture whose codes run from near to far: evenly, or evenly in the inverse."""
+    """Read a picture whose codes are linear, from near to far, in depth or in inverse depth."""
     near, far = number(node, f"{space}Near"), number(node, f"{space}Far")
     if near is None or far is None:
         raise BrokenDepth("does not say its range: Near or Far is missing")
     unit, style, measure = ((find(node, f"{space}{name}") or "").lower() for name in ("Units", "Format", "MeasureType"))
-    # A Pixel says diopters of what grows from near to far, and so is none: the order counts, not the unit.
+    # Pixel phones state diopters even for values that grow from near to far: the order counts, not the unit.
     diopters = unit == "diopters" and near > far
     known = unit in _UNITS_M or diopters
     near, far = (value * _UNITS_M.get(unit, 1.0) for value in (near, far))
@@ -320,7 +320,7 @@ def _coded(node: Element, space: str, picture: bytes, layout: str, lens: Lens | 
 
 
 def _item(data: bytes, tree: Element, uri: str) -> bytes:
-    """The bytes of a directory entry; they are appended to the primary picture in the directory's order."""
+    """The bytes of an item in the photo's directory; items follow the primary picture in the directory's order."""
     entries = [node for node in tree.iter() if (get(node, f"{ITEM}Mime") or get(node, f"{ITEM}Length")) is not None]
     index = next((i for i, node in enumerate(entries) if get(node, f"{ITEM}DataURI") == uri), None)
     if index is None:
@@ -333,7 +333,7 @@ def _item(data: bytes, tree: Element, uri: str) -> bytes:
     length = lengths[index]
     places = [len(data) - sum(lengths[index:])]  # counted from the end
     if (end := end_of_picture(data)) is not None:
-        # Writers disagree on whether lengths include paddings, and on the primary's.
+        # Writers disagree on whether lengths include paddings, and on the primary picture's length.
         behind = [0, *lengths[1:]]
         padded = [length + padding for length, padding in zip(behind, paddings, strict=True)]
         places = [end + sum(sizes[:index]) for sizes in (padded, behind)] + places
@@ -345,12 +345,12 @@ def _item(data: bytes, tree: Element, uri: str) -> bytes:
 
 
 def _android_lens(tree: Element) -> Lens | None:
-    """The single imaging model, in pixels; its centre may be stored relative to the picture's size, as specified."""
+    """The lens of the only imaging model; its centre may be stored relative to the picture's size, as specified."""
     models = [node for node in tree.iter() if get(node, f"{MODEL}FocalLengthX") is not None]
     names = ("FocalLengthX", "FocalLengthY", "PrincipalPointX", "PrincipalPointY", "ImageWidth", "ImageHeight")
     try:
         fx, fy, cx, cy, width, height = (number(models[0], f"{MODEL}{name}") for name in names)
-    except (IndexError, BrokenDepth):  # the map can do without
+    except (IndexError, BrokenDepth):  # the map is usable without a lens
         return None
     if len(models) > 1 or fx is None or fy is None or width is None or height is None:
         return None
@@ -361,7 +361,7 @@ def _android_lens(tree: Element) -> Lens | None:
 
 
 FULL_CODES = {"L": 255, "I;10": 1023, "I;12": 4095}
-ASSUMED = Scale("disparity", 0.1, 1.0)  # 10 m to 1 m: a portrait's usual range, where a file says none
+ASSUMED = Scale("disparity", 0.1, 1.0)  # 10 m to 1 m: a portrait's usual range, if a file states none
 
 
 def _find_in_heif(data: bytes) -> CodedDepth | None:
@@ -375,16 +375,16 @@ def _find_in_heif(data: bytes) -> CodedDepth | None:
         image = pillow_heif.open_heif(io.BytesIO(data), hdr_to_16bit=False).info["depth_images"][0]
         width, height = image.size
         check_pixels(width, height, len(data), "it")
-        codes, full = np.array(image), FULL_CODES[image.mode]  # its own rotation is applied
+        codes, full = np.array(image), FULL_CODES[image.mode]  # already turned by the item's rotation
     packets = xmp_packets(data) if alone else ()
     scale, lens, source = next(filter(None, map(describe, packets)), (None, None, ""))
-    if scale is None:  # Apple's words count more than HEVC's
+    if scale is None:  # Apple's XMP takes precedence over HEVC's range
         scale, source = _hevc_scale(image.info.get("metadata") or {})
     return CodedDepth(codes, full, scale, source, lens, turned, turn)
 
 
 def _hevc_scale(stated: dict[str, Any]) -> tuple[Scale, str]:
-    """The depth range that HEVC states and its source, else the usual range of portraits."""
+    """The depth range that HEVC states, else the usual range of portraits; and its source, for the report."""
     kind = stated.get("representation_type")
     first, last = (stated.get(name) for name in (("d_min", "d_max") if kind == 1 else ("z_near", "z_far")))
     if kind == 3:

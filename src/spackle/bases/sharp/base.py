@@ -245,7 +245,7 @@ class Owner:
 
     @property
     def places(self) -> tuple[str, str]:
-        """Names under which it is looked for beside a decoder: the link of `link_owner`, and its own name."""
+        """The file names tried for the checkpoint beside a decoder: the link of `link_owner`, and its own name."""
         return f"trained-on-{one_line(Path(self.sha256).name)[:12]}.link", self.path.name
 
 

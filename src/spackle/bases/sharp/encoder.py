@@ -54,7 +54,7 @@ _HEAVY = (nn.Linear, nn.Conv2d, nn.ConvTranspose2d, nn.GroupNorm)
 
 
 class ExactConv(nn.Conv2d):
-    """A convolution that stays in float32, as it is cheap and directly reads pixels or writes what makes Gaussians."""
+    """A convolution that stays in float32, because it is cheap and reads the pixels or writes the Gaussians' values."""
 
     def forward(self, x: Tensor) -> Tensor:
         with torch.autocast(x.device.type, enabled=False):  # the decoder is trained under autocast

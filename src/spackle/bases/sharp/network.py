@@ -49,7 +49,7 @@ class GroupNorm(nn.GroupNorm):
     """
 
     def forward(self, x: Tensor) -> Tensor:
-        """[1, C, H, W] to the same."""
+        """Normalise [1, C, H, W]; the shape stays the same."""
         if x.device.type != "cpu" or x.dtype != torch.float32 or len(x) != 1:
             return super().forward(x)
         rows = x[0].permute(1, 2, 0)  # [H, W, C]
@@ -197,7 +197,7 @@ class DepthNetwork(nn.Module):
         )
 
     def disparity(self, maps: list[Tensor]) -> Tensor:
-        """[1, 2, side, side] ≥ 0, float32."""
+        """Disparity [1, 2, side, side] ≥ 0, float32, from the encoder's maps."""
         out: Tensor = self.head(self.decoder(maps))
         return out
 
@@ -234,7 +234,7 @@ class PredictionHead(nn.Module):
         self.texture_prediction_head = ExactConv(width, TEXTURE * LAYERS, 1)
 
     def forward(self, texture: Tensor, geometry: Tensor) -> Tensor:
-        """[14, 2, H, W] float32."""
+        """Deltas [14, 2, H, W] float32 from texture and geometry features [1, F, H, W]."""
         geometry = self.geometry_prediction_head(geometry)[0].unflatten(0, (GEOMETRY, LAYERS))
         texture = self.texture_prediction_head(texture)[0].unflatten(0, (TEXTURE, LAYERS))
         return torch.cat([geometry, texture])

@@ -125,7 +125,7 @@ def _store_block(first: int, count: int, columns: Any, new_quats: Any, new_scale
 
 @kernel
 def _other_axes(a: Any, b: Any) -> Any:
-    """The other axes of a right-handed frame that begins with a: b made orthogonal, or any if b has no direction; c."""
+    """The second and third axes of a right-handed frame: b made orthogonal to a, or any axis if b has no direction."""
     c = _cross(a, b)
     if not _dot(c, c) > UPRIGHT:
         x, y, z = abs(a[0]), abs(a[1]), abs(a[2])
