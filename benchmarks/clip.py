@@ -1,11 +1,11 @@
-"""How calm the holes of a clip are: `python benchmarks/clip.py [--side N] [--frames N]` (needs scikit-image).
+"""Measure the flicker in a clip's holes: `python benchmarks/clip.py [--side N] [--frames N]` (needs scikit-image).
 
-A camera moves through the Middlebury Motorcycle scene, before which a painted board stands or passes by. The scene's
-geometry is known, so each frame comes with its depth, and for each completed view there is the true view, with the
-true motion of all that the board hid. Followed by that motion into the view before, a hole's pixel should find its
-colour again: the mean absolute difference of sRGB is its flicker. "Alone" is each frame by itself, "carried" what
-`spackle predict` draws. "Seen" is the same figure for what the frame does show: the floor. All in units of 1/255.
-The method follows its own optical flow; the true motion and the truth only judge.
+A camera moves through the Middlebury Motorcycle scene, in front of which a painted board stands or passes by. The
+scene's geometry is known, so each frame has its depth, and each completed view has a true view with the true motion of
+everything that the board hid. A hole's pixel, followed by that motion into the previous view, should have the same
+colour there: its flicker is the mean absolute difference in sRGB. "Alone" completes each frame by itself, "carried" is
+what `spackle predict` renders. "Seen" is the same figure for visible pixels, a lower bound. All are in units of 1/255.
+The method uses its own optical flow; the true motion and the true views serve for the measurement only.
 """
 
 from __future__ import annotations
@@ -38,24 +38,24 @@ from spackle.surface import surface_gaussians
 
 BOARD_M, FOCUS_M = 1.5, 3.0
 DISPARITY = 0.3
-PATH = 4  # the clip is the beginning of a path of this many times its length
+PATH = 4  # the clip is the beginning of a camera path this many times as long
 Truth = tuple[Camera, Rendering]
-Sums = dict[str, list[Tensor]]  # a figure → its pixels, a tensor for each frame
-SAME_DEPTH = 0.02  # relative difference within which two views see the same thing
-# Of the simulated depth network, from frame to frame: scale, shift (of the median) and waves of inverse depth.
+Sums = dict[str, list[Tensor]]  # for each figure, its pixels in each frame
+SAME_DEPTH = 0.02  # relative difference of depth up to which two views see the same surface
+# Simulated errors of a depth network, which vary between frames: scale, shift (over the median), waves.
 SCALE_NOISE, SHIFT_NOISE, WAVE_NOISE = 0.05, 0.02, 0.01
 
 
 class World(NamedTuple):
-    """What the clip is taken of."""
+    """The scene of a clip."""
 
     still: Gaussians
-    board: Gaussians  # at its place in the first frame
+    board: Gaussians  # at its position in the first frame
     camera: Camera
 
 
 Eye = tuple[float, float, float]
-CLIPS: dict[str, tuple[Eye, float]] = {  # in metres: where the camera gets to, and how far the board goes to the right
+CLIPS: dict[str, tuple[Eye, float]] = {  # in metres: where the camera ends, how far the board moves right
     "pan past a board": ((0.20, 0.0, 0.0), 0.0),
     "walk towards it": ((0.0, 0.0, 0.25), 0.0),
     "a board passes": ((0.0, 0.0, 0.0), 0.40),
@@ -64,7 +64,7 @@ CLIPS: dict[str, tuple[Eye, float]] = {  # in metres: where the camera gets to, 
 
 
 def load_world(side: int) -> World:
-    """Motorcycle's left photo, `side` pixels wide, completed so that it may be walked through; and the board."""
+    """Motorcycle's left photo, `side` pixels wide, completed for cameras all around; and the board."""
     from skimage.transform import resize
 
     pair = load_motorcycle()
@@ -81,7 +81,7 @@ def load_world(side: int) -> World:
 
 
 def depth_map(depth: Tensor) -> DepthMap:
-    """Of depth [H, W] in metres, 0 where it is not known."""
+    """A depth map from depth [H, W] in metres, where 0 means unknown."""
     return DepthMap(depth, depth > 0, None, None, "depth", Path("clip"))
 
 
@@ -97,12 +97,12 @@ def board(camera: Camera) -> Gaussians:
 
 
 def moved(camera: Camera, eye: Eye) -> Camera:
-    """The camera at another place, looking at what it looked at."""
+    """The camera at another position, looking at the same point."""
     return camera.looking(torch.tensor(eye), torch.tensor([0.0, 0.0, FOCUS_M]))
 
 
 def said_depth(depth: Tensor, dice: torch.Generator) -> Tensor:
-    """True depth [H, W] as a network might say it: with another scale, shift and dents in each frame."""
+    """True depth [H, W] with errors like a network's: another scale, shift and dents in each frame."""
     rolls = torch.randn(2, generator=dice)
     waves = torch.randn(1, 1, 4, 6, generator=dice)
     waves = torch.nn.functional.interpolate(waves, size=depth.shape, mode="bicubic")[0, 0]
@@ -111,7 +111,7 @@ def said_depth(depth: Tensor, dice: torch.Generator) -> Tensor:
 
 
 def play(world: World, clip: str, frames: int, noisy: bool, steady: bool) -> Iterator[tuple[CompletedView, Truth]]:
-    """Each frame's completed view, and the truth."""
+    """Yield each frame's completed view and true view."""
     renderer, dice = get_renderer(), torch.Generator().manual_seed(0)
     path, flow, network = PATH * frames, OpenCV("this").flow, shipped_network()
     completer = ClipCompleter("rotate", DISPARITY, path, renderer, flow, align=steady, network=network)
@@ -130,7 +130,7 @@ def play(world: World, clip: str, frames: int, noisy: bool, steady: bool) -> Ite
 
 
 def true_flow(now: Truth, was: Truth) -> tuple[Tensor, Tensor]:
-    """Of what stands still, from a true view into the one before: [H, W, 2], and where both see the same, [H, W]."""
+    """Flow [H, W, 2] of static surfaces from a true view to the previous one; [H, W] bool: where both see the same."""
     (camera, view), (camera_before, before) = now, was
     grid = pixel_grid(view.depth)
     uv, z = camera_before.project(camera.unproject(grid, view.depth))
@@ -139,15 +139,15 @@ def true_flow(now: Truth, was: Truth) -> tuple[Tensor, Tensor]:
 
 
 def mean(parts: list[Tensor]) -> float:
-    """Over all pixels of all frames."""
+    """The mean over all pixels of all frames."""
     return float(torch.cat([part.flatten().double() for part in parts]).mean())
 
 
 def judge(world: World, clip: str, frames: int, noisy: bool) -> Sums:
-    """Both ways through the same clip, side by side."""
+    """Measure a clip completed both ways, "carried" and "alone"."""
     sums: Sums = collections.defaultdict(list)
     past: dict[str, tuple[CompletedView, Truth]] = {}
-    # Where the depth is exact there is nothing to hold still, so the same run has both.
+    # Exact depth needs no alignment between frames, so one run gives both.
     steady = [noisy, False] if noisy else [False]
     for runs in zip(*(play(world, clip, frames, noisy, way) for way in steady), strict=True):
         now = {"carried": runs[0], "alone": runs[-1]}
@@ -162,7 +162,7 @@ def judge(world: World, clip: str, frames: int, noisy: bool) -> Sums:
 
 
 def compare(sums: Sums, name: str, now: tuple[CompletedView, Truth], was: tuple[CompletedView, Truth]) -> None:
-    """Flicker of a view's holes, and of what is seen in it."""
+    """Add the flicker of a view's holes and of its visible pixels to `sums`."""
     (drawn, truth), (earlier, before) = now, was
     flow, same = true_flow(truth, before)
     held = sample(earlier.hole[..., None].float(), pixel_grid(flow) + flow)[..., 0]

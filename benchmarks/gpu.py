@@ -1,10 +1,11 @@
-"""The first ten minutes on a machine with an NVIDIA GPU: what works there, is exact and is fast, as one Markdown file.
+"""The first ten minutes on a machine with an NVIDIA GPU: a report in Markdown on what works, how exactly, how fast.
 
 python benchmarks/gpu.py [-o gpu.md] [-c SHARP.pt] [--only STEP,...]
 
-Each step runs in a process of its own, for a fault in a kernel ends the process, and says what it must show. A step
-that cannot run here is skipped with its reason: without a GPU all are, which is the dry run. The file is written anew
-after each step and is meant for docs/performance.md. `spackle weights make sharp.pt` makes weights for -c.
+Each step runs in its own process, because a fault in a kernel ends the process, and the report states what the step
+must show. A step that cannot run here is skipped with its reason; without a GPU this applies to all, as a dry run. The
+file is rewritten after each step and is meant for docs/performance.md. `spackle weights make sharp.pt` makes weights
+for -c.
 """
 
 from __future__ import annotations
@@ -50,17 +51,17 @@ from spackle.training.samples import Sample
 REPOSITORY = Path(__file__).parents[1]
 SKIPPED, LIMIT_S, RUNS = 77, 1200, 20
 CUDA = torch.device("cuda")
-CLOSE = 2e-4  # of sRGB: nearer is the same
+CLOSE = 2e-4  # smaller differences in sRGB count as equal
 TESTS = "tests/render/test_cuda.py"
-CROP, BATCH = 96, 8  # cells along a training crop; of a step
+CROP, BATCH = 96, 8  # cells along a training crop; crops per step
 
 
-class Skip(Exception):  # nothing went wrong
-    """Why a step cannot run here."""
+class Skip(Exception):  # not an error
+    """Raised with the reason why a step cannot run here."""
 
 
 def renderer() -> GsplatRenderer:
-    """The GPU's, or a `Skip` that says what is missing."""
+    """The GPU renderer; raises `Skip` with what is missing."""
     try:
         return GsplatRenderer()
     except InputError as error:
@@ -68,7 +69,7 @@ def renderer() -> GsplatRenderer:
 
 
 def run(*command: str) -> Iterator[str]:
-    """The lines that a program prints; the step fails where it does."""
+    """Yield the lines that a program prints; the step fails if the program fails."""
     if shutil.which(command[0]) is None:
         raise Skip(f"there is no {command[0]} on the path")
     done = subprocess.run(command, capture_output=True, text=True, cwd=REPOSITORY)
@@ -80,7 +81,7 @@ def run(*command: str) -> Iterator[str]:
 def sharp(
     options: argparse.Namespace, precision: Precision = "fp32", *, compiled: bool = False
 ) -> tuple[SharpBase, Photo]:
-    """SHARP on the GPU, and a photo of noise."""
+    """Load SHARP on the GPU, and make a photo of noise."""
     if not torch.cuda.is_available():
         raise Skip("PyTorch sees no NVIDIA GPU on this machine")
     if options.checkpoint is None:
@@ -91,13 +92,13 @@ def sharp(
 
 
 def views() -> tuple[Gaussians, list[Camera]]:
-    """A scene of SHARP's size, and the photo's camera and one from aside."""
+    """A scene of SHARP's size, the photo's camera, and a camera to its side."""
     scene, camera = photo_scene()
     return scene, [camera, extremes(camera, 0.3, DepthRange.of(scene))[1]]
 
 
 def rows(tasks: dict[str, Task], runs: int = RUNS) -> Iterator[str]:
-    """A table of median milliseconds of tasks that take turns."""
+    """Yield a table of the tasks' median milliseconds; the tasks take turns."""
     yield from ("", "| what | median |", "|---|---|")
     for (name, stage), times in measure(runs, tasks, CUDA).items():
         if stage == TOTAL:
@@ -113,7 +114,7 @@ def machine(options: argparse.Namespace) -> Iterator[str]:
 
 
 def build(options: argparse.Namespace) -> Iterator[str]:
-    """gsplat's kernels build and load; the second time takes seconds"""
+    """gsplat's kernels build and load; loading them again takes seconds"""
     if importlib.util.find_spec("gsplat") is None:
         raise Skip("gsplat is not installed: pip install 'spackle-nvs[cuda]'")
     start = time.perf_counter()
@@ -125,7 +126,7 @@ def build(options: argparse.Namespace) -> Iterator[str]:
 
 
 def empty(options: argparse.Namespace) -> Iterator[str]:
-    """an empty scene is black, and an empty set beside another changes nothing"""
+    """an empty scene renders black, and an empty set added to another changes nothing"""
     gpu = renderer()
     scene, camera = photo_scene(256)
     black, alone, both = (gpu.render(s, camera) for s in ([], [scene], [scene, Gaussians.empty()]))
@@ -134,13 +135,13 @@ def empty(options: argparse.Namespace) -> Iterator[str]:
 
 
 def parity(options: argparse.Namespace) -> Iterator[str]:
-    """all pass and none of gsplat's is skipped: values, gradients, tiles, batches, memory"""
+    """all tests of values, gradients, tiles, batches and memory pass, and none of gsplat's is skipped"""
     renderer()
     yield list(run(sys.executable, "-m", "pytest", TESTS, "-q", "-rs"))[-1]
 
 
 def against_cpu(options: argparse.Namespace) -> Iterator[str]:
-    """at eps2d 0 nearly all pixels within 2e-4 of the processor's, and next to no Gaussian drawn by one alone"""
+    """with eps2d 0 nearly all pixels are within 2e-4 of the CPU's, and hardly any Gaussian is drawn by one alone"""
     gpu, (scene, cameras) = renderer(), views()
     for camera in cameras:
         one, other = gpu.render(scene, camera), CpuRenderer().render(scene, camera)
@@ -161,7 +162,7 @@ def against_cpu(options: argparse.Namespace) -> Iterator[str]:
 
 
 def sanitizer(options: argparse.Namespace) -> Iterator[str]:
-    """no invalid access in forward and backward, through tiles and batches"""
+    """no invalid memory access in forward and backward passes, with tiles and batches"""
     renderer()
     words = "gradients or tiles or together"
     command = ["compute-sanitizer", "--tool", "memcheck", "--error-exitcode", "1"]
@@ -169,7 +170,7 @@ def sanitizer(options: argparse.Namespace) -> Iterator[str]:
 
 
 def counted_waits(call: Callable[[], object]) -> list[str]:
-    """The places in which a call makes the host wait for the GPU, after one call that warms up."""
+    """The lines of code where a call makes the host wait for the GPU; the call runs once before, to warm up."""
     call()
     torch.cuda.synchronize()
     torch.cuda.set_sync_debug_mode("warn")
@@ -184,14 +185,14 @@ def counted_waits(call: Callable[[], object]) -> list[str]:
 
 
 def waits(options: argparse.Namespace) -> Iterator[str]:
-    """the host waits once between photo and scene: for the scene"""
+    """the host waits for the GPU once between photo and scene: to get the scene"""
     base, photo = sharp(options)
     places = counted_waits(lambda: base.predict(photo))
     yield f"{len(places)} waits: {', '.join(places)}"
 
 
 def precisions(options: argparse.Namespace) -> Iterator[str]:
-    """bf16 is several times as fast as fp32; a captured graph says the same as the network, and sooner"""
+    """bf16 is several times as fast as fp32; a captured graph gives the network's results, but faster"""
     tasks: dict[str, Task] = {}
     found: dict[str, torch.Tensor] = {}
     ways: list[tuple[str, Precision, bool]] = [
@@ -218,7 +219,7 @@ def speed(options: argparse.Namespace) -> Iterator[str]:
     tiles = torch.zeros(SIDE // TILE, SIDE // TILE, dtype=torch.bool, device=CUDA)
     tiles[:24, :24] = True
 
-    def again(_: object) -> None:  # what completion does
+    def again(_: object) -> None:  # as in completion
         view: Rendering = gpu.render(there, cameras[0])
         gpu.render([there, few], cameras[0], tiles=tiles, onto=view)
 
@@ -236,7 +237,7 @@ def speed(options: argparse.Namespace) -> Iterator[str]:
 
 
 def training(options: argparse.Namespace) -> Iterator[str]:
-    """a step, loss and gradients, takes a twentieth of the processor's, and waits once"""
+    """a step with loss and gradients takes a twentieth of its time on the CPU, and waits for the GPU once"""
     gpu = renderer()
     scene, camera = holed_scene(768)
     view = find_view(scene, camera, gpu)[1]
@@ -264,7 +265,7 @@ def training(options: argparse.Namespace) -> Iterator[str]:
 
 
 def completion(options: argparse.Namespace) -> Iterator[str]:
-    """a view completed on the GPU shows what the processor's shows, as closed, and sooner"""
+    """a view completed on the GPU looks the same as on the CPU, has as few holes, and takes less time"""
     gpu = renderer()
     scene, camera = holed_scene()
     view = find_view(scene, camera, gpu)[1]
@@ -291,7 +292,7 @@ def completion(options: argparse.Namespace) -> Iterator[str]:
 
 
 def suite(options: argparse.Namespace) -> Iterator[str]:
-    """completion adds 3 ms at most to a view, 60 frames are drawn within a second"""
+    """completion adds at most 3 ms to a view, and 60 frames are rendered within a second"""
     renderer()
     with tempfile.TemporaryDirectory() as folder:
         weights = [] if options.checkpoint is None else ["-c", str(options.checkpoint)]
@@ -304,7 +305,7 @@ STEPS = (machine, build, empty, parity, against_cpu, sanitizer, waits, precision
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the steps; 0 unless one failed."""
+    """Run the steps; returns 0 unless one failed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, default=Path("gpu.md"))
     parser.add_argument("-c", "--checkpoint", type=Path)

@@ -1,4 +1,4 @@
-"""The naive renderer that ours is measured against: tile by tile, Gaussian by Gaussian, pixel by pixel."""
+"""A naive renderer, as the baseline for ours: tile by tile, Gaussian by Gaussian, pixel by pixel."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Arrays = tuple[Array, ...]  # a scene's five tensors
 
 
 def naive_render(scene: Gaussians, camera: Camera, lap: Lap = lambda name: None) -> Tensor:
-    """RGB [H, W, 3] sRGB of Gaussians, with `eps2d` 0; depth and alpha are drawn, too, as ours are."""
+    """Render Gaussians to [H, W, 3] sRGB, with `eps2d` 0; depth and alpha are computed too, as in ours."""
     tensors, view = tuple(t.numpy() for t in scene.tensors), KernelCamera.of(camera, 0.0)
     splats, boxes = np.empty((len(scene), 6), np.float32), np.zeros((len(scene), 4), np.int32)
     run_chunks(lambda a, b: naive_project(a, b, tensors, view, splats, boxes), len(scene), PROJECT_GRAIN)
@@ -43,7 +43,7 @@ def naive_render(scene: Gaussians, camera: Camera, lap: Lap = lambda name: None)
 
 @numba.njit(nogil=True, cache=True)
 def naive_project(first: int, last: int, scene: Arrays, view: KernelCamera, splats: Array, boxes: Array) -> None:
-    """Centre, depth and inverse covariance [N, 6], and boxes of pixels [N, 4], of Gaussians first..last."""
+    """Write centre, depth and inverse covariance [N, 6], and pixel boxes [N, 4], of the Gaussians first..last."""
     means, quats, scales, opacities, _ = scene
     lens, pose, width, height, _ = view
     for i in range(first, last):
@@ -65,7 +65,7 @@ def naive_project(first: int, last: int, scene: Arrays, view: KernelCamera, spla
 
 @numba.njit(nogil=True, cache=True)
 def naive_bin(order: Array, boxes: Array, rows: int, columns: int) -> tuple[Array, Array]:
-    """Lists of Gaussians per tile, front to back."""
+    """Make the list of Gaussians of each tile, front to back."""
     starts = np.zeros(rows * columns + 1, np.int64)
     for i in order:
         for row in range(boxes[i, 2] // TILE, (boxes[i, 3] + TILE - 1) // TILE):
@@ -85,7 +85,7 @@ def naive_bin(order: Array, boxes: Array, rows: int, columns: int) -> tuple[Arra
 def naive_blend(
     first: int, last: int, scene: Arrays, splats: Array, boxes: Array, starts: Array, ids: Array, images: Array
 ) -> None:
-    """Blend tiles first..last into [H, W, 5], black before: sRGB, depth and alpha."""
+    """Blend the tiles first..last into [H, W, 5], which is zero before: sRGB, depth and alpha."""
     opacities, colors = scene[3], scene[4]
     height, width, _ = images.shape
     columns = (width + TILE - 1) // TILE

@@ -2,9 +2,10 @@
 
     python benchmarks/reproduce.py -o reproduction
 
-Each command that a reader would type is printed and run; docs/reproduction.md has them at the paper's size. What stands
-in: for the six datasets a scene each in their layouts, one real (scikit-image's Motorcycle), five made of its other
-pictures; for SHARP its architecture from 512² pixels with random weights and the made scenes' depth in all photos.
+Each command that a reader would type is printed and run; docs/reproduction.md has them at the paper's size. Each of the
+six datasets is replaced by one scene in its layout: one is real (scikit-image's Motorcycle), five are synthetic, made
+from scikit-image's other pictures. SHARP is replaced by a network of its architecture for 512² pixels, with random
+weights, fitted to the synthetic scenes' depth; it predicts nearly the same depth for all photos.
 """
 
 from __future__ import annotations
@@ -33,24 +34,24 @@ from spackle.bases.sharp.encoder import MICRO, WINDOWS
 from spackle.evaluation.datasets import stereo
 
 WIDTH, HEIGHT = 192, 144
-FOCAL = math.hypot(WIDTH, HEIGHT) * 30 / math.hypot(36, 24)  # what a photo has that does not tell its lens
-WALL, OBJECT = 4.0, 2.2  # depths of a made scene, in metres
-SIZE, LOW = 1.1, 0.1  # of the object, and how far its middle is below the photo's
-EYES = (0.0, 0.35, -0.35)  # metres to the right; the first is the photo's
+FOCAL = math.hypot(WIDTH, HEIGHT) * 30 / math.hypot(36, 24)  # the focal length assumed for photos without metadata
+WALL, OBJECT = 4.0, 2.2  # depths of a synthetic scene's two surfaces, in metres
+SIZE, LOW = 1.1, 0.1  # the object's size, and how far its middle is below the photo's, in metres
+EYES = (0.0, 0.35, -0.35)  # eyes' positions to the right, in metres; the first is the photo's
 BASELINE = EYES[1]
 RANKS, VIEWS, STEPS = 2, 6, 40
-PICTURED = ("middlebury", "wildrgbd", "tanks")  # in the figures
+PICTURED = ("middlebury", "wildrgbd", "tanks")  # datasets in the figures
 Array = NDArray[Any]
 
 
 class Scene(NamedTuple):
-    """An object before a wall, both flat and facing the camera, each with a picture of scikit-image on it."""
+    """An object in front of a wall, both flat and facing the camera, each showing a picture of scikit-image."""
 
     wall: str
     front: str
 
     def seen(self, eye: float = 0.0) -> tuple[Array, Array]:
-        """Photo [H, W, 3] and depth [H, W] from a place beside the photo's."""
+        """Photo [H, W, 3] and depth [H, W] from an eye `eye` metres to the right."""
         y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
         right, down = (x - WIDTH / 2) / FOCAL, (y - HEIGHT / 2) / FOCAL
         u, v = (OBJECT * right + eye) / SIZE, (OBJECT * down - LOW) / SIZE
@@ -60,7 +61,7 @@ class Scene(NamedTuple):
 
 
 def painted(name: str, u: Array, v: Array) -> Array:
-    """Colours [H, W, 3] of a picture where (0, 0) is its middle and ±½ its border."""
+    """Colours [H, W, 3] of a picture at (u, v); (0, 0) is its middle, ±½ its border."""
     picture = torch.from_numpy(np.atleast_3d(getattr(pictures, name)())[..., :3].copy()).float().movedim(-1, 0)
     place = torch.from_numpy(2 * np.stack([u, v], -1)).float()
     colors = grid_sample(picture[None], place[None], padding_mode="border", align_corners=False)[0]
@@ -82,13 +83,13 @@ LEARNED = [Scene(wall, front) for wall, front in zip(WALLS, WALLS[1:] + WALLS[:1
 
 
 def save(path: Path, image: Array) -> None:
-    """Write a picture, and the folders above it."""
+    """Write a picture; missing folders are created."""
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(image).save(path)
 
 
 def middlebury(scene: Path) -> None:
-    """The Motorcycle at half of scikit-image's size, by a description of the pair."""
+    """Write the Motorcycle at half of scikit-image's size, with a scene.json."""
     left, right, disparity = pictures.stereo_motorcycle()
     save(scene / "left.png", np.asarray(Image.fromarray(left).reduce(2)))
     save(scene / "right.png", np.asarray(Image.fromarray(right).reduce(2)))
@@ -101,7 +102,7 @@ def middlebury(scene: Path) -> None:
 
 
 def booster(scene: Path, made: Scene) -> None:
-    """With OpenCV's calibration: millimetres, and pixel centres at whole numbers."""
+    """Write a scene as in Booster, with OpenCV's calibration: millimetres, pixel centres at integers."""
     photo, depth = made.seen()
     save(scene / "camera_00" / "im0.png", photo)
     save(scene / "camera_02" / "im0.png", made.seen(BASELINE)[0])
@@ -114,7 +115,7 @@ def booster(scene: Path, made: Scene) -> None:
 
 
 def wildrgbd(scene: Path, made: Scene, scale: float = 0.2) -> None:
-    """A world that a hand holds, with the frames' depth in millimetres."""
+    """Write a scene as in WildRGB-D, scaled to a hand-held object, with depth in millimetres."""
     poses = ""
     for number, eye in enumerate(EYES):
         photo, depth = made.seen(eye)
@@ -122,12 +123,12 @@ def wildrgbd(scene: Path, made: Scene, scale: float = 0.2) -> None:
         save(scene / "depth" / f"{number:05d}.png", (1000 * scale * depth).round().astype(np.uint16))
         poses += f"{number} 1 0 0 {scale * eye} 0 1 0 0 0 0 1 0 0 0 0 1\n"
     (scene / "cam_poses.txt").write_text(poses)
-    K = [FOCAL, 0, 0, 0, FOCAL, 0, WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5, 1]  # by columns
+    K = [FOCAL, 0, 0, 0, FOCAL, 0, WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5, 1]  # column by column
     (scene / "metadata").write_text(json.dumps({"w": WIDTH, "h": HEIGHT, "K": K}))
 
 
 def colmap(photos: Path, model: Path, made: Scene, above: str = "") -> None:
-    """Photos and a model of them as text, with a point every eighth pixel of the first one."""
+    """Write photos and a COLMAP model as text, with a point at every eighth pixel of the first photo."""
     depth, images = made.seen()[1][4::8, 4::8], ""
     v, u = np.mgrid[4:HEIGHT:8, 4:WIDTH:8] + 0.5
     points = np.stack([(u - WIDTH / 2) * depth / FOCAL, (v - HEIGHT / 2) * depth / FOCAL, depth], -1).reshape(-1, 3)
@@ -143,7 +144,7 @@ def colmap(photos: Path, model: Path, made: Scene, above: str = "") -> None:
 
 
 def llff(scene: Path, made: Scene) -> None:
-    """Each photo's columns down, right, backwards, eye and lens, then its bounds."""
+    """Write a scene as in LLFF: for each photo the columns down, right, backwards, eye and lens, then bounds."""
     rows = []
     for number, eye in enumerate(EYES):
         save(scene / "images_4" / f"image{number:03d}.png", made.seen(eye)[0])
@@ -153,7 +154,7 @@ def llff(scene: Path, made: Scene) -> None:
 
 
 def make_data(data: Path, photos: Path) -> None:
-    """The six datasets, and photos to learn from."""
+    """Write the six datasets, and photos for training."""
     middlebury(data / "middlebury" / "Motorcycle")
     booster(data / "booster" / "train" / "balanced" / "Table", SCENES["booster"])
     wildrgbd(data / "wildrgbd" / "bowl" / "scenes" / "scene_000", SCENES["wildrgbd"])
@@ -167,10 +168,10 @@ def make_data(data: Path, photos: Path) -> None:
 
 @torch.no_grad()
 def fit_sharp(random: Path, fitted: Path) -> None:
-    """Give random weights the depth of made scenes; deltas start at zero, opacities near one.
+    """Fit random weights to the depth of synthetic scenes; deltas start at zero, opacities near one.
 
-    Tokens of the whole picture get the low frequencies of their place, and of the decoder only the way from there to
-    the disparities stays open, so these are linear in them: the same in all photos.
+    The tokens of the whole image get low-frequency position embeddings. All of the decoder is zeroed but the path from
+    these tokens to the disparities, which is thus linear and nearly the same for all photos.
     """
     weights, grid, depths = load_file(random), MICRO.grid, "monodepth_model.monodepth_predictor."
     across = (np.arange(grid) + 0.5) * math.pi / grid
@@ -183,10 +184,10 @@ def fit_sharp(random: Path, fitted: Path) -> None:
         weights[name].zero_()
         if name.endswith((".out_conv.weight", ".deconv.weight")):
             weights[name] += torch.eye(MICRO.depth_width)[..., None, None]
-    for layer, tap in (("0", 1), ("1", slice(None)), ("2", 1), ("4", 0)):  # the first channel, to the nearer surface
+    for layer, tap in (("0", 1), ("1", slice(None)), ("2", 1), ("4", 0)):  # channel 0: the nearer surface
         weights[f"{depths}head.{layer}.weight"][0, 0, tap, tap] = 1.0
-    weights[f"{depths}head.4.weight"][1, 0] = 0.97  # and to the one behind
-    weights["prediction_head.texture_prediction_head.bias"][-2:] = 6.0  # of the opacities, which are a sigmoid's
+    weights[f"{depths}head.4.weight"][1, 0] = 0.97  # channel 1: the surface behind
+    weights["prediction_head.texture_prediction_head.bias"][-2:] = 6.0  # the opacities, before their sigmoid
     save_file(weights, fitted)
     encoder: Any = load_network(fitted, torch.float32).monodepth_model.monodepth_predictor.encoder
     seen, wanted = [], []
@@ -209,12 +210,12 @@ def fit_sharp(random: Path, fitted: Path) -> None:
 
 
 def commands() -> list[str]:
-    """From the photos to the tables and figures."""
+    """The command lines, from photos to tables and figures."""
     sharp, residual = "--base sharp -c sharp.safetensors", "--residual sharp-decoder/best.safetensors"
     few = f"data.pseudo=pseudo data.validation_views={VIEWS} loss.features=none run.validate_every=10 optim.warmup=4"
     train = f"torchrun --nproc-per-node {RANKS} --no-python spackle train --recipe"
     crops = f"optim.steps={STEPS} optim.batch=4 data.views=30 data.crops=2 data.cells=32"
-    fast = f"optim.steps={STEPS // 2} optim.batch=8 optim.lr=4e-3 optim.min_lr=4e-4"  # for so few steps
+    fast = f"optim.steps={STEPS // 2} optim.batch=8 optim.lr=4e-3 optim.min_lr=4e-4"  # high rates for few steps
     methods = "--methods base,paper,spackle,direct-ft,dense --direct-ft direct-ft/best.safetensors"
     lines = [
         f"spackle dataset build photos -o pseudo {sharp} --views {VIEWS} --inpainter exemplar --disparity 0.3 0.6",
@@ -240,7 +241,7 @@ def commands() -> list[str]:
 
 
 def run(out: Path, line: str) -> None:
-    """Print a command of a reader's, and run it in the folder of results; its own words go to log.txt there."""
+    """Print a command line and run it in the folder of results; its output goes to log.txt there."""
     print(f"$ {line}", flush=True)
     began, words = time.monotonic(), shlex.split(line)
     with (out / "log.txt").open("a") as log:
@@ -253,7 +254,7 @@ def run(out: Path, line: str) -> None:
 
 
 def main() -> None:
-    """Make what stands in, and run all commands."""
+    """Make the data and the weights, and run all commands."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, default=Path("reproduction"), help="a folder, which is new")
     out, began = parser.parse_args().output.absolute(), time.monotonic()

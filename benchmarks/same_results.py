@@ -1,13 +1,13 @@
-"""Hashes what a fixed set of commands writes, to hold two versions of the code against each other, bit for bit.
+"""Hash what a fixed set of commands writes, to compare two versions of the code bit for bit.
 
     python benchmarks/same_results.py -o before.json
     (change the code)
     python benchmarks/same_results.py --against before.json
 
-The commands: `demo`, and `predict` of the demo's photo by lite (three given cameras; keyframes), by its depth in view
-mode, and by its depth without weights. Run both on one machine: the last bits depend on its processor and threads.
-Reports are compared without what differs between two runs of one version: times and the digest of the request. Videos
-are left out: the encoder's threads make their bytes differ from run to run, and they show what the scenes hold.
+The commands are `demo`, and `predict` of the demo's photo: with lite (three given cameras; keyframes), with its depth
+in view mode, and with its depth without weights. Run both versions on one machine, because the last bits depend on its
+processor and threads. Of reports, times and the digest of the request are ignored, because they differ between runs of
+one version. Videos are left out: the encoder's threads make their bytes vary, and they only show the scenes.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def write_inputs(folder: Path) -> None:
 
 
 def commands(folder: Path) -> dict[str, list[str]]:
-    """Name of the output folder to the words of the command."""
+    """The arguments of each command, by the name of its output folder."""
     photo = ["predict", f"{folder}/photo.png"]
     depth = ["--depth", f"{folder}/depth.npy"]
     return {
@@ -63,7 +63,7 @@ def commands(folder: Path) -> dict[str, list[str]]:
 
 
 def digest(file: Path) -> str:
-    """SHA-256 of a file; of a report without what varies between two runs."""
+    """SHA-256 of a file; for reports, without the entries that vary between runs."""
     content = file.read_bytes()
     if file.name == "report.json":
         report = {key: value for key, value in json.loads(content).items() if key not in VARYING}
@@ -72,7 +72,7 @@ def digest(file: Path) -> str:
 
 
 def main() -> int:
-    """Run the commands, print each file's hash, and return 1 where one differs."""
+    """Run the commands, print each file's hash, and return 1 if one differs."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, help="write the hashes here, as JSON")
     parser.add_argument("--against", type=Path, help="compare with these hashes")

@@ -1,34 +1,34 @@
-"""The scoreboard: how good lifted and completed scenes are, measured on stereo pairs.
+"""The scoreboard: measure the quality of lifted and completed scenes on stereo pairs.
 
     python benchmarks/scoreboard.py PAIRS --features squeezenet_v1.0.npz [--small 4] [-o NOW.json] [--against OLD.json]
     python benchmarks/scoreboard.py PAIRS ... --without "far bias" --without "network+texture"
     python benchmarks/scoreboard.py PAIRS ... --ledger > ledger.md
     python benchmarks/scoreboard.py --photos FOLDER [--without NAME] -o sheet.jpg
 
-PAIRS holds one folder a scene: two photos, a disparity map and a `scene.json` (`spackle.training.sources.load_pair`).
-In a folder of photos each has a fifth of its width cut off at either side: the middle is lifted by lite's depth of the
-whole, and the whole is the view that is completed.
-
+PAIRS has one folder per scene: two photos, a disparity map and a `scene.json` (`spackle.training.sources.load_pair`).
 The left photo is lifted by its true depth, and the right camera's view is completed and compared with the right photo.
-The hole is where the lifted photo's opacity in that view is below 0.95; the band is what lies within 8 pixels of it.
+PAIRS may also be a folder of photos. A fifth of the width is then cut off at each side of a photo, its middle is lifted
+by lite's depth for the whole photo, and the view to complete is the whole photo.
+
+The hole is where the lifted photo's opacity in the view is below 0.95; the band is within 8 pixels of the hole.
 
 distance ↓    SqueezeNet 1.0 at conv1, fire3, fire5 and fire9: mean squared difference of unit feature vectors over the
-              cells, by the share of each that is hole; outside of the hole the view is the truth. 0 to 2
-texture ↓     Frobenius norm of the difference of the vectors' Gram matrices over that of the truth's
-sharpness     mean magnitude of the grey gradient over the truth's, 3 pixels and more inside of the hole; 1 is best
-PSNR ↑        in the hole; band ↑ in the band; elsewhere ↑ outside of both, dB
-seam ↓        mean grey difference within 2 pixels of the photo's former border, over that of 3 to 20 pixels beside it
-photo ↑       PSNR of the completed scene at the photo's own camera against the photo, dB
+              cells, weighted by the fraction that is hole; outside the hole the view is replaced by the truth. 0 to 2
+texture ↓     Frobenius norm of the difference of the vectors' Gram matrices, over that of the truth's matrices
+sharpness     mean gradient magnitude in grey over the truth's, at least 3 pixels inside the hole; 1 is best
+PSNR ↑        in the hole; band ↑: in the band; elsewhere ↑: outside both; in dB
+seam ↓        mean grey difference within 2 pixels of the photo's former border, over that at 3 to 20 pixels from it
+photo ↑       PSNR of the completed scene at the photo's own camera against the photo, in dB
 agreement ↑   the same against the lifted photo, at most 100 dB
-HAR ↓         what is left of the hole, percent of the view
-base, aux     thousands of Gaussians; s lift and s fill: processor seconds of all threads
+HAR ↓         the hole that is left, in percent of the view
+base, aux     thousands of Gaussians; s lift and s fill: CPU seconds of all threads
 
---small N gives the lift maps of a side N times smaller, in 256 steps of inverse depth, as phones store them. --without
-switches one mechanism of `MECHANISMS` off, or several joined by +, in a run of its own; hole and band stay those of
-the default. --ledger does so with each, and prints what changes. --against compares with another run's file: up : down
-counts the scenes whose figure rose and fell, p is that of a two-sided sign test. --photos completes some photos by
-`lite` and writes a sheet: a row a photo, at the left and at the right end of its move the lifted photo and what each
-run makes of it.
+--small N lifts by depth maps of 1/N of the side, in 256 steps of inverse depth, as phones store them. --without runs
+once more with a mechanism of `MECHANISMS` switched off, or several joined by +; hole and band stay those of the
+default. --ledger does this with each mechanism and prints the changes. --against compares with another run's file: up :
+down counts the scenes whose figure rose and fell, p is the p-value of a two-sided sign test. --photos completes some
+photos with `lite` and writes a sheet with a row for each photo: at the left and the right end of its camera path, the
+lifted photo and the result of each run.
 """
 
 from __future__ import annotations
@@ -66,34 +66,34 @@ from spackle.image import load_photo, resize_photo
 from spackle.training.losses import FeatureNet, covered, hole_psnr, load_features
 from spackle.training.sources import load_pair
 
-Row = dict[str, float]  # a scene's figures
-Rows = dict[str, Row]  # of scenes, by their names
-Replace = Callable[[Any], Any]  # from a function or constant to what stands in for it
+Row = dict[str, float]  # the figures of a scene, by name
+Rows = dict[str, Row]  # the rows of scenes, by name
+Replace = Callable[[Any], Any]  # from a function or constant to its replacement
 
 LAYERS = ("conv1", "fire3", "fire5", "fire9")
 BAND_PX = 8
-NEAR, BESIDE, STEP = 2, 20, 0.05  # of a seam: pixels, pixels, and the relative step of depth that makes it none
-STEPS = 255  # of a phone's inverse depth
-DIGITS = dict.fromkeys(("distance", "texture", "seam", "HAR"), 3)  # others 2
+NEAR, BESIDE, STEP = 2, 20, 0.05  # for seams: pixels, pixels, relative depth step above which there is no seam
+STEPS = 255  # of inverse depth in a phone's map
+DIGITS = dict.fromkeys(("distance", "texture", "seam", "HAR"), 3)  # other figures have 2
 SECONDS = ("s lift", "s fill")
-PHOTOS, PHOTO_HEIGHT = 8, 256  # of a sheet
-CUT_PHOTOS = 24  # of a folder, whose sides are cut off
+PHOTOS, PHOTO_HEIGHT = 8, 256  # of photos on a sheet
+CUT_PHOTOS = 24  # photos of a folder that are used with cut sides
 DEFAULT = "default"
 RENDERER = get_renderer()
 
 
 def first(own: Any) -> Any:
-    """A function that returns its first argument in place of another."""
+    """Replace a function by one that returns its first argument."""
     return lambda given, *more, **named: given
 
 
 def unbiased(own: Any) -> Any:
-    """`far_fill` with both sides of a rim alike."""
+    """`far_fill` without preference for the farther side of a rim."""
     return lambda *given, far_bias=None, **named: own(*given, far_bias=0.0, **named)
 
 
 def filled_from_around(own: Any) -> Any:
-    """`fill_around` that treats what lies beyond the photo's border as any hole."""
+    """`fill_around` that treats holes beyond the photo's border like other holes."""
     return lambda cues, across, uv, known, inside, *cameras: far_fill(
         cues.inverse_depth, cues.rgb.permute(2, 0, 1), known, far_bias=FAR_BIAS * inside
     )
@@ -104,7 +104,7 @@ def no_edges(own: Any) -> Any:
 
 
 def one_surface(own: Any) -> Any:
-    """`find_layers` of pixels that show one surface each."""
+    """`find_layers` that assumes a single surface in each pixel."""
 
     def layers(*images: Any) -> Layers:
         found: Layers = own(*images)
@@ -113,7 +113,7 @@ def one_surface(own: Any) -> Any:
     return layers
 
 
-# What is switched off while a photo is lifted, and while it is completed: names in the package, and what replaces them.
+# Mechanisms of lifting and of completion that can be switched off: names in the package, and their replacements.
 LIFT: dict[str, dict[str, Replace]] = {
     "smoothed": {"smoothed": first},
     "edges": {"find_edges": no_edges},
@@ -136,9 +136,9 @@ MECHANISMS = (*FILL, *LIFT)
 
 
 def holders(target: str) -> list[ModuleType]:
-    """Modules of the package that hold a thing under its name, or under `home.name` where others are called so, too.
+    """Modules of the package that have an object under this name; `home.name` selects the module `home`'s object.
 
-    LookupError unless it is one thing: a mechanism that is gone, or has another name now, is no silence.
+    LookupError unless it is a single object, so that removed or renamed mechanisms do not pass unnoticed.
     """
     home, _, name = target.rpartition(".")
     modules = [m for n, m in list(sys.modules.items()) if n.startswith("spackle.") and name in vars(m)]
@@ -150,7 +150,7 @@ def holders(target: str) -> list[ModuleType]:
 
 @contextlib.contextmanager
 def switched_off(run: str, *stages: dict[str, dict[str, Replace]]) -> Iterator[None]:
-    """Without the mechanisms of a run that belong to some stages."""
+    """Switch off those mechanisms of a run that belong to some stages."""
     with contextlib.ExitStack() as stack:
         for stage in stages:
             for target, replace in [item for name in run.split("+") for item in stage.get(name, {}).items()]:
@@ -162,7 +162,7 @@ def switched_off(run: str, *stages: dict[str, dict[str, Replace]]) -> Iterator[N
 
 
 class Perception:
-    """Distance and texture by a frozen SqueezeNet."""
+    """Measures distance and texture by a frozen SqueezeNet."""
 
     def __init__(self, network: FeatureNet) -> None:
         self.network, self.maps = network, dict[str, Tensor]()
@@ -172,7 +172,7 @@ class Perception:
             )
 
     def compare(self, rgb: Tensor, truth: Tensor, hole: Tensor) -> Row:
-        """Of views [H, W, 3] in a hole [H, W]."""
+        """Compare views [H, W, 3] inside a hole [H, W]."""
         self.network(torch.stack([torch.where(hole[..., None], rgb, truth), truth]).movedim(-1, 1))
         distances, textures = [], []
         for both in (self.maps[layer] for layer in LAYERS):  # [2, C, h, w]
@@ -186,7 +186,7 @@ class Perception:
 
 
 class Pair:
-    """A stereo pair, and what all runs share: hole, band and former border of the right camera's view."""
+    """A stereo pair with the hole, band and former border in the right camera's view, which all runs share."""
 
     def __init__(self, place: Path, small: int) -> None:
         pair = load_pair(place) if place.is_dir() else load_cut(place)
@@ -199,7 +199,7 @@ class Pair:
         self.crossings = crossings(seeds.render(self.beside).depth, self.beside, self.camera)
 
     def measure(self, run: str, perception: Perception | None) -> Row:
-        """A run's figures."""
+        """The figures of a run."""
         began = time.process_time()
         with switched_off(run, LIFT):
             prediction = lift(self.left, self.depth, self.camera)
@@ -224,7 +224,7 @@ class Pair:
 
 
 def load_cut(file: Path) -> tuple[Tensor, Tensor, DepthMap, Camera, Camera]:
-    """A photo without a fifth of its width at either side, as `load_pair` has a pair: the photo is the right one."""
+    """A photo and its middle three fifths as a pair, as returned by `load_pair`: the middle is the left photo."""
     photo = resize_photo(load_photo(file))
     inverse, side = spackle.LiteBase.load().inverse_depth(photo.rgb), photo.width // 5
     inverse = F.interpolate(inverse[None, None], (photo.height, photo.width), mode="bilinear")[0, 0]
@@ -236,7 +236,7 @@ def load_cut(file: Path) -> tuple[Tensor, Tensor, DepthMap, Camera, Camera]:
 
 
 def smaller(depth: DepthMap, times: int) -> DepthMap:
-    """A map of a side so many times smaller: the mean inverse depth of what is known in each cell, in 256 steps."""
+    """A depth map with sides `times` times smaller: the mean known inverse depth in each cell, in 256 steps."""
     valid = depth.valid.float()
     sums = F.avg_pool2d(torch.stack([valid / depth.depth.where(depth.valid, torch.ones(())), valid]), times)
     known = sums[1] > 0
@@ -249,7 +249,7 @@ def smaller(depth: DepthMap, times: int) -> DepthMap:
 
 
 def crossings(depth: Tensor, camera: Camera, photo: Camera) -> list[Tensor]:
-    """Where neighbours (in rows: [H, W − 1], in columns: [W, H − 1]) lie on both sides of the photo's border."""
+    """Whether the photo's border passes between neighbours in rows [H, W − 1] and in columns [W, H − 1]."""
     uv, _ = photo.project(camera.unproject(camera.pixel_centers(), depth))
     found = []
     for axis, size in enumerate((photo.width, photo.height)):
@@ -260,8 +260,8 @@ def crossings(depth: Tensor, camera: Camera, photo: Camera) -> list[Tensor]:
 
 
 def seam(rgb: Tensor, crossings: Sequence[Tensor]) -> float:
-    """Mean grey difference across the crossings over that beside them; NaN where there is none."""
-    sums = torch.zeros(2, 2, dtype=torch.float64)  # near, beside: (differences, their number)
+    """Mean grey difference across the crossings, over that beside them; NaN if there are no crossings."""
+    sums = torch.zeros(2, 2, dtype=torch.float64)  # rows near and beside, columns sum of differences and their number
     for picture, crossing in zip((rgb @ GREY, (rgb @ GREY).T), crossings, strict=True):
         steps = (picture[:, 1:] - picture[:, :-1]).abs()
         reach = [F.max_pool1d(crossing.float(), 2 * r - 1, 1, r - 1) > 0 for r in (NEAR, BESIDE)]
@@ -280,14 +280,14 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def table(rows: Rows) -> str:
-    """A row a scene, and the mean."""
+    """A table with a row for each scene and one for the mean."""
     measures = list(next(iter(rows.values())))
     every = rows | {"mean": {m: change(m, rows, rows)[0] for m in measures}}
     return markdown(["", *measures], [[n, *(text(m, r[m]) for m in measures)] for n, r in every.items()])
 
 
 def change(measure: str, before: Rows, now: Rows) -> tuple[float, float, int, int]:
-    """A measure's means before and now over the scenes that have both, and in how many it rose and fell."""
+    """A measure's means before and now over the scenes that have both, and the numbers of rises and falls."""
     pairs = np.array([(before[name][measure], now[name][measure]) for name in now if name in before]).reshape(-1, 2)
     old, new = pairs[~np.isnan(pairs).any(1)].T
     before_mean, mean = (float(part.mean()) if len(part) else math.nan for part in (old, new))
@@ -295,13 +295,13 @@ def change(measure: str, before: Rows, now: Rows) -> tuple[float, float, int, in
 
 
 def sign_test(up: int, down: int) -> float:
-    """How likely a split as uneven is, where up and down are equally likely."""
+    """The probability of a split at least as uneven if up and down are equally likely."""
     ways = sum(math.comb(up + down, k) for k in range(min(up, down) + 1))
     return min(1.0, ways / 2.0 ** (up + down - 1))
 
 
 def comparison(before: Rows, now: Rows) -> str:
-    """A row a measure."""
+    """A table with a row for each measure."""
     known = next(iter(before.values()), {})
     changes = {m: change(m, before, now) for m in next(iter(now.values())) if m in known}
     rows = [
@@ -314,7 +314,7 @@ def comparison(before: Rows, now: Rows) -> str:
 
 
 def ledger(runs: dict[str, Rows]) -> str:
-    """The default's means, and for each other run how they change without its mechanisms."""
+    """A table of the default's means, and of their changes in each run without a mechanism."""
     default = runs[DEFAULT]
     measures = [m for m in next(iter(default.values())) if m not in SECONDS]
     rows = [["(nothing)", *(text(m, change(m, default, default)[0]) for m in measures)]]
@@ -325,13 +325,13 @@ def ledger(runs: dict[str, Rows]) -> str:
 
 
 def pictures_in(folder: Path, most: int) -> list[Path]:
-    """Photos of a folder, spread evenly over their names."""
+    """At most `most` photos of a folder, evenly spaced in the order of names."""
     files = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in (".jpg", ".jpeg", ".png")]
     return [files[i] for i in sorted({round(i) for i in np.linspace(0, len(files) - 1, most)})] if files else []
 
 
 def sheet(folder: Path, runs: Sequence[str]) -> Image.Image:
-    """A row a photo: at the left and the right end of its move the lifted photo, and what each run makes of it."""
+    """A row for each photo: at the left and right end of its path, the lifted photo and each run's result."""
     base, rows = spackle.LiteBase.load(), []
     for file in pictures_in(folder, PHOTOS):
         pictures = []
@@ -348,7 +348,7 @@ def sheet(folder: Path, runs: Sequence[str]) -> Image.Image:
 
 
 def thumbnail(rgb: Tensor) -> np.ndarray:
-    """[PHOTO_HEIGHT, w, 3] bytes."""
+    """Resize to [PHOTO_HEIGHT, w, 3] bytes."""
     picture = Image.fromarray((255 * rgb.clamp(0, 1)).round().byte().numpy())
     return np.asarray(picture.resize((round(picture.width * PHOTO_HEIGHT / picture.height), PHOTO_HEIGHT)))
 

@@ -1,8 +1,8 @@
-"""Load on `spackle serve`: what happens to photos when the server is killed, how fast it answers, what clients cost it.
+"""Load test of `spackle serve`: photos after the server is killed, response times, and the cost of clients.
 
     python benchmarks/serve.py [--side 480] [--photos 20] [--workers 2] [-o results.json]
 
-Photos are completed by the real pipeline with `lite`; the server is a process of its own on this machine.
+Photos are completed by the real pipeline with `lite`; the server is a separate process on this machine.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ TOKEN, SCENES, BOUNDARY = "benchmark", "/api/v1/scenes", "7d1"
 
 
 def photo(side: int) -> bytes:
-    """One of the examples of the page, its long side so many pixels."""
+    """One of the page's example photos, `side` pixels on its long side."""
     with resources.files("spackle.web").joinpath("page", "coffee.jpg").open("rb") as file, Image.open(file) as image:
         image.thumbnail((side, side))
         image.save(content := io.BytesIO(), "JPEG", quality=92)
@@ -39,7 +39,7 @@ def photo(side: int) -> bytes:
 
 
 def upload(content: bytes) -> bytes:
-    """The request that sends a photo."""
+    """The HTTP request that uploads a photo."""
     options = json.dumps({"files": ["scene.spz"]})
     body = (
         f'--{BOUNDARY}\r\nContent-Disposition: form-data; name="options"\r\n\r\n{options}\r\n--{BOUNDARY}\r\n'
@@ -56,7 +56,7 @@ def head(method: str, path: str, more: str = "") -> bytes:
 
 
 class Client:
-    """One connection that stays."""
+    """A client with a persistent connection."""
 
     def __init__(self, port: int) -> None:
         self.port = port
@@ -78,7 +78,7 @@ class Client:
 
 
 class Server:
-    """`spackle serve` in a process."""
+    """`spackle serve` in a child process."""
 
     def __init__(self, folder: Path, workers: int, waiting: int) -> None:
         words = ["serve", "--port", "0", "--token", TOKEN, "--base", "lite", "-o", str(folder)]
@@ -92,7 +92,7 @@ class Server:
         self.port = int(found[1])
 
     def facts(self) -> dict[str, float]:
-        """Memory, threads and open files of the server itself, without its workers."""
+        """Memory, threads and open files of the server process, without its workers."""
         status = Path(f"/proc/{self.process.pid}/status").read_text()
         memory, threads = (int(re.search(rf"{key}:\s+(\d+)", status)[1]) for key in ("VmRSS", "Threads"))  # type: ignore[index]
         return {
@@ -102,7 +102,7 @@ class Server:
         }
 
     def busy(self) -> float:
-        """Seconds of the processor so far."""
+        """CPU seconds so far."""
         fields = Path(f"/proc/{self.process.pid}/stat").read_text().rpartition(")")[2].split()
         return sum(map(int, fields[11:13])) / os.sysconf("SC_CLK_TCK")
 
@@ -117,7 +117,7 @@ async def states(port: int, ids: list[str]) -> dict[str, Any]:
 
 
 async def latencies(port: int, id: str, seconds: float, pause: float = 0.02) -> list[float]:
-    """Milliseconds that a question for the status takes, asked again and again."""
+    """Request the status again and again; returns the milliseconds of each answer."""
     found: list[float] = []
     async with Client(port) as client:
         end = time.perf_counter() + seconds
@@ -140,7 +140,7 @@ async def post(port: int, request: bytes) -> tuple[int, Any]:
 
 
 def killed_in_between(folder: Path, content: bytes, count: int, workers: int) -> dict[str, Any]:
-    """All photos at once; the server is killed once a quarter is done, and once half is, and started again."""
+    """Upload all photos at once; kill and restart the server when a quarter is done, and when half is."""
     server = Server(folder, workers, count)
     before = server.facts()
     start = time.monotonic()
@@ -187,7 +187,7 @@ async def _together(port: int, request: bytes, count: int) -> list[tuple[int, An
 
 
 async def rate(port: int, id: str, connections: int, seconds: float) -> float:
-    """Answers a second to questions for the status, each connection asking as soon as it has its answer."""
+    """Status answers per second, if each connection asks again as soon as it has an answer."""
     count, end = 0, time.perf_counter() + seconds
 
     async def one() -> None:
@@ -202,7 +202,7 @@ async def rate(port: int, id: str, connections: int, seconds: float) -> float:
 
 
 def crowd(folder: Path, content: bytes) -> dict[str, Any]:
-    """A hundred uploads at once, status by the second, and clients that are slow."""
+    """Measure a hundred simultaneous uploads, status answers per second, and the effect of slow clients."""
     server = Server(folder, 1, 32)
     before = server.facts()
     start = time.monotonic()
@@ -238,7 +238,7 @@ def crowd(folder: Path, content: bytes) -> dict[str, Any]:
 
 
 async def _slow(server: Server, id: str, request: bytes) -> dict[str, Any]:
-    """200 clients that send half of a head and 20 that send a photo by the byte, and how others are served then."""
+    """How others are served while 200 clients send half of a request head and 20 send a photo byte by byte."""
     connections = [await asyncio.open_connection("127.0.0.1", server.port) for _ in range(220)]
     for k, (_, writer) in enumerate(connections):
         writer.write(request[:20] if k < 200 else request[:400])

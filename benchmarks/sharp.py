@@ -1,11 +1,10 @@
-"""SHARP against the original, side by side: one photo to a PLY on disk, each in a process of its own.
+"""Compare SHARP in Spackle with the original: one photo to a PLY on disk, each in its own process.
 
 python benchmarks/sharp.py --original CHECKOUT [--original-python PYTHON] [--weights FILE.pt] [--photo FILE]
 
-CHECKOUT is a clone of github.com/apple/ml-sharp, PYTHON an interpreter that has its requirements. Without --weights
-deterministic ones are made (2.8 GB in the temporary folder). Prints a Markdown table: seconds of each stage, the whole
-process as its parent sees it, and the peak of its resident memory; then how far the Gaussians and two renders are
-apart.
+CHECKOUT is a clone of github.com/apple/ml-sharp, PYTHON an interpreter with its requirements installed. Without
+--weights, deterministic ones are made (2.8 GB in the temporary folder). Prints a Markdown table of seconds per stage,
+seconds of the whole process, and peak resident memory; then how far the Gaussians and two renders differ.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ STAGES = ("import", "build and load", "network", "post-processing", "save")
 
 
 class Clock:
-    """Seconds of named stages, one after the other."""
+    """Takes the seconds of named stages, which follow each other."""
 
     def __init__(self, device: str) -> None:
         self.device, self.seconds, self.last = device, dict[str, float](), time.perf_counter()
@@ -43,7 +42,7 @@ class Clock:
 
 
 def run_original(clock: Clock, weights: Path, photo: Path, output: Path, *, checkout: str) -> None:
-    """What the original's `sharp predict` does, with a clock in it."""
+    """Do what the original's `sharp predict` does, with timed stages."""
     sys.path.insert(0, f"{checkout}/src")
     import torch
 
@@ -74,13 +73,13 @@ def run_original(clock: Clock, weights: Path, photo: Path, output: Path, *, chec
 def declare_operators(folder: Path, namespace: str = "torchvision") -> list[str]:
     """Declare the operators of torchvision that are missing; returns their names.
 
-    Beside a torch of another build torchvision's compiled operators do not load, and its import stops at the first. The
-    original uses its Python parts alone, so the names suffice.
+    If torch is of another build, torchvision's compiled operators do not load, and its import fails at the first one.
+    The original uses only torchvision's Python code, so declaring the names is enough.
     """
     import torch
 
     for compiled in folder.glob("_C*.so"):
-        with contextlib.suppress(OSError, RuntimeError):  # of another build
+        with contextlib.suppress(OSError, RuntimeError):  # for another build of torch
             torch.ops.load_library(compiled)
     text = (folder / "_meta_registrations.py").read_text()
     names = sorted(set(re.findall(r'register_(?:meta|fake)\("(?:torchvision::)?(\w+)"', text)))
@@ -88,13 +87,13 @@ def declare_operators(folder: Path, namespace: str = "torchvision") -> list[str]
     library = torch.library.Library(namespace, "FRAGMENT")
     for name in missing:
         library.define(f"{name}(Tensor x) -> Tensor")
-    vars(declare_operators).setdefault("kept", []).append(library)  # the names last as long as it does
+    vars(declare_operators).setdefault("kept", []).append(library)  # the names exist as long as this object
     return missing
 
 
 def run_ours(clock: Clock, weights: Path, photo: Path, output: Path, **options: Any) -> None:
-    """The same with Spackle."""
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line does
+    """Do the same with Spackle."""
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line sets it
     import spackle
     from spackle.bases.sharp.base import to_metric
 
@@ -111,7 +110,7 @@ def run_ours(clock: Clock, weights: Path, photo: Path, output: Path, **options: 
 
 
 def measure(name: str, python: str, arguments: dict[str, Any]) -> dict[str, Any]:
-    """Run one contender as a child; its stages, the seconds from start to exit, and its peak memory in GB."""
+    """Run one contender as a child process: seconds of its stages and from start to exit, and peak memory in GB."""
     print(f"{name} …", file=sys.stderr, flush=True)
     start = time.perf_counter()
     call = [python, __file__, "--child", json.dumps(arguments, default=str)]
@@ -126,7 +125,7 @@ def measure(name: str, python: str, arguments: dict[str, Any]) -> dict[str, Any]
 
 
 def compare(ply: Path, reference: Path) -> str:
-    """How far two files of the same Gaussians are apart."""
+    """A text about the differences between two files of the same Gaussians."""
     import torch
 
     import spackle
@@ -148,7 +147,7 @@ def compare(ply: Path, reference: Path) -> str:
 
 
 def print_table(results: list[dict[str, Any]]) -> None:
-    """Markdown, a contender a row; ratios are to the first."""
+    """Print a Markdown table with a row for each contender; ratios are relative to the first."""
     print(f"\n| | {' | '.join(STAGES)} | whole process | peak memory | whole | post-processing + save |")
     print(f"|---|{'---|' * (len(STAGES) + 4)}")
     post = [r["post-processing"] + r["save"] for r in results]
@@ -160,7 +159,7 @@ def print_table(results: list[dict[str, Any]]) -> None:
 
 
 def make_inputs(weights: Path | None, photo: Path | None, folder: Path) -> tuple[Path, Path]:
-    """Deterministic weights and the demo's photo where nothing is given."""
+    """Weights and photo; by default deterministic weights, which are made here, and the demo's photo."""
     if weights is None:
         weights = Path(tempfile.gettempdir()) / "sharp_deterministic.pt"
         if not weights.exists():

@@ -1,10 +1,10 @@
-"""Time every stage on this machine: its limits, the renderer, completion, a video, SHARP.
+"""Time every stage on this machine: hardware limits, the renderer, completion, a video, SHARP.
 
 python benchmarks/suite.py [-o FOLDER] [--only SECTION,...] [--runs N] [--device cuda] [-c SHARP.pt] [--residual FILE]
 
-Needs no dataset and no weights; SHARP is timed with -c, whose file `spackle weights make` makes. Writes suite.json
-(every run's value) and suite.md after each section. A section that cannot run here is listed with its reason. What is
-compared takes turns within one process, after one turn that compiles and does not count.
+Needs no dataset and no weights; SHARP is timed if -c gives a file, as made by `spackle weights make`. Writes suite.json
+(every run's value) and suite.md after each section. A section that cannot run here is listed with its reason. Tasks
+that are compared take turns within one process, after one untimed turn, which compiles.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ from spackle.residual import ResidualNet, hole_area_ratio
 from spackle.residual.architectures import load_residual
 from spackle.scene_fill import FillContext, fill_scene, fill_view
 
-LIMIT_RUNS = 7  # at least: the best run counts
+LIMIT_RUNS = 7  # the least number of runs, of which the fastest counts
 MATRIX_SIDE, COPY_MB = 2048, 256
 PRODUCT, COPY = "matrix product, {}", "copy of memory"
 RENDER_STAGES = ("project", "sort", "bin", "blend")
@@ -61,7 +61,7 @@ LIFT, COMPLETE, DRAW, ENCODE = "photo and depth to Gaussians", "completion of th
 EACH, GUARDS = "frames rendered and completed, each by itself", "the photo's occlusion guard, for each of them"
 FORWARD, UNPROJECT, SAVE = "forward", "unprojection", "save as PLY"
 
-Peaks = Mapping[str, float]  # a figure of the limits -> its best run, operations or bytes a millisecond
+Peaks = Mapping[str, float]  # for each measured limit, its best run in operations or bytes per millisecond
 
 
 class Timed(NamedTuple):
@@ -70,16 +70,16 @@ class Timed(NamedTuple):
     name: str
     values: Values
     unit: str = "ms"
-    limit_ms: float | None = None  # the least time that it needs, at the measured limit that holds for it
+    limit_ms: float | None = None  # the least possible time, at the measured limit that applies
 
 
-Section = tuple[list[Timed], dict[str, Any]]  # figures; sizes and settings, ready for JSON
+Section = tuple[list[Timed], dict[str, Any]]  # the figures; and sizes and settings, ready for JSON
 
 
 def limits_section(runs: int, device: torch.device = CPU, share: float = 1.0) -> Section:
-    """Products of square matrices, 2·side³ operations each, and copies, whose bytes are read and written.
+    """Time products of square matrices, 2·side³ operations each, and copies, whose bytes are read and written.
 
-    `share` is of the full sizes.
+    `share` scales the sizes.
     """
     side = round(share * MATRIX_SIDE)
     figures: list[Timed] = []
@@ -99,7 +99,7 @@ def limits_section(runs: int, device: torch.device = CPU, share: float = 1.0) ->
 
 
 def renderer_section(runs: int, side: int, peaks: Peaks) -> Section:
-    """The CPU renderer on a scene of SHARP's size: stages, a whole call, and the naive renderer of the same picture."""
+    """Time the CPU renderer on a scene of SHARP's size: its stages, a whole call, and the naive renderer."""
     scene, camera = photo_scene(side)
     tasks: dict[str, Task] = {
         "ours": lambda lap: render_in_laps(scene, camera, lap),
@@ -108,7 +108,7 @@ def renderer_section(runs: int, side: int, peaks: Peaks) -> Section:
     }
     times = measure(runs, tasks)
     call, naive = times["call", TOTAL], times["naive", TOTAL]
-    least = len(scene) * GAUSSIAN_BYTES + side * side * PIXEL_BYTES  # bytes that are read once or written once
+    least = len(scene) * GAUSSIAN_BYTES + side * side * PIXEL_BYTES  # bytes that must be read or written once
     figures = [Timed(stage, times["ours", stage]) for stage in RENDER_STAGES]
     figures.append(Timed("whole call: RGB, depth, alpha", call, limit_ms=least / peaks[COPY]))
     figures += [Timed(f"naive: {stage}", times["naive", stage]) for stage in RENDER_STAGES]
@@ -117,7 +117,7 @@ def renderer_section(runs: int, side: int, peaks: Peaks) -> Section:
 
 
 def render_in_laps(scene: Gaussians, camera: Camera, lap: Lap) -> None:
-    """What `spackle.render.cpu.draw` does, step by step."""
+    """Do what `spackle.render.cpu.draw` does, with a lap after each step."""
     view = KernelCamera.of(camera, 0.0)
     wanted = wanted_tiles(view, None)
     splats, spans = project([scene], view, wanted)
@@ -138,7 +138,7 @@ def completion_section(
     network: ResidualNet | None,
     device: torch.device = CPU,
 ) -> Section:
-    """One view, 5 % of which are holes, beside the base's render of it; without a network the seeds fill the holes."""
+    """Time the completion of a view with 5 % holes, and the base's rendering; if `network` is None, by seeds."""
     disparity, camera = find_view(base, photo_camera, renderer)
     context = FillContext(base, photo_camera, renderer, network)
     times = measure(runs, {"": lambda lap: complete_in_laps(context, camera, lap)}, device)
@@ -164,11 +164,11 @@ def video_section(
     frames: int = FRAMES,
     device: torch.device = CPU,
 ) -> Section:
-    """A photo, which `lift` makes Gaussians of, to an MP4 along `rotate-forward`: as one scene, and frame by frame.
+    """Time a photo, lifted by `lift`, to an MP4 along `rotate-forward`: as one scene, and frame by frame.
 
-    Frame by frame, each is rendered and completed from scratch, its occlusion guard included, and shares nothing with
-    the others but the photo's Gaussians. Lifting and encoding are the same in both ways, and count in both. At most
-    `VIDEO_RUNS`.
+    Frame by frame, each frame is rendered and completed from scratch, including its occlusion guard; frames share only
+    the photo's Gaussians. Lifting and encoding are the same in both ways, and included in both. There are at most
+    `VIDEO_RUNS` runs.
     """
     prediction, aux = lift(), Gaussians.empty()
     depths = DepthRange.of(prediction.gaussians)
@@ -181,7 +181,7 @@ def video_section(
         lap(LIFT)
         aux = fill_scene(FillContext(base.gaussians, base.camera, renderer, network), path).aux
         lap(COMPLETE)
-        with torch.no_grad():  # as bytes, so that all frames fit into memory
+        with torch.no_grad():  # frames as bytes, so that all fit into memory
             views = (renderer.render([base.gaussians, aux], camera).rgb for camera in path)
             pictures: list[Tensor] = [(rgb * 255).round().to(torch.uint8) for rgb in views]
         lap(DRAW)
@@ -210,7 +210,7 @@ def video_section(
 
 
 def sharp_section(runs: int, base: SharpBase, photo: Photo, peaks: Peaks, device: torch.device = CPU) -> Section:
-    """A photo to a scene on disk by SHARP, stage by stage; its time does not depend on what the photo shows."""
+    """Time a photo to a scene on disk by SHARP, by stage; the time does not depend on the photo's content."""
     count = 0
 
     def whole(lap: Lap) -> None:
@@ -224,7 +224,7 @@ def sharp_section(runs: int, base: SharpBase, photo: Photo, peaks: Peaks, device
             save_ply(gaussians, Path(folder) / "scene.ply", camera=photo.camera)
         lap(SAVE)
 
-    # The run that is counted warms up; a compiled network hides its operations, and warms up within `measure`.
+    # Counting operations also warms up. A compiled network hides its operations, and is warmed up by `measure`.
     flops = 0.0 if base.compiled else count_flops(lambda: whole(lambda name: None))
     times = measure(runs, {"": whole}, device, warm=flops > 0)
     least = flops / peaks[PRODUCT.format(base.precision)] if flops else None
@@ -237,19 +237,19 @@ def sharp_section(runs: int, base: SharpBase, photo: Photo, peaks: Peaks, device
 
 
 def count_flops(call: Callable[[], Any]) -> float:
-    """Operations of the products, convolutions and attention in a call: two for each multiplication and addition."""
+    """Count operations in a call's products, convolutions and attention: a multiply-add is two."""
 
     def attention(query: Any, key: Any, value: Any, *rest: Any, **more: Any) -> Any:
         return sdpa_flop_count(query, key, value)  # type: ignore[no-untyped-call]
 
-    flash = torch.ops.aten._scaled_dot_product_flash_attention_for_cpu  # which PyTorch does not count
+    flash = torch.ops.aten._scaled_dot_product_flash_attention_for_cpu  # PyTorch does not count it
     with FlopCounterMode(display=False, custom_mapping={flash: attention}) as counter:
         call()
     return float(counter.get_total_flops())
 
 
 def section(name: str, options: argparse.Namespace, peaks: Peaks) -> Section:
-    """Measure a section of `TITLES`; InputError where it cannot run here, and why."""
+    """Measure a section of `TITLES`; InputError, with the reason, if it cannot run here."""
     runs, side, device = options.runs, options.side, torch.device(options.device)
     if name == "limits":
         return limits_section(runs, device, min(1.0, side / SIDE))
@@ -340,7 +340,7 @@ def _table(name: str, figures: list[Timed], facts: Mapping[str, Any]) -> str:
 
 
 def _number(value: float) -> str:
-    """Three digits at least, without a power of ten where one can do without."""
+    """Format with at least three digits, without an exponent if possible."""
     if not math.isfinite(value) or abs(value) >= 100 or value == 0:
         return f"{value:,.0f}"
     return f"{value:.1f}" if abs(value) >= 10 else f"{value:.2f}" if abs(value) >= 0.1 else f"{value:.2g}"

@@ -1,4 +1,4 @@
-"""Synthetic scenes of SHARP's size for benchmarks, views of them with holes, and the commit that is measured."""
+"""Synthetic scenes of SHARP's size for benchmarks, views of them with holes, and the measured commit."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from spackle.gaussians import Gaussians
 from spackle.render import Renderer
 from spackle.residual import hole_area_ratio
 
-SIDE = 1536  # pixels along SHARP's picture
+SIDE = 1536  # pixels a side, as in SHARP
 CELL = 2
-HOLES, HALVINGS, CLOSE = 0.05, 14, 0.01  # of a view; of the search for it, and its relative tolerance
-# Boxes in front of the wall: left, top, right, bottom as shares of the picture, and their depth in metres.
-# They cover less than a tenth, so that paths look at the wall.
+HOLES, HALVINGS, CLOSE = 0.05, 14, 0.01  # share of a view; steps and relative tolerance of the search
+# Boxes in front of the wall: left, top, right, bottom as fractions of the image, and depth in metres.
+# They cover less than a tenth of it, so that camera paths look at the wall.
 BOXES = ((0.15, 0.20, 0.30, 0.40, 3.5), (0.60, 0.35, 0.80, 0.55, 3.0), (0.35, 0.70, 0.50, 0.80, 4.0))
 WALL_M = 6.0
-BEHIND = 1.02  # the second layer's depth over the first's
+BEHIND = 1.02  # ratio of the second layer's depth to the first's
 SPREAD_PX = 1.3
 
 
 def photo_scene(side: int = SIDE) -> tuple[Gaussians, Camera]:
     """Two layers of (side/2)² Gaussians, aligned with the pixels of a photo, over smooth but varied depths.
 
-    Opacities lie between 0.04 and 0.99, so that more Gaussians are drawn than a surface would need.
+    Opacities are between 0.04 and 0.99, so that more Gaussians are rendered than a surface would need.
     """
     generator = torch.Generator().manual_seed(0)
     camera, uv, xs, ys, grid = _pixels(side)
@@ -46,7 +46,7 @@ def photo_scene(side: int = SIDE) -> tuple[Gaussians, Camera]:
 
 
 def holed_scene(side: int = SIDE) -> tuple[Gaussians, Camera]:
-    """As many Gaussians, closed as the photo's camera sees them: boxes before a wall, which show holes from aside."""
+    """A scene of the same size, with holes only in views from the side: boxes in front of a wall."""
     camera, uv, xs, ys, grid = _pixels(side)
     n, depth = grid * grid, torch.full((grid, grid), WALL_M)
     for left, top, right, bottom, metres in BOXES:
@@ -62,7 +62,7 @@ def holed_scene(side: int = SIDE) -> tuple[Gaussians, Camera]:
 
 
 def _pixels(side: int) -> tuple[Camera, Tensor, Tensor, Tensor, int]:
-    """The photo's camera; centres of its cells [g, g, 2]; their columns and rows [g, g]; how many there are a side."""
+    """The photo's camera; its cells' centres [g, g, 2], their columns and rows [g, g], and g, the cells a side."""
     grid = side // CELL
     ys, xs = torch.meshgrid(torch.arange(grid), torch.arange(grid), indexing="ij")
     uv = (torch.stack([xs, ys], dim=-1) + 0.5) * (side / grid)
@@ -70,7 +70,7 @@ def _pixels(side: int) -> tuple[Camera, Tensor, Tensor, Tensor, int]:
 
 
 def find_view(base: Gaussians, camera: Camera, renderer: Renderer, share: float = HOLES) -> tuple[float, Camera]:
-    """The disparity at which a share of the view from the right is holes, by bisection; and that view.
+    """Find by bisection the disparity at which the right view has this share of holes; returns it and the view.
 
     Raises:
         InputError: there is no such view.
@@ -88,9 +88,9 @@ def find_view(base: Gaussians, camera: Camera, renderer: Renderer, share: float 
 
 
 def commit() -> str:
-    """Of the checkout that this package runs from, with a + where files were changed since; "unknown" without one."""
+    """The commit of the checkout that this package runs from, with a + if files have changed; else "unknown"."""
     git = ["git", "-C", str(Path(spackle.__file__).parent)]
-    try:  # a project that this package is only installed into does not track it
+    try:  # fails if the package is installed inside another project, which does not track it
         subprocess.run([*git, "ls-files", "--error-unmatch", "__init__.py"], capture_output=True, check=True)
         found = [*git, "describe", "--always", "--dirty=+", "--exclude=*"]
         return subprocess.run(found, capture_output=True, check=True, text=True).stdout.strip()
