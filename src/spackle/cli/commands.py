@@ -227,7 +227,7 @@ def view(
         typer.Argument(metavar="SCENE_OR_PHOTO", help="A scene, or a photo to complete; without it the page is empty."),
     ] = None,
     base: Annotated[
-        str, typer.Option(metavar="NAME", help="What turns photos into Gaussians, as `spackle predict` has it.")
+        str, typer.Option(metavar="NAME", help="What turns photos into Gaussians, as for `spackle predict`.")
     ] = "auto",
     depth: Annotated[Path | None, typer.Option(metavar="FILE", help="Depth of the photo.")] = None,
     depth_kind: DepthKindOption = "auto",
@@ -244,7 +244,7 @@ def view(
     keep_frame: KeepFrameOption = False,
     device: DeviceOption = "auto",
     host: HostOption = "127.0.0.1",
-    port: Annotated[int, typer.Option(metavar="N", help="Listen at this port; 0: any that is free.")] = 0,
+    port: Annotated[int, typer.Option(metavar="N", help="Listen at this port; 0: any free port.")] = 0,
     browser: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in a browser.")] = True,
     token: Annotated[
         bool,
@@ -272,7 +272,7 @@ def view(
 
 def serve(
     host: HostOption = "127.0.0.1",
-    port: Annotated[int, typer.Option(metavar="N", help="Listen at this port; 0: any that is free.")] = 8080,
+    port: Annotated[int, typer.Option(metavar="N", help="Listen at this port; 0: any free port.")] = 8080,
     token: Annotated[
         str | None,
         typer.Option(
@@ -300,7 +300,7 @@ def serve(
         int, typer.Option(min=1, metavar="N", help="Number of photos that may wait; further ones are refused.")
     ] = 32,
     base: Annotated[
-        str, typer.Option(metavar="NAME", help="What turns photos into Gaussians, as `spackle predict` has it.")
+        str, typer.Option(metavar="NAME", help="What turns photos into Gaussians, as for `spackle predict`.")
     ] = "auto",
     checkpoint: CheckpointOption = None,
     device: DeviceOption = "auto",

@@ -110,7 +110,7 @@ def evaluate(
     as_json: JsonOption = False,
     verbose: VerboseOption = False,
 ) -> None:
-    """Measure on a dataset, in the paper's protocols: rows.jsonl, tables.md, tables.tex, worst.png, best.png."""
+    """Evaluate on a dataset by the paper's protocols: rows.jsonl, tables.md, tables.tex, worst.png, best.png."""
     from spackle.bases.settings import BaseSettings
     from spackle.evaluation.evaluate import EvaluateOptions, parse_disparities, split_words
     from spackle.evaluation.evaluate import evaluate as run
@@ -196,7 +196,7 @@ def bench(
     as_json: JsonOption = False,
     verbose: VerboseOption = False,
 ) -> None:
-    """Count and time what Spackle adds to the base, in the paper's tables: rows.jsonl, bench.md, bench.tex."""
+    """Count and time what Spackle adds to the base, as in the paper's tables: rows.jsonl, bench.md, bench.tex."""
     from spackle.bases.settings import BaseSettings
     from spackle.evaluation.bench import TIMED
     from spackle.evaluation.bench import bench as run

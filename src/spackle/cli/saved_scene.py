@@ -141,7 +141,7 @@ def _photo_camera(file: SceneFile, size: tuple[int, int] | None, lens: Mapping[s
 
 
 def export_scene(scene: Path, outputs: Sequence[Path], reporter: Reporter) -> None:
-    """Write a scene in the formats that the outputs' names end in, each file whole or not at all.
+    """Write a scene to each output in the format of its suffix; a file is written whole or not at all.
 
     Raises InputError for a scene or name that cannot be used, and for a scene too large for a format.
     """

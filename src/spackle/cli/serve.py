@@ -39,7 +39,7 @@ class Place(NamedTuple):
     """Where the app listens, and whether a browser opens."""
 
     host: str
-    port: int  # 0: any that is free
+    port: int  # 0: any free port
     token: str | None
     browser: bool  # whether to open the page in one
 

@@ -47,7 +47,7 @@ FORMATS = frozenset({"JPEG", "MPO", "PNG", "WEBP", "HEIF", "TIFF"})
 
 
 class SceneOptions(BaseModel):
-    """Options of a client for a scene."""
+    """Options that a client can set for a scene."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
