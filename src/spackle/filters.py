@@ -145,7 +145,7 @@ def _fill_level(depths: Floats, values: Floats, known: Bools, bias: Floats) -> N
     count, channels = known.size - np.count_nonzero(known), values.shape[-1]
     if count == 0:
         return
-    reference = np.float32(torch.from_numpy(depths[known]).median() if bias.any() else 1)  # of two, the lower
+    reference = np.float32(torch.from_numpy(depths[known]).median() if bias.any() else 1)  # the lower of two medians
     size = [-(-side // 2) for side in known.shape]
     coarse = (np.empty(size, np.float32), np.empty((*size, channels), np.float32))
     masks = (np.empty(size, np.bool_), np.empty(size, np.float32))
@@ -166,7 +166,10 @@ def _coarsen(
     start: int, stop: int, depths: Any, values: Any, known: Any, bias: Any, reference: Any,
     coarse_depths: Any, coarse_values: Any, coarse_known: Any, coarse_bias: Any,
 ) -> None:  # fmt: skip
-    """Rows start..stop of the coarser level: means of each 2×2's known pixels, far ones weighted most; flags; bias."""
+    """Compute rows start..stop of the coarser level from each 2×2 pixels.
+
+    These are the mean of the known pixels, far ones weighted most; whether any is known; and the mean bias.
+    """
     height, width = depths.shape
     channels = values.shape[2]
     weights = np.empty(4, np.float32)

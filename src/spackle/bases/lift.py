@@ -32,7 +32,7 @@ class RgbdBase:
 
     def __init__(self, depth: DepthMap, lens_source: str = "calibration") -> None:
         self.depth = depth
-        self.lens_source = lens_source  # of the map's intrinsics; "" if they are the user's
+        self.lens_source = lens_source  # where the map's intrinsics come from; "" if from the user
 
     def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
         """Gaussians of the photo's pixels at its working size; InputError for a map of another aspect ratio."""

@@ -184,7 +184,7 @@ def _survey(
 def _share(colors: Any, color: Any, y: int, x: int) -> Any:
     """The near colour's share in the mixture closest to a pixel, and two squared distances.
 
-    They are those from the pixel to that mixture, and between both colours.
+    The first is from the pixel to that mixture, the second between both colours.
     """
     apart, along, away = np.float32(0), np.float32(0), np.float32(0)
     for c in range(3):

@@ -1,7 +1,7 @@
 """ProPainter, the paper's inpainter (optional: pip install 'spackle-nvs[propainter]').
 
-It propagates pixels along the optical flow into holes, and generates what no frame shows. Its networks are pytorchcv's;
-as that package would download weights by itself, it is given networks that have their weights.
+It propagates pixels along the optical flow into holes, and generates what no frame shows. Its networks come from
+pytorchcv. That package would download weights by itself, so it is given networks that have their weights.
 """
 
 from __future__ import annotations
