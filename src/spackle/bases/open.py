@@ -107,7 +107,7 @@ def _lift(settings: BaseSettings, photo: Photo, depth: Depth) -> Base | None:
         found = read()
     width, height = photo.framed_size
     found.check_shape(height, width, photo.path)
-    if found.K is None or not photo.focal_source.startswith("--"):  # the user gave no focal length
+    if found.K is None or not photo.focal_source.startswith("--"):  # "--…": the user gave it
         return RgbdBase(found, "the photo's depth" if found.note else "calibration")
     focal = photo.focal_px * (found.depth.shape[1] / width)
     return RgbdBase(read(focal_px=focal) if read else found.with_focal(focal), "")
