@@ -38,7 +38,7 @@ def train(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Delete a run in OUT and start anew.")] = False,
     verbose: VerboseOption = False,
 ) -> None:
-    """Train the residual network or SHARP's decoder: best.safetensors, last.safetensors, run.json, pictures and logs."""
+    """Train the residual network or SHARP's decoder: best.safetensors, last.safetensors, run.json, pictures, logs."""
     from spackle.errors import InputError
     from spackle.progress import Reporter
     from spackle.training.direct_ft import DirectFt
