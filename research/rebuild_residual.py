@@ -1,10 +1,10 @@
-"""Rebuilds the shipped weights of the residual from data to file: four runs, and the means of their weights.
+"""Rebuild the shipped weights of the residual: four training runs, and means of their weights.
 
     python research/rebuild_residual.py -o OUT data.photos=PHOTOS data.stereo=PAIRS \\
         data.rgbd.0.folder=KITCHEN data.rgbd.1.folder=OFFICE loss.features_path=squeezenet_v1.0.npz
 
-OUT gets a folder for each run, and residual.safetensors. The same command resumes where a killed one stopped. KEY=VALUE
-replace values of every run, after its own.
+OUT gets a folder for each run, and residual.safetensors. The same command resumes after a killed one. KEY=VALUE
+override values in every run.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from pathlib import Path
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-RUNS = {  # name: what it starts from, and its values beside those of the recipe cpu
+RUNS = {  # name: initial weights, and values that override the recipe cpu
     "first": ("", "data.views=1200 optim.steps=2700 loss.color_blur=0 loss.perceptual=1 loss.gram=1"),
     "second": ("first", "data.views=420 optim.steps=2000 optim.warmup=60 optim.lr=3e-4 optim.min_lr=2e-5"),
     "third": ("mixed", "data.views=1524 optim.steps=4000"),
     "fourth": ("third", "data.views=1124 data.seed=1 optim.steps=2400 optim.lr=2e-4 optim.min_lr=1e-5"),
 }
-MIXED = {"first": 0.35, "second": 0.65}  # shares of the weights that the third run starts from
+MIXED = {"first": 0.35, "second": 0.65}  # the third run starts from a mean with these shares
 SHIPPED = {"mixed": 0.1, "third": 0.4, "fourth": 0.5}
 
 
 def mean(files: Mapping[Path, float]) -> dict[str, Tensor]:
-    """Weights of files by their shares, in float32."""
+    """The mean of files' weights, weighted by their shares, in float32."""
     parts = [
         {name: share * tensor.float() for name, tensor in load_file(file).items()} for file, share in files.items()
     ]
@@ -37,7 +37,7 @@ def mean(files: Mapping[Path, float]) -> dict[str, Tensor]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line; returns the exit status of the run that failed, else 0."""
+    """Run the command; returns the exit status of a failed run, else 0."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, required=True, help="a folder; runs in it go on")
     parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="of every run: where the data lies")

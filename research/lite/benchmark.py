@@ -1,13 +1,13 @@
-"""The lite base's depth beside two guesses that need no photo, on measured depth, as a Markdown table.
+"""Compare the lite base's depth, and two guesses that need no photo, with measured depth, as a Markdown table.
 
     python research/lite/benchmark.py --stereo FOLDER --rgbd FOLDER --unit 0.001 [--last 0.2] [--weights FILE] \
         [--pictures PNG] [--standing PHOTOS]
 
-Each --stereo is a folder of scenes, each with a scene.json, or of the format of ETH3D and Middlebury 2014 (calib.txt).
-Each --rgbd is a folder of NAME.color.jpg and NAME.depth.png, with its --unit in metres; --last takes the last share of
-its frames, those that `lite.yaml` does not learn from. Every guess gets the scale and shift that fit best
-(`depth_loss.py`). --standing makes 40 streets with standing things, their surfaces cut from PHOTOS, and judges within
-the things (`standing.py`). The last line is the time for a photo of 640×480, median of 9.
+Each --stereo is a folder of scenes, which have a scene.json, or a calib.txt as in ETH3D and Middlebury 2014. Each
+--rgbd is a folder of NAME.color.jpg and NAME.depth.png, with its --unit in metres; --last uses only the last share of
+its frames, those that `lite.yaml` does not train on. Each guess is aligned by the best scale and shift
+(`depth_loss.py`). --standing makes 40 synthetic streets with standing objects, with textures cut from PHOTOS, and
+measures the error within objects (`standing.py`). The last line is the time for a photo of 640×480, median of 9 runs.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ STREETS, STREETS_SEED = 40, 202
 
 
 def frames_of(arguments: argparse.Namespace) -> Iterator[tuple[str, list[Frame]]]:
-    """Groups of frames by name."""
+    """Yield groups of frames with their names."""
     for folder in arguments.stereo:
         plain = [scene for scene in sorted(folder.iterdir()) if not (scene / "scene.json").is_file() and scene.is_dir()]
         if len(plain) < len(list(folder.iterdir())):
@@ -57,7 +57,7 @@ def frames_of(arguments: argparse.Namespace) -> Iterator[tuple[str, list[Frame]]
 
 
 def guesses(base: LiteBase, frame: Frame) -> dict[str, Tensor]:
-    """Each guess of a frame's inverse depth, [H, W]."""
+    """All guesses of a frame's inverse depth [H, W], by name."""
     height, width = frame.inverse_depth.shape
     seen = base.inverse_depth(frame.rgb.permute(1, 2, 0))[None, None]
     seen = interpolate(seen, size=(height, width), mode="bilinear", align_corners=False)[0, 0]
@@ -69,7 +69,7 @@ def score(frame: Frame, guess: Tensor) -> DepthScore:
 
 
 def standing(base: LiteBase, photos: Path) -> str:
-    """A line on made streets with standing things."""
+    """The table's line on synthetic streets with standing objects."""
     draw = PhotoDraw(find_files(photos, "--standing", PHOTO_SUFFIXES, "photos"), print)
     scores: dict[str, list[StandingScore]] = {guess: [] for guess in GUESSES[1:]}
     for number in range(STREETS):
@@ -86,7 +86,7 @@ def standing(base: LiteBase, photos: Path) -> str:
 
 
 def seconds(base: LiteBase, runs: int = 9) -> float:
-    """For a photo of 640×480, from its pixels to the inverse depth."""
+    """Median seconds from the pixels of a 640×480 photo to its inverse depth."""
     photo, times = torch.rand(480, 640, 3), []
     for _ in range(runs + 1):
         start = time.perf_counter()

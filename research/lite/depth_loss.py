@@ -1,6 +1,6 @@
-"""What a predicted inverse depth is compared with: the loss (up to a factor, up to a line, in its steps) and the score.
+"""The loss of predicted inverse depth (up to a factor, up to scale and shift, and of its differences) and its score.
 
-The score brings a relative inverse depth to the truth by its best scale and shift, beside a guess that needs no photo.
+The score aligns a relative inverse depth to the truth by the best scale and shift; a guess without photo is a baseline.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ from torch.nn.functional import interpolate
 from spackle.bases.lite import network_size
 from spackle.training.recipe import RecipePart, Share
 
-FARTHEST = 0.02  # of the median inverse depth: what is farther, sky above all, counts as this far
+FARTHEST = 0.02  # over the median inverse depth: what is farther, mostly sky, counts as this far
 NEAREST = 20.0
-AT_MOST = 2.0  # an error in log inverse depth beyond this counts as this: such truth is more often wrong than hard
-STEEPEST = 1.0  # likewise of a step between neighbours
-SCALES = (1, 2, 4, 8)  # strides at which steps are compared
+AT_MOST = 2.0  # greater errors in log inverse depth count as this: the truth there is more often wrong than difficult
+STEEPEST = 1.0  # the same for differences between neighbours
+SCALES = (1, 2, 4, 8)  # strides between neighbours in the loss term steps
 
 
 class DepthLossWeights(RecipePart):
-    """How much each term counts."""
+    """The weights of the loss's terms."""
 
     factor: Share = 1.0
     line: Share = 1.0
     steps: Share = 0.5
-    offset: Share = 0.1  # of no use to anyone, but without it features grow until half precision cannot hold them
+    offset: Share = 0.1  # without it features grow until they overflow half precision
 
 
 def depth_loss(
@@ -37,16 +37,16 @@ def depth_loss(
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """The loss [], and its terms [] unweighted, as means over the pictures.
 
-    With t the true inverse depth over its median, and e = predicted − log t minus its own median:
-    factor is mean |e|; line is mean |a·exp(predicted) + b − t| / (t + 0.2) after the least-squares a ≥ 0 and b,
-    in the spirit of MiDaS (Ranftl et al. 2020); steps is the sum over `SCALES` of mean |∂e/∂x| + |∂e/∂y|;
-    offset is the size of the median that e was freed from, which the other terms do not know.
+    Let t be the true inverse depth over its median, and e = predicted − log t, from which its own median is subtracted.
+    factor is mean |e|. line is mean |a·exp(predicted) + b − t| / (t + 0.2) with the least-squares a ≥ 0 and b, similar
+    to MiDaS (Ranftl et al. 2020). steps is the sum over `SCALES` of mean |∂e/∂x| + |∂e/∂y|. offset is the absolute
+    value of the subtracted median, which the other terms do not depend on.
 
     Args:
         predicted: [B, H, W] log inverse depth.
         truth: [B, H, W] inverse depth in any unit, 0 for infinitely far.
         valid: [B, H, W] bool, where the truth is known.
-        weights: of the terms.
+        weights: the weights of the terms.
     """
     mask = valid.to(predicted.dtype)
     truth = (truth / _median(truth, valid & (truth > 0)).clamp_min(1e-6)).clamp(FARTHEST, NEAREST)
@@ -66,7 +66,7 @@ def depth_loss(
 
 
 def _line(predicted: Tensor, truth: Tensor, mask: Tensor) -> Tensor:
-    """[B] error of the inverse depth after its best scale and shift."""
+    """[B] the term line: the error of the inverse depth after the best scale and shift."""
     inverse = predicted.clamp(-8, 4).exp()
     count = mask.sum((1, 2)).clamp_min(1)
 
@@ -79,7 +79,7 @@ def _line(predicted: Tensor, truth: Tensor, mask: Tensor) -> Tensor:
 
 
 def _steps(error: Tensor, mask: Tensor) -> Tensor:
-    """[B] how differently neighbours differ, at several strides."""
+    """[B] the term steps: errors of the differences between neighbours, at several strides."""
     total = error.new_zeros(len(error))
     for stride in SCALES:
         e, m = error[:, ::stride, ::stride], mask[:, ::stride, ::stride]
@@ -96,7 +96,7 @@ def _mean(x: Tensor, mask: Tensor) -> Tensor:
 
 
 def _median(x: Tensor, valid: Tensor) -> Tensor:
-    """[B, 1, 1] of the valid values; 1 where there are none."""
+    """[B, 1, 1] the median of an image's valid values; 1 if there are none."""
     values = [
         one[known].median() if bool(known.any()) else one.new_ones(()) for one, known in zip(x, valid, strict=True)
     ]
@@ -108,7 +108,7 @@ FARTHEST_FACTOR = 2.0  # an aligned depth is at most this many times the farthes
 
 @dataclasses.dataclass(frozen=True)
 class DepthScore:
-    """Of one picture."""
+    """The score of one picture."""
 
     abs_rel: float  # mean |z − z*| / z*
     delta: float  # share of pixels with max(z/z*, z*/z) < 1.25
@@ -120,17 +120,17 @@ def score_depth(inverse_depth: Tensor, depth: Tensor, valid: Tensor) -> DepthSco
     Args:
         inverse_depth: [H, W] up to scale and shift.
         depth: [H, W] true z in any unit.
-        valid: [H, W] bool, where it is known.
+        valid: [H, W] bool, where the true depth is known.
     """
     true = 1 / depth[valid].double()
     found = align(inverse_depth[valid].double(), true).clamp_min(true.min() / FARTHEST_FACTOR)
-    ratio = true / found  # of depths: found over true
+    ratio = true / found  # of the aligned depth to the true depth
     within = torch.maximum(ratio, 1 / ratio) < 1.25
     return DepthScore(float((ratio - 1).abs().mean()), float(within.double().mean()))
 
 
 def align(values: Tensor, true: Tensor) -> Tensor:
-    """[N] a·values + b nearest to `true` [N] by least squares; its mean where the values are all the same."""
+    """[N] a·values + b with the least-squares distance to `true` [N]; the mean of `true` if all values are equal."""
     v, t = values - values.mean(), true - true.mean()
     spread = (v * v).sum()
     scale = (v * t).sum() / spread if spread > 1e-12 * len(v) * values.abs().max() ** 2 else v.new_zeros(())
@@ -138,7 +138,7 @@ def align(values: Tensor, true: Tensor) -> Tensor:
 
 
 def vertical_ramp(height: int, width: int) -> Tensor:
-    """[H, W] the guess that needs no photo: what stands lower in the picture is nearer."""
+    """[H, W] a guess that needs no photo: what is lower in the picture is nearer."""
     return (torch.arange(height) + 0.5)[:, None].expand(height, width)
 
 
@@ -147,10 +147,10 @@ MEASURES = ("abs_rel", "delta", "ramp_abs_rel", "loss", "factor", "line", "steps
 
 @dataclasses.dataclass(frozen=True)
 class DepthJudge:
-    """What the loss needs besides a batch."""
+    """Computes loss and scores of a network."""
 
     weights: DepthLossWeights
-    pixels: int  # of what the network sees of a judged frame, nearly
+    pixels: int  # approximate number of pixels to which validation frames are resized
     precision: torch.dtype
     device: torch.device  # of the network
 
@@ -162,7 +162,7 @@ class DepthJudge:
 
     @torch.no_grad()
     def measure(self, network: nn.Module, frame: Frame) -> dict[str, float]:
-        """`MEASURES` of a frame: scores at its own size, the loss at the network's."""
+        """`MEASURES` of a frame: scores at the frame's size, the loss at the network's."""
         batch = self._batch(frame)
         predicted = self._run(network, batch.rgb)
         truth, valid = batch.inverse_depth.to(self.device), batch.valid.to(self.device)
@@ -185,12 +185,12 @@ class DepthJudge:
         return predicted.float()
 
     def _batch(self, frame: Frame) -> DepthBatch:
-        """A frame at the size that the network sees."""
+        """A frame at the size that the network gets."""
         height, width = frame.inverse_depth.shape
         return DepthBatch.of([frame], network_size(height, width, self.pixels))
 
 
 def _at_size_of(frame: Frame, predicted: Tensor) -> Tensor:
-    """[H, W] inverse depth from its logarithm [1, h, w]."""
+    """[H, W] inverse depth at a frame's size, from log inverse depth [1, h, w]."""
     size = frame.inverse_depth.shape
     return interpolate(predicted.exp()[None], size=size, mode="bilinear", align_corners=False)[0, 0].cpu()

@@ -1,4 +1,4 @@
-"""Photos with measured depth, of depth cameras and stereo pairs, and their augmentation: other views, other light."""
+"""Photos with measured depth, from depth cameras and stereo pairs, and their augmentation: camera and light."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from spackle.training.recipe import RgbdFolder
 from spackle.training.sources import find_files, load_frame, load_pair
 
 Rng = np.random.Generator
-FOCAL = 1.1  # in widths: of photos whose lens is not known; only turning the camera asks for it
+FOCAL = 1.1  # in widths: assumed for photos with unknown lens, to turn the camera
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,27 +28,27 @@ class Frame:
 
     rgb: Tensor  # [3, H, W] sRGB in 0..1
     inverse_depth: Tensor  # [H, W] in any unit, 0 for infinitely far
-    valid: Tensor  # [H, W] bool, where it is known
+    valid: Tensor  # [H, W] bool, where inverse_depth is known
 
 
 @dataclasses.dataclass(frozen=True)
 class Turning:
     """How far the camera of a frame is turned and zoomed."""
 
-    zoom: tuple[float, float]  # drawn between these; 1 shows as much of the frame as fits
+    zoom: tuple[float, float]  # a range; 1 shows as much of the frame as fits
     degrees: tuple[float, float, float]  # standard deviations of yaw, pitch and roll
 
 
-MEASURED = Turning((1.0, 1.6), (4.0, 4.0, 4.0))  # few scenes have to look like many
-MADE = Turning((1.0, 1.4), (2.0, 2.0, 3.0))  # synthetic scenes are drawn from every side already
-GUESSED = Turning((1.0, 1.4), (3.0, 3.0, 4.0))  # photos are many
-MINGLED_SCALE = (-0.2, 0.8)  # logarithms: of the front frame's median inverse depth over the back one's
+MEASURED = Turning((1.0, 1.6), (4.0, 4.0, 4.0))  # few scenes must look like many
+MADE = Turning((1.0, 1.4), (2.0, 2.0, 3.0))  # synthetic scenes vary in their cameras already
+GUESSED = Turning((1.0, 1.4), (3.0, 3.0, 4.0))  # there are many photos
+MINGLED_SCALE = (-0.2, 0.8)  # range of the logarithm of the front frame's median inverse depth over the back frame's
 
 
 def turned(rng: Rng, frame: Frame, height: int, width: int, turning: Turning) -> Frame:
-    """What a camera at the same place sees that looks elsewhere, and by chance its mirror image.
+    """The frame as seen by a camera at the same place with another direction; mirrored half of the time.
 
-    Turning needs no depth; the inverse depth changes by the known factor between the two cameras' axes.
+    The image depends on the direction alone; inverse depth changes by the known ratio of z in both cameras.
     """
     rows, columns = frame.inverse_depth.shape
     focal = FOCAL * columns
@@ -81,9 +81,9 @@ def _rotation(angles: NDArray[Any]) -> NDArray[Any]:
 
 
 def mingled(rng: Rng, back: Frame, front: Frame) -> Frame:
-    """Two frames of one size as one scene: each pixel shows the one that is nearer there, at a random relative scale.
+    """Merge two frames of one size: each pixel shows the one that is nearer there, at a random relative scale.
 
-    Outlines and textures are real ones, and so is the depth; only that these things ever stood together is not.
+    Outlines, textures and depth are real; only the combination is not.
     """
     both = back.valid & front.valid
     if not bool(both.any()):
@@ -99,11 +99,11 @@ def mingled(rng: Rng, back: Frame, front: Frame) -> Frame:
 
 
 def relit(rng: Rng, rgb: Tensor) -> Tensor:
-    """[3, H, W] in another light, through another camera: brightness, tint, contrast, glare, grey, blur, noise."""
+    """[3, H, W] as in other light and by another camera: brightness, tint, contrast, glare, grey, blur, noise."""
     tint = np.exp(rng.normal(0, 0.12, (3, 1, 1)) + rng.normal(0, 0.2)).astype(np.float32)
     rgb = rgb * torch.from_numpy(tint)
     mean = rgb.mean((1, 2), keepdim=True)
-    harsh = rng.uniform(0.3, 1.0) if rng.random() < 0.12 else 0.0  # black shadows, and what is bright is white
+    harsh = rng.uniform(0.3, 1.0) if rng.random() < 0.12 else 0.0  # black shadows and white highlights
     rgb = mean + (rgb - mean) * math.exp(rng.normal(harsh, 0.25)) + harsh * rng.uniform(-0.1, 0.3)
     grey = rgb.mean(0, keepdim=True)
     rgb = grey + (rgb - grey) * (0.0 if rng.random() < 0.2 else math.exp(rng.normal(0, 0.3)))
@@ -116,25 +116,25 @@ def relit(rng: Rng, rgb: Tensor) -> Tensor:
     return rgb.clamp(0, 1)
 
 
-SAME = 1.05  # neighbours whose depths differ by less are of one surface
+SAME = 1.05  # neighbours belong to one surface if their depths differ by a smaller factor
 
 
 def warp_to_right(depth: Tensor, valid: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
-    """Each pixel's depth carried to where the right photo shows it; the nearest of several stays.
+    """Move each pixel's depth to its position in the right photo; of several at one position the nearest stays.
 
     Args:
-        depth: [H, W] of the left photo's pixels; both cameras look the same way, so it is the right one's as well.
+        depth: [H, W] in the left photo; it is the same in the right camera, because the cameras' axes are parallel.
         valid: [H, W] bool, where it is known.
-        shift: [H, W] pixels to the right, negative in a pair that is not crossed.
+        shift: [H, W] in pixels, positive to the right; usually negative.
 
     Returns:
-        Depth [H, W], and where it is known [H, W]: not where the left photo shows nothing. A surface that the
-        right camera sees wider has cracks, which are closed where they are a pixel wide.
+        Depth [H, W], and [H, W] bool where it is known: not where the left photo is occluded. Surfaces that are wider
+        in the right photo get cracks, which are closed if they are one pixel wide.
     """
     rows, columns = (place.numpy() for place in valid.nonzero(as_tuple=True))
     z = depth[valid].numpy()
     places = np.rint(columns + shift[valid].numpy()).astype(np.int64)
-    order = np.argsort(-z, kind="stable")  # of several values for one pixel NumPy keeps the last
+    order = np.argsort(-z, kind="stable")  # if several values go to one pixel, NumPy keeps the last
     order = order[(places[order] >= 0) & (places[order] < depth.shape[1])]
     carried = np.full(tuple(depth.shape), np.inf, depth.numpy().dtype)
     carried[rows[order], places[order]] = z[order]
@@ -144,32 +144,32 @@ def warp_to_right(depth: Tensor, valid: Tensor, shift: Tensor) -> tuple[Tensor, 
 
 
 def _close_cracks(depth: NDArray[np.float32]) -> None:
-    """A pixel between two of one surface, with nothing in it or what lies behind, is of that surface."""
+    """Fill a pixel between two of one surface with that surface, if it is empty or shows something behind."""
     left, middle, right = depth[:, :-2], depth[:, 1:-1], depth[:, 2:]
     nearer, farther = np.minimum(left, right), np.maximum(left, right)
     crack = (farther < SAME * nearer) & (middle > SAME * farther)
     middle[crack] = farther[crack]
 
 
-LEARNED_SIDE = 480  # pixels of the longer side of what is learned from
-JUDGED_SIDE = 768  # likewise of what is judged by
+LEARNED_SIDE = 480  # pixels of a training frame's longer side, at most
+JUDGED_SIDE = 768  # the same for validation frames
 
 
 @dataclasses.dataclass(frozen=True)
 class Measured:
-    """A file, and how to read it."""
+    """A frame on disk, and how to read it."""
 
-    path: Path  # of the photo, or of the stereo pair's folder
-    unit_m: float | None = None  # of a depth camera's files; None for a stereo pair
-    right: bool = False  # of a stereo pair's photos the right one
+    path: Path  # the photo, or the stereo pair's folder
+    unit_m: float | None = None  # metres per unit of a depth camera's file; None for a stereo pair
+    right: bool = False  # whether the frame is a stereo pair's right photo
 
     @property
     def name(self) -> str:
-        """What it is called in messages."""
+        """The frame's name in messages."""
         return f"{self.path} (right)" if self.right else str(self.path)
 
     def read(self, side: int) -> Frame:
-        """The frame, its longer side no longer than this; InputError where it cannot be read."""
+        """Read the frame, with at most `side` pixels on the longer side; InputError if that fails."""
         if self.unit_m is not None:
             rgb, stored = load_frame(self.path, self.unit_m)
             return reduced(rgb, stored.depth, stored.valid, side)
@@ -183,21 +183,21 @@ class Measured:
 
 @dataclasses.dataclass(frozen=True)
 class Group:
-    """Frames that look alike: they are judged together, and each group counts as much as another."""
+    """Similar validation frames; the score is a mean over groups, so that each group counts the same."""
 
     name: str
     files: Sequence[Measured]
 
 
 def of_camera(camera: RgbdFolder, held: float) -> tuple[list[Measured], list[Measured]]:
-    """The frames of a folder to learn from, and those to be judged by, which are the last ones by name.
+    """A folder's frames for training, and those for validation, which are the last ones by name.
 
     Args:
         camera: the folder and its unit.
-        held: the share that is judged by; one frame at least is learned from.
+        held: the share for validation; at least one frame is left for training.
 
     Raises:
-        InputError: no such folder, or nothing in it.
+        InputError: there is no such folder, or it has no frames.
     """
     files = find_files(camera.folder, "data.rgbd", (".color.jpg",), "NAME.color.jpg")
     frames = [Measured(file, camera.unit_m) for file in files]
@@ -206,16 +206,16 @@ def of_camera(camera: RgbdFolder, held: float) -> tuple[list[Measured], list[Mea
 
 
 def of_scenes(folder: Path, key: str, *, right: bool = False) -> list[Measured]:
-    """The left photos of the stereo pairs below a folder, or both; InputError where there are none."""
+    """The left photos of all stereo pairs below a folder, with `right` both photos; InputError if there are none."""
     folders = [file.parent for file in find_files(folder, key, ("scene.json",), "scene.json")]
     return [Measured(pair, right=side) for side in ((False, True) if right else (False,)) for pair in folders]
 
 
 def read_all(files: Sequence[Measured], side: int, warn: Callable[[str], None]) -> list[tuple[str, Frame]]:
-    """Frames with their names; those that cannot be read are passed over and named.
+    """Read frames; returns them with their names. Unreadable ones are skipped and reported to `warn`.
 
     Raises:
-        InputError: none can be read.
+        InputError: no frame can be read.
     """
     frames: list[tuple[str, Frame]] = []
     for file in files:
@@ -234,13 +234,13 @@ def read_all(files: Sequence[Measured], side: int, warn: Callable[[str], None]) 
 
 
 def reduced(rgb: Tensor, depth: Tensor, valid: Tensor, side: int) -> Frame:
-    """A frame no larger than it need be; its depth is one of the pixels' that it stands for, no mean.
+    """Reduce a frame to the size `side`; depth is sampled at the nearest pixel, not averaged.
 
     Args:
         rgb: [H, W, 3] sRGB.
         depth: [h, w] of nearly the same shape.
-        valid: [h, w] bool.
-        side: pixels of the longer side.
+        valid: [h, w] bool, where depth is known.
+        side: the most pixels on the longer side.
     """
     height, width = rgb.shape[:2]
     scale = min(1.0, side / max(height, width))

@@ -1,4 +1,4 @@
-"""What a step learns from: pictures with depth of several sources, by nothing but the step and the place in it."""
+"""Training batches: pictures with depth from several sources, chosen by seed, step and index in the batch alone."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from spackle.errors import InputError
 from spackle.files import atomic_path
 from spackle.image import load_photo
 
-UPRIGHT = 0.2  # share of steps whose pictures stand upright
-COARSER = 2  # the network's output has half of its input's size
+UPRIGHT = 0.2  # share of steps with upright pictures
+COARSER = 2  # ratio of the network's input size to its output size
 
 
 class Source(Protocol):
-    """A supply of frames."""
+    """A source of frames."""
 
     @property
     def turning(self) -> Turning:
-        """How far its cameras are turned."""
+        """How far cameras are turned for augmentation."""
 
     @property
     def mingles(self) -> float:
-        """How often one of its frames and another, of any source, make one picture."""
+        """The probability that a frame is merged with another one from any source."""
 
     def draw(self, rng: Rng) -> tuple[str, Frame]:
-        """A random one and what it is called; InputError where it cannot be read."""
+        """Draw a random frame; returns its name and the frame. InputError if it cannot be read."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Kept:
 
     frames: Sequence[tuple[str, Frame]]
     turning: Turning = MEASURED
-    mingles: float = 0.35  # there are few
+    mingles: float = 0.35  # high, because frames are few
 
     def draw(self, rng: Rng) -> tuple[str, Frame]:
         """As `Source` has it."""
@@ -69,7 +69,7 @@ class Kept:
 
 @dataclasses.dataclass(frozen=True)
 class DepthBatch:
-    """Pictures of one size, and their truth at half of it."""
+    """Pictures of one size, and their true inverse depth at half the size."""
 
     rgb: Tensor  # [B, 3, H, W] sRGB in 0..1
     inverse_depth: Tensor  # [B, H/2, W/2] in any unit
@@ -77,7 +77,7 @@ class DepthBatch:
 
     @staticmethod
     def of(frames: Sequence[Frame], size: tuple[int, int]) -> DepthBatch:
-        """Frames of one size as a network of the input (height, width) sees them; depth is one of theirs, no mean."""
+        """Resize frames of one size for a network with the input `size`; depth is sampled at the nearest pixel."""
         rgb, inverse_depth, valid = (
             torch.stack([getattr(frame, field.name) for frame in frames]) for field in dataclasses.fields(Frame)
         )
@@ -89,17 +89,17 @@ class DepthBatch:
 
 @dataclasses.dataclass(frozen=True)
 class Mixture:
-    """Sources by their shares."""
+    """Draws pictures from sources by their shares."""
 
     sources: Sequence[Source]
     shares: Sequence[float]
-    size: tuple[int, int]  # height and width; upright steps have them the other way round
+    size: tuple[int, int]  # height and width; swapped in upright steps
     seed: int
-    scales: Sequence[float] = (1.0,)  # of what the network sees of a step's pictures, one drawn for each step
+    scales: Sequence[float] = (1.0,)  # factors on `size`; each step draws one
 
     def batch(self, step: int, places: Sequence[int]) -> DepthBatch:
-        """The pictures at some places of a step, seen large or small; InputError where one cannot be read."""
-        # A seed ends in zeros without end: a step's own numbers would be those of its place 0, hence the 1 below.
+        """The pictures with these indices in a step, at a random scale; InputError if one cannot be read."""
+        # NumPy pads seeds with zeros, so [seed, step] equals [seed, step, 0]; pictures therefore add 1 (below).
         rng = np.random.default_rng([self.seed, step])
         height, width = self.size[::-1] if rng.random() < UPRIGHT else self.size
         scale = self.scales[int(rng.integers(len(self.scales)))]
@@ -107,11 +107,11 @@ class Mixture:
         return DepthBatch.of(pictures, scaled_size(height, width, scale))
 
     def name(self, step: int, place: int) -> str:
-        """Where the picture at a place of a step comes from."""
+        """The name of the picture with this index in a step."""
         return self._picture(step, place, *self.size)[0]
 
     def _picture(self, step: int, place: int, height: int, width: int) -> tuple[str, Frame]:
-        """What it is called, which its size does not change, and itself."""
+        """A picture's name and the picture; the name does not depend on the size."""
         rng = np.random.default_rng([self.seed, step, 1 + place])
         source = self._source(rng)
         name, frame = source.draw(rng)
@@ -127,22 +127,22 @@ class Mixture:
         return self.sources[int(rng.choice(len(self.sources), p=np.array(self.shares) / sum(self.shares)))]
 
 
-LOOKS_PX = (128 * 160, 192 * 256, 256 * 320, 352 * 480)  # each both ways round; much smaller ones agree on little
-UNSURE = 0.12  # where looks, of all sizes and networks, differ by more than this in logarithms, a guess does not count
-STEEP = 0.25  # nor where it changes by more than this from pixel to pixel: its outlines are soft, true ones are not
+LOOKS_PX = (128 * 160, 192 * 256, 256 * 320, 352 * 480)  # in both orientations; much smaller sizes agree less
+UNSURE = 0.12  # greatest deviation, in logarithms, of predictions by all sizes and networks for a guess to count
+STEEP = 0.25  # nor does a guess count where it changes by more between pixels: predicted outlines are blurred
 
 
 @dataclasses.dataclass(frozen=True)
 class GuessedPhotos:
-    """A folder of guesses, one for each photo, as a source."""
+    """Photos with the teacher's guesses, which are stored in a folder, as a source."""
 
     folder: Path
     photos: Sequence[Path]
     turning: Turning = GUESSED
-    mingles: float = 0.6  # whatever is behind, the front one's outlines are then true
+    mingles: float = 0.6  # high, because merging gives exact outlines
 
     def fill(self, base: LiteBase, progress: Callable[[int, int], None], warn: Warn) -> None:
-        """Guess what is missing; a photo that cannot be read is named and left out."""
+        """Make missing guesses; photos that cannot be read are left out and reported to `warn`."""
         self.folder.mkdir(parents=True, exist_ok=True)
         looks = [InputScale(pixels, network) for pixels in LOOKS_PX for network in range(len(base.networks))]
         for index, photo in enumerate(self.photos):
@@ -175,7 +175,7 @@ class GuessedPhotos:
 
 
 def sure_inverse_depth(looks: Tensor) -> Tensor:
-    """[h, w] the mean of looks [n, h, w] in logarithms, over its median; 0 where they disagree, or it is steep."""
+    """[h, w] the geometric mean of predictions, given as logarithms [n, h, w]; 0 where they differ or it is steep."""
     looks = looks - looks.flatten(1).median(1).values[:, None, None]
     mean = looks.mean(0)
     around = max_pool2d(mean[None], 3, 1, 1) + max_pool2d(-mean[None], 3, 1, 1)

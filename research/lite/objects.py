@@ -1,4 +1,4 @@
-"""Solids in their places, how they are turned, and objects for synthetic scenes: solids that stand on a spot as one."""
+"""Placed and rotated solids, and objects of synthetic scenes, which are several solids on one spot."""
 
 from __future__ import annotations
 
@@ -17,37 +17,37 @@ UP = np.array([0.0, -1.0, 0.0])  # y points down
 
 
 def turn(yaw: float) -> Array:
-    """[3, 3] around the vertical."""
+    """[3, 3] rotation around the vertical."""
     c, s = math.cos(yaw), math.sin(yaw)
     return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
 
 
 def nod(pitch: float) -> Array:
-    """[3, 3] around the line to the right."""
+    """[3, 3] rotation around the axis to the right."""
     c, s = math.cos(pitch), math.sin(pitch)
     return np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
 
 
 def lean(roll: float) -> Array:
-    """[3, 3] around the line of sight."""
+    """[3, 3] rotation around the optical axis."""
     c, s = math.cos(roll), math.sin(roll)
     return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
 
 
 def anyhow(rng: Rng) -> Array:
-    """Turned by anything around the vertical."""
+    """[3, 3] rotation around the vertical by a random angle."""
     return turn(rng.uniform(-math.pi, math.pi))
 
 
 def solid(rng: Rng, kind: int, center: Array, axes: Array, texture: int | None = None, *, casts: bool = True) -> Solid:
-    """One shape; a random whole texture where none is given."""
+    """A solid; without `texture` it gets a random one that covers all of its surface."""
     skin = int(rng.integers(WHOLE)) if texture is None else texture
     many = (2.0, 1.0) if kind in (ELLIPSOID, CYLINDER) else (1.0, 1.0)
     return Solid(kind, _f(center), _f(axes), skin, many, casts)
 
 
 def wall(rng: Rng, center: Array, axes: Array, across: float, up: float) -> Solid:
-    """A sheet without a shadow, as large as half of it each way."""
+    """A sheet that casts no shadow; `across` and `up` are half its width and height."""
     return solid(rng, SHEET, center, axes @ np.diag([across, up, 1.0]), casts=False)
 
 
@@ -59,12 +59,12 @@ def ground(rng: Rng, axes: Array, center: Array, wide: float, deep: float, repea
 
 
 def cut(rng: Rng) -> int:
-    """A texture with the outline of some thing."""
+    """The index of a random texture with an outline."""
     return WHOLE + int(rng.integers(CUT))
 
 
 def pole(rng: Rng, foot: Array, tall: float, thick: float, axes: Array, texture: int | None = None) -> Solid:
-    """A round post from a foot upwards, upwards as `axes` has it."""
+    """A round post from a foot upwards, in the upward direction of `axes`."""
     return solid(rng, CYLINDER, foot + axes @ UP * tall / 2, axes @ np.diag([thick, tall / 2, thick]), texture)
 
 
@@ -76,7 +76,7 @@ Triple = tuple[float, float, float]
 
 
 def thing(rng: Rng, foot: Array, size: float, yaw: float) -> list[Solid]:
-    """Furniture and the like: a box with more on top, a table, a ball, a tube or a cut-out."""
+    """An object like furniture: a box, perhaps with more on top, a table, a ball, a tube or a cut-out."""
     wide, deep, tall = size * rng.uniform(0.4, 1.3), size * rng.uniform(0.3, 1.2), size * rng.uniform(0.3, 1.6)
     axes, choice = turn(yaw), rng.random()
     if choice < 0.4:
@@ -103,13 +103,13 @@ def tube(rng: Rng, foot: Array, thick: float, tall: float) -> list[Solid]:
 
 
 def books(rng: Rng, foot: Array, size: float) -> list[Solid]:
-    """Some upright side by side, a little askew, or some in a pile."""
+    """Books, either upright side by side, a little askew, or in a pile."""
     axes, count = turn(rng.normal(0, 0.5)), int(rng.integers(1, 6))
     made, along = [], 0.0
     if rng.random() < 0.5:
         for _ in range(count):
             thick, tall, deep = size * rng.uniform(0.06, 0.25), size * rng.uniform(0.7, 1.2), size * rng.uniform(0.5, 1)
-            if count == 1 or rng.random() < 0.15:  # its cover to the front
+            if count == 1 or rng.random() < 0.15:  # the cover faces the front
                 thick, deep = 0.8 * tall, thick
             tilt = lean(rng.normal(0, 0.08)) @ nod(rng.normal(0, 0.06))
             center = foot + axes @ np.array([along + thick, 0.0, 0.3 * size * rng.random()]) + tall * UP
@@ -125,7 +125,7 @@ def books(rng: Rng, foot: Array, size: float) -> list[Solid]:
 
 
 def bottle(rng: Rng, foot: Array, size: float) -> list[Solid]:
-    """A pin, vase or bottle: round, with a neck, by chance with a ball on it."""
+    """A pin, vase or bottle: round, with a neck, sometimes with a ball on top."""
     thick, tall = size * rng.uniform(0.2, 0.6), size * rng.uniform(0.5, 1.2)
     body = solid(rng, ELLIPSOID, foot + tall * UP, np.diag([thick, tall, thick]))
     neck = pole(rng, foot + 1.4 * tall * UP, tall, rng.uniform(0.3, 0.6) * thick, np.eye(3), body.texture)
@@ -134,7 +134,7 @@ def bottle(rng: Rng, foot: Array, size: float) -> list[Solid]:
 
 
 def doll(rng: Rng, foot: Array, size: float) -> list[Solid]:
-    """A body, a head and limbs of it."""
+    """A doll with body, head and limbs."""
     axes, skin = turn(rng.normal(0, 0.6)) @ lean(rng.normal(0, 0.25)), int(rng.integers(WHOLE))
     body, head = ((0.0, -0.6, 0.0), (0.5, 0.6, 0.4), None), ((0.0, -1.5, 0.0), (0.4, 0.45, 0.4), skin)
     parts: list[tuple[Triple, Triple, int | None]] = [body, head]
@@ -146,7 +146,7 @@ def doll(rng: Rng, foot: Array, size: float) -> list[Solid]:
 
 
 def plant(rng: Rng, foot: Array, size: float) -> list[Solid]:
-    """A pot, thin stems, leaves with gaps between them."""
+    """A plant: a pot, thin stems, leaves with gaps between them."""
     made = [pole(rng, foot, 0.6 * size, 0.35 * size, np.eye(3))]
     for _ in range(rng.integers(2, 7)):
         axes, tall = turn(rng.uniform(-3, 3)) @ lean(rng.normal(0, 0.35)), size * rng.uniform(0.6, 1.8)
@@ -175,7 +175,7 @@ ORNAMENTS: tuple[Callable[[Rng, Array, float], list[Solid]], ...] = (books, bott
 
 
 def ornament(rng: Rng, foot: Array, size: float) -> list[Solid]:
-    """Something that stands on tables and shelves, nearly `size` wide to each side."""
+    """A random small object for tables and shelves, about `size` wide to each side."""
     if (choice := int(rng.integers(len(ORNAMENTS) + 2))) < len(ORNAMENTS):
         return ORNAMENTS[choice](rng, foot, size)
     return thing(rng, foot, size, rng.uniform(-math.pi, math.pi))

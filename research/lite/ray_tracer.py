@@ -1,6 +1,6 @@
-"""Pictures of simple solids with their exact depth, one ray for each sample.
+"""Render simple solids with exact depth, one ray for each sample.
 
-Splats would give the outlines of such scenes a soft depth; a ray gives the one surface that it meets.
+Splats would blur depth at outlines; a ray has the depth of the one surface that it hits.
 """
 
 from __future__ import annotations
@@ -17,36 +17,36 @@ from spackle._numba import kernel
 Floats = NDArray[np.float32]
 SHEET, BOX, ELLIPSOID, CYLINDER = range(4)
 FAR = 1e6
-NUDGE = 1e-3  # a shadow ray starts this far along, relative to the distance
+NUDGE = 1e-3  # relative distance from the surface at which a shadow ray starts
 
 
 @dataclasses.dataclass(frozen=True)
 class Solid:
-    """A unit shape, placed: the sheet |x|, |y| ≤ 1 at z = 0; the cube and ball of radius 1; the tube |y| ≤ 1."""
+    """A placed unit shape: sheet |x|, |y| ≤ 1 at z = 0; cube |x|, |y|, |z| ≤ 1; ball, or tube |y| ≤ 1, of radius 1."""
 
     kind: int
     center: Floats  # [3] metres
-    axes: Floats  # [3, 3] columns: the unit shape's axes in the world, metres long
-    texture: int  # index
-    repeats: tuple[float, float]  # of the texture along its two sides
-    casts: bool = True  # a shadow
+    axes: Floats  # [3, 3] columns: the unit shape's axes in the world, in metres
+    texture: int  # index of the texture
+    repeats: tuple[float, float]  # how often the texture repeats along its two sides
+    casts: bool = True  # whether it casts a shadow
 
 
 def trace(
     solids: list[Solid], textures: Floats, rays: Floats, light: Floats, ambient: float, sky: Floats
 ) -> tuple[Floats, Floats]:
-    """Colours and distances along rays from the origin.
+    """Trace rays from the origin.
 
     Args:
-        solids: what there is to hit.
-        textures: [T, S, S, 4] colours 0..1 and coverage; less than half a coverage lets the ray through.
-        rays: [N, 3] directions; the distance is in units of their length.
-        light: [3] unit vector towards it.
-        ambient: share of the light that comes from everywhere.
-        sky: [N, 3] colours where nothing is hit.
+        solids: the solids of the scene.
+        textures: [T, S, S, 4] colours 0..1 and coverage; rays pass through where coverage is below 0.5.
+        rays: [N, 3] directions; distances are in units of their length.
+        light: [3] unit vector towards the light.
+        ambient: share of ambient light.
+        sky: [N, 3] colours of rays that hit nothing.
 
     Returns:
-        Colours [N, 3] and distances [N], inf where nothing is hit.
+        Colours [N, 3] and distances [N], inf for rays that hit nothing.
     """
     inverse = np.stack([np.linalg.inv(s.axes) for s in solids]).astype(np.float32)
     kinds = np.array([s.kind for s in solids])
@@ -54,7 +54,7 @@ def trace(
     skins = np.array([s.texture for s in solids])
     repeats = np.array([s.repeats for s in solids], np.float32)
     casts = np.array([s.casts for s in solids])
-    around = 1.001 * np.array([(s.axes.astype(np.float64) ** 2).sum() for s in solids])  # squared radii of balls
+    around = 1.001 * np.array([(s.axes.astype(np.float64) ** 2).sum() for s in solids])  # squared bounding radii
     colors, distances = sky.astype(np.float32).copy(), np.full(len(rays), np.inf, np.float32)
     _trace(kinds, centers, inverse, skins, repeats, casts, around, textures, rays, light, ambient, colors, distances)
     return colors, distances
@@ -62,7 +62,7 @@ def trace(
 
 @kernel
 def _hit(kind: int, o: Any, d: Any, nearest: float, found: Any) -> Any:
-    """Where a ray o + t·d meets a unit shape beyond `nearest`: t, or FAR; `found` becomes u, v and the normal."""
+    """The t > `nearest` at which a ray o + t·d hits a unit shape, or FAR; writes u, v and the normal to `found`."""
     if kind == SHEET:
         if d[2] == 0.0:
             return FAR
@@ -92,7 +92,7 @@ def _hit(kind: int, o: Any, d: Any, nearest: float, found: Any) -> Any:
         found[2], found[3], found[4] = 0.0, 0.0, 0.0
         found[2 + axis] = 1.0
         return enter
-    # A ball, or a tube, which is a ball that does not look at y.
+    # A ball, or a tube, for which y is ignored.
     w = 1.0 if kind == ELLIPSOID else 0.0
     a = d[0] * d[0] + w * d[1] * d[1] + d[2] * d[2]
     b = o[0] * d[0] + w * o[1] * d[1] + o[2] * d[2]
@@ -119,7 +119,7 @@ def _covered(textures: Any, skin: int, u: float, v: float) -> Any:
 
 @kernel
 def _near(center: Any, start: Any, ray: Any, around: float) -> Any:
-    """Whether the line start + t·ray comes as near to a center as the root of `around`."""
+    """Whether the line start + t·ray passes a centre at most at the distance √`around`."""
     x, y, z = center[0] - start[0], center[1] - start[1], center[2] - start[2]
     along = x * ray[0] + y * ray[1] + z * ray[2]
     return (x * x + y * y + z * z - around) * (ray[0] ** 2 + ray[1] ** 2 + ray[2] ** 2) <= along * along
@@ -163,7 +163,7 @@ def _trace(
         if which < 0:
             continue
         distances[i] = nearest
-        # The surface's normal, turned towards the eye.
+        # The surface's normal, flipped towards the eye.
         facing, length, lit = 0.0, 0.0, 0.0
         for k in range(3):
             normal[k] = inverse[which, 0, k] * best[2] + inverse[which, 1, k] * best[3] + inverse[which, 2, k] * best[4]
@@ -187,7 +187,7 @@ def _trace(
                     shine = 0.0
                     break
         shade = ambient + (1 - ambient) * shine
-        # The texture, between its four nearest pixels.
+        # The texture, interpolated between the four nearest pixels.
         x, y = ((best[0] * repeats[which, 0]) % 1.0) * (size - 1), ((best[1] * repeats[which, 1]) % 1.0) * (size - 1)
         left, top = int(x), int(y)
         fx, fy = x - left, y - top

@@ -1,10 +1,10 @@
-"""Rebuilds lite.safetensors, the shipped weights of the lite base, from data to file: five runs, and means of weights.
+"""Rebuild lite.safetensors, the shipped weights of the lite base: five training runs, and means of weights.
 
     python research/lite/rebuild.py -o OUT data.photos=PHOTOS data.stereo=PAIRS \\
         data.rgbd.0.folder=KITCHEN data.rgbd.1.folder=OFFICE data.validation_stereo=OTHER_PAIRS
 
-OUT gets a folder for each run, and lite.safetensors. The same command resumes where a killed one stopped. KEY=VALUE
-replace values of every run, after its own.
+OUT gets a folder for each run, and lite.safetensors. The same command resumes after a killed one. KEY=VALUE override
+values in every run.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from weights import save_networks
 from spackle.bases.lite import LiteNet, load_networks
 
 SMALL = "network=lite0 data.scales=[1] optim.warmup=60"
-RUNS = {  # name: what it starts from, the teacher, and its values beside those of lite.yaml
+RUNS = {  # name: initial weights, teacher, and values that override lite.yaml
     "one": ("", "", f"{SMALL} data.made=2000 data.shares.made=0.45 data.shares.stereo=0.33 data.shares.rgbd=0.22"),
     "two": ("one", "", f"{SMALL} data.made=4000 data.shares.made=0.45 data.shares.stereo=0.35 data.shares.rgbd=0.2"
             " optim.steps=1356 optim.min_lr=3e-4"),
     "three": ("one+two", "one+two", f"{SMALL} optim.steps=400 optim.lr=7e-4 optim.min_lr=7e-4"),
     "four": ("one+three", "one+three", f"{SMALL} data.seed=7 optim.steps=1350 optim.lr=4e-4 optim.min_lr=1e-5"),
-    # Its schedule was planned for 5,800 steps; at step 3,500, which ships, the rate was 3.7e-4.
+    # Its schedule was planned for 5,800 steps; the shipped weights are from step 3,500, at a rate of 3.7e-4.
     "larger": ("", "smaller", "data.seed=11 data.made=4500 data.guesses=1525 optim.steps=3500 optim.min_lr=3.7e-4"),
 }  # fmt: skip
 MEANS = {
@@ -38,7 +38,7 @@ RECIPE = Path(__file__).with_name("lite.yaml")
 
 
 def mean(files: Mapping[Path, float]) -> LiteNet:
-    """The network of files with one network each, its weights by their shares."""
+    """Average the networks of several files, weighted by their shares; each file holds one network."""
     networks = [load_networks(file)[0] for file in files]
     states = [network.state_dict() for network in networks]
     shares = list(files.values())
@@ -49,7 +49,7 @@ def mean(files: Mapping[Path, float]) -> LiteNet:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line; returns the exit status of the run that failed, else 0."""
+    """Run the command; returns the exit status of a failed run, else 0."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, required=True, help="a folder; runs in it go on")
     parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="of every run: where the data lies")

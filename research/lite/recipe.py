@@ -1,4 +1,4 @@
-"""What a training run of the lite base is made of: values, and the files that they name."""
+"""The recipe of a training run of the lite base, and the files that it names."""
 
 from __future__ import annotations
 
@@ -30,81 +30,81 @@ from spackle.training.recipe import (
 from spackle.training.samples import short_digest
 from spackle.training.sources import find_files
 
-RANDOM = Path("random")  # in place of the encoder's file: weights that have seen nothing, for tests and experiments
+RANDOM = Path("random")  # instead of the encoder's file: random weights, for tests and experiments
 Side = Annotated[Whole, Field(ge=STRIDE, le=2048, multiple_of=STRIDE)]
 Scale = Annotated[float, Field(ge=0.1, le=2)]
 
 
 class LiteShares(RecipePart):
-    """How often a picture comes from each source; they need not add up to 1. One without data counts as 0."""
+    """The share of pictures from each source; shares need not add up to 1, and a source without data gets none."""
 
     made: Share = 0.4
     stereo: Share = 0.28
     rgbd: Share = 0.14
-    guessed: Share = 0.18  # where there is a teacher
+    guessed: Share = 0.18  # if there is a teacher
 
 
 class LiteData(RecipePart):
-    """Where photos with depth come from."""
+    """The sources of photos with depth."""
 
-    photos: Place = None  # a folder, with its subfolders: the surfaces of synthetic scenes are cut from them
-    rgbd: Annotated[tuple[RgbdFolder, ...], FREE] = ()  # of these the focal length is not asked for
+    photos: Place = None  # a folder, with its subfolders; textures of synthetic scenes are cut from them
+    rgbd: Annotated[tuple[RgbdFolder, ...], FREE] = ()  # their focal lengths are not used
     stereo: Place = None  # a folder of scenes, each with a scene.json
-    made: Count = 4900  # synthetic scenes
-    teacher: Path | None = None  # weights of an earlier run: what they guess of `photos` is learned from as well
-    guesses: Count = 1500  # of so many photos at most
+    made: Count = 4900  # number of synthetic scenes
+    teacher: Path | None = None  # weights of an earlier run, whose guesses for `photos` are also trained on
+    guesses: Count = 1500  # at most this number of photos
     shares: LiteShares = LiteShares()
-    size: tuple[Side, Side] = (256, 320)  # height and width of what is learned from; a fifth of the steps stand upright
-    # Of that, one drawn for each step: the base looks at photos at several sizes.
+    size: tuple[Side, Side] = (256, 320)  # height and width of pictures; swapped in a fifth of the steps
+    # Factors on `size`; each step draws one, because the base uses several sizes.
     scales: Annotated[tuple[Scale, ...], Field(min_length=1)] = (1.0,)
-    cache: Place = None  # a folder for synthetic scenes and guesses; inside the output where None
-    seed: Seed = 0  # of the synthetic scenes alone, so that runs with other seeds learn from the same ones
-    # Share of each folder of `rgbd` that judges, the last frames by name: neighbours look alike.
+    cache: Place = None  # a folder for synthetic scenes and guesses; None: inside the output
+    seed: Seed = 0  # for synthetic scenes alone: runs that differ only in run.seed share them
+    # Share of each folder of `rgbd` for validation: the last frames by name, because neighbouring frames are alike.
     validation: Annotated[float, Field(ge=0, le=0.9)] = 0.2
-    validation_stereo: Place = None  # scenes to be judged by; those of `stereo` are learned from, all of them
+    validation_stereo: Place = None  # scenes for validation; all scenes of `stereo` are for training
 
 
 class LiteOptim(OptimRecipe):
-    """As for the other methods, and what the encoder, which comes with weights of its own, does otherwise."""
+    """The optimiser as for the other methods, and other rates for the pretrained encoder."""
 
     encoder_rate: Annotated[float, Field(ge=0, le=10)] = 0.2  # factor on the encoder's learning rate
-    # The encoder's first stages stay as they are, and its stem with them; 0: all of it learns.
+    # How many of the encoder's first stages are frozen, with its stem; 0: nothing is frozen.
     frozen: Annotated[Whole, Field(ge=0, le=len(STAGES["lite2"]))] = 2
 
 
 class LiteRecipe(AnyRecipe):
-    """All of a training run of the lite base."""
+    """The recipe of a training run of the lite base."""
 
     data: LiteData = LiteData()
     loss: DepthLossWeights = DepthLossWeights()
     optim: LiteOptim = LiteOptim()
-    network: Size = "lite2"  # how large the encoder is: EfficientNet-Lite0's or -Lite2's
-    encoder: Path | None = None  # its .pth; None: of the installed package; "random": none
-    init: Path | None = None  # weights of the whole network to start from
+    network: Size = "lite2"  # size of the encoder: EfficientNet-Lite0 or -Lite2
+    encoder: Path | None = None  # its .pth file; None: from the installed package; "random": random weights
+    init: Path | None = None  # initial weights of the whole network
 
 
-SCENES_VERSION = 5  # goes up whenever the same photos would make other scenes
-GUESSES_VERSION = 1  # likewise of guesses by the same weights
-STEREO = "stereo"  # the group of data.validation_stereo
+SCENES_VERSION = 5  # increases whenever the same photos would give different scenes
+GUESSES_VERSION = 1  # the same for guesses by the same weights
+STEREO = "stereo"  # the name of the group of data.validation_stereo
 
 
 @dataclasses.dataclass(frozen=True)
 class LiteFiles:
-    """Sorted; what has no share is empty."""
+    """The files of a recipe, sorted; sources without a share are empty."""
 
     data: LiteData
     photos: Sequence[Path]
     stereo: Sequence[Measured]
     rgbd: Sequence[Measured]
-    guessed: Sequence[Path]  # photos that a teacher makes guesses of
+    guessed: Sequence[Path]  # photos for which the teacher makes guesses
     groups: Sequence[Group]
 
     @staticmethod
     def of(data: LiteData) -> LiteFiles:
-        """Look for them.
+        """Find the files that a recipe names.
 
         Raises:
-            InputError: a folder that is missing or without such files; nothing to learn from, or to be judged by.
+            InputError: a folder is missing or has no such files, or there is nothing to train on or to validate with.
         """
         shares, groups = data.shares, []
         photos = [] if data.photos is None else find_files(data.photos, "data.photos", PHOTO_SUFFIXES, "photos")
@@ -140,12 +140,12 @@ class LiteFiles:
 
     @property
     def scenes_digest(self) -> str:
-        """Twelve digits: the same for the same scenes, wherever the photos lie and however many are made."""
+        """Twelve digits that identify the synthetic scenes, whatever the photos' folder and the number of scenes."""
         return short_digest((SCENES_VERSION, self.data.seed, list(self.data.size), self._below(self.photos)))
 
     @property
     def guesses_digest(self) -> str:
-        """Twelve digits: the same photos and the same teacher, wherever they lie; of no teacher too."""
+        """Twelve digits that identify the photos and the teacher (or none), wherever the files are."""
         teacher = self.data.teacher
         weights = hashlib.sha256(teacher.read_bytes()).hexdigest() if teacher is not None and self.guessed else ""
         return short_digest((GUESSES_VERSION, weights, self._below(self.guessed)))
@@ -156,7 +156,7 @@ class LiteFiles:
 
     @property
     def digest(self) -> str:
-        """Twelve digits of all that is learned from and judged by."""
+        """Twelve digits that identify all training and validation data."""
         facts = self.data.model_dump(mode="json")
         for name in ("photos", "stereo", "validation_stereo", "cache", "rgbd", "teacher"):
             facts.pop(name)
@@ -165,18 +165,18 @@ class LiteFiles:
 
 
 def _spread(photos: Sequence[Path], count: int) -> Sequence[Path]:
-    """So many of them, from all over the folder; all where there are no more."""
+    """`count` photos, evenly spaced over the folder; all if there are fewer."""
     return [photos[number * len(photos) // count] for number in range(count)] if count < len(photos) else photos
 
 
 def _check_apart(learned: Sequence[Measured], judged: Sequence[Measured], folder: Path) -> None:
-    """InputError where a scene is in both."""
+    """InputError if a scene is used for both training and validation."""
     if both := {file.path.resolve() for file in learned} & {file.path.resolve() for file in judged}:
         raise InputError(f"{folder}: data.validation_stereo has scenes of data.stereo in it, such as {min(both)}")
 
 
 def _with_own_names(groups: Sequence[Group]) -> list[Group]:
-    """The same groups; where two have one name, the later ones are numbered."""
+    """The same groups; if several have one name, the later ones are numbered."""
     named: dict[str, Group] = {}
     for group in groups:
         name, number = group.name, 1

@@ -1,4 +1,4 @@
-"""Kinds of synthetic scenes, seen from a camera at the origin: rooms and tables, streets and yards, still lifes."""
+"""Kinds of synthetic scenes, for a camera at the origin: rooms and tables, streets and yards, still lifes."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ from objects import (
 from ray_tracer import BOX, CYLINDER, ELLIPSOID, SHEET, Solid
 from textures import LATTICE, LEAVES, WHOLE
 
-Scene = tuple[list[Solid], float]  # what there is, and how far the camera looks down
+Scene = tuple[list[Solid], float]  # the solids, and by which angle the camera looks down
 
 
 def room(rng: Rng) -> Scene:
-    """Floor, three walls and by chance a ceiling, turned; things along the walls and on the floor."""
+    """A rotated room: floor, three walls, sometimes a ceiling; objects along the walls and on the floor."""
     eye, ceiling = rng.uniform(0.8, 1.8), rng.uniform(2.2, 3.2)
     deep, left, right = rng.uniform(2.0, 7.0), rng.uniform(0.8, 4.0), rng.uniform(0.8, 4.0)
     yaw = math.radians(rng.uniform(-40, 40))
@@ -49,13 +49,13 @@ def room(rng: Rng) -> Scene:
     ]
     if rng.random() < 0.6:
         solids.append(ground(rng, axes, np.array([middle, eye - ceiling, 0.0]), span, deep))
-    if rng.random() < 0.5:  # what the photo is of
+    if rng.random() < 0.5:  # the main object of the picture
         z = rng.uniform(0.4, 0.8) * deep
         big = ornament if rng.random() < 0.5 else functools.partial(thing, yaw=rng.uniform(-math.pi, math.pi))
         solids += big(rng, np.array([rng.normal(0, 0.1) * z, eye, z]), z * rng.uniform(0.15, 0.35))
     for _ in range(rng.integers(2, 9)):
         place = (rng.uniform(-left, right), eye, rng.uniform(0.9, deep))
-        if rng.random() < 0.5:  # along a wall, as furniture stands
+        if rng.random() < 0.5:  # along a wall, like furniture
             side = rng.integers(3)
             place = ((-left, right, place[0])[side], eye, deep if side == 2 else place[2])
         angle = yaw if rng.random() < 0.7 else rng.uniform(-math.pi, math.pi)
@@ -64,7 +64,7 @@ def room(rng: Rng) -> Scene:
 
 
 def table(rng: Rng) -> Scene:
-    """A surface seen from above with small things on it, by chance a wall behind."""
+    """A table seen from above with small objects on it, sometimes a wall behind."""
     eye, reach = rng.uniform(0.25, 0.9), rng.uniform(0.8, 2.5)
     axes = turn(math.radians(rng.uniform(-30, 30)))
     top = reach if rng.random() < 0.6 else 4.0
@@ -80,7 +80,7 @@ def table(rng: Rng) -> Scene:
 
 
 def sheets(rng: Rng) -> Scene:
-    """Leaning boards, cut-outs and balls in front of a wall, floating as they like."""
+    """Leaning boards, cut-outs and balls, which float in front of a wall."""
     reach = rng.uniform(1.5, 4.0)
     solids = [board(rng, reach, 0.4, 0.3)]
     for _ in range(rng.integers(2, 9)):
@@ -94,12 +94,12 @@ def sheets(rng: Rng) -> Scene:
 
 
 def board(rng: Rng, away: float, yaw: float, pitch: float) -> Solid:
-    """What stands behind all else, more or less turned."""
+    """The sheet behind everything else, slightly rotated."""
     return wall(rng, np.array([0.0, 0.0, away]), turn(rng.normal(0, yaw)) @ nod(rng.normal(0, pitch)), 9.0, 9.0)
 
 
 def street(rng: Rng) -> Scene:
-    """Ground to the horizon, houses to both sides, things in front of them."""
+    """A street: ground to the horizon, houses on both sides, objects in front of them."""
     eye = rng.uniform(1.0, 2.2)
     axes = turn(math.radians(rng.uniform(-25, 25)))
     solids = [ground(rng, axes, np.array([0.0, eye, 200.0]), 300.0, 300.0, repeats=200.0)]
@@ -115,7 +115,7 @@ def street(rng: Rng) -> Scene:
 
 
 def yard(rng: Rng) -> Scene:
-    """Posts, stones and trees near by, by chance a roof overhead, fronts of houses at the side and far away, hills."""
+    """A yard: posts, stones and trees nearby, sometimes a roof overhead, house fronts beside and far away, hills."""
     eye = rng.uniform(1.1, 2.0)
     solids = [ground(rng, turn(rng.normal(0, 0.3)), np.array([0.0, eye, 200.0]), 300.0, 300.0, repeats=200.0)]
     if rng.random() < 0.6:
@@ -153,7 +153,7 @@ def yard(rng: Rng) -> Scene:
 
 
 def _front(rng: Rng, eye: float, x: float, z: float, yaw: float) -> Solid:
-    """A house, its foot on the ground: long, and as tall as houses are."""
+    """A house front that stands on the ground, of usual length and height."""
     tall, along, deep = rng.uniform(1.5, 6), rng.uniform(2, 12), rng.uniform(2, 12)
     center = np.array([x + math.copysign(deep if abs(x) < 10 else 0.0, x), eye - tall, z])
     box = solid(rng, BOX, center, turn(rng.normal(0, yaw)) @ np.diag([deep, tall, along]))
@@ -161,7 +161,7 @@ def _front(rng: Rng, eye: float, x: float, z: float, yaw: float) -> Solid:
 
 
 def _tree(rng: Rng, foot: Array, tall: float) -> list[Solid]:
-    """A trunk and leaves around its end, with gaps between them."""
+    """A tree: a trunk, and leaves around its end with gaps between them."""
     made = [pole(rng, foot, tall, rng.uniform(0.02, 0.06) * tall, lean(rng.normal(0, 0.08)))]
     for _ in range(rng.integers(2, 6)):
         place = foot + np.array([rng.normal(0, 0.2), -rng.uniform(0.7, 1.2), rng.normal(0, 0.2)]) * tall
@@ -174,11 +174,11 @@ def _tree(rng: Rng, foot: Array, tall: float) -> list[Solid]:
 
 
 def _canopy(rng: Rng, eye: float) -> list[Solid]:
-    """A pillar that spreads into a roof like a mushroom's, with ribs, whose edge may be above the camera."""
+    """A pillar that spreads into a mushroom-like roof with ribs; its edge may be above the camera."""
     z = rng.uniform(2.5, 9)
     x, rise = rng.uniform(-0.5, 0.5) * z, rng.uniform(0.9, 2.6)
     wide, skin = z * rng.uniform(0.4, 1.1), int(rng.integers(WHOLE))
-    thick = rng.uniform(0.3, 0.9) * rise  # the camera stays below it
+    thick = rng.uniform(0.3, 0.9) * rise  # so that the camera is below it
     ribs = (float(rng.integers(2, 16)), 1.0)
     top = solid(rng, ELLIPSOID, np.array([x, -rise - 0.15, z]), np.diag([wide, thick, wide]), skin)
     made = [Solid(top.kind, top.center, top.axes, skin, ribs)]
@@ -189,7 +189,7 @@ def _canopy(rng: Rng, eye: float) -> list[Solid]:
 
 
 def _eaves(rng: Rng, eye: float) -> list[Solid]:
-    """A roof over the camera that ends before it, with beams and posts at its edge."""
+    """A roof above the camera that ends in front of it, with beams and posts at its edge."""
     rise, edge = rng.uniform(0.7, 2.2), rng.uniform(1.5, 9)
     axes, wide = turn(rng.normal(0, 0.4)), rng.uniform(2, 8)
     x = rng.normal(0, 0.4) * wide
@@ -219,7 +219,7 @@ def _branches(rng: Rng, eye: float) -> list[Solid]:
 
 
 def _arcade(rng: Rng, eye: float) -> list[Solid]:
-    """Columns in rows below a ceiling, by chance a wall on one side."""
+    """Rows of columns below a ceiling, sometimes a wall on one side."""
     rise, half, step = rng.uniform(0.8, 2.5), rng.uniform(0.9, 3), rng.uniform(1.5, 4)
     axes, thick = turn(rng.normal(0, 0.35)), rng.uniform(0.08, 0.35)
     skin, length = int(rng.integers(WHOLE)), step * rng.integers(2, 7)
@@ -236,11 +236,11 @@ def _arcade(rng: Rng, eye: float) -> list[Solid]:
 
 
 def still_life(rng: Rng) -> Scene:
-    """Many things close together on a table, nearly at the height of the eye, before boards and cloth."""
+    """A still life: many objects close together on a table near eye level, in front of boards and cloth."""
     reach = rng.uniform(0.9, 2.2)
     eye, near = reach * rng.uniform(0.12, 0.45), reach * rng.uniform(0.45, 0.7)
     solids = [board(rng, reach * 1.02, 0.25, 0.08), ground(rng, np.eye(3), np.array([0.0, eye, 0.0]), 4.0, reach)]
-    for _ in range(rng.integers(0, 4)):  # posters and cartons just before what is behind
+    for _ in range(rng.integers(0, 4)):  # posters and cartons just in front of the background
         z = reach * rng.uniform(0.8, 1.0)
         half = reach * rng.uniform(0.1, 0.45, 2)
         x, hung = rng.uniform(-0.5, 0.5) * z, rng.random() < 0.5
@@ -258,7 +258,7 @@ def still_life(rng: Rng) -> Scene:
 
 
 def heap(rng: Rng) -> Scene:
-    """Rows of things one behind and above the other that fill the picture."""
+    """A heap: rows of objects, each behind and above the one before, which fill the picture."""
     z, slope = rng.uniform(0.8, 2.0), rng.uniform(0.15, 1.4)
     kinds = [(doll, bottle, books, flat, ornament)[int(k)] for k in rng.integers(0, 5, 2)]
     solids, y = [board(rng, z * rng.uniform(1.5, 2.2), 0.2, 0.1)], rng.uniform(0.35, 0.6) * z
@@ -271,13 +271,13 @@ def heap(rng: Rng) -> Scene:
             x += size * rng.uniform(0.8, 2.0)
         rise = size * rng.uniform(0.9, 1.8)
         y, z = y - rise, z + slope * rise
-    under = nod(math.atan2(nearest - z, lowest - y))  # what they lie on
+    under = nod(math.atan2(nearest - z, lowest - y))  # the surface that they lie on
     solids.append(wall(rng, np.array([0.0, (y + lowest) / 2, (nearest + z) / 2 + 0.5 * size]), under, 4.0, 4.0))
     return solids, 0.0
 
 
 def shelf(rng: Rng) -> Scene:
-    """Boards with rows of things on them, from nearly in front, by chance something that stands before them."""
+    """A shelf seen almost frontally: boards with rows of objects, sometimes with something in front of them."""
     away, deep, across = rng.uniform(0.9, 2.8), rng.uniform(0.2, 0.5), rng.uniform(0.8, 2.5)
     axes, skin = turn(rng.normal(0, 0.35)), int(rng.integers(WHOLE))
     at = np.array([rng.normal(0, 0.3), 0.0, away])
@@ -310,7 +310,7 @@ def shelf(rng: Rng) -> Scene:
 
 
 def _cloth(rng: Rng, floor: float, away: float) -> list[Solid]:
-    """Hanging folds: narrow sheets edge to edge, turned this way and that."""
+    """A hanging cloth: narrow sheets, edge to edge, rotated alternately like folds."""
     skin, made = int(rng.integers(WHOLE)), list[Solid]()
     tall, x, z = away * rng.uniform(0.2, 0.6), rng.uniform(-0.7, 0.3) * away, away
     back = nod(rng.uniform(-0.5, 0.1))

@@ -1,4 +1,4 @@
-"""Streets with people, cars, animals, posts and signs that stand on the ground, which pixel is whose, and a score."""
+"""Streets with objects that stand on the ground (people, cars, animals, posts), labels of pixels, and a score."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from torch import Tensor
 from spackle.training.sources import Photos
 
 Things = list[list[Solid]]
-MOST = 64  # things in a scene: there are fewer
-FARTHEST_M = 100.0  # beyond is sky, which would decide about the scale of all
+MOST = 64  # more than a scene's number of objects
+FARTHEST_M = 100.0  # farther is sky, which would otherwise determine the scale
 
 
 def _pavement(rng: Rng) -> tuple[list[Solid], Things, float]:
-    """What is behind, the things that stand before it, and how far the camera looks down."""
+    """The background, the objects in front of it, and by which angle the camera looks down."""
     eye = rng.uniform(1.1, 2.3)
     axes = turn(math.radians(rng.uniform(-20, 20)))
     behind = [ground(rng, axes, np.array([0.0, eye, 200.0]), 300.0, 300.0, repeats=200.0)]
@@ -38,11 +38,11 @@ def _pavement(rng: Rng) -> tuple[list[Solid], Things, float]:
                 front = solid(rng, BOX, center, axes @ np.diag([5.0, tall, deep]))
                 behind.append(dataclasses.replace(front, repeats=(float(rng.integers(1, 4)),) * 2))
                 z += 2 * deep + (rng.uniform(1, 12) if rng.random() < 0.3 else 0.0)
-    if rng.random() < 0.6:  # what closes the street
+    if rng.random() < 0.6:  # a wall at the end of the street
         behind.append(
             solid(rng, BOX, np.array([rng.uniform(-9, 9), eye - 4, rng.uniform(18, 90)]), np.diag([30.0, 9, 2]))
         )
-    for _ in range(rng.integers(0, 4)):  # trees behind
+    for _ in range(rng.integers(0, 4)):  # trees in the background
         z = rng.uniform(12, 60)
         foot, tall = np.array([rng.uniform(-0.6, 0.6) * z, eye, z]), rng.uniform(3, 9)
         behind.append(pole(rng, foot, tall, 0.03 * tall, lean(rng.normal(0, 0.06))))
@@ -57,7 +57,7 @@ def _pavement(rng: Rng) -> tuple[list[Solid], Things, float]:
 
 
 def person(rng: Rng, foot: Array) -> list[Solid]:
-    """Legs, body, arms and a head, dressed in three textures; by chance on a bicycle."""
+    """A person: legs, body, arms and a head in three textures; sometimes on a bicycle."""
     tall, axes = rng.uniform(1.2, 1.95), turn(rng.uniform(-math.pi, math.pi)) @ lean(rng.normal(0, 0.04))
     legs, coat, skin = (int(rng.integers(WHOLE)) for _ in range(3))
     made, rides = [], rng.random() < 0.3
@@ -82,7 +82,7 @@ def person(rng: Rng, foot: Array) -> list[Solid]:
 
 
 def car(rng: Rng, foot: Array) -> list[Solid]:
-    """A box on four wheels with a smaller one on it; some are vans."""
+    """A car: a box on four wheels with a smaller box on top; some are vans."""
     axes = turn(rng.uniform(-0.4, 0.4) + (math.pi / 2 if rng.random() < 0.4 else 0.0))
     wide, long, body = rng.uniform(0.75, 1.0), rng.uniform(1.6, 2.4), rng.uniform(0.3, 0.42)
     cabin = rng.uniform(0.25, 0.35) if rng.random() < 0.8 else rng.uniform(0.5, 0.8)
@@ -106,7 +106,7 @@ def car(rng: Rng, foot: Array) -> list[Solid]:
 
 
 def animal(rng: Rng, foot: Array) -> list[Solid]:
-    """A body on four legs, a neck and a head."""
+    """An animal: a body on four legs, a neck and a head."""
     size, axes, fur = rng.uniform(0.25, 1.0), turn(rng.uniform(-math.pi, math.pi)), int(rng.integers(WHOLE))
     legs, thick = rng.uniform(0.5, 0.9) * size, rng.uniform(0.28, 0.42) * size
     made = [solid(rng, ELLIPSOID, foot + (legs + 0.6 * thick) * UP, axes @ np.diag([thick, thick, size]), fur)]
@@ -119,7 +119,7 @@ def animal(rng: Rng, foot: Array) -> list[Solid]:
 
 
 def post(rng: Rng, foot: Array) -> list[Solid]:
-    """A bollard, a lamp post, a sign or a traffic light: thin, and much taller than what is behind its foot is near."""
+    """A bollard, lamp post, sign or traffic light: thin, and tall enough to reach in front of distant background."""
     tall, thick = rng.uniform(0.7, 6), rng.uniform(0.025, 0.12)
     made = [pole(rng, foot, tall, thick, lean(rng.normal(0, 0.02)))]
     if rng.random() < 0.6:
@@ -131,7 +131,7 @@ def post(rng: Rng, foot: Array) -> list[Solid]:
 
 
 def trunk(rng: Rng, foot: Array) -> list[Solid]:
-    """The lower part of a tree, its crown above the picture or in it."""
+    """A tree trunk, whose crown may be above the picture."""
     tall = rng.uniform(2, 8)
     return [
         pole(rng, foot, tall, rng.uniform(0.07, 0.3), lean(rng.normal(0, 0.05))),
@@ -140,7 +140,7 @@ def trunk(rng: Rng, foot: Array) -> list[Solid]:
 
 
 def board(rng: Rng, foot: Array) -> list[Solid]:
-    """A cut-out on its edge, a hoarding or a railing."""
+    """An upright cut-out: a hoarding or a railing."""
     if rng.random() < 0.4:
         return flat(rng, foot, rng.uniform(0.4, 1.2))
     half = rng.uniform(0.3, 1.0, 2)
@@ -159,7 +159,7 @@ THINGS: tuple[tuple[Callable[[Rng, Array], list[Solid]], float], ...] = (
 
 
 def labelled_scene(rng: Rng, photos: Photos, height: int, width: int) -> tuple[Frame, Tensor]:
-    """A street and [H, W] int64: 0 for what is behind, then the number of the thing that a pixel shows."""
+    """A street, and labels [H, W] int64: 0 for background, else the number of the object that a pixel shows."""
     owners: list[int] = []
 
     def build(rng: Rng) -> Scene:
@@ -168,7 +168,7 @@ def labelled_scene(rng: Rng, photos: Photos, height: int, width: int) -> tuple[F
         return [*behind, *(part for thing in things for part in thing)], pitch
 
     seen = drawn(rng, photos, height, width, build)
-    # The same once more: each solid in a texture that says whose it is, under light from everywhere.
+    # Render again under ambient light, with the number of its object as each solid's grey.
     marks = [owner / MOST for owner in owners]
     skins = np.stack([_marked(seen.skins[one.texture], mark) for one, mark in zip(seen.solids, marks, strict=True)])
     solids = [dataclasses.replace(one, texture=index) for index, one in enumerate(seen.solids)]
@@ -180,24 +180,24 @@ def labelled_scene(rng: Rng, photos: Photos, height: int, width: int) -> tuple[F
 
 
 def _marked(skin: Floats, mark: float) -> Floats:
-    """[S, S, 4] one grey with the outline of a texture."""
+    """[S, S, 4] a texture's outline filled with one grey."""
     return np.concatenate([np.full((*skin.shape[:2], 3), mark, np.float32), skin[..., 3:]], -1)
 
 
-SMALLEST = 0.001  # share of the picture; smaller things are not judged
+SMALLEST = 0.001  # share of the picture; smaller objects are ignored
 
 
 @dataclasses.dataclass(frozen=True)
 class StandingScore:
-    """Of the things of one picture."""
+    """The score of one picture's objects."""
 
-    within: float  # mean |log z − log z* − its median over the thing|: 0 where each thing has its true shape
-    abs_rel: float  # mean |z − z*| / z* over things, after the best scale and shift of the whole picture
+    within: float  # mean |log z − log z* − its median over the object|; 0 if every object has its true shape
+    abs_rel: float  # mean |z − z*| / z* over objects, aligned by the whole picture
     things: int
 
 
 def score_standing(inverse_depth: Tensor, frame: Frame, owner: Tensor) -> StandingScore:
-    """Judge an inverse depth [H, W], up to scale and shift, within things [H, W] (0: none); each thing counts alike."""
+    """Judge an inverse depth [H, W], up to scale and shift, within objects [H, W] (0: none), each with equal weight."""
     true = frame.inverse_depth.double()
     near = true > 1 / FARTHEST_M
     v, t = inverse_depth.double(), true[near]

@@ -1,4 +1,4 @@
-"""Synthetic scenes with exact depth, their surfaces cut from photos, drawn once and kept in files of many."""
+"""Synthetic scenes with exact depth and textures cut from photos; rendered once, and stored several to a file."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from spackle.files import atomic_path
 from spackle.image import load_photo
 from spackle.training.sources import Photos
 
-SAMPLES = 2  # rays along each side of a pixel
-KINDS: tuple[tuple[Callable[[Rng], Scene], float], ...] = (  # and how often
+SAMPLES = 2  # rays per pixel in each direction
+KINDS: tuple[tuple[Callable[[Rng], Scene], float], ...] = (  # with their relative frequencies
     (room, 0.17),
     (table, 0.09),
     (sheets, 0.05),
@@ -37,11 +37,11 @@ KINDS: tuple[tuple[Callable[[Rng], Scene], float], ...] = (  # and how often
 
 
 def synthetic_scene(rng: Rng, photos: Photos, height: int, width: int) -> tuple[Tensor, Tensor]:
-    """A picture [H, W, 3] sRGB, and its inverse depth [H, W] in 1/m (0 in the sky), known exactly.
+    """Render a random scene: [H, W, 3] sRGB, and exact inverse depth [H, W] in 1/m (0 in the sky).
 
     Args:
-        rng: all choices come from here.
-        photos: gives the pictures that surfaces are cut from.
+        rng: the source of all random choices.
+        photos: gives photos, from which textures are cut.
         height: in pixels.
         width: likewise.
     """
@@ -51,17 +51,17 @@ def synthetic_scene(rng: Rng, photos: Photos, height: int, width: int) -> tuple[
 
 @dataclasses.dataclass(frozen=True)
 class Picture:
-    """A scene, drawn, and what it was drawn from."""
+    """A rendered scene and its inputs."""
 
     rgb: Tensor  # [H, W, 3] sRGB
     inverse_depth: Tensor  # [H, W] in 1/m
     solids: list[Solid]
-    skins: Floats  # [T, S, S, 4] their textures
-    rays: Floats  # [N, 3], `SAMPLES`² a pixel
+    skins: Floats  # [T, S, S, 4] textures of the solids
+    rays: Floats  # [N, 3], `SAMPLES`² per pixel
 
 
 def drawn(rng: Rng, photos: Photos, height: int, width: int, build: Callable[[Rng], Scene]) -> Picture:
-    """A scene of a kind, see `synthetic_scene`."""
+    """Render a scene made by `build`; see `synthetic_scene`."""
     skins = textures(rng, photos)
     solids, pitch = build(rng)
     focal = width * rng.uniform(0.7, 1.5)
@@ -73,17 +73,17 @@ def drawn(rng: Rng, photos: Photos, height: int, width: int, build: Callable[[Rn
     fine = (height * SAMPLES, width * SAMPLES)
     rgb = _exposed(rng, torch.from_numpy(colors))
     rgb = avg_pool2d(rgb.reshape(*fine, 3).permute(2, 0, 1)[None], SAMPLES)[0]
-    inverse = torch.from_numpy(1.0 / distances).reshape(fine)[::SAMPLES, ::SAMPLES]  # one of them: no in-between
+    inverse = torch.from_numpy(1.0 / distances).reshape(fine)[::SAMPLES, ::SAMPLES]  # one per pixel: no averages
     return Picture(rgb.permute(1, 2, 0).contiguous(), inverse.contiguous(), solids, skins, rays)
 
 
 def _exposed(rng: Rng, rgb: Tensor) -> Tensor:
-    """As bright as photos are on the whole; what is brighter than white is white."""
+    """Scale to the usual brightness of photos; brighter values become white."""
     return (rgb * (rng.uniform(0.25, 0.6) / float(rgb.mean().clamp_min(0.02)))).clamp(0, 1)
 
 
 def _rays(height: int, width: int, focal: float, pitch: float, roll: float) -> Floats:
-    """[N, 3] directions of depth one, for `SAMPLES`² rays a pixel, turned down by `pitch` and around by `roll`."""
+    """[N, 3] directions of depth one, for `SAMPLES`² rays a pixel, rotated by `pitch` (down) and `roll`."""
     y, x = np.mgrid[: height * SAMPLES, : width * SAMPLES].astype(np.float32)
     x, y = ((x + 0.5) / SAMPLES - width / 2) / focal, ((y + 0.5) / SAMPLES - height / 2) / focal
     x, y = x * math.cos(roll) - y * math.sin(roll), x * math.sin(roll) + y * math.cos(roll)
@@ -92,19 +92,19 @@ def _rays(height: int, width: int, focal: float, pitch: float, roll: float) -> F
 
 
 PER_FILE = 50
-UPRIGHT = 0.25  # share of scenes that stand upright
-TRIES = 20  # photos that may be unreadable one after the other
+UPRIGHT = 0.25  # share of upright scenes
+TRIES = 20  # how many photos in a row may be unreadable
 Warn = Callable[[str], None]
 
 
 class PhotoDraw:
-    """A random photo of many; one that cannot be read is named once, and another one drawn."""
+    """Draws random photos; an unreadable one is reported once, and another one is drawn."""
 
     def __init__(self, files: Sequence[Path], warn: Warn) -> None:
         self.files, self.warn, self.bad = files, warn, set[Path]()
 
     def __call__(self, rng: Rng) -> Tensor:
-        """[H, W, 3] sRGB; InputError where there is nothing but bad ones."""
+        """A random photo [H, W, 3] sRGB; InputError if `TRIES` in a row cannot be read."""
         for _ in range(TRIES):
             file = self.files[int(rng.integers(len(self.files)))]
             if file in self.bad:
@@ -119,23 +119,23 @@ class PhotoDraw:
 
 @dataclasses.dataclass(frozen=True)
 class SyntheticScenes:
-    """A folder of synthetic scenes, numbered from 0: the same number, seed, size and photos give the same scene."""
+    """A folder of synthetic scenes, numbered from 0; number, seed, size and photos determine a scene."""
 
     folder: Path
     photos: Sequence[Path]
-    size: tuple[int, int]  # height and width; an upright one has them the other way round
+    size: tuple[int, int]  # height and width; swapped for upright scenes
     seed: int
     count: int
 
     def fill(self, progress: Callable[[int, int], None], warn: Warn) -> None:
-        """Draw what is missing. A damaged file is named and made anew; so is, silently, one that has too few.
+        """Make missing scenes. A damaged file is reported and replaced; one with too few scenes is replaced silently.
 
         Args:
-            progress: told how many scenes are there.
-            warn: told what was passed over or made anew.
+            progress: called with the number of scenes that exist.
+            warn: called with what was skipped or made anew.
 
         Raises:
-            InputError: where nothing can be written, or no photo be read.
+            InputError: nothing can be written, or no photo can be read.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         draw = PhotoDraw(self.photos, warn)
@@ -146,7 +146,7 @@ class SyntheticScenes:
             progress(last, self.count)
 
     def frame(self, index: int) -> Frame:
-        """A scene; InputError where its file is missing or damaged."""
+        """Read a scene; InputError if its file is missing or damaged."""
         path, row = self._file(index), index % PER_FILE
         try:
             with safe_open(path, framework="pt") as file:
@@ -163,7 +163,7 @@ class SyntheticScenes:
         return self.folder / f"{index // PER_FILE:04d}.safetensors"
 
     def _stored(self, first: int, warn: Warn) -> int:
-        """How many whole scenes the file of a scene has."""
+        """The number of complete scenes in a scene's file."""
         path = self._file(first)
         pixels = self.size[0] * self.size[1]
         try:
@@ -190,7 +190,7 @@ class SyntheticScenes:
             temporary.write_bytes(save(tensors))
 
     def _scene(self, index: int, draw: PhotoDraw) -> tuple[Tensor, Tensor, Tensor]:
-        """A scene as it is stored: flat, 8 bits a colour, half precision of depth."""
+        """A scene as it is stored: flattened, with 8-bit colours and depth in half precision."""
         rng = np.random.default_rng([self.seed, index])
         upright = rng.random() >= 1 - UPRIGHT
         rgb, inverse_depth = synthetic_scene(rng, draw, *(self.size[::-1] if upright else self.size))

