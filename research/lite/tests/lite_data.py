@@ -1,4 +1,4 @@
-"""A little of everything that the lite base learns from."""
+"""A small example of each kind of training data of the lite base."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ def f32(values: object) -> NDArray[np.float32]:
 
 
 def photo(rng: np.random.Generator) -> Tensor:
-    """[H, W, 3] always the same one."""
+    """[H, W, 3] a photo, always the same one."""
     return torch.from_numpy(picture(96, 80)).float() / 255
 
 
 def write_data(place: Path) -> None:
-    """Photos, one of them broken; kitchen/ with six frames of a depth camera; pairs/ and others/ with a stereo pair."""
+    """Write photos (one is broken), kitchen/ with six depth camera frames, pairs/ and others/ with a stereo pair."""
     write_photo(place / "photos" / "sub" / "a.png", 120, 90)
     Image.fromarray(255 - picture(90, 120)).save(place / "photos" / "b.png")
     (place / "photos" / "broken.jpg").write_bytes(b"\xff\xd8 no more")
@@ -35,7 +35,7 @@ def write_data(place: Path) -> None:
 
 
 def _write_stereo(folder: Path, near: float) -> None:
-    """Two photos, and the left one's disparity: depth = 0.1 · 60 / d."""
+    """Write two photos and the left one's disparity d: depth = 0.1 · 60 / d."""
     for name in ("left", "right"):
         write_photo(folder / f"{name}.png")
     np.save(folder / "disparity.npy", 6.0 / metres(near=near))

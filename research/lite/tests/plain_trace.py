@@ -1,4 +1,4 @@
-"""`ray_tracer.trace` once more: a ray at a time, without a compiler, in double precision."""
+"""A slow reference for `ray_tracer.trace`: one ray at a time, not compiled, in double precision."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from ray_tracer import BOX, ELLIPSOID, NUDGE, SHEET, Solid
 
 Array = NDArray[Any]
-Hit = tuple[float, float, float, Array]  # t, the texture's u and v, the normal before its turn into the world
+Hit = tuple[float, float, float, Array]  # t, the texture's u and v, the normal in the unit shape's axes
 
 
 def plain_trace(
     solids: list[Solid], textures: Array, rays: Array, light: Array, ambient: float, sky: Array
 ) -> tuple[Array, Array]:
-    """Colours [N, 3] and distances [N] as `trace` has them."""
+    """Colours [N, 3] and distances [N], as from `trace`."""
     colors, distances = sky.astype(np.float64), np.full(len(rays), np.inf)
     for number, ray in enumerate(rays.astype(np.float64)):
         seen = [(*hit, solid) for solid in solids if (hit := first_hit(solid, textures, np.zeros(3), ray, 0.05))]
@@ -36,12 +36,12 @@ def plain_trace(
 
 
 def first_hit(solid: Solid, textures: Array, start: Array, ray: Array, beyond: float) -> Hit | None:
-    """The first place beyond `beyond` where a ray meets a solid; None where it is missed, or not covered there."""
+    """A ray's first hit of a solid beyond `beyond`, where the texture covers it; None if there is none."""
     axes = solid.axes.astype(np.float64)
     o, d = np.linalg.solve(axes, start - solid.center), np.linalg.solve(axes, ray)
     hits = sorted(unit_hits(solid.kind, o, d), key=lambda hit: hit[0])
     if solid.kind == BOX:
-        hits = hits[:1]  # from inside a box there is no box
+        hits = hits[:1]  # a box is invisible from inside
     for t, u, v, normal in hits:
         if t > beyond:
             u, v = (u * solid.repeats[0]) % 1.0, (v * solid.repeats[1]) % 1.0
@@ -52,7 +52,7 @@ def first_hit(solid: Solid, textures: Array, start: Array, ray: Array, beyond: f
 
 
 def unit_hits(kind: int, o: Array, d: Array) -> Iterator[Hit]:
-    """Everywhere that a line meets a unit shape."""
+    """Yield all hits of a line with a unit shape."""
     if kind == SHEET:
         if d[2]:
             x, y, _ = o - o[2] / d[2] * d
@@ -78,7 +78,7 @@ def unit_hits(kind: int, o: Array, d: Array) -> Iterator[Hit]:
 
 
 def between_pixels(texture: Array, u: float, v: float) -> Array:
-    """[3] the colour between the four nearest pixels."""
+    """[3] the colour, interpolated between the four nearest pixels."""
     x, y = u * (len(texture) - 1), v * (len(texture) - 1)
     left, top = int(x), int(y)
     total = np.zeros(3)

@@ -1,4 +1,4 @@
-"""What a step of the lite base's training is made of, and what its network is judged by."""
+"""The training batches and the validation of the lite base."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.slow  # not part of the package: `make test-slow` runs 
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Frames of a depth camera and stereo pairs."""
+    """A folder with frames of a depth camera and stereo pairs."""
     place = tmp_path_factory.mktemp("lite")
     write_data(place)
     return place
@@ -57,7 +57,7 @@ def test_a_place_in_a_step_decides_what_stands_there_and_nothing_else() -> None:
     names = [mixture.name(step, 0) for step in range(300)]
     assert 70 < sum(name.startswith("9") for name in names) < 130
     assert 70 < sum(" and " in name for name in names) < 140
-    assert any(name.startswith("9 and") and name != "9 and 9" for name in names)  # of two sources
+    assert any(name.startswith("9 and") and name != "9 and 9" for name in names)  # merged from two sources
 
 
 def test_a_step_sees_its_pictures_large_or_small() -> None:
@@ -79,13 +79,13 @@ def test_a_step_sees_its_pictures_large_or_small() -> None:
 
 
 def test_of_two_frames_in_one_picture_the_nearer_one_shows() -> None:
-    """The front one's median is put at e^scale of the back one's; where one is not known, the back one stays."""
+    """The front frame's median becomes e^scale of the back frame's; where one is unknown, the back frame stays."""
     depth = torch.tensor([[1.0, 1.0, 4.0, 9.0, 1.0]])
     valid = torch.tensor([[True, True, True, False, True]])
     back = Frame(torch.zeros(3, 1, 5), torch.full((1, 5), 2.0), torch.tensor([[True, True, True, True, False]]))
     front = Frame(torch.ones(3, 1, 5), depth, valid)
     shown = mingled(np.random.default_rng(0), back, front)
-    scale = 2 * math.exp(np.random.default_rng(0).uniform(*MINGLED_SCALE))  # both medians, over what both know
+    scale = 2 * math.exp(np.random.default_rng(0).uniform(*MINGLED_SCALE))  # medians where both are known
     assert scale > 2
     expected = torch.tensor([[scale, scale, 4 * scale, 2.0, 2.0]])
     torch.testing.assert_close(shown.inverse_depth, expected)
@@ -113,13 +113,13 @@ def test_the_last_frames_of_a_folder_judge_and_the_others_teach(place: Path) -> 
 
 
 def test_the_right_photo_has_the_depth_of_the_left_one() -> None:
-    """A near thing moves by 3 pixels and hides what is there; what it uncovers is not known."""
+    """A near object moves by 3 pixels and hides what is there; what it uncovers is unknown."""
     depth = torch.tensor([[8.0, 8.0, 8.0, 8.0, 2.0, 2.0, 8.0, 8.0]])
     valid = torch.tensor([[True, True, True, True, True, True, True, False]])
-    seen, known = warp_to_right(depth, valid, -6 / depth + 0.75)  # 0, and 2.25 to the left
+    seen, known = warp_to_right(depth, valid, -6 / depth + 0.75)  # far: 0; near: 2.25 to the left
     assert known.tolist() == [[True, True, True, True, False, False, True, False]]
     assert seen[known].tolist() == [8, 8, 2, 2, 8]
-    # A slope that is seen wider has a crack a pixel wide; with nothing in it, or what is behind, it is closed.
+    # A slope that becomes wider has a crack one pixel wide, which is closed if it is empty or shows the background.
     slope, shift = torch.tensor([[9.0, 2.0, 2.02, 2.04, 2.06]]), torch.tensor([[3.0, 0.0, 0.0, 1.0, 1.0]])
     for behind in (True, False):
         seen, known = warp_to_right(slope, torch.tensor([[behind, True, True, True, True]]), shift)
@@ -144,8 +144,8 @@ def test_both_photos_of_a_pair_teach_and_the_left_one_judges(place: Path) -> Non
 def test_guesses_are_kept_where_the_looks_agree_and_are_not_steep() -> None:
     looks = torch.zeros(3, 8, 12)
     looks[:, :, 7:] += 1  # an outline
-    looks += torch.tensor([0.0, 5.0, -2.0])[:, None, None]  # each has a factor of its own
-    looks[0, 2, 2] += 0.4  # nobody knows
+    looks += torch.tensor([0.0, 5.0, -2.0])[:, None, None]  # each prediction has its own factor
+    looks[0, 2, 2] += 0.4  # predictions disagree here
     guess = sure_inverse_depth(looks)
     known = guess > 0
     assert not known[:, 6:8].any()
@@ -204,7 +204,7 @@ def test_a_network_that_knows_the_depth_has_a_perfect_score(place: Path) -> None
 
     class Knowing(nn.Module):
         def forward(self, rgb: torch.Tensor) -> torch.Tensor:
-            return frame.inverse_depth[1::2, 1::2].log()[None]  # in the middle of two pixels, the later one counts
+            return frame.inverse_depth[1::2, 1::2].log()[None]  # between two pixels, the later one is sampled
 
     judge = DepthJudge(DepthLossWeights(), 64 * 64, torch.float32, torch.device("cpu"))
     frame = Frame(*(torch.cat([part, part[..., :16, :]], -2) for part in (frame.rgb, frame.inverse_depth, frame.valid)))

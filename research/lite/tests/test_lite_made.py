@@ -1,4 +1,4 @@
-"""Made scenes: what they are of, how they are kept, and that their depth is exact."""
+"""Synthetic scenes: their content, how they are stored, and that their depth is exact."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_a_made_scene_has_the_inverse_depth_of_its_planes(monkeypatch: pytest.Mo
     """A plane's inverse depth is an affine function of the pixel, whatever the lens and however the camera rolls."""
 
     def ground(rng: np.random.Generator) -> tuple[list[Solid], float]:
-        """1.5 m below the eye, before a wall at 16 m."""
+        """Ground 1.5 m below the eye, in front of a wall at 16 m."""
         flat = f32([[50, 0, 0], [0, 0, -1], [0, 50, 0]])
         floor = Solid(SHEET, f32([0, 1.5, 0]), flat, 0, (1.0, 1.0))
         return [floor, Solid(SHEET, f32([0, 0, 16]), f32(np.diag([50, 50, 1])), 1, (1.0, 1.0))], 0.0
@@ -38,7 +38,7 @@ def test_a_made_scene_has_the_inverse_depth_of_its_planes(monkeypatch: pytest.Mo
     rgb, inverse_depth = synthetic_scene(np.random.default_rng(3), photo, 64, 96)
     assert (rgb.shape, inverse_depth.shape) == ((64, 96, 3), (64, 96))
     assert 0 <= float(rgb.min()) < float(rgb.max()) <= 1
-    assert 0.2 < float(rgb.mean()) < 0.65  # exposed as photos are
+    assert 0.2 < float(rgb.mean()) < 0.65  # brightness as in photos
     wall = (inverse_depth - 1 / 16).abs() < 1e-6
     assert wall[0].all()
     floor = ~wall
@@ -80,7 +80,7 @@ def test_each_pixel_of_a_street_knows_whose_it_is_and_the_score_asks_for_true_sh
     )
     assert perfect.within < 1e-6
     assert perfect.abs_rel < 1e-6
-    # A thing at another depth keeps its shape; one that leans loses it by the logarithm of how far.
+    # An object moved in depth keeps its shape; if it leans, its error is the logarithm of the change in depth.
     near = owner == int(owner[owner > 0].mode().values)
     moved = score_standing(torch.where(near, 1.3 * true, true), frame, owner)
     rows = torch.arange(64)[:, None].expand(64, 96)
@@ -111,7 +111,7 @@ def scenes(folder: Path, count: int) -> SyntheticScenes:
 
 
 def filled(made: SyntheticScenes) -> list[str]:
-    """What was said while the scenes were made."""
+    """Make the scenes; returns the warnings."""
     said: list[str] = []
     made.fill(lambda done, total: None, said.append)
     return said
@@ -138,7 +138,7 @@ def test_scenes_are_made_once_and_a_damaged_file_is_made_anew(tmp_path: Path) ->
             made.frame(5)
         assert f"{file}: damaged, made anew" in filled(made)
         assert file.read_bytes() == whole
-    # More of them begin with the same ones.
+    # A larger set begins with the same scenes.
     more = scenes(tmp_path, 8)
     filled(more)
     assert all(torch.equal(more.frame(index).rgb, frames[index].rgb) for index in range(6))

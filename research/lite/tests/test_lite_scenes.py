@@ -1,4 +1,4 @@
-"""What the lite base learns from and by: made scenes, their rays, turned cameras, the loss and the score."""
+"""Training of the lite base: the ray tracer, turned cameras, the loss, the score and the encoder."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ Floats = NDArray[np.float32]
 
 
 def random_solids(rng: np.random.Generator, count: int) -> list[Solid]:
-    """Of every kind, turned and stretched, some around the eye."""
+    """Solids of every kind, rotated and stretched, some around the eye."""
     solids = []
     for number in range(count):
         axes = np.linalg.qr(rng.normal(size=(3, 3)))[0] * rng.uniform(0.2, 1.0, 3)
@@ -59,7 +59,7 @@ def test_rays_meet_what_their_plain_twin_meets(seed: int) -> None:
     sky = rng.random((len(rays), 3)).astype(np.float32)
     colors, distances = trace(solids, textures, rays, light, 0.4, sky)
     plain_colors, plain_distances = plain_trace(solids, textures, rays, light, 0.4, sky)
-    # A ray along an outline, of a thing, a cut-out or a shadow, may pass on either side.
+    # A ray along the outline of an object, cut-out or shadow may pass on either side.
     same = np.isclose(distances, plain_distances, rtol=1e-4)
     assert same.mean() > 0.99
     alike = np.abs(colors - plain_colors).max(-1) < 2e-3
@@ -77,7 +77,7 @@ def test_a_wall_has_the_depth_that_it_has_and_a_box_throws_a_shadow_on_it() -> N
     light = f32([0.6, 0.0, -0.8])  # from the right and from behind
     colors, distances = trace([wall, box], textures, rays, light, 0.5, np.zeros((5, 3), np.float32))
     assert distances.tolist() == pytest.approx([3, 3, 1.75, math.inf, 3])
-    # The wall has 0.8 of the light, and the shadow of the box's middle falls 0.75 to its left.
+    # The wall gets 0.8 of the light; the shadow of the box's middle is 0.75 to the left of it.
     assert colors[:, 0].tolist() == pytest.approx([0.9, 0.9, 0.9, 0, 0.9], abs=1e-6)
     shadow = f32([[0.25 / 3, 0, 1]])
     colors, _ = trace([wall, box], textures, shadow, light, 0.5, np.zeros((1, 3), np.float32))
@@ -88,7 +88,7 @@ def test_a_wall_has_the_depth_that_it_has_and_a_box_throws_a_shadow_on_it() -> N
 
 
 def plane(height: int, width: int) -> Frame:
-    """A frontal plane at depth 1, with a photo on it and a border that is not known."""
+    """A frontal plane at depth 1, with a photo on it and a border of unknown depth."""
     rgb = torch.from_numpy(picture(width, height)).float().permute(2, 0, 1) / 255
     valid = torch.ones(height, width, dtype=torch.bool)
     valid[:, :2] = False
@@ -108,7 +108,7 @@ def test_a_camera_that_is_not_turned_sees_a_part_of_the_photo() -> None:
 
 
 def test_a_camera_turned_aside_sees_a_frontal_plane_aslant() -> None:
-    """Its inverse depth is n·ray with n the plane's normal in the new camera: affine in the pixel, with |n| = 1."""
+    """Its inverse depth is n·ray, with the plane's normal n in the new camera, |n| = 1: affine in the pixel."""
     seen = turned(np.random.default_rng(5), plane(48, 64), 48, 64, Turning((1.5, 1.5), (10.0, 10.0, 10.0)))
     rows, columns = (place.double() for place in seen.valid.nonzero(as_tuple=True))
     A = torch.stack([columns, rows, torch.ones_like(rows)], 1)
@@ -143,13 +143,13 @@ def terms(predicted: Tensor, truth: list[float], valid: list[bool]) -> dict[str,
 
 
 def test_each_term_of_the_loss_is_what_it_says_it_is() -> None:
-    """Inverse depths 1, 2, 4, 8 are ½, 1, 2, 4 medians; the third is predicted wrong by a factor of e^0.3."""
+    """Inverse depths 1, 2, 4, 8 are ½, 1, 2, 4 medians; the third one's prediction is wrong by a factor of e^0.3."""
     truth, known = [1.0, 2.0, 4.0, 8.0], [True] * 4
     error = torch.tensor([0.0, 0.0, 0.3, 0.0])
     right = torch.tensor(truth).log() + 7  # whatever the factor
     found = terms(right + error, truth, known)
     assert found["factor"] == pytest.approx(0.3 / 4, rel=1e-5)
-    # Neighbours: 0, 0.3, 0.3 over 4 pixels; every second one: 0.3 over 2; then there is but one left.
+    # Neighbours: 0, 0.3, 0.3 over 4 pixels; every second pixel: 0.3 over 2; then only one pixel is left.
     assert found["steps"] == pytest.approx(0.6 / 4 + 0.3 / 2, rel=1e-5)
     p, t = [0.5, 1.0, 2 * math.exp(0.3), 4.0], [0.5, 1.0, 2.0, 4.0]
     p, mean = [value - sum(p) / 4 for value in p], sum(t) / 4
@@ -160,7 +160,7 @@ def test_each_term_of_the_loss_is_what_it_says_it_is() -> None:
 
 
 def test_only_the_offset_knows_a_factor_and_pulls_it_back() -> None:
-    """Medians are of the known ones: of two pictures one is too near by e^3, and of the third nothing is known."""
+    """Medians are over known pixels; one picture is too near by e^3, and in the third nothing is known."""
     truth = torch.tensor([[[1.0, 2.0, 4.0]]]).expand(3, 1, 3)
     valid = torch.tensor([True, True, False])[:, None, None].expand(3, 1, 3)
     predicted = (truth.log() + torch.tensor([3.0, 0.0, 9.0])[:, None, None]).requires_grad_()
@@ -183,7 +183,7 @@ def test_what_is_not_known_does_not_count_and_gross_errors_count_as_less() -> No
     assert terms(right, truth, known) == pytest.approx({"factor": 0, "line": 0, "steps": 0}, abs=1e-3)
     found = terms(right + torch.tensor([0.0, 0.0, 0.0, -5.0, 0.0, 0.0]), truth, known)
     assert found["factor"] == pytest.approx(2 / 4)
-    assert found["steps"] == pytest.approx(1 / 4)  # every second and every fourth one miss it
+    assert found["steps"] == pytest.approx(1 / 4)  # strides 2 and 4 skip it
     assert terms(right, truth, [False] * 6) == {"factor": 0, "line": 0, "steps": 0}
 
 
@@ -212,7 +212,7 @@ def test_a_score_knows_neither_scale_nor_shift() -> None:
 
 
 def test_a_score_by_hand() -> None:
-    """Half at 1 m, half at 2 m: a guess that tells nothing apart is put at 4/3 m."""
+    """Half is at 1 m, half at 2 m: a constant guess is aligned to 4/3 m."""
     depth = torch.tensor([[1.0, 1.0], [2.0, 2.0]])
     score = score_depth(torch.full((2, 2), 0.3), depth, torch.ones(2, 2, dtype=torch.bool))
     assert score.abs_rel == pytest.approx(1 / 3)
@@ -239,7 +239,7 @@ def test_near_is_light_and_unknown_is_grey() -> None:
 
 
 def published(rng: torch.Generator, size: Size) -> dict[str, Tensor]:
-    """Tensors by the names of EfficientNet-Lite's conversions to PyTorch, at random."""
+    """Random tensors with the names in EfficientNet-Lite's conversions to PyTorch."""
     tensors: dict[str, Tensor] = {}
 
     def layer(convolution: str, norm: str, shape: torch.Size) -> None:
@@ -261,7 +261,7 @@ def published(rng: torch.Generator, size: Size) -> dict[str, Tensor]:
 
 
 def plain_features(tensors: dict[str, Tensor], x: Tensor, size: Size) -> list[Tensor]:
-    """EfficientNet-Lite layer by layer, convolution and normalisation apart, with TensorFlow's padding."""
+    """EfficientNet-Lite layer by layer, with separate convolution and normalisation, and TensorFlow's padding."""
 
     def layer(x: Tensor, convolution: str, norm: str, stride: int = 1, groups: int = 1) -> Tensor:
         weight = tensors[f"{convolution}.weight"]

@@ -1,4 +1,4 @@
-"""Training of the lite base: a run from photos to weights, cut off and gone on with, and what it refuses."""
+"""Training of the lite base: a run from photos to weights, resuming after an interruption, and errors."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ encoder: random
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recipe, all that it names and, from the first run on, made scenes."""
+    """A folder with a recipe, all files that it names and, after the first run, synthetic scenes."""
     place = tmp_path_factory.mktemp("lite")
     write_data(place)
     (place / "recipe.yaml").write_text(RECIPE % {"place": place})
@@ -57,7 +57,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def whole(place: Path) -> tuple[Path, Run]:
-    """A run of ten steps in one go."""
+    """A run of ten steps without interruption."""
     return place / "whole", train(place, place / "whole")
 
 
@@ -67,7 +67,7 @@ def arguments(place: Path, output: Path, *more: object) -> list[str]:
 
 
 def train(place: Path, output: Path, *more: object) -> Run:
-    """The script within this process: a new one takes seconds to start."""
+    """Run the script within this process, because a new process takes seconds to start."""
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         code = main(arguments(place, output, *more))
@@ -86,7 +86,7 @@ def test_a_run_leaves_weights_pictures_and_a_report(whole: tuple[Path, Run]) -> 
     assert (report["method"], report["ended"], report["step"], report["aim"]) == ("lite", "steps", 10, "abs_rel")
     (found,) = report["history"]
     assert found.keys() >= {"loss", "factor", "line", "steps", "abs_rel", "delta", "ramp_abs_rel", "kitchen/delta"}
-    # Each group counts as much as another, however many frames it has.
+    # All groups count the same, whatever their numbers of frames.
     assert found["abs_rel"] == pytest.approx((found["kitchen/abs_rel"] + found["stereo/abs_rel"]) / 2)
     assert report["best"] == found["abs_rel"]
     (line,) = [line for line in done.lines if line.startswith("step 10: ")]
