@@ -243,7 +243,7 @@ def training(options: argparse.Namespace) -> Iterator[str]:
     view = find_view(scene, camera, gpu)[1]
     photo, target = torch.rand(2, view.height, view.width, 3)
     whole = Sample.of(scene, CpuRenderer().render(scene, view), view, camera, photo, target)
-    cells = whole.cues.mask[:-CROP, :-CROP].nonzero()
+    cells = whole.features.mask[:-CROP, :-CROP].nonzero()
     picked = cells[torch.linspace(0, len(cells) - 1, BATCH).long()].tolist()
     crops = [whole.crop(max(row - CROP // 2, 0), max(column - CROP // 2, 0), CROP, CROP) for row, column in picked]
 

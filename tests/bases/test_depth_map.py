@@ -198,7 +198,7 @@ def test_relative_maps(tmp_path: Path, content: bytes, step: float | None, kind:
         (as_bytes(SLOPE), {"kind": "near-white", "near": 0.0}, "--near 0, --far 15: give two distances"),
         (as_bytes(np.ones((9, 9))), {"kind": "near-black"}, "the same depth nearly everywhere"),
         (as_bytes(np.full((9, 9), np.nan)), {"kind": "near-black"}, "the same depth nearly everywhere"),
-        (png(np.zeros((4, 4, 3), np.uint8) + np.uint8([200, 9, 9])), {"kind": "near-white"}, "in colours"),
+        (png(np.zeros((4, 4, 3), np.uint8) + np.uint8([200, 9, 9])), {"kind": "near-white"}, "a colour picture"),
         (b"hello there, I am text", {"kind": "near-white"}, "not an image"),
     ],
 )

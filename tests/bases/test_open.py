@@ -91,7 +91,7 @@ def test_auto_takes_the_photos_depth_then_sharp_then_lite(
     sharp.unlink()
     choice = pick(photo)[1]
     assert (choice.base, choice.why, choice.failures) == ("lite", f"{NO_DEPTH}, {NO_SHARP}", ())
-    assert "--depth FILE, `spackle weights get depth` (140.6 MB, MIT)" in choice.note
+    assert "`spackle weights get depth` (140.6 MB, MIT)" in choice.note
     prediction, choice = pick(portrait)
     assert (choice.base, choice.why) == ("rgbd", "the depth in the photo")
     assert str(prediction.notes["depth"]).startswith("portrait depth of the photo")

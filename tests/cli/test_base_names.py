@@ -171,7 +171,7 @@ def test_a_folder_is_done_again_when_weights_come_or_go(
         base, (warning,) = again()
         assert (base, again()) == ("lite", done)
     assert str(tmp_path / "out" / "a") in warning
-    assert warning.endswith(f"by lite: {NO_DEPTH}, SHARP cannot be used, {NO_MODEL} ({sharp})")
+    assert warning.endswith(f"lite now replaces it: {NO_DEPTH}, SHARP cannot be used, {NO_MODEL} ({sharp})")
     install(made, tmp_path)
     assert again() == ("sharp", [])
     sharp.unlink()

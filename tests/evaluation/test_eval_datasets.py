@@ -384,7 +384,7 @@ def test_bounds_are_the_last_resort_and_nothing_is_an_error() -> None:
     found = aligned(ramp(), bounds=(4.0, 10.0))
     assert (found.scale, found.source, found.pixels) == (pytest.approx(2.0, rel=1e-3), "bounds", 0)
     assert found.spread < 1e-3
-    with pytest.raises(InputError, match="case: no depth of it is known"):
+    with pytest.raises(InputError, match="case: none of its depth is known"):
         aligned(ramp())
     with pytest.raises(InputError, match="its points and the base's depth share under 8 pixels"):
         aligned(ramp(), points=lambda: Points(torch.ones(3, 2), torch.ones(3)))

@@ -101,7 +101,9 @@ def serve(folder: Path, work: SceneWork, workers: int, keep: Keep, place: Place,
     """Complete photos for programs until the user stops it; InputError for an option that cannot be used."""
     work.base.check()
     with listening(folder, work, workers, keep, place, reporter) as (_, urls):
-        reporter.log(f"token: {place.token}; send it as `Authorization: Bearer TOKEN` or in the page's address")
+        reporter.log(
+            f"token: {place.token} (send it as `Authorization: Bearer TOKEN`, or use the address, which holds it)"
+        )
         announce("HTTP interface, and its page", urls, place, reporter)
 
 
