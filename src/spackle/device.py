@@ -129,7 +129,7 @@ def thread_count() -> int:
     return torch.get_num_threads()
 
 
-CHUNKS = 64  # chunks of a task: so many that uneven ones balance among threads
+CHUNKS = 6  # chunks of a task for each thread: so many that uneven ones balance
 
 
 def run_chunks(function: Callable[[int, int], object], total: int, grain: int | None = None) -> None:
@@ -138,7 +138,7 @@ def run_chunks(function: Callable[[int, int], object], total: int, grain: int | 
     Writes of different chunks must not overlap. A thread takes the next chunk when it has finished one, so uneven
     chunks balance.
     """
-    grain = grain or max(-(-total // CHUNKS), 1)
+    grain = grain or max(-(-total // (CHUNKS * thread_count())), 1)
     chunks = -(-total // grain)
     helpers = min(thread_count(), chunks) - 1
     starts = iter(range(0, total, grain))
