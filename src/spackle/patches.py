@@ -32,7 +32,6 @@ SIDE = 2 * RADIUS + 1
 COARSEST = 48  # cells of the short side; no level is smaller
 ROUNDS = 6  # of search and vote at each level
 JUMPS = (4, 1)  # distances in cells of the neighbours whose matches are tried, in successive searches
-MIRRORS = 2  # sources: the picture, and the picture mirrored left to right
 TONE_CELLS = 4.0  # standard deviation of the blur that makes the tone
 FADING = 0.8  # factor on a cell's weight in a patch for each cell that it lies deeper in the hole
 FAINTEST_CELL = np.float32(1e-30)  # least weight of a cell: far above what float32 rounds to zero

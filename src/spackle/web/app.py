@@ -98,7 +98,10 @@ def create_app(
     decoding = asyncio.Lock()  # one photo at a time: a large one takes a gigabyte
 
     def with_files(job: Job) -> SceneState:
-        names = {name for folder in (job.folder, job.results) if folder.is_dir() for name in os.listdir(folder)}
+        names = set[str]()
+        for folder in (job.folder, job.results):
+            with contextlib.suppress(FileNotFoundError):  # not made yet, or deleted by another request just now
+                names.update(os.listdir(folder))
         return job.model_copy(update={"files": sorted(names.intersection(FILES))})
 
     def job_of(id: str) -> Job:
