@@ -1,8 +1,4 @@
-"""The residual network f_res (paper, section 3.3, eq. 5) turns a view's features into a delta for every cell.
-
-Its input is the rendered view, the base values, the colours at a hole's far rim along the epipolar line, and the
-colours of matching patches of the view.
-"""
+"""The residual network f_res (paper, section 3.3, eq. 5) turns a view's features into deltas for every cell."""
 
 from __future__ import annotations
 
@@ -26,26 +22,26 @@ ALIKE = 1.4  # a far rim whose inverse depth exceeds the seed's by more than thi
 # Channels of the features.
 VIEW_DEPTH, SEED_DEPTH, SEED_RGB = 3, 6, slice(7, 10)
 VIEW_CHANNELS = SEED_RGB.stop  # rendered colour 3, depth, opacity, mask, seed depth, seed colour 3
-FAR_RIM = slice(VIEW_CHANNELS, VIEW_CHANNELS + 3)  # the far rim's colour minus the seed's, both as logits
-MIRRORED = slice(FAR_RIM.stop, FAR_RIM.stop + 3)  # likewise, for the colour mirrored at the rim
-EXEMPLAR = slice(MIRRORED.stop + 1, MIRRORED.stop + 4)  # likewise, for patches; after the rim's distance
-RIM_CHANNELS = EXEMPLAR.stop + 1  # number of channels with the patch distance, which is the last
-PHOTO = slice(RIM_CHANNELS, RIM_CHANNELS + 3)  # if given: the photo's colour at the cell's point
-KNOWN_COLORS = (FAR_RIM, MIRRORED, EXEMPLAR)  # colours that a network may copy
+FAR_RIM = slice(VIEW_CHANNELS, VIEW_CHANNELS + 3)  # logit of the far rim's colour minus logit of the seed's colour
+MIRRORED = slice(FAR_RIM.stop, FAR_RIM.stop + 3)  # the same difference for the colour mirrored at the rim
+EXEMPLAR = slice(MIRRORED.stop + 1, MIRRORED.stop + 4)  # and for patches; the channel before is the rim's distance
+RIM_CHANNELS = EXEMPLAR.stop + 1  # number of channels without the photo; the last is the patch distance
+PHOTO = slice(RIM_CHANNELS, RIM_CHANNELS + 3)  # optional: the photo's colour at the cell's point
+KNOWN_COLORS = (FAR_RIM, MIRRORED, EXEMPLAR)  # differences that a network may add to the seed's colour
 # Channels of the deltas, as in SHARP: geometry (pixel, inverse depth), texture (scales, quaternion, colour, opacity).
 DELTAS = [2, 1, 3, 4, 3, 1]
 GEOMETRY_CHANNELS, TEXTURE_CHANNELS, DELTA_CHANNELS = sum(DELTAS[:2]), sum(DELTAS[2:]), sum(DELTAS)
 COLOR = slice(10, 13)
-COLOR_MARGIN = 1.0 / 512  # keeps the inverse sigmoid finite, below 8-bit resolution
+COLOR_MARGIN = 1.0 / 512  # keeps the inverse sigmoid finite; less than one step of 8-bit colour
 
 TYPICAL_DISTANCE = 16.0  # from a cell to the rim, in cells
 TYPICAL_MISMATCH = 0.1
-STRIDE = 16  # cells along the side of one cell of an architecture's coarsest grid: four halvings
+STRIDE = 16  # cells along the side of one cell of a network's coarsest grid, after four halvings
 
 
 @dataclasses.dataclass(frozen=True)
 class Rim:
-    """Values at the far rim for each masked cell; elsewhere the cell's own values."""
+    """Values for each masked cell from the far rim of its hole; unmasked cells have their own values."""
 
     rgb: Tensor  # [h, w, 3] sRGB at the far rim
     mirrored: Tensor  # [h, w, 3] sRGB at the cell's mirror image beyond the rim, if on the same surface; else `rgb`
@@ -53,21 +49,19 @@ class Rim:
     exemplar: Tensor  # [h, w, 3] sRGB of matching patches elsewhere in the view, with the seeds' tone
     mismatch: Tensor  # [h, w] patch distance: root mean squared difference of a match; 0 elsewhere
     beyond: Tensor  # [h, w] bool: masked cells whose points project outside of the photo
-    photo: Tensor | None = None  # [h, w, 3] sRGB of the photo, if requested (see `seen_in_photo`); outside, the seed's
+    photo: Tensor | None = None  # [h, w, 3] sRGB of the photo, see `seen_in_photo`; outside of it the seed's colour
 
 
 def find_rim(
     features: ViewFeatures, seeds: Seeds, camera: Camera, photo_camera: Camera, photo: Tensor | None = None
 ) -> tuple[Rim, Patches]:
-    """Walk from each masked cell in both directions along its epipolar line, and take the farther surface.
+    """Values at the far rims of a view's holes (see `walk`), and patches of the view that match its masked cells.
 
-    Between the photo and the view, points move along lines through the epipole, the projection of the photo's eye. So
-    such a line leads from a hole to the surface that was uncovered, and structure at the rim often continues along it.
-    If a line meets no surface, or one much nearer than the seed, the seed is kept.
+    Between photo and view, image points move along epipolar lines. An epipolar line therefore leads from a hole to the
+    surface that was uncovered. If the line meets no surface, or a surface much nearer than the seed, the seed is kept.
 
-    Also returns patches of the view that match its masked cells. Behind an object they are matched by the seeds'
-    colours; beyond the photo's border, where seeds are blurred, by the mirrored colours. The `photo` [H, W, 3] sRGB is
-    for a network that `sees_photo`.
+    Cells inside the photo are matched by the seeds' colours. Cells beyond the photo's border have blurred seeds and are
+    matched by mirrored colours. `photo` [H, W, 3] sRGB is needed by a network that `sees_photo`.
     """
     rgb, depths = seeds.rgb.detach(), seeds.inverse_depth.detach()
     values = torch.cat([rgb, depths[..., None]], dim=-1)
@@ -84,12 +78,12 @@ def find_rim(
 
 
 def network_input(view: ViewFeatures, seeds: Seeds, rim: Rim) -> Tensor:
-    """Features [1, 21, h, w] (24 with the photo), centred around zero; depths as log (inverse depth / its median)."""
+    """Features [1, 21, h, w], or [1, 24, h, w] with the photo; depths are log(inverse depth / median)."""
     view_depth = torch.where(view.inverse_depth > 0, (view.inverse_depth / seeds.unit).clamp_min(1e-4).log(), 0.0)
     seed_depth = (seeds.inverse_depth / seeds.unit).clamp_min(1e-4).log()
     maps = [view_depth, view.alpha, view.mask.to(view.alpha), seed_depth]
     grids = (seeds.rgb, rim.rgb, rim.mirrored, rim.exemplar, rim.distance[..., None], rim.mismatch[..., None])
-    *colors, distance, mismatch = (grid[view.mask] for grid in grids)  # elsewhere all differences are 0
+    *colors, distance, mismatch = (grid[view.mask] for grid in grids)
     seed, near, mirrored, patches = map(color_logit, colors)
     distance, mismatch = (distance / TYPICAL_DISTANCE).log1p(), mismatch / TYPICAL_MISMATCH
     at_rim = torch.cat([near - seed, mirrored - seed, distance, patches - seed, mismatch], dim=-1)
@@ -106,14 +100,14 @@ def color_logit(value: Tensor) -> Tensor:
 
 
 class ResidualNet(nn.Module):
-    """f_res, in one of the `architectures`: maps features of `network_input` to deltas [B, 14, h, w], for any h and w.
+    """f_res: maps features [B, C, h, w] of `network_input` to deltas [B, 14, h, w], for any h and w.
 
-    Its last layers start at zero, so an untrained network returns the seeds unchanged.
+    The last layers start at zero, so the deltas of an untrained network are zero.
     """
 
-    name: ClassVar[str]  # its name in recipes and weight files
-    sees_photo: ClassVar[bool]  # whether its features include the photo
-    local: ClassVar[bool]  # whether a cell's deltas are the same in every crop with enough context around it
+    name: ClassVar[str]  # in recipes and weight files
+    sees_photo: ClassVar[bool]  # whether the features include the photo
+    local: ClassVar[bool]  # whether a cell's deltas are the same in every crop with enough context around the cell
 
 
 @torch.no_grad()
@@ -126,15 +120,15 @@ def predict_deltas(
     *,
     dense: bool = False,
 ) -> Tensor:
-    """Deltas [h, w, 14] float32 of a view's masked cells, on the CPU; 0 elsewhere.
+    """Deltas [h, w, 14] float32 on the CPU; 0 in unmasked cells.
 
     A `local` network runs only on crops around the masked cells, see `crops_around`.
 
     Args:
-        network: a `ResidualNet`, perhaps wrapped; its input is moved to its device.
+        network: a `ResidualNet`.
         view, seeds, rim: one view's features, seeds and rim.
-        precision: precision of the convolutions; auto is bfloat16 if the hardware multiplies it natively.
-        dense: return the deltas of all cells.
+        precision: of the convolutions; auto is bfloat16 if the hardware multiplies it natively.
+        dense: return the deltas of all cells, masked or not.
     """
     device = next(network.parameters()).device
     dtype = pick_dtype(precision, device)
@@ -142,7 +136,7 @@ def predict_deltas(
     whole = (Crop(0, 0, *view.mask.shape),) * 2
     field = view.alpha.new_zeros(*view.mask.shape, DELTA_CHANNELS)
     features = network_input(view, seeds, rim)
-    # One autocast block around all crops, so that the weights are converted once.
+    # One autocast block around all crops: the weights are converted once.
     with own_arithmetic(device), torch.autocast(device.type, dtype, enabled=dtype != torch.float32):
         for inner, outer in crops_around(chosen, STRIDE) if getattr(network, "local", True) else [whole]:
             part = features[(..., *outer.slices)].contiguous(memory_format=torch.channels_last).to(device)

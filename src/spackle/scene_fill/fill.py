@@ -1,8 +1,6 @@
-"""Complete one view, or a whole path with one scene.
+"""Complete one view, or all views of a path with one set of aux Gaussians.
 
-To the residual's cells this adds occlusion guards, texture and a second pass. Base Gaussians are never changed. The
-renderer and the network run on the renderer's device, everything else on the CPU. Each rendering is copied to the CPU
-once, and its new Gaussians are copied back once.
+The renderer and the network run on the renderer's device, all other code runs on the CPU.
 """
 
 from __future__ import annotations
@@ -30,31 +28,31 @@ from spackle.scene_fill.occlusion_guard import OcclusionGuard, free_factors, mov
 from spackle.scene_fill.texture import HoleView, Texture, exemplar_texture, in_cells, sharpened
 from spackle.surface import BEHIND, PIXEL_SPREAD, surface_slope
 
-PASSES = 2  # a second pass closes the places that the first one's blobs left thin
-WIDEST = 8  # widest views of a path: they guard their surfaces from the start
-# The two widest views, on opposite sides, show nearly all holes. They alone get the chosen texture; later views get
-# the exemplar's. Both are completed before anything is added beneath the rims of either.
+PASSES = 2  # the second pass fills cells in which the first pass left alpha below the threshold
+WIDEST = 8  # so many of the widest views protect their surfaces from the start
+# The two widest views lie on opposite sides and show nearly all holes. Only these two views get the chosen texture;
+# later views get the exemplar texture. Rim underlays are added after both views are completed.
 OPPOSITE = 2
-FLAT = 0.01  # sRGB: pixels that differ less from their cell's mean need no Gaussians of their own
-SEEDS_HAR = 0.01  # in a path's view with a smaller HAR the seeds alone fill: the network's work would go unnoticed
+FLAT = 0.01  # sRGB: if a cell's pixels differ less from the cell's mean, the cell gets one Gaussian
+SEEDS_HAR = 0.01  # a path's view with a smaller HAR is filled without the network, whose effect would be invisible
 FEW_HOLES = 1e-3  # a smaller HAR is invisible in a frame of a path
-LEAST_VISITS = 24  # at least this many frames of a path are checked, or half of them if that is more
-COARSE = 3  # an underlay is smooth: one Gaussian, COARSE times as large, for COARSE × COARSE cells
-REACH_CELLS = COARSE * BLOB_CELLS  # how far an underlay extends beneath a rim: the reach of one of its Gaussians
-EVERY = (slice(None, None, COARSE),) * 2  # the cells that have an underlay's Gaussian
+LEAST_VISITS = 24  # half of a path's frames are checked, and at least this many
+COARSE = 3  # an underlay is smooth: each of its Gaussians is COARSE times as large and covers COARSE × COARSE cells
+REACH_CELLS = COARSE * BLOB_CELLS  # an underlay extends this far beneath a rim: the reach of one underlay Gaussian
+EVERY = (slice(None, None, COARSE),) * 2  # the cells that have an underlay Gaussian
 
 
 @dataclasses.dataclass(frozen=True)
 class FillContext:
-    """The base of a photo, and everything that is needed to fill the holes of its views."""
+    """The base of a photo, and all settings that fill the holes of its views."""
 
     base: Gaussians
     photo_camera: Camera
     renderer: Renderer
-    network: ResidualNet | None = None  # None: deltas of zero, so the seeds alone fill the holes
-    texture: Texture | None = exemplar_texture  # None: the colours of the network or the seeds
+    network: ResidualNet | None = None  # None: all deltas are zero
+    texture: Texture | None = exemplar_texture  # None: Gaussians keep the colours of the network or the seeds
     threshold: float = MASK_THRESHOLD
-    precision: Precision = "auto"  # the network's: auto is bfloat16 if the hardware multiplies it natively
+    precision: Precision = "auto"  # of the network; auto is bfloat16 if the hardware multiplies it natively
 
     @functools.cached_property
     def placed(self) -> FillContext:
@@ -67,7 +65,7 @@ class FillContext:
 
     @functools.cached_property
     def photo(self) -> Tensor | None:
-        """[H, W, 3] sRGB: the base rendered at the photo's camera, for a network that `sees_photo`; else None."""
+        """[H, W, 3] sRGB: the base rendered at the photo's camera; None unless the network `sees_photo`."""
         seen = self.network is not None and self.network.sees_photo
         return self.renderer.render(self.placed.base, self.photo_camera).rgb if seen else None
 
@@ -77,14 +75,14 @@ class FillContext:
         return dataclasses.replace(self, network=None, texture=None)
 
     def photo_guard(self) -> OcclusionGuard:
-        """The guard of the photo's view: no aux Gaussian may lie in front of the surfaces that it shows."""
+        """The occlusion guard of the photo's own view."""
         rendering = self.renderer.render(self.placed.base, self.photo_camera)
         return OcclusionGuard.of(rendering, self.photo_camera, self.threshold)
 
 
 @dataclasses.dataclass(frozen=True)
 class FilledView:
-    """The aux Gaussians of one view, and its rendering with them."""
+    """The aux Gaussians of one view, and the view rendered with base and aux Gaussians."""
 
     aux: Gaussians
     rendering: Rendering
@@ -95,7 +93,7 @@ class FilledScene:
     """One set of aux Gaussians for all views."""
 
     aux: Gaussians
-    pictures: Mapping[int, Tensor]  # [H, W, 3] uint8 by index: completed views that were rendered anyway
+    pictures: Mapping[int, Tensor]  # [H, W, 3] uint8 sRGB: final renderings, by view index, of some views
 
 
 @torch.no_grad()
@@ -105,13 +103,13 @@ def fill_view(
     guards: Sequence[OcclusionGuard] | None = None,
     rendering: Rendering | None = None,
 ) -> FilledView:
-    """Complete one view by itself; only the tiles that change are drawn again.
+    """Complete one view by itself.
 
     Args:
-        context: the photo's base, and what fills its holes.
+        context: the photo's base and the settings of the fill.
         camera: the view.
-        guards: views whose surfaces must stay in front; only the photo's if None.
-        rendering: the base rendered from this view, if it is already available.
+        guards: views whose surfaces aux Gaussians must not hide; None: only the photo's view.
+        rendering: the base rendered from this view, if already available.
     """
     guards = [context.photo_guard()] if guards is None else guards
     stage, device = _Stage(context.placed), context.base.means.device
@@ -127,19 +125,19 @@ def fill_scene(
     exact: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> FilledScene:
-    """Complete a whole path by one set of aux Gaussians, which all frames share.
+    """Complete all views of a path with one set of aux Gaussians.
 
-    Views are visited from the widest inwards, spread over the path. Each view is rendered with the Gaussians of earlier
-    ones, and adds its own in its holes and beneath the holes' rims, always behind the surfaces that the photo, the
-    widest views and earlier views show. Gaussians beneath the rims of the two widest views are added after both are
-    completed, because each of them may show, and fill better, what lies beneath a rim of the other.
+    Views are visited in the order of `farthest_first`. Each view is rendered with base Gaussians and all earlier aux
+    Gaussians, and then gets new aux Gaussians in its holes and beneath the rims of its holes. New Gaussians lie behind
+    all surfaces that the photo, the widest views and earlier views show. The two widest views get their rim underlays
+    last: one view may show, and fill better, what lies beneath a rim of the other view.
 
     Args:
-        context: the photo's base, and what fills its holes.
+        context: the photo's base and the settings of the fill.
         cameras: the frames of a path in order; with `exact`, any views.
-        exact: check every view, and complete it if it has any hole. Otherwise holes too small to see may stay open, and
-            only half of a long path's frames are checked.
-        progress: called with (views visited so far, total number of views to visit).
+        exact: check every view, and complete every view that has a hole. Otherwise invisibly small holes may remain,
+            and only half of a long path's frames are checked.
+        progress: called with (number of visited views, number of views to visit).
     """
     if not cameras:
         return FilledScene(Gaussians.empty(context.base.means.device), {})
@@ -189,9 +187,9 @@ def fill_scene(
 
 
 def farthest_first(cameras: Sequence[Camera], photo_camera: Camera) -> list[int]:
-    """Indices of the views: the widest first, then always the one farthest from all earlier ones.
+    """Indices of views: first the view farthest from the photo, then always the view farthest from all earlier views.
 
-    So the first n views are spread evenly over the path, for any n.
+    The first n views are thus spread evenly over the path, for any n.
     """
     if not cameras:
         return []
@@ -216,10 +214,10 @@ def _fill(
     *,
     beneath: bool,
 ) -> tuple[list[Gaussians], list[Gaussians], Rendering]:
-    """Gaussians in the holes of the stage's view, Gaussians beneath their rims if `beneath`, and the completed view."""
+    """Returns the Gaussians in a view's holes, the rim underlays (if `beneath`), and the completed view."""
     aux, rims = [Gaussians.empty()], []
     for turn in range(PASSES):
-        # The seeds close what the network's blobs left thin: the network would only leave it thin again.
+        # The network would predict the same faint Gaussians again.
         means = context.seeds_alone if turn else context
         features = ViewFeatures.of(view, context.threshold)
         if not bool(features.mask.any()):
@@ -243,11 +241,9 @@ def _propose(
     camera: Camera,
     guards: Sequence[OcclusionGuard],
 ) -> tuple[Gaussians, Seeds]:
-    """One Gaussian for each masked cell, all behind the guards' surfaces.
+    """Gaussians of the masked cells, behind the guards' surfaces; and the seeds for `rim_underlay`.
 
-    With a texture, a cell whose pixels differ also has one for each pixel.
-
-    Also returns the seeds, from which `rim_underlay` continues beneath the rims.
+    Each cell has one Gaussian. With a texture, a cell whose pixels differ has a Gaussian for each pixel too.
     """
     mask, seeds = features.mask, make_seeds(features, camera, context.photo_camera)
     chosen, eye, deltas, picture, beyond, parts = seeds.select(mask), camera.position, None, None, None, []
@@ -269,12 +265,12 @@ def _propose(
         index = rough.nonzero()[:, 0]
         pixels = _pixels(chosen.select(index), None if deltas is None else deltas[index], camera, blobs[index])
         parts.append(moved_away(pixels, eye, factors[index].repeat_interleave(CELL**2)))
-        # As in a lifted photo, each cell has one Gaussian behind those of its pixels.
+        # As in a lifted photo, a cell's own Gaussian lies behind the Gaussians of its pixels.
         cells = dataclasses.replace(cells, colors=srgb_to_linear(wanted.clamp(0, 1)).mean((1, 2)))
         factors = factors / (1 - BEHIND)
     parts.append(moved_away(cells, eye, factors))
     inverse_depth = seeds.inverse_depth.clone()
-    if beyond is not None:  # beyond the photo's border, what lies beneath the rim must follow what was moved away
+    if beyond is not None:  # beyond the photo's border, the underlay must follow the cells that were moved away
         moved = beyond & (factors > 0)
         inverse_depth[mask] = torch.where(moved, 1 / (depths * factors), inverse_depth[mask])
     return Gaussians.cat(parts), dataclasses.replace(seeds, inverse_depth=inverse_depth)
@@ -293,21 +289,15 @@ def _pixels(seeds: Seeds, deltas: Tensor | None, camera: Camera, colors: Tensor)
 
 
 def rim_underlay(mask: Tensor, seeds: Seeds, camera: Camera) -> Gaussians:
-    """Gaussians that extend the holes' seeds beneath the surfaces around the holes.
+    """Gaussians that continue the filling of holes (`mask` [h, w] bool) beneath the surfaces around the holes.
 
-    From another view the rim of a hole moves, and a slit opens between the visible surface and the hole's filling. The
-    underlay closes most such slits in advance: fewer views of a path remain to be completed, and they agree.
-
-    Args:
-        mask: [h, w] bool: the cells of the view's holes.
-        seeds: the seeds of all cells.
-        camera: the view.
+    From another view, a slit appears between the rim of a hole and the hole's filling. The underlay closes most slits
+    in advance. `seeds` are those of all cells of the view.
     """
     rim = (greatest_around(mask, REACH_CELLS) & ~mask)[EVERY]
     if not bool(rim.any()) or bool(rim.all()):
         return Gaussians.empty()
     coarse, rgb = far_fill(seeds.inverse_depth[EVERY], seeds.rgb[EVERY].permute(2, 0, 1), ~rim)
-    # Beneath the rim, behind all visible or filled surfaces within a blob's reach.
     depth, chosen = seeds.inverse_depth.clone(), mask.new_zeros(mask.shape)
     depth[EVERY], chosen[EVERY] = coarse, rim
     placed = placed_behind(depth, chosen, seeds.inverse_depth, COARSE * BLOB_CELLS)[EVERY]
@@ -317,23 +307,22 @@ def rim_underlay(mask: Tensor, seeds: Seeds, camera: Camera) -> Gaussians:
 
 
 class _Stage:
-    """The base, the Gaussians added to it, and their last rendering, all on the renderer's device."""
+    """The base, the added Gaussians, and the last rendering of both, on the renderer's device."""
 
     def __init__(self, context: FillContext) -> None:
         self._renderer, self._device, self._sets = context.renderer, device_of(context.renderer), [context.base]
 
     def look(self, camera: Camera, rendering: Rendering | None = None) -> Rendering:
-        """The rendering from a camera, copied to the CPU; `rendering`, if given, is used instead of a new one."""
+        """The rendering from a camera, copied to the CPU; if `rendering` is given, it is not rendered again."""
         drawn = self._renderer.render(self._sets, camera) if rendering is None else rendering.to(self._device)
         self._camera, self._drawn = camera, drawn
         return drawn.to(PROCESSOR)
 
     def add(self, *sets: Gaussians) -> None:
-        """Add Gaussians, which the next `look` includes."""
         self._sets += [part.to(self._device) for part in sets]
 
     def look_again(self, new: Gaussians) -> Rendering:
-        """Add Gaussians, and render from the last camera again; only the tiles that they touch are redrawn."""
+        """Add Gaussians, and render from the last camera again; only tiles that the Gaussians touch are redrawn."""
         self.add(new)
         tiles = touched_tiles(new, self._camera)
         self._drawn = self._renderer.render(self._sets, self._camera, tiles=tiles, onto=self._drawn)

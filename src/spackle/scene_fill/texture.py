@@ -1,7 +1,6 @@
-"""Colours of filled holes: structure from the residual, texture from patches or an inpainter.
+"""Colours of filled holes: low frequencies from the residual, high frequencies (texture) from patches or an inpainter.
 
-The paper's network learns texture from an inpainter's images. A network that learns from true views predicts smooth
-colours where the truth is ambiguous, so texture is added here.
+A network that learns from true views predicts smooth colours if the truth is ambiguous, so texture is added afterwards.
 """
 
 from __future__ import annotations
@@ -22,16 +21,16 @@ from spackle.residual.base_values import Seeds
 from spackle.residual.network import Rim
 from spackle.residual.view_features import CELL, LEAST, ViewFeatures, hole_mask
 
-TEXTURE_PX = 2.0  # standard deviation of a blur: what it removes is texture, what remains is structure
+TEXTURE_PX = 2.0  # standard deviation of the blur that separates structure (low frequencies) from texture
 TEXTURE_FADING = 0.16  # mismatch at which the texture has faded to 1/e
 EXTENDED_CELLS, SAME_DEPTH = 4.0, 0.05  # reach of the rim's colours beyond the photo's border; relative depth
-OVERLAP_PX = 0.8  # standard deviation of blobs' blur in the image: wider than a blob, because votes blur as well
+OVERLAP_PX = 0.8  # standard deviation of the blur that overlapping Gaussians and votes of patches cause
 STEPS = 2  # Jacobi steps of `sharpened`
 
 
 @dataclasses.dataclass(frozen=True)
 class HoleView:
-    """A view with holes, its seeds and patches, and the residual's structure in its holes."""
+    """A view with holes, and all data from which a texture computes colours."""
 
     rendering: Rendering
     features: ViewFeatures
@@ -41,11 +40,11 @@ class HoleView:
     structure: Tensor  # [h, w, 3] sRGB of all cells; masked cells have the residual's colours
 
 
-Texture = Callable[[HoleView], Tensor]  # colours [2h, 2w, 3] sRGB of the view's pixels; only masked cells are used
+Texture = Callable[[HoleView], Tensor]  # gives colours [2h, 2w, 3] sRGB of pixels; only masked cells are used
 
 
 def exemplar_texture(view: HoleView) -> Tensor:
-    """The residual's structure, with high frequencies copied from elsewhere in the view."""
+    """Colours [2h, 2w, 3] sRGB: the residual's structure plus texture copied from elsewhere in the view."""
     features, patches = view.features, view.patches
     pixels = in_cells(view.rendering.rgb)
     painted = from_cells(patch_blocks(patches, pixels))
@@ -57,17 +56,17 @@ def exemplar_texture(view: HoleView) -> Tensor:
 
 
 def painted_texture(painter: Inpainter, view: HoleView) -> Tensor:
-    """The view with its holes painted by an inpainter, which replaces the residual's structure too."""
+    """Colours [2h, 2w, 3] sRGB of the view with its holes painted by an inpainter, without the residual's structure."""
     hole = hole_mask(view.rendering.alpha)
     views = (view.rendering.rgb[None], hole[None], known_inverse_depth(view.rendering.depth, hole)[None])
     return from_cells(in_cells(painter.paint(*views)[0]))
 
 
 def patch_blocks(patches: Patches, blocks: Tensor) -> Tensor:
-    """Fill the holes of an image given as one block per cell, [H, W, k, k, c], with blocks from elsewhere in the image.
+    """Fill the masked cells of an image, [H, W, k, k, c] by cell, with blocks from elsewhere in the image.
 
-    A filled block is the mean of the blocks proposed by the matches of its cell and of the eight neighbours, weighted
-    towards better matches. `Patches.rgb`, in which whole patches vote, loses fine detail.
+    A filled block is a weighted mean of the blocks that the matches of its cell and of the eight neighbours propose;
+    better matches weigh more. It keeps details that `Patches.rgb`, a vote of whole patches, loses.
     """
     height, width = patches.mismatch.shape
     sources = torch.stack([blocks, blocks.flip(1, 3)])
@@ -90,10 +89,7 @@ def patch_blocks(patches: Patches, blocks: Tensor) -> Tensor:
 
 
 def _in_proportion(fine: Tensor, view: HoleView) -> Tensor:
-    """Factors [h, w] ≤ 1 that make the texture `fine` [2h, 2w, 3] no stronger than that of the surface around a hole.
-
-    Strong texture from elsewhere does not belong on a plain wall, even if its patches match the wall's tone.
-    """
+    """Factors [h, w] ≤ 1 that make the texture `fine` [2h, 2w, 3] no stronger than the texture around a hole."""
     energy, hole = avg_pool2d(fine.square().sum(-1)[None], CELL)[0], view.features.mask.float()
     parts = torch.stack([energy * hole, hole, energy * (1 - hole), 1 - hole], dim=-1)
     own, masked, others, seen = broadly_blurred(parts, TONE_CELLS).clamp_min(LEAST).unbind(-1)
@@ -105,17 +101,17 @@ def _in_proportion(fine: Tensor, view: HoleView) -> Tensor:
 
 
 def _magnified(cells: Tensor, mask: Tensor) -> Tensor:
-    """Interpolate colours [h, w, 3] to pixels [2h, 2w, 3], from the masked cells ([h, w] bool) alone."""
+    """Interpolate colours [h, w, 3] to pixels [2h, 2w, 3]; only cells in `mask` ([h, w] bool) contribute."""
     both = torch.cat([cells * mask[..., None], mask[..., None]], dim=-1).permute(2, 0, 1)
     pixels = interpolate(both[None], scale_factor=CELL, mode="bilinear")[0].permute(1, 2, 0)
     return pixels[..., :3] / pixels[..., 3:].clamp_min(1e-6)
 
 
 def extended(view: HoleView) -> Tensor:
-    """Structure [h, w, 3] that, just beyond the photo's border, has the colour of the nearest visible cell.
+    """Structure [h, w, 3]; just beyond the photo's border it has the colour of the nearest visible cell.
 
-    With distance it fades to `structure`. The colour is used only if that cell has the same depth, and never behind an
-    object, because there the nearest cell is the object's.
+    The colour fades to `structure` with the distance to that cell, and with the difference in depth. Holes behind an
+    object keep `structure`, because their nearest visible cell may belong to the object.
     """
     features = view.features
     near = nearest_known(features.mask.numpy())
@@ -126,10 +122,7 @@ def extended(view: HoleView) -> Tensor:
 
 
 def sharpened(wanted: Tensor) -> Tensor:
-    """Colours [H, W, c] of blobs whose overlap shows the wanted colours [H, W, c], found by Jacobi steps.
-
-    A pixel shows about a weighted mean of the blobs around it; the weight is a Gaussian of OVERLAP_PX.
-    """
+    """Colours [H, W, c] of Gaussians that, blurred by overlap, show the wanted colours [H, W, c]; by Jacobi steps."""
     colors = wanted
     for _ in range(STEPS):
         colors = colors + wanted - blurred(colors, OVERLAP_PX)
