@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -12,7 +11,6 @@ from command import Run, run
 from photos import metres, picture, write_depth
 from PIL import Image
 
-os.environ.setdefault("RAY_AUTH_MODE", "token")  # before Ray is loaded: a cluster of newer versions wants one
 VIEWS = 4
 SHORT = ["--base", "rgbd", "--views", VIEWS, "--shard-size", 2, "--threads", 1]
 

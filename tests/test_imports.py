@@ -15,7 +15,7 @@ import spackle
 SOURCES = Path(spackle.__file__).parent
 FILES = sorted(SOURCES.rglob("*.py"))
 
-OPTIONAL = ("gsplat", "transformers", "pyiqa", "propainter", "ray", "viser", "skimage", "yaml", "tensorboard")
+OPTIONAL = ("gsplat", "transformers", "pyiqa", "propainter", "viser", "skimage", "yaml", "tensorboard")
 OPTIONAL += ("cv2", "fsspec", "pytorchcv", "torchvision")
 
 # The rooms of the house, and what each may import besides itself. Single files at the top are rooms of their own where

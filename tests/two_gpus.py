@@ -40,12 +40,7 @@ class TwoGpus(TorchFunctionMode):
 
 
 class Worker:
-    """A `PhotoWorker` that tells the GPU of its process, when another has begun as well."""
-
-    setup: Mapping[str, Any] = {}
-
-    def inputs(self, job: Any) -> object:
-        return job
+    """A `Worker` that tells the GPU of its process, when another has begun as well."""
 
     def make(self, job: Path) -> tuple[str, list[int]]:
         name = multiprocessing.current_process().name

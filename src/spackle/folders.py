@@ -6,7 +6,6 @@ import contextlib
 import hashlib
 import json
 import os
-import secrets
 import shutil
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -103,25 +102,6 @@ def _alone_in(folder: Path) -> Iterator[None]:
         except OSError as error:
             raise InputError(f"{folder / LOCK}: cannot write: {reason_in_a_line(error)}") from error
         yield
-
-
-def mark(folder: Path) -> str:
-    """Write a mark into a folder that the caller has locked (`alone`), and return it, so that `check_mark` on another
-    machine can recognise the folder.
-    """
-    word = secrets.token_hex(8)
-    (folder / LOCK).write_text(word)
-    return word
-
-
-def check_mark(folder: Path, word: str) -> None:
-    """InputError if `folder` does not contain this mark."""
-    try:
-        if (folder / LOCK).read_text() == word:
-            return
-    except (OSError, ValueError):
-        pass
-    raise InputError(f"{folder}: this node sees another folder here: it must lie on a disk that all nodes share")
 
 
 @contextlib.contextmanager

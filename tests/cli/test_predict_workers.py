@@ -1,4 +1,4 @@
-"""`spackle predict FOLDER --workers N`, here and on Ray: the same files as one by one, whoever dies."""
+"""`spackle predict FOLDER --workers N` writes the same files as one process, even after a kill."""
 
 from __future__ import annotations
 
@@ -12,14 +12,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import dataset_builds  # noqa: F401  # sets what a cluster wants
 import pytest
 from command import SHORT, Run, names_in, report_of, run
 from photos import HEIGHT, WIDTH, metres, write_depth, write_photo
-
-from spackle.cli.photos import Predictor
-from spackle.errors import InputError
-from spackle.folders import check_mark, mark, results_folder
 
 FILES = {"scene.ply", "report.json", "video.gif"}  # x264 may encode otherwise each time
 
@@ -106,24 +101,3 @@ def test_killed_workers_are_a_line_and_the_same_command_goes_on(
     assert ".lock" not in names_in(out)
     assert predict(place, out).code == 1
     assert list(content(out)) == list(content(place / "alone"))
-
-
-def test_workers_on_ray_give_the_same_files(place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("ray")
-    ray = ("--ray", "local", "--workers", 2)
-    done = predict(place, tmp_path / "out", *ray)
-    assert (done.code, done.lines[-1]) == (1, "1 of 3 photos failed"), done.err
-    assert list(content(tmp_path / "out")) == list(content(place / "alone"))
-    monkeypatch.setattr(Predictor, "setup", {"spackle": "0.0"})  # in this process alone
-    elsewhere = predict(place, tmp_path / "elsewhere", *ray)
-    assert elsewhere.code == 2
-    assert "would give other results" in elsewhere.lines[-1]
-
-
-def test_a_folder_for_results_that_a_node_does_not_see_is_a_line(tmp_path: Path) -> None:
-    with results_folder(tmp_path / "out", alone=True):
-        word = mark(tmp_path / "out")
-        check_mark(tmp_path / "out", word)
-        for folder, given in ((tmp_path / "out", "another"), (tmp_path / "elsewhere", word)):
-            with pytest.raises(InputError, match=f"{folder}: .* on a disk that all nodes share"):
-                check_mark(folder, given)

@@ -6,10 +6,10 @@ from pathlib import Path
 
 from two_gpus import Worker
 
-from spackle.workers import Workers, at_work_here
+from spackle.workers import at_work
 
 
 def test_each_of_several_workers_has_its_own_gpu(tmp_path: Path) -> None:
-    with at_work_here(Workers(2, 1, gpu=True), Worker, [tmp_path] * 4, lambda: False) as results:
+    with at_work(Worker, [tmp_path] * 4, lambda: False, count=2, threads=1) as results:
         found = {name: tuple(numbers) for name, numbers in results}
     assert sorted(found.values()) == [(0,), (1,)]

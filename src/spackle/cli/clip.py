@@ -49,7 +49,6 @@ def clip_options(predict: PredictOptions) -> Options:
         ),
         ("format", video.format, video.suffix != ".mp4", "it becomes an mp4, with its sound"),
         ("workers", predict.workers, predict.workers > 1, "each frame needs the one before"),
-        ("ray", predict.ray, predict.ray is not None, "each frame needs the one before"),
     ]
     for option, value, given, why in unfit:
         if given:

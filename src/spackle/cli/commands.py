@@ -127,20 +127,21 @@ def predict(
     workers: Annotated[
         int,
         typer.Option(
-            hidden=True, help="Number of processes that share the photos, each with its own copy of the base's network."
+            hidden=True,
+            min=1,
+            max=1024,
+            help="Number of processes that share the photos, each with its own copy of the base's network.",
         ),
     ] = 1,
     threads: Annotated[
         int | None,
         typer.Option(
             hidden=True,
+            min=1,
+            max=1024,
             help="Threads of each worker; the last bits of a network's output depend on their number.",
-            show_default="the cores, shared evenly; 2 with --ray",
+            show_default="the cores, shared evenly",
         ),
-    ] = None,
-    ray: Annotated[
-        str | None,
-        typer.Option(metavar="ADDRESS", hidden=True, help="Start workers on a Ray cluster, see `dataset build -h`."),
     ] = None,
     as_json: JsonOption = False,
     verbose: VerboseOption = False,
@@ -159,7 +160,7 @@ def predict(
     settings = BaseSettings(base, depth, *reading, checkpoint, precision, device=device, **speed)
     scene = Options(settings, path, FillOptions(residual, fill, mode))
     lens = {"focal_px": focal_px, "focal_mm": focal_mm, "fov": fov}
-    options = PredictOptions(scene, lens, render, keep_base, depth_out, keep_frame, overwrite, workers, threads, ray)
+    options = PredictOptions(scene, lens, render, keep_base, depth_out, keep_frame, overwrite, workers, threads)
     if predict_all(photos, output, options, Reporter(verbose, as_json=as_json)):
         raise typer.Exit(1)
 

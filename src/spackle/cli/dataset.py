@@ -66,12 +66,10 @@ def dataset_build(
         int | None,
         typer.Option(help="Long side in pixels at which the inpainter works; default: propainter 640, lama 1024."),
     ] = None,
-    workers: Annotated[int, typer.Option(help="Number of processes, each with its own base.")] = 1,
-    ray: Annotated[
-        str | None,
-        typer.Option(metavar="ADDRESS", help="Workers on a Ray cluster: auto, local, HOST:PORT or ray://HOST:PORT."),
-    ] = None,
-    threads: Annotated[int, typer.Option(help="Threads of each process; they change SHARP's last bits.")] = 2,
+    workers: Annotated[int, typer.Option(min=1, max=1024, help="Number of processes, each with its own base.")] = 1,
+    threads: Annotated[
+        int, typer.Option(min=1, max=1024, help="Threads of each process; they change SHARP's last bits.")
+    ] = 2,
     shard_size: Annotated[int, typer.Option(min=1, max=1_000_000, help="Number of photos in a tar file.")] = 50,
     device: DeviceOption = "auto",
     verbose: VerboseOption = False,
@@ -94,7 +92,6 @@ def dataset_build(
         inpainter_weights=inpainter_weights,
         inpainter_side=inpainter_side,
         workers=workers,
-        ray=ray,
         threads=threads,
         shard_size=shard_size,
     )

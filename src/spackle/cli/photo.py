@@ -25,7 +25,6 @@ class PredictOptions:
     overwrite: bool = False  # of several photos, redo those that are done
     workers: int = 1  # processes that share the photos
     threads: int | None = None  # of each worker
-    ray: str | None = None  # address of the cluster that runs the workers; None: this machine
 
     def open(self) -> Pipeline:
         """Open the pipeline for all photos; InputError for an option that cannot be used with any photo."""

@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 
@@ -30,7 +30,7 @@ from spackle.clips.files import is_clip
 from spackle.device import thread_count
 from spackle.errors import InputError
 from spackle.files import check_file, files_in, fingerprint
-from spackle.folders import as_recorded, check_mark, digest_of, mark, results_folder
+from spackle.folders import as_recorded, digest_of, results_folder
 from spackle.image import PHOTO_SUFFIXES
 from spackle.patches import match_patches
 from spackle.photo_results import REPORT, earlier_report, predict_photo
@@ -41,10 +41,9 @@ from spackle.render.blend import blend_tiles
 from spackle.scene_fill import FillContext, OcclusionGuard, fill_scene
 from spackle.scene_fill.occlusion_guard import free_factors
 from spackle.surface import surface_gaussians
-from spackle.weights import installed, weights_digest
-from spackle.workers import Workers, at_work, cluster, threads_of_torch
+from spackle.weights import installed
+from spackle.workers import at_work, threads_of_torch
 
-THREADS_ON_RAY = 2  # of each worker
 SIDE = 64  # side in pixels of the picture that `compile_kernels` completes
 
 
@@ -61,7 +60,8 @@ def predict_all(given: Sequence[Path], output: Path, options: PredictOptions, re
     InputError for an option, a clip or a single photo that cannot be used.
     """
     named = find_photos(given)
-    workers = _workers_for(options, len(named))
+    count = min(options.workers, len(named))
+    threads = options.threads or max(1, thread_count() // count)
     single = len(given) == len(named) == 1 and not os.path.isdir(given[0])
     if clips := [photo.path for photo in named if is_clip(photo.path)]:
         if not single:
@@ -77,20 +77,15 @@ def predict_all(given: Sequence[Path], output: Path, options: PredictOptions, re
     if single:
         check_file(named[0].path, "photo")
     shared = _shared_digest(options, pipeline)
-    with (
-        cluster(workers) as ray,
-        results_folder(output, alone=not single or ray is not None),
-        compiled_ahead(pipeline.renderer, reporter.log),
-    ):
+    with results_folder(output, alone=not single), compiled_ahead(pipeline.renderer, reporter.log):
         predictor = Predictor(output, options, shared, single, pipeline, reporter.verbose)
         left = predictor.left(named, reporter)
-        if workers.count == 1 and ray is None:
-            with threads_of_torch(workers.threads):
+        if count == 1:
+            with threads_of_torch(threads):
                 failed = sum(not predictor.predict(photo, reporter) for photo in left)
         else:
-            word = None if ray is None else mark(output)
-            open_predictor = partial(Predictor.open, output, options, shared, single, reporter.verbose, word)
-            failed = _predict_by_workers(ray, workers, open_predictor, list(left), len(named), reporter)
+            open_predictor = partial(Predictor.open, output, options, shared, reporter.verbose)
+            failed = _predict_by_workers(open_predictor, list(left), len(named), count, threads, reporter)
     if failed:
         reporter.log(f"{failed} of {len(named)} photos failed")
     else:
@@ -127,22 +122,12 @@ def find_photos(given: Sequence[Path]) -> list[NamedPhoto]:
     return [NamedPhoto(photo, name(photo)) for photo in photos]
 
 
-def _workers_for(options: PredictOptions, photos: int) -> Workers:
-    """The worker settings, with no more workers than photos and no more threads than torch has; InputError if
-    impossible.
-    """
-    Workers(options.workers, 1 if options.threads is None else options.threads).check()
-    count = min(options.workers, photos)
-    share = max(1, thread_count() // count) if options.ray is None else THREADS_ON_RAY
-    return Workers(count, options.threads or share, options.ray, gpu=options.scene.base.device != "cpu")
-
-
 def _predict_by_workers(
-    ray: Any,
-    workers: Workers,
     open_predictor: Callable[[], Predictor],
     left: Sequence[NamedPhoto],
     total: int,
+    count: int,
+    threads: int,
     reporter: Reporter,
 ) -> int:
     """Predict photos by workers; returns how many failed. Messages about a photo are printed once it is done.
@@ -156,7 +141,7 @@ def _predict_by_workers(
     with (
         asked_to_stop(alone=True) as stop,
         reporter.steps("photos", ready, total) as step,
-        at_work(ray, workers, open_predictor, left, reporter.log, stop) as results,
+        at_work(open_predictor, left, stop, count=count, threads=threads) as results,
     ):
         for done, result in enumerate(results, ready + 1):
             for what in result.said:
@@ -181,7 +166,7 @@ class Predicted(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Predictor:
-    """Predicts one photo after the other; a `PhotoWorker`."""
+    """Predicts one photo after the other; a `Worker`."""
 
     output: Path
     options: PredictOptions
@@ -191,25 +176,21 @@ class Predictor:
     verbose: bool
 
     @staticmethod
-    def open(
-        output: Path, options: PredictOptions, shared: str, single: bool, verbose: bool, word: str | None
-    ) -> Predictor:
-        """Open a predictor; InputError if `output` is not the folder that was marked with `word`."""
-        if word is not None:
-            check_mark(output, word)
-        return Predictor(output, options, shared, single, options.open(), verbose)
+    def open(output: Path, options: PredictOptions, shared: str, verbose: bool) -> Predictor:
+        """Open the predictor of a worker process; InputError if its base cannot be opened."""
+        return Predictor(output, options, shared, False, options.open(), verbose)
 
-    @property
-    def setup(self) -> dict[str, str]:
-        """Version, and digests of the files that all photos share."""
-        files = {**_shared_files(self.options.scene), **self.options.scene.base.files}
-        return {"spackle": spackle.__version__, **{kind: weights_digest(file) for kind, file in files.items()}}
-
-    def inputs(self, photo: NamedPhoto) -> str:
-        """The digest of `request`; "none" if a file is missing."""
-        with contextlib.suppress(InputError):  # `predict` reports the error
-            return self.request(photo)
-        return "none"
+    def is_done(self, photo: NamedPhoto) -> bool:
+        """Whether the results of an earlier run with the same input and options are still complete."""
+        folder = self.output / photo.name
+        earlier = {} if self.single or self.options.overwrite else earlier_report(folder)
+        with contextlib.suppress(InputError):  # `predict` reports a missing file
+            return (
+                bool(earlier)
+                and earlier.get("request") == self.request(photo)
+                and as_recorded(folder, REPORT, earlier.get("files"))
+            )
+        return False
 
     def request(self, photo: NamedPhoto) -> str:
         """A digest of all that a photo's results depend on; InputError if the photo or its depth map is missing."""
@@ -228,15 +209,9 @@ class Predictor:
     def left(self, photos: Iterable[NamedPhoto], reporter: Reporter) -> Iterator[NamedPhoto]:
         """The photos that are not done yet; logs those that are."""
         for photo in photos:
-            folder = self.output / photo.name
-            earlier = {} if self.single or self.options.overwrite else earlier_report(folder)
-            if (
-                earlier
-                and earlier.get("request") == self.inputs(photo)
-                and as_recorded(folder, REPORT, earlier.get("files"))
-            ):
+            if self.is_done(photo):
                 reporter.log(f"{photo.path.name}: done already (--overwrite does it again)")
-                reporter.result({"folder": folder, "done_already": True})
+                reporter.result({"folder": self.output / photo.name, "done_already": True})
             else:
                 yield photo
 

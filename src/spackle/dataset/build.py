@@ -21,14 +21,14 @@ from spackle.dataset.shards import NAME, Manifest, load_manifest, write_shard
 from spackle.dataset.views import COMPLETIONS, complete_views, draw_path, path_cameras, render_views
 from spackle.errors import InputError, check_name, reading
 from spackle.files import fingerprint, write_whole
-from spackle.folders import differences, digest_of, make_folder, photo_digest, remove_half_written, results_folder
+from spackle.folders import differences, digest_of, make_folder, remove_half_written, results_folder
 from spackle.image import load_photo, resize_photo
 from spackle.inpaint import INPAINTERS, Inpainter, InpainterOptions, get_inpainter, inpainter_class
 from spackle.progress import Reporter, asked_to_stop, counted, timed
 from spackle.render import get_renderer
 from spackle.residual import MASK_THRESHOLD
 from spackle.weights import weights_digest, weights_digests
-from spackle.workers import Workers, at_work, cluster
+from spackle.workers import at_work
 
 MAX_PHOTOS = 1_000_000  # a photo's key has six digits
 PARTS = "parts"  # folder in the output for samples that are not in a shard yet
@@ -50,19 +50,12 @@ class DatasetOptions:
     inpainter_weights: Path | None = None  # a file or folder, if the inpainter has a network
     inpainter_side: int | None = None  # long side in pixels of the images that the inpainter's network gets
     workers: int = 1  # processes
-    ray: str | None = None  # address of a Ray cluster; None: this machine
     threads: int = 2  # threads per process
     shard_size: int = 50  # photos per shard
 
     @property
     def inpaints_by_network(self) -> bool:
         return self.inpainter in INPAINTERS and inpainter_class(self.inpainter).network
-
-    @property
-    def processes(self) -> Workers:
-        network = self.base.network or self.inpaints_by_network  # without one, a cluster's workers need no GPU
-        gpu = self.base.device != "cpu" and (network or self.ray is None)
-        return Workers(self.workers, self.threads, self.ray, gpu)
 
     def open_inpainter(self) -> Inpainter | None:
         """Open the inpainter; None if none paints the targets. InputError if a package or weights are missing."""
@@ -91,7 +84,6 @@ class DatasetOptions:
             raise InputError(
                 f"--disparity {low:g} {high:g}: give the smaller and the greater, above 0 and up to {MAX_DISPARITY:g}"
             )
-        self.processes.check()
 
     def depth_of(self, photo: PhotoFile) -> Path | None:
         """A photo's depth map, in the photo's subfolder of --depth if there is one; None without --depth."""
@@ -159,18 +151,17 @@ def build_dataset(source: Path, output: Path, options: DatasetOptions, reporter:
     maker = Maker(options)  # raises its errors before any long work
     if maker.inpainter is not None and maker.inpainter.notice:
         reporter.log(maker.inpainter.notice)
-    with cluster(options.processes) as ray:
-        root, names = find_photos(source, options.images, reporter.log)
-        if options.sample is None and len(names) > MAX_PHOTOS:
-            raise InputError(
-                f"{source}: {len(names):,} photos are too many for a dataset (at most {MAX_PHOTOS:,}): "
-                "give --sample, or build several"
-            )
-        with reporter.stage("photos") as step:
-            photos = choose(root, names, options.sample, options.seed, reporter.log, step)
-        config = configuration(options, photos, maker.inpainter)
-        with results_folder(output, (NAME,), alone=True):
-            return _Build(photos, output, options, reporter, config).run(ray)
+    root, names = find_photos(source, options.images, reporter.log)
+    if options.sample is None and len(names) > MAX_PHOTOS:
+        raise InputError(
+            f"{source}: {len(names):,} photos are too many for a dataset (at most {MAX_PHOTOS:,}): "
+            "give --sample, or build several"
+        )
+    with reporter.stage("photos") as step:
+        photos = choose(root, names, options.sample, options.seed, reporter.log, step)
+    config = configuration(options, photos, maker.inpainter)
+    with results_folder(output, (NAME,), alone=True):
+        return _Build(photos, output, options, reporter, config).run()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -184,21 +175,12 @@ class Made:
 
 
 class Maker:
-    """A `PhotoWorker` that makes photos' samples: base, views and targets."""
+    """A `Worker` that makes photos' samples: base, views and targets."""
 
     def __init__(self, options: DatasetOptions) -> None:
         """Open base and inpainter; InputError if that fails. Their networks are loaded with the first photo."""
         self.options, self.base = options, open_base(options.base)
         self.renderer, self.inpainter = get_renderer(options.base.device), options.open_inpainter()
-
-    @property
-    def setup(self) -> dict[str, Any]:
-        """The manifest's configuration, without the photos."""
-        return configuration(self.options, (), self.inpainter)
-
-    def inputs(self, photo: PhotoFile) -> list[str]:
-        """Name and digests of a photo and of its depth map, as this machine has them."""
-        return [photo_digest(photo.path), *self.options.inputs_of(photo)]
 
     def make(self, photo: PhotoFile) -> Made:
         """Make a photo's sample; BaseError if the base would fail for every photo."""
@@ -273,8 +255,8 @@ class _Build:
         self.problems: dict[int, str] = {}  # why photos have no sample, by index
         self.seconds = dict.fromkeys(STAGES, 0.0)
 
-    def run(self, ray: Any) -> str:
-        """Make the missing samples, on a Ray cluster if `ray` is the package; returns "complete" or "stopped"."""
+    def run(self) -> str:
+        """Make the missing samples; returns "complete" or "stopped"."""
         jobs = [photo for photo in self.photos if photo.index in self.missing]
         if ready := len(self.photos) - len(jobs):
             self.reporter.log(f"{self.output}: going on, {ready} of {len(self.photos)} photos are done")
@@ -283,8 +265,9 @@ class _Build:
             for number in range(-(-len(self.photos) // self.size)):
                 self._write_shard(number)
             if jobs:
-                make = self.options.processes, partial(Maker, self.options)
-                with timed("wall", total), at_work(ray, *make, jobs, self.reporter.log, stop) as results:
+                make, options = partial(Maker, self.options), self.options
+                work = at_work(make, jobs, stop, count=options.workers, threads=options.threads)
+                with timed("wall", total), work as results:
                     for done, result in enumerate(results, ready + 1):
                         self._keep(result)
                         self._write_shard(result.index // self.size)
