@@ -1,7 +1,6 @@
-"""Photos that bring their depth along, by the letter of each layout: HEIC as files, and JPEG written in four ways.
+"""Make photos with a depth map inside: HEIC from files, JPEG in Apple's, GDepth's and Dynamic Depth's layouts.
 
-The photo's stored pixels are `picture()`, whatever its orientation. Maps are given as codes [H, W], whole
-numbers in the orientation of those pixels.
+The photo's stored pixels are `picture()` in each EXIF orientation. A map is given as codes [H, W] for these pixels.
 """
 
 from __future__ import annotations
@@ -30,12 +29,12 @@ APPLE = 'xmlns:apdi="http://ns.apple.com/pixeldatainfo/1.0/" xmlns:depthData="ht
 GDEPTH = 'xmlns:GDepth="http://ns.google.com/photos/1.0/depthmap/" xmlns:xmpNote="http://ns.adobe.com/xmp/note/"'
 DYNAMIC = " ".join(
     f'xmlns:{name}="http://ns.google.com/photos/dd/1.0/{name.lower()}/"'
-    for name in ("Device", "Container", "Item", "Camera", "DepthMap", "ImagingModel")
+    for name in ("Device", "Container", "Item", "Camera", "DepthMap")
 )
 
 
 def codes(width: int = WIDTH // 2, height: int = HEIGHT // 2) -> NDArray[np.uint8]:
-    """A bright box before a dark slope, [H, W], alike in no two corners; all of 0 and 255 occur."""
+    """[H, W]: a bright box in front of a dark slope; the corners differ, and 0 and 255 occur."""
     y, x = np.mgrid[:height, :width]
     slope = 20 + 2 * x + 3 * y
     slope[height // 4 : height // 2, width // 3 : width // 2] = 200
@@ -44,7 +43,7 @@ def codes(width: int = WIDTH // 2, height: int = HEIGHT // 2) -> NDArray[np.uint
 
 
 def upright(stored: NDArray[Any], orientation: int) -> NDArray[Any]:
-    """Pixels as the EXIF orientation turns them."""
+    """Stored pixels, turned by an EXIF orientation."""
     image = Image.fromarray(stored)
     image.getexif()[ORIENTATION] = orientation
     return np.asarray(ImageOps.exif_transpose(image))
@@ -67,7 +66,7 @@ def _encoded(values: Codes, kind: str, **options: object) -> bytes:
 
 
 def xmp(body: str, names: str) -> bytes:
-    """An XMP packet of one description; `body` begins with its further attributes and the end of its tag."""
+    """An XMP packet with one description; `body` begins with the rest of the description's tag."""
     rdf = f'<rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"><rdf:Description rdf:about="" {names}'
     whole = f'<x:xmpmeta xmlns:x="adobe:ns:meta/">{rdf}{body}</rdf:Description></rdf:RDF></x:xmpmeta>'
     return f'<?xpacket begin="\ufeff"?>{whole}<?xpacket end="w"?>'.encode()
@@ -85,19 +84,13 @@ def apple_xmp(
     native: str | None = "hdis",
     ends: tuple[object, object] = (0.5, 3.0),
     accuracy: str = "relative",
-    matrix: tuple[object, ...] | None = None,
-    size: tuple[object, object] = (WIDTH, HEIGHT),
     more: str = "",
 ) -> bytes:
-    """What an iPhone writes beside an auxiliary image; `matrix` column by column, for a photo of `size`."""
+    """What an iPhone writes beside an auxiliary image."""
     said: dict[str, object] = {"apdi:IntMinValue": 0, "apdi:IntMaxValue": 255}
     said |= {"apdi:FloatMinValue": ends[0], "apdi:FloatMaxValue": ends[1], "depthData:Accuracy": accuracy}
     if native is not None:
         said["apdi:NativeFormat"] = int.from_bytes(native.encode(), "big")
-    if matrix is not None:
-        entries = "".join(f"<rdf:li>{entry}</rdf:li>" for entry in matrix)
-        said["depthData:IntrinsicMatrix"] = f"<rdf:Seq>{entries}</rdf:Seq>"
-        said["depthData:IntrinsicMatrixReferenceWidth"], said["depthData:IntrinsicMatrixReferenceHeight"] = size
     return xmp(f">{elements(said)}{more}", APPLE)
 
 
@@ -106,7 +99,7 @@ def segment(marker: int, body: bytes) -> bytes:
 
 
 def with_segments(image: bytes, *segments: bytes) -> bytes:
-    """Further segments at the head of a JPEG."""
+    """Insert segments at the head of a JPEG."""
     return image[:2] + b"".join(segments) + image[2:]
 
 
@@ -115,7 +108,7 @@ def xmp_segment(packet: bytes) -> bytes:
 
 
 def extended_segments(packet: bytes, part: int = 1000) -> tuple[str, list[bytes]]:
-    """The digest that the main packet has to name, and the parts."""
+    """The digest that the main packet must name, and the segments of an extended XMP."""
     digest = hashlib.md5(packet, usedforsecurity=False).hexdigest().upper()
     head = b"http://ns.adobe.com/xmp/extension/\0" + digest.encode()
     return digest, [
@@ -125,7 +118,7 @@ def extended_segments(packet: bytes, part: int = 1000) -> tuple[str, list[bytes]
 
 
 def multi_picture(photo: bytes, *others: bytes, order: str = "<", shift: int = 0) -> bytes:
-    """A JPEG with further ones behind it, listed in the Multi-Picture Format; `shift` makes the list lie."""
+    """A JPEG with further JPEGs after it, listed in the Multi-Picture Format with offsets that are wrong by `shift`."""
     count = 1 + len(others)
     place, at = 10, len(photo) + 8 + 50 + 16 * count  # of the byte order mark, and of the second picture
     entries = struct.pack(f"{order}IIIHH", 0x20030000, at, 0, 0, 0)
@@ -139,7 +132,7 @@ def multi_picture(photo: bytes, *others: bytes, order: str = "<", shift: int = 0
 
 
 def apple_jpeg(map_: NDArray[np.uint8], packet: bytes | None = None, orientation: int = 1, order: str = "<") -> bytes:
-    """A portrait with a gain map and a matte before its depth map, as iPhones have them."""
+    """A portrait as iPhones write it: the depth map comes after a gain map and a matte."""
     other = jpeg(np.flipud(map_))
     gain_map = with_segments(other, xmp_segment(xmp("><apdi:StoredFormat>1278226488</apdi:StoredFormat>", APPLE)))
     said = apple_xmp("L008", more="<apdi:AuxiliaryImageType>depth</apdi:AuxiliaryImageType>")
@@ -150,7 +143,7 @@ def apple_jpeg(map_: NDArray[np.uint8], packet: bytes | None = None, orientation
 
 @dataclasses.dataclass(frozen=True)
 class Range:
-    """What Android's layouts say of a map."""
+    """What Android's layouts state about a map."""
 
     near: object = 0.5
     far: object = 8.0
@@ -164,12 +157,10 @@ class Range:
         return {f"{prefix}:{name}": value for name, value in named.items()}
 
 
-def gdepth_jpeg(
-    image: bytes, said: Range = Range(), orientation: int = 1, part: int | None = 1000, text: str | None = None
-) -> bytes:
-    """The map as base64 in the XMP: in its extension in parts of so many bytes, or in the main packet."""
+def gdepth_jpeg(image: bytes, said: Range = Range(), orientation: int = 1, part: int | None = 1000) -> bytes:
+    """The map as base64 in an extended XMP with parts of `part` bytes, or in the main packet if `part` is None."""
     properties = said.properties("GDepth") | {"GDepth:Mime": "image/png"}
-    data = {"GDepth:Data": base64.b64encode(image).decode() if text is None else text}
+    data = {"GDepth:Data": base64.b64encode(image).decode()}
     photo = jpeg(picture(), orientation)
     if part is None:
         return with_segments(photo, xmp_segment(xmp(attributes(properties | data) + ">", GDEPTH)))
@@ -179,26 +170,15 @@ def gdepth_jpeg(
 
 
 def dynamic_jpeg(
-    image: bytes,
-    said: Range = Range(unit="Meters"),
-    orientation: int = 1,
-    padding: int = 0,
-    model: dict[str, object] | None = None,
-    extended: bool = False,
-    length: int | None = None,
-    trailer: bytes = b"",
-    primary: int = 0,
+    image: bytes, said: Range = Range(unit="Meters"), orientation: int = 1, extended: bool = False
 ) -> bytes:
-    """The map behind the photo, after another item, where a directory in the (extended) XMP has it."""
+    """The map behind the photo and another item; a directory in the (extended) XMP lists all three."""
     other, uri = jpeg(codes()[::-1]), "android/depthmap"
     depth = {"DepthMap:ItemSemantic": "Depth", **said.properties("DepthMap"), "DepthMap:DepthURI": uri}
     entries: list[dict[str, object]] = [
-        {"Item:Mime": mime, "Item:Length": size, "Item:DataURI": name, "Item:Padding": gap}
-        for mime, size, name, gap in (
-            ("image/jpeg", primary, "primary_image", padding),
-            ("image/jpeg", len(other), "android/gainmap", 0),
-            ("image/png", len(image) if length is None else length, uri, 0),
-        )
+        {"Item:Mime": "image/jpeg", "Item:Length": 0, "Item:DataURI": "primary_image"},
+        {"Item:Mime": "image/jpeg", "Item:Length": len(other), "Item:DataURI": "android/gainmap"},
+        {"Item:Mime": "image/png", "Item:Length": len(image), "Item:DataURI": uri},
     ]
     resource = 'rdf:parseType="Resource"'
     if extended:  # as Pixels have it
@@ -208,17 +188,14 @@ def dynamic_jpeg(
     else:
         items = "".join(f"<rdf:li><Container:Item{attributes(entry)}/></rdf:li>" for entry in entries)
         of_map = f"<Camera:DepthMap{attributes(depth)}/>"
-    said_of_lens = attributes({f"ImagingModel:{name}": value for name, value in (model or {}).items()})
-    lens = f"<Camera:ImagingModel><rdf:Description{said_of_lens}/></Camera:ImagingModel>" if model else ""
     directory = f"<Container:Directory><rdf:Seq>{items}</rdf:Seq></Container:Directory>"
-    body = f"><Device:Cameras><rdf:Seq><rdf:li>{of_map}{lens}</rdf:li></rdf:Seq></Device:Cameras>"
+    body = f"><Device:Cameras><rdf:Seq><rdf:li>{of_map}</rdf:li></rdf:Seq></Device:Cameras>"
     packet = xmp(f"{body}<Device:Container>{directory}</Device:Container>", DYNAMIC)
     segments = [xmp_segment(packet)]
     if extended:
         digest, parts = extended_segments(packet)
         segments = [xmp_segment(xmp(f' xmpNote:HasExtendedXMP="{digest}">', GDEPTH.split()[1])), *parts]
-    photo = with_segments(jpeg(picture(), orientation), *segments)
-    return photo + b"\0" * padding + other + image + trailer
+    return with_segments(jpeg(picture(), orientation), *segments) + other + image
 
 
 HEVC = b"urn:mpeg:hevc:2015:auxid:2"
@@ -226,7 +203,7 @@ HEVC = b"urn:mpeg:hevc:2015:auxid:2"
 
 @functools.cache
 def heic_files() -> dict[str, bytes]:
-    """By name, what libheif encoded losslessly, and boxes of the letter of the standards were put around."""
+    """HEIC files by name: their pictures were encoded without loss by libheif, their boxes written by the standards."""
     with tarfile.open(Path(__file__).parent / "data" / "heic_portraits.tar.xz") as archive:
         return {entry.name: archive.extractfile(entry).read() for entry in archive}  # type: ignore[union-attr]
 
@@ -240,10 +217,10 @@ def heic(
     information: str = "",
     own_turn: bool = False,
 ) -> bytes:
-    """A photo, an auxiliary image of some kind, and XMP behind them, as far as `heic_files` has them.
+    """One of `heic_files`: a photo with an auxiliary image of type `kind`, followed by an XMP packet.
 
-    The orientation is HEIF's rotation and mirroring of the photo, with `own_turn` of the map too; `information` is
-    HEVC's depth representation information.
+    HEIF properties turn the photo by `orientation`, and with `own_turn` also the map. `information` names the map's
+    range in HEVC's depth representation information.
     """
     shown = "no map" if map_ is None else f"map {zlib.crc32(map_.tobytes()):08x}"
     turned, known = " with its map" if own_turn else "", information or "no range"

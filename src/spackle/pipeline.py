@@ -5,7 +5,6 @@ The command line, the Python API, the web page and the demo use it; ComfyUI uses
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
@@ -270,9 +269,7 @@ def resolved(fill: Fill) -> Fill:
     """The fill that "auto" stands for: "lama" if its weights have been downloaded, else "exemplar"."""
     if fill != "auto":
         return fill
-    with contextlib.suppress(InputError):  # a machine without a home folder
-        return "lama" if installed("lama") else "exemplar"
-    return "exemplar"
+    return "lama" if installed("lama") else "exemplar"
 
 
 def open_texture(fill: Fill) -> Texture | None:

@@ -1,4 +1,4 @@
-"""Read depth maps: metres in NumPy, PNG and PFM, Middlebury's disparities, and grey pictures."""
+"""Read depth maps: metres in NumPy, PNG and PFM files, Middlebury's disparities, and relative depth in any picture."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from torch import Tensor
 from spackle.bases import NEAREST_M
 from spackle.errors import InputError, reading, shown
 from spackle.files import check_file
-from spackle.image import MAX_PIXELS, check_pixels, read_image
+from spackle.image import check_pixels, read_image
 
 Array = NDArray[Any]
 StrPath = str | os.PathLike[str]
 Quantity = Literal["depth", "disparity"]
-# What the numbers of a file are. near-white: inverse depth, near-black: depth, both up to scale and shift.
+# The meaning of a file's numbers. near-white: inverse depth, near-black: depth, both up to scale and shift.
 DepthKind = Literal["auto", "metric", "disparity", "near-white", "near-black"]
 DEPTH_KINDS: tuple[DepthKind, ...] = get_args(DepthKind)
 RELATIVE: tuple[DepthKind, ...] = ("near-white", "near-black")
@@ -33,29 +33,29 @@ RELATIVE: tuple[DepthKind, ...] = ("near-white", "near-black")
 SUFFIXES = (".npy", ".npz", ".png", ".pfm")
 MAX_TEXT_BYTES = 1 << 16  # a calibration is a few lines
 PNG_UNIT_M = 0.001
-LARGEST = 1e9  # largest number in a calibration; its square still fits single precision
+LARGEST = 1e9  # largest number in a calibration: the square of 1e9 still fits float32
 ASPECT_TOLERANCE = 0.01
 CALIBRATED_SIZE_TOLERANCE = 0.02
-MIN_DISTINCT = 16  # fewer values may share a divisor by chance
+MIN_DISTINCT = 16  # fewer distinct values may share a divisor by chance
 FAR_M = 15.0  # where the farthest surface of a relative map is placed
-EXTREMES = (0.01, 0.99)  # quantiles that count as the extremes
-STRETCH = 4.0  # values beyond these quantiles are mapped alike, up to this factor nearer or farther
-FILLED = 0.05  # a PNG whose values come this close to both ends of the 16 bits is a relative map, not millimetres
+EXTREMES = (0.01, 0.99)  # quantiles that count as the nearest and the farthest depth
+STRETCH = 4.0  # depths beyond the extremes are limited to this factor nearer or farther
+FILLED = 0.05  # a 16-bit PNG is a relative map if its values come this close (as a share) to both ends of the range
 GREY = 8  # of 255: the channels of a grey picture differ by less, even after lossy compression
 WHICH = "give --depth-kind near-white (as MiDaS, Depth Anything and ComfyUI write it), near-black or metric"
 
 
 @dataclasses.dataclass(frozen=True)
 class DepthMap:
-    """Depth as stored: neither filled nor cleaned."""
+    """A depth map as it was stored: neither filled nor cleaned."""
 
     depth: Tensor  # [H, W] float32 z in metres; 0 where not valid
     valid: Tensor  # [H, W] bool
-    K: Tensor | None  # [3, 3] intrinsics in pixels of this map, from its calibration
-    quantum: float | None  # step of integer values: metres of depth, or 1/m of inverse depth
-    quantity: Quantity  # what was stored, hence the unit of `quantum`
+    K: Tensor | None  # [3, 3] intrinsics in pixels of this map, from the map's calibration
+    quantum: float | None  # quantisation step: metres for depth, 1/m for disparity
+    quantity: Quantity  # the stored quantity
     path: Path
-    note: str = ""  # for the report: the kind of depth map that was inside a photo
+    note: str = ""  # for the report: the format of a depth map that was inside a photo
 
     @property
     def range_in_words(self) -> str:
@@ -65,16 +65,16 @@ class DepthMap:
 
     def check_shape(self, height: int, width: int, photo: StrPath) -> None:
         """InputError unless a height×width photo has this map's aspect ratio within 1 %."""
-        own_height, own_width = self.depth.shape
-        if abs(own_width * height / (own_height * width) - 1) > ASPECT_TOLERANCE:
+        rows, columns = self.depth.shape
+        if abs(columns * height / (rows * width) - 1) > ASPECT_TOLERANCE:
             raise InputError(
-                f"depth map {self.path} is {own_width}×{own_height} but photo {photo} is {width}×{height}: "
+                f"depth map {self.path} is {columns}×{rows} but photo {photo} is {width}×{height}: "
                 "give a depth map with the photo's size or aspect ratio"
             )
 
     def with_focal(self, focal_px: float) -> DepthMap:
-        """The map with another focal length, in pixels of the map; depths that come from disparity are scaled along."""
-        if self.K is None or self.quantity == "depth" or self.note:  # these metres do not depend on the lens
+        """The map with another focal length, in pixels of the map; depths computed from disparity are scaled too."""
+        if self.K is None or self.quantity == "depth":  # measured metres do not depend on the focal length
             return dataclasses.replace(self, K=None)
         # depth = baseline · focal / disparity
         K, ratio = self.K.clone(), focal_px / float(self.K[0, 0])
@@ -84,10 +84,13 @@ class DepthMap:
 
 
 def find_depth(depth: Path, photo: Path) -> Path:
-    """A photo's depth map: the file `depth`, or a file with the photo's name in the folder `depth`; else InputError."""
+    """The depth map of a photo: the file `depth`, or the file with the photo's name in the folder `depth`.
+
+    InputError if the folder has no such file.
+    """
     if not os.path.isdir(depth):
         return depth
-    for name in (photo.name, photo.stem):  # a.jpg.npy before a.npy, which may belong to a.png
+    for name in (photo.name, photo.stem):  # a.jpg.npy before a.npy, because a.npy may belong to a.png
         for suffix in SUFFIXES:
             candidate = depth / f"{name}{suffix}"
             if os.path.isfile(candidate) and candidate.resolve() != photo.resolve():
@@ -107,22 +110,22 @@ def load_depth(
 ) -> DepthMap:
     """Read a depth map, a disparity map with its calibration, or a relative map.
 
-    Depth: `.npy`, `.npz` (one array, or the key `depth`) and `.pfm` in metres, with 0, NaN and inf for
-    unknown; 16-bit `.png` in millimetres, with 0 and 65535 for unknown. The content decides the format.
+    Depth is stored in metres in `.npy`, `.npz` (one array, or the key `depth`) and `.pfm`: 0, NaN and inf mean unknown.
+    A 16-bit `.png` stores millimetres: 0 and 65535 mean unknown. The content decides the format.
 
-    Disparity d becomes depth = baseline · focal / (d + doffs), with inf (in a PNG also 0) for unknown. A file holds
+    Disparity d becomes depth = baseline · focal / (d + doffs); inf (in a PNG also 0) means unknown. A file holds
     disparity if `calib` is given, if a `scene.json` in the same folder names the file as its `disparity`, or if the
-    file's name starts with "disp" and a Middlebury `calib.txt` lies beside it.
+    file's name starts with "disp" and the same folder has a Middlebury `calib.txt`.
 
-    Relative: the same formats, and any grey picture; see `relative_depth`.
+    A relative map has one of these formats, or is any grey picture; see `relative_depth`.
 
     Args:
         path: the file.
         focal_px: replaces the calibration's focal length, in pixels of the map.
         calib: a Middlebury `calib.txt` or a `scene.json`.
-        kind: what the numbers are; auto means disparity under the conditions above, else metric, never relative.
-        near: metres at which a relative map begins.
-        far: metres at which a relative map ends.
+        kind: meaning of the numbers; auto means disparity under the conditions above, else metric, never relative.
+        near: nearest depth of a relative map, in metres.
+        far: farthest depth of a relative map, in metres.
 
     Raises:
         InputError: the map is missing, broken, too large, misshapen, negative or entirely unknown, or it looks
@@ -134,11 +137,9 @@ def load_depth(
         return relative_depth(stored, kind, path, near, far)
     lens = None if kind == "metric" else _find_calibration(Path(path), calib)
     if kind == "disparity" and lens is None:
-        raise InputError(f"{path}: no calibration lies beside it: give --calib FILE, or --depth-kind near-white")
-    if focal_px is not None:
-        if not (math.isfinite(focal_px) and focal_px > 0):
-            raise InputError(f"--focal-px must be a positive number, got {focal_px}")
-        lens = lens and dataclasses.replace(lens, focal_px=focal_px)
+        raise InputError(f"{path}: its folder has no calibration: give --calib FILE, or --depth-kind near-white")
+    if lens and focal_px is not None:
+        lens = dataclasses.replace(lens, focal_px=focal_px)
     stored, is_png = read_array(path)
     if kind == "auto" and lens is None and is_png:
         _check_metric(stored, path)
@@ -146,7 +147,7 @@ def load_depth(
 
 
 def depth_of_array(stored: Array, path: Path, kind: DepthKind = "auto") -> DepthMap:
-    """A depth map from an array [H, W] of metres (0, NaN, inf: unknown) or relative values; `path` is for messages."""
+    """A depth map from an array [H, W] of metres (0, NaN, inf: unknown) or relative values; messages name `path`."""
     if stored.ndim != 2 or not stored.size or stored.dtype.kind not in "fiu":
         raise InputError(f"{path}: an array of {stored.dtype} {shown(stored.shape)}: give [height, width] in metres")
     return relative_depth(stored, kind, path) if kind in RELATIVE else _depth_map(stored, False, None, path)
@@ -179,16 +180,15 @@ def relative_depth(
 ) -> DepthMap:
     """Convert inverse depth (near-white) or depth (near-black) [H, W], known up to scale and shift, to metres.
 
-    The 1 % and 99 % quantiles are mapped to `near` and `far`; NaN and inf are unknown. `step` is the quantisation step
-    of numbers that were stored as integers. InputError, naming `path`, if nearly all depths are equal, or unless
-    0 < `near` < `far`.
+    The 1 % and 99 % quantiles become `near` and `far`; NaN and inf mean unknown. `step` is the quantisation step of
+    `stored`. InputError (naming `path`) if nearly all depths are equal, or unless 0 < `near` < `far`.
     """
     if not 0 < near < far < LARGEST:
         raise InputError(f"--near {near:g}, --far {far:g}: give two distances in metres, the nearer one first")
     values, known = stored.astype(np.float64), np.isfinite(stored)
     low, high = np.quantile(values[known], EXTREMES) if known.any() else (0.0, 0.0)
     if not high > low:
-        raise InputError(f"{path}: shows the same depth nearly everywhere: give another depth map")
+        raise InputError(f"{path}: the depth is the same nearly everywhere: give another depth map")
     share = (np.where(known, values, low) - low) / (high - low)
     if kind == "near-white":
         unit = (1 / near - 1 / far) / (high - low)
@@ -204,14 +204,14 @@ def relative_depth(
 
 
 def _check_metric(stored: Array, path: StrPath) -> None:
-    """InputError if a PNG's values fill the range of 16 bits, as those of a relative map do and millimetres do not."""
+    """InputError if a PNG's values fill the range of 16 bits, as relative depth does and millimetres do not."""
     known = stored[(stored > 0) & (stored < 65535)]
     if known.size and known.min() < FILLED * 65535 and known.max() > (1 - FILLED) * 65535:
-        raise InputError(f"{path}: its values fill the range of 16 bits, as those of a relative map do: {WHICH}")
+        raise InputError(f"{path}: its values fill the range of 16 bits, as relative depth does: {WHICH}")
 
 
 def is_depth(metres: Tensor) -> Tensor:
-    """Mask of valid depths: positive, with a finite inverse, which many values of a byte-swapped file lack."""
+    """Mask of valid depths: positive and finite, with a finite inverse."""
     return torch.isfinite(metres) & (metres > 0) & torch.isfinite(1 / metres)
 
 
@@ -235,13 +235,9 @@ class Calibration:
 
     def check(self, path: StrPath) -> Calibration:
         """Return this calibration; InputError, naming the file, if its numbers are impossible."""
-        for name in ("focal_px", "baseline_m", "scale"):
-            if not 1 / LARGEST <= getattr(self, name) <= LARGEST:
-                raise InputError(f"{path}: {name} must be a positive number below {LARGEST:g}")
-        if not all(abs(number) <= LARGEST for number in (self.cx, self.cy, self.doffs_px)):
-            raise InputError(f"{path}: cx, cy and doffs must be finite numbers below {LARGEST:g}")
-        if self.size is not None and not all(1 <= side <= MAX_PIXELS for side in self.size):
-            raise InputError(f"{path}: width and height must be numbers of pixels")
+        positive, others = (self.focal_px, self.baseline_m, self.scale), (self.cx, self.cy, self.doffs_px)
+        if not all(1 / LARGEST <= n <= LARGEST for n in positive) or not all(abs(n) <= LARGEST for n in others):
+            raise InputError(f"{path}: a number is not positive, or is above {LARGEST:g}")
         return self
 
 
@@ -251,7 +247,7 @@ def calibrations_beside(path: Path) -> tuple[Path, Path]:
 
 
 def read_calibration(path: StrPath) -> Calibration:
-    """A pair's calibration from a `scene.json` or Middlebury's `calib.txt`; InputError for a file that is neither."""
+    """A stereo pair's calibration from a `scene.json` or Middlebury's `calib.txt`; InputError for another file."""
     lens = _read_scene(path, None) if Path(path).suffix.lower() == ".json" else None
     return lens or _read_calib(path)
 
@@ -265,14 +261,12 @@ def _find_calibration(path: Path, calib: StrPath | None) -> Calibration | None:
     if stem.startswith("disp") and text.is_file():
         return _read_calib(text)
     if stem.startswith("disp") or stem.endswith(("disp", "disparity")):
-        raise InputError(
-            f"{path}: its name says that it is a disparity map: give its calibration with --calib, or rename it"
-        )
+        raise InputError(f"{path}: by its name a disparity map: give its calibration with --calib, or rename the file")
     return None
 
 
 def _read_calib(path: StrPath) -> Calibration:
-    """Middlebury's text: cam0=[f 0 cx; 0 f cy; 0 0 1], doffs in pixels, baseline in millimetres."""
+    """Read Middlebury's text: cam0=[f 0 cx; 0 f cy; 0 0 1], doffs in pixels, baseline in millimetres."""
     pairs = (line.partition("=") for line in read_text(path).splitlines())
     entries = {name.strip(): value.strip() for name, _, value in pairs}
     number = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
@@ -304,24 +298,23 @@ def read_text(path: StrPath, kind: str = "calibration", at_most: int = MAX_TEXT_
 
 
 def _as_depth(stored: Array, is_png: bool, path: StrPath) -> tuple[Array, Array, float]:
-    """Depth in metres, validity and the unit of the stored values in metres."""
+    """Depth in metres, its validity, and the unit of stored values in metres."""
     if is_png:
         if stored.dtype == np.uint8:
-            raise InputError(
-                f"{path}: an 8-bit PNG holds no metres: give 16 bits, or --depth-kind near-white or near-black"
-            )
+            advice = "give 16 bits, or --depth-kind near-white or near-black"
+            raise InputError(f"{path}: an 8-bit PNG holds no metres: {advice}")
         return stored * PNG_UNIT_M, stored != 65535, PNG_UNIT_M
     if stored.dtype.kind in "iu" and np.median(stored) > 500:
-        raise InputError(f"{path}: whole numbers around {np.median(stored):.0f} are hardly metres: divide by 1000")
+        raise InputError(f"{path}: integers around {np.median(stored):.0f} are hardly metres: divide them by 1000")
     return stored, np.isfinite(stored), 1.0
 
 
 def _as_disparity(stored: Array, is_png: bool, lens: Calibration, path: StrPath) -> tuple[Array, Array, float]:
-    """Depth in metres, validity and the unit of the stored values in 1/m."""
+    """Depth in metres, its validity, and the unit of stored values in 1/m."""
     height, width = stored.shape
     if lens.size and max(abs(lens.size[0] / width - 1), abs(lens.size[1] / height - 1)) > CALIBRATED_SIZE_TOLERANCE:
         calibrated = f"{lens.size[0]}×{lens.size[1]}"
-        raise InputError(f"{path}: {width}×{height} pixels, but its calibration is for {calibrated}: scale them alike")
+        raise InputError(f"{path}: {width}×{height} pixels, but the calibration is for {calibrated}: scale both alike")
     valid = np.isfinite(stored) & (stored != lens.invalid)
     if is_png:
         valid &= stored > 0
@@ -331,7 +324,7 @@ def _as_disparity(stored: Array, is_png: bool, lens: Calibration, path: StrPath)
 
 
 def grid_step(values: Array) -> float | None:
-    """The step of the integer grid that all values lie on; None if a value is not an integer."""
+    """The step of the integer grid on which all values lie; None if a value is not an integer."""
     if values.max() > 1 << 53 or not np.array_equal(values, np.round(values)):
         return None
     distinct = np.unique(values.astype(np.int64))
@@ -379,7 +372,7 @@ def _png_values(image: Image.Image, path: StrPath, grey: bool) -> Array:
 
 
 def _read_npy(file: IO[bytes], path: StrPath) -> Array:
-    """Read one array, but no more bytes than the file holds, whatever its header claims; nothing is unpickled."""
+    """Read one array without unpickling; the header's size must match the bytes that the file holds."""
     old = np.lib.format.read_magic(file) == (1, 0)
     read_header = np.lib.format.read_array_header_1_0 if old else np.lib.format.read_array_header_2_0
     shape, fortran, dtype = read_header(file)
@@ -400,7 +393,7 @@ def _read_npz(file: IO[bytes], path: StrPath) -> Array:
 
 
 def _read_pfm(file: IO[bytes], path: StrPath) -> Array:
-    """PFM stores rows from the bottom up; the sign of its scale gives the byte order, the magnitude is ignored."""
+    """Read a PFM file, which stores rows from the bottom up; the sign of its scale gives the byte order."""
     kind, size, scale = (file.readline(64).split() for _ in range(3))
     if kind == [b"PF"]:
         raise InputError(f"{path}: a PFM with three channels is not a depth map: give one channel (Pf)")

@@ -1,8 +1,6 @@
 """Open a base by its settings, and turn photos into Gaussians with it.
 
-`auto` tries the depth in the photo's file, then the networks whose weights are here: SHARP, MoGe, Depth Anything, lite.
-It falls back to the next candidate when one fails, and logs why. The focal length comes from the user, else from
-the depth map's calibration, else from the photo's file, else from a network that estimates it, else by default.
+`auto` tries the depth in the photo's file, then SHARP, MoGe and lite, as far as their weights are on this machine.
 """
 
 from __future__ import annotations
@@ -25,7 +23,7 @@ from spackle.bases.settings import AUTO, HF, NETWORKS, RGBD, ROUGH, BaseSettings
 from spackle.bases.sharp.base import SharpBase
 from spackle.device import MemoryShort
 from spackle.errors import InputError
-from spackle.files import fingerprint
+from spackle.files import check_file
 from spackle.image import Photo
 from spackle.weights import check_undamaged
 
@@ -36,11 +34,10 @@ ORDER = {  # candidates of `auto`: the name in reports and the log, and the reas
     RGBD: ("the depth in the photo", "no depth in the photo"),
     "sharp": ("SHARP", "no SHARP weights here"),
     "moge": ("MoGe", "no MoGe weights here"),
-    "depth": ("Depth Anything", ""),  # of an earlier download, which few have
     "lite": ("lite", ""),
 }
 NO_DEPTH = (
-    "--base rgbd needs depth, and there is none in the photo: give --depth FILE, or --depth FOLDER for many photos"
+    "--base rgbd needs depth, and the photo has none inside: give --depth FILE, or --depth FOLDER for many photos"
 )
 
 
@@ -54,18 +51,15 @@ def open_base(settings: BaseSettings) -> OpenedBase:
     InputError for an option that the base cannot use, or a missing file.
     """
     settings.check()
+    for file in settings.files.values():
+        check_file(file, "file of weights")
     why = f"--base {settings.named}" if settings.name != AUTO else "--depth" if settings.depth is not None else "-c"
-    candidates = ORDER if settings.named == AUTO else {settings.named: (why, "")}
-    return OpenedBase(candidates, settings, _fingerprints(settings), {})
+    return OpenedBase(ORDER if settings.named == AUTO else {settings.named: (why, "")}, settings, {})
 
 
 def open_loaded(base: Base) -> OpenedBase:
     """Wrap a base that the calling program has loaded."""
-    return OpenedBase({base.name: ("loaded", "")}, BaseSettings(), {}, {base.name: base})
-
-
-def _fingerprints(settings: BaseSettings) -> dict[str, str]:
-    return {name: fingerprint(file, "file of weights") for name, file in settings.files.items()}
+    return OpenedBase({base.name: ("loaded", "")}, BaseSettings(), {base.name: base})
 
 
 def _load_network(name: str, settings: BaseSettings) -> Base | None:
@@ -80,16 +74,14 @@ def _load_network(name: str, settings: BaseSettings) -> Base | None:
     check_undamaged(file)
     if name == "moge":
         return MogeBase.load(file, device=device, precision=precision)
-    if name == "depth":
-        return HfBase.load(str(file.parent), device=device, precision=precision, name=name)
     windows, compiled = settings.windows, settings.compiled
     return SharpBase.load(file, precision=precision, windows=windows, compiled=compiled, device=device)
 
 
 def _lift(settings: BaseSettings, photo: Photo, depth: Depth) -> Base | None:
-    """The base that lifts a photo by its depth: from this call, the settings, or the photo's file; None without depth.
+    """The base that lifts a photo by its depth: `depth`, else the settings' map, else the map in the photo's file.
 
-    The user's focal length replaces the map's.
+    None if there is no depth. A focal length that the user gives replaces the map's.
     """
     source = settings.depth if depth is None else depth
     if source is None and photo.path.is_file():  # a photo that a program made has no file
@@ -105,11 +97,9 @@ def _lift(settings: BaseSettings, photo: Photo, depth: Depth) -> Base | None:
         file = find_depth(source, photo.path)
         read = functools.partial(load_depth, file, calib=settings.calib, kind=settings.depth_kind, **ends)
         found = read()
-    width, height = photo.framed_size
-    found.check_shape(height, width, photo.path)
     if found.K is None or not photo.focal_source.startswith("--"):  # "--…": the user gave it
-        return RgbdBase(found, "the photo's depth" if found.note else "calibration")
-    focal = photo.focal_px * (found.depth.shape[1] / width)
+        return RgbdBase(found)
+    focal = photo.focal_px * (found.depth.shape[1] / photo.framed_size[0])
     return RgbdBase(read(focal_px=focal) if read else found.with_focal(focal), "")
 
 
@@ -119,8 +109,7 @@ class ResolvedBase:
 
     base: str
     why: str
-    failures: tuple[str, ...] = ()  # of candidates tried before: each one's name and error
-    lasting: bool = True  # False: memory was short, so the same files may get another base next time
+    failures: tuple[str, ...] = ()  # name and error of each candidate that failed before
     note: str = ""  # for the user, if `auto` chose this base for the first time
 
 
@@ -133,16 +122,11 @@ class OpenedBase:
     """Turns photos into Gaussians. The first photo that needs a network loads it for all others."""
 
     def __init__(
-        self,
-        candidates: Mapping[str, tuple[str, str]],
-        settings: BaseSettings,
-        fingerprints: Mapping[str, str],
-        loaded: dict[str, Base | None],
+        self, candidates: Mapping[str, tuple[str, str]], settings: BaseSettings, loaded: dict[str, Base | None]
     ) -> None:
         """`candidates` are tried in their order (see `ORDER`); `loaded` maps names to networks already loaded."""
-        self.candidates, self.fingerprints = candidates, fingerprints
-        self._settings, self._loaded = settings, loaded
-        self._failed: dict[str, tuple[str, bool]] = {}  # for all photos: the reason, and whether memory was short
+        self.candidates, self._settings, self._loaded = candidates, settings, loaded
+        self._failed: dict[str, str] = {}  # candidates that no photo can use, with the reason
         self._notes: set[str] = set()  # given for earlier photos
 
     def predict(
@@ -152,7 +136,7 @@ class OpenedBase:
 
         Args:
             photo: at its full size.
-            depth: this photo's depth, used instead of the settings'; for rgbd only.
+            depth: this photo's depth, used instead of the settings' depth; for rgbd only.
             log: gets a line for each candidate that fails.
             stage: times the stages "prepare", in which a base is loaded, and "base", in which it predicts.
 
@@ -160,66 +144,53 @@ class OpenedBase:
             InputError: this photo or its depth cannot be used.
             BaseError: the base cannot be used for any photo.
         """
-        reasons, failures, lasting = list[str](), list[str](), True
-        with contextlib.ExitStack() as stages:
-            stages.enter_context(stage("prepare"))
-            for name, (title, absence) in self.candidates.items():
-                base: Base | None = None
-                try:
-                    if name not in self._failed:
+        reasons, failures = list[str](), list[str]()
+        for name, (title, absence) in self.candidates.items():
+            base: Base | None = None
+            try:
+                if name not in self._failed:
+                    with stage("prepare"):
                         base = self.load(photo, depth, name)
-                    if base is None:
-                        reason, short = self._failed.get(name, (absence, False))
-                        reasons += [reason] if reason else []
-                        lasting &= not short
-                        continue
-                    stages.close()
-                    prediction = base.predict(photo, stages.enter_context(stage("base")))
-                    if not prediction.gaussians.finite:
-                        problem = "the base's Gaussians leave the range of float32: check depth and focal length"
-                        raise InputError(f"{photo.path}: {problem}")
-                    break
-                except InputError as error:
-                    short, shared = isinstance(error, MemoryShort), name != RGBD or name in self._loaded
-                    for_good = shared and (base is None or short)  # another photo does not help
-                    if for_good and len(self.candidates) == 1:
-                        raise BaseError(str(error)) from error
-                    if name == list(self.candidates)[-1] or isinstance(error, BaseError):
-                        raise
-                    reasons.append(f"{title} cannot be used")
-                    failures.append(f"{title}: {error}")
-                    lasting &= not short
-                    log(f"{photo.path.name}: going on without {title}: {error}")
-                    if for_good:
-                        self._failed[name] = reasons[-1], short
-                        self._loaded.pop(name, None)  # frees its memory
+                if base is None:
+                    reasons.append(self._failed.get(name, absence))
+                    continue
+                with stage("base") as progress:
+                    prediction = base.predict(photo, progress)
+                if not prediction.gaussians.finite:
+                    problem = "the base's Gaussians leave the range of float32: check depth and focal length"
+                    raise InputError(f"{photo.path}: {problem}")
+                break
+            except InputError as error:
+                shared = name != RGBD or name in self._loaded
+                for_good = shared and (base is None or isinstance(error, MemoryShort))  # another photo does not help
+                if for_good and len(self.candidates) == 1:
+                    raise BaseError(str(error)) from error
+                if name == list(self.candidates)[-1]:
+                    raise
+                reasons.append(f"{title} cannot be used")
+                failures.append(f"{title}: {error}")
+                log(f"{photo.path.name}: going on without {title}: {error}")
+                if for_good:
+                    self._failed[name] = reasons[-1]
+                    self._loaded.pop(name, None)  # frees its memory
         why = ", ".join(reasons) or title
         note = f"base {name} ({why})" + (f": {ROUGH}" if name == "lite" else "")
         new = len(self.candidates) > 1 and note not in self._notes
         self._notes.add(note)
-        return prediction, ResolvedBase(name, why, tuple(failures), lasting, note if new else "")
+        return prediction, ResolvedBase(name, why, tuple(failures), note if new else "")
 
     def load(self, photo: Photo, depth: Depth = None, name: str | None = None) -> Base | None:
         """Load the candidate `name`, or the first one; None if the photo has no depth, or the machine no weights.
 
-        InputError if it cannot be loaded; this is a BaseError if it is the only candidate or its files have changed.
+        InputError if it cannot be loaded.
         """
         name = name or next(iter(self.candidates))
         if name == RGBD and name not in self._loaded:
             return _lift(self._settings, photo, depth)
         if name not in self._loaded:
-            try:
-                self._loaded[name] = _load_network(name, self._settings)
-            except InputError as error:
-                if len(self.candidates) > 1:
-                    raise
-                raise BaseError(str(error)) from error
-            if _fingerprints(self._settings) != self.fingerprints:
-                files = ", ".join(map(str, self._settings.files.values()))
-                raise BaseError(f"{files}: changed while this was running: start again")
+            self._loaded[name] = _load_network(name, self._settings)
         return self._loaded[name]
 
     def only(self, choice: ResolvedBase) -> OpenedBase:
         """The chosen base for all further photos, such as the frames of a clip, without a fallback."""
-        chosen = {choice.base: self.candidates[choice.base]}
-        return OpenedBase(chosen, self._settings, self.fingerprints, self._loaded)
+        return OpenedBase({choice.base: self.candidates[choice.base]}, self._settings, self._loaded)

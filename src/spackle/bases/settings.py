@@ -1,4 +1,4 @@
-"""The bases that `--base` can name, and the user's options for them."""
+"""The bases that `--base` can name, and the options for each base."""
 
 from __future__ import annotations
 
@@ -13,26 +13,25 @@ from spackle.bases.depth_map import DEPTH_KINDS, RELATIVE, DepthKind, DepthMap
 from spackle.bases.sharp.base import check_windows
 from spackle.device import PRECISIONS, Precision
 from spackle.errors import InputError, check_name
-from spackle.weights import PUBLISHED, published_as, weights_folder
+from spackle.weights import PUBLISHED, weights_folder
 
 AUTO, RGBD = "auto", "rgbd"
-HF = "hf:"  # a folder, or owner/name of the hub, follows
-AUTO_NETWORKS = ("sharp", "moge", "depth", "lite")  # in the order that `auto` tries them
+HF = "hf:"  # before a folder, or a Hugging Face model's owner/name
+AUTO_NETWORKS = ("sharp", "moge", "lite")  # in the order that `auto` tries them
 NETWORKS = (*AUTO_NETWORKS, "hf:NAME_OR_FOLDER")
 READING = ("--depth-kind", "--near", "--far")  # how to read a depth map
 NOT_SHARP = "lifted; not SHARP, so not the paper's base"
-KINDS = {  # the description below tables, and the options that only some bases take
+KINDS = {  # each base's description below tables, and the options that only some bases take
     RGBD: (f"the dataset's own depth, map or points, {NOT_SHARP}", ("--depth", "--calib", *READING)),
-    "sharp": ("Apple's network, from the photo alone", ("-c", "--precision", "--sharp")),
+    "sharp": ("SHARP's network, from the photo alone", ("-c", "--precision", "--sharp")),
     "moge": (f"MoGe-2, from the photo alone, {NOT_SHARP}", ("-c", "--precision")),
-    "depth": (f"Depth-Anything-V2-Small of an earlier download, from the photo alone, {NOT_SHARP}", ("--precision",)),
     "lite": (f"Spackle's own small depth networks, from the photo alone, {NOT_SHARP}", ("-c",)),
     "hf": (f"a depth model of transformers, from the photo alone, {NOT_SHARP}", ("--precision",)),
     AUTO: ("", ("--calib", *READING, "--precision", "--sharp")),  # for the base that it chooses
 }
 HF_FILES: tuple[str, ...] = ("config.json", "preprocessor_config.json", "processor_config.json")
 HF_FILES += ("model.safetensors", "model-*.safetensors", "model.safetensors.index.json")
-Depth = Path | DepthMap | None  # of a photo; a path may be a folder of depth maps named like the photos
+Depth = Path | DepthMap | None  # a photo's depth; a path may be a folder of depth maps named like the photos
 
 
 def _download(name: str) -> str:
@@ -40,39 +39,33 @@ def _download(name: str) -> str:
 
 
 ROUGH = f"rough geometry; give --depth FILE for better geometry, or run {_download('depth')}, or {_download('sharp')}"
-DEPTH_ANYTHING = "depth-anything-v2-small/model.safetensors"  # where an earlier `weights get depth` put it
 MISSING = {  # what to do if a base's weights are missing
     "sharp": f"no weights of SHARP on this machine: {_download('sharp')} downloads them, -c FILE takes a local copy",
     "moge": f"no weights of MoGe on this machine: {_download('depth')} downloads them, -c FILE takes a local copy",
-    "depth": "no Depth Anything of an earlier download on this machine: give --base moge, whose weights "
-    "`spackle weights get depth` downloads, or --base hf:depth-anything/Depth-Anything-V2-Small-hf",
 }
 
 
 def _weights_here(name: str) -> Path | None:
-    """The file with a base's weights on this machine; None if it is not there."""
-    places = {"sharp": PUBLISHED["sharp"].file, "moge": PUBLISHED["depth"].file, "depth": DEPTH_ANYTHING}
-    try:
-        file = weights_folder() / places[name] if name in places else lite.SHIPPED if name == "lite" else None
-    except InputError:  # the machine has no folder for downloads
-        return None
-    return file if file is not None and file.is_file() else None
+    """The file with a base's weights on this machine; None if it is missing."""
+    folder = weights_folder()
+    places = {"sharp": folder / PUBLISHED["sharp"].file, "moge": folder / PUBLISHED["depth"].file, "lite": lite.SHIPPED}
+    return places[name] if name in places and places[name].is_file() else None
 
 
 @dataclasses.dataclass(frozen=True)
 class BaseSettings:
-    """A base's name, and the user's options for it."""
+    """A base's name and options."""
 
-    name: str = AUTO  # or one of `KINDS`, or `hf:…`
+    name: str = AUTO  # or another name in `KINDS`, or `hf:…`
     depth: Depth = None
     calib: Path | None = None  # calibration of a disparity map
     depth_kind: DepthKind = "auto"  # what the numbers of a depth map are
-    near: float | None = None  # metres at which a relative depth map begins; None: `load_depth`'s default
-    far: float | None = None  # and metres at which it ends
+    near: float | None = None  # nearest depth of a relative map in metres; None: `load_depth`'s default
+    far: float | None = None  # farthest depth of a relative map in metres
     checkpoint: Path | None = None  # weights of SHARP, MoGe or lite
     precision: Precision = "auto"  # of the network
-    windows: int | None = None  # how many SHARP computes at once; 1 takes the least memory
-    compiled: bool = False
+    windows: int | None = None  # number of windows that SHARP computes at once; 1 takes the least memory
+    compiled: bool = False  # run SHARP by torch.compile
     device: str = "auto"
 
     @property
@@ -89,28 +82,23 @@ class BaseSettings:
 
     @property
     def folder(self) -> Path | None:
-        """The folder that `hf:…` names; None for a model of the hub and for other bases."""
+        """The folder that `hf:…` names; None for a model on the hub and for other bases."""
         folder = os.path.expanduser(self.name.removeprefix(HF))
         return Path(folder) if self.name.startswith(HF) and os.path.isdir(folder) else None
 
     @property
     def public_name(self) -> str:
-        """The base's name in published results; of a folder, only the last part."""
+        """The base's name in published results; only the last part of a folder's path."""
         return self.named if self.folder is None else HF + self.folder.resolve().name
 
     @property
     def description(self) -> str:
-        """The base's description below tables; it calls weights Apple's only if they were downloaded from Apple."""
-        file = self.files.get("sharp")
-        if file is None or published_as(file) is PUBLISHED["sharp"]:
-            return KINDS[self.named.partition(":")[0]][0]
-        return (
-            f"SHARP's architecture, from the photo alone, with the weights of {file.name}, which Apple did not publish"
-        )
+        """The base's description below tables."""
+        return KINDS[self.named.partition(":")[0]][0]
 
     @property
     def files(self) -> dict[str, Path]:
-        """The files that the predictions depend on: weights by the base's name, or a folder's files by their names."""
+        """The files that predictions depend on: weights by the base's name, or a folder's files by their own names."""
         if self.folder is not None:
             return {file.name: file for p in HF_FILES for file in sorted(self.folder.glob(p)) if file.is_file()}
         names = AUTO_NETWORKS if self.named == AUTO else (self.named,)
@@ -118,12 +106,12 @@ class BaseSettings:
         return {name: file for name, file in found.items() if file is not None}
 
     def check(self, *, one: bool = False) -> None:
-        """InputError for an unknown base, for an option that it cannot use, and, with `one`, for the base `auto`."""
+        """InputError for an unknown base or an option that the base cannot use; with `one` also for the base `auto`."""
         if one and self.name == AUTO:
             known = ", ".join((RGBD, *NETWORKS))
-            raise InputError(f"--base {AUTO}: results must name their base: choose one of {known}")
+            raise InputError(f"--base {AUTO} is not allowed here, because the results name their base: give {known}")
         if self.name == HF:
-            raise InputError(f"--base {HF} names no model: give owner/name of the hub, or a folder")
+            raise InputError(f"--base {HF} names no model: give a Hugging Face model as owner/name, or a folder")
         if not self.name.startswith(HF):
             check_name("--base", self.name, (AUTO, RGBD, *NETWORKS))
         check_name("--precision", self.precision, PRECISIONS)
@@ -140,13 +128,13 @@ class BaseSettings:
         kind = self.named.partition(":")[0]
         for option, value in options.items():
             if value is not None and option not in KINDS[kind][1]:
-                raise InputError(f"{option} {value}: the {kind} base has no use for it: leave the option out")
+                raise InputError(f"{option} {value}: the {kind} base does not take this option: leave it out")
         check_windows("--sharp windows", self.windows)
         check_name("--depth-kind", self.depth_kind, DEPTH_KINDS)
         for option in ("--calib", *READING):
             if (value := options[option]) is not None and self.depth is None:
-                raise InputError(f"{option} {value}: says how to read a depth map: give the map with --depth")
+                raise InputError(f"{option} {value}: there is no depth map to read: give the map with --depth")
             if value is not None and option in ("--near", "--far") and self.depth_kind not in RELATIVE:
-                raise InputError(f"{option} {value}: is for a relative map: add --depth-kind {' or '.join(RELATIVE)}")
+                raise InputError(f"{option} {value}: only for relative maps: add --depth-kind {' or '.join(RELATIVE)}")
         if self.named in MISSING and not self.files:
             raise InputError(f"--base {self.named}: {MISSING[self.named]}")

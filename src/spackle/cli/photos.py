@@ -76,7 +76,7 @@ def predict_all(given: Sequence[Path], output: Path, options: PredictOptions, re
     pipeline = options.open()
     if single:
         check_file(named[0].path, "photo")
-    shared = _shared_digest(options, pipeline)
+    shared = _shared_digest(options)
     with results_folder(output, alone=not single), compiled_ahead(pipeline.renderer, reporter.log):
         predictor = Predictor(output, options, shared, single, pipeline, reporter.verbose)
         left = predictor.left(named, reporter)
@@ -241,19 +241,20 @@ class Predictor:
         return True
 
 
-def _shared_digest(options: PredictOptions, pipeline: Pipeline) -> str:
+def _shared_digest(options: PredictOptions) -> str:
     """A digest of everything that all photos share: version, options, contents of their files; InputError for a missing
     file.
     """
     base, path, fill = options.scene.base, options.scene.path, options.scene.fill
     name = base.named if base.folder is None else "hf"  # the digests of its files identify it, wherever they lie
+    files = {**_shared_files(options.scene), **base.files}
     # Windows and compilation change only the last bits of results.
     base = dataclasses.replace(base, name=name, depth=None, calib=None, checkpoint=None, windows=None, compiled=False)
     path = dataclasses.replace(path, cameras=None, path=None)
     choices: list[object] = [dataclasses.asdict(base), dataclasses.asdict(path), fill.weights, fill.texture, fill.mode]
     choices += [options.lens, options.render, options.keep_base, options.depth_out, options.keep_frame]
-    prints = {kind: fingerprint(file, kind) for kind, file in _shared_files(options.scene).items()}
-    return digest_of([spackle.__version__, choices, pipeline.base.fingerprints, prints])
+    prints = {kind: fingerprint(file, kind) for kind, file in files.items()}
+    return digest_of([spackle.__version__, choices, prints])
 
 
 def _shared_files(options: Options) -> dict[str, Path]:

@@ -11,7 +11,7 @@ import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from spackle.errors import InputError, check_name, reading
+from spackle.errors import InputError, check_name
 from spackle.files import check_file, sha256_of
 
 HUB = "https://huggingface.co"  # HF_ENDPOINT names a mirror of it
@@ -49,17 +49,11 @@ def published_weights(name: str) -> PublishedWeights:
 
 
 def weights_folder() -> Path:
-    """The folder for downloaded weights: $SPACKLE_WEIGHTS, else spackle/weights in $XDG_CACHE_HOME or ~/.cache.
-
-    InputError if neither variable is set and the user has no home folder.
-    """
-    with reading(
-        "downloaded weights", "there is no home folder for them: name a folder in SPACKLE_WEIGHTS", RuntimeError
-    ):
-        if chosen := os.environ.get("SPACKLE_WEIGHTS"):
-            return Path(chosen).expanduser()
-        cache = Path(os.environ.get("XDG_CACHE_HOME", ""))
-        return (cache if cache.is_absolute() else Path.home() / ".cache") / "spackle" / "weights"
+    """The folder for downloaded weights: $SPACKLE_WEIGHTS, else spackle/weights in $XDG_CACHE_HOME or ~/.cache."""
+    if chosen := os.environ.get("SPACKLE_WEIGHTS"):
+        return Path(os.path.expanduser(chosen))
+    cache = os.environ.get("XDG_CACHE_HOME", "")
+    return Path(cache if os.path.isabs(cache) else os.path.expanduser("~/.cache")) / "spackle" / "weights"
 
 
 def installed(name: str) -> Path | None:

@@ -12,20 +12,10 @@ from xml.etree.ElementTree import Element
 
 from PIL.JpegImagePlugin import JpegImageFile
 
-from spackle.errors import reason_in_a_line
-
-
-class BrokenDepth(Exception):
-    """The depth map inside a photo cannot be used; the message completes "the depth map in the photo …"."""
-
-
 XMP, MORE_XMP = b"http://ns.adobe.com/xap/1.0/\0", b"http://ns.adobe.com/xmp/extension/\0"
-MAX_MARKERS = 10_000
 MAX_PICTURES = 64
 _GUID = re.compile(rb"HasExtendedXMP\s*(?:=\s*[\"']|>\s*)([0-9A-Fa-f]{32})")
 _PICTURES = 0xB002
-_MARKER = re.compile(rb"\xff([^\x00\xd0-\xd7\xff])")  # the others occur in compressed data, as data or restarts
-_END = b"\xd9"
 
 
 def open_jpeg(data: bytes) -> JpegImageFile | None:
@@ -42,30 +32,13 @@ def xmp_of(image: JpegImageFile | None) -> bytes:
     return next((body[len(XMP) :] for name, body in segments if name == "APP1" and body.startswith(XMP)), b"")
 
 
-def extended_xmp_of(image: JpegImageFile) -> tuple[bytes, bool]:
-    """The extended XMP, which did not fit into the main packet, as far as it is present, and whether it is complete."""
-    if (named := _GUID.search(xmp_of(image))) is None:
-        return b"", True
-    parts = [body.removeprefix(MORE_XMP) for name, body in image.applist if name == "APP1" and MORE_XMP in body[:40]]
-    parts = [part for part in parts if part[:32].lower() == named[1].lower() and len(part) >= 40]
-    joined, lengths = bytearray(), {part[32:36] for part in parts}
-    for part in sorted(parts, key=lambda part: part[36:40]):
-        if int.from_bytes(part[36:40], "big") != len(joined):
-            break
-        joined += part[40:]
-    return bytes(joined), lengths <= {len(joined).to_bytes(4, "big")}
-
-
-def end_of_picture(data: bytes) -> int | None:
-    """The position after the end of the JPEG at the file's beginning; None if the JPEG has no end."""
-    at = 2
-    for _ in range(MAX_MARKERS):
-        if (found := _MARKER.search(data, at)) is None:
-            return None
-        if found[1] == _END:
-            return found.end()
-        at = found.end() + int.from_bytes(data[found.end() : found.end() + 2], "big")
-    return None
+def extended_xmp_of(image: JpegImageFile) -> bytes:
+    """The extended XMP, which did not fit into the main packet; empty if there is none or a part is missing."""
+    named = _GUID.search(xmp_of(image))
+    bodies = [body.removeprefix(MORE_XMP) for name, body in image.applist if name == "APP1" and MORE_XMP in body[:40]]
+    parts = [body for body in bodies if named and body[:32].lower() == named[1].lower()]
+    joined = b"".join(part[40:] for part in sorted(parts, key=lambda part: part[36:40]))
+    return joined if parts and parts[0][32:36] == len(joined).to_bytes(4, "big") else b""
 
 
 def further_pictures(image: JpegImageFile) -> list[tuple[int, int]]:
@@ -92,30 +65,27 @@ BY_ORIENTATION = {2: "x", 3: "xy", 4: "y", 5: "t", 6: "tx", 7: "txy", 8: "ty"}  
 _TURNS = {b"irot": ("", "ty", "xy", "tx"), b"imir": ("y", "x")}
 _DEPTH_TYPES = {b"urn:mpeg:hevc:2015:auxid:2", b"urn:mpeg:avc:2015:auxid:2"}
 _DEPTH_TYPES |= {b"urn:mpeg:mpegB:cicp:systems:auxiliary:depth"}
-_MALFORMED = (struct.error, KeyError, IndexError, ValueError)
 Boxes = Iterator[tuple[bytes, memoryview]]
 
 
-def find_depth_item(data: bytes) -> tuple[bool, str, str] | None:
-    """Find the auxiliary depth map of the primary picture; None if there is none, or if the boxes are broken.
+def turn_of_depth_item(data: bytes) -> str | None:
+    """The turn that the decoded depth map of a HEIF's primary picture still needs.
 
-    Returns:
-        Whether there is exactly one such map; the map's own rotation and mirroring, which a decoder applies; and, if
-        the map has none, those of the primary picture.
+    None if the picture does not have exactly one auxiliary depth map, or the boxes are broken.
     """
     try:
         content = next(body for kind, body in _boxes(memoryview(data)) if kind == b"meta")
         meta = dict(_boxes(content[4:]))
         (primary,) = struct.unpack_from(">I" if meta[b"pitm"][0] else ">H", meta[b"pitm"], 4)
         auxiliary, properties = list(_auxiliary(meta[b"iref"], primary)), _properties(meta[b"iprp"])
-    except (*_MALFORMED, StopIteration):
+    except (struct.error, KeyError, IndexError, ValueError, StopIteration):
         return None
     depth = [item for item in auxiliary if _is_depth(properties.get(item, ()))]
     if len(depth) != 1:  # if there are several, it is unknown which one a decoder picks
-        return (False, "", "") if depth else None
+        return None
+    # A decoder applies the map's turn. Apple turns the picture and leaves the map as the sensor saw it.
     own, of_primary = (_turn(properties.get(item, ())) for item in (depth[0], primary))
-    # Apple rotates the picture and leaves the map as the sensor saw it.
-    return True, own or "", "" if own is not None else of_primary or ""
+    return of_primary or "" if own is None else ""
 
 
 def _boxes(body: memoryview) -> Boxes:
@@ -168,20 +138,14 @@ def _turn(properties: Iterable[tuple[bytes, memoryview]]) -> str | None:
 
 
 MAX_TAGS = 40_000
-RDF_ITEM = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}li"
 
 
 def parse_xmp(packet: bytes) -> Element:
-    """The root element of a packet; BrokenDepth if the text is not XML, or looks hostile."""
-    try:
-        text = packet.strip(b"\0").decode("utf-8-sig")
-        if "<!DOCTYPE" in text:
-            raise BrokenDepth("is described by XMP with a document type, which is not read")
-        if text.count("<") > MAX_TAGS:
-            raise BrokenDepth("is described by XMP that is too large")
-        return ElementTree.fromstring(text)
-    except (ElementTree.ParseError, ValueError) as error:
-        raise BrokenDepth(f"is described by XMP that cannot be read ({reason_in_a_line(error)})") from error
+    """The root element of a packet; ValueError if it looks hostile, ParseError if it is not XML."""
+    text = packet.strip(b"\0").decode("utf-8-sig")
+    if "<!DOCTYPE" in text or text.count("<") > MAX_TAGS:
+        raise ValueError("its XMP has a document type or too many tags")
+    return ElementTree.fromstring(text)
 
 
 def get(node: Element, name: str) -> str | None:
@@ -197,13 +161,8 @@ def find(tree: Element, name: str) -> str | None:
 
 
 def number(tree: Element, name: str) -> float | None:
-    """A property, see `find`, as a finite number; BrokenDepth if it is anything else."""
-    if (text := find(tree, name)) is None:
-        return None
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise BrokenDepth(f"has {text[:40]!r} for {name.rpartition('}')[2]}, which is not a number")
-    return value
+    """A property, see `find`, as a number; ValueError if it is not a finite number."""
+    text = find(tree, name)
+    if text is not None and not math.isfinite(float(text)):
+        raise ValueError(f"{name.rpartition('}')[2]} is {text}")
+    return None if text is None else float(text)
