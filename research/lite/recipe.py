@@ -25,13 +25,12 @@ from spackle.training.recipe import (
     RgbdFolder,
     Seed,
     Share,
-    Whole,
 )
 from spackle.training.samples import short_digest
 from spackle.training.sources import find_files
 
 RANDOM = Path("random")  # instead of the encoder's file: random weights, for tests and experiments
-Side = Annotated[Whole, Field(ge=STRIDE, le=2048, multiple_of=STRIDE)]
+Side = Annotated[int, Field(ge=STRIDE, le=2048, multiple_of=STRIDE)]
 Scale = Annotated[float, Field(ge=0.1, le=2)]
 
 
@@ -69,7 +68,7 @@ class LiteOptim(OptimRecipe):
 
     encoder_rate: Annotated[float, Field(ge=0, le=10)] = 0.2  # factor on the encoder's learning rate
     # How many of the encoder's first stages are frozen, with its stem; 0: nothing is frozen.
-    frozen: Annotated[Whole, Field(ge=0, le=len(STAGES["lite2"]))] = 2
+    frozen: Annotated[int, Field(ge=0, le=len(STAGES["lite2"]))] = 2
 
 
 class LiteRecipe(AnyRecipe):

@@ -21,7 +21,7 @@ from spackle.device import pick_dtype
 from spackle.folders import make_folder
 from spackle.formats.png import sheet
 from spackle.progress import Reporter, Step
-from spackle.training.residual import CACHE, PICTURED, parameters
+from spackle.training.residual import CACHE, PICTURED
 from spackle.training.train import Task, rank, wait_for_ranks
 
 PICTURE_SIDE = 320  # pixels of a picture's longer side
@@ -111,11 +111,7 @@ class LiteTask(Task):
         self.mixture = Mixture(each, parts, recipe.data.size, recipe.run.seed, recipe.data.scales)
         self.validation_items = len(judged)
         self.measures = (*MEASURES, *(f"{group}/{name}" for group in judged for name in ("abs_rel", "delta")))
-        return {
-            "samples": {"train": counts, "validation": judged, "digest": self.digest},
-            "parameters": parameters(self.network),
-            "precision": str(precision).removeprefix("torch."),
-        }
+        return {"samples": {"train": counts, "validation": judged, "digest": self.digest}}
 
     def groups(self) -> list[dict[str, Any]]:
         """One group of weights for each rate: the pretrained encoder has its own."""
@@ -157,10 +153,6 @@ class LiteTask(Task):
             guess = colored(predicted, *ends(predicted[frame.valid]))
             rows.append([frame.rgb.permute(1, 2, 0), guess, colored(true, *ends(true[frame.valid]), frame.valid)])
         return sheet(rows, PICTURE_SIDE)
-
-    def names(self, step: int, items: Sequence[int]) -> list[str]:
-        """The sources of a step's pictures."""
-        return [self.mixture.name(step, place) for place in items]
 
     def export(self, network: nn.Module, path: Path) -> None:
         """Write the weights in eight bits, for `spackle predict --base lite`."""

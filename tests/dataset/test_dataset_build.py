@@ -263,5 +263,9 @@ def test_targets_that_the_untrained_network_draws_are_refused(copy: Path, tmp_pa
     manifest.model_copy(update={"config": {**manifest.config, "inpainter": {"name": name}}}).save(copy)
     options = (f"data.pseudo={copy}", "loss.features=none")
     done = run("train", "--recipe", "paper", "-o", tmp_path / "out", *options)
-    refuses(done, f"{copy}: built with --inpainter {name}", "teach nothing: build another with --inpainter propainter")
+    refuses(
+        done,
+        f"{copy}: built with --inpainter {name}",
+        "teach nothing: build another dataset with --inpainter propainter",
+    )
     assert not (tmp_path / "out").exists()

@@ -90,7 +90,7 @@ def listing(path: Path) -> None:
 BAD: dict[str, Callable[[Path], object]] = {  # by what is said of them
     "not a video": lambda path: path.write_text("no clip"),
     "damaged": lambda path: path.write_bytes(write_clip(path, moving(4)).read_bytes()[:-200]),
-    "cut off": cut_off,
+    "truncated": cut_off,
     "a list of other files": listing,
     "no moving picture": sound_alone,
     "codec": unknown_codec,
@@ -128,7 +128,6 @@ def test_a_clip_becomes_one_of_the_same_times_and_sound(tmp_path: Path) -> None:
     assert report["clip"]["sound"] == {"codec": "aac", "copied": True}
     assert report["hole_area_ratio"]["before"] > 0.02
     assert report["hole_area_ratio"]["after"] < 0.001
-    assert report["flicker"]["carried"] < report["flicker"]["alone"]
 
 
 def test_a_frame_that_fails_is_named_and_nothing_is_left(tmp_path: Path) -> None:

@@ -154,14 +154,14 @@ def test_a_step_has_the_own_view_and_a_photo_teaches_or_judges(place: Path) -> N
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["data.pseudo=null"], "data: --method direct-ft learns from data.pseudo"),
-        (["data.photos={place}/photos"], "samples of other sources have Gaussians that cannot change"),
-        (["data.pseudo={place}/rgbd"], "rgbd: built with --base rgbd, but SHARP must learn its own holes"),
-        (["data.pseudo={place}/geometry"], "built with --inpainter geometry, which draws what the untrained residual"),
-        (["-c", "{place}/other.safetensors"], "data: built with other weights of SHARP (SHA-256 "),
-        (["-c", "{place}/whole/best.safetensors"], "best.safetensors: a decoder that was trained already"),
-        (["optim.batch=6"], "optim.batch=6: --method direct-ft takes 4 views"),
-        (["init=weights.safetensors"], "init=weights.safetensors: --method direct-ft starts from SHARP's checkpoint"),
+        (["data.pseudo=null"], "--method direct-ft learns only from data.pseudo"),
+        (["data.photos={place}/photos"], "leave out init and other data"),
+        (["data.pseudo={place}/rgbd"], "rgbd: built with the base rgbd"),
+        (["data.pseudo={place}/geometry"], "built with --inpainter geometry, whose targets teach nothing"),
+        (["-c", "{place}/other.safetensors"], "other.safetensors"),
+        (["-c", "{place}/whole/best.safetensors"], "best.safetensors: an already trained decoder"),
+        (["optim.batch=6"], "optim.batch=6: give a multiple of 4 views"),
+        (["init=weights.safetensors"], "leave out init and other data"),
         (["--method", "residual"], "sharp.safetensors: --method residual learns without a base"),
     ],
 )
@@ -193,10 +193,10 @@ def test_without_c_sharp_comes_from_the_folder_of_weights(
 def test_a_folder_belongs_to_one_method_and_one_network(place: Path, whole: Path, tmp_path: Path) -> None:
     out = shutil.copytree(whole, tmp_path / "out")
     done = run("train", "--recipe", place / "recipe.yaml", "-o", out, "data.cells=16")
-    refuses(done, f"{out}: holds a run of --method direct-ft")
+    refuses(done, f"{out}: holds a run with other settings (--method")
     saved = torch.load(out / "checkpoint.pt", weights_only=True)
     name = "prediction_head.geometry_prediction_head.weight"
     saved["network"][name] = saved["network"][name][:2].clone()
     torch.save(saved, out / "checkpoint.pt")
     done = train(place, out, "optim.steps=5")
-    assert (done.code, "its checkpoint is of another network " in done.err, name in done.err) == (2, True, True)
+    assert (done.code, "the checkpoint has another network " in done.err, name in done.err) == (2, True, True)

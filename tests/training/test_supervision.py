@@ -25,14 +25,13 @@ from spackle.residual.complete import compose
 from spackle.residual.network import DELTA_CHANNELS
 from spackle.residual.view_features import CELL, ViewFeatures, cell_centers
 from spackle.training import samples, sources
-from spackle.training.recipe import DataRecipe, Recipe, load_recipe
+from spackle.training.recipe import DataRecipe
 from spackle.training.residual import MIN_AUX, training_cells
 from spackle.training.samples import (
     EXACT,
     HOLE_SHARE,
     Sample,
     Source,
-    disk_needed,
     load_sample,
     make_samples,
     save_sample,
@@ -249,10 +248,10 @@ def test_a_sample_comes_back_small_and_shows_the_same(tmp_path: Path) -> None:
     view, base = shifted(scene.camera.resized(192, 144), 0.4), scene.base()
     target = (255 * CPU.render(base, view).rgb).round() / 255
     crop = Sample.of(base, CPU.render(base, view), view, scene.camera, scene.rgb, target).crop(4, 20, 64, 64)
-    path, data = tmp_path / "0.safetensors", DataRecipe(crops=1, cells=64)
+    path = tmp_path / "0.safetensors"
     save_sample(crop, path)
     found, content = load_sample(path), path.read_bytes()
-    assert len(content) <= disk_needed(data, [], tmp_path, 1)
+    assert len(content) < 55 * 128**2
     assert len(found.base) < 0.5 * len(base)
     for name in (*EXACT, "seeds.uv"):
         part, _, field = name.partition(".")
@@ -269,12 +268,8 @@ def test_a_sample_comes_back_small_and_shows_the_same(tmp_path: Path) -> None:
     assert path.read_bytes() == content
     for keep in (0, 200, -1):
         path.write_bytes(content[:keep])
-        with pytest.raises(InputError, match=r"0\.safetensors: no training sample, or damaged"):
+        with pytest.raises(InputError, match=r"0\.safetensors: not a training sample, or damaged"):
             load_sample(path)
-    paper = load_recipe(Recipe, "paper", ["loss.features=none"]).data
-    bytes_a_crop = disk_needed(paper, [], tmp_path / "none", 1)
-    assert bytes_a_crop <= 2e6
-    assert bytes_a_crop * (paper.views + paper.validation_views) < 60e9
 
 
 def fill(folder: Path, killed_at: int | None = None) -> tuple[list[str], list[float]]:

@@ -9,7 +9,6 @@ import shutil
 import signal
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import gsplat_stand_in
 import numpy as np
@@ -97,7 +96,7 @@ def train(place: Path, output: Path, *more: str) -> Run:
 def test_a_run_leaves_weights_pictures_and_a_report(whole: Path, done: Run) -> None:
     assert names_in(whole) >= {"checkpoint.pt", "best.safetensors", "last.safetensors", "run.json", "pictures"}
     report = json.loads((whole / "run.json").read_text())
-    assert (report["ended"], report["step"], report["features"]) == ("steps", 6, "none")
+    assert (report["ended"], report["step"]) == ("steps", 6)
     assert report["history"][0].keys() >= {"loss", "color", "alpha", "preserve", "hole_psnr", "har_before", "har_after"}
     with Image.open(whole / "pictures" / "0000006.png") as sheet:
         assert sheet.width == 4 * 32
@@ -126,7 +125,7 @@ def test_the_papers_architecture_learns_from_sharps_and_predicts(
     predicted = run(*predict, "--residual", f"{out}/best.safetensors")
     assert predicted.code == 0, predicted.err
     refused = train(place, tmp_path / "other", f"init={out}/best.safetensors")
-    assert (refused.code, "give network=sharp-decoder" in refused.err) == (2, True), refused.err
+    refuses(refused, "set network=sharp-decoder")
 
 
 def test_ctrl_c_leaves_a_checkpoint_that_leads_to_the_same_end(
@@ -152,8 +151,7 @@ def test_ctrl_c_leaves_a_checkpoint_that_leads_to_the_same_end(
 def test_a_folder_belongs_to_one_recipe_and_one_process(place: Path, out: Path) -> None:
     with hold(out / ".lock"):
         assert "another run is at work" in train(place, out, "optim.steps=7").err
-    done = train(place, out, "optim.lr=2e-3")
-    assert (done.code, "another recipe (optim.lr differs)" in done.err) == (2, True), done.err
+    refuses(train(place, out, "optim.lr=2e-3"), "holds a run with other settings (optim.lr)")
     assert train(place, out, "run.validate_every=2", "optim.steps=7").code == 0
     assert state(out).progress.step == 7
     assert train(place, out, "optim.lr=2e-3", "optim.steps=1", "--overwrite").code == 0
@@ -207,17 +205,12 @@ def test_the_second_process_puts_nothing_on_the_first_gpu(
         (["data.photos=null"], "the recipe has no data"),
         (["data.photos=/nowhere"], "/nowhere: no such folder, but data.photos names it"),
         (["data.photos={broken}", "data.views=1"], "none of 2 views gave a sample"),
-        (["data.stereo={empty}"], "looked for scene.json"),
+        (["data.stereo={empty}"], "contains no scene.json"),
         (["loss.features=squeezenet", "loss.features_path=/no", "loss.feature_size=64"], "/no: no such weight"),
         (["run.device=cuda"], "device 'cuda': torch finds no CUDA device"),
-        (["data.shares.rgbd=0"], "may take 831.5 kB, and 100.0 kB are free: give data.cache=FOLDER"),  # a full disk
     ],
 )
-def test_what_cannot_be_trained_is_said_in_a_line(
-    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: list[str], said: str
-) -> None:
-    if "are free" in said:
-        monkeypatch.setattr("shutil.disk_usage", lambda folder: SimpleNamespace(free=100_000))
+def test_what_cannot_be_trained_is_said_in_a_line(place: Path, tmp_path: Path, options: list[str], said: str) -> None:
     if options == ["run.device=cuda"] and torch.cuda.is_available():
         pytest.skip("there is a GPU")
     folders = {name: tmp_path / name for name in ("empty", "broken")}
@@ -230,17 +223,14 @@ def test_what_cannot_be_trained_is_said_in_a_line(
     assert not (tmp_path / "out" / "checkpoint.pt").exists()
 
 
-def test_a_gradient_that_is_no_number_names_what_made_it(place: Path, whole: Path, tmp_path: Path) -> None:
+def test_a_gradient_that_is_no_number_ends_the_run(place: Path, whole: Path, tmp_path: Path) -> None:
     cache = shutil.copytree(place / "cache", tmp_path / "cache")
-    samples = list(cache.glob("*/train/*.safetensors"))
-    for path in samples:
+    for path in cache.glob("*/train/*.safetensors"):
         sample = load_sample(path)
         sample.seeds.slope.fill_(math.nan)
         save_sample(sample, path)
     done = train(place, tmp_path / "out", f"data.cache={cache}")
-    assert done.code == 2
-    assert "out: step 0 gave numbers that are not finite (gradient)" in done.lines[-1]
-    assert sum(path.name in done.lines[-1] for path in samples) == 2
+    assert (done.code, "out: step 0: gradient not finite" in done.lines[-1]) == (2, True)
     assert not (tmp_path / "out" / "checkpoint.pt").exists()
 
 

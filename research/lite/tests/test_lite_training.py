@@ -90,8 +90,7 @@ def test_a_run_leaves_weights_pictures_and_a_report(whole: tuple[Path, Run]) -> 
     assert found["abs_rel"] == pytest.approx((found["kitchen/abs_rel"] + found["stereo/abs_rel"]) / 2)
     assert report["best"] == found["abs_rel"]
     (line,) = [line for line in done.lines if line.startswith("step 10: ")]
-    assert line.startswith(f"step 10: validation abs_rel {found['abs_rel']:.4f} (the best so far), delta 0.")
-    assert sum(report["parameters"].values()) == sum(weight.numel() for weight in LiteNet().parameters())
+    assert f"abs_rel {found['abs_rel']:.4f}, delta 0." in line
     with Image.open(folder / "pictures" / "0000010.png") as sheet:
         assert sheet.size == (3 * 64, 3 * 48)
     average = state(folder).average
@@ -190,7 +189,7 @@ def test_a_killed_run_goes_on_and_ends_as_if_nothing_had_been(
     assert process.returncode == -signal.SIGKILL
     assert state(tmp_path / "out").progress.step == 2
     done = train(place, tmp_path / "out")
-    assert f"{tmp_path}/out: going on from step 2" in done.lines
+    assert f"{tmp_path}/out: resuming from step 2" in done.lines
     assert_same_weights(tmp_path / "out", whole[0])
     assert (tmp_path / "out" / "best.safetensors").read_bytes() == (whole[0] / "best.safetensors").read_bytes()
 

@@ -11,7 +11,7 @@ from spackle.bases import BasePrediction
 from spackle.bases.depth_map import RELATIVE
 from spackle.bases.open import ResolvedBase
 from spackle.cli.photo import PredictOptions
-from spackle.clips.complete import FIGURES, ClipCompleter, CompletedView
+from spackle.clips.complete import ClipCompleter, CompletedView
 from spackle.clips.files import ClipWriter, clip_frames, read_clip
 from spackle.errors import InputError
 from spackle.files import write_json
@@ -124,7 +124,6 @@ def predict_clip(
                         "after": hole_area_ratio(view.view.alpha),
                         "aux": len(view.gaussians[1]),
                         "cut": view.cut,
-                        **view.flicker,
                     }
                 )
                 step(index + 1, len(clip))
@@ -132,7 +131,6 @@ def predict_clip(
             reporter.log(f"{path.name}: its sound ({clip.audio}) cannot be stored in an mp4 and is left out")
         assert first is not None
         camera = first[1].camera
-        flicker = {name: [frame[name] for frame in frames if name in frame] for name in FIGURES}
         report = {
             **shared_report(*first, pipeline, reporter),
             "clip": {
@@ -153,18 +151,13 @@ def predict_clip(
                 "after": _mean([frame["after"] for frame in frames]),
                 "worst_after": max(frame["after"] for frame in frames),
             },
-            # In units of 1/255; None where no frame has the figure.
-            "flicker": {name: round(255 * _mean(values), 3) if values else None for name, values in flicker.items()},
         }
         report["seconds"]["by_stage"] = {name: round(value, 3) for name, value in completer.seconds.items()}
         report["files"] = file_records(new, [new / FILES[0]])
         write_json(report, new / FILES[-1])
-    holes, figures = report["hole_area_ratio"], report["flicker"]
-    calm = ""
-    if figures["carried"] is not None:
-        calm = f", flicker in holes {figures['alone']:.1f} -> {figures['carried']:.1f}"
+    holes = report["hole_area_ratio"]
     reporter.log(
-        f"{path.name}: {len(clip)} frames, holes {holes['before']:.2%} -> {holes['after']:.3%}{calm}, "
+        f"{path.name}: {len(clip)} frames, holes {holes['before']:.2%} -> {holes['after']:.3%}, "
         f"{report['seconds']['total']:.1f} s -> {folder}"
     )
     reporter.result({"folder": folder, **report})

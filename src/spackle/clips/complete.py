@@ -1,4 +1,4 @@
-"""Complete the view of each of a clip's frames in order, consistent with the depth and colours of the frame before."""
+"""Complete a view for each frame of a clip, consistent with the depth and colours of the previous frame."""
 
 from __future__ import annotations
 
@@ -15,10 +15,7 @@ from spackle.clips.temporal import (
     Flow,
     FrameMemory,
     align_depth,
-    flicker,
-    pixel_grid,
     propagate_colors,
-    sample,
     track,
 )
 from spackle.device import Precision
@@ -29,20 +26,19 @@ from spackle.render.protocol import Rendering
 from spackle.residual import ResidualNet, hole_mask
 from spackle.scene_fill import FillContext, OcclusionGuard, fill_view
 
-FOLLOW = 0.05  # each frame moves the path's depths by this part towards the frame's own: they arrive in about a second
+FOLLOW = 0.05  # in each frame, the path's depth range moves by this part towards the frame's depth range
 
 
 @dataclasses.dataclass(frozen=True)
 class CompletedView:
-    """A frame's completed view."""
+    """The completed view of a frame."""
 
     camera: Camera
-    gaussians: tuple[Gaussians, Gaussians]  # the base's, and aux
-    view: Rendering  # of all of them
-    before: Rendering  # of the base's alone
-    alone: Rendering  # completed without the past
-    cut: bool = False  # whether the frame before belongs to another shot
-    flicker: dict[str, float] = dataclasses.field(default_factory=dict)  # those of FIGURES that are known
+    gaussians: tuple[Gaussians, Gaussians]  # base and aux
+    view: Rendering  # of base and aux Gaussians
+    before: Rendering  # of base Gaussians
+    alone: Rendering  # completed without earlier frames
+    cut: bool = False  # whether the previous frame belongs to another shot
 
     @property
     def hole(self) -> Tensor:
@@ -50,44 +46,38 @@ class CompletedView:
         return hole_mask(self.before.alpha)
 
 
-# Mean change from the frame before, along the motion found, in sRGB of 0..1: of pixels that both bases cover ("seen"),
-# and of pixels that are holes in both, each frame completed by itself ("alone") or as finally drawn ("carried").
-FIGURES = ("seen", "alone", "carried")
-
-
 @dataclasses.dataclass(frozen=True)
 class _Past:
-    """The state that a frame leaves for the next one."""
+    """The state of a frame that the next frame needs."""
 
     rgb: Tensor  # [H, W, 3] the input
-    inverse_depth: Tensor  # [H, W] as the base predicted it, 0 where unknown
+    inverse_depth: Tensor  # [H, W] as predicted by the base, 0 if unknown
     alignment: DepthAlignment
-    depths: DepthRange  # the path's
+    depths: DepthRange  # of the path
     memory: FrameMemory | None = None
-    drawn: CompletedView | None = None
 
 
 @dataclasses.dataclass
 class ClipCompleter:
-    """Takes the frames in order and completes the view of each; only the last frame is kept in memory."""
+    """Completes the views of frames in order; only one earlier frame is in memory."""
 
     trajectory: TrajectoryKind
-    disparity: float | None  # None: the base's own
-    frames: int  # number of frames in the clip, and so on the path
+    disparity: float | None  # None: the disparity of each prediction
+    frames: int  # number of frames in the clip
     renderer: Renderer
     flow: Flow
-    align: bool = True  # align the base's depth with that of the frame before
+    align: bool = True  # align the base's depth with the depth of the previous frame
     fill: bool = True  # fill holes
     network: ResidualNet | None = None
     precision: Precision = "auto"
-    overscan: float = 0.0  # fraction by which the focal length is longer than the photo's
-    seconds: dict[str, float] = dataclasses.field(default_factory=dict)  # time spent on each stage
+    overscan: float = 0.0  # fraction by which the view's focal length exceeds the photo's
+    seconds: dict[str, float] = dataclasses.field(default_factory=dict)  # time of each stage
     _past: _Past | None = None
     _count: int = 0
 
     @torch.no_grad()
     def add(self, rgb: Tensor, prediction: BasePrediction) -> CompletedView:
-        """Complete the next frame: `rgb` [H, W, 3], sRGB at the size of the prediction's camera, and its prediction.
+        """Complete the next frame, `rgb` [H, W, 3] sRGB, from the base's prediction for this frame.
 
         ValueError if depths and focal length allow no path.
         """
@@ -102,7 +92,7 @@ class ClipCompleter:
             alone = before
             if self.fill:
                 parts = (base, prediction.camera, self.renderer, self.network)
-                # No texture: it would be found anew in each frame, and flicker.
+                # Without texture, which would flicker: each frame would find other patches.
                 context = FillContext(*parts, texture=None, precision=self.precision)
                 filled = fill_view(context, camera, [guard], before)
                 aux, alone = filled.aux, filled.rendering
@@ -111,20 +101,19 @@ class ClipCompleter:
             with timed("carry", self.seconds):
                 memory_before = None if past is None else past.memory
                 views = (before, alone)
-                aux, memory, flow = propagate_colors(base, aux, camera, self.renderer, views, memory_before, self.flow)
+                aux, memory = propagate_colors(base, aux, camera, self.renderer, views, memory_before, self.flow)
                 drawn = dataclasses.replace(drawn, gaussians=(base, aux), view=memory.view)
-                if past is not None and past.drawn is not None and flow is not None:
-                    drawn = dataclasses.replace(drawn, flicker=_flicker(drawn, past.drawn, flow))
-        self._past = dataclasses.replace(now, memory=memory, drawn=drawn)
+        self._past = dataclasses.replace(now, memory=memory)
         self._count += 1
         return drawn
 
     def _aligned(
         self, rgb: Tensor, prediction: BasePrediction
     ) -> tuple[Gaussians, OcclusionGuard, _Past, _Past | None]:
-        """Align the base's depth to the past.
+        """Align the base's depth with the previous frame's depth.
 
-        Returns the aligned base, the frame's occlusion guard, the state to keep, and the past; None after a cut.
+        Returns the aligned base, the photo's occlusion guard, the state for the next frame, and the state of the
+        previous frame (None after a cut).
         """
         seen = self.renderer.render(prediction.gaussians, prediction.camera)
         known = ~hole_mask(seen.alpha) & (seen.depth > 0)
@@ -142,13 +131,3 @@ class ClipCompleter:
         if past is not None:
             depths = past.depths.towards(depths, FOLLOW)
         return base, guard, _Past(rgb, inverse_depth, alignment, depths), past
-
-
-def _flicker(drawn: CompletedView, earlier: CompletedView, flow: Tensor) -> dict[str, float]:
-    """Those of FIGURES that can be measured between this frame and the one before."""
-    hole = drawn.hole
-    was = sample(earlier.hole[..., None].float(), pixel_grid(flow) + flow)[..., 0]
-    both, neither = hole & (was > 0.999), ~hole & (was < 0.001)
-    pairs = ((drawn.view, earlier.view, neither), (drawn.alone, earlier.alone, both), (drawn.view, earlier.view, both))
-    values = (flicker(one.rgb, other.rgb, flow, chosen) for one, other, chosen in pairs)
-    return {name: value for name, value in zip(FIGURES, values, strict=True) if value is not None}

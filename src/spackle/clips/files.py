@@ -1,7 +1,4 @@
-"""Read the frames of any video that FFmpeg decodes, upright, in sRGB, with their times; and write clips.
-
-A written clip is H.264, with the frame times and the sound of the clip that it was made from.
-"""
+"""Read clips in any format of FFmpeg, and write clips as H.264 with the times and the sound of the original."""
 
 from __future__ import annotations
 
@@ -22,31 +19,32 @@ from av.video.reformatter import VideoReformatter
 from av.video.stream import VideoStream
 from torch import Tensor
 
-from spackle.errors import InputError, reason_in_a_line
+from spackle.errors import InputError, reading
 from spackle.files import check_file
 from spackle.formats.video import BT709, H264, StreamEncoder, VideoWriter
 from spackle.image import check_pixels
 
 SUFFIXES = {".mp4", ".m4v", ".mov", ".webm", ".mkv", ".avi", ".gif", ".mpg", ".mpeg", ".ts", ".mts", ".m2ts", ".wmv"}
 SUFFIXES |= {".flv", ".3gp", ".ogv"}
-UNSPECIFIED, BT601 = 2, 5  # FFmpeg's numbers of matrices
-HD_ROWS = 720  # a video that does not declare its colours is read as BT.709 from this height on, as players do
-LISTS = {"concat", "dash", "hls", "rtsp", "sdp", "webm_dash_manifest"}  # formats whose files make FFmpeg open others
+UNSPECIFIED, BT601 = 2, 5  # FFmpeg's numbers of colour matrices
+HD_ROWS = 720  # from this height on, a video without declared colour matrix is read as BT.709, as players do
+LISTS = {"concat", "dash", "hls", "rtsp", "sdp", "webm_dash_manifest"}  # formats that make FFmpeg open other files
+DECODING = (av.FFmpegError, ValueError)  # errors of a damaged file
 HDR = {16: "PQ", 18: "HLG"}  # FFmpeg's numbers of transfers
 DEFAULT_RATE = Fraction(25)
 CLOCK = Fraction(1, 90_000)  # unit of written times, in seconds
-RATES = (Fraction(1, 1000), Fraction(1000))  # lowest and highest frame rate that an encoder takes
+RATES = (Fraction(1, 1000), Fraction(1000))  # lowest and highest frame rate that an encoder accepts
 
 
 @dataclasses.dataclass(frozen=True)
 class Clip:
-    """Facts about a clip, found by reading all of it."""
+    """Facts about a clip, found by reading the whole clip."""
 
     path: Path
     width: int  # of an upright frame with square pixels
     height: int
-    times: tuple[Fraction, ...]  # each frame's time in seconds, increasing from 0
-    start: Fraction  # the first frame's time by the file's clock
+    times: tuple[Fraction, ...]  # of the frames, in seconds, increasing from 0
+    start: Fraction  # time of the first frame in the file
     rate: Fraction  # mean number of frames a second
     audio: str | None  # codec of the sound
     hdr: str | None  # transfer function, if it is an HDR one: "PQ" or "HLG"
@@ -56,13 +54,13 @@ class Clip:
 
     @property
     def seconds(self) -> Fraction:
-        """The clip's length: the last frame lasts as long as the one before it."""
+        """The length of the clip; the last frame lasts as long as the frame before."""
         last = self.times[-1] - self.times[-2] if len(self) > 1 else 1 / self.rate
         return self.times[-1] + last
 
 
 def is_clip(path: Path) -> bool:
-    """Whether a file is a video, by its suffix; a GIF with a single frame is a photo."""
+    """Whether a file is a video, judged by the suffix; a GIF with a single frame is a photo."""
     if path.suffix.lower() not in SUFFIXES or os.path.isdir(path):
         return False
     if path.suffix.lower() != ".gif":
@@ -72,7 +70,7 @@ def is_clip(path: Path) -> bool:
             pictures = (packet for packet in container.demux(video=0) if packet.size)
             return next(pictures, None) is not None and next(pictures, None) is not None
     except (av.FFmpegError, ValueError, IndexError):
-        return False  # reading it as a photo then reports what is wrong
+        return False
 
 
 def read_clip(
@@ -80,19 +78,15 @@ def read_clip(
 ) -> Clip:
     """Decode a clip from beginning to end, so that damage in any frame is reported at once.
 
-    Only the first `first` frames are read, all if None. `progress` is called with (frames read, number of frames that
-    the file states). InputError if the file is no clip, cut off, damaged, without video, or of an unknown codec.
+    Args:
+        path: the file.
+        first: number of frames to read; all if None.
+        progress: called with (number of frames read, number of frames in the file).
+
+    Raises:
+        InputError: the file is not a clip, truncated, damaged, without video, or of an unknown codec.
     """
     check_file(path, "clip")
-    try:
-        return _read_clip(path, first, progress)
-    except InputError as error:
-        line, cause = str(error), error.__cause__
-    # A new error: the first one's traceback refers to the decoder, whose threads would live as long as the error.
-    raise InputError(line) from (cause and cause.with_traceback(None))
-
-
-def _read_clip(path: str | os.PathLike[str], first: int | None, progress: Callable[[int, int], None] | None) -> Clip:
     ticks: list[Fraction | None] = []
     frame = None
     with _opened(path) as (container, stream):
@@ -105,7 +99,7 @@ def _read_clip(path: str | os.PathLike[str], first: int | None, progress: Callab
             if progress:
                 progress(len(ticks), max(len(ticks), first or stream.frames))
     if frame is None:
-        raise InputError(f"{path}: it has no frames: give another clip")
+        raise InputError(f"{path}: has no frames: give another clip")
     width, height = _square_size(frame, aspect)
     if _quarters(frame) % 2:
         width, height = height, width
@@ -116,35 +110,27 @@ def _read_clip(path: str | os.PathLike[str], first: int | None, progress: Callab
 
 
 def clip_frames(clip: Clip) -> Iterator[Tensor]:
-    """The frames of a clip, [H, W, 3] float32 sRGB in 0..1; InputError if the file has become shorter meanwhile."""
+    """The frames of a clip, [H, W, 3] float32 sRGB in 0..1."""
     with _opened(clip.path) as (container, stream):
-        aspect, count = stream.sample_aspect_ratio or Fraction(1), 0
-        reformatter = VideoReformatter()
+        aspect, reformatter = stream.sample_aspect_ratio or Fraction(1), VideoReformatter()
         for frame in _decoded(clip.path, container, stream, len(clip)):
-            count += 1
             yield _picture(frame, aspect, reformatter)
-    if count < len(clip):
-        raise InputError(f"{clip.path}: has become shorter while it was read: start again")
 
 
 @contextlib.contextmanager
 def _opened(path: str | os.PathLike[str]) -> Iterator[tuple[InputContainer, VideoStream]]:
-    """Open a file, and find its video stream."""
-    try:
+    """Open a file, and find the video stream."""
+    with reading(path, "not a video, or damaged at the beginning or end ({reason})", *DECODING):
         container = av.open(str(path), metadata_errors="replace")  # in strict mode, the file stays open after an error
-    except (av.FFmpegError, ValueError) as error:
-        reason = reason_in_a_line(error)
-        raise InputError(f"{path}: not a video, or damaged at its beginning or end ({reason})") from error
     with container:
         if LISTS & set(container.format.name.split(",")):
             raise InputError(f"{path}: is a list of other files, not a video: give one of these files")
         pictures = [s for s in container.streams.video if not s.disposition & Disposition.attached_pic]
         if not pictures:
-            what = "has sound but no moving picture" if container.streams.audio else "has no moving picture"
-            raise InputError(f"{path}: {what}: give a video")
+            raise InputError(f"{path}: has no moving picture: give a video")
         stream = pictures[0]
         if stream.codec_context is None:
-            raise InputError(f"{path}: its codec is unknown to this FFmpeg: convert it to H.264 first")
+            raise InputError(f"{path}: FFmpeg does not know the codec: convert the clip to H.264 first")
         check_pixels(stream.codec_context.width, stream.codec_context.height, os.path.getsize(path), path)
         stream.thread_type = "AUTO"
         yield container, stream
@@ -153,60 +139,49 @@ def _opened(path: str | os.PathLike[str]) -> Iterator[tuple[InputContainer, Vide
 def _decoded(
     path: str | os.PathLike[str], container: InputContainer, stream: VideoStream, first: int | None
 ) -> Iterator[av.VideoFrame]:
-    """Decode frames, which must all have the same size; an error names the frame."""
+    """Decode frames, which must all have the same size."""
     size, count, packets = None, 0, 0
-    try:
+    with reading(path, "the clip is damaged or truncated ({reason}): give a whole clip, or --frames N", *DECODING):
         for packet in container.demux(stream):
             packets += packet.size > 0
             for frame in packet.decode():
                 shape = (frame.width, frame.height, frame.rotation)
                 if size not in (None, shape):
-                    raise InputError(
-                        f"{path}: frame {count} has another size than the frames before it: cut the clip there"
-                    )
+                    raise InputError(f"{path}: frame {count} has a new size: use --frames {count}")
                 size = shape
                 yield frame
                 count += 1
                 if count == first:
                     return
-    except InputError:
-        raise
-    except (av.FFmpegError, ValueError) as error:
-        raise InputError(
-            f"{path}: frame {count} cannot be decoded ({reason_in_a_line(error)}): the clip is damaged or cut off"
-            + (f"; --frames {count} takes what is before" if count else "")
-        ) from error
-    if packets < stream.frames:
-        raise InputError(
-            f"{path}: cut off after {packets} of {stream.frames} frames: give a whole clip, or --frames {max(1, count)}"
-        )
+        if packets < stream.frames:
+            raise ValueError(f"{packets} of {stream.frames} frames")
 
 
 def _picture(frame: av.VideoFrame, aspect: Fraction, reformatter: VideoReformatter) -> Tensor:
-    """A frame as [H, W, 3]: FFmpeg converts it from its colour matrix and range; then it is turned upright."""
+    """A frame as an upright image [H, W, 3] sRGB in 0..1."""
     width, height = _square_size(frame, aspect)
     matrix = frame.colorspace
     if matrix == UNSPECIFIED:
         matrix = BT709 if frame.height >= HD_ROWS else BT601
-    # Not `frame.reformat`, which would start new threads for each frame.
+    # `frame.reformat` would start new threads for each frame.
     rgb = reformatter.reformat(frame, width, height, "rgb24", src_colorspace=matrix).to_ndarray()
     turned = np.ascontiguousarray(np.rot90(rgb, _quarters(frame)))
     return torch.from_numpy(turned).float().div_(255)
 
 
 def _quarters(frame: av.VideoFrame) -> int:
-    """The number of counter-clockwise quarter turns that bring a frame upright."""
+    """The number of counter-clockwise quarter turns that make a frame upright."""
     return round(frame.rotation / 90) % 4
 
 
 def _square_size(frame: av.VideoFrame, aspect: Fraction) -> tuple[int, int]:
-    """A frame's size in square pixels, enlarged along one side; its own pixels are `aspect` times as wide as high."""
+    """The size of a frame in square pixels, if its stored pixels are `aspect` times as wide as high."""
     wide, high = max(aspect, Fraction(1)), max(1 / aspect, Fraction(1))
     return max(1, round(frame.width * wide)), max(1, round(frame.height * high))
 
 
 def _rising(ticks: list[Fraction | None], rate: Fraction) -> tuple[Fraction, ...]:
-    """Increasing times from zero; a frame whose time is missing or does not increase follows at the mean rate."""
+    """Increasing times from zero; a missing or decreasing time is replaced by the time at the mean rate."""
     times: list[Fraction] = []
     start = ticks[0] or Fraction(0)
     for tick in ticks:
@@ -217,10 +192,9 @@ def _rising(ticks: list[Fraction | None], rate: Fraction) -> tuple[Fraction, ...
 
 
 class ClipWriter(VideoWriter):
-    """Writes as many frames as a clip has, at its times, with its sound; the file appears if the block succeeds."""
+    """Writes an .mp4 with the times and the sound of a clip; the file appears if the block succeeds."""
 
     def __init__(self, path: str | os.PathLike[str], clip: Clip) -> None:
-        """Prepare to write an .mp4; InputError if no file can be written there."""
         super().__init__(path)
         self.clip = clip
 
@@ -234,7 +208,7 @@ class ClipWriter(VideoWriter):
 
 
 class _ClipEncoder(StreamEncoder):
-    """Encodes frames at evenly spaced times, and then gives their packets the clip's times."""
+    """Encodes frames at evenly spaced times, and then gives the packets the clip's times."""
 
     def __init__(self, path: Path, width: int, height: int, clip: Clip) -> None:
         self._even = min(max(clip.rate.limit_denominator(1001), RATES[0]), RATES[1])
@@ -251,13 +225,11 @@ class _ClipEncoder(StreamEncoder):
             self._held: av.Packet[AudioStream] | None = None
 
     def finish(self) -> None:
-        """Flush the encoder, and copy the sound up to the video's end."""
         self._write(self._stream.encode(None))
         self._copy_sound(self._clip.seconds)
         self.close()
 
     def close(self) -> None:
-        """Close both files; this writes the index."""
         super().close()
         if self._input is not None:
             self._input.close()
@@ -275,14 +247,14 @@ class _ClipEncoder(StreamEncoder):
             self._container.mux(packet)
 
     def _time(self, index: int) -> Fraction:
-        """The time of a frame; times before the first and after the last frame follow at the mean rate."""
+        """The time of a frame; before the first and after the last frame, times follow the mean rate."""
         times = self._clip.times
         if 0 <= index < len(times):
             return times[index]
         return times[0] + index / self._even if index < 0 else times[-1] + (index - len(times) + 1) / self._even
 
     def _copy_sound(self, until: Fraction) -> None:
-        """Copy the clip's sound up to a time, packet by packet; stop at the first damaged packet."""
+        """Copy the clip's sound up to a time; stop at the first damaged packet."""
         while self._input is not None:
             try:
                 packet = self._held or next(self._sounds, None)
@@ -296,7 +268,7 @@ class _ClipEncoder(StreamEncoder):
             if self._held is not None:
                 return
             if begin + lasts <= 0:
-                continue  # before the first picture
+                continue  # before the first frame
             packet.pts, packet.dts = begin, None if packet.dts is None else packet.dts - ticks
             packet.stream = self._output
             self._container.mux(packet)

@@ -1,8 +1,7 @@
-"""Keep a clip's frames from flickering: flow from frame to frame, colours propagated along it, aligned depth.
+"""Avoid flicker in clips: align depth between frames, and propagate colours along the optical flow.
 
-The paper has no clips: it would complete each frame independently. Here each frame's aux Gaussians keep their
-positions, and take colours from the frame before, at the points from which the background moved. Colours that an
-earlier frame saw count more, and last longer, than colours that completion made up. All blending is in linear light.
+The paper completes single views. In a clip, the aux Gaussians of a frame take colours from the previous frame; colours
+seen in an earlier frame weigh more than completed colours. All blending is in linear light.
 """
 
 from __future__ import annotations
@@ -23,47 +22,47 @@ from spackle.render import Renderer, touched_tiles
 from spackle.render.protocol import Rendering
 from spackle.residual.view_features import CELL, hole_mask
 
-# Given two sRGB images [H, W, 3], the offset [H, W, 2] from each pixel of the first to its content in the second.
+# Maps two sRGB images [H, W, 3] to the offset [H, W, 2] from each pixel of the first image to its place in the second.
 Flow = Callable[[Tensor, Tensor], Tensor]
 
-RETURN_PX, RETURN_SHARE = 1.0, 0.05  # flow there and back must end within so many pixels, plus this part of its length
-ALIKE = 0.1  # largest mean sRGB difference between two pixels that count as the same content
-SAME_SHOT = 0.3  # fraction of a frame that must be found again in the one before, else it starts another shot
-THINNING = 4  # every fourth pixel along each axis is enough to fit six numbers
+RETURN_PX, RETURN_SHARE = 1.0, 0.05  # forward and backward flow may differ by so many pixels, plus this part of a flow
+ALIKE = 0.1  # largest mean sRGB difference between two pixels that show the same content
+SAME_SHOT = 0.3  # least fraction of a frame whose content the previous frame shows, unless a new shot begins
+THINNING = 4  # a fit of six numbers uses every fourth pixel along each axis
 ROUNDS = 8  # rounds of reweighting
-FIT_PX = 0.5  # a pixel whose flow differs this much from the camera's motion counts half
+FIT_PX = 0.5  # a pixel whose flow differs this much from the camera's motion has half weight
 
-KEEP = 0.98  # factor on the trust in a colour from frame to frame: a colour that was seen lasts over fifty frames
-GUESS = 0.9  # trust in a colour that completion made up; a colour that was seen has 1
-NEARER = 0.1  # a past pixel that was nearer by this relative difference belongs to another surface
-CARRIED = 0.5  # a pixel with more weight than this on the past counts as propagated
+KEEP = 0.98  # factor on the trust in a colour per frame: a seen colour lasts over fifty frames
+GUESS = 0.9  # trust in a completed colour; the trust in a seen colour is 1
+NEARER = 0.1  # a pixel of the previous frame nearer by this relative difference belongs to another surface
+CARRIED = 0.5  # a pixel in which the previous frame has more weight counts as propagated
 THIN = 0.05  # lower bound of a share of a pixel's light, for safe division
-FAINT = 0.25  # a contribution with a smaller share of a pixel is too uncertain to be remembered
+FAINT = 0.25  # an aux contribution with a smaller share of a pixel is not remembered
 MAX_GAIN = 2.0  # largest change of exposure between two frames
 
-LEAK = 0.95  # part of the correction that is kept from frame to frame: flicker vanishes, slow changes stay the base's
-FEWEST = 64  # number of tracked pixels that a fit needs
-OFF = 0.02  # of the median inverse depth: a pixel with this error counts half
-NO_SHIFT = 0.01  # weight of a penalty on shift, relative to all pixels: if all depths are alike, only the scale changes
+LEAK = 0.95  # part of the depth correction that is kept per frame, so that errors do not add up
+FEWEST = 64  # least number of tracked pixels for a fit
+OFF = 0.02  # a pixel with this error, as part of the median inverse depth, has half weight
+NO_SHIFT = 0.01  # weight of a penalty on the shift: if all depths are alike, only the scale changes
 MAX_SCALE = 2.0  # largest scale between two frames
 LEAST = 0.25  # a shift leaves at least this fraction of an inverse depth
 
 
 @dataclasses.dataclass(frozen=True)
 class Track:
-    """Where a frame's content was in an earlier frame."""
+    """The flow from a frame to an earlier frame."""
 
-    flow: Tensor  # [H, W, 2] pixels (x, y), from this frame's pixels to the earlier one's
-    sure: Tensor  # [H, W] bool: the flow there and back agree, and the colours too
+    flow: Tensor  # [H, W, 2] pixels (x, y)
+    sure: Tensor  # [H, W] bool: forward and backward flow agree, and so do the colours
 
     def same_shot(self, where: Tensor | None = None) -> bool:
-        """Whether enough of the frame, or of its pixels `where` [H, W], was visible in the earlier one."""
+        """Whether the earlier frame shows enough of this frame, or of the pixels `where` [H, W] bool."""
         sure = self.sure if where is None else self.sure[where]
         return sure.numel() > 0 and float(sure.float().mean()) >= SAME_SHOT
 
 
 def track(picture: Tensor, earlier: Tensor, flow: Flow) -> Track:
-    """Track a frame [H, W, 3] back into an earlier one of the same size."""
+    """Find the flow from a frame [H, W, 3] to an earlier frame of the same size."""
     back, forth = flow(picture, earlier), flow(earlier, picture)
     target = pixel_grid(back) + back
     gap = (back + sample(forth, target)).norm(dim=-1)
@@ -79,7 +78,7 @@ def pixel_grid(image: Tensor) -> Tensor:
 
 
 def inside(uv: Tensor, height: int, width: int) -> Tensor:
-    """[...] bool: whether a position [..., 2], in pixels, lies between the outermost pixels' centres."""
+    """[...] bool: whether a position [..., 2], in pixels, lies between the centres of the outermost pixels."""
     return ((uv >= 0.5) & (uv <= uv.new_tensor([width, height]) - 0.5)).all(-1)
 
 
@@ -91,10 +90,13 @@ def sample(image: Tensor, uv: Tensor) -> Tensor:
 
 
 def extend_flow(found: Track, inverse_depth: Tensor, known: Tensor, camera: Camera) -> Tensor:
-    """The flow [H, W, 2], extended into holes: the camera's motion, plus the far rim's deviation from that motion.
+    """Extend the flow into holes: the camera's motion, plus the deviation from that motion at a hole's far rim.
 
-    The flow of `found` is kept where it is reliable and `known` [H, W] is true. `inverse_depth` [H, W] is positive
-    everywhere, and in holes it is the fill's. `camera` is the frame's.
+    Args:
+        found: the flow; reliable flow is kept in the pixels `known`.
+        inverse_depth: [H, W], positive; in holes the depth of the filling.
+        known: [H, W] bool: pixels outside of holes.
+        camera: of the frame.
     """
     trusted = known & found.sure
     if not bool(trusted.any()):
@@ -118,17 +120,16 @@ def _motions(inverse_depth: Tensor, camera: Camera) -> Tensor:
 
 
 def _thinned(chosen: Tensor, fewest: int) -> Tensor:
-    """Every fourth of the chosen pixels [H, W] along each axis, if these are at least `fewest`; else all."""
     thin = torch.zeros_like(chosen)
     thin[::THINNING, ::THINNING] = chosen[::THINNING, ::THINNING]
     return thin if int(thin.sum()) >= fewest else chosen
 
 
 def _fit(basis: Tensor, flow: Tensor, trusted: Tensor) -> Tensor:
-    """The six numbers of the motion that most of the image follows; moving objects are outvoted."""
+    """The six numbers of the camera motion, by robust least squares; moving objects have little weight."""
     chosen = _thinned(trusted, 6)
     rows, wanted = basis[chosen].double(), flow[chosen].double()
-    size = rows.flatten(0, 1).norm(dim=0).clamp_min(1e-12)  # so that one small ridge suits all columns
+    size = rows.flatten(0, 1).norm(dim=0).clamp_min(1e-12)  # one ridge suits all normalised columns
     rows = rows / size
     weights = rows.new_ones(len(rows))
     motion = rows.new_zeros(6)
@@ -145,12 +146,12 @@ def _fit(basis: Tensor, flow: Tensor, trusted: Tensor) -> Tensor:
 
 @dataclasses.dataclass(frozen=True)
 class FrameMemory:
-    """The state that is kept of a completed view."""
+    """The state of a completed view that the next frame needs."""
 
     view: Rendering  # completed
-    light: Tensor  # [H, W, 3] linear: the view's light; in holes only that of the aux Gaussians
+    light: Tensor  # [H, W, 3] linear light of the view; in holes the light of the aux Gaussians alone
     inverse_depth: Tensor  # [H, W] of the same surfaces, positive
-    trust: Tensor  # [H, W] in 0..1: 1 if the base shows it, about KEEP^n if it did n frames ago
+    trust: Tensor  # [H, W] in 0..1: 1 if the base shows the pixel, about KEEP^n if a base showed it n frames ago
 
 
 def propagate_colors(
@@ -161,21 +162,17 @@ def propagate_colors(
     views: tuple[Rendering, Rendering],
     past: FrameMemory | None,
     flow: Flow,
-) -> tuple[Gaussians, FrameMemory, Tensor | None]:
-    """Give the aux Gaussians of a frame the colours that the previous view showed in the frame's holes.
+) -> tuple[Gaussians, FrameMemory]:
+    """Give the aux Gaussians of a frame colours of the previous view; returns recoloured Gaussians and the memory.
 
     Args:
-        base: the frame's own Gaussians.
-        aux: the Gaussians that complete this view, made without the past.
+        base: the base Gaussians of the frame.
+        aux: the aux Gaussians of the view, made without earlier frames.
         camera: the view.
         renderer: renders the view again.
         views: renderings of the base alone, and with `aux`.
         past: memory of the previous view; None at the start. A view of another shot is ignored, see `Track.same_shot`.
-        flow: finds the motion between two images.
-
-    Returns:
-        The recoloured aux Gaussians, the memory of the view, and the flow [H, W, 2] into the previous view, holes
-        included; the flow is None if there is no previous view of this shot.
+        flow: finds the optical flow between two images.
     """
     before, own = views
     hole = hole_mask(before.alpha)
@@ -184,12 +181,10 @@ def propagate_colors(
     start = FrameMemory(own, made_up, inverse_depth, _trust(hole, share, torch.zeros_like(share)))
     found = None if past is None else track(own.rgb, past.view.rgb, flow)
     if past is None or found is None or not found.same_shot(~hole):
-        return aux, start, None
+        return aux, start
     motion = extend_flow(found, inverse_depth, ~hole, camera)
-    if not bool(hole.any()):
-        return aux, start, motion
     recalled, weight = _recall(past, pixel_grid(motion) + motion, inverse_depth)
-    # How much brighter the frame is than the one before, measured where both show the same surfaces.
+    # The change of exposure, measured on surfaces that both frames show.
     same = found.sure & ~hole
     was = sample(past.light, pixel_grid(made_up) + found.flow)[same]
     gain = made_up[same].mean(0) / was.mean(0).clamp_min(1e-4)
@@ -198,20 +193,22 @@ def propagate_colors(
     fresh = made_up + _beside(recalled - made_up, hole, weight, inverse_depth)
     blended = (fresh + weight[..., None] * (recalled - fresh)).clamp(0, 1)
     light = torch.where(hole[..., None], blended, made_up)
-    # The colour of a faint cell is all noise: no change can be measured against it.
+    # The colour of a faint cell is too noisy to measure a change.
     changed = _recoloured(aux, camera, light - made_up, torch.where(hole & (share >= FAINT), share, 0.0))
     view = renderer.render([base, changed], camera, tiles=touched_tiles(aux, camera), onto=own)
-    return changed, FrameMemory(view, light, inverse_depth, _trust(hole, share, weight)), motion
+    return changed, FrameMemory(view, light, inverse_depth, _trust(hole, share, weight))
 
 
 def _trust(hole: Tensor, share: Tensor, weight: Tensor) -> Tensor:
-    """Confidence [H, W] in a view's colours: 1 where the base shows them; in holes the past's or a guess's."""
     filled = torch.where(share < FAINT, 0.0, weight.clamp_min(GUESS))
     return torch.where(hole, filled, 1.0)
 
 
 def behind(before: Rendering, own: Rendering, hole: Tensor) -> tuple[Tensor, Tensor]:
-    """Linear light [H, W, 3] and inverse depth [H, W] of a view; in holes only the added Gaussians' light and depth."""
+    """Linear light [H, W, 3] and inverse depth [H, W] of a view; in holes of the aux Gaussians alone.
+
+    `before` is the rendering of the base, `own` of base and aux Gaussians.
+    """
     share = (own.alpha - before.alpha).clamp_min(THIN)
     there, now = srgb_to_linear(before.rgb), srgb_to_linear(own.rgb)
     added = ((now - there) / share[..., None]).clamp(0, 1)
@@ -223,7 +220,7 @@ def behind(before: Rendering, own: Rendering, hole: Tensor) -> tuple[Tensor, Ten
 
 
 def _recall(past: FrameMemory, uv: Tensor, inverse_depth: Tensor) -> tuple[Tensor, Tensor]:
-    """Past light [H, W, 3] at pixels uv [H, W, 2], without pixels of nearer surfaces, and the trust in it [H, W]."""
+    """Light [H, W, 3] of the previous view at pixels uv [H, W, 2], without nearer surfaces, and its trust [H, W]."""
     height, width = past.trust.shape
     corner = (uv - 0.5).floor()
     part = uv - 0.5 - corner
@@ -243,7 +240,7 @@ def _recall(past: FrameMemory, uv: Tensor, inverse_depth: Tensor) -> tuple[Tenso
 
 
 def _beside(change: Tensor, hole: Tensor, weight: Tensor, inverse_depth: Tensor) -> Tensor:
-    """Spread the change [H, W, 3] of propagated pixels over new ones; it falls to 0 at the rim, so no seam shows."""
+    """Spread the change [H, W, 3] of propagated pixels over new pixels; the change falls to 0 at the rim."""
     carried = weight > CARRIED
     known = ~hole | carried
     values = torch.where(carried[..., None], change, 0.0).permute(2, 0, 1)
@@ -254,7 +251,7 @@ def _beside(change: Tensor, hole: Tensor, weight: Tensor, inverse_depth: Tensor)
 
 
 def _recoloured(aux: Gaussians, camera: Camera, change: Tensor, share: Tensor) -> Gaussians:
-    """Recolour aux Gaussians by the change [H, W, 3], averaged over each one's cell with the weights `share` [H, W]."""
+    """Recolour aux Gaussians by the change [H, W, 3], averaged over cells with the weights `share` [H, W]."""
     weighted = torch.cat([change * share[..., None], share[..., None]], dim=-1)
     sums = avg_pool2d(weighted.permute(2, 0, 1)[None], CELL, ceil_mode=True)[0]
     mean = sums[:3] / sums[3:].clamp_min(1e-6)
@@ -266,10 +263,9 @@ def _recoloured(aux: Gaussians, camera: Camera, change: Tensor, share: Tensor) -
 
 
 def flicker(view: Tensor, earlier: Tensor, flow: Tensor, chosen: Tensor) -> float | None:
-    """Mean absolute difference between a view [H, W, 3] and an earlier one warped by a flow [H, W, 2], both sRGB.
+    """Mean absolute sRGB difference between a view [H, W, 3] and an earlier view warped by the flow [H, W, 2].
 
-    The flow leads from the view's pixels to the earlier view's. The mean is over the pixels `chosen` [H, W]; None if
-    there are none.
+    The mean is over the pixels `chosen` [H, W]; None if there are none.
     """
     uv = pixel_grid(flow) + flow
     chosen = chosen & inside(uv, *chosen.shape)
@@ -293,16 +289,16 @@ class DepthAlignment:
         return DepthAlignment(self.scale * first.scale, self.scale * first.shift + self.shift)
 
     def leaked(self) -> DepthAlignment:
-        """A map a little nearer to the identity than this one."""
+        """A map a little nearer to the identity."""
         return DepthAlignment(self.scale**LEAK, LEAK * self.shift)
 
     def of_depth(self, depth: Tensor) -> Tensor:
-        """Mapped depths of any shape; those behind the eye are only scaled."""
+        """Mapped depths of any shape; depths ≤ 0 are only scaled."""
         front = depth > 0
         return torch.where(front, 1 / self.of(1 / depth.where(front, 1.0)), depth / self.scale)
 
     def of_gaussians(self, gaussians: Gaussians) -> Gaussians:
-        """Move Gaussians along the rays of a camera at the world's origin, which sees them as before."""
+        """Move and scale Gaussians along the rays of a camera at the origin, whose image does not change."""
         if self == DepthAlignment():
             return gaussians
         z = gaussians.means[:, 2]
@@ -311,10 +307,7 @@ class DepthAlignment:
 
 
 def align_depth(inverse_depth: Tensor, earlier: Tensor, found: Track) -> DepthAlignment:
-    """Fit the map from a frame's inverse depth [H, W] (0: unknown) to the earlier frame's, where both show the same.
-
-    Robust least squares: moving objects, and places where the two depths differ in shape, are outvoted.
-    """
+    """Fit the map from a frame's inverse depth [H, W] (0: unknown) to an earlier frame's, by robust least squares."""
     was = sample(earlier[..., None], pixel_grid(earlier) + found.flow)[..., 0]
     chosen = _thinned(found.sure & (inverse_depth > 0) & (was > 0), FEWEST)
     now, then = inverse_depth[chosen].double(), was[chosen].double()

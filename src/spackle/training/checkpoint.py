@@ -1,4 +1,4 @@
-"""Files of a training run: the checkpoint, which is written atomically, and TensorBoard curves."""
+"""Files of a training run: the checkpoint from which a run resumes, and TensorBoard curves."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import dataclasses
 import io
 import math
 import shutil
-import warnings
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -29,7 +28,7 @@ Log = Callable[[str], None]
 
 @dataclasses.dataclass
 class Progress:
-    """The progress of a run, as plain numbers."""
+    """The progress of a run."""
 
     step: int = 0  # steps done
     best: float | None = None  # lowest value of the task's `aim`, such as the loss; None before the first validation
@@ -39,11 +38,11 @@ class Progress:
     history: list[dict[str, float]] = dataclasses.field(default_factory=list)  # the measures of each validation
 
     def validated(self, measures: dict[str, float], aim: str, min_delta: float) -> bool:
-        """Record a validation; returns whether its measure `aim` is lower than the best by more than `min_delta`."""
+        """Record a validation; returns whether the measure `aim` is lower than the best by more than `min_delta`."""
         self.history.append({"step": self.step, **measures})
-        best = math.inf if self.best is None else self.best
-        if math.isfinite(measures[aim]) and measures[aim] < best - min_delta:
-            self.best, self.best_step, self.stale = measures[aim], self.step, 0
+        best, value = math.inf if self.best is None else self.best, measures.get(aim, math.inf)
+        if value < best - min_delta:
+            self.best, self.best_step, self.stale = value, self.step, 0
         else:
             self.stale += 1
         return self.stale == 0
@@ -51,7 +50,7 @@ class Progress:
 
 @dataclasses.dataclass(frozen=True)
 class Checkpoint:
-    """All state that the next step depends on; the step's number determines its samples."""
+    """All state on which the next step depends; the number of a step determines the step's samples."""
 
     progress: Progress
     network: dict[str, Tensor]
@@ -59,11 +58,11 @@ class Checkpoint:
     optimizer: dict[str, Any]
     recipe: dict[str, Any]
     digest: str  # identifies the samples
-    method: str = "residual"  # older checkpoints do not name one
+    method: str = "residual"
 
 
 def save_checkpoint(checkpoint: Checkpoint, folder: Path) -> None:
-    """Write checkpoint.pt; InputError if that fails, as on a full disk: then the previous checkpoint remains."""
+    """Write checkpoint.pt; if the disk is full, raise InputError and keep the previous checkpoint."""
     buffer = io.BytesIO()  # torch's own writer hides that a disk is full
     torch.save({**vars(checkpoint), "progress": dataclasses.asdict(checkpoint.progress)}, buffer)
     with atomic_path(folder / CHECKPOINT, durable=True) as temporary:
@@ -71,7 +70,7 @@ def save_checkpoint(checkpoint: Checkpoint, folder: Path) -> None:
 
 
 def load_checkpoint(folder: Path) -> Checkpoint | None:
-    """The checkpoint in a folder, if any; InputError if it cannot be read."""
+    """The checkpoint in a folder; None if there is none, InputError if it cannot be read."""
     path = folder / CHECKPOINT
     if not path.exists():
         return None
@@ -81,23 +80,19 @@ def load_checkpoint(folder: Path) -> Checkpoint | None:
 
 
 def find_checkpoint(output: Path, method: str, recipe: AnyRecipe, digest: str, log: Log) -> Checkpoint | None:
-    """The checkpoint from which a run resumes, if any.
-
-    InputError if the folder holds a different run, or its checkpoint cannot be read.
-    """
+    """The checkpoint from which a run resumes, or None; InputError if the folder holds a different run."""
     checkpoint = load_checkpoint(output)
     if checkpoint is None:
         return None
-    what, other = "", differences(checkpoint.recipe, recipe)
-    if checkpoint.method != method:
-        what = f"--method {checkpoint.method}, not of {method}"
-    elif other:
-        what = f"another recipe ({other[0]}{f' and {len(other) - 1} more' if len(other) > 1 else ''} differs)"
-    elif checkpoint.digest != digest:
-        what = "another recipe (the files that data names differ)"
-    if what:
-        raise InputError(f"{output}: holds a run of {what}: choose another with -o, or --overwrite to start anew")
-    log(f"{output}: going on from step {checkpoint.progress.step}")
+    changed = [] if checkpoint.method == method else ["--method"]
+    changed += differences(checkpoint.recipe, recipe)
+    changed += [] if checkpoint.digest == digest else ["the data's files"]
+    if changed:
+        raise InputError(
+            f"{output}: holds a run with other settings ({', '.join(changed)}): choose another folder with -o, "
+            "or --overwrite to start anew"
+        )
+    log(f"{output}: resuming from step {checkpoint.progress.step}")
     return checkpoint
 
 
@@ -108,15 +103,10 @@ def remove_run(output: Path) -> None:
 
 
 def open_logs(folder: Path, first: int, log: Log) -> AbstractContextManager[Any]:
-    """A writer of TensorBoard's event files in a run's folder; None if TensorBoard is not installed.
-
-    Values that an earlier process logged after the step `first` are hidden.
-    """
+    """A context with TensorBoard's `SummaryWriter`, which hides values after step `first`; None if not installed."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # protobuf warns about its own version
-            import tensorboard  # noqa: F401  # checked here: torch's import would raise another message
-            from torch.utils.tensorboard import SummaryWriter
+        import tensorboard  # noqa: F401  # if it is missing, torch's import raises another error
+        from torch.utils.tensorboard import SummaryWriter
     except ImportError:
         log("no TensorBoard logs: pip install 'spackle-nvs[train]'")
         return contextlib.nullcontext()

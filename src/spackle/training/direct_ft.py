@@ -1,8 +1,7 @@
-"""The paper's naive decoupled baseline ("Direct FT"): the base's own decoder is trained in place of the residual.
+"""The paper's naive decoupled baseline ("Direct FT"): SHARP's own decoder is trained in place of the residual.
 
-Targets and losses are the residual's, but the number of Gaussians is fixed: to fill a hole, some Gaussians must leave
-the surfaces that they showed. The paper calls this capacity competition. Only "the non-Spackle training path" has
-losses at the input view ("Training Details and Loss Weights"), so a step here includes each photo's own view.
+Targets and losses are those of the residual. Each step includes the photo's own view: only "the non-Spackle training
+path" has losses at the input view ("Training Details and Loss Weights").
 """
 
 from __future__ import annotations
@@ -23,7 +22,6 @@ from spackle.bases.sharp.encoder import set_precision
 from spackle.bases.sharp.network import DecoderInput, SharpNetwork, compose
 from spackle.camera import Camera
 from spackle.dataset.sample import DatasetView
-from spackle.dataset.shards import DatasetFiles
 from spackle.device import enough_memory, own_arithmetic
 from spackle.errors import InputError
 from spackle.files import write_whole
@@ -38,23 +36,19 @@ from spackle.training.samples import short_digest
 from spackle.training.sources import divided_photos, open_pseudo
 from spackle.weights import check_undamaged, installed, weights_digest
 
-VIEWS_AT_ONCE = 4  # views of a photo in a step: they share one pass through the encoder, the most expensive part
+VIEWS_AT_ONCE = 4  # views of a photo in a step; they share one pass through the encoder, the most expensive part
 
 
 @dataclasses.dataclass(frozen=True)
 class TunableSharp:
-    """SHARP with a trainable decoder, `network.gaussian_decoder()`: in float32, so that small steps change it."""
+    """SHARP with frozen weights, and a trainable decoder `network.gaussian_decoder()` in float32."""
 
     network: SharpNetwork
-    precision: torch.dtype  # of convolutions and products: frozen weights are stored in it, the decoder is autocast
+    precision: torch.dtype  # frozen weights are stored in it, the decoder is autocast to it
 
     @staticmethod
     def load(path: str | os.PathLike[str], precision: torch.dtype, device: torch.device) -> TunableSharp:
-        """Read a checkpoint (see `load_network`) and freeze it; `precision` is float32 or bfloat16.
-
-        Raises:
-            InputError: the file is missing, broken or foreign, or less than the 2.8 GB to read it are free.
-        """
+        """Read a checkpoint, see `load_network`, and freeze it; `precision` is float32 or bfloat16."""
         network = load_network(path, torch.float32)
         set_precision(network.monodepth_model, precision)
         return TunableSharp(network.to(device), precision)
@@ -68,7 +62,7 @@ class TunableSharp:
             return self.network.encode(image, photo_camera.focal[0] / photo_camera.width, usual_windows(device))
 
     def gaussians(self, decoder: nn.Module, encoded: DecoderInput, place: torch.device | str = "cpu") -> Gaussians:
-        """Gaussians in SHARP's normalised space, on device `place`; gradients reach `decoder`, a `GaussianDecoder`."""
+        """Gaussians in SHARP's normalised space, on the device `place`; gradients reach `decoder`."""
         device = encoded.picture.device
         autocast = torch.autocast(device.type, self.precision, enabled=self.precision != torch.float32)
         with own_arithmetic(device):
@@ -78,60 +72,65 @@ class TunableSharp:
 
 
 def normalised_camera(camera: Camera, photo_camera: Camera) -> Camera:
-    """A camera that sees Gaussians in normalised space as `camera` sees the same Gaussians in metres.
+    """A camera that sees Gaussians in SHARP's normalised space as `camera` sees the same Gaussians in metres.
 
-    The map from normalised space to metres, D = diag(W / 2fx, H / 2fy, 1) of the photo's camera, is not a rotation.
-    Applying it to Gaussians takes an eigendecomposition (`stretch_gaussians`), whose gradient is undefined for round
-    Gaussians, such as SHARP's initial ones. A renderer uses the camera's matrix P only as P x for centres and P Σ Pᵀ
-    for covariances, so a camera with the matrix P D renders the same image, and all gradients exist.
+    D = diag(W / 2fx, H / 2fy, 1) maps normalised space to metres. Stretching Gaussians by D takes an eigendecomposition
+    (`stretch_gaussians`), whose gradient is undefined for round Gaussians. A renderer uses the camera's matrix P only
+    as P x for centres and P Σ Pᵀ for covariances. The matrix P D thus renders the same image, with all gradients.
     """
     fx, fy = photo_camera.focal
-    matrix = camera.world_to_camera.double()  # rounding the product to float32 would shift the image
+    matrix = camera.world_to_camera.double()  # float32 would shift the image
     stretch = matrix.new_tensor([photo_camera.width / (2 * fx), photo_camera.height / (2 * fy), 1.0, 1.0])
     return dataclasses.replace(camera, world_to_camera=matrix * stretch)
 
 
 def render_photo(decoder: nn.Module, base: TunableSharp, views: Sequence[DatasetView], renderer: Renderer) -> ViewBatch:
-    """Predict a photo's Gaussians and render them in the given views; InputError if memory runs out.
+    """Predict a photo's Gaussians and render them in the given views; only `decoder` gets gradients.
 
-    Only the decoder, which runs after the frozen encoder of `base`, gets gradients.
+    InputError if memory runs out.
     """
     photo_camera = views[0].photo_camera
-    advice = ["try optim.precision=bf16"] if base.precision == torch.float32 else []
-    with enough_memory(*advice):
+    with enough_memory("try optim.precision=bf16"):
         gaussians = base.gaussians(decoder, base.encode(views[0].photo, photo_camera), device_of(renderer))
         drawn = [renderer.render(gaussians, normalised_camera(view.camera, photo_camera)) for view in views]
     return ViewBatch.of(drawn, [v.rendering.rgb for v in views], [v.target for v in views], [v.mask for v in views])
 
 
 class DirectFt(ViewTask):
-    """Its items are photos, run one at a time, because a photo's gradient in SHARP's decoder takes gigabytes."""
+    """Trains SHARP's decoder; its items are photos, run one at a time, because one gradient takes gigabytes."""
 
     name: ClassVar[str] = "direct-ft"
     at_once = 1
 
     def __init__(self, recipe: Recipe, device: torch.device, checkpoint: Path | None = None) -> None:
-        """Check that checkpoint (None: the downloaded one) and dataset match; no network is loaded yet.
+        """Check that checkpoint (None: the downloaded one) and dataset match, without loading the network.
 
         InputError if the recipe, the checkpoint or the dataset cannot be used.
         """
         super().__init__(recipe, device)
-        if recipe.optim.batch % VIEWS_AT_ONCE:
-            raise InputError(
-                f"optim.batch={recipe.optim.batch}: --method direct-ft takes {VIEWS_AT_ONCE} views of a photo "
-                f"at a time: give a multiple of {VIEWS_AT_ONCE}"
-            )
-        if recipe.init is not None:
-            raise InputError(f"init={recipe.init}: --method direct-ft starts from SHARP's checkpoint: leave it out")
         data = recipe.data
-        if data.pseudo is None or data.photos or data.rgbd or data.stereo:
+        if recipe.optim.batch % VIEWS_AT_ONCE:
+            raise InputError(f"optim.batch={recipe.optim.batch}: give a multiple of {VIEWS_AT_ONCE} views")
+        if data.pseudo is None or recipe.init or data.photos or data.rgbd or data.stereo:
             raise InputError(
-                "data: --method direct-ft learns from data.pseudo, a dataset of `spackle dataset build --base sharp`, "
-                "and from nothing else: samples of other sources have Gaussians that cannot change"
+                "--method direct-ft learns only from data.pseudo, a dataset of `spackle dataset build --base sharp`: "
+                "leave out init and other data"
             )
-        self.owner = _find_owner(checkpoint)
+        path = checkpoint or installed("sharp")
+        if path is None:
+            raise InputError(f"--method direct-ft: {MISSING['sharp']}")
+        read_tensors(path, "give SHARP's checkpoint")  # without the numbers; refuses other files
+        if owner_of(path) is not None:
+            raise InputError(f"-c {path}: an already trained decoder: give the original checkpoint of SHARP")
+        check_undamaged(path)
+        self.owner = Owner(path, weights_digest(path))
         self.files = open_pseudo(data.pseudo)
-        _check_base(self.files, self.owner.sha256)
+        base = self.files.manifest.config.get("base", {})
+        if (base.get("name"), base.get("weights")) != ("sharp", self.owner.sha256):
+            raise InputError(
+                f"{data.pseudo}: built with the base {base.get('name')}, weights {base.get('weights')}: build a "
+                f"dataset with --base sharp and the weights {path}"
+            )
         self.learned, self.validation = divided_photos(self.files, data)
         self.digest = short_digest((self.files.manifest.digest, self.learned, self.validation))
         self.items, self.validation_items = len(self.learned), len(self.validation)
@@ -141,15 +140,11 @@ class DirectFt(ViewTask):
         """Load SHARP."""
         self.base = TunableSharp.load(self.owner.path, self.precision, self.device)
         self.network = self.base.network.gaussian_decoder().let_learn()
-        facts = self.facts(self.base.network)
-        reporter.log(
-            f"{self.items} training photos, {self.validation_items} validation photos; "
-            f"{facts['parameters']['learn']:,} weights of SHARP learn, {facts['parameters']['stay']:,} stay"
-        )
-        return {**facts, "checkpoint": {"file": self.owner.path.name, "sha256": self.owner.sha256}}
+        reporter.log(f"{self.items} training photos, {self.validation_items} validation photos")
+        return {"checkpoint": {"file": self.owner.path.name, "sha256": self.owner.sha256}}
 
     def batch(self, step: int | None, items: Sequence[int]) -> list[DatasetView]:
-        """Views of a photo: its own and random others, or all for validation (step None); InputError for a bad file."""
+        """Views of a photo, see `drawn_views`; for validation (step None) all views."""
         (item,) = items
         group = self.files[(self.validation if step is None else self.learned)[item]]
         drawn = range(group.views) if step is None else drawn_views([self.recipe.run.seed, step, item], group.views)
@@ -160,16 +155,13 @@ class DirectFt(ViewTask):
 
     @torch.no_grad()
     def picture(self, network: nn.Module) -> Tensor:
-        """[H, W, 3] sRGB: for some photos, a row for the own view and one for the view with the largest hole."""
+        """[H, W, 3] sRGB: for some photos, one row for the photo's view and one for the view with the largest hole."""
         rows: list[tuple[Tensor, ...]] = []
         for place in self.validation[:: max(1, 2 * self.validation_items // PICTURED)][: PICTURED // 2]:
             group = self.files[place]
             done = self.complete(network, [group.view(0), group.view(int(np.argmax(group.holes)))])
             rows += zip(done.base_rgb, done.rgb, done.target, strict=True)
         return sheet(rows, PICTURE_SIDE)
-
-    def names(self, step: int, items: Sequence[int]) -> list[str]:
-        return [self.files.samples[self.learned[item]][1].photo for item in items]
 
     def export(self, network: nn.Module, path: Path) -> None:
         """Write the decoder in float32, for `spackle predict --base sharp -c`, and a link to its checkpoint."""
@@ -178,33 +170,6 @@ class DirectFt(ViewTask):
 
 
 def drawn_views(seed: Sequence[int], views: int) -> list[int]:
-    """Numbers of `VIEWS_AT_ONCE` of a photo's views: its own, 0, and random others; all if it has fewer."""
+    """Numbers of up to `VIEWS_AT_ONCE` views of a photo: the photo's own view, 0, and random other views."""
     others = 1 + np.random.default_rng(seed).permutation(views - 1)[: VIEWS_AT_ONCE - 1]
     return [0, *sorted(others.tolist())]
-
-
-def _check_base(files: DatasetFiles, weights_sha256: str) -> None:
-    """InputError if a dataset was made with another base, or with other weights than those to train."""
-    base = files.manifest.config.get("base", {})
-    if base.get("name") != "sharp":
-        raise InputError(
-            f"{files.location}: built with --base {base.get('name')}, but SHARP must learn its own holes: "
-            "build one with --base sharp"
-        )
-    if base.get("weights") != weights_sha256:
-        raise InputError(
-            f"{files.location}: built with other weights of SHARP (SHA-256 {base.get('weights')}): "
-            "give them with -c, or build a dataset with these"
-        )
-
-
-def _find_owner(checkpoint: Path | None) -> Owner:
-    """The checkpoint to train; a downloaded one is checked against the published digest."""
-    path = checkpoint or installed("sharp")
-    if path is None:
-        raise InputError(f"--method direct-ft: {MISSING['sharp']}")
-    read_tensors(path, "give SHARP's checkpoint")  # refuses files that are no checkpoint, without reading the weights
-    if owner_of(path) is not None:
-        raise InputError(f"-c {path}: a decoder that was trained already: give the checkpoint that it was trained on")
-    check_undamaged(path)
-    return Owner(path, weights_digest(path))

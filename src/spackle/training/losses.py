@@ -1,13 +1,8 @@
-"""The four terms of eq. 12 as pure functions, and two measures of how far a filled hole is from the truth.
+"""The four terms of eq. 12, two measures of a filled hole's error, and the feature networks.
 
-Inside the `hole` [B, H, W] bool, a completed view `rgb` [B, H, W, 3] sRGB 0..1 and its `alpha` [B, H, W] are compared
-with the `target` [B, H, W, 3]; outside, with the base's view `base_rgb` [B, H, W, 3]. Each term is a mean over the
-pixels of an image inside or outside the hole, then over the images of the batch: a small hole counts as much as a large
-one, and an image without such pixels gives a differentiable 0. So the loss of a batch is the mean of its images'
-losses, however processes divide them.
-
-The perceptual term and `hole_distance` compare features of a frozen network (paper, "Training Details and Loss
-Weights"): the paper's ResNet-50, or SqueezeNet 1.0, which takes 3 MB and is many times faster.
+Arguments of the terms: `rgb` [B, H, W, 3] sRGB 0..1 and `alpha` [B, H, W] of completed views, the base's view
+`base_rgb` [B, H, W, 3], the `target` [B, H, W, 3], the `hole` [B, H, W] bool. A term is a mean over pixels of an image,
+then over images. An image without such pixels gives a differentiable 0.
 """
 
 from __future__ import annotations
@@ -27,9 +22,9 @@ from spackle.filters import blurred, greatest_around
 from spackle.network_file import load_strict, read_tensors
 from spackle.training.recipe import LossRecipe
 
-ALPHA_FLOOR = 1e-3  # below 1/255, the least alpha that is rendered: the clamp removes no gradient of a visible splat
-NO_LENGTH = 1e-10  # the least length that a feature vector is divided by, as in LPIPS
-TINY = 1e-6  # avoids division by zero: by the RMS of all-zero features, and by the area of an empty hole
+ALPHA_FLOOR = 1e-3  # less than 1/255, the least alpha that is rendered: the clamp removes no visible splat's gradient
+NO_LENGTH = 1e-10  # least divisor of feature vectors, as in LPIPS
+TINY = 1e-6  # avoids division by zero
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of sRGB 0..1, as in torchvision
 CAFFE_MEAN = (104.0, 117.0, 123.0)  # of BGR 0..255
 # The input channels and squeezed channels of fire2 to fire9.
@@ -40,14 +35,14 @@ SQUEEZED = dict(enumerate([(96, 16), (128, 16), (128, 32), (256, 32), (256, 48),
 
 
 class FeatureNet(nn.Module):
-    """Maps [B, 3, H, W] sRGB 0..1 to four feature maps [B, C, h, w], fine to coarse; only the images get gradients."""
+    """Maps [B, 3, H, W] sRGB 0..1 to four feature maps [B, C, h, w], fine to coarse; weights get no gradients."""
 
     name: str  # in reports
-    head: str  # prefix of the classifier's tensors, which are ignored if a file has them
+    head: str  # prefix of the classifier's tensors, which are ignored
 
 
 class Bottleneck(nn.Module):
-    """ResNet's block: maps [B, inside, h, w] to [B, 4 width, h / stride, w / stride]; names as in torchvision."""
+    """ResNet's block: maps [B, inside, h, w] to [B, 4 width, h / stride, w / stride]."""
 
     def __init__(self, inside: int, width: int, stride: int) -> None:
         super().__init__()
@@ -65,9 +60,9 @@ class Bottleneck(nn.Module):
 
 
 class ResNet50(FeatureNet):
-    """The paper's feature extractor, with torchvision's names, for images of at least 32 pixels a side.
+    """The paper's feature network, with torchvision's names of tensors, for images of at least 32 pixels a side.
 
-    Returns the outputs of layer1 to layer4: 256, 512, 1024, 2048 channels at 1/4, 1/8, 1/16, 1/32 of the image's size.
+    Outputs of layer1 to layer4: 256, 512, 1024, 2048 channels at 1/4, 1/8, 1/16, 1/32 of the image's size.
     """
 
     name, head = "resnet50", "fc."
@@ -88,7 +83,7 @@ class ResNet50(FeatureNet):
 
 
 class Fire(nn.Module):
-    """SqueezeNet's block: maps [B, inside, h, w] to [B, 8 squeeze, h, w]; names as in its weight file."""
+    """SqueezeNet's block: maps [B, inside, h, w] to [B, 8 squeeze, h, w]."""
 
     def __init__(self, inside: int, squeeze: int) -> None:
         super().__init__()
@@ -102,10 +97,9 @@ class Fire(nn.Module):
 
 
 class SqueezeNet(FeatureNet):
-    """SqueezeNet 1.0 as Caffe computes it, for images of at least 35 pixels a side.
+    """SqueezeNet 1.0 as in Caffe: 3 MB, much faster than ResNet-50, for images of at least 32 pixels a side.
 
-    Returns the outputs of conv1, fire4, fire8, fire9: 96, 256, 512, 512 channels at 1/2, 1/4, 1/8, 1/16. The first
-    convolution has no padding, so cells lie up to 5 pixels further inwards than if the image were divided evenly.
+    Outputs of conv1, fire4, fire8, fire9: 96, 256, 512, 512 channels at about 1/2, 1/4, 1/8, 1/16 of the image's size.
     """
 
     name, head = "squeezenet", "conv10."
@@ -120,7 +114,7 @@ class SqueezeNet(FeatureNet):
         maps = {1: self.conv1(255 * images.flip(1) - _channels(CAFFE_MEAN, images)).relu()}
         for number in SQUEEZED:
             x = maps[number - 1]
-            if number in (2, 5, 9):  # Caffe's pooling includes windows that extend beyond the edge
+            if number in (2, 5, 9):  # Caffe's pooling windows may extend beyond the edge
                 x = F.max_pool2d(x, 3, 2, ceil_mode=True)
             maps[number] = self.get_submodule(f"fire{number}")(x)
         return [maps[number] for number in (1, 4, 8, 9)]
@@ -129,21 +123,15 @@ class SqueezeNet(FeatureNet):
 def load_features(
     name: Literal["resnet50", "squeezenet", "none"], path: Path | None, device: torch.device | str = "cpu"
 ) -> FeatureNet | None:
-    """Load a frozen network from a local file; no code in the file is run.
+    """Load a frozen feature network; "none" gives None.
 
-    Args:
-        name: which network; "none" gives None.
-        path: for ResNet-50 torchvision's .pth file; for SqueezeNet 1.0 an .npz with `conv1.w`, `conv1.b`,
-            `fire2/conv1x1_1.w`, ... A classifier in the file is ignored.
-        device: where the network runs.
-
-    Raises:
-        InputError: the file is missing, broken, or no such network.
+    `path` is torchvision's .pth file of ResNet-50, or an .npz of SqueezeNet 1.0 with the names of Caffe: `conv1.w`,
+    `conv1.b`, `fire2/conv1x1_1.w`, ... InputError if the file is missing, broken, or holds another network.
     """
     if name == "none":
         return None
     if path is None:
-        raise InputError(f"{name}: its weights are not given: name their file, or choose none")
+        raise InputError(f"{name}: the file of weights is not given: name the file, or choose none")
     network: FeatureNet = ResNet50() if name == "resnet50" else SqueezeNet()
     advice = f"give another file with {name}'s weights"
     tensors = read_tensors(path, advice) if name == "resnet50" else _read_npz(path, advice)
@@ -152,7 +140,6 @@ def load_features(
 
 
 def _read_npz(path: Path, advice: str) -> dict[str, Tensor]:
-    """The tensors of an .npz, with names changed like `fire2/conv1x1_1.w` to `fire2.conv1x1_1.weight`."""
     check_file(path, "weight file")
     broken = reading(path, f"not a file of weights ({{reason}}): {advice}")
     with broken, open(path, "rb") as file, np.load(file, allow_pickle=False) as arrays:
@@ -161,7 +148,6 @@ def _read_npz(path: Path, advice: str) -> dict[str, Tensor]:
 
 
 def _channels(numbers: tuple[float, ...], images: Tensor) -> Tensor:
-    """Three channel values as a tensor [3, 1, 1] on the images' device."""
     return torch.tensor(numbers, dtype=images.dtype).to(images.device, non_blocking=True)[:, None, None]
 
 
@@ -171,8 +157,8 @@ def _channels(numbers: tuple[float, ...], images: Tensor) -> Tensor:
 def color_loss(rgb: Tensor, target: Tensor, hole: Tensor, blur: float = 0.0) -> Tensor:
     """[] mean |rgb - target| over a hole's pixels and the channels.
 
-    `blur` is the standard deviation in pixels with which the difference is first blurred within the hole: then only low
-    frequencies count, and the perceptual term alone decides on texture.
+    With `blur` > 0 the difference is first blurred within the hole, by a Gaussian of this standard deviation in pixels;
+    the perceptual term alone then determines texture.
     """
     apart = torch.where(hole[..., None], rgb - target, 0)
     if blur > 0:
@@ -182,16 +168,13 @@ def color_loss(rgb: Tensor, target: Tensor, hole: Tensor, blur: float = 0.0) -> 
 
 
 def alpha_loss(alpha: Tensor, hole: Tensor) -> Tensor:
-    """[] mean -log(max(alpha, 0.001)) over a hole: cross entropy towards 1.
-
-    The clamp keeps the gradient below 1000; it has no other effect, because a splat below 1/255 is not rendered.
-    """
+    """[] mean -log(max(alpha, 0.001)) over a hole: cross entropy towards 1."""
     opaque = torch.where(hole, alpha, 1).clamp_min(ALPHA_FLOOR)
     return _mean_of_images(-opaque.log(), hole)
 
 
 def preserve_loss(rgb: Tensor, base_rgb: Tensor, hole: Tensor) -> Tensor:
-    """[] mean |rgb - base_rgb| over the pixels outside the hole and the channels; `base_rgb` gets no gradient."""
+    """[] mean |rgb - base_rgb| over pixels outside of the hole and channels; `base_rgb` gets no gradient."""
     return color_loss(rgb, base_rgb.detach(), ~hole)
 
 
@@ -205,19 +188,22 @@ def perceptual_loss(
     size: int | None = 512,
     gram: float = 1.0,
 ) -> Tensor:
-    """[] differences of features and of their Gram matrices near the hole.
+    """[] differences of features and of Gram matrices near the hole, summed over layers.
 
-    The hole is first dilated by a max-pool of `dilation`, an odd side in pixels; outside it the target replaces the
-    prediction. F and T are a layer's features [C, h, w] of prediction and target, both divided by the root mean square
-    of T (no gradient), so that all layers have the same scale; w [h, w] is the fraction of each cell that the dilated
-    hole covers. The loss is the sum over layers of
+    F and T are a layer's features [C, h, w] of prediction and target, divided by the root mean square of T; w [h, w] is
+    the fraction of each cell that the dilated hole covers. A layer adds
 
         sum(w |F - T|) / (C sum(w))  +  gram · mean |G(F) - G(T)|,    G(F) = (F w) F^T / sum(w),  [C, C].
 
-    `size` is the longer side of the images that the network sees; None leaves them as they are.
+    Args:
+        features: the network.
+        rgb, target, hole: as in all terms. Outside of the dilated hole, the target replaces the prediction.
+        dilation: side in pixels of the max-pool that dilates the hole.
+        size: longer side in pixels to which images are resized for the network; None: not resized.
+        gram: weight of the Gram matrices.
     """
     near = greatest_around(hole, dilation // 2)
-    if near.device.type == "cpu" and not near.any():  # reading this from a GPU would wait for it
+    if near.device.type == "cpu" and not near.any():  # reading a mask on a GPU would wait for the GPU
         return rgb[:0].sum()  # 0, and a gradient of zeros, without the network
     ours = features(_resized(torch.where(near[..., None], rgb, target), size))
     with torch.no_grad():
@@ -235,9 +221,9 @@ def total_loss(
     recipe: LossRecipe,
     features: FeatureNet | None = None,
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """The weighted sum of eq. 12, which is minimised, and its terms by name, unweighted and detached; all are [].
+    """The weighted sum [] of eq. 12, and the unweighted, detached terms [] by name.
 
-    If `features` is None, the perceptual term is left out, whatever network the recipe names.
+    If `features` is None, there is no perceptual term.
     """
     terms = {
         "color": color_loss(rgb, target, hole, recipe.color_blur),
@@ -253,18 +239,11 @@ def total_loss(
 
 @torch.no_grad()
 def hole_distance(features: FeatureNet, rgb: Tensor, target: Tensor, hole: Tensor) -> float:
-    """Perceptual distance inside a hole, like LPIPS without its learned weights; 0 is equal, lower is better.
+    """Perceptual distance inside a hole, like LPIPS without learned weights; 0 if equal, NaN if the hole is empty.
 
-    For each layer, the feature vectors of both images are scaled to unit length along the channels. Their squared
-    difference (0 to 2 per cell, because features are not negative) is averaged over the cells, weighted by the fraction
-    of each that the undilated hole covers; the layers are summed. Distances by different networks are not comparable,
-    nor are they comparable with published LPIPS.
-
-    Args:
-        features: the feature network, usually `SqueezeNet`.
-        rgb: [H, W, 3] the completed view, sRGB 0..1, used only inside the hole.
-        target: [H, W, 3] the truth, finite everywhere.
-        hole: [H, W] bool; the distance is NaN if it is empty.
+    Feature vectors are scaled to unit length. Their squared difference is averaged over a layer's cells, weighted by
+    the fraction of each cell that the hole covers, and summed over layers. Only distances by the same network are
+    comparable. `rgb` and `target` are [H, W, 3] sRGB 0..1, `hole` is [H, W] bool.
     """
     if not hole.any():
         return math.nan
@@ -278,9 +257,9 @@ def hole_distance(features: FeatureNet, rgb: Tensor, target: Tensor, hole: Tenso
 
 
 def hole_psnr(rgb: Tensor, target: Tensor, hole: Tensor) -> float:
-    """-10 log10 of the mean squared difference over a hole's pixels and the channels, in dB; higher is better.
+    """PSNR in dB over a hole's pixels; infinite for equal images, NaN for an empty hole.
 
-    `rgb` and `target` are [H, W, 3] sRGB 0..1, `hole` is [H, W] bool. Infinite for equal images, NaN for an empty hole.
+    `rgb` and `target` are [H, W, 3] sRGB 0..1, `hole` is [H, W] bool.
     """
     if not hole.any():
         return math.nan
@@ -289,18 +268,17 @@ def hole_psnr(rgb: Tensor, target: Tensor, hole: Tensor) -> float:
 
 
 def covered(mask: Tensor, features: Tensor) -> Tensor:
-    """[B, 1, h, w] the fraction, 0..1, of each cell of a feature map [B, C, h, w] that a mask [B, H, W] covers."""
+    """[B, 1, h, w]: the fraction of each cell of a feature map [B, C, h, w] that a mask [B, H, W] covers."""
     height, width = features.shape[-2:]
     return F.adaptive_avg_pool2d(mask[:, None].to(features.dtype), (height, width))
 
 
 def _mean_of_images(values: Tensor, where: Tensor) -> Tensor:
-    """[] mean of values [B, H, W], 0 outside the mask `where`: over each image's mask, then over the images."""
+    """[] mean of values [B, H, W], 0 outside of the mask `where`, over each image's mask, then over images."""
     return (values.sum((1, 2)) / where.sum((1, 2)).clamp_min(1)).mean()
 
 
 def _resized(images: Tensor, size: int | None) -> Tensor:
-    """Resize [B, H, W, 3] to [B, 3, h, w], whose longer side is `size`; None keeps the size."""
     images = images.movedim(-1, 1)
     height, width = images.shape[-2:]
     if size is None or size == max(height, width):
@@ -321,6 +299,5 @@ def _layer_terms(ours: Tensor, theirs: Tensor, weight: Tensor) -> tuple[Tensor, 
 
 
 def _gram(features: Tensor, weight: Tensor, area: Tensor) -> Tensor:
-    """Gram matrices [B, C, C]: means over the cells, weighted by `weight`."""
     together = (features * weight).flatten(2) @ features.flatten(2).mT
     return together / area.clamp_min(TINY)[:, None, None]

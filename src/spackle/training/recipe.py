@@ -1,69 +1,36 @@
-"""Recipes of training runs: settings with bounds, read from YAML and overridden by `key=value`."""
+"""Recipes: settings of training runs, read from YAML and overridden by `key=value`."""
 
 from __future__ import annotations
 
 import os
-import typing
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from spackle.camera_path import MAX_DISPARITY
 from spackle.device import Precision
 from spackle.errors import InputError, reading, shown
 from spackle.files import check_file
-from spackle.residual.view_features import CELL
 from spackle.weights import installed
 
 PACKAGED = Path(__file__).parent / "recipes"
-MAX_BYTES = 1 << 16
-LEAST_SIDE = 36  # pixels a side that the feature networks need at least
-# Marks keys that may change when a run resumes: its length, how often it validates, where its files lie. Whether the
-# samples are the same is decided by their digest.
-FREE = "free"
+FREE = "free"  # marks keys that may change when a run resumes; samples are compared by digest, not by these keys
 
-
-def _as_number(value: object) -> object:
-    """Convert text such as 1e3, which YAML 1.1 does not read as a number."""
-    try:
-        return float(value) if isinstance(value, str) else value
-    except ValueError:
-        return value
-
-
-def _odd(value: int) -> int:
-    if value % 2 == 0:
-        raise ValueError(f"{value} is even; a square around a pixel has an odd side")
-    return value
-
-
-def _ascending(value: tuple[float, float]) -> tuple[float, float]:
-    if value[0] > value[1]:
-        raise ValueError(f"runs from {value[0]:g} down to {value[1]:g}; give the smaller one first")
-    return value
-
-
-Whole = Annotated[int, BeforeValidator(_as_number)]
 Share = Annotated[float, Field(ge=0, le=1e6)]
-Count = Annotated[Whole, Field(ge=1, le=1_000_000)]  # file names of samples have six digits
+Count = Annotated[int, Field(ge=1, le=1_000_000)]  # file names of samples have six digits
 Beta = Annotated[float, Field(ge=0, lt=1)]
 Disparity = Annotated[float, Field(ge=0, le=MAX_DISPARITY)]
-Interval = Annotated[Whole, Field(ge=1), FREE]  # steps
+Interval = Annotated[int, Field(ge=1), FREE]  # steps
 Place = Annotated[Path | None, FREE]
-Seed = Annotated[Whole, Field(ge=0, le=2**31 - 2)]
+Seed = Annotated[int, Field(ge=0, le=2**31 - 2)]
 
 
 class RecipePart(BaseModel):
-    """A section of a recipe; an empty section keeps the defaults."""
+    """A section of a recipe."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _not_empty(cls, value: Any) -> Any:
-        return {} if value is None else value
 
 
 class RgbdFolder(RecipePart):
@@ -75,35 +42,34 @@ class RgbdFolder(RecipePart):
 
 
 class Shares(RecipePart):
-    """The share of views from each source; shares need not add up to 1, and a source without data gets none."""
+    """Relative shares of the views from each source; a source without data gets no share."""
 
     composites: Share = 0.66
     rgbd: Share = 0.12
     stereo: Share = 0.10  # `reverse_view` of the left photo
-    pairs: Share = 0.12  # the right photo as the target
-    pseudo: Annotated[Share, FREE] = 1.0  # renderings with completed targets; absent from older checkpoints
+    pairs: Share = 0.12  # the right photo is the target
+    pseudo: Annotated[Share, FREE] = 1.0  # views of a dataset
 
 
 class DataRecipe(RecipePart):
-    """Where views with holes and their truth come from, and how many there are."""
+    """Sources and numbers of the training views."""
 
     photos: Place = None  # a folder, with its subfolders
     rgbd: Annotated[tuple[RgbdFolder, ...], FREE] = ()
     stereo: Place = None  # a folder of scenes, each with a scene.json
     pseudo: Place = None  # a dataset that `spackle dataset build` made
     shares: Shares = Shares()
-    # The least and the greatest disparity of the virtual camera.
-    disparity: Annotated[tuple[Disparity, Disparity], AfterValidator(_ascending)] = (0.1, 0.6)
-    views: Count = 20_000  # the paper's: 1,000 photos, 20 views of each
-    crops: Annotated[Whole, Field(ge=1, le=100)] = 3  # at most, per view
-    cells: Annotated[Whole, Field(ge=16, le=768)] = 96  # cells of 2×2 pixels along a crop's side
+    disparity: tuple[Disparity, Disparity] = (0.1, 0.6)  # least and greatest disparity of the virtual camera
+    views: Count = 20_000  # the paper: 20 views of 1,000 photos
+    crops: Annotated[int, Field(ge=1, le=100)] = 3  # most crops of a view
+    cells: Annotated[int, Field(ge=16, le=768)] = 96  # cells of 2×2 pixels along a crop's side
     validation_views: Count = 100
     cache: Place = None  # a folder for the samples; None: inside the output
-    seed: Seed = 0  # for the samples alone: runs that differ only in run.seed share them
+    seed: Seed = 0  # for the samples alone: runs that differ only in run.seed share samples
 
 
 class LossRecipe(RecipePart):
-    """The weights of eq. 12's terms, and the perceptual term's network (paper, "Training Details and Loss Weights")."""
+    """Weights of the terms of eq. 12, and settings of the terms (paper, "Training Details and Loss Weights")."""
 
     color: Share = 10.0
     alpha: Share = 0.5
@@ -112,40 +78,34 @@ class LossRecipe(RecipePart):
     features: Literal["resnet50", "squeezenet", "none"] = "resnet50"
     features_path: Place = None
     # Longer side in pixels to which crops are resized for the feature network; None: not resized.
-    feature_size: Annotated[Whole, Field(ge=64, le=4096)] | None = 512
-    dilation: Annotated[Whole, Field(ge=1, le=1001), AfterValidator(_odd)] = 21  # pixels
-    color_blur: Annotated[float, Field(ge=0, le=64)] = 0.0  # pixels; if > 0 only low frequencies count
-    gram: Share = 1.0  # weight of the perceptual term's Gram statistics
+    feature_size: Annotated[int, Field(ge=64, le=4096)] | None = 512
+    dilation: Annotated[int, Field(ge=1, le=1001)] = 21  # pixels, odd
+    color_blur: Annotated[float, Field(ge=0, le=64)] = 0.0  # standard deviation in pixels, see `color_loss`
+    gram: Share = 1.0  # weight of Gram matrices within the perceptual term
 
     @property
     def features_file(self) -> Path | None:
-        """The feature network's weights: `features_path`, else what `spackle weights get features` fetched."""
+        """Weights of the feature network: `features_path`, else the file of `spackle weights get features`."""
         return self.features_path or (installed("features") if self.features == "resnet50" else None)
 
 
 class OptimRecipe(RecipePart):
-    """AdamW with a linear warm-up and a cosine after it (paper, "Training Details and Loss Weights")."""
+    """AdamW with linear warm-up, then a cosine (paper, "Training Details and Loss Weights")."""
 
     lr: Annotated[float, Field(gt=0, le=1)] = 1.6e-4
     min_lr: Annotated[float, Field(ge=0, le=1)] = 1.6e-5
-    warmup: Annotated[Whole, Field(ge=0)] = 10_000  # steps
+    warmup: Annotated[int, Field(ge=0)] = 10_000  # steps
     steps: Interval = 100_000
-    batch: Annotated[Whole, Field(ge=1, le=100_000)] = 16  # crops per step, over all processes
+    batch: Annotated[int, Field(ge=1, le=100_000)] = 16  # crops per step, over all processes
     betas: tuple[Beta, Beta] = (0.9, 0.999)
     weight_decay: Annotated[float, Field(ge=0, le=10)] = 1e-4
-    clip: Annotated[float, Field(gt=0)] = 1.0  # the gradient's maximum norm
+    clip: Annotated[float, Field(gt=0)] = 1.0  # largest norm of the gradient
     ema: Beta = 0.999  # decay of the averaged weights, which are validated and exported; 0: no average
     precision: Precision = "auto"  # of the network; auto: bf16 if the hardware supports it natively
 
-    @model_validator(mode="after")
-    def _falls(self) -> OptimRecipe:
-        if self.min_lr > self.lr:
-            raise ValueError(f"min_lr {self.min_lr:g} is above lr {self.lr:g}")
-        return self
-
 
 class RunRecipe(RecipePart):
-    """Settings of the run; only the seed and the stopping rule affect what is learned."""
+    """Settings of the run."""
 
     seed: Seed = 0  # for initial weights and the order of samples
     validate_every: Interval = 1000
@@ -153,7 +113,7 @@ class RunRecipe(RecipePart):
     log_every: Interval = 50
     patience: Interval = 10  # validations without improvement before the run ends
     min_delta: Annotated[float, Field(ge=0), FREE] = 1e-4  # smaller improvements do not count
-    device: Annotated[Literal["auto", "cpu", "cuda"], FREE] = "auto"  # of the networks; the renderer picks its own
+    device: Annotated[Literal["auto", "cpu", "cuda"], FREE] = "auto"  # of the networks, not of the renderer
 
 
 class AnyRecipe(RecipePart):
@@ -168,20 +128,17 @@ class Recipe(AnyRecipe):
 
     data: DataRecipe = DataRecipe()
     loss: LossRecipe = LossRecipe()
-    # The residual's architecture. Free because older checkpoints lack the key; weights of another one fail to load.
-    network: Annotated[Literal["unet", "sharp-decoder"], FREE] = "unet"
-    init: Path | None = None  # weights to start from; sharp-decoder also takes SHARP's own
+    network: Annotated[Literal["unet", "sharp-decoder"], FREE] = "unet"  # architecture of the residual
+    init: Path | None = None  # initial weights; sharp-decoder also takes SHARP's checkpoint
 
     @model_validator(mode="after")
     def _has_features(self) -> Recipe:
-        name, size = self.loss.features, self.loss.feature_size or CELL * self.data.cells
+        name = self.loss.features
         if name != "none" and self.loss.features_file is None:
             raise ValueError(
-                f"loss.features_path: missing; give the weights of {name}, fetch those of resnet50 with "
-                "`spackle weights get features`, or do without: loss.features=none"
+                f"loss.features_path: missing; give the weights of {name}, download the weights of resnet50 with "
+                "`spackle weights get features`, or choose loss.features=none"
             )
-        if name != "none" and size < LEAST_SIDE:
-            raise ValueError(f"data.cells: too small for {name} ({LEAST_SIDE} pixels); raise it, or loss.feature_size")
         return self
 
 
@@ -189,7 +146,7 @@ R = TypeVar("R", bound=AnyRecipe)
 
 
 def differences(stored: Mapping[str, Any], recipe: RecipePart, above: str = "") -> list[str]:
-    """The keys, prefixed by `above`, in which a recipe differs from a `model_dump` of another; no `FREE` ones."""
+    """Keys, without `FREE` keys, in which a recipe differs from the `model_dump` of another; prefixed by `above`."""
     fields, now = type(recipe).model_fields, recipe.model_dump(mode="json")
     keys = [above + name for name, value in stored.items() if name not in fields and value is not None]
     for name, field in fields.items():
@@ -202,24 +159,23 @@ def differences(stored: Mapping[str, Any], recipe: RecipePart, above: str = "") 
 
 
 def load_recipe(kind: type[R], path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> R:
-    """Read a recipe; values that it lacks are the defaults of `kind`.
+    """Read a recipe; missing values are the defaults of `kind`.
 
     Args:
         kind: the class of the recipe, such as `Recipe`.
-        path: a YAML file, or the name of a packaged one such as "cpu". Relative paths in it are relative to the
-            working directory.
+        path: a YAML file, or the name of a packaged recipe such as "cpu". Relative paths in the file are relative to
+            the working directory.
         overrides: texts `key=value`, such as optim.steps=100 or data.rgbd.0.folder=kitchen; values are YAML.
 
     Raises:
-        InputError: the file is missing or broken, or has an unknown key or a value out of bounds, which is named.
+        InputError: the file is missing or broken, or has an unknown key or a value out of bounds.
     """
     names = sorted(file.stem for file in PACKAGED.glob("*.yaml"))
     if os.fspath(path) in names and not os.path.isfile(path):
         path = PACKAGED / f"{os.fspath(path)}.yaml"
     elif os.sep not in os.fspath(path) and not os.path.exists(path):
-        raise InputError(f"{path}: no such recipe; there are {', '.join(names)}, or give a YAML file")
-    if check_file(path, "recipe") > MAX_BYTES:
-        raise InputError(f"{path}: too long for a recipe (at most {MAX_BYTES >> 10} KiB): is it the right file?")
+        raise InputError(f"{path}: no such recipe; choose from {', '.join(names)}, or give a YAML file")
+    check_file(path, "recipe")
     with reading(path, "not a recipe: {reason}", OSError, UnicodeDecodeError):
         text = Path(path).read_text(encoding="utf-8")
     content = _parse(text, path) or {}
@@ -232,14 +188,14 @@ def load_recipe(kind: type[R], path: str | os.PathLike[str], overrides: Sequence
     try:
         return kind.model_validate(content)
     except ValidationError as error:
-        raise InputError(f"{path}: {_first_problem(kind, error)}") from error
+        raise InputError(f"{path}: {_first_problem(error)}") from error
 
 
 def _parse(text: str, where: object) -> Any:
     try:
         import yaml
     except ImportError as error:
-        raise InputError("recipes are YAML, which needs a package: pip install 'spackle-nvs[train]'") from error
+        raise InputError("recipes need a package for YAML: pip install 'spackle-nvs[train]'") from error
     with reading(where, "not YAML: {reason}"):
         return yaml.safe_load(text)
 
@@ -255,17 +211,12 @@ def _set(content: Any, keys: Sequence[str], value: object) -> None:
         content = content[index]
 
 
-def _first_problem(kind: Any, error: ValidationError) -> str:
-    """A message about the first invalid value: its key, and what it must be."""
+def _first_problem(error: ValidationError) -> str:
+    """A message that names the key of the first invalid value, and what the value must be."""
     first = error.errors()[0]
     key = ".".join(str(name)[:60] for name in first["loc"])
-    message = first["msg"][0].lower() + first["msg"][1:]
+    if first["type"] == "value_error":
+        return str(first["ctx"]["error"])
     if first["type"] == "extra_forbidden":
-        for name in first["loc"][:-1]:
-            kind = typing.get_args(kind)[0] if isinstance(name, int) else kind.model_fields[name].annotation
-        message = f"there is no such key; there are {', '.join(kind.model_fields)}"
-    elif first["type"] == "value_error":
-        message = str(first["ctx"]["error"])
-    elif first["type"] != "missing":
-        message = f"{message}, not {shown(first['input'])}"
-    return f"{key}: {message}" if key else message
+        return f"{key}: there is no such key"
+    return f"{key}: {first['msg'][0].lower()}{first['msg'][1:]}, not {shown(first['input'])}".removeprefix(": ")

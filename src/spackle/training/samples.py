@@ -1,7 +1,4 @@
-"""Training samples: views with holes and their truth, crops of them, and their files.
-
-Each view is made once and read many times: `make_samples` writes the crops of all views into a folder.
-"""
+"""Training samples: views with holes and their targets, and crops of such views, which are stored in files."""
 
 from __future__ import annotations
 
@@ -35,40 +32,34 @@ from spackle.residual.view_features import CELL, ViewFeatures, cell_centers, hol
 from spackle.training.recipe import DataRecipe
 from spackle.training.train import rank, rank_count, wait_for_ranks
 
-REACH_PX = 16  # aux Gaussians of a hole extend at most this far beyond it
-# How a file stores tensors: `EXACT` ones in their own precision, `EIGHT_BITS` in eight bits, others in half precision.
+REACH_PX = 16  # aux Gaussians of a hole reach at most so many pixels beyond the hole
+# Files store the tensors `EXACT` in float32, the tensors `EIGHT_BITS` in eight bits, and all others in half precision.
 EXACT = ("camera.K", "camera.world_to_camera", "base.means", "rendering.alpha", "seeds.inverse_depth")
 RIM_COLORS = ("rim.rgb", "rim.mirrored", "rim.exemplar", "rim.photo")
 EIGHT_BITS = ("target", "rendering.rgb", "seeds.rgb", "base.opacities", "base.colors", *RIM_COLORS)
-PARTS = ("base", "rendering", "rim", "seeds")  # the fields of a sample that are dataclasses of tensors
-GAUSSIANS_A_PIXEL = 1.35  # the most base Gaussians that a crop keeps, per pixel
-# Sizes in a crop's file. Per pixel: `GAUSSIANS_A_PIXEL` Gaussians of 26 bytes, 8-bit colours of rendering and target,
-# alpha in float32 and depth in float16. Per cell: 5 colours of seed and rim in 8 bits, and 13 bytes for other fields.
-PIXEL_BYTES, CELL_BYTES, HEADER_BYTES = 26 * GAUSSIANS_A_PIXEL + 2 * 3 + 4 + 2, 5 * 3 + 13, 4096
-HOLE_SHARE = (0.02, 0.85)  # a crop is used if its share of hole pixels lies between these
-SAMPLES_VERSION = 7  # increases whenever the same recipe would give different samples
+PARTS = ("base", "rendering", "rim", "seeds")  # fields of a sample that are dataclasses of tensors
+GAUSSIANS_A_PIXEL = 1.35  # a crop keeps at most so many base Gaussians per pixel
+HOLE_SHARE = (0.02, 0.85)  # least and greatest share of hole pixels in a crop
+SAMPLES_VERSION = 7  # increase this whenever a recipe would give different samples
 P = TypeVar("P")
 
 
 @dataclasses.dataclass(frozen=True)
 class Sample:
-    """A view of frozen Gaussians with holes, and its target. No tensor requires gradients."""
+    """A view of frozen Gaussians with holes, and the view's target. No tensor requires gradients."""
 
     camera: Camera
-    base: Gaussians  # only Gaussians that touch the tiles around the holes
+    base: Gaussians  # in a crop only the Gaussians that contribute to `tiles`
     rendering: Rendering  # of the whole base
-    seeds: Seeds  # a grid, one for each 2×2 pixels
-    rim: Rim  # the same grid
+    seeds: Seeds  # [h, w]: one for each 2×2 pixels
+    rim: Rim  # [h, w]
     target: Tensor  # [H, W, 3] sRGB
 
     @staticmethod
     def of(
         base: Gaussians, rendering: Rendering, camera: Camera, photo_camera: Camera, photo: Tensor, target: Tensor
     ) -> Sample:
-        """A sample of a whole view: frozen Gaussians, their rendering by `camera`, and the `target` [H, W, 3] sRGB.
-
-        `photo_camera` is the camera of the base's `photo` [h, w, 3] sRGB.
-        """
+        """A sample of a whole view, from its `rendering`, its `target` [H, W, 3] and the base's `photo` [h, w, 3]."""
         rendering, features = rendering.detach(), ViewFeatures.of(rendering)
         seeds = make_seeds(features, camera, photo_camera)
         rim, _ = find_rim(features, seeds, camera, photo_camera, photo)
@@ -76,28 +67,28 @@ class Sample:
 
     @functools.cached_property
     def features(self) -> ViewFeatures:
-        """The view's cells; the sample must be on the CPU."""
+        """The features of the view; the sample must be on the CPU."""
         return ViewFeatures.of(self.rendering)
 
     @property
     def hole(self) -> Tensor:
-        """[H, W] bool: the hole, Q in the paper's loss."""
+        """[H, W] bool: the hole, Q in eq. 6."""
         return hole_mask(self.rendering.alpha)
 
     @property
     def tiles(self) -> Tensor:
-        """[ceil(H/16), ceil(W/16)] bool: the renderer's tiles that aux Gaussians can touch."""
+        """[ceil(H/16), ceil(W/16)] bool: tiles of the renderer that aux Gaussians can touch."""
         near = greatest_around(self.hole, REACH_PX)
         return max_pool2d(near[None, None].float(), TILE, ceil_mode=True)[0, 0] > 0
 
     def to(self, device: torch.device) -> Sample:
-        """The sample on another device; its camera stays on the CPU, where its values are read."""
+        """The sample's tensors on another device; the camera stays on the CPU."""
         move = functools.partial(Tensor.to, device=device, non_blocking=device.type != "cpu")
         parts = {name: _mapped(getattr(self, name), move) for name in PARTS}
         return dataclasses.replace(self, **parts, target=move(self.target))
 
     def crop(self, row: int, column: int, height: int, width: int) -> Sample:
-        """The part of a view with the upper left cell (row, column), height × width cells large."""
+        """Crop height × width cells, from the upper left cell (row, column)."""
         top, left = CELL * row, CELL * column
         pixels = (slice(top, top + CELL * height), slice(left, left + CELL * width))
         cells = (slice(row, row + height), slice(column, column + width))
@@ -116,11 +107,8 @@ class Sample:
         )._with_visible_base()
 
     def _with_visible_base(self) -> Sample:
-        """Drop the base Gaussians that contribute nothing to `tiles`.
-
-        If more than `GAUSSIANS_A_PIXEL` remain, the ones that contribute most are kept.
-        """
-        with torch.enable_grad():  # the gradient with respect to a Gaussian's colour is what it contributes
+        """Keep the base Gaussians that contribute most to `tiles`, at most `GAUSSIANS_A_PIXEL`."""
+        with torch.enable_grad():  # a Gaussian's contribution is the gradient with respect to its colour
             grey = torch.full_like(self.base.colors, 0.5).requires_grad_()
             scene = dataclasses.replace(self.base, colors=grey)
             drawn = CpuRenderer().render(scene, self.camera, tiles=self.tiles)
@@ -132,8 +120,8 @@ class Sample:
 
 
 def random_crops(sample: Sample, rng: np.random.Generator, count: int, cells: int) -> list[Sample]:
-    """Up to `count` square crops around hole cells of a view, `cells` cells a side."""
-    rows, columns = sample.camera.height // CELL, sample.camera.width // CELL  # whole cells only
+    """Up to `count` square crops around hole cells of a view, each with `cells` cells a side."""
+    rows, columns = sample.camera.height // CELL, sample.camera.width // CELL
     if min(rows, columns) < cells:
         return []
     where = sample.features.mask[:rows, :columns].nonzero()
@@ -152,7 +140,7 @@ def random_crops(sample: Sample, rng: np.random.Generator, count: int, cells: in
 
 
 def save_sample(sample: Sample, path: Path) -> None:
-    """Write a sample atomically; `disk_needed` has an upper bound of its size."""
+    """Write a sample atomically."""
     camera = sample.camera
     tensors = {
         "camera.K": camera.K,
@@ -163,7 +151,7 @@ def save_sample(sample: Sample, path: Path) -> None:
     for part in PARTS:
         tensors |= {f"{part}.{name}": value for name, value in vars(getattr(sample, part)).items()}
     tensors["seeds.unit"] = torch.tensor(sample.seeds.unit, dtype=torch.float64)
-    del tensors["seeds.uv"]  # they follow from the camera
+    del tensors["seeds.uv"]  # computed from the camera
     tensors["base.colors"] = linear_to_srgb(sample.base.colors)
     tensors |= {name: to_bytes(tensors[name]) for name in EIGHT_BITS}
     quats = sample.base.quats  # not normalised: the largest component becomes 127
@@ -175,7 +163,7 @@ def save_sample(sample: Sample, path: Path) -> None:
 
 def load_sample(path: str | os.PathLike[str]) -> Sample:
     """Read a sample; InputError if its file is missing or broken."""
-    with reading(path, "no training sample, or damaged: delete it, and it is made anew"):
+    with reading(path, "not a training sample, or damaged: delete the file; the next run makes it again"):
         parts: dict[str, dict[str, Any]] = {}
         for name, tensor in load_file(path).items():
             part, _, field = name.partition(".")
@@ -194,22 +182,22 @@ def load_sample(path: str | os.PathLike[str]) -> Sample:
 
 
 def _mapped(part: P, function: Callable[[Tensor], Tensor]) -> P:
-    """Apply a function to the tensors of a dataclass."""
+    """Apply a function to all tensors of a dataclass."""
     tensors = {name: value for name, value in vars(part).items() if isinstance(value, Tensor)}
     return dataclasses.replace(part, **{name: function(value) for name, value in tensors.items()})  # type: ignore[type-var]
 
 
 class Source(NamedTuple):
-    """A source of views with holes and truth, and its share of the samples."""
+    """A source of views with holes and targets."""
 
-    share: float  # weight among all sources; weights need not add up to 1
-    view: Callable[[np.random.Generator, int], Sample]  # makes the numbered view; InputError for an unusable file
+    share: float  # weight among all sources
+    view: Callable[[np.random.Generator, int], Sample]  # makes a view by its number; InputError for an unusable file
     names: Sequence[str]  # the names of the source and of its files, relative to their folder
     views: int | None = None  # number of views, numbered from 0; None: any number, drawn at random
 
 
 def digest_of_samples(data: DataRecipe, sources: Sequence[Source]) -> str:
-    """Twelve digits that identify the samples' content; paths and the number of samples do not affect them."""
+    """Twelve digits that identify the content of samples, whatever their number and paths."""
     facts = data.model_dump(mode="json")
     for name in ("photos", "stereo", "pseudo", "cache", "views", "validation_views"):
         facts.pop(name)
@@ -220,7 +208,7 @@ def digest_of_samples(data: DataRecipe, sources: Sequence[Source]) -> str:
 
 
 def short_digest(value: Any) -> str:
-    """Twelve hexadecimal digits that identify a recipe's data."""
+    """Twelve hexadecimal digits that identify a value by its `repr`."""
     return hashlib.sha256(repr(value).encode()).hexdigest()[:12]
 
 
@@ -233,32 +221,31 @@ def make_samples(
     progress: Step,
     warn: Callable[[str], None],
 ) -> list[Path]:
-    """Make the missing samples of a folder's first `views` views; returns the files of all of them, in order.
+    """Make the missing samples of the first `views` views in a folder; returns the files of all samples in order.
 
-    The processes of a run share the work, and several recipes may share the folder. `seed` determines the views; if
-    there is one source, it may have fewer. `progress` is called with the number of views that this process has done and
-    the number of its views; `warn` with the reason if a view cannot be made. InputError if nothing can be written, or
-    no view gave a sample.
+    Args:
+        data: the number of crops per view and their size.
+        sources: each view comes from one of these, drawn by share. A single source may have fewer views.
+        folder: a folder for the samples, which several recipes may share.
+        seed: determines the views.
+        views: number of views. The processes of a run divide them.
+        progress: called with (number of views done, number of views) of this process.
+        warn: called with the reason if a view cannot be made.
+
+    Raises:
+        InputError: no file can be written, or no view gave a sample.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    views = _at_most(views, sources)
+    if len(sources) == 1 and sources[0].views is not None:
+        views = min(views, sources[0].views)
     shares = np.array([source.share for source in sources])
-
-    def drawn(index: int) -> tuple[int, np.random.Generator]:
-        """Draw a view's source; returns it and the generator for the view's other random numbers."""
-        rng = np.random.default_rng([seed, index])
-        return int(rng.choice(len(sources), p=shares / shares.sum())), rng
-
-    places, counts = list[tuple[int, int]](), [0] * len(sources)  # each view's source and its number there
-    for index in range(views):
-        choice = drawn(index)[0]
-        places.append((choice, counts[choice]))
-        counts[choice] += 1
+    rngs = [np.random.default_rng([seed, index]) for index in range(views)]
+    choices = [int(rng.choice(len(sources), p=shares / shares.sum())) for rng in rngs]
     mine = range(*(views * part // rank_count() for part in (rank(), rank() + 1)))  # one process reads a photo's views
     for done, index in enumerate(mine, 1):
         if _crop_files(folder, index) is None:
-            (choice, place), rng, crops = places[index], drawn(index)[1], list[Sample]()
-            source = sources[choice]
+            source, rng, crops = sources[choices[index]], rngs[index], list[Sample]()
+            place = choices[:index].count(choices[index])  # number of the view in its source
             try:
                 view = source.view(rng, place if source.views is None else place % source.views)
                 crops = random_crops(view, rng, data.crops, data.cells)
@@ -266,32 +253,20 @@ def make_samples(
                 warn(str(error))
             for number, crop in enumerate(crops):
                 save_sample(crop, folder / f"{index:06d}-{number}.safetensors")
-            write_whole(folder / f"{index:06d}.done", f"{len(crops)}\n".encode())  # last: the crops are complete
+            write_whole(folder / f"{index:06d}.done", f"{len(crops)}\n".encode())  # written after all crops
         progress(done, len(mine))
     wait_for_ranks()
     files = [file for index in range(views) for file in _crop_files(folder, index) or ()]
     if not files:
         raise InputError(
-            f"{folder}: none of {views} views gave a sample: photos must be readable, larger than "
-            f"{2 * data.cells} pixels each way, and seen from aside (data.disparity)"
+            f"{folder}: none of {views} views gave a sample: photos must be readable and larger than "
+            f"{2 * data.cells} pixels each way, and data.disparity must be large enough for holes"
         )
     return files
 
 
-def disk_needed(data: DataRecipe, sources: Sequence[Source], folder: Path, views: int) -> int:
-    """The most bytes that the missing samples of a folder's first `views` views can take."""
-    missing = sum(_crop_files(folder, index) is None for index in range(_at_most(views, sources)))
-    return missing * data.crops * (data.cells**2 * int(CELL**2 * PIXEL_BYTES + CELL_BYTES) + HEADER_BYTES)
-
-
-def _at_most(views: int, sources: Sequence[Source]) -> int:
-    """`views`, or the number of views of the only source if that has fewer."""
-    alone = sources[0].views if len(sources) == 1 else None
-    return views if alone is None else min(views, alone)
-
-
 def _crop_files(folder: Path, index: int) -> list[Path] | None:
-    """The files of a view's crops; None if the crops have not been made."""
+    """The files of a view's crops; None if they are not complete."""
     with contextlib.suppress(FileNotFoundError, ValueError):
         count = int((folder / f"{index:06d}.done").read_text())
         files = [folder / f"{index:06d}-{number}.safetensors" for number in range(count)]

@@ -1,9 +1,4 @@
-"""Sources of views with holes and their truth: photos, RGB-D frames, stereo pairs, a pseudo-supervised dataset.
-
-`reverse_view` needs no inpainter: the parts of a photo that a virtual camera cannot see become holes, and the photo is
-their truth. Photos without depth are combined into scenes: cut-outs at known depths in front of another photo
-(`composite`).
-"""
+"""Sources of views with holes and targets: photos, RGB-D frames, stereo pairs, a pseudo-supervised dataset."""
 
 from __future__ import annotations
 
@@ -34,22 +29,19 @@ from spackle.render import Renderer
 from spackle.training.recipe import DataRecipe
 from spackle.training.samples import Sample, Source
 
-TOLERANCE = 0.02  # a Gaussian counts as seen up to this far behind the visible surface, relative to its depth
-CORNER = 0.25  # pixels: a centre closer than this to a pixel's corner is at the corner
-FRAMES = 24  # frames of a path; one of them is the virtual camera
-NO_TARGETS = {  # inpainters whose results teach nothing, and why
-    "none": "leaves the holes open",
-    "geometry": "draws what the untrained residual draws",
-}
+TOLERANCE = 0.02  # a Gaussian up to this far behind the visible surface, relative to the depth, counts as visible
+CORNER = 0.25  # pixels: a centre closer than this to a pixel's corner counts as being at the corner
+FRAMES = 24  # frames of a path, one of which becomes the virtual camera
+NO_TARGETS = ("none", "geometry")  # inpainters that leave holes empty, or paint what the untrained residual renders
 
 Draw = Callable[[np.random.Generator], tuple[Tensor, DepthMap, Camera]]  # draws a photo [H, W, 3] sRGB with depth
 View = Callable[[np.random.Generator], Sample]
 
 
 def find_sources(data: DataRecipe, renderer: Renderer, *, validation: bool) -> list[Source]:
-    """Find a recipe's files, for training or for `validation`; a dataset has different photos for each.
+    """Find the files of a recipe, for training or for `validation`.
 
-    InputError if the recipe names no data, or a folder that is missing or lacks such files.
+    InputError if the recipe names no data, or a folder is missing or has no suitable files.
     """
     shares, sources = data.shares, list[Source]()
 
@@ -66,7 +58,7 @@ def find_sources(data: DataRecipe, renderer: Renderer, *, validation: bool) -> l
         add("composites", shares.composites, data.photos, photos, reverse(partial(composite_photo, photos=photos)))
     frames = [find_files(camera.folder, "data.rgbd", (".color.jpg",), "NAME.color.jpg") for camera in data.rgbd]
     for camera, files in zip(data.rgbd, frames, strict=True):
-        share = shares.rgbd * len(files) / sum(map(len, frames))  # every frame is equally likely
+        share = shares.rgbd * len(files) / sum(map(len, frames))  # all frames are equally likely
         draw = partial(frame_photo, frames=files, focal_px=camera.focal_px, unit_m=camera.unit_m)
         add("rgbd", share, camera.folder, files, reverse(draw))
     if data.stereo is not None:
@@ -77,10 +69,9 @@ def find_sources(data: DataRecipe, renderer: Renderer, *, validation: bool) -> l
         dataset = open_pseudo(data.pseudo)
         split = divided_photos(dataset, data)
         places = [(photo, view) for photo in split[validation] for view in views_with_holes(dataset, photo)]
-        photo_at = lru_cache(1)(dataset.__getitem__)  # cached, because the views of a photo follow each other
+        photo_at = lru_cache(1)(dataset.__getitem__)  # the views of a photo follow each other
 
         def stored(rng: np.random.Generator, index: int) -> Sample:
-            """A stored view as a sample; InputError if its file is damaged."""
             photo = photo_at(places[index][0])
             view = photo.view(places[index][1])
             return Sample.of(photo.base, view.rendering, view.camera, view.photo_camera, view.photo, view.target)
@@ -89,19 +80,18 @@ def find_sources(data: DataRecipe, renderer: Renderer, *, validation: bool) -> l
         sources.append(Source(shares.pseudo, stored, names, views=len(places)))
     if not sources:
         raise InputError(
-            "the recipe has no data: give data.photos=FOLDER, data.rgbd, data.stereo or data.pseudo, "
-            "and a share above 0"
+            "the recipe has no data: set data.photos=FOLDER, data.rgbd, data.stereo or data.pseudo, and a share above 0"
         )
     return sources
 
 
 def find_files(folder: Path, key: str, endings: tuple[str, ...], what: str) -> list[Path]:
-    """All files below a folder with one of these endings, sorted; InputError if there is no folder or no such file."""
+    """All files below a folder with one of these endings, sorted; InputError if there are none."""
     if not os.path.isdir(folder):
         raise InputError(f"{folder}: no such folder, but {key} names it: give {key}=FOLDER")
     files = files_in(folder, endings, below=True)
     if not files:
-        raise InputError(f"{folder}: {key} names this folder, but there is nothing in it: looked for {what}")
+        raise InputError(f"{folder}: contains no {what}: set {key} to another folder")
     return files
 
 
@@ -111,13 +101,13 @@ def find_files(folder: Path, key: str, endings: tuple[str, ...], what: str) -> l
 def reverse_view(prediction: BasePrediction, photo: Tensor, viewer: Camera, renderer: Renderer) -> Sample:
     """Keep the Gaussians that a virtual camera sees, and render them at the photo's own camera.
 
-    In the sample, the virtual camera acts as the input camera, and the photo as the novel view.
+    Parts of the photo that the virtual camera cannot see become holes, and the photo is the target.
 
     Args:
-        prediction: from `lift` with levels=0: one Gaussian per pixel, the other surface of mixed pixels, the backing.
+        prediction: from `lift` with levels=0.
         photo: [H, W, 3] sRGB at the camera's size.
-        viewer: the virtual camera.
-        renderer: draws the views.
+        viewer: the virtual camera, which is the input camera of the sample.
+        renderer: renders the views.
     """
     camera, gaussians = prediction.camera, prediction.gaussians
     view = renderer.render(gaussians, viewer)
@@ -126,10 +116,9 @@ def reverse_view(prediction: BasePrediction, photo: Tensor, viewer: Camera, rend
 
 
 def seen_from(gaussians: Gaussians, viewer: Camera, depth: Tensor) -> Tensor:
-    """[N] bool: the Gaussians that a camera sees, judged by its rendered `depth` [H, W] around their centres.
+    """[N] bool: the Gaussians in front of the greatest rendered `depth` [H, W] of 3×3 pixels around their centres.
 
-    The greatest depth of 3×3 pixels counts, because Gaussians are wider than a pixel: at an outline the nearer depth
-    bleeds over the farther surface, and on a steep surface a pixel holds more than one depth.
+    One pixel would not do: at an outline, the nearer depth covers pixels of the farther surface.
     """
     around = max_pool2d(depth[None, None], 3, stride=1, padding=1)[0, 0]
     uv, z = viewer.project(gaussians.means)
@@ -140,10 +129,10 @@ def seen_from(gaussians: Gaussians, viewer: Camera, depth: Tensor) -> Tensor:
 
 
 def with_backing(seen: Tensor, gaussians: Gaussians, camera: Camera) -> Tensor:
-    """Extend `seen` [N] to the backing: a backing Gaussian counts as seen if the farthest pixel around it does.
+    """Extend `seen` [N] to backing Gaussians, which lie behind their surface by design (`spackle.bases.lift.lift`).
 
-    Backing Gaussians lie behind their surface by design, so their own depth does not decide. The Gaussians of a lifted
-    photo begin with one per pixel; among the others, the backing is at corners of pixels (`spackle.bases.lift.lift`).
+    A backing Gaussian counts as seen if the farthest of the four pixels around the Gaussian is seen. Of a lifted
+    photo's Gaussians, the first H · W belong to pixels; of all others, backing Gaussians lie at corners of pixels.
     """
     width, height = camera.width, camera.height
     uv, z = camera.project(gaussians.means)
@@ -161,7 +150,7 @@ def random_reverse_view(
 ) -> Sample:
     """`reverse_view` of a random photo, with a random frame of a random path as the virtual camera."""
     rgb, depth, camera = draw(rng)
-    prediction = lift(rgb, depth, camera, levels=0)  # no tiles: they are seen or hidden as a whole
+    prediction = lift(rgb, depth, camera, levels=0)  # no tiles: a tile would be seen or hidden as a whole
     kind = SHARP_TRAJECTORIES[rng.integers(len(SHARP_TRAJECTORIES))]
     reach = DepthRange.of(prediction.gaussians)
     viewer = trajectory(kind, camera, rng.uniform(*disparity), reach, FRAMES)[rng.integers(FRAMES)]
@@ -169,20 +158,20 @@ def random_reverse_view(
 
 
 def right_view(rng: np.random.Generator, folders: Sequence[Path], renderer: Renderer) -> Sample:
-    """The lifted left photo of a random stereo pair, rendered at the right camera; the right photo is the truth."""
+    """The lifted left photo of a random stereo pair, rendered at the right camera; the right photo is the target."""
     left, right, depth, camera, beside = load_pair(_chosen(rng, folders))
     base = lift(left, depth, camera).gaussians
     return Sample.of(base, renderer.render(base, beside), beside, camera, left, right)
 
 
 def open_pseudo(location: str | os.PathLike[str]) -> DatasetFiles:
-    """Open a pseudo-supervised dataset (appendix, "Dataset"); InputError if it is unfinished or teaches nothing."""
+    """Open a pseudo-supervised dataset (appendix, "Dataset"); InputError if it cannot teach anything."""
     files = DatasetFiles(location)
     name = files.manifest.config.get("inpainter", {}).get("name")
     if name in NO_TARGETS:
         raise InputError(
-            f"{location}: built with --inpainter {name}, which {NO_TARGETS[name]}, so its targets teach nothing: "
-            "build another with --inpainter propainter, exemplar or lama"
+            f"{location}: built with --inpainter {name}, whose targets teach nothing: build another dataset with "
+            "--inpainter propainter, exemplar or lama"
         )
     if not any(views_with_holes(files, photo) for photo in range(len(files))):
         raise InputError(f"{location}: no view in it has a hole: build it with a wider --disparity")
@@ -190,14 +179,14 @@ def open_pseudo(location: str | os.PathLike[str]) -> DatasetFiles:
 
 
 def divided_photos(files: DatasetFiles, data: DataRecipe) -> tuple[list[int], list[int]]:
-    """Indices of a dataset's photos for training, and of those for validation, shuffled by `data.seed`.
+    """Indices of a dataset's photos for training, and of other photos for validation, shuffled by `data.seed`.
 
-    Training and validation share no photo. InputError if the dataset has a single photo.
+    InputError if the dataset has a single photo.
     """
     photos, per_photo = len(files), len(files.samples[0][1].holes)
     if photos < 2:
         raise InputError(
-            f"{data.pseudo}: a single photo, but training and validation need one each: build it with more"
+            f"{data.pseudo}: has a single photo, but training and validation need different photos: build a larger one"
         )
     order = [int(place) for place in np.random.default_rng(data.seed).permutation(photos)]
     held = min(max(1, data.validation_views // per_photo), photos // 2)
@@ -205,7 +194,6 @@ def divided_photos(files: DatasetFiles, data: DataRecipe) -> tuple[list[int], li
 
 
 def views_with_holes(files: DatasetFiles, photo: int) -> list[int]:
-    """The numbers of a photo's views that have a hole."""
     return [view for view, hole in enumerate(files.samples[photo][1].holes) if hole > 0]
 
 
@@ -215,13 +203,11 @@ def views_with_holes(files: DatasetFiles, photo: int) -> list[int]:
 def frame_photo(
     rng: np.random.Generator, frames: Sequence[Path], focal_px: float, unit_m: float
 ) -> tuple[Tensor, DepthMap, Camera]:
-    """A random photo of a depth camera, its depth and its camera; see `load_frame`."""
     rgb, depth = load_frame(_chosen(rng, frames), unit_m)
     return rgb, depth, Camera.from_focal(focal_px, rgb.shape[1], rgb.shape[0])
 
 
 def left_photo(rng: np.random.Generator, folders: Sequence[Path]) -> tuple[Tensor, DepthMap, Camera]:
-    """The left photo of a random stereo pair, its depth and its camera; see `load_pair`."""
     left, _, depth, camera, _ = load_pair(_chosen(rng, folders))
     return left, depth, camera
 
@@ -231,10 +217,10 @@ def _chosen(rng: np.random.Generator, files: Sequence[Path]) -> Path:
 
 
 def load_frame(color: Path, unit_m: float) -> tuple[Tensor, DepthMap]:
-    """Read a depth camera's photo NAME.color.jpg, [H, W, 3] sRGB, and its depth in NAME.depth.png.
+    """Read the photo NAME.color.jpg of a depth camera, [H, W, 3] sRGB, and the depth in NAME.depth.png.
 
-    `unit_m` is the length of one unit of the depth file, where 0 and 65535 mean unknown. InputError if a file is
-    missing or broken.
+    `unit_m` is one unit of the depth file in metres; 0 and 65535 mean unknown depth. InputError if a file is missing or
+    broken.
     """
     rgb = load_photo(color).rgb
     stored = load_depth(color.with_name(color.name.replace(".color.", ".depth.")).with_suffix(".png"))
@@ -243,12 +229,12 @@ def load_frame(color: Path, unit_m: float) -> tuple[Tensor, DepthMap]:
 
 
 def load_pair(folder: Path) -> tuple[Tensor, Tensor, DepthMap, Camera, Camera]:
-    """Read a stereo pair: left and right photo [H, W, 3] sRGB, depth of the left one, left and right camera.
+    """Read a stereo pair: left and right photo [H, W, 3] sRGB, depth of the left photo, left and right camera.
 
     InputError if a file is missing or broken.
     """
     scene = folder / "scene.json"
-    with reading(folder, "no stereo pair: needs a scene.json that names the photos and the lens ({reason})"):
+    with reading(folder, "no stereo pair: needs a scene.json that names photos and calibration ({reason})"):
         facts = json.loads(scene.read_text(encoding="utf-8"))
         names = [folder / facts[key] for key in ("left", "right", "disparity")]
         lens = read_calibration(scene)
@@ -268,14 +254,14 @@ def load_pair(folder: Path) -> tuple[Tensor, Tensor, DepthMap, Camera, Camera]:
 # Photos without depth -----------------------------------------------------------------------------
 
 COMPOSITE_SIZE = (336, 448)  # height, width; swapped in half of the composites
-FOCAL_MM = (20.0, 50.0)  # the range of focal lengths, 35 mm equivalent
+FOCAL_MM = (20.0, 50.0)  # range of focal lengths, 35 mm equivalent
 BACKGROUND_M = (3.0, 8.0)  # depth of the farthest plane
-NEARER = (1.15, 4.0)  # ratio of a cut-out's inverse depth to the largest that it covers
+NEARER = (1.15, 4.0)  # ratio of a cut-out's inverse depth to the largest inverse depth behind the cut-out
 NEAREST_M = 0.7
-OBJECTS = (1, 4)
+OBJECTS = (1, 4)  # number of cut-outs
 AREA = (0.01, 0.35)  # share of the image that a cut-out may cover
 
-Photos = Callable[[np.random.Generator], Tensor]  # a random photo, [H, W, 3] sRGB
+Photos = Callable[[np.random.Generator], Tensor]  # gives a random photo [H, W, 3] sRGB
 
 
 def composite_photo(rng: np.random.Generator, photos: Sequence[Path]) -> tuple[Tensor, DepthMap, Camera]:
@@ -289,7 +275,7 @@ def composite_photo(rng: np.random.Generator, photos: Sequence[Path]) -> tuple[T
 
 
 def composite(rng: np.random.Generator, photos: Photos, height: int, width: int) -> tuple[Tensor, Tensor]:
-    """An image [H, W, 3] sRGB composed of several photos, and its exact inverse depth [H, W] in 1/m."""
+    """An image [H, W, 3] sRGB of cut-outs of photos in front of another photo, and its inverse depth [H, W] in 1/m."""
     rgb = random_crop(rng, photos(rng), height, width)
     inverse_depth = _background(rng, height, width)
     for _ in range(rng.integers(OBJECTS[0], OBJECTS[1] + 1)):
@@ -309,7 +295,7 @@ def composite(rng: np.random.Generator, photos: Photos, height: int, width: int)
 
 
 def random_crop(rng: np.random.Generator, photo: Tensor, height: int, width: int) -> Tensor:
-    """[height, width, 3]: a random part of a photo [h, w, 3] at a random scale, mirrored half of the time."""
+    """[height, width, 3]: a random part of a photo [h, w, 3] at a random scale, mirrored in half of all cases."""
     rows, columns = photo.shape[:2]
     smallest = max(height / rows, width / columns)
     scale = smallest * rng.uniform(1.0, 1.5)
@@ -321,7 +307,7 @@ def random_crop(rng: np.random.Generator, photo: Tensor, height: int, width: int
 
 
 def _background(rng: np.random.Generator, height: int, width: int) -> Tensor:
-    """Inverse depth [H, W] of a wall, at random with the ground in front of it or a second wall beside it."""
+    """Inverse depth [H, W] of a wall, at random with ground or a second wall."""
     far = 1.0 / rng.uniform(*BACKGROUND_M)
     plane = far * (1 + _tilt(rng, height, width, 0.3))
     if rng.random() < 0.5:  # the ground: inverse depth grows linearly below the horizon
@@ -334,20 +320,20 @@ def _background(rng: np.random.Generator, height: int, width: int) -> Tensor:
 
 
 def _tilt(rng: np.random.Generator, height: int, width: int, most: float) -> Tensor:
-    """A linear ramp [H, W] of random direction, with values within ±`most`."""
+    """A linear ramp [H, W] of random direction, within ±`most`."""
     y, x = torch.meshgrid(torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij")
     a, b = (rng.uniform(-most, most) / 2 for _ in range(2))
     return a * x + b * y
 
 
 def outline(rng: np.random.Generator, picture: Tensor) -> Tensor:
-    """A mask [H, W] in 0..1 of random shape; its edge is about a pixel wide, as in a camera's image."""
+    """A mask [H, W] in 0..1 of random shape, with an edge about one pixel wide."""
     height, width = picture.shape[:2]
     cloud = _noise(rng, height, width, rng.uniform(0.1, 0.35))
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     cy, cx = rng.uniform(0.1, 1.0) * height, rng.uniform(0.0, 1.0) * width
     kind = rng.random()
-    if kind < 0.35:  # pixels similar to a point's colour: outlines follow those of real objects
+    if kind < 0.35:  # pixels similar to a point's colour, so that outlines follow real objects
         smooth = avg_pool2d(picture.permute(2, 0, 1)[None], 9, stride=1, padding=4, count_include_pad=False)[0]
         color = smooth[:, min(int(cy), height - 1), min(int(cx), width - 1)]
         unlike = ((smooth - color[:, None, None]) ** 2).sum(0) / rng.uniform(0.01, 0.04)
@@ -356,7 +342,7 @@ def outline(rng: np.random.Generator, picture: Tensor) -> Tensor:
     elif kind < 0.75:  # a blob
         ry, rx = (rng.uniform(0.08, 0.4) * side for side in (height, width))
         field = 1 - ((x - cx) / rx) ** 2 - ((y - cy) / ry) ** 2 + rng.uniform(0.0, 0.8) * cloud
-    else:  # a bar, like poles, legs and frames
+    else:  # a bar
         angle = rng.uniform(-0.4, 0.4) + (math.pi / 2 if rng.random() < 0.25 else 0.0)
         across = ((x - cx) * math.cos(angle) + (y - cy) * math.sin(angle)).abs()
         field = 1 - across / (rng.uniform(0.008, 0.06) * width) + 0.2 * cloud

@@ -1,7 +1,6 @@
-"""The training loop, from top to bottom: batch, forward, losses, step, validate, save.
+"""The training loop: batch, forward, losses, step, validate, save.
 
-A `Task` defines the network, its data and its loss. Processes started by torchrun train one network together. A run
-that ended in any way resumes from its last checkpoint.
+A `Task` defines the network, the data and the loss. Processes that torchrun starts train one network together.
 """
 
 from __future__ import annotations
@@ -51,12 +50,12 @@ from spackle.training.checkpoint import (
 )
 from spackle.training.recipe import AnyRecipe, OptimRecipe
 
-EMA_START = 10  # early decay is (step + 1) / (step + 10), so that the average soon forgets the initial weights
-PATIENCE = timedelta(hours=24)  # how long a process waits for another, which may take longer to make samples
+EMA_START = 10  # the early decay is (step + 1) / (step + 10): the average soon forgets the initial weights
+PATIENCE = timedelta(hours=24)  # a process waits so long for other processes, which may still make samples
 END = {
     "steps": "all steps are done",
-    "patience": "no improvement any more",
-    "stopped": "stopped; the same command resumes from here",
+    "patience": "the validation no longer improves",
+    "stopped": "stopped; the same command resumes the run",
 }
 R = TypeVar("R", bound=AnyRecipe)
 K = TypeVar("K")
@@ -64,45 +63,42 @@ V = TypeVar("V")
 
 
 class Task(Protocol):
-    """A network to train, and the items that it learns from, numbered from 0.
+    """A network to train, and the items of its training data, numbered from 0.
 
-    Construction is quick and raises InputError for unusable input; `prepare` sets the remaining attributes.
+    The constructor is quick and raises InputError for unusable input; `prepare` sets the last two attributes.
     """
 
-    name: ClassVar[str]  # the name in `--method` and in checkpoints
+    name: ClassVar[str]  # in `--method` and in checkpoints
     aim: ClassVar[str] = "loss"  # the measure by which the best weights are chosen; lower is better
-    at_once: ClassVar[int | None] = None  # items in one pass through the network; None: all items of the process's step
+    at_once: ClassVar[int | None] = None  # items in one pass through the network; None: all items of a step
     digest: str  # identifies the training data by content, not by paths
     items_a_step: int  # over all processes
     network: nn.Module  # weights with requires_grad are trained in place
     measures: Sequence[str]  # names of the values that `measure` returns
-    items: int  # number of items to learn from; an epoch has each once
+    items: int  # number of training items; an epoch has each item once
     validation_items: int
 
     def prepare(self, output: Path, reporter: Reporter) -> dict[str, Any]:
-        """Do the long preparations, in every process; returns facts for run.json. InputError for unusable files."""
+        """Do all long preparations; returns facts for run.json. Every process calls this."""
 
     def groups(self) -> list[dict[str, Any]]:
         """The optimiser's groups of weights; a group's "lr_scale" is a factor on the learning rate."""
         return [{"params": [weight for weight in self.network.parameters() if weight.requires_grad]}]
 
     def batch(self, step: int | None, items: Sequence[int]) -> Any:
-        """Load items of a training step, or of validation (None); InputError if one cannot be read.
+        """Load items of a training step, or validation items if `step` is None; InputError if an item cannot be read.
 
         The result depends on the arguments alone; any thread may call this.
         """
 
     def loss(self, network: nn.Module, batch: Any) -> tuple[Tensor, dict[str, Tensor]]:
-        """The loss [] of a batch, with gradients, and its terms []."""
+        """The loss [] of a batch, with gradients, and the loss's terms []."""
 
     def measure(self, network: nn.Module, batch: Any) -> dict[str, list[float]]:
-        """Measure a network on a batch of validation items: the values of each measure, by its name."""
+        """Measure a network on a batch of validation items; returns the values of each measure by name."""
 
     def picture(self, network: nn.Module) -> Tensor:
-        """[H, W, 3] sRGB: what the network does on a few validation items."""
-
-    def names(self, step: int, items: Sequence[int]) -> list[str]:
-        """Names of a step's items, for messages about a bad one."""
+        """[H, W, 3] sRGB: results of the network for a few validation items."""
 
     def export(self, network: nn.Module, path: Path) -> None:
         """Write the weights in the format that the package reads; InputError if that fails."""
@@ -115,13 +111,13 @@ def train(
 
     Args:
         recipe: the settings of the run.
-        open_task: creates the task on a device; raises InputError for unusable input before any long work.
+        open_task: creates the task on a device.
         output: a folder for all results.
         reporter: used by the first process.
-        overwrite: start anew: delete an older run in `output`, but keep its samples.
+        overwrite: delete an older run in `output`, but keep its samples.
 
     Returns:
-        Why the run ended: "steps" (all are done), "patience" (no improvement) or "stopped" (by a signal).
+        Why the run ended: "steps" (all steps are done), "patience" (no improvement) or "stopped" (by a signal).
 
     Raises:
         InputError: a file or folder cannot be used, or the loss is not finite.
@@ -155,16 +151,15 @@ def _learn(
     device: torch.device,
     reporter: Reporter,
 ) -> tuple[str, int]:
-    """Run the training loop; returns why it ended, and at which step."""
+    """Run the training loop; returns why the loop ended, and the number of steps."""
     optim, run = recipe.optim, recipe.run
     network: nn.Module = task.network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     average = copy.deepcopy(network).requires_grad_(False)
-    # Gradients are averaged over the processes while they are computed.
     wrapped = DistributedDataParallel(network) if rank_count() > 1 else network
     optimizer = AdamW(task.groups(), optim.lr, betas=optim.betas, weight_decay=optim.weight_decay)
     progress, stopped = Progress(), False
     if checkpoint:
-        with reading(folder, "its checkpoint is of another network ({reason}): choose another with -o, or --overwrite"):
+        with reading(folder, "the checkpoint has another network ({reason}): choose another folder, or --overwrite"):
             network.load_state_dict(checkpoint.network)
             average.load_state_dict(checkpoint.average)
             optimizer.load_state_dict(checkpoint.optimizer)
@@ -172,22 +167,18 @@ def _learn(
     facts |= {"method": task.name, "aim": task.aim, "recipe": recipe.model_dump(mode="json")}
     facts |= {"processes": rank_count(), "versions": versions(), "hardware": hardware(device)}
 
-    def state() -> Checkpoint:
-        states = network.state_dict(), average.state_dict(), optimizer.state_dict()
-        return Checkpoint(progress, *states, facts["recipe"], task.digest, task.name)
-
     def ended() -> str:
-        """Why the run ends now; empty if it continues."""
+        """Why the run ends now; empty if the run continues."""
         if progress.step >= optim.steps:
             return "steps"
         return "patience" if progress.stale >= run.patience else "stopped" if stopped else ""
 
     def report(ended: str | None = None) -> None:
         if rank() == 0:
-            write_json(_without_nan({**facts, "ended": ended, **dataclasses.asdict(progress)}), folder / RUN)
+            write_json({**facts, "ended": ended, **dataclasses.asdict(progress)}, folder / RUN)
 
     def parts(step: int) -> list[list[int]]:
-        """This process's items of a step, divided into passes through the network."""
+        """The items of this process at a step, divided into passes through the network."""
         items = samples_of_step(step, task.items, task.items_a_step, run.seed, rank(), rank_count())
         size = task.at_once or len(items)
         return [items[start : start + size] for start in range(0, len(items), size)]
@@ -208,7 +199,7 @@ def _learn(
         while not ended():
             step = progress.step
 
-            # Forward and backward: gradients add up over a step's parts; the last part averages them over processes.
+            # Forward and backward: parts add up their gradients, which are averaged over processes after the last part
             optimizer.zero_grad(set_to_none=True)
             sums: dict[str, Tensor] = {}
             for number, part in enumerate(split := parts(step), 1):
@@ -225,11 +216,7 @@ def _learn(
             stopped = totals.pop("stop") > 0
             numbers = {name: total / rank_count() for name, total in totals.items()}
             if bad := [name for name, value in numbers.items() if not math.isfinite(value)]:
-                names = ", ".join(task.names(step, [item for part in split for item in part]))
-                raise InputError(
-                    f"{folder}: step {step} gave numbers that are not finite ({', '.join(bad)}): "
-                    f"lower optim.lr, or remove what is broken among {names}"
-                )
+                raise InputError(f"{folder}: step {step}: {', '.join(bad)} not finite: lower optim.lr")
 
             # Step
             rate = learning_rate(step, optim)
@@ -250,7 +237,7 @@ def _learn(
                 tell(progress.step, f"loss {numbers['loss']:.4f}")
                 recent = []
 
-            # Validate the averaged weights, keep them if they are the best so far, and write a picture of their results
+            # Validate the averaged weights, and export them if they are the best so far
             if progress.step % run.validate_every == 0 or last:
                 measures = validate(task, average, device)
                 best = progress.validated(measures, task.aim, run.min_delta)
@@ -263,16 +250,15 @@ def _learn(
                     curves("validation", measures)
                     if logs is not None:
                         logs.add_image("views", sheet.clamp(0, 1), progress.step, dataformats="HWC")
-                    told = "the best so far" if best else f"best {progress.best:.4f} at step {progress.best_step}"
-                    rest = ", ".join(f"{name} {value:.4f}" for name, value in measures.items() if name != task.aim)
-                    line = f"validation {task.aim} {measures[task.aim]:.4f} ({told}), {rest}"
-                    reporter.log(f"step {progress.step}: {line}")
+                    values = ", ".join(f"{name} {value:.4f}" for name, value in measures.items())
+                    reporter.log(f"step {progress.step}: validation {values} (best step: {progress.best_step})")
                     report()
 
             # Save
             if rank() == 0 and (progress.step % run.save_every == 0 or ended()):
                 task.export(average, folder / LAST)
-                save_checkpoint(state(), folder)  # after the export: a run killed in between exports again
+                states = network.state_dict(), average.state_dict(), optimizer.state_dict()
+                save_checkpoint(Checkpoint(progress, *states, facts["recipe"], task.digest, task.name), folder)
                 report()
     report(ended())
     return ended(), progress.step
@@ -280,22 +266,23 @@ def _learn(
 
 @torch.no_grad()
 def validate(task: Task, network: nn.Module, device: torch.device) -> dict[str, float]:
-    """Means of a task's measures over its validation items, which the processes share; all get the same means.
+    """Means of a task's measures over all validation items, without values that are not finite.
 
-    Measures without a value are left out.
+    The processes divide the items, and each process gets the same means.
     """
     totals, counts = dict.fromkeys(task.measures, 0.0), dict.fromkeys(task.measures, 0.0)
     mine, size = range(rank(), task.validation_items, rank_count()), task.at_once or task.items_a_step // rank_count()
     for start in range(0, len(mine), size):
         for name, values in task.measure(network, task.batch(None, mine[start : start + size])).items():
-            totals[name] += sum(values)
-            counts[name] += len(values)
+            finite = [value for value in values if math.isfinite(value)]
+            totals[name] += sum(finite)
+            counts[name] += len(finite)
     totals, counts = sum_of_ranks(totals, device), sum_of_ranks(counts, device)
     return {name: total / counts[name] for name, total in totals.items() if counts[name]}
 
 
 def made_ahead(make: Callable[[K], V], keys: Iterable[K]) -> Generator[V, None, None]:
-    """Yield `make(key)` for each key, in order; a thread computes the next value while the current one is used."""
+    """Yield `make(key)` for each key, in order; a thread computes the next value in advance."""
     with ThreadPoolExecutor(1, thread_name_prefix="batches") as worker:
         begun = deque[Future[V]]()
         for key in keys:
@@ -306,7 +293,7 @@ def made_ahead(make: Callable[[K], V], keys: Iterable[K]) -> Generator[V, None, 
 
 
 def learning_rate(step: int, optim: OptimRecipe) -> float:
-    """The rate at a step, from 0: linear warm-up, then a cosine to `min_lr` ("Training Details and Loss Weights")."""
+    """The learning rate at a step: linear warm-up, then a cosine to `min_lr` ("Training Details and Loss Weights")."""
     if step < optim.warmup:
         return optim.lr * (step + 1) / optim.warmup
     done = min(1.0, (step - optim.warmup) / max(1, optim.steps - optim.warmup))
@@ -314,15 +301,15 @@ def learning_rate(step: int, optim: OptimRecipe) -> float:
 
 
 def ema_decay(step: int, decay: float) -> float:
-    """The factor of the old average at a step; the new weights get the rest."""
+    """The weight of the old average at a step; the new weights get the rest."""
     return min(decay, (step + 1) / (step + EMA_START))
 
 
 def samples_of_step(step: int, count: int, batch: int, seed: int, rank: int = 0, ranks: int = 1) -> list[int]:
-    """The indices, below `count`, of a process's samples at a step; they depend on the arguments alone.
+    """Indices, below `count`, of the samples that one process uses at a step.
 
-    Every epoch is a permutation of all samples, chosen by `seed`; a batch may extend into the next epoch. The `ranks`
-    processes divide the global batch evenly.
+    Every epoch is a permutation of all samples, chosen by `seed`; a batch may extend into the next epoch. `ranks`
+    processes divide each batch evenly.
     """
     share = batch // ranks
     first = step * batch + rank * share
@@ -339,10 +326,9 @@ def _epoch(seed: int, epoch: int, count: int) -> NDArray[np.int64]:
 
 @contextlib.contextmanager
 def joined_ranks(kind: str) -> Iterator[torch.device]:
-    """Join the processes of this run by torchrun's environment variables; yields this process's device.
+    """Join the processes of this run by torchrun's environment variables; yields the device of this process.
 
-    `kind` "cuda" communicates by NCCL, "cpu" by Gloo. InputError if a variable is not a number, or the other processes
-    cannot be reached.
+    `kind` "cuda" communicates by NCCL, "cpu" by Gloo. InputError if the processes cannot join.
     """
     local = 0
     if "WORLD_SIZE" in os.environ:
@@ -359,7 +345,7 @@ def joined_ranks(kind: str) -> Iterator[torch.device]:
 
 
 def rank() -> int:
-    """The number of this process among those that train together; process 0 writes and reports."""
+    """The number of this process among all training processes; process 0 writes and reports."""
     return dist.get_rank() if dist.is_initialized() else 0
 
 
@@ -375,18 +361,8 @@ def wait_for_ranks() -> None:
 
 
 def sum_of_ranks(numbers: Mapping[str, float], device: torch.device) -> dict[str, float]:
-    """The sum of each number over the processes; all get the same result."""
-    # In float64, so that decisions do not depend on the number of processes.
+    """The sum of each number over all processes, in float64."""
     tensor = torch.tensor(list(numbers.values()), dtype=torch.float64, device=device)
     if rank_count() > 1:
         dist.all_reduce(tensor)
     return dict(zip(numbers, tensor.tolist(), strict=True))
-
-
-def _without_nan(value: Any) -> Any:
-    """Replace numbers that are not finite, which JSON lacks, by None."""
-    if isinstance(value, dict):
-        return {key: _without_nan(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_without_nan(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
