@@ -232,7 +232,7 @@ def sharp_section(runs: int, base: SharpBase, photo: Photo, peaks: Peaks, device
     figures += [Timed(name, times["", name]) for name in (UNPROJECT, SAVE)]
     figures.append(Timed("photo to scene", times["", TOTAL]))
     facts = {"weights": base.weights, "precision": base.precision, "side": base.network.config.side}
-    facts |= {"windows": base.windows, "compiled": base.compiled, "compile_problem": base.compile_problem or None}
+    facts |= {"windows": base.windows, "compiled": base.compiled}
     return figures, {**facts, "gaussians": count}
 
 

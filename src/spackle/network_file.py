@@ -48,7 +48,6 @@ def load_strict(
     path: str | os.PathLike[str],
     advice: str,
     *,
-    unused: Shapes | None = None,
     prepare: Callable[[nn.Module], object] | None = None,
 ) -> Network:
     """Fill a network, which may be on the meta device, with a file's tensors, which must match exactly, and freeze it.
@@ -59,7 +58,6 @@ def load_strict(
         network: the network to fill.
         tensors: the file's tensors, see `read_tensors`.
         path, advice: for messages: the file, and what to do about a wrong one.
-        unused: names and shapes of further tensors that the file must contain.
         prepare: converts the filled network in place, while its tensors are still mapped from the disk.
 
     Raises:
@@ -67,7 +65,7 @@ def load_strict(
     """
     ours = network.state_dict()
     used = {name: tuple(tensor.shape) for name, tensor in ours.items() if tensor.is_floating_point()}
-    check_tensors(tensors, used | (unused or {}), path, advice, ignored=ours.keys() - used.keys())
+    check_tensors(tensors, used, path, advice, ignored=ours.keys() - used.keys())
     state = {name: tensors[name].float().contiguous() for name in used}
     network.load_state_dict(state, strict=False, assign=True)
     network.eval().requires_grad_(False)

@@ -108,13 +108,13 @@ def test_a_decoders_file_finds_its_checkpoint(owner: Owner, base: TunableSharp, 
 @pytest.mark.parametrize(
     ("beside", "noted", "missing", "said"),
     [
-        (None, True, "", r"trained on sharp\.safetensors, which is not beside it: put"),
+        (None, True, "", r"trained on sharp\.safetensors, which is not in this folder: put"),
         (b"another", True, "", "trained on a checkpoint with the SHA-256"),
         (..., True, "feature_model.fusion.out_conv.bias", r"1 names differ, e\.g\. feature_model\.fusion"),
         (..., False, "", "does not say which checkpoint it was trained on"),
     ],
 )
-def test_decoders_without_their_checkpoint_are_a_line(
+def test_a_decoder_without_its_checkpoint_is_refused(
     owner: Owner, base: TunableSharp, tmp_path: Path, beside: Any, noted: bool, missing: str, said: str
 ) -> None:
     decoder = base.network.gaussian_decoder().state_dict()

@@ -1,4 +1,4 @@
-"""The hf base: a depth model of the transformers library predicts depth, which is lifted like a measured map.
+"""The hf base: lift the depth that a model of the transformers library predicts.
 
 Optional: pip install 'spackle-nvs[hf]'.
 """
@@ -26,26 +26,22 @@ from spackle.device import Precision, enough_memory, own_arithmetic, pick_device
 from spackle.errors import InputError, reading, reason_in_a_line
 from spackle.image import Photo, resize_photo
 
-_HUB_NAME = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*", re.ASCII)
 _NEVER_USED = re.compile(r".*fusion_stage\.layers\.0\.residual_layer1\..*")  # for finer features; never published
 
 Meaning = Literal["metres", "relative disparity", "canonical disparity"]  # the last: focal length / width / metres
-Window = tuple[float, ...]  # the photo in a padded picture: top, bottom, left, right, as shares of its sides
+Window = tuple[float, ...]  # the photo in a padded picture: top, bottom, left, right, as shares of the picture's sides
 Prepare = Callable[[Tensor], tuple[Tensor, Window]]  # [H, W, 3] sRGB in 0..1 to pixel values [1, 3, h, w]
 WHOLE: Window = (0.0, 1.0, 0.0, 1.0)
-MEANINGS: dict[str, Meaning] = {  # by `model_type` of config.json; two kinds may also be metric: see `meaning_of`
+MEANINGS: dict[str, Meaning] = {  # by `model_type` of config.json; depth_anything may also be metric: see `meaning_of`
     "depth_anything": "relative disparity",
     "depth_pro": "canonical disparity",
     "dpt": "relative disparity",
     "glpn": "metres",
-    "tipsv2_dpt": "metres",
     "zoedepth": "metres",
 }
-# The image processors of these models exist for torchvision only; they resize to one size, antialiased or not.
-ANTIALIAS = {"depth_pro": False, "tipsv2_dpt": True}
-# Relative disparity has no known unit and no known zero. Its zero is put at FARTHEST_M and its greatest values at
-# NEAREST_M: their ratio of 20 gives a clear parallax, and one step of the network's noise far away is not yet a depth
-# edge. The smallest value is not stretched to FARTHEST_M: a wall seen from the front would become a valley.
+# Relative disparity has no known unit and no known zero. A disparity of zero is put at FARTHEST_M, the greatest at
+# NEAREST_M: the ratio of 20 gives a clear parallax, and noise far away makes no depth edges. The smallest disparity is
+# not stretched to FARTHEST_M, because a wall seen from the front would become a valley.
 FARTHEST_M = 30.0
 FLAT = 1e-5  # relative spread below which all pixels count as equal
 
@@ -59,26 +55,22 @@ class HfBase:
         self.precision = precision
 
     @staticmethod
-    def load(model: str, *, device: str | None = None, precision: Precision = "auto", name: str = "") -> HfBase:
+    def load(model: str, *, device: str | None = None, precision: Precision = "auto") -> HfBase:
         """Read a model from a folder, or as owner/name from the hub's cache, else the hub; none of its code is run.
 
-        At the precision auto, matrix products are bf16 if the hardware multiplies it natively. The base's name is
-        hf:MODEL unless `name` is given. InputError for a device, package, model or file that is missing, broken or
-        unknown, and for too little memory; ValueError for an unknown precision.
+        At the precision auto, matrix products are bf16 if the hardware multiplies it natively. InputError for a device,
+        package, model or file that is missing, broken or unknown, and for too little memory; ValueError for an unknown
+        precision.
         """
         target = pick_device(device)
-        dtype, name = pick_dtype(precision, target), name or f"hf:{model}"
-        source = os.path.expanduser(model)
-        is_folder = os.path.isdir(source)
-        if not is_folder and not _HUB_NAME.fullmatch(model):
-            raise InputError(f"hf:{model}: neither a folder nor a model of the hub: give a folder, or owner/name")
+        dtype, name, source = pick_dtype(precision, target), f"hf:{model}", os.path.expanduser(model)
         transformers = _transformers()
-        problem = "cannot be loaded ({reason}): give its files again, or another model"
+        problem = "cannot be loaded ({reason}): give a folder with all its files, or owner/name of another model"
         with reading(name, problem), enough_memory("give a smaller model"):
             try:
                 network, prepare, meaning = _read(transformers, source, name, from_hub=False)
             except OSError:  # the hub's cache lacks a file
-                if is_folder:
+                if os.path.isdir(source):
                     raise
                 network, prepare, meaning = _read(transformers, source, name, from_hub=True)
             _lower_linear(network, dtype)
@@ -98,15 +90,13 @@ class HfBase:
         camera, lens_source = photo.camera, ""
         if fov is not None and 0 < fov < 180 and photo.focal_source.startswith("default"):
             focal = 0.5 * photo.width / math.tan(math.radians(fov) / 2)
-            if believed_lens(focal, photo.width, photo.height):  # by Depth Pro, the only kind that gives one
+            if believed_lens(focal, photo.width, photo.height):
                 camera, lens_source = Camera.from_focal(focal, photo.width, photo.height), "Depth Pro"
         depth = to_depth_map(raw, self.meaning, camera.focal[0] / photo.width, self.name, photo.path)
         prediction = lift_guess(photo, depth, camera, progress)
         relative = self.meaning == "relative disparity"
         scale = f"relative, scaled to {NEAREST_M:g}–{FARTHEST_M:g} m" if relative else "metric, by the model"
         notes = {**prediction.notes, "precision": self.precision, "depth_scale": scale}
-        if invalid := int((~depth.valid).sum()):
-            notes["depth_invalid_pixels"] = invalid
         return dataclasses.replace(prediction, notes=notes, lens_source=lens_source)
 
     @torch.no_grad()
@@ -117,32 +107,26 @@ class HfBase:
         with own_arithmetic(device):
             output = self.network(pixel_values=pixels.to(device))
         raw, fov = output.predicted_depth.float().cpu(), getattr(output, "field_of_view", None)
-        if raw.ndim != 3 or len(raw) != 1:
-            raise ValueError(f"an output of shape {tuple(raw.shape)}")
         sides = (raw.shape[1], raw.shape[1], raw.shape[2], raw.shape[2])
         top, bottom, left, right = (round(share * side) for share, side in zip(window, sides, strict=True))
         return raw[0, top:bottom, left:right], None if fov is None else float(fov)
 
 
 def meaning_of(settings: Mapping[str, Any], name: str) -> Meaning:
-    """What a model's output means, by its config.json; InputError if that is unknown, because a guess may be wrong."""
+    """The meaning of a model's output by its config.json; InputError if it is unknown, because a guess may be wrong."""
     kind, stated = str(settings.get("model_type")), str(settings.get("depth_estimation_type", "relative"))
-    if kind not in MEANINGS:
-        known = ", ".join(MEANINGS)
-        raise InputError(f"{name}: {kind[:40]!a} is no kind of depth model that is known here: give one of {known}")
-    if kind == "depth_anything" and stated not in ("relative", "metric"):
-        raise InputError(f"{name}: its depth is {stated[:40]!a}, neither relative nor metric: give another model")
     backbone = settings.get("backbone_config")
-    # DINOv2's own depth heads, for NYU and KITTI; MiDaS has other backbones.
-    dinov2 = kind == "dpt" and isinstance(backbone, dict) and backbone.get("model_type") == "dinov2"
-    return "metres" if dinov2 or (kind == "depth_anything" and stated == "metric") else MEANINGS[kind]
+    dinov2 = kind == "dpt" and isinstance(backbone, dict) and backbone.get("model_type") == "dinov2"  # no MiDaS
+    if kind not in MEANINGS or dinov2 or stated not in ("relative", "metric"):
+        known = ", ".join(MEANINGS)
+        raise InputError(f"{name}: the output of {kind[:40]!a} has no known meaning: give a model of type {known}")
+    return "metres" if kind == "depth_anything" and stated == "metric" else MEANINGS[kind]
 
 
 def to_depth_map(raw: Tensor, meaning: Meaning, focal: float, name: str, photo: Path) -> DepthMap:
     """Convert a model's output [h, w] float32 to metres; pixels without a positive finite depth are not valid.
 
-    Canonical disparity depends on `focal`, the photo's focal length over its width; `name` and `photo` are for
-    messages.
+    Canonical disparity depends on `focal`, the photo's focal length over its width; messages name `name` and `photo`.
 
     Raises:
         InputError: the output has no finite number, none above zero, or the same one everywhere.
@@ -170,9 +154,8 @@ def _transformers() -> Any:
         import transformers
         import transformers.utils.logging as logs
     except Exception as error:  # a torchvision of another build raises RuntimeError
-        if isinstance(error, ModuleNotFoundError) and error.name in ("transformers", "huggingface_hub"):
-            raise InputError("depth models need a package: pip install 'spackle-nvs[hf]'") from error
-        raise InputError(f"transformers cannot be imported ({reason_in_a_line(error)}): install it again") from error
+        problem = f"depth models need transformers ({reason_in_a_line(error)})"
+        raise InputError(f"{problem}: pip install 'spackle-nvs[hf]'") from error
     logs.set_verbosity(logs.CRITICAL)  # problems that matter are raised
     logs.disable_progress_bar()
     return transformers
@@ -186,8 +169,8 @@ def _read(transformers: Any, source: str, name: str, *, from_hub: bool) -> tuple
     files = {"local_files_only": not from_hub, "trust_remote_code": False}
     settings, _ = transformers.PretrainedConfig.get_config_dict(source, **files)
     meaning, kind = meaning_of(settings, name), str(settings["model_type"])  # before weights are loaded
-    if kind in ANTIALIAS:
-        prepare = _stretched(transformers.ImageProcessingMixin.get_image_processor_dict(source, **files)[0], kind)
+    if kind == "depth_pro":  # its image processor needs torchvision
+        prepare = _stretched(transformers.ImageProcessingMixin.get_image_processor_dict(source, **files)[0])
     else:  # always Pillow's: torchvision's results differ in the last digits, and it does not fit every torch
         prepare = _processed(transformers.AutoImageProcessor.from_pretrained(source, backend="pil", **files), kind)
     # Half precision is widened, because only matrix products gain by it. Mismatched shapes are reported below.
@@ -218,32 +201,25 @@ def _processed(processor: Any, kind: str) -> Prepare:
     def prepare(rgb: Tensor) -> tuple[Tensor, Window]:
         image = Image.fromarray((rgb * 255).round().to(torch.uint8).numpy())
         pixels = torch.as_tensor(processor(images=image, return_tensors="pt")["pixel_values"])
-        if not getattr(processor, "do_pad", False):
-            return pixels, WHOLE
-        window: Window = ()
-        bare = processor(images=image, return_tensors="pt", do_pad=False)["pixel_values"].shape[2:]
-        for side, whole, inside in zip(rgb.shape[:2], pixels.shape[2:], bare, strict=True):
-            if kind == "zoedepth":  # reflects the photo beyond its borders, and resizes both together
-                margin, whole, inside = int(math.sqrt(side / 2) * 3), side + 2 * int(math.sqrt(side / 2) * 3), side
-            else:  # centred in a picture that is padded to multiples of a size
-                margin = (whole - inside) // 2
-            window += (margin / whole, (margin + inside) / whole)
+        window = WHOLE
+        if kind == "zoedepth" and processor.do_pad:  # reflects the photo beyond its borders, then resizes both together
+            window = ()
+            for side in rgb.shape[:2]:
+                margin = int(math.sqrt(side / 2) * 3)
+                window += (margin / (side + 2 * margin), (margin + side) / (side + 2 * margin))
         return pixels, window
 
     return prepare
 
 
-def _stretched(settings: Mapping[str, Any], kind: str) -> Prepare:
+def _stretched(settings: Mapping[str, Any]) -> Prepare:
     """Preprocessing by preprocessor_config.json: stretch the photo bilinearly to one size, and normalise it."""
     size = int(settings["size"]["height"]), int(settings["size"]["width"])
     if settings.get("resample", 2) != Image.Resampling.BILINEAR or not (1 <= min(size) <= max(size) <= 4096):
         raise ValueError(f"an input of {size[1]}×{size[0]}, or resized otherwise than bilinear")
-    mean, std = torch.zeros(3), torch.ones(3)
-    if settings.get("do_normalize", "image_mean" in settings):
-        mean, std = torch.tensor(settings["image_mean"]).float(), torch.tensor(settings["image_std"]).float()
+    mean, std = (torch.tensor(settings[key]).float() for key in ("image_mean", "image_std"))
 
     def prepare(rgb: Tensor) -> tuple[Tensor, Window]:
-        pixels = ((rgb - mean) / std).permute(2, 0, 1)[None]
-        return interpolate(pixels, size=size, mode="bilinear", antialias=ANTIALIAS[kind]), WHOLE
+        return interpolate(((rgb - mean) / std).permute(2, 0, 1)[None], size=size, mode="bilinear"), WHOLE
 
     return prepare

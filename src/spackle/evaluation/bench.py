@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -16,7 +15,7 @@ import numpy.typing as npt
 import torch
 
 from spackle.bases import BasePrediction
-from spackle.bases.sharp.base import unused_shapes
+from spackle.bases.sharp.base import PARAMETERS
 from spackle.bases.sharp.encoder import FULL
 from spackle.bases.sharp.network import SharpNetwork
 from spackle.camera import Camera
@@ -163,8 +162,7 @@ def count_parameters(residual: ResidualNet | None) -> dict[str, float]:
     with torch.device("meta"):
         used = sum(p.numel() for p in SharpNetwork(FULL).parameters())
     extra = 0 if residual is None else sum(p.numel() for p in residual.parameters())
-    base = used + sum(map(math.prod, unused_shapes(FULL).values()))
-    return {"base": base, "base_used": used, "residual": extra, "share": extra / base}
+    return {"base": PARAMETERS, "base_used": used, "residual": extra, "share": extra / PARAMETERS}
 
 
 # --- the clock

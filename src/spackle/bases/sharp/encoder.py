@@ -1,4 +1,4 @@
-"""SHARP's sizes, its precision and its encoder: a vision transformer over windows of three sizes of the picture.
+"""SHARP's sizes, precision and encoder: a vision transformer over windows of the picture at three sizes.
 
 Modules are named as in the checkpoint.
 """
@@ -25,13 +25,12 @@ class SharpConfig:
     embed: int = 1024  # width of both vision transformers
     depth: int = 24  # their blocks
     heads: int = 16
-    classes: int = 21841  # of the transformers' classifiers, which are in the checkpoint and never used
     taps: tuple[int, int] = (5, 11)  # blocks whose tokens become the two finest feature maps
     pyramid: tuple[int, int, int, int] = (256, 512, 1024, 1024)  # channels of the coarser feature maps, fine to coarse
     depth_width: int = 256  # channels of the depth decoder, and of the finest feature map
     gaussian_width: int = 128  # channels of the Gaussian decoder
     feature_width: int = 32  # channels that the Gaussians are predicted from
-    patch: int = 16  # pixels of a token's side; the decoders count on 16
+    patch: int = 16  # side of a token in pixels; the decoders assume 16
     window: int = 384  # side in pixels of a transformer's input, a multiple of 8 tokens
 
     @property
@@ -46,7 +45,7 @@ class SharpConfig:
 
 
 FULL = SharpConfig()
-TINY = SharpConfig(48, 4, 3, 8, (0, 1), (16, 24, 32, 32), depth_width=16, gaussian_width=16, feature_width=16)
+TINY = SharpConfig(48, 4, 3, (0, 1), (16, 24, 32, 32), depth_width=16, gaussian_width=16, feature_width=16)
 MICRO = dataclasses.replace(TINY, window=128)  # a ninth of the pixels
 CONFIGS = {"full": FULL, "tiny": TINY, "micro": MICRO}
 
@@ -54,7 +53,7 @@ _HEAVY = (nn.Linear, nn.Conv2d, nn.ConvTranspose2d, nn.GroupNorm)
 
 
 class ExactConv(nn.Conv2d):
-    """A convolution that stays in float32, because it is cheap and reads the pixels or writes the Gaussians' values."""
+    """A convolution that stays in float32: it is cheap, and reads the pixels or writes the Gaussians' values."""
 
     def forward(self, x: Tensor) -> Tensor:
         with torch.autocast(x.device.type, enabled=False):  # the decoder is trained under autocast
@@ -62,7 +61,7 @@ class ExactConv(nn.Conv2d):
 
 
 def lower(x: Tensor, module: nn.Module) -> Tensor:
-    """`x` in the precision that a module computes in."""
+    """`x` in the module's precision."""
     weight: Tensor = module.weight  # type: ignore[assignment]
     return x.to(weight.dtype)
 
@@ -138,7 +137,7 @@ class TransformerBlock(nn.Module):
         return projected
 
 
-# Windows along a side: of the picture at full size, overlapping by a quarter, and at half its size, by a half.
+# Number of windows along a side of the picture: at full size they overlap by a quarter, at half size by a half.
 # At a quarter of its size, the picture is one window.
 FULL_WINDOWS, HALF_WINDOWS = 5, 3
 WINDOWS = FULL_WINDOWS**2 + HALF_WINDOWS**2 + 1
@@ -201,7 +200,7 @@ def cut(image: Tensor, window: int, count: int) -> Tensor:
 
 
 def merge(maps: Tensor, trim: int) -> Tensor:
-    """The inverse of `cut` for feature maps [n², C, G, G]: each loses `trim` cells at a side with a neighbour."""
+    """The inverse of `cut` for feature maps [n², C, G, G]; a map loses `trim` cells at each side with a neighbour."""
     count = int(len(maps) ** 0.5)
     size = maps.shape[-1]
     spans = [slice(trim if i else 0, size - trim if i < count - 1 else size) for i in range(count)]

@@ -1,6 +1,6 @@
-"""SHARP (Apple, 2025): predicts two layers of Gaussians from one picture, with DPT's decoders (Ranftl 2021).
+"""SHARP (Apple, 2025): predict two layers of Gaussians from one picture, with DPT's decoders (Ranftl 2021).
 
-Modules are named as in the checkpoint. `torch.compile` can compile a network's forward, and a CUDA graph replay it.
+Modules are named as in the checkpoint.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from spackle.bases import Progress
 from spackle.bases.sharp.encoder import (
     LAYERS,
     STRIDE,
-    WINDOWS,
     ExactConv,
     SharpConfig,
     SlidingPyramid,
@@ -27,11 +26,11 @@ from spackle.bases.sharp.encoder import (
 from spackle.color import srgb_to_linear
 from spackle.gaussians import Gaussians
 
-GROUPS = 8  # of the group norms
+GROUPS = 8  # channel groups of the group norms
 
 
 class Residual(nn.Module):
-    """x plus the output of a few layers for x."""
+    """Adds the output of a few layers to their input."""
 
     def __init__(self, *layers: nn.Module) -> None:
         super().__init__()
@@ -67,7 +66,7 @@ class GroupNorm(nn.GroupNorm):
 
 
 def plain_residual(dim: int) -> Residual:
-    """A residual block of two 3×3 convolutions, each after a ReLU, of which only the second may work in place."""
+    """A residual block of two 3×3 convolutions, each after a ReLU; the first ReLU keeps its input."""
     first, second = (nn.Conv2d(dim, dim, 3, padding=1) for _ in range(2))
     return Residual(nn.ReLU(), first, nn.ReLU(inplace=True), second)
 
@@ -80,7 +79,7 @@ def normed_residual(dim: int, out: int) -> Residual:
 
 
 class Fusion(nn.Module):
-    """Adds finer features to coarser ones, and with `doubles` doubles the size."""
+    """Adds finer features to coarser features, and doubles the size if `doubles` is set."""
 
     def __init__(self, dim: int, doubles: bool) -> None:
         super().__init__()
@@ -109,7 +108,7 @@ class Decoder(nn.Module):
     def forward(self, maps: Sequence[Tensor], features: Tensor | None = None) -> Tensor:
         """Fuse maps, listed from fine to coarse, [1, dims[i], H/2^i, W/2^i], into [1, width, H, W].
 
-        The coarsest map is added to `features`; SHARP has none, so the layers for this addition are skipped.
+        The coarsest map is added to `features`. SHARP gives no `features` and skips the layers for this addition.
         """
         for level in reversed(range(len(maps))):
             projected = self.convs[level](maps[level])
@@ -128,7 +127,7 @@ class SharpOutput:
     """The network's output for one picture."""
 
     start: InitialGaussians  # Gaussians on the two surfaces
-    deltas: Tensor  # [14, 2, side/2, side/2] float32, to be applied to them
+    deltas: Tensor  # [14, 2, side/2, side/2] float32 changes of these Gaussians
 
 
 @dataclasses.dataclass(frozen=True)
@@ -141,7 +140,7 @@ class DecoderInput:
 
 
 class SharpNetwork(nn.Module):
-    """The whole network, except the parts that inference never uses (see `unused_shapes`)."""
+    """The whole network, without the parts that inference never uses."""
 
     def __init__(self, config: SharpConfig) -> None:
         super().__init__()
@@ -170,7 +169,6 @@ class SharpNetwork(nn.Module):
         depth_network: DepthNetwork = self.monodepth_model.monodepth_predictor  # type: ignore[assignment]
         maps = depth_network.encoder(image * 2 - 1, batch, progress)
         disparity = depth_network.disparity(maps)
-        # PyTorch computes number / tensor in this way; written out, a tensor as the factor gives the same bits.
         start = make_start(image, disparity.clamp(*DISPARITY_RANGE).reciprocal() * disparity_factor)
         return DecoderInput(start, torch.cat([image, start.disparity_map], dim=1) * 2 - 1, maps)
 
@@ -252,7 +250,7 @@ class GaussianDecoder(nn.Module):
         """Enable gradients, except for unused weights: 295,168 in the published checkpoint."""
         self.requires_grad_()
         coarsest: Fusion = self.feature_model.decoder.fusions[-1]  # type: ignore[assignment]
-        coarsest.resnet1.requires_grad_(False)  # it takes finer features, which the coarsest level does not get
+        coarsest.resnet1.requires_grad_(False)  # for finer features, which the coarsest level does not get
         return self
 
     def forward(self, picture: Tensor, maps: list[Tensor]) -> Tensor:
@@ -289,7 +287,7 @@ class InitialGaussians:
 
 def make_start(image: Tensor, depth: Tensor) -> InitialGaussians:
     """The initial Gaussians of a picture [1, 3, side, side] with depth layers [1, 2, side, side]."""
-    factor = NEAREST / (depth.min().double() + SMALLEST_INVERSE)  # stays on its device, so that the CPU need not wait
+    factor = NEAREST / (depth.min().double() + SMALLEST_INVERSE)
     disparity = 1.0 / (depth * factor).clamp_max(FARTHEST)
     return InitialGaussians(disparity, max_pool2d(disparity, STRIDE)[0], avg_pool2d(image, STRIDE)[0], 1.0 / factor)
 
@@ -327,59 +325,15 @@ def _rows(attribute: Tensor) -> Tensor:
     return attribute.flatten(1).T.contiguous()
 
 
-WARM_UPS = 2  # calls before a capture, in which libraries choose their kernels and take their workspaces
+def compile_forward(network: SharpNetwork, backend: str = "inductor") -> SharpNetwork:
+    """A twin of the network with the same weights, which `torch.compile` compiles at the first call.
 
-
-def compile_forward(network: SharpNetwork, backend: str = "inductor") -> SharpNetwork | GraphedForward:
-    """A network's forward, with the same weights, which `torch.compile` compiles at the first call.
-
-    This needs a C++ compiler on a CPU and Triton on a GPU; a RuntimeError at the first call says what is missing. All
-    48 blocks of the two transformers share one compilation; values differ from the network's by rounding. The `backend`
-    "eager" compiles nothing.
+    Compilation needs a C++ compiler on a CPU and Triton on a GPU, else the first call raises a RuntimeError. All 48
+    blocks of the two transformers share one compilation. The `backend` "eager" compiles nothing.
     """
     twin = copy.deepcopy(network, {id(weight): weight for weight in network.parameters()})
     depth: DepthNetwork = twin.monodepth_model.monodepth_predictor  # type: ignore[assignment]
     blocks = [module for module in twin.modules() if isinstance(module, TransformerBlock)]
     for module in (*blocks, depth.decoder, depth.head, twin.feature_model):
         module.compile(backend=backend, dynamic=False)
-    return GraphedForward(twin) if next(network.parameters()).device.type == "cuda" else twin
-
-
-class GraphedForward:
-    """A network's forward, captured once and replayed as one CUDA graph, by one thread at a time."""
-
-    def __init__(self, network: SharpNetwork) -> None:
-        self.network = network
-        self.graph: torch.cuda.CUDAGraph | None = None
-
-    def __call__(
-        self, image: Tensor, disparity_factor: float, batch: int, progress: Progress | None = None
-    ) -> SharpOutput:
-        """The network's forward, always with the batch of the first call; `progress` is called only at the end."""
-        with torch.cuda.device(image.device):
-            if self.graph is None:
-                self._capture(image, batch)
-            self.image.copy_(image)
-            self.factor.fill_(disparity_factor)
-            assert self.graph is not None
-            self.graph.replay()
-        if progress:
-            progress(WINDOWS, WINDOWS)
-        start = self.output.start  # the next replay writes over it
-        return SharpOutput(InitialGaussians(*(t.clone() for t in vars(start).values())), self.output.deltas.clone())
-
-    @torch.inference_mode(False)
-    @torch.no_grad()
-    def _capture(self, image: Tensor, batch: int) -> None:
-        """Record a forward into buffers that later calls may overwrite, with or without inference mode."""
-        self.image, self.factor = image.clone(), image.new_ones(())
-        side = torch.cuda.Stream()  # type: ignore[no-untyped-call]
-        side.wait_stream(torch.cuda.current_stream())
-        with torch.cuda.stream(side):
-            for _ in range(WARM_UPS):
-                self.network(self.image, self.factor, batch)
-        torch.cuda.current_stream().wait_stream(side)
-        graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph, stream=side):  # by default the stream would be the first device's
-            self.output: SharpOutput = self.network(self.image, self.factor, batch)
-        self.graph = graph
+    return twin
