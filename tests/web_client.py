@@ -18,12 +18,11 @@ import web_work
 from photos import picture
 from PIL import Image
 
-from spackle.web import create_app
-from spackle.web.guard import Access, Limits
+from spackle.web.app import create_app, server_of
+from spackle.web.guard import Access
 from spackle.web.jobs import Jobs, Keep
-from spackle.web.server import server_of
 
-QUICK = Limits(upload=0.6, send=0.5, upload_bytes=100_000)
+MAX_BYTES = 100_000  # of an upload
 SCENES, BOUNDARY = "/api/v1/scenes", "7d1"
 
 
@@ -103,15 +102,15 @@ def served(
     token: str | None = "s3cret",
     host: str = "127.0.0.1",
     work: Any = web_work.work,
-    limits: Limits = QUICK,
+    max_bytes: int = MAX_BYTES,
     keep: Keep = Keep(),  # noqa: B008
 ) -> Iterator[Served]:
     with socket.socket() as listener:
         listener.bind((host, 0))
         listener.listen()
         address, port = listener.getsockname()
-        app = create_app(folder, work, keep=keep, access=Access.at(host, address, token), limits=limits)
-        server = server_of(app, silent=0.3)
+        app = create_app(folder, work, keep=keep, access=Access.at(host, address, token), max_bytes=max_bytes)
+        server = server_of(app)
         thread = threading.Thread(target=server.run, args=([listener],))
         thread.start()
         try:

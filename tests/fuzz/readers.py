@@ -255,7 +255,7 @@ READERS: dict[str, Reader] = {
         ],
         lambda folder: load_photo_depth(_only(folder)),
     ),
-    "ply": Reader([_ply, *(_writes("a.ply", content) for content in (test_ply.SHARP, test_ply.ASCII))], _read_ply),
+    "ply": Reader([_ply, *(_writes("a.ply", content) for content in (test_ply.SHARP, test_ply.GOOD))], _read_ply),
     "scenes": Reader(
         [*map(_encoded, ("spz", "splat", "sog", "compressed.ply"))], lambda folder: load_scene(_only(folder))
     ),

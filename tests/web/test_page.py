@@ -31,7 +31,7 @@ from spackle.pipeline import complete
 from spackle.render import CpuRenderer
 from spackle.scene import Scene
 from spackle.views import scene_path
-from spackle.web.guard import Limits
+from spackle.web.guard import MAX_BYTES
 from spackle.web.work import SceneWork
 
 WEB = Path(__file__).parents[2] / "web"
@@ -258,7 +258,7 @@ def test_all_of_the_photo_and_every_control_has_room(page: Any, size: tuple[int,
 def test_a_photo_is_sent_to_the_server_and_watched(browser: Any, tmp_path: Path) -> None:
     photo, depth = write_pair(tmp_path / "first")
     photo = photo.rename(tmp_path / "my photo.png")
-    with served(tmp_path / "scenes", work=SceneWork(), limits=Limits()) as server:
+    with served(tmp_path / "scenes", work=SceneWork(), max_bytes=MAX_BYTES) as server:
         address = f"http://127.0.0.1:{server.port}{server.root}/"
         page = (found := opened(browser, address)).page
         page.get_by_role("button", name="Choose a photo…").click()

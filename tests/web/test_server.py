@@ -10,7 +10,6 @@ import socket
 import struct
 import subprocess
 import sys
-import time
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,12 +19,12 @@ import pillow_heif
 import pytest
 from photos import metres
 from PIL import Image
-from web_client import PHOTO, QUICK, SCENES, Served, answer_of, eventually, form, post, request, saved, served
+from web_client import MAX_BYTES, PHOTO, SCENES, Served, answer_of, eventually, form, post, request, saved, served
 
 from spackle.errors import InputError
 from spackle.task_process import DIED
 from spackle.web.app import shown_name
-from spackle.web.jobs import ATTEMPTS, Keep
+from spackle.web.jobs import Keep
 
 ROOT = Path(__file__).parents[2]
 
@@ -190,7 +189,7 @@ def test_one_photo_of_a_usable_size_is_asked_for(server: Served) -> None:
 
 def test_an_upload_is_bounded_while_it_comes(server: Served) -> None:
     waiting = set(server.jobs.folder.iterdir())
-    assert server.send(bytes(QUICK.upload_bytes + 1)).status == 413
+    assert server.send(bytes(MAX_BYTES + 1)).status == 413
     assert server.send(bytes(20_000_000)).status == 413  # it learns why while it sends
     with server.dial(post(0).replace(b"Content-Length: 0", b"Transfer-Encoding: chunked")) as endless:
         with contextlib.suppress(OSError):
@@ -198,43 +197,22 @@ def test_an_upload_is_bounded_while_it_comes(server: Served) -> None:
             for _ in range(40):
                 endless.sendall(b"4000\r\n" + bytes(0x4000) + b"\r\n")
         assert answer_of(endless)[9:12] in (b"413", b"")  # it sends on, and may be hung up on
-    assert server.send(b"").status == 400
     assert server.ask(SCENES, "POST", form(more=("a", b""), another=("b", b""))).status == 400
     assert set(server.jobs.folder.iterdir()) == waiting
 
 
-@pytest.mark.parametrize(("how", "status"), [("silent", b"408"), ("dripping", b"408"), ("gone", b"")])
-def test_a_slow_or_vanishing_client_leaves_its_place(server: Served, how: str, status: bytes) -> None:
+def test_a_slow_or_vanishing_client_leaves_its_place(server: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("spackle.web.app.UPLOAD_S", 0.5)
     before = set(server.jobs.folder.iterdir())
-    with server.dial(post(90_000) + form()[:90]) as connection:
-        eventually(lambda: set(server.jobs.folder.iterdir()) != before)
-        if how == "gone":
-            connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-            connection.close()
-        elif how == "dripping":
-            with contextlib.suppress(OSError):
-                for _ in range(60):
-                    connection.sendall(b"a")
-                    time.sleep(0.05)
-        if status:
-            assert answer_of(connection).split()[1] == status
-        eventually(lambda: set(server.jobs.folder.iterdir()) == before)
-
-
-def test_a_connection_that_says_or_reads_nothing_is_closed(server: Served) -> None:
-    with server.dial(b"GET / HTTP/1.1\r\nHost: local") as silent:
-        assert answer_of(silent) == b""
-    content = bytes(30_000_000)  # more than the socket's buffers hold
-    id = server.send().json["id"]
-    assert server.events(id)
-    job = server.jobs.get(id)
-    assert job is not None
-    (job.results / "base.splats").write_bytes(content)
-    with server.dial(request(f"/s3cret{SCENES}/{id}/files/base.splats")) as deaf:
-        deaf.recv(12)
-        time.sleep(2)
-        assert len(answer_of(deaf)) < len(content)
-    assert len(server.ask(f"{SCENES}/{id}/files/base.splats").body) == len(content)
+    for gone in (False, True):
+        with server.dial(post(90_000) + form()[:90]) as connection:
+            eventually(lambda: set(server.jobs.folder.iterdir()) != before)
+            if gone:
+                connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+                connection.close()
+            else:
+                assert answer_of(connection).split()[1] == b"408"
+            eventually(lambda: set(server.jobs.folder.iterdir()) == before)
 
 
 def png_claiming(width: int, height: int) -> bytes:
@@ -273,7 +251,7 @@ def test_what_is_a_photo_is_found_out_by_decoding(server: Served, content: bytes
         ("../../etc/passwd.png", "passwd.png"),
         ("C:\\photos\\a.png", "a.png"),
         ("\x1b[31m\r\na\u202e.png", "[31ma.png"),
-        (f"{200 * 'a'}.png", f"{40 * 'a'}…{36 * 'a'}.png"),
+        (f"{200 * 'a'}.png", f"{76 * 'a'}.png"),
     ],
 )
 def test_a_name_is_for_people_only(name: str, shown: str) -> None:
@@ -302,16 +280,13 @@ def test_photos_wait_and_go_on_after_a_restart(tmp_path: Path) -> None:
         with pytest.raises(InputError, match="another"):
             served(tmp_path).__enter__()
     (tmp_path / ".new-of-a-killed-server").mkdir()
-    for attempt in range(ATTEMPTS):
-        with served(tmp_path) as server:
-            if attempt + 1 < ATTEMPTS:
-                eventually(lambda server=server: server.ask(f"{SCENES}/{slow}").json["stage"] == "base")  # type: ignore[misc]
-                continue
-            assert [server.events(id)[-1]["state"] for id in (slow, *waiting)] == ["failed", "done", "done"]
-            assert "twice" in server.ask(f"{SCENES}/{slow}").json["error"]
-            server.jobs.keep = Keep(seconds=0)
-            server.jobs.tidy()
-            assert {path.name for path in tmp_path.iterdir()} == {".lock"}
+    with served(tmp_path) as server:
+        eventually(lambda: server.ask(f"{SCENES}/{slow}").json["stage"] == "base")
+        assert server.ask(f"{SCENES}/{slow}", "DELETE").status == 204
+        assert [server.events(id)[-1]["state"] for id in waiting] == ["done", "done"]
+        server.jobs.keep = Keep(seconds=0)
+        server.jobs.tidy()
+        assert {path.name for path in tmp_path.iterdir()} == {".lock"}
 
 
 @pytest.mark.parametrize("count", [9, pytest.param(200, marks=pytest.mark.slow)])

@@ -18,6 +18,7 @@ from spackle.cli.options import (
     HostOption,
     JsonOption,
     KeepFrameOption,
+    PortOption,
     PrecisionName,
     SharpOption,
     VerboseOption,
@@ -245,7 +246,7 @@ def view(
     keep_frame: KeepFrameOption = False,
     device: DeviceOption = "auto",
     host: HostOption = "127.0.0.1",
-    port: Annotated[int, typer.Option(metavar="N", help="Listen at this port; 0: any free port.")] = 0,
+    port: PortOption = 0,
     browser: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in a browser.")] = True,
     token: Annotated[
         bool,
@@ -273,7 +274,7 @@ def view(
 
 def serve(
     host: HostOption = "127.0.0.1",
-    port: Annotated[int, typer.Option(metavar="N", help="Listen at this port; 0: any free port.")] = 8080,
+    port: PortOption = 8080,
     token: Annotated[
         str | None,
         typer.Option(

@@ -26,8 +26,10 @@ PrecisionOption = Annotated[PrecisionName, typer.Option(help="Precision of the b
 DeviceOption = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Where to compute.")]
 FovOption = Annotated[float | None, typer.Option(help="Horizontal field of view in degrees.")]
 HostOption = Annotated[
-    str, typer.Option(metavar="H", help="Listen here; 0.0.0.0 admits everybody in the network who has the token.")
+    str,
+    typer.Option(metavar="H", help="Address of the server; 0.0.0.0 admits everybody in the network with the token."),
 ]
+PortOption = Annotated[int, typer.Option(metavar="N", min=0, max=65535, help="Port of the server; 0: any free one.")]
 KeepFrameOption = Annotated[
     bool, typer.Option("--keep-frame", help="Keep a scan's margin or letterbox bars, which are otherwise cropped.")
 ]

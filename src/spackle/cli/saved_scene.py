@@ -21,7 +21,7 @@ from spackle.errors import InputError
 from spackle.files import check_writable, write_whole
 from spackle.folders import results_folder
 from spackle.formats import save_png, save_video
-from spackle.formats.html import PageScene, single_html
+from spackle.formats.html import single_html
 from spackle.formats.scene_files import Encoder, SceneFile, encoder_of, load_scene
 from spackle.formats.spz import LARGEST, spz_grid
 from spackle.formats.video import FORMATS
@@ -34,7 +34,7 @@ from spackle.video_frames import FrameMaker, video_problem
 from spackle.views import PathOptions
 
 TOLERATED = 0.01  # fraction of a frame that may be holes before the log mentions it
-PAGE: dict[str, Encoder] = {".html": lambda scene: single_html(page_of(Scene.of_file(scene), scene.path))}
+PAGE: dict[str, Encoder] = {".html": lambda file: single_html(Scene.of_file(file).page(page_name(file.path)))}
 
 
 def render_scene(
@@ -186,16 +186,7 @@ def _report_file(scene: SceneFile, output: Path, seconds: float, reporter: Repor
     reporter.result({"file": output, "gaussians": count, "bytes": size, "seconds": seconds, "drawn_nearer": far})
 
 
-def page_of(scene: Scene, path: Path) -> PageScene:
-    """The scene of a file for the page; InputError, naming the file, if it cannot be rendered.
-
-    The page shows the folder's name for a file called scene.ply or base.ply, else the file's own name.
-    """
+def page_name(path: Path) -> str:
+    """A scene's name on the page: the folder's name for a file called scene.ply or base.ply, else the file's name."""
     place = path.absolute()
-    name = place.parent.name if place.name in ("scene.ply", "base.ply") and place.parent.name else place.stem
-    try:
-        return scene.page(name)
-    except InputError as error:
-        raise InputError(f"{path}: {str(error).removeprefix(f'{name}: ')}") from error
-    except ValueError as error:
-        raise InputError(f"{path}: cannot be viewed: {error}: give the lens with --fov") from error
+    return place.parent.name if place.name in ("scene.ply", "base.ply") and place.parent.name else place.stem

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import errno
 import logging
 import os
 import socket
@@ -18,18 +17,17 @@ from typing import NamedTuple
 
 from spackle.bases.open import open_base
 from spackle.bases.settings import AUTO, RGBD, BaseSettings
-from spackle.cli.saved_scene import page_of
-from spackle.errors import InputError, reason_in_a_line
+from spackle.cli.saved_scene import page_name
+from spackle.errors import InputError, reading
 from spackle.files import check_file
 from spackle.formats.scene_files import scene_kind
 from spackle.image import load_photo
 from spackle.progress import Reporter, asked_to_stop
 from spackle.scene import Scene
 from spackle.views import PathOptions
-from spackle.web import create_app
+from spackle.web.app import create_app, server_of
 from spackle.web.guard import Access
 from spackle.web.jobs import LOG, Jobs, Keep
-from spackle.web.server import server_of
 from spackle.web.work import PREVIEW, SceneWork, check_photo
 
 LOOPBACK = "127.0.0.1"
@@ -52,14 +50,17 @@ def view(
     place: Place,
     reporter: Reporter,
 ) -> None:
-    """Show a scene or a photo, or an empty page, until the user stops it.
+    """Show a scene or a photo, or an empty page, until the user stops the server; then delete all scenes.
 
-    Depth, calibration and `lens` (`focal_px` and `fov`) belong to that photo alone; `usual` (disparity, keep_frame,
-    depth_kind) holds for all photos that the page sends. Scenes live until this returns. InputError for a file that is
-    neither, or an option that cannot be used.
+    Depth, calibration and `lens` (`focal_px` and `fov`) belong to the target; `usual` (disparity, keep_frame,
+    depth_kind) holds for all photos that the page sends. InputError for a target that is neither photo nor scene, or an
+    option that cannot be used.
     """
     PathOptions(disparity=usual["disparity"]).check()  # type: ignore[arg-type]
-    name = "Spackle" if target is None else checked(target, settings, lens, bool(usual["keep_frame"]), reporter)
+    name = "Spackle"
+    if target is not None:
+        with reporter.stage("load"):
+            name = _checked(target, settings, lens, bool(usual["keep_frame"]))
     base = AUTO if settings.name == RGBD else settings.name
     others = dataclasses.replace(settings, depth=None, depth_kind="auto", name=base)
     others.check()
@@ -77,32 +78,30 @@ def view(
             announce(name, urls, place, reporter)
 
 
-def checked(
-    target: Path, settings: BaseSettings, lens: Mapping[str, float | None], keep_frame: bool, reporter: Reporter
-) -> str:
-    """The name of a photo or scene on the page; InputError, before the page opens, if it or its depth is missing."""
+def _checked(target: Path, settings: BaseSettings, lens: Mapping[str, float | None], keep_frame: bool) -> str:
+    """The name of a photo or scene on the page; InputError if the target, or its depth, cannot be read."""
     check_file(target, "photo or scene")
     settings.check()
-    with reporter.stage("load"):
-        if scene_kind(target):
-            if settings.depth is not None:
-                raise InputError(f"--depth {settings.depth}: {target.name} is a scene already: leave the option out")
-            return str(page_of(Scene.load(target, **lens), target).description["name"])
-        photo = load_photo(target, keep_frame=keep_frame or settings.depth is not None, **lens)
-        photo.check_shape()
+    if scene_kind(target):
         if settings.depth is not None:
-            open_base(settings).load(photo)
-        if settings.checkpoint is not None:
-            check_file(settings.checkpoint, "file of weights")
+            raise InputError(f"--depth {settings.depth}: {target.name} is a scene already: leave the option out")
+        Scene.load(target, **lens)
+        return page_name(target)
+    photo = load_photo(target, keep_frame=keep_frame or settings.depth is not None, **lens)
+    photo.check_shape()
+    if settings.depth is not None:
+        open_base(settings).load(photo)
+    if settings.checkpoint is not None:
+        check_file(settings.checkpoint, "file of weights")
     return target.name
 
 
 def serve(folder: Path, work: SceneWork, workers: int, keep: Keep, place: Place, reporter: Reporter) -> None:
-    """Complete photos for programs until the user stops it; InputError for an option that cannot be used."""
+    """Complete photos for programs until the user stops the server; InputError for an option that cannot be used."""
     work.base.check()
     with listening(folder, work, workers, keep, place, reporter) as (_, urls):
         reporter.log(
-            f"token: {place.token} (send it as `Authorization: Bearer TOKEN`, or use the address, which holds it)"
+            f"token: {place.token} (send it as `Authorization: Bearer TOKEN`, or use the address with the token in it)"
         )
         announce("HTTP interface, and its page", urls, place, reporter)
 
@@ -111,12 +110,12 @@ def serve(folder: Path, work: SceneWork, workers: int, keep: Keep, place: Place,
 def listening(
     folder: Path, work: SceneWork, workers: int, keep: Keep, place: Place, reporter: Reporter
 ) -> Iterator[tuple[Jobs, list[str]]]:
-    """Yields the app's jobs and the page's addresses, and then answers requests until Ctrl-C or SIGTERM."""
-    with asked_to_stop(alone=True) as stopped, listener_at(place.host, place.port) as listener, told_to(reporter):
+    """Yield the app's jobs and the page's addresses; after the block, answer requests until Ctrl-C or SIGTERM."""
+    with asked_to_stop(alone=True) as stopped, listener_at(place.host, place.port) as listener, logged_to(reporter):
         address, port = listener.getsockname()[:2]
         access = Access.at(place.host, address, place.token)
         if not access.local and place.token is None:
-            raise InputError(f"--host {place.host}: without a token others could send photos: leave --no-token out")
+            raise InputError(f"--host {place.host}: other machines can connect: leave --no-token out")
         app = create_app(folder, work, workers=workers, keep=keep, access=access)
         here = {"0.0.0.0": LOOPBACK, "::": "::1"}.get(address, address)
         addresses = [here] if access.local else [here, address_in_network(place.host)]
@@ -128,7 +127,7 @@ def listening(
 
 
 @contextlib.contextmanager
-def told_to(reporter: Reporter) -> Iterator[None]:
+def logged_to(reporter: Reporter) -> Iterator[None]:
     """Log jobs to the terminal, and requests if `verbose`."""
     handler = logging.Handler()
     handler.emit = lambda record: reporter.log(handler.format(record))  # type: ignore[method-assign]
@@ -142,27 +141,29 @@ def told_to(reporter: Reporter) -> Iterator[None]:
 
 
 def listener_at(host: str, port: int) -> socket.socket:
-    """A listening socket; InputError, naming the option, if the address cannot be used."""
-    if not 0 <= port <= 65535:
-        raise InputError(f"--port {port}: must lie between 1 and 65535 (0: any free port)")
-    try:
-        family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
-        return socket.create_server(address, family=family, backlog=128)
-    except (OSError, UnicodeError) as error:
-        reason = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else reason_in_a_line(error)
-        if isinstance(error, socket.gaierror | UnicodeError) or error.errno == errno.EADDRNOTAVAIL:
-            line = f"--host {host}: not an address of this machine: {reason}: leave it out, or give 0.0.0.0 for all"
-        else:
-            line = f"--port {port}: cannot listen at {host}: {reason}: give another port, or 0 for any free one"
-        raise InputError(line) from error
+    """A listening socket; InputError if the address cannot be used."""
+    with reading(
+        f"--host {host}, --port {port}", "cannot listen there: {reason}: give another one", OSError, UnicodeError
+    ):
+        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        # asyncio avoids delays of 40 ms (TCP_NODELAY) only if the socket names its protocol.
+        listener = socket.socket(family, kind, protocol)
+        try:
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            listener.bind(address)
+            listener.listen(128)
+        except OSError:
+            listener.close()
+            raise
+        return listener
 
 
 def announce(name: str, urls: list[str], place: Place, reporter: Reporter) -> None:
-    """Print the page's addresses, warn if it is open to the network, and open a browser if there is a screen."""
+    """Print the page's addresses, warn if other machines can connect, and open a browser if there is a screen."""
     if len(urls) > 1:
         reporter.log(
-            f"warning: everybody in the network who has the token can send photos to --host {place.host} and use this "
-            "machine to complete them; the connection is not encrypted"
+            f"warning: --host {place.host} admits everybody in the network who has the token; the connection is not "
+            "encrypted"
         )
         reporter.log(f"{name}: from other machines {urls[1]}")
     reporter.log(f"{name}: {urls[0]} (Ctrl-C ends)")
@@ -170,14 +171,14 @@ def announce(name: str, urls: list[str], place: Place, reporter: Reporter) -> No
     # A text browser would take over the terminal.
     screen = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"))
     if place.browser and sys.platform.startswith("linux") and not screen:
-        reporter.log("no screen here: open that page yourself, from another machine through `ssh -L`")
+        reporter.log("this machine has no screen: open the page on another machine, through `ssh -L`")
     elif place.browser:
         # Some browsers return only when they are closed.
         threading.Thread(target=webbrowser.open, args=(urls[0],), daemon=True, name="browser").start()
 
 
 def address_in_network(host: str) -> str:
-    """The address by which others reach this machine, listening at `host`."""
+    """The address at which other machines reach a server that listens at `host`."""
     if host not in ("0.0.0.0", "::", ""):
         return host
     with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:

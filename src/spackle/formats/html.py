@@ -165,4 +165,6 @@ def _digest(text: str) -> str:
 
 
 def page_file(name: str) -> bytes:
-    return resources.files("spackle.web").joinpath("page", name).read_bytes()
+    return (
+        resources.files("spackle").joinpath("web", "page", name).read_bytes()
+    )  # importing FastAPI would take a second

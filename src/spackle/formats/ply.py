@@ -1,4 +1,4 @@
-"""Gaussians as PLY: writes INRIA's layout; reads INRIA's, SHARP's and PlayCanvas's, and checks the header first."""
+"""Write Gaussians in INRIA's PLY layout, and read the layouts of INRIA, SHARP and PlayCanvas."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import math
 import os
 import re
 from collections.abc import Iterator, Sequence
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -24,16 +23,16 @@ from spackle.formats.scene_files import SH_C0, Columns, SceneFile, function_name
 from spackle.gaussians import Gaussians
 
 MAX_HEADER_BYTES = 1 << 16
-MAX_EXTRA_ROWS = 64  # SHARP's elements after the vertices hold at most 16 numbers
+MAX_EXTRA_ROWS = 64  # larger tables than this hold no camera
 
 _TYPES = "char uchar short ushort int uint float double int8 uint8 int16 uint16 int32 uint32 float32 float64"
 _CODES = dict(zip(_TYPES.split(), ["i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"] * 2, strict=True))
-_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 
 SMALLEST_OPACITY, LARGEST_OPACITY = 1e-12, 1 - 2.0**-24  # bounds that keep the logit finite
 
-# A block fits the cache, and is so small that torch computes it in one thread. Blocks are padded to full size, so that
-# a row's bits depend neither on the rows after it nor on the number of threads.
+# Gaussians that are converted at a time. Blocks are padded to full size, so that a row's bits depend neither on the
+# rows after it nor on the number of threads.
 BLOCK = 8192
 
 _READ = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2"]
@@ -56,9 +55,13 @@ def save_ply(
     """Write a binary PLY that viewers of 3D Gaussian splatting read.
 
     The one element, `vertex`, is float32: x y z, normals of zero, f_dc from the sRGB colour, opacity as logit, scales
-    as logarithms, rot as unit quaternion wxyz. Each row depends only on its Gaussian. Comments, which `PlyFile` reads,
-    keep the photo's camera (at the world's origin), the number of base Gaussians, which come first, and the disparity
-    for which the scene was completed, see `spackle.camera_path.max_offset`.
+    as logarithms, rot as unit quaternion wxyz. Each row depends only on its Gaussian. Comments in the header keep
+    `camera`, `base_count` and `disparity`.
+
+    Args:
+        camera: the photo's camera, at the world's origin.
+        base_count: the number of base Gaussians, which come first.
+        disparity: the disparity for which the scene was completed, see `spackle.camera_path.max_offset`.
 
     Raises:
         InputError: `path` cannot be written.
@@ -111,7 +114,7 @@ def ply_header(
 
 
 def load_ply(path: StrPath) -> Gaussians:
-    """Read Gaussians from an INRIA or SHARP file, binary or ASCII; see `PlyFile.gaussians`."""
+    """Read Gaussians from a binary PLY file of INRIA's, SHARP's or PlayCanvas's layout; see `PlyFile.gaussians`."""
     return PlyFile(path).gaussians()
 
 
@@ -122,11 +125,11 @@ class Element:
     name: str
     count: int
     fields: list[tuple[str, str]] = dataclasses.field(default_factory=list)  # (name, NumPy type or "list")
-    start: int = -1  # offset after the header, in bytes, or in lines of an ASCII file; -1 from the first list on
+    start: int = -1  # offset in the file, in bytes; -1 from the first table with lists on
 
 
 class PlyFile:
-    """A PLY file's header, and its tables up to the first one with lists, which has no fixed row size.
+    """A binary PLY file's header, and its tables up to the first one with lists.
 
     InputError if the file is no PLY file, has an endless or broken header, or is too short for its tables.
     """
@@ -144,17 +147,16 @@ class PlyFile:
         end = re.search(rb"\n[ \t]*end_header[ \t\r]*\n", head)
         if end is None:
             raise InputError(f"{path}: the header has no end: the file is damaged or cut off")
-        self._data = end.end()
         with reading(path, "broken PLY header: {reason}", ValueError, KeyError, IndexError):
             self._parse(head[: end.start()].decode("latin-1").split("\n")[1:])
-            self._place_tables()
+            self._place_tables(end.end())
 
     def gaussians(self) -> Gaussians:
         """Read the scene; colours become linear RGB.
 
         Properties may have any order and type; spherical harmonics above degree 0 (f_rest) are ignored.
-        SHARP's `color_space` states whether colours are sRGB (0) or linear (1). Without it, a file with SHARP's camera
-        is read as linear, as SHARP does, and any other file as sRGB.
+        SHARP's `color_space` states whether colours are sRGB (0) or linear (1). Without `color_space`, a file with
+        SHARP's camera is read as linear, as SHARP does, and any other file as sRGB.
 
         Raises:
             InputError: there are no Gaussians, or some contain NaN or inf. An infinite opacity logit is allowed: SHARP
@@ -164,13 +166,13 @@ class PlyFile:
         if chunks := [element for element in self.elements if element.name == "chunk"]:
             decode = function_named("spackle.formats.compressed_ply:decode_compressed_ply")
             with reading(self.path, "the compressed tables cannot be read: {reason}: export the scene again"):
-                tables = (np.concatenate(list(self._blocks(element))) for element in (chunks[0], vertex))
-                gaussians: Gaussians = decode(*tables).gaussians()
+                gaussians: Gaussians = decode(self._rows(chunks[0]), self._rows(vertex)).gaussians()
             return gaussians
         linear = bool(extras["color_space"].any()) if "color_space" in extras else "intrinsic" in extras
         parts = [torch.empty(vertex.count, columns.stop - columns.start) for columns in _SLICES]
-        table, broken = np.zeros((len(_READ), BLOCK), np.float32), 0
-        for index, rows in enumerate(self._blocks(vertex)):
+        table, broken, whole = np.zeros((len(_READ), BLOCK), np.float32), 0, self._rows(vertex)
+        for start in range(0, vertex.count, BLOCK):
+            rows = whole[start : start + BLOCK]
             with np.errstate(over="ignore", invalid="ignore"):  # numbers beyond float32 become inf, and are counted
                 for k, name in enumerate(_READ):
                     table[k, : len(rows)] = rows[name]
@@ -180,7 +182,7 @@ class PlyFile:
             broken += int(np.count_nonzero(~np.isfinite(table[:, : len(rows)]).all(axis=0)))
             table[3:6] = rgb.clamp_min(0) if linear else srgb_to_linear(rgb)
             for part, columns in zip(parts, _SLICES, strict=True):
-                part[index * BLOCK :][: len(rows)] = torch.from_numpy(table[columns, : len(rows)].T)
+                part[start : start + BLOCK] = torch.from_numpy(table[columns, : len(rows)].T)
         if broken:
             raise InputError(
                 f"{self.path}: {broken} of {vertex.count} Gaussians are not finite: export the scene again"
@@ -191,7 +193,7 @@ class PlyFile:
     def camera(self) -> Camera | None:
         """The photo's camera, which SHARP stores after the Gaussians and `save_ply` in a comment.
 
-        None for files without a camera; InputError if the camera is invalid.
+        None if the file has no camera; InputError if the camera is invalid.
         """
         K, matrix = np.eye(3), np.eye(4)
         if numbers := self._numbers("spackle_camera", 6, lowest=-math.inf):
@@ -208,17 +210,17 @@ class PlyFile:
         return checked_camera(torch.from_numpy(K), torch.from_numpy(matrix), width, height, where)
 
     def base_count(self) -> int | None:
-        """The number of base Gaussians, which come first.
+        """The number of base Gaussians, which come first; None for files of other programs.
 
-        None for files of other programs; InputError if the file states more Gaussians than it contains.
+        InputError if the file states more base Gaussians than it contains Gaussians.
         """
         numbers = self._numbers("spackle_base", 1, highest=self._vertex().count)
         return int(numbers[0]) if numbers else None
 
     def disparity(self) -> float | None:
-        """The disparity for which the scene was completed.
+        """The disparity for which the scene was completed; None if the file states none.
 
-        None if the file does not state it; InputError if the stored value is not a valid number.
+        InputError if the stored value is not a valid number.
         """
         numbers = self._numbers("spackle_disparity", 1)
         return numbers[0] if numbers else None
@@ -237,6 +239,8 @@ class PlyFile:
                     self.comments[name] = others
                 case [] | ["comment" | "obj_info", *_]:
                     pass
+                case ["format", "ascii", _]:
+                    raise ValueError("the file is text: export a binary PLY")
                 case ["format", name, _]:
                     order = _ORDERS[name]
                 case ["element", name, count] if int(count) >= 0:
@@ -249,19 +253,15 @@ class PlyFile:
                     raise ValueError(f"cannot understand the line {' '.join(words)[:80]!r}")
         if not order:
             raise ValueError("there is no format line")
-        self._ascii = order == "="
 
-    def _place_tables(self) -> None:
-        """Find where each table starts; refuse a file that is too short before anything is allocated."""
-        start, end = 0, self._data - self._ascii  # the last line needs no line break
+    def _place_tables(self, start: int) -> None:
+        """Set where each table starts; InputError if the file is too short."""
         for element in self.elements:
             if "list" in dict(element.fields).values():
                 return
-            row = np.dtype(element.fields).itemsize  # ValueError for a name given twice
             element.start = start
-            start += element.count * (1 if self._ascii else row)
-            end += element.count * (2 * len(element.fields) if self._ascii else row)  # a number and a separator
-            if end > self._size:
+            start += element.count * np.dtype(element.fields).itemsize  # ValueError for a name given twice
+            if start > self._size:
                 announced = f"{element.count} rows of {element.name!r} are announced"
                 raise InputError(f"{self.path}: cut off: {announced}, but the file ends after {self._size} bytes")
 
@@ -292,24 +292,13 @@ class PlyFile:
 
     def _extras(self) -> dict[str, NDArray[np.float64]]:
         """The numbers in small tables, such as SHARP's camera, by their properties' names."""
-        tables = [e for e in self.elements if e.name != "vertex" and e.start >= 0 and e.fields]
-        small = [(e, rows) for e in tables if e.count <= MAX_EXTRA_ROWS for rows in self._blocks(e)]
-        return {name: rows[name].astype(np.float64) for element, rows in small for name, _ in element.fields}
+        small = [
+            element
+            for element in self.elements
+            if element.name != "vertex" and element.start >= 0 and element.fields and element.count <= MAX_EXTRA_ROWS
+        ]
+        return {name: self._rows(each)[name].astype(np.float64) for each in small for name, _ in each.fields}
 
-    def _blocks(self, element: Element) -> Iterator[NDArray[Any]]:
-        """The rows of a table, BLOCK at a time, as structured arrays; InputError if they are not numbers."""
-        broken = reading(self.path, f"{element.name!r} is broken: {{reason}}", ValueError)
-        with open(self.path, "rb") as file, broken:
-            file.seek(self._data + (0 if self._ascii else element.start))
-            lines = islice(file, element.start, None)
-            for first in range(0, element.count, BLOCK):
-                count = min(BLOCK, element.count - first)
-                if self._ascii:
-                    texts = [line for line in islice(lines, count) if line.strip()]
-                    dtype = [(name, "f8") for name, _ in element.fields]
-                    rows = np.loadtxt(texts, dtype, comments=None, ndmin=1) if len(texts) == count else np.empty(0)
-                else:
-                    rows = np.fromfile(file, element.fields, count)
-                if len(rows) < count:
-                    raise InputError(f"{self.path}: {element.name!r} is cut off")
-                yield rows
+    def _rows(self, element: Element) -> NDArray[Any]:
+        """The rows of a table, as a structured array."""
+        return np.fromfile(self.path, element.fields, element.count, offset=element.start)

@@ -6,15 +6,15 @@ import contextlib
 import dataclasses
 import math
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from fractions import Fraction
-from importlib import import_module
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar
 
 import av
+import av.filter
 import numpy as np
 from av.video.reformatter import VideoReformatter
 from av.video.stream import VideoStream
@@ -36,30 +36,30 @@ class VideoFormat:
 
     codec: str
     container: str
-    options: dict[str, str]  # the encoder's
-    container_options: dict[str, str]  # these put the index at the front, so that the video plays while it loads
-    pixels: str  # pixel format; yuv420p is tagged as BT.709 and needs even sides
-    counts: bool  # whether the file states how often it plays (0: for ever); otherwise it stores every repetition
+    options: dict[str, str]  # of the encoder
+    container_options: dict[str, str]  # put the index at the front, so that the video plays while it loads
+    pixels: str  # pixel format
+    counts: bool  # True: the file states how often it plays (0: for ever). False: the file stores every repetition
     fps: tuple[float, float]  # lowest and highest rate
     max_side: int
 
     @property
     def loop(self) -> int:
-        """How often a file plays by default; 0: for ever."""
+        """How often a video plays by default; 0: for ever."""
         return 0 if self.counts else 1
 
 
-# Without cpu-independent, x264's code for macroblock trees reads uninitialised memory: equal frames give other bytes.
+# Without cpu-independent, x264 reads uninitialised memory, and equal frames give different bytes.
 _X264 = {"crf": "17", "preset": "veryfast", "x264-params": "cpu-independent=1"}
 # VP9 at crf 24 comes close to x264 at 17; cpu-used 4 costs little quality and saves most of the time.
 _VPX = {"crf": "24", "b": "0", "deadline": "good", "cpu-used": "4", "row-mt": "1"}
 _FAST_START = {"movflags": "+faststart"}
 H264 = VideoFormat("libx264", "mp4", _X264, _FAST_START, "yuv420p", False, (0.001, 1000), 16_384)
-_CUES_FIRST = {"cues_to_front": "1", "fflags": "+bitexact"}  # else FFmpeg chooses a random track number
+_CUES_FIRST = {"cues_to_front": "1", "fflags": "+bitexact"}  # without bitexact the track number is random
 VP9 = VideoFormat("libvpx-vp9", "webm", _VPX, _CUES_FIRST, "yuv420p", False, (0.001, 1000), 16_384)
 # Browsers show a frame of 10 ms or less for 100 ms; GIF counts time in 1/100 s, WebP in 1/1000 s.
 GIF = VideoFormat("gif", "gif", {}, {}, "pal8", True, (0.01, 50), 65_535)
-# libwebp's own conversion to YUV is the best. Its animation encoder would keep old blocks where little changes.
+# libwebp converts to YUV better than FFmpeg. The encoder libwebp_anim would keep old blocks where little changes.
 WEBP = VideoFormat("libwebp", "webp", {"quality": "85"}, {}, "bgra", True, (0.01, 90), 16_383)
 FORMATS = {".mp4": H264, ".m4v": H264, ".mov": H264, ".webm": VP9, ".gif": GIF, ".webp": WEBP}
 
@@ -87,27 +87,26 @@ W = TypeVar("W", bound="VideoWriter")
 
 
 class VideoWriter:
-    """Writes frames to a video, which appears if the `with` block ends without error.
+    """Writes frames to a video; the file appears if the `with` block ends without error.
 
-    .mp4, .m4v, .mov (H.264) and .webm (VP9) are yuv420p in BT.709 colours, which the file declares. Their index comes
-    first, so that they play while they load. An odd width or height grows by one: the last column or row is repeated.
-    .gif has one palette for all frames, .webp is lossy; both keep odd sizes. A frame is encoded while the next one is
-    made. Until the end, GIF keeps all frames in an unnamed temporary file, and WebP the compressed video in memory.
+    .mp4, .m4v, .mov (H.264) and .webm (VP9) are yuv420p with BT.709 colours, and play while they load. An odd width or
+    height grows by one: the last column or row is repeated. .gif has one palette for all frames, which are in
+    memory until the end; .webp is lossy. A thread encodes a frame while the caller makes the next one.
     """
 
-    _encoder: Any  # StreamEncoder, or GifEncoder
+    _encoder: StreamEncoder
 
     def __init__(self, path: str | os.PathLike[str], fps: float = 30, loop: int | None = None) -> None:
         """Prepare to write.
 
         Args:
-            path: its suffix selects the format.
-            fps: frames a second; at most 50 for GIF and 90 for WebP, because browsers slow faster ones down.
-            loop: how often the frames are shown. GIF and WebP store the number; 0, the default, means for ever. The
-                others store every repetition, 1 by default.
+            path: file name; the suffix selects the format.
+            fps: frames a second; at most 50 for GIF and 90 for WebP, because browsers slow down faster animations.
+            loop: how often the video plays. GIF and WebP store this number; 0, their default, means for ever. Other
+                formats store every repetition; their default is 1.
 
         Raises:
-            InputError: no such file can be written.
+            InputError: unknown suffix, unsuitable fps or loop, or a path that cannot be written.
         """
         self._kind = check_video(path, fps, loop)
         check_writable(path)
@@ -154,22 +153,18 @@ class VideoWriter:
             self._wait()
             self._encoder.finish()
 
-    def _open(self, height: int, width: int) -> Any:
-        kind, largest = self._kind, self._kind.max_side
-        if max(height, width) > largest:
+    def _open(self, height: int, width: int) -> StreamEncoder:
+        if max(height, width) > (largest := self._kind.max_side):
             raise InputError(f"{self.path}: {width}×{height} is too large for this format (at most {largest})")
-        if kind is GIF:  # by its name: other videos never load it
-            gif = import_module("spackle.formats.video_gif")
-            return gif.GifEncoder(self._temporary, width, height, self._rate, self._plays)
-        return StreamEncoder(kind, self._temporary, width, height, self._rate, self._plays)
+        return StreamEncoder(self._kind, self._temporary, width, height, self._rate, self._plays)
 
 
 def save_video(
     frames: Iterable[Tensor], path: str | os.PathLike[str], fps: float = 30, loop: int | None = None
 ) -> None:
-    """Write frames, sRGB [H, W, 3] in 0..1, in the format that the file name's suffix selects; see `VideoWriter`.
+    """Write frames, sRGB [H, W, 3] in 0..1, as a video; the arguments are those of `VideoWriter`.
 
-    `frames` may be a generator: a frame is encoded while the next one is made. If it raises, no file is left.
+    If `frames` is a generator that raises, no file is left.
     """
     with VideoWriter(path, fps, loop) as writer:
         for frame in frames:
@@ -177,22 +172,22 @@ def save_video(
 
 
 class StreamEncoder:
-    """Encodes frames into a video that plays `plays` times: the file stores this number, or repeats all packets."""
+    """Encodes frames into a video that plays `plays` times."""
 
     def __init__(self, kind: VideoFormat, path: Path, width: int, height: int, rate: Fraction, plays: int) -> None:
         self._kind, self._rate, self._count = kind, rate, 0
         self._plays = 1 if kind.counts else plays
         self._packets: list[av.Packet[VideoStream]] = []  # compressed; kept only if they must be repeated
-        try:
-            av.Codec(kind.codec, "w")
-        except ValueError as error:  # PyAV's UnknownCodecError is one
-            raise InputError(f"this PyAV has no encoder {kind.codec}: choose .mp4, or `pip install -U av`") from error
-        options = kind.container_options | ({"loop": str(plays)} if kind.counts else {})
+        options = dict(kind.container_options)
+        if kind.counts:  # GIF counts repetitions, and -1 means none; WebP counts how often the video plays
+            loop = {0: 0, 1: -1}.get(plays, plays - 1) if kind is GIF else plays
+            options["loop"] = str(loop)
         self._container = av.open(str(path), "w", format=kind.container, options=options)
         stream = self._container.add_stream(kind.codec, rate=rate, options=kind.options)
         assert isinstance(stream, VideoStream)
         self._stream = stream
         self._reformatter = VideoReformatter()
+        self._palette = PaletteFilter(width, height, 1 / rate) if kind is GIF else None
         stream.width, stream.height, stream.pix_fmt = width, height, kind.pixels
         if kind.pixels == "yuv420p":
             stream.width, stream.height = width + width % 2, height + height % 2
@@ -201,21 +196,29 @@ class StreamEncoder:
             context.colorspace = context.color_primaries = context.color_trc = BT709
 
     def add(self, rgb: NDArray[np.uint8]) -> None:
-        """Append a frame [H, W, 3]; in yuv420p an odd side grows by one."""
-        colors: dict[str, Any] = {}
-        if self._kind.pixels == "yuv420p":
+        """Append a frame [H, W, 3]."""
+        pixels, colors = self._kind.pixels, dict[str, Any]()
+        if pixels == "yuv420p":
             rgb = np.pad(rgb, [(0, rgb.shape[0] % 2), (0, rgb.shape[1] % 2), (0, 0)], mode="edge")
             colors = {"src_colorspace": "ITU709", "dst_colorspace": "ITU709"}
             colors |= {"src_color_range": "JPEG", "dst_color_range": "MPEG"}
         picture = av.VideoFrame.from_ndarray(rgb, format="rgb24")
-        picture = self._reformatter.reformat(picture, format=self._kind.pixels, **colors)
+        picture = self._reformatter.reformat(picture, format="bgra" if self._palette else pixels, **colors)
         picture.pts, picture.time_base = self._count, 1 / self._rate
-        self._write(self._stream.encode(picture))
+        self._encode(picture)
         self._count += 1
+
+    def _encode(self, picture: av.VideoFrame | None) -> None:
+        """Encode a frame; None: the video ends."""
+        pictures = [picture] if self._palette is None else [*self._palette.push(picture)]
+        for each in pictures:
+            self._write(self._stream.encode(each))
 
     def finish(self) -> None:
         """Write the packets that the encoder still holds, and repeat all packets as often as needed."""
-        self._write(self._stream.encode(None))
+        self._encode(None)
+        if self._palette is not None:
+            self._write(self._stream.encode(None))
         for repetition in range(1, self._plays):
             for packet in self._packets:
                 before, after = (self._ticks(packet, plays) for plays in (repetition - 1, repetition))
@@ -237,3 +240,29 @@ class StreamEncoder:
         """Duration of `plays` repetitions, in the packet's time unit."""
         assert packet.time_base is not None
         return round(plays * self._count / self._rate / packet.time_base)
+
+
+class PaletteFilter:
+    """Converts frames to one palette, so that no colour flickers, with error diffusion; keeps all frames in memory."""
+
+    def __init__(self, width: int, height: int, tick: Fraction) -> None:
+        graph = av.filter.Graph()
+        self._source = graph.add_buffer(width=width, height=height, format=av.VideoFormat("bgra"), time_base=tick)
+        split, self._sink = graph.add("split"), graph.add("buffersink")
+        palette, use = graph.add("palettegen"), graph.add("paletteuse", "dither=sierra2_4a")
+        self._source.link_to(split)
+        split.link_to(palette, 0)
+        split.link_to(use, 1, 0)
+        palette.link_to(use, 0, 1)
+        use.link_to(self._sink)
+        graph.configure()
+        self._graph = graph
+
+    def push(self, frame: av.VideoFrame | None) -> Iterator[av.VideoFrame]:
+        """Take a frame in "bgra" (None at the end), and yield the frames that are ready."""
+        self._source.push(frame)
+        with contextlib.suppress(av.BlockingIOError, av.EOFError):
+            while True:
+                ready = self._sink.pull()
+                assert isinstance(ready, av.VideoFrame)
+                yield ready

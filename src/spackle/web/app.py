@@ -1,4 +1,4 @@
-"""The app: the page, and the HTTP interface that the page uses as programs do. Read `create_app`."""
+"""The app: the page, and the HTTP interface, which the page uses, too. Read `create_app`."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from collections.abc import AsyncIterator
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal, get_args
 
+import uvicorn
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import FileResponse, HTMLResponse, JSONResponse, Response
@@ -28,19 +29,21 @@ from spackle.errors import InputError, check_name, one_line
 from spackle.formats.html import page_file
 from spackle.image import PHOTO_SUFFIXES
 from spackle.task_process import Work
-from spackle.web.guard import Access, Guard, Limits
+from spackle.web.guard import MAX_BYTES, Access, Guard
 from spackle.web.jobs import Job, Jobs, Keep, SceneState
 from spackle.web.work import PREVIEW, Download, FileName, SceneOptions, SceneWork, Video, check_photo
 
-PagePart = Literal["page.json", "base.splats", "aux.splats", "photo.jpg"]  # what the page draws
+PagePart = Literal["page.json", "base.splats", "aux.splats", "photo.jpg"]  # files that the page draws
 SCENES = "/api/v1/scenes"
 FILES = [PREVIEW, *get_args(Download), *get_args(Video)]  # files that a state lists
 DEPTH_SUFFIXES = (".npy", ".npz", ".png", ".pfm")  # of depth maps, as for `spackle predict --depth`
-PACE_S = 0.1  # seconds between two looks for news for a listener
-WORK, KEEP, LIMITS = SceneWork(), Keep(), Limits()
-MAX_NAME = 80  # characters of a name that are shown
+POLL_S = 0.1  # seconds between two checks whether a state has changed
+UPLOAD_S = 300.0  # seconds that an upload may take, because it holds a place in the queue
+MAX_NAME = 80  # characters
+CONNECTIONS = 512  # open at a time; further ones are refused
+WORK, KEEP = SceneWork(), Keep()
 FILE = {"type": "string", "format": "binary"}
-UPLOAD: dict[str, Any] = {  # by hand: FastAPI would read a declared form before the photo has its place
+UPLOAD: dict[str, Any] = {  # not declared as a form: FastAPI would read it before the queue has a place
     "schema": {
         "type": "object",
         "required": ["photo"],
@@ -61,20 +64,20 @@ def create_app(
     workers: int = 1,
     keep: Keep = KEEP,
     access: Access | None = None,
-    limits: Limits = LIMITS,
+    max_bytes: int = MAX_BYTES,
 ) -> FastAPI:
     """An app for a server, or to mount in another app, which then controls access.
 
-    Its processes start at once and end with the app; if another app mounts it, call `app.state.jobs.close()` at the
-    end. Unfinished photos resume when an app next opens the folder.
+    The worker processes start at once and end with the app; if another app mounts this one, call
+    `app.state.jobs.close()` at the end. Unfinished photos resume when an app next opens the folder.
 
     Args:
-        folder: for photos and scenes; InputError if another server uses it.
-        work: the function of a worker process for a photo.
+        folder: folder of photos and scenes; InputError if another server uses it.
+        work: the function with which a worker process completes a photo.
         workers: number of processes, each of which holds the base's network.
-        keep: limits of the folder: age and size of scenes, and the number of waiting photos.
-        access: token and host that requests are checked against; None leaves that to the caller.
-        limits: upload size, connections and times of a client.
+        keep: limits of the folder: age and size of scenes, and number of waiting photos.
+        access: token and host that requests are checked against; None leaves checks to the caller.
+        max_bytes: largest upload, with its depth map.
     """
     jobs = Jobs(folder, work, workers, keep)
     bases = work.bases if isinstance(work, SceneWork) else [AUTO]
@@ -94,13 +97,13 @@ def create_app(
         exception_handlers={HTTPException: refused, RequestValidationError: unknown},
     )
     app.state.jobs = jobs
-    app.add_middleware(Guard, access=access, limits=limits)
-    decoding = asyncio.Lock()  # one photo at a time: a large one takes a gigabyte
+    app.add_middleware(Guard, access=access, max_bytes=max_bytes)
+    decoding = asyncio.Lock()  # one photo at a time: decoding a large one takes a gigabyte
 
     def with_files(job: Job) -> SceneState:
         names = set[str]()
         for folder in (job.folder, job.results):
-            with contextlib.suppress(FileNotFoundError):  # not made yet, or deleted by another request just now
+            with contextlib.suppress(FileNotFoundError):  # another request may have deleted it
                 names.update(os.listdir(folder))
         return job.model_copy(update={"files": sorted(names.intersection(FILES))})
 
@@ -114,7 +117,7 @@ def create_app(
         """Send a photo. The photo is queued; if the queue is full, the answer is 429."""
         with jobs.place() as new:
             try:
-                form = await asyncio.wait_for(request.form(max_files=2, max_fields=1), limits.upload)
+                form = await asyncio.wait_for(request.form(max_files=2, max_fields=1), UPLOAD_S)
             except asyncio.TimeoutError:
                 raise HTTPException(408, "the photo arrived too slowly") from None
             try:
@@ -146,7 +149,7 @@ def create_app(
             if state is not seen:
                 seen = state
                 yield with_files(state)
-            await asyncio.sleep(PACE_S)
+            await asyncio.sleep(POLL_S)
 
     @app.get(SCENES + "/{id}/files/{file}", response_class=FileResponse)
     async def get_file(id: str, file: FileName | PagePart) -> FileResponse:
@@ -165,7 +168,7 @@ def create_app(
     @app.get("/page.json", include_in_schema=False)
     async def get_page_state() -> dict[str, object]:
         writes = access is None or access.token is not None
-        upload = {"suffixes": PHOTO_SUFFIXES, "max_bytes": limits.upload_bytes, "bases": bases} if writes else None
+        upload = {"suffixes": PHOTO_SUFFIXES, "max_bytes": max_bytes, "bases": bases} if writes else None
         return {"upload": upload}
 
     @app.get("/healthz", include_in_schema=False)
@@ -211,18 +214,15 @@ def _saved(upload: UploadFile, folder: Path, stem: str, name: str, suffixes: tup
     suffix = PurePosixPath(upload.filename or "").suffix.lower()
     if suffix not in suffixes:
         raise HTTPException(415, f"{name}: this kind of file is not accepted: give {', '.join(suffixes)}")
-    if not upload.size:
-        raise HTTPException(400, f"{name}: the file is empty")
     with (folder / f"{stem}{suffix}").open("xb") as file:
         shutil.copyfileobj(upload.file, file)
     return f"{stem}{suffix}"
 
 
 def shown_name(given: str) -> str:
-    """The last part of a file's name, made safe to show in terminals, pages and logs."""
+    """The last part of a file's name, without characters that are unsafe in terminals, pages and logs."""
     last = re.split(r"[/\\]", given)[-1]
-    name = "".join(character for character in last if character.isprintable()).strip()
-    return name if len(name) <= MAX_NAME else f"{name[: MAX_NAME // 2]}…{name[-MAX_NAME // 2 :]}"
+    return "".join(character for character in last if character.isprintable()).strip()[-MAX_NAME:]
 
 
 async def refused(request: Request, error: Any) -> JSONResponse:
@@ -231,3 +231,20 @@ async def refused(request: Request, error: Any) -> JSONResponse:
 
 async def unknown(request: Request, error: Any) -> JSONResponse:
     return JSONResponse({"error": "there is nothing with that name"}, 404)
+
+
+def server_of(app: FastAPI) -> uvicorn.Server:
+    """A server whose `run(sockets=[listener])` serves until Ctrl-C or SIGTERM; then the app's processes end."""
+    return uvicorn.Server(
+        uvicorn.Config(
+            app,
+            http="h11",
+            ws="none",
+            log_config=None,
+            log_level="critical",
+            server_header=False,
+            proxy_headers=False,
+            limit_concurrency=CONNECTIONS,
+            timeout_graceful_shutdown=1,  # seconds for clients that still watch a photo
+        )
+    )

@@ -1,12 +1,11 @@
-"""The outermost layer of the app: checks access, and limits what a client may use.
+"""The outermost layer of the app: checks access and the size of uploads.
 
-A stranger's page can make a browser send requests to this machine, with DNS rebinding even under the stranger's own
-host name. Such a request is recognised by its Host, Origin or Sec-Fetch-Site header.
+A stranger's page can make a browser send requests to this machine, with DNS rebinding even under the stranger's host
+name. The headers Host, Origin and Sec-Fetch-Site reveal such a request.
 """
 
 from __future__ import annotations
 
-import asyncio
 import hmac
 import ipaddress
 import logging
@@ -24,8 +23,9 @@ from spackle.errors import one_line
 
 LOG = logging.getLogger("spackle.web")
 HOST = re.compile(r"(\[[0-9a-f:.%]+\]|[0-9a-z._-]+)(?::\d{1,5})?", re.IGNORECASE)
-OWN_SITES = {"same-origin", "none"}  # none: typed by a person, or a bookmark
-# The page loads scripts and styles from this server only, sends nothing elsewhere, and no page can frame it.
+OWN_SITES = {"same-origin", "none"}  # none: an address that a person typed, or a bookmark
+MAX_BYTES = 200_000_000  # of an upload: photo and depth map
+# The page loads scripts and styles from this server only and sends nothing elsewhere; no other page can frame it.
 HEADERS = {
     "Cache-Control": "no-store",  # a photo is private
     "Content-Security-Policy": "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; style-src 'self'; "
@@ -39,24 +39,16 @@ HEADERS = {
 }
 
 
-class Limits(NamedTuple):
-    """Limits for a client; times in seconds."""
-
-    upload: float = 300  # for a whole upload
-    send: float = 20  # for a piece of an answer: a client that never reads must not keep a file open
-    upload_bytes: int = 200_000_000  # photo and depth map
-
-
 class Access(NamedTuple):
-    """Access rules of a stand-alone server; a mounted app leaves access to the app that mounts it."""
+    """Access rules of a stand-alone server."""
 
-    token: str | None  # first part of the path, or Bearer; without a token no photo is accepted
-    names: frozenset[str] = frozenset({"localhost"})  # accepted hosts; numeric ones cannot be rebound
+    token: str | None  # a request has it as the first part of the path, or as Bearer; None: no photo is accepted
+    names: frozenset[str] = frozenset({"localhost"})  # accepted host names
     local: bool = True  # only this machine can connect
 
     @staticmethod
     def at(host: str, address: str, token: str | None) -> Access:
-        """The access rules of a server that listens at `host`, whose numeric address is `address`."""
+        """The rules for a server that listens at `host`, whose numeric address is `address`."""
         if is_loopback(address):
             return Access(token)
         machine = socket.gethostname().lower()
@@ -86,7 +78,7 @@ class Access(NamedTuple):
         return scope
 
     def _is_own(self, name: str) -> bool:
-        try:
+        try:  # DNS rebinding needs a name: a numeric host is safe
             return is_loopback(name.strip("[]")) or not self.local
         except ValueError:
             return name.rstrip(".") in self.names
@@ -103,8 +95,8 @@ def is_loopback(address: str) -> bool:
 class Guard:
     """Middleware that refuses or limits requests, and sets security headers in every answer."""
 
-    def __init__(self, app: ASGIApp, access: Access | None, limits: Limits) -> None:
-        self.app, self.access, self.limits = app, access, limits
+    def __init__(self, app: ASGIApp, access: Access | None, max_bytes: int) -> None:
+        self.app, self.access, self.max_bytes = app, access, max_bytes
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":  # no WebSocket
@@ -112,8 +104,8 @@ class Guard:
         headers, count = Headers(scope=scope), 0
 
         def check(size: int) -> None:
-            if size > self.limits.upload_bytes:
-                raise HTTPException(413, f"more than {self.limits.upload_bytes / 1e6:g} MB: send a smaller photo")
+            if size > self.max_bytes:
+                raise HTTPException(413, f"more than {self.max_bytes / 1e6:g} MB: send a smaller photo")
 
         async def bounded() -> Message:
             nonlocal count
@@ -126,7 +118,7 @@ class Guard:
                 MutableHeaders(scope=message).update(HEADERS)
                 path = scope["path"].replace((self.access and self.access.token) or "/", "…", 1)
                 LOG.debug(one_line(f"{scope['method']} {path} {message['status']}"))
-            await asyncio.wait_for(send(message), self.limits.send)
+            await send(message)
 
         try:
             admitted = scope if self.access is None else self.access.admitted(scope, headers)
@@ -134,8 +126,8 @@ class Guard:
             await self.app(admitted, bounded, answer)
         except HTTPException as error:
             await JSONResponse({"error": error.detail}, error.status_code)(scope, receive, answer)
-        except (asyncio.TimeoutError, ClientDisconnect):
-            LOG.debug("a client has gone, or does not read what it asked for")  # its connection is closed
+        except ClientDisconnect:
+            LOG.debug("a client disconnected")
         except Exception:
             LOG.exception("this went wrong:")
             raise

@@ -1,4 +1,4 @@
-"""Jobs: photos that become scenes, one at a time in each worker process; their folder outlives the server."""
+"""Jobs: worker processes turn photos into scenes; the folder of jobs outlives the server."""
 
 from __future__ import annotations
 
@@ -23,10 +23,9 @@ from spackle.folders import results_folder
 from spackle.task_process import DIED, Event, TaskProcess, Work
 
 LOG = logging.getLogger("spackle.web")
-RECORD, NEW = "job.json", ".new-"  # a job's own file; prefix of the folders of incomplete uploads
-ATTEMPTS = 2  # times that a job may start: one that brings the server down must not do so for ever
-ENDED_TWICE = "the server ended twice while it worked on this photo"
-LOOK_S = 60.0  # seconds between two looks for results that are too old
+RECORD, NEW = "job.json", ".new-"  # the file of a job's state; prefix of the folders of incomplete uploads
+RETRY_S = 10  # seconds after which a client may try again if the queue was full
+TIDY_S = 60.0  # seconds between two searches for results that are too old
 
 
 class Keep(NamedTuple):
@@ -53,12 +52,11 @@ class SceneState(BaseModel):
 
 
 class Job(SceneState):
-    """The state with fields for the server alone; RECORD stores all but the folder."""
+    """A photo's state with fields for the server alone; RECORD stores all but the folder."""
 
-    source: str  # below the job's folder, or elsewhere on this machine
+    source: str  # the photo: a name in the job's folder, or an absolute path
     depth: str | None = None
     options: dict[str, Any] = {}
-    attempts: int = 0
     folder: Path = Field(default=Path(), exclude=True)
 
     @property
@@ -72,14 +70,12 @@ class Job(SceneState):
 class Jobs:
     """The jobs in a folder, and the processes that work on them.
 
-    A `Job` is immutable: each change replaces it by a new one.
-
     Args:
         folder: holds a folder for each job; InputError if another server uses it.
-        work: takes (job, file) and reports {stage, done, total} or {line}. Without a file it makes a scene of a photo;
-            with one it adds that file to a scene that is done.
-        workers: number of processes for photos; one more adds files.
-        keep: what the folder may hold.
+        work: takes (job, file) and reports {stage, done, total} or {line}. If `file` is None, `work` makes a scene of
+            the photo; else it adds this file to a finished scene.
+        workers: number of processes for photos; another process adds files to finished scenes.
+        keep: limits of the folder.
     """
 
     def __init__(self, folder: Path, work: Work, workers: int, keep: Keep) -> None:
@@ -87,12 +83,12 @@ class Jobs:
         self._held = contextlib.ExitStack()
         self._held.enter_context(results_folder(folder, alone=True))
         self._lock, self._closed = threading.RLock(), threading.Event()
-        self._jobs: dict[str, Job] = {}
+        self._jobs: dict[str, Job] = {}  # a change replaces a job by a new one
         self._work, self._processes, self._of_thread = work, list[TaskProcess](), threading.local()
         self._running: dict[str, TaskProcess] = {}  # by job
-        self._workers, self._receiving, self._pace = workers, 0, 10.0  # photos; seconds that a job took
+        self._receiving = 0  # photos
         self._photos, self._files = ThreadPoolExecutor(workers), ThreadPoolExecutor(1)
-        self._photos.submit(self._process)  # loads while the first photo comes
+        self._photos.submit(self._process)  # starts while the first photo is uploaded
         self._take_up()
         threading.Thread(target=self._tidy_until_closed, daemon=True).start()
 
@@ -105,9 +101,7 @@ class Jobs:
                 job = Job.model_validate_json((folder / RECORD).read_bytes())
                 self._jobs[job.id] = job.model_copy(update={"folder": folder})
         for job in sorted(self._jobs.values(), key=lambda job: job.created):
-            if job.state == "running" and job.attempts >= ATTEMPTS:
-                self._end(job.id, ENDED_TWICE)
-            elif job.ended is None:
+            if job.ended is None:
                 self._change(job.id, state="queued")
                 self._photos.submit(self._run, job.id)
 
@@ -116,7 +110,7 @@ class Jobs:
 
     def _change(self, id: str, **values: object) -> None:
         with self._lock:
-            if id in self._jobs:  # it may have been removed
+            if id in self._jobs:  # `remove` may have deleted the job
                 self._jobs[id] = self._jobs[id].model_copy(update=values)
 
     @contextlib.contextmanager
@@ -125,21 +119,20 @@ class Jobs:
         with self._lock:
             waiting = self._receiving + sum(job.state == "queued" for job in self._jobs.values())
             if waiting >= self.keep.waiting:
-                seconds = str(max(1, round(self._pace / self._workers)))
-                line = f"too many photos are waiting: try again in {seconds} seconds"
-                raise HTTPException(429, line, {"Retry-After": seconds})
+                line = f"too many photos are waiting: try again in {RETRY_S} seconds"
+                raise HTTPException(429, line, {"Retry-After": str(RETRY_S)})
             self._receiving += 1
         folder = self.folder / f"{NEW}{secrets.token_hex(8)}"
         try:
             folder.mkdir()
             yield folder
         finally:
-            shutil.rmtree(folder, ignore_errors=True)  # `add` has renamed it if the photo was accepted
+            shutil.rmtree(folder, ignore_errors=True)  # `add` has renamed the folder of an accepted photo
             with self._lock:
                 self._receiving -= 1
 
     def add(self, folder: Path, name: str, source: str, depth: str | None, options: dict[str, Any]) -> Job:
-        """Add a job for a photo in a folder that `place` yielded; `source` and `depth` may lie elsewhere."""
+        """Add a job for a photo in a folder that `place` yielded; `source` and `depth` may be absolute paths."""
         id = folder.name.removeprefix(NEW)
         job = Job(id=id, name=name, source=source, depth=depth, options=options, folder=folder)
         job.save()
@@ -148,7 +141,7 @@ class Jobs:
         return job
 
     def make(self, job: Job, file: str) -> Future[str | None]:
-        """Make one more file of a finished scene; the future's result is None, or the reason for failure."""
+        """Add a file to a finished scene; the future's result is None, or the reason for failure."""
         return self._files.submit(lambda: self._process().do((job, file), lambda event: None))
 
     def remove(self, id: str) -> None:
@@ -182,11 +175,11 @@ class Jobs:
 
     def _run(self, id: str) -> None:
         """Give a photo to the thread's process, and wait for the scene."""
-        process, start = self._process(), time.monotonic()
+        process = self._process()
         with self._lock:
             if self._closed.is_set() or id not in self._jobs:
                 return
-            self._change(id, state="running", attempts=self._jobs[id].attempts + 1)
+            self._change(id, state="running")
             self._running[id], job = process, self._jobs[id]
         try:
             shutil.rmtree(job.results, ignore_errors=True)
@@ -196,10 +189,9 @@ class Jobs:
         except (OSError, InputError) as problem:
             error = f"{job.name}: cannot be stored here: {reason_in_a_line(problem)}"
         if error == DIED:
-            self._closed.wait(1)  # the end of a whole service may reach this process before us
+            self._closed.wait(1)  # a signal to end the whole service may reach the worker process first
         self._running.pop(id, None)
         if not self._closed.is_set():
-            self._pace = time.monotonic() - start
             self._end(id, error)
 
     def _tell(self, id: str, event: Event) -> None:
@@ -211,13 +203,13 @@ class Jobs:
             self._change(id, stage=event["stage"], share=event["done"] / total if total else None)
 
     def _end(self, id: str, error: str | None) -> None:
-        """Record a job's end on the disk, then publish it; the photo is deleted."""
+        """Record a job's end on the disk, then publish the end; delete the photo."""
         with self._lock:
             if (job := self._jobs.get(id)) is None:
                 return
             end = {"state": "failed" if error else "done", "error": error, "ended": time.time()}
             ended = job.model_copy(update={**end, "stage": None, "share": None})
-            with contextlib.suppress(InputError):  # the disk is full: the next server does it again
+            with contextlib.suppress(InputError):  # the disk is full: the next server repeats the job
                 ended.save()
                 for file in (job.source, job.depth):
                     if file is not None and not os.path.isabs(file):
@@ -227,8 +219,8 @@ class Jobs:
             LOG.error("error: %s", error)
 
     def _tidy_until_closed(self) -> None:
-        while not self._closed.wait(LOOK_S):
-            with contextlib.suppress(OSError):  # a file is being written
+        while not self._closed.wait(TIDY_S):
+            with contextlib.suppress(OSError):  # a worker may rename a file meanwhile
                 self.tidy()
 
     def tidy(self) -> None:

@@ -40,9 +40,9 @@ Video = Literal[
     "dolly-zoom.mp4",
 ]  # fmt: skip
 FileName = Download | Video
-MADE: list[FileName] = ["scene.ply", "scene.spz", "scene.glb", "scene.html", "video.mp4", "report.json"]  # by default
+MADE: list[FileName] = ["scene.ply", "scene.spz", "scene.glb", "scene.html", "video.mp4", "report.json"]  # the default
 PAGE, PREVIEW, SIDE = "page.json", "photo.jpg", 1280  # pixels of the preview's long side
-# The formats that Pillow may decode, whatever a file's name says: for some others it would start other programs.
+# The formats that Pillow may decode: for EPS, for example, Pillow would start another program.
 FORMATS = frozenset({"JPEG", "MPO", "PNG", "WEBP", "HEIF", "TIFF"})
 
 
@@ -68,7 +68,7 @@ class SceneOptions(BaseModel):
 
 @dataclasses.dataclass
 class SceneWork:
-    """The worker's function, which keeps the last base loaded."""
+    """The function of a worker process; it keeps the last base loaded."""
 
     base: BaseSettings = dataclasses.field(default_factory=BaseSettings)
     usual: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # default options of jobs
@@ -77,11 +77,11 @@ class SceneWork:
 
     @property
     def bases(self) -> list[str]:
-        """The bases that a client may choose: the server's own, auto, and those that need no download."""
+        """The bases that a client may choose: the server's, "auto", and the bases whose weights are on this machine."""
         return list(dict.fromkeys([self.base.name, AUTO, *BaseSettings().files]))
 
     def __call__(self, task: tuple[Job, str | None], tell: Tell) -> None:
-        """Do a task; InputError, without any path of this server, for a photo, depth map or scene that is unusable."""
+        """Do a task; InputError, without any path of this server, for an unusable photo, depth map or scene."""
         job, file = task
         options, teller = SceneOptions.model_validate({**self.usual, **job.options}), Teller(job, tell, self.verbose)
         ply, source, note = job.results / "scene.ply", job.folder / job.source, ""
@@ -106,7 +106,7 @@ class SceneWork:
             raise InputError(teller.cleaned(str(error))) from error
 
     def _complete(self, job: Job, options: SceneOptions, teller: Teller) -> str:
-        """Make the files of `predict_photo` from a photo; returns a remark for the user."""
+        """Make the files of `predict_photo` from a photo; returns a note for the user."""
         settings = self.base
         if job.depth is not None:
             depth, kind = job.folder / job.depth, options.depth_kind
@@ -116,7 +116,7 @@ class SceneWork:
         path = PathOptions(options.trajectory, options.disparity, frames=options.frames)
         chosen = Options(settings, path, FillOptions(fill=options.fill))
         if self.opened is None or self.opened.options.base != settings:
-            self.opened = None  # frees it before another network is loaded
+            self.opened = None  # frees the network before another one is loaded
             self.opened = Pipeline.open(chosen)
         pipeline = dataclasses.replace(self.opened, options=chosen)
         lens = options.model_dump(include={"focal_px", "focal_mm", "fov"})
@@ -139,7 +139,7 @@ class SceneWork:
 
 
 class Teller(Reporter):
-    """Reports to the server what a terminal would show, with the photo's name in place of a path."""
+    """Reports log lines and progress to the server, with the photo's name in place of paths."""
 
     def __init__(self, job: Job, tell: Tell, verbose: bool) -> None:
         super().__init__(verbose, Console(file=io.StringIO(), force_terminal=False))
@@ -162,9 +162,9 @@ class Teller(Reporter):
 
 
 def check_photo(path: Path, name: str, preview: Path) -> None:
-    """Decode a photo completely, and write a small JPEG of it, which the page shows until the scene is ready.
+    """Decode a photo, and write a small JPEG to `preview`, which the page shows until the scene is ready.
 
-    InputError, naming the file `name`, if it is no photo of an accepted format.
+    InputError, naming the file `name`, if the file is no photo of an accepted format.
     """
 
     def decode(image: Image.Image) -> None:
