@@ -185,8 +185,6 @@ def test_no_photos_is_a_line(tmp_path: Path) -> None:
         (("--trajectory", "loop"), "'loop' is not one of"), (("--base", "auto"), "--base auto"),
         (("--base", "sharp"), "--depth"), (("--depth", __file__), f"--depth {__file__}: no such folder"),
         (("--inpainter", "nobody"), "--inpainter nobody"), (("--inpainter", "propainter"), "inpainter propainter"),
-        (("--inpainter", "geometry", "--inpainter-weights", "w"), "the geometry inpainter has no network"),
-        (("--inpainter", "opencv", "--inpainter-side", 320), "the opencv inpainter has no network"),
         (("--inpainter", "propainter", "--inpainter-side", 64), "--inpainter-side must be between 128 and 1536"),
     ],
 )  # fmt: skip

@@ -12,7 +12,6 @@ import pytest
 from command import names_in, refuses, run
 from scenes import box_before_wall
 
-from spackle.bases.lift import RgbdBase
 from spackle.bases.settings import BaseSettings
 from spackle.errors import InputError
 from spackle.evaluation import bench
@@ -20,7 +19,7 @@ from spackle.evaluation.case import Points
 from spackle.evaluation.evaluate import EvaluateOptions, open_evaluation
 from spackle.evaluation.folder import load_run
 from spackle.evaluation.protocols import large_views
-from spackle.evaluation.rows import PAPER, STAGES, Row
+from spackle.evaluation.rows import BASE_PATH, EXTRA, PAPER, Row, pivot
 from spackle.evaluation.rows import Run as Results
 from spackle.evaluation.tables import make_tables
 from spackle.render import get_renderer
@@ -33,9 +32,9 @@ STAGE_MS = {"base": 1000.0, "view": 400.0, "photo": 1.0, "completion": 4.0, "rer
 
 
 def cost(added: int = 20, factor: float = 1.0) -> dict[str, float]:
-    """The figures of a view whose base path takes 1,400 ms and Spackle's part 14."""
+    """The numbers of a view whose base path takes 1,400 ms and Spackle's part 14."""
     runs = {name: np.array([0.5, 1, 30]) * factor * ms / 1000 for name, ms in STAGE_MS.items()}
-    return {name: value for name, value in bench.view_figures(1000, added, runs) if not name.endswith("_run_ms")}
+    return bench.view_numbers(1000, added, runs)
 
 
 def results(title: str = "Middlebury", factor: float = 1.0) -> Results:
@@ -49,8 +48,7 @@ def results(title: str = "Middlebury", factor: float = 1.0) -> Results:
     rows = []
     for k in range(3):
         image = Row(title, f"image {k}", "", "", "", "", None)
-        facts = {"load": 1.5, "warm": 1, "note.precision": "bf16"}
-        rows += [image._replace(metric=metric, value=value) for metric, value in facts.items()]
+        rows.append(image._replace(metric="note.precision", value="bf16"))
         for disparity in config["disparities"]:
             view = image._replace(setting=f"{disparity:g}", view="right")
             for method, count in (("paper", 10 * k), ("spackle", 40 * k)):
@@ -73,7 +71,7 @@ def test_the_networks_have_the_papers_parameters(name: str, count: int) -> None:
 
 def test_times_are_medians_of_runs_that_add_up() -> None:
     found = cost()
-    times = {"base_ms": 1400, "extra_ms": 14, "spackle_ms": 1414, "overhead": 0.01, "overhead_of_view": 14 / 400}
+    times = {"base_ms": 1400, "spackle_ms": 1414, "overhead": 0.01}
     assert {name: found[name] for name in times} == pytest.approx(times)
     assert (found["base_fps"], found["aux_share"], found["merged"]) == (pytest.approx(1 / 1.4), 0.02, 1020)
 
@@ -82,8 +80,8 @@ def test_costs_are_joined_over_datasets_and_with_large_views() -> None:
     counted = evaluation_data.results("LLFF", False, lambda image: {"spackle": {"aux": 30, "aux_share": 0.5}})
     runs = [results(), results("Booster", 4.0), counted]
     tables = {table.label: table for table in make_tables(runs)}
-    assert [*tables][-3:] == ["tab:efficiency_gaussian_overhead", EXPANDED, "tab:efficiency_stages"]
-    overhead, expanded, stages = [*tables.values()][-3:]
+    assert [*tables][-2:] == ["tab:efficiency_gaussian_overhead", EXPANDED]
+    overhead, expanded = [*tables.values()][-2:]
     groups = dict.fromkeys(group for group, _ in overhead.heads)
     assert [*groups] == ["", *(f"S{k}: disparity 0.{k + 2}" for k in (1, 2, 3))]
     lines = [cells for rows in overhead.bodies for cells in rows]
@@ -102,9 +100,8 @@ def test_costs_are_joined_over_datasets_and_with_large_views() -> None:
     lines = [cells for rows in expanded.bodies for cells in rows]
     assert tuple(lines[0][:6]) == ("Middlebury", "S1", *paper, "1,010")
     assert tuple(lines[0][6:]) == ("2,800.0", "2,828.0", "1.00%", "0.357", "0.354", "3/23")
-    assert tuple(lines[2][3:9]) == ("3,387", "0.29", "1,183,035", "6,410.3†", "1,449.4", "-3.3%†")
-    assert sum("†" in "".join(cells) for cells in lines) == 1
-    for table in (overhead, expanded, stages):
+    assert tuple(lines[2][3:9]) == ("3,387", "0.29", "1,183,035", "6,410.3", "1,449.4", "-3.3%")
+    for table in (overhead, expanded):
         assert any(
             "renderer and residual on cuda. Machine: A Processor, 2 cores, 2 threads" in note for note in table.notes
         )
@@ -118,7 +115,7 @@ def test_a_view_costs_what_a_completion_adds() -> None:
     camera = large_views(prediction, (0.3,), 1280)[0].camera
     paper, spackle = (len(bench.complete_in_laps(context, camera, laps.append, name)) for name in bench.TIMED)
     assert spackle == len(fill_view(context, camera).aux) > paper > 64
-    assert {*laps} == {*STAGES} - {"base"}
+    assert {*laps} == {*BASE_PATH, *EXTRA} - {"base"}
     laps.clear()
     opaque = dataclasses.replace(prediction.gaussians, scales=3 * prediction.gaussians.scales)
     closed = FillContext(opaque, prediction.camera, renderer)
@@ -126,23 +123,17 @@ def test_a_view_costs_what_a_completion_adds() -> None:
     assert "rerender" not in laps  # a view without holes
 
 
-def test_points_suffice_and_the_first_prediction_does_not_count(scenes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_points_suffice_and_without_depth_a_case_is_refused(scenes: Path) -> None:
     settings: dict[str, Any] = {"methods": ("spackle",), "disparities": (0.3,), "metrics": (), "residual": "seeds"}
     tools = open_evaluation(EvaluateOptions("middlebury", scenes, base=BaseSettings("rgbd"), **settings))
-    case, predict, predictions = tools.cases[0], RgbdBase.predict, list[Any]()
-    config = {"title": "Middlebury", "base_runs": 1, "runs": 1, "base": {"device": "cpu"}}
+    case, config = tools.cases[0], {"title": "Middlebury", "base_runs": 1, "runs": 1, "base": {"device": "cpu"}}
     assert case.depth is not None
     known = case.depth()
     points = Points(known.valid.nonzero().flip(-1) + 0.5, known.depth[known.valid])
-    found = bench.time_case(dataclasses.replace(case, depth=None, points=lambda: points), tools, config, True)
+    found = bench.time_case(dataclasses.replace(case, depth=None, points=lambda: points), tools, config)
     assert next(row.value for row in found if row.metric == "base_gaussians")
     with pytest.raises(InputError, match="neither a depth map nor points"):
-        bench.time_case(dataclasses.replace(case, depth=None), tools, config, True)
-    monkeypatch.setattr(RgbdBase, "predict", lambda *words: predictions.append(words) or predict(*words))
-    for warm, calls in ((False, 2), (True, 1)):
-        predictions.clear()
-        found = bench.time_case(case, tools, config, warm)
-        assert (len(predictions), sum(row.metric == "base_run_ms" for row in found)) == (calls, 2 * 2)
+        bench.time_case(dataclasses.replace(case, depth=None), tools, config)
 
 
 def test_from_files_to_tables(scenes: Path, tmp_path: Path) -> None:
@@ -154,23 +145,20 @@ def test_from_files_to_tables(scenes: Path, tmp_path: Path) -> None:
     found = load_run(output)
     assert found.about["parameters"]["residual"] == 8_023_153
     assert (found.settings, found.measured) == (["0.3", "0.5"], ["Ball", "Door"])
-    assert set(found.numbers("warm")) == {1}
+    values = pivot(found.rows, "metric", "setting", "method")
     for setting in found.settings:
-        for method in bench.TIMED:  # both ends of the swipe, as `evaluate` looks from
-            assert {len(found.numbers(f"{stage}_run_ms", setting, method)) for stage in STAGES} == {2 * 2 * 2}
-            bases = [base for base in found.numbers("base_gaussians") for _ in range(2)]
-            added = zip(bases, found.numbers("aux", setting, method), strict=True)
-            assert found.numbers("merged", setting, method) == [base + aux for base, aux in added]
-    refuses(run(*words, "--runs", 3, "--limit", 2), "of another kind (base_runs: 2 -> 3; runs: 2 -> 3)")
+        for method in bench.TIMED:  # at both ends of the swipe
+            bases = [base for base in values["base_gaussians", "", ""] for _ in range(2)]
+            added = zip(bases, values["aux", setting, method], strict=True)
+            assert values["merged", setting, method] == [base + aux for base, aux in added]
+    refuses(run(*words, "--runs", 3, "--limit", 2), "of other options (base_runs: 2 -> 3; runs: 2 -> 3)")
     refuses(run("evaluate", *words[1:], "--metrics", "none"), "config.json: not of `spackle evaluate`")
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ((), "Missing option '--dataset'"),
         (("one", "--dataset", "middlebury", "--runs", "0"), "Invalid value for '--runs'"),
-        (("one", "two", "--dataset", "middlebury"), "two: belongs to no option"),
         (("--dataset", "middlebury", "--base", "rgbd", "gone"), "gone: no such folder"),
     ],
 )

@@ -16,14 +16,14 @@ from PIL import Image
 
 from spackle.evaluation.folder import image_file
 from spackle.evaluation.methods import METHODS as FACTS
-from spackle.evaluation.pictures import encode, evenly
-from spackle.evaluation.report import make_report, overhead_plot
+from spackle.evaluation.pictures import evenly
+from spackle.evaluation.report import make_report, scenes_plot
 from spackle.evaluation.rows import IMAGES
 from spackle.evaluation.rows import Run as Results
 from spackle.evaluation.tables import make_tables
 
 pytest.importorskip("matplotlib")
-EVIL = "<script>alert('1')</script>&\"$x_{$\x01\ud800"
+EVIL = "<script>alert('1')</script>&\"$x_{$"
 METHODS = ("base", "inpaint2d", "seeds", "spackle")
 
 
@@ -86,7 +86,7 @@ def report(folder: Path, *runs: Results, size: tuple[int, int] = (48, 32)) -> st
         for k, method in enumerate((*METHODS, "truth")):
             file = image_file(folder, index, runs[0].images[index], f".{method}.webp")
             file.parent.mkdir(exist_ok=True)
-            file.write_bytes(encode(Image.new("RGB", size, (20 * index % 256, 9 * k, 90))))
+            Image.new("RGB", size, (20 * index % 256, 9 * k, 90)).save(file)
     return make_report([(one, folder) for one in runs])
 
 
@@ -95,7 +95,7 @@ def test_a_page_is_well_formed_and_needs_nothing_else(tmp_path: Path) -> None:
     text = report(tmp_path, *runs)
     page, tables = Page(text), make_tables(runs)
     assert text == report(tmp_path, *runs)
-    assert len(page.drawings()) == 5  # near views: overhead, PSNR, distance; large views: holes, overhead
+    assert len(page.drawings()) == 3  # near views: PSNR, distance; large views: holes
     sections = [part["id"] for part in page.named("section")]
     assert sections == ["summary", "plots", "pictures", "tables", "setup"]
     assert not re.search(r"://|@import|url\(|\*\*", text)
@@ -119,28 +119,24 @@ def test_every_string_from_outside_is_escaped(tmp_path: Path) -> None:
     page = Page(text)
     assert text.count("<script") == 1
     assert "<b>damaged" not in text
-    assert "\x01" not in text
-    text.encode("utf-8")
-    assert f"{EVIL[:-2]}\ufffd\ufffd3" in page.text("h4")
+    assert f"{EVIL}3" in page.text("h4")
     assert page.drawings()
 
 
-def test_many_evaluations_have_fewer_and_smaller_pictures(tmp_path: Path) -> None:
+def test_many_evaluations_have_fewer_pictures(tmp_path: Path) -> None:
     runs = [results(False, 2, title) for title in IMAGES]
-    pictures = Page(report(tmp_path, *runs, size=(900, 600))).named("img")
-    sizes = [int(str(image["width"])) for image in pictures if "width" in image]
-    assert len(sizes) == len(runs) * 2 * (len(METHODS) + 1)  # two images of each, and the truth
-    assert {*sizes} == {round(960 * (8 / 12) ** 0.5)}
+    pictures = [image for image in Page(report(tmp_path, *runs)).named("img") if "width" in image]
+    assert len(pictures) == len(runs) * 2 * (len(METHODS) + 1)  # two images of each, and the truth
 
 
 def test_plots_show_each_value_once_in_a_form_of_its_method() -> None:
     assert len({facts.color for facts in FACTS.values()}) == len({facts.form for facts in FACTS.values()}) == len(FACTS)
     assert [evenly(11, 4), evenly(3, 8), evenly(5, 1)] == [[0, 3, 7, 10], [0, 1, 2], [0]]
-    plot = overhead_plot(results(near=True, count=3))
+    plot = scenes_plot(results(near=True, count=3), "distance")
     assert plot is not None
     drawn = [part.get("style", "") for part in ElementTree.fromstring(plot.svg).iter() if part.tag.endswith("}use")]
-    for method in ("seeds", "spackle"):  # a dot for each image and view, and one in the legend
-        assert sum(f"fill: {FACTS[method].color}" in style for style in drawn) == 3 * 2 + 1
+    for method in ("seeds", "spackle"):  # a dot for each image, and one in the legend
+        assert sum(f"fill: {FACTS[method].color}" in style for style in drawn) == 3 + 1
 
 
 def test_the_command_writes_it_and_tables_write_the_same(

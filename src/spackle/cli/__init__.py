@@ -72,14 +72,10 @@ app.command(short_help="Describe a scene, photo, depth map or clip")(commands.in
 app.command(short_help="Complete one photo and compare with its true second view")(commands.demo)
 app.add_typer(weights.weights, name="weights", short_help="Download or list weights that others publish")
 app.command(short_help="Train the residual network or SHARP's decoder")(train.train)
-app.command(context_settings=evaluate.EXTRA_WORDS, short_help="Evaluate on a dataset by the paper's protocols")(
-    evaluate.evaluate
-)
+app.command(short_help="Evaluate on a dataset by the paper's protocols")(evaluate.evaluate)
 app.command(short_help="Merge several evaluations into the same tables")(evaluate.tables)
 app.command(short_help="Draw the paper's figures from several evaluations")(evaluate.figures)
-app.command(context_settings=evaluate.EXTRA_WORDS, short_help="Measure what Spackle costs, in Gaussians and in time")(
-    evaluate.bench
-)
+app.command(short_help="Measure what Spackle costs, in Gaussians and in time")(evaluate.bench)
 app.add_typer(dataset.dataset, name="dataset", short_help="Build training data: views with holes and completed targets")
 
 

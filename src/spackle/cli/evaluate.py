@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -19,21 +19,16 @@ from spackle.cli.options import (
 )
 from spackle.errors import InputError
 
-# Of `--disparity 0.3 0.4 0.5` only the first number belongs to the option, see `_sorted_words`.
-EXTRA_WORDS = {"allow_extra_args": True}
-NUMBER = re.compile(r"[\d.,]+")
-UNFIT = re.compile(r"[^\w.-]+")  # characters that a folder's name should not have
+UNFIT = re.compile(r"[^\w.-]+")  # characters that are replaced in a folder's name
 
-# Options that both commands have.
+# Options of both `evaluate` and `bench`.
 Limit = Annotated[
     int | None, typer.Option(min=1, max=1_000_000, help="Evaluate this number of images, spread over the dataset.")
 ]
-_DATASET = typer.Option(
-    metavar="NAME", help="middlebury, booster, wildrgbd, tanks, eth3d, llff; an unknown name lists all."
-)
-Folder = Annotated[
-    Path | None, typer.Argument(metavar="FOLDER", help="Where the dataset was unpacked.", show_default=False)
+DatasetName = Annotated[
+    str, typer.Option(metavar="NAME", help="Dataset: middlebury, booster, wildrgbd, tanks, eth3d or llff.")
 ]
+Folder = Annotated[Path, typer.Argument(metavar="FOLDER", help="Where the dataset was unpacked.")]
 BaseName = Annotated[str, typer.Option(help="sharp, moge, depth, lite, hf:NAME, or rgbd with the dataset's own depth.")]
 Checkpoint = Annotated[Path | None, typer.Option("-c", "--checkpoint", help="Weights of the base.")]
 Residual = Annotated[
@@ -62,9 +57,11 @@ Html = Annotated[bool, typer.Option("--html", help="Also write report.html, one 
 
 def evaluate(
     context: typer.Context,
-    dataset: Annotated[str, _DATASET],
-    folder: Folder = None,
-    protocol: Annotated[str, typer.Option(help="large-view (wide moves) or near-view (second photos).")] = "large-view",
+    folder: Folder,
+    dataset: DatasetName,
+    protocol: Annotated[
+        Literal["large-view", "near-view"], typer.Option(help="Views of wide camera moves, or of second photos.")
+    ] = "large-view",
     methods: Annotated[
         str,
         typer.Option(
@@ -75,11 +72,7 @@ def evaluate(
     disparity: Disparity = "0.3,0.4,0.5",
     side: Side = None,
     second_views: Annotated[
-        str,
-        typer.Option(
-            metavar="all|nearest",
-            help="Which second photos a near view is compared with: all of the scene, or the nearest.",
-        ),
+        Literal["all", "nearest"], typer.Option(help="Near views: all second photos of the scene, or the nearest.")
     ] = "all",
     metrics: Annotated[
         str | None,
@@ -116,13 +109,12 @@ def evaluate(
     from spackle.evaluation.evaluate import evaluate as run
     from spackle.progress import Reporter
 
-    source, numbers = _sorted_words(context, folder, disparity)
     options = EvaluateOptions(
         dataset=dataset,
-        root=source,
+        root=folder,
         protocol=protocol,
         methods=split_words(methods),
-        disparities=parse_disparities(numbers),
+        disparities=parse_disparities(disparity),
         side=side,
         second_views=second_views,
         metrics=None if metrics is None else () if metrics == "none" else split_words(metrics),
@@ -134,7 +126,8 @@ def evaluate(
         limit=limit,
         download=download_metrics,
     )
-    if options.near and _has_disparities(context):
+    given = context.get_parameter_source("disparity")
+    if options.near and given is not None and given.name == "COMMANDLINE":
         raise InputError(
             f"--disparity {disparity}: --protocol near-view renders the views of the true second photos: "
             "leave one of them out"
@@ -175,9 +168,8 @@ def figures(
 
 
 def bench(
-    context: typer.Context,
-    dataset: Annotated[str, _DATASET],
-    folder: Folder = None,
+    folder: Folder,
+    dataset: DatasetName,
     disparity: Disparity = "0.3,0.4,0.5",
     side: Side = None,
     base: BaseName = "sharp",
@@ -203,12 +195,11 @@ def bench(
     from spackle.evaluation.evaluate import EvaluateOptions, parse_disparities
     from spackle.progress import Reporter
 
-    source, numbers = _sorted_words(context, folder, disparity)
     options = EvaluateOptions(
         dataset=dataset,
-        root=source,
+        root=folder,
         methods=TIMED,
-        disparities=parse_disparities(numbers),
+        disparities=parse_disparities(disparity),
         side=side,
         metrics=(),
         base=BaseSettings(base, checkpoint=checkpoint, precision=precision, device=device, **sharp_speed(sharp)),
@@ -218,23 +209,3 @@ def bench(
     results = output or Path(f"bench-{dataset}-{UNFIT.sub('-', base)}")
     if run(options, runs, base_runs, results, Reporter(verbose, as_json=as_json)) == "stopped":
         raise typer.Exit(INTERRUPTED)
-
-
-def _has_disparities(context: typer.Context) -> bool:
-    """Whether --disparity was given on the command line."""
-    source = context.get_parameter_source("disparity")
-    return source is not None and source.name == "COMMANDLINE"
-
-
-def _sorted_words(context: typer.Context, folder: Path | None, disparity: str) -> tuple[Path, str]:
-    """The folder, and the disparities with further numbers given as separate words; InputError for any other word."""
-    words = [*([] if folder is None else [str(folder)]), *context.args]
-    listed = _has_disparities(context)
-    others = [word for word in words if not (listed and NUMBER.fullmatch(word))]
-    others = others or words[:1]  # a folder may be named by a number
-    if not others:
-        raise InputError("FOLDER is missing: name the dataset's folder after the command")
-    if len(others) > 1:
-        raise InputError(f"{others[-1]}: belongs to no option: separate list items with commas: --methods A,B")
-    words.remove(others[0])
-    return Path(others[0]), ",".join((disparity, *words))

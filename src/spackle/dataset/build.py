@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -23,7 +24,7 @@ from spackle.errors import InputError, check_name, reading
 from spackle.files import fingerprint, write_whole
 from spackle.folders import differences, digest_of, make_folder, remove_half_written, results_folder
 from spackle.image import load_photo, resize_photo
-from spackle.inpaint import INPAINTERS, Inpainter, InpainterOptions, get_inpainter, inpainter_class
+from spackle.inpaint import INPAINTERS, Inpainter, InpainterOptions, get_inpainter
 from spackle.progress import Reporter, asked_to_stop, counted, timed
 from spackle.render import get_renderer
 from spackle.residual import MASK_THRESHOLD
@@ -53,19 +54,15 @@ class DatasetOptions:
     threads: int = 2  # threads per process
     shard_size: int = 50  # photos per shard
 
-    @property
-    def inpaints_by_network(self) -> bool:
-        return self.inpainter in INPAINTERS and inpainter_class(self.inpainter).network
-
     def open_inpainter(self) -> Inpainter | None:
-        """Open the inpainter; None if none paints the targets. InputError if a package or weights are missing."""
+        """Open the inpainter; None for "geometry" and "none". InputError if a package or weights are missing."""
         if self.inpainter not in INPAINTERS:
             return None
         device = None if self.base.device == "auto" else self.base.device
         return get_inpainter(self.inpainter, InpainterOptions(self.inpainter_weights, self.inpainter_side, device))
 
     def check(self) -> None:
-        """InputError if options contradict each other; inpainters check their own options."""
+        """InputError if options contradict each other; inpainters check their options themselves."""
         self.base.check(one=True)
         depth = self.base.depth
         if depth is None and not self.base.network:
@@ -73,16 +70,13 @@ class DatasetOptions:
                 f"--base {self.base.name} needs the photos' depth: give --depth FOLDER; {', '.join(NETWORKS)} need none"
             )
         if isinstance(depth, Path) and not depth.is_dir():  # a single map would fit one photo only
-            raise InputError(f"--depth {depth}: no such folder: a dataset takes one with a depth map for each photo")
+            raise InputError(f"--depth {depth}: no such folder: give a folder with a depth map for each photo")
         check_name("--inpainter", self.inpainter, COMPLETIONS)
-        for option, value in (("weights", self.inpainter_weights), ("side", self.inpainter_side)):
-            if value is not None and not self.inpaints_by_network:
-                line = f"--inpainter-{option} {value}: the {self.inpainter} inpainter has no network"
-                raise InputError(f"{line}: leave the option out")
         low, high = self.disparity
         if not 0 < low <= high <= MAX_DISPARITY:
             raise InputError(
-                f"--disparity {low:g} {high:g}: give the smaller and the greater, above 0 and up to {MAX_DISPARITY:g}"
+                f"--disparity {low:g} {high:g}: give the smaller number, then the greater, above 0 and up to "
+                f"{MAX_DISPARITY:g}"
             )
 
     def depth_of(self, photo: PhotoFile) -> Path | None:
@@ -105,7 +99,7 @@ class DatasetOptions:
 def configuration(options: DatasetOptions, photos: Sequence[PhotoFile], inpainter: Inpainter | None) -> dict[str, Any]:
     """Everything that determines the shards' bytes, ready for JSON, without paths of this machine.
 
-    This includes the number of threads, on which SHARP's last bits depend, but not the number of workers.
+    The number of threads is included, because SHARP's last bits depend on it; the number of workers is not.
     """
     base = options.base
     inputs = digest_of([options.inputs_of(photo) for photo in photos])
@@ -303,7 +297,7 @@ class _Build:
             return
         parts = [(self.photos[i].key, self._part(i)) for i in indices if i not in self.problems]
         name = f"shard-{number:06d}.tar"
-        skipped = [self._portable(self.photos[i].name, self.problems[i]) for i in indices if i in self.problems]
+        skipped = [self._portable(self.photos[i], self.problems[i]) for i in indices if i in self.problems]
         with timed("write", self.seconds):
             self.shards[number] = write_shard(parts, self.output / name, skipped)
             self._save(complete=False)
@@ -321,9 +315,7 @@ class _Build:
         samples = sum(len(shard.samples) for shard in shards)
         if samples:
             self._save(complete=True)
-        for file in (self.output / PARTS).iterdir():  # left by a run that was killed after writing their shard
-            file.unlink(missing_ok=True)
-        (self.output / PARTS).rmdir()
+        shutil.rmtree(self.output / PARTS)
         if not samples:
             for name in (NAME, *(shard.file for shard in shards)):
                 (self.output / name).unlink(missing_ok=True)
@@ -335,11 +327,9 @@ class _Build:
         total = decimal(sum(shard.size for shard in shards))
         self.reporter.log(f"{counted(samples, 'photo')} in {counted(len(shards), 'shard')}, {total} -> {self.output}")
 
-    def _portable(self, name: str, problem: str) -> str:
+    def _portable(self, photo: PhotoFile, problem: str) -> str:
         """The error message about a photo, without the paths of folders, which differ between machines."""
-        for photo in self.photos:
-            problem = problem.replace(str(photo.path), photo.name)
-        depth = self.options.base.depth
+        problem, depth = problem.replace(str(photo.path), photo.name), self.options.base.depth
         if isinstance(depth, Path) and depth.name:  # "." and "/" would be found anywhere
             problem = problem.replace(str(depth), "--depth")
-        return problem if problem.startswith(f"{name}: ") else f"{name}: {problem}"
+        return problem if problem.startswith(f"{photo.name}: ") else f"{photo.name}: {problem}"

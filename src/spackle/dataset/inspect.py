@@ -90,13 +90,11 @@ def _shard_problems(location: str | os.PathLike[str], shard: ShardEntry) -> Iter
 
 
 def preview_dataset(location: str, output: Path, photos: int, views: int, reporter: Reporter) -> None:
-    """Write a sheet (base, mask and target of some views of some photos) and a video of one path, base beside target.
+    """Write a sheet (base, mask and target of some views of some photos) and a video of a path, base beside target.
 
     InputError if the dataset is unfinished or damaged, or the folder cannot be written to.
     """
     files = DatasetFiles(location)
-    if not len(files):
-        raise InputError(f"{location}: holds no photos")
     with results_folder(output, (SHEET, VIDEO), alone=True):
         groups = [files[index] for index in _spread(len(files), photos)]
         rows: list[list[Tensor]] = []
@@ -105,7 +103,7 @@ def preview_dataset(location: str, output: Path, photos: int, views: int, report
             masks = [view.mask[..., None].expand(-1, -1, 3).float() for view in chosen]
             rows += [[view.rendering.rgb for view in chosen], masks, [view.target for view in chosen]]
         save_png(sheet(rows, THUMBNAIL, fill=1.0), output / SHEET)
-        # View 0 is the photo's own, which is not on the path.
+        # View 0 is the photo's view, which is not on the path.
         path = (groups[0].view(index) for index in range(1, groups[0].views))
         save_video((torch.cat([view.rendering.rgb, view.target], dim=1) for view in path), output / VIDEO, fps=FPS)
     reporter.log(f"{SHEET} and {VIDEO} -> {output}")

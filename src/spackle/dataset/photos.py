@@ -11,28 +11,27 @@ from pathlib import Path
 from typing import Any
 
 from spackle.errors import InputError, reading
-from spackle.files import check_file, files_in, sha256_of
+from spackle.files import files_in, sha256_of
 from spackle.image import PHOTO_SUFFIXES, load_photo
 from spackle.progress import Step
 
 SUFFIXES = (*PHOTO_SUFFIXES, ".gif", ".bmp")
 MIN_SIDE = 32  # pixels: no depth can be recognised in smaller images
-MAX_JSON_BYTES = 1 << 30
-NAMED = 5  # how many missing files the log names
+NAMED = 5  # the most missing files that the log names
 
 
 @dataclasses.dataclass(frozen=True)
 class PhotoFile:
     """A photo of a dataset."""
 
-    index: int  # its number in the dataset
+    index: int  # the photo's number in the dataset
     path: Path
-    name: str  # relative to its folder, with slashes
+    name: str  # relative to the folder of photos, with slashes
     sha256: str  # of the file
 
     @property
     def key(self) -> str:
-        """The photo's number as text; its files in the dataset have names that begin with it."""
+        """The photo's number as text, with which the names of the photo's files in the dataset begin."""
         return f"{self.index:06d}"
 
 
@@ -41,7 +40,7 @@ def find_photos(source: Path, folder: Path | None, log: Callable[[str], None]) -
 
     Args:
         source: a folder, whose subfolders are included, or a COCO file `{"images": [{"file_name": …}, …]}`.
-        folder: where the COCO file's photos are; None: beside the file.
+        folder: the folder of the COCO file's photos; None: the file's own folder.
         log: receives a line if photos that the COCO file names are missing.
 
     Raises:
@@ -49,8 +48,6 @@ def find_photos(source: Path, folder: Path | None, log: Callable[[str], None]) -
     """
     if not os.path.isdir(source):
         return _named_by_coco(source, folder, log)
-    if folder is not None:
-        raise InputError(f"{folder}: only a COCO JSON needs a folder beside it, and {source} is a folder itself")
     names = [file.relative_to(source).as_posix() for file in files_in(source, SUFFIXES, below=True)]
     if not names:
         raise InputError(f"{source}: no photos in this folder (looked for {', '.join(SUFFIXES)})")
@@ -58,16 +55,12 @@ def find_photos(source: Path, folder: Path | None, log: Callable[[str], None]) -
 
 
 def _named_by_coco(source: Path, folder: Path | None, log: Callable[[str], None]) -> tuple[Path, list[str]]:
-    if check_file(source, "folder of photos or COCO JSON") > MAX_JSON_BYTES:
-        raise InputError(f'{source}: too long for COCO annotations (at most 1 GiB): take out what is not "images"')
-    with reading(source, 'neither a folder nor COCO annotations: needs {"images": [{"file_name": …}, …]}'):
+    with reading(source, 'neither a folder nor COCO annotations {"images": [{"file_name": …}, …]}: {reason}'):
         content: Any = json.loads(source.read_text(encoding="utf-8"))
         names = [image["file_name"] for image in content["images"]]
     if not names:
         raise InputError(f"{source}: names no images")
     root = source.parent if folder is None else folder
-    if not os.path.isdir(root):
-        raise InputError(f"{root}: no such folder, but the photos of {source.name} should be in it")
     for name in names:  # names must not lead out of the folder
         if not isinstance(name, str) or not name or "\0" in name or name.startswith("/") or ".." in Path(name).parts:
             raise InputError(f"{source}: {str(name)[:60]!r} is not the file name of an image")
@@ -86,8 +79,8 @@ def choose(
 ) -> list[PhotoFile]:
     """Choose a dataset's photos, sorted by name: all, or a random subset of `count`.
 
-    The subset depends on names, contents and seed alone. Photos that cannot be read, are too small or are copies of
-    others are skipped and reported to `warn`; others take their place. InputError if fewer than `count` are usable.
+    The subset depends on names, contents and seed alone. Unreadable photos, small photos and copies are reported to
+    `warn` and replaced by other photos. InputError if fewer than `count` photos are usable.
     """
     wanted = len(names) if count is None else count
     order = names if count is None else sorted(names, key=lambda n: hashlib.sha256(f"{seed}:{n}".encode()).digest())

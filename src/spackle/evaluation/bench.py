@@ -19,13 +19,13 @@ from spackle.bases.sharp.base import PARAMETERS
 from spackle.bases.sharp.encoder import FULL
 from spackle.bases.sharp.network import SharpNetwork
 from spackle.camera import Camera
-from spackle.device import hardware, load_average, versions
-from spackle.evaluation.case import Case, Viewpoint, load_case
+from spackle.device import hardware, versions
+from spackle.evaluation.case import Case, load_case
 from spackle.evaluation.evaluate import EvaluateOptions, Evaluation, open_evaluation
 from spackle.evaluation.folder import ROWS, measure_images, write_rows
 from spackle.evaluation.methods import METHODS, make_method
 from spackle.evaluation.protocols import large_views
-from spackle.evaluation.rows import BASE_PATH, EXTRA, NOTE, STAGES, Row
+from spackle.evaluation.rows import BASE_PATH, EXTRA, NOTE, Row, mean, pivot, setting_title
 from spackle.evaluation.tables import make_tables, write_tables
 from spackle.folders import results_folder
 from spackle.gaussians import Gaussians
@@ -67,97 +67,91 @@ def bench(options: EvaluateOptions, runs: int, base_runs: int | None, output: Pa
     config["base"] |= {"device": options.device.type if options.base.network else "cpu"}
     config |= {"hardware": hardware(options.device), "versions": versions()}
     about = {"parameters": count_parameters(evaluation.network)}
-    timed: list[str] = []  # images timed by this process, which is warm after the first
-
-    def time_next(index: int, case: Case, metrics: Sequence[str]) -> tuple[list[Row], list[Path]]:
-        rows = time_case(case, evaluation, config, bool(timed))
-        timed.append(case.name)
-        return rows, []
-
     with results_folder(output, (ROWS, *FILES), alone=True):
-        run = measure_images(evaluation.cases, time_next, output, config, about, options.root, reporter)
+
+        def measure_one(index: int, case: Case) -> tuple[list[Row], list[Path]]:
+            return time_case(case, evaluation, config), []
+
+        run = measure_images(evaluation.cases, measure_one, output, config, about, options.root, reporter)
         if run is None:
             return "stopped"
         write_tables(make_tables([run]), output, FILES, run.label_suffix)
         write_rows(run.rows, output / ROWS)
     count, total = len(run.measured), len(run.images)
     reporter.log(f"{run.title}: {count} of {total} images -> {output}")
-    for method in TIMED:
-        overheads = {s: statistics.median(run.numbers("overhead", s, method)) for s in run.settings}
-        listed = ", ".join(f"{setting}: {100 * overhead:.2f} %" for setting, overhead in overheads.items())
-        reporter.log(f"overhead of {METHODS[method].title} {listed}")
+    overheads = pivot((row for row in run.rows if row.metric == "overhead"), "method", "setting")
+    for (method, setting), values in overheads.items():
+        overhead = mean(values, statistics.median).value or 0.0
+        reporter.log(f"overhead of {METHODS[method].title} {setting_title(setting)}: {100 * overhead:.2f} %")
     reporter.result({"folder": output, "images": total, "measured": count})
     return "complete"
 
 
-def time_case(case: Case, evaluation: Evaluation, config: Mapping[str, Any], warm: bool) -> list[Row]:
-    """Time all settings of an image; `warm`: whether this process has predicted before.
+def time_case(case: Case, evaluation: Evaluation, config: Mapping[str, Any]) -> list[Row]:
+    """Time all settings of an image.
 
     Raises:
         InputError: a file cannot be used, the case lacks depth, or Gaussians are not finite.
         BaseError: the base would fail for every image.
     """
-    load, options, device = load_average(), evaluation.options, device_of(evaluation.renderer)
+    options, device = evaluation.options, device_of(evaluation.renderer)
     loaded = load_case(case, options.max_side)
     opened = evaluation.open(loaded)
     opened.load(loaded.full)  # not timed
+    # SHARP on a CPU takes a minute, of which compiling kernels is a small part: the first prediction is timed.
+    warm = options.base.named == "sharp" and config["base"]["device"] == "cpu"
     latest: dict[str, BasePrediction] = {}
-    # SHARP's first prediction on a CPU counts: it takes a minute, of which compiling kernels is a small part.
-    counts = warm or (options.base.named == "sharp" and config["base"]["device"] == "cpu")
     predict = {"": lambda _: latest.update(base=opened.predict(loaded.full)[0])}
-    seconds = measure(config["base_runs"], predict, device, warm=counts)["", TOTAL] / MS
-    prediction, none = latest["base"], np.zeros(config["runs"])
+    seconds = measure(config["base_runs"], predict, device, warm=warm)["", TOTAL] / MS
+    prediction = latest["base"]
     context = evaluation.context(prediction)
-    facts: dict[str, Any] = {"width": loaded.photo.width, "height": loaded.photo.height, "load": load}
-    facts |= {"warm": int(warm or not counts), "base_gaussians": len(prediction.gaussians)}
+    facts: dict[str, Any] = {"width": loaded.photo.width, "height": loaded.photo.height}
+    facts |= {"base_gaussians": len(prediction.gaussians)}
     facts |= {f"{NOTE}{name}": value for name, value in prediction.notes.items()}
-    rows = [Row(config["title"], case.name, "", "", "", metric, value) for metric, value in facts.items()]
+    image = Row(config["title"], case.name, "", "", "", "", None)
+    rows = [image._replace(metric=metric, value=value) for metric, value in facts.items()]
     added: dict[str, int] = {}
 
-    def complete(view: Viewpoint, method: str, lap: Lap) -> None:
-        added[method] = len(complete_in_laps(context, view.camera, lap, method))
+    def complete(camera: Camera, method: str, lap: Lap) -> None:
+        added[method] = len(complete_in_laps(context, camera, lap, method))
 
     for view in large_views(prediction, options.disparities, options.max_side):
-        times = measure(config["runs"], {method: partial(complete, view, method) for method in TIMED}, device)
+        tasks = {method: partial(complete, view.camera, method) for method in TIMED}
+        times = measure(config["runs"], tasks, device)
         for method, count in added.items():
             # A method may lack a stage: a view without holes is not rendered again.
-            stages = {name: times.get((method, name), none) / MS for name in STAGES} | {"base": seconds}
-            row = Row(config["title"], case.name, view.setting, view.name, method, "", None)
-            figures = view_figures(len(context.base), count, stages)
-            rows += [row._replace(metric=metric, value=value) for metric, value in figures]
+            stages = {stage: values / MS for (name, stage), values in times.items() if name == method}
+            row = image._replace(setting=view.setting, view=view.name, method=method)
+            numbers = view_numbers(len(context.base), count, stages | {"base": seconds})
+            rows += [row._replace(metric=metric, value=value) for metric, value in numbers.items()]
     return rows
 
 
-def view_figures(base: int, added: int, seconds: Mapping[str, Values]) -> list[tuple[str, float]]:
-    """The table figures that follow from a view's numbers of Gaussians and the seconds of `STAGES` in each run.
+def view_numbers(base: int, added: int, seconds: Mapping[str, Values]) -> dict[str, float]:
+    """The numbers in tables that follow from a view's numbers of Gaussians and the seconds of each stage in each run.
 
-    These are counts, milliseconds (medians over runs), shares (not percent), views per second, and the milliseconds of
-    each run.
+    These are counts, milliseconds (medians over runs), shares (not percent) and views per second.
     """
-    stages = {name: MS * float(np.median(seconds[name])) for name in STAGES}
-    before, extra = (sum(stages[name] for name in names) for names in (BASE_PATH, EXTRA))
-    figures = {
+    before, extra = (
+        sum(MS * float(np.median(seconds[stage])) for stage in stages if stage in seconds)
+        for stages in (BASE_PATH, EXTRA)
+    )
+    return {
         "aux": added,
         "aux_share": added / base,
         "merged": base + added,
         "base_ms": before,
         "spackle_ms": before + extra,
-        "extra_ms": extra,
         "overhead": extra / before,
-        "overhead_of_view": extra / stages["view"],
         "base_fps": MS / before,
         "spackle_fps": MS / (before + extra),
-        **{f"{name}_stage_ms": ms for name, ms in stages.items()},
     }
-    each = [(f"{name}_run_ms", MS * value) for name, values in seconds.items() for value in values.tolist()]
-    return [*figures.items(), *each]
 
 
 def count_parameters(residual: ResidualNet | None) -> dict[str, float]:
     """Count parameters: SHARP's checkpoint (702.31 M), its part used in inference, the residual, the residual's share.
 
-    SHARP's are counted in a network without weights. Inference needs neither SHARP's classifiers nor the part that
-    aligns depths.
+    Inference uses neither SHARP's classifiers nor the part that aligns depths.
     """
     with torch.device("meta"):
         used = sum(p.numel() for p in SharpNetwork(FULL).parameters())
@@ -172,8 +166,8 @@ def measure(runs: int, tasks: Mapping[str, Task], device: torch.device = CPU, *,
     """Milliseconds of each task (stage "total") and of its stages, in each run.
 
     A task gets a function and calls it with a stage's name when the stage ends; stages of the same name within a run
-    add up. A stage ends when the device has done its work. The tasks take turns, so that a busy machine slows all of
-    them alike. Unless they are `warm`, an untimed run comes first, which compiles and warms up.
+    add up. A stage ends when the device has done its work. The tasks take turns, so that a busy machine slows all
+    tasks alike. Unless the tasks are `warm`, an untimed run comes first, which compiles and warms up.
     """
 
     def now() -> float:
@@ -202,7 +196,7 @@ def measure(runs: int, tasks: Mapping[str, Task], device: torch.device = CPU, *,
 
 @dataclasses.dataclass(frozen=True)
 class _LappedRenderer:
-    """A `Renderer` that ends a stage before and after each render, so that rendering is timed apart from completion."""
+    """A `Renderer` that ends a stage before and after each render, which times rendering apart from completion."""
 
     renderer: Renderer
     lap: Lap

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,10 +14,9 @@ from spackle.bases.depth_map import DepthMap
 from spackle.camera import Camera
 from spackle.errors import InputError
 from spackle.evaluation.rows import NEAR
-from spackle.files import files_in
-from spackle.image import MAX_SIDE, PHOTO_SUFFIXES, Photo, load_photo, resize_photo, working_size
+from spackle.image import MAX_SIDE, Photo, load_photo, resize_photo, working_size
 
-SHAPE_TOLERANCE = 0.01  # relative difference of aspect ratio that is accepted between a photo and its camera
+SHAPE_TOLERANCE = 0.01  # accepted relative difference of aspect ratio between a photo and its camera
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,7 +26,7 @@ class SecondView:
     name: str
     photo: Path
     camera: Camera  # of the photo's aspect ratio; in the input photo's frame and the dataset's unit
-    near: bool = True  # among the few whose viewpoint is close to the input photo's
+    near: bool = True  # whether --second-views nearest takes this view
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,34 +43,11 @@ class Case:
 
     name: str  # unique in the dataset; slashes separate scene and view
     photo: Path
-    camera: Camera | None = None  # of the photo's aspect ratio; None: the photo tells its lens itself
+    camera: Camera | None = None  # of the photo's aspect ratio; None: the photo's metadata give the focal length
     depth: Callable[[], DepthMap] | None = None  # of the photo's aspect ratio, in the dataset's unit
     points: Callable[[], Points] | None = None
-    bounds: tuple[float, float] | None = None  # nearest and farthest depth, if nothing else is known
+    bounds: tuple[float, float] | None = None  # nearest and farthest depth, for cases without depth and points
     seconds: tuple[SecondView, ...] = ()
-
-
-@dataclasses.dataclass(frozen=True)
-class EvalDataset:
-    """The description of a dataset in its official layout."""
-
-    name: str  # the name for --dataset
-    title: str  # the name in the paper's tables
-    terms: str  # terms of use, in a few words
-    expected: str  # the files of a scene, for messages
-    is_scene: Callable[[Path], bool]
-    cases: Callable[[Mapping[str, Path]], list[Case]]  # from scene names to folders; InputError for bad files
-    skip: Sequence[str] = ()  # names of folders without ground truth, or with the same photos again
-
-
-def has_any(folder: Path, *names: str) -> bool:
-    """Whether a folder has one of these files or folders."""
-    return any((folder / name).exists() for name in names)
-
-
-def photo_files(folder: Path) -> list[Path]:
-    """The photos directly in a folder, sorted by name; none if there is no folder."""
-    return files_in(folder, PHOTO_SUFFIXES) if folder.is_dir() else []
 
 
 class Viewpoint(NamedTuple):
@@ -88,11 +64,10 @@ class LoadedCase:
     """A case whose photos have been read."""
 
     case: Case
-    full: Photo  # the input at its stored size, with the dataset's focal length; what bases get
+    full: Photo  # the input at its stored size, with the dataset's focal length; bases get this photo
     photo: Photo  # the input at the working size
     camera: Camera  # of `photo`, at the world's origin: from the dataset, or else from the photo
     seconds: tuple[Viewpoint, ...]  # with cameras in the input photo's frame and the dataset's unit
-    lacks: tuple[str, ...] = ()  # why some of the case's second photos are missing from `seconds`
 
 
 def load_case(case: Case, max_side: int = MAX_SIDE) -> LoadedCase:
@@ -101,7 +76,7 @@ def load_case(case: Case, max_side: int = MAX_SIDE) -> LoadedCase:
     Views have even sides, so a second photo with an odd side loses its last row or column.
 
     Raises:
-        InputError: the photo, or every second photo, is missing, no image, or differs from its camera in aspect ratio.
+        InputError: a photo is missing, no image, or differs from its camera in aspect ratio.
     """
     full = load_photo(case.photo)
     if case.camera is not None:
@@ -110,20 +85,12 @@ def load_case(case: Case, max_side: int = MAX_SIDE) -> LoadedCase:
         full = dataclasses.replace(full, focal_px=focal, focal_source="dataset")
     photo = resize_photo(full, max_side)
     camera = photo.camera if case.camera is None else case.camera.resized(photo.width, photo.height)
-    seconds, lacks = [], []
-    for view in case.seconds:
-        try:
-            seconds.append(_load_view(view, max_side))
-        except InputError as error:
-            lacks.append(str(error))
-    if lacks and not seconds:
-        raise InputError(lacks[0])
     camera = dataclasses.replace(camera, world_to_camera=torch.eye(4))
-    return LoadedCase(case, full, photo, camera, tuple(seconds), tuple(lacks))
+    return LoadedCase(case, full, photo, camera, tuple(_load_view(view, max_side) for view in case.seconds))
 
 
 def _load_view(view: SecondView, max_side: int) -> Viewpoint:
-    """Check a second view; its photo is not kept but read again on demand, because a scene may have hundreds."""
+    """Check a second photo; the photo is read again on demand, because a scene may have hundreds."""
     stored = load_photo(view.photo)
     _check_shape(view.photo, stored, view.camera)
     camera = view.camera.resized(*working_size(stored.width, stored.height, max_side))
@@ -145,7 +112,7 @@ def _check_shape(path: Path, photo: Photo, camera: Camera) -> None:
 
 
 def known_depth(case: Case) -> DepthMap:
-    """A case's depth map; if it has none, a map of its points: a pixel of the case's camera gets its nearest point.
+    """A case's depth map, or a map of its points: each pixel of the case's camera gets its nearest point.
 
     Raises:
         InputError: the case has neither, or a file of it cannot be used.

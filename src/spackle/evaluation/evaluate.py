@@ -21,12 +21,12 @@ from spackle.device import hardware, pick_device, pick_dtype, versions
 from spackle.errors import InputError, check_name
 from spackle.evaluation.case import Case, LoadedCase, known_depth, load_case
 from spackle.evaluation.datasets import DATASETS, read_cases
-from spackle.evaluation.folder import ROWS, from_root, image_file, load_run, measure_images, write_rows
+from spackle.evaluation.folder import ROWS, earlier_metrics, image_file, load_run, measure_images, write_rows
 from spackle.evaluation.methods import METHODS, make_method
 from spackle.evaluation.metrics import DEFAULT_METRICS, DEFINITIONS, METRICS, NOTICE, OWN, open_metrics
 from spackle.evaluation.pictures import BEST, WORST, save_picture, write_sheets
 from spackle.evaluation.protocols import INPUT, Alignment, Gauges, align, large_views, measure_views, to_base
-from spackle.evaluation.report import REPORT, check_matplotlib, figures_table, make_report
+from spackle.evaluation.report import REPORT, check_matplotlib, make_report, means_table
 from spackle.evaluation.rows import DISPARITIES, NOTE, REMARK, Row
 from spackle.evaluation.table import NOT_RUN, plain
 from spackle.evaluation.tables import FILES, make_tables, write_tables
@@ -34,7 +34,7 @@ from spackle.files import write_whole
 from spackle.folders import digest_of, results_folder
 from spackle.gaussians import Gaussians
 from spackle.image import MAX_SIDE
-from spackle.inpaint import INPAINTERS, Inpainter, InpainterOptions, get_inpainter
+from spackle.inpaint import Inpainter, InpainterOptions, get_inpainter
 from spackle.pipeline import FillOptions
 from spackle.progress import Reporter, counted
 from spackle.render import Renderer, device_of, get_renderer
@@ -45,8 +45,6 @@ from spackle.weights import weights_digest, weights_digests
 
 BASE = BaseSettings("sharp")
 LARGE_SIDE = 1280  # long side of the paper's large views: its added Gaussians are (1280 / 1536)² of HAR × grid at 1536
-MAX_DISPARITIES = 6  # at most; each takes columns of a table
-SECOND_VIEWS = ("all", "nearest")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,7 +62,7 @@ class EvaluateOptions:
     direct_ft: Path | None = None  # weights of the method direct-ft
     inpainter: str = "opencv"  # of the method inpaint2d
     features: Path | None = None  # SqueezeNet's weights, for the metric distance
-    second_views: str = "all"  # one of `SECOND_VIEWS`: which second photos near-view uses
+    second_views: str = "all"  # which second photos near-view uses: "all" or "nearest"
     side: int | None = None  # long side of the views; None: the paper's, 1280 for large views, 1536 for near ones
     limit: int | None = None  # the number of images, spread over the dataset
     download: bool = False  # pyiqa may fetch weights
@@ -79,32 +77,21 @@ class EvaluateOptions:
         return self.side or (MAX_SIDE if self.near else LARGE_SIDE)
 
     @property
-    def wanted(self) -> tuple[str, ...]:
-        """The metrics to measure, in the order of `METRICS`."""
-        named = DEFAULT_METRICS[self.protocol] if self.metrics is None else self.metrics
-        return tuple(name for name in METRICS if name in named)
-
-    @property
     def device(self) -> torch.device:
         """The device of networks."""
         return pick_device(None if self.base.device == "auto" else self.base.device)
 
     @property
     def opened(self) -> BaseSettings:
-        """The base's settings; bases that take no precision get none, and it then applies to the residual alone."""
-        alone = self.base.named in ("rgbd", "lite")
-        return dataclasses.replace(self.base, precision="auto") if alone else self.base
+        """The base's settings; a base that takes no precision gets none, and then only the residual uses it."""
+        without = self.base.named in ("rgbd", "lite")
+        return dataclasses.replace(self.base, precision="auto") if without else self.base
 
     def check(self) -> None:
         """InputError if an option cannot be used; the images are not looked at."""
         check_name("--dataset", self.dataset, DATASETS)
-        check_name("--protocol", self.protocol, DEFAULT_METRICS)
         for method in self.methods:
             check_name("--methods", method, METHODS)
-        check_name("--inpainter", self.inpainter, INPAINTERS)
-        check_name("--second-views", self.second_views, SECOND_VIEWS)
-        if self.second_views == "nearest" and not self.near:
-            raise InputError("--second-views nearest: large views have no second photos: add --protocol near-view")
         for metric in self.metrics or ():
             check_name("--metrics", metric, METRICS)
             if METRICS[metric].truth and not self.near:
@@ -114,21 +101,16 @@ class EvaluateOptions:
         self.opened.check(one=True)
         if self.residual == "none":
             raise InputError("--residual none: there would be nothing to evaluate: add --methods base instead")
-        if "direct-ft" in self.methods:
-            if self.base.name != "sharp":
-                raise InputError("--methods direct-ft: is SHARP with further training: add --base sharp")
-            if self.direct_ft is None:
-                made = "which `spackle train --method direct-ft` made"
-                raise InputError(f"--methods direct-ft: no weights: give --direct-ft FILE, {made}")
-        elif self.direct_ft is not None:
-            raise InputError(f"--direct-ft {self.direct_ft}: no method takes it: add direct-ft to --methods")
-        if not 1 <= len(self.disparities) <= MAX_DISPARITIES:
-            raise InputError(f"--disparity: give one to {MAX_DISPARITIES} numbers, got {len(self.disparities)}")
+        if "direct-ft" in self.methods and (self.base.name != "sharp" or self.direct_ft is None):
+            raise InputError(
+                "--methods direct-ft: is SHARP with further training: add --base sharp, and --direct-ft FILE with the "
+                "weights of `spackle train --method direct-ft`"
+            )
         for value in self.disparities:
             if not 0 < value <= MAX_DISPARITY:  # also refuses NaN
                 raise InputError(f"--disparity {value:g}: must be above 0 and up to {MAX_DISPARITY:g}")
-        if len(set(self.disparities)) < len(self.disparities):
-            raise InputError("--disparity: the same number twice: leave one out")
+        if not self.disparities:
+            raise InputError("--disparity: give at least one number")
 
 
 def split_words(text: str) -> tuple[str, ...]:
@@ -137,9 +119,9 @@ def split_words(text: str) -> tuple[str, ...]:
 
 
 def parse_disparities(text: str) -> tuple[float, ...]:
-    """Read "0.3,0.4" or "0.3 0.4" as numbers; InputError for other text."""
+    """Read "0.3,0.4" as numbers, and drop repetitions; InputError for other text."""
     try:
-        return tuple(float(word) for word in split_words(",".join(text.split())))
+        return tuple(dict.fromkeys(map(float, split_words(text))))
     except ValueError as error:
         raise InputError(f"--disparity {text}: not numbers: give them with commas, such as 0.3,0.4,0.5") from error
 
@@ -151,13 +133,13 @@ class Evaluation:
     options: EvaluateOptions
     cases: Sequence[Case]
     base: OpenedBase  # see `open`
-    direct: OpenedBase | None  # of the method direct-ft
+    direct: OpenedBase | None  # for the method direct-ft
     network: ResidualNet | None
-    inpainter: Inpainter | None  # of the method inpaint2d
+    inpainter: Inpainter | None  # for the method inpaint2d
     renderer: Renderer
     gauges: Gauges
     config: dict[str, Any]  # everything that determines the renders, ready for JSON, without paths
-    metrics: dict[str, str]  # for each wanted metric, who measures it, or why it is not run
+    metrics: dict[str, str]  # for each wanted metric the package that measures it, or why the metric is not run
 
     def open(self, loaded: LoadedCase) -> OpenedBase:
         """The base of a case: a network, or else the case's depth or points; InputError if it has neither."""
@@ -170,43 +152,61 @@ class Evaluation:
         return FillContext(prediction.gaussians, prediction.camera, *fill, precision=self.options.base.precision)
 
 
-def open_evaluation(options: EvaluateOptions) -> Evaluation:
+def open_evaluation(options: EvaluateOptions, more_metrics: Sequence[str] = ()) -> Evaluation:
     """Check the options and load what all images share; a base's networks are loaded with the first image.
 
-    InputError if an option, the dataset, weights or a package cannot be used.
+    `more_metrics` are measured besides the options' metrics. InputError if an option, the dataset, weights or a
+    package cannot be used.
     """
     options.check()
-    base, dataset, fill, wanted = options.base, DATASETS[options.dataset], FillOptions(options.residual), options.wanted
-    cases, limit = read_cases(dataset.name, options.root), options.limit
-    if limit is not None and limit < len(cases):  # evenly spaced
-        cases = [cases[(2 * k + 1) * len(cases) // (2 * limit)] for k in range(limit)]
-    every = options.near and options.second_views == "all"
-    cases = [
-        dataclasses.replace(case, seconds=tuple(s for s in case.seconds if every or (options.near and s.near)))
-        for case in cases
-    ]
-    if not cases:
-        raise InputError(f"{options.root}: {dataset.name}: no images: check the folder")
-    if options.near and not any(case.seconds for case in cases):
-        raise InputError(f"{options.root}: {dataset.name}: has no second photos: take --protocol large-view")
-    if not base.network and not any(case.depth or case.points for case in cases):
-        problem = "has no depth of any kind, which --base rgbd needs"
-        raise InputError(f"{options.root}: {dataset.name}: {problem}: take {', '.join(NETWORKS)}")
-    network, direct, features, inpainter = fill.load(), None, None, None
+    base, cases = options.base, _cases_of(options)
+    network, direct, features, inpainter = FillOptions(options.residual).load(), None, None, None
     if "inpaint2d" in options.methods:
         inpainter = get_inpainter(options.inpainter, InpainterOptions(device=options.device.type))
     if options.direct_ft is not None:
         direct = open_base(dataclasses.replace(base, checkpoint=options.direct_ft))
-    if options.features is not None and "distance" in wanted:
+    if options.features is not None:
         features = load_features("squeezenet", options.features)
+    named = [*(DEFAULT_METRICS[options.protocol] if options.metrics is None else options.metrics), *more_metrics]
+    wanted = tuple(name for name in METRICS if name in named)
     published = [name for name in wanted if name in DEFINITIONS]
     metrics, states = open_metrics(published, options.device.type, options.download)
     states = dict.fromkeys(wanted, OWN) | states
     if "distance" in wanted:
-        states["distance"] = "not run: weights: give SqueezeNet's with --features FILE"
+        states["distance"] = f"{NOT_RUN}: weights: give SqueezeNet's with --features FILE"
         if options.features is not None:
             states["distance"] = f"{OWN}, weights {weights_digest(options.features)[:16]}"
     renderer = get_renderer(base.device)
+    config = _configuration(options, cases, inpainter, renderer)
+    gauges = Gauges(wanted, metrics, features)
+    return Evaluation(
+        options, cases, open_base(options.opened), direct, network, inpainter, renderer, gauges, config, states
+    )
+
+
+def _cases_of(options: EvaluateOptions) -> list[Case]:
+    """The cases to evaluate, with the second views to compare; InputError if the dataset does not fit the options."""
+    where = f"{options.root}: {options.dataset}"
+    cases, limit = read_cases(options.dataset, options.root), options.limit
+    if limit is not None and limit < len(cases):  # evenly spaced
+        cases = [cases[(2 * k + 1) * len(cases) // (2 * limit)] for k in range(limit)]
+    if not options.near:
+        cases = [dataclasses.replace(case, seconds=()) for case in cases]
+    elif options.second_views == "nearest":
+        cases = [dataclasses.replace(case, seconds=tuple(s for s in case.seconds if s.near)) for case in cases]
+    if options.near and not any(case.seconds for case in cases):
+        raise InputError(f"{where}: has no second photos: take --protocol large-view")
+    if not options.base.network and not any(case.depth or case.points for case in cases):
+        problem = "has neither depth maps nor points, which --base rgbd needs"
+        raise InputError(f"{where}: {problem}: take {', '.join(NETWORKS)}")
+    return cases
+
+
+def _configuration(
+    options: EvaluateOptions, cases: Sequence[Case], inpainter: Inpainter | None, renderer: Renderer
+) -> dict[str, Any]:
+    """Everything that determines the renders, ready for JSON, without paths."""
+    base, dataset, fill = options.base, DATASETS[options.dataset], FillOptions(options.residual)
     precision = str(pick_dtype(base.precision, device_of(renderer))).removeprefix("torch.")
     config: dict[str, Any] = {
         "kind": "evaluate",
@@ -214,7 +214,7 @@ def open_evaluation(options: EvaluateOptions) -> Evaluation:
         "dataset": dataset.name,
         "title": dataset.title,
         "terms": dataset.terms,
-        "images": {"count": len(cases), "limit": limit, "names": digest_of([case.name for case in cases])},
+        "images": {"count": len(cases), "limit": options.limit, "names": digest_of([case.name for case in cases])},
         "protocol": options.protocol,
         "side": options.max_side,
         "disparities": None if options.near else list(options.disparities),
@@ -226,7 +226,7 @@ def open_evaluation(options: EvaluateOptions) -> Evaluation:
             "weights": weights_digests(base.files),
             "precision": base.precision,
         },
-        "device": device_of(renderer).type,  # where renderer, residual and the base's network run
+        "device": device_of(renderer).type,  # of the renderer, the residual and the base's network
         "methods": list(options.methods),
         "residual": {
             "weights": "seeds" if fill.file is None else "shipped" if options.residual is None else "given",
@@ -238,10 +238,7 @@ def open_evaluation(options: EvaluateOptions) -> Evaluation:
     if inpainter is not None:
         weights = {name: weights_digest(file) for name, file in inpainter.files.items()}
         config["inpainter"] = {"name": inpainter.name, "version": inpainter.version, "weights": weights}
-    gauges = Gauges(wanted, metrics, features)
-    return Evaluation(
-        options, cases, open_base(options.opened), direct, network, inpainter, renderer, gauges, config, states
-    )
+    return config
 
 
 def evaluate(options: EvaluateOptions, output: Path, reporter: Reporter, html: bool = False) -> str:
@@ -253,22 +250,28 @@ def evaluate(options: EvaluateOptions, output: Path, reporter: Reporter, html: b
     """
     if html:
         check_matplotlib("--html")
-    evaluation = open_evaluation(options)
-    _log_missing(evaluation, reporter)
-    about = {"versions": versions(), "machine": hardware(options.device)}
+    earlier = earlier_metrics(output)
+    evaluation = open_evaluation(options, earlier)
+    for name, state in evaluation.metrics.items():
+        if state.startswith(NOT_RUN):
+            if name in earlier:
+                raise InputError(f"{output}: holds the metric {name}, which cannot be measured now: {state}")
+            reporter.log(f"{name}: {state}")
+    if evaluation.gauges.published:
+        reporter.log(NOTICE)
+    about = {"versions": versions(), "machine": hardware(options.device), "metrics": evaluation.metrics}
     with results_folder(output, (ROWS, WORST, BEST, *FILES, *([REPORT] if html else [])), alone=True):
 
-        def measure(index: int, case: Case, metrics: Sequence[str]) -> tuple[list[Row], list[Path]]:
-            rows, pictures = measure_case(case, evaluation, metrics)
-            for remark in (row.value for row in rows if row.metric == REMARK):
+        def measure(index: int, case: Case) -> tuple[list[Row], list[Path]]:
+            rows, pictures = measure_case(case, evaluation)
+            for remark in dict.fromkeys(row.value for row in rows if row.metric == REMARK):
                 reporter.log(f"{case.name}: {remark}")
             files = [image_file(output, index, case.name, f".{name}.webp") for name in pictures]
             for file, picture in zip(files, pictures.values(), strict=True):
                 save_picture(picture, file)
             return rows, files
 
-        shared = evaluation.config, about, options.root, reporter, evaluation.metrics
-        run = measure_images(evaluation.cases, measure, output, *shared)
+        run = measure_images(evaluation.cases, measure, output, evaluation.config, about, options.root, reporter)
         if run is None:
             return "stopped"
         write_tables(make_tables([run]), output, suffix=run.label_suffix)
@@ -278,29 +281,15 @@ def evaluate(options: EvaluateOptions, output: Path, reporter: Reporter, html: b
         write_rows(run.rows, output / ROWS)
     count, problems = len(run.measured), len(run.problems)
     more = f", {problems} passed over" if problems else ""
-    for line in plain(figures_table(run, run.rows)):
+    for line in plain(means_table(run, run.rows)):
         reporter.log(line)
     reporter.log(f"{run.title}: {counted(count, 'image')}{more} -> {output}")
     reporter.result({"folder": output, "images": count + problems, "measured": count})
     return "complete"
 
 
-def _log_missing(evaluation: Evaluation, reporter: Reporter) -> None:
-    """Log why metrics are not run, and pyiqa's licence if it is used."""
-    reasons: dict[str, list[str]] = {}
-    for name, state in evaluation.metrics.items():
-        if state.startswith(NOT_RUN):
-            reasons.setdefault(state, []).append(name)
-    for state, names in reasons.items():
-        reporter.log(f"{', '.join(names)}: {state}")
-    if evaluation.gauges.published:
-        reporter.log(NOTICE)
-
-
-def measure_case(
-    case: Case, evaluation: Evaluation, metrics: Sequence[str] = ()
-) -> tuple[list[Row], dict[str, Tensor]]:
-    """Measure an image: its rows, which include `metrics`, and images [H, W, 3], see `measure_views`, and the photo.
+def measure_case(case: Case, evaluation: Evaluation) -> tuple[list[Row], dict[str, Tensor]]:
+    """Measure an image: its rows, and images [H, W, 3]: the photo, and the views of `measure_views`.
 
     InputError if a file is missing or cannot be used; BaseError if the base would fail for every image.
     """
@@ -309,28 +298,27 @@ def measure_case(
     if options.near and not case.seconds:
         raise InputError(f"{case.name}: has no second photo")
     prediction = evaluation.open(loaded).predict(loaded.full)[0]
-    alignment = _align(loaded, prediction, evaluation, not options.base.network) if options.near else None
+    alignment = _align(loaded, prediction, evaluation) if options.near else None
     if alignment:
-        lenses = loaded.camera, prediction.camera, alignment.scale
-        views = [view._replace(camera=to_base(view.camera, *lenses)) for view in loaded.seconds]
+        frames = loaded.camera, prediction.camera, alignment.scale
+        views = [view._replace(camera=to_base(view.camera, *frames)) for view in loaded.seconds]
     else:
         views = large_views(prediction, options.disparities, options.max_side)
 
     @cache
     def direct_ft() -> tuple[Gaussians, float]:
-        """The Gaussians of direct FT, and the factor by which camera positions are multiplied for their unit."""
+        """The Gaussians of direct FT, and the factor that converts camera positions to the unit of these Gaussians."""
         assert evaluation.direct is not None
         other = evaluation.direct.predict(loaded.full)[0]
         if alignment is None:
             return other.gaussians, 1.0
-        return other.gaussians, alignment.scale / _align(loaded, other, evaluation, False).scale
+        return other.gaussians, alignment.scale / _align(loaded, other, evaluation).scale
 
     context = evaluation.context(prediction)
     method = partial(make_method, context=context, inpainter=evaluation.inpainter, direct_ft=direct_ft)
     methods = {name: partial(method, name) for name in options.methods}
     image = Row(str(evaluation.config["title"]), case.name, "", "", "", "", None)
-    gauges = dataclasses.replace(evaluation.gauges, metrics=metrics)
-    rows, pictures = measure_views(image, context, views, methods, gauges)
+    rows, pictures = measure_views(image, context, views, methods, evaluation.gauges)
     facts = {
         "width": loaded.photo.width,
         "height": loaded.photo.height,
@@ -340,17 +328,16 @@ def measure_case(
         **{f"alignment_{name}": value for name, value in (dataclasses.asdict(alignment) if alignment else {}).items()},
     }
     known = [image._replace(metric=metric, value=value) for metric, value in facts.items()]
-    for lack in loaded.lacks:
-        remark = f"without one of its second photos: {from_root(lack, options.root)}"
-        known.append(image._replace(metric=REMARK, value=remark))
     return [*known, *rows], pictures | {INPUT: loaded.photo.rgb}
 
 
 @torch.no_grad()
-def _align(loaded: LoadedCase, prediction: BasePrediction, evaluation: Evaluation, is_truth: bool) -> Alignment:
+def _align(loaded: LoadedCase, prediction: BasePrediction, evaluation: Evaluation) -> Alignment:
     """Find the scale between base and dataset, from the base's depth at the photo's own camera."""
+    if not evaluation.options.base.network:  # the base is the dataset's own depth
+        return Alignment(1.0, 0, 0.0, "same")
     view = evaluation.renderer.render(prediction.gaussians, prediction.camera)
-    return align(loaded.case, view.depth, ~hole_mask(view.alpha), base_is_truth=is_truth)
+    return align(loaded.case, view.depth, ~hole_mask(view.alpha))
 
 
 def merge_tables(folders: Sequence[Path], output: Path, reporter: Reporter, html: bool = False) -> None:

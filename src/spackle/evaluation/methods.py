@@ -55,20 +55,21 @@ def make_method(
     inpainter: Inpainter | None = None,
     direct_ft: Callable[[], tuple[Gaussians, float]] | None = None,
 ) -> Fill:
-    """Make the function by which a method of `METHODS` fills the views of a photo's base.
+    """Make the function that fills the views of a photo's base by a method of `METHODS`.
 
     Args:
-        name: see `METHODS`.
-        cameras: of all views of a setting, because a method may complete them together.
+        name: a name in `METHODS`.
+        cameras: of all views of a setting, because a method may complete all views together.
         context: the base, and what fills the holes of its views.
         inpainter: for inpaint2d.
-        direct_ft: for direct-ft; the fine-tuned base's Gaussians, and the factor for camera positions in their unit.
+        direct_ft: for direct-ft: the fine-tuned base's Gaussians, and the factor that converts camera positions to the
+            unit of these Gaussians.
     """
     context = context.placed
     guard = context.photo_guard() if name in ("spackle", "seeds", "dense") else None
 
     def on_top(aux_of: Callable[[Camera, Rendering], Gaussians]) -> Fill:
-        """A method that renders the base and the aux Gaussians of `aux_of` together."""
+        """A method that renders the base together with the aux Gaussians from `aux_of`."""
 
         def fill(camera: Camera, before: Rendering) -> MethodView:
             aux = aux_of(camera, before)

@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import io
-import math
 import socket
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -20,6 +19,7 @@ from torch import Tensor
 
 from spackle.errors import reason_in_a_line
 from spackle.evaluation.rows import load_data
+from spackle.evaluation.table import NOT_RUN
 from spackle.filters import blurred, greatest_around
 from spackle.training.losses import hole_psnr
 
@@ -27,16 +27,16 @@ OWN = "own"
 NOTICE = "pyiqa: PolyForm Noncommercial licence 1.0.0; several of the networks that it fetches are for research only"
 NOT_INSTALLED = "pyiqa is not installed: pip install 'spackle-nvs[eval]'"
 WINDOW, SIGMA = 11, 1.5  # SSIM's window, in pixels (Wang et al. 2004)
-GREY = torch.tensor([0.299, 0.587, 0.114])
-INNER = 7  # pixels; sharpness uses pixels of a mask whose surrounding square of this side lies in the mask
 C1, C2 = 0.01**2, 0.03**2  # SSIM's constants K1 = 0.01, K2 = 0.03, for values in 0..1
+GREY = torch.tensor([0.299, 0.587, 0.114])
+INNER = 7  # side in pixels of the square around a pixel that must lie in the mask, for sharpness
 
 Metric = Callable[[Tensor, Tensor | None], float]  # from (image, truth), each [H, W, 3] sRGB 0..1, to a score
 
 
 @dataclasses.dataclass(frozen=True)
-class Figure:
-    """A metric of a view."""
+class MetricFacts:
+    """The description of a metric."""
 
     title: str  # with an arrow for the better direction
     definition: str  # the exact definition, for captions
@@ -49,26 +49,18 @@ class Figure:
         return f"{value:.{self.digits}f}"
 
 
-METRICS = {name: Figure(**facts) for name, facts in load_data("metrics.json").items()}
-DEFINITIONS = {name: figure for name, figure in METRICS.items() if figure.options is not None}  # pyiqa's metrics
+METRICS = {name: MetricFacts(**facts) for name, facts in load_data("metrics.json").items()}
+DEFINITIONS = {name: facts for name, facts in METRICS.items() if facts.options is not None}  # pyiqa's metrics
 DEFAULT_METRICS = {
-    "large-view": [name for name, figure in METRICS.items() if not figure.truth],
-    "near-view": [name for name, figure in METRICS.items() if figure.truth],
+    "large-view": [name for name, facts in METRICS.items() if not facts.truth],
+    "near-view": [name for name, facts in METRICS.items() if facts.truth],
 }
 
 
-def metric_name(figure: str) -> str | None:
-    """The metric of a figure such as "psnr", "psnr_hole" or "psnr_outside"; None for counts and shares."""
-    name = figure.partition("_")[0]
+def metric_name(column: str) -> str | None:
+    """The metric of a column such as "psnr", "psnr_hole" or "psnr_outside"; None for counts and shares."""
+    name = column.partition("_")[0]
     return name if name in METRICS else None
-
-
-def reduction(before: float, after: float) -> float:
-    """1 − after / before: the relative decrease of the HAR (paper, eq. 11); NaN if there was no hole.
-
-    The paper (tab:controlled_disocclusion) and we compute it from a dataset's mean HAR.
-    """
-    return 1 - after / before if before > 0 else math.nan
 
 
 def psnr(image: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
@@ -80,7 +72,7 @@ def psnr(image: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
 def sharpness(image: Tensor, truth: Tensor, mask: Tensor) -> float:
     """Ratio of the mean gradient magnitude in grey to the truth's: 1 is as sharp as the truth, 0 has no detail.
 
-    It is measured inside `mask` [H, W], at least 3 pixels from its border; NaN if there is no such pixel. `image` and
+    Counts pixels inside `mask` [H, W], at least 3 pixels from the mask's border; NaN if no pixel counts. `image` and
     `truth` are [H, W, 3] sRGB 0..1.
     """
     inner = ~greatest_around(~mask, INNER // 2)
@@ -91,8 +83,8 @@ def sharpness(image: Tensor, truth: Tensor, mask: Tensor) -> float:
 def ssim_average(similarity: Tensor, mask: Tensor | None = None) -> float:
     """Average a map of structural similarity (Wang et al. 2004); 1 is equal, higher is better.
 
-    Without a mask, pixels count whose window lies within the image, as published. With a mask, all of its pixels count,
-    also at the image's border, where much of a hole is.
+    Without a mask, pixels count if their window lies within the image, as published. With a mask, all pixels of the
+    mask count, also at the image's border, because much of a hole is at the border.
 
     Args:
         similarity: [H, W, 3], from `ssim_map`.
@@ -119,7 +111,6 @@ def ssim_map(image: Tensor, truth: Tensor) -> Tensor:
 
 
 def _blur(image: Tensor) -> Tensor:
-    """Blur [H, W, 3] with the window; the image is mirrored at its border, and border pixels are repeated."""
     reach = WINDOW // 2
     wide = np.pad(image.numpy(), ((reach, reach), (reach, reach), (0, 0)), "symmetric")
     return blurred(torch.from_numpy(wide), SIGMA)[reach:-reach, reach:-reach]
@@ -134,7 +125,7 @@ def open_metrics(names: Sequence[str], device: str, download: bool) -> tuple[dic
         download: let pyiqa download missing weights; if False, its network access is blocked while it loads.
 
     Returns:
-        The metrics that were loaded; and for each name pyiqa's version, or the reason why it is "not run".
+        The metrics that were loaded; and for each name pyiqa's version, or the reason why the metric is "not run".
     """
     metrics: dict[str, Metric] = {}
     states: dict[str, str] = {}
@@ -146,24 +137,22 @@ def open_metrics(names: Sequence[str], device: str, download: bool) -> tuple[dic
     except Exception as error:  # pyiqa needs torchvision, which may not match the installed torch
         absent = isinstance(error, ModuleNotFoundError) and error.name == "pyiqa"
         why = NOT_INSTALLED if absent else f"pyiqa cannot be imported: {reason_in_a_line(error)}"
-        return metrics, dict.fromkeys(names, f"not run: {why}")
+        return metrics, dict.fromkeys(names, f"{NOT_RUN}: {why}")
     for name in names:
-        attempts: list[str] = []
         try:
-            with _quiet(), contextlib.nullcontext() if download else _off_the_network(attempts):
-                options: dict[str, Any] = DEFINITIONS[name].options or {}
-                metrics[name] = _measure_by(pyiqa.create_metric(name, device=torch.device(device), **options))
-                states[name] = f"pyiqa {getattr(pyiqa, '__version__', 'unknown')}"
+            with _quiet(), contextlib.nullcontext() if download else _off_the_network():
+                network = pyiqa.create_metric(name, device=torch.device(device), **(DEFINITIONS[name].options or {}))
+            metrics[name], states[name] = _measure_by(network), f"pyiqa {pyiqa.__version__}"
         except Exception as error:  # a foreign package may raise anything; the report gets one line
             why = f"pyiqa cannot load it: {reason_in_a_line(error)}"
-            if attempts:
-                why = "weights: not on this machine (--download-metrics lets pyiqa fetch them)"
-            states[name] = f"not run: {why}"
+            if not download:
+                why += " (--download-metrics lets pyiqa fetch missing weights)"
+            states[name] = f"{NOT_RUN}: {why}"
     return metrics, states
 
 
 def _measure_by(network: Callable[..., Any]) -> Metric:
-    """Make a metric of a pyiqa network; it returns one number, which may be NaN."""
+    """Make a metric of a pyiqa network, which returns one number, possibly NaN."""
 
     def measure(picture: Tensor, truth: Tensor | None = None) -> float:
         images = [image.clamp(0, 1).permute(2, 0, 1)[None].float() for image in (picture, truth) if image is not None]
@@ -184,13 +173,12 @@ def _quiet() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _off_the_network(attempts: list[str]) -> Iterator[None]:
-    """Block lookups of host names, with which every download begins, and record them in `attempts`."""
+def _off_the_network() -> Iterator[None]:
+    """Block lookups of host names, with which every download begins."""
     lookup = socket.getaddrinfo
 
-    def refuse(host: Any, *rest: Any, **more: Any) -> Any:
-        attempts.append(str(host))
-        raise OSError("no download without leave")
+    def refuse(*given: Any, **more: Any) -> Any:
+        raise OSError("weights are not on this machine")
 
     socket.getaddrinfo = refuse
     try:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -29,7 +28,7 @@ from spackle.progress import Reporter
 
 WORST, BEST = "worst.png", "best.png"
 SHEET_CELL, SHEET_FONT, CASES = 320, 14, 6  # pixels, pixels, rows of a contact sheet
-# Images are ranked by the first of these metrics that was measured for a method.
+# Images are ranked by the first of these metrics that the method has.
 ORDER = {"near-view": ("distance", "lpips", "psnr_hole"), "large-view": ("clipiqa", "musiq", "har", "har_before")}
 NAMES = {"psnr_hole": "PSNR in the hole ↑", "har": "HAR ↓", "har_before": "the base's HAR ↓"}
 LARGE_SIDE = 960  # the most pixels on a stored picture's longer side
@@ -40,8 +39,8 @@ UP = ("psnr_hole", "clipiqa", "musiq")  # metrics of `ORDER` for which higher is
 CAPTIONS = "figures.tex"
 DPI, WIDTH = 400, 5.5  # dots per inch, and the paper's text width in inches
 POINTS = 7  # font size
-MOST_BOXES, BOX = 2, 0.22  # boxes in a picture at most; side of a box over the longer side
-LEAST_SCORE = 0.02  # the least product of the shares of hole and seen pixels in a box
+MOST_BOXES, BOX = 2, 0.22  # the most boxes in a picture; side of a box over the picture's longer side
+LEAST_SCORE = 0.02  # the least product of the shares of hole pixels and other pixels in a box
 
 Boxes = Sequence[tuple[float, float, float, float]]  # left, top, right, bottom, as fractions of the picture
 
@@ -103,24 +102,18 @@ def _as_wide(picture: Image.Image, width: int) -> Image.Image:
     return picture.resize((width, round(width * picture.height / picture.width)), Image.Resampling.LANCZOS)
 
 
-# --- what an evaluation keeps
+# --- the pictures of an evaluation
 
 
 def save_picture(picture: Tensor, path: Path) -> None:
-    """Write [H, W, 3] sRGB 0..1 as WebP, reduced to `LARGE_SIDE` if it is larger."""
+    """Write [H, W, 3] sRGB 0..1 as WebP, with a longer side of at most `LARGE_SIDE` pixels."""
+    image = Image.fromarray(to_bytes(thumbnail(picture, LARGE_SIDE)).numpy())
     with atomic_path(path) as temporary:
-        temporary.write_bytes(encode(Image.fromarray(to_bytes(thumbnail(picture, LARGE_SIDE)).numpy())))
-
-
-def encode(image: Image.Image) -> bytes:
-    """Encode an image as WebP; the same image gives the same bytes."""
-    file = io.BytesIO()
-    image.save(file, format="WEBP", quality=QUALITY, method=4)
-    return file.getvalue()
+        image.save(temporary, format="WEBP", quality=QUALITY, method=4)
 
 
 def kept_pictures(run: Run, folder: Path, image: str) -> dict[str, Path]:
-    """The stored pictures of an image, by method name; then "truth", "input" and "hole"."""
+    """The stored pictures of an image: by each method, then "truth", "input" and "hole"."""
     files = {name: image_file(folder, run.images.index(image), image, f".{name}.webp") for name in (*METHODS, *OTHERS)}
     return {name: path for name, path in files.items() if path.is_file()}
 
@@ -149,7 +142,7 @@ def rank(run: Run) -> Ranking | None:
 
 
 def write_sheets(run: Run, folder: Path) -> None:
-    """Write best.png and worst.png: six images by each method, and the truth; nothing if nothing was measured."""
+    """Write best.png and worst.png: six images by each method, and the truth. Writes nothing without a ranking."""
     ranking = rank(run)
     if ranking is None:
         return
@@ -199,13 +192,13 @@ TITLES = {INPUT: "Input", HOLE: "Occluded regions", "direct-ft": "Direct FT"}
 def make_figures(folders: Sequence[Path], rows: int, output: Path, reporter: Reporter) -> None:
     """Draw figures from large-view evaluations as PDF and PNG, and write their captions for LaTeX.
 
-    An image is shown by its view with the largest hole. A figure has at most `rows` images, but at least one per run.
+    Each image appears as its view with the largest hole. A figure has at most `rows` images, but at least one per run.
 
     Raises:
         InputError: a folder has no results, or no large-view evaluation has its pictures.
     """
-    runs = [(run, folder) for run, folder in ((load_run(folder), folder) for folder in folders) if not run.timed]
-    runs = [(run, folder) for run, folder in runs if not run.near]
+    runs = [(load_run(folder), folder) for folder in folders]
+    runs = [(run, folder) for run, folder in runs if not run.timed and not run.near]
     made = {}
     for figure in FIGURES:
         having = [(run, folder) for run, folder in runs if figure.needs in run.methods]
@@ -213,9 +206,8 @@ def make_figures(folders: Sequence[Path], rows: int, output: Path, reporter: Rep
             made[figure.name] = drawn
     if not made:
         raise InputError(f"{folders[0]}: nothing to draw: give folders of `spackle evaluate` with --disparity 0.6")
-    for figure in FIGURES:
-        if figure.name not in made:
-            reporter.log(f"no figure {figure.name}: no large-view run has pictures of {figure.needs}")
+    for name in [figure.name for figure in FIGURES if figure.name not in made]:
+        reporter.log(f"no figure {name}: no large-view run has its pictures")
     files = [f"{name}.{end}" for name in made for end in ("pdf", "png")]
     with results_folder(output, (*files, CAPTIONS), alone=True):
         for name, (image, _) in made.items():
@@ -227,7 +219,7 @@ def make_figures(folders: Sequence[Path], rows: int, output: Path, reporter: Rep
 
 
 def _draw(figure: PaperFigure, runs: Sequence[tuple[Run, Path]], most: int) -> tuple[Image.Image, str] | None:
-    """Draw a figure; returns it and its LaTeX, None if no image has all pictures."""
+    """Draw a figure; returns the picture and its LaTeX, or None if no image has all pictures."""
     columns = [name for name in figure.columns if name in (INPUT, HOLE) or any(name in run.methods for run, _ in runs)]
     rows = []
     for run, folder in runs:
@@ -247,7 +239,7 @@ def _draw(figure: PaperFigure, runs: Sequence[tuple[Run, Path]], most: int) -> t
 
 
 def _cell(run: Run, image: str, name: str, pictures: dict[str, Image.Image], figure: PaperFigure) -> Cell:
-    """A picture with its marks: boxes around holes for the base, the share of added Gaussians for methods."""
+    """A picture with marks: boxes around holes for the base, the share of added Gaussians for methods."""
     if name == HOLE:  # framed, because it may be white on a white page
         width, height = pictures[name].size
         ImageDraw.Draw(pictures[name]).rectangle((0, 0, width - 1, height - 1), outline="grey")
@@ -261,7 +253,7 @@ def _cell(run: Run, image: str, name: str, pictures: dict[str, Image.Image], fig
 
 
 def hole_boxes(hole: Image.Image) -> Boxes:
-    """Disjoint boxes where hole pixels (white) and seen pixels mix most evenly."""
+    """Disjoint boxes in which hole pixels (white) and other pixels mix most evenly."""
     mask = torch.from_numpy(np.asarray(hole.convert("L")) > 127).float()
     height, width = mask.shape
     side = min(round(BOX * max(mask.shape)), *mask.shape)

@@ -35,22 +35,20 @@ class Gauges:
     """The metrics to measure, besides holes and counts."""
 
     metrics: Sequence[str]  # names in `METRICS`
-    published: Mapping[str, Metric]  # those of pyiqa that were loaded
+    published: Mapping[str, Metric]  # pyiqa's metrics that were loaded
     features: FeatureNet | None  # for the metric "distance"
 
     def measure(self, rgb: Tensor, truth: Tensor | None, hole: Tensor) -> Iterator[tuple[str, float | str]]:
         """Measure an image [H, W, 3]; yields names and values. A metric that fails gives NaN and a remark.
 
-        Metrics that need a truth are left out if there is none; `hole` [H, W] is the base's hole.
+        Without a truth, metrics that need a truth are left out; `hole` [H, W] is the base's hole.
         """
         places: dict[str, Tensor | None] = {"": None, "_hole": hole, "_outside": ~hole}
         for name in self.metrics:
-            if METRICS[name].truth and truth is None:
-                continue
-            if name in self.published:
+            if name in self.published and not (METRICS[name].truth and truth is None):
                 try:
                     yield name, self.published[name](rgb, truth if METRICS[name].truth else None)
-                except Exception as error:  # a foreign package may fail on an unusual image; the report names it
+                except Exception as error:  # a foreign package may fail on an unusual image; the report names the error
                     yield name, math.nan
                     yield REMARK, f"{name} failed: {reason_in_a_line(error)}"
             elif truth is not None and name == "psnr":
@@ -63,11 +61,11 @@ class Gauges:
 
 
 def large_views(prediction: BasePrediction, disparities: Sequence[float], side: int) -> list[Viewpoint]:
-    """The views of the paper's controlled rendering (section 4.1), which states disparities but not the views.
+    """The views of the paper's controlled rendering (section 4.1): the two ends of the `swipe` path at each disparity.
 
-    Here they are the two ends of the `swipe` path at each disparity m: the eye moves sideways by m · ‖(W/f, H/f)‖ ·
-    z_near, once to the left and once to the right, and looks at the focus point. The lens is the photo's; the long side
-    is at most `side`, and both sides are even, as the paper's counts of dense grids imply.
+    At disparity m the camera moves sideways by m · ‖(W/f, H/f)‖ · z_near, once to the left and once to the right, and
+    looks at the focus point; the paper does not say so. Intrinsics are the photo's. The long side is at most `side`,
+    and both sides are even, as the paper's counts of dense grids imply.
 
     Raises:
         InputError: no Gaussian is in front of the camera, or there is no path with such a disparity.
@@ -86,7 +84,7 @@ def large_views(prediction: BasePrediction, disparities: Sequence[float], side: 
 
 @dataclasses.dataclass(frozen=True)
 class Alignment:
-    """The scale between the base's and the dataset's unit of length."""
+    """The ratio of the base's unit of length to the dataset's."""
 
     scale: float  # z_dataset = scale · z_base
     pixels: int  # pixels with known depth that were compared; 0 if the source is "bounds" or "same"
@@ -94,37 +92,31 @@ class Alignment:
     source: Literal["depth", "points", "bounds", "same"]
 
 
-def align(case: Case, z_base: Tensor, seen: Tensor, *, base_is_truth: bool = False) -> Alignment:
+def align(case: Case, z_base: Tensor, seen: Tensor) -> Alignment:
     """Find the scale as the median of z_dataset / z_base over the pixels where both are known.
 
-    The dataset's depth map is used; without one its points; without points its bounds. A metric base and a metric
-    dataset are aligned too, because a network's metres are rarely exact. Only a base that was made from the dataset's
-    own depth needs no scale.
+    The dataset's depth map is used; without a map its points; without points its bounds. A metric base and a metric
+    dataset are aligned too, because a network's metres are rarely exact.
 
     Args:
         case: the case, in the dataset's unit.
         z_base: [H, W] the base's depth at the input camera, at any size with the photo's aspect ratio.
-        seen: [H, W] bool, where that depth is valid.
-        base_is_truth: whether the base is the dataset's own depth map, lifted.
+        seen: [H, W] bool, the pixels where that depth is valid.
 
     Raises:
         InputError: no depth of the case is known, or too little of it where the base's depth is valid.
     """
-    if base_is_truth:
-        return Alignment(1.0, 0, 0.0, "same")
     seen = seen & torch.isfinite(z_base) & (z_base > 0)
-    if case.depth is not None and (alignment := _of_ratios(_depth_ratios(case.depth(), z_base, seen), "depth")):
-        return alignment
-    if case.points is not None and (
-        alignment := _of_ratios(_point_ratios(case, case.points(), z_base, seen), "points")
-    ):
-        return alignment
+    if case.depth is not None and (found := _of_ratios(_depth_ratios(case.depth(), z_base, seen), "depth")):
+        return found
+    if case.points is not None and (found := _of_ratios(_point_ratios(case, case.points(), z_base, seen), "points")):
+        return found
     if case.bounds is not None and seen.any():
         return _of_bounds(case.bounds, z_base[seen])
-    sources = {"depth map": case.depth, "points": case.points, "bounds": case.bounds}
-    has = ", ".join(name for name, value in sources.items() if value is not None)
-    reason = f"its {has} and the base's depth share under {MIN_PIXELS} pixels" if has else "none of its depth is known"
-    raise InputError(f"{case.name}: {reason}: the base's scale cannot be found, leave its second views out")
+    raise InputError(
+        f"{case.name}: the base's scale cannot be found: the dataset's depth is unknown, or the dataset's and the "
+        f"base's depth share under {MIN_PIXELS} pixels: take --protocol large-view"
+    )
 
 
 def to_base(view: Camera, photo: Camera, base: Camera, scale: float) -> Camera:
@@ -132,8 +124,8 @@ def to_base(view: Camera, photo: Camera, base: Camera, scale: float) -> Camera:
 
     If the base's principal point or focal length differs from the dataset's, the base's scene is sheared: the same
     pixel at the same depth is another point. The returned camera projects the base's points to the pixels where `view`
-    projects the dataset's. This is exact if the two cameras look in the same direction, as in rectified pairs, or if
-    the lenses agree; otherwise it is exact up to a skew of the pixel grid.
+    projects the dataset's. The result is exact if the two cameras look in the same direction, as in rectified pairs, or
+    have the same intrinsics; otherwise it is exact up to a skew of the pixel grid.
 
     Args:
         view: in the input photo's frame and the dataset's unit.
@@ -149,20 +141,20 @@ def to_base(view: Camera, photo: Camera, base: Camera, scale: float) -> Camera:
     shear = torch.linalg.solve(photo.K.double(), base.resized(photo.width, photo.height).K.double())
     # RQ decomposition: an upper triangular matrix with positive diagonal times a rotation.
     flip = torch.eye(3, dtype=torch.float64).flip(0)
-    rotation, lens = torch.linalg.qr((flip @ (K @ pose[:3, :3] @ shear)).T)
-    lens, rotation = flip @ lens.T @ flip, flip @ rotation.T
-    signs = torch.diag(lens.diagonal().sign())
-    lens, rotation = lens @ signs, signs @ rotation
+    rotation, intrinsics = torch.linalg.qr((flip @ (K @ pose[:3, :3] @ shear)).T)
+    intrinsics, rotation = flip @ intrinsics.T @ flip, flip @ rotation.T
+    signs = torch.diag(intrinsics.diagonal().sign())
+    intrinsics, rotation = intrinsics @ signs, signs @ rotation
     matrix = torch.eye(4, dtype=torch.float64)
     matrix[:3, :3] = rotation
-    matrix[:3, 3] = torch.linalg.solve(lens, K @ pose[:3, 3]) / scale
-    lens = lens / lens[2, 2]
-    lens[0, 1] = 0.0  # drop the skew, which a Camera cannot have
-    return Camera(lens.to(view.K), matrix.to(view.world_to_camera), view.width, view.height)
+    matrix[:3, 3] = torch.linalg.solve(intrinsics, K @ pose[:3, 3]) / scale
+    intrinsics = intrinsics / intrinsics[2, 2]
+    intrinsics[0, 1] = 0.0  # drop the skew, which a Camera cannot have
+    return Camera(intrinsics.to(view.K), matrix.to(view.world_to_camera), view.width, view.height)
 
 
 def _depth_ratios(known: DepthMap, z_base: Tensor, seen: Tensor) -> Tensor:
-    """Ratios of dataset depth to base depth; each pixel of the base uses the map's nearest pixel."""
+    """Ratios of dataset depth to base depth; each pixel of the base uses the nearest pixel of the depth map."""
     (height, width), (rows, columns) = z_base.shape, known.depth.shape
     y = ((torch.arange(height) + 0.5) * rows / height).long()
     x = ((torch.arange(width) + 0.5) * columns / width).long()
@@ -171,7 +163,7 @@ def _depth_ratios(known: DepthMap, z_base: Tensor, seen: Tensor) -> Tensor:
 
 
 def _point_ratios(case: Case, points: Points, z_base: Tensor, seen: Tensor) -> Tensor:
-    """Ratios of dataset depth to base depth; each point uses the base's pixel that it falls into."""
+    """Ratios of dataset depth to base depth; each point uses the pixel of the base in which the point lies."""
     assert case.camera is not None  # the points are in its pixels
     height, width = z_base.shape
     cells = (points.uv * torch.tensor([width / case.camera.width, height / case.camera.height])).floor().long()
@@ -208,10 +200,9 @@ def measure_views(
 
     Returns:
         Rows, with dataset and image as in the row `image`; and pictures [H, W, 3] of the view with the largest hole:
-        the hole (white), the view by each method, and last the truth, if there is one.
+        the hole (white), the view by each method, and the truth, if known.
     """
     rows: list[Row] = []
-    remarks: dict[Row, None] = {}
     pictures: dict[str, Tensor] = {}
     largest, base = -1.0, len(context.base)
     for setting in dict.fromkeys(view.setting for view in viewpoints):
@@ -225,20 +216,18 @@ def measure_views(
             for name, fill in fills.items():
                 rgb, alpha, aux = fill(view.camera, before)
                 shown[name] = rgb = rgb.cpu()  # the truth is on the CPU
-                figures: list[tuple[str, float | str]] = [("har_before", share)]
+                numbers: list[tuple[str, float | str]] = [("har_before", share)]
                 if alpha is not None:  # HAR after completion, and coverage (paper, eqs. 11 and 10)
-                    open_share = hole_area_ratio(alpha)
-                    figures += [("har", open_share), ("coverage", 1 - open_share)]
+                    left = hole_area_ratio(alpha)
+                    numbers += [("har", left), ("coverage", 1 - left)]
                 if aux is not None:
                     count = len(aux)
-                    figures += [("aux", count), ("aux_share", count / base), ("merged", base + count)]
-                    figures.append(("hole_cells", share * hole.numel() / CELL**2))
+                    numbers += [("aux", count), ("aux_share", count / base), ("merged", base + count)]
+                    numbers.append(("hole_cells", share * hole.numel() / CELL**2))
                 row = image._replace(setting=setting, view=view.name, method=name)
-                for metric, value in (*figures, *gauges.measure(rgb, truth, hole)):
-                    if isinstance(value, str):
-                        remarks[image._replace(metric=metric, value=value)] = None
-                    else:
-                        rows.append(row._replace(metric=metric, value=value if math.isfinite(value) else None))
+                for metric, value in (*numbers, *gauges.measure(rgb, truth, hole)):
+                    finite = isinstance(value, str) or math.isfinite(value)
+                    rows.append(row._replace(metric=metric, value=value if finite else None))
             if share > largest:
                 largest, pictures = share, shown | ({} if truth is None else {TRUTH: truth})
-    return [*rows, *remarks], pictures
+    return rows, pictures

@@ -1,4 +1,4 @@
-"""Measured figures and the paper's own ones (paper.json), one row per figure; tables are pivots of rows."""
+"""Measured numbers and the paper's (paper.json), one row per number; tables are pivots of rows."""
 
 from __future__ import annotations
 
@@ -12,14 +12,6 @@ from typing import Any, NamedTuple
 
 NEAR = "near"  # the setting of views at the viewpoints of second photos
 PROBLEM, REMARK, NOTE = "problem", "remark", "note."  # metrics with text as values; "note." precedes a note's name
-# The stages of a view, in order, with their names in the tables.
-STAGES = {
-    "base": "photo to base Gaussians",
-    "view": "render of the view",
-    "photo": "render at the photo's camera",
-    "completion": "mask, seeds, network, placing",
-    "rerender": "re-render with the aux Gaussians",
-}
 BASE_PATH = ("base", "view")  # the stages from the photo to a view without Spackle
 EXTRA = ("photo", "completion", "rerender")  # the stages that Spackle adds
 Value = float | str | None
@@ -38,7 +30,7 @@ DISPARITIES = tuple(map(float, SETTINGS))
 
 
 class Row(NamedTuple):
-    """One figure. If it describes an image as a whole, setting, view and method are empty."""
+    """One number. If it describes an image as a whole, setting, view and method are empty."""
 
     dataset: str  # its name in the paper's tables
     image: str
@@ -46,14 +38,14 @@ class Row(NamedTuple):
     view: str
     method: str
     metric: str
-    value: Value  # None if the figure is not finite; text for a problem, a remark or a note
+    value: Value  # None if the number is not finite; text for a problem, a remark or a note
 
 
 class Mean(NamedTuple):
-    """The mean of a figure over views."""
+    """The mean of a metric over views."""
 
-    value: float | None  # None if no view has a finite figure
-    bad: int  # the number of views that were left out because their figure is not finite
+    value: float | None  # None if no view has a finite value
+    bad: int  # the number of views without a finite value
 
 
 def mean(values: Sequence[Value], of: Callable[[list[float]], float] = statistics.fmean) -> Mean:
@@ -112,7 +104,7 @@ class Run:
 
     @property
     def problems(self) -> dict[str, str]:
-        """Images without figures, each with the reason."""
+        """Images that could not be measured, each with the reason."""
         return {row.image: str(row.value) for row in self.rows if row.metric == PROBLEM}
 
     @property
@@ -122,24 +114,17 @@ class Run:
 
     @property
     def measured(self) -> list[str]:
-        """The images with figures."""
         problems = self.problems
         return [image for image in self.images if image not in problems]
 
-    def numbers(self, metric: str, setting: str = "", method: str = "") -> list[float]:
-        """A figure's finite values at a setting by a method; by default, of figures of whole images."""
-        key = setting, method, metric
-        values = (row.value for row in self.rows if (row.setting, row.method, row.metric) == key)
-        return [float(value) for value in values if value is not None]
-
     def by_image(self, metric: str, method: str) -> dict[str, float]:
-        """The mean of a figure over each image's views; images without a finite value are left out."""
+        """The mean of a metric over each image's views; images without a finite value are left out."""
         rows = (row for row in self.rows if (row.method, row.metric) == (method, metric))
         means = {image: mean(values).value for (image,), values in pivot(rows, "image").items()}
         return {image: value for image, value in means.items() if value is not None}
 
     def largest_hole(self, image: str) -> tuple[str, str]:
-        """Setting and view of the image's view with the largest hole in the base, which is the one that is shown."""
+        """Setting and view of the image's view with the largest hole in the base; pictures show this view."""
         holes = [row for row in self.rows if (row.image, row.metric) == (image, "har_before")]
         shown = max(holes, key=lambda row: float(row.value or 0))
         return shown.setting, shown.view
@@ -147,7 +132,7 @@ class Run:
 
 @functools.cache
 def paper_rows(label: str) -> tuple[Row, ...]:
-    """The figures of a table of the paper; percent become shares. Tables with a single setting are of near views."""
+    """The numbers of a table of the paper, with shares instead of percent."""
     rows = []
     for table in (table for table in PAPER["tables"] if table["label"] == label):
         metrics = table["metrics"]
@@ -161,16 +146,5 @@ def paper_rows(label: str) -> tuple[Row, ...]:
 
 
 def setting_title(setting: str, pattern: str = "{}") -> str:
-    """The title of a setting: "S1" for "0.3", or by a pattern such as "{}: disparity {}"; of others "disparity 0.6"."""
+    """The title of a setting: "S1" for "0.3", or a pattern filled with "S1" and "0.3"; "disparity 0.6" for others."""
     return pattern.format(f"S{SETTINGS.index(setting) + 1}", setting) if setting in SETTINGS else f"disparity {setting}"
-
-
-def datasets(runs: Sequence[Run]) -> list[str]:
-    """Titles of datasets: all of the paper's in its order, then others that were run."""
-    return list(dict.fromkeys([*IMAGES, *(run.title for run in runs)]))
-
-
-def images_text(run: Run) -> str:
-    """The number of measured images, such as "12/23" if the paper has 23."""
-    wanted = IMAGES.get(run.title)
-    return f"{len(run.measured)}" if wanted is None else f"{len(run.measured)}/{wanted}"

@@ -7,7 +7,7 @@ import itertools
 import re
 from collections.abc import Callable, Sequence
 
-EMPTY = ""  # a cell without a figure
+EMPTY = ""  # a cell without a number
 NOT_RUN = "not run"  # the name of an empty row
 BEST = "**"  # put around the text of the best cell
 Cells = Sequence[str]
@@ -21,18 +21,18 @@ class Table:
     label: str  # the label in the paper's source, if the paper has the table
     title: str
     caption: str
-    heads: Sequence[tuple[str, str]]  # for each column: its group's head, or "", and its own head
+    heads: Sequence[tuple[str, str]]  # for each column the head of its group ("" without a group) and the column's head
     bodies: Sequence[Sequence[Cells]]  # groups of rows, with a rule between groups
-    words: int = 1  # text columns on the left; of two, the first has a group's name in its first row
+    words: int = 1  # text columns on the left; with two or more, the first one shows a group's name in its first row
     notes: Sequence[str] = ()
 
 
 def _ratio(value: float) -> str:
-    """Four decimals, as in the paper; a value that would round to zero keeps two significant digits."""
+    """Four decimals, as in the paper; two significant digits if the value would round to zero."""
     return f"{value:.1e}" if 0 < value < 0.5e-4 else f"{value:.4f}"
 
 
-# Overheads below 10 % have two decimals, because the question is whether they are below 1 %.
+# Overheads below 10 % have two decimals: readers ask whether the overhead is below 1 %.
 TEXTS: dict[str, Text] = {
     "count": "{:,.0f}".format,
     "hundredths": "{:,.2f}".format,
@@ -47,7 +47,7 @@ TEXTS: dict[str, Text] = {
 
 
 def mark_best(values: Sequence[float | None], texts: Sequence[str], lower: bool) -> list[str]:
-    """Make the text of the best value bold, and all equal texts; none if all texts are equal."""
+    """Make the text of the best value bold, and texts equal to this text; no text is bold if all texts are equal."""
     known = {value: text for value, text in zip(values, texts, strict=True) if value is not None}
     if len(set(known.values())) < 2:
         return list(texts)
@@ -56,12 +56,12 @@ def mark_best(values: Sequence[float | None], texts: Sequence[str], lower: bool)
 
 
 def groups(heads: Sequence[tuple[str, str]]) -> list[tuple[str, int]]:
-    """The upper heads: for each, its name and the number of its columns."""
+    """The name of each upper head and the number of columns below it."""
     return [(name, len(list(columns))) for name, columns in itertools.groupby(heads, key=lambda head: head[0])]
 
 
 def markdown(table: Table) -> str:
-    """A table in Markdown; a group's head is put before the heads of its columns."""
+    """A table in Markdown; a column's head begins with the head of its group."""
     head = [f"{group}: {column}" if group else column for group, column in table.heads]
     lines = [f"**{table.title}** (`{table.label}`). {table.caption}", "", _row(head), "|" + "---|" * len(head)]
     lines += [_row(cells) for rows in table.bodies for cells in rows]
@@ -70,7 +70,7 @@ def markdown(table: Table) -> str:
 
 
 def plain(table: Table) -> list[str]:
-    """A table as lines for a terminal, without title and notes; text is left-aligned, figures right-aligned."""
+    """A table as lines for a terminal, without title and notes; numbers are right-aligned."""
     heads = [head.replace("\N{NO-BREAK SPACE}", " ") for _, head in table.heads]
     rows = [heads, *(cells for rows in table.bodies for cells in rows)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
@@ -89,7 +89,7 @@ SIGNS = {
     "±": r"$\pm$", "−": "$-$", "–": "--", "…": r"\ldots{}", "σ": r"$\sigma$", "<": "$<$", ">": "$>$", "≥": r"$\geq$",
     "†": r"$\dagger$", "‡": r"$\ddagger$", "→": r"$\to$",
 }  # fmt: skip
-LAST_LETTER = "\u017f"  # the last letter that pdfLaTeX's usual fonts have; names of scenes may have others
+LAST_LETTER = "\u017f"  # the last letter in pdfLaTeX's usual fonts; names of scenes may have other letters
 
 
 def tex(text: str) -> str:
@@ -99,7 +99,7 @@ def tex(text: str) -> str:
 
 
 def latex(table: Table, suffix: str = "") -> str:
-    """A table in LaTeX, for booktabs and graphicx; its label ends with `suffix`, and notes are below the table."""
+    """A table in LaTeX, for booktabs and graphicx; the label ends with `suffix`, and notes are below the table."""
     shape = "l" * table.words + "c" * (len(table.heads) - table.words)
     lines = [r"\begin{table*}[t]", r"\centering", r"\scriptsize", rf"\caption{{{tex(table.caption)}}}"]
     lines += [

@@ -1,6 +1,6 @@
-"""The paper's six tables and two more, as pivots of rows; the paper's figures have rows beside ours.
+"""The paper's six tables and one more, as pivots of rows; the paper's numbers are rows beside ours.
 
-tables.json has their titles, captions, columns (group, title, metric, number format) and notes.
+tables.json has titles, captions, columns (group, title, metric, number format) and notes.
 """
 
 from __future__ import annotations
@@ -10,23 +10,19 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from spackle.errors import InputError
 from spackle.evaluation.methods import METHODS, RESIDUAL
-from spackle.evaluation.metrics import DEFINITIONS, METRICS, NOTICE, metric_name, reduction
+from spackle.evaluation.metrics import METRICS, metric_name
 from spackle.evaluation.rows import (
     IMAGES,
     NEAR,
     NOTE,
     PAPER,
     SETTINGS,
-    STAGES,
     Mean,
     Row,
     Run,
-    datasets,
-    images_text,
+    Value,
     load_data,
     mean,
     paper_rows,
@@ -40,18 +36,17 @@ FILES = ("tables.md", "tables.tex")
 TABLES, NOTES = load_data("tables.json").values()
 EFFICIENCY, EXPANDED = "tab:efficiency_gaussian_overhead", "tab:expanded_efficiency_gaussian_overhead"
 FROM_PAPER = " (paper)"  # the end of the method's name in the paper's rows
-# Relative decreases: the reference method (None: the row's own), its figure, and the row's figure that replaces it.
-REDUCED: dict[str, tuple[str | None, str, str]] = {
-    "reduction": (None, "har_before", "har"),
-    "aux_reduction": ("dense", "aux", "aux"),
+# Derived metrics: a metric over another one of the same method, or of the named method.
+RATIOS = {
+    "aux_per_cell": ("aux", "hole_cells", ""),
+    "reduction": ("har", "har_before", ""),  # 1 minus this ratio (paper, eq. 11)
+    "aux_reduction": ("aux", "aux", "dense"),  # 1 minus this ratio
 }
-TIMES = ("base_ms", "spackle_ms", "overhead", "base_fps", "spackle_fps")  # their medians are shown, means of others
-ODD = {("Middlebury", "0.3", metric) for metric in ("base_ms", "overhead", "base_fps")}  # contradictory figures
-ODD_MARK, RECIPE_MARK = NOTES["odd"][0], NOTES["recipe"][0]
+TIMES = ("base_ms", "spackle_ms", "overhead", "base_fps", "spackle_fps")  # tables show medians of these
 
 
 class Column(NamedTuple):
-    """A column: a figure at a setting."""
+    """A column: a metric at a setting."""
 
     group: str
     title: str
@@ -61,31 +56,39 @@ class Column(NamedTuple):
     lower: bool | None = None  # whether lower is better; None: do not mark the best
 
 
+Layout = tuple[list[tuple[str, str]], list[list[Cells]]]  # heads and bodies of a `Table`
+Values = Mapping[tuple[str, ...], Sequence[Value]]  # by method, setting and metric
+
+
 def make_tables(runs: Sequence[Run], *, whole: bool = False) -> list[Table]:
-    """Make the tables for which the runs have figures; with `whole`, all of the paper's.
+    """Make the tables for which the runs have numbers; with `whole`, all of the paper's.
 
     Counts of Gaussians and times come from benchmarks; for datasets without one, counts come from their large views.
 
     Raises:
         InputError: two runs have the same dataset, protocol and base, or runs differ in their disparities.
     """
-    seen: set[tuple[str, str, str]] = set()
-    for run in runs:
-        key = str(run.config["protocol"]), run.title, run.base
-        if key in seen:
-            raise InputError(f"two results for {run.title} under {key[0]} with the base {run.base}: give one of them")
-        seen.add(key)
-    of = {"near": [run for run in runs if run.near], "bench": [run for run in runs if run.timed]}
+    keys = [(str(run.config["protocol"]), run.title, run.base) for run in runs]
+    for protocol, title, base in keys:
+        if keys.count((protocol, title, base)) > 1:
+            raise InputError(f"two results for {title} under {protocol} with the base {base}: give one of them")
+    of = {"near": [run for run in runs if run.near]}
     of["large"] = [run for run in runs if not run.near and not run.timed]
-    of["cost"] = of["bench"] + [run for run in of["large"] if ("bench", run.title, run.base) not in seen]
-    settings = next((run.settings for run in runs if not run.near), SETTINGS)
-    if any(run.settings != settings for run in runs if not run.near):
+    of["cost"] = [run for run in runs if run.timed]
+    of["cost"] += [run for run in of["large"] if ("bench", run.title, run.base) not in keys]
+    disparities = {tuple(run.settings) for run in runs if not run.near} or {tuple(SETTINGS)}
+    if len(disparities) > 1:
         raise InputError("the results have different disparities: make a separate table for each")
-    return [
-        _table(label, spec, of[spec["of"]], [NEAR] if spec["of"] == "near" else settings)
-        for label, spec in TABLES.items()
-        if of[spec["of"]] or (whole and paper_rows(label))
-    ]
+    layouts = {"tab:near_view": _near_table, EFFICIENCY: _overhead_table, EXPANDED: _expanded_table}
+    tables = []
+    for label, spec in TABLES.items():
+        chosen = of[spec["of"]]
+        if chosen or (whole and paper_rows(label)):
+            settings = [NEAR] if spec["of"] == "near" else [*next(iter(disparities))]
+            heads, bodies = layouts.get(label, _dataset_table)(label, spec, chosen, settings)
+            notes = [*dict.fromkeys(_notes(spec, chosen)), *spec.get("notes", ())]
+            tables.append(Table(label, spec["title"], spec["caption"], heads, bodies, spec.get("words", 2), notes))
+    return tables
 
 
 def write_tables(tables: Sequence[Table], folder: Path, files: Sequence[str] = FILES, suffix: str = "") -> None:
@@ -96,59 +99,34 @@ def write_tables(tables: Sequence[Table], folder: Path, files: Sequence[str] = F
 
 
 def method_name(run: Run, method: str, title: str = "") -> str:
-    """The name of a method's row: with the base's name, and a mark unless the residual's weights were given."""
+    """The name of a method's row: with the base's name, and ‡ unless the residual's weights were given."""
     if method == "base":
         return f"{run.base} alone"
-    mark = RECIPE_MARK if method in RESIDUAL and run.config["residual"]["weights"] != "given" else ""
+    mark = NOTES["recipe"][0] if method in RESIDUAL and run.config["residual"]["weights"] != "given" else ""
     return f"{title or METHODS[method].title}{mark} ({run.base})"
 
 
-def _table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], settings: Sequence[str]) -> Table:
-    makers = {
-        "tab:near_view": _near_table,
-        EFFICIENCY: _overhead_table,
-        EXPANDED: _expanded_table,
-        "tab:efficiency_stages": _stages_table,
-    }
-    heads, bodies = makers.get(label, _dataset_table)(label, spec, runs, settings)
-    cells = "".join(cell for rows in bodies for cells in rows for cell in cells)
-    notes = list(dict.fromkeys([*_notes(spec, runs, cells), *(_timed_notes(runs) if spec["of"] != "near" else [])]))
-    return Table(label, spec["title"], spec["caption"], heads, bodies, words=spec.get("words", 2), notes=notes)
-
-
-# --- notes
-
-
-def _notes(spec: Mapping[str, Any], runs: Sequence[Run], cells: str) -> list[str]:
-    """Notes below a table: views, bases, rows, the residual's weights, definitions, reasons for missing figures, and
-    pyiqa's licence.
-    """
-    names = tuple(dict.fromkeys(name for name in (metric_name(column[2]) for column in spec["columns"]) if name))
-    notes = [NOTES["swipe"].format(side=run.config["side"]) for run in runs if not run.near]
-    for kind in dict.fromkeys(run.config["second_views"] for run in runs if run.near):
-        titles = dict.fromkeys(run.title for run in runs if run.config["second_views"] == kind)
-        notes.append(NOTES[kind].format(datasets=", ".join(titles)))
+def _notes(spec: Mapping[str, Any], runs: Sequence[Run]) -> list[str]:
+    """Notes below a table, with repetitions: views, bases, rows, weights, metrics, missing images, times."""
+    names = dict.fromkeys(name for column in spec["columns"] if (name := metric_name(column[2])))
+    rows = {method: spec.get("rows", {}).get(method) for run in runs for method in _row_names(spec, run)}
+    notes = [NOTES[run.config["second_views"] if run.near else "large"].format(**run.config) for run in runs]
     notes += [f"Base {run.base}: {run.config['base']['says']}." for run in runs]
-    called: dict[str, str] = {name: spec.get("rows", {}).get(name) or METHODS[name].title for name in METHODS}
-    shown = dict.fromkeys(name for run in runs for name in run.methods if called[name] in cells)
-    notes += [f"Rows: {'; '.join(f'{called[name]}: {METHODS[name].says}' for name in shown)}."] if shown else []
-    for weights in dict.fromkeys(_weights(run) for run in runs):
-        foreign = not weights.startswith("given")
-        notes.append(NOTES["recipe"].format(residual=weights) if foreign else f"Residual: {weights}.")
-    notes += [f"{METRICS[name].title[:-2]}: {METRICS[name].definition}." for name in names]
-    measured = [(run.title, name, run.about.get("metrics", {}).get(name)) for run in runs for name in names]
-    states = [(title, METRICS[name].title[:-2], state) for title, name, state in measured]
-    for why in dict.fromkeys(why for *_, why in states if str(why).startswith(NOT_RUN)):
-        where, what = (", ".join(dict.fromkeys(one[k] for one in states if one[2] == why)) for k in (0, 1))
-        notes.append(f"{where}: {what} {why}.")
+    said = [f"{title or METHODS[method].title}: {METHODS[method].says}" for method, title in rows.items()]
+    notes += [f"Rows: {'; '.join(said)}."] if said else []
     for run in runs:
-        if passed := list(run.problems):
-            more = f" and {len(passed) - 5} more" if len(passed) > 5 else ""
-            listed = f"{', '.join(passed[:5])}{more}"
-            notes.append(f"{run.title}: {len(passed)} of {len(run.images)} images gave no figures: {listed}.")
-    notes += [NOTES[mark] for mark, sign in (("best", "**"), ("n", "/"), ("odd", ODD_MARK)) if sign in cells]
-    notes += [NOTES["average"]] if "Average" in cells else []
-    return [*notes, f"{NOTICE}."] if any(name in DEFINITIONS for name in names) else notes
+        weights = _weights(run)
+        given = run.config["residual"]["weights"] == "given"
+        notes.append(f"Residual: {weights}." if given else NOTES["recipe"].format(residual=weights))
+    notes += [f"{METRICS[name].title[:-2]}: {METRICS[name].definition}." for name in names]
+    for run in runs:
+        states = {name: str(run.about.get("metrics", {}).get(name)) for name in names}
+        for why in dict.fromkeys(state for state in states.values() if state.startswith(NOT_RUN)):
+            notes.append(f"{', '.join(METRICS[name].title[:-2] for name in names if states[name] == why)} {why}.")
+        if problems := list(run.problems):
+            listed = ", ".join([*problems[:5], *(["…"] if len(problems) > 5 else [])])
+            notes.append(f"{run.title}: {len(problems)} of {len(run.images)} images could not be measured: {listed}.")
+    return notes + [note for run in runs if run.timed for note in _timed_notes(run)]
 
 
 def _weights(run: Run) -> str:
@@ -156,35 +134,28 @@ def _weights(run: Run) -> str:
     residual = run.config["residual"]
     if not residual["sha256"]:
         return "the residual has no weights, its deltas are 0"
-    origin = (
-        "given weights" if residual["weights"] == "given" else "the residual has the weights that ship with Spackle"
-    )
+    given = residual["weights"] == "given"
+    origin = "given weights" if given else "the residual has the weights that ship with Spackle"
     return f"{origin} ({residual['sha256'][:8]})"
 
 
-def _timed_notes(runs: Sequence[Run]) -> list[str]:
-    """Notes on times: machine, method, other load, sizes of the networks."""
-    notes, runs = [], [run for run in runs if run.timed]
-    if cold := [row.image for run in runs for row in run.rows if row.metric == "warm" and not row.value]:
-        notes.append(NOTES["cold"].format(images=", ".join(cold)))
-    if loads := [load for run in runs for load in run.numbers("load")]:
-        notes.append(NOTES["load"].format(median=statistics.median(loads), least=min(loads), most=max(loads)))
-    for run in runs:
-        base, hardware, versions = run.config["base"], run.config["hardware"], run.config["versions"]
-        precision = next((row.value for row in run.rows if row.metric == f"{NOTE}precision"), None)
-        network = f"{run.base}'s network in {precision} on {base['device']}; " if precision else ""
-        if run.config["residual"]["precision"]:
-            network += f"residual in {run.config['residual']['precision']}; "
-        place = f"{hardware['cpu']}, {hardware['cores']} cores, {hardware['threads']} threads"
-        place += f", {hardware['gpu']}" if "gpu" in hardware else ""
-        named = ", ".join(f"{name} {version}" for name, version in versions.items())
-        notes.append(f"Times: {network}renderer and residual on {run.config['device']}. Machine: {place}; {named}.")
-        notes.append(NOTES["runs"].format(**run.config))
-        counted = {name: value / 1e6 for name, value in run.about["parameters"].items()}
-        sizes = {"base": counted["base"], "used": counted["base_used"], "residual": counted["residual"]}
-        sizes |= {"merged": counted["base"] + counted["residual"], "share": 1e8 * counted["share"]}
-        notes.append(NOTES["parameters"].format(**sizes, **PAPER["parameters"]))
-    return notes
+def _timed_notes(run: Run) -> list[str]:
+    """Notes on times: networks, machine, method, and sizes of the networks."""
+    base, residual, hardware = run.config["base"], run.config["residual"], run.config["hardware"]
+    precision = next((row.value for row in run.rows if row.metric == f"{NOTE}precision"), None)
+    network = f"{run.base}'s network in {precision} on {base['device']}; " if precision else ""
+    network += f"residual in {residual['precision']}; " if residual["precision"] else ""
+    machine = [hardware["cpu"], f"{hardware['cores']} cores", f"{hardware['threads']} threads"]
+    machine += [hardware["gpu"]] if "gpu" in hardware else []
+    versions = ", ".join(f"{name} {version}" for name, version in run.config["versions"].items())
+    counted = {name: value / 1e6 for name, value in run.about["parameters"].items()}
+    sizes = {"base": counted["base"], "used": counted["base_used"], "residual": counted["residual"]}
+    sizes |= {"merged": counted["base"] + counted["residual"], "share": 1e8 * counted["share"]}
+    return [
+        f"Times: {network}renderer and residual on {run.config['device']}. Machine: {', '.join(machine)}; {versions}.",
+        NOTES["runs"].format(**run.config),
+        NOTES["parameters"].format(**sizes, **PAPER["parameters"]),
+    ]
 
 
 # --- the pivots
@@ -194,67 +165,64 @@ def _columns(spec: Mapping[str, Any], settings: Iterable[str], over: str = "") -
     """A table's columns at each setting; if the pattern `over` is given, it makes the head of each setting."""
     columns = []
     for setting in settings:
-        for group, title, figure, *text in spec["columns"]:
-            name, group = metric_name(figure), setting_title(setting, over) if over else group
+        for group, title, metric, *text in spec["columns"]:
+            name, group = metric_name(metric), setting_title(setting, over) if over else group
             best = METRICS[name].lower if name and spec.get("best") else None
-            columns.append(
-                Column(group, title, setting, figure, TEXTS[text[0]] if text else METRICS[str(name)].text, best)
-            )
+            write = TEXTS[text[0]] if text else METRICS[str(name)].text
+            columns.append(Column(group, title, setting, metric, write, best))
     return columns
 
 
-def _cells(rows: Iterable[Row], columns: Sequence[Column], methods: Iterable[str]) -> list[list[str]]:
+def _find(values: Values, method: str, setting: str, metric: str) -> Mean | None:
+    """A metric's mean, or the ratio of two means; values of whole images are valid for all methods."""
+    if known := values.get((method, setting, metric)) or values.get(("", "", metric)):
+        return mean(known, statistics.median if metric in TIMES else statistics.fmean)
+    if metric in RATIOS:
+        of, over, other = RATIOS[metric]
+        part, whole = _find(values, method, setting, of), _find(values, other or method, setting, over)
+        if method != other and part and part.value is not None and whole and whole.value:
+            ratio = part.value / whole.value
+            return Mean(1 - ratio if metric.endswith("reduction") else ratio, 0)
+    return None
+
+
+def _text(found: Mean | None, column: Column, method: str) -> str:
+    """A cell: the number, and the count of views without a number; the paper's percentages keep their digits."""
+    if found is None:
+        return EMPTY
+    write = TEXTS["tenths %"] if method.endswith(FROM_PAPER) and column.metric == "overhead" else column.text
+    bad = f"({found.bad} NaN)" if found.bad else ""
+    return f"{EMPTY if found.value is None else write(found.value)} {bad}".strip()
+
+
+def _cells(rows: Iterable[Row], columns: Sequence[Column], methods: Sequence[str]) -> list[list[str]]:
     """A row of texts for each method; the best of a column is marked."""
-    rows = list(rows)
-    values_of, dataset = pivot(rows, "method", "setting", "metric"), rows[0].dataset if rows else ""
-
-    def find(method: str, setting: str, metric: str) -> Mean | None:
-        """A figure, possibly a derived one; figures of whole images are valid for all methods."""
-        if values := values_of.get((method, setting, metric)) or values_of.get(("", "", metric)):
-            return mean(values, statistics.median if metric in TIMES else statistics.fmean)
-        if metric == "aux_per_cell":
-            aux, holes = find(method, setting, "aux"), find(method, setting, "hole_cells")
-            return Mean(aux.value / holes.value, 0) if aux and aux.value and holes and holes.value else None
-        if metric in REDUCED:
-            of, figure, after = REDUCED[metric]
-            base, left = find(of or method, setting, figure), find(method, setting, after)
-            if method != of and base and base.value and left and left.value is not None:
-                return Mean(reduction(base.value, left.value), 0)
-        return None
-
-    def text(figure: Mean | None, column: Column, method: str) -> str:
-        """Write a figure, and after it the number of views without one; the paper's percentages keep their digits."""
-        if figure is None:
-            return EMPTY
-        paper = method.endswith(FROM_PAPER)
-        write = TEXTS["tenths %"] if paper and column.metric == "overhead" else column.text
-        mark = ODD_MARK if paper and (dataset, column.setting, column.metric) in ODD else ""
-        bad = f"({figure.bad} NaN)" if figure.bad else ""
-        return f"{EMPTY if figure.value is None else write(figure.value)}{mark} {bad}".strip()
-
-    texts = []
+    values, texts = pivot(rows, "method", "setting", "metric"), []
     for column in columns:
-        figures = [find(method, column.setting, column.metric) for method in methods]
-        cells = [text(figure, column, method) for figure, method in zip(figures, methods, strict=True)]
-        values = [None if figure is None else figure.value for figure in figures]
-        texts.append(cells if column.lower is None else mark_best(values, cells, column.lower))
+        means = {method: _find(values, method, column.setting, column.metric) for method in methods}
+        cells = [_text(found, column, method) for method, found in means.items()]
+        if column.lower is not None:
+            cells = mark_best([found.value if found else None for found in means.values()], cells, column.lower)
+        texts.append(cells)
     return [list(cells) for cells in zip(*texts, strict=True)]
 
 
-Layout = tuple[list[tuple[str, str]], list[list[Cells]]]  # heads and bodies of a `Table`
+def _row_names(spec: Mapping[str, Any], run: Run) -> dict[str, str]:
+    """The methods of a run that a table shows, with the names of their rows."""
+    if "rows" in spec:
+        return {name: method_name(run, name, title) for name, title in spec["rows"].items() if name in run.methods}
+    having = {row.method for row in run.rows if row.metric == spec["having"]} - {"base"} if "having" in spec else None
+    return {method: method_name(run, method) for method in run.methods if having is None or method in having}
+
+
+def _datasets(runs: Sequence[Run]) -> list[str]:
+    """Titles of datasets: all of the paper's in its order, then others that were run."""
+    return list(dict.fromkeys([*IMAGES, *(run.title for run in runs)]))
 
 
 def grouped(name: str, rows: Sequence[Cells]) -> list[Cells]:
     """Prepend a column with the rows' common name, which only the first row shows."""
     return [(EMPTY if k else name, *cells) for k, cells in enumerate(rows)]
-
-
-def _row_names(spec: Mapping[str, Any], run: Run) -> dict[str, str]:
-    """A run's methods that a table shows (all, those named in it, or those with a certain figure), with their names."""
-    if "rows" in spec:
-        return {name: method_name(run, name, title) for name, title in spec["rows"].items() if name in run.methods}
-    having = {row.method for row in run.rows if row.metric == spec["having"]} - {"base"} if "having" in spec else None
-    return {method: method_name(run, method) for method in run.methods if having is None or method in having}
 
 
 def _rows(
@@ -263,9 +231,9 @@ def _rows(
     """A dataset's rows, ours (or "not run") and then the paper's: name, number of images, and cells of each."""
     rows = []
     for run in (run for run in runs if run.title == dataset):
-        names = _row_names(spec, run)
-        lines = _cells(run.rows, columns, names)
-        rows += [(name, images_text(run), cells) for name, cells in zip(names.values(), lines, strict=True)]
+        names, of = _row_names(spec, run), f"/{IMAGES[dataset]}" if dataset in IMAGES else ""
+        lines = _cells(run.rows, columns, list(names))
+        rows += [(name, f"{len(run.measured)}{of}", cells) for name, cells in zip(names.values(), lines, strict=True)]
     rows = rows or [(NOT_RUN, EMPTY, [EMPTY] * len(columns))]
     papers = [row for row in paper_rows(label) if row.dataset == dataset]
     for name in dict.fromkeys(row.method for row in papers):
@@ -278,13 +246,13 @@ def _dataset_table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], set
     """A table with rows for each dataset's methods and the paper's; its columns are repeated for each disparity."""
     columns = _columns(spec, settings, "" if settings == [NEAR] else "{}: disparity {}")
     heads = [("", "Dataset"), ("", "Method"), ("", "n"), *((column.group, column.title) for column in columns)]
-    of = {dataset: _rows(label, spec, runs, dataset, columns) for dataset in datasets(runs)}
+    of = {dataset: _rows(label, spec, runs, dataset, columns) for dataset in _datasets(runs)}
     return heads, [grouped(dataset, [(name, n, *cells) for name, n, cells in rows]) for dataset, rows in of.items()]
 
 
 def _near_table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], settings: Sequence[str]) -> Layout:
     """A table with a row for each method, and columns for each dataset."""
-    columns, titles = _columns(spec, settings), datasets(runs)
+    columns, titles = _columns(spec, settings), _datasets(runs)
     ours: dict[str, dict[str, list[str]]] = {}
     theirs: dict[str, dict[str, list[str]]] = {}
     for title in titles:
@@ -302,15 +270,15 @@ def _near_table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], settin
 def _overhead_table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], settings: Sequence[str]) -> Layout:
     """A table of added Gaussians for each dataset and on average, and of medians of the datasets' median times."""
     counts = _columns(spec, settings, "{}: disparity {}")
-    of = {dataset: _rows(EXPANDED, spec, runs, dataset, counts) for dataset in datasets(runs)}
+    of = {dataset: _rows(EXPANDED, spec, runs, dataset, counts) for dataset in _datasets(runs)}
     bodies = [grouped(dataset, [(name, *cells) for name, _, cells in rows]) for dataset, rows in of.items()]
-    pools: dict[str, list[Row]] = {}  # for each row's name, the figures of all datasets
+    pools: dict[str, list[Row]] = {}  # for each row's name, the numbers of all datasets
     for run in runs:
-        for method, name in _row_names(spec, run).items():
-            for (by, setting, metric), values in pivot(run.rows, "method", "setting", "metric").items():
-                if by == method:
-                    over = mean(values, statistics.median if metric in TIMES else statistics.fmean)
-                    pools.setdefault(name, []).append(Row("", run.title, setting, "", name, metric, over.value))
+        values, names = pivot(run.rows, "method", "setting", "metric"), _row_names(spec, run)
+        for method, setting, metric in values:
+            if method in names and (found := _find(values, method, setting, metric)):
+                row = Row("", run.title, setting, "", names[method], metric, found.value)
+                pools.setdefault(names[method], []).append(row)
     for row in paper_rows(label):
         pools.setdefault(row.method, []).append(row)
     bodies.append(grouped("Average", [(name, *_cells(pool, counts, [name])[0]) for name, pool in pools.items()]))
@@ -326,29 +294,10 @@ def _overhead_table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], se
 def _expanded_table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], settings: Sequence[str]) -> Layout:
     """A table of counts, times and rates, with a row for each setting and method."""
     bodies = []
-    for dataset in datasets(runs):
+    for dataset in _datasets(runs):
         rows: list[Cells] = []
         for setting in settings:
             lines = _rows(label, spec, runs, dataset, _columns(spec, [setting]))
             rows += [(setting_title(setting), name, *cells, n) for name, n, cells in lines]
         bodies.append(grouped(dataset, rows))
     return [("", head) for head in ("Dataset", "Setting", "From", *(c[1] for c in spec["columns"]), "n")], bodies
-
-
-def _stages_table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], settings: Sequence[str]) -> Layout:
-    """A table of the stages' times, with a row for each setting and method, and columns for stages and sums."""
-    stages = [("", title, f"{name}_stage_ms", "tenths") for name, title in STAGES.items()]
-    columns = [(title, metric, TEXTS[text]) for _, title, metric, text in (*stages, *spec["columns"])]
-    bodies = []
-    for run in runs:
-        rows: list[Cells] = []
-        for setting in settings:
-            for method in run.methods:
-                cells = []
-                for _, metric, text in columns:
-                    numbers = run.numbers(metric, setting, method)
-                    low, middle, high = map(text, np.quantile(numbers, [0.25, 0.5, 0.75]))
-                    cells.append(f"{middle} [{low}, {high}]")
-                rows.append((setting_title(setting), method_name(run, method), *cells))
-        bodies.append(grouped(run.title, rows))
-    return [("", head) for head in ("Dataset", "Setting", "From", *(title for title, *_ in columns))], bodies

@@ -1,4 +1,4 @@
-"""Read COLMAP models, text or binary: cameras, points, and which points each photo sees."""
+"""Read COLMAP models, text or binary: cameras, points, and the points that each photo sees."""
 
 from __future__ import annotations
 
@@ -13,17 +13,16 @@ import torch
 from numpy.typing import NDArray
 
 from spackle.camera import Camera
-from spackle.errors import InputError, reading, shown
+from spackle.errors import InputError, reading
 from spackle.evaluation.case import Points
-from spackle.files import check_file
 from spackle.formats.camera_files import LARGEST, checked_camera
 from spackle.gaussians import quat_to_matrix
 
 Array = NDArray[Any]
 
 # Lenses that distort the corner by more than this fraction of the long side are refused. Smaller distortion is ignored:
-# it is nearly the same in photos from close viewpoints, so 1 % of it changes the shift between corresponding pixels by
-# a few percent only.
+# photos from close viewpoints share it, so a distortion of 1 % changes the shift between corresponding pixels by only a
+# few percent.
 MAX_BEND = 0.02
 MAX_ERROR_PX = 2.0  # the greatest accepted reprojection error of a point, a mean over its photos
 # Name and number of parameters by COLMAP's model id; other models are too far from a pinhole.
@@ -71,13 +70,11 @@ def read_model(folder: Path) -> Model:
     Raises:
         InputError: a file is missing or damaged, or a lens is too far from a pinhole.
     """
-    damaged = "not a COLMAP file ({reason}): it is damaged or cut off"
+    damaged = "not a COLMAP file ({reason}): the file is missing, damaged or cut off"
     binary = (folder / "cameras.bin").is_file()
     cameras, images, points = (
         folder / f"{name}.{'bin' if binary else 'txt'}" for name in ("cameras", "images", "points3D")
     )
-    for path in (cameras, images, points):
-        check_file(path, "part of a COLMAP model")
     with reading(points, damaged):
         records = _points_bin(points) if binary else _points_txt(points)
         table = np.array([point for point in records if point[4] <= MAX_ERROR_PX], np.float64).reshape(-1, 5)
@@ -92,21 +89,19 @@ def read_model(folder: Path) -> Model:
 
 
 def _lens(path: Path, model: int | str, width: int, height: int, parameters: list[float]) -> Camera:
-    known = next((m for key, m in MODELS.items() if model in (key, m[0])), None)
-    if known is None or len(parameters) != known[1]:
+    name, count = next((m for key, m in MODELS.items() if model in (key, m[0])), ("", -1))
+    if len(parameters) != count:
         raise InputError(f"{path}: lens model {model} is not a pinhole: undistort the photos with COLMAP first")
-    single = known[0].startswith(("SIMPLE", "RADIAL"))
+    single = name.startswith(("SIMPLE", "RADIAL"))
     fx, fy, cx, cy, *bend = [parameters[0], *parameters] if single else parameters
     K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
     lens = checked_camera(K, torch.eye(4, dtype=torch.float64), width, height, f"{path}: a lens", dtype=torch.float64)
-    if not np.isfinite(bend).all():
-        raise InputError(f"{path}: a lens of {shown(parameters)}: the file is damaged")
     corner = np.array([max(cx, width - cx) / fx, max(cy, height - cy) / fy])
     square = float(corner @ corner)
     # k1, k2 distort radially; p1, p2 shift a point at radius r by at most 3 (|p1| + |p2|) r².
     radial = sum(abs(k) * square ** (n + 1) for n, k in enumerate(bend[:2])) * float(np.hypot(*corner))
     tangential = 3 * sum(map(abs, bend[2:])) * square
-    if (radial + tangential) * max(fx, fy) > MAX_BEND * max(width, height):
+    if not (radial + tangential) * max(fx, fy) <= MAX_BEND * max(width, height):  # also refuses NaN
         raise InputError(f"{path}: this lens bends the corners by over {MAX_BEND:.0%}: undistort the photos first")
     return lens
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import collections
 import dataclasses
-import hashlib
 import itertools
 import math
 from collections.abc import Callable, Iterable, Sequence
@@ -22,8 +20,8 @@ from spackle.errors import InputError
 from spackle.evaluation.case import Case, Points, SecondView
 from spackle.evaluation.datasets.colmap import Model
 
-MAX_NEAR = 3  # at most, second views of a photo that count as near
-BASELINES = (0.05, 0.25)  # of the eyes, over the photo's middle depth; Middlebury's pairs have 0.05 to 0.2
+MAX_NEAR = 3  # the most second views of a photo that count as near
+BASELINES = (0.05, 0.25)  # distance of the cameras over the photo's middle depth; Middlebury's pairs have 0.05 to 0.2
 MAX_TURN = 30.0  # the greatest angle between the optical axes, in degrees
 MIN_SHARED = 0.3  # the least fraction of the photo's points that a near view sees too
 
@@ -35,9 +33,9 @@ class Posed:
     name: str
     photo: Path
     camera: Camera  # in the scene's world, float64
-    depth: float  # middle depth of what it sees; NaN if unknown
-    ids: NDArray[Any] | None = None  # ids of the points that it sees
-    points: Callable[[], Points] | None = None  # their positions in the photo
+    depth: float  # middle depth of the photo's content; NaN if unknown
+    ids: NDArray[Any] | None = None  # ids of the points that the photo sees
+    points: Callable[[], Points] | None = None  # positions of these points in the photo
     bounds: tuple[float, float] | None = None  # nearest and farthest depth
 
 
@@ -64,10 +62,10 @@ def check_two(scene: Path, count: int) -> None:
 
 
 def make_cases(views: Sequence[Posed], wanted: Iterable[int] | None = None) -> list[Case]:
-    """Make cases of photos: all other photos are second views, in the case's frame, with the nearest eye first.
+    """Make cases of photos: all other photos are second views, in the case's frame, with the nearest camera first.
 
-    At most three second views, the nearest that qualify, count as near. Such a view's eye is 5 % to 25 % of the photo's
-    middle depth away, it is turned by at most 30°, and it sees at least 30 % of the photo's points. If points are
+    At most three second views count as near, the nearest that qualify. A view qualifies if its camera is 5 % to 25 % of
+    the photo's middle depth away, is turned by at most 30°, and sees at least 30 % of the photo's points. If points are
     unknown, each camera must instead see the middle of the other's view. A photo may have no near view.
 
     Args:
@@ -77,7 +75,7 @@ def make_cases(views: Sequence[Posed], wanted: Iterable[int] | None = None) -> l
     poses = torch.stack([view.camera.world_to_camera for view in views])
     eyes = torch.stack([view.camera.position for view in views]).numpy()
     axes = poses[:, 2, :3].numpy()
-    lenses = [view.camera.to(dtype=torch.float32) for view in views]
+    cameras = [view.camera.to(dtype=torch.float32) for view in views]
     cases = []
     for index in range(len(views)) if wanted is None else wanted:
         view = views[index]
@@ -87,14 +85,14 @@ def make_cases(views: Sequence[Posed], wanted: Iterable[int] | None = None) -> l
         order = sorted(set(range(len(views))) - {index}, key=lambda k: (float(apart[k]), views[k].name))
         near = set(itertools.islice((k for k in order if fits[k] and _sees_the_same(view, views[k])), MAX_NEAR))
         placed = (poses @ torch.linalg.inv(poses[index])).float()
-        seconds = tuple(SecondView(views[k].name, views[k].photo, _at(lenses[k], placed[k]), k in near) for k in order)
-        camera = _at(lenses[index], torch.eye(4))
+        seconds = tuple(SecondView(views[k].name, views[k].photo, _at(cameras[k], placed[k]), k in near) for k in order)
+        camera = _at(cameras[index], torch.eye(4))
         cases.append(Case(view.name, view.photo, camera, None, view.points, view.bounds, seconds))
     return cases
 
 
-def _at(lens: Camera, world_to_camera: Tensor) -> Camera:
-    return dataclasses.replace(lens, world_to_camera=world_to_camera)
+def _at(camera: Camera, world_to_camera: Tensor) -> Camera:
+    return dataclasses.replace(camera, world_to_camera=world_to_camera)
 
 
 def _sees_the_same(view: Posed, other: Posed) -> bool:
@@ -109,36 +107,22 @@ def _sees_the_same(view: Posed, other: Posed) -> bool:
 
 
 def spread(scenes: Sequence[str], frames: Callable[[str], Sequence[int]], count: int) -> dict[str, list[int]]:
-    """Choose at most `count` frames, spread evenly over the scenes; the same on every machine.
+    """Choose at most `count` frames, spread evenly over the scenes and, within a scene, over its frames.
 
-    The choice depends on names alone. Scenes are taken in the order of their hashed names; scenes named `GROUP/REST`
-    are taken from the groups in turn, so that no group is favoured. With more scenes than frames, each of the first
-    scenes gives one frame. With fewer scenes, all give the same number, or all that they have; within a scene the
-    frames are equally spaced, from a start that depends on the scene's name.
+    Each scene gives an equal share of the frames, or all frames that it has; with more scenes than `count`, evenly
+    spaced scenes give one frame each.
 
     Args:
-        scenes: unique names.
+        scenes: names, in order.
         frames: returns a scene's frames in order; called only for scenes that are used.
-        count: the total number of frames.
 
     Returns:
-        The scenes that are used, in the order of `scenes`, each with its frames in order.
+        The scenes that are used, in order, each with its frames in order.
     """
-    groups: dict[str, list[str]] = {}
-    for scene in sorted(scenes, key=_hash):
-        groups.setdefault(scene.partition("/")[0] if "/" in scene else "", []).append(scene)
-    order = [(turn, _hash(group), scene) for group, names in groups.items() for turn, scene in enumerate(names)]
-    held = {scene: frames(scene) for _, _, scene in sorted(order)[:count]}
-    rounds = range(max(map(len, held.values()), default=0))  # in each round, every scene with frames left gives one
-    turns = (scene for turn in rounds for scene in held if turn < len(held[scene]))
-    shares = collections.Counter(itertools.islice(turns, count))
-    picked: dict[str, list[int]] = {}
-    for scene in (scene for scene in scenes if scene in held):
-        length, share = len(held[scene]), shares[scene]
-        start = _hash(scene) % length / length if share else 0
-        picked[scene] = [held[scene][int((place + start) * length / share)] for place in range(share)]
+    turns = [scenes[k * len(scenes) // count] for k in range(count)]
+    picked = {}
+    for scene in dict.fromkeys(turns):
+        held, share = frames(scene), turns.count(scene)
+        share = min(share, len(held))
+        picked[scene] = [held[(2 * k + 1) * len(held) // (2 * share)] for k in range(share)]
     return picked
-
-
-def _hash(name: str) -> int:
-    return int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big")

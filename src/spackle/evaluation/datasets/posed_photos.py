@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,23 +16,23 @@ from torch import Tensor
 from spackle.bases.depth_map import load_depth, read_text
 from spackle.camera import Camera
 from spackle.errors import InputError, reading
-from spackle.evaluation.case import Case, has_any, photo_files
+from spackle.evaluation.case import Case
 from spackle.evaluation.datasets.colmap import model_folder, read_model
 from spackle.evaluation.datasets.multiview import Posed, check_two, make_cases, posed_by, spread
 from spackle.evaluation.datasets.stereo import HALF_PIXEL
 from spackle.evaluation.rows import IMAGES
+from spackle.files import files_in
 from spackle.formats.camera_files import checked_camera
+from spackle.image import PHOTO_SUFFIXES
 
-ETH3D_MODEL = "dslr_calibration_undistorted"
-LLFF_PHOTOS = ("images_4", "images", "images_8")  # the first that exists is used
-LLFF_BOUNDS = "poses_bounds.npy"
+LLFF_PHOTOS = ("images_4", "images", "images_8")  # the first of these folders with photos is used
 MAX_POSES_BYTES = 1 << 24
 POSE_TOLERANCE = 0.05  # for the rotations of published poses, see `checked_camera`
 MIDDLE_DEPTH_M = 0.8  # objects are held in front of the phone; second views are thus 4 to 20 cm away
 
 
 def _camera(K: Tensor, pose: Tensor, width: int, height: int, where: str) -> Camera:
-    """A float64 camera from `K` and a camera-to-world pose; InputError if the lens or the pose is impossible."""
+    """A float64 camera from `K` and a camera-to-world pose; InputError if K or the pose is impossible."""
     camera = checked_camera(K, pose, width, height, where, dtype=torch.float64, tolerance=POSE_TOLERANCE)
     return dataclasses.replace(camera, world_to_camera=torch.linalg.inv(pose))
 
@@ -49,27 +48,11 @@ def eth3d_cases(scenes: Mapping[str, Path]) -> list[Case]:
     belongs to the distorted photos and is not used. For second views see `make_cases`. The 13 training scenes have the
     paper's 454 images.
     """
-    return [case for scene in scenes.values() for case in _photos_of(scene)]
-
-
-def _photos_of(scene: Path) -> list[Case]:
-    folder = scene / ETH3D_MODEL
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder: unpack the scene's dslr_undistorted archive")
-    model, photos = read_model(folder), []
-    for view in model.views:  # the name includes a folder: dslr_images_undistorted/DSC_0286.JPG
-        places = [scene / "images" / view.name, scene / view.name, scene / "images" / Path(view.name).name]
-        photo = next((place for place in places if place.is_file()), None)
-        if photo is None:
-            why = "no such photo, but the model has it: unpack the scene's dslr_undistorted archive"
-            raise InputError(f"{places[0]}: {why}")
-        photos.append(photo)
-    return make_cases(posed_by(scene, model, photos))
-
-
-def is_eth3d(folder: Path) -> bool:
-    """Whether a folder is a scene of ETH3D."""
-    return has_any(folder, ETH3D_MODEL, "dslr_calibration_jpg", "images/dslr_images_undistorted")
+    cases = []
+    for scene in scenes.values():
+        model = read_model(scene / "dslr_calibration_undistorted")
+        cases += make_cases(posed_by(scene, model, [scene / "images" / view.name for view in model.views]))
+    return cases
 
 
 # --- Tanks and Temples
@@ -78,28 +61,25 @@ def is_eth3d(folder: Path) -> bool:
 def tanks_cases(scenes: Mapping[str, Path]) -> list[Case]:
     """Cases of scenes with `SCENE/images` and `SCENE/sparse/0`, the usual layout for COLMAP and 3D Gaussian splatting.
 
-    `SCENE/sparse` without the 0, and `SCENE/dense/{images,sparse}`, are read too. The lens must be close to a pinhole;
-    `colmap image_undistorter` makes it one. The dataset's own archives have no such models, only `.log` poses without
-    lenses, which are not read. The unit of length is arbitrary.
+    `SCENE/sparse` without the 0, and `SCENE/dense/{images,sparse}`, are read too. The camera must be close to a
+    pinhole; `colmap image_undistorter` makes such cameras. The dataset's own archives have no such models, only `.log`
+    poses without intrinsics, which are not read. The unit of length is arbitrary.
 
-    `spread` takes 512 photos evenly from all scenes, by names alone; second views come from all photos, see
-    `make_cases`. The paper's 331,776 cells correspond to 1920×1080, the size of most scenes' frames. Frames of
-    2048×1080 become 1536×810; the 980×545 photos published with 3D Gaussian splatting keep their size.
+    `spread` takes 512 photos from all scenes; second views come from all photos, see `make_cases`. The paper's 331,776
+    cells correspond to 1920×1080, the size of most scenes' frames. Frames of 2048×1080 become 1536×810; the 980×545
+    photos published with 3D Gaussian splatting keep their size.
     """
     read = {name: _tanks_views(scene) for name, scene in scenes.items()}
     picked = spread(list(scenes), lambda name: range(len(read[name])), IMAGES["Tanks"])
-    return [case for name, views in read.items() for case in make_cases(views, picked.get(name, []))]
+    return [case for name, chosen in picked.items() for case in make_cases(read[name], chosen)]
 
 
 def _tanks_views(scene: Path) -> list[Posed]:
     folder = model_folder(scene)
     model = read_model(folder)
     top = scene / "dense" if "dense" in folder.relative_to(scene).parts else scene
-    photos = [top / "images" / view.name for view in model.views]
-    for photo in photos:
-        if not os.path.isfile(photo):  # False for a name that is too long
-            raise InputError(f"{photo}: no such photo, but {folder} has it: put the scene's photos there")
-    return posed_by(scene, model, photos, [Path(view.name).with_suffix("").as_posix() for view in model.views])
+    names = [Path(view.name).with_suffix("").as_posix() for view in model.views]
+    return posed_by(scene, model, [top / "images" / view.name for view in model.views], names)
 
 
 # --- LLFF
@@ -108,10 +88,10 @@ def _tanks_views(scene: Path) -> list[Posed]:
 def llff_cases(scenes: Mapping[str, Path]) -> list[Case]:
     """Eight scenes with `poses_bounds.npy`, `sparse/0`, or both, and photos in `images_4`, `images` or `images_8`.
 
-    If there is a COLMAP model, from which the poses were made, its cameras and points are used, and the near and far
-    bounds only if it has no points. Photos of the model are matched to files by name, else by order; rows of
-    `poses_bounds.npy` always by order. The unit of length is arbitrary. For second views see `make_cases`; without a
-    model, the middle depth is half way between the bounds in inverse depth.
+    A COLMAP model, from which the dataset's poses were made, gives cameras and points. The near and far bounds are used
+    only if the model has no points, or there is no model; then the middle depth is half way between the bounds in
+    inverse depth. Photos of the model are matched to files by name, else by order; rows of `poses_bounds.npy` always by
+    order. The unit of length is arbitrary. For second views see `make_cases`.
 
     The paper's 190,512 cells correspond to `images_4` (1008×756); `images` (4032×3024) would give 1536×1152.
     """
@@ -119,11 +99,11 @@ def llff_cases(scenes: Mapping[str, Path]) -> list[Case]:
 
 
 def _llff_views(scene: Path) -> list[Posed]:
-    photos = next((files for name in LLFF_PHOTOS if (files := photo_files(scene / name))), None)
-    if photos is None:
-        raise InputError(f"{scene}: no photos: expected them in {', '.join(LLFF_PHOTOS)}")
+    folders = (scene / name for name in LLFF_PHOTOS if (scene / name).is_dir())
+    photos = next((files for folder in folders if (files := files_in(folder, PHOTO_SUFFIXES))), [])
     check_two(scene, len(photos))
-    rows = _read_bounds(scene / LLFF_BOUNDS, len(photos)) if (scene / LLFF_BOUNDS).is_file() else ()
+    path = scene / "poses_bounds.npy"
+    rows = _read_bounds(path, len(photos)) if path.is_file() else ()
     bounds = {photo: (float(row[15]), float(row[16])) for photo, row in zip(photos, rows, strict=False)}
     if (scene / "sparse").is_dir():
         model = read_model(model_folder(scene))
@@ -132,7 +112,7 @@ def _llff_views(scene: Path) -> list[Posed]:
     views = []
     for photo, row in zip(photos, rows, strict=True):  # a scene has one or the other
         near, far = bounds[photo]
-        camera = _camera_of_row(row, f"{scene / LLFF_BOUNDS}: {photo.name}")
+        camera = _camera_of_row(row, f"{path}: {photo.name}")
         middle = 2 / (1 / near + 1 / far)
         views.append(Posed(f"{scene.name}/{photo.stem}", photo, camera, middle, bounds=bounds[photo]))
     return views
@@ -152,14 +132,13 @@ def _read_bounds(path: Path, count: int) -> NDArray[Any]:
 
 
 def _camera_of_row(row: NDArray[Any], where: str) -> Camera:
-    """The camera of a `poses_bounds.npy` row: columns down, right, backwards, eye, (height, width, focal length)."""
+    """The camera of a `poses_bounds.npy` row: columns down, right, backwards, position, (height, width, focal)."""
     matrix = torch.from_numpy(np.asarray(row[:15], np.float64).reshape(3, 5))
-    down, right, backwards, eye, lens = matrix.unbind(1)
-    height, width, focal = (float(number) for number in lens)
+    down, right, backwards, position, (height, width, focal) = matrix.unbind(1)
     pose = torch.eye(4, dtype=torch.float64)
-    pose[:3] = torch.stack([right, down, -backwards, eye], dim=1)
+    pose[:3] = torch.stack([right, down, -backwards, position], dim=1)
     K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float64)
-    return _camera(K, pose, round(width), round(height), where)
+    return _camera(K, pose, round(float(width)), round(float(height)), where)
 
 
 def _match(scene: Path, names: Sequence[str], photos: Sequence[Path]) -> list[Path]:
@@ -186,9 +165,9 @@ def wildrgbd_cases(scenes: Mapping[str, Path]) -> list[Case]:
     `metadata` is JSON with w, h, and K column by column, for pixel centres at integers, as in the dataset's own tool.
     `cam_poses.txt` has a line for each frame: its number and the 16 numbers of camera-to-world, OpenCV convention.
 
-    `spread` takes 512 frames, from the categories in turn; with 512 scenes or more, one from each scene used. Second
-    views come from all frames of the scene, see `make_cases`, which gets 0.8 m as the middle depth. Photos of 640×480
-    or 480×640 keep their size and have the paper's 76,800 cells.
+    `spread` takes 512 frames; with 512 scenes or more, one from each scene used. Second views come from all frames of
+    the scene, see `make_cases`, which gets 0.8 m as the middle depth. Photos of 640×480 or 480×640 keep their size and
+    have the paper's 76,800 cells.
     """
     read: dict[str, list[Posed]] = {}
 
@@ -208,24 +187,19 @@ def category_and_scene(folder: Path) -> str:
 
 
 def _with_depth(case: Case) -> Case:
-    """Add to a case the depth map with its photo's number; InputError if there is none."""
-    at = case.photo.parent.parent / "depth" / case.photo.name
-    if not at.is_file():
-        raise InputError(f"{at}: no such depth map, but {case.photo} is there: unpack the scene again")
+    """Add the depth map with the photo's number to a case."""
     assert case.camera is not None
-    K = case.camera.K
-    return dataclasses.replace(case, depth=lambda: dataclasses.replace(load_depth(at), K=K))
+    path, K = case.photo.parent.parent / "depth" / case.photo.name, case.camera.K
+    return dataclasses.replace(case, depth=lambda: dataclasses.replace(load_depth(path), K=K))
 
 
 def _wildrgbd_views(name: str, scene: Path) -> list[Posed]:
     metadata, poses = scene / "metadata", scene / "cam_poses.txt"
-    metadata = metadata if metadata.is_file() else next(iter(scene.glob("metadata.json")), metadata)
     with reading(metadata, "not the metadata of a scene ({reason}): needs w, h and K of nine numbers"):
         facts = json.loads(read_text(metadata, "description of the camera"))
         width, height = int(facts["w"]), int(facts["h"])
         K = torch.tensor(facts["K"], dtype=torch.float64).reshape(3, 3).T.clone()
         K[:2, 2] += HALF_PIXEL
-        checked_camera(K, torch.eye(4, dtype=torch.float64), width, height, f"{metadata}: the lens")
     with reading(poses, "not a list of poses ({reason}): needs a frame and 16 numbers a line"):
         lines = [line.split() for line in read_text(poses, "list of poses", MAX_POSES_BYTES).splitlines()]
         frames = [(int(line[0]), np.array(line[1:], np.float64).reshape(4, 4)) for line in lines if line]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Mapping
@@ -18,14 +19,11 @@ from torch import Tensor
 from spackle.bases.depth_map import Calibration, DepthMap, load_depth, read_array, read_calibration, read_text
 from spackle.camera import Camera
 from spackle.errors import InputError, reading
-from spackle.evaluation.case import Case, SecondView, has_any, photo_files
-from spackle.files import check_file
-from spackle.image import read_image
+from spackle.evaluation.case import Case, SecondView
+from spackle.files import files_in
+from spackle.image import PHOTO_SUFFIXES, read_image
 
-# Middlebury's and Booster's calibration has (0, 0) in the middle of the first pixel; here it is that pixel's corner.
-# (For Middlebury's smaller sizes the principal point was divided without regard to this, so it is known to half a pixel
-# only; this does not affect the pair, because both cameras are shifted alike.)
-HALF_PIXEL = 0.5
+HALF_PIXEL = 0.5  # Middlebury's and Booster's (0, 0) is the middle of the first pixel; here (0, 0) is its corner
 TRUTHS = ("disp0GT.pfm", "disp0.pfm")  # the names in MiddEval3, and in the 2014 dataset
 # Middlebury's calibration of the Motorcycle at a quarter of its size, as in scikit-image.
 MOTORCYCLE_FOCAL, MOTORCYCLE_CX, MOTORCYCLE_CY = 994.978, 311.193, 254.877
@@ -33,12 +31,11 @@ MOTORCYCLE_DOFFS, MOTORCYCLE_BASELINE = 31.086, 0.193001
 
 
 def _pair(
-    name: str, left: Path, right: Path, lens: Calibration, size: tuple[int, int], depth: Callable[[], DepthMap]
+    name: str, left: Path, right: Path, lens: Calibration, size: tuple[int, int] | None, depth: Callable[[], DepthMap]
 ) -> Case:
-    """A case of the left photo, with the right one as second view; in `lens`, (0, 0) is the first pixel's corner."""
-    for photo in (left, right):
-        if not photo.exists():
-            check_file(photo, "photo")  # raises; unreadable photos are reported when they are evaluated
+    """A case of the left photo, with the right photo as second view; in `lens`, (0, 0) is the first pixel's corner."""
+    if size is None:  # the photo cannot be read: its evaluation reports why
+        return Case(name, left, depth=depth)
     cameras = _cameras(lens, size)
     return Case(name, left, cameras[0], depth=depth, seconds=(SecondView("right", right, cameras[1]),))
 
@@ -51,14 +48,12 @@ def _cameras(lens: Calibration, size: tuple[int, int]) -> tuple[Camera, Camera]:
     return Camera(lens.K, torch.eye(4), *size), Camera(K, pose, *size)
 
 
-def _picture_size(path: Path) -> tuple[int, int] | None:
-    """(width, height) from an image's header; None if it cannot be read, InputError if the file is missing."""
-    try:
-        return read_image(path, lambda image: (image.width, image.height))
-    except InputError:
-        if path.exists():
-            return None
-        raise
+def _size_of(*photos: Path) -> tuple[int, int] | None:
+    """(width, height) from the header of the first readable photo; None if no photo is readable."""
+    for photo in photos:
+        with contextlib.suppress(InputError):
+            return read_image(photo, lambda image: (image.width, image.height))
+    return None
 
 
 def _from_corner(lens: Calibration) -> Calibration:
@@ -66,7 +61,7 @@ def _from_corner(lens: Calibration) -> Calibration:
 
 
 def _depth_by(lens: Calibration, path: Path, read: Callable[[], NDArray[Any]]) -> Callable[[], DepthMap]:
-    """A reader of z = focal · baseline / (disparity + doffs), from disparities in pixels; those ≤ 0 are unknown."""
+    """A reader of z = focal · baseline / (disparity + doffs); disparities in pixels of 0 or less are unknown."""
 
     def depth() -> DepthMap:
         stored = read()
@@ -99,25 +94,19 @@ def pair_of_2014(folder: Path) -> Case:
 # --- Middlebury
 
 
-def is_middlebury(folder: Path) -> bool:
-    """Whether a folder is a scene, and not the photos of one of Booster's cameras."""
-    return has_any(folder, "scene.json") or (has_any(folder, "im0.png") and not folder.name.startswith("camera_"))
-
-
 def middlebury_cases(scenes: Mapping[str, Path]) -> list[Case]:
     """One case for each scene; the second view is the true right photo.
 
     A scene's folder has `im0.png` with `calib.txt` (2014 at full size; MiddEval3 at full, half or quarter size), or a
     `scene.json`, which describes any rectified pair. `X-imperfect` is skipped if there is `X-perfect`; test scenes are
-    skipped, because they have no ground truth. The paper's 23 scenes are those of 2014. MiddEval3's three sizes have
-    the same scene names: give only `trainingF`, `trainingH` or `trainingQ`.
+    skipped, because they have no ground truth. The paper's 23 scenes are those of 2014.
     """
     names = [name for name in scenes if name.replace("-imperfect", "-perfect") not in scenes.keys() - {name}]
     return [_middlebury_case(scenes[name]) for name in names]
 
 
 def _middlebury_case(folder: Path) -> Case:
-    """A case from `scene.json`, with pixel centres at half-integers and lengths that may be nominal, or as of 2014."""
+    """A case from `scene.json` (pixel centres at half-integers, lengths possibly nominal), or as of 2014."""
     path = folder / "scene.json"
     if not path.exists():
         return pair_of_2014(folder)
@@ -125,38 +114,30 @@ def _middlebury_case(folder: Path) -> Case:
     with reading(path, "not a scene description: needs the photos and the disparity map"):
         facts = json.loads(read_text(path))
         left, right, truth = (folder / str(facts[key]) for key in ("left", "right", "disparity"))
-    size, depth = _picture_size(left), partial(load_depth, truth, calib=path)
-    # A damaged photo is reported when it is evaluated.
-    return _pair(folder.name, left, right, lens, size, depth) if size else Case(folder.name, left, depth=depth)
+    return _pair(folder.name, left, right, lens, _size_of(left), partial(load_depth, truth, calib=path))
 
 
 # --- Booster
 
 
 def booster_cases(scenes: Mapping[str, Path]) -> list[Case]:
-    """Cases of 12-megapixel stereo scenes with glass and mirrors: one for each left photo, that is, for each light.
+    """Cases of 12-megapixel stereo scenes with glass and mirrors: a case for each left photo, that is, for each light.
 
     Left photos are `train/balanced/SCENE/camera_00/im*.png` of 4112×3008 pixels; right photos have the same names in
     `camera_02`. One `disp_00.npy` and one `calib_00-02.xml` (OpenCV: proj_matL, proj_matR, baselineLR in millimetres)
-    serve all lights. Test scenes, which have no ground truth, and unbalanced ones, whose right camera differs, are
+    serve all lights. Test scenes, which have no ground truth, and unbalanced scenes, whose right camera differs, are
     skipped. At the working size the photos have 1536×1124 pixels and the paper's 431,616 cells.
     """
     return [case for scene in scenes.values() for case in _lights_of(scene)]
 
 
 def _lights_of(scene: Path) -> list[Case]:
-    photos = photo_files(scene / "camera_00")
-    if not photos:
-        raise InputError(f"{scene / 'camera_00'}: no photos: expected im0.png and more; unpack the scene again")
-    names = [f"{scene.name}/{photo.stem}" for photo in photos]
-    size = next((size for photo in photos if (size := _picture_size(photo))), None)  # a scene's photos have one size
+    photos, rights = files_in(scene / "camera_00", PHOTO_SUFFIXES), scene / "camera_02"
     lens, truth = _read_opencv(scene / "calib_00-02.xml"), scene / "disp_00.npy"
     if not truth.is_file():
         raise InputError(f"{truth}: no such disparity map: give train/balanced; Booster's test scenes have none")
-    depth, rights = _depth_by(lens, truth, lambda: read_array(truth)[0]), scene / "camera_02"
-    if size is None:  # unreadable photos are reported when they are evaluated
-        return [Case(name, p, depth=depth) for name, p in zip(names, photos, strict=True)]
-    return [_pair(name, p, rights / p.name, lens, size, depth) for name, p in zip(names, photos, strict=True)]
+    depth, size = _depth_by(lens, truth, lambda: read_array(truth)[0]), _size_of(*photos)
+    return [_pair(f"{scene.name}/{p.stem}", p, rights / p.name, lens, size, depth) for p in photos]
 
 
 def _read_opencv(path: Path) -> Calibration:
