@@ -1,4 +1,4 @@
-"""The Python interface: three lines for most people, the pieces for the others."""
+"""The Python interface."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ import spackle
 from spackle.bases.lift import RgbdBase
 from spackle.bases.settings import BaseSettings
 from spackle.formats import PlyFile
-from spackle.pipeline import Options, complete_photo
+from spackle.pipeline import Options, Pipeline
+from spackle.progress import LogReporter
 
 
 @pytest.fixture(scope="module")
@@ -30,21 +31,20 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> spackle.Scene:
     return spackle.predict(photo, depth)
 
 
-def promised() -> list[str]:
-    """The package's own example, and the README's."""
+def documented() -> list[str]:
+    """The examples in the package's docstring and in the README."""
     assert spackle.__doc__ is not None
     readme = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
     blocks = [block.split("```")[0] for block in readme.split("```python\n")[1:]]
     return [spackle.__doc__[spackle.__doc__.index("import spackle") :], *blocks]
 
 
-@pytest.mark.parametrize("code", promised(), ids=lambda code: f"{len(code)} characters")
-def test_the_three_lines_that_we_promise(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str) -> None:
+@pytest.mark.parametrize("code", documented(), ids=lambda code: f"{len(code)} characters")
+def test_the_documented_three_lines_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str) -> None:
     assert len([line for line in code.splitlines() if line]) == 3
     write_photo(tmp_path / "photo.jpg")
     write_depth(tmp_path / "depth.png")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("SPACKLE_WEIGHTS", str(tmp_path))  # not by SHARP, wherever the test runs
     exec(code, {})
     with av.open("video.mp4") as container:
         frames = list(container.decode(video=0))
@@ -53,8 +53,9 @@ def test_the_three_lines_that_we_promise(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_every_public_name_is_there_and_no_other() -> None:
-    for name in [*spackle.__all__, *spackle.__all__]:  # a second look finds no module of that name
+    for name in [*spackle.__all__, *spackle.__all__]:  # twice, because an import could replace a name by a module
         assert not isinstance(getattr(spackle, name), ModuleType)
+    assert {"predict", "Scene", "__version__"} <= set(dir(spackle))
     with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
         spackle.nonsense  # noqa: B018
 
@@ -64,7 +65,7 @@ def test_files_names_and_values_are_the_same_input(scene: spackle.Scene, pair: t
     loaded = spackle.load_photo(photo), spackle.load_depth(depth)
     assert same_bits(spackle.predict(*loaded).gaussians, scene.gaussians)
     assert same_bits(spackle.predict(str(photo), str(depth)).gaussians, scene.gaussians)
-    whole = complete_photo(loaded[0], Options(BaseSettings(depth=depth)))
+    whole = Pipeline.open(Options(BaseSettings(depth=depth))).complete(loaded[0], LogReporter())
     assert same_bits(whole.scene.gaussians, scene.gaussians)
     alone = RgbdBase(loaded[1]).predict(loaded[0])
     assert same_bits(scene.base, alone.gaussians)
@@ -72,22 +73,17 @@ def test_files_names_and_values_are_the_same_input(scene: spackle.Scene, pair: t
     assert same_bits(scene.gaussians.select(torch.arange(len(scene.base))), scene.base)
 
 
-def test_a_photo_and_its_depth_in_every_form(scene: spackle.Scene, pair: tuple[Path, Path], tmp_path: Path) -> None:
+def test_a_photo_and_its_depth_in_every_form(pair: tuple[Path, Path], tmp_path: Path) -> None:
     photo, depth = pair
     pixels, metres_of = np.asarray(Image.open(photo).convert("RGB")), spackle.load_depth(depth)
     depths = [depth.read_bytes(), io.BytesIO(depth.read_bytes()), metres_of.depth.numpy(), metres_of.depth.double()]
-    photos = [
-        photo.read_bytes(),
-        io.BytesIO(photo.read_bytes()),
-        Image.open(photo),
-        pixels,
-        torch.from_numpy(pixels / 255),
-    ]
+    photos = [photo.read_bytes(), io.BytesIO(photo.read_bytes()), Image.open(photo), pixels]
+    photos += [torch.from_numpy(pixels / 255)]
     session = spackle.Spackle(residual="seeds")
     expected = session.predict(photo, depth)
     for form in photos:
         assert same_bits(session.predict(form, depth).gaussians, expected.gaussians)
-    for form in depths:  # an array says nothing of the steps in which a file stores depth
+    for form in depths:  # the rounding steps of an array's depth are unknown
         made = session.predict(photo, form, trajectory="swipe").base
         assert len(made) == len(expected.base)
         torch.testing.assert_close(made.means, expected.base.means, rtol=2e-3, atol=2e-3)
@@ -95,18 +91,12 @@ def test_a_photo_and_its_depth_in_every_form(scene: spackle.Scene, pair: tuple[P
     assert isinstance(portrait, bytes)
     (tmp_path / "portrait.jpg").write_bytes(portrait)
     assert same_bits(session.predict(portrait).base, session.predict(tmp_path / "portrait.jpg").base)  # with its depth
-    with pytest.warns(DeprecationWarning, match="trajectory= now"):
-        assert len(scene.path(kind="swipe", frames=3)) == 3
-
-
-JPEG = b"\xff\xd8" + bytes(100_000)
 
 
 @pytest.mark.parametrize(
     ("photo", "options", "words"),
     [
-        (JPEG, {}, "photo: not an image"),
-        ("x" * 100_000, {}, "xxx"),
+        (b"\xff\xd8" + bytes(100_000), {}, "photo: not an image"),
         (io.StringIO("x" * 100_000), {}, "binary mode"),
         (np.zeros((48, 64)), {}, "[height, width, 3]"),
         (np.full((48, 64, 3), 200.0), {}, "from 200 to 200"),
@@ -115,15 +105,14 @@ JPEG = b"\xff\xd8" + bytes(100_000)
         (np.zeros((48, 64, 3)), {"depth": np.zeros((48, 64))}, "all-invalid"),
         (np.zeros((48, 64, 3)), {"base": "lite", "depth": np.ones((48, 64))}, "not both"),
         (np.zeros((48, 64, 3)), {"base": "sharpest"}, "sharp"),
-        (np.zeros((48, 64, 3)), {"residual": "no" * 9000}, "no such weight file"),
+        (np.zeros((48, 64, 3)), {"residual": "missing"}, "no such weight file"),
     ],
-    ids=lambda value: value if isinstance(value, str) and len(value) < 30 else type(value).__name__,
+    ids=lambda value: value if isinstance(value, str) else type(value).__name__,
 )
-def test_whatever_it_is_given_the_message_is_short(photo: Any, options: Any, words: str) -> None:
+def test_bad_input_is_refused(photo: Any, options: Any, words: str) -> None:
     with pytest.raises(spackle.InputError) as caught:
         spackle.predict(photo, **options)
     assert words in str(caught.value)
-    assert len(str(caught.value)) <= 300
 
 
 def test_scenes_go_to_open_files(scene: spackle.Scene, tmp_path: Path) -> None:
@@ -137,7 +126,7 @@ def test_scenes_go_to_open_files(scene: spackle.Scene, tmp_path: Path) -> None:
     with av.open(io.BytesIO(video.getvalue())) as container:
         assert len(list(container.decode(video=0))) == 3
     depth = scene.depth_map()
-    assert float(((depth / torch.from_numpy(metres()) - 1).abs() < 0.05).float().mean()) > 0.9  # but for its outlines
+    assert float(((depth / torch.from_numpy(metres()) - 1).abs() < 0.05).float().mean()) > 0.9  # except at outlines
     with pytest.raises(spackle.InputError, match="which format"):
         scene.export(io.BytesIO())
 
@@ -157,7 +146,7 @@ def test_save_and_load(scene: spackle.Scene, tmp_path: Path) -> None:
     photo = write_photo(tmp_path / "wide.png", 1600, 200)
     made = spackle.predict(photo, write_depth(tmp_path / "d.npy", metres(1600, 200)), trajectory="swipe", fill="none")
     assert (made.camera.width, made.camera.height) == (1536, 192)  # the working size of a large photo
-    for width, height in ((1, 1), (31, 64), (290, 36), (40, 321)):
+    for width, height in ((31, 64), (290, 36)):
         photo = write_photo(tmp_path / "odd.png", width, height)
         with pytest.raises(spackle.InputError, match=rf"odd\.png: {width}×{height} is too small or too narrow: give"):
             spackle.predict(photo)
@@ -167,7 +156,6 @@ def test_a_scene_is_loaded_exported_and_shown(scene: spackle.Scene, tmp_path: Pa
     counts = f"{len(scene.base):,} base + {len(scene.aux):,} aux Gaussians, {WIDTH}×{HEIGHT}"
     assert repr(scene) == f"Scene({counts}, cpu)"
     assert repr(scene.base) == f"Gaussians({len(scene.base):,}, cpu)"
-    assert repr(scene.camera).startswith(f"Camera({WIDTH}×{HEIGHT}, focal length ")
     for name in ("scene.ply", "scene.spz", "scene.html"):
         scene.export(tmp_path / name)
     loaded = spackle.Scene.load(tmp_path / "scene.ply")
@@ -184,7 +172,7 @@ def test_a_scene_is_loaded_exported_and_shown(scene: spackle.Scene, tmp_path: Pa
         scene.export(tmp_path / "scene.obj")
 
 
-def test_predict_takes_a_lens_and_tells_how_far_it_is(
+def test_predict_takes_a_focal_length_and_draws_its_progress(
     pair: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     photo, depth = pair
@@ -193,10 +181,9 @@ def test_predict_takes_a_lens_and_tells_how_far_it_is(
     assert "complete" in capsys.readouterr().err
     with pytest.raises(ValueError, match="load_photo"):
         spackle.predict(spackle.load_photo(photo), depth, fov=90)
-    assert {"predict", "Scene", "__version__"} <= set(dir(spackle))
 
 
-def test_complete_visits_what_it_is_given(scene: spackle.Scene, tmp_path: Path) -> None:
+def test_complete_fills_the_given_views(scene: spackle.Scene, tmp_path: Path) -> None:
     photo, depth = write_pair(tmp_path)
     prediction = RgbdBase(spackle.load_depth(depth)).predict(spackle.load_photo(photo))
     seen: list[tuple[int, int]] = []
@@ -205,21 +192,16 @@ def test_complete_visits_what_it_is_given(scene: spackle.Scene, tmp_path: Path) 
     assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
     assert all(spackle.hole_area_ratio(made.render(camera).alpha) < 2e-3 for camera in cameras)
     seeds = spackle.complete(prediction, cameras, exact=True, network=None)
-    shown = psnr(made.render(cameras[0]).rgb, seeds.render(cameras[0]).rgb)
-    assert 10 < shown < 60  # the weights that come with Spackle matter
+    assert 10 < psnr(made.render(cameras[0]).rgb, seeds.render(cameras[0]).rgb) < 60  # the weights matter
 
 
-def test_bad_input_is_a_value_error_that_names_the_file(scene: spackle.Scene, tmp_path: Path) -> None:
+def test_messages_name_the_file(scene: spackle.Scene, tmp_path: Path) -> None:
     photo, depth = write_pair(tmp_path)
-    for arguments, culprit in (((tmp_path / "no.png", depth), "no.png"), ((photo, photo), "photo.png")):
-        with pytest.raises(spackle.InputError, match=culprit) as caught:
-            spackle.predict(*arguments)
-        assert isinstance(caught.value, ValueError)
     wrong = write_depth(tmp_path / "wrong.npy", metres(HEIGHT, WIDTH))
-    with pytest.raises(spackle.InputError, match=r"wrong\.npy"):
-        spackle.predict(photo, wrong)
+    for arguments, culprit in (((tmp_path / "no.png", depth), "no.png"), ((photo, wrong), "wrong.npy")):
+        with pytest.raises(ValueError, match=culprit):
+            spackle.predict(*arguments)
     with pytest.raises(spackle.InputError, match="nowhere"):
         scene.save(tmp_path / "nowhere" / "scene.ply")
     with pytest.raises(spackle.InputError, match=r"video\.txt"):
         scene.save_video(tmp_path / "video.txt")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["depth.npy", "photo.png", "wrong.npy"]

@@ -43,7 +43,7 @@ if TYPE_CHECKING:  # for editors and type checkers
 
 __version__ = "0.1.0"  # the only place: pyproject.toml reads it here
 
-# A name is imported at its first use: `spackle --help` need not wait for torch.
+# A name is imported at its first use, so that `spackle --help` does not wait for torch.
 _NAMES = {
     "spackle.bases": ("Base", "BasePrediction"),
     "spackle.bases.depth_map": ("DepthMap", "load_depth"),

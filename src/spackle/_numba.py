@@ -1,4 +1,4 @@
-"""Typed decorators around numba, which ships no types of its own."""
+"""Typed decorators around numba, which has no type annotations."""
 
 from __future__ import annotations
 
@@ -19,28 +19,28 @@ Array = NDArray[Any]  # what kernels take
 ZERO, HALF, ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 MANTISSA = np.int32(23)  # bits of a float32's mantissa
 
-# Fused multiply-adds are allowed. Reordered sums are not, because results must be the same bit for bit; nor is the
-# assumption that no NaN or infinity occurs, because kernels test for these.
+# Reordered sums are not allowed, because results must be the same bit for bit; "nnan" and "ninf" are not, because
+# kernels test for NaN and infinity.
 _FASTMATH = {"contract", "nsz", "afn"}
 
 
 def kernel(function: Callable[..., R]) -> Callable[..., R]:
-    """Compile a function at its first call, cache the machine code on disk, and run it without the GIL."""
+    """Compile a function at its first call, cache the machine code on disk, and run without the GIL."""
     return _compiled(function, _FASTMATH)
 
 
 def reordering_kernel(function: Callable[..., R]) -> Callable[..., R]:
-    """A `kernel` whose sums may be reordered, which lets them run in vector registers."""
+    """A `kernel` whose sums may be reordered, which allows vector instructions."""
     return _compiled(function, {"reassoc", *_FASTMATH})
 
 
 def inlined_kernel(function: Callable[..., R]) -> Callable[..., R]:
-    """A `kernel` that is inlined into the loops that call it, because only then do these run in vector registers."""
+    """A `kernel` that is inlined into the calling loops, which allows vector instructions."""
     return _compiled(function, _FASTMATH, forceinline=True)
 
 
 def is_compiled(function: Callable[..., Any]) -> bool:
-    """Whether a kernel's machine code for this CPU is cached on disk; true also if it cannot be cached."""
+    """Whether machine code of a kernel for this CPU is cached on disk; true also if the cache is off."""
     kept = _kept(function)
     processor = cpu_target.target_context.codegen().magic_tuple()
     return kept is None or any(key[1] == processor for key in kept._load_index())
@@ -56,7 +56,7 @@ def _compiled(function: Callable[..., R], fastmath: set[str], **more: Any) -> Ca
 
 
 def _surroundings(function: Callable[..., Any]) -> str:
-    """A hash of the numbers and kernels that a function's module uses; numba itself checks only the function's file."""
+    """A hash of the numbers and kernels in a function's module; numba itself checks only the module's own text."""
     seen = []
     for name, value in sorted(function.__globals__.items()):
         if isinstance(value, Dispatcher):
@@ -67,6 +67,6 @@ def _surroundings(function: Callable[..., Any]) -> str:
 
 
 def _kept(compiled: Any) -> Any:
-    """Numba's internal disk cache of a kernel's machine code; None if numba has none, or if the cache is off."""
+    """Numba's internal disk cache of a kernel's machine code; None if the cache is off."""
     file = getattr(getattr(compiled, "_cache", None), "_cache_file", None)
     return file if hasattr(file, "_source_stamp") else None

@@ -8,7 +8,7 @@ import math
 import torch
 from torch import Tensor
 
-SHORTEST_LOOK = 1e-6  # eye and target coincide if their distance, relative to that from the origin, is smaller
+SHORTEST_LOOK = 1e-6  # least distance of eye and target, relative to their largest coordinate
 LEAST_TILT = 1e-3  # least angle in radians between the viewing direction and up
 
 
@@ -29,13 +29,9 @@ class Camera:
         if self.width < 1 or self.height < 1:
             raise ValueError(f"Camera size {self.width}×{self.height} is empty")
 
-    def __repr__(self) -> str:
-        eye = ", ".join(f"{x:.3g}" for x in self.position.tolist())
-        return f"Camera({self.width}×{self.height}, focal length {self.focal[0]:.4g} px, at ({eye}))"
-
     @staticmethod
     def from_focal(focal_px: float, width: int, height: int) -> Camera:
-        """A photo's own camera: at the world's origin, with the principal point in the middle."""
+        """A camera at the world's origin, with the principal point in the image's middle."""
         if not (math.isfinite(focal_px) and focal_px > 0):
             raise ValueError(f"focal length must be positive, got {focal_px} px")
         K = torch.tensor([[focal_px, 0.0, width / 2], [0.0, focal_px, height / 2], [0.0, 0.0, 1.0]])
@@ -48,19 +44,16 @@ class Camera:
 
     @property
     def position(self) -> Tensor:
-        """The eye in world coordinates, [3]."""
+        """The camera's centre in world coordinates, [3]."""
         return -self.world_to_camera[:3, :3].T @ self.world_to_camera[:3, 3]
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Camera:
-        """The same camera with its matrices on another device or in another dtype."""
-        return dataclasses.replace(
-            self,
-            K=self.K.to(device=device, dtype=dtype),
-            world_to_camera=self.world_to_camera.to(device=device, dtype=dtype),
-        )
+        """Move or convert the matrices, as `Tensor.to` does."""
+        K, pose = (matrix.to(device=device, dtype=dtype) for matrix in (self.K, self.world_to_camera))
+        return dataclasses.replace(self, K=K, world_to_camera=pose)
 
     def resized(self, width: int, height: int) -> Camera:
-        """The same view on another pixel grid: the intrinsics are scaled along each axis."""
+        """The same view with another number of pixels; the intrinsics are scaled along each axis."""
         factors = torch.tensor([width / self.width, height / self.height, 1.0]).to(self.K)
         return dataclasses.replace(self, K=self.K * factors[:, None], width=width, height=height)
 
@@ -72,21 +65,21 @@ class Camera:
         return dataclasses.replace(self, K=K, width=width, height=height)
 
     def even(self) -> Camera:
-        """The same view with an even width and height: an odd side grows by one."""
+        """The same view with even width and height; an odd side grows by one pixel."""
         return self.resized(self.width + self.width % 2, self.height + self.height % 2)
 
     def zoomed(self, factor: float) -> Camera:
-        """The same view with a focal length that is longer by a factor."""
+        """The view with the focal length multiplied by a factor."""
         K = self.K.clone()
         K[:2, :2] *= factor
         return dataclasses.replace(self, K=K)
 
     def looking(self, eye: Tensor, target: Tensor) -> Camera:
-        """The same lens at `eye` [3], turned to `target` [3], so that the world's y axis points down; see `look_at`."""
+        """The camera at `eye` [3], turned to `target` [3], with the world's y axis downwards; see `look_at`."""
         return dataclasses.replace(self, world_to_camera=look_at(eye, target).to(self.world_to_camera))
 
     def to_camera(self, points: Tensor) -> Tensor:
-        """World points [..., 3] in this camera's coordinates, [..., 3]."""
+        """Convert world points [..., 3] to camera coordinates [..., 3]."""
         matrix = beside(self.world_to_camera, points)
         return points @ matrix[:3, :3].T + matrix[:3, 3]
 
@@ -106,17 +99,19 @@ class Camera:
         return (local - matrix[:3, 3]) @ matrix[:3, :3]
 
     def pixel_centers(self, stride: int = 1) -> Tensor:
-        """Centres of cells of stride×stride pixels, [H/stride, W/stride, 2] as (x, y), in pixels."""
+        """Centres (x, y) of cells of stride×stride pixels, [H/stride, W/stride, 2]."""
         ys = (torch.arange(self.height // stride) + 0.5) * stride
         xs = (torch.arange(self.width // stride) + 0.5) * stride
         return torch.stack(torch.meshgrid(xs, ys, indexing="xy"), dim=-1)
 
 
 def look_at(eye: Tensor, target: Tensor, up: Tensor | None = None) -> Tensor:
-    """world_to_camera [4, 4], float64, for an eye [3] that looks at a target [3]; `up` [3] (None: -y) points upwards.
+    """The matrix world_to_camera [4, 4], float64, of a camera at `eye` [3] that looks at `target` [3].
+
+    `up` [3], by default -y, points upwards in the image.
 
     Raises:
-        ValueError: eye and target coincide, or `up` has no length or lies along the viewing direction.
+        ValueError: eye and target coincide, or `up` has no length or is parallel to the viewing direction.
     """
     eye, target = eye.double(), target.double()
     forward, down = target - eye, eye.new_tensor([0.0, 1.0, 0.0])
@@ -138,5 +133,5 @@ def look_at(eye: Tensor, target: Tensor, up: Tensor | None = None) -> Tensor:
 
 
 def beside(numbers: Tensor, other: Tensor) -> Tensor:
-    """Convert a small tensor to the dtype and device of another one, without waiting for a GPU when copying to it."""
+    """Convert a small tensor to the dtype and device of another tensor, without waiting for a GPU."""
     return numbers.to(other, non_blocking=other.device.type != "cpu")

@@ -1,4 +1,4 @@
-"""Camera paths: trajectories around the photo's eye, and paths through the keyframes of a path file."""
+"""Camera paths: trajectories around the photo's camera position, and smooth paths through keyframes."""
 
 from __future__ import annotations
 
@@ -17,22 +17,21 @@ from spackle.gaussians import Gaussians
 
 SharpTrajectory = Literal["swipe", "shake", "rotate", "rotate-forward"]
 TrajectoryKind = Literal[SharpTrajectory, "vertical", "orbit", "dolly-zoom"]
-# SHARP's own trajectories, which the paper uses: data and training draw only from these.
+# SHARP's trajectories, which the paper uses for data and training.
 SHARP_TRAJECTORIES: tuple[SharpTrajectory, ...] = get_args(SharpTrajectory)
 TRAJECTORIES: tuple[TrajectoryKind, ...] = get_args(TrajectoryKind)
 PathUnit = Literal["metres", "disparity"]
 UNITS: tuple[PathUnit, ...] = get_args(PathUnit)
 
-NEAR_QUANTILE = 0.001  # depth quantile of z_near, in proportion to which the eye moves
-FOCUS_QUANTILE = 0.1  # quantile of the depth at which the camera looks
+NEAR_QUANTILE = 0.001  # quantile of depth that defines z_near
+FOCUS_QUANTILE = 0.1  # quantile of depth that defines the focus depth
 MIN_FOCUS_M = 2.0  # metres; a nearer focus would turn the camera too much
-MAX_DISPARITY = 2.0  # with wider moves nothing of the photo is in view
-OVERSCAN = 0.05  # relative gain in focal length for completed scenes: it hides most of what is beyond the photo
+MAX_DISPARITY = 2.0  # beyond, the photo is out of view
+OVERSCAN = 0.05  # relative gain in focal length, which hides most of the fill beyond the photo's border
 MAX_ZOOM = 0.15  # forward motion of rotate-forward, in units of z_near
 
-MIN_FOV, MAX_FOV = 1.0, 170.0  # degrees; beyond, a planar image is useless
-UP = (0.0, -1.0, 0.0)  # the photo's up, the default
-LEAST_STEP = 1e-6  # least time between two keys, in seconds
+MIN_FOV, MAX_FOV = 1.0, 170.0  # degrees
+LEAST_STEP = 1e-6  # least time between two keyframes, in seconds
 STILL = 1e-100  # smaller slopes count as 0, because their inverse would overflow
 Array = NDArray[np.float64]
 
@@ -41,12 +40,12 @@ Array = NDArray[np.float64]
 class DepthRange:
     """The two depths that a trajectory depends on."""
 
-    near: float  # 0.1 % quantile
+    near: float  # z_near: the 0.1 % quantile
     focus: float  # 10 % quantile, at least 2 m
 
     @staticmethod
     def of(gaussians: Gaussians) -> DepthRange:
-        """Measure the depths of the Gaussians in front of the photo's camera, which is at the world's origin."""
+        """Measure the depths of Gaussians in front of a camera at the world's origin."""
         z = gaussians.means[:, 2].detach().double().cpu().numpy()
         z = z[z > 0]
         if z.size == 0:
@@ -55,13 +54,13 @@ class DepthRange:
         return DepthRange(float(near), max(MIN_FOCUS_M, float(focus)))
 
     def towards(self, other: DepthRange, part: float) -> DepthRange:
-        """Move towards another range by `part` (0..1), on a logarithmic scale."""
+        """Interpolate to another range by `part` (0..1), on a logarithmic scale."""
         near, focus = (a * (b / a) ** part for a, b in ((self.near, other.near), (self.focus, other.focus)))
         return DepthRange(near, focus)
 
 
 def trajectory_kind(name: str) -> TrajectoryKind:
-    """A trajectory by its name, or by its old spelling with `_`; ValueError for an unknown name."""
+    """A trajectory by its name, in which `_` may replace `-`; ValueError for an unknown name."""
     kind = name.replace("_", "-")
     if kind not in TRAJECTORIES:
         raise ValueError(f"unknown trajectory {name!r}: choose one of {', '.join(TRAJECTORIES)}")
@@ -69,7 +68,7 @@ def trajectory_kind(name: str) -> TrajectoryKind:
 
 
 def max_offset(camera: Camera, disparity: float, depth_range: DepthRange) -> float:
-    """How far the eye moves sideways for a disparity m: m · ‖(W/f, H/f)‖ · z_near."""
+    """Sideways offset of the camera for a disparity m: m · ‖(W/f, H/f)‖ · z_near."""
     fx, fy = camera.focal
     return disparity * math.hypot(camera.width / fx, camera.height / fy) * depth_range.near
 
@@ -81,8 +80,9 @@ def trajectory(
     depth_range: DepthRange,
     frames: int = 60,
     looped: bool = False,
+    only: int | None = None,
 ) -> list[Camera]:
-    """Cameras along a path around the photo's eye, looking at the focus point.
+    """Cameras along a path around the photo's camera position; all of them look at the focus point.
 
     Args:
         kind: swipe (left to right), shake (left-right, then up-down), rotate (a circle), rotate-forward (left-right
@@ -90,47 +90,16 @@ def trajectory(
             distance from the focus point), or dolly-zoom (backward, while zooming in so that objects at the focus
             point keep their size).
         camera: the photo's camera at the world's origin.
-        disparity: the widest offset, in the units of `max_offset`.
+        disparity: the widest offset, see `max_offset`.
         depth_range: depths of the base's Gaussians.
         frames: number of cameras.
-        looped: make a path that repeats without a jump: swipe also returns, slower at its ends; the other paths, which
-            are closed, leave out their last frame.
+        looped: make a path that repeats without a jump: swipe also returns, and the other paths, whose last frame
+            equals their first, lose their last frame.
+        only: compute one camera, the one at this index.
 
     Raises:
         ValueError: an unknown path, a disparity outside 0..2, or less than one frame.
     """
-    eyes, target = _flight(kind, camera, disparity, depth_range, frames, looped)
-    return [_looking(kind, camera, eye, target) for eye in eyes]
-
-
-def view_at(
-    kind: TrajectoryKind, camera: Camera, disparity: float, depth_range: DepthRange, index: int, frames: int
-) -> Camera:
-    """One camera of `trajectory`, computed without the others."""
-    eyes, target = _flight(kind, camera, disparity, depth_range, frames)
-    return _looking(kind, camera, eyes[index], target)
-
-
-def extremes(camera: Camera, disparity: float, depth_range: DepthRange) -> tuple[Camera, Camera]:
-    """The leftmost and the rightmost view at a disparity, in which holes are widest."""
-    left, right = trajectory("swipe", camera, disparity, depth_range, frames=2)
-    return left, right
-
-
-def _looking(kind: TrajectoryKind, camera: Camera, eye: Tensor, target: Tensor) -> Camera:
-    view = camera.looking(eye, target)
-    return view.zoomed(1 - float(eye[2] / target[2])) if kind == "dolly-zoom" else view
-
-
-def _flight(
-    kind: TrajectoryKind,
-    camera: Camera,
-    disparity: float,
-    depth_range: DepthRange,
-    frames: int,
-    looped: bool = False,
-) -> tuple[Tensor, Tensor]:
-    """Eye positions [frames, 3], and the point [3] at which all of them look."""
     kind = trajectory_kind(kind)
     if not 0 <= disparity <= MAX_DISPARITY:
         raise ValueError(f"disparity must be between 0 and {MAX_DISPARITY:g}, got {disparity:g}")
@@ -152,7 +121,7 @@ def _flight(
     elif kind == "rotate":
         xyz = [side * turn.sin(), side * turn.cos(), zero]
     elif kind == "vertical":
-        flat = min(1.0, camera.height / camera.width)  # in a wide photo a lowered eye is soon beneath the floor
+        flat = min(1.0, camera.height / camera.width)  # in a wide photo a lowered camera is soon beneath the floor
         xyz = [zero, flat * side * turn.sin(), zero]
     elif kind == "orbit":
         angle = math.atan2(side, focus) * turn.sin()
@@ -161,8 +130,19 @@ def _flight(
         xyz = [zero, zero, side * (turn.cos() - 1) / 2]
     else:
         xyz = [side * turn.sin(), zero, forward * (1 - turn.cos()) / 2]
-    eyes = torch.stack(xyz, dim=-1)[: frames - looped]
-    return eyes, torch.tensor([0.0, 0.0, focus], dtype=torch.float64)
+    eyes, target = torch.stack(xyz, dim=-1)[: frames - looped], zero.new_tensor([0.0, 0.0, focus])
+    if only is not None:
+        eyes = eyes[only : only + 1]
+    views = [camera.looking(eye, target) for eye in eyes]
+    if kind == "dolly-zoom":
+        views = [view.zoomed(1 - float(eye[2] / focus)) for view, eye in zip(views, eyes, strict=True)]
+    return views
+
+
+def extremes(camera: Camera, disparity: float, depth_range: DepthRange) -> tuple[Camera, Camera]:
+    """The leftmost and the rightmost view at a disparity, which have the widest holes."""
+    left, right = trajectory("swipe", camera, disparity, depth_range, frames=2)
+    return left, right
 
 
 class PathError(ValueError):
@@ -171,19 +151,16 @@ class PathError(ValueError):
 
 @dataclasses.dataclass(frozen=True)
 class Keyframe:
-    """The camera at one time, in the coordinates of the photo's camera (x right, y down, z forward)."""
+    """A camera at one time, in the coordinates of the photo's camera (x right, y down, z forward)."""
 
     time: float  # seconds
-    eye: tuple[float, float, float]
-    target: tuple[float, float, float]  # the point at which it looks
-    up: tuple[float, float, float] = UP  # direction that is roughly upwards in the image
+    eye: tuple[float, float, float]  # position of the camera
+    target: tuple[float, float, float]  # a point on the optical axis
+    up: tuple[float, float, float] = (0.0, -1.0, 0.0)  # direction that is roughly upwards in the image
     fov: float | None = None  # horizontal field of view in degrees; None: the photo's
 
     def __post_init__(self) -> None:
-        """PathError if the keyframe describes no view, for instance if the eye is at the target."""
-        numbers = (self.time, *self.eye, *self.target, *self.up, *([] if self.fov is None else [self.fov]))
-        if not all(math.isfinite(number) for number in numbers):
-            raise PathError("every number must be finite, not NaN or infinite")
+        """Raise a PathError if the keyframe describes no view, for instance if eye and target coincide."""
         if self.fov is not None and not MIN_FOV <= self.fov <= MAX_FOV:
             raise PathError(f"fov must be from {MIN_FOV:g} to {MAX_FOV:g} degrees, got {self.fov:g}")
         _look_at(self.eye, self.target, self.up)
@@ -194,50 +171,43 @@ class KeyframePath:
     """A smooth path through keyframes.
 
     Each coordinate of eye, target and up, and the logarithm of the focal length, is a monotone cubic in time
-    (Fritsch and Butland): it passes through every key exactly, and between two keys it stays between their
-    values. If two consecutive keys have the same camera, the camera stands still between them.
+    (Fritsch and Butland): it passes through every keyframe, and stays between the values of two neighbours.
     """
 
-    keys: tuple[Keyframe, ...]  # at least two, times increasing
-    closed: bool = False  # whether the path returns from the last key to the first, in the mean time between keys
+    keys: tuple[Keyframe, ...]  # at least two, at increasing times
+    closed: bool = False  # whether the path returns from the last keyframe to the first, in the mean time step
     unit: PathUnit = "metres"  # "disparity": lengths are multiples of the offset for --disparity 1
 
     def __post_init__(self) -> None:
-        """PathError if the keyframes make no path: there are too few, or their times do not increase."""
+        """Raise a PathError if keyframes are too few, or times do not increase."""
         if len(self.keys) < 2:
             raise PathError(f"a path needs at least two keyframes, got {len(self.keys)}")
         for index, (one, other) in enumerate(zip(self.keys, self.keys[1:], strict=False)):
             if not other.time - one.time >= LEAST_STEP:
                 order = f"keyframe {index + 1} is at {other.time:g} s, the one before at {one.time:g} s"
                 raise PathError(f"times must increase, by a microsecond at least: {order}")
-        if self.unit not in UNITS:
-            raise PathError(f"unknown unit {self.unit!r}: choose {' or '.join(UNITS)}")
 
     @property
     def seconds(self) -> float:
-        """Duration from the first key to the last; of a closed path, back to the first."""
+        """Duration from the first keyframe to the last, or, for a closed path, back to the first."""
         span = self.keys[-1].time - self.keys[0].time
         return span * len(self.keys) / (len(self.keys) - 1) if self.closed else span
 
     def frame_count(self, fps: float) -> int:
-        """The path's number of frames, with both ends unless it is closed."""
+        """The path's number of frames."""
         return max(1, round(self.seconds * fps) + (not self.closed))
 
     def cameras(self, camera: Camera, frames: int, depth_range: DepthRange) -> list[Camera]:
-        """Views at equal time steps; they have the size of the photo's `camera`, whose eye is the origin.
+        """Views at equal time steps, of the size of the photo's `camera`, which is at the origin.
 
-        An open path begins at its first key and ends at its last. A closed path stops one frame before it would reach
-        the first frame again. `depth_range` determines the length of the unit "disparity".
+        An open path includes both its ends; a closed path does not repeat its first frame at its end. `depth_range`
+        determines the length of the unit "disparity".
 
         Raises:
-            PathError: between two keys the eye meets the target, or the viewing direction becomes parallel to up.
+            PathError: between two keyframes the eye meets the target, or the view becomes parallel to up.
         """
         steps = frames if self.closed else max(1, frames - 1)
         return self.at([self.keys[0].time + k * self.seconds / steps for k in range(frames)], camera, depth_range)
-
-    def key_cameras(self, camera: Camera, depth_range: DepthRange) -> list[Camera]:
-        """The views at the keys."""
-        return self.at([key.time for key in self.keys], camera, depth_range)
 
     def at(self, times: list[float], camera: Camera, depth_range: DepthRange) -> list[Camera]:
         """Views at these times in seconds; see `cameras`."""
@@ -271,9 +241,9 @@ def _look_at(*vectors: Sequence[float] | Array) -> Tensor:
 
 
 def interpolate(times: Array, values: Array, wanted: Array, period: float | None = None) -> Array:
-    """Evaluate monotone cubics at times `wanted` [M]: they pass through `values` [K, C] at increasing `times` [K].
+    """Evaluate at times `wanted` [M] the monotone cubics through `values` [K, C] at increasing `times` [K].
 
-    Returns [M, C]. With a period, the values repeat: the first one recurs at times[0] + period.
+    Returns [M, C]. With a period, the first value recurs at times[0] + period.
     """
     if period is not None:
         times = np.concatenate([times[-1:] - period, times, times[:2] + period])
@@ -292,7 +262,7 @@ def interpolate(times: Array, values: Array, wanted: Array, period: float | None
 
 
 def _inner_tangents(steps: Array, slopes: Array) -> Array:
-    """Tangents [K − 2, C]: the weighted harmonic mean of the slopes on both sides, 0 if their signs differ."""
+    """Tangents [K − 2, C]: weighted harmonic means of the slopes on both sides; 0 if the signs differ."""
     before, after = slopes[:-1], slopes[1:]
     first, second = steps[1:] * 2 + steps[:-1], steps[1:] + 2 * steps[:-1]
     agree = (before * after > 0) & (np.minimum(np.abs(before), np.abs(after)) > STILL)

@@ -1,7 +1,4 @@
-"""Convert between sRGB, which photos and screens use, and linear RGB, in which light adds up.
-
-`DepthColors` shows inverse depth as colours, near ones bright, on one scale for a whole video.
-"""
+"""Convert between sRGB and linear RGB, and show depth as colours."""
 
 from __future__ import annotations
 
@@ -24,15 +21,15 @@ def srgb_to_linear(srgb: Tensor) -> Tensor:
 def linear_to_srgb(linear: Tensor) -> Tensor:
     """Encode as sRGB (IEC 61966-2-1) elementwise; values are clamped to 0..1 first."""
     linear = linear.clamp(0, 1)
-    # The inner clamp keeps the gradient of the unused branch finite at zero.
+    # Without the clamp, the gradient of the unused branch would be infinite at zero.
     power = 1.055 * linear.clamp_min(0.0031308) ** (1 / 2.4) - 0.055
     return torch.where(linear <= 0.0031308, linear * 12.92, power)
 
 
-MEASURED, LOOKS = 50_000, 60  # Gaussians and views that are sampled for the scale: torch's quantile takes at most 16 M
+MEASURED, LOOKS = 50_000, 60  # numbers of Gaussians and views that are sampled for the scale
 FARTHEST, NEAREST = 0.002, 0.998  # quantiles of inverse depth at the ends of the scale
-UNKNOWN_GREY = 0.5  # a grey, which does not occur in the colour map
-# Seventeen evenly spaced colours of matplotlib's inferno (CC0): lightness is even, and the colour-blind can read it.
+UNKNOWN_GREY = 0.5  # sRGB of unknown depth; the colour map contains no grey
+# Seventeen evenly spaced colours of matplotlib's inferno (CC0).
 INFERNO = (
     *((0.001, 0.000, 0.014), (0.042, 0.028, 0.141), (0.129, 0.047, 0.291), (0.238, 0.037, 0.396)),
     *((0.342, 0.062, 0.429), (0.441, 0.099, 0.432), (0.541, 0.135, 0.415), (0.640, 0.171, 0.381)),
@@ -44,17 +41,17 @@ INFERNO = (
 
 @dataclasses.dataclass(frozen=True)
 class DepthColors:
-    """A scale of colours between two depths; depths beyond have the colour of the scale's end."""
+    """A scale of colours between two depths; depths beyond get the colour of the nearer end."""
 
     near: float  # depth of the brightest colour
     far: float  # depth of the darkest colour
 
     @staticmethod
     def over(gaussians: Gaussians, cameras: Sequence[Camera]) -> DepthColors:
-        """The scale for a set of views: it spans the depths that they show, except for 0.2 % at either end.
+        """The scale that spans the depths in a set of views, except for 0.2 % at either end.
 
         Raises:
-            ValueError: no view shows anything of the scene.
+            ValueError: no Gaussian is in a view.
         """
         step = max(1, len(gaussians) // MEASURED)
         means = gaussians.means.detach()[::step].cpu()
@@ -77,15 +74,14 @@ class DepthColors:
 
 
 def _inverse_in_frame(means: Tensor, camera: Camera) -> Tensor:
-    """Inverse depths 1/z of the points in `means` [N, 3] that lie within a view's image."""
     uv, z = camera.to("cpu").project(means)
     inside = (z > 0.01) & (uv >= 0).all(dim=-1) & (uv < uv.new_tensor([camera.width, camera.height])).all(dim=-1)
     return 1 / z[inside]
 
 
 def to_bytes(image: Tensor) -> Tensor:
-    """Round values in 0..1 to uint8 on the CPU; values outside are clamped, NaN becomes 0, and uint8 stays as it is."""
+    """Round values in 0..1 to uint8 on the CPU; values outside are clamped, NaN becomes 0, and uint8 is kept."""
     if image.dtype == torch.uint8:
         return image.detach().cpu()
-    scaled = image.detach().float().mul(255)  # a copy, so that the next operations may be in place
+    scaled = image.detach().float().mul(255)
     return scaled.nan_to_num_(0.0).clamp_(0, 255).round_().to("cpu", torch.uint8)

@@ -1,4 +1,4 @@
-"""Rectangles of a grid of pixels or cells; `crops_around` covers all masked cells with a few small ones."""
+"""Rectangles of a grid; `crops_around` covers all masked cells with a few small rectangles."""
 
 from __future__ import annotations
 
@@ -13,13 +13,10 @@ from spackle.filters import greatest_around
 
 Mask = NDArray[np.bool_]
 
-# How many cells around the masked ones the residual network gets. A delta's receptive field reaches 205 cells, but its
-# influence fades: with the shipped weights, cells beyond 64 change a delta by less than 1/100 of bfloat16's rounding
-# error; cells beyond 48 by 1/10 of it; cells beyond 32 by as much as it. See tests/residual/test_crops.py.
-MARGIN = 48
+MARGIN = 48  # cells; farther cells change a delta of the shipped weights by 1/10 of bfloat16's rounding error
 WHOLE = 0.8  # if crops cover more than this fraction of the grid, the whole grid is used instead
-NEARLY = 1.1  # a rectangle with up to this multiple of the least possible area is not cut, because that saves little
-CALL_BLOCKS = 8  # fixed cost of a crop, in blocks of 16×16 cells
+NEARLY = 1.1  # a rectangle is not cut if its area is below this multiple of the least possible area
+CALL_BLOCKS = 8  # fixed cost of a crop, in blocks of step×step cells
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,7 +35,7 @@ class Crop:
 
     @property
     def slices(self) -> tuple[slice, slice]:
-        """A pair of slices for an array [h, w, ...]."""
+        """Slices for an array [h, w, ...]."""
         return slice(self.top, self.bottom), slice(self.left, self.right)
 
     def moved(self, down: int, right: int) -> Crop:
@@ -63,16 +60,16 @@ class Crop:
 
 
 def crops_around(mask: Tensor, step: int, margin: int = MARGIN) -> list[tuple[Crop, Crop]]:
-    """A few small rectangles that together contain all masked cells, each also with the context that the network needs.
+    """Cover all masked cells with a few small rectangles.
 
     Args:
         mask: [h, w] bool.
-        step: the network's stride; outer rectangles begin at multiples of it, so that coarse grids stay aligned.
-        margin: number of cells around the masked ones that the network needs.
+        step: the network's stride; outer rectangles begin at multiples of the stride.
+        margin: number of cells around the masked cells that the network needs.
 
     Returns:
-        Pairs (inner, outer), where outer includes the margin. The inner rectangles cover each masked cell exactly once;
-        or there is one pair, with the whole grid twice.
+        Pairs (inner, outer) of rectangles; outer includes the margin. The inner rectangles contain each masked cell
+        exactly once. If cropping saves little, the only pair consists of the whole grid twice.
     """
     cells: Mask = mask.cpu().numpy()
     whole = Crop(0, 0, *cells.shape)
@@ -91,22 +88,20 @@ def crops_around(mask: Tensor, step: int, margin: int = MARGIN) -> list[tuple[Cr
 
 
 def _tight(cells: Mask, crop: Crop) -> Crop:
-    """Shrink a rectangle to its masked cells, of which there must be at least one."""
+    """Shrink a rectangle to its masked cells; at least one cell must be masked."""
     rows, columns = (np.flatnonzero(cells[crop.slices].any(axis)) for axis in (1, 0))
     edges = (int(edge) for edge in (rows[0], columns[0], rows[-1] + 1, columns[-1] + 1))
     return Crop(*edges).moved(crop.top, crop.left)
 
 
 def _cut(blocks: Mask, crop: Crop, reach: int) -> list[Crop]:
-    """Cut a rectangle in two, recursively, wherever that saves work; its masked blocks touch all four of its sides."""
+    """Cut a tight rectangle recursively in two if that saves work."""
     own = crop.grown(reach, 1, *blocks.shape).area
     if own <= NEARLY * _least(blocks, crop, reach):
         return [crop]
     inside = blocks[crop.slices]
     halves = np.concatenate([_row_halves(inside), _row_halves(inside.T)[..., [1, 0, 3, 2]]])
     halves += (crop.top, crop.left) * 2
-    if not len(halves):
-        return [crop]
     low, high = np.maximum(halves[..., :2] - reach, 0), np.minimum(halves[..., 2:] + reach, blocks.shape)
     best = halves[(high - low).prod(-1).sum(1).argmin()]
     parts = [part for half in best for part in _cut(blocks, Crop(*map(int, half)), reach)]
@@ -115,7 +110,7 @@ def _cut(blocks: Mask, crop: Crop, reach: int) -> list[Crop]:
 
 
 def _least(blocks: Mask, crop: Crop, reach: int) -> int:
-    """A lower bound for the number of blocks that the network must process, however a rectangle is cut."""
+    """Lower bound, for all cuts of a rectangle, of the number of blocks that the network processes."""
     near = np.zeros_like(blocks)
     near[crop.slices] = blocks[crop.slices]
     return int(greatest_around(torch.from_numpy(near), reach).sum())

@@ -1,12 +1,8 @@
-"""Device, memory, precision and threads of computations, and the facts about them for reports.
-
-Numba's own parallel loops need a threading layer that is unsafe to enter from two Python threads or after a fork. A
-plain thread pool is safe in both cases, and kernels for it compile faster. The last bits of a network's output depend
-on the number of threads, because it changes the order of sums.
-"""
+"""Device, memory, precision and threads of computations, and facts about the machine for reports."""
 
 from __future__ import annotations
 
+import functools
 import os
 import platform
 import threading
@@ -22,25 +18,16 @@ import torch
 import spackle
 from spackle.errors import InputError
 
-# Words in the messages with which torch reports a shortage of memory, if it does not raise a dedicated exception.
-_SHORTAGES = (
-    "DefaultCPUAllocator",
-    "not enough memory",
-    "allocate memory",  # from the system, when a file is mapped; and from torch
-    "out of memory",  # CUDA outside torch's allocator
-    "_ALLOC_FAILED",  # cuBLAS and cuDNN
-)
+# Torch reports a shortage of memory also by plain RuntimeErrors, whose messages contain one of these phrases.
+_SHORTAGES = ("DefaultCPUAllocator", "not enough memory", "allocate memory", "out of memory", "_ALLOC_FAILED")
 
 
 class MemoryShort(InputError):
-    """There was too little memory; a later attempt may succeed."""
+    """Too little memory was free; a later attempt may succeed."""
 
 
 def pick_device(device: torch.device | str | None) -> torch.device:
-    """The torch device of this name; for None, a CUDA device if there is one, else the CPU.
-
-    InputError if the device does not exist, or is neither a CPU nor a CUDA device.
-    """
+    """The CPU or CUDA device of this name; None selects CUDA if available. InputError for any other device."""
     present = torch.cuda.is_available()
     if device is None:
         return torch.device("cuda" if present else "cpu")
@@ -50,7 +37,7 @@ def pick_device(device: torch.device | str | None) -> torch.device:
     except (RuntimeError, TypeError) as error:
         raise InputError(f"{shown}: there is no such device: give cpu or cuda") from error
     if target.type not in ("cpu", "cuda"):
-        raise InputError(f"{shown}: networks do not run there: give cpu or cuda")
+        raise InputError(f"{shown}: networks do not run on such a device: give cpu or cuda")
     if target.type == "cuda" and not present:
         raise InputError(f"{shown}: torch finds no CUDA device: give cpu, or install a torch and a driver for CUDA")
     if target.type == "cuda" and (target.index or 0) >= torch.cuda.device_count():
@@ -59,14 +46,14 @@ def pick_device(device: torch.device | str | None) -> torch.device:
 
 
 def memory_is_short(error: BaseException) -> bool:
-    """Whether an exception reports a shortage of memory, in one of torch's many ways."""
+    """Whether an exception reports a shortage of memory."""
     named = isinstance(error, (MemoryError, torch.OutOfMemoryError))
     return named or any(words in str(error) for words in _SHORTAGES)
 
 
 @contextmanager
 def enough_memory(*advice: str, what: str = "for the network") -> Iterator[None]:
-    """Turn a shortage of memory, which torch reports in many ways, into one `MemoryShort` line with advice."""
+    """Turn a shortage of memory into a `MemoryShort` with advice."""
     try:
         yield
     except (MemoryError, RuntimeError) as error:
@@ -78,17 +65,15 @@ def enough_memory(*advice: str, what: str = "for the network") -> Iterator[None]
 
 @contextmanager
 def own_arithmetic(device: torch.device) -> Iterator[None]:
-    """Compute in the tensors' own dtypes, whatever the caller has set for other networks.
+    """Switch off autocast and TF32 during the block, so that networks compute in the dtypes of their tensors.
 
-    Autocast would round to sixteen bits; TF32 would drop thirteen bits of each float32 in a GPU's convolutions. TF32's
-    switches hold for the whole process, so other threads are affected too until the switches are restored.
+    TF32's switches hold for the whole process, so the block affects other threads too.
     """
     with torch.autocast("cpu", enabled=False), torch.autocast("cuda", enabled=False):
         if device.type != "cuda":
             yield
             return
-        # Not the older allow_tf32, which cannot be read if the caller has used these newer switches.
-        switches = torch.backends.cuda.matmul, torch.backends.cudnn.conv  # type: ignore[attr-defined]  # its stubs
+        switches = torch.backends.cuda.matmul, torch.backends.cudnn.conv  # type: ignore[attr-defined]  # torch's stubs
         before = [switch.fp32_precision for switch in switches]
         try:
             for switch in switches:
@@ -104,9 +89,7 @@ PRECISIONS = ("auto", "fp32", "bf16")
 
 
 def pick_dtype(precision: Precision, device: torch.device) -> torch.dtype:
-    """The dtype for a value of --precision on a device; ValueError for an unknown precision."""
-    if precision not in PRECISIONS:
-        raise ValueError(f"precision {precision!r} is none of {', '.join(PRECISIONS)}")
+    """The dtype for a precision on a device; "auto" is bfloat16 on hardware that multiplies bfloat16."""
     if precision == "auto":
         return torch.bfloat16 if multiplies_bf16(device) else torch.float32
     return torch.float32 if precision == "fp32" else torch.bfloat16
@@ -120,27 +103,21 @@ def multiplies_bf16(device: torch.device) -> bool:
     return bool(has.get("amx_bf16") or has.get("avx512_bf16"))
 
 
-_pool: ThreadPoolExecutor | None = None
-_pool_lock = threading.Lock()
-
-
 def thread_count() -> int:
-    """Number of threads: torch's own, so that one setting controls both."""
+    """Number of threads: torch's, so that one setting controls both."""
     return torch.get_num_threads()
 
 
-CHUNKS = 6  # chunks of a task for each thread: so many that uneven ones balance
+CHUNKS = 6  # chunks of a task for each thread; several chunks balance uneven work
 
 
 def run_chunks(function: Callable[[int, int], object], total: int, grain: int | None = None) -> None:
     """Call `function(start, stop)` for chunks of 0..total, each at most `grain` long, in any order, on several threads.
 
-    Writes of different chunks must not overlap. A thread takes the next chunk when it has finished one, so uneven
-    chunks balance.
+    Writes of different chunks must not overlap.
     """
     grain = grain or max(-(-total // (CHUNKS * thread_count())), 1)
-    chunks = -(-total // grain)
-    helpers = min(thread_count(), chunks) - 1
+    helpers = min(thread_count(), -(-total // grain)) - 1
     starts = iter(range(0, total, grain))
     lock = threading.Lock()
 
@@ -152,7 +129,7 @@ def run_chunks(function: Callable[[int, int], object], total: int, grain: int | 
                 return
             function(start, min(start + grain, total))
 
-    futures = [_executor().submit(work) for _ in range(helpers)]
+    futures = [_threads(os.getpid()).submit(work) for _ in range(helpers)]
     try:
         work()
     finally:
@@ -160,22 +137,10 @@ def run_chunks(function: Callable[[int, int], object], total: int, grain: int | 
             future.result()
 
 
-def _executor() -> ThreadPoolExecutor:
-    global _pool
-    with _pool_lock:
-        if _pool is None:
-            _pool = ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="spackle")
-        return _pool
-
-
-def _forget_pool() -> None:
-    """Drop the pool in a forked child, which has none of its parent's threads."""
-    global _pool, _pool_lock
-    _pool, _pool_lock = None, threading.Lock()
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_forget_pool)
+@functools.cache
+def _threads(process: int) -> ThreadPoolExecutor:
+    """A process's thread pool, which, unlike numba's loops, works for several Python threads and after a fork."""
+    return ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix=f"spackle-{process}")
 
 
 def versions() -> dict[str, str]:
@@ -185,11 +150,9 @@ def versions() -> dict[str, str]:
 
 
 def hardware(device: torch.device) -> dict[str, Any]:
-    """The CPU, its cores, the number of threads, and the GPU if that is the device."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:  # not a Linux
-        lines = []
+    """Names of the CPU and, for a CUDA device, of the GPU; numbers of cores and threads."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text(encoding="utf-8").splitlines() if info.exists() else []
     names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
     facts = {"cpu": names[0] if names else platform.machine(), "cores": os.cpu_count(), "threads": thread_count()}
     return facts | ({"gpu": torch.cuda.get_device_name(device)} if device.type == "cuda" else {})

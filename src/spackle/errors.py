@@ -4,31 +4,21 @@ from __future__ import annotations
 
 import contextlib
 import difflib
-import functools
 import reprlib
-import warnings
-from collections.abc import Callable, Iterable, Iterator
-from typing import ParamSpec, TypeVar
+from collections.abc import Iterable, Iterator
 
-P = ParamSpec("P")
-R = TypeVar("R")
-
-LONGEST = 300  # most characters of a message
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother = 2, 60, 60
 
 
 class InputError(ValueError):
-    """Bad input from a user: the message names the file or value, what is wrong and what to do.
-
-    The command line prints the message as one line and exits with code 2.
-    """
+    """Bad input from a user: one line that names the file or value, what is wrong and what to do."""
 
 
 def reason_in_a_line(error: object) -> str:
     """The text of a library's exception, at most 200 characters, for the middle of a message."""
-    said = getattr(error, "strerror", None) or error  # the system's text, without error number and file name
-    return one_line(" ".join(str(said).split()))[:200] or type(error).__name__
+    text = getattr(error, "strerror", None) or error  # the system's text, without error number and file name
+    return one_line(" ".join(str(text).split()))[:200] or type(error).__name__
 
 
 @contextlib.contextmanager
@@ -36,10 +26,9 @@ def reading(what: object, problem: str, *errors: type[Exception]) -> Iterator[No
     """Turn an exception that a library raises in the block into the InputError "{what}: {problem}".
 
     Args:
-        what: the file that is read, or another subject of the message.
-        problem: what is wrong and what to do; "{reason}" in it is replaced by the library's message.
+        what: subject of the message, usually the file that the block reads.
+        problem: what is wrong and what to do; "{reason}" stands for the library's message.
         errors: exceptions that mean bad input; by default all, because untrusted bytes can raise any exception.
-            An InputError passes unchanged.
     """
     caught = errors or (Exception,)
     try:
@@ -51,7 +40,7 @@ def reading(what: object, problem: str, *errors: type[Exception]) -> Iterator[No
 
 
 def one_line(text: str) -> str:
-    """A text without control characters, safe for a terminal or a log: file names can contain escape codes."""
+    """The text with control characters escaped, because file names can contain a terminal's escape codes."""
     line = " ".join(text.splitlines())
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
 
@@ -61,37 +50,8 @@ def shown(value: object) -> str:
     return _SHORT.repr(value)[:60]
 
 
-def renamed(**names: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorator: accept arguments under their names in the previous release, with a DeprecationWarning."""
-
-    def decorate(function: Callable[P, R]) -> Callable[P, R]:
-        @functools.wraps(function)
-        def called(*arguments: P.args, **named: P.kwargs) -> R:
-            for old, new in names.items():
-                if old in named:
-                    warnings.warn(f"{function.__name__}({old}=) is called {new}= now", DeprecationWarning, stacklevel=2)
-                    named[new] = named.pop(old)
-            return function(*arguments, **named)
-
-        return called
-
-    return decorate
-
-
-@contextlib.contextmanager
-def short_messages() -> Iterator[None]:
-    """Shorten an InputError's message of more than 300 characters in the middle: it may quote a program's values."""
-    try:
-        yield
-    except InputError as error:
-        message, half = str(error), LONGEST // 2 - 2
-        if len(message) <= LONGEST:
-            raise
-        raise InputError(f"{message[:half]} … {message[-half:]}") from error
-
-
 def check_name(option: str, name: str, known: Iterable[str]) -> None:
-    """InputError if a name is unknown; the message suggests the most similar known name."""
+    """Raise an InputError for an unknown name; the message suggests the most similar known name."""
     names = list(known)
     if name in names:
         return

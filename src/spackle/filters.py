@@ -1,4 +1,4 @@
-"""Image filters: blur, the greatest value in a window, a distance transform, and values propagated into holes."""
+"""Image filters: blurs, the maximum in a window, a distance transform, and the fill of holes from their rims."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from torch.nn.functional import avg_pool2d, interpolate, pad
 from spackle._numba import kernel
 from spackle.device import run_chunks
 
-FAR = 1 << 14  # distance in cells to the nearest known pixel if there is none
-FAR_BIAS = 80.0  # how sharply the far side of a rim wins: a sample 5 % nearer than the fill counts 1/50
-SWEEPS = 12  # relaxation sweeps at each resolution; more gain nothing
+FAR = 1 << 14  # distance, in pixels, of a pixel that does not exist
+FAR_BIAS = 80.0  # preference for the far side of a rim: a sample 5 % nearer than the fill has the weight 1/50
+SWEEPS = 12  # relaxation sweeps at each resolution
 
-MIN_TRUST = 1e-6  # least weight of a rim sample, so that a hole with only a near rim still gets its colour
+MIN_TRUST = 1e-6  # least weight of a rim sample, which matters if a hole has only a near rim
 MAX_EXPONENT = 30.0  # keeps weights within single precision
 LIGHTEST, HEAVIEST = (np.float32(np.exp(sign * MAX_EXPONENT)) for sign in (-1, 1))
 AROUND = 4  # neighbours of a pixel
@@ -29,7 +29,7 @@ Bools = NDArray[np.bool_]
 
 
 def blurred(image: Tensor, sigma: float) -> Tensor:
-    """Blur a picture [..., H, W, C] with a Gaussian of `sigma` pixels; nothing beyond the border has weight."""
+    """Blur a picture [..., H, W, C] with a Gaussian of `sigma` pixels, normalised by the weights inside the picture."""
     weights = [math.exp(-0.5 * (offset / sigma) ** 2) for offset in range(math.ceil(3 * sigma) + 1)]
     for dim in (-2, -3):
         mass = _weighted_sum(image.new_ones(image.shape[dim]), weights, 0)
@@ -47,7 +47,7 @@ def broadly_blurred(image: Tensor, sigma: float) -> Tensor:
 
 
 def _weighted_sum(values: Tensor, weights: Sequence[float], dim: int) -> Tensor:
-    """Weighted sum of neighbours along a dimension; on a CPU this is many times faster than a thin convolution."""
+    """Weighted sum of neighbours along a dimension, many times faster on a CPU than a convolution."""
     size = values.shape[dim]
     total = weights[0] * values
     for offset, weight in enumerate(weights[1:size], start=1):
@@ -57,14 +57,11 @@ def _weighted_sum(values: Tensor, weights: Sequence[float], dim: int) -> Tensor:
 
 
 def greatest_around(image: Tensor, reach: int) -> Tensor:
-    """For each pixel the greatest value of an image or mask [..., H, W] within `reach` rows and columns.
-
-    Window sizes are doubled step by step; pooling on a CPU would visit every pixel of every window.
-    """
+    """For each pixel the maximum of an image or mask [..., H, W] within `reach` rows and columns."""
     size = 2 * reach + 1
     image = pad(image, (reach,) * 4, value=0 if image.dtype == torch.bool else -math.inf)
     for dim in (-1, -2):
-        width = 1
+        width = 1  # of the window; doubling it is faster on a CPU than pooling
         while width < size:
             step = min(width, size - width)
             count = image.shape[dim] - step
@@ -74,9 +71,9 @@ def greatest_around(image: Tensor, reach: int) -> Tensor:
 
 
 def nearest_known(hole: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """For each pixel the row and column [2, H, W] of the nearest (rarely the second nearest) outside of a hole [H, W].
+    """For each pixel the row and column [2, H, W] of the nearest pixel outside of a hole [H, W].
 
-    The place is far away if there is no such pixel.
+    In rare cases the second nearest pixel is found. If the whole image is a hole, rows and columns are `-FAR`.
     """
     near = np.where(hole, -FAR, np.indices(hole.shape)).astype(np.int32)
     _propagate_nearest(hole, near)
@@ -84,14 +81,14 @@ def nearest_known(hole: NDArray[np.bool_]) -> NDArray[np.int32]:
 
 
 def distance_to(near: NDArray[np.int32]) -> Tensor:
-    """The distance [H, W] in pixels from each pixel to its place in `near` [2, H, W], as `nearest_known` gives it."""
+    """The distance [H, W] in pixels from each pixel to its nearest known pixel, given by `nearest_known`."""
     row, column = torch.from_numpy(near - np.indices(near.shape[1:], np.int32)).float()
     return torch.hypot(row, column)
 
 
 @kernel
 def _propagate_nearest(hole: Any, near: Any) -> None:
-    """Each cell takes its neighbours' nearest cell if that is nearer; four sweeps alternate in direction."""
+    """Give each cell the nearest cell of a neighbour if that is nearer, in four sweeps of alternating direction."""
     height, width = hole.shape
     for turn in range(4):
         for i in range(height):
@@ -111,16 +108,15 @@ def _propagate_nearest(hole: Any, near: Any) -> None:
 def far_fill(
     inverse_depth: Tensor, values: Tensor, known: Tensor, *, far_bias: Tensor | float = FAR_BIAS
 ) -> tuple[Tensor, Tensor]:
-    """Fill the unknown part of an inverse depth image and of further values.
+    """Fill the unknown part of an inverse depth image and of further values, mostly from the far side of each hole.
 
-    A moving camera uncovers what lies behind a surface, so a hole between a near and a far surface extends the far one.
-    A coarse-to-fine fill gives the first guess; at every resolution a relaxation turns it into a membrane over the rim.
-    In the relaxation, a rim sample nearer than the fill has the weight min(1, fill / sample)^far_bias. The work grows
-    with the hole, not the image.
+    A moving camera uncovers the surface behind, so a hole between a near and a far surface belongs to the far one. From
+    coarse to fine, an interpolated guess is relaxed to a membrane over the rim, in which a rim sample has the weight
+    min(1, fill / sample)^far_bias.
 
     Args:
-        inverse_depth: [H, W], positive where known.
-        values: [C, H, W] further values to propagate, such as colours.
+        inverse_depth: [H, W], positive at known pixels.
+        values: [C, H, W] further values, such as colours.
         known: [H, W] bool. Values at unknown pixels are ignored.
         far_bias: one number, or one for each pixel [H, W]; 0 treats both sides of the rim alike.
 
@@ -132,7 +128,7 @@ def far_fill(
     """
     if not bool(known.any()):
         raise ValueError("nothing to fill from: no pixel is known")
-    # The values of a pixel lie side by side in memory, because the hole's pixels are scattered.
+    # Channels last, because a hole's pixels are scattered in memory.
     depths = inverse_depth.detach().cpu().float().clone(memory_format=torch.contiguous_format)
     others = values.detach().cpu().float().permute(1, 2, 0).clone(memory_format=torch.contiguous_format)
     bias = torch.as_tensor(far_bias, dtype=torch.float32).cpu().expand(inverse_depth.shape).contiguous()
@@ -141,7 +137,7 @@ def far_fill(
 
 
 def _fill_level(depths: Floats, values: Floats, known: Bools, bias: Floats) -> None:
-    """Fill a level's inverse depths [H, W] and values [H, W, C] in place from the next coarser level, then relax."""
+    """Fill inverse depths [H, W] and values [H, W, C] in place from the next coarser level, then relax them."""
     count, channels = known.size - np.count_nonzero(known), values.shape[-1]
     if count == 0:
         return
@@ -166,10 +162,7 @@ def _coarsen(
     start: int, stop: int, depths: Any, values: Any, known: Any, bias: Any, reference: Any,
     coarse_depths: Any, coarse_values: Any, coarse_known: Any, coarse_bias: Any,
 ) -> None:  # fmt: skip
-    """Compute rows start..stop of the coarser level from each 2×2 pixels.
-
-    These are the mean of the known pixels, far ones weighted most; whether any is known; and the mean bias.
-    """
+    """Reduce 2×2 pixels to one, in rows start..stop of the coarser level; far pixels have the largest weights."""
     height, width = depths.shape
     channels = values.shape[2]
     weights = np.empty(4, np.float32)
@@ -201,7 +194,7 @@ def _coarsen(
 
 @kernel
 def _far_weight(relative: Any, bias: Any) -> Any:
-    """relative^−bias, kept within single precision."""
+    """relative^−bias, within single precision."""
     if bias == 0:
         return np.float32(1)
     exponent = -bias * np.log(max(relative, np.float32(1e-6)))
@@ -212,9 +205,9 @@ def _far_weight(relative: Any, bias: Any) -> Any:
 
 @kernel
 def _find_holes(known: Any, count: int) -> Any:
-    """Flat positions of hole pixels [n], numbers of their neighbours [n, 4], and flat positions of rim pixels.
+    """Flat positions of the n hole pixels, numbers [n, 4] of their neighbours, and flat positions of the rim's pixels.
 
-    Neighbours are numbered holes first, then the rim; beyond the image a pixel is its own neighbour.
+    Numbers count the hole's pixels first, then the rim's; at the image's border a pixel is its own neighbour.
     """
     height, width = known.shape
     holes, links = np.empty(count, np.int32), np.empty((count, AROUND), np.int32)
@@ -245,7 +238,7 @@ def _find_holes(known: Any, count: int) -> Any:
 
 @kernel
 def _guess(width: int, coarse_depths: Any, coarse_values: Any, holes: Any, samples: Any) -> None:
-    """Write the holes' samples [n, 1 + C], interpolated bilinearly from the coarser level."""
+    """Interpolate the holes' samples [n, 1 + C] bilinearly from the coarser level."""
     rows, columns, channels = coarse_values.shape
     for n in range(len(holes)):
         y, x = holes[n] // width, holes[n] % width
@@ -266,7 +259,7 @@ def _guess(width: int, coarse_depths: Any, coarse_values: Any, holes: Any, sampl
 
 @kernel
 def _relax(samples: Any, copy: Any, links: Any, bias: Any, sweeps: int) -> Any:
-    """Samples after Jacobi sweeps on the holes, which come first; nothing flows across the image's border."""
+    """Jacobi sweeps over the samples of holes, which come before the samples of the rim."""
     count, channels = len(links), samples.shape[1]
     old, new = samples, copy
     for _ in range(sweeps):
@@ -293,7 +286,7 @@ def _relax(samples: Any, copy: Any, links: Any, bias: Any, sweeps: int) -> Any:
 
 @kernel
 def _conductance(here: Any, there: Any, bias: Any) -> Any:
-    """The weight of a rim sample `there` for the fill `here`: 1, or less the nearer the sample is."""
+    """The weight min(1, here / there)^bias of a rim sample `there` for the fill `here`."""
     if there <= here:
         return np.float32(1)
     ratio = max(here / max(there, np.float32(1e-12)), np.float32(1e-6))

@@ -1,4 +1,4 @@
-"""Folders for results: locked by one run, filled with complete sets of files, recognised by digests."""
+"""Folders for results: locks, complete sets of files, and digests of files."""
 
 from __future__ import annotations
 
@@ -7,29 +7,19 @@ import hashlib
 import json
 import os
 import shutil
-import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from spackle.errors import InputError, reading, reason_in_a_line
+from spackle.errors import InputError, reading
 from spackle.files import LEFTOVER, check_writable, fingerprint, sha256_of
 
-LOCK, NEW = ".lock", ".new"
-
-if sys.platform == "win32":
-    import msvcrt
-
-    def _lock(file: BinaryIO) -> None:
-        try:
-            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
-        except OSError as error:
-            raise BlockingIOError(*error.args) from error
-else:
+try:
     import fcntl
+except ImportError:  # on Windows, where two runs are not kept apart
+    fcntl = None  # type: ignore[assignment]
 
-    def _lock(file: BinaryIO) -> None:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+LOCK, NEW = ".lock", ".new"
 
 
 @contextlib.contextmanager
@@ -44,7 +34,7 @@ def hold(path: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        with contextlib.suppress(OSError):  # Windows deletes no open file; the lock file may stay
+        with contextlib.suppress(OSError):
             path.unlink()
         file.close()
 
@@ -53,9 +43,9 @@ def _acquire(path: Path) -> BinaryIO:
     while True:
         with contextlib.ExitStack() as stack:
             file = stack.enter_context(open(path, "ab"))
-            _lock(file)
-            # Its last holder may have deleted it between these two steps: then we have locked a file without a name.
-            with contextlib.suppress(FileNotFoundError):
+            if fcntl is not None:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            with contextlib.suppress(FileNotFoundError):  # the last holder deleted the file before we locked it
                 if os.path.samestat(os.fstat(file.fileno()), os.stat(path)):
                     stack.pop_all()
                     return file
@@ -63,17 +53,23 @@ def _acquire(path: Path) -> BinaryIO:
 
 @contextlib.contextmanager
 def results_folder(path: Path, files: Sequence[str] = (), *, alone: bool = False) -> Iterator[None]:
-    """Create a folder for results; it is removed if the block leaves it empty.
+    """Create a folder for results; remove the folder if the block writes no file into it.
 
-    InputError, before any long work, if the `files` of the block cannot be written. Temporary files that a killed run
-    left are deleted. `alone` locks the folder during the block; InputError if another run has locked it.
+    Temporary files of killed runs are deleted. `alone` locks the folder during the block.
+
+    Raises:
+        InputError: `files` cannot be written, or another run has locked the folder.
     """
     missing = [folder for folder in (path, *path.parents) if not os.path.exists(folder)]
     try:
         with contextlib.ExitStack() as stack:
             make_folder(path)
             if alone:
-                stack.enter_context(_alone_in(path))
+                try:
+                    stack.enter_context(hold(path / LOCK))
+                except BlockingIOError as error:
+                    advice = "wait for its end, end it, or choose another folder with -o"
+                    raise InputError(f"{path}: another run is at work in this folder: {advice}") from error
             for name in files:
                 check_writable(path / name)
             with contextlib.suppress(OSError):
@@ -85,36 +81,19 @@ def results_folder(path: Path, files: Sequence[str] = (), *, alone: bool = False
                 folder.rmdir()
 
 
-@contextlib.contextmanager
-def _alone_in(folder: Path) -> Iterator[None]:
-    """Lock the folder during the block; the kernel frees the lock of a killed run."""
-    with contextlib.ExitStack() as stack:
-        try:
-            while True:
-                with contextlib.suppress(FileNotFoundError):  # another run has just removed the empty folder
-                    stack.enter_context(hold(folder / LOCK))
-                    break
-                make_folder(folder)
-        except BlockingIOError as error:
-            raise InputError(
-                f"{folder}: another run is at work in this folder: wait for it, end it, or choose another with -o"
-            ) from error
-        except OSError as error:
-            raise InputError(f"{folder / LOCK}: cannot write: {reason_in_a_line(error)}") from error
-        yield
 
 
 @contextlib.contextmanager
 def whole_set(folder: Path, last: str) -> Iterator[Path]:
-    """Yield a new folder for a set of files; if the block succeeds, the files move to `folder`.
+    """Yield a new folder for a set of files; if the block succeeds, the files replace an older set in `folder`.
 
-    If it raises, an older set is kept. The presence of the file `last` means that the others are complete, so it is
-    deleted first and moved last. The caller must have locked the folder (`alone`), see `results_folder`.
+    The file `last` is deleted first and moved last, so that its presence means a complete set. The caller must have
+    locked the folder, see `results_folder`.
     """
     new = folder / NEW
     try:
         with reading(new, "cannot write: {reason}", OSError):
-            if os.path.lexists(new):  # left by a killed run
+            if new.exists():  # from a killed run
                 shutil.rmtree(new)
             new.mkdir()
         yield new
@@ -131,15 +110,14 @@ def file_records(folder: Path, files: Iterable[Path]) -> dict[str, dict[str, obj
     records: dict[str, dict[str, object]] = {}
     for path in files:
         with open(path, "rb") as file:
-            size = os.fstat(file.fileno()).st_size
-            records[path.relative_to(folder).as_posix()] = {"bytes": size, "sha256": sha256_of(file)}
+            records[path.relative_to(folder).as_posix()] = {"bytes": path.stat().st_size, "sha256": sha256_of(file)}
     return records
 
 
 def as_recorded(folder: Path, report: str, records: object) -> bool:
-    """Whether a folder still holds the files that a report lists with their `file_records`.
+    """Whether a folder still holds the files that a report lists by `file_records`.
 
-    Sizes and times are compared; a file newer than the report, as in a copied folder, is read.
+    Sizes are compared; the content is hashed if a file is newer than the report, as in a copied folder.
     """
     if not isinstance(records, Mapping) or not records:
         return False
@@ -156,14 +134,14 @@ def as_recorded(folder: Path, report: str, records: object) -> bool:
 
 
 def photo_digest(path: Path) -> str:
-    """The digest of a photo; "none" if it is missing, which is reported when its turn comes."""
+    """The photo's `fingerprint`, or "none" for a missing photo."""
     with contextlib.suppress(InputError):
         return fingerprint(path, "photo")
     return "none"
 
 
 def remove_half_written(*folders: Path, files: Sequence[str] | None = None) -> None:
-    """Delete the temporary files that killed runs left for `files`; None: for any file, in locked folders."""
+    """Delete temporary files of killed runs: those of the named `files`, or, in locked folders, all (None)."""
     for folder in folders:
         for file in folder.iterdir():
             match = LEFTOVER.fullmatch(file.name)
@@ -172,7 +150,7 @@ def remove_half_written(*folders: Path, files: Sequence[str] | None = None) -> N
 
 
 def make_folder(path: Path) -> None:
-    """Create a folder for results, or check that it is writable; InputError if this is impossible."""
+    """Create a folder for results if it is missing; InputError if the folder cannot be created or written."""
     with reading(path, "cannot create this output folder: {reason}; choose another with -o", OSError, ValueError):
         path.mkdir(parents=True, exist_ok=True)
     if not os.access(path, os.W_OK | os.X_OK):
@@ -185,7 +163,7 @@ def digest_of(value: object) -> str:
 
 
 def differences(old: Mapping[str, Any], new: Mapping[str, Any], where: str = "") -> list[str]:
-    """The differences of two configurations, as "key: old -> new"."""
+    """List the differences of two configurations as "key: old -> new"."""
 
     def short(value: object) -> str:
         text = json.dumps(value)

@@ -1,4 +1,4 @@
-"""A set of 3D Gaussians as one object with five tensors."""
+"""Sets of 3D Gaussians, and quaternions."""
 
 from __future__ import annotations
 
@@ -62,14 +62,11 @@ class Gaussians:
         return Gaussians(*(t.detach() for t in self.tensors))
 
     def select(self, index: Tensor | slice) -> Gaussians:
-        """The Gaussians that a boolean mask [N], an index tensor [M] or a slice selects."""
+        """Select Gaussians by a boolean mask [N], an index tensor [M] or a slice."""
         return Gaussians(*(t[index] for t in self.tensors))
 
     def transform(self, matrix: Tensor) -> Gaussians:
-        """Apply a similarity (rotation, uniform scale, translation).
-
-        Args:
-            matrix: [4, 4], which maps old world coordinates to new ones.
+        """Apply a similarity [4, 4]: rotation, uniform scale and translation.
 
         Raises:
             ValueError: the upper left 3×3 block is not a proper rotation times a scale.
@@ -98,7 +95,7 @@ class Gaussians:
 
 
 def quat_to_matrix(quats: Tensor) -> Tensor:
-    """Rotation matrices [..., 3, 3] of quaternions [..., 4] (wxyz), which need not be normalised."""
+    """Convert quaternions [..., 4] (wxyz, of any length) to rotation matrices [..., 3, 3]."""
     w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -109,9 +106,9 @@ def quat_to_matrix(quats: Tensor) -> Tensor:
 
 
 def quat_from_matrix(rotation: Tensor) -> Tensor:
-    """Unit quaternions [..., 4] (wxyz, w ≥ 0) of rotation matrices [..., 3, 3].
+    """Convert rotation matrices [..., 3, 3] to unit quaternions [..., 4] (wxyz, w ≥ 0).
 
-    The largest of the four components is used as divisor, so that the result is well conditioned for every rotation.
+    The divisor is the largest of the four components, so the result is well conditioned for every rotation.
     """
     (m00, m01, m02), (m10, m11, m12), (m20, m21, m22) = (row.unbind(-1) for row in rotation.unbind(-2))
     w = torch.stack([1 + m00 + m11 + m22, m21 - m12, m02 - m20, m10 - m01], -1)
@@ -126,7 +123,7 @@ def quat_from_matrix(rotation: Tensor) -> Tensor:
 
 
 def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
-    """Hamilton product of quaternions (wxyz), broadcast over leading axes: the rotation by b, followed by that by a."""
+    """Hamilton product of quaternions [..., 4] (wxyz): rotate by b, then by a."""
     aw, ax, ay, az = a.unbind(-1)
     bw, bx, by, bz = b.unbind(-1)
     return torch.stack(

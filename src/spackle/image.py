@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import io
 import math
-import numbers
 import os
 import warnings
 from collections.abc import Callable
@@ -26,17 +25,17 @@ from spackle.photo_frame import PhotoFrame, find_frame
 
 T = TypeVar("T")
 
-PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".heic", ".heif", ".tif", ".tiff")  # of photos in a folder
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".heic", ".heif", ".tif", ".tiff")
 MAX_PIXELS = 100_000_000  # a larger image would take more than a gigabyte as float32
 SMALL_PIXELS, PIXELS_A_BYTE = 32_000_000, 32  # a strongly compressed photo has 20 pixels for each byte
-LEAST_SIDE, MOST_ASPECT = 32, 8  # pixels; long side over short side: a smaller or narrower photo shows no scene
+LEAST_SIDE, MOST_ASPECT = 32, 8  # pixels of the short side; largest ratio of long to short side
 MAX_SIDE = 1536  # long side of the working size
-EDGE = 0.005  # of the long side: see `pad_edge`
-DEFAULT_FOCAL_MM = 30.0  # 35 mm equivalent, used if nothing is known; SHARP's choice
+EDGE = 0.005  # width of the border that `pad_edge` replaces, as a share of the long side
+DEFAULT_FOCAL_MM = 30.0  # 35 mm equivalent for a photo of unknown focal length; SHARP's choice
 FILM_DIAGONAL_MM = math.hypot(36, 24)
-PHONE_FOCAL_MM, PHONE_FACTOR = 10.0, 8.4  # a shorter lens is taken to have a small sensor: SHARP's crude rule
+PHONE_FOCAL_MM, PHONE_FACTOR = 10.0, 8.4  # SHARP's rule: a shorter focal length means a sensor 8.4 times smaller
 LENSES = (0.01, 10_000.0)  # range of accepted focal lengths, in long sides of the photo: 178° to 0.006°
-PLAUSIBLE_MM = (3.0, 3000.0)  # a 35 mm equivalent outside this range comes from a broken tag
+PLAUSIBLE_MM = (3.0, 3000.0)  # range of plausible 35 mm equivalents in EXIF
 
 _EXIF_IFD = 0x8769
 _FOCAL_LENGTH, _FOCAL_35MM = 0x920A, 0xA405
@@ -46,17 +45,13 @@ _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # inch, cm, mm, µm
 
 @dataclasses.dataclass(frozen=True)
 class Photo:
-    """An upright image and the focal length with which it was taken."""
+    """An upright image and its focal length."""
 
-    rgb: Tensor  # [H, W, 3] float32 sRGB in 0..1
+    rgb: Tensor = dataclasses.field(repr=False)  # [H, W, 3] float32 sRGB in 0..1
     focal_px: float  # in pixels of `rgb`
     focal_source: str  # "--focal-px", "--focal-mm", "--fov", "EXIF" or "default 30 mm"
     path: Path
     frame: PhotoFrame | None = None  # the border that was cropped, in pixels of `rgb`
-
-    def __repr__(self) -> str:
-        lens = f"focal length {self.focal_px:.4g} px ({self.focal_source})"
-        return f"Photo({self.path.name!r}, {self.width}×{self.height}, {lens})"
 
     @property
     def height(self) -> int:
@@ -67,18 +62,18 @@ class Photo:
         return int(self.rgb.shape[1])
 
     def check_shape(self) -> None:
-        """InputError if the photo is too small or too narrow to show a scene."""
+        """Raise an InputError for a photo that is too small or too narrow to show a scene."""
         check_shape(self.width, self.height, self.path)
 
     @property
     def framed_size(self) -> tuple[int, int]:
-        """(width, height) before the border was cropped; of a photo at full size, this is the file's image size."""
+        """Width and height before the border was cropped."""
         left, top, right, bottom = self.frame.widths if self.frame else (0, 0, 0, 0)
         return round(self.width + left + right), round(self.height + top + bottom)
 
     @property
     def camera(self) -> Camera:
-        """The photo's own camera, at the world's origin; cropping a border shifts the principal point."""
+        """The photo's camera, at the world's origin; cropping a border shifts the principal point."""
         left, top, right, bottom = self.frame.widths if self.frame else (0, 0, 0, 0)
         camera = Camera.from_focal(self.focal_px, self.width, self.height)
         return camera.cropped((left - right) / 2, (top - bottom) / 2, self.width, self.height)
@@ -94,24 +89,23 @@ def load_photo(
 ) -> Photo:
     """Read a JPEG, PNG, WebP, HEIC, TIFF or any other image that Pillow opens.
 
-    EXIF orientation is applied, colours are converted from an embedded profile to sRGB, and transparent pixels are laid
-    over white; of an animation the first frame is read. If no focal length is given, EXIF's is taken, else that of a
-    30 mm lens.
+    The photo is rotated as EXIF asks, and converted to sRGB from an embedded profile. Transparent pixels become white.
+    Only the first frame of an animation is read. Without `focal_px`, `focal_mm` and `fov`, the focal length is taken
+    from EXIF, or that of a 30 mm lens.
 
     Args:
         path: the file.
         focal_px: focal length in pixels of the upright photo.
-        focal_mm: focal length as its 35 mm film equivalent, by the diagonal.
+        focal_mm: 35 mm equivalent of the focal length, by the diagonal.
         fov: horizontal field of view in degrees.
-        keep_frame: whether to keep a uniform border; otherwise it is cropped, unless a focal length is given.
+        keep_frame: keep a uniform border, which is otherwise cropped unless a focal length is given.
 
     Raises:
         InputError: the file is missing, broken or too large, or the focal length is invalid.
     """
-    _check_focal(focal_px, focal_mm, fov)
 
     def read(image: Image.Image) -> tuple[Tensor, dict[int, object]]:
-        tags = _exif(image)  # before loading: a TIFF loses its tags once its pixels are loaded
+        tags = _exif(image)  # a TIFF loses its tags when its pixels are loaded
         image.load()
         return _to_rgb(_upright(image), path), tags
 
@@ -120,15 +114,9 @@ def load_photo(
 
 
 def photo_of_picture(
-    picture: Image.Image | NDArray[Any] | Tensor,
-    *,
-    focal_px: float | None = None,
-    focal_mm: float | None = None,
-    fov: float | None = None,
-    keep_frame: bool = True,
+    picture: Image.Image | NDArray[Any] | Tensor, *, keep_frame: bool = True, **lens: float | None
 ) -> Photo:
-    """A photo from an image in memory, PIL's or [H, W, 3] sRGB as uint8 or floats in 0..1; see `load_photo`."""
-    _check_focal(focal_px, focal_mm, fov)
+    """A photo from a PIL image, or from [H, W, 3] sRGB as uint8 or floats in 0..1; `lens` as for `load_photo`."""
     path, exif = Path("photo"), dict[int, object]()
     if isinstance(picture, Image.Image):
         check_pixels(picture.width, picture.height, MAX_PIXELS, path)
@@ -145,12 +133,12 @@ def photo_of_picture(
         rgb = values.float() / 255 if values.dtype == torch.uint8 else values.float().clone()
         if not (torch.isfinite(rgb).all() and rgb.min() >= 0 and rgb.max() <= 1):
             raise InputError(f"{path}: colours from {rgb.min():g} to {rgb.max():g}: give floats from 0 to 1, or uint8")
-    return _photo(rgb, exif, path, keep_frame, focal_px=focal_px, focal_mm=focal_mm, fov=fov)
+    return _photo(rgb, exif, path, keep_frame, **lens)
 
 
-def _photo(rgb: Tensor, exif: dict[int, object], path: Path, keep_frame: bool, **given: float | None) -> Photo:
+def _photo(rgb: Tensor, exif: dict[int, object], path: Path, keep_frame: bool, **lens: float | None) -> Photo:
     height, width = rgb.shape[:2]
-    focal, source = focal_length(path, width, height, exif, **given)
+    focal, source = focal_length(path, width, height, exif, **lens)
     frame = None if keep_frame or source.startswith("--") else find_frame(rgb)
     return Photo(frame.inside(rgb, width, height) if frame else rgb, focal, source, path, frame)
 
@@ -165,12 +153,20 @@ def focal_length(
     focal_mm: float | None = None,
     fov: float | None = None,
 ) -> tuple[float, str]:
-    """The focal length in pixels and its source: one of `load_photo`'s options, else EXIF, else a default lens.
+    """The focal length in pixels and its source; see `load_photo`.
 
     Raises:
-        InputError: the focal length is invalid; the message names the photo, `path`.
+        InputError: the focal length is invalid.
     """
-    _check_focal(focal_px, focal_mm, fov)
+    given = {"--focal-px": focal_px, "--focal-mm": focal_mm, "--fov": fov}
+    named = {name: value for name, value in given.items() if value is not None}
+    if len(named) > 1:
+        raise InputError(f"{' and '.join(named)} are given together: give one of them")
+    for name, value in named.items():
+        if not (math.isfinite(value) and value > 0):
+            raise InputError(f"{name} must be a positive number, got {value!r}")
+        if name == "--fov" and value >= 180:
+            raise InputError(f"--fov must lie between 0 and 180 degrees, got {value}")
     if focal_px is not None:
         focal, source = focal_px, "--focal-px"
     elif focal_mm is not None:
@@ -191,7 +187,7 @@ def focal_length(
 
 
 def resize_photo(photo: Photo, max_side: int = MAX_SIDE) -> Photo:
-    """The photo at its working size (see `working_size`), resized by Lanczos; the focal length is scaled too."""
+    """Resize a photo and its focal length to its `working_size`, by Lanczos."""
     width, height = working_size(photo.width, photo.height, max_side)
     if (width, height) == (photo.width, photo.height):
         return photo
@@ -208,10 +204,9 @@ def resize_photo(photo: Photo, max_side: int = MAX_SIDE) -> Photo:
 
 
 def pad_edge(rgb: Tensor) -> Tensor:
-    """Replace a photo's [H, W, 3] outermost pixels, `EDGE` of its long side, by the pixels just inside of them.
+    """Replace the outermost pixels of a photo [H, W, 3] by the pixels just inside.
 
-    The outermost lines often do not belong to the image: they are a scan's edge, or were mixed with outside colours by
-    resizing. In a view from the side they would show as a line, and as streaks where the fill extends them.
+    The outermost pixels often show a scan's edge, or colours mixed by resizing; the fill would extend them as streaks.
     """
     height, width = rgb.shape[:2]
     edge = min(round(EDGE * max(height, width)), (min(height, width) - 1) // 2)
@@ -220,20 +215,20 @@ def pad_edge(rgb: Tensor) -> Tensor:
 
 
 def working_size(width: int, height: int, max_side: int = MAX_SIDE) -> tuple[int, int]:
-    """(width, height) with the long side at most `max_side`, never enlarged."""
+    """Width and height scaled down so that the long side is at most `max_side`."""
     scale = min(1.0, max_side / max(width, height))
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
 def film_to_pixels(focal_mm: float, width: int, height: int) -> float:
-    """Convert a 35 mm equivalent focal length to pixels: the diagonals of film and photo correspond."""
+    """Convert a 35 mm equivalent focal length to pixels, by the diagonals of film and photo."""
     return focal_mm * math.hypot(width, height) / FILM_DIAGONAL_MM
 
 
 def focal_from_exif(tags: dict[int, object], width: int, height: int) -> float | None:
     """Focal length in pixels of a width×height photo from EXIF tags (number → value), or None.
 
-    The most trusted tags are used: the 35 mm equivalent; else the lens with the sensor's pixel pitch; else the lens.
+    The 35 mm equivalent comes first, then the focal length with the sensor's pixel pitch, then the focal length alone.
     """
 
     def plausible(mm: float) -> bool:
@@ -257,7 +252,7 @@ def focal_from_exif(tags: dict[int, object], width: int, height: int) -> float |
 
 
 class _BoundedFile(io.BufferedReader):
-    """A file that never tries to read beyond its end: else a PNG chunk that claims 4 GB would be allocated."""
+    """A file that allocates no more than its size, even if a PNG chunk claims 4 GB."""
 
     def __init__(self, raw: io.FileIO) -> None:
         super().__init__(raw)
@@ -268,14 +263,10 @@ class _BoundedFile(io.BufferedReader):
 
 
 def read_image(path: str | os.PathLike[str], read: Callable[[Image.Image], T]) -> T:
-    """Open an image of at most 100 megapixels, and return the result of `read`, which gets it before pixels are loaded.
-
-    Raises:
-        InputError: for any failure. A decoder can raise any exception on untrusted bytes, so all are caught.
-    """
+    """Open an image of at most 100 megapixels, and return `read(image)`; InputError if decoding fails."""
     check_file(path, "photo")
     with reading(path, "cannot be decoded ({reason}): the file is damaged or cut off"), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # about broken EXIF or 90 megapixels: not worth reporting
+        warnings.simplefilter("ignore")  # about broken EXIF
         if "HEIF" not in Image.OPEN:
             import pillow_heif
 
@@ -287,13 +278,11 @@ def read_image(path: str | os.PathLike[str], read: Callable[[Image.Image], T]) -
         except Image.DecompressionBombError:
             raise InputError(f"{path}: more than 100 megapixels: shrink it first") from None
         except UnidentifiedImageError:
-            raise InputError(
-                f"{path}: not an image in any format that is known here: give a JPEG, PNG, WebP, HEIC or TIFF"
-            ) from None
+            raise InputError(f"{path}: not an image of a known format: give a JPEG, PNG, WebP, HEIC or TIFF") from None
 
 
 def check_shape(width: int, height: int, path: str | os.PathLike[str]) -> None:
-    """InputError if a photo of this size is too small or too narrow to show a scene."""
+    """Raise an InputError for a size that is too small or too narrow to show a scene."""
     short, long = sorted((width, height))
     if short < LEAST_SIDE or long > MOST_ASPECT * short:
         wanted = f"at least {LEAST_SIDE} pixels a side, and at most {MOST_ASPECT} times as long as wide"
@@ -301,29 +290,13 @@ def check_shape(width: int, height: int, path: str | os.PathLike[str]) -> None:
 
 
 def check_pixels(width: int, height: int, size: int, path: str | os.PathLike[str]) -> None:
-    """InputError, before a decoder allocates memory, for an image above 100 megapixels, or above 32 in a small file.
-
-    So a file below 1 MB takes at most 1.5 GB of memory, whatever image size it announces. `size` is the file's, in
-    bytes.
-    """
+    """Raise an InputError if an image in a file of `size` bytes would take too much memory."""
     most = min(MAX_PIXELS, max(SMALL_PIXELS, PIXELS_A_BYTE * size))
     if width * height > most:
         raise InputError(
             f"{path}: {width}×{height} is too large (at most {most // 10**6} megapixels in {size:,} bytes): "
             "shrink it first"
         )
-
-
-def _check_focal(focal_px: float | None, focal_mm: float | None, fov: float | None) -> None:
-    given = {"--focal-px": focal_px, "--focal-mm": focal_mm, "--fov": fov}
-    named = {name: value for name, value in given.items() if value is not None}
-    if len(named) > 1:
-        raise InputError(f"{' and '.join(named)} are given together: give one of them")
-    for name, value in named.items():
-        if not (isinstance(value, numbers.Real) and math.isfinite(value) and value > 0):
-            raise InputError(f"{name} must be a positive number, got {value!r}")
-        if name == "--fov" and value >= 180:
-            raise InputError(f"--fov must lie between 0 and 180 degrees, got {value}")
 
 
 def _upright(image: Image.Image) -> Image.Image:
@@ -334,7 +307,7 @@ def _upright(image: Image.Image) -> Image.Image:
 
 
 def _exif(image: Image.Image) -> dict[int, object]:
-    """The tags of the main directory and the EXIF directory; none if they are broken."""
+    """The tags of the main directory and of the EXIF directory; empty if broken."""
     try:
         exif = image.getexif()
         return {**exif, **exif.get_ifd(_EXIF_IFD)}
@@ -369,15 +342,13 @@ def _to_rgb(image: Image.Image, path: str | os.PathLike[str]) -> Tensor:
 
 
 def _to_srgb(image: Image.Image, profile: bytes | None) -> Image.Image:
-    """Convert from an embedded colour profile, which is ignored if it is broken or does not fit the image."""
     if not profile:
         return image
     try:
         source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
         if "sRGB" in ImageCms.getProfileDescription(source):
-            return image  # a conversion would only round
+            return image
         target = ImageCms.createProfile("sRGB")
-        converted = ImageCms.profileToProfile(image, source, target, outputMode="RGB")
-    except (ImageCms.PyCMSError, OSError, ValueError, TypeError):
+        return ImageCms.profileToProfile(image, source, target, outputMode="RGB") or image
+    except (ImageCms.PyCMSError, OSError, ValueError, TypeError):  # the profile is broken or of another mode
         return image
-    return converted or image

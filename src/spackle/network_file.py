@@ -1,8 +1,7 @@
-"""Load weights from an untrusted file: names, shapes and numbers are checked, and no code in the file is run.
+"""Load weights from an untrusted safetensors, `torch.save` or TorchScript file without running code in the file.
 
-A file is safetensors, or was written by `torch.save` or TorchScript, whatever its name. The latter two write a zip
-archive of tensors, possibly code, and a pickle that places each tensor in a tree of objects. The code is ignored, and
-the pickle is read with inert stand-ins for all classes and functions in it.
+`torch.save` and TorchScript write a zip archive of tensors, code, and a pickle that places each tensor in a tree of
+objects. The pickle is read with inert stand-ins for all its classes and functions.
 """
 
 from __future__ import annotations
@@ -28,9 +27,9 @@ from spackle.files import check_file
 Network = TypeVar("Network", bound=nn.Module)
 Shapes = dict[str, tuple[int, ...]]  # tensors' shapes by name
 
-NAMED = 3  # number of differing names that a message lists
-MAX_PICKLE = 4_000_000  # bytes; a pickle for a thousand tensors has a tenth of that
-MAX_NODES = 100_000  # nodes of the tree; an object that occurs in several places counts each time
+NAMED = 3  # number of names that a message lists
+MAX_PICKLE = 4_000_000  # bytes; a pickle for a thousand tensors has a tenth
+MAX_NODES = 100_000  # nodes of the tree; a repeated object counts each time
 MAX_PATH = 1000  # characters of a path from the tree's root
 STORAGES = {
     "torch FloatStorage": torch.float32,
@@ -50,15 +49,14 @@ def load_strict(
     *,
     prepare: Callable[[nn.Module], object] | None = None,
 ) -> Network:
-    """Fill a network, which may be on the meta device, with a file's tensors, which must match exactly, and freeze it.
-
-    Weights become float32; integer tensors, such as counts, stay as they are. Nothing shares memory with the file.
+    """Fill a network with a file's tensors, converted to float32, and freeze it; integer buffers keep their values.
 
     Args:
-        network: the network to fill.
+        network: the network, which may be on the meta device.
         tensors: the file's tensors, see `read_tensors`.
-        path, advice: for messages: the file, and what to do about a wrong one.
-        prepare: converts the filled network in place, while its tensors are still mapped from the disk.
+        path: the file, for messages.
+        advice: what to do about a wrong file, for messages.
+        prepare: converts the filled network in place, before tensors are copied from the file.
 
     Raises:
         InputError: tensors are missing, unknown, of another shape, or not finite.
@@ -72,14 +70,14 @@ def load_strict(
     if prepare is not None:
         prepare(network)
     for name, tensor in (*network.named_parameters(), *network.named_buffers()):
-        if name in used and tensor.data_ptr() == tensors[name].data_ptr():  # the file may change later
+        if name in used and tensor.data_ptr() == tensors[name].data_ptr():  # still mapped from the file
             tensor.data = tensor.data.clone()
     check_finite(network, path, advice)
     return network
 
 
 def channels_last(network: nn.Module) -> None:
-    """Convert kernels to channels-last, which is fast on a CPU."""
+    """Convert kernels to channels-last, which is faster on a CPU."""
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs lack it
 
 
@@ -90,7 +88,10 @@ def check_tensors(
     advice: str,
     ignored: Collection[str] = (),
 ) -> None:
-    """InputError unless a file has float tensors of exactly these names and shapes; further names may be `ignored`."""
+    """Raise an InputError unless a file has float tensors of the expected names and shapes, and no others.
+
+    Names in `ignored` are not checked.
+    """
     kinds = {
         "missing": sorted(expected.keys() - found.keys()),
         "unknown": sorted(found.keys() - expected.keys() - set(ignored)),
@@ -109,8 +110,8 @@ def check_tensors(
 
 
 def check_finite(network: nn.Module, path: str | os.PathLike[str], advice: str) -> None:
-    """InputError unless all numbers of a network from a file are finite."""
-    # A finite sum proves that all numbers are finite, and is cheap; as finite numbers may overflow, others are checked.
+    """Raise an InputError unless all numbers of a network are finite."""
+    # A finite sum is a cheap proof; the sum of finite numbers may overflow.
     broken = [name for name, t in network.state_dict().items() if not (t.sum().isfinite() or t.isfinite().all())]
     if broken:
         raise InputError(f"{path}: holds numbers that are not finite ({_some(broken)}): {advice}")
@@ -123,10 +124,9 @@ def _some(names: list[str]) -> str:
 
 
 def read_tensors(path: str | os.PathLike[str], advice: str) -> dict[str, Tensor]:
-    """The tensors of a file by name; their numbers are read from the disk when they are used.
+    """The tensors of a file by name, mapped from the disk.
 
-    Other content of the file is ignored. In TorchScript and in nested dicts, a name is the path to the tensor, joined
-    by dots. Messages about a wrong file end with `advice`.
+    In TorchScript and in nested dicts, a name is the path to the tensor, joined by dots. Messages end with `advice`.
 
     Raises:
         InputError: the file is missing or broken, or holds no weights.
@@ -139,10 +139,9 @@ def read_tensors(path: str | os.PathLike[str], advice: str) -> dict[str, Tensor]
 
 
 def read_checkpoint(path: str | os.PathLike[str], name: str, advice: str) -> tuple[object, dict[str, Tensor]]:
-    """One value of the dict in a `torch.save` file, such as a network's settings, and all the dict's tensors by path.
+    """The value `name` of the dict in a `torch.save` file, and the dict's tensors; see `read_tensors`.
 
-    The value is untrusted; it consists of numbers, strings, lists, dicts and inert stand-ins. Raises InputError like
-    `read_tensors`.
+    The value is untrusted, and consists of numbers, strings, lists, dicts and inert stand-ins.
     """
     with _reading_weights(path, advice):
         root = _read_archive(path)
@@ -152,7 +151,7 @@ def read_checkpoint(path: str | os.PathLike[str], name: str, advice: str) -> tup
 
 
 def read_note(path: str | os.PathLike[str], name: str) -> str | None:
-    """The value of a key in a safetensors file's metadata; None if the key is missing or the format is another."""
+    """The value `name` in a safetensors file's metadata; None if missing, or in another format."""
     with open(path, "rb") as file:
         if file.read(9)[8:] != b"{":
             return None
@@ -168,7 +167,6 @@ def _reading_weights(path: str | os.PathLike[str], advice: str) -> Iterator[None
 
 
 def _read(path: str | os.PathLike[str]) -> dict[str, Tensor]:
-    """Read the tensors; the first bytes tell the format, because files get renamed."""
     with open(path, "rb") as file:
         head = file.read(9)
     if head.startswith(b"PK\x03\x04"):
@@ -178,21 +176,15 @@ def _read(path: str | os.PathLike[str]) -> dict[str, Tensor]:
             return {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118  # it is no dict
     if not head.startswith(b"\x80"):
         raise ValueError("it is neither safetensors nor PyTorch's")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # about kinds of tensors that are refused below
-        try:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
             loaded = torch.load(path, map_location="cpu", weights_only=True)  # the format of PyTorch before 1.6
-        except pickle.UnpicklingError as error:
-            raise ValueError("a bare pickle that holds more than tensors; nothing in it was run") from error
-    return {name: x for name, x in loaded.items() if isinstance(name, str) and _is_plain(x)}
-
-
-def _is_plain(value: object) -> bool:
-    """Whether a value is a dense CPU tensor without extra attributes (attributes could replace its methods)."""
-    if type(value) not in (Tensor, nn.Parameter) or vars(value):
-        return False
-    assert isinstance(value, Tensor)
-    return not value.is_nested and value.layout == torch.strided and value.device.type == "cpu"
+    except pickle.UnpicklingError as error:
+        raise ValueError("a bare pickle that holds more than tensors; nothing in it was run") from error
+    tensors = {name: x for name, x in loaded.items() if isinstance(name, str) and isinstance(x, Tensor)}
+    dense = {name: x for name, x in tensors.items() if (x.layout, x.device.type) == (torch.strided, "cpu")}
+    return {name: Tensor.detach(x) for name, x in dense.items()}  # without attributes that replace methods
 
 
 def _read_archive(path: str | os.PathLike[str]) -> object:
@@ -204,22 +196,20 @@ def _read_archive(path: str | os.PathLike[str]) -> object:
         root = names[0].removesuffix("data.pkl")
         if archive.getinfo(names[0]).file_size > MAX_PICKLE:
             raise ValueError("its pickle is too large for a network")
-        if f"{root}byteorder" in archive.namelist() and archive.read(f"{root}byteorder") != b"little":
-            raise ValueError("its numbers are not little-endian")
-        summed = any(record.CRC for record in archive.infolist())  # torch.save can omit checksums
-        if summed and (damaged := archive.testzip()) is not None:
+        has_checksums = any(record.CRC for record in archive.infolist())  # torch.save can omit them
+        if has_checksums and (damaged := archive.testzip()) is not None:
             raise ValueError(f"damaged at {damaged}")
         return _Unpickler(archive.read(names[0]), archive, path, f"{root}data/").load()
 
 
 class _StandIn:
-    """Replaces an object of any class, or the result of any function, and stores the fields that it is given."""
+    """Replaces an object of any class, or the result of any function."""
 
-    kind = ""  # in a subclass: module and name of the class or function that it replaces
+    kind = ""  # in a subclass: module and name of the replaced class or function
     fields: dict[object, object]
 
     def __new__(cls, *arguments: Any) -> Any:
-        """An empty stand-in; or a tensor, if `kind` is one of torch's functions that rebuild tensors and parameters."""
+        """A tensor, if `kind` is a function of torch that rebuilds tensors or parameters; else an empty stand-in."""
         if cls.kind == "torch._utils _rebuild_tensor_v2" and isinstance(arguments[0], Tensor):
             storage, offset, shape, stride = arguments[:4]
             return storage.as_strided(shape, stride, offset)  # raises an error beyond the storage
@@ -237,8 +227,8 @@ class _StandIn:
             self.fields.update(state)
 
 
-class _Unpickler(pickle._Unpickler):  # the one in Python: the one in C allocates whatever memory a pickle asks for
-    """Reads a pickle as plain values, `_StandIn` and tensors; no class or function in it is looked up."""
+class _Unpickler(pickle._Unpickler):  # in Python; the one in C allocates any amount of memory that a pickle asks for
+    """Reads a pickle as plain values, `_StandIn` and tensors."""
 
     def __init__(self, data: bytes, archive: zipfile.ZipFile, path: str | os.PathLike[str], folder: str) -> None:
         super().__init__(io.BytesIO(data))
@@ -249,7 +239,7 @@ class _Unpickler(pickle._Unpickler):  # the one in Python: the one in C allocate
         return type("_StandIn", (_StandIn,), {"kind": f"{module} {name}"})
 
     def persistent_load(self, pid: Any) -> Tensor | None:
-        """The numbers of a storage as a flat tensor; None for a type that is not in STORAGES."""
+        """A storage as a flat tensor; None for a type that is not in STORAGES."""
         _, storage, key, _, count = pid
         record = self._archive.getinfo(f"{self._folder}{key}")
         if storage.kind not in STORAGES:
@@ -266,7 +256,7 @@ class _Unpickler(pickle._Unpickler):  # the one in Python: the one in C allocate
 
 
 def _tensors(root: object) -> dict[str, Tensor]:
-    """All tensors in a tree of objects and dicts, by their paths, joined by dots."""
+    """All tensors in a tree of objects and dicts, by their dotted paths."""
     found: dict[str, Tensor] = {}
     waiting, nodes = [("", root)], 0
     while waiting:

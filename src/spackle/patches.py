@@ -1,13 +1,8 @@
-"""PatchMatch: fill a hole from the picture itself, from coarse to fine.
+"""PatchMatch (Barnes et al. 2009, Wexler et al. 2007): fill a hole by patches of the picture, from coarse to fine.
 
-Each cell of a hole searches for a patch of the known part that matches its surroundings (Barnes et al. 2009). All
-patches that cover a cell vote for its colour. Both steps alternate from coarse to fine (Wexler et al. 2007). The cost
-of the patch at q for a cell p sums the differences in colour, in centre depth and in centre tone, and the distance:
+The cost of the patch at q for a cell p of the hole, with colours I, log inverse depth z and blurred colours L, is
 
-    cost = mean |I(p + o) - I(q + o)|²  +  (0.15 dz / σz)²  +  2 |L(p) - L(q)|²  +  0.05 (|p - q| / size)²
-
-The mean runs over the offsets o of a patch; a cell of the hole counts less in it the deeper it lies in the hole. I are
-the colours, z is the logarithm of inverse depth, and the tone L is the caller's guess, blurred.
+    mean |I(p + o) - I(q + o)|²  +  (0.15 dz / σz)²  +  2 |L(p) - L(q)|²  +  0.05 (|p - q| / size)²
 """
 
 from __future__ import annotations
@@ -29,22 +24,22 @@ from spackle.filters import blurred, greatest_around, nearest_known
 
 RADIUS = 3  # patches have 7×7 cells
 SIDE = 2 * RADIUS + 1
-COARSEST = 48  # cells of the short side; no level is smaller
-ROUNDS = 6  # of search and vote at each level
-JUMPS = (4, 1)  # distances in cells of the neighbours whose matches are tried, in successive searches
-TONE_CELLS = 4.0  # standard deviation of the blur that makes the tone
-FADING = 0.8  # factor on a cell's weight in a patch for each cell that it lies deeper in the hole
-FAINTEST_CELL = np.float32(1e-30)  # least weight of a cell: far above what float32 rounds to zero
+COARSEST = 48  # least short side of a level, in cells
+ROUNDS = 6  # number of searches and votes at each level
+JUMPS = (4, 1)  # distances, in cells, to the neighbours whose matches a search tries
+TONE_CELLS = 4.0  # standard deviation, in cells, of the blur that makes the tone L
+FADING = 0.8  # a cell's weight in a patch is 0.8^d at a depth of d cells in the hole
+FAINTEST_CELL = np.float32(1e-30)  # least weight of a cell
 DEPTH_WEIGHT, TONE_WEIGHT, OFFSET_WEIGHT = 0.15, math.sqrt(2), 0.05
-LEAST_SPREAD = 0.05  # least σz, for walls that face the camera, whose depth hardly varies
-SAME_SURFACE = 0.25  # standard deviations of z by which a cell and its mirror image may differ
+LEAST_SPREAD = 0.05  # least σz; the depth of a wall that faces the camera hardly varies
+SAME_SURFACE = 0.25  # greatest difference in z / σz between a cell and its mirror image
 FAINTEST_VOTE, LEAST_COST = 1e-6, 1e-8
 
 Floats = NDArray[np.float32]
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int32]
-# The best patch so far of each of the n cells of a level's hole: the cells' numbers [h, w], -1 outside of the hole;
-# source, row and column of the patch's centre [n, 3]; costs [n].
+# The best patches for the n cells of a hole: numbers of the cells [h, w], -1 outside of the hole; source, row and
+# column of each patch's centre [n, 3]; costs [n].
 Matches = tuple[Ints, Ints, Floats]
 
 
@@ -52,16 +47,16 @@ Matches = tuple[Ints, Ints, Floats]
 class Patches:
     """A picture whose hole is filled by patches of its known part."""
 
-    rgb: Tensor  # [H, W, 3] sRGB; outside of the hole as it was
+    rgb: Tensor  # [H, W, 3] sRGB; unchanged outside of the hole
     mismatch: Tensor  # [H, W] root of the cost of each cell's patch; 0 outside of the hole
-    matches: Tensor  # [H, W, 3] picture (1 is the mirrored one), row, column of that patch; -1 where there is none
+    matches: Tensor  # [H, W, 3] picture (1: mirrored), row and column of each cell's patch; -1 outside of the hole
 
 
 def match_patches(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> Patches:
-    """Fill a hole by patches of the known part; the result is the same for any number of threads.
+    """Fill a hole by patches of the known part.
 
     Args:
-        guess: [H, W, 3] sRGB; in the hole, smooth colours; blurred, they are the tone that a patch should have.
+        guess: [H, W, 3] sRGB, with smooth colours in the hole.
         hole: [H, W] bool.
         inverse_depth: [H, W], positive everywhere.
     """
@@ -80,14 +75,14 @@ def match_patches(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> Patches
 class _Level:
     """One level of the pyramid, h × w cells."""
 
-    rgb: Floats  # [h, w, 3]; in the hole the latest votes, written in place
+    rgb: Floats  # [h, w, 3]; votes change the hole's cells in place
     traits: Floats  # [h, w, 4] tone and depth, scaled so that squared differences are costs
     hole: Bools  # [h, w]
-    weights: Floats  # [h + 6, w + 6] of a cell in a patch; 0 beyond the picture
+    weights: Floats  # [h + 6, w + 6] weights of cells in a patch; 0 beyond the picture
 
 
 def _pyramid(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> list[_Level]:
-    """Build the pyramid, finest level first; its holes are initialised with mirror images of the same surface."""
+    """Build the pyramid, finest level first."""
     depth = inverse_depth.clamp_min(1e-9).log()[..., None]
     depth = depth / max(float(depth[~hole].std(correction=0)) if bool((~hole).any()) else 0.0, LEAST_SPREAD)
     rgb, tone, levels = guess.clone(memory_format=torch.contiguous_format), guess, list[_Level]()
@@ -110,7 +105,7 @@ def _pyramid(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> list[_Level]
 
 @kernel
 def _mirror(rgb: Any, hole: Any, depth: Any, near: Any) -> None:
-    """Fill each hole cell, in place, with its mirror image at the nearest known cell, if both depths are alike."""
+    """Fill each hole cell, in place, with its mirror image at the nearest known cell if the depths are similar."""
     height, width = hole.shape
     for y in range(height):
         for x in range(width):
@@ -122,7 +117,7 @@ def _mirror(rgb: Any, hole: Any, depth: Any, near: Any) -> None:
 
 
 def _match(level: _Level, coarse: Matches | None, number: int) -> Matches | None:
-    """Alternate search and vote, changing the level's colours in place; None if there is no hole, or no patch."""
+    """Alternate search and vote at a level; None without a hole, or without any patch."""
     usable = ~greatest_around(torch.from_numpy(level.hole), RADIUS).numpy()
     usable[:RADIUS] = usable[-RADIUS:] = False
     usable[:, :RADIUS] = usable[:, -RADIUS:] = False
@@ -160,7 +155,7 @@ def _match(level: _Level, coarse: Matches | None, number: int) -> Matches | None
 
 @kernel
 def _begin(cells: Any, refine: bool, coarse_numbers: Any, coarse: Any, valid: Any, pool: Any, places: Any) -> None:
-    """Initialise a level's matches: the coarser level's, with doubled coordinates, or random ones."""
+    """Initialise matches by the coarser level's matches, or at random."""
     rows, columns = coarse_numbers.shape
     height, width = valid.shape[1:]
     for n in range(len(cells)):
@@ -169,7 +164,7 @@ def _begin(cells: Any, refine: bool, coarse_numbers: Any, coarse: Any, valid: An
         places[n, 0], places[n, 1], places[n, 2] = 0, pick[0], pick[1]
         k = coarse_numbers[min(y // 2, rows - 1), min(x // 2, columns - 1)] if refine else -1
         if k >= 0:
-            # The columns of a mirrored picture count from the other side.
+            # Columns of a mirrored picture count from the right.
             m, side = coarse[k, 0], width - 2 * columns if coarse[k, 0] else 0
             row, column = 2 * coarse[k, 1] + y % 2, 2 * coarse[k, 2] + x % 2 + side
             if 0 <= row < height and 0 <= column < width and valid[m, row, column]:
@@ -178,7 +173,6 @@ def _begin(cells: Any, refine: bool, coarse_numbers: Any, coarse: Any, valid: An
 
 @kernel
 def _hash(value: Any) -> Any:
-    """A pseudorandom uint32: a hash of the argument."""
     value = np.uint32(value)
     value ^= value >> np.uint32(16)
     value = np.uint32(value * np.uint32(0x7FEB352D))
@@ -212,7 +206,7 @@ def _cost(
     padded: Any, weights: Any, own: Any, sources: Any, traits: Any, offset: Any,
     y: int, x: int, m: int, v: int, u: int, bound: Any,
 ) -> Any:  # fmt: skip
-    """The cost of source m's patch at (v, u) for the cell (y, x); infinite if it exceeds the bound."""
+    """The cost of source m's patch at (v, u) for the cell (y, x); infinite beyond the bound."""
     cost = np.float32(0)
     for c in range(own.shape[2]):
         apart = own[y, x, c] - traits[m, v, u, c]
@@ -229,12 +223,10 @@ def _score(
     start: int, stop: int, cells: Any, places: Any,
     padded: Any, weights: Any, own: Any, sources: Any, traits: Any, offset: Any, costs: Any,
 ) -> None:  # fmt: skip
-    """Recompute the costs of the matches start..stop after the colours have changed."""
-    whole = np.float32(1e30)
     for n in range(start, stop):
         y, x = cells[n]
         m, v, u = places[n]
-        costs[n] = _cost(padded, weights, own, sources, traits, offset, y, x, m, v, u, whole)
+        costs[n] = _cost(padded, weights, own, sources, traits, offset, y, x, m, v, u, np.float32(1e30))
 
 
 @kernel
@@ -242,7 +234,7 @@ def _search(
     start: int, stop: int, cells: Any, numbers: Any, before: Any, worth: Any, valid: Any, pool: Any, jump: int,
     seed: Any, padded: Any, weights: Any, own: Any, sources: Any, traits: Any, offset: Any, places: Any, costs: Any,
 ) -> None:  # fmt: skip
-    """Improve the matches of cells start..stop: try neighbours' matches, a random one, and some ever closer ones."""
+    """Improve the matches of cells start..stop: try neighbours' matches, a random patch, and patches ever nearer."""
     mirrors, height, width = valid.shape
     for n in range(start, stop):
         y, x = cells[n]
@@ -287,7 +279,7 @@ def _search(
 def _vote(
     start: int, stop: int, cells: Any, numbers: Any, places: Any, costs: Any, mean: Any, sources: Any, rgb: Any
 ) -> None:
-    """Set the colours of cells start..stop to the mean of all patches that cover them; better matches count more."""
+    """Set the colours of cells start..stop to weighted means of all patches that cover the cells."""
     height, width = numbers.shape
     for n in range(start, stop):
         y, x = cells[n]
@@ -299,7 +291,6 @@ def _vote(
                 k = numbers[y + dy, x + dx]
                 if k < 0:
                     continue
-                # A patch lies within its source, so these indices are valid.
                 m, v, u = places[k, 0], places[k, 1] - dy, places[k, 2] - dx
                 weight = np.float32(np.exp(-costs[k] / mean)) + np.float32(FAINTEST_VOTE)
                 red += weight * sources[m, v, u, 0]

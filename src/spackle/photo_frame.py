@@ -1,7 +1,4 @@
-"""The uniform frame around a picture: a scan's margin, letterbox bars, a white mount.
-
-A false detection cuts off part of the picture, so only opposite sides of one colour with straight inner edges count.
-"""
+"""Detect the uniform frame around a picture, such as a scan's margin, letterbox bars or a white mount."""
 
 from __future__ import annotations
 
@@ -10,15 +7,15 @@ import dataclasses
 import numpy as np
 from torch import Tensor
 
-NARROWEST, WIDEST = 2, 0.25  # of a frame's side: in pixels, and as a share of the photo's width or height
-NOISE, STEP = 9 / 255, 20 / 255  # from the frame's colour: largest mean difference in it, least beyond it
-STRAIGHT = 0.8  # share of the edge that has the step
-EDGE_PX = 6  # length of a blurred edge, on which frame and picture are mixed
+NARROWEST, WIDEST = 2, 0.25  # bounds for the width of a side: in pixels, and as a share of the photo's side
+NOISE, STEP = 9 / 255, 20 / 255  # differences from the frame's colour: at most in the frame, at least beyond its edge
+STRAIGHT = 0.8  # least share of an edge's pixels that differ by STEP
+EDGE_PX = 6  # width of a blurred edge
 
 
 @dataclasses.dataclass(frozen=True)
 class PhotoFrame:
-    """The widths of a frame's sides in pixels; 0 for a side without one."""
+    """The widths of a frame's four sides in pixels; 0 for a side without frame."""
 
     left: float
     top: float
@@ -37,11 +34,11 @@ class PhotoFrame:
         return f"a frame ({widths} pixels: left, top, right, bottom) is cut off"
 
     def scaled(self, across: float, down: float) -> PhotoFrame:
-        """The same frame, in pixels of a photo resized by these factors."""
+        """The frame of a photo that is resized by these factors."""
         return PhotoFrame(self.left * across, self.top * down, self.right * across, self.bottom * down)
 
     def inside(self, picture: Tensor, width: int, height: int) -> Tensor:
-        """The part of a picture [H, W, ...] of a width×height photo inside the frame, to the nearest pixel."""
+        """Cut the frame of a width×height photo off a picture [H, W, ...] of the photo at any size."""
         rows, columns = picture.shape[:2]
         left, right = (round(side * columns / width) for side in (self.left, self.right))
         top, bottom = (round(side * rows / height) for side in (self.top, self.bottom))
@@ -49,7 +46,10 @@ class PhotoFrame:
 
 
 def find_frame(rgb: Tensor) -> PhotoFrame | None:
-    """The uniform frame of an sRGB picture [H, W, 3] in 0..1, or None."""
+    """The uniform frame of an sRGB picture [H, W, 3] in 0..1, or None.
+
+    Only opposite sides of one colour with straight inner edges count, because a false frame would crop the picture.
+    """
     across, down = rgb.numpy().swapaxes(0, 1), rgb.numpy()
     inwards = (across, down, across[::-1], down[::-1])  # lines [N, M, 3] from the left, the top, the right, the bottom
     colors = np.stack([np.median(lines[0], axis=0) for lines in inwards])
@@ -59,7 +59,7 @@ def find_frame(rgb: Tensor) -> PhotoFrame | None:
     ]
     plain = [int((lines.mean(1) <= NOISE).cumprod().sum()) for lines in differences]
     for side, lines in enumerate(differences):
-        before, after = plain[1 - side % 2], plain[3 - side % 2]  # pixels at a line's ends, in the adjacent sides
+        before, after = plain[1 - side % 2], plain[3 - side % 2]  # widths of the two adjacent sides
         edge = (lines[plain[side] :, before : lines.shape[1] - after] > STEP)[:EDGE_PX].mean(1)
         if plain[side] >= NARROWEST and edge.max(initial=0.0) >= STRAIGHT:
             widths[side] = plain[side] + int((edge >= 0.95 * edge.max()).argmax()) + 1
@@ -67,6 +67,6 @@ def find_frame(rgb: Tensor) -> PhotoFrame | None:
         alike = np.where(np.abs(colors - colors[side]).max(1) <= NOISE, widths, 0)
         if alike[side] and alike[side + 2]:
             frame = PhotoFrame(*alike.tolist())
-            inner = find_frame(frame.inside(rgb, *down.shape[1::-1]))  # a mount may have a line in it
+            inner = find_frame(frame.inside(rgb, *down.shape[1::-1]))  # such as a line inside a mount
             return PhotoFrame(*(alike + (inner.widths if inner else 0)).tolist())
     return None

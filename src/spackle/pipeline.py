@@ -1,7 +1,4 @@
-"""The pipeline from a photo to a completed scene: base, camera path, fill. See `complete_photo`, `Pipeline.complete`.
-
-The command line, the Python API, the web page and the demo use it; ComfyUI uses its last stage, `complete`.
-"""
+"""The pipeline from a photo to a completed scene: base, camera path, fill. Begin with `Pipeline.complete`."""
 
 from __future__ import annotations
 
@@ -23,7 +20,7 @@ from spackle.errors import InputError
 from spackle.gaussians import Gaussians
 from spackle.image import Photo
 from spackle.inpaint import InpainterOptions, get_inpainter
-from spackle.progress import LogReporter, Reporter, Step
+from spackle.progress import Reporter
 from spackle.render import Renderer, get_renderer
 from spackle.residual.architectures import SHIPPED, load_residual, shipped_network
 from spackle.residual.network import ResidualNet
@@ -33,9 +30,8 @@ from spackle.scene_fill.texture import Texture, exemplar_texture, painted_textur
 from spackle.views import PathOptions, PlannedViews, choose_move, plan_views
 from spackle.weights import installed
 
-Shipped = Literal["shipped"]  # the weights that come with the package, if it has any
 Fill = Literal["auto", "network", "exemplar", "lama", "none"]  # source of the texture in holes
-Mode = Literal["scene", "view"]  # one set of aux Gaussians for all views, or one for each
+Mode = Literal["scene", "view"]  # one set of aux Gaussians for all views, or one set for each view
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,7 +44,7 @@ class FillOptions:
 
     @property
     def texture(self) -> Fill:
-        """The fill, with "auto" resolved; if `residual` is "none", the fill is "none" too, which leaves holes open.
+        """The fill, with "auto" resolved; "none" if `residual` is "none".
 
         In view mode "auto" means "exemplar", because inpainting would take seconds for each view.
         """
@@ -64,8 +60,9 @@ class FillOptions:
     @property
     def file(self) -> Path | None:
         """The file of the weights; None without a network."""
-        named = {"shipped": SHIPPED, "seeds": None, "none": None}
-        return named[self.weights] if self.weights in named else Path(self.weights)
+        if self.weights in ("seeds", "none"):
+            return None
+        return SHIPPED if self.weights == "shipped" else Path(self.weights)
 
     def load(self) -> ResidualNet | None:
         """The network, if any; InputError for a file that cannot be used."""
@@ -74,7 +71,7 @@ class FillOptions:
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """All options for a photo: its base, the camera path that it is completed for, the fill."""
+    """All options for a photo: base, camera path and fill."""
 
     base: BaseSettings = dataclasses.field(default_factory=BaseSettings)
     path: PathOptions = dataclasses.field(default_factory=PathOptions)
@@ -82,30 +79,21 @@ class Options:
 
     @property
     def give_geometry(self) -> bool:
-        """Whether a depth map or cameras are given: these belong to the whole photo, so no border may be cropped."""
+        """Whether a depth map or cameras are given; both belong to the whole photo, so its border is kept."""
         return self.base.depth is not None or self.path.cameras is not None
 
 
 @dataclasses.dataclass(frozen=True)
 class CompletedPhoto:
-    """A photo's scene, and what it was made of."""
+    """A photo's scene, with the results of the stages before."""
 
     photo: Photo  # at its full size
     prediction: BasePrediction
     choice: ResolvedBase
     views: PlannedViews
     scene: Scene  # its disparity is None for given views and keyframes
-    pictures: Mapping[int, Tensor]  # [H, W, 3] uint8 of completed views, by index, as far as completion rendered them
+    pictures: Mapping[int, Tensor]  # [H, W, 3] uint8, by index: the completed views that completion has rendered
     saved_view: str | None = None  # in view mode: the view that `scene.aux` belongs to
-
-
-def complete_photo(photo: Photo, options: Options = Options(), reporter: Reporter | None = None) -> CompletedPhoto:
-    """Complete a photo's scene; for many photos keep a `Pipeline`, which loads networks once.
-
-    Raises:
-        InputError: an option, the photo, or its depth map cannot be used.
-    """
-    return Pipeline.open(options).complete(photo, reporter or LogReporter())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,12 +104,12 @@ class Pipeline:
     base: OpenedBase
     network: ResidualNet | None
     renderer: Renderer
-    given_views: list[Camera] | None = None  # those of --cameras, in place of a path
-    keyframes: KeyframePath | None = None  # those of --path
+    given_views: list[Camera] | None = None  # from --cameras; they replace a path
+    keyframes: KeyframePath | None = None  # from --path
 
     @staticmethod
     def open(options: Options) -> Pipeline:
-        """Check the options and open what they name; InputError for an option that no photo can use."""
+        """Check the options, and load the files that they name; InputError for an option that no photo can use."""
         options.base.check()
         options.path.check()
         network = options.fill.load()
@@ -132,11 +120,16 @@ class Pipeline:
 
     def complete(self, photo: Photo, reporter: Reporter) -> CompletedPhoto:
         """Complete the scene of a photo at its full size; InputError if the photo or its depth map cannot be used."""
+        base, fill = self.options.base, self.options.fill
         prediction, choice = self.predict(photo, reporter)
         views = plan_views(prediction, self.options.path, photo.path, self.given_views, self.keyframes)
+        texture = open_texture(fill.texture)
+        gaussians, camera = prediction.gaussians, prediction.camera
+        context = FillContext(gaussians, camera, self.renderer, self.network, texture, precision=base.precision)
         with reporter.stage("complete") as step:
-            chosen = views.looked_at if self.options.fill.mode == "scene" else range(len(views.cameras))
-            scene, drawn = self.fill(prediction, [views.cameras[index] for index in chosen], step)
+            chosen = views.looked_at if fill.mode == "scene" else range(len(views.cameras))
+            cameras = [views.cameras[index] for index in chosen] if fill.texture != "none" else []
+            scene, drawn = fill_views(context, cameras, fill.mode, self.given_views is not None, step)
             pictures = {chosen[index]: picture for index, picture in drawn.items()}
         if not scene.aux.finite:
             source = self.options.path.cameras or photo.path
@@ -146,7 +139,7 @@ class Pipeline:
         return done if scene.by_view is None else _with_farthest_view(done)
 
     def predict(self, photo: Photo, reporter: Reporter) -> tuple[BasePrediction, ResolvedBase]:
-        """The photo's Gaussians, and the base that made them; logs the base, the focal length and the move."""
+        """Predict the photo's Gaussians, and choose the size of the camera's movement; also return the chosen base."""
         photo.check_shape()
         name = photo.path.name
         if photo.frame is not None:
@@ -154,39 +147,19 @@ class Pipeline:
         prediction, choice = self.base.predict(photo, log=reporter.warn, stage=reporter.stage)
         if choice.note:
             reporter.log(f"{name}: {choice.note}")
-        given = self._disparity(prediction) is None or self.options.path.disparity is not None
-        if not given:
+        chosen = self._disparity(prediction) is not None and self.options.path.disparity is None
+        if chosen:
             with reporter.stage("move"):
                 prediction = choose_move(prediction, self.renderer, photo.path)
         reporter.log(
             f"{name}: {len(prediction.gaussians):,} Gaussians from {choice.base}, "
             f"focal length {prediction.camera.focal[0]:.0f} px ({prediction.lens_source or photo.focal_source})"
         )
-        if not given:
+        if chosen:
             reporter.log(f"{name}: {move_in_words(prediction)}")
         if depth_range := prediction.notes.get("depth_range"):
             reporter.log(f"{name}: its depth is {depth_range}")
-        if missing := float(prediction.notes.get("depth_filled", 0)):
-            reporter.log(f"{name}: {missing:.1%} of the depth was missing and has been filled")
-        if self.options.base.depth is not None and (size := prediction.notes.get("depth_resampled_from")):
-            width, height = prediction.camera.width, prediction.camera.height
-            reporter.log(f"{name}: the depth map is {size}, and was resampled to the photo's {width}×{height}")
         return prediction, choice
-
-    def fill(
-        self, prediction: BasePrediction, cameras: Sequence[Camera], progress: Step | None = None
-    ) -> tuple[Scene, Mapping[int, Tensor]]:
-        """The scene with the holes of these views filled, and the pictures that `fill_views` returns."""
-        fill, exact = self.options.fill, self.given_views is not None
-        context = FillContext(
-            prediction.gaussians,
-            prediction.camera,
-            self.renderer,
-            self.network,
-            open_texture(fill.texture),
-            precision=self.options.base.precision,
-        )
-        return fill_views(context, cameras if fill.texture != "none" else (), fill.mode, exact, progress)
 
     def _disparity(self, prediction: BasePrediction) -> float | None:
         """The path's disparity; None if views or keyframes are given."""
@@ -195,16 +168,14 @@ class Pipeline:
 
 
 def move_in_words(prediction: BasePrediction) -> str:
-    """The camera's move that `choose_move` has chosen, in words."""
+    """A line for the log about the disparity that `choose_move` has chosen."""
     reach, usual, invented = prediction.disparity, prediction.notes["usual_disparity"], prediction.notes["uncovered"]
     of, more = (f" of {usual:g}", f"; `--disparity {usual:g}` moves farther") if reach != usual else ("", "")
     return f"camera moves by disparity {reach:g}{of}: {invented:.1%} of the widest view is invented{more}"
 
 
 def _with_farthest_view(done: CompletedPhoto) -> CompletedPhoto:
-    """In view mode, take the aux Gaussians of the measured view farthest from the photo's eye, because a file holds one
-    set.
-    """
+    """Take the aux Gaussians of the measured view that is farthest from the photo, because a file holds one set."""
     views, by_view = done.views, done.scene.by_view
     assert by_view is not None
     eye = done.prediction.camera.position.double()
@@ -220,24 +191,25 @@ def complete(
     *,
     mode: Mode = "scene",
     exact: bool = False,
-    network: ResidualNet | Shipped | None = "shipped",
+    network: ResidualNet | Literal["shipped"] | None = "shipped",
     fill: Fill = "auto",
     renderer: Renderer | None = None,
     precision: Precision = "auto",
     progress: Callable[[int, int], None] | None = None,
 ) -> Scene:
-    """Fill the holes of all views: in scene mode with one set of aux Gaussians, see `fill_scene`.
+    """Fill the holes of all views.
 
     Args:
         prediction: a base's result.
         cameras: the views.
-        mode: "view" fills each view by itself, and leaves `Scene.aux` empty.
-        exact: in scene mode, only these views will be shown, and none between them.
-        network: residual weights, by default those that come with Spackle; None: the seeds alone fill the holes.
-        fill: see `open_texture`; "none" leaves the holes open.
-        renderer: if None, the CPU's.
+        mode: "scene" makes one set of aux Gaussians for all views, see `fill_scene`; "view" makes one for each view,
+            and leaves `Scene.aux` empty.
+        exact: in scene mode: no view between these views will be rendered.
+        network: the residual network, by default Spackle's; None fills the holes by the seeds alone.
+        fill: see `open_texture`; "none" keeps the holes.
+        renderer: by default the CPU's.
         precision: number type of the network.
-        progress: called with the number of views done, and that of all views.
+        progress: called with (views done, all views).
     """
     chosen = shipped_network() if network == "shipped" else network
     texture, drawer = open_texture(fill), renderer or get_renderer()
@@ -252,7 +224,7 @@ def fill_views(
     exact: bool,
     progress: Callable[[int, int], None] | None,
 ) -> tuple[Scene, Mapping[int, Tensor]]:
-    """The scene, and pictures [H, W, 3] uint8 of completed views, by index, as far as completion rendered them."""
+    """Fill the holes of views; also return pictures [H, W, 3] uint8, by index, of the views that were rendered."""
     base, camera = context.base, context.photo_camera
     if mode == "scene" or not cameras:
         filled = fill_scene(context, cameras, exact, progress)
@@ -266,16 +238,16 @@ def fill_views(
 
 
 def resolved(fill: Fill) -> Fill:
-    """The fill that "auto" stands for: "lama" if its weights have been downloaded, else "exemplar"."""
+    """Replace "auto" by "lama" if LaMa's weights have been downloaded, else by "exemplar"."""
     if fill != "auto":
         return fill
     return "lama" if installed("lama") else "exemplar"
 
 
 def open_texture(fill: Fill) -> Texture | None:
-    """The texture function of a fill: "lama" paints the widest views, "exemplar" takes patches of the view itself.
+    """The texture function of a fill: "lama" inpaints the widest views, "exemplar" takes patches of each view.
 
-    "auto" is one of these, see `resolved`. "network" and "none" give None. InputError for "lama" without its weights.
+    "auto" is one of the two, see `resolved`; "network" and "none" give None. InputError for "lama" without its weights.
     """
     chosen = resolved(fill)
     return _lama() if chosen == "lama" else exemplar_texture if chosen == "exemplar" else None

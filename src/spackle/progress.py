@@ -1,4 +1,4 @@
-"""Progress of long work: bars on a terminal, lines in a log. Also ends long work at Ctrl-C."""
+"""Progress of long work: bars on a terminal, lines in a log; and the end of long work at Ctrl-C."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import copy
 import io
 import json
 import logging
-import os
 import signal
 import sys
 import threading
@@ -49,25 +48,10 @@ def counted(count: int, thing: str) -> str:
     return f"{count:,} {thing}{'' if count == 1 else 's'}"
 
 
-@contextlib.contextmanager
-def progress_line(name: str, shown: bool = True) -> Iterator[Step]:
-    """Yields a function of (done, of how many) that draws a bar on one line, in terminals and notebooks alike."""
-    start = time.monotonic()
-
-    def draw(done: int, total: int) -> None:
-        if shown:
-            bar = "█" * (20 * done // total) if total else ""
-            print(f"\r{name:<10}{bar:<20} {done}/{total} {time.monotonic() - start:.0f} s", end="", file=sys.stderr)
-
-    yield draw
-    if shown:
-        print(file=sys.stderr)
-
-
 class Reporter:
-    """Logs what is going on, and how long each stage took, to `console` (None: the standard error).
+    """Logs messages and progress to `console` (None: the standard error), and times stages.
 
-    `verbose` logs details, too; `as_json` prints each result as a line of JSON on the standard output, for scripts.
+    `verbose` also logs details; `as_json` prints each result as a line of JSON on the standard output.
     """
 
     def __init__(self, verbose: bool = False, console: Console | None = None, *, as_json: bool = False) -> None:
@@ -77,22 +61,22 @@ class Reporter:
         self.seconds: dict[str, float] = {}  # of each stage so far
 
     def restarted(self) -> Reporter:
-        """A copy of this reporter for the next photo, with no stage timed yet."""
+        """A copy of this reporter with no stage timed yet."""
         other = copy.copy(self)
         other.seconds = {}
         return other
 
     def result(self, values: Mapping[str, object]) -> None:
-        """Print a result as JSON, if scripts asked for it."""
+        """Print a result as a line of JSON if `as_json`."""
         if self.as_json:
-            print(json.dumps(values, allow_nan=False, default=str), flush=True)  # paths are given as text
+            print(json.dumps(values, allow_nan=False, default=str), flush=True)
 
     def log(self, line: str) -> None:
         """Print a line."""
         self.console.print(escape(one_line(line)), soft_wrap=True)
 
     def warn(self, line: str) -> None:
-        """Print a warning: a line about something that could not be done as asked."""
+        """Print a line about something that could not be done as asked."""
         self.log(line)
 
     def detail(self, line: str) -> None:
@@ -102,8 +86,8 @@ class Reporter:
 
     @contextlib.contextmanager
     def stage(self, name: str) -> Iterator[Step]:
-        """Time a stage into `self.seconds[name]`; yields a function to call as it advances."""
-        start, busy = time.perf_counter(), time.process_time()
+        """Add the block's duration to `self.seconds[name]`; yield a function of (done, total) that reports progress."""
+        start = time.perf_counter()
         if self.console.is_terminal:
             with self._bars(MofNCompleteColumn()) as bars:
                 task = bars.add_task(name, total=None)
@@ -112,13 +96,11 @@ class Reporter:
             yield lambda done, total: None
         elapsed = time.perf_counter() - start
         self.seconds[name] = round(self.seconds.get(name, 0.0) + elapsed, 3)
-        cores = os.cpu_count() or 1
-        busy = (time.process_time() - busy) / max(elapsed, 1e-9) / cores
-        self.detail(f"  {name}: {elapsed:.2f} s, {counted(cores, 'core')} {min(busy, 1.0):.0%} busy")
+        self.detail(f"  {name}: {elapsed:.2f} s")
 
     @contextlib.contextmanager
     def steps(self, name: str, start: int, total: int) -> Iterator[Callable[[int, str], None]]:
-        """Report equal steps from `start` on; yields a function of (done, a remark). A log gets a line for each."""
+        """Report equal steps from `start` to `total`; yield a function of (done, remark)."""
         if self.console.is_terminal:
             with self._bars(MofNCompleteColumn(), TextColumn("{task.fields[remark]}")) as bars:
                 task = bars.add_task(name, total=total, completed=start, remark="")
@@ -134,24 +116,18 @@ class Reporter:
 
     @contextlib.contextmanager
     def transfer(self, name: str) -> Iterator[Step]:
-        """Report a transfer; yields a function of (bytes done, of how many). A log gets a line for each tenth."""
+        """Report a transfer; yield a function of (bytes done, total bytes). A log gets a line for each tenth."""
         if self.console.is_terminal:
             with self._bars(DownloadColumn(), TransferSpeedColumn()) as bars:
                 task = bars.add_task(name, total=None)
-
-                def advance(done: int, total: int) -> None:
-                    if not 0 < bars.tasks[0].completed <= done:  # bytes of earlier runs would distort the speed
-                        bars.reset(task, total=total, completed=done)
-                    bars.update(task, completed=done)
-
-                yield advance
+                yield lambda done, total: bars.update(task, completed=done, total=total)
         else:
-            said = 0
+            told = 0
 
             def tell(done: int, total: int) -> None:
-                nonlocal said
-                if (tenth := done * 10 // total) != said and done < total:
-                    said = tenth
+                nonlocal told
+                if (tenth := done * 10 // total) != told and done < total:
+                    told = tenth
                     self.log(f"{name}: {decimal(done)} of {decimal(total)}")
 
             yield tell
@@ -162,7 +138,7 @@ class Reporter:
 
 
 class LogReporter(Reporter):
-    """Reports to the logger "spackle", and draws progress on one line of the standard error if asked to."""
+    """Logs to the logger "spackle"; with `progress`, draws a bar on one line of the standard error."""
 
     def __init__(self, progress: bool = False) -> None:
         super().__init__()
@@ -176,12 +152,21 @@ class LogReporter(Reporter):
 
     @contextlib.contextmanager
     def stage(self, name: str) -> Iterator[Step]:
-        with progress_line(name, self._progress and name in ("base", "complete")) as step:
-            yield step
+        """Draw the progress of the stages "base" and "complete", in terminals and notebooks alike."""
+        start, drawn = time.monotonic(), self._progress and name in ("base", "complete")
+
+        def draw(done: int, total: int) -> None:
+            if drawn:
+                bar = "█" * (20 * done // total) if total else ""
+                print(f"\r{name:<10}{bar:<20} {done}/{total} {time.monotonic() - start:.0f} s", end="", file=sys.stderr)
+
+        yield draw
+        if drawn:
+            print(file=sys.stderr)
 
 
 class Notes(Reporter):
-    """Collects messages in a worker, for the main process to print."""
+    """Collects the messages of a worker, which the main process prints."""
 
     def __init__(self, verbose: bool = False) -> None:
         super().__init__(verbose, Console(file=io.StringIO(), force_terminal=False))
@@ -196,11 +181,11 @@ class Notes(Reporter):
 
 @contextlib.contextmanager
 def asked_to_stop(alone: bool) -> Iterator[Callable[[], bool]]:
-    """Yields a function that tells whether Ctrl-C or SIGTERM came, so that a run can end between two steps.
+    """Yield a function that tells whether Ctrl-C or SIGTERM came, so that a run can end between two steps.
 
-    A second Ctrl-C ends the run at once, except under torchrun, which sends the first Ctrl-C a second time.
+    If `alone`, a second Ctrl-C ends the run at once; torchrun, which sends each Ctrl-C twice, needs `alone=False`.
     """
-    asked: list[int] = []  # not an Event: a signal that arrives while an Event is set waits for its lock for ever
+    asked: list[int] = []  # an Event could deadlock: a second signal may arrive while the first one holds its lock
     if threading.current_thread() is not threading.main_thread():  # only the main thread gets signals
         yield lambda: False
         return

@@ -15,10 +15,8 @@ from torch import Tensor
 from spackle.bases import USUAL_DISPARITY
 from spackle.camera import Camera
 from spackle.camera_path import OVERSCAN, DepthRange, KeyframePath, TrajectoryKind
-from spackle.errors import renamed
-from spackle.files import Target, check_writable, write_bytes
+from spackle.files import Target, write_whole
 from spackle.formats.html import PageScene, page_scene, single_html
-from spackle.formats.ply import save_ply
 from spackle.formats.scene_files import Encoder, SceneFile, at_origin, encoder_of, load_scene
 from spackle.formats.video import check_video, save_video
 from spackle.gaussians import Gaussians
@@ -28,18 +26,18 @@ from spackle.render.protocol import Rendering
 from spackle.residual.view_features import hole_mask
 from spackle.views import PATH_FRAMES, SECONDS, scene_path
 
-DEFAULT_SIZE = (1280, 720)  # of a scene without a camera
+DEFAULT_SIZE = (1280, 720)  # width and height for a file that stores no camera
 
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """Base and aux Gaussians of a photo, in the frame of its camera."""
+    """Base and aux Gaussians of a photo, in the coordinates of the photo's camera."""
 
-    base: Gaussians  # what the photo shows; never changed
-    aux: Gaussians  # what completion added
-    camera: Camera  # the photo's
+    base: Gaussians  # predicted from the photo; never changed
+    aux: Gaussians  # added by completion
+    camera: Camera  # the photo's camera, at the origin
     by_view: tuple[Gaussians, ...] | None = None  # in view mode: the aux Gaussians of each completed view
-    disparity: float | None = None  # disparity for which it was completed, if known
+    disparity: float | None = None  # the disparity for which the scene was completed, if known
 
     def __repr__(self) -> str:
         size = f"{self.camera.width}×{self.camera.height}"
@@ -58,7 +56,7 @@ class Scene:
 
     @staticmethod
     def of_file(file: SceneFile, focal_px: float | None = None, fov: float | None = None) -> Scene:
-        """The scene in a loaded file, in the frame of its camera; see `load`."""
+        """The scene in a loaded file; see `load`."""
         gaussians, camera = file.gaussians, file.camera
         if camera is None or focal_px is not None or fov is not None:
             width, height = (camera.width, camera.height) if camera else DEFAULT_SIZE
@@ -78,27 +76,33 @@ class Scene:
         """All Gaussians, the base's first."""
         return Gaussians.cat([self.base, self.aux])
 
-    def _reach(self, disparity: float | None) -> float:
-        """The disparity of a path: the given one, else the scene's, else the usual one."""
-        usual = USUAL_DISPARITY if self.disparity is None else self.disparity
-        return usual if disparity is None else disparity
-
     def of_view(self, index: int) -> list[Gaussians]:
         """The sets of Gaussians from which a completed view is rendered."""
         return [self.base, self.aux if self.by_view is None else self.by_view[index]]
 
-    @renamed(kind="trajectory")
     def path(
-        self, trajectory: TrajectoryKind = "rotate-forward", disparity: float | None = None, frames: int = PATH_FRAMES
+        self,
+        trajectory: TrajectoryKind = "rotate-forward",
+        disparity: float | None = None,
+        frames: int = PATH_FRAMES,
+        looped: bool = False,
     ) -> list[Camera]:
-        """Cameras of a video around the photo's camera position; width and height of the picture are even."""
-        return scene_path(self.base, self.camera, trajectory, self._reach(disparity), frames)
+        """Cameras of a path around the photo's camera position, of even width and height.
+
+        Args:
+            trajectory: see `spackle.camera_path.trajectory`.
+            disparity: by default the scene's.
+            frames: number of cameras.
+            looped: make a path that repeats without a jump.
+        """
+        usual = USUAL_DISPARITY if self.disparity is None else self.disparity
+        return scene_path(self.base, self.camera, trajectory, usual if disparity is None else disparity, frames, looped)
 
     def along(self, keyframes: KeyframePath, frames: int | None = None, fps: float = 30) -> list[Camera]:
-        """Cameras through keyframes (see `spackle.formats.load_path`); by default one for each frame of the path's
-        duration at `fps`.
+        """Cameras through keyframes (see `spackle.formats.load_path`), by default for the whole path at `fps`.
 
-        ValueError if a view between two keyframes is impossible.
+        Raises:
+            ValueError: a view between two keyframes is impossible.
         """
         count = frames or keyframes.frame_count(fps)
         return keyframes.cameras(self.camera.even(), count, DepthRange.of(self.base))
@@ -109,13 +113,13 @@ class Scene:
             return (renderer or get_renderer()).render([self.base, self.aux], camera)
 
     def frames(self, cameras: Iterable[Camera], renderer: Renderer | None = None) -> Iterator[Rendering]:
-        """Render the views along a path, one after the other."""
+        """Render the views one after the other."""
         renderer = renderer or get_renderer()
         for camera in cameras:
             yield self.render(camera, renderer)
 
     def depth_map(self, renderer: Renderer | None = None) -> Tensor:
-        """Depth [H, W] of the base at the photo's camera, metres if the base is metric; 0 where it is empty."""
+        """Depth [H, W] of the base at the photo's camera, in metres for a metric base; 0 in holes."""
         with torch.no_grad():
             view = (renderer or get_renderer()).render(self.base, self.camera)
         return torch.where(hole_mask(view.alpha), 0, view.depth)
@@ -125,16 +129,13 @@ class Scene:
 
         Args:
             target: a path, or a file that is open for writing bytes.
-            disparity: that for which the scene was completed; it limits `spackle view`. Default: `Scene.disparity`.
+            disparity: limit of the camera's movement in `spackle view`; by default `Scene.disparity`.
         """
-        reach = self.disparity if disparity is None else disparity
-        if isinstance(target, str | os.PathLike):
-            save_ply(self.gaussians, target, camera=self.camera, base_count=len(self.base), disparity=reach)
-        else:
-            target.write(dataclasses.replace(self, disparity=reach).to_bytes("ply"))
+        scene = self if disparity is None else dataclasses.replace(self, disparity=disparity)
+        write_whole(target, scene.to_bytes("ply"))
 
     def page(self, name: str, note: str = "") -> PageScene:
-        """The scene for the page of `spackle view`, with a name and a note as in `page_scene`."""
+        """The scene in the form that `spackle view` shows; see `page_scene`."""
         return page_scene(name, self.base, self.aux, self.camera, self.disparity, note)
 
     def export(self, target: Target, format: str | None = None) -> None:
@@ -142,17 +143,14 @@ class Scene:
 
         Args:
             target: a path, or a file that is open for writing bytes.
-            format: "ply", "compressed.ply", "spz", "splat", "sog", "glb", or "html" (page and scene); by default the
-                path's suffix.
+            format: "ply", "compressed.ply", "spz", "splat", "sog", "glb", or "html" (viewer and scene in one file); by
+                default the path's suffix.
 
         Raises:
-            InputError: an unknown format, or a scene too large for it.
+            InputError: an unknown format, or a scene too large for the format.
         """
-        name = Path(f"scene.{format}") if format else None
-        if isinstance(target, str | os.PathLike):
-            check_writable(target)
-            name = name or Path(target)
-        write_bytes(self._encoded(name or Path("scene")), target)
+        name = target if isinstance(target, str | os.PathLike) else "scene"
+        write_whole(target, self._encoded(Path(f"scene.{format}" if format else name)))
 
     def to_bytes(self, format: str) -> bytes:
         """The bytes that `export` would write."""
@@ -164,10 +162,9 @@ class Scene:
         return encoder_of(name, {".html": page})(file)
 
     def show(self, height: int = 480) -> InlinePage:
-        """A page with the scene, `height` pixels high; a notebook shows it if it is the last value of a cell."""
+        """A viewer with the scene, `height` pixels high, which a notebook displays as the value of a cell."""
         return InlinePage(single_html(self.page("scene")).decode(), height)
 
-    @renamed(kind="trajectory")
     def save_video(
         self,
         target: Target,
@@ -180,34 +177,37 @@ class Scene:
         format: str | None = None,
         renderer: Renderer | None = None,
     ) -> None:
-        """Write a video of a camera path, by default of 4 seconds; `loop` as in `spackle.formats.VideoWriter`.
+        """Write a video of a camera path that repeats without a jump; see `path`.
 
-        The focal length is 1 + `overscan` times the photo's, so that most of what lies beyond the photo is not seen.
-        `target` is a path, or a file that is open for writing bytes; `format` is "mp4", "webm", "gif" or "webp", by
-        default the path's suffix, and mp4 for an open file.
+        Args:
+            target: a path, or a file that is open for writing bytes.
+            trajectory, disparity: see `path`.
+            frames: number of frames, by default 4 seconds.
+            fps: frames per second.
+            loop: see `spackle.formats.VideoWriter`.
+            overscan: relative gain in focal length, which hides most of the fill beyond the photo's border.
+            format: "mp4", "webm", "gif" or "webp"; by default the path's suffix, or mp4 for an open file.
+            renderer: by default the CPU's.
         """
         if format is None and isinstance(target, str | os.PathLike):
             check_video(target, fps, loop)
             count = max(1, round(SECONDS * fps)) if frames is None else frames
-            cameras = scene_path(self.base, self.camera, trajectory, self._reach(disparity), count, looped=True)
+            cameras = self.path(trajectory, disparity, count, looped=True)
             views = self.frames((camera.zoomed(1 + overscan) for camera in cameras), renderer)
             save_video((view.rgb for view in views), target, fps, loop)
             return
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / f"video.{format or 'mp4'}"
             self.save_video(path, trajectory, disparity, frames, fps, loop, overscan, renderer=renderer)
-            write_bytes(path.read_bytes(), target)
+            write_whole(target, path.read_bytes())
 
 
 @dataclasses.dataclass(frozen=True)
 class InlinePage:
-    """The page, embedded in a notebook."""
+    """The viewer, embedded in a notebook."""
 
-    html: str
+    html: str = dataclasses.field(repr=False)
     height: int  # pixels
-
-    def __repr__(self) -> str:
-        return f"InlinePage({len(self.html) / 1e6:.1f} MB, shown by a notebook)"
 
     def _repr_html_(self) -> str:
         style = f"width: 100%; height: {self.height}px; border: 0"

@@ -20,7 +20,7 @@ from spackle.bases.depth_map import DepthKind, DepthMap, depth_of_array, load_de
 from spackle.bases.open import open_base, open_loaded
 from spackle.bases.settings import AUTO, BaseSettings
 from spackle.camera_path import TrajectoryKind
-from spackle.errors import InputError, renamed, short_messages, shown
+from spackle.errors import InputError, shown
 from spackle.image import Photo, load_photo, photo_of_picture
 from spackle.pipeline import Fill, FillOptions, Options, Pipeline
 from spackle.progress import LogReporter
@@ -36,9 +36,8 @@ Residual = str | os.PathLike[str] | ResidualNet | None
 
 
 class Spackle:
-    """Completes many photos with networks that are loaded once, at the first photo that needs them."""
+    """Completes many photos; a network is loaded once, at the first photo that needs it."""
 
-    @short_messages()
     def __init__(
         self,
         base: str | Base = AUTO,
@@ -51,14 +50,14 @@ class Spackle:
         """Choose base, fill and device.
 
         Args:
-            base: a name as for `--base`, or a loaded base, such as `SharpBase.load(weights)`. "auto" takes the best for
-                each photo: its depth, else SHARP or MoGe if weights have been downloaded, else lite, whose geometry
-                is rough. The choice, and candidates that fail, are logged to the logger "spackle".
-            residual: a weight file, a loaded network, "seeds" to fill without a network, or "none" to leave the holes
-                open; None takes the weights that come with Spackle.
-            fill: source of the texture in the holes, see `spackle.pipeline.open_texture`; "none" leaves the holes open.
+            base: a name as for `--base`, or a loaded base, such as `SharpBase.load(weights)`. "auto" takes the best
+                base for each photo: a depth map, SHARP or MoGe if their weights have been downloaded, or the rough
+                lite. The logger "spackle" gets the choice.
+            residual: a weight file, a loaded network, "seeds" to fill without a network, or "none" to keep the holes;
+                None takes the weights that come with Spackle.
+            fill: source of the texture in the holes, see `spackle.pipeline.open_texture`; "none" keeps the holes.
             device: "auto", "cpu" or "cuda", for base and renderer.
-            renderer: None takes the device's own.
+            renderer: by default the renderer of the device.
 
         Raises:
             InputError: an unknown name, or weights that cannot be used.
@@ -72,7 +71,6 @@ class Spackle:
         self._given = not isinstance(base, str) or base not in (AUTO, "rgbd")
         self._pipeline = Pipeline(options, opened, network or chosen.load(), renderer or get_renderer(device))
 
-    @short_messages()
     def predict(
         self,
         photo: PhotoSource,
@@ -92,7 +90,7 @@ class Spackle:
             raise InputError("predict takes the photo's depth, or a base that needs none, but not both")
         lens = {"focal_px": focal_px, "focal_mm": focal_mm, "fov": fov}
         if isinstance(photo, Photo) and lens != dict.fromkeys(lens):
-            raise InputError("a loaded photo has its lens already: give focal_px, focal_mm or fov to load_photo")
+            raise InputError("a loaded photo has a focal length already: give focal_px, focal_mm or fov to load_photo")
         pipeline, options = self._pipeline, self._pipeline.options
         options = dataclasses.replace(options, path=PathOptions(trajectory, disparity))
         options.path.check()
@@ -108,7 +106,6 @@ class Spackle:
             return dataclasses.replace(pipeline, options=options).complete(loaded, LogReporter(progress)).scene
 
 
-@renamed(kind="trajectory")
 def predict(
     photo: PhotoSource,
     depth: DepthSource | None = None,
@@ -127,7 +124,7 @@ def predict(
     fov: float | None = None,
     progress: bool = False,
 ) -> Scene:
-    """Turn a photo into a scene without holes along a camera path; for many photos keep a `Spackle`, which loads once.
+    """Turn a photo into a scene without holes along a camera path; for many photos keep a `Spackle`.
 
     Args:
         photo: a path, the bytes of a file, an open file, a PIL picture, a loaded photo, or an array or tensor
@@ -136,19 +133,17 @@ def predict(
             in metres (0, NaN or inf: unknown), or a loaded depth map.
         base, residual, fill, device, renderer: see `Spackle`.
         trajectory: the path for which the scene is completed, in addition to the leftmost and rightmost views.
-        disparity: how far the path goes, see `spackle.camera_path.max_offset`; if None, chosen for the photo (see
-            `choose_move`), at most 0.15 for lite, else 0.3.
+        disparity: size of the camera's movement, see `spackle.camera_path.max_offset`; None lets `choose_move` decide,
+            with a limit of 0.15 for lite and 0.3 for other bases.
         depth_kind: the meaning of a depth map's numbers, see `spackle.load_depth`.
-        keep_frame: keep a uniform frame around a file's picture; otherwise it is cropped if neither depth nor a focal
-            length is given.
-        focal_px: focal length in pixels of the upright photo; by default the one stored in the file, see `load_photo`.
-        focal_mm: focal length in mm, 35 mm film equivalent, instead of `focal_px`.
-        fov: horizontal field of view in degrees, instead of `focal_px`.
+        keep_frame: keep a uniform frame around a picture, which is otherwise cropped unless depth or a focal length is
+            given.
+        focal_px, focal_mm, fov: the focal length, see `load_photo`.
         progress: draw progress on one line of the standard error.
 
     Raises:
         InputError: a photo, a depth map, a name or weights that cannot be used; `base` together with `depth`, or a
-            lens for a loaded photo.
+            focal length for a loaded photo.
     """
     return Spackle(base, residual=residual, fill=fill, device=device, renderer=renderer).predict(
         photo,
@@ -166,7 +161,7 @@ def predict(
 
 @contextlib.contextmanager
 def _photo(source: PhotoSource, **options: Any) -> Iterator[Photo]:
-    """The loaded photo; one given as bytes has a temporary file during the block, so that its depth can be read."""
+    """Load the photo; bytes get a temporary file during the block, from which a base can read the photo's depth."""
     if isinstance(source, Photo):
         yield source
     elif isinstance(source, Image.Image | np.ndarray | Tensor):
@@ -190,16 +185,14 @@ def _depth(source: DepthSource, kind: DepthKind) -> Iterator[Path | DepthMap]:
 
 @contextlib.contextmanager
 def _as_file(source: str | os.PathLike[str] | bytes | BinaryIO, kind: str) -> Iterator[Path]:
-    """A path to the source's bytes; messages call a temporary file "photo" or "depth"."""
+    """A path to the source's bytes; messages call a temporary file `kind`."""
     if isinstance(source, str | os.PathLike):
         yield Path(source)
         return
-    content = source if isinstance(source, bytes | bytearray | memoryview) else None
-    if content is None and callable(read := getattr(source, "read", None)):
-        content = read()
-    if not isinstance(content, bytes | bytearray | memoryview):
-        holds = "a path, bytes, a file opened in binary mode, or an array"
-        raise InputError(f"{kind}: {type(source).__name__} {shown(source)} is not accepted: give {holds}")
+    content = source.read() if hasattr(source, "read") else source
+    if not isinstance(content, bytes):
+        accepted = "a path, bytes, a file opened in binary mode, or an array"
+        raise InputError(f"{kind}: {type(source).__name__} {shown(source)} is not accepted: give {accepted}")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / kind
         path.write_bytes(content)

@@ -14,14 +14,14 @@ from spackle.camera import Camera, beside
 from spackle.device import run_chunks
 from spackle.gaussians import Gaussians, quat_from_matrix
 
-EDGE = 0.03  # a relative jump of inverse depth between neighbours beyond this is a depth edge
-CREASE = 0.01  # if the slopes of both sides differ by more, only the flatter one counts, if it is no more than this
+EDGE = 0.03  # a larger relative difference of inverse depth between neighbouring pixels is a depth edge
+CREASE = 0.01  # a larger relative difference between the slopes on both sides of a pixel is a crease
 THICKNESS = 0.05  # third axis, in units of the smaller of the other two
-# Of an opaque Gaussian. Not higher: a blob that would bring the transmittance below the renderer's stop (1e-4) is not
-# drawn at all, so a blob of opacity 0.999 behind a veil of alpha 0.9 would leave a hole that nothing can fill.
+# Opacity of a solid Gaussian. The renderer skips a Gaussian that would bring the transmittance below 1e-4, so a
+# Gaussian of opacity 0.999 behind another of alpha 0.9 would be skipped and leave a hole.
 OPACITY = np.float32(0.99)
-PIXEL_SPREAD = 0.5  # standard deviation of a Gaussian for one pixel, which a wider one backs
-BEHIND = 0.005  # relative distance behind a surface at which a Gaussian does not spill over it
+PIXEL_SPREAD = 0.5  # standard deviation, in pixels, of a Gaussian for one pixel in front of a wider Gaussian
+BEHIND = 0.005  # relative distance behind a surface at which a Gaussian does not show through the surface
 
 
 def surface_gaussians(
@@ -33,17 +33,14 @@ def surface_gaussians(
     colors: Tensor,
     opacities: Tensor,
 ) -> Gaussians:
-    """One Gaussian for each sample of a surface, aligned with it.
-
-    Seen from `camera` each is a blob of `spread` pixels; from elsewhere it foreshortens like the surface, so that a
-    plane has no gaps.
+    """Make a flat Gaussian in the tangent plane of each sample of a surface.
 
     Args:
         camera: the view in which the samples are given.
         uv: [N, 2] pixel positions.
         inverse_depth: [N] 1/z.
         slope: [N, 2] derivative of the inverse depth by pixel x and y.
-        spread: [N], [N, 2] along pixel x and y, or one number: standard deviation in pixels of `camera`.
+        spread: standard deviation in pixels of `camera`: [N], or [N, 2] along pixel x and y, or one number.
         colors: [N, 3] linear RGB.
         opacities: [N].
     """
@@ -75,12 +72,11 @@ def _principal_axes(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
 def surface_slope(inverse_depth: Tensor) -> Tensor:
     """Derivative of the inverse depth by pixel x and y, [H, W, 2], that never crosses a depth edge.
 
-    The inverse depth of a plane is linear in the pixel, so both one-sided differences agree on a plane
-    however slanted. Otherwise the flatter side is the surface and the other one an edge; if even the flatter one is
-    steep, the depth is unreliable and the pixel faces the camera.
+    The inverse depth of a plane is linear in the pixel, so the differences to both neighbours agree. If they differ,
+    the flatter one is used; if even the flatter one is steep, the slope is 0.
 
     Args:
-        inverse_depth: [H, W] float32 or float64, positive everywhere. No gradient goes through.
+        inverse_depth: [H, W] float32 or float64, positive everywhere; gradients do not pass.
     """
     image = inverse_depth.detach().cpu().contiguous().numpy()
     slopes = np.empty((*image.shape, 2), image.dtype)
@@ -91,13 +87,12 @@ def surface_slope(inverse_depth: Tensor) -> Tensor:
 
 @kernel
 def _slopes(start: int, stop: int, image: Any, crease: Any, edge: Any, slopes: Any) -> None:
-    """Compute rows start..stop of the slopes."""
     height, width = image.shape
     for y in range(start, stop):
         above, below = max(y - 1, 0), min(y + 1, height - 1)
         for x in range(width):
             here, left, right = image[y, x], max(x - 1, 0), min(x + 1, width - 1)
-            # At a border, the only difference that exists is used for both sides.
+            # At a border, one difference serves for both sides.
             ahead, behind = image[y, right] - here, here - image[y, left]
             forward, backward = ahead if right > x else behind, behind if left < x else ahead
             slopes[y, x, 0] = _slope(here, backward, forward, crease, edge)
@@ -108,7 +103,6 @@ def _slopes(start: int, stop: int, image: Any, crease: Any, edge: Any, slopes: A
 
 @kernel
 def _slope(here: Any, backward: Any, forward: Any, crease: Any, edge: Any) -> Any:
-    """The slope along one axis, from the differences to both neighbours."""
     smooth = abs(forward - backward) <= crease * here
     flatter = backward if abs(backward) < abs(forward) else forward
     slope = (forward + backward) / 2 if smooth else flatter

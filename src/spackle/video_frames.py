@@ -1,4 +1,4 @@
-"""Make the frames of a video: their size and format, for one eye or two, in colour or as depth."""
+"""Frames of a video: size, fit, one eye or two, colour or depth."""
 
 from __future__ import annotations
 
@@ -7,12 +7,11 @@ import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, cast, get_args
+from typing import Literal, cast
 
 import torch
 from torch import Tensor
-from torch.nn import functional
-from torch.nn.functional import interpolate
+from torch.nn.functional import adaptive_avg_pool2d, interpolate
 
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange
@@ -25,20 +24,19 @@ from spackle.render.protocol import Rendering
 VideoFormat = Literal["mp4", "webm", "gif", "webp"]
 Show = Literal["color", "depth"]
 StereoLayout = Literal["sbs", "sbs-half", "ou", "ou-half", "anaglyph"]
-LAYOUTS: tuple[StereoLayout, ...] = get_args(StereoLayout)
-PARALLAX = 0.03  # of the image's width, between z_near and infinity: comfortable on a monitor or a projection
+PARALLAX = 0.03  # difference in parallax between z_near and infinity, as a share of the image's width
 Fit = Literal["pad", "blur", "crop"]
 PRESETS = {"16:9": (1920, 1080), "9:16": (1080, 1920), "1:1": (1080, 1080)}  # names that --size accepts
-ALIKE = 0.01  # if aspect ratios differ by less, the view is cropped, so that there are no thin margins
-BLURRED_PX, BLURRED_LIGHT = 12, 0.6  # long side to which the image is reduced for blurred margins; their brightness
+ALIKE = 0.01  # if aspect ratios differ by less, the view is cropped, which avoids thin margins
+BLURRED_PX, BLURRED_LIGHT = 12, 0.6  # long side of the reduced image that makes blurred margins; margins' brightness
 GAP = 6  # pixels between the two images of --compare
 MAX_VIDEO_SIDE = 8192
 MAX_IPD = 1e6
 DEFAULT_FPS = 30
-COVERED = 0.5  # opacity below which a pixel counts as having no depth
+COVERED = 0.5  # a pixel of smaller opacity has no depth
 
-# E. Dubois, "A projection method to generate anaglyph stereo images", ICASSP 2001: least squares over the spectra
-# of a display and of red-cyan glasses, in linear light. Rows: weights of the eye's R, G and B in the result's R, G, B.
+# E. Dubois, "A projection method to generate anaglyph stereo images", ICASSP 2001, for red-cyan glasses, in linear
+# light. A row holds the weights of one eye's R, G and B in one channel of the result.
 DUBOIS_LEFT = ((0.456, 0.500, 0.176), (-0.040, -0.038, -0.016), (-0.015, -0.021, -0.005))
 DUBOIS_RIGHT = ((-0.043, -0.088, -0.002), (0.378, 0.734, -0.018), (-0.072, -0.113, 1.226))
 
@@ -49,28 +47,20 @@ class Stereo:
 
     layout: StereoLayout
     ipd: float  # distance between the eyes, in the scene's unit (metres if the base is metric)
-    convergence: float  # depth without parallax, which appears at the screen; inf: principal points are not shifted
-
-    def __post_init__(self) -> None:
-        if self.layout not in LAYOUTS:
-            raise ValueError(f"unknown stereo layout {self.layout!r}: choose one of {', '.join(LAYOUTS)}")
-        if not (0 < self.ipd < math.inf and self.convergence > 0):
-            raise ValueError(f"no stereo with eyes {self.ipd:g} apart and a screen at {self.convergence:g}")
+    convergence: float  # depth without parallax, which appears at the screen; may be infinite
 
     def eyes(self, camera: Camera) -> tuple[Camera, Camera]:
-        """The cameras of the left and the right eye: the view's, moved along its x axis, not turned.
+        """Cameras of the left and the right eye: parallel, on both sides of `camera` along its x axis.
 
-        The cameras are parallel; their principal points are shifted so that points at depth `convergence` appear at the
-        same position in both images. Turning the cameras inwards instead would distort each image to a trapezium, and
-        shift its rows.
+        Principal points are shifted so that points at depth `convergence` have the same position in both images.
         """
         return _moved(camera, -self.ipd / 2, self.convergence), _moved(camera, self.ipd / 2, self.convergence)
 
     def pack(self, left: Tensor, right: Tensor) -> Tensor:
         """Combine the eyes' images [H, W, 3], sRGB, in one frame.
 
-        sbs [H, 2W, 3] has the left eye on the left, ou [2H, W, 3] has it on top; their half variants squeeze the
-        frame to [H, W, 3] (an odd side grows by one); anaglyph is for glasses with the red filter on the left eye.
+        sbs [H, 2W, 3] has the left eye on the left, ou [2H, W, 3] on top; the half variants squeeze the frame to
+        [H, W, 3] (an odd side grows by one); anaglyph is for glasses with the red filter on the left eye.
         """
         if self.layout == "anaglyph":
             return anaglyph(left, right)
@@ -80,24 +70,21 @@ class Stereo:
 
     def frame_size(self, width: int, height: int) -> tuple[int, int]:
         """Width and height of a frame, for eyes' images of this size."""
-        if self.layout in ("sbs", "sbs-half"):
-            return 2 * (width if self.layout == "sbs" else (width + 1) // 2), height
-        if self.layout in ("ou", "ou-half"):
-            return width, 2 * (height if self.layout == "ou" else (height + 1) // 2)
-        return width, height
+        wide, tall = {"sbs": (2 * width, height), "ou": (width, 2 * height)}.get(self.layout, (width, height))
+        if self.layout == "sbs-half":
+            wide += width % 2
+        elif self.layout == "ou-half":
+            tall += height % 2
+        return wide, tall
 
 
 def default_ipd(camera: Camera, depth_range: DepthRange) -> float:
-    """The distance between the eyes for which the scene's depth has a parallax of 3 % of the image's width.
-
-    parallax = fx · ipd · (1/near − 1/∞), so ipd = 0.03 · (W/fx) · z_near. So the scene's unit does not matter, and
-    objects at arm's length do not get too much parallax. For a 30 mm lens and z_near = 1.8 m this is the human 65 mm.
-    """
+    """The distance between the eyes that gives a parallax of 3 % of the image's width between z_near and infinity."""
     return PARALLAX * camera.width / camera.focal[0] * depth_range.near
 
 
 def anaglyph(left: Tensor, right: Tensor) -> Tensor:
-    """A red-cyan image [..., 3] of two sRGB images [..., 3], mixed in linear light by Dubois' matrices."""
+    """Mix two sRGB images [..., 3] to a red-cyan image, in linear light."""
     one, other = srgb_to_linear(left), srgb_to_linear(right)
     mixed = one @ one.new_tensor(DUBOIS_LEFT).T + other @ other.new_tensor(DUBOIS_RIGHT).T
     return linear_to_srgb(mixed)
@@ -111,11 +98,11 @@ def _moved(camera: Camera, right: float, convergence: float) -> Camera:
 
 
 def _halved(picture: Tensor, side: bool) -> Tensor:
-    """Halve an image's width (if `side`) or height; pixels are averaged in linear light."""
+    """Halve an image's width (if `side`) or height in linear light."""
     height, width = picture.shape[:2]
     size = (height, (width + 1) // 2) if side else ((height + 1) // 2, width)
     light = srgb_to_linear(picture).permute(2, 0, 1)[None]
-    return linear_to_srgb(functional.adaptive_avg_pool2d(light, size))[0].permute(1, 2, 0)
+    return linear_to_srgb(adaptive_avg_pool2d(light, size))[0].permute(1, 2, 0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,19 +110,19 @@ class VideoOptions:
     """Options that all videos share."""
 
     format: VideoFormat | None = None  # None: mp4
-    fps: float | None = None  # None: 30; for a clip it must be None, because a clip keeps its own rate
-    loop: int | None = None  # None: the format's default, which is for ever for gif and webp, once for the others
+    fps: float | None = None  # None: 30; must be None for a clip, whose frame rate is kept
+    loop: int | None = None  # None: gif and webp repeat for ever, mp4 and webm play once
     size: tuple[int, int] | None = None  # width and height of one eye's image; None: the photo's
-    fit: Fit = "pad"  # how a view with another aspect ratio is fitted: black margins, blurred margins, or cropping
+    fit: Fit = "pad"  # for a view of another aspect ratio: black margins, blurred margins, or cropping
     show: Show = "color"
     stereo: StereoLayout | None = None
     ipd: float | None = None  # None: `default_ipd`
     convergence: float | None = None  # None: the focus depth
-    compare: bool = False  # whether a frame shows the base with its holes on the left, the completed scene on the right
+    compare: bool = False  # whether each frame shows the base on the left and the completed scene on the right
 
     @property
     def suffix(self) -> str:
-        """The file name's suffix."""
+        """The suffix of a file name."""
         return f".{self.format or 'mp4'}"
 
     @property
@@ -149,7 +136,7 @@ class VideoOptions:
         return FORMATS[self.suffix].loop if self.loop is None else self.loop
 
     def check(self) -> None:
-        """InputError if no video can have these options."""
+        """Raise an InputError for options that contradict each other."""
         self._blame(f"--fps {self.rate:g}", None)
         self._blame(f"--loop {self.loop}", self.loop)
         for option, value in {"--ipd": self.ipd, "--convergence": self.convergence}.items():
@@ -167,14 +154,14 @@ class VideoOptions:
             )
 
     def _blame(self, option: str, loop: int | None) -> None:
-        """InputError, naming `option`, if the format does not allow the rate or `loop`."""
+        """Raise an InputError that begins with `option` if the format does not allow the rate or `loop`."""
         try:
             check_video(name := f"video{self.suffix}", self.rate, loop)
         except InputError as error:
             raise InputError(f"{option}: {str(error).removeprefix(f'{name}: ')}") from error
 
     def for_file(self, file: Path) -> VideoOptions:
-        """The options, with the format set by a file's suffix; InputError if --format contradicts it."""
+        """Set the format by a file's suffix; InputError if --format contradicts the suffix."""
         suffix = file.suffix.lower()
         meant = "mp4" if suffix in (".m4v", ".mov") else cast(VideoFormat, suffix[1:])
         if self.format not in (None, meant):
@@ -184,7 +171,7 @@ class VideoOptions:
 
 @dataclasses.dataclass(frozen=True)
 class FrameMaker:
-    """Makes frames of a video from renderings: one image or two, in colour or as depth."""
+    """Makes frames of a video from renderings."""
 
     options: VideoOptions
     stereo: Stereo | None = None
@@ -192,10 +179,7 @@ class FrameMaker:
 
     @staticmethod
     def of(options: VideoOptions, gaussians: Gaussians, cameras: Sequence[Camera], source: Path) -> FrameMaker:
-        """The frame maker for a scene and a path, from which missing options are derived.
-
-        InputError, naming `source`, if no such video is possible.
-        """
+        """Derive missing options from the scene and the cameras; InputError, naming `source`, for impossible videos."""
         try:
             stereo = _stereo(options, gaussians, cameras[0])
             depth = DepthColors.over(gaussians, cameras) if options.show == "depth" else None
@@ -212,7 +196,7 @@ class FrameMaker:
 
     @property
     def plain(self) -> bool:
-        """Whether a frame is just one colour view at its own size."""
+        """Whether a frame is one colour view at the size of its camera."""
         return self.stereo is None and self.depth is None and self.options.size is None
 
     @property
@@ -222,11 +206,11 @@ class FrameMaker:
         return size and (size[0] + size[0] % 2, size[1] + size[1] % 2)
 
     def eyes(self, camera: Camera) -> tuple[Camera, ...]:
-        """The view itself, or the cameras of its left and right eye."""
+        """The camera itself, or the cameras of a stereo view's left and right eye."""
         return (camera,) if self.stereo is None else self.stereo.eyes(camera)
 
     def frame(self, views: Sequence[Rendering]) -> Tensor:
-        """One frame [H, W, 3], sRGB, from the renderings of `eyes`; with `compare`, from those of base and scene."""
+        """One frame [H, W, 3], sRGB, from renderings of `eyes`, or, with `compare`, of base and scene."""
         pictures = [v.rgb if self.depth is None else self.depth(v.depth, v.alpha >= COVERED) for v in views]
         if self.canvas is not None:
             pictures = [with_margins(picture, *self.canvas, self.options.fit == "blur") for picture in pictures]
@@ -236,7 +220,7 @@ class FrameMaker:
         return pictures[0] if self.stereo is None else self.stereo.pack(*pictures)
 
     def sized(self, camera: Camera) -> Camera:
-        """A view at the size in which it is rendered: that of one eye's image, without margins."""
+        """The camera at the size of one eye's image without margins."""
         if self.canvas is None:
             return camera
         width, height = self.canvas
@@ -247,14 +231,14 @@ class FrameMaker:
         return camera.resized(*(max(1, round(scale * side)) for side in (camera.width, camera.height)))
 
     def frame_size(self, camera: Camera) -> tuple[int, int]:
-        """Width and height of a frame for a view of this size; the file has the same if both are even."""
+        """Width and height of a frame for a view of the camera's size."""
         width, height = self.canvas or (camera.width, camera.height)
         if self.options.compare:
             return 2 * width + GAP, height
         return (width, height) if self.stereo is None else self.stereo.frame_size(width, height)
 
     def note(self, name: str, camera: Camera, frames: int) -> dict[str, object]:
-        """The report's entry for the video: its properties and file name, because a folder may contain older videos."""
+        """The report's entry for the video."""
         width, height = self.frame_size(self.sized(camera))
         stereo: dict[str, object] | None = None
         if self.stereo is not None:
@@ -264,7 +248,7 @@ class FrameMaker:
             "file": name,
             "frames": frames,
             "fps": self.options.rate,
-            "plays": self.options.plays,  # 0: for ever
+            "plays": self.options.plays,
             "width": width,
             "height": height,
             "show": self.options.show,
@@ -273,7 +257,6 @@ class FrameMaker:
 
 
 def _stereo(options: VideoOptions, gaussians: Gaussians, camera: Camera) -> Stereo | None:
-    """The stereo view that the options ask for, with defaults that suit the scene; None without --stereo."""
     if options.stereo is None:
         return None
     ipd, convergence = options.ipd, options.convergence
@@ -289,7 +272,7 @@ def _stereo(options: VideoOptions, gaussians: Gaussians, camera: Camera) -> Ster
 
 
 def cover(camera: Camera, width: int, height: int) -> Camera:
-    """The view at another size, scaled without distortion; if the aspect ratio differs, two sides are cropped."""
+    """The view at another size, scaled without distortion; two sides are cropped if the aspect ratio differs."""
     scale = max(width / camera.width, height / camera.height)
     K = camera.zoomed(scale).K
     center = torch.tensor([camera.width / 2, camera.height / 2])
@@ -298,7 +281,7 @@ def cover(camera: Camera, width: int, height: int) -> Camera:
 
 
 def with_margins(picture: Tensor, width: int, height: int, blurred: bool) -> Tensor:
-    """Centre an image [h, w, 3] in one of [height, width, 3], with margins that are black or blurred from the image."""
+    """Centre an image [h, w, 3] in one of [height, width, 3]; margins are black, or a blurred copy of the image."""
     h, w = picture.shape[:2]
     if (w, h) == (width, height):
         return picture
@@ -317,7 +300,7 @@ def with_margins(picture: Tensor, width: int, height: int, blurred: bool) -> Ten
 
 
 def video_problem(cameras: Sequence[Camera]) -> str | None:
-    """The reason why these views cannot be the frames of a video, or None."""
+    """The reason why these views cannot be the frames of one video, or None."""
     sizes = {(camera.width, camera.height) for camera in cameras}
     if len(sizes) > 1:
         return "the frames differ in size"
@@ -327,7 +310,7 @@ def video_problem(cameras: Sequence[Camera]) -> str | None:
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """Parse WxH, or one of `PRESETS`, as (width, height); InputError for anything else."""
+    """Parse WxH, or a name in `PRESETS`, as (width, height); InputError for anything else."""
     if text in PRESETS:
         return PRESETS[text]
     match = re.fullmatch(r"([0-9]{1,5})[xX×]([0-9]{1,5})", text)

@@ -1,4 +1,4 @@
-"""The views of a scene: the camera path, the video along it, the views whose holes are filled."""
+"""Plan the views of a scene: the camera path, the frames of a video, and the views whose holes are filled."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from spackle.camera import Camera
 from spackle.camera_path import (
     MAX_DISPARITY,
     OVERSCAN,
+    TRAJECTORIES,
     DepthRange,
     KeyframePath,
     PathError,
     TrajectoryKind,
     extremes,
     trajectory,
-    trajectory_kind,
 )
-from spackle.errors import InputError
+from spackle.errors import InputError, check_name
 from spackle.formats.camera_files import load_cameras, load_path
 from spackle.gaussians import Gaussians
 from spackle.image import working_size
@@ -32,10 +32,10 @@ from spackle.render.protocol import Renderer
 from spackle.residual.view_features import hole_area_ratio
 from spackle.video_frames import FrameMaker, VideoOptions
 
-PATH_FRAMES, MAX_FRAMES = 60, 10_000  # of a path: the default, and the most
-SECONDS = 4.0  # of a video along a trajectory
+PATH_FRAMES, MAX_FRAMES = 60, 10_000  # default and largest number of frames
+SECONDS = 4.0  # default duration of a video along a trajectory
 MAX_OVERSCAN = 0.5
-MEASURED_KEYFRAMES = 16  # keyframes at most whose holes are reported
+MEASURED_KEYFRAMES = 16  # largest number of keyframes whose holes are reported
 
 
 def scene_path(
@@ -46,10 +46,7 @@ def scene_path(
     frames: int = PATH_FRAMES,
     looped: bool = False,
 ) -> list[Camera]:
-    """The cameras of a path around the photo's camera, of the photo's size with both sides made even.
-
-    A path that is `looped`, as for videos, continues from its last camera to the first, see `trajectory`.
-    """
+    """The cameras of a `trajectory`, of the photo's size with both sides made even."""
     return trajectory(kind, camera.even(), disparity, DepthRange.of(base), frames, looped)
 
 
@@ -58,20 +55,17 @@ class PathOptions:
     """Options of the camera path, and of the video along it."""
 
     trajectory: TrajectoryKind = "rotate-forward"
-    disparity: float | None = None  # None: as the base has it
-    cameras: Path | None = None  # exactly these views in place of a trajectory
-    path: Path | None = None  # keyframes in place of a trajectory
-    frames: int | None = None  # None: as many as the seconds take
-    seconds: float | None = None  # of the video; None: 4, or the keyframes' own
+    disparity: float | None = None  # None: the base's
+    cameras: Path | None = None  # a file of views that replace the trajectory
+    path: Path | None = None  # a file of keyframes that replace the trajectory
+    frames: int | None = None  # None: seconds times the frame rate
+    seconds: float | None = None  # duration of the video; None: 4, or the keyframes'
     video: VideoOptions = dataclasses.field(default_factory=VideoOptions)
-    overscan: float = OVERSCAN  # share by which a trajectory's focal length exceeds the photo's
+    overscan: float = OVERSCAN  # relative gain in focal length along a trajectory
 
     def check(self) -> None:
-        """InputError for an impossible path or video, or views that are given twice."""
-        try:
-            trajectory_kind(self.trajectory)
-        except ValueError as error:
-            raise InputError(f"--trajectory: {error}") from error
+        """Raise an InputError for an impossible path or video, or for options that contradict each other."""
+        check_name("--trajectory", self.trajectory.replace("_", "-"), TRAJECTORIES)
         if self.disparity is not None and not (math.isfinite(self.disparity) and 0 <= self.disparity <= MAX_DISPARITY):
             raise InputError(f"--disparity must be between 0 and {MAX_DISPARITY:g}, got {self.disparity:g}")
         if self.frames is not None and not 1 <= self.frames <= MAX_FRAMES:
@@ -86,7 +80,7 @@ class PathOptions:
         if self.cameras is not None and self.path is not None:
             raise InputError(f"--path {self.path}: --cameras gives the views already: leave one of them out")
         if self.cameras is not None and self.video.size is not None:
-            raise InputError(f"--size: the views of --cameras {self.cameras} have a size of their own: leave it out")
+            raise InputError(f"--size: the views of --cameras {self.cameras} have sizes already: leave --size out")
         if not 0 <= self.overscan <= MAX_OVERSCAN:
             raise InputError(f"--overscan must be between 0 and {MAX_OVERSCAN:g}, got {self.overscan:g}")
         self.video.check()
@@ -97,23 +91,23 @@ class PathOptions:
         return views, None if self.path is None else load_path(self.path)
 
     def reach(self, default: float) -> float:
-        """The disparity of the path: the one that is given, or the default."""
+        """The path's disparity: that of the options, or the default."""
         return default if self.disparity is None else self.disparity
 
     def fly(
         self, gaussians: Gaussians, camera: Camera, keyframes: KeyframePath | None, disparity: float = USUAL_DISPARITY
     ) -> list[Camera]:
-        """The cameras of a video: through keyframes or along the trajectory, at the photo's size made even.
+        """The cameras of a video through keyframes or along the trajectory, of the photo's size made even.
 
         Args:
-            gaussians: the scene, whose depths set how far the path goes.
-            camera: the photo's.
-            keyframes: those of --path.
-            disparity: used if the options have none.
+            gaussians: the scene, whose depths determine the path's length.
+            camera: the photo's camera.
+            keyframes: the keyframes of --path.
+            disparity: default for the options' disparity.
 
         Raises:
             PathError: the keyframes give no usable path.
-            ValueError: this scene allows no such path.
+            ValueError: the scene allows no such path.
         """
         given = self.frames or (self.seconds and round(self.seconds * self.video.rate))
         if keyframes is None:
@@ -128,14 +122,14 @@ class PathOptions:
 
 @dataclasses.dataclass(frozen=True)
 class PlannedViews:
-    """The views whose holes are filled, and the video frames that they make up."""
+    """The views whose holes are filled, and the video frames that consist of these views."""
 
     cameras: list[Camera]
     measured: dict[str, int]  # name → index: views whose holes are reported
-    frames: list[tuple[int, ...]]  # of the video: each a view, or the left eye's and the right eye's
-    stills: int  # this many views, the first ones, are also saved as pictures
+    frames: list[tuple[int, ...]]  # for each frame of the video the index of its view, or of its two eyes' views
+    stills: int  # the number of views at the beginning that are also saved as pictures
     maker: FrameMaker
-    looked_at: list[int]  # views that a scene is completed for: more frames of the same path uncover nothing more
+    looked_at: list[int]  # views for which a scene is completed; more frames of the same path uncover nothing more
 
     @staticmethod
     def of(
@@ -146,7 +140,7 @@ class PlannedViews:
         unseen: Sequence[Camera] = (),
         every: int = 1,
     ) -> PlannedViews:
-        """Plan a path's frames, for one eye or two, with `unseen` further views to fill, and `others` to measure.
+        """Plan the frames of a path, `unseen` further views to fill, and `others` to fill and measure.
 
         A scene is completed for one frame in `every`.
         """
@@ -162,15 +156,14 @@ class PlannedViews:
         return PlannedViews(cameras, measured, frames, len(path) if stills else 0, maker, looked_at)
 
 
-COARSE_PX = 240  # long side of the pictures that show what a move uncovers
-MOVE_STEP = 0.01  # step of the disparities that are chosen among
-LEAST_MOVE = 0.04  # the smallest disparity; less shows no parallax
-LOOKS = 3  # disparities tried, at most, between 0 and the base's usual one
+COARSE_PX = 240  # long side of the renderings in which `choose_move` measures holes
+MOVE_STEP = 0.01  # `choose_move` rounds the disparity down to a multiple of this step
+LEAST_MOVE = 0.04  # the smallest disparity; a smaller one shows no parallax
+LOOKS = 3  # largest number of disparities that `choose_move` tries besides the usual one
 
 
 @contextlib.contextmanager
 def _possible_path(source: Path) -> Iterator[None]:
-    """InputError, naming the photo, if its depths and focal length allow no camera path."""
     try:
         yield
     except PathError:
@@ -181,11 +174,13 @@ def _possible_path(source: Path) -> Iterator[None]:
 
 @torch.no_grad()
 def choose_move(prediction: BasePrediction, renderer: Renderer, source: Path) -> BasePrediction:
-    """The prediction with the farthest disparity, up to its usual one, at which holes in the widest views stay within
-    its limit.
+    """Replace the prediction's disparity by the largest one whose holes stay within `prediction.uncovered`.
 
-    Its notes get the base's usual disparity and the share of holes in the two widest views (eqs. 10, 11), measured in
-    coarse renderings. InputError, naming `source`, the photo, if its depths and focal length allow no path.
+    The usual disparity is the upper limit. Holes are the mean hole-area ratio (eq. 11) of the leftmost and the
+    rightmost view, measured in coarse renderings. The notes get this ratio and the usual disparity.
+
+    Raises:
+        InputError: the depths and the focal length of the photo `source` allow no camera path.
     """
     gaussians, usual, allowed = prediction.gaussians, prediction.disparity, prediction.uncovered
     with _possible_path(source):
@@ -196,7 +191,7 @@ def choose_move(prediction: BasePrediction, renderer: Renderer, source: Path) ->
         ends = extremes(camera, disparity, depths)
         return sum(hole_area_ratio(renderer.render(gaussians, end).alpha) for end in ends) / len(ends)
 
-    near, far = (0.0, 0.0), (usual, uncovered(usual))  # (disparity, holes): allowed, and too many
+    near, far = (0.0, 0.0), (usual, uncovered(usual))  # (disparity, holes): within the limit, and beyond
     if far[1] <= allowed:
         near = far
     for _ in range(LOOKS if near[0] < usual else 0):
@@ -219,9 +214,10 @@ def plan_views(
     given: list[Camera] | None = None,
     keyframes: KeyframePath | None = None,
 ) -> PlannedViews:
-    """Plan the given views, or else a path, whose holes are measured at its two extremes or at its keyframes.
+    """Plan the given views, or a path whose holes are measured at its two extremes or at its keyframes.
 
-    InputError, naming `source`, the photo, if its depths and focal length allow no such path.
+    Raises:
+        InputError: the depths and the focal length of the photo `source` allow no camera path.
     """
     gaussians, camera = prediction.gaussians, prediction.camera
     if given:
@@ -231,7 +227,7 @@ def plan_views(
             cameras = path.fly(gaussians, camera, keyframes, prediction.disparity)
             reach, depths = path.reach(prediction.disparity), DepthRange.of(gaussians)
             others = _measured(reach, camera.even(), depths, keyframes)
-            # What the longer lens leaves out is filled too, because other programs render with the photo's lens.
+            # Other programs render without overscan, so views with the photo's focal length are filled too.
             upright = keyframes is None and path.trajectory in ("shake", "rotate", "vertical")
             unseen = trajectory("rotate", camera.even(), reach, depths, frames=5)[:4:2] if upright else []
     except PathError as error:
@@ -244,9 +240,8 @@ def plan_views(
 def _measured(
     disparity: float, camera: Camera, depths: DepthRange, keyframes: KeyframePath | None
 ) -> dict[str, Camera]:
-    """The views whose holes are reported, by their names."""
     if keyframes is None:
         return dict(zip((f"{-disparity:g}", f"+{disparity:g}"), extremes(camera, disparity, depths), strict=True))
-    keys = keyframes.key_cameras(camera, depths)
+    keys = keyframes.at([key.time for key in keyframes.keys], camera, depths)
     step = math.ceil(len(keys) / MEASURED_KEYFRAMES)
     return {f"keyframe {index}": keys[index] for index in range(0, len(keys), step)}

@@ -12,8 +12,6 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from spackle.bases.depth_map import DepthMap
-from spackle.bases.lift import lift
 from spackle.image import load_photo, resize_photo
 from spackle.photo_frame import PhotoFrame, find_frame
 
@@ -28,14 +26,14 @@ def scene(width: int = WIDTH, height: int = HEIGHT) -> Picture:
 
 
 def framed(picture: Picture, widths: Sequence[int], color: Sequence[float]) -> Picture:
-    """With a frame of so many pixels (left, top, right, bottom) around it."""
+    """Add a frame of these widths (left, top, right, bottom)."""
     left, top, right, bottom = widths
     sides = [(top, bottom), (left, right)]
     return np.stack([np.pad(picture[..., c], sides, constant_values=color[c]) for c in range(3)], axis=-1)
 
 
 def found(picture: Picture, quality: int | None = None) -> PhotoFrame | None:
-    """In a picture with 8 bits, perhaps saved as a JPEG before."""
+    """Find the frame after rounding to 8 bits and, with `quality`, JPEG compression."""
     image = Image.fromarray(np.round(255 * picture.clip(0, 1)).astype(np.uint8))
     if quality is not None:
         image.save(file := io.BytesIO(), "JPEG", quality=quality)
@@ -45,7 +43,7 @@ def found(picture: Picture, quality: int | None = None) -> PhotoFrame | None:
 
 FRAMES = [
     ((9, 9, 9, 9), (0.03, 0.02, 0.02)),
-    ((3, 14, 20, 4), (0.95, 0.92, 0.85)),  # a mount of its own colour, as wide as it likes on each side
+    ((3, 14, 20, 4), (0.95, 0.92, 0.85)),  # a mount of different widths
     ((0, 25, 0, 25), (0.0, 0.0, 0.0)),
     ((30, 0, 31, 0), (0.1, 0.15, 0.45)),
     ((8, 12, 9, 0), (1.0, 1.0, 1.0)),  # a caption takes the fourth side
@@ -75,46 +73,28 @@ FRAMELESS = {
     "a picture": scene(),
     "blinds that begin at the border": np.where(Y % 6 < 2, 0.6 * scene(), scene()),
     "one colour": np.zeros((HEIGHT, WIDTH, 3)),
-    "a sky that fades to its horizon": np.where(Y < 25, (0.3, 0.5, 0.9) + 0.01 * Y, scene()),
     "a blue sky above a wall's straight edge": np.where(Y < 25, (0.3, 0.5, 0.9), scene()),
     "a white sky above roofs": np.where(25 + 8 * np.sin(X / 9) > Y, 1.0, scene()),
     "a disc on white": np.where(DISC, scene(), 1.0),
-    "a tilted box on white": np.where((abs(X - 90 + Y / 9) < 70) & (abs(Y - 60 - X / 9) < 40), scene(), 1.0),
     "a long box on white": np.where((Y > 15) & (Y < 105) & (abs(X - 90 + 40 * np.cos(Y / 20)) < 40), scene(), 1.0),
     "a vignette": scene() * np.exp(-(((X - WIDTH / 2) / 60) ** 4) - ((Y - HEIGHT / 2) / 40) ** 4),
     "a dark wall beside a lit door": np.where(X < 30 + Y / 20, 0.05, scene()),
     "bars of two colours": np.where(X < 12, (0.2, 0.3, 0.5), np.where(X > 160, (0.5, 0.2, 0.2), scene())),
     "too wide a bar": np.where(X < 60, 0.0, scene()),
     "a bar on one side": framed(scene(), (0, 0, 7, 0), (1.0, 1.0, 1.0)),
-    "three dark columns of a wall": framed(scene(), (0, 0, 3, 0), (0.05, 0.05, 0.05)),
     "lines of one pixel": framed(scene(), (1, 1, 1, 1), (0.0, 0.0, 0.0)),
     "a pixel": scene(1, 1),
-    "a speck": framed(scene(3, 3), (1, 1, 1, 1), (0.0, 0.0, 0.0)),
 }
 
 
-def test_bars_of_two_colours_hide_no_letterbox() -> None:
-    frame = found(framed(FRAMELESS["bars of two colours"], (0, 3, 0, 3), (0.0, 0.0, 0.0)))
-    assert frame is not None
-    assert [width > 0 for width in frame.widths] == [False, True, False, True]
-
-
 @pytest.mark.parametrize("kind", FRAMELESS)
-def test_what_only_looks_like_a_frame_is_none(kind: str) -> None:
+def test_other_borders_are_no_frame(kind: str) -> None:
     assert found(FRAMELESS[kind]) is None
 
 
-def framed_file(folder: Path) -> Path:
-    """A photo with a white frame of 9, 9, 10 and 11 pixels, which is transparent."""
-    whole = np.round(255 * framed(scene(), (9, 9, 10, 11), (1.0, 1.0, 1.0))).astype(np.uint8)
-    opaque = np.full((*whole.shape[:2], 1), 255, np.uint8)
-    opaque[:9] = opaque[-11:] = opaque[:, :9] = opaque[:, -10:] = 0
-    Image.fromarray(np.concatenate([whole, opaque], axis=-1)).save(path := folder / "a.png")
-    return path
-
-
 def test_a_crop_keeps_the_camera(tmp_path: Path) -> None:
-    path = framed_file(tmp_path)
+    path = tmp_path / "photo.png"
+    Image.fromarray(np.round(255 * framed(scene(), (9, 9, 10, 11), (1.0, 1.0, 1.0))).astype(np.uint8)).save(path)
     whole, photo = load_photo(path), load_photo(path, keep_frame=False)
     assert whole.frame is None
     assert photo.frame is not None
@@ -125,25 +105,4 @@ def test_a_crop_keeps_the_camera(tmp_path: Path) -> None:
     assert torch.equal(photo.camera.K, inside.K)
     small, full = resize_photo(photo, 90), photo.camera
     torch.testing.assert_close(small.camera.K, full.resized(small.width, small.height).K, rtol=0.01, atol=0.01)
-
-
-def test_gaussians_inside_a_frame_are_the_same_without_it(tmp_path: Path) -> None:
-    path = framed_file(tmp_path)
-    whole, photo = load_photo(path), load_photo(path, keep_frame=False)
-    assert photo.frame is not None
-    assert photo.frame.widths[:2] == (10, 10)  # even: the lift places Gaussians on a grid of 2×2 pixels
-    depth = torch.linspace(2, 3, whole.height)[:, None].expand(-1, whole.width).contiguous()
-    inner = photo.frame.inside(depth, whole.width, whole.height)
-    means, inside = (
-        lift(taken.rgb, DepthMap(part, part > 0, None, None, "depth", path), taken.camera, levels=0).gaussians.means
-        for taken, part in ((whole, depth), (photo, inner))
-    )
-    assert len(means) > len(inside) >= inner.numel()
-    apart = torch.cdist(inside[::9], means, compute_mode="donot_use_mm_for_euclid_dist").amin(1)
-    assert float(apart.quantile(0.95)) < 1e-5
-
-
-def test_nothing_is_cut_off_where_a_focal_length_is_given(tmp_path: Path) -> None:
-    path = framed_file(tmp_path)
-    assert load_photo(path, focal_px=70, keep_frame=False).frame is None
-    assert load_photo(path, fov=60, keep_frame=False).frame is None
+    assert load_photo(path, fov=60, keep_frame=False).frame is None  # the field of view belongs to the whole photo

@@ -1,4 +1,4 @@
-"""Two eyes and their frame, and depth as colours."""
+"""Stereo views and their frames, and depth as colours."""
 
 from __future__ import annotations
 
@@ -15,30 +15,28 @@ from spackle.camera import Camera
 from spackle.camera_path import DepthRange
 from spackle.color import INFERNO, UNKNOWN_GREY, DepthColors, linear_to_srgb, srgb_to_linear
 from spackle.render import CpuRenderer
-from spackle.video_frames import LAYOUTS, FrameMaker, Stereo, VideoOptions, anaglyph, default_ipd
+from spackle.video_frames import FrameMaker, Stereo, VideoOptions, anaglyph, default_ipd
 from spackle.views import scene_path
 
 CAMERA = Camera.from_focal(60, 64, 48)
 
 
 def parallax(stereo: Stereo, camera: Camera, point: Sequence[float]) -> list[float]:
-    """How far to the right, and below, the left eye sees a point of where the right eye does, in pixels."""
+    """A point's pixel in the left eye's image minus that in the right eye's image."""
     (left, _), (right, _) = (eye.project(torch.tensor(point)) for eye in stereo.eyes(camera))
     return (left - right).tolist()
 
 
 @settings(deadline=None, max_examples=50)
 @given(st.floats(0.01, 0.5), st.floats(1, 20), st.floats(-1, 1), st.floats(-1, 1))
-def test_parallax_is_crossed_before_the_screen_and_none_on_it(
-    ipd: float, convergence: float, x: float, y: float
-) -> None:
+def test_parallax_changes_its_sign_at_the_screen(ipd: float, convergence: float, x: float, y: float) -> None:
     stereo = Stereo("sbs", ipd, convergence)
     for part, expected in ((1, 0), (0.5, 60 * ipd / convergence), (2, -60 * ipd / (2 * convergence))):
         z = part * convergence
-        assert parallax(stereo, CAMERA, [x * z, y * z, z]) == pytest.approx([expected, 0], abs=1e-3)  # no toe-in
+        assert parallax(stereo, CAMERA, [x * z, y * z, z]) == pytest.approx([expected, 0], abs=1e-3)
 
 
-def test_eyes_stand_beside_a_view_and_spread_its_depth() -> None:
+def test_eyes_are_beside_the_view_and_their_distance_fits_the_depth() -> None:
     camera = CAMERA.looking(torch.tensor([1.0, 0.5, 0.0]), torch.tensor([0.0, 0.0, 4.0]))
     left, right = Stereo("sbs", 0.2, float("inf")).eyes(camera)
     torch.testing.assert_close((left.position + right.position) / 2, camera.position)
@@ -52,28 +50,22 @@ def test_eyes_stand_beside_a_view_and_spread_its_depth() -> None:
     assert default_ipd(lens, depths) == pytest.approx(0.065, abs=0.001)
 
 
-@pytest.mark.parametrize(("layout", "ipd", "convergence"), [("sbs", 0, 1), ("sbs", 1, 0), ("wide", 1, 1)])
-def test_eyes_that_cannot_be(layout: str, ipd: float, convergence: float) -> None:
-    with pytest.raises(ValueError, match="stereo"):
-        Stereo(layout, ipd, convergence)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("layout", ["sbs", "sbs-half", "ou", "ou-half", "anaglyph"])
 @pytest.mark.parametrize(("height", "width"), [(48, 64), (47, 65)])
-def test_frames_have_the_size_that_is_foretold(layout: str, height: int, width: int) -> None:
+def test_frame_size_and_layout(layout: str, height: int, width: int) -> None:
     stereo, eyes = Stereo(layout, 0.06, 2.0), torch.rand(2, height, width, 3)  # type: ignore[arg-type]
     frame = stereo.pack(*eyes)
     assert (frame.shape[1], frame.shape[0]) == stereo.frame_size(width, height)
     left, right = srgb_to_linear(eyes)
     if layout in ("sbs", "ou"):
         assert torch.equal(frame, torch.cat(list(eyes), dim=1 if layout == "sbs" else 0))
-    elif (layout, width) == ("sbs-half", 64):  # means of light
+    elif (layout, width) == ("sbs-half", 64):
         torch.testing.assert_close(frame[:, 32:], linear_to_srgb((right[:, ::2] + right[:, 1::2]) / 2))
     elif (layout, width) == ("ou-half", 64):
         torch.testing.assert_close(frame[:24], linear_to_srgb((left[::2] + left[1::2]) / 2))
 
 
-def test_an_anaglyph_of_grey_is_grey_and_each_eye_has_its_glass() -> None:
+def test_an_anaglyph_of_grey_is_grey_and_each_eye_has_its_filter() -> None:
     grey = torch.linspace(0, 1, 64).repeat(3, 1).T
     torch.testing.assert_close(anaglyph(grey, grey), grey, atol=0.004, rtol=0)
     white, black = torch.ones(1, 3), torch.zeros(1, 3)
@@ -92,7 +84,7 @@ def test_depth_colours_are_linear_in_inverse_depth() -> None:
     torch.testing.assert_close(odd[1:], torch.tensor([INFERNO[-1], INFERNO[0]]))
 
 
-def test_one_scale_serves_all_views_of_a_video() -> None:
+def test_depth_colours_of_a_video_share_one_scale() -> None:
     scene = box_before_wall(near=2.0, far=6.0)
     base = scene.base()
     path = scene_path(base, scene.camera, "rotate-forward", 0.3, 5)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from spackle.bases import BasePrediction
 from spackle.camera import Camera
-from spackle.camera_path import DepthRange, TrajectoryKind, view_at
+from spackle.camera_path import DepthRange, TrajectoryKind, trajectory
 from spackle.clips.temporal import (
     DepthAlignment,
     Flow,
@@ -85,7 +85,7 @@ class ClipCompleter:
             base, guard, now, past = self._aligned(rgb, prediction)
         even = prediction.camera.even()
         disparity = prediction.disparity if self.disparity is None else self.disparity
-        camera = view_at(self.trajectory, even, disparity, now.depths, self._count, self.frames)
+        (camera,) = trajectory(self.trajectory, even, disparity, now.depths, self.frames, only=self._count)
         camera = camera.zoomed(1 + self.overscan)
         with timed("complete", self.seconds):
             before, aux = self.renderer.render(base, camera), Gaussians.empty()

@@ -80,7 +80,7 @@ class Manifest(BaseModel, frozen=True, extra="ignore", strict=True):
     def save(self, folder: Path) -> None:
         """Write manifest.json atomically."""
         text = json.dumps(self._content() | {"sha256": self.digest}, indent=1, sort_keys=True, allow_nan=False)
-        with atomic_path(folder / NAME, durable=True) as temporary:
+        with atomic_path(folder / NAME) as temporary:
             temporary.write_text(text + "\n", encoding="utf-8")
 
     def _content(self) -> dict[str, Any]:
@@ -127,7 +127,7 @@ def write_shard(parts: Sequence[tuple[str, Path]], target: Path, passed_over: Se
     """
     samples: list[SampleEntry] = []
     whole, offset = hashlib.sha256(), 0
-    with atomic_path(target, durable=True) as temporary, open(temporary, "wb") as file:
+    with atomic_path(target) as temporary, open(temporary, "wb") as file:
         for key, path in parts:
             data = path.read_bytes()
             try:

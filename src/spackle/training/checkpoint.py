@@ -65,7 +65,7 @@ def save_checkpoint(checkpoint: Checkpoint, folder: Path) -> None:
     """Write checkpoint.pt; if the disk is full, raise InputError and keep the previous checkpoint."""
     buffer = io.BytesIO()  # torch's own writer hides that a disk is full
     torch.save({**vars(checkpoint), "progress": dataclasses.asdict(checkpoint.progress)}, buffer)
-    with atomic_path(folder / CHECKPOINT, durable=True) as temporary:
+    with atomic_path(folder / CHECKPOINT) as temporary:
         temporary.write_bytes(buffer.getbuffer())
 
 

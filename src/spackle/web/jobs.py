@@ -64,7 +64,7 @@ class Job(SceneState):
         return self.folder / "results"
 
     def save(self) -> None:
-        write_json(self.model_dump(mode="json"), self.folder / RECORD, durable=True)
+        write_json(self.model_dump(mode="json"), self.folder / RECORD)
 
 
 class Jobs:
