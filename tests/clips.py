@@ -15,7 +15,7 @@ Bytes = NDArray[np.uint8]
 
 
 def moving(count: int = 4, height: int = 48, width: int = 64) -> list[Bytes]:
-    """A picture that moves to the right by a pixel a frame."""
+    """Frames of a picture that moves to the right by one pixel per frame."""
     wide = picture(width + count, height)
     return [np.ascontiguousarray(wide[:, count - k : count - k + width]) for k in range(count)]
 
@@ -29,7 +29,7 @@ def write_clip(
     sound: str | None = None,
     turned: int = 0,
 ) -> Path:
-    """A clip of 10 frames a second, or with its frames at `ticks` of 1/10 s."""
+    """Write a clip of 10 frames per second, or with frames at `ticks` of 1/10 s."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=10, options={"crf": "10"} if codec == "libx264" else {})
         voice = container.add_stream(sound, rate=8000) if sound else None

@@ -1,4 +1,4 @@
-"""The command line within this process, and what it leaves behind."""
+"""Run the command line within this process."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ FILES = {"scene.ply", "video.mp4", "report.json"}
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """What a command line came to."""
+    """Exit code and output of a command."""
 
     code: int
     out: str
@@ -35,12 +35,11 @@ class Run:
 
     @property
     def lines(self) -> list[str]:
-        """What it said, but for the notice of a first use, which depends on what this machine has compiled before."""
+        """Lines of the log without the notice about kernels that are not yet compiled."""
         return [line for line in self.err.splitlines() if not line.startswith("first use: ")]
 
 
 def run(*arguments: object) -> Run:
-    """The entry point within this process: a new one takes seconds to start."""
     out, err = io.StringIO(), io.StringIO()
     code: object = 0
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
@@ -54,7 +53,7 @@ def run(*arguments: object) -> Run:
 
 
 def page_of(command: Sequence[object], **options: Any) -> bytes:
-    """The page that `spackle view` shows, as a process that then ends; `options` are those of Popen."""
+    """The page that `spackle view` shows; `options` are those of Popen."""
     server = subprocess.Popen(list(map(str, command)), stderr=subprocess.PIPE, text=True, **options)
     try:
         assert server.stderr is not None
@@ -78,20 +77,16 @@ def names_in(folder: Path) -> set[str]:
     return set(os.listdir(folder))
 
 
-def shortened(options: Sequence[object]) -> tuple[object, ...]:
-    """Options of three frames, but where views are given: these are the frames."""
-    return tuple(options) if "--cameras" in options else (*SHORT, *options)
-
-
 def predicted(photo: Path, depth: Path, out: Path, *options: object) -> Run:
-    """`spackle predict` that has to succeed, three frames long."""
-    result = run("predict", photo, "--depth", depth, "-o", out, *shortened(options))
+    """Run `spackle predict` successfully, for three frames or for the views of --cameras."""
+    short = () if "--cameras" in options else SHORT
+    result = run("predict", photo, "--depth", depth, "-o", out, *short, *options)
     assert result.code == 0, result.err
     return result
 
 
 def refuses(result: Run, *named: object) -> None:
-    """One line that names the culprit."""
+    """Check that a command failed with one line that contains `named`."""
     assert (result.code, result.out, len(result.lines)) == (2, "", 1), result.err
     assert result.lines[0].startswith("error: ")
     for name in named:

@@ -1,4 +1,4 @@
-"""The same examples in every run; HYPOTHESIS_PROFILE=explore looks for new ones."""
+"""Fixtures, and hypothesis profiles: HYPOTHESIS_PROFILE=explore looks for new examples."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-# Before torch is loaded: its idle threads would spin, which makes tests that run beside each other slow.
+# Before torch is imported: idle threads that spin slow down tests in parallel processes.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-# What this machine has downloaded is for no test: LaMa would paint all holes.
+# Tests must not use downloaded weights.
 os.environ["SPACKLE_WEIGHTS"] = str(Path(__file__).with_name("no weights"))
 
 settings.register_profile("repeat", derandomize=True, deadline=None)
@@ -29,7 +29,7 @@ def pair(tmp_path: Path) -> tuple[Path, Path]:
 
 @pytest.fixture(scope="session")
 def made(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Weights of SHARP's and lite's networks, which show no scene."""
+    """Random weights of SHARP and lite."""
     from sharp_weights import write_tiny
     from stand_in import SHARP_FILE, write_lite
 
@@ -39,7 +39,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.fixture
 def shipped(tmp_path: Path, made: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A machine without SHARP, and with weights of lite that belong to the test."""
+    """Random weights of lite in place of the shipped ones; SHARP is not installed."""
     monkeypatch.setenv("SPACKLE_WEIGHTS", str(tmp_path / "weights"))
     lite = Path(shutil.copy(made["lite"], tmp_path / "lite.safetensors"))
     monkeypatch.setattr("spackle.bases.lite.SHIPPED", lite)

@@ -1,4 +1,4 @@
-"""Small datasets: photos with depth, builds of them, and builds that are killed."""
+"""Photos with depth, and builds of datasets, also killed ones."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SHORT = ["--base", "rgbd", "--views", VIEWS, "--shard-size", 2, "--threads", 1]
 
 
 def write_inputs(place: Path, count: int = 5, width: int = 72, height: int = 54) -> Path:
-    """Photos in a folder and its subfolder, and their depth."""
+    """Write photos into a folder and its subfolder, and their depth maps."""
     for number in range(count):
         name = f"{'deep/' if number == 1 else ''}{number}"
         path = place / "photos" / f"{name}.png"
@@ -41,7 +41,7 @@ def content(folder: Path) -> dict[str, bytes]:
 
 
 def dying_build(script: Path, patch: str, place: Path, output: Path, *more: object) -> subprocess.Popen[bytes]:
-    """A build in a process of its own, in which `patch` makes `die()` be called."""
+    """Start a build in a new process, where `patch` installs calls of `die()`."""
     script.write_text(f"""
 import multiprocessing, os, subprocess, sys
 import spackle.dataset.build as build
@@ -57,7 +57,7 @@ if __name__ == "__main__":
 
 
 def is_alive(pid: int) -> bool:
-    """Whether a process still does anything; one that nobody has waited for yet does not."""
+    """Whether a process runs; a zombie does not."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:

@@ -1,4 +1,4 @@
-"""A small dataset in Middlebury's folders, whose right photos are true, and a stand-in for pyiqa."""
+"""Stereo pairs in Middlebury's layout, results of an evaluation, and a stand-in for pyiqa."""
 
 from __future__ import annotations
 
@@ -17,18 +17,17 @@ from PIL import Image
 from spackle.evaluation.rows import Row, Run
 
 WIDTH, HEIGHT, FOCAL = 72, 48, 60.0
-NEAR_PX, FAR_PX = 10, 4  # disparities of a box and of the wall behind it
+NEAR_PX, FAR_PX = 10, 4  # disparities of the box and of the wall
 BASELINE = 0.2
 
 
 def write_pfm(path: Path, values: NDArray[np.float32]) -> None:
-    """Rows from the bottom up, little-endian."""
     head = f"Pf\n{values.shape[1]} {values.shape[0]}\n-1.0\n".encode()
     path.write_bytes(head + values[::-1].astype("<f4").tobytes())
 
 
 def write_boxes(folder: Path, seed: int) -> None:
-    """A box before a wall, seen from both sides, with a scene.json."""
+    """Write a stereo pair of a box before a wall."""
     rng = np.random.default_rng(seed)
     hue, phase = rng.uniform(0.3, 0.7, 3), rng.uniform(0, 6, 3)
     left, top = int(rng.integers(20, 30)), int(rng.integers(8, 16))
@@ -58,7 +57,7 @@ Figures = Mapping[str, Mapping[str, float | None]]  # method, metric
 
 
 def results(title: str, near: bool, figures: Callable[[int], Figures], count: int = 2, name: str = "scene_{}") -> Run:
-    """An evaluation of some images with two views a setting, whose figures go by the image, and one without any."""
+    """An evaluation of `count` images with the metrics `figures(image)`, and of one image that could not be read."""
     config: dict[str, Any] = {
         "kind": "evaluate",
         "title": title,
@@ -86,7 +85,6 @@ def results(title: str, near: bool, figures: Callable[[int], Figures], count: in
 
 
 def fake_pyiqa(patch: pytest.MonkeyPatch, create: Callable[..., object]) -> None:
-    """Put a module in pyiqa's place: with `create_metric`."""
     module = types.ModuleType("pyiqa")
     module.__dict__.update(__version__="9.9", create_metric=create)
     patch.setitem(sys.modules, "pyiqa", module)

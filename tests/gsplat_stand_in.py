@@ -1,5 +1,7 @@
-"""The four functions of gsplat 1.5.3 that Spackle calls, in plain PyTorch, and as strict: what the real ones refuse,
-read as other memory, or die of, fails here."""
+"""The four functions of gsplat 1.5.3 that Spackle calls, in plain PyTorch.
+
+They refuse all inputs that gsplat refuses, misreads or crashes on.
+"""
 
 from __future__ import annotations
 
@@ -79,7 +81,7 @@ def isect_tiles(
 
 
 def isect_offset_encode(isect_ids: Tensor, n_images: int, tile_width: int, tile_height: int) -> Tensor:
-    """[n_images, rows, columns] where each tile's ids begin."""
+    """The index [n_images, rows, columns] of each tile's first id."""
     check(isect_ids, isect_ids.shape, dtype=torch.int64)
     counts = torch.bincount(isect_ids, minlength=n_images * tile_height * tile_width)
     return (counts.cumsum(0) - counts).reshape(n_images, tile_height, tile_width).int()
@@ -89,7 +91,7 @@ def rasterize_to_pixels(
     means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, image_width: int, image_height: int,
     tile_size: int, isect_offsets: Tensor, flatten_ids: Tensor, *, masks: Tensor | None = None, packed: bool = False,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """[I, H, W, D] and [I, H, W, 1]; where the mask is False it holds anything, as the kernel's does."""
+    """Colours [I, H, W, D] and alphas [I, H, W, 1]; NaN in tiles that are not in the mask."""
     assert packed
     n, (images, rows, columns) = len(means2d), isect_offsets.shape
     assert colors.shape[1] in (1, 2, 3, 4, 5, 8), "kernels are built for these numbers of channels"
@@ -128,7 +130,6 @@ def rasterize_to_pixels(
 def check(
     first: Tensor, shape: tuple[int, ...], dtype: torch.dtype = torch.float32, **others: tuple[Tensor, tuple[int, ...]]
 ) -> None:
-    """The kernels read one device's memory as numbers of one type."""
     for name, (tensor, expected) in {"first": (first, shape), **others}.items():
         wanted = torch.float32 if name == "first" and first.is_floating_point() else dtype
         assert tensor.dtype == wanted, f"{name}: expected {wanted}, found {tensor.dtype}"

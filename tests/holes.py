@@ -1,4 +1,4 @@
-"""Views with holes in them, and networks to fill them, that the residual's tests share."""
+"""Views with holes, and residual networks."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CPU = CpuRenderer()
 
 
 def random_view(seed: int, height: int, width: int) -> Rendering:
-    """A rendering as it may come: holes, veils and solid pixels; depth 0 where alpha is 0."""
+    """A random rendering with empty, translucent and opaque pixels."""
     generator = torch.Generator().manual_seed(seed)
     kind = torch.randint(0, 4, (height, width), generator=generator)
     veil = torch.rand(height, width, generator=generator)
@@ -34,7 +34,7 @@ def random_view(seed: int, height: int, width: int) -> Rendering:
 
 
 def box_view(disparity: float = 0.2, side: int = 1, width: int = 96, height: int = 72) -> tuple[FillContext, Camera]:
-    """A box before a wall, and a view that looks behind the box."""
+    """A box before a wall, and a camera from which the wall behind the box is a hole."""
     scene = box_before_wall(width=width, height=height, focal=width * 80 // 96)
     context = FillContext(scene.base(), scene.camera, CPU)
     return context, extremes(scene.camera, disparity, DepthRange.of(context.base))[side]
@@ -43,14 +43,14 @@ def box_view(disparity: float = 0.2, side: int = 1, width: int = 96, height: int
 def features_of(
     base: Gaussians | Rendering, camera: Camera, photo_camera: Camera, photo: Tensor | None = None
 ) -> tuple[ViewFeatures, Seeds, Rim]:
-    """What f_res is given of a view: of Gaussians, or of a rendering."""
+    """The inputs of f_res for a view of Gaussians, or for a rendering."""
     features = ViewFeatures.of(base if isinstance(base, Rendering) else CPU.render(base, camera))
     seeds = make_seeds(features, camera, photo_camera)
     return features, seeds, find_rim(features, seeds, camera, photo_camera, photo)[0]
 
 
 def random_network(seed: int = 0, size: float = 0.02, name: str = "unet") -> ResidualNet:
-    """A network whose last layers are not zero, so that everything in it matters, if nothing sensible."""
+    """A network whose last layers are not zero."""
     torch.manual_seed(seed)
     network = open_residual(name)
     with torch.no_grad():
@@ -67,7 +67,7 @@ def shipped() -> ResidualNet:
 
 
 class CountingNetwork(ResidualNet):
-    """A network that keeps how many cells it was shown."""
+    """Counts the cells that a network processes."""
 
     name, sees_photo, local = "counting", False, True
 

@@ -1,4 +1,4 @@
-"""Small photos, depth maps and damaged files on disk, and a reader of PLY that shares no code with ours."""
+"""Small photos, depth maps, scenes and cameras on disk, and an independent reader of PLY."""
 
 from __future__ import annotations
 
@@ -35,14 +35,13 @@ def metres(width: int = WIDTH, height: int = HEIGHT, near: float = 2.0, far: flo
 
 
 def write_photo(path: Path, width: int = WIDTH, height: int = HEIGHT) -> Path:
-    """`picture` in the format of the name."""
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(picture(width, height)).save(path)
     return path
 
 
 def write_depth(path: Path, depth: NDArray[np.float32] | None = None) -> Path:
-    """Depth in metres as .npy, or in millimetres as .png."""
+    """Write depth in metres as .npy, or in millimetres as .png."""
     depth = metres() if depth is None else depth
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == ".png":
@@ -53,7 +52,6 @@ def write_depth(path: Path, depth: NDArray[np.float32] | None = None) -> Path:
 
 
 def write_pair(folder: Path) -> tuple[Path, Path]:
-    """A photo and its depth: photo.png and depth.npy."""
     return write_photo(folder / "photo.png"), write_depth(folder / "depth.npy")
 
 
@@ -67,13 +65,11 @@ class Ply:
     body: bytes
 
     def row(self, index: int) -> dict[str, float]:
-        """One vertex."""
         numbers = np.frombuffer(self.body, "<f4").reshape(self.count, -1)[index]
         return dict(zip(self.names, numbers.tolist(), strict=True))
 
 
 def read_ply(path: Path) -> Ply:
-    """Parse a file by the letter of the format; AssertionError where it deviates."""
     head, _, body = path.read_bytes().partition(b"end_header\n")
     lines = head.decode("ascii").splitlines()
     assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
@@ -89,7 +85,7 @@ def read_ply(path: Path) -> Ply:
 def damaged_scene(
     scene: Path, path: Path, header: Callable[[str], str], data: Callable[[bytes], bytes] = lambda body: body
 ) -> Path:
-    """A copy of a scene whose header and data have been tampered with."""
+    """Copy a scene with a changed header and changed data."""
     head, end, body = scene.read_bytes().partition(b"end_header\n")
     path.write_bytes(header(head.decode("ascii")).encode("ascii") + end + data(body))
     return path
@@ -98,7 +94,7 @@ def damaged_scene(
 def camera_file(
     path: Path, rights: list[float], sizes: list[tuple[int, int]] | None = None, focal: float = 55.0
 ) -> Path:
-    """Views that look straight ahead from places to the right of the photo's."""
+    """Write untilted cameras at these distances to the right of the photo's camera."""
     frames = []
     for right, (width, height) in zip(rights, sizes or [(WIDTH, HEIGHT)] * len(rights), strict=True):
         K = [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]
@@ -109,7 +105,7 @@ def camera_file(
 
 
 def calibration(path: Path, focal: float, baseline_mm: float, doffs: float) -> Path:
-    """Middlebury's calib.txt for a photo of the usual size."""
+    """Write Middlebury's calib.txt."""
     matrix = f"[{focal} 0 {WIDTH / 2}; 0 {focal} {HEIGHT / 2}; 0 0 1]"
     path.write_text(
         f"cam0={matrix}\ncam1={matrix}\ndoffs={doffs}\nbaseline={baseline_mm}\nwidth={WIDTH}\nheight={HEIGHT}\n"

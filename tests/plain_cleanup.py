@@ -1,4 +1,4 @@
-"""Oracles of the kernels of depth maps: SciPy's cheapest paths, plain Python."""
+"""Oracles for kernels of depth maps: plain Python, and SciPy's cheapest paths."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Pixel = tuple[int, int]
 
 @contextlib.contextmanager
 def uncompiled(*modules: ModuleType) -> Iterator[None]:
-    """Run the kernels of some modules as the Python that they are written in, which checks every index."""
+    """Run the kernels of these modules as plain Python, which checks indices."""
     with pytest.MonkeyPatch.context() as patch, np.errstate(all="ignore"):
         for module in modules:
             for name, value in vars(module).items():
@@ -28,13 +28,13 @@ def uncompiled(*modules: ModuleType) -> Iterator[None]:
 
 
 def around(shape: tuple[int, ...], pixel: Pixel, reach: int = 1) -> list[Pixel]:
-    """The pixels of an image within `reach` of one, itself among them."""
+    """The pixels of an image within `reach` rows and columns."""
     rows, columns = (range(max(p - reach, 0), min(p + reach + 1, n)) for p, n in zip(pixel, shape, strict=False))
     return list(itertools.product(rows, columns))
 
 
 def cheapest(sources: Bools, targets: Bools, cost: Callable[[Pixel, Pixel], float]) -> dict[Pixel, Pixel]:
-    """The source that each target is cheapest to reach from, by SciPy; `cost` is that of a step between neighbours."""
+    """For each target the source of its cheapest path; `cost` is added to the length of each step."""
     csgraph = pytest.importorskip("scipy.sparse.csgraph")
     pixels = list(np.ndindex(*targets.shape))
     number, steps = {pixel: k for k, pixel in enumerate(pixels)}, np.zeros((len(pixels), len(pixels)))

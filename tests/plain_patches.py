@@ -1,4 +1,4 @@
-"""The plain twin of the costs in `spackle.patches`: the formula, for all sources of a cell at once."""
+"""The costs of `spackle.patches` by NumPy, for all patches of a cell at once."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ INNER = slice(RADIUS, -RADIUS)
 
 
 class Subject:
-    """A random picture with a hole that touches its border, as the kernels take it, and the module's formula."""
+    """A random picture with holes, in the arrays that the kernels take, and the costs by the module's formula."""
 
     def __init__(self, height: int, width: int) -> None:
         rgb = torch.rand(height, width, 3, generator=torch.Generator().manual_seed(0))
@@ -39,7 +39,7 @@ class Subject:
         room._score(0, len(self.cells), self.cells, self.places, *self.target, self.costs)
 
     def formula(self, y: int, x: int) -> np.ndarray:
-        """[2, height, width] costs of all sources, also mirrored ones; infinite where a patch is not all known."""
+        """Costs [2, height, width] of all patches and mirrored patches; infinite for patches that touch the hole."""
         cells = np.argwhere(np.ones((SIDE, SIDE))) + np.array([y, x]) - RADIUS
         deep = np.hypot(*(cells[:, None] - np.argwhere(~self.hole)).T).min(0)
         weights = np.where(((cells >= 0) & (cells < self.hole.shape)).all(1), 0.8**deep, 0).reshape(SIDE, SIDE)

@@ -1,6 +1,6 @@
-"""The plainest readers of the formats that scenes are exported to, straight from what their makers publish.
+"""Independent readers of the export formats, written from the formats' specifications.
 
-Each takes a file's bytes and gives columns of means, quats wxyz, scales, opacities and sRGB, in the file's own axes.
+Each turns a file's bytes into columns of means, quats (wxyz), scales, opacities and sRGB, in the file's axes.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Columns = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 def gaussians_of(columns: Columns, flipped: bool) -> Gaussians:
-    """Columns as a scene; `flipped` turns y up, z backward into y down, z forward."""
+    """Convert columns to Gaussians; `flipped` turns the axes y up, z backward into y down, z forward."""
     means, quats, scales, opacities, srgb = (
         torch.tensor(np.asarray(column), dtype=torch.float32) for column in columns
     )
@@ -35,7 +35,7 @@ def gaussians_of(columns: Columns, flipped: bool) -> Gaussians:
 
 
 def with_largest(parts: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Quaternions [N, 4] of three components [N, 3] and the place of the largest, which follows from them."""
+    """Quaternions [N, 4] from their three smaller components [N, 3] and the index of the largest one."""
     largest = np.sqrt(np.maximum(0, 1 - np.square(parts).sum(1)))
     return np.array([np.insert(*numbers) for numbers in zip(parts, places, largest, strict=True)])
 
@@ -102,7 +102,6 @@ def sog_columns(data: bytes) -> Columns:
 
 
 def glb_parts(data: bytes) -> tuple[dict[str, Any], bytes]:
-    """A .glb's JSON and its binary part."""
     magic, version, size, json_size, json_kind = struct.unpack("<4sIII4s", data[:20])
     assert (magic, version, size, json_kind) == (b"glTF", 2, len(data), b"JSON")
     bin_size, bin_kind = struct.unpack("<I4s", data[20 + json_size : 28 + json_size])

@@ -1,4 +1,4 @@
-"""Small scenes with exact depth, and one real stereo pair, that several tests share."""
+"""Small scenes with exact depth, and one real stereo pair."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def texture(height: int, width: int, hue: tuple[float, float, float] = (0.5, 0.4
 
 
 def random_gaussians(count: int = 400, seed: int = 3, dtype: torch.dtype = torch.float32) -> Gaussians:
-    """Gaussians with three different scales, turned any way, before a camera at the origin."""
+    """Random anisotropic Gaussians in front of a camera at the origin."""
     g = torch.Generator().manual_seed(seed)
     return Gaussians(
         torch.rand(count, 3, generator=g) * torch.tensor([2.0, 1.5, 4.0]) + torch.tensor([-1.0, -0.75, 2.0]),
@@ -67,13 +67,12 @@ def slanted_plane(near: float, far: float, axis: int, width: int = 160, height: 
 
 
 def wall(depth: float = 4.0, width: int = 64, height: int = 48, focal: float = 60) -> Scene:
-    """A plane that faces the camera."""
     camera = Camera.from_focal(focal, width, height)
     return Scene(texture(height, width), torch.full((height, width), depth), camera)
 
 
 def box_mask(width: int, height: int) -> Tensor:
-    """[H, W] bool: the pixels of the box in `box_before_wall`, the middle third each way."""
+    """The pixels [H, W] of the box in `box_before_wall`."""
     return torch.from_numpy(box(width, height))
 
 
@@ -86,19 +85,19 @@ def box_before_wall(near: float = 2.0, far: float = 6.0, width: int = 96, height
 
 
 def cast(camera: Camera, z: float) -> Tensor:
-    """[H, W, 3] where a view's pixels meet the world's plane at depth z."""
+    """The points [H, W, 3] at which rays through a view's pixels meet the world's plane at depth z."""
     centers = camera.pixel_centers()
     ray = camera.unproject(centers, torch.ones(centers.shape[:-1])) - camera.position
     return camera.position + ray * ((z - camera.position[2]) / ray[..., 2])[..., None]
 
 
 def shifted(camera: Camera, right: float, focus: float = 4.0) -> Camera:
-    """The photo's camera moved sideways, still looking at the same spot."""
+    """A camera moved to the right that looks at the point at depth `focus`."""
     return camera.looking(torch.tensor([right, 0.0, 0.0]), torch.tensor([0.0, 0.0, focus]))
 
 
 def turned_camera(width: int, height: int, focal: float) -> Camera:
-    """A camera that is neither at the origin nor level, its principal point off the middle."""
+    """A tilted camera away from the origin, with an off-centre principal point."""
     camera = Camera.from_focal(focal, width, height)
     camera.K[0, 2] += 2.3
     camera.K[1, 2] -= 1.1
@@ -113,10 +112,9 @@ def random_scene(
     dtype: torch.dtype = torch.float32,
     sizes: tuple[float, float] = (0.6, 12.0),
 ) -> Gaussians:
-    """Gaussians in and around the view, some behind the camera; no two at nearly the same depth.
+    """Gaussians in and around the view, some behind the camera, at clearly different depths.
 
-    With more solidity more of them are opaque: pixels fill up, alphas reach their clamp. `sizes` are the least and the
-    greatest standard deviation on the image, in pixels.
+    `solidity` raises opacities. `sizes` are the least and the greatest standard deviation in the image, in pixels.
     """
     generator = torch.Generator().manual_seed(seed)
 
@@ -137,12 +135,11 @@ def random_scene(
 
 
 def away(camera: Camera) -> Camera:
-    """The photo's camera turned round: it sees nothing of the photo's scene."""
+    """The camera turned by 180 degrees."""
     return camera.looking(torch.zeros(3), torch.tensor([0.0, 0.0, -1.0]))
 
 
 def tensors_of(value: object) -> Iterator[Tensor]:
-    """Every tensor in a value and in the values in it."""
     if isinstance(value, Tensor):
         yield value
     elif dataclasses.is_dataclass(value):
@@ -151,18 +148,16 @@ def tensors_of(value: object) -> Iterator[Tensor]:
 
 
 def psnr(a: Tensor, b: Tensor) -> float:
-    """Of images in 0..1; inf where they are the same."""
     return -10 * float((a - b).double().square().mean().log10())
 
 
 def same_bits(a: Rendering | Gaussians, b: Rendering | Gaussians) -> bool:
-    """Whether two values of one type hold the same tensors, bit for bit."""
     return all(torch.equal(*pair) for pair in zip(tensors_of(a), tensors_of(b), strict=True))
 
 
 @dataclasses.dataclass(frozen=True)
 class Stereo:
-    """The left photo with its depth, and what the right camera saw."""
+    """The left photo with its depth, and the right photo."""
 
     left: Scene
     right: Camera
@@ -188,5 +183,4 @@ def motorcycle() -> Stereo:
 
 @functools.cache
 def motorcycle_base() -> BasePrediction:
-    """Motorcycle's left photo, lifted once for all tests of a run."""
     return motorcycle().left.lift()

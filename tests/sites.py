@@ -1,4 +1,4 @@
-"""A web server on this machine for one file, which can do what servers and networks do wrong."""
+"""A local web server for one file, which can imitate faults of servers and networks."""
 
 from __future__ import annotations
 
@@ -13,23 +13,22 @@ from typing import Any
 
 @dataclasses.dataclass
 class Site:
-    """What the server has and how it behaves; `requests` is what it was asked."""
+    """A server's content and faults, and the requests that it has received."""
 
     url: str
     content: bytes
-    others: dict[str, bytes] = dataclasses.field(default_factory=dict)  # by the end of their paths
+    others: dict[str, bytes] = dataclasses.field(default_factory=dict)  # contents by file name
     ranges: bool = True
     status: int = 200
-    headers: dict[str, str | None] = dataclasses.field(default_factory=dict)  # None: left out
-    drops: list[int] = dataclasses.field(default_factory=list)  # bytes before each of the next answers breaks off
-    hang_after: int | None = None  # bytes of an answer, then nothing until `go_on` is set
+    headers: dict[str, str | None] = dataclasses.field(default_factory=dict)  # None omits a header
+    drops: list[int] = dataclasses.field(default_factory=list)  # bytes after which the next answers break off
+    hang_after: int | None = None  # bytes after which an answer waits for `go_on`
     go_on: threading.Event = dataclasses.field(default_factory=threading.Event)
-    requests: list[dict[str, str]] = dataclasses.field(default_factory=list)  # headers, and the path by "path"
+    requests: list[dict[str, str]] = dataclasses.field(default_factory=list)  # headers and path
 
 
 @contextlib.contextmanager
 def serve(content: bytes) -> Iterator[Site]:
-    """A site with that content until the block ends."""
     server = _Server(("127.0.0.1", 0), _Handler)
     server.site = Site(f"http://127.0.0.1:{server.server_port}/weights.pt", content)
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
@@ -48,7 +47,7 @@ class _Server(ThreadingHTTPServer):
     site: Site
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A client that hangs up is what many tests are about."""
+        """Do not log clients that hang up."""
 
 
 class _Handler(BaseHTTPRequestHandler):

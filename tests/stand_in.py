@@ -1,4 +1,4 @@
-"""Bases in no time, whose depth is known beforehand; other weights than the published; `spackle predict` with them."""
+"""A base without network, and small replacements for published weights."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ QUICK = ("--no-render", "--residual", "none")
 
 
 class StandIn:
-    """A base that knows where the box is."""
+    """A base that knows the depth of `photos.picture`."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -38,21 +38,19 @@ class StandIn:
 
 
 def write_lite(path: Path) -> Path:
-    """Random weights of the lite network."""
     torch.manual_seed(0)
     save_file(LiteNet().state_dict(), path)
     return path
 
 
 def publish(patch: pytest.MonkeyPatch, name: str, content: bytes, **changes: object) -> PublishedWeights:
-    """Let other bytes be the published ones of that name, until the test ends."""
+    """Replace the published weights of that name by other bytes until the test ends."""
     facts = {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest(), **changes}
     patch.setitem(PUBLISHED, name, dataclasses.replace(PUBLISHED[name], **facts))  # type: ignore[arg-type]
     return PUBLISHED[name]
 
 
 def write_model(folder: Path) -> Path:
-    """A folder that looks like a model of transformers."""
     folder.mkdir(parents=True)
     for name, text in (("config.json", "{}"), ("model.safetensors", "weights"), ("README.md", "about it")):
         (folder / name).write_text(text)
@@ -60,5 +58,4 @@ def write_model(folder: Path) -> Path:
 
 
 def predict(tmp_path: Path, *options: object) -> Run:
-    """`spackle predict` into `out`, without completion."""
     return run("predict", "-o", tmp_path / "out", *QUICK, *options)

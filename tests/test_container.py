@@ -1,8 +1,7 @@
-"""The Dockerfile without Docker: its rules, and its steps in a shell, in an empty environment under another root."""
+"""The Dockerfile without Docker: its files, and its steps in a shell, in an empty environment under another root."""
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shlex
@@ -26,18 +25,7 @@ def steps() -> list[tuple[str, str]]:
     return [(word, rest.strip()) for word, _, rest in (line.partition(" ") for line in joined)]
 
 
-def test_the_rules_of_a_good_image_hold() -> None:
-    words = [word for word, _ in steps()]
-    assert words[0] == "FROM"
-    assert re.fullmatch(r"python:3\.\d+-slim-\w+", steps()[0][1])  # a version, not latest
-    assert "ADD" not in words
-    assert words.count("USER") == 1
-    last = dict(steps())
-    assert last["USER"] not in ("0", "root")
-    assert words.index("USER") < words.index("ENTRYPOINT")
-    assert json.loads(last["ENTRYPOINT"]) == ["spackle"]
-    assert "PIP_NO_CACHE_DIR=1" in last["ENV"]
-    assert not re.search(r"\bsudo\b|apt-get|curl|wget", TEXT)
+def test_copied_files_exist_and_are_not_ignored() -> None:
     copied = [name for word, rest in steps() if word == "COPY" for name in rest.split()[:-1]]
     assert all((ROOT / name).exists() for name in copied)
     kept = {line.removeprefix("!") for line in (ROOT / ".dockerignore").read_text().splitlines() if line[0] == "!"}
@@ -45,7 +33,7 @@ def test_the_rules_of_a_good_image_hold() -> None:
 
 
 @pytest.mark.skipif(os.environ.get("SPACKLE_EMPTY") != "1", reason="fetches torch: make test-wheel")
-def test_its_steps_make_a_command_that_predicts_and_views(tmp_path: Path) -> None:
+def test_its_steps_install_a_command_that_predicts_and_views(tmp_path: Path) -> None:
     root = tmp_path / "image"
     venv.create(root / "python", with_pip=True)
     place, variables = root, {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "NUMBA"))}

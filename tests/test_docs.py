@@ -1,4 +1,4 @@
-"""What the docs name exists: functions and files of ARCHITECTURE.md, and every link inside the repository."""
+"""The docs name existing functions, files, links and options, and stay short."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def names_in(path: Path) -> set[str]:
     return names
 
 
-def test_the_architecture_names_what_there_is() -> None:
+def test_the_architecture_names_existing_files_and_functions() -> None:
     text = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
     found = re.findall(r"`([\w/]+\.(?:py|yaml))(?::(\w+))?`", text)
     assert len(found) > 30
@@ -50,7 +50,7 @@ def test_links_lead_somewhere(page: Path) -> None:
 
 
 def commands() -> list[str]:
-    """Every command of ours in the docs, whatever it needs."""
+    """Every `spackle` command in the docs."""
     text = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
     blocks = re.findall(r"```bash\n(.*?)```", text, re.DOTALL)
     lines = re.sub(r"\\\n\s*", "", "\n".join(blocks)).splitlines()
@@ -58,7 +58,7 @@ def commands() -> list[str]:
 
 
 @pytest.mark.parametrize("line", commands())
-def test_the_command_line_takes_what_the_docs_type(line: str) -> None:
+def test_the_command_line_accepts_the_commands_in_the_docs(line: str) -> None:
     words, command = shlex.split(line)[1:], get_command(app)
     while isinstance(command, TyperGroup):
         command = command.commands[words.pop(0)]

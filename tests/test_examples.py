@@ -1,4 +1,4 @@
-"""The examples: each runs on small inputs, keeps to forty lines, and stands in the docs."""
+"""The examples: each runs on small inputs, has at most forty lines, and is listed in the docs."""
 
 from __future__ import annotations
 
@@ -23,7 +23,6 @@ EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 
 
 def main_of(number: int) -> Callable[..., Any]:
-    """The function that an example's command calls."""
     (file,) = (ROOT / "examples").glob(f"{number:02}_*.py")
     main: Callable[..., Any] = runpy.run_path(str(file))["main"]
     return main
@@ -86,7 +85,7 @@ def test_examples_of_videos(scene: Path, tmp_path: Path) -> None:
     assert frames(tmp_path / "sbs.mp4") == 24
     files = (tmp_path / "anaglyph.png", scene.with_name("photo.png"))
     glasses, photo = (np.asarray(Image.open(file), float) for file in files)
-    assert np.abs(glasses[..., 0] - photo[..., 0]).mean() > 5  # of 255: the left eye's red, and not the photo's
+    assert np.abs(glasses[..., 0] - photo[..., 0]).mean() > 5  # of 255
 
 
 @pytest.mark.slow

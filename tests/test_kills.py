@@ -1,4 +1,4 @@
-"""Commands that are killed ten times at random moments and resumed give what an uninterrupted run gives."""
+"""Commands that are killed ten times at random moments and resumed write the files of an uninterrupted run."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def train(place: Path) -> Words:
 
 
 def same_files(one: Path, other: Path) -> None:
-    """All files are equal, but for the times in them."""
+    """All files are equal, except for times."""
 
     def timeless(content: Any) -> Any:
         if isinstance(content, dict):
@@ -79,26 +79,26 @@ def test_ten_kills_change_nothing(
 ) -> None:
     whole, killed, rng, kills, runs = tmp_path / "whole", tmp_path / "killed", random.Random(0), 0, 0
     words = [sys.executable, "-m", "spackle", *map(str, command(tmp_path))]
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}  # sums in one order
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}  # a fixed order of sums
 
     def started(folder: Path) -> subprocess.Popen[bytes]:
         return subprocess.Popen([*words, folder], env=environment, stderr=subprocess.DEVNULL)
 
-    assert started(whole).wait() == 0  # also compiles the kernels, which none of the next has to
+    assert started(whole).wait() == 0  # the first run also compiles kernels
     start, process = time.monotonic(), started(killed)
     while not killed.exists() and process.poll() is None:
         time.sleep(0.01)
-    begins = time.monotonic() - start  # what is before is imports
+    begins = time.monotonic() - start  # after the imports
     assert process.wait() == 0
     lasts = time.monotonic() - start
     while kills < 10:
-        if process.returncode == 0:  # done: once more, from the start
+        if process.returncode == 0:  # complete: begin again
             same(whole, killed)
             shutil.rmtree(killed)
-        assert (runs := runs + 1) < 100, f"{kills} kills only: on this machine a run lasts {begins} to {lasts} s"
+        assert (runs := runs + 1) < 100, f"only {kills} kills: a run lasts {begins} to {lasts} s"
         process = started(killed)
         try:
-            process.wait(rng.uniform(begins, (begins + lasts) / 2))  # a run that goes on has less to do
+            process.wait(rng.uniform(begins, (begins + lasts) / 2))  # a resumed run is shorter
         except subprocess.TimeoutExpired:
             process.kill()
         assert process.wait() in (0, -signal.SIGKILL)

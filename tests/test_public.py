@@ -1,4 +1,4 @@
-"""What semantic versioning covers: a name that goes or comes here belongs into CHANGELOG.md."""
+"""The public names; a change of these lists needs a line in CHANGELOG.md."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_the_public_names_are_these() -> None:
 
 
 @pytest.mark.parametrize("name", spackle.__all__)
-def test_what_is_public_has_types_that_say_something(name: str) -> None:
+def test_public_functions_are_annotated_without_any(name: str) -> None:
     thing = getattr(spackle, name)
     methods = [value for key, value in vars(thing).items() if not key.startswith("_")] if inspect.isclass(thing) else []
     for function in filter(inspect.isfunction, [thing, *methods, getattr(thing, "__init__", None)]):

@@ -1,4 +1,4 @@
-"""The quick start, word for word, by the wheel alone: in an empty environment, outside of the checkout."""
+"""The commands of the quick start work with the wheel in a new environment, outside of the checkout."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def commands() -> list[list[str]]:
 
 @pytest.fixture(scope="module")
 def environment(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An environment's programs. SPACKLE_EMPTY=1 lets pip fetch what the wheel asks for; else it is borrowed."""
+    """Folder of an environment's programs; SPACKLE_EMPTY=1 lets pip install dependencies, which else are borrowed."""
     folder = tmp_path_factory.mktemp("wheel")
     shutil.copytree(ROOT, folder / "source", ignore=shutil.ignore_patterns(".*", "node_modules", "tests", "docs"))
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet"]
@@ -95,16 +95,9 @@ def test_the_python_of_the_quick_start_works_by_the_wheel(environment: Path, pla
 def test_programs_are_type_checked_by_the_wheel(environment: Path, tmp_path: Path) -> None:
     pytest.importorskip("mypy")
     program = Path(shutil.copy(Path(__file__).parent / "data" / "typed_program.py", tmp_path))
-    checker = [
-        sys.executable,
-        "-m",
-        "mypy",
-        "--strict",
-        "--no-error-summary",
-        "--python-executable",
-        environment / "python",
-    ]
-    done = subprocess.run([*checker, program], cwd=tmp_path, env=ALONE, capture_output=True, text=True, timeout=600)
+    options = ["--strict", "--no-error-summary", "--python-executable", environment / "python"]
+    checker = [sys.executable, "-m", "mypy", *options, program]
+    done = subprocess.run(checker, cwd=tmp_path, env=ALONE, capture_output=True, text=True, timeout=600)
     found = re.findall(r"^typed_program\.py:(\d+): error: .*\[([a-z-]+)\]$", done.stdout, re.MULTILINE)
     lines = enumerate(program.read_text(encoding="utf-8").splitlines(), 1)
     wrong = [(str(number), words[1]) for number, line in lines if len(words := line.rsplit("  # ", 1)) == 2]

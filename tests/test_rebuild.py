@@ -1,4 +1,4 @@
-"""The commands that rebuild the weights that ship, in miniature: from data to a file that the package takes."""
+"""The scripts that rebuild the shipped weights, in miniature: from data to a file that the package loads."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`make reproduce`: the paper's chain in miniature gives every table and figure, and gives them in time."""
+"""`make reproduce`: the paper's experiment in miniature gives every table and figure within eight minutes."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_the_papers_chain_gives_its_tables_and_figures(tmp_path: Path) -> None:
     out, before = tmp_path / "out", os.times()
     done = subprocess.run([sys.executable, ROOT / "benchmarks/reproduce.py", "-o", out], capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr + (out / "log.txt").read_text()[-2000:]
-    # Eight minutes of two cores, however busy the machine is.
+    # eight minutes of two cores
     assert sum(os.times()[2:4]) - sum(before[2:4]) < 2 * 480
     for name in ("unet", "sharp-decoder", "direct-ft"):
         report = json.loads((out / name / "run.json").read_text())
@@ -55,7 +55,7 @@ def test_the_papers_chain_gives_its_tables_and_figures(tmp_path: Path) -> None:
         cells = width * height / 4 / len(run.measured) ** 2
         assert har < 0.1 * before
         assert aux / (before * cells) == pytest.approx(1, abs=0.05)
-        # Direct FT fills holes at the cost of all else, as in the paper's table 4, and the residual does not.
+        # As in the paper's table 4, Direct FT damages pixels outside of holes, and the residual does not.
         near = load_run(out / "runs" / f"{name}-near")
         assert sum_of(near, "direct-ft", "psnr_outside") < 0.9 * sum_of(near, "base", "psnr_outside")
         assert sum_of(near, "paper", "psnr_outside") == pytest.approx(sum_of(near, "base", "psnr_outside"), rel=2e-3)

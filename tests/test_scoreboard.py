@@ -1,4 +1,4 @@
-"""The scoreboard measures a pair, compares with itself, and knows every mechanism by its name in the package."""
+"""The scoreboard measures and compares pairs, and finds every mechanism in the package."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ WALL_PX, BOX_PX = 4, 12  # disparities
 
 @pytest.fixture
 def pairs(tmp_path: Path) -> Path:
-    """A folder of one pair, a box before a wall, and SqueezeNet's weights before any training."""
+    """A folder with one pair, a box before a wall, and random weights of SqueezeNet."""
     folder, width, height = tmp_path / "pair", 120, 84
     write_photo(folder / "left.png", width, height)
     inside, left = box(width, height), picture(width, height)
@@ -41,7 +41,6 @@ def pairs(tmp_path: Path) -> Path:
 
 
 def run(pairs: Path, *words: str) -> dict[str, Any]:
-    """The figures that a run writes."""
     scoreboard.main([str(pairs), "--features", str(pairs / "squeezenet.npz"), "-o", str(pairs / "now.json"), *words])
     runs: dict[str, Any] = json.loads((pairs / "now.json").read_text())["runs"]
     return runs
@@ -58,26 +57,13 @@ def test_a_pair_is_measured_and_compared(pairs: Path, capsys: pytest.CaptureFixt
     (pairs / "now.json").rename(pairs / "before.json")
     without = run(pairs, "--against", str(pairs / "before.json"), "--without", "network+texture")
     changed = without["network+texture"]["pair"]
-    assert changed["aux"] < row["aux"]  # one a cell, where the texture has one a pixel
+    assert changed["aux"] < row["aux"]
     assert changed["base"] == row["base"]
     output = capsys.readouterr().out
     assert "1 scenes; but for the seconds nothing changed." in output
     assert "| network+texture |" in output
     with pytest.raises(SystemExit):
         run(pairs, "--small", "4", "--against", str(pairs / "before.json"))
-
-
-def test_small_maps_are_means_of_inverse_depth(pairs: Path) -> None:
-    depth = scoreboard.load_pair(pairs / "pair")[2]
-    depth.valid[:4, :8] = False
-    depth.valid[0, 0] = True
-    small = scoreboard.smaller(depth, 4)
-    assert small.depth.shape == (21, 30)
-    assert bool(small.valid[0, 0])
-    assert not bool(small.valid[0, 1])
-    wall, thing = (0.2 * 100 / d for d in (WALL_PX, BOX_PX))
-    assert float(small.depth[0, 0]) == pytest.approx(wall, rel=1e-3)
-    assert float(small.depth[10, 15]) == pytest.approx(thing, rel=1e-3)
 
 
 def test_sign_test() -> None:
@@ -97,14 +83,6 @@ def test_each_mechanism_is_in_the_package(name: str) -> None:
                 there = [vars(module)[target.rpartition(".")[2]] for module in scoreboard.holders(target)]
                 assert there[0] is not own[0]
             assert own == [vars(module)[target.rpartition(".")[2]] for module in scoreboard.holders(target)]
-
-
-def test_a_mechanism_that_is_gone_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(scoreboard.FILL, "gone", {"no_such_function": scoreboard.first})
-    with pytest.raises(LookupError, match="no_such_function"), scoreboard.switched_off("gone", scoreboard.FILL):
-        pass
-    with pytest.raises(LookupError, match="things of that name"):
-        scoreboard.holders("SWEEPS")  # of filters, maps and colours
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Training runs as processes of their own, and what they leave."""
+"""Training runs in separate processes, and their checkpoints."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from spackle.training.checkpoint import Checkpoint, load_checkpoint
 
 @pytest.fixture(scope="module", autouse=True)
 def one_thread() -> Iterator[None]:
-    """Sums in one order: what is compared in a module that imports this are bits."""
+    """One thread fixes the order of sums, so that results are equal bit for bit."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -32,7 +32,6 @@ def state(folder: Path) -> Checkpoint:
 
 
 def losses_of(done: Run) -> list[float]:
-    """The loss of each step that a run has logged."""
     return [float(line.split("loss ")[1].split(",")[0]) for line in done.lines if line.startswith("train: ")]
 
 
@@ -44,7 +43,7 @@ def assert_same_weights(one: Path, other: Path, tolerance: float = 0.0) -> None:
 
 
 def started(arguments: Sequence[str], code: str, **environment: str) -> subprocess.Popen[str]:
-    """A command in a process of its own, with something done before it."""
+    """Start a command in a new process that first runs `code`."""
     code = f"import sys\nsys.argv = {['spackle', *arguments]!r}\n{code}\nfrom spackle.cli import main\nmain()"
     return subprocess.Popen(
         [sys.executable, "-c", code],
@@ -55,7 +54,7 @@ def started(arguments: Sequence[str], code: str, **environment: str) -> subproce
 
 
 def killed_at(number: int) -> str:
-    """What kills a run in a step, counted from 0, before its weights change; for `started`."""
+    """Code for `started` that kills a run in this step, counted from 0, before its weights change."""
     return f"""
 import os
 from spackle.training import train
@@ -65,7 +64,7 @@ train.learning_rate = lambda step, optim: os.kill(os.getpid(), 9) if step == {nu
 
 
 def run_two(arguments: Sequence[str], code: str = "") -> None:
-    """Run a command in two processes that talk to each other."""
+    """Run a command in two distributed processes."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = str(free.getsockname()[1])
