@@ -31,6 +31,7 @@ OVERSCAN = 0.05  # relative gain in focal length, which hides most of the fill b
 MAX_ZOOM = 0.15  # forward motion of rotate-forward, in units of z_near
 
 MIN_FOV, MAX_FOV = 1.0, 170.0  # degrees
+UP = (0.0, -1.0, 0.0)
 LEAST_STEP = 1e-6  # least time between two keyframes, in seconds
 STILL = 1e-100  # smaller slopes count as 0, because their inverse would overflow
 Array = NDArray[np.float64]
@@ -156,7 +157,7 @@ class Keyframe:
     time: float  # seconds
     eye: tuple[float, float, float]  # position of the camera
     target: tuple[float, float, float]  # a point on the optical axis
-    up: tuple[float, float, float] = (0.0, -1.0, 0.0)  # direction that is roughly upwards in the image
+    up: tuple[float, float, float] = UP  # direction that is roughly upwards in the image
     fov: float | None = None  # horizontal field of view in degrees; None: the photo's
 
     def __post_init__(self) -> None:

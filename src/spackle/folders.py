@@ -81,8 +81,6 @@ def results_folder(path: Path, files: Sequence[str] = (), *, alone: bool = False
                 folder.rmdir()
 
 
-
-
 @contextlib.contextmanager
 def whole_set(folder: Path, last: str) -> Iterator[Path]:
     """Yield a new folder for a set of files; if the block succeeds, the files replace an older set in `folder`.
