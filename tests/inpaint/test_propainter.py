@@ -22,7 +22,6 @@ from spackle.inpaint.propainter import (
     NETWORKS,
     PropainterInpainter,
     dilated,
-    give_weights,
     weight_files,
 )
 
@@ -170,11 +169,9 @@ def test_colours_that_are_none_are_refused(
 def test_weights_that_are_not_there_are_told(tmp_path: Path) -> None:
     published = [f"{name}-0000-d74fed4b.pth" for name in NETWORKS]
     for given, files, said in (
-        (None, [], "give --inpainter-weights FOLDER with raft_things, .* unpacked from https"),
-        (tmp_path / "missing", [], "no folder that can be read"),
-        (tmp_path, [], "holds no raft_things"),
-        (tmp_path / published[0], published, "no folder"),
-        (tmp_path, ["propainter.safetensors"], "holds propainter-0000-d74fed4b.pth and propainter.safetensors"),
+        (None, [], "give a folder with one file for each of raft_things, .* unpacked from https"),
+        (tmp_path / "missing", [], "has 0 files raft_things"),
+        (tmp_path, [*published, "propainter.safetensors"], "has 2 files propainter-"),
     ):
         for name in files:
             (tmp_path / name).write_bytes(b"")
@@ -184,24 +181,8 @@ def test_weights_that_are_not_there_are_told(tmp_path: Path) -> None:
     assert [file.name for file in weight_files(tmp_path).values()] == published
 
 
-def test_a_network_takes_its_own_from_a_published_file(tmp_path: Path) -> None:
-    network, values = nn.Linear(3, 2), {"weight": torch.ones(2, 3).half(), "bias": torch.zeros(2)}
-    torch.save(values | {"more": [1], "others": torch.ones(3)}, tmp_path / "a.pth")
-    give_weights(network, "small", tmp_path / "a.pth")
-    assert torch.equal(network.weight, torch.ones(2, 3))  # and float32
-    torch.save({"weight": torch.ones(2, 3)}, tmp_path / "a.pth")
-    with pytest.raises(InputError, match=r"1 missing \(bias\): unpack the file of small from https"):
-        give_weights(network, "small", tmp_path / "a.pth")
-    torch.save(values, tmp_path / "small-0000-0badf00d.pth")
-    with pytest.raises(InputError, match="SHA-1 is not the one in its name"):
-        give_weights(network, "small", tmp_path / "small-0000-0badf00d.pth")
-
-
 BROKEN = "operator torchvision::nms does not exist"  # what torchvision says beside another torch
-MISSING = {
-    "pytorchcv": "pip install 'spackle-nvs[propainter]'",
-    "torchvision": f"torchvision cannot be imported ({BROKEN}): install the one that was built for torch",
-}
+MISSING = {"pytorchcv": "pip install 'spackle-nvs[propainter]'", "torchvision": f"cannot import its package ({BROKEN})"}
 
 
 @pytest.mark.parametrize("package", MISSING)

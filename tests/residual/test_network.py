@@ -100,7 +100,10 @@ def test_a_file_says_its_architecture_and_gives_the_same_network(name: str, tmp_
     context, camera = box_view()
     view = features_of(context.base, camera, context.photo_camera, CPU.render(context.base, context.photo_camera).rgb)
     assert torch.equal(predict_deltas(loaded, *view, "fp32"), predict_deltas(network, *view, "fp32"))
-    for wrong, said in ((next(n for n in ARCHITECTURES if n != name), "another network's"), ("vit", "not known here")):
+    for wrong, said in (
+        (next(n for n in ARCHITECTURES if n != name), "another network's"),
+        ("vit", "unknown architecture"),
+    ):
         save_file(tensors, path, {NOTE: wrong})
         with pytest.raises(InputError, match=said):
             load_residual(path)

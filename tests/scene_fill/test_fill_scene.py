@@ -10,14 +10,13 @@ import pytest
 import torch
 from holes import CPU, box_view, random_network
 from scenes import away, box_before_wall, motorcycle, motorcycle_base, psnr, same_bits, shifted, wall
-from torch import Tensor
 
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, TrajectoryKind, extremes, trajectory
 from spackle.color import to_bytes
 from spackle.filters import greatest_around
 from spackle.gaussians import Gaussians
-from spackle.render import CpuRenderer, touched_tiles
+from spackle.render import CpuRenderer
 from spackle.render.protocol import Rendering
 from spackle.residual import ViewFeatures, hole_area_ratio, hole_mask, make_seeds
 from spackle.residual.architectures import UNet
@@ -80,55 +79,6 @@ def test_no_aux_gaussian_of_a_scene_hides_the_photo() -> None:
     inside = (z > 0) & (x >= 0) & (x < 96) & (y >= 0) & (y < 72)
     assert int(inside.sum()) > 100
     assert bool((z[inside] > depth[y[inside], x[inside]] * 1.0005).all())
-
-
-FAR = torch.device("meta")
-
-
-class FarGaussians(Gaussians):
-    """Gaussians on the renderer's device, as far as a machine with one device can tell."""
-
-
-class FarRendering(Rendering):
-    """A view on the renderer's device."""
-
-
-class FarRenderer:
-    """Draws what lies on its device, and nothing else."""
-
-    device = FAR
-
-    def render(self, sets: Any, camera: Camera, *, onto: Any = None, tiles: Any = None) -> FarRendering:
-        sets = [sets] if isinstance(sets, Gaussians) else sets
-        assert all(isinstance(part, FarGaussians) for part in sets)
-        assert onto is None or isinstance(onto, FarRendering)
-        return FarRendering(*CPU.render(sets, camera, tiles=tiles, onto=onto).tensors)
-
-    def touched_tiles(self, gaussians: Gaussians, camera: Camera) -> Tensor:
-        assert isinstance(gaussians, FarGaussians)
-        return touched_tiles(gaussians, camera)
-
-
-def test_images_travel_down_once_and_gaussians_up_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    context, camera = box_view(0.3)
-    path = path_of(context, "swipe", frames=3)
-    expected = [fill_view(context, camera).aux, fill_scene(context, path).aux]
-    moved: list[object] = []
-
-    def to(value: Any, device: torch.device) -> Any:
-        near, far = (Gaussians, FarGaussians) if isinstance(value, Gaussians) else (Rendering, FarRendering)
-        if isinstance(value, far) == (device == FAR):
-            return value
-        moved.append(value)
-        return (far if device == FAR else near)(*value.tensors)
-
-    for kind in (Gaussians, Rendering):
-        monkeypatch.setattr(kind, "to", to)
-    context = dataclasses.replace(context, renderer=FarRenderer())
-    for found, wanted in zip((fill_view(context, camera).aux, fill_scene(context, path).aux), expected, strict=True):
-        assert same_bits(found, wanted)
-    assert len({id(value) for value in moved}) == len(moved) > 10
-    assert sum(value is context.base for value in moved) == 1
 
 
 def test_an_underlay_is_hidden_and_closes_neighbours_holes() -> None:

@@ -10,7 +10,6 @@ import signal
 import sys
 from pathlib import Path
 
-import gsplat_stand_in
 import numpy as np
 import pytest
 import torch
@@ -20,7 +19,6 @@ from photos import picture
 from PIL import Image
 from scenes import box_before_wall, shifted, tensors_of
 from training_runs import assert_same_weights, losses_of, one_thread, run_two, state
-from two_gpus import TwoGpus
 
 from spackle.folders import hold
 from spackle.gaussians import Gaussians
@@ -182,21 +180,6 @@ def test_two_processes_learn_what_one_does(place: Path, tmp_path: Path, monkeypa
     assert_same_weights(tmp_path / "two", tmp_path / "one", 1e-5)
     one, two = (state(tmp_path / name).progress.history[0] for name in ("one", "two"))
     assert two == pytest.approx(one, rel=1e-4)  # blobs at nearly one depth may swap
-
-
-def test_the_second_process_puts_nothing_on_the_first_gpu(
-    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("spackle.render.cuda.load_gsplat", lambda device: gsplat_stand_in)
-    monkeypatch.setattr("spackle.training.sources.COMPOSITE_SIZE", (64, 80))
-    monkeypatch.setattr("torch.distributed.init_process_group", lambda backend, **options: None)
-    for name, value in {"WORLD_SIZE": "2", "RANK": "1", "LOCAL_RANK": "1"}.items():
-        monkeypatch.setenv(name, value)
-    with TwoGpus(monkeypatch) as gpus:
-        small = ("data.views=2", "data.validation_views=1", "data.crops=1", "optim.steps=1", "run.validate_every=1")
-        options = ("run.device=cuda", f"data.cache={tmp_path}/cache", *small)
-        done = train(place, tmp_path / "out", *options)
-    assert (done.code, gpus.used) == (0, {1}), done.err
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,4 @@
-"""Inpainters, which fill the holes of pictures: their protocol, and the table of their names.
-
-To add an inpainter, write a class in a file of its own (see `Inpainter`), add a line to `INPAINTERS`, and test it.
-"""
+"""Inpainters fill the holes of images."""
 
 from __future__ import annotations
 
@@ -18,7 +15,7 @@ from spackle.errors import InputError, check_name
 from spackle.image import MAX_SIDE
 
 MIN_SIDE = 128  # pixels; the coarsest map of ProPainter's flow, 1/64, needs two cells each way
-INPAINTERS = {  # file and class, imported when the inpainter is asked for
+INPAINTERS = {  # module and class, imported on use
     "exemplar": ("plain", "ExemplarInpainter"),
     "lama": ("lama", "LamaInpainter"),
     "opencv": ("plain", "OpencvInpainter"),
@@ -28,48 +25,47 @@ INPAINTERS = {  # file and class, imported when the inpainter is asked for
 
 @dataclasses.dataclass(frozen=True)
 class InpainterOptions:
-    """Options of all inpainters; each inpainter uses those that it needs."""
+    """Options of all inpainters."""
 
-    weights: Path | None = None  # a file or a folder; None: those that `spackle weights get` has downloaded
-    side: int | None = None  # pixels of the long side at which a network works; None: its own default
+    weights: Path | None = None  # a file or a folder; None: the download of `spackle weights get`
+    side: int | None = None  # pixels of the long side of a network's input; None: the network's default
     device: str | None = None  # "cpu" or "cuda"; None: CUDA if available
 
     def side_or(self, default: int) -> int:
-        """The side, or a network's default; InputError for a side that is too small or too large."""
+        """The side, or `default`; InputError for a side that is too small or too large."""
         if self.side is not None and not MIN_SIDE <= self.side <= MAX_SIDE:
             raise InputError(f"--inpainter-side must be between {MIN_SIDE} and {MAX_SIDE}, got {self.side}")
         return default if self.side is None else self.side
 
 
 class Inpainter(Protocol):
-    """Fills the holes of pictures; the same input gives the same output."""
+    """Fills the holes of images; the same input gives the same output."""
 
     name: str
-    version: str  # another version may give other pixels
+    version: str  # different versions may give different pixels
     network: ClassVar[bool]  # takes weights and a side, and uses a GPU
-    video: ClassVar[bool]  # makes the views agree with each other; else it paints each by itself
-    notice: ClassVar[str]  # a line to show before the inpainter is used, such as its licence; may be empty
-    files: Mapping[str, Path]  # its weights, by the names that a manifest gives them
+    video: ClassVar[bool]  # paints all views together, so that they agree
+    notice: ClassVar[str]  # a line to show before use, such as a licence; may be empty
+    files: Mapping[str, Path]  # weights, by their names in manifests
 
     def __init__(self, options: InpainterOptions) -> None:
-        """Find the packages and weights that it needs; InputError if they are missing."""
+        """Find packages and weights; InputError if they are missing."""
 
     def paint(self, rgb: Tensor, hole: Tensor, inverse_depth: Tensor) -> Tensor:
-        """Paint the holes of V views of one scene, ordered as a moving camera would see them.
+        """Paint the holes of V views of one scene, in the order of a moving camera.
 
         Args:
             rgb: [V, H, W, 3] sRGB in 0..1.
             hole: [V, H, W] bool.
-            inverse_depth: [V, H, W] 1/z of what the views show; 0 where it is unknown.
+            inverse_depth: [V, H, W] 1/z of the visible surfaces; 0 if unknown.
 
         Returns:
             [V, H, W, 3] sRGB in 0..1, equal to `rgb` bit for bit outside of the holes.
         """
-        ...
 
 
 def inpainter_class(name: str) -> type[Inpainter]:
-    """The class of an inpainter by its name; InputError for an unknown one."""
+    """The class of an inpainter; InputError for an unknown name."""
     check_name("inpainter", name, INPAINTERS)
     file, kind = INPAINTERS[name]
     found: type[Inpainter] = getattr(import_module(f"{__name__}.{file}"), kind)
@@ -77,10 +73,10 @@ def inpainter_class(name: str) -> type[Inpainter]:
 
 
 def get_inpainter(name: str, options: InpainterOptions) -> Inpainter:
-    """An inpainter by its name; InputError for an unknown one, or one whose package or weights are missing."""
+    """An inpainter by name; InputError if the name is unknown, or a package or weights are missing."""
     return inpainter_class(name)(options)
 
 
 def known_inverse_depth(depth: Tensor, hole: Tensor) -> Tensor:
-    """The `inverse_depth` of `Inpainter.paint`, from rendered depth [V, H, W]: 0 in holes and where the depth is 0."""
+    """The argument `inverse_depth` of `Inpainter.paint`, from rendered depth [V, H, W]."""
     return torch.where(~hole & (depth > 0), 1 / depth.clamp_min(1e-6), 0.0)

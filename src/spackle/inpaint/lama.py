@@ -1,8 +1,4 @@
-"""LaMa: large holes in one pass of a network that sees the whole picture at once (Suvorov et al., WACV 2022).
-
-The network receives a rectangle around each group of holes, reduced if it is large. `spackle weights get lama`
-downloads its published weights.
-"""
+"""LaMa: a network with fast Fourier convolutions (Suvorov et al., WACV 2022), run on crops around holes."""
 
 from __future__ import annotations
 
@@ -22,21 +18,21 @@ from spackle.inpaint import InpainterOptions
 from spackle.network_file import Shapes, check_finite, check_tensors, read_tensors
 from spackle.weights import installed
 
-SIDE = 1024  # pixels of the long side at which it works
-MULTIPLE = 8  # which divides both sides of the network's input
-SMALLEST = 2 * MULTIPLE  # least pixels of a side: features of an eighth of it are padded by reflection
-MARGIN = 128  # pixels around a group of holes that the network sees
+SIDE = 1024  # default for the long side of the input in pixels
+MULTIPLE = 8  # both sides of the network's input are multiples of this
+SMALLEST = 2 * MULTIPLE  # least side in pixels: features have an eighth of the side and are padded by reflection
+MARGIN = 128  # pixels around a group of holes in the network's input
 BLOCK = 16  # pixels of the grid on which groups are found
-LOCAL = 4  # in the blocks, one of so many channels is local, the others are global
+LOCAL = 4  # one of so many channels is local, all others are global
 EPSILON = 1e-5  # of batch norms
-WIDTH, BLOCKS = 64, 18  # of "big-lama"
+WIDTH, BLOCKS = 64, 18  # size of the published network "big-lama"
 FIRST = "model.1.ffc.convl2l.weight"
 ADVICE = "`spackle weights get lama` downloads LaMa's weights"
 Tensors = Mapping[str, Tensor]
 
 
 class LamaInpainter:
-    """Paints each view by itself: sharp, but different from view to view."""
+    """Paints each view by itself."""
 
     name = "lama"
     network: ClassVar[bool] = True
@@ -44,27 +40,19 @@ class LamaInpainter:
     notice: ClassVar[str] = ""
 
     def __init__(self, options: InpainterOptions) -> None:
-        """Load the weights. The network works at `options.side`; its picture is then enlarged to the crop's size.
-
-        Raises:
-            InputError: an invalid side or device, or weights that are missing, damaged or another network's.
-        """
+        """Load the network; InputError for an invalid side or device, or unsuitable weights."""
         self._side = options.side_or(SIDE)
         self._device = pick_device(options.device)
         path = options.weights or installed("lama")
         if path is None:
-            raise InputError("inpainter lama: has no weights: `spackle weights get lama` downloads them (206 MB)")
+            raise InputError("inpainter lama: no weights: `spackle weights get lama` downloads 206 MB")
         self.files: Mapping[str, Path] = {"lama": path}
         self._network = load_network(path).to(self._device)
         self.version = f"1, long side {self._side}"
 
     @torch.no_grad()
     def paint(self, rgb: Tensor, hole: Tensor, inverse_depth: Tensor) -> Tensor:
-        """Paint the holes of each view by itself with the network's colours; depth is ignored.
-
-        Raises:
-            InputError: memory is short, or the network's colours are not finite.
-        """
+        """Paint the views, see `Inpainter.paint`; InputError if memory is short, or the colours are not finite."""
         painted = rgb.clone()
         for view, mask, target in zip(rgb, hole, painted, strict=True):
             for group, crop in groups_of(mask):
@@ -75,29 +63,29 @@ class LamaInpainter:
         return painted
 
     def _draw(self, rgb: Tensor, hole: Tensor) -> Tensor:
-        """The picture [h, w, 3] that the network makes of one with holes [h, w]."""
+        """The network's output [h, w, 3] for an image [h, w, 3] with holes [h, w]."""
         height, width = hole.shape
         colors = torch.where(hole[..., None], 0.0, rgb).permute(2, 0, 1)[None].to(self._device)
         mask = hole[None, None].to(self._device)
         small = working_size(width, height, self._side)[::-1]
         if small != (height, width):
             known = F.adaptive_avg_pool2d((~mask).to(colors), small)
-            mask = known < 0.999  # a pixel is masked if any part of it lies in a hole
+            mask = known < 0.999  # a reduced pixel is masked if any part lies in a hole
             colors = F.adaptive_avg_pool2d(colors, small)
         shortage = enough_memory("lower --inpainter-side", what=f"for LaMa at {max(small)} pixels")
         with shortage, own_arithmetic(self._device):
             drawn: Tensor = self._network(padded(colors), padded(mask))[..., : small[0], : small[1]]
         if not bool(drawn.isfinite().all()):
-            raise InputError(f"{self.files['lama']}: LaMa's colours are not finite with these weights: give others")
+            raise InputError(f"{self.files['lama']}: LaMa's colours are not finite: give other weights")
         if small != (height, width):
             drawn = F.interpolate(drawn, (height, width), mode="bicubic").clamp_(0, 1)
         return drawn[0].permute(1, 2, 0)
 
 
 def groups_of(hole: Tensor) -> list[tuple[Crop, Crop]]:
-    """Rectangles around groups of holes [H, W], each with the larger crop that the network receives.
+    """Rectangles around groups of holes [H, W], each with the larger crop for the network.
 
-    Rectangles are merged if they touch, or if one crop for both has fewer pixels.
+    Two rectangles are merged if they touch, or if a common crop has fewer pixels than two crops.
     """
 
     def seen(group: Crop) -> Crop:
@@ -118,7 +106,7 @@ def groups_of(hole: Tensor) -> list[tuple[Crop, Crop]]:
 
 
 def padded(x: Tensor) -> Tensor:
-    """[B, C, H, W] to sides that the network takes, reflected to the right and below."""
+    """Pad [B, C, H, W] to sides that the network accepts, by reflection to the right and below."""
     for axis in (-2, -1):
         side = x.shape[axis]
         steps = torch.arange(max(SMALLEST, -(-side // MULTIPLE) * MULTIPLE), device=x.device) % max(2 * side - 2, 1)
@@ -127,19 +115,16 @@ def padded(x: Tensor) -> Tensor:
 
 
 def load_network(path: Path) -> LamaNetwork:
-    """Load the network from a file of TorchScript, which is not run, of `torch.save` or of safetensors.
+    """Load the network, of any width and depth, from TorchScript (as data), `torch.save` or safetensors.
 
-    Weights of another width or depth are accepted. Half precision is widened. Names may begin with the path to the
-    generator; tensors of other networks, such as a discriminator, are ignored.
-
-    Raises:
-        InputError: the file is missing or broken, or holds another network.
+    Names of tensors may begin with the path to the generator; tensors of other networks are ignored. InputError if the
+    file is missing or broken, or holds another network.
     """
     found = read_tensors(path, ADVICE)
     before = (name.removesuffix(FIRST) for name in found if name.endswith(FIRST))
     prefix = min((start for start in before if not start or start.endswith("generator.")), key=len, default=None)
     if prefix is None:
-        raise InputError(f"{path}: another network's weights: it holds no generator: {ADVICE}")
+        raise InputError(f"{path}: holds no generator of LaMa: {ADVICE}")
     tensors = {
         name.removeprefix(prefix): tensor
         for name, tensor in found.items()
@@ -156,7 +141,7 @@ def load_network(path: Path) -> LamaNetwork:
 
 
 def expected_shapes(width: int = WIDTH, blocks: int = BLOCKS) -> Shapes:
-    """Names and shapes of the published tensors, without batch norms' counts of batches."""
+    """Names and shapes of the published tensors, without `num_batches_tracked`."""
     shapes: Shapes = {}
 
     def conv(name: str, *shape: int, bias: bool = False, transposed: bool = False) -> None:
@@ -208,14 +193,13 @@ def _last_stage(blocks: int) -> int:
 
 
 class LamaNetwork(nn.Module):
-    """Predicts colours for the holes of a picture whose sides are multiples of 8, at least 16; for inference alone.
+    """Predicts colours for the holes of an image whose sides are multiples of 8, at least 16; for inference alone.
 
-    It runs in channels-last memory, its batch norms folded into the convolutions before them. Convolutions pad by
-    reflection; a layer has local features (a quarter) and global ones.
+    Batch norms are folded into the convolutions before them; memory is channels-last.
     """
 
     def __init__(self, tensors: Tensors) -> None:
-        """Take tensors as `expected_shapes` names them, in single precision."""
+        """Take tensors with the names of `expected_shapes`, in float32."""
         super().__init__()
         blocks = sum(name.endswith("conv1.bn_l.weight") for name in tensors)
         self.first = _conv(*_folded(tensors, "model.1.ffc.convl2l", "model.1.bn_l"))
@@ -229,7 +213,7 @@ class LamaNetwork(nn.Module):
             for stage in _up_stages(blocks)
         )
         last = f"model.{_last_stage(blocks)}"
-        # 3 output channels use a CPU's registers poorly, so the kernel's 7 rows become channels, which are summed.
+        # Three output channels use a CPU's registers poorly: the kernel's 7 rows become channels and are summed.
         weight = tensors[f"{last}.weight"].permute(2, 0, 1, 3).flatten(0, 1)[:, :, None]
         self.rows = _conv(weight, tensors[f"{last}.bias"].repeat(7) / 7)
         self.eval().requires_grad_(False)
@@ -239,7 +223,7 @@ class LamaNetwork(nn.Module):
         return self.logits(torch.cat([torch.where(hole, 0.0, rgb), hole.to(rgb)], 1)).sigmoid_()
 
     def logits(self, x: Tensor) -> Tensor:
-        """[B, 3, H, W] before the sigmoid, from [B, 4, H, W]: colours, 0 in the holes, and a mask, 1 in the holes."""
+        """Logits [B, 3, H, W] of [B, 4, H, W]: colours, 0 in the holes, and the mask, 1 in the holes."""
         x = self.first(_reflected(x.contiguous(memory_format=torch.channels_last), 3)).relu_()
         for conv in self.down:
             x = conv(_reflected(x, 1)).relu_()
@@ -254,12 +238,9 @@ class LamaNetwork(nn.Module):
 
 
 class FourierLayer(nn.Module):
-    """A fast Fourier convolution: local outputs come from all features, global ones from local features and the
-    spectrum.
-    """
+    """A fast Fourier convolution with local and global features."""
 
     def __init__(self, tensors: Tensors, name: str) -> None:
-        """Take the tensors whose names begin with `name`."""
         super().__init__()
         spectral = f"{name}.ffc.convg2g"
         scale, shift = _affine(tensors, f"{name}.bn_l")
@@ -272,7 +253,7 @@ class FourierLayer(nn.Module):
         self.wide = _linear(tensors[f"{spectral}.conv2.weight"] * scale.view(-1, 1, 1, 1), None)
 
     def forward(self, x: Tensor) -> Tensor:
-        """[B, C, h, w] to the same shape; the first C / LOCAL channels are local."""
+        """Map [B, C, h, w] to the same shape; the first C / LOCAL channels are local."""
         padded, local = _reflected(x, 1), x.shape[1] // LOCAL
         near = self.near(padded)
         far = self.far(padded[:, :local].contiguous(memory_format=torch.channels_last))
@@ -281,7 +262,7 @@ class FourierLayer(nn.Module):
         return torch.cat([near, far], 1).relu_()
 
     def _spectral(self, x: Tensor) -> Tensor:
-        """[B, h, w, D] to the same shape: two linear maps, and between them one with a ReLU on the picture's spectrum.
+        """Map [B, h, w, D] to the same shape: linear, linear with ReLU on the spectrum, linear.
 
         Real and imaginary parts of the spectrum alternate in memory, in the channel order of the published tensors.
         """
@@ -293,14 +274,14 @@ class FourierLayer(nn.Module):
 
 
 def _affine(tensors: Tensors, norm: str) -> tuple[Tensor, Tensor]:
-    """A batch norm as scale and offset of each channel."""
+    """The scale and the offset of each channel in a batch norm."""
     mean, var, weight, bias = (tensors[f"{norm}.{key}"] for key in ("running_mean", "running_var", "weight", "bias"))
     scale = weight / torch.sqrt(var + EPSILON)
     return scale, bias - mean * scale
 
 
 def _folded(tensors: Tensors, conv: str, norm: str, *, transposed: bool = False) -> tuple[Tensor, Tensor]:
-    """Weight and bias of a convolution with its batch norm folded in."""
+    """Weight and bias of a convolution, with the batch norm folded in."""
     scale, shift = _affine(tensors, norm)
     shape = (1, -1, 1, 1) if transposed else (-1, 1, 1, 1)
     bias = tensors.get(f"{conv}.bias")
@@ -308,7 +289,7 @@ def _folded(tensors: Tensors, conv: str, norm: str, *, transposed: bool = False)
 
 
 def _conv(weight: Tensor, bias: Tensor, *, stride: int = 1, transposed: bool = False) -> nn.Module:
-    """A convolution with this weight and bias; a transposed one doubles the sides."""
+    """A convolution with this weight and bias; a transposed convolution doubles the sides."""
     one, other, height, width = weight.shape
     conv: nn.Conv2d | nn.ConvTranspose2d
     if transposed:
@@ -321,7 +302,7 @@ def _conv(weight: Tensor, bias: Tensor, *, stride: int = 1, transposed: bool = F
 
 
 def _linear(weight: Tensor, bias: Tensor | None) -> nn.Linear:
-    """A 1×1 convolution of features whose channels are the last axis."""
+    """A 1×1 convolution for features with channels last."""
     linear = nn.Linear(weight.shape[1], weight.shape[0], bias is not None, device="meta")
     linear.weight = nn.Parameter(weight.flatten(1).contiguous())
     if bias is not None:

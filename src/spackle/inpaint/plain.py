@@ -1,4 +1,4 @@
-"""Inpainters without a network: patches of the picture itself; and OpenCV's (pip install 'spackle-nvs[opencv]')."""
+"""Inpainters without a network: patches of the image itself, and OpenCV (pip install 'spackle-nvs[opencv]')."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from spackle.filters import far_fill
 from spackle.inpaint import InpainterOptions
 from spackle.patches import match_patches
 
-RADIUS = 5.0  # pixels around a hole's pixel that colour it
+RADIUS = 5.0  # pixels: how far colours are propagated into a hole
 
 
 class PlainInpainter:
@@ -27,16 +27,15 @@ class PlainInpainter:
 
 
 class ExemplarInpainter(PlainInpainter):
-    """Paints each view by itself, with its own texture: PatchMatch, which starts from the colours of the far rim."""
+    """Paints each view by itself by PatchMatch, with patches of the view; holes start with the far rim's colours."""
 
     name = "exemplar"
     version = "1"
 
     def __init__(self, options: InpainterOptions) -> None:
-        """Ignore the options."""
+        """There are no options."""
 
     def paint(self, rgb: Tensor, hole: Tensor, inverse_depth: Tensor) -> Tensor:
-        """The views [V, H, W, 3] with their holes [V, H, W] painted; see `Inpainter.paint`."""
         return torch.stack([_painted(*view) for view in zip(rgb, hole, inverse_depth, strict=True)])
 
 
@@ -51,7 +50,7 @@ def _painted(rgb: Tensor, hole: Tensor, inverse_depth: Tensor) -> Tensor:
 
 
 class OpenCV:
-    """OpenCV's inpainting of pictures and optical flow."""
+    """OpenCV's inpainting and optical flow."""
 
     def __init__(self, wanted_by: str) -> None:
         """Import OpenCV; InputError, naming `wanted_by`, if it is not installed."""
@@ -64,22 +63,17 @@ class OpenCV:
         self._flow = self._cv2.DISOpticalFlow_create(self._cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
 
     def inpaint(self, rgb: Tensor, mask: Tensor, radius: float) -> Tensor:
-        """Fill a mask [H, W] bool in sRGB [H, W, 3] by Telea's method: [H, W, 3], with 8 bits a channel."""
+        """Fill a mask [H, W] bool in sRGB [H, W, 3] by Telea's method; returns [H, W, 3] with 8 bits per channel."""
         filled = self._cv2.inpaint(_bytes(rgb).numpy(), mask.to(torch.uint8).numpy(), radius, self._cv2.INPAINT_TELEA)
         return torch.from_numpy(filled).float() / 255
 
     def flow(self, picture: Tensor, other: Tensor) -> Tensor:
-        """Dense inverse search (Kroeger et al., 2016): the displacement of each pixel's content in another picture.
+        """Optical flow from one sRGB image [H, W, 3] to another (Kroeger et al., 2016): [H, W, 2] (x, y) in pixels.
 
-        Args:
-            picture: [H, W, 3] sRGB in 0..1.
-            other: [H, W, 3], likewise.
-
-        Returns:
-            [H, W, 2] (x, y) in pixels; zero if a side is too short to search for motion.
+        The flow is zero if a side is too short for the search.
         """
         height, width = picture.shape[:2]
-        if min(height, width) < 16:  # the search works on patches of 8 pixels, at several sizes
+        if min(height, width) < 16:  # the search uses patches of 8 pixels at several scales
             return torch.zeros(height, width, 2, device=picture.device)
         grey = [self._cv2.cvtColor(_bytes(image).numpy(), self._cv2.COLOR_RGB2GRAY) for image in (picture, other)]
         return torch.from_numpy(self._flow.calc(grey[0], grey[1], None)).to(picture.device)
@@ -90,17 +84,15 @@ def _bytes(rgb: Tensor) -> Tensor:
 
 
 class OpencvInpainter(PlainInpainter):
-    """Paints each view by itself by Telea's method: quick, but depth is ignored, and views differ from each other."""
+    """Paints each view by itself by Telea's method: fast, without depth."""
 
     name = "opencv"
 
     def __init__(self, options: InpainterOptions) -> None:
-        """Find the package; InputError if it is not installed."""
         self._opencv = OpenCV("inpainter opencv:")
         self.version = f"telea {RADIUS:g}, cv2 {self._opencv.version}"
 
     def paint(self, rgb: Tensor, hole: Tensor, inverse_depth: Tensor) -> Tensor:
-        """Paint each view by itself; colours in the holes have 8 bits a channel."""
         painted = []
         for view, mask in zip(rgb, hole, strict=True):
             filled = self._opencv.inpaint(view, mask, RADIUS) if bool(mask.any()) else view

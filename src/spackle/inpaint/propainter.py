@@ -1,12 +1,10 @@
-"""ProPainter, the paper's inpainter (optional: pip install 'spackle-nvs[propainter]').
+"""ProPainter, the paper's inpainter, with the networks of pytorchcv (pip install 'spackle-nvs[propainter]').
 
-It propagates pixels along the optical flow into holes, and generates what no frame shows. Its networks come from
-pytorchcv. That package would download weights by itself, so it is given networks that have their weights.
+Pixels are propagated into holes along the optical flow; pixels that no frame shows are generated.
 """
 
 from __future__ import annotations
 
-import hashlib
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,17 +16,18 @@ from torch import Tensor, nn
 from torch.nn.functional import max_pool2d
 
 from spackle.device import enough_memory, pick_device
-from spackle.errors import InputError, reason_in_a_line
+from spackle.errors import InputError, reading
 from spackle.image import working_size
 from spackle.inpaint import MIN_SIDE, InpainterOptions
 from spackle.network_file import load_strict, read_tensors
 
-NETWORKS = ("raft_things", "propainter_rfc", "propainter")  # flow, its completion, colours; prefixes of file names
+NETWORKS = ("raft_things", "propainter_rfc", "propainter")  # flow, completion of flow, colours; prefixes of file names
 SOURCE = "https://github.com/osmr/imgclsmob/releases/tag/v0.0.570"
-SIDE = 640  # pixels of the long side at which it works; it was trained on 432×240
-MULTIPLE = 8  # which divides both sides of the networks' input
-DILATION = 4  # pixels around a hole that count as hole, because its rim is a mixture; the authors' choice
-ITERATIONS = 20  # of the flow, the authors' choice
+SIDE = 640  # default for the long side of the input in pixels; the training had 432×240
+MULTIPLE = 8  # both sides of the networks' input are multiples of this
+DILATION = 4  # steps by which holes are dilated, because rims have mixed colours; the authors' choice
+INSTALL = "pip install 'spackle-nvs[propainter]'"
+ITERATIONS = 20  # of the flow; the authors' choice
 
 
 class PropainterInpainter:
@@ -43,26 +42,19 @@ class PropainterInpainter:
     )
 
     def __init__(self, options: InpainterOptions) -> None:
-        """Find the package, and load the weights. The network works at `options.side`; its pictures are then enlarged
-        to the views' size.
-
-        Raises:
-            InputError: an invalid side, a missing package, or weights that are missing, damaged or another network's.
-        """
+        """Load the networks; InputError for an invalid side, a missing package, or unsuitable weights."""
         self._side = options.side_or(SIDE)
-        version = _package_version()
+        with reading("inpainter propainter", f"cannot import its package ({{reason}}): {INSTALL}"):
+            import pytorchcv
+            import pytorchcv.models.propainter_stream
         self.files: Mapping[str, Path] = weight_files(options.weights)
         self._networks = [_network(name, file) for name, file in self.files.items()]
         self._device = pick_device(options.device)
-        self.version = f"1, pytorchcv {version}, long side {self._side}"
+        self.version = f"1, pytorchcv {pytorchcv.__version__}, long side {self._side}"
 
     @torch.no_grad()
     def paint(self, rgb: Tensor, hole: Tensor, inverse_depth: Tensor) -> Tensor:
-        """Complete the views as the frames of one video, and take its colours in the holes.
-
-        Raises:
-            InputError: memory is short, or the colours are not finite.
-        """
+        """Paint the views, see `Inpainter.paint`; InputError if memory is short, or the colours are not finite."""
         if not bool(hole.any()):
             return rgb
         height, width = hole.shape[1:]
@@ -72,12 +64,12 @@ class PropainterInpainter:
         with enough_memory("lower --inpainter-side", what=f"for ProPainter at {self._side} pixels"):
             filled = self._fill(frames.clamp(0, 1), holes.float()).to(rgb)
         if not bool(filled.isfinite().all()):
-            raise InputError("ProPainter: its colours are not finite: give the published --inpainter-weights")
+            raise InputError("ProPainter: the colours are not finite: give the published --inpainter-weights")
         painted = F.interpolate(filled, (height, width), mode="bicubic").clamp(0, 1).permute(0, 2, 3, 1)
         return torch.where(hole[..., None], painted, rgb)
 
     def _fill(self, frames: Tensor, holes: Tensor) -> Tensor:
-        """Frames [V, 3, h, w] in 0..1, repainted in and around the holes [V, 1, h, w], where `holes` is 1."""
+        """Repaint frames [V, 3, h, w] in 0..1 in and around the holes [V, 1, h, w], 1 in a hole."""
         from pytorchcv.models.propainter_stream import ProPainterIterator, TensorSequencer
 
         count, _, height, width = frames.shape
@@ -107,21 +99,8 @@ def dilated(holes: Tensor) -> Tensor:
     return holes
 
 
-def _package_version() -> str:
-    try:
-        import pytorchcv
-        import pytorchcv.models.propainter_stream
-    except Exception as error:  # a torchvision of another build raises RuntimeError
-        if isinstance(error, ModuleNotFoundError) and (error.name or "").startswith("pytorchcv"):
-            raise InputError("inpainter propainter needs a package: pip install 'spackle-nvs[propainter]'") from error
-        raise InputError(
-            f"inpainter propainter: torchvision cannot be imported ({reason_in_a_line(error)}): "
-            f"install the one that was built for torch {torch.__version__}, from the same source"
-        ) from error
-    return str(pytorchcv.__version__)
-
-
 def _network(name: str, file: Path) -> nn.Module:
+    """A frozen network with the weights of a file, whose unknown tensors are ignored."""
     from pytorchcv.models.propainter import propainter
     from pytorchcv.models.propainter_rfc import propainter_rfc
     from pytorchcv.models.raft import raft_things
@@ -130,45 +109,21 @@ def _network(name: str, file: Path) -> nn.Module:
         network: nn.Module = raft_things(in_normalize=False, iters=ITERATIONS)
     else:
         network = propainter_rfc() if name == "propainter_rfc" else propainter()
-    give_weights(network, name, file)
-    return network
+    advice = f"unpack the file of {name} from {SOURCE} again"
+    ours, found = network.state_dict().keys(), read_tensors(file, advice)
+    return load_strict(network, {key: tensor for key, tensor in found.items() if key in ours}, file, advice)
 
 
 def weight_files(folder: Path | None) -> dict[str, Path]:
-    """The file of each of `NETWORKS` in a folder: NAME.pth, NAME-….pth as it is published, or .safetensors.
-
-    Raises:
-        InputError: the folder is missing, or does not hold exactly one file of each.
-    """
-    wanted = f"{', '.join(NETWORKS)}: one .pth file of each, unpacked from {SOURCE}"
-    if folder is None:
-        raise InputError(f"inpainter propainter: has no weights: give --inpainter-weights FOLDER with {wanted}")
-    try:
-        names = sorted(file.name for file in folder.iterdir())
-    except (OSError, ValueError) as error:
-        raise InputError(f"--inpainter-weights {folder}: no folder that can be read: give one with {wanted}") from error
+    """The files NAME.pth, NAME-….pth or .safetensors of all `NETWORKS` in a folder; InputError unless one file each."""
     files = {}
     for network in NETWORKS:
-        own = [name for name in names if re.fullmatch(rf"{network}(-.*)?\.(pth|safetensors)", name)]
-        if len(own) != 1:
-            found = f"{own[0]} and {own[1]}" if own else f"no {network}-….pth"
-            raise InputError(f"--inpainter-weights {folder}: holds {found}: it should hold {wanted}")
-        files[network] = folder / own[0]
+        pattern = rf"{network}(-.*)?\.(pth|safetensors)"
+        found = [] if folder is None else [file for file in folder.glob("*") if re.fullmatch(pattern, file.name)]
+        if len(found) != 1:
+            raise InputError(
+                f"--inpainter-weights {folder}: has {len(found)} files {network}-….pth: give a folder with one file "
+                f"for each of {', '.join(NETWORKS)}, unpacked from {SOURCE}"
+            )
+        files[network] = found[0]
     return files
-
-
-def give_weights(network: nn.Module, name: str, file: Path) -> None:
-    """Fill a network from its file and freeze it; half precision is widened.
-
-    As in the package that publishes them, tensors that the network does not have are ignored.
-
-    Raises:
-        InputError: the file is missing or broken, or holds another network.
-    """
-    advice = f"unpack the file of {name} from {SOURCE} again"
-    found = read_tensors(file, advice)
-    published = re.search(r"-\d{4}-([0-9a-f]{8})\.pth$", file.name)  # the first digits of its SHA-1
-    if published and not hashlib.sha1(file.read_bytes(), usedforsecurity=False).hexdigest().startswith(published[1]):
-        raise InputError(f"{file}: damaged, because its SHA-1 is not the one in its name: {advice}")
-    ours = network.state_dict().keys()
-    load_strict(network, {key: tensor for key, tensor in found.items() if key in ours}, file, advice)

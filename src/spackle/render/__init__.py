@@ -1,4 +1,4 @@
-"""Renderers: turn Gaussians and a camera into an image, its depth and its opacity."""
+"""Renderers turn Gaussians and a camera into colour, depth and opacity."""
 
 import logging
 from collections.abc import Sequence
@@ -19,10 +19,9 @@ LOG = logging.getLogger("spackle")
 
 
 def get_renderer(device: str = "auto") -> Renderer:
-    """The renderer for a device: "cpu", "cuda", or "auto" for the best one on this machine.
+    """The renderer for a device: "cpu", "cuda", or "auto" for "cuda" if available.
 
-    Raises:
-        InputError: the device is unknown, or its renderer cannot run here.
+    InputError if the device is unknown, or the renderer cannot run on this machine.
     """
     if device not in ("auto", "cpu", "cuda"):
         raise InputError(f"--device {device}: unknown device; use auto, cpu or cuda")
@@ -33,7 +32,7 @@ def get_renderer(device: str = "auto") -> Renderer:
         except InputError as error:
             if device == "cuda":
                 raise
-            LOG.warning("rendering on the processor: %s", error)
+            LOG.warning("rendering on the CPU: %s", error)
     return CpuRenderer()
 
 
@@ -45,7 +44,7 @@ def render_batch(
     tiles: Sequence[Tensor | None],
     onto: Sequence[Rendering | None],
 ) -> list[Rendering]:
-    """Render several views of one size, see `Renderer.render`: in one batch on a GPU, else one by one."""
+    """Render several views of one size, see `Renderer.render`; on a GPU in one batch."""
     if hasattr(renderer, "render_batch"):
         together: list[Rendering] = renderer.render_batch(scenes, cameras, tiles=tiles, onto=onto)
         return together
@@ -54,6 +53,6 @@ def render_batch(
 
 
 def device_of(renderer: Renderer) -> torch.device:
-    """The device on which a renderer computes."""
+    """The device of a renderer."""
     place: torch.device = getattr(renderer, "device", torch.device("cpu"))
     return place

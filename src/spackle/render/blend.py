@@ -1,7 +1,7 @@
-"""Blending of tiles: front to back, in linear light.
+"""Blend the Gaussians of a tile front to back in linear light.
 
-A tile's pixels are stored in patches of sixteen, each of which fills a vector register. Per-pixel functions have
-neither branches nor calls, so that loops over pixels run in vector registers.
+A tile's pixels are stored in patches of sixteen, the size of a vector register. Functions for pixels have neither
+branches nor calls: only then do loops over pixels run in vector registers.
 """
 
 from __future__ import annotations
@@ -15,31 +15,30 @@ from spackle._numba import MANTISSA, ONE, ZERO, Array, inlined_kernel, kernel
 from spackle.render.project import RECORD, Arrays, Numbers, in_tile
 from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_STOP
 
-# Constants of per-pixel functions are float32 throughout: a Python float would widen a whole expression to float64.
 LIMIT = np.float32(ALPHA_MAX)
 FAINT = np.float32(ALPHA_MIN)
 LOWEST = np.float32(-60.0)
-ROUND = np.float32(1.5 * 2.0**23)  # adding this rounds a small float to an integer in its low bits
+ROUND = np.float32(1.5 * 2.0**23)  # this plus a small float has the rounded float as integer in its low bits
 ROUND_BITS = np.int32(0x4B400000)
 KNEE = np.float32(0.0031308)  # linear value at which sRGB changes from a line to a power
 LINE = np.float32(12.92)
 
 
 def _power_series(function: Any, low: float, high: float, degree: int) -> list[np.float32]:
-    """Coefficients, lowest power first, of a near-minimax polynomial for a function on low..high."""
+    """Coefficients, lowest power first, of a near-minimax polynomial on low..high."""
     fit = Chebyshev.interpolate(function, degree, [low, high])
     return [np.float32(c) for c in fit.convert(kind=Polynomial).coef]
 
 
-# 2^x on -½..½, with an error of 1e-7.
+# 2^x on -½..½; error 1e-7.
 E0, E1, E2, E3, E4, E5 = _power_series(np.exp2, -0.5, 0.5, 5)
-# sRGB's power as a polynomial in t, where the fourth root of the linear value is MIDDLE + SPREAD·t; error 2e-7.
+# sRGB's power as a polynomial in t, with the fourth root of the linear value = MIDDLE + SPREAD·t; error 2e-7.
 _root = float(KNEE) ** 0.25
 MIDDLE, SPREAD = np.float32((1 + _root) / 2), np.float32((1 - _root) / 2)
 S0, S1, S2, S3, S4, S5, S6, S7, S8 = _power_series(
     lambda t: 1.055 * ((1 + _root) / 2 + (1 - _root) / 2 * t) ** (5 / 3) - 0.055, -1.0, 1.0, 8
 )
-# The inverse of that power is y²·q^1.6, where q is the fourth root of y; relative error of a few 1e-8.
+# The inverse power is y²·q^1.6, with q the fourth root of y; relative error of a few 1e-8.
 ENCODED_KNEE = np.float32(0.04045)
 _low_root = ((float(ENCODED_KNEE) + 0.055) / 1.055) ** 0.25
 D0, D1, D2, D3, D4, D5 = _power_series(lambda q: q**1.6, _low_root, 1.0, 5)
@@ -57,7 +56,7 @@ def exp2(x: np.float32) -> np.float32:
 
 @kernel
 def alpha_of(power: np.float32) -> np.float32:
-    """A Gaussian's alpha, 2^power: clamped from above, and 0 if below the threshold."""
+    """Alpha, 2^power: clamped from above, and 0 below the threshold."""
     alpha = min(exp2(max(power, LOWEST)), LIMIT)
     return alpha if alpha >= FAINT else ZERO
 
@@ -83,39 +82,39 @@ def decode_srgb(encoded: np.float32) -> np.float32:
 
 @kernel
 def srgb_slope(linear: np.float32, encoded: np.float32) -> np.float32:
-    """The derivative of `encode_srgb` at `linear`, given its value `encoded` there; 0 where it clamps."""
+    """The derivative of `encode_srgb` at `linear`, given `encoded = encode_srgb(linear)`."""
     slope = LINE if linear <= KNEE else (encoded + np.float32(0.055)) / (np.float32(2.4) * linear)
     return slope if ZERO <= linear <= ONE else ZERO
 
 
-# A tile's state is one flat buffer of six planes: light (the transmittance, 0 once a pixel is full), red,
-# green, blue, depth, alpha. It is one buffer, because the compiler then knows that the planes do not overlap. Alpha is
-# summed separately: computed as 1 - light, a small alpha would lose digits, and so would depth, which is divided by it.
+# A tile's state is a flat buffer of six planes: light (the transmittance, 0 once a pixel is full), red, green, blue,
+# depth, alpha. In one buffer, the compiler knows that planes do not overlap. Alpha is summed separately, because
+# 1 - light would lose digits of a small alpha.
 PLANE = TILE * TILE
 STATE = 6 * PLANE
 
-# A plane stores its patches of PATCH × PATCH pixels one after the other. Most Gaussians are small: the patches that one
-# touches are about two thirds as many as the tile's rows that it touches.
+# A plane stores its patches of PATCH × PATCH pixels one after the other. A typical Gaussian touches fewer patches than
+# rows of the tile.
 PATCH = 4
 PATCHES = TILE // PATCH  # number of patches along a tile's side
 LANES = PATCH * PATCH
 
 STOP = np.float32(TRANSMITTANCE_STOP)
-SLACK = np.float32(1e-3)  # pixels, allowance for rounding
+SLACK = np.float32(1e-3)  # pixels, for rounding
 SIDE = np.float32(TILE)
-CHECK_EVERY = 16  # Gaussians that are fetched at once; after each batch the whole tile is checked for being full
+CHECK_EVERY = 16  # Gaussians per batch; after each batch, blending ends if the whole tile is full
 
 
 class TileLists(NamedTuple):
-    """The list of Gaussians that each tile draws, front to back."""
+    """The Gaussians of each tile, front to back."""
 
-    ids: Array  # [E] int32, the lists one after the other
+    ids: Array  # [E] int32, all lists one after the other
     starts: Array  # [T + 1] int64, the start of each tile's list
 
 
 @kernel
 def blend_patch(state: Array, offset: np.uint64, left: np.float32, top: np.float32, splat: Numbers) -> None:
-    """Draw one Gaussian into the patch whose first pixel is (left, top); all coordinates are relative to the tile."""
+    """Draw a Gaussian into the patch with the first pixel (left, top), relative to the tile."""
     x, y, slope, across, fall, peak, depth, red, green, blue = splat
     for lane in range(LANES):
         i = offset + np.uint64(lane)
@@ -137,7 +136,7 @@ def blend_patch(state: Array, offset: np.uint64, left: np.float32, top: np.float
 @kernel
 def span_of(center: np.float32, reach: np.float32) -> tuple[int, int]:
     """The range first..last (exclusive) of a tile's rows or columns that a Gaussian may touch."""
-    # Adding one before or after truncation rounds up; a call to ceil or floor would cost more than drawing a patch.
+    # One is added before or after truncation to round up: ceil or floor would cost more than drawing a patch.
     first = int(max(center - reach - SLACK, -ONE) + ONE)
     last = min(int(min(center + reach + SLACK, SIDE)) + 1, TILE)
     return first, last
@@ -145,14 +144,14 @@ def span_of(center: np.float32, reach: np.float32) -> tuple[int, int]:
 
 @kernel
 def patches_of(center: np.float32, reach: np.float32) -> tuple[int, int]:
-    """The range of patches, first..last (exclusive), along one axis of a tile that a Gaussian may touch."""
+    """The range first..last (exclusive) of patches along one axis of a tile that a Gaussian may touch."""
     first, last = span_of(center, reach)
     return first // PATCH, (last + PATCH - 1) // PATCH
 
 
 @inlined_kernel
 def blend_splat(state: Array, record: Array, left: int, top: int) -> None:
-    """Draw one Gaussian into the tile whose first pixel is (left, top)."""
+    """Draw a Gaussian into the tile with the first pixel (left, top)."""
     x, y, slope, across, fall, peak, half_width, half_height, depth, red, green, blue = in_tile(record, left, top)
     splat = x, y, slope, across, fall, peak, depth, red, green, blue
     first_row, last_row = patches_of(y, half_height)
@@ -172,7 +171,7 @@ def pixel_index(row: int, column: int) -> int:
 
 @kernel
 def blend_splats(state: Array, records: Array, count: int, left: int, top: int) -> None:
-    """Draw the first `count` records into a tile; this is a separate function so that constants stay in registers."""
+    """Draw the first `count` records into a tile; in a separate function, constants stay in registers."""
     for index in range(count):
         blend_splat(state, records[index], left, top)
 
@@ -188,7 +187,7 @@ def is_full(state: Array) -> bool:
 
 @kernel
 def store_tile(state: Array, left: int, top: int, images: Arrays) -> None:
-    """Compute a tile's final colours, depth and alpha, and write the pixels inside the image."""
+    """Write a tile's colours, depth and alpha to the pixels inside the image."""
     rgb, depth, alpha, linear = images
     rows, columns = min(TILE, depth.shape[0] - top), min(TILE, depth.shape[1] - left)
     if len(linear) > 0:
@@ -215,10 +214,7 @@ def store_color(state: Array, left: int, top: int, rows: int, columns: int, imag
 
 @kernel
 def blend_tiles(first: int, last: int, tiles: Array, lists: TileLists, records: Array, images: Arrays) -> None:
-    """Draw tiles first..last of the list `tiles` [K] into images: rgb [H, W, 3], depth and alpha [H, W].
-
-    Linear colour goes to the fourth image, [H, W, 3], unless that is empty.
-    """
+    """Draw the tiles first..last of `tiles` [K] into images: rgb [H, W, 3], depth, alpha, linear colour or empty."""
     ids, starts = lists
     columns = (images[1].shape[1] + TILE - 1) // TILE
     state, near = np.empty(STATE, np.float32), np.empty((CHECK_EVERY, RECORD), np.float32)
@@ -239,7 +235,7 @@ def blend_tiles(first: int, last: int, tiles: Array, lists: TileLists, records: 
 
 @kernel
 def fetch(records: Array, ids: Array, begin: int, count: int, near: Array) -> None:
-    """Copy records, which are scattered in memory, to `near` in one go, so that their cache misses overlap."""
+    """Copy records, which are scattered in memory, to `near`; in this loop their cache misses overlap."""
     for n in range(count):
         record = records[ids[begin + n]]
         for field in range(RECORD):

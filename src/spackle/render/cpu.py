@@ -1,4 +1,4 @@
-"""The CPU renderer, differentiable in all its inputs: project, sort, assign to tiles, blend."""
+"""The CPU renderer: project, sort, assign to tiles, blend; `gradients` adds the backward pass."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from spackle.render.protocol import Rendering, check_tiles
 
 PROJECT_GRAIN = 1 << 16  # Gaussians a thread projects at a time
 BLEND_GRAIN = 64  # tiles a thread blends at a time
-DIGIT_BITS = 11  # three digits hold the 31 bits of a positive float; a table of 2048 counts stays in cache
+DIGIT_BITS = 11  # three digits hold the 31 bits of a positive float
 BUCKETS = 1 << DIGIT_BITS
 MASK = BUCKETS - 1
 
@@ -37,14 +37,14 @@ class CpuRenderer:
         tiles: Tensor | None = None,
         onto: Rendering | None = None,
     ) -> Rendering:
-        """Draw Gaussians as a camera sees them; see `Renderer.render`. The result is float32."""
+        """See `Renderer.render`; the result is float32."""
         sets = [gaussians] if isinstance(gaussians, Gaussians) else list(gaussians)
         view = KernelCamera.of(camera, eps2d)
         wanted = wanted_tiles(view, tiles)
         onto = onto if tiles is not None else None
         inputs = [t for part in sets for t in part.tensors] + list(onto.tensors if onto else ())
         if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
-            # Imported by name, so that rendering alone never loads the gradient code.
+            # Without gradients this module, which needs time to compile, is not loaded.
             drawn: Rendering = import_module("spackle.render.gradients").draw(sets, view, wanted, onto)
             return drawn
         return draw(sets, view, wanted, onto).rendering()
@@ -52,50 +52,59 @@ class CpuRenderer:
 
 @dataclasses.dataclass(frozen=True)
 class Drawing:
-    """A rendering, and the intermediate results that its gradient needs."""
+    """A rendering, and the intermediate results that the gradient needs."""
 
     view: KernelCamera
-    wanted: Array  # [rows, columns] bool, the tiles that were drawn
+    wanted: Array  # [rows, columns] bool: the drawn tiles
     splats: Splats
     lists: TileLists
-    images: Arrays  # float32: rgb [H, W, 3] sRGB, depth [H, W], alpha [H, W], and the colour before sRGB or [0, 0, 3]
+    images: Arrays  # float32: rgb [H, W, 3] sRGB, depth [H, W], alpha [H, W], linear colour [H, W, 3] or [0, 0, 3]
 
     def rendering(self) -> Rendering:
-        """The images as tensors, which share their memory."""
+        """The images as tensors that share memory."""
         return Rendering(*(torch.from_numpy(image) for image in self.images[:3]))
 
 
 def draw(
     sets: Sequence[Gaussians], view: KernelCamera, wanted: Array, onto: Rendering | None, *, keep_linear: bool = False
 ) -> Drawing:
-    """Draw sets of Gaussians as one, in the wanted tiles [rows, columns] bool, over a copy of `onto`.
+    """Draw sets of Gaussians in the wanted tiles [rows, columns] bool, over a copy of `onto` (None: black).
 
-    If `onto` is None, the other tiles are black and empty. The gradient needs the linear colour (`keep_linear`).
+    The gradient needs the linear colour (`keep_linear`).
     """
     splats, lists = deal_out(sets, view, wanted)
-    return blend(splats, lists, view, wanted, onto, keep_linear)
+    size = (view.height, view.width)
+    linear = np.zeros((*(size if keep_linear else (0, 0)), 3), np.float32)
+    if onto is None:
+        images = tuple(np.zeros((*size, *rest), np.float32) for rest in ((3,), (), ()))
+    else:
+        images = tuple(np.array(as_array(image)) for image in onto.tensors)
+    images = (*images, linear)
+    tiles = np.flatnonzero(wanted)
+    run_chunks(lambda a, b: blend_tiles(a, b, tiles, lists, splats.records, images), len(tiles), BLEND_GRAIN)
+    return Drawing(view, wanted, splats, lists, images)
 
 
 def touched_tiles(gaussians: Gaussians, camera: Camera) -> Tensor:
-    """[ceil(H/16), ceil(W/16)] bool: tiles whose pixels can change when these Gaussians are added or removed."""
+    """[ceil(H/16), ceil(W/16)] bool: tiles with pixels that these Gaussians can change."""
     view = KernelCamera.of(camera, 0.0)
     _, lists = deal_out([gaussians], view, wanted_tiles(view, None))
     return torch.from_numpy(np.diff(lists.starts) > 0).reshape(view.tiles)
 
 
 def deal_out(sets: Sequence[Gaussians], view: KernelCamera, wanted: Array) -> tuple[Splats, TileLists]:
-    """Project and sort Gaussians, and assign them to tiles: everything except blending."""
+    """Project and sort Gaussians, and assign them to tiles."""
     splats, spans = project(sets, view, wanted)
     return splats, list_tiles(sort_by_depth(splats.keys, splats.ids, spans), splats.boxes, wanted)
 
 
 def as_array(tensor: Tensor) -> Array:
-    """A tensor as a contiguous float32 array; not copied if it already is one on the CPU."""
+    """A tensor as a contiguous float32 array, without copy if possible."""
     return tensor.detach().to(device="cpu", dtype=torch.float32).contiguous().numpy()
 
 
 def wanted_tiles(view: KernelCamera, tiles: Tensor | None) -> Array:
-    """The tiles to draw, [rows, columns] bool."""
+    """The tiles to draw [rows, columns] bool; all for None."""
     if tiles is None:
         return np.ones(view.tiles, np.bool_)
     check_tiles(tiles, view.height, view.width)
@@ -103,14 +112,14 @@ def wanted_tiles(view: KernelCamera, tiles: Tensor | None) -> Array:
 
 
 def project(sets: Sequence[Gaussians], view: KernelCamera, wanted: Array) -> tuple[Splats, Array]:
-    """Project several sets without joining them, and keep the Gaussians that touch wanted tiles.
+    """Project Gaussians, and keep those that touch wanted tiles.
 
     Returns:
-        The splats, and the spans (start, count) [C, 2] of the keys and ids that are in use.
+        The splats, and the spans (start, count) [C, 2] of used keys and ids.
     """
     n, before, first = sum(len(part) for part in sets), count_before(wanted), 0
     records, boxes = np.empty((n, RECORD), np.float32), np.empty((n, 4), np.uint16)
-    splats = Splats(records, boxes, np.empty(n, np.uint32), np.empty(n, np.int32))  # unwritten parts take no memory
+    splats = Splats(records, boxes, np.empty(n, np.uint32), np.empty(n, np.int32))
     spans: list[tuple[int, int]] = []
     for part in sets:
         scene = tuple(as_array(tensor) for tensor in part.tensors)
@@ -129,10 +138,10 @@ def sort_by_depth(keys: Array, ids: Array, spans: Array) -> Array:
     Args:
         keys: [N] uint32, the bits of positive floats; overwritten.
         ids: [N] int32; overwritten.
-        spans: [C, 2] int64, the pieces (start, count) of keys and ids that are in use.
+        spans: [C, 2] int64, the used pieces (start, count) of keys and ids.
 
     Returns:
-        [M] int32, the ids in order of their keys; M is the sum of the counts.
+        [M] int32, the ids in the order of keys; M is the sum of all counts.
     """
     total = int(spans[:, 1].sum())
     items, others = (keys, ids), (np.empty(total, np.uint32), np.empty(total, np.int32))
@@ -144,7 +153,7 @@ def sort_by_depth(keys: Array, ids: Array, spans: Array) -> Array:
 
 
 def _sort_digit(items: Arrays, spans: Array, shift: int, into: Arrays) -> None:
-    """Sort (keys, ids) only by the digit at bit `shift`; items with equal digits keep their order."""
+    """Sort (keys, ids) by the digit at bit `shift`; items with equal digits keep their order."""
     counts = np.zeros((len(spans), BUCKETS), np.int64)
     run_chunks(lambda a, b: count_digits(a, b, spans, items[0], shift, counts), len(spans), 1)
     positions = starts_of(counts)
@@ -152,24 +161,20 @@ def _sort_digit(items: Arrays, spans: Array, shift: int, into: Arrays) -> None:
 
 
 def even_spans(total: int, parts: int) -> Array:
-    """Cut 0..total into equal pieces (start, count), [parts, 2] int64."""
+    """Divide 0..total into equal pieces (start, count), [parts, 2] int64."""
     edges = np.linspace(0, total, parts + 1).astype(np.int64)
     return np.stack([edges[:-1], np.diff(edges)], axis=1)
 
 
 def starts_of(counts: Array) -> Array:
-    """Start position of each piece's items in each bucket; buckets are in order, and so are pieces within a bucket.
-
-    Args:
-        counts: [C, B], the number of items of bucket b in piece c.
-    """
+    """Start positions [C, B] of items, ordered by bucket and then by piece, from the numbers of items [C, B]."""
     flat = counts.T.reshape(-1)
     return np.ascontiguousarray((np.cumsum(flat) - flat).reshape(counts.shape[::-1]).T)
 
 
 @kernel
 def count_digits(first: int, last: int, spans: Array, keys: Array, shift: int, counts: Array) -> None:
-    """For each of the pieces first..last, count how often each digit occurs in its keys."""
+    """Count the occurrences of each digit in the keys of pieces first..last."""
     for piece in range(first, last):
         row = counts[piece]
         for i in range(spans[piece, 0], spans[piece, 0] + spans[piece, 1]):
@@ -178,7 +183,7 @@ def count_digits(first: int, last: int, spans: Array, keys: Array, shift: int, c
 
 @kernel
 def scatter(first: int, last: int, spans: Array, items: Arrays, shift: int, positions: Array, into: Arrays) -> None:
-    """Move the (keys, ids) of pieces first..last to their sorted positions."""
+    """Move the keys and ids of pieces first..last to their sorted positions."""
     (keys, ids), (sorted_keys, sorted_ids) = items, into
     for piece in range(first, last):
         row = positions[piece]
@@ -196,7 +201,7 @@ def list_tiles(order: Array, boxes: Array, wanted: Array) -> TileLists:
     Args:
         order: [M] int32, visible Gaussians front to back.
         boxes: [N, 4] uint16, the tiles that each Gaussian touches.
-        wanted: [rows, columns] bool, the tiles to make lists for; the others' lists stay empty.
+        wanted: [rows, columns] bool; lists of other tiles are empty.
     """
     parts = thread_count()
     spans = even_spans(len(order), parts)
@@ -214,7 +219,7 @@ def list_tiles(order: Array, boxes: Array, wanted: Array) -> TileLists:
 def count_entries(
     first: int, last: int, spans: Array, order: Array, boxes: Array, wanted: Array, sorted_boxes: Array, counts: Array
 ) -> None:
-    """Count each tile's entries in pieces first..last of the order, and store the Gaussians' boxes in that order."""
+    """Count the entries of each tile in pieces first..last of the order, and copy the boxes in this order."""
     columns, flat = wanted.shape[1], wanted.reshape(-1)
     for piece in range(first, last):
         row_counts = counts[piece]
@@ -223,8 +228,7 @@ def count_entries(
             i = np.uint64(order[k])
             left, right, top, bottom = boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3]
             sorted_boxes[k, 0], sorted_boxes[k, 1], sorted_boxes[k, 2], sorted_boxes[k, 3] = left, right, top, bottom
-            # The bounds are read back on purpose: with bounds in memory the compiler emits scalar loops, and vector
-            # code costs more for a box of a few tiles.
+            # With bounds read from memory the compiler emits scalar loops, which are faster for a box of a few tiles.
             for row in range(sorted_boxes[k, 2], sorted_boxes[k, 3]):
                 for column in range(sorted_boxes[k, 0], sorted_boxes[k, 1]):
                     tile = np.uint64(row * columns + column)
@@ -236,7 +240,7 @@ def count_entries(
 def write_entries(
     first: int, last: int, spans: Array, order: Array, sorted_boxes: Array, wanted: Array, positions: Array, ids: Array
 ) -> None:
-    """Write each tile's entries from pieces first..last of the order; `sorted_boxes` are in that order."""
+    """Write the entries of each tile from pieces first..last of the order."""
     columns, flat = wanted.shape[1], wanted.reshape(-1)
     for piece in range(first, last):
         places = positions[piece]
@@ -248,19 +252,3 @@ def write_entries(
                     if flat[tile]:
                         ids[np.uint64(places[tile])] = order[k]
                         places[tile] += 1
-
-
-def blend(
-    splats: Splats, lists: TileLists, view: KernelCamera, wanted: Array, onto: Rendering | None, keep_linear: bool
-) -> Drawing:
-    """Draw the wanted tiles; see `draw`."""
-    size = (view.height, view.width)
-    linear = np.zeros((*(size if keep_linear else (0, 0)), 3), np.float32)
-    if onto is None:
-        images = tuple(np.zeros((*size, *rest), np.float32) for rest in ((3,), (), ()))
-    else:
-        images = tuple(np.array(as_array(image)) for image in onto.tensors)
-    images = (*images, linear)
-    tiles = np.flatnonzero(wanted)
-    run_chunks(lambda a, b: blend_tiles(a, b, tiles, lists, splats.records, images), len(tiles), BLEND_GRAIN)
-    return Drawing(view, wanted, splats, lists, images)

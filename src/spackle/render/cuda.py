@@ -1,4 +1,4 @@
-"""The GPU renderer: gsplat with the interface of `Renderer`."""
+"""The GPU renderer, by gsplat."""
 
 from __future__ import annotations
 
@@ -19,14 +19,13 @@ from spackle.gaussians import Gaussians, quat_to_matrix
 from spackle.render.project import FINITE
 from spackle.render.protocol import NEAR_PLANE, TILE, Rendering, check_tiles, paste, tile_grid
 
-VERSIONS = ("1.5.3", "1.6")  # gsplat >= the first, < the second: others do not build, or have another largest alpha
 INSTALL = "pip install 'spackle-nvs[cuda]'"
-MOST_ENTRIES = 2**31 - 1  # in the tile lists, because gsplat's rasteriser counts them in int32
+MOST_ENTRIES = 2**31 - 1  # in the lists of tiles, which gsplat counts in int32
 
 
 @dataclasses.dataclass(frozen=True)
 class Material:
-    """A set of Gaussians on the GPU, as gsplat needs it, in float32."""
+    """A set of Gaussians on the GPU in float32, as input of gsplat."""
 
     means: Tensor  # [N, 3]
     covariances: Tensor  # [N, 6]
@@ -35,10 +34,7 @@ class Material:
 
     @staticmethod
     def of(part: Gaussians, device: torch.device) -> Material:
-        """Upload a set.
-
-        Gaussians that are not finite become transparent; removing them would synchronise with the GPU.
-        """
+        """Upload a set; Gaussians that are not finite become transparent."""
         there = [tensor.to(device, torch.float32, non_blocking=True) for tensor in part.tensors]
         finite = torch.stack([t.detach().isfinite().unsqueeze(-1).flatten(1).all(1) for t in there]).all(0)
         usable = Gaussians(*(torch.where(finite if t.ndim == 1 else finite[:, None], t, 0) for t in there))
@@ -46,30 +42,27 @@ class Material:
 
 
 def upper_covariances(part: Gaussians) -> Tensor:
-    """[N, 6]: xx, xy, xz, yy, yz, zz of Σ, without matrix products, which autocast and TF32 would round."""
+    """[N, 6]: xx, xy, xz, yy, yz, zz of Σ; matrix products would be rounded by autocast and TF32."""
     x, y, z = (quat_to_matrix(part.quats) * part.scales[:, None, :]).unbind(1)
     pairs = ((x, x), (x, y), (x, z), (y, y), (y, z), (z, z))
     return torch.stack([(a * b).sum(-1) for a, b in pairs], dim=-1)
 
 
 class SetStore:
-    """Cache of sets that have been uploaded to the GPU; an entry lives as long as the set's means.
-
-    A set that requires gradients is not cached, because it changes at every step.
-    """
+    """Cache of sets on the GPU; an entry lives as long as the set's means. Sets with gradients are not cached."""
 
     def __init__(self, device: torch.device) -> None:
         self.device = device
         self._kept = WeakTensorKeyDictionary()
 
     def material(self, part: Gaussians) -> Material:
-        """The set on the GPU; uploaded again if a tensor has been replaced or changed in place."""
+        """The set on the GPU; it is uploaded again if a tensor was replaced or changed in place."""
         if any(t.requires_grad or t.is_inference() for t in part.tensors):  # inference tensors have no version counter
             return Material.of(part, self.device)
         others, state = part.tensors[1:], [(t._version, t.data_ptr()) for t in part.tensors]
         kept = self._kept.get(part.means)  # type: ignore[no-untyped-call]
         if kept is None or kept[1] != state or any(a is not b for a, b in zip(kept[0], others, strict=True)):
-            with torch.inference_mode(False):  # a later caller may need gradients of a drawing with it
+            with torch.inference_mode(False):  # a later caller may need gradients
                 kept = self._kept[part.means] = others, state, Material.of(part, self.device)
         material: Material = kept[2]
         return material
@@ -78,16 +71,12 @@ class SetStore:
 class GsplatRenderer:
     """Classic 3D Gaussian splatting by gsplat on an NVIDIA GPU; a `Renderer`.
 
-    Gaussians may lie on the CPU or on the GPU: the images are returned on the first set's device. Sets without
-    gradients stay on the GPU as long as their tensors exist, so a scene is uploaded only once.
+    Gaussians may be on the CPU or on the GPU; images are on the device of the first set. Sets without gradients stay on
+    the GPU as long as their tensors exist.
     """
 
     def __init__(self, device: str | torch.device = "cuda") -> None:
-        """Load gsplat.
-
-        Raises:
-            InputError: there is no GPU or no gsplat, or gsplat's kernels cannot be built here.
-        """
+        """Load gsplat; InputError if there is no GPU or no gsplat, or gsplat's kernels cannot be built."""
         self.device = torch.device(device)
         self._gsplat = load_gsplat(self.device)
         self._store = SetStore(self.device)
@@ -101,11 +90,7 @@ class GsplatRenderer:
         tiles: Tensor | None = None,
         onto: Rendering | None = None,
     ) -> Rendering:
-        """Draw Gaussians as a camera sees them; see `Renderer.render`. The result is float32.
-
-        Raises:
-            MemoryShort: the GPU's memory is too small.
-        """
+        """See `Renderer.render`; the result is float32. MemoryShort if the GPU's memory is too small."""
         sets = [gaussians] if isinstance(gaussians, Gaussians) else gaussians
         return self.render_batch([sets], [camera], eps2d=eps2d, tiles=[tiles], onto=[onto])[0]
 
@@ -118,11 +103,9 @@ class GsplatRenderer:
         tiles: Sequence[Tensor | None] | None = None,
         onto: Sequence[Rendering | None] | None = None,
     ) -> list[Rendering]:
-        """Render several views of one size, with the same bits as `render`, but waiting for the GPU only once.
+        """Render several views of one size in one batch, with the same bits as `render`.
 
-        Raises:
-            ValueError: a grid of tiles does not fit the view, or the views differ in size.
-            MemoryShort: the GPU's memory is too small.
+        ValueError if the views differ in size, or `tiles` do not fit. MemoryShort if the GPU's memory is too small.
         """
         width, height = cameras[0].width, cameras[0].height
         if any((camera.width, camera.height) != (width, height) for camera in cameras):
@@ -151,11 +134,11 @@ class GsplatRenderer:
         eps2d: float,
         wanted: Sequence[Tensor | None],
     ) -> list[Rendering]:
-        """Draw the images in the tiles `wanted` [rows, columns]; other pixels are undefined."""
+        """Draw the tiles `wanted` [rows, columns]; other pixels are undefined."""
         width, height = cameras[0].width, cameras[0].height
         rows, columns = tile_grid(height, width)
         materials: list[Material] = []
-        seen: list[Any] = []  # for each set: its view's number, radii [N, 2], means2d [N, 2], depths, conics [N, 3]
+        seen: list[Any] = []  # for each set: number of the view, radii [N, 2], means2d [N, 2], depths, conics [N, 3]
         for k, (parts, (view, lens)) in enumerate(zip(scenes, self._matrices(cameras), strict=True)):
             for part in parts:
                 if not len(part):  # gsplat 1.5.3 divides by the number of Gaussians
@@ -199,34 +182,14 @@ class GsplatRenderer:
 
 
 def load_gsplat(device: torch.device) -> ModuleType:
-    """Import gsplat and check its kernels; raises the errors of `GsplatRenderer`."""
+    """Import gsplat with its kernels, which are built at the first import; see `GsplatRenderer` for errors."""
     if device.type == "cuda" and not torch.cuda.is_available():
         raise InputError("--device cuda: PyTorch sees no NVIDIA GPU on this machine; use --device cpu")
-    # gsplat's kernels are built at its first import: compilers fail in many ways.
-    with reading("--device cuda", "gsplat's kernels cannot be built here: {reason}; use --device cpu"):
-        try:
-            import gsplat
-        except ModuleNotFoundError as error:
-            if error.name == "gsplat":
-                raise InputError(f"--device cuda: needs gsplat: {INSTALL}, or use --device cpu") from error
-            raise
-        check_version(gsplat.__version__)
+    with reading("--device cuda", f"gsplat cannot be used ({{reason}}): {INSTALL}, or use --device cpu"):
+        import gsplat
         from gsplat.cuda import _backend
-    if _backend._C is None:
-        raise InputError(
-            "--device cuda: gsplat has no kernels here: it needs a CUDA toolkit (nvcc) or a wheel built for this "
-            "PyTorch; use --device cpu"
-        )
+
+        if _backend._C is None:
+            raise RuntimeError("it has no kernels: it needs a CUDA toolkit (nvcc) or a wheel built for this PyTorch")
     package: ModuleType = gsplat
     return package
-
-
-def check_version(found: str) -> None:
-    """InputError for an unsuitable version of gsplat."""
-    numbers = [int(part) for part in found.split("+")[0].split(".") if part.isdigit()]
-    low, high = ([int(part) for part in version.split(".")] for version in VERSIONS)
-    if not low <= numbers < high:
-        raise InputError(
-            f"--device cuda: gsplat {found} does not build here or renders differently: {INSTALL} installs a "
-            f"version from {VERSIONS[0]} up to, but not including, {VERSIONS[1]}; or use --device cpu"
-        )

@@ -1,7 +1,7 @@
 """The gradient of a rendering.
 
-Each tile is drawn again in chunks of Gaussians, and these are then visited back to front, which gives the gradients of
-splats. Those are propagated to the Gaussians.
+Each tile is drawn again in chunks of Gaussians. The Gaussians of a chunk are then visited back to front, which gives
+gradients of the splats, and from these the gradients of the Gaussians.
 """
 
 from __future__ import annotations
@@ -26,37 +26,36 @@ from spackle.render.protocol import ALPHA_MIN, TILE, Rendering, tile_mask
 
 FIELDS = 5  # tensors in a set of Gaussians
 
-# Sums over a tile's pixels for one Gaussian. With u = x - centre and v = ∂L/∂ln(alpha), these are the sums of v,
-# v·u, v·u², v·dy, v·dy², v·u·dy, then the gradients of red, green, blue and depth.
+# Number of sums over a tile's pixels for one Gaussian: with u = x - centre and v = ∂L/∂ln(alpha), the sums of v, v·u,
+# v·u², v·dy, v·dy², v·u·dy, then the gradients of red, green, blue and depth.
 SUMS = 10
 
-# The workspace is one flat buffer of planes, as in `blend`, but with pixels in row order: the transmittance, the
-# contribution of everything behind the current Gaussian, and the gradients of red, green, blue, depth and alpha.
+# The workspace is a flat buffer of planes with pixels in row order: the transmittance, the contribution of all
+# Gaussians behind the current one, and the gradients of red, green, blue, depth and alpha.
 BEHIND = 1 * PLANE
 GRADIENTS = 2 * PLANE
 WORKSPACE = 7 * PLANE
 
-# While a chunk of Gaussians is drawn forward, its alphas and transmittances are noted for the backward pass. The notes
-# fit into the second-level cache.
+# Alphas and transmittances of a chunk of Gaussians, noted for the backward pass, fit into the second-level cache.
 CHUNK = 128  # Gaussians
 NOTE = 2 * TILE  # floats for one row of one Gaussian
 NOTES = CHUNK * TILE * NOTE
-INVISIBLE = np.float32(math.log2(ALPHA_MIN) - 1e-3)  # a row whose largest alpha is 2^x for a smaller x draws nothing
+INVISIBLE = np.float32(math.log2(ALPHA_MIN) - 1e-3)  # log2 of alpha, below which a Gaussian draws nothing
 
 
 def draw(sets: Sequence[Gaussians], view: KernelCamera, wanted: Array, onto: Rendering | None) -> Rendering:
-    """Draw like `spackle.render.cpu.draw`, with gradients for the tensors that require them."""
+    """Draw like `spackle.render.cpu.draw`, with gradients."""
     under = [None] * 3 if onto is None else [image.float() for image in onto.tensors]
     fields = [t.to(device="cpu", dtype=torch.float32) for part in sets for t in part.tensors]
     return Rendering(*Draw.apply(view, wanted, *under, *fields))  # type: ignore[no-untyped-call]
 
 
 class Draw(torch.autograd.Function):
-    """Draws sets of Gaussians, given as a flat sequence of tensors, over the three images of `onto`."""
+    """Draws sets of Gaussians, given as flat sequence of tensors, over three images."""
 
     @staticmethod
     def forward(ctx: Any, view: KernelCamera, wanted: Array, *tensors: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-        """Draw; `tensors` are rgb, depth and alpha of `onto` (or three None), then five for each set, all float32."""
+        """Draw; `tensors` are rgb, depth and alpha of `onto` (or three None), then five float32 tensors per set."""
         under, fields = tensors[:3], [t for t in tensors[3:] if t is not None]
         sets = [Gaussians(*fields[k : k + FIELDS]) for k in range(0, len(fields), FIELDS)]
         onto = None if under[0] is None else Rendering(*under)  # type: ignore[arg-type]
@@ -68,11 +67,11 @@ class Draw(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        """Turn the gradients of the three images into those of the tensors that require them."""
-        fields = ctx.saved_tensors[3:]  # PyTorch raises an error if these or the images have been changed in place
+        """Turn gradients of the three images into gradients of the tensors."""
+        fields = ctx.saved_tensors[3:]  # saved, because PyTorch raises an error if they were changed in place
         needs = ctx.needs_input_grad[2:]
         drawn = tile_mask(torch.from_numpy(ctx.drawing.wanted), *gradients[1].shape)
-        under = [  # no gradient where tiles were drawn over the image beneath
+        under = [  # no gradient for pixels over which tiles were drawn
             torch.where(mask, 0, gradient) if need else None
             for mask, gradient, need in zip((drawn[..., None], drawn, drawn), gradients, needs, strict=False)
         ]
@@ -92,8 +91,8 @@ class Draw(torch.autograd.Function):
 def pixel_sums(drawing: Drawing, gradients: Arrays, rows: Array, count: int) -> Array:
     """Sums over pixels for each Gaussian that needs gradients: a table [count, SUMS] float32.
 
-    Each tile writes its own sums; they are added in the order of tiles, so the result does not depend on the threads.
-    `rows` [N] int32 holds each Gaussian's row in the table, -1 if it needs no gradients.
+    `rows` [N] int32 has each Gaussian's row in the table, or -1. Sums of tiles are added in the order of tiles: the
+    result does not depend on the number of threads.
     """
     lists, records, images = drawing.lists, drawing.splats.records, drawing.images
     entry_rows = rows[lists.ids]
@@ -113,7 +112,7 @@ def pixel_sums(drawing: Drawing, gradients: Arrays, rows: Array, count: int) -> 
 
 
 def set_gradients(fields: Sequence[Tensor], view: KernelCamera, table: Array) -> list[Tensor | None]:
-    """The gradients of one set's five tensors, from its sums over pixels."""
+    """The gradients of a set's five tensors, from sums over pixels."""
     scene, gradients = tuple(as_array(t) for t in fields), tuple(np.zeros(t.shape, np.float32) for t in fields)
     run_chunks(lambda a, b: project_backward(a, b, scene, view, table, gradients), len(table), PROJECT_GRAIN)
     return [torch.from_numpy(g) for g in gradients]
@@ -121,9 +120,9 @@ def set_gradients(fields: Sequence[Tensor], view: KernelCamera, table: Array) ->
 
 @kernel
 def replay_row(work: Array, offset: np.uint64, notes: Array, note: np.uint64, peak: np.float32, bell: Numbers) -> None:
-    """Draw one row as `blend_patch` does; `bell` holds the rate and the centre of the Gaussian's fall-off in the row.
+    """Draw a row of a Gaussian, and note each pixel's alpha (0 if nothing is drawn) and transmittance.
 
-    Note each pixel's alpha (0 if nothing is drawn there) and the transmittance before the Gaussian.
+    `bell` has the rate and the centre of the Gaussian's fall-off in the row.
     """
     across, center = bell
     for x in range(TILE):
@@ -142,8 +141,7 @@ def replay_row(work: Array, offset: np.uint64, notes: Array, note: np.uint64, pe
 def replay(work: Array, notes: Array, records: Array, ids: Array, left: int, top: int, first_notes: Array) -> int:
     """Draw a chunk of Gaussians again; `first_notes` [CHUNK] receives the start of each Gaussian's notes.
 
-    Returns:
-        The number of Gaussians that were drawn before the tile was full.
+    Returns the number of Gaussians that were drawn until the tile was full.
     """
     note = np.uint64(0)
     for k in range(len(ids)):
@@ -164,7 +162,7 @@ def replay(work: Array, notes: Array, records: Array, ids: Array, left: int, top
 
 @kernel
 def pass_row(work: Array, offset: np.uint64, notes: Array, note: np.uint64, look: Numbers) -> None:
-    """Step back over a row of a Gaussian that needs no gradient; `look` holds its colour and depth."""
+    """Step back over a row of a Gaussian without gradient; `look` has colour and depth."""
     red, green, blue, depth = look
     for x in range(TILE):
         i, n = offset + np.uint64(x), note + np.uint64(x)
@@ -178,7 +176,7 @@ def pass_row(work: Array, offset: np.uint64, notes: Array, note: np.uint64, look
 def gather_row(
     work: Array, offset: np.uint64, notes: Array, note: np.uint64, center: np.float32, look: Numbers
 ) -> tuple[np.float32, np.float32, np.float32, np.float32, np.float32, np.float32, np.float32]:
-    """Step back over a row of a Gaussian, and return the sums over its pixels (those of SUMS without dy)."""
+    """Step back over a row of a Gaussian, and return the sums (see SUMS, without dy) over the row's pixels."""
     red, green, blue, depth = look
     sum_v, sum_vu, sum_vuu = ZERO, ZERO, ZERO
     sum_red, sum_green, sum_blue, sum_depth = ZERO, ZERO, ZERO, ZERO
@@ -191,7 +189,7 @@ def gather_row(
         alpha, light, behind = notes[n], notes[n + np.uint64(TILE)], work[i + np.uint64(BEHIND)]
         weight = alpha * light
         work[i + np.uint64(BEHIND)] = behind + weight * value
-        # A larger alpha shows more of this Gaussian and less of what lies behind; at the clamp the gradient is 0.
+        # A larger alpha shows more of this Gaussian and less of Gaussians behind; a clamped alpha has no gradient.
         slope = alpha * (light * value - behind / (ONE - alpha))
         v = slope if alpha < LIMIT else ZERO
         u = np.float32(x) - center
@@ -209,7 +207,7 @@ def gather_row(
 def walk_back(
     work: Array, notes: Array, note: np.uint64, record: Array, left: int, top: int, wanted: bool, sums: Array
 ) -> None:
-    """Step back over one Gaussian, whose notes begin at `note`; its gradients, if needed, go to `sums` [SUMS]."""
+    """Step back over a Gaussian, whose notes begin at `note`; if `wanted`, add to `sums` [SUMS]."""
     x, y, slope, _, fall, height, _, half_height, depth, red, green, blue = in_tile(record, left, top)
     look, (first, last) = (red, green, blue, depth), span_of(y, half_height)
     for row in range(first, last):
@@ -237,10 +235,7 @@ def walk_back(
 
 @kernel
 def load_gradients(work: Array, left: int, top: int, images: Arrays, gradients: Arrays) -> None:
-    """Turn the gradients of a tile's rgb, depth and alpha into those of its blended sums.
-
-    They are 0 for pixels outside of the image.
-    """
+    """Turn gradients of a tile's rgb, depth and alpha into gradients of blended sums; 0 outside of the image."""
     rgb, depth, alpha, linear = images
     rgb_grad, depth_grad, alpha_grad = gradients
     for i in range(GRADIENTS, GRADIENTS + 5 * PLANE):
@@ -260,16 +255,15 @@ def load_gradients(work: Array, left: int, top: int, images: Arrays, gradients: 
 
 @kernel
 def backward_tile(room: Arrays, records: Array, ids: Array, wanted: Array, left: int, top: int, sums: Array) -> None:
-    """Compute the gradients of one tile with the list `ids` [n], for the entries that are `wanted` [n] bool.
+    """Compute the gradients of a tile with the list `ids` [n], for the entries `wanted` [n] bool.
 
     Args:
-        room: three buffers: [WORKSPACE] with the gradients loaded, [NOTES] for notes, [CHUNK] for the start of each
-            Gaussian's notes.
-        sums: [m, SUMS], one row for each wanted entry, in the list's order.
+        room: three buffers: [WORKSPACE] with loaded gradients, [NOTES], [CHUNK] for the start of each Gaussian's notes.
+        sums: [m, SUMS], one row for each wanted entry.
     """
     work, notes, first_notes = room
     chunks = (len(ids) + CHUNK - 1) // CHUNK
-    before = np.empty((chunks, PLANE), np.float32)  # the light that reaches each chunk
+    before = np.empty((chunks, PLANE), np.float32)  # transmittance before each chunk
     work[:PLANE] = ONE
     work[BEHIND : BEHIND + PLANE] = ZERO
     for chunk in range(chunks):
@@ -296,11 +290,9 @@ def backward_tiles(
     first: int, last: int, tiles: Array, lists: TileLists, wanted: Array, records: Array,
     images: Arrays, gradients: Arrays, slots: Array, sums: Array,
 ) -> None:  # fmt: skip
-    """Compute the gradients of tiles first..last of the list `tiles` [K], for the entries that are `wanted` [E] bool.
+    """Compute the gradients of the tiles first..last of `tiles` [K], for the entries `wanted` [E] bool.
 
-    Args:
-        slots: [T + 1] int64, the start of each tile's rows in `sums`.
-        sums: [M, SUMS] float32, initially zeros.
+    `slots` [T + 1] int64 has the start of each tile's rows in `sums` [M, SUMS], initially zeros.
     """
     room = np.empty(WORKSPACE, np.float32), np.empty(NOTES, np.float32), np.empty(CHUNK, np.uint64)
     columns = (images[1].shape[1] + TILE - 1) // TILE
@@ -314,7 +306,7 @@ def backward_tiles(
 
 @kernel
 def collect_sums(first: int, last: int, share: int, rows: Array, sums: Array, table: Array) -> None:
-    """Add `sums` [M, SUMS], in order, to the table [G, SUMS] at `rows` [M], for rows first·share to last·share only."""
+    """Add `sums` [M, SUMS] to the rows first·share to last·share of the table [G, SUMS]; `rows` [M] are the places."""
     for slot in range(len(rows)):
         row = rows[slot]
         if first * share <= row < last * share:
@@ -326,10 +318,10 @@ def collect_sums(first: int, last: int, share: int, rows: Array, sums: Array, ta
 def project_backward(
     start: int, stop: int, scene: Arrays, camera: KernelCamera, table: Array, gradients: Arrays
 ) -> None:
-    """Compute the gradients of Gaussians start..stop of one set, in float64 as `project_chunk` does.
+    """Compute the gradients of the Gaussians start..stop of a set, in float64, from `table` [N, SUMS].
 
-    `scene` and `gradients` are the set's five arrays and theirs. `table` [N, SUMS] holds the sums over pixels for each
-    Gaussian of the set (see SUMS). A row of zeros means that no pixel shows the Gaussian: its gradients are left as is.
+    `scene` and `gradients` are the set's five arrays and their gradients. A Gaussian with a row of zeros is invisible
+    and gets no gradients.
     """
     (means, quats, scales, opacities, _), lens, pose = scene, camera.lens, camera.pose
     means_grad, quats_grad, scales_grad, opacities_grad, colors_grad = gradients
@@ -354,10 +346,10 @@ def project_backward(
 
 @kernel
 def splat_backward(row: Array, factors: Numbers, eps2d: float, factor_grad: Array) -> tuple[float, float]:
-    """Turn sums over pixels into the gradients of the factor M, written to `factor_grad`, and of the centre, returned.
+    """Turn sums over pixels into gradients of the factor M, written to `factor_grad`, and of the centre, returned.
 
-    For a pixel at d from the centre, ∂ln(alpha)/∂centre = p and ∂ln(alpha)/∂Σ = ½ p pᵀ with p = Σ⁻¹ d.
-    In the blender's terms p = (A·u, D·dy - k·A·u), with A = Σyy/det, D = 1/Σyy and the slope k = Σxy/Σyy.
+    For a pixel at d from the centre, ∂ln(alpha)/∂centre = p and ∂ln(alpha)/∂Σ = ½ p pᵀ with p = Σ⁻¹ d
+    = (A·u, D·dy - k·A·u), with A = Σyy/det, D = 1/Σyy and the slope k = Σxy/Σyy.
     """
     _, xy, yy, det = spread(factors, eps2d)
     across, fall = yy / det, 1.0 / yy
@@ -376,13 +368,13 @@ def splat_backward(row: Array, factors: Numbers, eps2d: float, factor_grad: Arra
 def factor_backward(
     j: Numbers, pose: Array, r: Numbers, scale: Array, factor_grad: Array, grads: Arrays, scale_grad: Array
 ) -> None:
-    """Turn the gradient of the factor M = J W R S into those of the Jacobian J, the rotation R and the scales."""
+    """Turn the gradient of the factor M = J W R S into gradients of the Jacobian J, the rotation R and the scales."""
     jacobian_grad, rotation_grad = grads
     jacobian_grad[:, :] = 0.0
     for k in range(3):
         scale_grad[k] = 0.0
         for b in range(3):
-            # J W has two rows; its column b is multiplied by the axis' component b.
+            # Column b of J W is multiplied by component b of the axis.
             h0, h1 = j[0] * pose[0, b] + j[1] * pose[2, b], j[2] * pose[1, b] + j[3] * pose[2, b]
             along, axis = h0 * factor_grad[0, k] + h1 * factor_grad[1, k], r[3 * b + k]
             scale_grad[k] += along * axis
@@ -394,7 +386,7 @@ def factor_backward(
 
 @kernel
 def quat_backward(quat: Array, r: Array, grad: Array) -> None:
-    """Turn the gradient of a rotation matrix into that of the quaternion before normalisation."""
+    """Turn the gradient of a rotation matrix into the gradient of the quaternion before normalisation."""
     w, x, y, z = np.float64(quat[0]), np.float64(quat[1]), np.float64(quat[2]), np.float64(quat[3])
     norm = 1.0 / max(math.sqrt(w * w + x * x + y * y + z * z), 1e-12)
     w, x, y, z = w * norm, x * norm, y * norm, z * norm
@@ -411,7 +403,7 @@ def quat_backward(quat: Array, r: Array, grad: Array) -> None:
 def point_backward(
     local: Array, lens: Array, jacobian_grad: Array, u_grad: float, v_grad: float, depth_grad: float
 ) -> tuple[float, float, float]:
-    """The gradient of the centre in camera space, from the gradients of its pixel, its Jacobian and its depth."""
+    """The gradient of the centre in camera space, from the gradients of the pixel, the Jacobian and the depth."""
     x, y, z = local
     tx, ty = min(lens[5], max(lens[4], x / z)), min(lens[7], max(lens[6], y / z))
     fx, fy = lens[0] / z, lens[1] / z

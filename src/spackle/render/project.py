@@ -1,6 +1,6 @@
-"""Project Gaussians to the image: each gets a packed record, a box of tiles and a sort key.
+"""Project Gaussians to the image: each visible Gaussian gets a record, a box of tiles and a sort key.
 
-The arithmetic runs on a block of Gaussians in vector registers; records are then packed one by one.
+The arithmetic runs on a block of Gaussians in vector registers; records are then written one by one.
 """
 
 from __future__ import annotations
@@ -17,29 +17,28 @@ from spackle.render.protocol import ALPHA_MIN, NEAR_PLANE, TILE, tile_grid
 Numbers = Array | tuple[Any, ...]
 Arrays = tuple[Array, ...]
 
-# A record holds what blending needs, in three quarters of a cache line. In a row of pixels at distance dy from the
-# centre, a Gaussian's alpha is 2^(PEAK - FALL·dy² - ACROSS·(x - X - SLOPE·dy)²). In this form, rounding cannot make the
-# quadratic form negative.
+# A record has the numbers for blending. In a row of pixels at distance dy from the centre, alpha is
+# 2^(PEAK - FALL·dy² - ACROSS·(x - X - SLOPE·dy)²). Rounding cannot make this quadratic form negative.
 X, Y, SLOPE, ACROSS, FALL, PEAK, HALF_WIDTH, HALF_HEIGHT, DEPTH, RED, GREEN, BLUE = range(12)
 RECORD = 12  # floats in a record
 
 BLUR_CLAMP = 0.3  # a centre farther outside, in half image sizes, is linearised at this distance from the border
 
-# Results for a block of Gaussians go into one flat buffer of planes, because the compiler then knows that these do not
-# overlap: first the record's fields, then the box of tiles touched. All are float32, which represents boxes exactly.
+# Results for a block of Gaussians are planes of one flat float32 buffer: fields of the record, then the box of tiles.
+# In one buffer, the compiler knows that planes do not overlap.
 LEFT, RIGHT, TOP, BOTTOM = range(DEPTH + 1, DEPTH + 5)
-BLOCK = 256  # Gaussians; with so many the buffer stays in the first-level cache
+BLOCK = 256  # Gaussians; the buffer of a block fits into the first-level cache
 BUFFER = (BOTTOM + 1) * BLOCK
 
 ROOT_HALF_BITS = np.int32(0x3F3504F3)  # of the square root of a half
 LN_2 = math.log(2.0)
-# ln((1 + t) / (1 - t)) = 2t + 2t³/3 + 2t⁵/5 + …; the omitted terms are below float64's last digit for t² < 0.0295.
+# ln((1 + t) / (1 - t)) = 2t + 2t³/3 + 2t⁵/5 + …; for t² < 0.0295, omitted terms are below float64's last digit.
 L3, L5, L7, L9, L11, L13, L15, L17, L19 = (2.0 / k for k in range(3, 20, 2))
 
 ONCE, TWICE, THRICE = np.uint64(1), np.uint64(2), np.uint64(3)
 LOG2_E = math.log2(math.e)
 LOG_FAINT = math.log(ALPHA_MIN)
-FINITE = 1e30  # larger values would overflow float32 later
+FINITE = 1e30  # larger values would later overflow float32
 
 
 class KernelCamera(NamedTuple):
@@ -73,21 +72,21 @@ class Splats(NamedTuple):
     """Projected Gaussians, in the order of the sets."""
 
     records: Array  # [N, RECORD] float32
-    boxes: Array  # [N, 4] uint16, the tiles touched: columns from, to, rows from, to (exclusive)
-    keys: Array  # [N] uint32, the bits of the depth of visible Gaussians, packed to the front of each chunk
-    ids: Array  # [N] int32, the Gaussians that the keys belong to
+    boxes: Array  # [N, 4] uint16, touched tiles: first column, last, first row, last (exclusive)
+    keys: Array  # [N] uint32, the bits of the depth of visible Gaussians, at the front of each chunk
+    ids: Array  # [N] int32, the Gaussians of the keys
 
 
 @inlined_kernel
 def in_tile(record: Array, left: int, top: int) -> Numbers:
-    """A record's twelve numbers, with (X, Y) relative to the centre of a tile's first pixel, (left, top)."""
+    """A record's numbers, with (X, Y) relative to the centre of the tile's first pixel (left, top)."""
     x, y = record[X] - np.float32(left) - HALF, record[Y] - np.float32(top) - HALF
     shape = x, y, record[SLOPE], record[ACROSS], record[FALL], record[PEAK], record[HALF_WIDTH], record[HALF_HEIGHT]
     return *shape, record[DEPTH], record[RED], record[GREEN], record[BLUE]
 
 
 def count_before(wanted: Array) -> Array:
-    """The number of wanted tiles above and to the left of each corner, [rows + 1, columns + 1] int32."""
+    """[rows + 1, columns + 1] int32: the number of wanted tiles above and to the left of each corner."""
     return np.pad(wanted.astype(np.int32).cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0))).astype(np.int32)
 
 
@@ -95,20 +94,19 @@ def count_before(wanted: Array) -> Array:
 def project_chunk(
     start: int, stop: int, first: int, scene: Arrays, camera: KernelCamera, wanted_before: Array, splats: Splats
 ) -> int:
-    """Project Gaussians start..stop of a set's five arrays; the set's first Gaussian has the index `first` among all
-    sets.
+    """Project the Gaussians start..stop of a set, whose first Gaussian has the index `first` among all sets.
 
-    A Gaussian that touches no wanted tile counts as invisible; see `count_before`.
+    A Gaussian that touches no wanted tile is invisible. Keys and ids of visible Gaussians begin at first + start.
 
     Returns:
-        The number of visible Gaussians; their keys and ids begin at first + start.
+        The number of visible Gaussians.
     """
     means, quats, scales, opacities, colors = scene
     found = first + start
     block = np.empty(BUFFER, np.float32)
     for begin in range(start, stop, BLOCK):
         end = min(begin + BLOCK, stop)
-        # Flat arrays, because only then does the compiler know the stride between a Gaussian's numbers.
+        # For flat arrays, the compiler knows the stride between a Gaussian's numbers.
         shapes = means[begin:end].reshape(-1), quats[begin:end].reshape(-1), scales[begin:end].reshape(-1)
         measure_block(block, *shapes, opacities[begin:end], camera)
         found = pack_block(block, colors[begin:end].reshape(-1), first + begin, found, wanted_before, splats)
@@ -119,15 +117,9 @@ def project_chunk(
 def measure_block(
     block: Array, means: Array, quats: Array, scales: Array, opacities: Array, camera: KernelCamera
 ) -> None:
-    """Project up to BLOCK Gaussians; invisible Gaussians get an empty box.
+    """Project up to BLOCK Gaussians, given as flat arrays, into `block` [BUFFER]; RIGHT is 0 for an invisible Gaussian.
 
-    Arithmetic is float64, which costs little here and keeps thin Gaussians exact. There are neither branches nor
-    calls, so that all of it runs in vector registers.
-
-    Args:
-        block: [BUFFER], the result; an invisible Gaussian's RIGHT is 0.
-        means, quats, scales, opacities: flat arrays.
-        camera: the view.
+    Float64 keeps thin Gaussians exact.
     """
     lens, pose = camera.lens, camera.pose
     for k in range(len(opacities)):
@@ -150,7 +142,7 @@ def measure_block(
         fall, across = 0.5 * LOG2_E * narrow, 0.5 * LOG2_E * cyy / det
         left, right = cover(u, half_width, camera.width)
         top, bottom = cover(v, half_height, camera.height)
-        # Each comparison is written so that it is false for NaN.
+        # All comparisons are false for NaN.
         sound = (z >= NEAR_PLANE) & (z < FINITE) & (opacity >= ALPHA_MIN) & (opacity < FINITE)
         sound &= (det > 0.0) & (det < FINITE) & (cxx < FINITE) & (cyy < FINITE)
         sound &= (across < FINITE) & (fall < FINITE)
@@ -178,7 +170,7 @@ def covariance(x: float, y: float, nearness: float, quat: Numbers, scale: Number
 
 @inlined_kernel
 def jacobian(x: float, y: float, nearness: float, lens: Array) -> Numbers:
-    """The projection's Jacobian J at (x, y, 1) / nearness, as (a, b, c, d): its rows are (a, 0, b) and (0, c, d)."""
+    """The projection's Jacobian [[a, 0, b], [0, c, d]] at (x, y, 1) / nearness, as (a, b, c, d)."""
     a, c = lens[0] * nearness, lens[1] * nearness
     return a, -a * min(lens[5], max(lens[4], x)), c, -c * min(lens[7], max(lens[6], y))
 
@@ -196,7 +188,7 @@ def rotation(quat: Numbers) -> Numbers:
 
 @inlined_kernel
 def factor(j: Numbers, pose: Array, r: Numbers, scale: Numbers) -> Numbers:
-    """The two rows of M = J W R S, one after the other; the projected covariance is M Mᵀ."""
+    """The two rows of M = J W R S; the projected covariance is M Mᵀ."""
     a, b, c, d = j
     h0, h1, h2 = a * pose[0, 0] + b * pose[2, 0], a * pose[0, 1] + b * pose[2, 1], a * pose[0, 2] + b * pose[2, 2]
     v0, v1, v2 = c * pose[1, 0] + d * pose[2, 0], c * pose[1, 1] + d * pose[2, 1], c * pose[1, 2] + d * pose[2, 2]
@@ -211,8 +203,8 @@ def factor(j: Numbers, pose: Array, r: Numbers, scale: Numbers) -> Numbers:
 def spread(m: Numbers, eps2d: float) -> Numbers:
     """The covariance M Mᵀ + eps2d·I as (xx, xy, yy), and its determinant.
 
-    The determinant of M Mᵀ is the squared cross product of M's rows (Cauchy–Binet). In this form it suffers no
-    cancellation for a Gaussian seen edge-on.
+    The determinant of M Mᵀ is the squared cross product of M's rows (Cauchy–Binet), exact also for a Gaussian seen
+    edge-on.
     """
     m0, m1, m2, n0, n1, n2 = m
     cxx = m0 * m0 + m1 * m1 + m2 * m2
@@ -226,8 +218,8 @@ def spread(m: Numbers, eps2d: float) -> Numbers:
 @inlined_kernel
 def cover(center: float, extent: float, size: int) -> tuple[np.int32, np.int32]:
     """The pixels first..last (exclusive) along one axis whose centres may lie within `extent` of `center`."""
-    slack = 0.501  # half a pixel, from its edge to its centre, and room for rounding in blending
-    # In this order of min and max, NaN becomes 0, and the result always fits into an integer.
+    slack = 0.501  # half a pixel, and room for rounding in blending
+    # In this order of min and max, NaN becomes 0, and all results fit into integers.
     low = min(np.float64(size), max(0.0, center - extent - slack))
     high = min(np.float64(size), max(0.0, center + extent + slack))
     first = np.int32(low)
@@ -236,17 +228,13 @@ def cover(center: float, extent: float, size: int) -> tuple[np.int32, np.int32]:
 
 @kernel
 def pack_block(block: Array, colors: Array, first: int, found: int, wanted_before: Array, splats: Splats) -> int:
-    """Write the boxes of the projected Gaussians numbered `first`, `first` + 1, ….
+    """Write boxes of the projected Gaussians `first`, `first` + 1, …; for visible Gaussians also records, keys, ids.
 
-    For the visible ones also write records, keys and ids; their first key goes to position `found`.
-
-    Returns:
-        The position of the next key.
+    The first key goes to position `found`; returns the position of the next key.
     """
     records, boxes, keys, ids = splats
     depth_bits = keys.view(np.float32)
     for k in range(len(colors) // 3):
-        # Unsigned, so that no check for negative indices is compiled.
         i, i3, out, place = np.uint64(k), np.uint64(3 * k), np.uint64(first + k), np.uint64(found)
         right = np.uint32(block[i + np.uint64(RIGHT * BLOCK)])
         boxes[out, 0], boxes[out, 1] = 0, 0
@@ -278,7 +266,7 @@ def touches(left: np.uint32, right: np.uint32, top: np.uint32, bottom: np.uint32
 
 @inlined_kernel
 def natural_log(x: np.float32) -> float:
-    """The logarithm of a positive number, accurate to float64's last digits."""
+    """The logarithm of a positive number, accurate to the last digits of float64."""
     bits = np.float32(x).view(np.int32)
     exponent = (bits - ROOT_HALF_BITS) >> MANTISSA
     m = np.float64(np.int32(bits - (exponent << MANTISSA)).view(np.float32))  # from sqrt(1/2) to sqrt(2)

@@ -1,4 +1,4 @@
-"""The protocol of renderers, and the rendering that they return."""
+"""The protocol of renderers, and their result."""
 
 from __future__ import annotations
 
@@ -21,32 +21,24 @@ class Rendering:
     depth: Tensor  # [H, W] expected z, normalised by alpha; 0 where alpha is 0
     alpha: Tensor  # [H, W] accumulated opacity in 0..1
 
-    def __repr__(self) -> str:
-        height, width = self.alpha.shape
-        return f"Rendering({width}×{height}, {self.alpha.device})"
-
     @property
     def tensors(self) -> tuple[Tensor, Tensor, Tensor]:
         """The three images in field order."""
         return self.rgb, self.depth, self.alpha
 
     def to(self, device: torch.device) -> Rendering:
-        """The images on another device, moved in one copy, because each copy synchronises with the GPU."""
-        if self.rgb.device == device:
-            return self
-        flat = torch.cat([image.flatten() for image in self.tensors]).to(device)
-        parts = torch.split(flat, [image.numel() for image in self.tensors])
-        return Rendering(*(part.view(image.shape) for part, image in zip(parts, self.tensors, strict=True)))
+        """The images on another device."""
+        return self if self.rgb.device == device else Rendering(*(image.to(device) for image in self.tensors))
 
     def detach(self) -> Rendering:
         """The same values, detached from autograd."""
         return Rendering(*(image.detach() for image in self.tensors))
 
 
-ALPHA_MAX = 0.999  # one Gaussian's largest alpha (released gsplat; its main branch has 0.99)
+ALPHA_MAX = 0.999  # largest alpha of a Gaussian, as in gsplat 1.5
 ALPHA_MIN = 1.0 / 255.0  # fainter contributions are skipped
-TRANSMITTANCE_STOP = 1e-4  # a pixel is full when its transmittance falls to this
-NEAR_PLANE = 0.01  # Gaussians nearer than this are not drawn
+TRANSMITTANCE_STOP = 1e-4  # a pixel is full if its transmittance falls to this
+NEAR_PLANE = 0.01  # nearer Gaussians are not drawn
 TILE = 16  # pixels along a tile's side
 
 
@@ -65,17 +57,12 @@ class Renderer(Protocol):
         """Draw Gaussians as a camera sees them.
 
         Args:
-            gaussians: one set, or several that are drawn together. Gradients are computed only for tensors that
-                require them.
+            gaussians: one set, or several sets that are drawn together. Gradients reach tensors that require them.
             camera: the view.
-            eps2d: added to the diagonal of each projected covariance, in pixels² (SHARP: 0,
-                gsplat's default: 0.3).
-            tiles: [ceil(H/16), ceil(W/16)] bool, the tiles to draw; all if None. No other tile is
-                touched.
-            onto: if `tiles` is given, the rendering from which all other tiles are copied bit for bit; if
-                None, these are black and empty.
+            eps2d: added to the diagonal of each projected covariance, in pixels² (SHARP: 0, gsplat's default: 0.3).
+            tiles: [ceil(H/16), ceil(W/16)] bool: the tiles to draw; None: all tiles.
+            onto: a rendering from which all other tiles are copied; None: other tiles are black and empty.
         """
-        ...
 
 
 def tile_grid(height: int, width: int) -> tuple[int, int]:
@@ -84,19 +71,19 @@ def tile_grid(height: int, width: int) -> tuple[int, int]:
 
 
 def check_tiles(tiles: Tensor, height: int, width: int) -> None:
-    """ValueError if the grid of tiles does not fit an image of this size."""
+    """ValueError if the shape of `tiles` does not fit an image of this size."""
     if tuple(tiles.shape) != (grid := tile_grid(height, width)):
         raise ValueError(f"tiles has shape {tuple(tiles.shape)}, expected {grid}: one for each {TILE}×{TILE} pixels")
 
 
 def tile_mask(tiles: Tensor, height: int, width: int) -> Tensor:
-    """[H, W] bool: the pixels of the chosen tiles [rows, columns]; ValueError if the grid does not fit the image."""
+    """[H, W] bool: the pixels of the tiles [rows, columns] bool; ValueError if the shape does not fit the image."""
     check_tiles(tiles, height, width)
     return tiles.repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)[:height, :width]
 
 
 def paste(rendering: Rendering, tiles: Tensor, onto: Rendering | None) -> Rendering:
-    """Combine the chosen tiles of a rendering, [rows, columns] bool, with the rest of `onto`, black if None."""
+    """Take the pixels of `tiles` ([rows, columns] bool) from a rendering, all others from `onto` (None: black)."""
     mask = tile_mask(tiles, *rendering.alpha.shape)
     others = onto.tensors if onto is not None else tuple(torch.zeros_like(image) for image in rendering.tensors)
     masks = (mask[..., None], mask, mask)

@@ -1,7 +1,4 @@
-"""A reference renderer in plain PyTorch: slow, of any dtype, and written like a textbook.
-
-Every pixel evaluates every Gaussian. Tests compare the fast renderers' values and gradients with it.
-"""
+"""A slow renderer in plain PyTorch, of any dtype, with which tests compare the fast renderers."""
 
 from __future__ import annotations
 
@@ -17,7 +14,7 @@ from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, NEAR_PLANE, TRANSMITTA
 
 
 class ReferenceRenderer:
-    """Classic 3D Gaussian splatting, computed straight from its definition; a `Renderer` for small scenes."""
+    """A `Renderer` for small scenes: each pixel evaluates each Gaussian."""
 
     def render(
         self,
@@ -28,7 +25,7 @@ class ReferenceRenderer:
         tiles: Tensor | None = None,
         onto: Rendering | None = None,
     ) -> Rendering:
-        """Draw Gaussians as a camera sees them; see `Renderer.render`. The result has the input's dtype."""
+        """See `Renderer.render`; the result has the dtype of the input."""
         joined = gaussians if isinstance(gaussians, Gaussians) else Gaussians.cat([Gaussians.empty(), *gaussians])
         visible = front_to_back(joined, camera)
         rendering = blend(visible, camera, eps2d)
@@ -61,8 +58,8 @@ def blend(gaussians: Gaussians, camera: Camera, eps2d: float) -> Rendering:
 def project_covariances(gaussians: Gaussians, camera: Camera, eps2d: float) -> Tensor:
     """Image-space covariances J W Σ Wᵀ Jᵀ + eps2d·I, [N, 2, 2].
 
-    J is the projection's Jacobian at the centre. For centres far outside the image, where it would explode, it is
-    evaluated at the border of a frame 1.3 times the image's size instead, as in gsplat.
+    J is the projection's Jacobian at the centre; far outside of the image, at the border of a frame of 1.3 times the
+    image's size, as in gsplat.
     """
     x, y, z = camera.to_camera(gaussians.means).unbind(-1)
     (fx, fy), K = camera.focal, camera.K.to(x)
@@ -78,13 +75,12 @@ def project_covariances(gaussians: Gaussians, camera: Camera, eps2d: float) -> T
 
 
 def falloff(gaussians: Gaussians, camera: Camera, eps2d: float) -> Tensor:
-    """Each Gaussian's opacity times its fall-off at each pixel, [N, H, W]; not yet clamped."""
+    """Unclamped alpha of each Gaussian at each pixel, [N, H, W]."""
     uv, _ = camera.project(gaussians.means)  # [N, 2]
     covariances = project_covariances(gaussians, camera, eps2d)[:, :, :, None, None]  # [N, 2, 2, 1, 1]
     xx, xy, yy = covariances[:, 0, 0], covariances[:, 0, 1], covariances[:, 1, 1]
     det = xx * yy - xy * xy
-    proper = det > 0  # a Gaussian without extent draws nothing
+    proper = det > 0  # a Gaussian without extent is invisible
     dx, dy = (camera.pixel_centers().to(uv) - uv[:, None, None, :]).unbind(-1)  # [N, H, W]
-    # The squared distance in standard deviations, dᵀ Σ⁻¹ d.
     distance = (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / torch.where(proper, det, 1)
     return torch.where(proper, gaussians.opacities[:, None, None] * torch.exp(-0.5 * distance), 0)

@@ -1,8 +1,4 @@
-"""The architectures of f_res, and their weight files.
-
-`UNet` takes little time if a view has few holes. `SharpDecoder` is the paper's, which "replicates the baseline
-architecture".
-"""
+"""The two architectures of f_res, and their weight files."""
 
 from __future__ import annotations
 
@@ -39,21 +35,21 @@ from spackle.residual.network import (
 )
 
 SHIPPED = Path(__file__).parent.parent / "weights" / "residual.safetensors"
-NOTE = "spackle.residual"  # metadata key of the architecture's name; older files lack it, and all hold a UNet
+NOTE = "spackle.residual"  # metadata key of the architecture's name; a file without this key holds a UNet
 WIDTHS = (48, 80, 128, 256, 256)  # channels of the U-Net from the finest grid to the coarsest
-COARSE_BLOCKS = 3  # residual blocks on the coarsest grid, where they see far and cost little
+COARSE_BLOCKS = 3  # residual blocks on the coarsest grid
 STEM_WIDTH = 48  # channels of the decoder's stem: its 0.24 M parameters complete the paper's 8.02 M
-STEM_GAIN = 3.0  # because the features are of order 0.3
+STEM_GAIN = 3.0  # features are of order 0.3
 
 
 def padded(features: Tensor) -> Tensor:
-    """Pad features [B, C, h, w] so that each side can be halved exactly at every level of the network."""
+    """Pad features [B, C, h, w] to multiples of `STRIDE`."""
     height, width = features.shape[-2:]
     return pad(features, (0, -width % STRIDE, 0, -height % STRIDE), mode="replicate")
 
 
 class ResidualBlock(nn.Module):
-    """x + conv(act(conv(act(x)))), initially the identity; no norms, because their statistics depend on the crop."""
+    """x + conv(act(conv(act(x)))), initially the identity; without norms, whose statistics would depend on the crop."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -61,14 +57,13 @@ class ResidualBlock(nn.Module):
         self.second = nn.Conv2d(channels, channels, 3, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map [B, C, h, w] to the same shape."""
-        # In place if no gradient needs the old values: at this size, allocation costs as much as the arithmetic.
+        # In place: at this size, allocation costs as much as the arithmetic.
         out: Tensor = self.second(self.first(torch.relu(x)).relu_())
         return out.add_(x)
 
 
 class UNet(ResidualNet):
-    """An encoder for a view's features, a decoder, and two heads like SHARP's: 8.02 M parameters."""
+    """A U-Net with two heads like SHARP's: 8.02 M parameters; fast for a view with few holes."""
 
     name, sees_photo, local = "unet", False, True
 
@@ -98,17 +93,17 @@ class UNet(ResidualNet):
             fine = interpolate(up(x), scale_factor=2, mode="bilinear", align_corners=False)
             x = decode(fine.add_(skip))
         heads = torch.cat([self.geometry(x), self.texture(x)], dim=1)[..., :height, :width]
-        # The last outputs are the weights of the known colours.
+        # The last outputs are weights of the known colours.
         deltas, shares = torch.split(heads, [DELTA_CHANNELS, len(KNOWN_COLORS)], dim=1)
         copied = sum(shares[:, k : k + 1] * features[:, colors] for k, colors in enumerate(KNOWN_COLORS))
         return torch.cat([deltas[:, : COLOR.start], deltas[:, COLOR] + copied, deltas[:, COLOR.stop :]], dim=1)
 
 
 class SharpDecoder(ResidualNet):
-    """SHARP's Gaussian decoder, applied to features of a view: 8.02 M parameters, 7.78 M of them in SHARP's layers.
+    """The paper's network, which "replicates the baseline architecture": SHARP's Gaussian decoder, 8.02 M parameters.
 
-    A stem replaces SHARP's encoder. SHARP's decoder also receives the photo and two layers of disparity; this one
-    receives the base values' colours and depth, and the view's depth, instead.
+    A stem with 0.24 M parameters replaces SHARP's encoder. Instead of photo and two layers of disparity, the decoder
+    receives the base values' colours and depth, and the view's depth.
     """
 
     name, sees_photo, local = "sharp-decoder", True, False  # group norms make a cell depend on all others
@@ -137,7 +132,7 @@ class SharpDecoder(ResidualNet):
         for to_map, down in itertools.zip_longest(self.maps, self.down):
             maps.append(to_map(x))
             x = torch.relu(down(x)) if down is not None else x
-        # Depths scaled to -1..1, as SHARP scales disparities: tanh(log(d) / 2) = (d - 1) / (d + 1).
+        # Depths in -1..1 like SHARP's disparities: tanh(log(d) / 2) = (d - 1) / (d + 1).
         depths = torch.tanh(features[:, [VIEW_DEPTH, SEED_DEPTH]] / 2)
         picture = torch.cat([2 * features[:, SEED_RGB], depths], dim=1)
         pixels = interpolate(picture, scale_factor=2, mode="nearest")
@@ -150,7 +145,7 @@ def _head(width: int, channels: int) -> nn.Sequential:
 
 
 def _initialise(network: UNet) -> None:
-    """Initialise weights: activations of order one at every scale, blocks as the identity, heads at zero."""
+    """Initialise weights: activations of order one, blocks as the identity, heads at zero."""
     for name, module in network.named_modules():
         if isinstance(module, nn.Conv2d):
             zero = name.endswith("second") or name in ("geometry.2", "texture.2")
@@ -174,21 +169,21 @@ def open_residual(name: str, config: SharpConfig = FULL) -> ResidualNet:
 
 @functools.cache
 def shipped_network() -> ResidualNet | None:
-    """The network with the weights that ship with the package; None if this build has no weights."""
+    """The network with the weights in the package; None if this build has no weights."""
     return load_residual(SHIPPED) if SHIPPED.is_file() else None
 
 
 def load_residual(path: str | os.PathLike[str]) -> ResidualNet:
-    """Read a network; InputError if the file is missing or broken, or its weights do not fit its architecture."""
+    """Read a network; InputError if the file is missing or broken, or holds another network."""
     advice = "give the residual's weights, 'seeds' or 'none'"
     tensors, name = read_tensors(path, advice), read_note(path, NOTE) or UNet.name
     if name not in (UNet.name, SharpDecoder.name):
-        raise InputError(f"{path}: of an architecture that is not known here, {one_line(name)[:60]}: {advice}")
+        raise InputError(f"{path}: unknown architecture {one_line(name)[:60]}: {advice}")
     return load_strict(open_residual(name, decoder_size(tensors)), tensors, path, advice, prepare=channels_last)
 
 
 def decoder_size(tensors: Mapping[str, Tensor]) -> SharpConfig:
-    """SHARP's size, published or tiny, found from a file's tensor shapes; the published size if it holds no decoder."""
+    """SHARP's size, judged by the tensors of a file; the published size if the file holds no decoder."""
     last = tensors.get("feature_model.fusion.out_conv.bias")
     width = FULL.gaussian_width if last is None else last.numel()
     return next((config for config in CONFIGS.values() if config.gaussian_width == width), FULL)

@@ -1,8 +1,7 @@
-"""Base values of the aux Gaussians (paper, section 3.3), to which f_res adds deltas, as SHARP does to its own.
+"""Base values ("seeds") of the aux Gaussians (paper, section 3.3), to which f_res adds deltas.
 
-How a hole is filled depends on its cause. Behind a surface of the photo, colour and depth are propagated from the far
-side of the rim. Beyond the photo's border, the surface that reaches the border is extended along the epipolar line at
-constant depth in the photo's frame. So level floors and walls remain planes.
+Behind a surface of the photo, colour and depth are propagated from the far side of a hole's rim. Beyond the photo's
+border, the surface at the border is extended along the epipolar line, at constant depth in the photo's frame.
 """
 
 from __future__ import annotations
@@ -19,22 +18,22 @@ from spackle.residual.epipolar_walk import walk
 from spackle.residual.view_features import CELL, LEAST, ViewFeatures, cell_centers
 from spackle.surface import BEHIND, surface_slope
 
-AT_BORDER = 0.03  # of the photo's width: a surface that ends farther inside the photo is not extended beyond the border
-BLOB_CELLS = 2  # a blob's reach in cells: within it, a blob must lie behind every visible surface
+AT_BORDER = 0.03  # of the photo's width: a surface that ends farther inside is not extended beyond the border
+BLOB_CELLS = 2  # a seed lies behind all visible surfaces within so many cells, the reach of its Gaussian
 
 
 @dataclasses.dataclass(frozen=True)
 class Seeds:
-    """Base values for every cell of a grid, to which the network's deltas are added."""
+    """Base values for every cell of a grid."""
 
     uv: Tensor  # [h, w, 2] pixels
     inverse_depth: Tensor  # [h, w]
-    slope: Tensor  # [h, w, 2] derivative of the inverse depth by pixel
+    slope: Tensor  # [h, w, 2] derivative of the inverse depth per pixel
     rgb: Tensor  # [h, w, 3] sRGB
     unit: float = 1.0  # the view's median inverse depth, the unit of inverse depths and their deltas
 
     def select(self, cells: Tensor) -> Seeds:
-        """The chosen cells as flat fields [n, ...]; `cells` is a boolean grid [h, w], or row-major indices [n]."""
+        """Flat fields [n, ...] of the cells `cells`: a boolean grid [h, w], or row-major indices [n]."""
         index = cells.flatten().nonzero()[:, 0] if cells.dtype == torch.bool else cells
         lead = self.inverse_depth.ndim - 1
         fields = (self.uv, self.inverse_depth, self.slope, self.rgb)
@@ -43,12 +42,12 @@ class Seeds:
 
 
 def make_seeds(features: ViewFeatures, camera: Camera, photo_camera: Camera) -> Seeds:
-    """Seeds for every cell of a view; covered cells keep their rendered colour and depth."""
+    """Seeds for all cells of a view; unmasked cells keep their rendered colour and depth."""
     known, uv = ~features.mask, beside(cell_centers(camera), features.rgb)
     if not bool(known.any()):
         known = features.inverse_depth > 0
     if not bool(known.any()):
-        # Nothing at all is visible: guess a grey wall, ten metres away.
+        # Nothing is visible: assume a grey wall ten metres away.
         grey = torch.full_like(features.rgb, 0.5)
         return Seeds(uv, torch.full_like(features.alpha, 0.1), torch.zeros_like(uv), grey, 0.1)
     across, _ = far_fill(features.inverse_depth, features.rgb.permute(2, 0, 1)[:0], known, far_bias=0.0)
@@ -60,7 +59,7 @@ def make_seeds(features: ViewFeatures, camera: Camera, photo_camera: Camera) -> 
 
 
 def inside_photo(inverse_depth: Tensor, camera: Camera, photo_camera: Camera) -> Tensor:
-    """[h, w] bool: whether a cell's point projects into the photo."""
+    """[h, w] bool: whether the point of a cell projects into the photo."""
     place, z = _place_in_photo(inverse_depth, camera, photo_camera)
     return ((z > 0) & (place >= 0) & (place < z)).all(-1)
 
@@ -68,7 +67,7 @@ def inside_photo(inverse_depth: Tensor, camera: Camera, photo_camera: Camera) ->
 def seen_in_photo(
     photo: Tensor, elsewhere: Tensor, inverse_depth: Tensor, camera: Camera, photo_camera: Camera
 ) -> Tensor:
-    """[h, w, 3] sRGB: the photo's [H, W, 3] colour at each cell's point; `elsewhere` [h, w, 3] outside of the photo."""
+    """[h, w, 3] sRGB: the colour of the photo [H, W, 3] at the point of each cell; outside of the photo `elsewhere`."""
     place, z = _place_in_photo(inverse_depth, camera, photo_camera)
     cells = avg_pool2d(photo.cpu().movedim(-1, 0)[None], CELL, ceil_mode=True, count_include_pad=False)
     grid = (2 * place / z.clamp_min(LEAST) - 1).clamp(-2, 2).to(cells)[None]
@@ -77,7 +76,7 @@ def seen_in_photo(
 
 
 def _place_in_photo(inverse_depth: Tensor, camera: Camera, photo_camera: Camera) -> tuple[Tensor, Tensor]:
-    """The cells' points projected into the photo: (x, y)·z [h, w, 2], x and y as fractions of its size; z [h, w, 1]."""
+    """Points of cells projected into the photo: (x, y)·z [h, w, 2] with x and y in 0..1 inside, and z [h, w, 1]."""
     rays, motion = _rays_in_photo(cell_centers(camera).double(), camera, photo_camera)
     points, lens = rays + inverse_depth[..., None] * motion[:3, 3], photo_camera.K.cpu().double()
     place, z = points[..., :2] * lens.diagonal()[:2] + points[..., 2:] * lens[:2, 2], points[..., 2:]
@@ -85,10 +84,9 @@ def _place_in_photo(inverse_depth: Tensor, camera: Camera, photo_camera: Camera)
 
 
 def _rays_in_photo(uv: Tensor, camera: Camera, photo_camera: Camera) -> tuple[Tensor, Tensor]:
-    """Rays [h, w, 3] of a view's cells in the photo's frame, and the transform [4, 4] from the view's to the photo's.
+    """Rays [h, w, 3] of a view's cells in the photo's frame, and the transform [4, 4] from view to photo.
 
-    A cell's point times its inverse depth is ray + shift · inverse depth, where shift is the transform's translation:
-    this saves divisions.
+    A point times its inverse depth is ray + translation · inverse depth.
     """
     here, photo = (view.world_to_camera.cpu().double() for view in (camera, photo_camera))
     motion, lens = beside(photo @ here.inverse(), uv), beside(camera.K, uv)
@@ -96,9 +94,9 @@ def _rays_in_photo(uv: Tensor, camera: Camera, photo_camera: Camera) -> tuple[Te
 
 
 def placed_behind(filled: Tensor, chosen: Tensor, seen: Tensor, radius: int) -> Tensor:
-    """Move the filled inverse depth [h, w] of the chosen cells ([h, w] bool) behind all surfaces within `radius` cells.
+    """Move the filled inverse depth [h, w] of chosen cells ([h, w] bool) behind all surfaces within `radius` cells.
 
-    `seen` is the inverse depth [h, w] of the visible surfaces, 0 where there is none.
+    `seen` [h, w] is the inverse depth of visible surfaces; 0: none.
     """
     farthest = -greatest_around(-torch.where(seen > 0, seen, torch.inf), radius)
     return torch.where(chosen, torch.minimum(filled, farthest) * (1 - BEHIND), filled)
@@ -113,15 +111,15 @@ def fill_around(
     camera: Camera,
     photo_camera: Camera,
 ) -> tuple[Tensor, Tensor]:
-    """Inverse depth [h, w], extended beyond the photo's border, and colours [3, h, w] of all cells.
+    """Inverse depth [h, w] and colours [3, h, w] of all cells, extended beyond the photo's border.
 
     Args:
-        features: the view's features.
+        features: of the view.
         across: [h, w] inverse depth, with holes filled from all sides.
         uv: [h, w, 2] pixels of the cells.
-        known: [h, w] bool: cells to propagate from.
-        inside: [h, w] bool: cells whose points project into the photo; there the far surface is propagated.
-        camera, photo_camera: the cameras of the view and of the photo.
+        known: [h, w] bool: cells from which values are propagated.
+        inside: [h, w] bool: cells that project into the photo; their holes are filled from the far surface.
+        camera, photo_camera: of the view and of the photo.
     """
     mask, bias, colors = features.mask, FAR_BIAS * inside, features.rgb.movedim(-1, 0)
     beyond = mask & ~inside
@@ -137,7 +135,7 @@ def fill_around(
 
     far, _, steps = walk(uv, values, across, mask, camera, photo_camera.position)
     away = 1 / far[..., 0].clamp_min(LEAST) - motion[2, 3]
-    hidden = beyond & (steps > 0) & (far[..., 1] == 0)  # by a nearer surface inside the photo
+    hidden = beyond & (steps > 0) & (far[..., 1] == 0)  # behind a nearer surface inside the photo
     traced = beyond & ~hidden & (steps > 0) & (away > 0) & (rays[..., 2] > 0)
     nearest = torch.where(known, features.inverse_depth, 0).amax()
     extended = torch.minimum((rays[..., 2] / away.clamp_min(LEAST)).clamp_min(LEAST), nearest)

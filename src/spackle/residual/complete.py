@@ -1,7 +1,4 @@
-"""Complete one view as the paper does: eqs. 2 to 7 in one pass.
-
-The union with the base (eq. 8) is `Gaussians.cat([base, aux])`; eq. 9 is its rendering.
-"""
+"""Complete one view as in the paper: eqs. 2 to 7 (eq. 8 is `Gaussians.cat([base, aux])`, eq. 9 its rendering)."""
 
 from __future__ import annotations
 
@@ -23,12 +20,12 @@ from spackle.residual.network import DELTAS, ResidualNet, color_logit, find_rim,
 from spackle.residual.view_features import CELL, MASK_THRESHOLD, ViewFeatures, hole_mask
 from spackle.surface import OPACITY, surface_gaussians
 
-SPREAD_PX = 1.3  # standard deviation: blobs two pixels apart reach alpha 0.95 even midway between them
-# A delta of one moves the position by a pixel, and changes colour and opacity by one in the sigmoid's domain. It
-# changes the quaternion by GAIN, and the inverse depth by GAIN times the view's median.
+SPREAD_PX = 1.3  # standard deviation: Gaussians two pixels apart reach alpha 0.95 everywhere
+# A delta of 1 changes the position by a pixel, and colour and opacity by 1 in the sigmoid's domain, but the quaternion
+# by GAIN, and the inverse depth by GAIN times the view's median.
 GAIN = 0.1
-LEAST_DEPTH = 1e-4  # least inverse depth, in medians of the view, so that no delta makes a distance infinite
-MAX_SCALE = 4.0  # the scale factor lies between 1 / MAX_SCALE and MAX_SCALE; at delta 0 its value and slope are 1
+LEAST_DEPTH = 1e-4  # least inverse depth, as part of the view's median
+MAX_SCALE = 4.0  # scale factors lie between 1 / MAX_SCALE and MAX_SCALE; for delta 0, value and slope are 1
 
 
 @torch.no_grad()
@@ -45,23 +42,21 @@ def complete_view(
     photo: Tensor | None = None,
     precision: Precision = "auto",
 ) -> Gaussians:
-    """𝒢̃_aug of a view (eq. 7): one Gaussian for each masked cell; the base is not changed.
+    """𝒢̃_aug of a view (eq. 7): one Gaussian for each masked cell.
 
-    A cell counts as masked if its first pixel is masked. So there are about HAR × grid masked cells, as in the paper's
-    tables.
+    A cell is masked if its first pixel is masked. About HAR × grid cells are then masked, as in the paper's tables.
 
     Args:
         base: 𝒢_base, N Gaussians in the world's frame.
         camera: the view v.
         photo_camera: the camera of the photo from which the base was predicted.
         renderer: ℛ.
-        network: f_res, which runs on the device that holds its weights; None: the base values alone (deltas of 0).
+        network: f_res, on any device; None: all deltas are 0.
         threshold: τ_α.
-        least: minimum number of Gaussians: if fewer cells are masked, the `least` least opaque cells are used. The
-            paper has 64 (training details); 0 leaves a view without holes as it is.
-        rendering: ℛ(𝒢_base, v), if it is already available.
-        photo: I as [H, W, 3] sRGB, for a network that `sees_photo`; if None, the base's rendering of it is used.
-        precision: the network's; auto is bfloat16 if the hardware multiplies it natively.
+        least: if fewer cells are masked, the `least` least opaque cells are used (paper, training details: 64).
+        rendering: ℛ(𝒢_base, v), if already available.
+        photo: I as [H, W, 3] sRGB, for a network that `sees_photo`; None: the rendering of the base.
+        precision: of the network; auto is bfloat16 if the hardware multiplies it natively.
     """
     view = renderer.render(base, camera) if rendering is None else rendering  # eqs. 2 and 3
     features = ViewFeatures.of(view, threshold)
@@ -81,13 +76,13 @@ def complete_view(
 
 
 def compose(seeds: Seeds, deltas: Tensor | None, camera: Camera, spread_px: float = SPREAD_PX) -> Gaussians:
-    """Aux Gaussians [n] from flat seeds; with deltas of None or zero, they have the seeds' own values.
+    """Aux Gaussians [n] from seeds and deltas (SHARP's composition); gradients reach the deltas.
 
     Args:
-        seeds: flat, as `Seeds.select` gives them: fields [n, ...].
-        deltas: [n, 14], or None. Gradients flow through them.
-        camera: the view that the seeds belong to.
-        spread_px: standard deviation of a blob.
+        seeds: flat fields [n, ...], see `Seeds.select`.
+        deltas: [n, 14]; None: zero.
+        camera: the view of the seeds.
+        spread_px: standard deviation of a Gaussian in pixels.
     """
     uv, inverse_depth, rgb = seeds.uv, seeds.inverse_depth, seeds.rgb
     opacities = torch.full_like(inverse_depth, float(OPACITY))
@@ -110,7 +105,6 @@ def _shift_positive(base: Tensor, delta: Tensor, unit: float) -> Tensor:
 
 
 def _scale_factor(delta: Tensor) -> Tensor:
-    """Scale factor for a delta: a sigmoid from 1 / MAX_SCALE to MAX_SCALE."""
     low, high = 1 / MAX_SCALE, MAX_SCALE
     center = math.log((1 - low) / (high - 1))
     steepness = (high - low) / ((1 - low) * (high - 1))

@@ -1,4 +1,4 @@
-"""Walk from the cells of a hole along their epipolar lines to the hole's far rim, and read the values there."""
+"""Walk along epipolar lines from the cells of a hole to the hole's far rim, and read values at the rim."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from spackle.camera import Camera
 from spackle.device import run_chunks
 from spackle.residual.view_features import CELL
 
-SAME_DEPTH = 1.1  # factor by which the inverse depth of a cell mirrored at the rim may differ from the rim's
-SAME_EYE = 1e-9 * CELL  # a shorter offset between cell and epipole (homogeneous) gives no direction
+SAME_DEPTH = 1.1  # a cell mirrored at the rim and the rim belong to one surface if inverse depths differ by less
+SAME_EYE = 1e-9 * CELL  # a shorter offset between cell and epipole (homogeneous) has no direction
 
 
 def walk(
@@ -24,19 +24,19 @@ def walk(
 
     Args:
         uv: [h, w, 2] pixels of the cells.
-        values: [h, w, c], to be looked up at the rim.
+        values: [h, w, c] to read at the rim.
         inverse_depth: [h, w], positive.
         mask: [h, w] bool.
         camera: of the view.
         eye: [3] position of the other camera; its projection into the view is the epipole.
 
     Returns:
-        Values [h, w, c] at the far rim; values [h, w, c] at the cell's mirror image beyond the rim, if that is on the
-        same surface, else the values at the rim; distance [h, w] to the rim in cells. For a line that meets no surface,
-        and outside of the mask, both values are the cell's own, and the distance is 0.
+        Values [h, w, c] at the far rim; values [h, w, c] at the cell's mirror image beyond the rim, or at the rim if
+        the mirror image lies on another surface; distance [h, w] to the rim in cells. Unmasked cells, and cells whose
+        line meets no surface, have their own values and distance 0.
     """
     eye = eye.double()
-    # The eye's projection into the view: homogeneous, because it may lie at infinity.
+    # Homogeneous, because the epipole may lie at infinity.
     epipole = (camera.K.to(eye) @ camera.to_camera(eye)).detach().cpu().numpy()
     view = [image.contiguous().numpy() for image in (uv, values, inverse_depth, mask)]
     grids = (view[1].copy(), view[1].copy(), np.zeros(mask.shape, np.float32))
@@ -50,7 +50,6 @@ def _walk(
     start: int, stop: int, uv: Any, rgb: Any, depths: Any, mask: Any, epipole: Any, same: float,
     found: Any, mirrored: Any, distance: Any,
 ) -> None:  # fmt: skip
-    """Walk from the masked cells of the rows start..stop."""
     height, width = depths.shape
     for y in range(start, stop):
         for x in range(width):
@@ -79,7 +78,7 @@ def _walk(
 
 @kernel
 def _line(epipole: Any, u: float, v: float) -> Any:
-    """The unit vector (x, y) along a pixel's epipolar line; (1, 0) if both eyes coincide."""
+    """The unit vector (x, y) along a pixel's epipolar line; (1, 0) if both camera positions coincide."""
     x, y = epipole[0] - epipole[2] * u, epipole[1] - epipole[2] * v
     length = np.sqrt(x * x + y * y)
     if length > SAME_EYE:
@@ -89,7 +88,7 @@ def _line(epipole: Any, u: float, v: float) -> Any:
 
 @kernel
 def _steps_to_rim(mask: Any, y: int, x: int, dy: float, dx: float) -> int:
-    """Number of one-cell steps to the first unmasked cell; 0 if the image ends before."""
+    """The number of steps of one cell to the first unmasked cell; 0 if the image ends before."""
     height, width = mask.shape
     k = 1
     while True:

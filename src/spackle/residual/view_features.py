@@ -1,7 +1,4 @@
-"""Features of a rendered view: its mask (paper, eq. 4), its hole-area ratio (eqs. 10 and 11), and the input of f_res.
-
-The input is a grid with one cell for each 2×2 pixels (section 3.3).
-"""
+"""Features of a rendered view: mask (paper, eq. 4), hole-area ratio (eqs. 10, 11), and cells of 2×2 pixels (3.3)."""
 
 from __future__ import annotations
 
@@ -38,16 +35,16 @@ def hole_area_ratio(alpha: Tensor, threshold: float = MASK_THRESHOLD) -> float:
 
 @dataclasses.dataclass(frozen=True)
 class ViewFeatures:
-    """A view's cells, on the CPU and without gradients. Grid: h × w = ceil(H/2) × ceil(W/2)."""
+    """The cells of a view, on the CPU and without gradients; h = ceil(H/2), w = ceil(W/2)."""
 
-    rgb: Tensor  # [h, w, 3] sRGB, linear mean over the cell divided by its opacity, so without the black background
-    inverse_depth: Tensor  # [h, w] 1/z of the farthest covered pixel; 0 in a cell without covered pixels
+    rgb: Tensor  # [h, w, 3] sRGB: mean in linear light, divided by the opacity to remove the black background
+    inverse_depth: Tensor  # [h, w] 1/z of the farthest pixel that is no hole; 0 if all pixels are holes
     alpha: Tensor  # [h, w] mean opacity
     mask: Tensor  # [h, w] bool: at least one pixel of the cell is a hole
 
     @staticmethod
     def of(rendering: Rendering, threshold: float = MASK_THRESHOLD) -> ViewFeatures:
-        """Reduce a rendering to cells; an odd last row or column is repeated."""
+        """Reduce a rendering to cells; an odd last row or column counts twice."""
         rendering = rendering.to(PROCESSOR).detach()
         images = (rendering.rgb.flatten(1), rendering.depth, rendering.alpha)
         view = [image.float().contiguous().numpy() for image in images]
@@ -61,7 +58,7 @@ class ViewFeatures:
 
 
 def cell_centers(camera: Camera) -> Tensor:
-    """Centres of a view's cells, [ceil(H/2), ceil(W/2), 2], in pixels."""
+    """Centres [ceil(H/2), ceil(W/2), 2] of a view's cells, in pixels."""
     return camera.even().pixel_centers(stride=CELL)
 
 
@@ -70,7 +67,7 @@ def _gather(
     start: int, stop: int, rgb: Any, depth: Any, alpha: Any, threshold: Any,
     colors: Any, inverse_depth: Any, opacity: Any, mask: Any,
 ) -> None:  # fmt: skip
-    """Compute the rows start..stop of the cells; colours are decoded a row at a time, so that the loop vectorises."""
+    """Compute the rows start..stop of the cells; loops over whole rows of colours run in vector registers."""
     height, width = alpha.shape
     columns = inverse_depth.shape[1]
     light = np.empty(CHANNELS * width, np.float32)
@@ -91,7 +88,7 @@ def _gather(
             inverse_depth[row, column] = np.float32(1) / far if holes < CELL * CELL else np.float32(0)
             opacity[row, column] = total / np.float32(CELL * CELL)
             mask[row, column] = holes > 0
-            for c in range(CHANNELS):  # the rendered light is already multiplied by alpha
+            for c in range(CHANNELS):  # rendered light is already multiplied by alpha
                 both = light[CHANNELS * left + c] + light[CHANNELS * right + c]
                 mean[CHANNELS * column + c] = both / max(total, np.float32(LEAST))
         for k in range(CHANNELS * columns):

@@ -1,8 +1,4 @@
-"""One scene that is consistent along a whole path; the paper completes each view by itself.
-
-`fill` builds on `spackle.residual` and chooses the order in which views are completed, `occlusion_guard` keeps aux
-Gaussians behind the surfaces that the photo and other views show, and `texture` gives a colour to each pixel.
-"""
+"""Complete all views of a path with one set of aux Gaussians; the paper completes single views."""
 
 from spackle.scene_fill.fill import FillContext, FilledScene, FilledView, fill_scene, fill_view
 from spackle.scene_fill.occlusion_guard import OcclusionGuard

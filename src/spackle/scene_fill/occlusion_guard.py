@@ -1,7 +1,4 @@
-"""Keep aux Gaussians behind the surfaces that the photo and other views already show.
-
-The paper composes a view's aux Gaussians with the base alone (eq. 8); one scene for many views needs these guards.
-"""
+"""Keep aux Gaussians behind the surfaces that the photo and other views show."""
 
 from __future__ import annotations
 
@@ -23,19 +20,19 @@ from spackle.render.protocol import ALPHA_MIN, Rendering
 from spackle.residual.view_features import MASK_THRESHOLD, PROCESSOR
 from spackle.surface import BEHIND
 
-WINDOW_PX = 4  # radius of the guard's window: most aux Gaussians reach no farther than this
-REACH = math.sqrt(-2 * math.log(ALPHA_MIN))  # standard deviations from its centre within which a Gaussian is visible
-MAX_REACH_PX = 40.0  # a huge Gaussian is checked no farther from its centre than this
-PIT = 0.027  # of a view's width: a nearer patch that is less than twice as wide is a pit
+WINDOW_PX = 4  # radius of the guard's window: most aux Gaussians reach no farther
+REACH = math.sqrt(-2 * math.log(ALPHA_MIN))  # a Gaussian is visible up to so many standard deviations from its centre
+MAX_REACH_PX = 40.0  # a Gaussian is checked only up to this distance from its centre
+PIT = 0.027  # of a view's width: a near spot less than twice as wide is removed
 STEPS = 48  # candidate positions along the line of sight, evenly spaced in inverse depth
 
 
 @dataclasses.dataclass(frozen=True)
 class OcclusionGuard:
-    """The farthest surface near each pixel of a view; no new Gaussian may lie in front of it."""
+    """The farthest surface near each pixel of a view; no new Gaussian may lie in front of this surface."""
 
     camera: Camera
-    depth: Tensor  # [H, W]; 0 where the view shows only holes
+    depth: Tensor  # [H, W]; 0 in holes
 
     @staticmethod
     def of(rendering: Rendering, camera: Camera, threshold: float = MASK_THRESHOLD) -> OcclusionGuard:
@@ -46,34 +43,29 @@ class OcclusionGuard:
 
 
 def push_behind(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) -> Gaussians:
-    """Move each Gaussian away from its view's eye until it hides no guarded surface, see `free_factors`."""
+    """Move Gaussians away from an eye [3] until they hide no guarded surface, see `free_factors`."""
     return moved_away(aux, eye, free_factors(aux, eye, guards))
 
 
 def moved_away(aux: Gaussians, eye: Tensor, factors: Tensor) -> Gaussians:
-    """Scale N Gaussians about the eye [3] by factors [N]; those with factor 0 are left out.
-
-    This moves and enlarges a Gaussian, which looks the same from that eye.
-    """
+    """Scale N Gaussians about the eye [3] by factors [N], without change from the eye; factor 0 removes a Gaussian."""
     eye, factor = beside(eye, aux.means), factors[:, None]
     moved = dataclasses.replace(aux, means=eye + factor * (aux.means - eye), scales=aux.scales * factor)
     return moved.select(factors > 0)
 
 
 def free_factors(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) -> Tensor:
-    """Factors [N] ≥ 1 by which Gaussians must move away from an eye to hide no guarded surface; 0 if none suffices.
-
-    Nearly every Gaussian has such a factor: moved far enough away, it lies behind every surface.
+    """Factors [N] ≥ 1 by which Gaussians must move away from an eye to hide no guarded surface; 0 if impossible.
 
     Args:
         aux: N Gaussians in the world's frame.
-        eye: [3] position of the camera for which they were made.
+        eye: [3] position of the camera for which the Gaussians were made.
         guards: the views to protect.
     """
     if not len(aux) or not guards:
         return torch.ones_like(aux.opacities)
     rays = (aux.means - beside(eye, aux.means)).detach().cpu().double().numpy()
-    quats, scales = (shape.detach().cpu().double().contiguous().numpy() for shape in (aux.quats, aux.scales))
+    covariances = aux.detach().to(dtype=torch.float64).covariances().cpu().flatten(1).numpy()  # [N, 9]
     lenses = np.empty((len(guards), 16))  # fx, fy, cx, cy and the 3×4 extrinsics of each view
     for lens, camera in zip(lenses, [guard.camera for guard in guards], strict=True):
         lens[:4] = camera.K.detach().cpu().numpy()[[0, 1, 0, 1], [0, 1, 2, 2]]
@@ -83,16 +75,12 @@ def free_factors(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) 
     starts = np.concatenate([[0], np.cumsum(sizes.prod(axis=1))])
     place, factors = beside(eye, aux.means).cpu().double().numpy(), np.empty(len(rays))
     views = (lenses, depths, sizes, starts)
-    run_chunks(lambda first, last: _free_factors(first, last, place, rays, quats, scales, *views, factors), len(rays))
+    run_chunks(lambda first, last: _free_factors(first, last, place, rays, covariances, *views, factors), len(rays))
     return torch.from_numpy(factors).to(aux.means)
 
 
 def without_pits(depths: Tensor, cells: Tensor) -> Tensor:
-    """Depths [n] of a view's chosen cells ([h, w] bool), after a morphological closing that removes narrow near spots.
-
-    Neighbouring Gaussians of one surface, moved one by one, would end at different depths and look scattered from other
-    views.
-    """
+    """Depths [n] of the cells `cells` ([h, w] bool), after a morphological closing that removes narrow near spots."""
     reach = max(1, round(PIT * cells.shape[1]))
     grid = depths.new_zeros(cells.shape)
     grid[cells] = depths
@@ -102,22 +90,18 @@ def without_pits(depths: Tensor, cells: Tensor) -> Tensor:
 
 @kernel
 def _free_factors(
-    first: int, last: int, eye: Any, rays: Any, quats: Any, scales: Any,
+    first: int, last: int, eye: Any, rays: Any, covariances: Any,
     lenses: Any, depths: Any, sizes: Any, starts: Any, factors: Any,
 ) -> None:  # fmt: skip
-    """For the Gaussians first..last, find the least factor 1 / (1 − k / STEPS) at which they hide no guarded surface.
-
-    The factor is 0 if there is none.
-    """
+    """Find the least factor 1 / (1 − k / STEPS), or 0, for the Gaussians first..last."""
     for n in range(first, last):
         factors[n] = 0
-        covariance = _covariance(quats[n], scales[n])
         for step in range(STEPS):
             factor = 1.0 / (1.0 - step / STEPS)
             x, y, z = eye[0] + factor * rays[n, 0], eye[1] + factor * rays[n, 1], eye[2] + factor * rays[n, 2]
             blocked = False
             for s in range(len(lenses)):
-                if _blocks(lenses[s], depths, starts[s], sizes[s, 0], sizes[s, 1], x, y, z, covariance, factor):
+                if _blocks(lenses[s], depths, starts[s], sizes[s, 0], sizes[s, 1], x, y, z, covariances[n], factor):
                     blocked = True
                     break
             if not blocked:
@@ -126,30 +110,11 @@ def _free_factors(
 
 
 @kernel
-def _covariance(quat: Any, scale: Any) -> Any:
-    """The covariance Σ = R S Sᵀ Rᵀ as (xx, yy, zz, xy, xz, yz)."""
-    length = max(np.sqrt(quat[0] ** 2 + quat[1] ** 2 + quat[2] ** 2 + quat[3] ** 2), 1e-12)
-    w, x, y, z = quat[0] / length, quat[1] / length, quat[2] / length, quat[3] / length
-    a, b, c = scale[0] ** 2, scale[1] ** 2, scale[2] ** 2
-    xa, xb, xc = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
-    ya, yb, yc = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
-    za, zb, zc = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
-    return (
-        a * xa * xa + b * xb * xb + c * xc * xc,
-        a * ya * ya + b * yb * yb + c * yc * yc,
-        a * za * za + b * zb * zb + c * zc * zc,
-        a * xa * ya + b * xb * yb + c * xc * yc,
-        a * xa * za + b * xb * zb + c * xc * zc,
-        a * ya * za + b * yb * zb + c * yc * zc,
-    )
-
-
-@kernel
 def _blocks(
     lens: Any, guards: Any, start: int, height: int, width: int,
     x: float, y: float, z: float, covariance: Any, factor: float,
 ) -> bool:  # fmt: skip
-    """Whether a Gaussian lies in front of a view's surface anywhere within its extent."""
+    """Whether any part of a Gaussian lies in front of a view's surface."""
     depth = lens[12] * x + lens[13] * y + lens[14] * z + lens[15]
     if not depth > 0:
         return False
@@ -162,7 +127,7 @@ def _blocks(
     reach_v = _reach(lens, 8, lens[1] * factor / depth, tan_v, covariance)
     if u < -reach_u or v < -reach_v or u > width + reach_u or v > height + reach_v:
         return False
-    # Adjacent windows of the guard cover the reach.
+    # Adjacent windows of the guard cover the Gaussian's extent.
     steps_u = int(np.ceil(max(reach_u - WINDOW_PX, 0.0) / (2 * WINDOW_PX)))
     steps_v = int(np.ceil(max(reach_v - WINDOW_PX, 0.0) / (2 * WINDOW_PX)))
     for j in range(-steps_v, steps_v + 1):
@@ -176,10 +141,10 @@ def _blocks(
 
 @kernel
 def _reach(lens: Any, row: int, scale: float, tangent: float, covariance: Any) -> float:
-    """A Gaussian's extent in pixels from its centre, along the image axis that `row` of the extrinsics belongs to."""
+    """A Gaussian's extent in pixels from its centre, along one image axis; `row` is the axis' place in `lens`."""
     a = scale * (lens[row] - tangent * lens[12])
     b = scale * (lens[row + 1] - tangent * lens[13])
     c = scale * (lens[row + 2] - tangent * lens[14])
-    xx, yy, zz, xy, xz, yz = covariance
-    variance = a * a * xx + b * b * yy + c * c * zz + 2 * (a * b * xy + a * c * xz + b * c * yz)
+    variance = a * a * covariance[0] + b * b * covariance[4] + c * c * covariance[8]
+    variance += 2 * (a * b * covariance[1] + a * c * covariance[2] + b * c * covariance[5])
     return float(min(REACH * np.sqrt(max(variance, 0.0)) + 1.0, MAX_REACH_PX))
