@@ -1,4 +1,4 @@
-"""MoGe-2 against arrays that the original computed with weights that anyone can make; lens, sky and wrong files."""
+"""MoGe-2 against arrays that the original computed with deterministic weights; focal length, sky and wrong files."""
 
 from __future__ import annotations
 
@@ -125,15 +125,13 @@ def test_whose_lens_counts_and_where_the_sky_goes(base: MogeBase, monkeypatch: p
         assert (kept.camera.focal[0], kept.lens_source) == (120, "")
     seen = base.predict(photo)
     assert (seen.camera.focal[0], seen.lens_source) == (pytest.approx(1.3 * HALF, rel=1e-6), "MoGe")
-    z, sky = seen.gaussians.means[:, 2], float((output.mask_logits < 0).float().mean())
-    assert float(z.max()) == pytest.approx(SKY * 8, rel=0.02)
-    assert seen.notes["sky"] == round(sky, 4)
+    assert float(seen.gaussians.means[:, 2].max()) == pytest.approx(SKY * 8, rel=0.02)
     points = output.points
     for factor in (-1, 30, 0.03):  # no lens turns a photo over, sees 174° or only 2°
         output = dataclasses.replace(output, points=points * torch.tensor([factor, factor, 1]))
         assert (base.predict(photo).camera.focal[0], base.predict(photo).lens_source) == (120, "")
     output.mask_logits.fill_(-1)
-    with pytest.raises(InputError, match=r"photo\.png: MoGe sees no surface"):
+    with pytest.raises(InputError, match=r"photo\.png: MoGe finds no surface"):
         base.predict(photo)
 
 
@@ -196,7 +194,6 @@ def changed(change: Callable[[dict[str, Any]], None], bytes_less: int = 0) -> Ca
         (changed(lambda c: c["neck"].update(resamplers=["pixel_shuffle"] * 4)), "neck.resamplers.0: .*pixel_shuffle"),
         (changed(lambda c: c["mask_head"].update(res_block_in_norm="group_norm")), "group_norm"),
         (changed(lambda c: c["points_head"].update(num_res_blocks=[10**9] * 5)), "num_res_blocks"),
-        (changed(lambda c: c["neck"].update(dim_in=[35, 2, 2, 2, 2])), "one part gives other channels"),
         (changed(lambda c: None), "of 341 tensors 341 missing .* 1 unknown"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Published weights and their downloads, from a server on this machine that misbehaves in every way we know."""
+"""Published weights and their downloads from a misbehaving server on this machine."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ import socket
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -21,7 +20,6 @@ from sites import Site, serve
 from stand_in import SHARP_FILE, publish
 
 from spackle.errors import InputError
-from spackle.folders import hold
 from spackle.progress import Reporter
 from spackle.weights import PUBLISHED, check_undamaged, installed, weights_digest, weights_folder
 from spackle.weights import download as module
@@ -35,7 +33,6 @@ CLOSED = "http://127.0.0.1:1/weights.pt"  # nobody listens at a port below 1024 
 
 @pytest.fixture(autouse=True)
 def _without_network_habits(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No proxy or mirror of this machine, and no waiting."""
     for name in ("http_proxy", "https_proxy", "all_proxy", "no_proxy", "hf_endpoint"):
         monkeypatch.delenv(name, raising=False)
         monkeypatch.delenv(name.upper(), raising=False)
@@ -58,14 +55,12 @@ def fetch(url: str, target: Path, progress: Progress | None = None) -> None:
 
 
 def fetches(url: str, target: Path, progress: Progress | None = None) -> None:
-    """The whole file, and nothing beside it."""
     fetch(url, target, progress)
     assert target.read_bytes() == CONTENT
     assert os.listdir(target.parent) == [target.name]
 
 
 def refused(url: str, target: Path, *parts: str) -> None:
-    """One line that says what is wrong, and no file."""
     with pytest.raises(InputError) as caught:
         fetch(url, target)
     assert len(str(caught.value).splitlines()) == 1
@@ -74,7 +69,6 @@ def refused(url: str, target: Path, *parts: str) -> None:
 
 
 def ranges(site: Site) -> list[str | None]:
-    """The Range of each request."""
     return [asked.get("Range") for asked in site.requests]
 
 
@@ -87,7 +81,7 @@ def test_an_older_file_or_a_link_stays_until_the_new_one_is_whole(site: Site, tm
     with pytest.raises(InputError):
         fetch(site.url, link)
     assert real.read_bytes() == b"old"
-    site.status, site.headers = 200, {"Content-Length": None}  # a length that is not told is known all the same
+    site.status, site.headers = 200, {"Content-Length": None}
     fetch(site.url, link)
     assert link.is_symlink()
     assert real.read_bytes() == CONTENT
@@ -106,8 +100,6 @@ def test_a_later_call_goes_on_with_the_rest(site: Site, target: Path, monkeypatc
         patch.setattr(module, "PAUSES", ())
         refused(site.url, target, "early", f"{BREAK:,} bytes")
     assert os.listdir(target.parent) == ["weights.pt.part"]
-    with hold(target.with_name("weights.pt.lock")):
-        refused(site.url, target, "another process")
     steps: list[tuple[int, int]] = []
     fetches(site.url, target, lambda done, total: steps.append((done, total)))
     assert ranges(site) == [None, f"bytes={BREAK}-"]
@@ -130,8 +122,7 @@ def test_the_beginning_of_another_file_is_dropped(site: Site, target: Path, size
         ({"status": 500}, ("HTTP 500", "later")),
         ({"status": 206}, ("is not a file",)),
         ({"headers": {"Content-Type": "text/html"}}, ("is not a file",)),
-        ({"headers": {"Content-Length": "0"}}, ("another file: 0 bytes, 1,000,003 were published",)),
-        ({"content": CONTENT + b"more"}, ("another file: 1,000,007 bytes",)),
+        ({"content": CONTENT + b"more"}, ("another file: 1,000,007 bytes instead of 1,000,003",)),
         ({"content": CONTENT[::-1]}, ("not the SHA-256", SHA256, "another address")),
         ({"drops": 3 * [len(CONTENT) - 10], "ranges": False}, ("10 bytes early",)),
         ({"status": 302, "headers": {"Location": "file:///etc/hostname"}}, ("HTTP 302",)),
@@ -157,10 +148,10 @@ def test_a_server_that_hangs_or_is_none(site: Site, target: Path, monkeypatch: p
 
 
 @pytest.mark.parametrize("url", ["", "a.pt", "file:///a", "http://", "https://[/", "http://a:b/", "http://a:0/"])
-def test_addresses_that_are_none(target: Path, url: str) -> None:
+def test_addresses_that_are_refused(target: Path, url: str) -> None:
     refused(url, target, repr(url))
-    with pytest.raises(InputError, match="password") as caught:
-        fetch(url.replace("://", "://me:secret@") if "//" in url else f"me:secret@{url}", target)
+    with pytest.raises(InputError, match="without user name and password") as caught:
+        fetch(f"{url}//me:secret@a", target)
     assert "secret" not in str(caught.value)
 
 
@@ -170,9 +161,6 @@ def test_places_that_cannot_be_written(site: Site, target: Path, monkeypatch: py
     refused(site.url, folder / "missing" / "a.pt", "a.pt", "does not exist")
     refused(site.url, folder / ("a" * 252), "too long", "choose another folder")  # with .part it is
     assert site.requests == []
-    with monkeypatch.context() as patch:
-        patch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(total=10, free=1))
-        refused(site.url, target, str(folder), "make room")
 
     def full(descriptor: int) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -202,7 +190,7 @@ def test_damage_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
         check_undamaged(file)
         assert weights_digest(file) == hashlib.sha256(content).hexdigest()
     file.write_bytes(CONTENT[::-1])
-    with pytest.raises(InputError, match=rf"{SHARP_FILE}: damaged.* delete it and run `spackle weights get sharp`"):
+    with pytest.raises(InputError, match=rf"{SHARP_FILE}: damaged.* run `spackle weights get sharp`"):
         check_undamaged(file)
     check_undamaged(file.rename(tmp_path / "mine.pt"))
     with pytest.raises(InputError, match="no such file"):
@@ -274,7 +262,7 @@ def test_get_to_a_place_of_your_own(site: Site, weights: Path, tmp_path: Path) -
         ("sharp", CLOSED, "no connection (Connection refused): check network"),
         ("sharp", "http://me:secret@127.0.0.1:1/", "password"),
         ("moge", CLOSED, "weights moge: unknown: there are sharp"),
-        ("lama", None, "205,669,692 were published"),
+        ("lama", None, "bytes instead of 205,669,692"),
     ],
 )
 def test_get_in_one_line_where_it_fails(site: Site, weights: Path, name: str, url: str | None, said: str) -> None:

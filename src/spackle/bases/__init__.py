@@ -1,4 +1,4 @@
-"""The interface of every base; `settings` lists the bases that `--base` can name, and `open` opens them."""
+"""The interface of every base. `settings` lists the bases that `--base` can name, and `open` opens them."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from spackle.camera import Camera
 from spackle.gaussians import Gaussians
 from spackle.image import Photo, film_to_pixels
 
-Progress = Callable[[int, int], None]  # (steps done, of how many)
-USUAL_DISPARITY = 0.3  # how far a camera goes if neither the user nor the base decides it; the paper's S1
+Progress = Callable[[int, int], None]  # (steps done, number of steps)
+USUAL_DISPARITY = 0.3  # the camera's disparity if neither the user nor the base limits it; the paper's S1
 UNCOVERED = 0.125  # share of the widest views that may be holes if the user sets no disparity; more is conspicuous
 
 
 @dataclasses.dataclass(frozen=True)
 class BasePrediction:
-    """What the photo shows, as Gaussians in the frame of the photo's camera."""
+    """The photo's Gaussians in the frame of the photo's camera."""
 
     gaussians: Gaussians
-    camera: Camera  # the photo's, at its working size
-    notes: dict[str, float | int | str]  # for the report: what was measured, filled or assumed
-    lens_source: str = ""  # where the focal length comes from, if not from the photo's file or the user
-    disparity: float = USUAL_DISPARITY  # limit of the move if the user sets none: up to here the geometry is right
+    camera: Camera  # the photo's camera, at its working size
+    notes: dict[str, float | int | str]  # for the report: measured, filled or assumed values
+    lens_source: str = ""  # source of the focal length, if it is neither the photo's file nor the user
+    disparity: float = USUAL_DISPARITY  # largest disparity with correct geometry, used if the user sets none
     uncovered: float = UNCOVERED  # share of the widest views that may be holes, if the user sets no disparity
 
 
@@ -35,7 +35,7 @@ class Base(Protocol):
     name: str
 
     def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
-        """Gaussians of everything that the photo shows, and nothing else.
+        """Gaussians of the surfaces that are visible in the photo, and no others.
 
         Args:
             photo: at its full size. The prediction's camera has the working size (see `working_size`).
@@ -44,7 +44,7 @@ class Base(Protocol):
         ...
 
 
-SEEN_LENSES_MM = (10.0, 600.0)  # 35 mm equivalents between which a network's estimate is believed: 130° to 4°
+SEEN_LENSES_MM = (10.0, 600.0)  # a network's estimate is plausible between these 35 mm equivalents (130° to 4°)
 
 
 def believed_lens(focal_px: float, width: int, height: int) -> bool:
@@ -53,8 +53,8 @@ def believed_lens(focal_px: float, width: int, height: int) -> bool:
     return shortest <= focal_px <= longest
 
 
-NEAREST_M = 1.5  # where the nearest surface of relative depth is placed: an arm's length and a half
-NEAREST_QUANTILE = 0.999  # trajectories use this quantile as the nearest depth, too; anything nearer is specks
+NEAREST_M = 1.5  # distance of the nearest surface if depth is relative
+NEAREST_QUANTILE = 0.999  # of inverse depth, as for trajectories; nearer pixels are specks
 
 
 def nearest(values: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Depth edges: find them in a depth map, and move them to the photo's outlines on the photo's grid."""
+"""Find the edges of a depth map, and move them to the photo's outlines on the photo's grid."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from spackle._numba import inlined_kernel, kernel
 from spackle.filters import far_fill
 from spackle.surface import EDGE
 
-STEEPEST = 5.0  # a surface at 79° to the image plane; only what is steeper may be a smeared edge
-REACH = 16  # most pixels of the map from a smeared edge's steepest place to its end
-FLAT = 0.1  # a smeared edge ends where its slope has fallen to about this share of its peak
-SWELL = 0.25  # a renewed rise of the slope by this share of the peak belongs to another edge
+STEEPEST = 5.0  # tangent of 79°: only surfaces at a larger angle to the image plane may be smeared edges
+REACH = 16  # most pixels of the map from a smeared edge's steepest pixel to its end
+FLAT = 0.1  # a smeared edge ends where its slope falls to about this share of the peak
+SWELL = 0.25  # if the slope rises again by this share of the peak, the rise belongs to another edge
 
 Floats = NDArray[np.float32]
 Bools = NDArray[np.bool_]
@@ -26,20 +26,19 @@ Bools = NDArray[np.bool_]
 class Edges:
     """The depth edges of a map."""
 
-    step: Floats  # [h, w] height, in inverse depth, of the smeared edge that a pixel lies in; 0 if it lies in none
-    across: Bools  # [h, w] an edge runs between a pixel and the one to its right
-    down: Bools  # [h, w] an edge runs between a pixel and the one below it
+    step: Floats  # [h, w] height, in inverse depth, of the smeared edge around a pixel; 0 outside of smeared edges
+    across: Bools  # [h, w] an edge runs between a pixel and its right neighbour
+    down: Bools  # [h, w] an edge runs between a pixel and its lower neighbour
 
 
 def find_edges(inverse_depth: Floats, known: Bools, focal: tuple[float, float]) -> Edges:
     """Find sharp and smeared depth edges along the rows and the columns of inverse depth [h, w].
 
-    The inverse depth of a plane is linear in the pixel, a crease bends it, a sphere curves it. Only at an edge does its
-    slope rise to a peak and fall again. A peak is an edge if it exceeds the slopes on both sides, if it is steeper than
-    any surface that fills much of a photo (which depends on `focal`, horizontal and vertical, in pixels of the map),
-    and if it changes the inverse depth by more than the share `EDGE` beyond what those slopes explain. The pixels
-    between the two feet of the peak belong to the smeared edge. No edge is found beside unknown pixels (`known` [h, w]
-    false).
+    Only at an edge does the slope of the inverse depth rise to a peak and fall again. A peak is an edge if it exceeds
+    the slopes on both sides, if it is steeper than `STEEPEST` (which depends on `focal`, horizontal and vertical, in
+    pixels of the map), and if it changes the inverse depth by more than the share `EDGE` beyond the slopes on both
+    sides. The pixels between the two feet of the peak belong to the smeared edge. No edge is found beside unknown
+    pixels (`known` [h, w] false).
     """
     step, across = _rows(inverse_depth, known, STEEPEST / focal[0])
     columns, below = _rows(np.ascontiguousarray(inverse_depth.T), np.ascontiguousarray(known.T), STEEPEST / focal[1])
@@ -52,7 +51,7 @@ def _rows(inverse_depth: Any, known: Any, steepest: float) -> Any:
     height, width = inverse_depth.shape
     step = np.zeros((height, width), np.float32)
     across = np.zeros((height, width), np.bool_)
-    gaps = np.empty(width + 1, np.float32)  # gaps[x]: the change from x - 1 to x; NaN beside unknown pixels
+    gaps = np.empty(width + 1, np.float32)  # gaps[x] is the change from x - 1 to x; NaN beside unknown pixels
     for y in range(height):
         row = inverse_depth[y]
         gaps[0] = gaps[width] = np.nan
@@ -79,7 +78,7 @@ def _rows(inverse_depth: Any, known: Any, steepest: float) -> Any:
 
 @kernel
 def _foot(gaps: Any, peak: int, way: int) -> Any:
-    """The slope beside an edge on one side (−1 if it is unknown), and the edge's outermost gap on that side."""
+    """The slope next to an edge on one side (−1 if unknown), and the index of the edge's last gap on that side."""
     if np.isnan(gaps[peak + way]):
         return np.float32(-1), peak
     sign = np.float32(1 if gaps[peak] > 0 else -1)
@@ -93,10 +92,10 @@ def _foot(gaps: Any, peak: int, way: int) -> Any:
             flattest, end = max(sign * gaps[k], np.float32(0)), k
         if flattest == 0:
             break
-        if 2 * sign * gaps[k] < top:  # a smeared edge ends about twice as far out as where it is half as steep
+        if 2 * sign * gaps[k] < top:  # a smeared edge is about twice as wide as its part above half the peak
             reach = min(reach, 2 * n + 1)
-    # If another edge is close, ending this one a little early is better than cutting into a thin object between them.
-    # And a peak without steep gaps beside it is a sharp edge, even if a round object's rim curves towards it.
+    # If another edge is close, this edge ends early and does not cut into a thin object between both edges.
+    # A peak without steep gaps beside it is a sharp edge, even if the rim of a round object curves towards it.
     crowded = abs(gaps[end + way]) > FLAT * top
     foot = peak
     while (end - foot) * way > 1:
@@ -107,27 +106,27 @@ def _foot(gaps: Any, peak: int, way: int) -> Any:
     return flattest, foot
 
 
-SLOPE_REACH = 3  # pixels of the map beside an edge within which the slope of that side is sought
-HOLE, OPEN, SETTLED = 0, 1, 2  # a pixel's depth is unknown, that of one of an edge's two sides, or known
+SLOPE_REACH = 3  # the slope beside an edge is measured within this number of the map's pixels
+HOLE, OPEN, SETTLED = 0, 1, 2  # a pixel's depth is unknown, undecided between the two sides of an edge, or known
 
 
 @dataclasses.dataclass(frozen=True)
 class Sampled:
-    """A map's inverse depth on the photo's grid. Open pixels keep the map's value, even where it mixes two surfaces."""
+    """A map's inverse depth on the photo's grid. Open pixels keep the map's value, even if it mixes two surfaces."""
 
     inverse_depth: Floats  # [H, W]
     state: NDArray[np.uint8]  # [H, W] HOLE, OPEN or SETTLED
-    step: Floats  # [H, W] height of the edge that an open pixel lies in
-    slope: tuple[Floats, Floats]  # [H, W] each: change of the inverse depth by pixel x and y, the flattest nearby
+    step: Floats  # [H, W] height of the edge around an open pixel
+    slope: tuple[Floats, Floats]  # [H, W] each: flattest change of the inverse depth by pixel x and y nearby
 
 
 def sample(inverse_depth: Floats, known: Bools, edges: Edges, height: int, width: int) -> Sampled:
-    """Resample a map's inverse depth [h, w], where known [h, w], to height×width.
+    """Resample a map's inverse depth [h, w] to height×width; `known` [h, w] marks the valid pixels.
 
     Between four map pixels of one surface the inverse depth is interpolated bilinearly, so a plane stays a plane. If an
-    edge runs between them, or one of them lies in a smeared edge, the photo's pixel stays open; but if it covers a map
-    pixel outside of smeared edges, it gets that pixel's depth, extended along its surface. If unknown map pixels have
-    more than half of the weight, the photo's pixel is a hole, unless it covers such a map pixel.
+    edge runs between these four, or one of them lies in a smeared edge, the photo's pixel stays open. If unknown map
+    pixels have more than half of the weight, the photo's pixel is a hole. But if the photo's pixel covers the centre of
+    a map pixel outside of smeared edges, it gets that pixel's depth, extended along the surface.
     """
     sound = known & (edges.step == 0)
     across = _flattest(inverse_depth, sound, edges.across)
@@ -145,7 +144,7 @@ def sample(inverse_depth: Floats, known: Bools, edges: Edges, height: int, width
 
 @kernel
 def _flattest(inverse_depth: Any, sound: Any, edge: Any) -> Any:
-    """The flattest slope near each pixel along its row, because the slope right beside a smeared edge is too steep."""
+    """The flattest slope near each pixel along its row; right beside a smeared edge the slope is too steep."""
     height, width = inverse_depth.shape
     slope = np.zeros((height, width), np.float32)
     for y in range(height):
@@ -209,25 +208,25 @@ def _sample(
             state[y, x] = SETTLED
             if not between and step == 0:
                 values[y, x] = max(bilinear, 0.5 * low) if count == 4 else planes / mass
-            elif closest < 0.5 + 1e-6:  # no other pixel of the photo is closer to that map pixel
+            elif closest < 0.5 + 1e-6:  # no other pixel of the photo is closer to this map pixel
                 values[y, x] = here
             else:
                 values[y, x], state[y, x], heights[y, x] = mixed / mass, OPEN, max(step, high - low)
     return values, state, heights
 
 
-CHANGE_COST = 35.0  # cost, in pixels of path, of a channel's change from 0 to 1, or of crossing a smeared edge
-NEAR_COST = 300.0  # and of filling a hole from a pixel that is far too near
+CHANGE_COST = 35.0  # cost of a channel's change from 0 to 1, or of crossing a smeared edge, in pixels of path length
+NEAR_COST = 300.0  # cost of filling a hole from a pixel that is much too near, in pixels of path length
 
 
 def settle(sampled: Sampled, rgb: Floats) -> Floats:
     """Give every open pixel, then every hole pixel, the depth of the known pixel to which its cheapest path leads.
 
-    A path over the photo costs its length plus the change of sRGB [H, W, 3] along it, so that depth spreads within
-    objects and stops at their outlines. In a smeared edge the change of the smeared depth is added, so that the paths
-    from both sides meet in its middle if the photo shows no outline; the depth of each side is extended along its
-    surface. In a hole, a start pixel nearer than the hole's far side costs extra, because most holes are background
-    that is hidden from a second camera.
+    A path costs its length plus the change of sRGB [H, W, 3] along it, so that depth spreads within objects and stops
+    at their outlines. In a smeared edge the change of the smeared depth is added, so that the paths from both sides
+    meet in the middle of the edge if the photo shows no outline. The depth of each side is extended along its surface.
+    In a hole, a start pixel nearer than the hole's far side costs extra, because most holes are background that is
+    hidden from a second camera.
 
     Returns:
         Inverse depth [H, W]; settled pixels are unchanged.
@@ -255,23 +254,23 @@ def settle(sampled: Sampled, rgb: Floats) -> Floats:
 
 @inlined_kernel
 def color_change(rgb: Any, y: int, x: int, v: int, u: int) -> Any:
-    """Sum of the channels' differences between the pixels (y, x) and (v, u) of a photo [H, W, 3]."""
+    """Sum of the channel differences between the pixels (y, x) and (v, u) of a photo [H, W, 3]."""
     change = abs(rgb[y, x, 0] - rgb[v, u, 0]) + abs(rgb[y, x, 1] - rgb[v, u, 1])
     return change + abs(rgb[y, x, 2] - rgb[v, u, 2])
 
 
 @kernel
 def _spread(cost: Any, source: Any, depths: Any, steps: Any, far: Any, rgb: Any, pixels: Any) -> None:
-    """Find, in place, each given pixel's cheapest path: its cost, and the start that it leads to, as y·W + x.
+    """Find the cheapest path of each of `pixels`: write its cost and its start (as y·W + x) to `cost` and `source`.
 
-    At first each start has cost 0, every other pixel has infinite cost, and each pixel is its own source.
+    The caller sets the cost of start pixels to 0, every other cost to infinity, and each source to the pixel itself.
     """
     height, width = depths.shape
     way, changed, before = -1, True, True
     while changed or before:
         before, changed = changed, False
         for i in range(len(pixels)):
-            n = pixels[i if way < 0 else len(pixels) - 1 - i]  # the neighbours tried below are already visited
+            n = pixels[i if way < 0 else len(pixels) - 1 - i]  # this sweep has visited the neighbours that are tried
             y, x = n // width, n % width
             for k in range(4):
                 v, u = (y + way, x + k - 1) if k < 3 else (y, x + way)

@@ -1,7 +1,4 @@
-"""Lift a photo and its depth map to surface-aligned Gaussians.
-
-The map's steps and noise are smoothed, its edges sharpened and its gaps filled.
-"""
+"""Lift a photo and its depth map to surface-aligned Gaussians: smooth the map, sharpen its edges, fill its gaps."""
 
 from __future__ import annotations
 
@@ -32,7 +29,7 @@ class RgbdBase:
 
     def __init__(self, depth: DepthMap, lens_source: str = "calibration") -> None:
         self.depth = depth
-        self.lens_source = lens_source  # where the map's intrinsics come from; "" if from the user
+        self.lens_source = lens_source  # source of the map's intrinsics; "" if the user gave them
 
     def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
         """Gaussians of the photo's pixels at its working size; InputError for a map of another aspect ratio."""
@@ -56,7 +53,7 @@ class RgbdBase:
 
 
 def lift_guess(photo: Photo, depth: DepthMap, camera: Camera, progress: Progress | None) -> BasePrediction:
-    """Lift a photo, its outermost lines replaced, by a network's depth; for `progress` the network was step 1 of 2."""
+    """Lift a photo (with its outermost lines replaced) by a network's depth, as step 2 of 2 of `progress`."""
     if progress:
         progress(1, 2)
     prediction = lift(pad_edge(photo.rgb), depth, camera)
@@ -66,13 +63,13 @@ def lift_guess(photo: Photo, depth: DepthMap, camera: Camera, progress: Progress
 
 
 def lift(rgb: Tensor, depth: DepthMap, camera: Camera, levels: int = LEVELS) -> BasePrediction:
-    """Lift a photo and its depth to Gaussians, see `layered_gaussians`.
+    """Lift a photo and its depth map to Gaussians, see `layered_gaussians`.
 
     Args:
         rgb: [H, W, 3] sRGB in 0..1.
-        depth: any size of the same aspect ratio.
-        camera: the photo's, at the world's origin.
-        levels: number of sizes of tiles whose pixels share a Gaussian; 0 gives every pixel its own.
+        depth: of any size with the photo's aspect ratio.
+        camera: the photo's camera, at the world's origin.
+        levels: number of tile sizes. All pixels of a tile share one Gaussian; with 0, every pixel has its own.
 
     Raises:
         InputError: no pixel has a depth.
@@ -97,15 +94,15 @@ def lift(rgb: Tensor, depth: DepthMap, camera: Camera, levels: int = LEVELS) -> 
     return BasePrediction(gaussians, camera, notes)
 
 
-SWEEPS = 100  # of smoothing; enough for steps about 30 pixels apart
-LEAST_NOISE = 5e-4  # relative to the inverse depth; less noise leaves no gaps between the Gaussians
-DEVIATIONS = 2.0  # standard deviations of the noise by which a value may change
+SWEEPS = 100  # smoothing iterations; enough for quantisation steps about 30 pixels apart
+LEAST_NOISE = 5e-4  # relative to the inverse depth; less noise causes no gaps between the Gaussians
+DEVIATIONS = 2.0  # a value may change by this number of the noise's standard deviations
 
 
 def noise_level(inverse_depth: Floats, known: Bools) -> float:
     """Standard deviation of the noise of most pixels, relative to the inverse depth.
 
-    The second difference by y and then by x is zero on planes and straight edges; the median ignores the rest.
+    The second difference by y and then by x is zero on planes and straight edges; the median ignores other pixels.
     """
     if min(inverse_depth.shape) < 3:
         return 0.0
@@ -121,11 +118,9 @@ def noise_level(inverse_depth: Floats, known: Bools) -> float:
 def smoothed(inverse_depth: Floats, known: Bools, step: Floats | np.float32) -> Floats:
     """The smoothest inverse depth [h, w] that its noise and its quantisation step (a number, or [h, w]) allow.
 
-    Noise of 0.3 % makes each Gaussian of a slanted surface face another way, and light shines through;
-    disparities in whole numbers turn a slanted plane into a staircase with a gap at every step. Each known value is
-    replaced by the mean of its neighbours on both sides, but changes by at most half a step or what noise explains. A
-    neighbour that differs by more than three times that belongs to another surface. Roughness as large as depth edges
-    is not noise but content, such as leaves or meshes.
+    Each known value is replaced by the mean of its neighbours on both sides. It changes by at most half a quantisation
+    step, or `DEVIATIONS` of the noise. A neighbour that differs by more than three times this limit belongs to another
+    surface. If the noise is as large as depth edges, it counts as content, such as leaves or meshes.
     """
     noise = noise_level(inverse_depth, known)
     reach = np.maximum(step / 2, DEVIATIONS * noise * (noise <= EDGE) * inverse_depth)
@@ -139,7 +134,7 @@ def smoothed(inverse_depth: Floats, known: Bools, step: Floats | np.float32) -> 
 
 @kernel
 def _relax(depths: Any, low: Any, high: Any, apart: Any) -> None:
-    """Smooth `depths` in place, within `low` and `high`."""
+    """Smooth `depths` in place, between `low` and `high`."""
     height, width = depths.shape
     for _ in range(SWEEPS):
         for y in range(height):

@@ -1,6 +1,6 @@
-"""The lite base: rough depth from the photo alone, by two small networks that come with the package.
+"""The lite base: rough depth from one photo, by two small networks in the package.
 
-Each consists of an EfficientNet-Lite encoder and a small decoder.
+A network consists of an EfficientNet-Lite encoder and a small decoder.
 """
 
 from __future__ import annotations
@@ -24,24 +24,23 @@ from spackle.errors import InputError
 from spackle.image import Photo, resize_photo
 from spackle.network_file import channels_last, load_strict, read_tensors
 
-STRIDE = 32  # both sides of the input are multiples of it
+STRIDE = 32  # both sides of a network's input are multiples of this number
 Size = Literal["lite0", "lite2"]
 # Stages of EfficientNet (Tan and Le 2019; Google's Lite variants have no squeeze-and-excitation).
 BLOCKS = ((3, 1, 1), (3, 2, 6), (5, 2, 6), (3, 2, 6), (5, 1, 6), (5, 2, 6), (3, 1, 6))  # kernel, stride, expansion
-DEPTHS: dict[Size, tuple[int, ...]] = {"lite0": (1, 2, 2, 3, 3, 4, 1), "lite2": (1, 3, 3, 4, 4, 5, 1)}  # in blocks
+DEPTHS: dict[Size, tuple[int, ...]] = {"lite0": (1, 2, 2, 3, 3, 4, 1), "lite2": (1, 3, 3, 4, 4, 5, 1)}  # blocks
 WIDTHS: dict[Size, tuple[int, ...]] = {
     "lite0": (16, 24, 40, 80, 112, 192, 320),
     "lite2": (16, 24, 48, 88, 120, 208, 352),
 }
-# Blocks, kernel, stride, expansion, channels.
-STAGES = {
+STAGES = {  # each stage: number of blocks, kernel, stride, expansion, channels
     size: tuple((n, *block, c) for n, block, c in zip(depths, BLOCKS, WIDTHS[size], strict=True))
     for size, depths in DEPTHS.items()
 }
 STEM = 32
-TAPS = (0, 1, 2, 4, 6)  # stages whose features the decoder sees: 1/2, 1/4, 1/8, 1/16 and 1/32 of the input
-DECODER = (24, 40, 64, 96, 160)  # its channels at those scales
-MEAN, STD = 127.0 / 255, 128.0 / 255  # normalisation of the input with which the encoder was pretrained
+TAPS = (0, 1, 2, 4, 6)  # the decoder gets the features of these stages: 1/2, 1/4, 1/8, 1/16 and 1/32 of the input
+DECODER = (24, 40, 64, 96, 160)  # the decoder's channels at these scales
+MEAN, STD = 127.0 / 255, 128.0 / 255  # the pretrained encoder's normalisation of its input
 
 
 class SameConv(nn.Conv2d):
@@ -57,7 +56,7 @@ class SameConv(nn.Conv2d):
 
 
 class MBConv(nn.Module):
-    """MBConv: a 1×1 convolution to more channels, a depthwise one, a 1×1 to fewer; plus the input if shapes agree."""
+    """MBConv: a 1×1 convolution to more channels, a depthwise one, one to fewer; adds the input if shapes agree."""
 
     def __init__(self, inputs: int, outputs: int, kernel: int, stride: int, expansion: int) -> None:
         super().__init__()
@@ -101,7 +100,7 @@ class Encoder(nn.Module):
 
 
 class Fuse(nn.Module):
-    """Features of the coarser scale, upsampled and refined by the features of this one."""
+    """Upsamples the features of the coarser scale, and adds the features of this scale."""
 
     def __init__(self, coarse: int, skip: int, outputs: int) -> None:
         super().__init__()
@@ -136,7 +135,7 @@ class LiteNet(nn.Module):
     def forward(self, rgb: Tensor) -> Tensor:
         """[B, 3, H, W] sRGB in 0..1, sides multiples of 32, to log inverse depth [B, H/2, W/2] up to a constant."""
         *finer, coarsest = self.encoder(rgb)
-        # The place of an object in the picture says much about its distance.
+        # The place of an object in the picture tells much about the object's distance.
         x = self.top(torch.cat([coarsest, _places(coarsest)], dim=1))
         x = x + self.context(coarsest.mean(dim=(2, 3), keepdim=True))
         x = x + self.spread(relu(x))
@@ -155,16 +154,16 @@ def _places(x: Tensor) -> Tensor:
     return grid.expand(batch, -1, -1, -1)
 
 
-ADVICE = "give lite's weights"  # if a file holds something else
-SCALE = "/scale"  # suffix to the name of 8-bit weights, for their quantisation step in each output channel
-LAST = f"encoder.stages.{len(STAGES['lite2']) - 1}.0.project.bias"  # its length tells which size a network has
+ADVICE = "give lite's weights"  # if a file holds other weights
+SCALE = "/scale"  # suffix of the tensor with the quantisation steps of 8-bit weights, one for each output channel
+LAST = f"encoder.stages.{len(STAGES['lite2']) - 1}.0.project.bias"  # the length of this tensor tells a network's size
 
 
 def load_networks(path: str | os.PathLike[str]) -> list[LiteNet]:
-    """Load the networks of a file for inference in single precision.
+    """Load the networks of a file for inference in float32.
 
-    Names of tensors begin with their network's number, unless the file holds a single network. InputError for a missing
-    or broken file, or for weights of another architecture.
+    The names of tensors begin with the network's number, unless the file holds a single network. InputError for a
+    missing or broken file, or for weights of another architecture.
     """
     tensors = _unpacked(read_tensors(path, ADVICE))
     if LAST in tensors:
@@ -185,7 +184,7 @@ def _network(tensors: dict[str, Tensor], path: str | os.PathLike[str]) -> LiteNe
 
 
 def _unpacked(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """All tensors as floats; 8-bit tensors without a fitting scale are left out, so that they count as missing."""
+    """All tensors as floats; an 8-bit tensor without a fitting scale is left out, so that it counts as missing."""
     values: dict[str, Tensor] = {}
     for name, tensor in tensors.items():
         scale = tensors.get(name + SCALE)
@@ -197,9 +196,9 @@ def _unpacked(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
 
 
 SHIPPED = Path(__file__).parents[1] / "weights" / "lite.safetensors"
-DISPARITY = 0.15  # beyond this, upright objects lean and poles bend: docs/lab/lite.md
-UNCOVERED = 0.075  # share of the widest views that may be holes: with more, invented parts catch the eye first
-FARTHEST = 60.0  # depths are limited to this multiple of the nearest one, as if beyond were sky
+DISPARITY = 0.15  # at a larger disparity upright objects lean and poles bend: docs/lab/lite.md
+UNCOVERED = 0.075  # share of the widest views that may be holes: more invented parts would be conspicuous
+FARTHEST = 60.0  # depths are limited to this multiple of the nearest depth
 
 
 @dataclasses.dataclass(frozen=True)
@@ -208,12 +207,12 @@ class InputScale:
 
     pixels: int  # of the network's input, approximately
     network: int = 0  # index of the network in the file
-    mirrored: bool = True  # whether the network sees the mirror image, too
-    tilt: bool = True  # whether its output contributes low frequencies, too, and not outlines alone
+    mirrored: bool = True  # whether the network also gets the mirror image
+    tilt: bool = True  # whether the output also contributes low frequencies, and not only outlines
 
 
-# Both networks were trained at up to 256×320. A small input shows them more of an object at once, a large one its
-# outlines: the mean output errs less than the best alone. The largest costs most, and mirroring it gains nothing.
+# Both networks were trained at up to 256×320. Small inputs show whole objects at once, large inputs show outlines: the
+# mean output has a smaller error than the best single output. Mirroring the largest input costs most and gains nothing.
 INPUT_SCALES = (
     InputScale(64 * 96),
     InputScale(96 * 128),
@@ -222,11 +221,11 @@ INPUT_SCALES = (
     InputScale(256 * 320),
     InputScale(448 * 608, mirrored=False, tilt=False),
 )
-COARSE = (3, 4)  # an output's low frequencies are its means in so many cells, with more along the longer side
+COARSE = (3, 4)  # an output's low frequencies are its means in 3×4 cells, with 4 cells along the longer side
 
 
 class LiteBase:
-    """Lifts the depth that small networks estimate: plausible parallax, not measurement."""
+    """Lifts the depth that small networks estimate: a plausible parallax, no measurement."""
 
     name = "lite"
 
@@ -236,12 +235,11 @@ class LiteBase:
 
     @classmethod
     def load(cls, path: Path | None = None, *, device: str | None = None) -> LiteBase:
-        """Read the networks from a file that lite's training wrote; by default the package's own.
+        """Read the networks from a file that lite's training wrote, by default the file in the package.
 
-        The device is cpu or a CUDA one; None: CUDA if available. InputError for a file or device that cannot be used.
+        `device` is cpu or a CUDA device; None: CUDA if available. InputError for a file or device that cannot be used.
         """
-        target = pick_device(device)
-        return cls(load_networks(path or SHIPPED), target)
+        return cls(load_networks(path or SHIPPED), pick_device(device))
 
     def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
         """Gaussians of the pixels of the photo at its working size, as `lift` makes them."""
@@ -255,23 +253,23 @@ class LiteBase:
         return dataclasses.replace(prediction, notes=notes, disparity=DISPARITY, uncovered=UNCOVERED)
 
     def inverse_depth(self, rgb: Tensor) -> Tensor:
-        """The networks' inverse depth of a photo [H, W, 3], sRGB in 0..1: the mean logarithm over all `INPUT_SCALES`.
+        """Inverse depth of a photo [H, W, 3] (sRGB in 0..1), by the mean logarithm over all `INPUT_SCALES`.
 
-        Returns [h, w] float32 inverse depth up to a factor, on the CPU: about 224×304, in the photo's aspect ratio.
+        Returns [h, w] float32 up to a factor, on the CPU: about 224×304, in the photo's aspect ratio.
         """
         scales = [scale for scale in INPUT_SCALES if scale.network < len(self.networks)]
         return merged(self.at_scales(rgb, scales), [scale.tilt for scale in scales]).exp()
 
     @torch.no_grad()
     def at_scales(self, rgb: Tensor, scales: Sequence[InputScale]) -> Tensor:
-        """[n, h, w] log inverse depth of a photo [H, W, 3] from n input scales, at the resolution of the last one."""
+        """[n, h, w] log inverse depth of a photo [H, W, 3] from n input scales, at the resolution of the last scale."""
         picture = rgb.float().permute(2, 0, 1)[None].to(self.device)
         outputs = [self._ask(picture, scale)[None, None] for scale in scales]
         finest = outputs[-1].shape[2:]
         return torch.cat([interpolate(output, size=finest, mode="bilinear")[0] for output in outputs]).cpu()
 
     def _ask(self, picture: Tensor, scale: InputScale) -> Tensor:
-        """[h/2, w/2] log inverse depth of a photo [1, 3, H, W], which the network receives resized to (h, w)."""
+        """[h/2, w/2] log inverse depth of a photo [1, 3, H, W], which is resized to (h, w) for the network."""
         size = network_size(picture.shape[2], picture.shape[3], scale.pixels)
         seen = interpolate(picture, size=size, mode="bicubic", antialias=True).clamp(0, 1)
         ways = torch.cat([seen, seen.flip(-1)]) if scale.mirrored else seen
@@ -288,11 +286,11 @@ def merged(outputs: Tensor, tilt: Sequence[bool]) -> Tensor:
 
 
 def network_size(height: int, width: int, pixels: int) -> tuple[int, int]:
-    """(height, width) of the network's input: about the photo's aspect ratio, and about `pixels` pixels."""
+    """(height, width) of a network's input: about the photo's aspect ratio and about `pixels` pixels."""
     return scaled_size(height, width, math.sqrt(pixels / (height * width)))
 
 
 def scaled_size(height: int, width: int, scale: float) -> tuple[int, int]:
-    """(height, width) times about `scale`, rounded to a size that the network accepts."""
+    """(height, width) times about `scale`, rounded to a size that a network accepts."""
     tall, wide = (max(STRIDE, round(side * scale / STRIDE) * STRIDE) for side in (height, width))
     return tall, wide

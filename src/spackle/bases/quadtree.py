@@ -1,4 +1,4 @@
-"""A quadtree that decides which pixels share a Gaussian, by weighing lost detail against the number of Gaussians."""
+"""A quadtree that decides which pixels share a Gaussian: it weighs lost detail against the number of Gaussians."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from spackle._numba import kernel
 from spackle.device import run_chunks
 
 LEVELS = 3  # the largest tiles have 8×8 pixels
-BEND = np.float32(0.003)  # largest relative deviation of the inverse depth in and around a tile from the tile's plane
-SQUARE, FLAT, TALL = 0, 1, 2  # one tile for a block, or two halves of it: one above the other, or side by side
+BEND = np.float32(0.003)  # largest relative deviation of the inverse depth from a tile's plane, in and around the tile
+SQUARE, FLAT, TALL = 0, 1, 2  # a block becomes one tile, two halves above each other, or two halves side by side
 
 
 @dataclasses.dataclass(frozen=True)
 class Tiles:
-    """Rectangles of one size that lie on a grid of such rectangles."""
+    """Rectangles of one size on a grid."""
 
     height: int  # pixels
     width: int
-    rows: Tensor  # [N] of the grid
-    columns: Tensor  # [N]
+    rows: Tensor  # [N] indices in the grid
+    columns: Tensor  # [N] indices in the grid
 
     def means(self, image: Tensor) -> Tensor:
         """[N, ...]: the mean of an image [H, W, ...] in each rectangle."""
@@ -48,11 +48,11 @@ def grid_means(image: Tensor, height: int, width: int) -> Tensor:
 
 
 class Quadtree:
-    """Blocks of 2×2, 4×4, … pixels, and the detail that each would lose as one tile or as two halves.
+    """Blocks of 2×2, 4×4, … pixels, and the detail that each block would lose as one tile or as two halves.
 
     A loss is the squared difference between pixels and bilinearly interpolated tile means, summed over pixels and
-    averaged over channels. A block becomes no tile if any pixel in it, or within one block side around it, is not free
-    or lies off the block's plane, because a tile's Gaussian reaches that far. Steep blocks become no tiles either.
+    averaged over channels. A steep block becomes no tile. Nor does a block if a pixel in it, or within one block side
+    around it, is not free or lies off the block's plane, because a tile's Gaussian reaches that far.
     """
 
     def __init__(
@@ -89,9 +89,9 @@ class Quadtree:
         return math.sqrt(float(finite.median()) / 4) if finite.numel() else 0.0
 
     def cut(self, worth: float) -> tuple[Tensor, list[Tiles]]:
-        """The division into tiles and single pixels of least total cost: their losses, plus `worth` for each Gaussian.
+        """The cheapest division into tiles and single pixels; the cost is all losses plus `worth` for each Gaussian.
 
-        Returns [H, W] bool, which is true for single pixels, and the tiles.
+        Returns [H, W] bool (true for single pixels), and the tiles.
         """
         single = torch.ones(self.shape, dtype=torch.bool)
         cost = torch.full(self.shape, worth)
@@ -116,7 +116,7 @@ class Quadtree:
 
 
 def _sizes(side: int) -> tuple[tuple[int, int], ...]:
-    """(height, width) of a block's tiles: SQUARE, FLAT, TALL."""
+    """(height, width) of a block's tiles for SQUARE, FLAT and TALL."""
     return (side, side), (side // 2, side), (side, side // 2)
 
 
@@ -161,7 +161,7 @@ def _fits(
 
 @kernel
 def _lost(row: int, column: int, height: int, width: int, means: Any, picture: Any) -> Any:
-    """Squared difference of a tile's pixels from its grid's means, interpolated bilinearly."""
+    """Squared difference between a tile's pixels and the bilinearly interpolated means of tiles."""
     rows, columns, channels = means.shape
     total = np.float32(0)
     for y in range(height):

@@ -1,4 +1,4 @@
-"""Silhouettes in two layers: both surfaces' colours beside a depth step, and the near one's coverage of each pixel."""
+"""Silhouettes in two layers: the colours of both surfaces beside a depth step, and the near surface's coverage."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ from spackle.bases.edges import Floats
 from spackle.device import run_chunks
 from spackle.surface import CREASE, EDGE
 
-REACH = 3  # pixels to either side of a step that may be mixtures
-STEADILY = 0.5  # a difference is a plane's if the next ones on both sides exceed this share of it
-WINDOW = 5  # pixels to each side from which both surfaces are estimated
-PURE = np.array([1.0, 0.01, 0.15, 1.0], np.float32)  # weight of a colour on the rings around a step
-STEADY = np.array([1.0, 0.1, 0.5, 1.0], np.float32)  # and of a depth: round objects curve away at their rims
-UNEXPLAINED = np.float32(0.002)  # squared difference from the photo at which a mixture does not explain a pixel
-FRINGE = np.float32(6.0)  # a fringe differs from the far colour by more variances, away from the near colour
+REACH = 3  # pixels on each side of a step that may be mixtures
+STEADILY = 0.5  # a difference belongs to a plane if the next differences on both sides exceed this share of it
+WINDOW = 5  # both surfaces are estimated from this number of pixels to each side
+PURE = np.array([1.0, 0.01, 0.15, 1.0], np.float32)  # weight of a colour on each ring around a step
+STEADY = np.array([1.0, 0.1, 0.5, 1.0], np.float32)  # weight of a depth on each ring: round objects curve away at rims
+UNEXPLAINED = np.float32(0.002)  # a mixture does not explain a pixel whose squared difference from it is larger
+FRINGE = np.float32(6.0)  # a fringe's squared difference from the far colour exceeds this number of variances
 BLUR = np.float32(1.2)  # pixels over which the map's outline is smoothed
-SURE = np.float32(0.2)  # least distance in pixels of a pixel's centre from the map's outline, on its own side
-STEPS, STEP = 6, 0.33  # shifts that are tried to each side, and their size in pixels
-SHIFT_COST = 0.04  # of a shift by one step, in variances of the colours
-RAMPS = np.array([1.75, 0.8])  # pixels from no to full coverage across an outline that a lens blurs
+SURE = np.float32(0.2)  # least distance in pixels between a pixel's centre and the map's outline
+STEPS, STEP = 6, 0.33  # number of shifts that are tried to each side, and their size in pixels
+SHIFT_COST = 0.04  # cost of a shift by one step, in variances of the colours
+RAMPS = np.array([1.75, 0.8])  # tried widths of a blurred outline: pixels from no to full coverage
 ASTRAY = 4.0  # weight of a pixel's distance from all mixtures, as part of the variance
-TEXTURE = np.float32(1.5)  # standard deviations by which a hidden colour may differ from the mean
+TEXTURE = np.float32(1.5)  # a hidden colour may differ from the mean by this number of standard deviations
 
 
 @dataclasses.dataclass(frozen=True)
 class Layers:
-    """Both surfaces beside the depth steps of a map. Elsewhere `ring` and `alpha` are 0, and the far layer holds the
-    pixel's own values.
+    """Both surfaces beside the depth steps of a map. Far from steps, `ring` and `alpha` are 0, and both layers hold the
+    pixel's values.
     """
 
-    ring: NDArray[np.uint8]  # [H, W] pixels to the nearest step, 1 beside it; 0 beyond `REACH`
+    ring: NDArray[np.uint8]  # [H, W] distance to the nearest step in pixels, from 1; 0 beyond `REACH`
     alpha: Floats  # [H, W] share of a pixel that the near surface covers
     depth: Floats  # [2, H, W] inverse depth of the near and the far surface
     slope: Floats  # [2, H, W, 2] derivative of the inverse depth by pixel x and y
@@ -43,12 +43,11 @@ class Layers:
 
 
 def find_layers(inverse_depth: Floats, slope: Floats, colors: Floats) -> Layers:
-    """Separate the pixels beside depth steps into a near and a far colour, whose mixture by alpha is the photo's
-    colour.
+    """Find a near colour, a far colour and alpha for each pixel beside a depth step; they mix to the photo's colour.
 
-    A lens blurs a silhouette, so that a pixel or two on each side show both surfaces; and the map's step may lie a
-    pixel or two beside the photo's outline. Both surfaces are continued across the step, with colours from pixels that
-    show one surface alone; the map's outline is shifted to the photo's.
+    A lens blurs a silhouette, so that a pixel or two on each side show both surfaces. Both surfaces are continued
+    across the step, with colours from pixels that show one surface alone. The map's outline, which may lie a pixel or
+    two beside the photo's outline, is shifted to it.
 
     Args:
         inverse_depth: [H, W].
@@ -69,7 +68,7 @@ def find_layers(inverse_depth: Floats, slope: Floats, colors: Floats) -> Layers:
 
 @kernel
 def _rings(image: Any) -> Any:
-    """Rings around the steps, and for the first ring the inverse depths [H, W, 2] above and below its step."""
+    """Rings of pixels around depth steps; for the first ring also the inverse depths [H, W, 2] on both sides."""
     height, width = image.shape
     ring = np.zeros((height, width), np.uint8)
     levels = np.zeros((height, width, 2), np.float32)
@@ -82,7 +81,7 @@ def _rings(image: Any) -> Any:
                 high, low = max(image[y, x], image[v, u]), min(image[y, x], image[v, u])
                 if high - low <= EDGE * low:
                     continue
-                # On a steep plane, such as the ground towards the horizon, the change continues on both sides.
+                # On a steep plane, such as ground near the horizon, the change continues on both sides.
                 jump = image[v, u] - image[y, x]
                 before = image[y, x] - image[y - k, x - 1 + k] if (y if k else x) > 0 else jump
                 after = image[v + k, u + 1 - k] - image[v, u] if (v + 1 < height if k else u + 1 < width) else jump
@@ -109,7 +108,7 @@ def _survey(
     start: int, stop: int, image: Any, colors: Any, ring: Any, levels: Any,
     inside: Any, depth: Any, slope: Any, color: Any, texture: Any,
 ) -> None:  # fmt: skip
-    """Estimate both surfaces, their mean colours, and each pixel's distance into the near one, in rows start..stop."""
+    """Estimate both surfaces, their mean colours, and each pixel's distance from the outline, in rows start..stop."""
     height, width = image.shape
     m = np.zeros((2, 9), np.float64)  # per side: weight, x, y, d, xx, yy, xy, xd, yd
     s = np.zeros((2, 7), np.float64)  # per side: weight, colour, its square
@@ -167,7 +166,7 @@ def _survey(
             far_in = np.float32(BLUR * np.log(part / (1 - part)) / 1.702)
             inside[y, x] = max(far_in, SURE) if near else min(far_in, -SURE)
             for side in range(2):
-                if near or side == 0:  # the map's depth is kept, except at near rims, which are ragged
+                if near or side == 0:  # a pixel of the far surface keeps the map's depth; near rims are ragged
                     at, across, down = _plane(m[side], level[side])
                     depth[side, y, x] = at
                     slope[side, y, x, 0], slope[side, y, x, 1] = across, down
@@ -182,9 +181,8 @@ def _survey(
 
 @inlined_kernel
 def _share(colors: Any, color: Any, y: int, x: int) -> Any:
-    """The near colour's share in the mixture closest to a pixel, and two squared distances.
-
-    The first is from the pixel to that mixture, the second between both colours.
+    """The near colour's share in the mixture closest to a pixel, the squared distance from the pixel to this mixture,
+    and the squared distance between both colours.
     """
     apart, along, away = np.float32(0), np.float32(0), np.float32(0)
     for c in range(3):
@@ -198,7 +196,7 @@ def _share(colors: Any, color: Any, y: int, x: int) -> Any:
 
 @kernel
 def _match(start: int, stop: int, colors: Any, ring: Any, inside: Any, color: Any, texture: Any, alpha: Any) -> None:
-    """Shift the map's outline sideways to the photo's, and compute each pixel's coverage, in rows start..stop."""
+    """Shift the map's outline to the photo's outline, and compute each pixel's alpha, in rows start..stop."""
     height, width = ring.shape
     shifts = 2 * STEPS + 1
     costs = np.zeros(len(RAMPS) * shifts)
@@ -224,7 +222,7 @@ def _match(start: int, stop: int, colors: Any, ring: Any, inside: Any, color: An
                 if costs[k] < costs[best]:
                     best = k
             shift = float(best % shifts - STEPS)
-            if 0 < best % shifts < shifts - 1:  # the lowest point of a parabola
+            if 0 < best % shifts < shifts - 1:  # refine by the minimum of a parabola
                 bend = costs[best - 1] - 2 * costs[best] + costs[best + 1]
                 if bend > 0:
                     shift += 0.5 * (costs[best - 1] - costs[best + 1]) / bend
@@ -233,12 +231,11 @@ def _match(start: int, stop: int, colors: Any, ring: Any, inside: Any, color: An
 
 @kernel
 def _unmix(colors: Any, ring: Any, inside: Any, alpha: Any, color: Any, texture: Any) -> None:
-    """Change both colours in place just enough to mix to the photo's colour, but no more than texture explains.
+    """Change both colours in place so that they mix to the photo's colour, but no more than texture explains.
 
-    A pixel that this does not explain gets the share of the closest mixture of the unchanged colours; a pixel far from
-    any mixture, such as the shaded edge of a round object, belongs to its own surface alone. A camera that sharpens its
-    images draws a fringe along an outline; around a dark object it is brighter than the background. The fringe is
-    assigned to the object, because otherwise it would remain on the background.
+    If this fails, a pixel gets the share of the closest mixture of the unchanged colours. A pixel far from any mixture,
+    such as the shaded edge of a round object, belongs to one surface alone. The fringe that a sharpening camera draws
+    along an outline is assigned to the near surface, because it would stay visible on the background.
     """
     height, width = ring.shape
     rest = np.zeros(3, np.float32)
@@ -279,7 +276,7 @@ def _unmix(colors: Any, ring: Any, inside: Any, alpha: Any, color: Any, texture:
 
 @kernel
 def _plane(m: Any, level: Any) -> Any:
-    """Inverse depth and slope of the plane fitted to weighted moments; `level` and zero slope without any weight."""
+    """Inverse depth and slope of the plane fitted to weighted moments; `level` and slope 0 if all weights are 0."""
     if m[0] < 1e-6:
         return np.float32(level), np.float32(0), np.float32(0)
     mx, my, md = m[1] / m[0], m[2] / m[0], m[3] / m[0]

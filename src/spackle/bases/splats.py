@@ -1,6 +1,6 @@
-"""Turn a photo with a depth at every pixel into Gaussians: one a pixel or tile, two at silhouettes, and a backing.
+"""Turn a photo with a depth at every pixel into Gaussians that blend to the photo.
 
-Together they blend to the photo.
+There is one for each pixel or tile, a second one at silhouettes, and a backing behind them.
 """
 
 from __future__ import annotations
@@ -23,30 +23,30 @@ from spackle.device import run_chunks
 from spackle.gaussians import Gaussians
 from spackle.surface import BEHIND, CREASE, EDGE, OPACITY, PIXEL_SPREAD, surface_gaussians, surface_slope
 
-# Blobs of half a pixel reproduce the photo sharply, but light passes between them. Blobs wide enough to
-# close the surface would blur it. So a coarse backing, one blob for 2×2 pixels or more, closes it from behind.
-# At the photo's camera this is 2 dB sharper than one layer of wider blobs.
-TILE_SPREAD = 0.55  # standard deviation, in units of the side, of a tile's Gaussian and of a 2×2 one in the backing
-LARGE_BACKING_SPREAD = 0.65  # the same for the backing's larger Gaussians, which lie away from depth steps
-RIM_BACKING_SPREAD = 0.42  # the same for the backing at a near surface's rim; wider, it would show past the rim
-BACKING_SIDES = 2  # the backing recedes by the depth change over this many of its sides, to not poke through
+# Gaussians of half a pixel reproduce the photo sharply, but light passes between them; wide ones would blur the photo.
+# A coarse backing, one Gaussian for 2×2 pixels or more, therefore closes the surface from behind. At the photo's
+# camera this is 2 dB sharper than one layer of wider Gaussians.
+TILE_SPREAD = 0.55  # standard deviation of a tile's Gaussian and of a 2×2 backing Gaussian, in units of their sides
+LARGE_BACKING_SPREAD = 0.65  # the same for larger backing Gaussians, which lie away from depth steps
+RIM_BACKING_SPREAD = 0.42  # the same for the backing at a near surface's rim: a wider backing would show past the rim
+BACKING_SIDES = 2  # the backing recedes by the depth change over this number of its sides, to stay hidden
 WORTH = 0.012  # squared sRGB difference that justifies one Gaussian, in units of the photo's detail
 LEAST_WORTH, MOST_WORTH = 1e-5, 2e-4
-BACKING_SHARE = 0.02  # share of a difference in the backing that shows through
-LEAST_MIXED = 0.05  # least share of a pixel that a surface must cover to have a Gaussian there
-SWEEPS = 3  # iterations that correct colours, and those that correct opacities
+BACKING_SHARE = 0.02  # share of the backing's colour that is visible through the front
+LEAST_MIXED = 0.05  # a surface has a Gaussian in a pixel if it covers at least this share of the pixel
+SWEEPS = 3  # number of iterations that correct colours, and of those that correct opacities
 
 
 def layered_gaussians(inverse_depth: Tensor, colors: Tensor, camera: Camera, levels: int = LEVELS) -> Gaussians:
-    """Gaussians, about one and at most 2.25 per pixel, that blend to the photo when seen from its camera.
+    """Gaussians, about one and at most 2.25 per pixel, that blend to the photo at the photo's camera.
 
-    Their order is: single pixels in row-major order, on the surface that covers most of the pixel; tiles of up to 8×8
-    pixels, where picture and depth allow them; the other surface of mixed pixels; the backing.
+    They come in this order: single pixels, row by row, on the surface that covers most of the pixel; tiles of up to 8×8
+    pixels; the other surface of mixed pixels; the backing.
 
     Args:
         inverse_depth: [H, W], positive everywhere.
         colors: [H, W, 3] linear RGB.
-        camera: the photo's.
+        camera: the photo's camera.
         levels: number of tile sizes; 0 gives one Gaussian per pixel and one backing Gaussian per 2×2 pixels.
     """
     slope = surface_slope(inverse_depth)
@@ -61,7 +61,7 @@ def layered_gaussians(inverse_depth: Tensor, colors: Tensor, camera: Camera, lev
     rest = pixels.rest.pixels(pixels.mixed, camera)
     parts = [pixels.most.pixels(single, camera), *front, rest, *_backing(pixels, worth, levels)]
     samples = _Samples(*(torch.cat(tensors) for tensors in zip(*parts, strict=True)))
-    corrected = _inner(ring != 1)[single]  # beside a step or at the border it would show as a ghost in other views
+    corrected = _inner(ring != 1)[single]  # corrected colours beside a step or at the border would be visible ghosts
     return surface_gaussians(camera, *_fitted(samples, colors, single, corrected, tiles))
 
 
@@ -77,10 +77,9 @@ class _Samples(NamedTuple):
 
 
 def _fitted(samples: _Samples, colors: Tensor, single: Tensor, corrected: Tensor, tiles: Sequence[Tiles]) -> _Samples:
-    """Correct the colours of tiles and of some single pixels by how much the blended picture differs from `colors`.
+    """Correct the colours of tiles and single pixels until all samples blend to `colors` at the photo's camera.
 
-    The blended picture is what the photo's camera sees. `corrected` [number of single pixels] bool chooses the single
-    pixels.
+    `corrected` [number of single pixels] bool chooses the single pixels.
     """
     fitted = samples.color.clone()
     order = samples.depth.argsort(descending=True, stable=True)
@@ -94,7 +93,7 @@ def _fitted(samples: _Samples, colors: Tensor, single: Tensor, corrected: Tensor
 
 
 class _Surface(NamedTuple):
-    """One surface for each pixel."""
+    """A surface at each pixel."""
 
     depth: Tensor  # [H, W] inverse
     slope: Tensor  # [H, W, 2]
@@ -102,7 +101,7 @@ class _Surface(NamedTuple):
     opacity: Tensor  # [H, W]
 
     def instead(self, where: Tensor, other: _Surface) -> _Surface:
-        """These surfaces, replaced by `other` at the pixels `where` [H, W] bool."""
+        """This surface, replaced by `other` at the pixels `where` [H, W] bool."""
         images = zip(other, self, strict=True)
         return _Surface(*(torch.where(where if a.ndim == 2 else where[..., None], a, b) for a, b in images))
 
@@ -113,9 +112,9 @@ class _Surface(NamedTuple):
         return _Samples(uv, depth, slope, torch.full_like(uv, PIXEL_SPREAD), color, opacity)
 
     def samples(self, tiles: Tiles, spread: float, pixels: int = 1) -> _Samples:
-        """An opaque Gaussian for each tile, with `spread` of its sides as standard deviations.
+        """An opaque Gaussian for each tile; its standard deviations are `spread` times the tile's sides.
 
-        A cell of the surface, in which tiles are measured, is `pixels` pixels wide.
+        The unit of tiles is a cell of the surface, which is `pixels` pixels wide.
         """
         depth, slope, color = (tiles.means(image) for image in (self.depth, self.slope, self.color))
         opacity = torch.full_like(depth, float(OPACITY))
@@ -126,15 +125,15 @@ class _Surface(NamedTuple):
 class _Pixels(NamedTuple):
     """The surfaces of a photo's pixels."""
 
-    most: _Surface  # the one that covers most of a pixel
-    rest: _Surface  # the other one, where `mixed`
+    most: _Surface  # the surface that covers most of a pixel
+    rest: _Surface  # the other surface; valid if `mixed`
     mixed: Tensor  # [H, W] bool
-    near: Tensor  # [H, W] bool: `most` is the nearer of the two
+    near: Tensor  # [H, W] bool: `most` is the near surface
     edge: Tensor  # [H, W] bool: a depth step is close
 
 
 def _split(layers: Layers, colors: Tensor) -> _Pixels:
-    """The surfaces of each pixel: two if each covers at least `LEAST_MIXED` of it (mixed), else one covers it all."""
+    """The surfaces of each pixel: two if both cover at least `LEAST_MIXED` of it (mixed), else a single one."""
     ring, alpha = torch.from_numpy(layers.ring), torch.from_numpy(layers.alpha)
     near = alpha >= 0.5
     mixed = torch.minimum(alpha, 1 - alpha) >= LEAST_MIXED
@@ -148,10 +147,9 @@ def _split(layers: Layers, colors: Tensor) -> _Pixels:
 
 
 def _backing(pixels: _Pixels, worth: float, levels: int) -> list[_Samples]:
-    """A wide Gaussian behind each cell of 2×2 pixels, along its farthest pixel's surface; larger ones in flat areas.
+    """A wide Gaussian behind each cell of 2×2 pixels, on its farthest pixel's surface; larger ones in flat areas.
 
-    A cell has none if it holds pixels of both surfaces, or if its farthest surface is only the far part of mixed
-    pixels.
+    A cell has no backing if it holds pixels of both surfaces, or if its far surface is visible only in mixed pixels.
     """
     behind = pixels.mixed & pixels.near
     deepest = pixels.most.instead(behind, pixels.rest)
@@ -163,7 +161,7 @@ def _backing(pixels: _Pixels, worth: float, levels: int) -> list[_Samples]:
     # The cell's centre lies half a pixel from the farthest pixel's centre.
     offset = torch.stack([0.5 - pick % 2, 0.5 - pick // 2], dim=-1)
     at_center = (far + (slope * offset).sum(-1)).clamp_min(0.5 * far.min())
-    # Its colour is the mean of the pixels on that surface.
+    # The colour is the mean of the cell's pixels on the same surface.
     same = (cells - far[..., None] < 0.02 * far[..., None]).to(far)
     color = (_cells(deepest.color) * same[..., None]).sum(2) / same.sum(2)[..., None]
     has_near, has_far = (_cells(pixels.edge & side).any(-1) for side in (pixels.near, ~pixels.near))
@@ -179,14 +177,14 @@ def _backing(pixels: _Pixels, worth: float, levels: int) -> list[_Samples]:
 
 
 def _receded(samples: _Samples, tiles: Tiles) -> _Samples:
-    """Move the backing behind the front Gaussians; `tiles` are measured in cells of 2×2 pixels."""
+    """Move the backing behind the front Gaussians; the unit of `tiles` is a cell of 2×2 pixels."""
     reach = 2 * BACKING_SIDES * torch.tensor([tiles.width, tiles.height])
     recede = 1 - BEHIND - (reach * samples.slope.abs()).sum(-1) / samples.depth
     return samples._replace(depth=samples.depth * recede, slope=samples.slope * recede[:, None])
 
 
 def _inner(free: Tensor) -> Tensor:
-    """[H, W] bool: the mask, false on the image's border, where a tile's Gaussian would reach beyond the image."""
+    """The mask [H, W], false on the image's border, because a tile's Gaussian would reach beyond the image."""
     inner = torch.zeros_like(free)
     inner[1:-1, 1:-1] = free[1:-1, 1:-1]
     return inner
@@ -199,15 +197,15 @@ def _cells(image: Tensor) -> Tensor:
     return grid.transpose(1, 2).flatten(2, 3)
 
 
-WEIGHTS = np.exp(-0.5 / PIXEL_SPREAD**2 * np.array([2, 1, 2, 1, 0, 1, 2, 1, 2])).astype(np.float32)  # of 3×3 neighbours
-FAINT, STOP = np.float32(1 / 255), np.float32(1e-4)  # alpha that the renderer skips, transmittance that stops it
-REACH = np.sqrt(-2 * np.log(FAINT))  # standard deviations at which an alpha becomes faint
+WEIGHTS = np.exp(-0.5 / PIXEL_SPREAD**2 * np.array([2, 1, 2, 1, 0, 1, 2, 1, 2])).astype(np.float32)  # 3×3 neighbours
+FAINT, STOP = np.float32(1 / 255), np.float32(1e-4)  # the renderer skips smaller alphas, stops at this transmittance
+REACH = np.sqrt(-2 * np.log(FAINT))  # an alpha of 1 falls to FAINT at this number of standard deviations
 
 
 def blended_opacities(alpha: Floats, ring: NDArray[np.uint8]) -> Floats:
-    """Opacities [H, W] with which near Gaussians and their neighbours together cover the share alpha [H, W] of pixels.
+    """Opacities [H, W] with which Gaussians and their neighbours together cover the share alpha [H, W] of each pixel.
 
-    All other Gaussians have full opacity; `ring` [H, W] is 0 where a pixel shows one surface alone.
+    `ring` [H, W] is 0 for a pixel that shows one surface alone.
     """
     result = alpha.copy()
     for _ in range(SWEEPS):
@@ -217,7 +215,7 @@ def blended_opacities(alpha: Floats, ring: NDArray[np.uint8]) -> Floats:
 
 @kernel
 def _thin(alpha: Any, ring: Any, result: Any) -> None:
-    """Correct the opacities `result` once, in place."""
+    """One iteration of `blended_opacities`, in place."""
     height, width = alpha.shape
     for y in range(height):
         for x in range(width):
@@ -232,13 +230,13 @@ def _thin(alpha: Any, ring: Any, result: Any) -> None:
 
 
 def mixture(spots: Floats, colors: Tensor, height: int, width: int) -> Tensor:
-    """The picture [H, W, 3] that the photo's camera sees of N Gaussians, blended as the renderer blends.
+    """The picture [H, W, 3] of N Gaussians at the photo's camera, blended like the renderer blends.
 
     Args:
         spots: [N, 5] centre x and y, standard deviation along x and y, all in pixels, and opacity; nearest first.
         colors: [N, 3] linear RGB.
-        height: of the picture.
-        width: of the picture.
+        height: height of the picture.
+        width: width of the picture.
     """
     image = np.zeros((height, width, 3), np.float32)
     run_chunks(lambda a, b: _mix(a, b, spots, colors.numpy(), image), height, grain=128)
@@ -247,7 +245,7 @@ def mixture(spots: Floats, colors: Tensor, height: int, width: int) -> Tensor:
 
 @kernel
 def _mix(start: int, stop: int, spots: Any, colors: Any, image: Any) -> None:
-    """Blend rows start..stop, nearest Gaussians first."""
+    """Blend the rows start..stop, nearest Gaussians first."""
     width = image.shape[1]
     half = np.float32(0.5)
     passes = np.ones((stop - start, width), np.float32)

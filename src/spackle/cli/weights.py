@@ -46,7 +46,7 @@ def weights_get(
     summary = f"{name}: {decimal(entry.bytes)}, SHA-256 {entry.sha256}"
     new = force or not os.path.isfile(path)
     if new:
-        with results_folder(path.parent, [path.name]):
+        with results_folder(path.parent, [path.name], alone=True):
             _fetch(entry, url or entry.address, path, reporter)
         reporter.log(f"{summary} -> {path}" + ("" if output is None else f"; {entry.option}"))
     else:

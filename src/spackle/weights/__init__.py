@@ -1,7 +1,4 @@
-"""Published weights: facts about each file, and its place on this machine.
-
-`published.json` holds the facts; to add a file, add an entry. `download.py` fetches one.
-"""
+"""Published weights: the facts in `published.json` about each file, and the file's place on this machine."""
 
 from __future__ import annotations
 
@@ -14,7 +11,7 @@ from pathlib import Path
 from spackle.errors import InputError, check_name
 from spackle.files import check_file, sha256_of
 
-HUB = "https://huggingface.co"  # HF_ENDPOINT names a mirror of it
+HUB = "https://huggingface.co"  # HF_ENDPOINT names a mirror
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,16 +21,16 @@ class PublishedWeights:
     name: str
     purpose: str
     url: str
-    file: str  # its name in the folder of weights
+    file: str  # name in the folder of weights
     bytes: int
     sha256: str  # 64 hexadecimal digits
     licence: str  # in a few words
-    notice: Sequence[str]  # lines that a person sees before the download
-    option: str  # the option that names a copy in another place
+    notice: Sequence[str]  # lines that are printed before the download
+    option: str  # the option that takes a copy in another folder
 
     @property
     def address(self) -> str:
-        """The file's address, on the hub's mirror if one is set."""
+        """The file's address, on a mirror of Hugging Face if HF_ENDPOINT names a mirror."""
         mirror = os.environ.get("HF_ENDPOINT", "").rstrip("/")
         return mirror + self.url.removeprefix(HUB) if mirror and self.url.startswith(f"{HUB}/") else self.url
 
@@ -43,7 +40,7 @@ PUBLISHED = {name: PublishedWeights(name, **facts) for name, facts in _FACTS.ite
 
 
 def published_weights(name: str) -> PublishedWeights:
-    """The entry of that name; InputError if there is none."""
+    """The entry of this name; InputError for an unknown name."""
     check_name("weights", name, PUBLISHED)
     return PUBLISHED[name]
 
@@ -57,7 +54,7 @@ def weights_folder() -> Path:
 
 
 def installed(name: str) -> Path | None:
-    """The file of published weights in `weights_folder`; None if it is not there."""
+    """The file of published weights in `weights_folder`; None if it is missing."""
     path = weights_folder() / published_weights(name).file
     return path if os.path.isfile(path) else None
 
@@ -65,18 +62,17 @@ def installed(name: str) -> Path | None:
 def published_as(path: Path) -> PublishedWeights | None:
     """The entry of published weights that matches a file's name and size; None for other files."""
     for entry in PUBLISHED.values():
-        named = path.parts[-len(Path(entry.file).parts) :] == Path(entry.file).parts
-        if named and os.path.isfile(path) and os.path.getsize(path) == entry.bytes:
+        if f"/{path.as_posix()}".endswith(f"/{entry.file}") and path.is_file() and path.stat().st_size == entry.bytes:
             return entry
     return None
 
 
 def check_undamaged(path: Path) -> None:
-    """InputError if a file with the name and size of published weights has another digest, or cannot be read."""
+    """InputError if a file has the name and size of published weights but not their digest."""
     entry = published_as(path)
     if entry is not None and file_digest(path) != entry.sha256:
-        again = f"delete it and run `spackle weights get {entry.name}`"
-        raise InputError(f"{path}: damaged, because its SHA-256 is not the published one: {again}")
+        again = f"delete the file and run `spackle weights get {entry.name}`"
+        raise InputError(f"{path}: damaged: its SHA-256 is not the published one: {again}")
 
 
 def weights_digest(path: Path) -> str:
@@ -86,7 +82,7 @@ def weights_digest(path: Path) -> str:
 
 
 def weights_digests(files: Mapping[str, Path]) -> str | dict[str, str] | None:
-    """`weights_digest` of a network's files: a digest for one file, a dict by name for several, None without files."""
+    """`weights_digest` of a network's files: a digest of one file, a dict by name of several, None without files."""
     digests = {name: weights_digest(file) for name, file in files.items()}
     return digests if len(digests) > 1 else next(iter(digests.values()), None)
 

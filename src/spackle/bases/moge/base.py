@@ -1,4 +1,4 @@
-"""The moge base: lifts MoGe-2's depth in metres, and takes its focal length if the photo's is unknown."""
+"""The moge base: lift the depth of MoGe-2, and take MoGe-2's focal length if the photo's is unknown."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from spackle.errors import InputError
 from spackle.image import Photo, resize_photo
 
 TOKENS = 1800  # for a photo, limited to the checkpoint's range
-SAMPLES = 64  # points along each side of the map, from which focal length and shift are found
-STEPS, STEP = 200, 1e-9  # of the search for the shift: the most, and the smallest, relative to 1 plus the shift
-SKY = 10.0  # the sky's distance, in units of the farthest surface's
+SAMPLES = 64  # points along each side of the map that determine focal length and shift
+STEPS, STEP = 200, 1e-9  # the search for the shift: most steps, and the smallest step relative to 1 + shift
+SKY = 10.0  # distance of the sky, as a multiple of the farthest surface's distance
 
 Floats = NDArray[np.float64]
 
 
 @dataclasses.dataclass(frozen=True)
 class MogeView:
-    """MoGe's depth of a photo, on a grid [h, w] over it."""
+    """MoGe's depth of a photo, on a grid [h, w] over the photo."""
 
     depth: Tensor  # [h, w] float32 z in metres, also where `surface` is false
     surface: Tensor  # [h, w] bool: the network's mask, false in the sky
@@ -63,8 +63,8 @@ class MogeBase:
     def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
         """Gaussians of the pixels of the photo at its working size, as `lift` makes them.
 
-        The user's or the file's focal length is kept; else MoGe's is taken, or the default if MoGe's is implausible.
-        The sky goes behind all surfaces. InputError if the network sees no surface, or memory is short.
+        The user's or the file's focal length is kept. Without one, MoGe's focal length is used if it is plausible, else
+        the default. The sky lies behind all surfaces. InputError if the network finds no surface, or memory is short.
         """
         photo = resize_photo(photo)
         least, most = self.network.config.num_tokens_range
@@ -82,13 +82,11 @@ class MogeBase:
             view = to_view(output, photo.width, photo.height, photo.focal_px)
         valid = view.surface & (view.depth > 0) & view.depth.isfinite()
         if not valid.any():
-            raise InputError(f"{photo.path}: MoGe sees no surface in it: give another photo, or --base lite")
+            raise InputError(f"{photo.path}: MoGe finds no surface: give another photo, or --base lite")
         depth = torch.where(view.surface, view.depth.where(valid, 0.0), SKY * view.depth[valid].max())
         depth_map = DepthMap(depth, valid | ~view.surface, None, None, "depth", photo.path)
         prediction = lift_guess(photo, depth_map, camera, progress)
         notes = {**prediction.notes, "precision": self.precision, "depth_scale": "metric, by the model"}
-        if not view.surface.all():
-            notes["sky"] = round(1 - float(view.surface.float().mean()), 4)
         return dataclasses.replace(prediction, notes=notes, lens_source=lens_source)
 
     @torch.no_grad()
@@ -101,9 +99,9 @@ class MogeBase:
 
 
 def to_view(output: MogeOutput, width: int, height: int, focal_px: float | None = None) -> MogeView:
-    """Convert the output for a width×height photo to metres, shifting the points so that each projects to its pixel.
+    """Convert the output for a width×height photo to metres; a shift along z lets each point project to its pixel.
 
-    The focal length in pixels of the photo is found along with the shift, unless it is given.
+    The focal length (in pixels of the photo) is estimated together with the shift, unless it is given.
     """
     rows, columns = output.mask_logits.shape
     half_diagonal = math.hypot(width, height) / 2
@@ -118,10 +116,10 @@ def to_view(output: MogeOutput, width: int, height: int, focal_px: float | None 
 
 
 def focal_and_shift(points: Floats, places: Floats, focal: float | None = None) -> tuple[float, float]:
-    """The focal length f and the shift s along z that let points [N, 3] project to their places [N, 2].
+    """The focal length f and the shift s along z with which points [N, 3] project to `places` [N, 2].
 
-    Minimises |f (x, y) / (z + s) - place|² by Gauss-Newton steps from s = 0, each halved until the error falls; the
-    best f for a shift has a closed form. f is in units of half the diagonal, as places are; a given f is kept. Fewer
+    Gauss-Newton steps from s = 0 minimise |f (x, y) / (z + s) - place|²; a step is halved until the error falls. The
+    best f for a shift has a closed form. The unit of f and of `places` is half the diagonal; a given f is kept. Fewer
     than two points give f = 1 and s = 0.
     """
     if len(points) < 2:

@@ -1,7 +1,7 @@
 """MoGe-2 (Wang et al. 2025, arXiv 2507.02546): a DINOv2 backbone, a pyramid of features, and a pyramid for each output.
 
-Modules are named as in the checkpoint, whose `model_config` gives the sizes. Options that no published checkpoint uses
-(other norms, activations and resamplers, registers, ViT-g) are refused.
+Modules are named as in the checkpoint. The checkpoint's `model_config` gives the sizes; options that no published
+checkpoint uses are refused.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import torch
-from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
@@ -24,9 +24,9 @@ from spackle.network_file import channels_last, load_strict, read_checkpoint
 
 ADVICE = "give MoGe-2's model.pt as it was downloaded"
 BACKBONES = {"dinov2_vits14": (384, 12, 6), "dinov2_vitb14": (768, 12, 12), "dinov2_vitl14": (1024, 24, 16)}
-PATCH = 14  # pixels of a token's side
+PATCH = 14  # side of a token in pixels
 GRID = 37  # tokens along a side for which the positions were learned
-LEVELS = 5  # of a pyramid, each twice as fine as the one before
+LEVELS = 5  # of a pyramid; each level is twice as fine as the previous level
 FINEST = 2 ** (LEVELS - 1)  # output pixels along a token's side
 conv3 = functools.partial(nn.Conv2d, kernel_size=3, padding=1, padding_mode="replicate")
 
@@ -43,10 +43,10 @@ class EncoderConfig(BaseModel, strict=True):
 
 
 class PyramidConfig(BaseModel, strict=True, extra="forbid"):
-    """The neck or a head: channels and numbers of blocks of each level, coarse to fine."""
+    """Channels and numbers of blocks of the neck or of a head, for each level from coarse to fine."""
 
     dim_in: Annotated[list[Width], PerLevel]
-    dim_out: Annotated[list[Width | None], PerLevel] | None  # None: a level outputs its features as they are
+    dim_out: Annotated[list[Width | None], PerLevel] | None  # None: a level's features are its output
     dim_res_blocks: Annotated[list[Width], PerLevel]
     num_res_blocks: Annotated[list[Count], PerLevel]
     dim_times_res_block_hidden: Literal[1] = 1
@@ -54,11 +54,6 @@ class PyramidConfig(BaseModel, strict=True, extra="forbid"):
     res_block_hidden_norm: Literal["none"]
     activation: Literal["relu"] = "relu"
     resamplers: Annotated[list[Literal["conv_transpose", "bilinear"]], Field(min_length=4, max_length=4)]
-
-    @property
-    def outputs(self) -> list[int]:
-        """Output channels of each level."""
-        return [out or width for out, width in zip(self.dim_out or [None] * LEVELS, self.dim_res_blocks, strict=True)]
 
 
 class MogeConfig(BaseModel, strict=True):
@@ -73,21 +68,10 @@ class MogeConfig(BaseModel, strict=True):
     remap_output: Literal["exp", "sinh_exp"]
     num_tokens_range: Annotated[list[Width], Field(min_length=2, max_length=2)]
 
-    @model_validator(mode="after")
-    def _fits(self) -> MogeConfig:
-        width, depth, _ = BACKBONES[self.encoder.backbone]
-        heads = [(self.points_head, 3), (self.mask_head, 1)] + ([(self.normal_head, 3)] if self.normal_head else [])
-        fits = max(self.encoder.intermediate_layers) < depth
-        fits &= self.neck.dim_in == [self.encoder.dim_out + 2] + [2] * (LEVELS - 1)
-        fits &= all(head.dim_in == self.neck.outputs and head.outputs[-1] == channels for head, channels in heads)
-        if not fits or (self.scale_head["dims"][0], self.scale_head["dims"][-1]) != (width, 1):
-            raise ValueError("one part gives other channels than the next takes")
-        return self
-
 
 @dataclasses.dataclass(frozen=True)
 class MogeOutput:
-    """The network's output for a photo, on a grid [h, w] over it; float32."""
+    """The network's output on a grid [h, w] over the photo; float32."""
 
     points: Tensor  # [h, w, 3] x right, y down, z forward, up to the metric scale and a shift along z
     mask_logits: Tensor  # [h, w] above 0 for a surface, else sky
@@ -101,7 +85,7 @@ class DinoBackbone(nn.Module):
         super().__init__()
         self.cls_token = nn.Parameter(torch.zeros(1, 1, width))
         self.pos_embed = nn.Parameter(torch.zeros(1, 1 + GRID**2, width))
-        self.mask_token = nn.Parameter(torch.zeros(1, width))  # used in training alone
+        self.mask_token = nn.Parameter(torch.zeros(1, width))  # for training only
         self.patch_embed = nn.ModuleDict({"proj": nn.Conv2d(3, width, PATCH, stride=PATCH)})
         self.blocks = nn.ModuleList(TransformerBlock(width, heads) for _ in range(depth))
         self.norm = nn.LayerNorm(width, eps=NORM_EPS)
@@ -201,7 +185,7 @@ class MogeNetwork(nn.Module):
         self.encoder = DinoEncoder(config.encoder)
         self.neck = Pyramid(config.neck)
         self.points_head, self.mask_head = Pyramid(config.points_head), Pyramid(config.mask_head)
-        self.normal_head = config.normal_head and Pyramid(config.normal_head)  # not run: a lifted photo needs none
+        self.normal_head = config.normal_head and Pyramid(config.normal_head)  # not run
         first, second, third = map(nn.Linear, config.scale_head["dims"][:-1], config.scale_head["dims"][1:])
         self.scale_head = nn.Sequential(first, nn.ReLU(), second, nn.ReLU(), third)
 
@@ -246,8 +230,8 @@ def load_network(path: str | os.PathLike[str], dtype: torch.dtype) -> MogeNetwor
     """A frozen network from MoGe-2's model.pt, on the CPU.
 
     Residual blocks compute in `dtype`, float32 or bfloat16, and add to float32 features, because bfloat16's eight bits
-    would turn slanted surfaces into stairs. InputError for a missing, broken or foreign file, or too little memory;
-    nothing in the file is executed.
+    would turn slanted surfaces into stairs. InputError for a missing, broken or foreign file, or too little memory.
+    Nothing in the file is executed.
     """
     content, tensors = read_checkpoint(path, "model_config", ADVICE)
     try:
@@ -255,7 +239,7 @@ def load_network(path: str | os.PathLike[str], dtype: torch.dtype) -> MogeNetwor
     except ValidationError as error:
         first = error.errors()[0]
         key = one_line(".".join(["model_config", *(str(name)[:60] for name in first["loc"])]))
-        said = f"no published kind of MoGe-2: {key}: {first['msg']}, not {shown(first['input'])}"
+        said = f"not a published kind of MoGe-2 ({key}: {first['msg']}, not {shown(first['input'])})"
         raise InputError(f"{path}: {said}: {ADVICE}") from error
     with torch.device("meta"):
         network = MogeNetwork(config)

@@ -1,4 +1,4 @@
-"""Stretch Gaussians along the axes of the world, which converts SHARP's to metres."""
+"""Stretch Gaussians along the world's axes, which converts SHARP's Gaussians to metres."""
 
 from __future__ import annotations
 
@@ -12,24 +12,23 @@ from spackle._numba import kernel
 from spackle.device import run_chunks
 from spackle.gaussians import Gaussians
 
-SWEEPS = 4  # after three, the cosine between two columns was 3e-3 at worst; after four, 1e-15
-UPRIGHT = 0.5  # squared sine of the angle between two columns below which the shorter one is noise
-BLOCK = 64  # Gaussians whose columns lie side by side in the first-level cache
+SWEEPS = 4  # the cosine between two columns is at worst 3e-3 after three sweeps, 1e-15 after four
+UPRIGHT = 0.5  # if the squared sine of the angle between two columns is smaller, the shorter column is noise
+BLOCK = 64  # number of Gaussians that the first-level cache holds
 LEAST = 1e-300  # avoids 0/0, and is smaller than the square of any positive float32
-GRAIN = 256 * BLOCK  # Gaussians that a thread takes at a time
+GRAIN = 256 * BLOCK  # number of Gaussians that a thread takes at a time
 
 
 def stretch_gaussians(gaussians: Gaussians, stretch: tuple[float, float, float]) -> Gaussians:
-    """Map N Gaussians on the CPU by D = diag(stretch), which turns and reshapes each one.
+    """Map N Gaussians on the CPU by D = diag(stretch), which rotates and reshapes each Gaussian.
 
-    A covariance R S² Rᵀ becomes M Mᵀ with M = D R S. Rotating M from the right does not change M Mᵀ. Such rotations
-    make M's columns orthogonal (one-sided Jacobi); then the columns' lengths are the new scales, and their directions
-    the new axes. The covariance itself is never formed: it would square the ratio of the scales, and lose the small
-    ones.
+    A covariance R S² Rᵀ becomes M Mᵀ with M = D R S. Rotations from the right leave M Mᵀ unchanged and make M's columns
+    orthogonal (one-sided Jacobi); then the columns' lengths are the new scales, and their directions are the new axes.
+    The covariance itself is never formed, because squared scales would lose the small scales.
 
     Returns:
-        N Gaussians with descending scales and unit quats with w ≥ 0 (a zero one counts as no rotation); opacities and
-        colors are the same tensors; the others are detached from autograd.
+        N Gaussians with descending scales and unit quats with w ≥ 0; a zero quat counts as no rotation. Opacities and
+        colors are the same tensors; means, quats and scales are detached from autograd.
     """
     means, quats, scales = (t.detach() for t in gaussians.tensors[:3])
     source = quats.contiguous().numpy(), scales.contiguous().numpy()
@@ -76,7 +75,7 @@ def _load_block(first: int, count: int, quats: Any, scales: Any, stretch: Any, c
 
 @kernel
 def _sweep_block(columns: Any) -> None:
-    """Rotate each pair of columns once, for the whole block and without branches, so that the loop is vectorised."""
+    """Rotate each pair of columns once for the whole block, without branches, so that the loop is vectorised."""
     for i in range(BLOCK):
         a, b, c = _column(columns, 0, i), _column(columns, 1, i), _column(columns, 2, i)
         a, b = _turn(a, b)
@@ -106,7 +105,7 @@ def _turn(p: Any, q: Any) -> Any:
 
 @kernel
 def _store_block(first: int, count: int, columns: Any, new_quats: Any, new_scales: Any) -> None:
-    """Read scales and rotations off orthogonal columns, longest first."""
+    """Compute scales and rotations from orthogonal columns, longest first."""
     for i in range(count):
         n = first + i
         a, b, c = _column(columns, 0, i), _column(columns, 1, i), _column(columns, 2, i)
@@ -125,7 +124,7 @@ def _store_block(first: int, count: int, columns: Any, new_quats: Any, new_scale
 
 @kernel
 def _other_axes(a: Any, b: Any) -> Any:
-    """The second and third axes of a right-handed frame: b made orthogonal to a, or any axis if b has no direction."""
+    """The second and third axis of a right-handed frame: b made orthogonal to a, or any axis if b is parallel to a."""
     c = _cross(a, b)
     if not _dot(c, c) > UPRIGHT:
         x, y, z = abs(a[0]), abs(a[1]), abs(a[2])
