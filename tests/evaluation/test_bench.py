@@ -153,14 +153,3 @@ def test_from_files_to_tables(scenes: Path, tmp_path: Path) -> None:
             assert values["merged", setting, method] == [base + aux for base, aux in added]
     refuses(run(*words, "--runs", 3, "--limit", 2), "of other options (base_runs: 2 -> 3; runs: 2 -> 3)")
     refuses(run("evaluate", *words[1:], "--metrics", "none"), "config.json: not of `spackle evaluate`")
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (("one", "--dataset", "middlebury", "--runs", "0"), "Invalid value for '--runs'"),
-        (("--dataset", "middlebury", "--base", "rgbd", "gone"), "gone: no such folder"),
-    ],
-)
-def test_bad_options_are_one_line(words: tuple[str, ...], message: str, tmp_path: Path) -> None:
-    refuses(run("bench", *words, "-o", tmp_path / "out"), message)

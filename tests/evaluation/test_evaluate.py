@@ -61,17 +61,6 @@ def test_psnr_and_ssim_are_scikit_images() -> None:
     assert psnr(image, image) == math.inf
 
 
-def test_a_broken_pyiqa_is_the_reason_why_its_metrics_are_not_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "pyiqa.py").write_text("raise RuntimeError('operator torchvision::nms does not exist')")
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.delitem(sys.modules, "pyiqa", raising=False)
-    metrics, states = open_metrics(["niqe", "lpips"], "cpu", download=False)
-    assert metrics == {}
-    assert all(state.startswith("not run: pyiqa cannot be imported: operator") for state in states.values())
-
-
 def test_variants_are_pinned_and_no_weights_are_downloaded(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: dict[str, Any] = {}
     seen: list[tuple[Tensor, ...]] = []

@@ -18,7 +18,6 @@ from spackle.evaluation.folder import image_file
 from spackle.evaluation.methods import METHODS as FACTS
 from spackle.evaluation.pictures import evenly
 from spackle.evaluation.report import make_report, scenes_plot
-from spackle.evaluation.rows import IMAGES
 from spackle.evaluation.rows import Run as Results
 from spackle.evaluation.tables import make_tables
 
@@ -121,12 +120,6 @@ def test_every_string_from_outside_is_escaped(tmp_path: Path) -> None:
     assert "<b>damaged" not in text
     assert f"{EVIL}3" in page.text("h4")
     assert page.drawings()
-
-
-def test_many_evaluations_have_fewer_pictures(tmp_path: Path) -> None:
-    runs = [results(False, 2, title) for title in IMAGES]
-    pictures = [image for image in Page(report(tmp_path, *runs)).named("img") if "width" in image]
-    assert len(pictures) == len(runs) * 2 * (len(METHODS) + 1)  # two images of each, and the truth
 
 
 def test_plots_show_each_value_once_in_a_form_of_its_method() -> None:

@@ -9,7 +9,6 @@ import pytest
 import suite
 from command import names_in
 from naive_renderer import naive_render
-from scenes import box_before_wall
 from suite_scenes import photo_scene
 
 from spackle.render import CpuRenderer
@@ -33,14 +32,6 @@ def test_the_renderers_section_and_the_naive_renderers_picture() -> None:
     assert float(difference.amax()) < 0.02
     assert facts["gaussians"] == (count := len(scene)) == SIDE * SIDE // 2
     assert whole.limit_ms == pytest.approx((count * 56 + SIDE * SIDE * 20) / 2e6)
-
-
-def test_one_scene_for_a_video_takes_less_than_each_by_itself() -> None:
-    section = suite.video_section(1, box_before_wall(width=64, height=48).lift, CpuRenderer(), None, frames=4)
-    found = rows_of(section)
-    once, each = "the same, the photo's occlusion guard made once", "frame by frame over one scene"
-    assert found[once].values[0] < found[each].values[0]
-    assert section[1]["added"] > 0
 
 
 def test_sections_are_gathered_and_what_cannot_run_is_named(tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
 """Feeds damaged files to the readers: `make fuzz N=5000`, or `python tests/fuzz/fuzz.py --replay CASE.json`.
 
-Each case follows from its reader's name and its number alone. A reader may raise `InputError` and nothing else, within
-10 s and 1.5 GB. They run in forked processes of bounded memory; a new one goes on behind a case that fails.
+A reader's name and a case's number determine the case. A reader may raise `InputError` and nothing else, within 10 s
+and 1.5 GB. Cases run in forked processes of bounded memory; after a failed case a new process continues.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import argparse
 import base64
 import ctypes
 import faulthandler
-import gc
 import json
 import multiprocessing
 import os
@@ -29,10 +28,10 @@ from typing import Any
 import numpy as np
 
 HERE = Path(__file__).resolve().parent
-ROOMS = [HERE.parent / room for room in ("", "evaluation", "formats", "values")]  # which have builders of files
+ROOMS = [HERE.parent / room for room in ("", "evaluation", "formats", "values")]  # folders with builders of files
 sys.path[:0] = map(str, [HERE, *ROOMS, HERE.parents[1] / "src"])
 
-SECONDS, BYTES = 10, 1_500_000_000  # at most, of a case
+SECONDS, BYTES = 10, 1_500_000_000  # the limits of a case
 FAILURES = Path("fuzz-failures")
 NUMBERS = [b"0", b"-1", b"1e300", b"-1e39", b"1e-300", b"nan", b"inf", b"9" * 400, b"9" * 5000, b"2147483648", b"0.5"]
 WORDS = [b"", b"null", b"true", b"[]", b"{}", b'""', b"\x1b[2J", b"\0", b"../../etc/passwd", b"[" * 10_000]
@@ -65,9 +64,7 @@ def mutated(files: Files, rng: np.random.Generator) -> Files:
 
 
 def damaged_bytes(data: bytes, rng: np.random.Generator) -> bytes:
-    start, stop, other = (
-        int(place) for place in [*np.sort(rng.integers(len(data) + 1, size=2)), rng.integers(len(data) + 1)]
-    )
+    start, stop, other = map(int, [*np.sort(rng.integers(len(data) + 1, size=2)), rng.integers(len(data) + 1)])
     stop = min(stop, start + int(rng.integers(1, 64)))
     kind = int(rng.integers(7))
     if kind == 0 and data:  # bits
@@ -75,17 +72,14 @@ def damaged_bytes(data: bytes, rng: np.random.Generator) -> bytes:
         hit = rng.integers(0, len(array), int(rng.integers(1, 9)))
         array[hit] ^= (1 << rng.integers(0, 8, len(hit))).astype(np.uint8)
         return array.tobytes()
-    if kind == 1:  # a number of 1 to 8 bytes, most of them in the head
+    if kind == 1:  # a number of 1 to 8 bytes, most often in the head
         start = int(len(data) * rng.random() ** 4)
         number = pick(rng, HEADS)[: 1 << int(rng.integers(4))]
         return data[:start] + number[:: pick(rng, [1, -1])] + data[start + len(number) :]
-    middle = {
-        2: b"",
-        3: data[start:stop] * int(rng.integers(2, 300)),
-        4: rng.bytes(stop - start),
-        5: data[other : other + stop - start],
-    }
-    return data[:start] + (middle.get(kind, b"") + data[stop:] if kind < 6 else b"")
+    if kind == 6:  # the end is missing
+        return data[:start]
+    repeated, random = data[start:stop] * int(rng.integers(2, 300)), rng.bytes(stop - start)
+    return data[:start] + [b"", b"", repeated, random, data[other : other + stop - start], b""][kind] + data[stop:]
 
 
 def damaged_text(data: bytes, rng: np.random.Generator) -> bytes:
@@ -106,7 +100,7 @@ def damaged_text(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def changed(content: Any, rng: np.random.Generator) -> Any:
-    """JSON with another value, or without one, somewhere in it."""
+    """JSON in which one value is replaced or missing."""
     if not isinstance(content, (dict, list)) or not content or rng.random() < 0.1:
         return pick(rng, VALUES)
     key = pick(rng, list(content) if isinstance(content, dict) else range(len(content)))
@@ -126,7 +120,7 @@ def save(name: str, number: int, files: Files, path: Path) -> Path:
 
 
 def problem_of(name: str, files: Files) -> str | None:
-    """What a reader did that it must not do."""
+    """A text about a forbidden behaviour of a reader; None if there is none."""
     from av import FFmpegError
     from readers import READERS
 
@@ -142,7 +136,7 @@ def problem_of(name: str, files: Files) -> str | None:
             links: list[BaseException] = [error]
             while cause := links[-1].__cause__ or links[-1].__context__:
                 links.append(cause)
-            # FFmpeg itself refuses any block over 2 GB, with the same error as where there is no memory.
+            # FFmpeg refuses any block over 2 GB, with the same error as for missing memory.
             if not any(isinstance(link, FFmpegError) for link in links) and any(
                 isinstance(link, MemoryError) or "allocate" in str(link) for link in links
             ):
@@ -160,9 +154,9 @@ def bound_memory() -> None:
 
 
 def bounded(name: str, files: Files) -> str | None:
-    """What was wrong; the process ends where it takes too long."""
-    signal.setitimer(signal.ITIMER_PROF, SECONDS)  # of the processor: others may be at work, too
-    faulthandler.dump_traceback_later(20 * SECONDS, exit=True)  # waits for something
+    """`problem_of`; the process ends if the reader takes too long."""
+    signal.setitimer(signal.ITIMER_PROF, SECONDS)  # processor time, because other programs may run
+    faulthandler.dump_traceback_later(20 * SECONDS, exit=True)  # for a reader that waits
     problem = problem_of(name, files)
     faulthandler.cancel_dump_traceback_later()
     signal.setitimer(signal.ITIMER_PROF, 0)
@@ -178,7 +172,7 @@ def case_of(name: str, seeds: Sequence[Files], number: int) -> Files:
 
 
 def run_cases(name: str, seeds: Sequence[Files], numbers: range, case: Path, said: Path) -> None:
-    """Up to the first that fails: the file `case` then holds it, and `said` what was wrong."""
+    """Run cases up to the first failure; the file `case` then holds this case, and `said` the problem."""
     with open(said, "w") as file:
         os.dup2(file.fileno(), sys.stderr.fileno())
     bound_memory()
@@ -190,11 +184,11 @@ def run_cases(name: str, seeds: Sequence[Files], numbers: range, case: Path, sai
 
 
 def seeds_of(name: str) -> list[Files]:
-    """What a reader can read."""
+    """Valid files for a reader."""
     from readers import READERS, contents
 
     seeds: list[Files] = []
-    for make in READERS[name].makers:  # also loads all that is needed, before memory is bounded
+    for make in READERS[name].makers:  # also loads all modules, before memory is bounded
         with tempfile.TemporaryDirectory() as place:
             make(Path(place))
             seeds.append(contents(Path(place)))
@@ -202,28 +196,8 @@ def seeds_of(name: str) -> list[Files]:
     return seeds
 
 
-def held(name: str, count: int) -> list[int]:
-    """Threads, open files and MB that this process has more of after so many cases, its garbage collector waiting."""
-    seeds, process = seeds_of(name), Path("/proc/self")
-    gc.disable()
-
-    def facts() -> list[int]:
-        pages = int((process / "statm").read_text().split()[1])
-        return [
-            len(os.listdir(process / "task")),
-            len(os.listdir(process / "fd")),
-            pages * resource.getpagesize() >> 20,
-        ]
-
-    before = facts()
-    for number in range(count):
-        if problem := problem_of(name, case_of(name, seeds, number)):
-            sys.exit(problem)
-    return [after - start for start, after in zip(before, facts(), strict=True)]
-
-
 def fuzz(name: str, count: int) -> int:
-    """How many cases of a reader failed: they are written to FAILURES, and what was wrong is printed."""
+    """The number of failed cases of a reader; each is written to FAILURES, and the problem is printed."""
     seeds = seeds_of(name)
     first = failed = 0
     with tempfile.TemporaryDirectory() as place:
@@ -247,12 +221,11 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("-n", type=int, default=300, help="cases of each reader")
     parser.add_argument("--readers", nargs="*", help="only these")
-    parser.add_argument("--held", action="store_true", help="print what one process then holds: threads, files, MB")
-    parser.add_argument("--replay", type=Path, nargs="+", help="cases that were written here before")
+    parser.add_argument("--replay", type=Path, nargs="+", help="files of FAILURES")
     given = parser.parse_args()
     warnings.simplefilter("ignore")
-    os.environ["OMP_NUM_THREADS"] = "1"  # threads take memory, and a forked process has none of them
-    ctypes.CDLL(None).mallopt(-8, 2)  # so many heaps at most: each new one takes 64 MB
+    os.environ["OMP_NUM_THREADS"] = "1"  # threads take memory, and do not survive a fork
+    ctypes.CDLL(None).mallopt(-8, 2)  # at most two heaps, because each heap takes 64 MB
     from readers import READERS
 
     if given.replay:
@@ -263,10 +236,6 @@ def main() -> int:
             problems.append(bounded(case["reader"], files))
             print(problems[-1] or "as it should be", flush=True)
         return any(problems)
-    if given.held:
-        for name in given.readers or READERS:
-            print(name, *held(name, given.n))
-        return 0
     return sum(fuzz(name, given.n) for name in given.readers or READERS) > 0
 
 

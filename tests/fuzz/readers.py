@@ -1,4 +1,4 @@
-"""What is fuzzed: small valid files for each reader of strangers' files, and the reader."""
+"""Small valid files for each reader of foreign files, and the readers."""
 
 from __future__ import annotations
 
@@ -52,14 +52,14 @@ Maker = Callable[[Path], object]
 
 @dataclasses.dataclass(frozen=True)
 class Reader:
-    """What makes valid files in a folder, and what reads them."""
+    """Functions that write valid files into a folder, and the function that reads the files."""
 
     makers: Sequence[Maker]
     read: Callable[[Path], object]
 
 
 def sealed(files: Files) -> Files:
-    """The files with checksums that fit again, so that damage gets past them."""
+    """The files with correct checksums, so that readers do not stop at the checksums."""
     done = {name: _sealed(name, data) for name, data in files.items()}
     if "manifest.json" in done:
         try:
@@ -120,7 +120,7 @@ def _ply(folder: Path) -> None:
 
 
 def _encoded(kind: str) -> Maker:
-    """A scene in another format; `sealed` packs a .spz."""
+    """A scene in another format than PLY; `sealed` packs a .spz."""
 
     def make(folder: Path) -> None:
         data = encoder_of(path := folder / f"a.{kind}")(SceneFile(path, random_gaussians(300)))
@@ -157,7 +157,7 @@ def _tree(name: str, *makers: Maker) -> Reader:
 
 
 def _text_model(folder: Path) -> None:
-    """COLMAP's text files, as ETH3D has them."""
+    """COLMAP's text files in the layout of Tanks and Temples."""
     scene = eth3d(folder / "Truck")
     (scene / "dslr_calibration_undistorted").rename(scene / "sparse")
 

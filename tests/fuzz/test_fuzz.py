@@ -1,4 +1,4 @@
-"""A hundred damaged files for each reader; `make fuzz N=5000` tries more. What fails lies in fuzz-failures/."""
+"""A hundred damaged files for each reader; `make fuzz N=5000` tries more. Failures are kept in fuzz-failures/."""
 
 from __future__ import annotations
 
@@ -10,12 +10,10 @@ from pathlib import Path
 
 import fuzz
 import numpy as np
-import pytest
 from PIL import Image
 
 
 def run(*arguments: object) -> str:
-    """What the command prints."""
     done = subprocess.run([sys.executable, fuzz.__file__, *map(str, arguments)], capture_output=True, text=True)
     assert done.returncode == 0, f"{done.stdout}{done.stderr}: python tests/fuzz/fuzz.py --replay shows one again"
     return done.stdout
@@ -23,13 +21,6 @@ def run(*arguments: object) -> str:
 
 def test_damaged_files_are_refused_in_time_and_in_memory() -> None:
     assert run("-n", 120) == ""
-
-
-@pytest.mark.parametrize("count", [150, pytest.param(3000, marks=pytest.mark.slow)])
-def test_damaged_files_leave_no_thread_no_file_and_no_memory_behind(count: int) -> None:
-    for line in run("-n", count, "--held", "--readers", "clips", "pictures", "depth").splitlines():
-        threads, files, megabytes = map(int, line.split()[1:])
-        assert (threads, files, megabytes < 40) == (0, 0, True), line
 
 
 def gif(side: int) -> bytes:

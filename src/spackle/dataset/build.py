@@ -1,9 +1,10 @@
-"""`spackle dataset build`: photos to shards, whose bytes are the same however often the build is interrupted."""
+"""`spackle dataset build`: photos to shards; an interrupted build resumes and writes the same bytes."""
 
 from __future__ import annotations
 
 import dataclasses
 import shutil
+import time
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -25,7 +26,7 @@ from spackle.files import fingerprint, write_whole
 from spackle.folders import differences, digest_of, make_folder, remove_half_written, results_folder
 from spackle.image import load_photo, resize_photo
 from spackle.inpaint import INPAINTERS, Inpainter, InpainterOptions, get_inpainter
-from spackle.progress import Reporter, asked_to_stop, counted, timed
+from spackle.progress import Reporter, asked_to_stop, counted
 from spackle.render import get_renderer
 from spackle.residual import MASK_THRESHOLD
 from spackle.weights import weights_digest, weights_digests
@@ -33,7 +34,6 @@ from spackle.workers import at_work
 
 MAX_PHOTOS = 1_000_000  # a photo's key has six digits
 PARTS = "parts"  # folder in the output for samples that are not in a shard yet
-STAGES = ("load", "base", "render", "inpaint", "encode", "write")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,9 +44,9 @@ class DatasetOptions:
     images: Path | None = None  # folder of the photos that a COCO JSON names
     sample: int | None = None  # number of photos; None: all
     seed: int = 0  # for the choice of photos and paths
-    views: int = 20  # per photo, including its own view, as in the paper
+    views: int = 20  # per photo, including the photo's camera, as in the paper
     trajectory: SharpTrajectory | None = None  # None: drawn for each photo
-    disparity: tuple[float, float] = (0.1, 0.6)  # drawn between these, see `spackle.camera_path.max_offset`
+    disparity: tuple[float, float] = (0.1, 0.6)  # range of the random disparity, see `spackle.camera_path.max_offset`
     inpainter: str = "exemplar"  # one of `COMPLETIONS`
     inpainter_weights: Path | None = None  # a file or folder, if the inpainter has a network
     inpainter_side: int | None = None  # long side in pixels of the images that the inpainter's network gets
@@ -92,7 +92,7 @@ class DatasetOptions:
         try:
             depth = self.depth_of(photo)
             return [photo.name, photo.sha256, *([fingerprint(depth, "depth map")] if depth else [])]
-        except InputError:  # the build reports it later
+        except InputError:  # the build reports the error later
             return [photo.name, photo.sha256, "none"]
 
 
@@ -142,7 +142,7 @@ def build_dataset(source: Path, output: Path, options: DatasetOptions, reporter:
         InputError: options, photos or folders cannot be used, or `output` holds another dataset.
     """
     options.check()
-    maker = Maker(options)  # raises its errors before any long work
+    maker = Maker(options)  # raises errors before any long work
     if maker.inpainter is not None and maker.inpainter.notice:
         reporter.log(maker.inpainter.notice)
     root, names = find_photos(source, options.images, reporter.log)
@@ -160,10 +160,9 @@ def build_dataset(source: Path, output: Path, options: DatasetOptions, reporter:
 
 @dataclasses.dataclass(frozen=True)
 class Made:
-    """The sample of a photo, or the reason why it has none."""
+    """The sample of a photo, or the reason why the photo has no sample."""
 
     index: int
-    seconds: dict[str, float]  # of each stage
     sample: bytes | None = None  # the photo's part of a tar archive
     problem: str | None = None
 
@@ -172,53 +171,46 @@ class Maker:
     """A `Worker` that makes photos' samples: base, views and targets."""
 
     def __init__(self, options: DatasetOptions) -> None:
-        """Open base and inpainter; InputError if that fails. Their networks are loaded with the first photo."""
+        """Open base and inpainter, whose networks are loaded with the first photo; InputError if opening fails."""
         self.options, self.base = options, open_base(options.base)
         self.renderer, self.inpainter = get_renderer(options.base.device), options.open_inpainter()
 
     def make(self, photo: PhotoFile) -> Made:
         """Make a photo's sample; BaseError if the base would fail for every photo."""
-        seconds: dict[str, float] = {}
         try:
-            return Made(photo.index, seconds, sample=self._sample(photo, seconds))
+            return Made(photo.index, sample=self._sample(photo))
         except BaseError:
             raise
         except InputError as error:
-            return Made(photo.index, seconds, problem=str(error))
+            return Made(photo.index, problem=str(error))
 
-    def _sample(self, file: PhotoFile, seconds: dict[str, float]) -> bytes:
-        options = self.options
-        with timed("load", seconds):
-            photo = load_photo(file.path)
-        with timed("base", seconds):
-            prediction, _ = self.base.predict(photo, options.depth_of(file))
-        with timed("render", seconds):
-            kind, disparity = draw_path(options.trajectory, options.disparity, options.seed, file.sha256)
-            with reading(file.path, "no camera path: {reason}", ValueError):
-                depth_range = DepthRange.of(prediction.gaussians)
-                cameras = path_cameras(kind, disparity, prediction.camera.even(), depth_range, options.views)
-            stack = render_views(prediction, cameras, self.renderer)
-        with timed("inpaint", seconds):
-            targets = complete_views(stack, options.inpainter, self.inpainter, self.renderer)
-        with timed("encode", seconds):
-            facts = {
-                "photo": {
-                    "name": file.name,
-                    "sha256": file.sha256,
-                    "width": photo.width,
-                    "height": photo.height,
-                    "focal_source": prediction.lens_source or photo.focal_source,
-                },
-                "base": {"gaussians": len(prediction.gaussians), **prediction.notes},
-                "inpainter": _completion(options, self.inpainter),
-                "threshold": MASK_THRESHOLD,
-                "trajectory": {"kind": kind, "disparity": disparity},
-            }
-            return pack_sample(file.key, resize_photo(photo).rgb, stack, targets, facts)
+    def _sample(self, file: PhotoFile) -> bytes:
+        options, photo = self.options, load_photo(file.path)
+        prediction, _ = self.base.predict(photo, options.depth_of(file))
+        kind, disparity = draw_path(options.trajectory, options.disparity, options.seed, file.sha256)
+        with reading(file.path, "no camera path: {reason}", ValueError):
+            depth_range = DepthRange.of(prediction.gaussians)
+            cameras = path_cameras(kind, disparity, prediction.camera.even(), depth_range, options.views)
+        stack = render_views(prediction, cameras, self.renderer)
+        targets = complete_views(stack, options.inpainter, self.inpainter, self.renderer)
+        facts = {
+            "photo": {
+                "name": file.name,
+                "sha256": file.sha256,
+                "width": photo.width,
+                "height": photo.height,
+                "focal_source": prediction.lens_source or photo.focal_source,
+            },
+            "base": {"gaussians": len(prediction.gaussians), **prediction.notes},
+            "inpainter": _completion(options, self.inpainter),
+            "threshold": MASK_THRESHOLD,
+            "trajectory": {"kind": kind, "disparity": disparity},
+        }
+        return pack_sample(file.key, resize_photo(photo).rgb, stack, targets, facts)
 
 
 class _Build:
-    """A dataset's photos, and which of them are done."""
+    """A dataset's photos, and the state of each."""
 
     def __init__(
         self,
@@ -247,21 +239,20 @@ class _Build:
             if index // self.size not in self.shards and not self._part(index).is_file()
         }
         self.problems: dict[int, str] = {}  # why photos have no sample, by index
-        self.seconds = dict.fromkeys(STAGES, 0.0)
 
     def run(self) -> str:
         """Make the missing samples; returns "complete" or "stopped"."""
         jobs = [photo for photo in self.photos if photo.index in self.missing]
         if ready := len(self.photos) - len(jobs):
             self.reporter.log(f"{self.output}: going on, {ready} of {len(self.photos)} photos are done")
-        total = {"wall": 0.0}
+        start = time.perf_counter()
         with self.reporter.stage("photos") as step, asked_to_stop(alone=True) as stop:
             for number in range(-(-len(self.photos) // self.size)):
                 self._write_shard(number)
             if jobs:
                 make, options = partial(Maker, self.options), self.options
                 work = at_work(make, jobs, stop, count=options.workers, threads=options.threads)
-                with timed("wall", total), work as results:
+                with work as results:
                     for done, result in enumerate(results, ready + 1):
                         self._keep(result)
                         self._write_shard(result.index // self.size)
@@ -271,7 +262,7 @@ class _Build:
         if self.missing:
             self.reporter.log("stopped; the same command resumes from here")
             return "stopped"
-        self._finish(len(jobs) - len(self.problems), total["wall"])
+        self._finish(len(jobs), time.perf_counter() - start)
         return "complete"
 
     def _part(self, index: int) -> Path:
@@ -279,30 +270,26 @@ class _Build:
         return self.output / PARTS / f"{self.photos[index].key}.tar"
 
     def _keep(self, result: Made) -> None:
-        """Write a photo's sample to its `_part`, or log why there is none."""
+        """Write a photo's sample to its `_part`, or log why the photo has no sample."""
         if result.sample is not None:
-            with timed("write", self.seconds):
-                write_whole(self._part(result.index), result.sample)
+            write_whole(self._part(result.index), result.sample)
         self.missing.discard(result.index)
-        for stage, time in result.seconds.items():
-            self.seconds[stage] += time
         if result.problem is not None:
             self.problems[result.index] = result.problem
             self.reporter.log(f"passed over: {result.problem}")
 
     def _write_shard(self, number: int) -> None:
-        """If all photos of a shard are done, write its file, then its entry in the manifest; then delete its parts."""
+        """If all photos of a shard are done, write the shard, then its entry in the manifest; then delete the parts."""
         indices = range(number * self.size, min((number + 1) * self.size, len(self.photos)))
         if number in self.shards or not self.missing.isdisjoint(indices):
             return
         parts = [(self.photos[i].key, self._part(i)) for i in indices if i not in self.problems]
         name = f"shard-{number:06d}.tar"
         skipped = [self._portable(self.photos[i], self.problems[i]) for i in indices if i in self.problems]
-        with timed("write", self.seconds):
-            self.shards[number] = write_shard(parts, self.output / name, skipped)
-            self._save(complete=False)
-            for _, path in parts:
-                path.unlink(missing_ok=True)
+        self.shards[number] = write_shard(parts, self.output / name, skipped)
+        self._save(complete=False)
+        for _, path in parts:
+            path.unlink(missing_ok=True)
         self.reporter.detail(f"  {name}: {len(parts)} photos, {decimal(self.shards[number].size)}")
 
     def _save(self, *, complete: bool) -> None:
@@ -322,8 +309,7 @@ class _Build:
             why = min(line for shard in shards for line in shard.passed_over)
             raise InputError(f"{self.output}: none of {len(self.photos)} photos gave a sample; for example {why}")
         if made:
-            stages = ", ".join(f"{stage} {self.seconds[stage] / made:.2f}" for stage in STAGES)
-            self.reporter.log(f"{3600 * made / seconds:,.0f} photos an hour; seconds a photo: {stages}")
+            self.reporter.log(f"{3600 * made / seconds:,.0f} photos an hour")
         total = decimal(sum(shard.size for shard in shards))
         self.reporter.log(f"{counted(samples, 'photo')} in {counted(len(shards), 'shard')}, {total} -> {self.output}")
 

@@ -55,7 +55,7 @@ def verify_dataset(location: str, reporter: Reporter) -> int:
             reporter.log(f"{location}: {line}")
             count += 1
     if not count:
-        reporter.log(f"{location}: {len(manifest.samples)} photos, {decimal(manifest.size)}, as they were written")
+        reporter.log(f"{location}: {len(manifest.samples)} photos, {decimal(manifest.size)}, undamaged")
     return count
 
 
@@ -63,7 +63,7 @@ def problems(location: str | os.PathLike[str], manifest: Manifest, progress: Ste
     """Read every byte of a dataset and yield a line for each problem. `progress` counts bytes."""
     done = 0
     if not manifest.complete:
-        yield "the dataset is not finished: run the command that builds it again"
+        yield "the dataset is not finished: run the same `spackle dataset build` again"
     for shard in manifest.shards:
         try:
             yield from (f"{shard.file}: {line}" for line in _shard_problems(location, shard))
@@ -74,7 +74,7 @@ def problems(location: str | os.PathLike[str], manifest: Manifest, progress: Ste
 
 
 def _shard_problems(location: str | os.PathLike[str], shard: ShardEntry) -> Iterator[str]:
-    """Check a shard's size, the digest of each sample, and the end of the archive; InputError if it cannot be read."""
+    """Check a shard's size, the digest of each sample, and the end of the archive; InputError if reading fails."""
     with open_in(location, shard.file) as file, reading(shard.file, "cannot be read: {reason}", OSError):
         size = file.seek(0, os.SEEK_END)
         if size != shard.size:
@@ -110,5 +110,4 @@ def preview_dataset(location: str, output: Path, photos: int, views: int, report
 
 
 def _spread(total: int, count: int) -> list[int]:
-    """Up to `count` indices below `total`, evenly spaced."""
     return sorted({round(place) for place in np.linspace(0, total - 1, min(count, total))})

@@ -1,6 +1,6 @@
 """Encode a photo with its views as part of a tar archive, and decode it; see docs/dataset.md.
 
-The same sample always has the same bytes. The loss in colours, opacity and depth is invisible, and that in Gaussians
+The same sample always has the same bytes. The loss in colours, opacity and depth is invisible; the loss in Gaussians is
 less than 1e-3 of a pixel; masks and cameras are exact.
 """
 
@@ -32,7 +32,7 @@ from spackle.gaussians import Gaussians
 from spackle.image import check_pixels
 from spackle.render.protocol import Rendering
 
-COMPRESSION = 1  # zlib's level: 6 takes three times as long and saves a tenth
+COMPRESSION = 1  # zlib's level: level 6 takes three times as long and saves a tenth of the bytes
 DEEPEST = 65535
 SMALLEST_SCALE = 1e-30
 END = bytes(2 * tarfile.BLOCKSIZE)  # the end-of-archive mark
@@ -43,7 +43,7 @@ class DatasetView:
     """One view of a photo: a training sample of the paper (appendix, "Dataset")."""
 
     key: str  # the photo's key in its dataset
-    index: int  # the view's number; 0 is the photo's own view
+    index: int  # the view's number; 0 is the photo's camera
     kind: str  # the kind of camera path
     photo: Tensor  # [h, w, 3] sRGB at its working size
     photo_camera: Camera
@@ -57,7 +57,7 @@ def pack_sample(key: str, photo: Tensor, stack: ViewStack, targets: Tensor, fact
     """A photo as part of a tar archive: KEY.json, KEY.photo.png, KEY.base.safetensors, then five files per view.
 
     The bytes have no end-of-archive mark and record no time, owner or machine. `photo` [h, w, 3] (at its working size)
-    and `targets` [V, H, W, 3] are sRGB; `facts` are written into the JSON and must have the mask's "threshold" and the
+    and `targets` [V, H, W, 3] are sRGB; `facts` go into the JSON and must have the mask's "threshold" and the
     "trajectory".
     """
     files: list[tuple[str, bytes]] = []
@@ -114,7 +114,6 @@ class PhotoGroup:
 
     @property
     def views(self) -> int:
-        """Number of views."""
         return len(self.holes)
 
     def view(self, index: int) -> DatasetView:
@@ -186,7 +185,7 @@ def decode_alpha(data: bytes) -> Tensor:
 
 
 def encode_depth(depth: Tensor, alpha: Tensor) -> tuple[bytes, tuple[float, float]]:
-    """Encode expected z [H, W] as PNG, in logarithmic steps; also returns (near, far), which `decode_depth` needs."""
+    """Encode expected z [H, W] as PNG, in logarithmic steps; also returns (near, far) for `decode_depth`."""
     z = depth.detach().cpu().double().numpy()
     known = (alpha.detach().cpu().numpy() > 0) & np.isfinite(z) & (z > 0)
     near, far = (float(z[known].min()), float(z[known].max())) if known.any() else (1.0, 1.0)
@@ -221,7 +220,7 @@ def encode_gaussians(gaussians: Gaussians) -> bytes:
 
 
 def decode_gaussians(data: bytes) -> Gaussians:
-    """Decode what `encode_gaussians` wrote, to float32; other bytes may raise any exception."""
+    """Decode bytes of `encode_gaussians` to float32; other bytes may raise any exception."""
     arrays = load(data)
     low, high = arrays["scale_logs"].tolist()
     scales = np.exp(low + arrays["scales"].astype(np.float64) / DEEPEST * max(high - low, 1e-12))
@@ -240,7 +239,6 @@ def _png(pixels: NDArray[Any]) -> bytes:
 
 
 def _pixels(data: bytes, axes: int) -> NDArray[Any]:
-    """Decode a PNG to an array with this number of axes."""
     with Image.open(io.BytesIO(data), formats=["PNG"]) as image:
         check_pixels(*image.size, len(data), "a picture")
         pixels = np.array(image)

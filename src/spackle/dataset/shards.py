@@ -27,10 +27,10 @@ class SampleEntry(BaseModel, frozen=True, extra="forbid", strict=True):
     """A photo in a shard."""
 
     key: str = Field(pattern="^[0-9A-Za-z]+$")
-    photo: str  # its name, relative to the folder of photos
-    offset: Bytes  # position of its first byte in the shard
+    photo: str  # the photo's name, relative to the folder of photos
+    offset: Bytes  # position of the sample's first byte in the shard
     size: Bytes
-    sha256: str  # of those bytes
+    sha256: str  # of the sample's bytes
     holes: tuple[Share, ...]  # HAR of each view
 
 
@@ -64,12 +64,10 @@ class Manifest(BaseModel, frozen=True, extra="ignore", strict=True):
 
     @property
     def views(self) -> int:
-        """The number of views of all photos."""
         return sum(len(sample.holes) for _, sample in self.samples)
 
     @property
     def size(self) -> int:
-        """The number of bytes of all shards."""
         return sum(shard.size for shard in self.shards)
 
     @property
@@ -78,7 +76,6 @@ class Manifest(BaseModel, frozen=True, extra="ignore", strict=True):
         return digest_of(self._content())
 
     def save(self, folder: Path) -> None:
-        """Write manifest.json atomically."""
         text = json.dumps(self._content() | {"sha256": self.digest}, indent=1, sort_keys=True, allow_nan=False)
         with atomic_path(folder / NAME) as temporary:
             temporary.write_text(text + "\n", encoding="utf-8")
@@ -91,11 +88,11 @@ class Manifest(BaseModel, frozen=True, extra="ignore", strict=True):
 def open_in(location: str | os.PathLike[str], name: str) -> IO[bytes]:
     """Open a seekable file in a folder or at an fsspec address (s3://bucket/dataset); InputError if that fails."""
     place = f"{str(location).rstrip('/')}/{name}"
-    package = "an address needs a package (pip install fsspec), and its protocol perhaps another"
+    package = "an address needs fsspec (pip install fsspec), and perhaps a package for its protocol"
     with (
         reading(place, f"cannot be opened ({{reason}}): {package}", ImportError, ValueError),
         reading(place, "cannot be read: {reason}", OSError),
-        reading(place, f"not there: is {location} a dataset of `spackle dataset build`?", FileNotFoundError),
+        reading(place, f"no such file: is {location} a dataset of `spackle dataset build`?", FileNotFoundError),
     ):
         if "://" not in place:
             return open(os.path.join(location, name), "rb")
@@ -116,7 +113,7 @@ def load_manifest(location: str | os.PathLike[str]) -> Manifest:
         recorded = content.pop("sha256")
         manifest = Manifest.model_validate_json(text)
         if not digest_of(content) == manifest.digest == recorded:
-            raise ValueError("its digest does not fit")
+            raise ValueError("the digest is wrong")
         return manifest
 
 
@@ -133,7 +130,7 @@ def write_shard(parts: Sequence[tuple[str, Path]], target: Path, passed_over: Se
             try:
                 group = PhotoGroup.of(key, data, str(path))
             except InputError as error:
-                raise InputError(f"{error}: delete it, and the same command makes it again") from error
+                raise InputError(f"{error}: delete this file, and the same command makes it again") from error
             entry = {"key": key, "photo": group.facts["photo"]["name"], "offset": offset, "size": len(data)}
             samples.append(SampleEntry(**entry, sha256=hashlib.sha256(data).hexdigest(), holes=group.holes))
             file.write(data)
@@ -158,15 +155,14 @@ class DatasetFiles(Dataset[PhotoGroup]):
         self.location = location
         self.manifest = load_manifest(location)
         if not self.manifest.complete:
-            raise InputError(f"{location}: not finished: run the command that builds it again")
+            raise InputError(f"{location}: not finished: run the same `spackle dataset build` again")
         self.samples = self.manifest.samples
 
     def __len__(self) -> int:
-        """The number of photos."""
         return len(self.samples)
 
     def __getitem__(self, index: int) -> PhotoGroup:
-        """The files of a photo, checked by their digest; InputError if they are damaged."""
+        """The files of a photo, checked by their digest; InputError for damaged files."""
         shard, sample = self.samples[index]
         where = f"{self.location}/{shard.file}"
         with open_in(self.location, shard.file) as file, reading(where, "cannot be read: {reason}", OSError):

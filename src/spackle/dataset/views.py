@@ -1,7 +1,6 @@
 """The views of a photo along a controlled camera path, and their completed targets (paper, appendix).
 
-Targets are painted by an inpainter so that all views agree, or rendered from one completed scene; or the holes stay
-open.
+An inpainter paints the targets so that all views agree, or one completed scene is rendered, or holes stay black.
 """
 
 from __future__ import annotations
@@ -25,8 +24,8 @@ from spackle.render import Renderer
 from spackle.residual import hole_mask
 from spackle.scene_fill.fill import farthest_first
 
-APART = 1e-3  # two views are the same if their eyes are closer than this times the maximum offset
-SPARE = 6  # extra frames of a path that are tried because some may coincide
+APART = 1e-3  # two views are the same if their cameras are closer than this times the maximum offset
+SPARE = 6  # the most extra frames of a path, tried because frames may coincide
 SAME_SURFACE = 0.03  # relative difference below which two depths belong to one surface
 LEAST = 1e-6  # the smallest inverse depth to divide by
 COMPLETIONS = (*INPAINTERS, "geometry", "none")  # values of --inpainter
@@ -44,10 +43,11 @@ def draw_path(
 def path_cameras(
     kind: SharpTrajectory, disparity: float, camera: Camera, depth_range: DepthRange, views: int
 ) -> list[Camera]:
-    """The photo's own view (`camera`, of the views' size), then others along the path: `views` different ones in all.
+    """`views` different cameras: the photo's `camera` (of the views' size), then cameras along the path.
 
-    Frames at the photo's eye and at the end of a closed path repeat others, so the path is sampled with more frames.
-    ValueError if the path is impossible, or the camera does not move on it.
+    A path may pass through the photo's camera position, and a closed path ends where it begins. So the path is sampled
+    with extra frames, and repeated views are dropped. ValueError if the path is impossible, or the camera does not
+    move.
     """
 
     def distance(one: Camera, other: Camera) -> float:
@@ -92,7 +92,7 @@ def render_views(prediction: BasePrediction, cameras: Sequence[Camera], renderer
 def complete_views(views: ViewStack, completion: str, inpainter: Inpainter | None, renderer: Renderer) -> Tensor:
     """Targets [V, H, W, 3] sRGB: new colours in the holes; elsewhere the views, bit for bit.
 
-    `completion` is one of `COMPLETIONS`; "none" leaves the holes open.
+    `completion` is one of `COMPLETIONS`; "none" returns the views unchanged.
     """
     if completion == "none":
         return views.rgb
@@ -105,7 +105,7 @@ def complete_views(views: ViewStack, completion: str, inpainter: Inpainter | Non
 def render_completed(views: ViewStack, renderer: Renderer) -> tuple[Tensor, Tensor]:
     """Colours [V, H, W, 3] and inverse depth [V, H, W] of one scene completed by seeds, so that all views agree.
 
-    Pixels that the completed scene still leaves uncovered take the colour and depth of their neighbours.
+    Pixels that stay uncovered take the colour and depth of their neighbours.
     """
     prediction = views.prediction
     aux = complete(prediction, views.cameras, exact=True, network=None, fill="network", renderer=renderer).aux
@@ -123,10 +123,10 @@ def render_completed(views: ViewStack, renderer: Renderer) -> tuple[Tensor, Tens
 
 @torch.no_grad()
 def paint_in_turn(inpainter: Inpainter, views: ViewStack, renderer: Renderer) -> Tensor:
-    """Paint the views' holes one view after the other, the farthest from the photo first, so that all agree.
+    """Paint the views' holes one view after the other, the farthest from the photo first, so that all views agree.
 
-    Views that were painted before are reprojected into a view's holes, and the inpainter paints the rest. The depth in
-    the holes comes from one completed scene.
+    Painted views are reprojected into the next view's holes, and the inpainter paints the rest. The depth in the holes
+    comes from one completed scene.
     """
     inverse_depths, targets = render_completed(views, renderer)[1], views.rgb.clone()
     painted: list[int] = []
@@ -136,7 +136,7 @@ def paint_in_turn(inpainter: Inpainter, views: ViewStack, renderer: Renderer) ->
             row, column = hole.nonzero(as_tuple=True)
             pixels = camera.pixel_centers().to(target)[row, column]
             points = camera.unproject(pixels, 1 / inverse_depths[index][row, column].clamp_min(LEAST))
-            colors, seen = looked_up(points, views.cameras[other], targets[other], inverse_depths[other])
+            colors, seen = _looked_up(points, views.cameras[other], targets[other], inverse_depths[other])
             target[row[seen], column[seen]] = colors[seen]
             hole[row[seen], column[seen]] = False
         if bool(hole.any()):
@@ -147,8 +147,8 @@ def paint_in_turn(inpainter: Inpainter, views: ViewStack, renderer: Renderer) ->
     return targets
 
 
-def looked_up(points: Tensor, camera: Camera, rgb: Tensor, inverse_depth: Tensor) -> tuple[Tensor, Tensor]:
-    """Colours [n, 3] of points [n, 3] in a view [H, W, 3] with inverse depth [H, W]; [n] bool: which ones it sees."""
+def _looked_up(points: Tensor, camera: Camera, rgb: Tensor, inverse_depth: Tensor) -> tuple[Tensor, Tensor]:
+    """Colours [n, 3] of points [n, 3] in a view [H, W, 3] with inverse depth [H, W]; [n] bool: the visible points."""
     uv, z = camera.project(points)
     place = 2 * uv / uv.new_tensor([camera.width, camera.height]) - 1
     images = torch.cat([rgb, inverse_depth[..., None]], -1).permute(2, 0, 1)

@@ -25,7 +25,7 @@ from spackle.evaluation.folder import ROWS, earlier_metrics, image_file, load_ru
 from spackle.evaluation.methods import METHODS, make_method
 from spackle.evaluation.metrics import DEFAULT_METRICS, DEFINITIONS, METRICS, NOTICE, OWN, open_metrics
 from spackle.evaluation.pictures import BEST, WORST, save_picture, write_sheets
-from spackle.evaluation.protocols import INPUT, Alignment, Gauges, align, large_views, measure_views, to_base
+from spackle.evaluation.protocols import INPUT, Gauges, align, large_views, measure_views, to_base
 from spackle.evaluation.report import REPORT, check_matplotlib, make_report, means_table
 from spackle.evaluation.rows import DISPARITIES, NOTE, REMARK, Row
 from spackle.evaluation.table import NOT_RUN, plain
@@ -298,9 +298,9 @@ def measure_case(case: Case, evaluation: Evaluation) -> tuple[list[Row], dict[st
     if options.near and not case.seconds:
         raise InputError(f"{case.name}: has no second photo")
     prediction = evaluation.open(loaded).predict(loaded.full)[0]
-    alignment = _align(loaded, prediction, evaluation) if options.near else None
-    if alignment:
-        frames = loaded.camera, prediction.camera, alignment.scale
+    if options.near:
+        scale = _align(loaded, prediction, evaluation)
+        frames = loaded.camera, prediction.camera, scale
         views = [view._replace(camera=to_base(view.camera, *frames)) for view in loaded.seconds]
     else:
         views = large_views(prediction, options.disparities, options.max_side)
@@ -310,9 +310,7 @@ def measure_case(case: Case, evaluation: Evaluation) -> tuple[list[Row], dict[st
         """The Gaussians of direct FT, and the factor that converts camera positions to the unit of these Gaussians."""
         assert evaluation.direct is not None
         other = evaluation.direct.predict(loaded.full)[0]
-        if alignment is None:
-            return other.gaussians, 1.0
-        return other.gaussians, alignment.scale / _align(loaded, other, evaluation).scale
+        return other.gaussians, scale / _align(loaded, other, evaluation) if options.near else 1.0
 
     context = evaluation.context(prediction)
     method = partial(make_method, context=context, inpainter=evaluation.inpainter, direct_ft=direct_ft)
@@ -325,17 +323,17 @@ def measure_case(case: Case, evaluation: Evaluation) -> tuple[list[Row], dict[st
         "focal_px": round(prediction.camera.focal[0], 3),
         "base_gaussians": len(prediction.gaussians),
         **{f"{NOTE}{name}": value for name, value in prediction.notes.items()},
-        **{f"alignment_{name}": value for name, value in (dataclasses.asdict(alignment) if alignment else {}).items()},
+        **({"scale": scale} if options.near else {}),
     }
     known = [image._replace(metric=metric, value=value) for metric, value in facts.items()]
     return [*known, *rows], pictures | {INPUT: loaded.photo.rgb}
 
 
 @torch.no_grad()
-def _align(loaded: LoadedCase, prediction: BasePrediction, evaluation: Evaluation) -> Alignment:
-    """Find the scale between base and dataset, from the base's depth at the photo's own camera."""
-    if not evaluation.options.base.network:  # the base is the dataset's own depth
-        return Alignment(1.0, 0, 0.0, "same")
+def _align(loaded: LoadedCase, prediction: BasePrediction, evaluation: Evaluation) -> float:
+    """The scale between base and dataset, from the base's depth at the photo's camera."""
+    if not evaluation.options.base.network:  # the base is the dataset's depth
+        return 1.0
     view = evaluation.renderer.render(prediction.gaussians, prediction.camera)
     return align(loaded.case, view.depth, ~hole_mask(view.alpha))
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Literal
 
 import torch
 from torch import Tensor
@@ -25,7 +24,6 @@ from spackle.scene_fill import FillContext
 from spackle.training.losses import FeatureNet, hole_distance
 
 MIN_PIXELS = 8  # the least number of pixels for a scale
-MAD_TO_SIGMA = 1.4826  # for a normal distribution
 BOUNDS_QUANTILES = (0.001, 0.999)  # the quantiles of point depths that LLFF's near and far are
 TRUTH, INPUT, HOLE = "truth", "input", "hole"  # names of pictures beside the methods
 
@@ -82,18 +80,8 @@ def large_views(prediction: BasePrediction, disparities: Sequence[float], side: 
         raise InputError(f"no camera path: {error}: check depth and focal length") from error
 
 
-@dataclasses.dataclass(frozen=True)
-class Alignment:
-    """The ratio of the base's unit of length to the dataset's."""
-
-    scale: float  # z_dataset = scale · z_base
-    pixels: int  # pixels with known depth that were compared; 0 if the source is "bounds" or "same"
-    spread: float  # relative deviation of pixels from the scale: a robust standard deviation
-    source: Literal["depth", "points", "bounds", "same"]
-
-
-def align(case: Case, z_base: Tensor, seen: Tensor) -> Alignment:
-    """Find the scale as the median of z_dataset / z_base over the pixels where both are known.
+def align(case: Case, z_base: Tensor, seen: Tensor) -> float:
+    """The scale between the units of length, z_dataset = scale · z_base: the median over pixels where both are known.
 
     The dataset's depth map is used; without a map its points; without points its bounds. A metric base and a metric
     dataset are aligned too, because a network's metres are rarely exact.
@@ -107,12 +95,19 @@ def align(case: Case, z_base: Tensor, seen: Tensor) -> Alignment:
         InputError: no depth of the case is known, or too little of it where the base's depth is valid.
     """
     seen = seen & torch.isfinite(z_base) & (z_base > 0)
-    if case.depth is not None and (found := _of_ratios(_depth_ratios(case.depth(), z_base, seen), "depth")):
-        return found
-    if case.points is not None and (found := _of_ratios(_point_ratios(case, case.points(), z_base, seen), "points")):
-        return found
+    ratios = [_depth_ratios(case.depth(), z_base, seen)] if case.depth else []
+    ratios += [_point_ratios(case, case.points(), z_base, seen)] if case.points else []
+    for known in ratios:
+        known = known[torch.isfinite(known) & (known > 0)].double()
+        if len(known) >= MIN_PIXELS:
+            return float(known.median())
     if case.bounds is not None and seen.any():
-        return _of_bounds(case.bounds, z_base[seen])
+        # The geometric mean of the scales that match the nearest and the farthest depth.
+        z = z_base[seen].double().sort().values
+        scales = [
+            known / float(z[round(q * (len(z) - 1))]) for known, q in zip(case.bounds, BOUNDS_QUANTILES, strict=True)
+        ]
+        return math.sqrt(math.prod(scales))
     raise InputError(
         f"{case.name}: the base's scale cannot be found: the dataset's depth is unknown, or the dataset's and the "
         f"base's depth share under {MIN_PIXELS} pixels: take --protocol large-view"
@@ -131,7 +126,7 @@ def to_base(view: Camera, photo: Camera, base: Camera, scale: float) -> Camera:
         view: in the input photo's frame and the dataset's unit.
         photo: the dataset's camera of the input photo.
         base: the base's camera of the input photo (`BasePrediction.camera`), at any size with the photo's aspect ratio.
-        scale: see `Alignment`.
+        scale: see `align`.
 
     Returns:
         The camera, with the image size of `view`, in the base's frame and unit.
@@ -171,21 +166,6 @@ def _point_ratios(case: Case, points: Points, z_base: Tensor, seen: Tensor) -> T
     x, y = cells[inside].unbind(1)
     known = seen[y, x]
     return points.z[inside][known] / z_base[y, x][known]
-
-
-def _of_ratios(ratios: Tensor, source: Literal["depth", "points"]) -> Alignment | None:
-    ratios = ratios[torch.isfinite(ratios) & (ratios > 0)].double()
-    if len(ratios) < MIN_PIXELS:
-        return None
-    scale = ratios.median()
-    return Alignment(float(scale), len(ratios), MAD_TO_SIGMA * float((ratios / scale - 1).abs().median()), source)
-
-
-def _of_bounds(bounds: tuple[float, float], z: Tensor) -> Alignment:
-    """A rough scale: the geometric mean of the scales that match the nearest depth and the farthest depth."""
-    near, far = (float(z.double().sort().values[round(q * (len(z) - 1))]) for q in BOUNDS_QUANTILES)
-    low, high = math.log(bounds[0] / near), math.log(bounds[1] / far)
-    return Alignment(math.exp((low + high) / 2), 0, abs(high - low) / 2, "bounds")
 
 
 @torch.no_grad()
