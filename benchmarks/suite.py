@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import functools
 import math
+import os
 import sys
 import tempfile
 import time
@@ -34,7 +35,7 @@ from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.base import to_metric
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, trajectory
-from spackle.device import hardware, load_average, versions
+from spackle.device import hardware, versions
 from spackle.errors import InputError, check_name
 from spackle.evaluation.bench import CPU, MS, TOTAL, Lap, Task, Values, complete_in_laps, measure
 from spackle.evaluation.datasets.stereo import load_motorcycle
@@ -312,7 +313,7 @@ def main(arguments: list[str]) -> None:
     lines = [f"# Speed\n\n{', '.join(f'{k} {v}' for k, v in about.items())}; commit {commit()}; {options.runs} runs."]
     peaks: dict[str, float] = {}
     for name in chosen:
-        load, start = load_average(), time.perf_counter()
+        load, start = round(os.getloadavg()[0], 2), time.perf_counter()
         try:
             figures, facts = section(name, options, peaks)
         except InputError as error:

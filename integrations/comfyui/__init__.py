@@ -22,7 +22,7 @@ from spackle.bases.depth_map import FAR_M, RELATIVE, relative_depth
 from spackle.bases.open import OpenedBase, open_base
 from spackle.bases.settings import AUTO, AUTO_NETWORKS, BaseSettings
 from spackle.camera import Camera
-from spackle.camera_path import MAX_DISPARITY, TRAJECTORIES, trajectory_kind
+from spackle.camera_path import MAX_DISPARITY, TRAJECTORIES, TrajectoryKind
 from spackle.color import linear_to_srgb, srgb_to_linear
 from spackle.formats.scene_files import SH_C0
 from spackle.gaussians import Gaussians
@@ -107,9 +107,9 @@ class CompleteScene:
         given = {"scene": ("SPACKLE_SCENE",), "trajectory": TRAJECTORY, "disparity": DISPARITY}
         return {"required": {**given, "fill": (list(FILLS),)}}
 
-    def complete(self, scene: Scene, trajectory: str, disparity: float, fill: Any) -> tuple[Scene]:
+    def complete(self, scene: Scene, trajectory: TrajectoryKind, disparity: float, fill: Any) -> tuple[Scene]:
         """The base's Gaussians stay as they are, and new ones are added."""
-        cameras = scene.path(trajectory_kind(trajectory), disparity)
+        cameras = scene.path(trajectory, disparity)
         made = complete_scene(BasePrediction(scene.base, scene.camera, {}), cameras, fill=fill)
         return (dataclasses.replace(made, disparity=disparity),)
 
@@ -128,9 +128,11 @@ class RenderView:
         given = {"scene": ("SPACKLE_SCENE",), "trajectory": TRAJECTORY, "disparity": DISPARITY, "frames": frames}
         return {"required": given}
 
-    def render(self, scene: Scene, trajectory: str, disparity: float, frames: int) -> tuple[Tensor, Tensor, Tensor]:
+    def render(
+        self, scene: Scene, trajectory: TrajectoryKind, disparity: float, frames: int
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """[frames, H, W, 3], [frames, H, W] and [frames, H, W, 3], at the photo's size made even."""
-        cameras = scene.path(trajectory_kind(trajectory), disparity, frames)
+        cameras = scene.path(trajectory, disparity, frames)
         renderer = get_renderer()
         views = [scene.render(camera, renderer) for camera in cameras]
         inverse = torch.stack([torch.where(view.alpha > 0, 1 / view.depth.clamp(min=1e-6), 0.0) for view in views])

@@ -21,7 +21,6 @@ TrajectoryKind = Literal[SharpTrajectory, "vertical", "orbit", "dolly-zoom"]
 SHARP_TRAJECTORIES: tuple[SharpTrajectory, ...] = get_args(SharpTrajectory)
 TRAJECTORIES: tuple[TrajectoryKind, ...] = get_args(TrajectoryKind)
 PathUnit = Literal["metres", "disparity"]
-UNITS: tuple[PathUnit, ...] = get_args(PathUnit)
 
 NEAR_QUANTILE = 0.001  # quantile of depth that defines z_near
 FOCUS_QUANTILE = 0.1  # quantile of depth that defines the focus depth
@@ -60,14 +59,6 @@ class DepthRange:
         return DepthRange(near, focus)
 
 
-def trajectory_kind(name: str) -> TrajectoryKind:
-    """A trajectory by its name, in which `_` may replace `-`; ValueError for an unknown name."""
-    kind = name.replace("_", "-")
-    if kind not in TRAJECTORIES:
-        raise ValueError(f"unknown trajectory {name!r}: choose one of {', '.join(TRAJECTORIES)}")
-    return kind
-
-
 def max_offset(camera: Camera, disparity: float, depth_range: DepthRange) -> float:
     """Sideways offset of the camera for a disparity m: m · ‖(W/f, H/f)‖ · z_near."""
     fx, fy = camera.focal
@@ -101,7 +92,9 @@ def trajectory(
     Raises:
         ValueError: an unknown path, a disparity outside 0..2, or less than one frame.
     """
-    kind = trajectory_kind(kind)
+    name = kind.replace("_", "-")
+    if name not in TRAJECTORIES:
+        raise ValueError(f"unknown trajectory {kind!r}: choose one of {', '.join(TRAJECTORIES)}")
     if not 0 <= disparity <= MAX_DISPARITY:
         raise ValueError(f"disparity must be between 0 and {MAX_DISPARITY:g}, got {disparity:g}")
     if frames < 1:
@@ -110,24 +103,24 @@ def trajectory(
     frames += looped
     zero = torch.zeros(frames, dtype=torch.float64)
     turn = torch.linspace(0, 1, frames, dtype=torch.float64) * 2 * math.pi
-    if kind == "swipe":
+    if name == "swipe":
         xyz = [-side * turn.cos() if looped else torch.linspace(-side, side, frames, dtype=torch.float64), zero, zero]
-    elif kind == "shake":
+    elif name == "shake":
         across = frames // 2
         first = torch.linspace(0, 1, across, dtype=torch.float64) * 2 * math.pi
         second = torch.linspace(0, 1, frames - across, dtype=torch.float64) * 2 * math.pi
         x = torch.cat([side * first.sin(), torch.zeros_like(second)])
         y = torch.cat([torch.zeros_like(first), side * second.sin()])
         xyz = [x, y, zero]
-    elif kind == "rotate":
+    elif name == "rotate":
         xyz = [side * turn.sin(), side * turn.cos(), zero]
-    elif kind == "vertical":
+    elif name == "vertical":
         flat = min(1.0, camera.height / camera.width)  # in a wide photo a lowered camera is soon beneath the floor
         xyz = [zero, flat * side * turn.sin(), zero]
-    elif kind == "orbit":
+    elif name == "orbit":
         angle = math.atan2(side, focus) * turn.sin()
         xyz = [focus * angle.sin(), zero, focus * (1 - angle.cos())]
-    elif kind == "dolly-zoom":
+    elif name == "dolly-zoom":
         xyz = [zero, zero, side * (turn.cos() - 1) / 2]
     else:
         xyz = [side * turn.sin(), zero, forward * (1 - turn.cos()) / 2]
@@ -135,7 +128,7 @@ def trajectory(
     if only is not None:
         eyes = eyes[only : only + 1]
     views = [camera.looking(eye, target) for eye in eyes]
-    if kind == "dolly-zoom":
+    if name == "dolly-zoom":
         views = [view.zoomed(1 - float(eye[2] / focus)) for view, eye in zip(views, eyes, strict=True)]
     return views
 

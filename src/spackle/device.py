@@ -45,19 +45,14 @@ def pick_device(device: torch.device | str | None) -> torch.device:
     return target
 
 
-def memory_is_short(error: BaseException) -> bool:
-    """Whether an exception reports a shortage of memory."""
-    named = isinstance(error, (MemoryError, torch.OutOfMemoryError))
-    return named or any(words in str(error) for words in _SHORTAGES)
-
-
 @contextmanager
 def enough_memory(*advice: str, what: str = "for the network") -> Iterator[None]:
     """Turn a shortage of memory into a `MemoryShort` with advice."""
     try:
         yield
     except (MemoryError, RuntimeError) as error:
-        if not memory_is_short(error):
+        named = isinstance(error, (MemoryError, torch.OutOfMemoryError))
+        if not (named or any(words in str(error) for words in _SHORTAGES)):
             raise
         remedies = ", or ".join([*advice, "close other programs"])
         raise MemoryShort(f"not enough memory {what}: {remedies}") from error
@@ -156,8 +151,3 @@ def hardware(device: torch.device) -> dict[str, Any]:
     names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
     facts = {"cpu": names[0] if names else platform.machine(), "cores": os.cpu_count(), "threads": thread_count()}
     return facts | ({"gpu": torch.cuda.get_device_name(device)} if device.type == "cuda" else {})
-
-
-def load_average() -> float | None:
-    """The machine's load over the last minute; None if unknown."""
-    return round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None

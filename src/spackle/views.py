@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import itertools
 import math
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import torch
@@ -24,7 +22,7 @@ from spackle.camera_path import (
     extremes,
     trajectory,
 )
-from spackle.errors import InputError, check_name
+from spackle.errors import InputError, check_name, reading
 from spackle.formats.camera_files import load_cameras, load_path
 from spackle.gaussians import Gaussians
 from spackle.image import working_size
@@ -131,30 +129,6 @@ class PlannedViews:
     maker: FrameMaker
     looked_at: list[int]  # views for which a scene is completed; more frames of the same path uncover nothing more
 
-    @staticmethod
-    def of(
-        path: list[Camera],
-        others: dict[str, Camera],
-        maker: FrameMaker,
-        stills: bool,
-        unseen: Sequence[Camera] = (),
-        every: int = 1,
-    ) -> PlannedViews:
-        """Plan the frames of a path, `unseen` further views to fill, and `others` to fill and measure.
-
-        A scene is completed for one frame in `every`.
-        """
-        middles = path if stills and maker.stereo else []  # pictures are taken midway between the eyes
-        eyes = [maker.eyes(camera) for camera in path]
-        cameras = [*middles, *(eye for pair in eyes for eye in pair), *unseen, *others.values()]
-        first, each = len(middles), len(eyes[0])
-        frames = [tuple(range(first + k * each, first + (k + 1) * each)) for k in range(len(path))]
-        last = len(cameras) - len(others)
-        measured = {name: last + k for k, name in enumerate(others)} or {str(k): k for k in range(len(path))}
-        others_at = range(first + len(path) * each, len(cameras))
-        looked_at = [*range(first), *itertools.chain(*frames[::every]), *others_at]
-        return PlannedViews(cameras, measured, frames, len(path) if stills else 0, maker, looked_at)
-
 
 COARSE_PX = 240  # long side of the renderings in which `choose_move` measures holes
 MOVE_STEP = 0.01  # `choose_move` rounds the disparity down to a multiple of this step
@@ -162,14 +136,7 @@ LEAST_MOVE = 0.04  # the smallest disparity; a smaller one shows no parallax
 LOOKS = 3  # largest number of disparities that `choose_move` tries besides the usual one
 
 
-@contextlib.contextmanager
-def _possible_path(source: Path) -> Iterator[None]:
-    try:
-        yield
-    except PathError:
-        raise
-    except ValueError as error:
-        raise InputError(f"{source}: no camera path: {error}: check the depth map and the focal length") from error
+NO_PATH = "no camera path: {reason}: check the depth map and the focal length"
 
 
 @torch.no_grad()
@@ -183,7 +150,7 @@ def choose_move(prediction: BasePrediction, renderer: Renderer, source: Path) ->
         InputError: the depths and the focal length of the photo `source` allow no camera path.
     """
     gaussians, usual, allowed = prediction.gaussians, prediction.disparity, prediction.uncovered
-    with _possible_path(source):
+    with reading(source, NO_PATH, ValueError):
         depths = DepthRange.of(gaussians)
     camera = prediction.camera.resized(*working_size(prediction.camera.width, prediction.camera.height, COARSE_PX))
 
@@ -220,21 +187,26 @@ def plan_views(
         InputError: the depths and the focal length of the photo `source` allow no camera path.
     """
     gaussians, camera = prediction.gaussians, prediction.camera
-    if given:
-        return PlannedViews.of(given, {}, FrameMaker.of(path.video, gaussians, given, source), stills=True)
-    try:
-        with _possible_path(source):
-            cameras = path.fly(gaussians, camera, keyframes, prediction.disparity)
+    path_cameras, others, unseen, every = given or [], dict[str, Camera](), list[Camera](), 1
+    if not given:
+        with reading(source, NO_PATH, ValueError), reading(path.path, "{reason}", PathError):
+            path_cameras = path.fly(gaussians, camera, keyframes, prediction.disparity)
             reach, depths = path.reach(prediction.disparity), DepthRange.of(gaussians)
             others = _measured(reach, camera.even(), depths, keyframes)
             # Other programs render without overscan, so views with the photo's focal length are filled too.
-            upright = keyframes is None and path.trajectory in ("shake", "rotate", "vertical")
-            unseen = trajectory("rotate", camera.even(), reach, depths, frames=5)[:4:2] if upright else []
-    except PathError as error:
-        raise InputError(f"{path.path}: {error}") from error
-    maker = FrameMaker.of(path.video, gaussians, cameras, source)
-    every = 1 if keyframes else max(1, len(cameras) // PATH_FRAMES)
-    return PlannedViews.of(cameras, others, maker, stills=False, unseen=unseen, every=every)
+            if keyframes is None and path.trajectory in ("shake", "rotate", "vertical"):
+                unseen = trajectory("rotate", camera.even(), reach, depths, frames=5)[:4:2]
+        every = 1 if keyframes else max(1, len(path_cameras) // PATH_FRAMES)
+    maker = FrameMaker.of(path.video, gaussians, path_cameras, source)
+    middles = given if given and maker.stereo else []  # pictures are taken midway between the eyes
+    eyes = [maker.eyes(view) for view in path_cameras]
+    first, each = len(middles), len(eyes[0])
+    cameras = [*middles, *itertools.chain(*eyes), *unseen, *others.values()]
+    frames = [tuple(range(k, k + each)) for k in range(first, first + each * len(eyes), each)]
+    last = len(cameras) - len(others)
+    measured = {name: last + k for k, name in enumerate(others)} or {str(k): k for k in range(len(eyes))}
+    looked_at = [*range(first), *itertools.chain(*frames[::every]), *range(first + each * len(eyes), len(cameras))]
+    return PlannedViews(cameras, measured, frames, len(given or []), maker, looked_at)
 
 
 def _measured(
