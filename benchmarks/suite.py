@@ -40,8 +40,7 @@ from spackle.errors import InputError, check_name
 from spackle.evaluation.bench import CPU, MS, TOTAL, Lap, Task, Values, complete_in_laps, measure
 from spackle.evaluation.datasets.stereo import load_motorcycle
 from spackle.evaluation.rows import EXTRA
-from spackle.files import write_json, write_whole
-from spackle.folders import make_folder
+from spackle.files import make_folder, write_json, write_whole
 from spackle.formats import save_ply, save_video
 from spackle.gaussians import Gaussians
 from spackle.image import Photo

@@ -18,7 +18,7 @@ from weights import first_network, freeze, save_networks
 
 from spackle.bases.lite import LiteBase, LiteNet
 from spackle.device import pick_dtype
-from spackle.folders import make_folder
+from spackle.files import make_folder
 from spackle.formats.png import sheet
 from spackle.progress import Reporter, Step
 from spackle.training.residual import CACHE, PICTURED

@@ -1,4 +1,4 @@
-"""Files: checked before they are read, written whole or not at all, and recognised by their digests."""
+"""Files and folders for results: checks, atomic writing, locks, complete sets of files, and digests."""
 
 from __future__ import annotations
 
@@ -8,14 +8,21 @@ import json
 import os
 import re
 import secrets
-from collections.abc import Iterator, Mapping
+import shutil
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from spackle.errors import InputError, reading, reason_in_a_line
 
+try:
+    import fcntl
+except ImportError:  # on Windows, where two runs are not kept apart
+    fcntl = None  # type: ignore[assignment]
+
 LEFTOVER = re.compile(r"\.(.+)\.[0-9a-f]{12}(\.\w+)")  # pattern of the temporary names that `atomic_path` gives
 MAX_HASHED = 200_000_000  # bytes; a larger file is recognised by its size and modification time
+LOCK, NEW = ".lock", ".new"  # names of a lock file and of a folder for a new set of files
 BLOCK = 1 << 20  # bytes that are hashed at once
 
 
@@ -118,3 +125,158 @@ def fingerprint(file: Path, kind: str) -> str:
     if size > MAX_HASHED:
         return f"{size} bytes of {file.stat().st_mtime_ns}"
     return hashlib.sha256(file.read_bytes()).hexdigest()
+
+
+@contextlib.contextmanager
+def hold(path: Path) -> Iterator[None]:
+    """Lock the file `path` during the block; a killed process leaves it unlocked.
+
+    Raises:
+        BlockingIOError: another process has locked it.
+        OSError: the file cannot be created, or the file system has no locks.
+    """
+    file = _acquire(path)
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):
+            path.unlink()
+        file.close()
+
+
+def _acquire(path: Path) -> BinaryIO:
+    while True:
+        with contextlib.ExitStack() as stack:
+            file = stack.enter_context(open(path, "ab"))
+            if fcntl is not None:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            with contextlib.suppress(FileNotFoundError):  # the last holder deleted the file before we locked it
+                if os.path.samestat(os.fstat(file.fileno()), os.stat(path)):
+                    stack.pop_all()
+                    return file
+
+
+@contextlib.contextmanager
+def results_folder(path: Path, files: Sequence[str] = (), *, alone: bool = False) -> Iterator[None]:
+    """Create a folder for results; remove the folder if the block writes no file into it.
+
+    Temporary files of killed runs are deleted. `alone` locks the folder during the block.
+
+    Raises:
+        InputError: `files` cannot be written, or another run has locked the folder.
+    """
+    missing = [folder for folder in (path, *path.parents) if not os.path.exists(folder)]
+    try:
+        with contextlib.ExitStack() as stack:
+            make_folder(path)
+            if alone:
+                try:
+                    stack.enter_context(hold(path / LOCK))
+                except BlockingIOError as error:
+                    advice = "wait for its end, end it, or choose another folder with -o"
+                    raise InputError(f"{path}: another run is at work in this folder: {advice}") from error
+            for name in files:
+                check_writable(path / name)
+            with contextlib.suppress(OSError):
+                remove_half_written(path, files=files)
+            yield
+    finally:
+        for folder in missing:
+            with contextlib.suppress(OSError):  # it is not empty
+                folder.rmdir()
+
+
+@contextlib.contextmanager
+def whole_set(folder: Path, last: str) -> Iterator[Path]:
+    """Yield a new folder for a set of files; if the block succeeds, the files replace an older set in `folder`.
+
+    The file `last` is deleted first and moved last, so that its presence means a complete set. The caller must have
+    locked the folder, see `results_folder`.
+    """
+    new = folder / NEW
+    try:
+        with reading(new, "cannot write: {reason}", OSError):
+            if new.exists():  # from a killed run
+                shutil.rmtree(new)
+            new.mkdir()
+        yield new
+        (folder / last).unlink(missing_ok=True)
+        files = [file.relative_to(new) for file in sorted(new.rglob("*")) if file.is_file()]
+        for name in sorted(files, key=lambda name: name == Path(last)):
+            os.replace(new / name, folder / name)
+    finally:
+        shutil.rmtree(new, ignore_errors=True)
+
+
+def file_records(folder: Path, files: Iterable[Path]) -> dict[str, dict[str, object]]:
+    """Size in bytes and SHA-256 of files in a folder, by name, for a report."""
+    records: dict[str, dict[str, object]] = {}
+    for path in files:
+        with open(path, "rb") as file:
+            records[path.relative_to(folder).as_posix()] = {"bytes": path.stat().st_size, "sha256": sha256_of(file)}
+    return records
+
+
+def as_recorded(folder: Path, report: str, records: object) -> bool:
+    """Whether a folder still holds the files that a report lists by `file_records`.
+
+    Sizes are compared; the content is hashed if a file is newer than the report, as in a copied folder.
+    """
+    if not isinstance(records, Mapping) or not records:
+        return False
+    try:
+        written = (folder / report).stat().st_mtime_ns
+        for name, record in records.items():
+            facts = (folder / name).stat()
+            newer = max(facts.st_mtime_ns, facts.st_ctime_ns) > written
+            if facts.st_size != record["bytes"] or (newer and file_records(folder, [folder / name])[name] != record):
+                return False
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+    return True
+
+
+def photo_digest(path: Path) -> str:
+    """The photo's `fingerprint`, or "none" for a missing photo."""
+    with contextlib.suppress(InputError):
+        return fingerprint(path, "photo")
+    return "none"
+
+
+def remove_half_written(*folders: Path, files: Sequence[str] | None = None) -> None:
+    """Delete temporary files of killed runs: those of the named `files`, or, in locked folders, all (None)."""
+    for folder in folders:
+        for file in folder.iterdir():
+            match = LEFTOVER.fullmatch(file.name)
+            if match and (files is None or match[1] + match[2] in files):
+                file.unlink(missing_ok=True)
+
+
+def make_folder(path: Path) -> None:
+    """Create a folder for results if it is missing; InputError if the folder cannot be created or written."""
+    with reading(path, "cannot create this output folder: {reason}; choose another with -o", OSError, ValueError):
+        path.mkdir(parents=True, exist_ok=True)
+    if not os.access(path, os.W_OK | os.X_OK):
+        raise InputError(f"{path}: this output folder is not writable; choose another with -o")
+
+
+def digest_of(value: object) -> str:
+    """SHA-256 of a value as JSON."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
+
+
+def differences(old: Mapping[str, Any], new: Mapping[str, Any], where: str = "") -> list[str]:
+    """List the differences of two configurations as "key: old -> new"."""
+
+    def short(value: object) -> str:
+        text = json.dumps(value)
+        return text if len(text) <= 40 else text[:12] + "…"
+
+    found: list[str] = []
+    for key in sorted({*old, *new}):
+        a, b = old.get(key), new.get(key)
+        if isinstance(a, Mapping) and isinstance(b, Mapping):
+            found += differences(a, b, f"{where}{key}.")
+        elif a != b:
+            found.append(f"{where}{key}: {short(a)} -> {short(b)}")
+    return found

@@ -16,8 +16,7 @@ import spackle
 from spackle.bases import BasePrediction
 from spackle.bases.open import ResolvedBase
 from spackle.bases.settings import AUTO, AUTO_NETWORKS, BaseSettings
-from spackle.files import write_json
-from spackle.folders import file_records, results_folder, whole_set
+from spackle.files import file_records, results_folder, whole_set, write_json
 from spackle.formats import save_gray_png, save_ply, save_png, save_video
 from spackle.formats.depth import save_depth
 from spackle.gaussians import Gaussians

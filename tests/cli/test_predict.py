@@ -27,7 +27,7 @@ from PIL import Image
 from safetensors.torch import save_file
 
 import spackle
-from spackle.folders import results_folder
+from spackle.files import results_folder
 from spackle.image import film_to_pixels
 from spackle.pipeline import FillOptions
 from spackle.residual.architectures import UNet

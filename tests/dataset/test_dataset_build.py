@@ -23,7 +23,7 @@ from spackle.dataset.build import Made, Maker
 from spackle.dataset.photos import PhotoFile, choose, find_photos
 from spackle.dataset.shards import load_manifest
 from spackle.errors import InputError
-from spackle.folders import hold
+from spackle.files import hold
 from spackle.render import get_renderer
 from spackle.training.recipe import DataRecipe
 from spackle.training.samples import Source, digest_of_samples

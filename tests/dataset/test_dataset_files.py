@@ -23,7 +23,7 @@ from spackle.dataset import DatasetFiles
 from spackle.dataset.sample import END, decode_alpha, decode_depth, encode_alpha, encode_depth
 from spackle.dataset.shards import load_manifest
 from spackle.errors import InputError
-from spackle.folders import digest_of
+from spackle.files import digest_of
 from spackle.render import get_renderer
 from spackle.residual import hole_mask
 

@@ -38,7 +38,7 @@ from spackle.dataset.shards import load_manifest
 from spackle.errors import one_line
 from spackle.evaluation.case import load_case
 from spackle.evaluation.datasets import read_cases
-from spackle.folders import digest_of
+from spackle.files import digest_of
 from spackle.formats import PlyFile, load_cameras, load_path, save_ply
 from spackle.formats.scene_files import SceneFile, encoder_of, load_scene
 from spackle.image import load_photo, resize_photo

@@ -20,7 +20,7 @@ from PIL import Image
 from scenes import box_before_wall, shifted, tensors_of
 from training_runs import assert_same_weights, losses_of, one_thread, run_two, state
 
-from spackle.folders import hold
+from spackle.files import hold
 from spackle.gaussians import Gaussians
 from spackle.render import get_renderer
 from spackle.residual.architectures import load_residual

@@ -14,8 +14,7 @@ from spackle.cli.photo import PredictOptions
 from spackle.clips.complete import ClipCompleter, CompletedView
 from spackle.clips.files import ClipWriter, clip_frames, read_clip
 from spackle.errors import InputError
-from spackle.files import write_json
-from spackle.folders import file_records, results_folder, whole_set
+from spackle.files import file_records, results_folder, whole_set, write_json
 from spackle.image import Photo, focal_length, resize_photo
 from spackle.inpaint.plain import OpenCV
 from spackle.photo_results import shared_report

@@ -17,8 +17,7 @@ from spackle.bases.settings import BaseSettings
 from spackle.cli.photos import compiled_ahead
 from spackle.evaluation.datasets.stereo import StereoPair, load_motorcycle
 from spackle.evaluation.metrics import sharpness
-from spackle.files import write_json
-from spackle.folders import results_folder
+from spackle.files import results_folder, write_json
 from spackle.formats import save_ply, save_png
 from spackle.image import Photo
 from spackle.photo_results import save_views

@@ -29,8 +29,7 @@ from spackle.cli.photo import PredictOptions
 from spackle.clips.files import is_clip
 from spackle.device import thread_count
 from spackle.errors import InputError
-from spackle.files import check_file, files_in, fingerprint
-from spackle.folders import as_recorded, digest_of, results_folder
+from spackle.files import as_recorded, check_file, digest_of, files_in, fingerprint, results_folder
 from spackle.image import PHOTO_SUFFIXES
 from spackle.patches import match_patches
 from spackle.photo_results import REPORT, earlier_report, predict_photo

@@ -18,8 +18,7 @@ from spackle.bases import USUAL_DISPARITY
 from spackle.camera import Camera
 from spackle.camera_path import PathError
 from spackle.errors import InputError
-from spackle.files import check_writable, write_whole
-from spackle.folders import results_folder
+from spackle.files import check_writable, results_folder, write_whole
 from spackle.formats import save_png, save_video
 from spackle.formats.html import single_html
 from spackle.formats.scene_files import Encoder, SceneFile, encoder_of, load_scene

@@ -35,7 +35,7 @@ def weights_get(
     """Download weights and check their SHA-256; a broken download resumes where it stopped."""
     from rich.filesize import decimal
 
-    from spackle.folders import results_folder
+    from spackle.files import results_folder
     from spackle.progress import Reporter
     from spackle.weights import file_digest, published_weights, weights_folder
 
@@ -99,8 +99,7 @@ def weights_make(
 
     from spackle.bases.sharp.base import expected_shapes
     from spackle.bases.sharp.encoder import CONFIGS
-    from spackle.files import atomic_path
-    from spackle.folders import results_folder
+    from spackle.files import atomic_path, results_folder
     from spackle.progress import Reporter
 
     with results_folder(output.parent, [output.name]), atomic_path(output) as temporary:

@@ -22,8 +22,15 @@ from spackle.dataset.sample import pack_sample
 from spackle.dataset.shards import NAME, Manifest, load_manifest, write_shard
 from spackle.dataset.views import COMPLETIONS, complete_views, draw_path, path_cameras, render_views
 from spackle.errors import InputError, check_name, reading
-from spackle.files import fingerprint, write_whole
-from spackle.folders import differences, digest_of, make_folder, remove_half_written, results_folder
+from spackle.files import (
+    differences,
+    digest_of,
+    fingerprint,
+    make_folder,
+    remove_half_written,
+    results_folder,
+    write_whole,
+)
 from spackle.image import load_photo, resize_photo
 from spackle.inpaint import INPAINTERS, Inpainter, InpainterOptions, get_inpainter
 from spackle.progress import Reporter, asked_to_stop, counted

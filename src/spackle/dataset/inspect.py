@@ -17,7 +17,7 @@ from torch import Tensor
 from spackle.dataset.sample import END
 from spackle.dataset.shards import DatasetFiles, Manifest, ShardEntry, load_manifest, open_in
 from spackle.errors import InputError, one_line, reading
-from spackle.folders import results_folder
+from spackle.files import results_folder
 from spackle.formats import save_png, save_video
 from spackle.formats.png import sheet
 from spackle.progress import Reporter, Step, counted

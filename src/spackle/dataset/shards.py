@@ -14,8 +14,7 @@ from torch.utils.data import Dataset
 
 from spackle.dataset.sample import END, PhotoGroup
 from spackle.errors import InputError, reading
-from spackle.files import atomic_path
-from spackle.folders import digest_of
+from spackle.files import atomic_path, digest_of
 
 NAME = "manifest.json"
 FORMAT = 1  # version of shards and manifest; others are refused

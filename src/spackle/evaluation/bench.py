@@ -27,7 +27,7 @@ from spackle.evaluation.methods import METHODS, make_method
 from spackle.evaluation.protocols import large_views
 from spackle.evaluation.rows import BASE_PATH, EXTRA, NOTE, Row, mean, pivot, setting_title
 from spackle.evaluation.tables import make_tables, write_tables
-from spackle.folders import results_folder
+from spackle.files import results_folder
 from spackle.gaussians import Gaussians
 from spackle.progress import Reporter
 from spackle.render import Renderer, device_of

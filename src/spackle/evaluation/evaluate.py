@@ -30,8 +30,7 @@ from spackle.evaluation.report import REPORT, check_matplotlib, make_report, mea
 from spackle.evaluation.rows import DISPARITIES, NOTE, REMARK, Row
 from spackle.evaluation.table import NOT_RUN, plain
 from spackle.evaluation.tables import FILES, make_tables, write_tables
-from spackle.files import write_whole
-from spackle.folders import digest_of, results_folder
+from spackle.files import digest_of, results_folder, write_whole
 from spackle.gaussians import Gaussians
 from spackle.image import MAX_SIDE
 from spackle.inpaint import Inpainter, InpainterOptions, get_inpainter

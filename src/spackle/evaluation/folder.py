@@ -20,8 +20,7 @@ from spackle.errors import InputError, reading
 from spackle.evaluation.case import Case
 from spackle.evaluation.rows import PROBLEM, Row, Run
 from spackle.evaluation.table import NOT_RUN
-from spackle.files import write_json, write_whole
-from spackle.folders import (
+from spackle.files import (
     as_recorded,
     differences,
     digest_of,
@@ -29,6 +28,8 @@ from spackle.folders import (
     make_folder,
     photo_digest,
     remove_half_written,
+    write_json,
+    write_whole,
 )
 from spackle.progress import Reporter, asked_to_stop
 

@@ -21,8 +21,7 @@ from spackle.evaluation.metrics import METRICS
 from spackle.evaluation.protocols import HOLE, INPUT, TRUTH
 from spackle.evaluation.rows import Run, load_data
 from spackle.evaluation.table import tex
-from spackle.files import atomic_path, write_whole
-from spackle.folders import results_folder
+from spackle.files import atomic_path, results_folder, write_whole
 from spackle.formats.png import thumbnail
 from spackle.progress import Reporter
 

@@ -14,8 +14,7 @@ from torch import Tensor, nn
 
 from spackle.device import pick_dtype
 from spackle.errors import InputError
-from spackle.files import write_whole
-from spackle.folders import make_folder
+from spackle.files import make_folder, write_whole
 from spackle.formats.png import sheet
 from spackle.network_file import load_strict, read_tensors
 from spackle.progress import Reporter

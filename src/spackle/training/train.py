@@ -31,8 +31,7 @@ from torch.optim import AdamW
 
 from spackle.device import hardware, pick_device, versions
 from spackle.errors import InputError, reading
-from spackle.files import write_json
-from spackle.folders import results_folder
+from spackle.files import results_folder, write_json
 from spackle.formats import save_png
 from spackle.progress import Reporter, asked_to_stop
 from spackle.training.checkpoint import (

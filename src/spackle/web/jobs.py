@@ -18,8 +18,7 @@ from fastapi import HTTPException
 from pydantic import BaseModel, Field
 
 from spackle.errors import InputError, reason_in_a_line
-from spackle.files import write_json
-from spackle.folders import results_folder
+from spackle.files import results_folder, write_json
 from spackle.task_process import DIED, Event, TaskProcess, Work
 
 LOG = logging.getLogger("spackle.web")
