@@ -4,8 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import functools
 import reprlib
-from collections.abc import Iterable, Iterator
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from typing import ParamSpec, TypeVar
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother = 2, 60, 60
@@ -37,6 +43,35 @@ def reading(what: object, problem: str, *errors: type[Exception]) -> Iterator[No
         raise
     except caught as error:
         raise InputError(f"{what}: {problem.replace('{reason}', reason_in_a_line(error))}") from error
+
+
+@contextlib.contextmanager
+def short_messages() -> Iterator[None]:
+    """Shorten an InputError's message to 300 characters, because it may quote a program's values."""
+    try:
+        yield
+    except InputError as error:
+        message = str(error)
+        if len(message) <= 300:
+            raise
+        raise InputError(f"{message[:148]} … {message[-148:]}") from error
+
+
+def renamed(**names: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Decorator: accept arguments by their names in the previous release, with a DeprecationWarning."""
+
+    def decorate(function: Callable[P, R]) -> Callable[P, R]:
+        @functools.wraps(function)
+        def called(*arguments: P.args, **named: P.kwargs) -> R:
+            for old, new in names.items():
+                if old in named:
+                    warnings.warn(f"{function.__name__}({old}=) is called {new}= now", DeprecationWarning, stacklevel=2)
+                    named[new] = named.pop(old)
+            return function(*arguments, **named)
+
+        return called
+
+    return decorate
 
 
 def one_line(text: str) -> str:

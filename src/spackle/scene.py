@@ -15,6 +15,7 @@ from torch import Tensor
 from spackle.bases import USUAL_DISPARITY
 from spackle.camera import Camera
 from spackle.camera_path import OVERSCAN, DepthRange, KeyframePath, TrajectoryKind
+from spackle.errors import renamed
 from spackle.files import Target, write_whole
 from spackle.formats.html import PageScene, page_scene, single_html
 from spackle.formats.scene_files import Encoder, SceneFile, at_origin, encoder_of, load_scene
@@ -80,6 +81,7 @@ class Scene:
         """The sets of Gaussians from which a completed view is rendered."""
         return [self.base, self.aux if self.by_view is None else self.by_view[index]]
 
+    @renamed(kind="trajectory")
     def path(
         self,
         trajectory: TrajectoryKind = "rotate-forward",

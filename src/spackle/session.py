@@ -20,7 +20,7 @@ from spackle.bases.depth_map import DepthKind, DepthMap, depth_of_array, load_de
 from spackle.bases.open import open_base, open_loaded
 from spackle.bases.settings import AUTO, BaseSettings
 from spackle.camera_path import TrajectoryKind
-from spackle.errors import InputError, shown
+from spackle.errors import InputError, renamed, short_messages, shown
 from spackle.image import Photo, load_photo, photo_of_picture
 from spackle.pipeline import Fill, FillOptions, Options, Pipeline
 from spackle.progress import LogReporter
@@ -38,6 +38,7 @@ Residual = str | os.PathLike[str] | ResidualNet | None
 class Spackle:
     """Completes many photos; a network is loaded once, at the first photo that needs it."""
 
+    @short_messages()
     def __init__(
         self,
         base: str | Base = AUTO,
@@ -71,6 +72,7 @@ class Spackle:
         self._given = not isinstance(base, str) or base not in (AUTO, "rgbd")
         self._pipeline = Pipeline(options, opened, network or chosen.load(), renderer or get_renderer(device))
 
+    @short_messages()
     def predict(
         self,
         photo: PhotoSource,
@@ -106,6 +108,7 @@ class Spackle:
             return dataclasses.replace(pipeline, options=options).complete(loaded, LogReporter(progress)).scene
 
 
+@renamed(kind="trajectory")
 def predict(
     photo: PhotoSource,
     depth: DepthSource | None = None,
