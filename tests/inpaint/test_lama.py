@@ -7,13 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from dataset_builds import build, write_inputs
 from safetensors.torch import save_file
 from sharp_weights import waves
 from torch import Tensor
 
 from spackle.cli.weights import lama_weights
-from spackle.dataset.shards import load_manifest
 from spackle.errors import InputError
 from spackle.inpaint import InpainterOptions, get_inpainter
 from spackle.inpaint.lama import MARGIN, LamaInpainter, LamaNetwork, expected_shapes, groups_of, load_network, padded
@@ -191,15 +189,3 @@ def test_what_goes_wrong_is_a_line(file: Path, tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(LamaNetwork, "forward", lambda self, rgb, hole: rgb * torch.nan)
     with pytest.raises(InputError, match="not finite"):
         inpainter.paint(*picture)
-
-
-def test_a_dataset_is_painted_and_says_by_what(file: Path, weights: Weights, tmp_path: Path) -> None:
-    place, options = write_inputs(tmp_path / "inputs", 1, 33, 32), ("--views", 3, "--inpainter", "lama")
-    done = build(place, tmp_path / "out", *options, "--inpainter-weights", file)
-    assert done.code == 0, done.err
-    used = load_manifest(tmp_path / "out").config["inpainter"]
-    assert (used["name"], used["version"], list(used["weights"])) == ("lama", "1, long side 1024", ["lama"])
-    save_file({name: x + 1 for name, x in weights.items()}, tmp_path / "other")  # which make another dataset
-    done = build(place, tmp_path / "out", *options, "--inpainter-weights", tmp_path / "other", "--inpainter-side", 320)
-    assert done.code == 2
-    assert all(words in done.lines[-1] for words in ("inpainter.weights.lama: ", "long side 1024", "long side 320"))

@@ -138,18 +138,6 @@ def test_what_the_networks_are_given(video: type[Video], inpainter: PropainterIn
     assert torch.equal(inpainter.paint(rgb, torch.zeros_like(hole), unknown), rgb)
 
 
-def test_large_views_are_worked_on_in_small_and_no_hole_is_lost(video: type[Video], weights: Path) -> None:
-    rgb, hole, unknown = views_of(2, 200, 300)
-    hole[:] = False
-    hole[1, 50, :] = True  # one pixel high
-    small = PropainterInpainter(InpainterOptions(weights, 150, "cpu"))
-    painted = small.paint(rgb, hole, unknown)
-    assert video.given[0][0].shape == (2, 3, 128, 152)
-    assert torch.equal(painted[~hole], rgb[~hole])
-    torch.testing.assert_close(painted[hole], torch.full((300, 3), 0.75))
-    assert "long side 150" in small.version
-
-
 def test_colours_that_are_none_are_refused(
     video: type[Video], inpainter: PropainterInpainter, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -14,7 +14,7 @@ from scenes import Scene, texture
 
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, extremes
-from spackle.crop import Crop, crops_around
+from spackle.crop import crops_around
 from spackle.residual import hole_area_ratio
 from spackle.residual.network import STRIDE, predict_deltas
 from spackle.scene_fill import fill_scene
@@ -42,20 +42,6 @@ def test_each_masked_cell_is_in_one_crop_with_a_margin(
     assert bool((times[mask] == 1).all())
     assert bool((times <= 1).all())
     assert sum(outer.area for _, outer in pairs) <= mask.numel()
-
-
-def test_holes_far_apart_have_crops_of_their_own() -> None:
-    mask = torch.zeros(768, 768, dtype=torch.bool)
-    assert crops_around(mask, STRIDE) == []
-    assert crops_around(~mask, STRIDE) == [(Crop(0, 0, 768, 768),) * 2]
-    mask[10:20, 30:40] = mask[600:640, 700:710] = True
-    pairs = crops_around(mask, STRIDE)
-    assert len(pairs) == 2
-    assert sum(outer.area for _, outer in pairs) < 0.1 * mask.numel()
-    mask[:, :12] = mask[:10, :400] = mask[758:, :400] = True  # a frame of holes is cut into its sides
-    pairs = crops_around(mask, STRIDE)
-    assert len(pairs) >= 5
-    assert sum(outer.area for _, outer in pairs) < 0.52 * mask.numel()
 
 
 def test_crops_give_what_the_whole_picture_gives() -> None:

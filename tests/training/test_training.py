@@ -97,7 +97,7 @@ def test_a_run_leaves_weights_pictures_and_a_report(whole: Path, done: Run) -> N
     assert (report["ended"], report["step"]) == ("steps", 6)
     assert report["history"][0].keys() >= {"loss", "color", "alpha", "preserve", "hole_psnr", "har_before", "har_after"}
     with Image.open(whole / "pictures" / "0000006.png") as sheet:
-        assert sheet.width == 4 * 32
+        assert sheet.width == 3 * 32
     average = state(whole).average
     for name in ("best", "last"):
         weights = load_residual(whole / f"{name}.safetensors").state_dict()

@@ -25,13 +25,12 @@ from spackle.dataset.sample import DatasetView
 from spackle.device import enough_memory, own_arithmetic
 from spackle.errors import InputError
 from spackle.files import write_whole
-from spackle.formats.png import sheet
 from spackle.gaussians import Gaussians
 from spackle.network_file import read_tensors
 from spackle.progress import Reporter
 from spackle.render import Renderer, device_of
 from spackle.training.recipe import Recipe
-from spackle.training.residual import PICTURE_SIDE, PICTURED, ViewBatch, ViewTask
+from spackle.training.residual import ViewBatch, ViewTask
 from spackle.training.samples import short_digest
 from spackle.training.sources import divided_photos, open_pseudo
 from spackle.weights import check_undamaged, installed, weights_digest
@@ -93,7 +92,7 @@ def render_photo(decoder: nn.Module, base: TunableSharp, views: Sequence[Dataset
     with enough_memory("try optim.precision=bf16"):
         gaussians = base.gaussians(decoder, base.encode(views[0].photo, photo_camera), device_of(renderer))
         drawn = [renderer.render(gaussians, normalised_camera(view.camera, photo_camera)) for view in views]
-    return ViewBatch.of(drawn, [v.rendering.rgb for v in views], [v.target for v in views], [v.mask for v in views])
+    return ViewBatch.of((one, v.rendering.rgb, v.target, v.mask) for one, v in zip(drawn, views, strict=True))
 
 
 class DirectFt(ViewTask):
@@ -152,16 +151,6 @@ class DirectFt(ViewTask):
 
     def complete(self, network: nn.Module, batch: Sequence[DatasetView]) -> ViewBatch:
         return render_photo(network, self.base, batch, self.renderer)
-
-    @torch.no_grad()
-    def picture(self, network: nn.Module) -> Tensor:
-        """[H, W, 3] sRGB: for some photos, one row for the photo's view and one for the view with the largest hole."""
-        rows: list[tuple[Tensor, ...]] = []
-        for place in self.validation[:: max(1, 2 * self.validation_items // PICTURED)][: PICTURED // 2]:
-            group = self.files[place]
-            done = self.complete(network, [group.view(0), group.view(int(np.argmax(group.holes)))])
-            rows += zip(done.base_rgb, done.rgb, done.target, strict=True)
-        return sheet(rows, PICTURE_SIDE)
 
     def export(self, network: nn.Module, path: Path) -> None:
         """Write the decoder in float32, for `spackle predict --base sharp -c`, and a link to its checkpoint."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -47,12 +47,10 @@ class ViewBatch:
     hole: Tensor  # [B, H, W] bool
 
     @staticmethod
-    def of(
-        drawn: Sequence[Rendering], base: Sequence[Tensor], target: Sequence[Tensor], hole: Sequence[Tensor]
-    ) -> ViewBatch:
-        """Stack all images on the device of the completed views `drawn`."""
-        rgb, alpha = [view.rgb for view in drawn], [view.alpha for view in drawn]
-        return ViewBatch(*(torch.stack(list(images)).to(rgb[0].device) for images in (rgb, alpha, base, target, hole)))
+    def of(images: Iterable[tuple[Rendering, Tensor, Tensor, Tensor]]) -> ViewBatch:
+        """Stack completed views, base views, targets and holes on the device of the completed views."""
+        fields = zip(*((view.rgb, view.alpha, *others) for view, *others in images), strict=True)
+        return ViewBatch(*(torch.stack([tensor.to(field[0].device) for tensor in field]) for field in fields))
 
 
 class ViewTask(Task):
@@ -71,13 +69,12 @@ class ViewTask(Task):
     def complete(self, network: nn.Module, batch: Any) -> ViewBatch:
         """Complete the views of a batch."""
 
-    def total(self, views: ViewBatch) -> tuple[Tensor, dict[str, Tensor]]:
-        """The loss [] of completed views and the loss's unweighted terms []."""
+    def loss(self, network: nn.Module, batch: Any) -> tuple[Tensor, dict[str, Tensor]]:
+        return self._loss_of(self.complete(network, batch))
+
+    def _loss_of(self, views: ViewBatch) -> tuple[Tensor, dict[str, Tensor]]:
         tensors = {name: tensor.to(self.device) for name, tensor in vars(views).items()}
         return total_loss(**tensors, recipe=self.recipe.loss, features=self.features)
-
-    def loss(self, network: nn.Module, batch: Any) -> tuple[Tensor, dict[str, Tensor]]:
-        return self.total(self.complete(network, batch))
 
     def measure(self, network: nn.Module, batch: Any) -> dict[str, list[float]]:
         """Measure each view.
@@ -86,7 +83,7 @@ class ViewTask(Task):
         target; seen_psnr in dB, outside of the hole against the base; har_before and har_after, the shares of holes.
         """
         views = self.complete(network, batch)
-        loss, terms = self.total(views)
+        loss, terms = self._loss_of(views)
         return {
             **{name: [float(value)] * len(views.rgb) for name, value in {"loss": loss, **terms}.items()},
             "hole_psnr": list(map(hole_psnr, views.rgb, views.target, views.hole)),
@@ -94,6 +91,13 @@ class ViewTask(Task):
             "har_before": [float(hole.double().mean()) for hole in views.hole],
             "har_after": [hole_area_ratio(alpha) for alpha in views.alpha],
         }
+
+    @torch.no_grad()
+    def picture(self, network: nn.Module) -> Tensor:
+        """[H, W, 3] sRGB, one row per validation item: base, completed view, target."""
+        items = range(0, self.validation_items, max(1, self.validation_items // PICTURED))[:PICTURED]
+        views = [self.complete(network, self.batch(None, [item])) for item in items]
+        return sheet([(view.base_rgb[-1], view.rgb[-1], view.target[-1]) for view in views], PICTURE_SIDE)
 
 
 def complete_samples(
@@ -122,9 +126,7 @@ def complete_samples(
         scenes.append([sample.base, compose(sample.seeds.select(index), deltas, sample.camera)])
     cameras, onto = [sample.camera for sample in samples], [sample.rendering for sample in samples]
     views = render_batch(renderer, scenes, cameras, tiles=tiles, onto=onto)
-    return ViewBatch.of(
-        views, [s.rendering.rgb for s in samples], [s.target for s in samples], [s.hole for s in samples]
-    )
+    return ViewBatch.of((view, s.rendering.rgb, s.target, s.hole) for view, s in zip(views, samples, strict=True))
 
 
 def training_cells(features: ViewFeatures, least: int = MIN_AUX) -> Tensor:
@@ -221,14 +223,6 @@ class ResidualTask(ViewTask):
 
     def complete(self, network: nn.Module | None, batch: Sequence[Sample]) -> ViewBatch:
         return complete_samples(network, batch, self.renderer, self.precision)
-
-    @torch.no_grad()
-    def picture(self, network: nn.Module) -> Tensor:
-        """[H, W, 3] sRGB, one row per sample: base, completed without and with a network, target."""
-        items = range(0, self.validation_items, max(1, self.validation_items // PICTURED))[:PICTURED]
-        batch = self.batch(None, items)
-        done, plain = self.complete(network, batch), self.complete(None, batch)
-        return sheet(list(zip(done.base_rgb, plain.rgb, done.rgb, done.target, strict=True)), PICTURE_SIDE)
 
     def export(self, network: nn.Module, path: Path) -> None:
         """Write the weights in half precision, for `spackle predict --residual`."""

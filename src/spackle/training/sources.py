@@ -35,7 +35,6 @@ FRAMES = 24  # frames of a path, one of which becomes the virtual camera
 NO_TARGETS = ("none", "geometry")  # inpainters that leave holes empty, or paint what the untrained residual renders
 
 Draw = Callable[[np.random.Generator], tuple[Tensor, DepthMap, Camera]]  # draws a photo [H, W, 3] sRGB with depth
-View = Callable[[np.random.Generator], Sample]
 
 
 def find_sources(data: DataRecipe, renderer: Renderer, *, validation: bool) -> list[Source]:
@@ -45,26 +44,29 @@ def find_sources(data: DataRecipe, renderer: Renderer, *, validation: bool) -> l
     """
     shares, sources = data.shares, list[Source]()
 
-    def add(name: str, share: float, folder: Path, files: Sequence[Path], view: View) -> None:
-        if share > 0:
-            names = [file.relative_to(folder).as_posix() for file in files]
-            sources.append(Source(share, lambda rng, index: view(rng), [name, *names]))
+    def add(name: str, share: float, folder: Path, files: Sequence[Path], draw: Draw | None = None) -> None:
+        """Add reverse views of the photos that `draw` gives, or for None the right views of stereo pairs."""
 
-    def reverse(draw: Draw) -> View:
-        return partial(random_reverse_view, draw=draw, disparity=data.disparity, renderer=renderer)
+        def view(rng: np.random.Generator, index: int) -> Sample:
+            return (
+                random_reverse_view(rng, draw, data.disparity, renderer) if draw else right_view(rng, files, renderer)
+            )
+
+        if share > 0:
+            sources.append(Source(share, view, [name, *(file.relative_to(folder).as_posix() for file in files)]))
 
     if data.photos is not None:
         photos = find_files(data.photos, "data.photos", PHOTO_SUFFIXES, "photos")
-        add("composites", shares.composites, data.photos, photos, reverse(partial(composite_photo, photos=photos)))
+        add("composites", shares.composites, data.photos, photos, partial(composite_photo, photos=photos))
     frames = [find_files(camera.folder, "data.rgbd", (".color.jpg",), "NAME.color.jpg") for camera in data.rgbd]
     for camera, files in zip(data.rgbd, frames, strict=True):
         share = shares.rgbd * len(files) / sum(map(len, frames))  # all frames are equally likely
         draw = partial(frame_photo, frames=files, focal_px=camera.focal_px, unit_m=camera.unit_m)
-        add("rgbd", share, camera.folder, files, reverse(draw))
+        add("rgbd", share, camera.folder, files, draw)
     if data.stereo is not None:
         scenes = [file.parent for file in find_files(data.stereo, "data.stereo", ("scene.json",), "scene.json")]
-        add("stereo", shares.stereo, data.stereo, scenes, reverse(partial(left_photo, folders=scenes)))
-        add("pairs", shares.pairs, data.stereo, scenes, partial(right_view, folders=scenes, renderer=renderer))
+        add("stereo", shares.stereo, data.stereo, scenes, partial(left_photo, folders=scenes))
+        add("pairs", shares.pairs, data.stereo, scenes)
     if data.pseudo is not None and shares.pseudo > 0:
         dataset = open_pseudo(data.pseudo)
         split = divided_photos(dataset, data)
