@@ -35,7 +35,7 @@ from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.base import to_metric
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, trajectory
-from spackle.device import hardware, versions
+from spackle.device import hardware, run_chunks, versions
 from spackle.errors import InputError, check_name
 from spackle.evaluation.bench import CPU, MS, TOTAL, Lap, Task, Values, complete_in_laps, measure
 from spackle.evaluation.datasets.stereo import load_motorcycle
@@ -45,7 +45,8 @@ from spackle.formats import save_ply, save_video
 from spackle.gaussians import Gaussians
 from spackle.image import Photo
 from spackle.render import CpuRenderer, Renderer, get_renderer
-from spackle.render.cpu import blend, list_tiles, project, sort_by_depth, wanted_tiles
+from spackle.render.blend import blend_tiles
+from spackle.render.cpu import BLEND_GRAIN, list_tiles, project, sort_by_depth, wanted_tiles
 from spackle.render.project import KernelCamera
 from spackle.residual import ResidualNet, hole_area_ratio
 from spackle.residual.architectures import load_residual
@@ -126,7 +127,10 @@ def render_in_laps(scene: Gaussians, camera: Camera, lap: Lap) -> None:
     lap("sort")
     lists = list_tiles(order, splats.boxes, wanted)
     lap("bin")
-    blend(splats, lists, view, wanted, None, False)
+    size = camera.height, camera.width
+    images = tuple(np.zeros(shape, np.float32) for shape in ((*size, 3), size, size, (0, 0, 3)))
+    tiles = np.flatnonzero(wanted)
+    run_chunks(lambda a, b: blend_tiles(a, b, tiles, lists, splats.records, images), len(tiles), BLEND_GRAIN)
     lap("blend")
 
 
@@ -142,14 +146,12 @@ def completion_section(
     disparity, camera = find_view(base, photo_camera, renderer)
     context = FillContext(base, photo_camera, renderer, network)
     times = measure(runs, {"": lambda lap: complete_in_laps(context, camera, lap)}, device)
-    render, guard, place, redraw = (times["", stage] for stage in ("view", *EXTRA))
+    render, guard, added = (times["", stage] for stage in ("view", *EXTRA))
     figures = [
         Timed("base render of the view", render),
         Timed("photo's occlusion guard, once a photo", guard),
-        Timed("mask, seeds, network, placing", place),
-        Timed("redraw", redraw),
-        Timed("added time", place + redraw),
-        Timed("added time over base render", (place + redraw) / render, "×"),
+        Timed("added time", added),
+        Timed("added time over base render", added / render, "×"),
     ]
     holes = hole_area_ratio(renderer.render(base, camera).alpha)
     facts = {"gaussians": len(base), "width": camera.width, "height": camera.height, "disparity": disparity}

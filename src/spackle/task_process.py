@@ -13,7 +13,7 @@ from typing import Any
 
 from spackle.errors import InputError, reason_in_a_line
 
-DIED = "the process that worked on this died, most likely for want of memory"
+DIED = "the worker process died, most likely for want of memory"
 Event = Mapping[str, Any]
 Tell = Callable[[Event], None]
 Work = Callable[[Any, Tell], None]  # pickled, like its tasks; raises InputError if a task cannot be done
@@ -38,7 +38,7 @@ class TaskProcess:
         self._process.join()
 
     def do(self, task: object, tell: Tell) -> str | None:
-        """Do a task; returns None if it succeeded, else a line that says why not."""
+        """Do a task; returns None, or a line with the reason for a failure."""
         try:
             self._pipe.send(task)
             while not isinstance(event := self._pipe.recv(), Ended):
@@ -69,12 +69,12 @@ def _serve(pipe: connection.Connection, work: Work) -> None:
             error = " ".join(str(problem).split())
         except Exception as bug:  # or too little memory: the next task may succeed
             traceback.print_exc()
-            error = f"this went wrong: {type(bug).__name__}: {reason_in_a_line(bug)}"
+            error = f"internal error: {type(bug).__name__}: {reason_in_a_line(bug)}"
         pipe.send(Ended(error))
 
 
 def end_with_parent() -> None:
-    """Wait until the parent process has ended, then end this one, which would otherwise wait for ever."""
+    """Wait until the parent process has ended, then end this process, which would otherwise run for ever."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     connection.wait([parent.sentinel])

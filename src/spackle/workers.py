@@ -11,7 +11,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 
@@ -19,13 +19,6 @@ from spackle.errors import InputError
 from spackle.task_process import end_with_parent
 
 QUEUED = 2  # jobs per process: the current one and the next; more would hold more uncollected results in memory
-
-
-class Worker(Protocol):
-    """Does one job after the other; jobs and results are pickled."""
-
-    def make(self, job: Any) -> Any:
-        """Do a job and return its result; InputError if no job can be done."""
 
 
 @contextlib.contextmanager
@@ -41,12 +34,13 @@ def threads_of_torch(count: int) -> Iterator[None]:
 
 @contextlib.contextmanager
 def at_work(
-    open_worker: Callable[[], Worker], jobs: Sequence[Any], stop: Callable[[], bool], *, count: int, threads: int
+    open_worker: Callable[[], Any], jobs: Sequence[Any], stop: Callable[[], bool], *, count: int, threads: int
 ) -> Iterator[Iterator[Any]]:
     """Yield the results of jobs as they arrive, in any order. Each process takes one of the GPUs.
 
     Args:
-        open_worker: called once in each process; pickled.
+        open_worker: makes an object whose `make(job)` returns a job's result; called once in each process. The
+            function, jobs and results are pickled.
         stop: whether the user has asked the command to end; the death of a process then only ends the results.
         count: number of processes; a single worker runs in this process.
         threads: torch's threads in each process.
@@ -85,10 +79,10 @@ def _results(pool: ProcessPoolExecutor, jobs: Sequence[Any], most: int, stop: Ca
             ) from error
 
 
-_open_worker: Callable[[], Worker]  # set in each worker process; called by its first job, which can report errors
+_open_worker: Callable[[], Any]  # set in each worker process; called by its first job, which can report errors
 
 
-def _start(threads: int, open_worker: Callable[[], Worker], numbers: Any) -> None:
+def _start(threads: int, open_worker: Callable[[], Any], numbers: Any) -> None:
     """Set up a process: it ignores Ctrl-C, ends with the main process, and takes a GPU."""
     global _open_worker
     _open_worker = functools.cache(open_worker)

@@ -166,11 +166,9 @@ def test_a_lost_or_damaged_file_is_named(name: str, file: str, content: str | No
     assert says in error_of(name, tmp_path)
 
 
-def test_too_few_photos_odd_poses_and_bent_lenses_are_refused(tmp_path: Path) -> None:
+def test_odd_poses_and_bent_lenses_are_refused(tmp_path: Path) -> None:
     assert "no such folder" in error_of("llff", tmp_path / "nowhere")
     assert "no scene of llff at or below it: expected SCENE/poses_bounds.npy" in error_of("llff", tmp_path)
-    llff(tmp_path / "one/fern", EYES[:1])
-    assert "at least two photos" in error_of("llff", tmp_path / "one")
     path = TREES["llff"](tmp_path / "poses") / "poses_bounds.npy"
     table = np.load(path)
     table[2, :3] = 1e30  # no rotation

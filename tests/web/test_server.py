@@ -260,7 +260,7 @@ def test_a_name_is_for_people_only(name: str, shown: str) -> None:
 
 @pytest.mark.parametrize(
     ("how", "error"),
-    [("bad", "bad.png: no depth at all"), ("bug", "this went wrong: KeyError: 'oh'"), ("die", DIED)],
+    [("bad", "bad.png: no depth at all"), ("bug", "internal error: KeyError: 'oh'"), ("die", DIED)],
 )
 def test_what_goes_wrong_is_told_in_a_line(server: Served, how: str, error: str) -> None:
     id = server.send(name=f"{how}.png").json["id"]

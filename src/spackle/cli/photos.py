@@ -165,7 +165,7 @@ class Predicted(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Predictor:
-    """Predicts one photo after the other; a `Worker`."""
+    """Predicts one photo after the other."""
 
     output: Path
     options: PredictOptions

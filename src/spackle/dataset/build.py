@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import shutil
 import time
@@ -96,11 +97,10 @@ class DatasetOptions:
 
     def inputs_of(self, photo: PhotoFile) -> list[str]:
         """Name and digest of a photo, and the digest of its depth map."""
-        try:
-            depth = self.depth_of(photo)
-            return [photo.name, photo.sha256, *([fingerprint(depth, "depth map")] if depth else [])]
-        except InputError:  # the build reports the error later
-            return [photo.name, photo.sha256, "none"]
+        inputs = [photo.name, photo.sha256]
+        with contextlib.suppress(InputError):  # the build reports a missing depth map later
+            inputs += [fingerprint(depth, "depth map")] if (depth := self.depth_of(photo)) else []
+        return inputs
 
 
 def configuration(options: DatasetOptions, photos: Sequence[PhotoFile], inpainter: Inpainter | None) -> dict[str, Any]:
@@ -175,7 +175,7 @@ class Made:
 
 
 class Maker:
-    """A `Worker` that makes photos' samples: base, views and targets."""
+    """Makes photos' samples: base, views and targets."""
 
     def __init__(self, options: DatasetOptions) -> None:
         """Open base and inpainter, whose networks are loaded with the first photo; InputError if opening fails."""
@@ -227,15 +227,14 @@ class _Build:
         reporter: Reporter,
         config: dict[str, Any],
     ) -> None:
-        """Start a build in a folder, or resume it; InputError if the folder holds another dataset."""
+        """Start or resume a build in a folder; InputError if the folder holds another dataset."""
         self.photos, self.output, self.options, self.reporter = photos, output, options, reporter
         self.config, self.size = config, options.shard_size
         if not (output / NAME).exists():
             Manifest(config=config, shards=(), complete=False).save(output)
         manifest = load_manifest(output)
         if lines := differences(manifest.config, config):
-            what = f"holds a dataset of another configuration ({'; '.join(lines)})"
-            raise InputError(f"{output}: {what}: choose another -o")
+            raise InputError(f"{output}: holds a dataset of other options ({'; '.join(lines)}): choose another -o")
         make_folder(output / PARTS)
         remove_half_written(output, output / PARTS)
         sizes = {path.name: path.stat().st_size for path in output.iterdir() if path.is_file()}
@@ -256,16 +255,14 @@ class _Build:
         with self.reporter.stage("photos") as step, asked_to_stop(alone=True) as stop:
             for number in range(-(-len(self.photos) // self.size)):
                 self._write_shard(number)
-            if jobs:
-                make, options = partial(Maker, self.options), self.options
-                work = at_work(make, jobs, stop, count=options.workers, threads=options.threads)
-                with work as results:
-                    for done, result in enumerate(results, ready + 1):
-                        self._keep(result)
-                        self._write_shard(result.index // self.size)
-                        step(done, len(self.photos))
-                        if stop():
-                            break
+            make, options = partial(Maker, self.options), self.options
+            with at_work(make, jobs, stop, count=options.workers, threads=options.threads) as results:
+                for done, result in enumerate(results, ready + 1):
+                    self._keep(result)
+                    self._write_shard(result.index // self.size)
+                    step(done, len(self.photos))
+                    if stop():
+                        break
         if self.missing:
             self.reporter.log("stopped; the same command resumes from here")
             return "stopped"

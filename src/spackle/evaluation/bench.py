@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import statistics
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -30,8 +29,7 @@ from spackle.evaluation.tables import make_tables, write_tables
 from spackle.files import results_folder
 from spackle.gaussians import Gaussians
 from spackle.progress import Reporter
-from spackle.render import Renderer, device_of
-from spackle.render.protocol import Rendering
+from spackle.render import device_of
 from spackle.residual import ResidualNet
 from spackle.scene_fill import FillContext
 
@@ -119,7 +117,6 @@ def time_case(case: Case, evaluation: Evaluation, config: Mapping[str, Any]) -> 
         tasks = {method: partial(complete, view.camera, method) for method in TIMED}
         times = measure(config["runs"], tasks, device)
         for method, count in added.items():
-            # A method may lack a stage: a view without holes is not rendered again.
             stages = {stage: values / MS for (name, stage), values in times.items() if name == method}
             row = image._replace(setting=view.setting, view=view.name, method=method)
             numbers = view_numbers(len(context.base), count, stages | {"base": seconds})
@@ -132,10 +129,7 @@ def view_numbers(base: int, added: int, seconds: Mapping[str, Values]) -> dict[s
 
     These are counts, milliseconds (medians over runs), shares (not percent) and views per second.
     """
-    before, extra = (
-        sum(MS * float(np.median(seconds[stage])) for stage in stages if stage in seconds)
-        for stages in (BASE_PATH, EXTRA)
-    )
+    before, extra = (sum(MS * float(np.median(seconds[stage])) for stage in stages) for stages in (BASE_PATH, EXTRA))
     return {
         "aux": added,
         "aux_share": added / base,
@@ -194,33 +188,14 @@ def measure(runs: int, tasks: Mapping[str, Task], device: torch.device = CPU, *,
     return {key: np.array(values) for key, values in times.items()}
 
 
-@dataclasses.dataclass(frozen=True)
-class _LappedRenderer:
-    """A `Renderer` that ends a stage before and after each render, which times rendering apart from completion."""
-
-    renderer: Renderer
-    lap: Lap
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.renderer, name)
-
-    def render(self, gaussians: Gaussians | Sequence[Gaussians], camera: Camera, **options: Any) -> Rendering:
-        self.lap("completion")
-        drawn = self.renderer.render(gaussians, camera, **options)
-        self.lap("rerender")
-        return drawn
-
-
 @torch.no_grad()
 def complete_in_laps(context: FillContext, camera: Camera, lap: Lap, method: str = "spackle") -> Gaussians:
-    """A view's aux Gaussians; calls `lap` after the stages "view", "photo", "completion" and (if holes) "rerender"."""
-    context, prepared = context.placed, False
+    """A view's aux Gaussians; calls `lap` after the stages "view", "photo" and "completion"."""
+    context = context.placed
     before = context.renderer.render(context.base, camera)
     lap("view")
-    renderer = _LappedRenderer(context.renderer, lambda stage: lap(stage if prepared else "photo"))
-    fill = make_method(method, [camera], dataclasses.replace(context, renderer=renderer))
+    fill = make_method(method, [camera], context)
     lap("photo")
-    prepared = True
     aux = fill(camera, before).aux
     lap("completion")
     assert aux is not None

@@ -133,7 +133,6 @@ def _dense_aux(context: FillContext, guard: OcclusionGuard | None, camera: Camer
 
 
 def _inpaint_2d(inpainter: Inpainter, camera: Camera, before: Rendering) -> MethodView:
-    """The base's rendering with its hole inpainted in 2D."""
     hole = hole_mask(before.alpha)
     flat = (before.rgb, hole, known_inverse_depth(before.depth, hole))
     return MethodView(inpainter.paint(*(image[None] for image in flat))[0], None, None)

@@ -88,7 +88,6 @@ def make_report(sources: Sequence[tuple[Run, Path]], *, whole: bool = False) -> 
 
 
 def _bold(text: str) -> Markup:
-    """Make text between ** bold."""
     return Markup(re.sub(r"\*\*(.+?)\*\*", r"<strong>\1</strong>", str(escape(text))))
 
 
@@ -186,7 +185,6 @@ class Plot(NamedTuple):
 
 
 def check_matplotlib(option: str) -> None:
-    """InputError if matplotlib is not installed."""
     if importlib.util.find_spec("matplotlib") is None:
         raise InputError(f"{option}: needs matplotlib: pip install 'spackle-nvs[eval]'")
 

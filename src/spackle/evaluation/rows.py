@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 NEAR = "near"  # the setting of views at the viewpoints of second photos
 PROBLEM, REMARK, NOTE = "problem", "remark", "note."  # metrics with text as values; "note." precedes a note's name
-BASE_PATH = ("base", "view")  # the stages from the photo to a view without Spackle
-EXTRA = ("photo", "completion", "rerender")  # the stages that Spackle adds
+BASE_PATH = ("base", "view")  # stages of a view without Spackle: photo to base Gaussians, render of the view
+EXTRA = ("photo", "completion")  # stages that Spackle adds: render at the photo's camera; mask to rendered view
 Value = float | str | None
 
 
@@ -86,7 +86,6 @@ class Run:
 
     @property
     def timed(self) -> bool:
-        """Whether the run is a benchmark."""
         return bool(self.config["kind"] == "bench")
 
     @property

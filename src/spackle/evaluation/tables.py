@@ -130,7 +130,6 @@ def _notes(spec: Mapping[str, Any], runs: Sequence[Run]) -> list[str]:
 
 
 def _weights(run: Run) -> str:
-    """A text about the origin of the residual's weights."""
     residual = run.config["residual"]
     if not residual["sha256"]:
         return "the residual has no weights, its deltas are 0"
@@ -140,7 +139,6 @@ def _weights(run: Run) -> str:
 
 
 def _timed_notes(run: Run) -> list[str]:
-    """Notes on times: networks, machine, method, and sizes of the networks."""
     base, residual, hardware = run.config["base"], run.config["residual"], run.config["hardware"]
     precision = next((row.value for row in run.rows if row.metric == f"{NOTE}precision"), None)
     network = f"{run.base}'s network in {precision} on {base['device']}; " if precision else ""
@@ -216,7 +214,6 @@ def _row_names(spec: Mapping[str, Any], run: Run) -> dict[str, str]:
 
 
 def _datasets(runs: Sequence[Run]) -> list[str]:
-    """Titles of datasets: all of the paper's in its order, then others that were run."""
     return list(dict.fromkeys([*IMAGES, *(run.title for run in runs)]))
 
 

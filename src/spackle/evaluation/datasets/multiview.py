@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from spackle.camera import Camera
-from spackle.errors import InputError
 from spackle.evaluation.case import Case, Points, SecondView
 from spackle.evaluation.datasets.colmap import Model
 
@@ -39,26 +38,15 @@ class Posed:
     bounds: tuple[float, float] | None = None  # nearest and farthest depth
 
 
-def posed_by(scene: Path, model: Model, photos: Sequence[Path], names: Sequence[str] | None = None) -> list[Posed]:
-    """Join the views of a scene's model with their photo files, in the same order; `names` default to the files'.
-
-    Raises:
-        InputError: there is only one view.
-    """
-    check_two(scene, len(model.views))
+def posed_by(scene: Path, model: Model, photos: Sequence[Path]) -> list[Posed]:
+    """Join the views of a scene's model with their photo files, in the same order."""
     posed = []
-    for view, photo, name in zip(model.views, photos, names or [photo.stem for photo in photos], strict=True):
+    for view, photo in zip(model.views, photos, strict=True):
         z = model.points(view).z
         middle = float(z.median()) if len(z) else math.nan
         points = partial(model.points, view) if len(view.ids) else None
-        posed.append(Posed(f"{scene.name}/{name}", photo, view.camera, middle, view.ids, points))
+        posed.append(Posed(f"{scene.name}/{photo.stem}", photo, view.camera, middle, view.ids, points))
     return posed
-
-
-def check_two(scene: Path, count: int) -> None:
-    """InputError if a scene has fewer than two photos."""
-    if count < 2:
-        raise InputError(f"{scene}: at least two photos with a pose are needed, {count} found: unpack the whole scene")
 
 
 def make_cases(views: Sequence[Posed], wanted: Iterable[int] | None = None) -> list[Case]:
@@ -72,6 +60,8 @@ def make_cases(views: Sequence[Posed], wanted: Iterable[int] | None = None) -> l
         views: all photos of a scene.
         wanted: indices of the photos that become cases; None: all.
     """
+    if not views:
+        return []
     poses = torch.stack([view.camera.world_to_camera for view in views])
     eyes = torch.stack([view.camera.position for view in views]).numpy()
     axes = poses[:, 2, :3].numpy()

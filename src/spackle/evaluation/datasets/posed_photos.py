@@ -18,7 +18,7 @@ from spackle.camera import Camera
 from spackle.errors import InputError, reading
 from spackle.evaluation.case import Case
 from spackle.evaluation.datasets.colmap import model_folder, read_model
-from spackle.evaluation.datasets.multiview import Posed, check_two, make_cases, posed_by, spread
+from spackle.evaluation.datasets.multiview import Posed, make_cases, posed_by, spread
 from spackle.evaluation.datasets.stereo import HALF_PIXEL
 from spackle.evaluation.rows import IMAGES
 from spackle.files import files_in
@@ -78,8 +78,7 @@ def _tanks_views(scene: Path) -> list[Posed]:
     folder = model_folder(scene)
     model = read_model(folder)
     top = scene / "dense" if "dense" in folder.relative_to(scene).parts else scene
-    names = [Path(view.name).with_suffix("").as_posix() for view in model.views]
-    return posed_by(scene, model, [top / "images" / view.name for view in model.views], names)
+    return posed_by(scene, model, [top / "images" / view.name for view in model.views])
 
 
 # --- LLFF
@@ -101,7 +100,6 @@ def llff_cases(scenes: Mapping[str, Path]) -> list[Case]:
 def _llff_views(scene: Path) -> list[Posed]:
     folders = (scene / name for name in LLFF_PHOTOS if (scene / name).is_dir())
     photos = next((files for folder in folders if (files := files_in(folder, PHOTO_SUFFIXES))), [])
-    check_two(scene, len(photos))
     path = scene / "poses_bounds.npy"
     rows = _read_bounds(path, len(photos)) if path.is_file() else ()
     bounds = {photo: (float(row[15]), float(row[16])) for photo, row in zip(photos, rows, strict=False)}
@@ -148,8 +146,7 @@ def _match(scene: Path, names: Sequence[str], photos: Sequence[Path]) -> list[Pa
         return [stems[Path(name).stem] for name in names]
     if len(names) != len(photos):
         raise InputError(
-            f"{photos[0].parent}: {len(photos)} photos, but the COLMAP model of {scene.name} has {len(names)} "
-            "under other names: unpack the scene again"
+            f"{scene}: {len(photos)} photos, but the COLMAP model has {len(names)} with other names: unpack it again"
         )
     return list(photos)
 
@@ -187,7 +184,6 @@ def category_and_scene(folder: Path) -> str:
 
 
 def _with_depth(case: Case) -> Case:
-    """Add the depth map with the photo's number to a case."""
     assert case.camera is not None
     path, K = case.photo.parent.parent / "depth" / case.photo.name, case.camera.K
     return dataclasses.replace(case, depth=lambda: dataclasses.replace(load_depth(path), K=K))
@@ -209,5 +205,4 @@ def _wildrgbd_views(name: str, scene: Path) -> list[Posed]:
         if photo := photos.get(f"{number:05d}"):
             camera = _camera(K, torch.from_numpy(pose), width, height, f"{poses}: {photo.name}")
             views.append(Posed(f"{name}/{photo.stem}", photo, camera, MIDDLE_DEPTH_M))
-    check_two(scene, len(views))
     return views
