@@ -1,4 +1,4 @@
-"""MoGe-2 in a small size with weights that anyone can make, and the picture that its golden numbers belong to."""
+"""MoGe-2 in a small size with deterministic weights, and the picture of the golden numbers."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spackle.bases.moge.network import MogeConfig, MogeNetwork, MogeOutput
+from spackle.bases.moge.network import MogeNetwork, MogeOutput
 from spackle.cli.weights import deterministic_weights
 
 
@@ -22,7 +22,7 @@ def settings(features: int, widths: list[int], blocks: tuple[list[int], list[int
     neck = {"dim_in": [features + 2, 2, 2, 2, 2], "dim_out": None, "num_res_blocks": blocks[0]} | shared
     heads = {
         f"{name}_head": {"dim_in": widths, "dim_out": [None] * 4 + [out], "num_res_blocks": blocks[1]} | shared
-        for name, out in (("points", 3), ("normal", 3), ("mask", 1))
+        for name, out in (("points", 3), ("mask", 1))
     }
     encoder = {"backbone": "dinov2_vits14", "intermediate_layers": [5, 11], "dim_out": features}
     more = {"scale_head": {"dims": [384, *scale, 1]}, "remap_output": "exp", "num_tokens_range": [35, 120]}
@@ -34,9 +34,8 @@ FULL = settings(384, [384, 256, 128, 64, 32], ([0, 1, 1, 1, 0], [0, 1, 1, 1, 0])
 
 
 def shapes_of(config: dict[str, Any]) -> dict[str, tuple[int, ...]]:
-    """Every name and shape of a state dict."""
     with torch.device("meta"):
-        return {name: tuple(t.shape) for name, t in MogeNetwork(MogeConfig(**config)).state_dict().items()}
+        return {name: tuple(t.shape) for name, t in MogeNetwork(config).state_dict().items()}
 
 
 def write_tiny(path: Path) -> Path:
@@ -48,7 +47,7 @@ def write_tiny(path: Path) -> Path:
     plus = {"neck.input_blocks.4": 4, "points_head.input_blocks.4": 1, "points_head.output_blocks.4": 0.25}
     for name, value in plus.items():
         made[f"{name}.weight"] *= 0.2
-        made[f"{name}.weight"][[0, 1], [0, 1]] += value  # so that x and y follow the place in the photo
+        made[f"{name}.weight"][[0, 1], [0, 1]] += value  # x and y then follow the place in the photo
     for name, values in (("mean", (0.485, 0.456, 0.406)), ("std", (0.229, 0.224, 0.225))):
         made[f"encoder.image_{name}"] = torch.tensor(values).view(1, 3, 1, 1)
     torch.save({"model_config": TINY, "model": made}, path)
@@ -67,7 +66,7 @@ HALF = math.hypot(160, 90) / 2  # half the diagonal of this scene
 
 
 def scene(shift: float, bend: float = 0.0, hole: bool = True, scale: float = 1.0) -> MogeOutput:
-    """What the network could say of waves at 90×160, seen by a lens of 1.3 half diagonals; the sky is a hole below."""
+    """A plausible output for waves at 90×160 and a focal length of 1.3 half diagonals; below is a hole of sky."""
     y, x = (np.mgrid[:90, :160] + 0.5 - np.array([45, 80]).reshape(2, 1, 1)) / HALF
     depth = 3 + np.sin(4 * x) * np.cos(3 * y)
     z = depth + shift + 2 * bend * y

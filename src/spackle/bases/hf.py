@@ -93,7 +93,7 @@ class HfBase:
             if believed_lens(focal, photo.width, photo.height):
                 camera, lens_source = Camera.from_focal(focal, photo.width, photo.height), "Depth Pro"
         depth = to_depth_map(raw, self.meaning, camera.focal[0] / photo.width, self.name, photo.path)
-        prediction = lift_guess(photo, depth, camera, progress)
+        prediction = lift_guess(photo, depth, camera)
         relative = self.meaning == "relative disparity"
         scale = f"relative, scaled to {NEAREST_M:g}–{FARTHEST_M:g} m" if relative else "metric, by the model"
         notes = {**prediction.notes, "precision": self.precision, "depth_scale": scale}

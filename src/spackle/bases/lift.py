@@ -52,14 +52,9 @@ class RgbdBase:
         return dataclasses.replace(prediction, notes=notes, lens_source="" if own is None else self.lens_source)
 
 
-def lift_guess(photo: Photo, depth: DepthMap, camera: Camera, progress: Progress | None) -> BasePrediction:
-    """Lift a photo (with its outermost lines replaced) by a network's depth, as step 2 of 2 of `progress`."""
-    if progress:
-        progress(1, 2)
-    prediction = lift(pad_edge(photo.rgb), depth, camera)
-    if progress:
-        progress(2, 2)
-    return prediction
+def lift_guess(photo: Photo, depth: DepthMap, camera: Camera) -> BasePrediction:
+    """Lift a photo, with its outermost lines replaced, by the depth that a network predicts."""
+    return lift(pad_edge(photo.rgb), depth, camera)
 
 
 def lift(rgb: Tensor, depth: DepthMap, camera: Camera, levels: int = LEVELS) -> BasePrediction:

@@ -248,7 +248,7 @@ class LiteBase:
         depth = NEAREST_M / (inverse_depth / nearest(inverse_depth.flatten())).clamp(1 / FARTHEST, 1)
         known = torch.ones_like(depth, dtype=torch.bool)
         depth_map = DepthMap(depth, known, None, None, "disparity", photo.path)
-        prediction = lift_guess(photo, depth_map, photo.camera, progress)
+        prediction = lift_guess(photo, depth_map, photo.camera)
         notes = {**prediction.notes, "precision": "fp32", "depth_scale": f"relative, the nearest at {NEAREST_M:g} m"}
         return dataclasses.replace(prediction, notes=notes, disparity=DISPARITY, uncovered=UNCOVERED)
 

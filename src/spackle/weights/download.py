@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-import time
 from collections.abc import Callable, Iterator
 from http.client import HTTPException, HTTPResponse, responses
 from pathlib import Path
@@ -17,20 +16,16 @@ from spackle.errors import InputError, reason_in_a_line
 from spackle.files import check_writable, sha256_of
 
 TIMEOUT = 30.0  # seconds without a byte
-PAUSES = (1.0, 2.0, 4.0, 8.0)  # seconds before each further try of a connection that broke
 CHUNK = 1 << 18  # most bytes that are read at once
+AGAIN = "try again, and the download resumes where it stopped"
 
 Progress = Callable[[int, int], None]  # (bytes done, bytes in all)
-
-
-class Dropped(Exception):
-    """There is no connection, or it broke."""
 
 
 def download(url: str, path: str | os.PathLike[str], size: int, sha256: str, progress: Progress | None = None) -> None:
     """Fetch `url` (http or https, without a password) to `path` in an existing folder.
 
-    The bytes are collected in NAME.part; the complete file then replaces an existing one. After a broken connection, a
+    The bytes are collected in NAME.part; the complete file then replaces an existing file. After a broken connection, a
     kill or Ctrl-C the next call requests only the missing bytes. `progress` counts the bytes of earlier calls too.
 
     Raises:
@@ -67,26 +62,10 @@ def check_url(url: str) -> None:
 
 
 def _receive(url: str, part: Path, size: int, progress: Progress) -> None:
-    """Complete `part` to `size` bytes; retries a connection that broke, but not one that could not be opened."""
-    kept, pauses = _size(part), list(PAUSES)
-    while _size(part) != size:
-        try:
-            _receive_rest(url, part, size, progress)
-        except Dropped as error:
-            done = _size(part)
-            if not pauses or done == kept:
-                remark = f" ({done:,} bytes have arrived and are kept)" if done else ""
-                raise InputError(f"{url}: {error}{remark}") from error
-            time.sleep(pauses.pop(0))
-
-
-def _size(part: Path) -> int:
-    return part.stat().st_size if part.exists() else 0
-
-
-def _receive_rest(url: str, part: Path, size: int, progress: Progress) -> None:
-    """Request the missing rest of `part`; follows redirects and the settings https_proxy and no_proxy."""
-    present = _size(part)
+    """Complete `part` to `size` bytes; follows redirects and the settings https_proxy and no_proxy."""
+    present = part.stat().st_size if part.exists() else 0
+    if present == size:
+        return
     headers = {"User-Agent": "spackle", "Accept-Encoding": "identity"}
     if 0 < present < size:
         headers["Range"] = f"bytes={present}-"
@@ -101,7 +80,7 @@ def _receive_rest(url: str, part: Path, size: int, progress: Progress) -> None:
                 with _network(url):
                     block = response.read1(min(CHUNK, size - done))  # read() would lose the bytes before a break
                 if not block:
-                    raise Dropped(f"the connection ended {size - done:,} bytes early")
+                    raise InputError(f"{url}: the connection ended {size - done:,} bytes early: {AGAIN}")
                 file.write(block)
                 file.flush()
                 done += len(block)
@@ -111,18 +90,16 @@ def _receive_rest(url: str, part: Path, size: int, progress: Progress) -> None:
 
 @contextlib.contextmanager
 def _network(url: str) -> Iterator[None]:
-    """Raises Dropped if the server cannot be reached, InputError if it does not give the file."""
+    """InputError if the server cannot be reached, or does not give the file."""
     try:
         yield
     except HTTPError as error:
         with error:
             status = f"the server answers HTTP {error.code} {responses.get(error.code, '')}".rstrip()
-        if error.code >= 500 or error.code == 429:
-            raise Dropped(f"{status}: try again later") from error
-        raise InputError(f"{url}: {status}: check the address, or give another") from error
+        raise InputError(f"{url}: {status}: check the address, or try again later") from error
     except (OSError, HTTPException) as error:
         reason = reason_in_a_line(error.reason if isinstance(error, URLError) else error)
-        raise Dropped(f"no connection ({reason}): check network, https_proxy and clock, and try again") from error
+        raise InputError(f"{url}: no connection ({reason}): check network and https_proxy, then {AGAIN}") from error
 
 
 def _first_byte(url: str, response: HTTPResponse, present: int, size: int) -> int:

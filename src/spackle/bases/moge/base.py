@@ -67,8 +67,7 @@ class MogeBase:
         the default. The sky lies behind all surfaces. InputError if the network finds no surface, or memory is short.
         """
         photo = resize_photo(photo)
-        least, most = self.network.config.num_tokens_range
-        tokens = min(max(TOKENS, least), most)
+        tokens = min(max(TOKENS, self.network.least_tokens), self.network.most_tokens)
         rows, columns = token_grid(photo.height, photo.width, tokens)
         size = min((FINEST * rows, FINEST * columns), (photo.height, photo.width))  # `lift` enlarges
         known = not photo.focal_source.startswith("default")
@@ -85,7 +84,7 @@ class MogeBase:
             raise InputError(f"{photo.path}: MoGe finds no surface: give another photo, or --base lite")
         depth = torch.where(view.surface, view.depth.where(valid, 0.0), SKY * view.depth[valid].max())
         depth_map = DepthMap(depth, valid | ~view.surface, None, None, "depth", photo.path)
-        prediction = lift_guess(photo, depth_map, camera, progress)
+        prediction = lift_guess(photo, depth_map, camera)
         notes = {**prediction.notes, "precision": self.precision, "depth_scale": "metric, by the model"}
         return dataclasses.replace(prediction, notes=notes, lens_source=lens_source)
 

@@ -10,16 +10,15 @@ import dataclasses
 import functools
 import math
 import os
-from collections.abc import Sequence
-from typing import Annotated, Literal
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
-from pydantic import BaseModel, Field, ValidationError
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
 from spackle.bases.sharp.encoder import NORM_EPS, TransformerBlock
-from spackle.errors import InputError, one_line, shown
+from spackle.errors import reading, shown
 from spackle.network_file import channels_last, load_strict, read_checkpoint
 
 ADVICE = "give MoGe-2's model.pt as it was downloaded"
@@ -30,43 +29,13 @@ LEVELS = 5  # of a pyramid; each level is twice as fine as the previous level
 FINEST = 2 ** (LEVELS - 1)  # output pixels along a token's side
 conv3 = functools.partial(nn.Conv2d, kernel_size=3, padding=1, padding_mode="replicate")
 
-Count = Annotated[int, Field(ge=0, le=64)]
-Width = Annotated[int, Field(ge=1, le=8192)]
-PerLevel = Field(min_length=LEVELS, max_length=LEVELS)
-ScaleDims = Annotated[list[Width], Field(min_length=4, max_length=4)]
-
-
-class EncoderConfig(BaseModel, strict=True):
-    backbone: Literal["dinov2_vits14", "dinov2_vitb14", "dinov2_vitl14"]
-    intermediate_layers: Annotated[list[Count], Field(min_length=1, max_length=40)]  # blocks whose tokens are used
-    dim_out: Width
-
-
-class PyramidConfig(BaseModel, strict=True, extra="forbid"):
-    """Channels and numbers of blocks of the neck or of a head, for each level from coarse to fine."""
-
-    dim_in: Annotated[list[Width], PerLevel]
-    dim_out: Annotated[list[Width | None], PerLevel] | None  # None: a level's features are its output
-    dim_res_blocks: Annotated[list[Width], PerLevel]
-    num_res_blocks: Annotated[list[Count], PerLevel]
-    dim_times_res_block_hidden: Literal[1] = 1
-    res_block_in_norm: Literal["none"]
-    res_block_hidden_norm: Literal["none"]
-    activation: Literal["relu"] = "relu"
-    resamplers: Annotated[list[Literal["conv_transpose", "bilinear"]], Field(min_length=4, max_length=4)]
-
-
-class MogeConfig(BaseModel, strict=True):
-    """The checkpoint's `model_config`; other keys are ignored."""
-
-    encoder: EncoderConfig
-    neck: PyramidConfig
-    points_head: PyramidConfig
-    mask_head: PyramidConfig
-    normal_head: PyramidConfig | None = None
-    scale_head: Annotated[dict[Literal["dims"], ScaleDims], Field(min_length=1)]
-    remap_output: Literal["exp", "sinh_exp"]
-    num_tokens_range: Annotated[list[Width], Field(min_length=2, max_length=2)]
+MOST_BLOCKS = 64  # of a pyramid's level
+USUAL = {  # options of a pyramid that are the same in all published checkpoints
+    "res_block_in_norm": "none",
+    "res_block_hidden_norm": "none",
+    "dim_times_res_block_hidden": 1,
+    "activation": "relu",
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,14 +80,14 @@ class DinoBackbone(nn.Module):
 class DinoEncoder(nn.Module):
     """Encodes an image to features [1, C, h, w] and the class token [1, C']."""
 
-    def __init__(self, config: EncoderConfig) -> None:
+    def __init__(self, config: Mapping[str, Any]) -> None:
         super().__init__()
-        width, depth, heads = BACKBONES[config.backbone]
-        self.layers = config.intermediate_layers
+        width, depth, heads = BACKBONES[config["backbone"]]
+        self.layers = [range(depth)[layer] for layer in config["intermediate_layers"]]
         self.register_buffer("image_mean", torch.zeros(1, 3, 1, 1))
         self.register_buffer("image_std", torch.ones(1, 3, 1, 1))
         self.backbone = DinoBackbone(width, depth, heads)
-        self.output_projections = nn.ModuleList(nn.Conv2d(width, config.dim_out, 1) for _ in self.layers)
+        self.output_projections = nn.ModuleList(nn.Conv2d(width, config["dim_out"], 1) for _ in self.layers)
 
     def forward(self, image: Tensor, rows: int, columns: int) -> tuple[Tensor, Tensor]:
         size = (PATCH * rows, PATCH * columns)
@@ -146,24 +115,32 @@ def resampler(kind: str, inputs: int, outputs: int) -> nn.Sequential:
     """Layers that double the size of feature maps."""
     if kind == "conv_transpose":
         return nn.Sequential(nn.ConvTranspose2d(inputs, outputs, 2, stride=2), conv3(outputs, outputs))
+    if kind != "bilinear":
+        raise ValueError(f"a resampler is {shown(kind)}")
     return nn.Sequential(nn.Upsample(scale_factor=2, mode="bilinear", align_corners=False), conv3(inputs, outputs))
 
 
 class Pyramid(nn.Module):
     """Features from coarse to fine: each level adds its input to the upsampled output of the coarser one."""
 
-    def __init__(self, config: PyramidConfig) -> None:
+    def __init__(self, config: Mapping[str, Any]) -> None:
         super().__init__()
-        widths, outs = config.dim_res_blocks, config.dim_out or [None] * LEVELS
-        self.input_blocks = nn.ModuleList(map(functools.partial(nn.Conv2d, kernel_size=1), config.dim_in, widths))
+        options = {"dim_times_res_block_hidden": 1, "activation": "relu", **config}
+        for key, value in USUAL.items():
+            if options.get(key) != value:
+                raise ValueError(f"{key} is {shown(options.get(key))}")
+        widths, counts, outs = config["dim_res_blocks"], config["num_res_blocks"], config["dim_out"] or [None] * LEVELS
+        if len(widths) != LEVELS or max(counts) > MOST_BLOCKS:
+            raise ValueError(f"num_res_blocks is {shown(counts)}")
+        self.input_blocks = nn.ModuleList(map(functools.partial(nn.Conv2d, kernel_size=1), config["dim_in"], widths))
         self.res_blocks = nn.ModuleList(
             nn.Sequential(*(ConvBlock(width) for _ in range(count)))
-            for width, count in zip(widths, config.num_res_blocks, strict=True)
+            for width, count in zip(widths, counts, strict=True)
         )
         self.output_blocks = nn.ModuleList(
             nn.Identity() if out is None else nn.Conv2d(width, out, 1) for width, out in zip(widths, outs, strict=True)
         )
-        self.resamplers = nn.ModuleList(map(resampler, config.resamplers, widths[:-1], widths[1:]))
+        self.resamplers = nn.ModuleList(map(resampler, config["resamplers"], widths[:-1], widths[1:]))
 
     def forward(self, inputs: Sequence[Tensor]) -> list[Tensor]:
         """The outputs of all levels [1, C, 2^l·h, 2^l·w] from one input of the same size for each level."""
@@ -179,14 +156,16 @@ class Pyramid(nn.Module):
 class MogeNetwork(nn.Module):
     """Predicts points, mask and metric scale from a photo."""
 
-    def __init__(self, config: MogeConfig) -> None:
+    def __init__(self, config: Mapping[str, Any]) -> None:
+        """Build the network for a checkpoint's `model_config`; raises any exception for an unpublished kind."""
         super().__init__()
-        self.config = config
-        self.encoder = DinoEncoder(config.encoder)
-        self.neck = Pyramid(config.neck)
-        self.points_head, self.mask_head = Pyramid(config.points_head), Pyramid(config.mask_head)
-        self.normal_head = config.normal_head and Pyramid(config.normal_head)  # not run
-        first, second, third = map(nn.Linear, config.scale_head["dims"][:-1], config.scale_head["dims"][1:])
+        self.least_tokens, self.most_tokens = map(int, config["num_tokens_range"])
+        self.plain_exp = {"exp": True, "sinh_exp": False}[config["remap_output"]]
+        self.encoder = DinoEncoder(config["encoder"])
+        self.neck = Pyramid(config["neck"])
+        self.points_head, self.mask_head = Pyramid(config["points_head"]), Pyramid(config["mask_head"])
+        dims = config["scale_head"]["dims"]
+        first, second, third = map(nn.Linear, dims[:-1], dims[1:])
         self.scale_head = nn.Sequential(first, nn.ReLU(), second, nn.ReLU(), third)
 
     def forward(self, image: Tensor, tokens: int, size: tuple[int, int]) -> MogeOutput:
@@ -194,7 +173,7 @@ class MogeNetwork(nn.Module):
         levels, scale = self.features(image, tokens)
         x, y, z = self.decode(self.points_head, levels, size).unbind(-1)
         z = z.exp()
-        x, y = (x * z, y * z) if self.config.remap_output == "exp" else (x.sinh(), y.sinh())
+        x, y = (x * z, y * z) if self.plain_exp else (x.sinh(), y.sinh())
         mask_logits = self.decode(self.mask_head, levels, size)[..., 0]
         return MogeOutput(torch.stack([x, y, z], dim=-1), mask_logits, scale)
 
@@ -233,17 +212,14 @@ def load_network(path: str | os.PathLike[str], dtype: torch.dtype) -> MogeNetwor
     would turn slanted surfaces into stairs. InputError for a missing, broken or foreign file, or too little memory.
     Nothing in the file is executed.
     """
-    content, tensors = read_checkpoint(path, "model_config", ADVICE)
-    try:
-        config = MogeConfig.model_validate(content)
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = one_line(".".join(["model_config", *(str(name)[:60] for name in first["loc"])]))
-        said = f"not a published kind of MoGe-2 ({key}: {first['msg']}, not {shown(first['input'])})"
-        raise InputError(f"{path}: {said}: {ADVICE}") from error
-    with torch.device("meta"):
-        network = MogeNetwork(config)
-    weights = {name.removeprefix("model."): tensor for name, tensor in tensors.items() if name.startswith("model.")}
+    config, tensors = read_checkpoint(path, "model_config", ADVICE)
+    with reading(path, f"not a published kind of MoGe-2 ({{reason}}): {ADVICE}"), torch.device("meta"):
+        network = MogeNetwork(config)  # type: ignore[arg-type]
+    weights = {  # without the head for normals, which Spackle does not use
+        name.removeprefix("model."): tensor
+        for name, tensor in tensors.items()
+        if name.startswith("model.") and not name.startswith("model.normal_head.")
+    }
     return load_strict(network, weights, path, ADVICE, prepare=functools.partial(set_precision, dtype=dtype))
 
 

@@ -6,7 +6,7 @@ import io
 import math
 import re
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
@@ -69,22 +69,19 @@ Boxes = Iterator[tuple[bytes, memoryview]]
 
 
 def turn_of_depth_item(data: bytes) -> str | None:
-    """The turn that the decoded depth map of a HEIF's primary picture still needs.
-
-    None if the picture does not have exactly one auxiliary depth map, or the boxes are broken.
-    """
+    """The turn that a HEIF's depth map still needs after decoding; None without exactly one map or for broken boxes."""
     try:
         content = next(body for kind, body in _boxes(memoryview(data)) if kind == b"meta")
         meta = dict(_boxes(content[4:]))
         (primary,) = struct.unpack_from(">I" if meta[b"pitm"][0] else ">H", meta[b"pitm"], 4)
-        auxiliary, properties = list(_auxiliary(meta[b"iref"], primary)), _properties(meta[b"iprp"])
+        properties = _properties(meta[b"iprp"])
     except (struct.error, KeyError, IndexError, ValueError, StopIteration):
         return None
-    depth = [item for item in auxiliary if _is_depth(properties.get(item, ()))]
-    if len(depth) != 1:  # if there are several, it is unknown which one a decoder picks
+    depth = [boxes for boxes in properties.values() if _is_depth(boxes)]
+    if len(depth) != 1:
         return None
     # A decoder applies the map's turn. Apple turns the picture and leaves the map as the sensor saw it.
-    own, of_primary = (_turn(properties.get(item, ())) for item in (depth[0], primary))
+    own, of_primary = _turn(depth[0]), _turn(properties.get(primary, []))
     return of_primary or "" if own is None else ""
 
 
@@ -99,15 +96,6 @@ def _boxes(body: memoryview) -> Boxes:
             raise ValueError("a box that ends beyond its parent")
         yield kind, body[at + head : at + size]
         at += size
-
-
-def _auxiliary(iref: memoryview, primary: int) -> Iterator[int]:
-    """The items that are auxiliary to the primary one."""
-    number, head = ("I", 6) if iref[0] else ("H", 4)
-    for kind, body in _boxes(iref[4:]):
-        source, count = struct.unpack_from(f">{number}H", body)
-        if kind == b"auxl" and primary in struct.unpack_from(f">{count}{number}", body, head):
-            yield source
 
 
 def _properties(iprp: memoryview) -> dict[int, list[tuple[bytes, memoryview]]]:
@@ -126,12 +114,12 @@ def _properties(iprp: memoryview) -> dict[int, list[tuple[bytes, memoryview]]]:
     return found
 
 
-def _is_depth(properties: Iterable[tuple[bytes, memoryview]]) -> bool:
+def _is_depth(properties: list[tuple[bytes, memoryview]]) -> bool:
     types = {bytes(body[4:]).partition(b"\0")[0] for kind, body in properties if kind == b"auxC"}
     return bool(types & _DEPTH_TYPES)
 
 
-def _turn(properties: Iterable[tuple[bytes, memoryview]]) -> str | None:
+def _turn(properties: list[tuple[bytes, memoryview]]) -> str | None:
     """Rotations and mirrorings, in the order in which they apply; None if there are none."""
     turns = [_TURNS[kind][body[0] % len(_TURNS[kind])] for kind, body in properties if kind in _TURNS and body]
     return "".join(turns) if turns else None
