@@ -12,11 +12,9 @@ import sysconfig
 import venv
 from pathlib import Path
 
-import numpy as np
 import pytest
 from command import page_of
-from photos import picture
-from PIL import Image
+from photos import write_photo
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "quick-start.md").read_text(encoding="utf-8")
@@ -46,9 +44,9 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (wheel,) = folder.glob("*.whl")
     venv.create(folder / "venv")
     python = folder / "venv" / "bin" / "python"
-    wanted = (
-        ["--constraint", ROOT / "constraints.txt", f"{wheel}[train]"] if empty else ["--no-deps", "--no-index", wheel]
-    )
+    wanted = ["--no-deps", "--no-index", wheel]
+    if empty:
+        wanted = ["--constraint", ROOT / "constraints.txt", f"{wheel}[train]"]
     subprocess.run([*pip, "--python", python, "install", *wanted], check=True, timeout=1800, env=ALONE)
     if not empty:
         (own,) = (folder / "venv" / "lib").glob("python*/site-packages")
@@ -59,14 +57,8 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("place")
-    (folder / "photos").mkdir()
-    image = Image.fromarray(picture()).resize((160, 120))
-    image.save(folder / "photo.jpg")
-    for name in ("a", "b", "c"):
-        noise = np.random.default_rng(ord(name)).normal(0, 8, (120, 160, 3))
-        Image.fromarray((np.asarray(image) + noise).clip(0, 255).astype(np.uint8)).save(
-            folder / "photos" / f"{name}.png"
-        )
+    for name, width in (("photo.jpg", 160), ("photos/a.png", 160), ("photos/b.png", 170), ("photos/c.png", 180)):
+        write_photo(folder / name, width, 120)
     return folder
 
 

@@ -10,28 +10,15 @@ import numpy as np
 import pytest
 import scoreboard
 import torch
-from photos import box, picture, write_photo
-from PIL import Image
+from evaluation_data import HEIGHT, WIDTH, write_boxes
 
 from spackle.training.losses import SqueezeNet
-
-WALL_PX, BOX_PX = 4, 12  # disparities
 
 
 @pytest.fixture
 def pairs(tmp_path: Path) -> Path:
-    """A folder with one pair, a box before a wall, and random weights of SqueezeNet."""
-    folder, width, height = tmp_path / "pair", 120, 84
-    write_photo(folder / "left.png", width, height)
-    inside, left = box(width, height), picture(width, height)
-    right = np.roll(left, -WALL_PX, 1)
-    right[np.roll(inside, -WALL_PX, 1)] = (50, 100, 180)  # the wall that the box hides
-    right[np.roll(inside, -BOX_PX, 1)] = left[inside]
-    Image.fromarray(right).save(folder / "right.png")
-    np.save(folder / "disparity.npy", np.where(inside, BOX_PX, WALL_PX).astype(np.float32))
-    facts: dict[str, Any] = {"left": "left.png", "right": "right.png", "disparity": "disparity.npy"}
-    facts |= {"focal_px": 100.0, "cx": width / 2, "cy": height / 2, "doffs_px": 0.0, "baseline_m": 0.2}
-    (folder / "scene.json").write_text(json.dumps(facts))
+    """A folder with one stereo pair, and random weights of SqueezeNet."""
+    write_boxes(tmp_path / "pair", 0)
     torch.manual_seed(0)
     state = {key: value.numpy() for key, value in SqueezeNet().state_dict().items()}
     for ours, theirs in {".conv": "/conv", ".weight": ".w", ".bias": ".b"}.items():
@@ -53,7 +40,7 @@ def test_a_pair_is_measured_and_compared(pairs: Path, capsys: pytest.CaptureFixt
     assert row["photo"] > 30
     assert row["agreement"] >= 45
     assert 0 <= row["HAR"] < 0.5
-    assert 0 < row["aux"] < row["base"] < 1.5 * 120 * 84 / 1000
+    assert 0 < row["aux"] < row["base"] < 1.5 * WIDTH * HEIGHT / 1000
     (pairs / "now.json").rename(pairs / "before.json")
     without = run(pairs, "--against", str(pairs / "before.json"), "--without", "network+texture")
     changed = without["network+texture"]["pair"]
@@ -91,13 +78,3 @@ def test_every_mechanism_can_be_switched_off(pairs: Path, capsys: pytest.Capture
     assert set(runs) == {"default", *scoreboard.MECHANISMS}
     rows = capsys.readouterr().out.splitlines()
     assert all(any(row.startswith(f"| {name} |") for row in rows) for name in scoreboard.MECHANISMS)
-
-
-@pytest.mark.slow
-def test_photos_are_completed_on_a_sheet(tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        write_photo(tmp_path / f"{name}.png", 96, 64)
-    scoreboard.main(["--photos", str(tmp_path), "--without", "texture", "-o", str(tmp_path / "sheet.jpg")])
-    with Image.open(tmp_path / "sheet.jpg") as sheet:
-        width, height = sheet.size
-    assert (width, height) == (2 * 3 * 384, 2 * (scoreboard.PHOTO_HEIGHT + 4))
