@@ -129,31 +129,25 @@ def fingerprint(file: Path, kind: str) -> str:
 
 @contextlib.contextmanager
 def hold(path: Path) -> Iterator[None]:
-    """Lock the file `path` during the block; a killed process leaves it unlocked.
+    """Lock the file `path` during the block; the lock of a killed process is released.
 
     Raises:
-        BlockingIOError: another process has locked it.
+        BlockingIOError: another process has locked the file.
         OSError: the file cannot be created, or the file system has no locks.
     """
-    file = _acquire(path)
-    try:
-        yield
-    finally:
-        with contextlib.suppress(OSError):
-            path.unlink()
-        file.close()
-
-
-def _acquire(path: Path) -> BinaryIO:
-    while True:
-        with contextlib.ExitStack() as stack:
+    with contextlib.ExitStack() as stack:
+        is_ours = False
+        while not is_ours:
             file = stack.enter_context(open(path, "ab"))
             if fcntl is not None:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             with contextlib.suppress(FileNotFoundError):  # the last holder deleted the file before we locked it
-                if os.path.samestat(os.fstat(file.fileno()), os.stat(path)):
-                    stack.pop_all()
-                    return file
+                is_ours = os.path.samestat(os.fstat(file.fileno()), os.stat(path))
+        try:
+            yield
+        finally:
+            with contextlib.suppress(OSError):
+                path.unlink()
 
 
 @contextlib.contextmanager
