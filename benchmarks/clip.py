@@ -25,7 +25,7 @@ from spackle.bases.depth_map import DepthMap
 from spackle.bases.lift import lift
 from spackle.camera import Camera
 from spackle.clips.complete import ClipCompleter, CompletedView
-from spackle.clips.temporal import flicker, pixel_grid, sample
+from spackle.clips.temporal import inside, pixel_grid, sample
 from spackle.color import srgb_to_linear
 from spackle.evaluation.datasets.stereo import load_motorcycle
 from spackle.gaussians import Gaussians
@@ -159,6 +159,16 @@ def judge(world: World, clip: str, frames: int, noisy: bool) -> Sums:
                 compare(sums, name, now[name], past[name])
         past = now
     return sums
+
+
+def flicker(view: Tensor, earlier: Tensor, flow: Tensor, chosen: Tensor) -> float | None:
+    """Mean absolute sRGB difference between a view [H, W, 3] and an earlier view warped by the flow [H, W, 2].
+
+    The mean is over the pixels `chosen` [H, W]; None if there are none.
+    """
+    uv = pixel_grid(flow) + flow
+    chosen = chosen & inside(uv, *chosen.shape)
+    return float((view - sample(earlier, uv)).abs().mean(-1)[chosen].mean()) if bool(chosen.any()) else None
 
 
 def compare(sums: Sums, name: str, now: tuple[CompletedView, Truth], was: tuple[CompletedView, Truth]) -> None:

@@ -15,7 +15,7 @@ from spackle.bases.depth_map import DepthMap
 from spackle.bases.lift import lift
 from spackle.camera import Camera
 from spackle.clips.complete import ClipCompleter, CompletedView
-from spackle.clips.temporal import DepthAlignment, Track, align_depth, extend_flow, flicker, pixel_grid, sample
+from spackle.clips.temporal import DepthAlignment, Track, align_depth, extend_flow, pixel_grid, sample
 from spackle.inpaint.plain import OpenCV
 from spackle.render import CpuRenderer
 from spackle.residual import hole_mask
@@ -101,10 +101,10 @@ def test_propagated_holes_are_calmer_and_no_worse() -> None:
         points, hole = cast(camera, WALL), drawn.hole
         assert not drawn.cut
         if past is not None:
-            flow = past[1].project(points)[0] - pixel_grid(hole)
-            both = hole & (sample(past[0].hole[..., None].float(), pixel_grid(hole) + flow)[..., 0] > 0.999)
-            for k, (one, other) in enumerate(((drawn.alone, past[0].alone), (drawn.view, past[0].view))):
-                flickers[k] += flicker(one.rgb, other.rgb, flow, both) or torch.nan
+            before, uv = past[0], past[1].project(points)[0]
+            both = hole & (sample(before.hole[..., None].float(), uv)[..., 0] > 0.999)
+            for k, (one, other) in enumerate(((drawn.alone, before.alone), (drawn.view, before.view))):
+                flickers[k] += (one.rgb - sample(other.rgb, uv)).abs().mean(-1)[both].mean()
         errors += torch.stack([(v.rgb - paint(points))[hole].square().mean() for v in (drawn.alone, drawn.view)])
         past = (drawn, camera)
     assert float(flickers[1]) < 0.6 * float(flickers[0])

@@ -5,9 +5,8 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-import pytest
 import torch
-from holes import CPU, CountingNetwork, box_view, features_of, shipped
+from holes import CountingNetwork, features_of, shipped
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import Scene, texture
@@ -15,10 +14,7 @@ from scenes import Scene, texture
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, extremes
 from spackle.crop import crops_around
-from spackle.residual import hole_area_ratio
 from spackle.residual.network import STRIDE, predict_deltas
-from spackle.scene_fill import fill_scene
-from spackle.scene_fill.fill import SEEDS_HAR
 
 
 @settings(deadline=None, max_examples=60)
@@ -62,15 +58,3 @@ def test_crops_give_what_the_whole_picture_gives() -> None:
     assert float(difference.mean()) < min(1e-3, 0.1 * float((bf16 - other)[mask].abs().mean()))
     predict_deltas(nothing, dataclasses.replace(view[0], mask=torch.zeros_like(mask)), *view[1:])
     assert nothing.cells == 0
-
-
-@pytest.mark.parametrize(
-    ("disparity", "exact", "asked"), [(0.006, False, False), (0.006, True, True), (0.3, False, True)]
-)
-def test_specks_of_a_path_are_the_seeds_alone(disparity: float, exact: bool, asked: bool) -> None:
-    context, camera = box_view(disparity, width=160, height=120)
-    counting = CountingNetwork(shipped())
-    context = dataclasses.replace(context, network=counting)  # type: ignore[arg-type]
-    assert (hole_area_ratio(CPU.render(context.base, camera).alpha) < SEEDS_HAR) == (disparity < 0.1)
-    assert len(fill_scene(context, [camera], exact=exact).aux) > 0
-    assert bool(counting.cells) == asked

@@ -262,16 +262,6 @@ def _recoloured(aux: Gaussians, camera: Camera, change: Tensor, share: Tensor) -
     return dataclasses.replace(aux, colors=(aux.colors + picked).clamp(0, 1))
 
 
-def flicker(view: Tensor, earlier: Tensor, flow: Tensor, chosen: Tensor) -> float | None:
-    """Mean absolute sRGB difference between a view [H, W, 3] and an earlier view warped by the flow [H, W, 2].
-
-    The mean is over the pixels `chosen` [H, W]; None if there are none.
-    """
-    uv = pixel_grid(flow) + flow
-    chosen = chosen & inside(uv, *chosen.shape)
-    return float((view - sample(earlier, uv)).abs().mean(-1)[chosen].mean()) if bool(chosen.any()) else None
-
-
 @dataclasses.dataclass(frozen=True)
 class DepthAlignment:
     """An affine map of inverse depth in the photo's camera: scale · 1/z + shift."""

@@ -37,7 +37,6 @@ SQUEEZED = dict(enumerate([(96, 16), (128, 16), (128, 32), (256, 32), (256, 48),
 class FeatureNet(nn.Module):
     """Maps [B, 3, H, W] sRGB 0..1 to four feature maps [B, C, h, w], fine to coarse; weights get no gradients."""
 
-    name: str  # in reports
     head: str  # prefix of the classifier's tensors, which are ignored
 
 
@@ -65,7 +64,7 @@ class ResNet50(FeatureNet):
     Outputs of layer1 to layer4: 256, 512, 1024, 2048 channels at 1/4, 1/8, 1/16, 1/32 of the image's size.
     """
 
-    name, head = "resnet50", "fc."
+    head = "fc."
 
     def __init__(self) -> None:
         super().__init__()
@@ -102,7 +101,7 @@ class SqueezeNet(FeatureNet):
     Outputs of conv1, fire4, fire8, fire9: 96, 256, 512, 512 channels at about 1/2, 1/4, 1/8, 1/16 of the image's size.
     """
 
-    name, head = "squeezenet", "conv10."
+    head = "conv10."
 
     def __init__(self) -> None:
         super().__init__()
