@@ -4,8 +4,8 @@ python benchmarks/gpu.py [-o gpu.md] [-c SHARP.pt] [--only STEP,...]
 
 Each step runs in its own process, because a fault in a kernel ends the process, and the report states what the step
 must show. A step that cannot run here is skipped with its reason; without a GPU this applies to all, as a dry run. The
-file is rewritten after each step and is meant for docs/performance.md. `spackle weights make sharp.pt` makes weights
-for -c.
+file is rewritten after each step and is meant for docs/performance.md. `benchmarks/random_weights.py sharp.pt` makes
+weights for -c.
 """
 
 from __future__ import annotations

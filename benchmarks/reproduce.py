@@ -25,11 +25,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image
+from random_weights import deterministic_weights
 from safetensors.torch import load_file, save_file
 from skimage import data as pictures
 from torch.nn.functional import grid_sample, interpolate, unfold
 
-from spackle.bases.sharp.base import load_network, to_square
+from spackle.bases.sharp.base import expected_shapes, load_network, to_square
 from spackle.bases.sharp.encoder import MICRO, WINDOWS
 from spackle.evaluation.datasets import stereo
 
@@ -261,7 +262,7 @@ def main() -> None:
     if out.exists():
         parser.error(f"{out}: is there already: give another folder with -o")
     make_data(out / "data", out / "photos")
-    run(out, "spackle weights make random.safetensors --size micro")
+    save_file(deterministic_weights(expected_shapes(MICRO)), out / "random.safetensors")
     fit_sharp(out / "random.safetensors", out / "sharp.safetensors")
     for line in commands():
         run(out, line)

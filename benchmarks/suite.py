@@ -2,7 +2,7 @@
 
 python benchmarks/suite.py [-o FOLDER] [--only SECTION,...] [--runs N] [--device cuda] [-c SHARP.pt] [--residual FILE]
 
-Needs no dataset and no weights; SHARP is timed if -c gives a file, as made by `spackle weights make`. Writes suite.json
+Needs no dataset and no weights; SHARP is timed if -c gives a file, as made by `random_weights.py`. Writes suite.json
 (every run's value) and suite.md after each section. A section that cannot run here is listed with its reason. Tasks
 that are compared take turns within one process, after one untimed turn, which compiles.
 """

@@ -25,7 +25,7 @@ ELSEWHERE = {
     "lite-card.md": "src/spackle/weights/lite.md",
 }
 CODE = {"python.md": "src/spackle/__init__.py", "commands.md": "src/spackle/cli/commands.py"}  # what a page is made of
-COMMANDS = ("predict", "view", "render", "export", "info", "demo", "weights get", "weights list", "weights make")
+COMMANDS = ("predict", "view", "render", "export", "info", "demo", "weights get", "weights list")
 COMMANDS += ("train", "dataset build", "dataset info", "dataset verify", "dataset preview", "evaluate", "tables")
 COMMANDS += ("bench",)
 EXAMPLE = re.compile(r"^`(examples/\w+\.py)`$", re.MULTILINE)  # what a line with nothing but a link becomes

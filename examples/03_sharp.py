@@ -2,8 +2,8 @@
 
 python examples/03_sharp.py sharp.pt out photo.jpg...
 
-`spackle weights get sharp` downloads Apple's weights, for research only. `spackle weights make sharp.pt` makes random
-weights: their scenes are meaningless, but their times are those of Apple's.
+`spackle weights get sharp` downloads Apple's weights, for research only. `python benchmarks/random_weights.py sharp.pt`
+makes random weights: their scenes are meaningless, but their times are those of Apple's.
 """
 
 import sys

@@ -35,8 +35,7 @@ class Run:
 
     @property
     def lines(self) -> list[str]:
-        """Lines of the log without the notice about kernels that are not yet compiled."""
-        return [line for line in self.err.splitlines() if not line.startswith("first use: ")]
+        return self.err.splitlines()
 
 
 def run(*arguments: object) -> Run:

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 import torch
+from random_weights import deterministic_weights
 from torch import Tensor
 
 from spackle.bases.moge.network import MogeNetwork, MogeOutput
-from spackle.cli.weights import deterministic_weights
 
 
 def settings(features: int, widths: list[int], blocks: tuple[list[int], list[int]], scale: list[int]) -> dict[str, Any]:

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from random_weights import deterministic_weights
 from safetensors.torch import save_file
 from torch import Tensor
 
 from spackle.bases.sharp.base import expected_shapes
 from spackle.bases.sharp.encoder import LAYERS, MICRO, STRIDE, SharpConfig
 from spackle.bases.sharp.network import SharpNetwork
-from spackle.cli.weights import deterministic_weights
 
 DATA = Path(__file__).parent / "data"
 

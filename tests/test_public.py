@@ -21,7 +21,7 @@ load_cameras load_depth load_photo load_ply predict save_ply
 """
 COMMANDS = """
 bench; dataset build; dataset info; dataset preview; dataset verify; demo; evaluate; export; figures; info; predict;
-render; serve; tables; train; view; weights get; weights list; weights make
+render; serve; tables; train; view; weights get; weights list
 """
 
 

@@ -9,7 +9,6 @@ from typing import Any, TypeVar, cast
 import numba
 import numpy as np
 from numba.core.dispatcher import Dispatcher
-from numba.core.registry import cpu_target
 from numpy.typing import NDArray
 
 R = TypeVar("R")
@@ -37,13 +36,6 @@ def reordering_kernel(function: Callable[..., R]) -> Callable[..., R]:
 def inlined_kernel(function: Callable[..., R]) -> Callable[..., R]:
     """A `kernel` that is inlined into the calling loops, which allows vector instructions."""
     return _compiled(function, _FASTMATH, forceinline=True)
-
-
-def is_compiled(function: Callable[..., Any]) -> bool:
-    """Whether machine code of a kernel for this CPU is cached on disk; true also if the cache is off."""
-    kept = _kept(function)
-    processor = cpu_target.target_context.codegen().magic_tuple()
-    return kept is None or any(key[1] == processor for key in kept._load_index())
 
 
 def _compiled(function: Callable[..., R], fastmath: set[str], **more: Any) -> Callable[..., R]:

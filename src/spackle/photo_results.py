@@ -15,7 +15,6 @@ from torch import Tensor
 import spackle
 from spackle.bases import BasePrediction
 from spackle.bases.open import ResolvedBase
-from spackle.bases.settings import AUTO, AUTO_NETWORKS, BaseSettings
 from spackle.files import file_records, results_folder, whole_set, write_json
 from spackle.formats import save_gray_png, save_ply, save_png, save_video
 from spackle.formats.depth import save_depth
@@ -29,49 +28,55 @@ from spackle.residual import hole_area_ratio, hole_mask
 REPORT = "report.json"
 
 
+@dataclasses.dataclass(frozen=True)
+class PhotoOptions:
+    """Options of reading a photo, and the files to write; other options belong to the pipeline."""
+
+    lens: Mapping[str, float | None]  # `focal_px`, `focal_mm` and `fov`, as `load_photo` takes them
+    render: bool = True  # write a video
+    keep_base: bool = False  # write base.ply, the Gaussians of what the photo shows
+    depth_out: str | None = None  # write the photo's depth, under this name
+    keep_frame: bool = False  # keep a uniform frame around the photo
+
+
 def predict_photo(
     path: Path,
     folder: Path,
     pipeline: Pipeline,
     reporter: Reporter,
-    *,
-    lens: Mapping[str, float | None],
-    keep_frame: bool = False,
-    keep_base: bool = False,
-    depth_out: str | None = None,
-    render: bool = True,
+    wanted: PhotoOptions,
     request: str | None = None,
 ) -> None:
-    """Predict one photo into `folder`: scene.ply, report.json, a video with `render`, and views/ with --cameras.
+    """Predict one photo into `folder`: scene.ply, report.json, and the files that `wanted` and --cameras add.
 
-    `keep_base` adds base.ply, the photo's own Gaussians, and `depth_out` a file of that name, the photo's depth.
-    `lens` and `keep_frame` are as for `load_photo`; the report stores the digest `request`. The files move to their
-    places once all are complete. InputError for a photo, a depth map or a folder that cannot be used.
+    The report stores the digest `request`. The files move to `folder` once all are complete.
+
+    Raises:
+        InputError: the photo, its depth map or the folder cannot be used.
     """
     reporter, options = reporter.restarted(), pipeline.options
     with reporter.stage("load"):
-        photo = load_photo(path, keep_frame=keep_frame or options.give_geometry, **lens)
+        photo = load_photo(path, keep_frame=wanted.keep_frame or options.give_geometry, **wanted.lens)
     video_file = f"video{options.path.video.suffix}"
     with contextlib.ExitStack() as folders:
-        wanted = {"base.ply": keep_base, "scene.ply": True, REPORT: True, video_file: render, depth_out: depth_out}
-        files = [file for file, is_wanted in wanted.items() if file and is_wanted]
+        files = ["base.ply"] * wanted.keep_base + ["scene.ply", REPORT] + [video_file] * wanted.render
+        files += [wanted.depth_out] if wanted.depth_out else []
         folders.enter_context(results_folder(folder, files, alone=True))
         stills = range(len(pipeline.given_views or []))
         if stills:
             pictures = [f"{index:04d}{kind}.png" for index in stills for kind in ("", "_base", "_mask")]
             folders.enter_context(results_folder(folder / "views", pictures))
         done = pipeline.complete(photo, reporter)
-        _warn_of_rougher(done, folder, options.base, reporter)
         scene, views = done.scene, done.views
         new = folders.enter_context(whole_set(folder, REPORT))
         with reporter.stage("write"):
-            parts = {"scene.ply": scene.gaussians} | ({"base.ply": scene.base} if keep_base else {})
+            parts = {"scene.ply": scene.gaussians} | ({"base.ply": scene.base} if wanted.keep_base else {})
             for file, part in parts.items():
                 save_ply(part, new / file, camera=scene.camera, base_count=len(scene.base), disparity=scene.disparity)
-            if depth_out is not None:
-                save_depth(scene.depth_map(pipeline.renderer), new / depth_out)
+            if wanted.depth_out is not None:
+                save_depth(scene.depth_map(pipeline.renderer), new / wanted.depth_out)
         video = None
-        if render:
+        if wanted.render:
             video = views.maker.note(video_file, views.cameras[views.frames[0][0]], len(views.frames))
             with reporter.stage("video") as step:
                 save_views(done, new / video_file, pipeline.renderer, step)
@@ -110,7 +115,7 @@ def predict_photo(
 
 
 def save_views(done: CompletedPhoto, path: Path, renderer: Renderer, step: Step) -> None:
-    """Write the planned views, all of one size, as a video; InputError for a file that cannot be written."""
+    """Write the planned views, which have one size, as a video; InputError if the file cannot be written."""
     views, video = done.views, done.views.maker.options
 
     def frames() -> Iterator[Tensor]:
@@ -139,7 +144,7 @@ def _save_pictures(done: CompletedPhoto, folder: Path, renderer: Renderer, step:
 
 @torch.no_grad()
 def _measure_holes(done: CompletedPhoto, renderer: Renderer) -> list[dict[str, Any]]:
-    """HAR (eq. 11) of each measured view, before and after completion."""
+    """Measure HAR (eq. 11) of each measured view, before and after completion."""
 
     def har(gaussians: list[Gaussians], view: int) -> float:
         return hole_area_ratio(renderer.render(gaussians, done.views.cameras[view]).alpha)
@@ -156,7 +161,6 @@ def shared_report(
     """The fields that the reports of a photo and of a clip share, ready for JSON."""
     path, weights = pipeline.options.path, pipeline.options.fill.weights
     given = path.cameras or path.path
-    reach = "photo" if "usual_disparity" in prediction.notes else f"default of {choice.base}"
     report: dict[str, Any] = {
         "spackle": spackle.__version__,
         "focal_px": round(prediction.camera.focal[0], 3),
@@ -164,26 +168,11 @@ def shared_report(
         "base": {"name": choice.base, "chosen": choice.why, "gaussians": len(prediction.gaussians)},
         "residual": {"weights": weights},
         "views": given.name if given else path.trajectory,
-        "disparity_source": None if given else "--disparity" if path.disparity is not None else reach,
         "seconds": {**reporter.seconds, "total": round(sum(reporter.seconds.values()), 3)},
     }
     if choice.failures:
         report["base"]["passed_over"] = list(choice.failures)
-    if weights == "seeds":
-        report["residual"]["note"] = "no trained weights: the seeds alone filled the holes"
     return report
-
-
-def _warn_of_rougher(done: CompletedPhoto, folder: Path, base: BaseSettings, reporter: Reporter) -> None:
-    """Warn if rougher results would replace those of a network whose weights are now damaged or missing."""
-    before, now = earlier_report(folder).get("base"), done.choice.base
-    better = before.get("name") if isinstance(before, dict) else None
-    if base.named == AUTO and better in AUTO_NETWORKS and now in AUTO_NETWORKS[AUTO_NETWORKS.index(better) + 1 :]:
-        file = base.files.get(str(better))
-        reporter.log(
-            f"{done.photo.path.name}: warning: {folder} was made by {better}, and the rougher {now} now replaces it: "
-            f"{done.choice.why}{'' if file is None else f' ({file})'}"
-        )
 
 
 def earlier_report(folder: Path) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import torch
 from photos import picture
+from random_weights import deterministic_weights
 from safetensors.torch import save_file
 from scenes import shifted
 from sharp_weights import MICRO
@@ -19,7 +20,6 @@ from torch import Tensor
 from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.base import NOTE, Owner, decoder_bytes, expected_shapes, link_owner
 from spackle.camera import Camera
-from spackle.cli.weights import deterministic_weights
 from spackle.errors import InputError
 from spackle.gaussians import Gaussians
 from spackle.image import Photo

@@ -26,8 +26,6 @@ from spackle.errors import InputError
 from spackle.formats import PlyFile
 from spackle.image import Photo
 
-NO_DEPTH, NO_MODEL = "no depth in the photo", "no MoGe weights here"
-
 
 @pytest.fixture(autouse=True)
 def _quick(shipped: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -144,42 +142,26 @@ def install(made: dict[str, Path], tmp_path: Path) -> Path:
 
 
 def test_a_folder_is_done_again_when_weights_come_or_go(
-    tmp_path: Path, made: dict[str, Path], shipped: Path, photos: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, made: dict[str, Path], shipped: Path, photos: Path
 ) -> None:
-    def bad(path: Path, **options: Any) -> None:
-        raise InputError(f"{path}: cut off")
-
-    def again(*options: object) -> tuple[str, list[str]]:
-        """The base of what is made now, and the warnings that it is rougher."""
+    def again(*options: object) -> str:
+        """The base whose results are made now."""
         succeeds(result := predict(tmp_path, photos, *options))
         name: str = report_of(tmp_path / "out" / "a")["base"]["name"]
-        warned = [line for line in result.lines if "was made by sharp" in line]
-        return "done already" if "done already" in result.err else name, warned
+        return "done already" if "done already" in result.err else name
 
     (photos / "b.png").unlink()
-    done = ("done already", list[str]())
-    assert [again(), again()] == [("lite", []), done]
+    assert [again(), again()] == ["lite", "done already"]
     save_file({name: 2 * tensor for name, tensor in load_file(shipped).items()}, shipped)
-    assert [again(), again()] == [("lite", []), done]
+    assert [again(), again()] == ["lite", "done already"]
     sharp = install(made, tmp_path)
-    assert [again(), again()] == [("sharp", []), done]
-    sharp.write_bytes(b"cut")
-    with monkeypatch.context() as patch:
-        patch.setattr(SharpBase, "load", bad)
-        base, (warning,) = again()
-        assert (base, again()) == ("lite", done)
-    assert str(tmp_path / "out" / "a") in warning
-    assert warning.endswith(f"lite now replaces it: {NO_DEPTH}, SHARP cannot be used, {NO_MODEL} ({sharp})")
-    install(made, tmp_path)
-    assert again() == ("sharp", [])
+    assert [again(), again()] == ["sharp", "done already"]
     sharp.unlink()
-    base, (warning,) = again()
-    assert (base, warning.endswith(NO_MODEL)) == ("lite", True)
-    # With depth no network counts.
+    assert again() == "lite"
     words = ("--depth", write_depth(tmp_path / "d.npy"))
-    assert again(*words) == ("rgbd", [])
+    assert again(*words) == "rgbd"
     install(made, tmp_path)
-    assert again(*words, "--base", "rgbd") == done
+    assert again(*words, "--base", "rgbd") == "done already"  # with depth no network counts
 
 
 def test_disparity_of_the_person_else_of_the_photo(tmp_path: Path) -> None:
@@ -192,7 +174,7 @@ def test_disparity_of_the_person_else_of_the_photo(tmp_path: Path) -> None:
     ):
         result = predict(tmp_path, photo, *options)
         report = report_of(tmp_path / "out" / "photo")
-        assert (report["disparity"], report["disparity_source"]) == (far, "photo" if said else "--disparity")
+        assert report["disparity"] == far
         assert said in result.err
         assert PlyFile(tmp_path / "out" / "photo" / "scene.ply").disparity() == far
         assert [row["view"] for row in report["hole_area_ratio"]] == [f"-{far:g}", f"+{far:g}"]

@@ -88,14 +88,6 @@ def test_an_ended_run_leaves_nothing_half_done(tmp_path: Path, pair: tuple[Path,
     assert len(decode(folder / "video.mp4")) == 3
 
 
-def test_a_full_standard_output_is_one_line(scene: Path, tmp_path: Path) -> None:
-    words = [*COMMAND, "export", str(scene), "-o", str(tmp_path / "a.splat"), "--json"]
-    with open("/dev/full", "w") as full:
-        done = subprocess.run(words, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
-    assert done.returncode == 2
-    assert done.stderr.splitlines()[-1] == "error: cannot write to the standard output: No space left on device"
-
-
 def test_no_control_character_of_a_name_reaches_the_terminal(tmp_path: Path, pair: tuple[Path, Path]) -> None:
     evil = tmp_path / "a\x1b]0;owned\x07\x9b2J\n\n\u202e\udcff.png"
     for words in (("predict", evil), ("predict", evil, "--json"), ("export", evil)):

@@ -1,4 +1,4 @@
-"""The demo does what it shows: a real photo, held against the true second one."""
+"""The demo completes a real photo better than 2D inpainting does."""
 
 from __future__ import annotations
 
@@ -35,19 +35,13 @@ def test_the_demo_fills_the_hole_better_than_2d_inpainting(tmp_path: Path, monke
     assert merged.body[: len(base.body)] == base.body
     assert (base.count, merged.count - base.count) == (report["base_gaussians"], report["aux_gaussians"])
     assert size_of(folder / "right_view.png") == size_of(folder / "right_photo.png") == SIZE
-    width, height = size_of(folder / "comparison.png")
-    assert (width > 3 * SIZE[0], height > 2 * SIZE[1]) == (True, True)
+    assert size_of(folder / "comparison.png") == (2 * SIZE[0] + 2, 2 * SIZE[1])  # made even
     frames = decode(folder / "video.mp4")
     assert (len(frames), frames[0].width, frames[0].height) == (30, SIZE[0] + 1, SIZE[1])  # made even
-    # The scores.
-    psnr, ssim = report["right_camera"]["psnr"], report["right_camera"]["ssim"]
+    psnr = report["right_camera"]["psnr"]
     hole = {name: score["in_hole"] for name, score in psnr.items()}
-    sharp = report["right_camera"]["sharpness"]
     assert max(hole[INPAINTING], hole["base"]) + 0.5 < min(hole[SPACKLE], hole[TRAINED])
     assert min(hole[SPACKLE], hole[TRAINED]) >= 16.5
-    assert 1.3 * sharp[SPACKLE] < sharp[TRAINED] < 1.1
-    assert sharp["base"] < sharp[INPAINTING] < sharp[TRAINED]
-    assert min(ssim[SPACKLE], ssim[TRAINED]) > ssim[INPAINTING] + 0.03  # sharp texture gains none over smooth seeds
     assert psnr["base"]["outside"] - psnr[SPACKLE]["outside"] <= 0.1
     assert psnr["base"]["outside"] - psnr[TRAINED]["outside"] <= 0.05
     before, after = (report["hole_area_ratio"][key] for key in ("before", "after"))
@@ -55,10 +49,10 @@ def test_the_demo_fills_the_hole_better_than_2d_inpainting(tmp_path: Path, monke
     assert 0.02 < before < 0.5
     assert after <= 0.03 * before
     assert report["right_camera"]["har_after"] <= 0.03 * report["right_camera"]["har_before"]
-    for name, score in psnr.items():  # the table shows the report's numbers
+    for name, score in psnr.items():  # the table has the report's numbers
         row = next(line for line in result.err.splitlines() if name in line)
         printed = [float(number) for number in re.findall(r"(\d+\.\d+)", row)]
-        assert printed == pytest.approx([score["in_hole"], ssim[name], sharp[name], score["outside"]], abs=0.006)
+        assert printed == pytest.approx([score["in_hole"], score["outside"]], abs=0.006)
 
 
 def test_without_scikit_image_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -68,7 +68,7 @@ def test_predict_writes_a_scene_a_video_and_a_report(plain: tuple[Path, Run]) ->
     assert (report["focal_source"], report["mode"], report["disparity"]) == ("default 30 mm", "scene", 0.07)
     assert report["focal_px"] == pytest.approx(film_to_pixels(30, WIDTH, HEIGHT), abs=1e-3)
     assert report["photo"] == {"file": "photo.png", "width": WIDTH, "height": HEIGHT}
-    assert (report["views"], report["disparity_source"]) == ("rotate-forward", "photo")
+    assert report["views"] == "rotate-forward"
     assert [view["view"] for view in report["hole_area_ratio"]] == ["-0.07", "+0.07"]
     for view in report["hole_area_ratio"]:
         assert 0.1 < view["before"] < 0.13
@@ -160,8 +160,7 @@ def test_weights_and_texture_are_named_and_change_the_scene(
             monkeypatch.setattr("spackle.pipeline.SHIPPED", tmp_path / "none.safetensors")
         predicted(*pair, tmp_path, "--no-render", *words)
         report = report_of(tmp_path / "photo")
-        note = {"note": "no trained weights: the seeds alone filled the holes"} if named == "seeds" else {}
-        assert report["residual"] == {"weights": named, "fill": texture, **note}
+        assert report["residual"] == {"weights": named, "fill": texture}
         assert read_ply(tmp_path / "photo" / "scene.ply").row(0) == read_ply(plain[0] / "scene.ply").row(0)
         requests.append(report["request"])
         scenes.append((tmp_path / "photo" / "scene.ply").read_bytes())
@@ -199,7 +198,7 @@ def test_odd_file_names(tmp_path: Path, name: str) -> None:
 
 def test_a_bad_photo_of_a_folder_stops_nothing_else(tmp_path: Path) -> None:
     photos, depths = tmp_path / "photos", tmp_path / "depths"
-    for name in ("a.jpg", "a.png", "a.jpg.png", "b.PNG", ".hidden.png", "e.png", "f.png"):
+    for name in ("a.jpg", "a.png", "b.PNG", ".hidden.png", "e.png", "f.png"):
         write_photo(photos / name)
     for name in ("notes.txt", "c.png"):
         (photos / name).write_text("not a photo")
@@ -207,26 +206,24 @@ def test_a_bad_photo_of_a_folder_stops_nothing_else(tmp_path: Path) -> None:
     (photos / "d.png").write_bytes((photos / "a.png").read_bytes()[:100])
     for name in ("a.npy", "b.png", "c.npy", "d.npy"):
         write_depth(depths / name)
-    write_depth(depths / "a.jpg.npy", metres(far=9))
     write_depth(depths / "f.npy", np.zeros((HEIGHT, WIDTH), np.float32))
     result = run("predict", photos, "--depth", depths, "-o", tmp_path / "out", *SHORT)
     assert result.code == 1, result.err
-    assert names_in(tmp_path / "out") == {"a.jpg", "a.png", "a.jpg.png", "b"}  # none collide
+    assert names_in(tmp_path / "out") == {"a.jpg", "a.png", "b"}  # none collide
     for name in names_in(tmp_path / "out"):
         assert names_in(tmp_path / "out" / name) == FILES
-        far = 9 if name.startswith("a.jpg") else 6
-        assert read_ply(tmp_path / "out" / name / "scene.ply").row(0)["z"] == pytest.approx(far, rel=1e-3)
+        assert read_ply(tmp_path / "out" / name / "scene.ply").row(0)["z"] == pytest.approx(6, rel=1e-3)
     errors = [line for line in result.lines if line.startswith("error: ")]
     assert all(bad in line for bad, line in zip(("c.png", "d.png", "e.png", "f.npy"), errors, strict=True))
-    assert result.lines[-1] == "4 of 8 photos failed"
+    assert result.lines[-1] == "4 of 7 photos failed"
 
 
-def test_several_photos_a_folder_and_a_pattern_share_a_run(tmp_path: Path) -> None:
-    names = ("a.png", "more/b.jpg", "wild1.png", "wild2.png")
+def test_several_photos_and_a_folder_share_a_run(tmp_path: Path) -> None:
+    names = ("a.png", "more/b.jpg")
     photos, out = [write_photo(tmp_path / name) for name in names], tmp_path / "out"
-    given = (photos[0], tmp_path / "more", tmp_path / "w*[0-9].png", "--depth", write_depth(tmp_path / "d.npy"))
+    given = (photos[0], tmp_path / "more", "--depth", write_depth(tmp_path / "d.npy"))
     result = run("predict", *given, "-o", out, *SHORT)
-    assert (result.code, names_in(out)) == (0, {"a", "b", "wild1", "wild2"}), result.err
+    assert (result.code, names_in(out)) == (0, {"a", "b"}), result.err
     scene = f"Look at {out / 'NAME' / 'video.mp4'}, or into the scene: spackle view {out / 'NAME' / 'scene.ply'}"
     assert result.lines[-1] == scene
     refuses(run("predict", photos[1], write_photo(tmp_path / "other" / "b.jpg"), "-o", out), "has the same name")

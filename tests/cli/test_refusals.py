@@ -54,7 +54,6 @@ PREDICT = [
     *((f"--sharp {value}", "--sharp") for value in ("windows=1", "windws=1", "windows=many", "compile")),
     *((f"--residual {file}.safetensors", f"{file}.safetensors") for file in ("nowhere", "bad")),
     *((f"{option} 0", option) for option in ("--workers", "--threads")),
-    *((f"--no-render {option}", option) for option in ("--fps 24.0", "--loop 2", "--format webm")),
     ("--depth-out depth.tiff", "depth.tiff"),
     ("--depth-out a/depth.npy", "--depth-out a/depth.npy"),
     ("--precision bf16", "--precision"),

@@ -13,8 +13,7 @@ from sharp_weights import gaussians_of, tiny_weights, write_tiny
 from stand_in import QUICK
 
 from spackle.bases.sharp import SharpBase
-from spackle.bases.sharp.base import load_network
-from spackle.bases.sharp.encoder import MICRO, TINY
+from spackle.bases.sharp.encoder import MICRO
 from spackle.device import pick_dtype
 
 
@@ -66,15 +65,3 @@ def test_the_network_is_not_loaded_for_what_cannot_be(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(SharpBase, "load", lambda *args, **options: pytest.fail("loaded"))
     assert run("predict", wrong[0], "-o", *wrong[1:], "--base", "sharp", "-c", weights, *QUICK).code == 2
-
-
-@pytest.mark.parametrize("suffix", [".pt", ".safetensors"])
-def test_anyone_can_make_weights_to_try_it_with(tmp_path: Path, suffix: str) -> None:
-    result = run("weights", "make", tmp_path / f"tiny{suffix}", "--size", "tiny")
-    assert result.code == 0, result.err
-    assert "show no scene" in result.err
-    network, weights = load_network(tmp_path / f"tiny{suffix}", torch.float32), tiny_weights(TINY)
-    assert all(torch.equal(tensor, weights[name]) for name, tensor in network.state_dict().items())
-    result = run("weights", "make", tmp_path / "three.bin", "--size", "tiny")
-    assert result.code == 2
-    assert ".safetensors" in result.err

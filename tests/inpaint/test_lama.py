@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from random_weights import lama_weights
 from safetensors.torch import save_file
 from sharp_weights import waves
 from torch import Tensor
 
-from spackle.cli.weights import lama_weights
 from spackle.errors import InputError
 from spackle.inpaint import InpainterOptions, get_inpainter
 from spackle.inpaint.lama import MARGIN, LamaInpainter, LamaNetwork, expected_shapes, groups_of, load_network, padded

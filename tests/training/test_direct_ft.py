@@ -12,13 +12,13 @@ import torch
 from command import Run, refuses, report_of, run
 from photos import picture, read_ply, write_photo
 from PIL import Image
+from random_weights import deterministic_weights
 from safetensors.torch import save_file
 from torch import Tensor
 from training_runs import losses_of, one_thread, run_two, state
 
 from spackle.bases.sharp.base import PARTS, expected_shapes
 from spackle.bases.sharp.encoder import MICRO
-from spackle.cli.weights import deterministic_weights
 from spackle.dataset import DatasetFiles
 from spackle.dataset.shards import load_manifest
 from spackle.render import get_renderer

@@ -30,10 +30,10 @@ WIDTH = 80
 
 
 class Overview(TyperGroup):
-    """The command group; its help shows examples, then one line for each command, those of RESEARCH last."""
+    """The command group; its help shows examples, then a line for each command, with the commands in RESEARCH last."""
 
     def format_help(self, ctx: typer.Context, formatter: object) -> None:  # type: ignore[override]
-        """Write the help so that it fits into 24 lines of 80 characters."""
+        """Write the help, in 24 lines of 80 characters."""
         write = formatter.write  # type: ignore[attr-defined]
         rows = [(name, command) for name in self.list_commands(ctx) if (command := self.get_command(ctx, name))]
         indent = max(len(name) for name, _ in rows) + 4
@@ -55,7 +55,7 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # its panels leave only a third of the width for the text
-    # Names of options and of their choices may be typed with underscores.
+    # Users may type the names of options and choices with underscores.
     context_settings={
         "help_option_names": ["-h", "--help"],
         "token_normalize_func": lambda name: name.replace("_", "-"),
@@ -98,16 +98,14 @@ def everywhere(
 
 def main() -> None:
     """Entry point: bad input is one line and exit code 2."""
-    # torch reads this as it is loaded. Its idle threads would otherwise spin, which makes completion three to five
-    # times slower if other programs use the cores, too.
+    # Otherwise idle threads of torch spin, which slows completion down by a factor of three to five on busy cores.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    # Python's collector would otherwise scan the 200,000 lasting objects of torch and numba again and again.
+    # Otherwise the garbage collector scans the 200,000 objects of torch and numba too often.
     gc.set_threshold(50_000)
     if threading.current_thread() is threading.main_thread():  # let SIGTERM run every `finally`, too
         signal.signal(signal.SIGTERM, _end)
     try:
         code = app(standalone_mode=False)
-        sys.stdout.flush()
     except InputError as error:
         _fail(str(error))
     except TyperException as error:  # an unknown option, or text in place of a number
@@ -115,19 +113,13 @@ def main() -> None:
             print(error.format_message(), file=sys.stderr)
             sys.exit(2)
         _fail(error.format_message())
-    except OSError as error:
-        if error.filename is not None:
-            raise
-        with contextlib.suppress(OSError, ValueError):  # Python would try to write again as it ends
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        _fail(f"cannot write to the standard output: {error.strerror or error}")
     if code == INTERRUPTED:
         print("interrupted", file=sys.stderr)
     sys.exit(code)
 
 
 def run() -> NoReturn:
-    """Run `main` and end the process at once: Python would need half a second to tear down torch."""
+    """Run `main` and end the process at once, because Python needs half a second to free torch."""
     code: object = 0
     try:
         main()

@@ -3,63 +3,60 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from statistics import fmean as mean
 
 from spackle.bases import BasePrediction
 from spackle.bases.depth_map import RELATIVE
 from spackle.bases.open import ResolvedBase
-from spackle.cli.photo import PredictOptions
 from spackle.clips.complete import ClipCompleter, CompletedView
 from spackle.clips.files import ClipWriter, clip_frames, read_clip
 from spackle.errors import InputError
 from spackle.files import file_records, results_folder, whole_set, write_json
 from spackle.image import Photo, focal_length, resize_photo
 from spackle.inpaint.plain import OpenCV
-from spackle.photo_results import shared_report
+from spackle.photo_results import PhotoOptions, shared_report
 from spackle.pipeline import Options, Pipeline, move_in_words
-from spackle.progress import Reporter, timed
+from spackle.progress import Reporter
 from spackle.residual import hole_area_ratio
 from spackle.video_frames import VideoOptions
 from spackle.views import choose_move
 
 FILES = ("video.mp4", "report.json")
-# Frames are named by their numbers, so that a folder may hold a depth map for each: 000000.npy for the first.
+# Names of frames, by their number: a folder may hold a depth map for each frame, 000000.npy for the first.
 NAME = "{:06d}"
 
 
-def clip_options(predict: PredictOptions) -> Options:
+def clip_options(scene: Options, photo: PhotoOptions, workers: int) -> Options:
     """The pipeline's options for a clip; InputError for an option that does not apply to a clip."""
-    base, path, fill = predict.scene.base, predict.scene.path, predict.scene.fill
-    video, plain = path.video, VideoOptions(format=path.video.format)
-    follows = "its camera follows a trajectory, once through the clip"
-    unfit: list[tuple[str, object, bool, str]] = [  # option, value, whether it was given, why it is not for a clip
-        ("cameras", path.cameras, path.cameras is not None, follows),
-        ("path", path.path, path.path is not None, follows),
-        ("seconds", path.seconds, path.seconds is not None, "its video is as long; --frames N takes its first N"),
-        ("mode", fill.mode, fill.mode != "scene", "each of its frames is one view"),
-        ("fill", fill.fill, fill.fill in ("exemplar", "lama"), "its texture would flicker"),
-        ("depth-out", predict.depth_out, predict.depth_out is not None, "its video is all that is written"),
-        ("no-render", "", not predict.render, "its video is all that is written"),
-        *(
-            (field.name, "", getattr(video, field.name) != getattr(plain, field.name), "its video follows the clip")
-            for field in dataclasses.fields(plain)
-        ),
-        ("format", video.format, video.suffix != ".mp4", "it becomes an mp4, with its sound"),
-        ("workers", predict.workers, predict.workers > 1, "each frame needs the one before"),
-    ]
-    for option, value, given, why in unfit:
+    depth, path, fill = scene.base.depth, scene.path, scene.fill
+    plain = VideoOptions(format=path.video.format)
+    unfit = {
+        **{
+            each.name: getattr(path.video, each.name) != getattr(plain, each.name) for each in dataclasses.fields(plain)
+        },
+        "cameras": path.cameras is not None,
+        "path": path.path is not None,
+        "seconds": path.seconds is not None,
+        "mode": fill.mode != "scene",
+        "fill": fill.fill in ("exemplar", "lama"),
+        "depth-out": photo.depth_out is not None,
+        "no-render": not photo.render,
+        "workers": workers > 1,
+        "format": path.video.suffix != ".mp4",
+    }
+    for option, given in unfit.items():
         if given:
-            raise InputError(f"{f'--{option} {value}'.strip()}: not for a clip: {why}; leave it out")
-    if base.depth is not None and not (isinstance(base.depth, Path) and base.depth.is_dir()):
+            raise InputError(f"--{option}: not for a clip: leave the option out, see docs/clips.md")
+    if depth is not None and not (isinstance(depth, Path) and depth.is_dir()):
         raise InputError(
-            f"--depth {base.depth}: a clip takes a folder with a map for each frame: {NAME.format(0)}.npy and so on"
+            f"--depth {depth}: for a clip, give a folder of maps: {NAME.format(0)}.npy for the first frame"
         )
     OpenCV("a clip, whose motion has to be followed,")
-    if fill.fill == "auto":  # so that no inpainter is opened
+    if fill.fill == "auto":  # opens no inpainter
         fill = dataclasses.replace(fill, fill="network")
-    return dataclasses.replace(predict.scene, fill=fill)
+    return dataclasses.replace(scene, fill=fill)
 
 
 def predict_clip(
@@ -67,7 +64,8 @@ def predict_clip(
 ) -> None:
     """Predict one clip into `folder`: video.mp4 with as many frames, and report.json; `lens` as for `load_photo`.
 
-    InputError for a clip, a frame, a depth map or a folder that cannot be used.
+    Raises:
+        InputError: the clip, a frame, a depth map or the folder cannot be used.
     """
     reporter, options = reporter.restarted(), pipeline.options
     with results_folder(folder, FILES, alone=True), whole_set(folder, FILES[-1]) as new:
@@ -79,7 +77,7 @@ def predict_clip(
             len(clip),
             pipeline.renderer,
             OpenCV("a clip").flow,
-            align=options.base.depth is None or options.base.depth_kind in RELATIVE,  # measured depth stays as it is
+            align=options.base.depth is None or options.base.depth_kind in RELATIVE,  # measured depth is not changed
             fill=options.fill.texture != "none",
             network=pipeline.network,
             precision=options.base.precision,
@@ -87,24 +85,22 @@ def predict_clip(
         )
         focal = focal_length(path, clip.width, clip.height, {}, **lens)
         if clip.hdr:
-            reporter.log(f"{path.name}: its {clip.hdr} colours are not converted, so they may look pale")
-        base, frames = pipeline.base, list[dict[str, Any]]()
+            reporter.log(f"{path.name}: the {clip.hdr} colours are not converted and may look pale")
+        base, frames = pipeline.base, list[dict[str, float]]()
         first: tuple[Photo, BasePrediction, ResolvedBase] | None = None
         with reporter.stage("frames") as step, ClipWriter(new / FILES[0], clip) as writer:
             pictures = clip_frames(clip)
             for index in range(len(clip)):
-                with timed("decode", completer.seconds):
-                    photo = Photo(next(pictures), *focal, path / NAME.format(index))
+                photo = Photo(next(pictures), *focal, path / NAME.format(index))
                 photo.check_shape()
-                with timed("base", completer.seconds):
-                    prediction, choice = base.predict(photo, log=reporter.log)
-                if first is None:
-                    if completer.disparity is None:  # the first frame's choice holds for all
+                prediction, choice = base.predict(photo, log=reporter.log)
+                if first is None:  # its base, disparity and focal length hold for all frames
+                    if completer.disparity is None:
                         prediction = choose_move(prediction, pipeline.renderer, photo.path)
                         completer.disparity = prediction.disparity
                         reporter.log(f"{path.name}: {move_in_words(prediction)}")
-                    first, base = (photo, prediction, choice), base.only(choice)  # it predicts all other frames, too
-                    if prediction.lens_source:  # a network's estimate; a clip has one lens, so it holds for all frames
+                    first, base = (photo, prediction, choice), base.only(choice)
+                    if prediction.lens_source:
                         seen = prediction.camera.focal[0] * clip.width / prediction.camera.width
                         focal = seen, prediction.lens_source
                     if choice.note:
@@ -115,8 +111,7 @@ def predict_clip(
                         f"({prediction.lens_source or photo.focal_source})"
                     )
                 view = _complete(completer, photo, prediction)
-                with timed("encode", completer.seconds):
-                    writer.add(view.view.rgb)
+                writer.add(view.view.rgb)
                 frames.append(
                     {
                         "before": hole_area_ratio(view.before.alpha),
@@ -127,9 +122,8 @@ def predict_clip(
                 )
                 step(index + 1, len(clip))
         if clip.audio and not writer.sound:
-            reporter.log(f"{path.name}: its sound ({clip.audio}) cannot be stored in an mp4 and is left out")
+            reporter.log(f"{path.name}: an mp4 cannot hold the sound ({clip.audio}), which is left out")
         assert first is not None
-        camera = first[1].camera
         report = {
             **shared_report(*first, pipeline, reporter),
             "clip": {
@@ -142,16 +136,10 @@ def predict_clip(
                 "cuts": [index for index, frame in enumerate(frames) if frame["cut"]],
                 "sound": {"codec": clip.audio, "copied": writer.sound} if clip.audio else None,
             },
-            "video": {"width": camera.width + camera.width % 2, "height": camera.height + camera.height % 2},
-            "aux": {"gaussians": round(_mean([frame["aux"] for frame in frames]))},  # of a frame
+            "aux": {"gaussians": round(mean(frame["aux"] for frame in frames))},  # of a frame
             "disparity": options.path.reach(first[1].disparity),
-            "hole_area_ratio": {
-                "before": _mean([frame["before"] for frame in frames]),
-                "after": _mean([frame["after"] for frame in frames]),
-                "worst_after": max(frame["after"] for frame in frames),
-            },
+            "hole_area_ratio": {end: mean(frame[end] for frame in frames) for end in ("before", "after")},
         }
-        report["seconds"]["by_stage"] = {name: round(value, 3) for name, value in completer.seconds.items()}
         report["files"] = file_records(new, [new / FILES[0]])
         write_json(report, new / FILES[-1])
     holes = report["hole_area_ratio"]
@@ -163,7 +151,7 @@ def predict_clip(
 
 
 def _complete(completer: ClipCompleter, photo: Photo, prediction: BasePrediction) -> CompletedView:
-    """A frame's completed view; InputError, naming the frame, if this is impossible."""
+    """Complete a frame's view; InputError, naming the frame, if this is impossible."""
     try:
         view = completer.add(resize_photo(photo).rgb, prediction)
     except ValueError as error:
@@ -171,7 +159,3 @@ def _complete(completer: ClipCompleter, photo: Photo, prediction: BasePrediction
     if not view.gaussians[1].finite:
         raise InputError(f"{photo.path}: a view too extreme to complete: give a smaller --disparity")
     return view
-
-
-def _mean(values: Sequence[float]) -> float:
-    return sum(values) / len(values)

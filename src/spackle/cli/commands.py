@@ -35,7 +35,7 @@ def predict(
     *,
     photos: Annotated[
         list[Path],
-        typer.Argument(metavar="PHOTO...", help="Photos, folders of photos, patterns such as *.jpg; or one clip."),
+        typer.Argument(metavar="PHOTO...", help="Photos, or folders of photos; or one clip."),
     ],
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="OUT", help="Results go to OUT/PHOTO_NAME/.")
@@ -152,8 +152,8 @@ def predict(
     A photo alone is enough. A depth map, or weights from `spackle weights get depth` or `sharp`, give better geometry.
     """
     from spackle.bases.settings import BaseSettings
-    from spackle.cli.photo import PredictOptions
-    from spackle.cli.photos import predict_all
+    from spackle.cli.photos import PredictOptions, predict_all
+    from spackle.photo_results import PhotoOptions
     from spackle.pipeline import FillOptions, Options
     from spackle.progress import Reporter
 
@@ -161,7 +161,8 @@ def predict(
     settings = BaseSettings(base, depth, *reading, checkpoint, precision, device=device, **speed)
     scene = Options(settings, path, FillOptions(residual, fill, mode))
     lens = {"focal_px": focal_px, "focal_mm": focal_mm, "fov": fov}
-    options = PredictOptions(scene, lens, render, keep_base, depth_out, keep_frame, overwrite, workers, threads)
+    photo = PhotoOptions(lens, render, keep_base, depth_out, keep_frame)
+    options = PredictOptions(scene, photo, overwrite, workers, threads)
     if predict_all(photos, output, options, Reporter(verbose, as_json=as_json)):
         raise typer.Exit(1)
 

@@ -4,46 +4,53 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import glob
 import os
 import shlex
-import subprocess
-import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-import torch
-
 import spackle
-from spackle._numba import is_compiled
-from spackle.bases.depth_map import calibrations_beside, depth_of_array, find_depth
-from spackle.bases.lift import lift
+from spackle.bases.depth_map import calibrations_beside, find_depth
 from spackle.bases.open import BaseError
-from spackle.camera import Camera
 from spackle.cli.clip import FILES as CLIP_FILES
 from spackle.cli.clip import clip_options, predict_clip
-from spackle.cli.photo import PredictOptions
 from spackle.clips.files import is_clip
 from spackle.device import thread_count
 from spackle.errors import InputError
 from spackle.files import as_recorded, check_file, digest_of, files_in, fingerprint, results_folder
+from spackle.formats.depth import check_depth_name
 from spackle.image import PHOTO_SUFFIXES
-from spackle.patches import match_patches
-from spackle.photo_results import REPORT, earlier_report, predict_photo
+from spackle.photo_results import REPORT, PhotoOptions, earlier_report, predict_photo
 from spackle.pipeline import Options, Pipeline
 from spackle.progress import Notes, Reporter, asked_to_stop
-from spackle.render import Renderer, device_of, get_renderer
-from spackle.render.blend import blend_tiles
-from spackle.scene_fill import FillContext, OcclusionGuard, fill_scene
-from spackle.scene_fill.occlusion_guard import free_factors
-from spackle.surface import surface_gaussians
+from spackle.video_frames import video_problem
 from spackle.weights import installed
 from spackle.workers import at_work, threads_of_torch
 
-SIDE = 64  # side in pixels of the picture that `compile_kernels` completes
+
+@dataclasses.dataclass(frozen=True)
+class PredictOptions:
+    """Options of `spackle predict`."""
+
+    scene: Options
+    photo: PhotoOptions
+    overwrite: bool = False  # redo photos whose results exist
+    workers: int = 1  # processes that share the photos
+    threads: int | None = None  # of each worker
+
+    def open(self) -> Pipeline:
+        """Open the pipeline for all photos; InputError for an option that cannot be used with any photo."""
+        if (name := self.photo.depth_out) is not None:
+            check_depth_name(name)
+            if Path(name).name != name:
+                raise InputError(f"--depth-out {name}: give a name without a folder: the file lies beside scene.ply")
+        pipeline, path = Pipeline.open(self.scene), self.scene.path
+        if self.photo.render and pipeline.given_views and (problem := video_problem(pipeline.given_views)):
+            raise InputError(f"{path.cameras}: {problem}, so they make no video: add --no-render for pictures only")
+        return pipeline
 
 
 class NamedPhoto(NamedTuple):
@@ -54,9 +61,10 @@ class NamedPhoto(NamedTuple):
 
 
 def predict_all(given: Sequence[Path], output: Path, options: PredictOptions, reporter: Reporter) -> int:
-    """Work through a clip, or photos and folders of photos; returns the number of photos that failed.
+    """Predict a clip, or photos and folders of photos; returns the number of photos that failed.
 
-    InputError for an option, a clip or a single photo that cannot be used.
+    Raises:
+        InputError: an option, a clip or a single photo cannot be used.
     """
     named = find_photos(given)
     count = min(options.workers, len(named))
@@ -65,18 +73,18 @@ def predict_all(given: Sequence[Path], output: Path, options: PredictOptions, re
     if clips := [photo.path for photo in named if is_clip(photo.path)]:
         if not single:
             raise InputError(f"{clips[0]}: is a clip: give it alone, without other photos or clips")
-        pipeline = Pipeline.open(clip_options(options))
+        pipeline = Pipeline.open(clip_options(options.scene, options.photo, options.workers))
         check_file(clips[0], "clip")
         folder = output / named[0].name
-        with results_folder(output), compiled_ahead(pipeline.renderer, reporter.log):
-            predict_clip(clips[0], folder, pipeline, options.lens, reporter)
+        with results_folder(output):
+            predict_clip(clips[0], folder, pipeline, options.photo.lens, reporter)
         reporter.log(f"Look at {folder / CLIP_FILES[0]}")
         return 0
     pipeline = options.open()
     if single:
         check_file(named[0].path, "photo")
     shared = _shared_digest(options)
-    with results_folder(output, alone=not single), compiled_ahead(pipeline.renderer, reporter.log):
+    with results_folder(output, alone=not single):
         predictor = Predictor(output, options, shared, single, pipeline, reporter.verbose)
         left = predictor.left(named, reporter)
         if count == 1:
@@ -89,7 +97,7 @@ def predict_all(given: Sequence[Path], output: Path, options: PredictOptions, re
         reporter.log(f"{failed} of {len(named)} photos failed")
     else:
         folder = output / (named[0].name if single else "NAME")
-        video = f" at {folder / f'video{options.scene.path.video.suffix}'}, or" if options.render else ""
+        video = f" at {folder / f'video{options.scene.path.video.suffix}'}, or" if options.photo.render else ""
         reporter.log(f"Look{video} into the scene: spackle view {shlex.quote(str(folder / 'scene.ply'))}")
     return failed
 
@@ -97,28 +105,23 @@ def predict_all(given: Sequence[Path], output: Path, options: PredictOptions, re
 def find_photos(given: Sequence[Path]) -> list[NamedPhoto]:
     """The given photos, and the photos in given folders sorted by name, each with the name of its results.
 
-    A name that is not a file may be a pattern that no shell has expanded. InputError for a folder without photos,
-    and for two photos whose results would have the same name.
+    InputError for a folder without photos, and for two photos whose results would have the same name.
     """
     photos: list[Path] = []
     for path in given:
         found = files_in(path, PHOTO_SUFFIXES) if os.path.isdir(path) else [path]
         if not found:
             raise InputError(f"{path}: no photos in this folder (looked for {', '.join(PHOTO_SUFFIXES)})")
-        pattern = not os.path.lexists(path) and sorted(map(Path, glob.glob(str(path))))
-        photos += pattern or found
-    # a.jpg and a.png must not write over each other, nor over a.jpg.png.
+        photos += found
     stems = Counter(photo.stem.casefold() for photo in photos)
-    names = Counter(photo.name.casefold() for photo in photos)
-    if twice := [photo for photo in photos if names[photo.name.casefold()] > 1]:
-        raise InputError(f"{twice[1]}: {twice[0]} has the same name: process them in two runs, each with its own -o")
-
-    def name(photo: Path) -> str:
-        stem = photo.stem.casefold()
-        plain = stems[stem] == 1 and stem not in names and photo.stem.strip(".")  # "...png" has the stem ".."
-        return photo.stem if plain else photo.name
-
-    return [NamedPhoto(photo, name(photo)) for photo in photos]
+    named: dict[str, NamedPhoto] = {}
+    for photo in photos:
+        plain = stems[photo.stem.casefold()] == 1 and photo.stem.strip(".")  # "...png" has the stem ".."
+        name = photo.stem if plain else photo.name
+        if other := named.get(name.casefold()):
+            raise InputError(f"{photo}: {other.path} has the same name: predict them in two runs, each with its own -o")
+        named[name.casefold()] = NamedPhoto(photo, name)
+    return list(named.values())
 
 
 def _predict_by_workers(
@@ -129,9 +132,9 @@ def _predict_by_workers(
     threads: int,
     reporter: Reporter,
 ) -> int:
-    """Predict photos by workers; returns how many failed. Messages about a photo are printed once it is done.
+    """Predict photos by workers, print the messages about each finished photo, and return how many photos failed.
 
-    If Ctrl-C or SIGTERM came, raises KeyboardInterrupt once the photos in progress are done.
+    After Ctrl-C or SIGTERM, raises KeyboardInterrupt once the photos in progress are done.
     """
     if not left:
         return 0
@@ -169,14 +172,14 @@ class Predictor:
 
     output: Path
     options: PredictOptions
-    shared: str  # the main process's digest of what all photos share
-    single: bool  # there is one photo: it is always redone, and its error ends the command
+    shared: str  # digest of what the results of all photos depend on
+    single: bool  # there is one photo, which is always redone; an error ends the command
     pipeline: Pipeline
     verbose: bool
 
     @staticmethod
     def open(output: Path, options: PredictOptions, shared: str, verbose: bool) -> Predictor:
-        """Open the predictor of a worker process; InputError if its base cannot be opened."""
+        """Open the predictor of a worker process."""
         return Predictor(output, options, shared, False, options.open(), verbose)
 
     def is_done(self, photo: NamedPhoto) -> bool:
@@ -201,7 +204,6 @@ class Predictor:
         return digest_of([self.shared, *files])
 
     def make(self, photo: NamedPhoto) -> Predicted:
-        """Predict one photo in a worker, see `predict`."""
         notes = Notes(self.verbose)
         return Predicted(photo.path.name, not self.predict(photo, notes), notes.said)
 
@@ -215,24 +217,13 @@ class Predictor:
                 yield photo
 
     def predict(self, photo: NamedPhoto, reporter: Reporter) -> bool:
-        """Predict a photo; returns whether it succeeded, and logs why not. InputError if no photo can be predicted."""
+        """Predict a photo; returns whether this succeeded, and logs an error. InputError if no photo can succeed."""
         folder = self.output / photo.name
         try:
-            options = self.options
-            predict_photo(
-                photo.path,
-                folder,
-                self.pipeline,
-                reporter,
-                lens=options.lens,
-                keep_frame=options.keep_frame,
-                keep_base=options.keep_base,
-                depth_out=options.depth_out,
-                render=options.render,
-                request=self.request(photo),
-            )
+            request = self.request(photo)
+            predict_photo(photo.path, folder, self.pipeline, reporter, self.options.photo, request)
         except InputError as error:
-            if self.single or isinstance(error, BaseError):  # no other photo can be worked on
+            if self.single or isinstance(error, BaseError):
                 raise
             reporter.log(f"error: {error}")
             reporter.result({"folder": folder, "error": str(error)})
@@ -241,63 +232,14 @@ class Predictor:
 
 
 def _shared_digest(options: PredictOptions) -> str:
-    """A digest of everything that all photos share: version, options, contents of their files; InputError for a missing
-    file.
-    """
+    """A digest of everything that the results of all photos depend on; InputError for a missing file."""
     base, path, fill = options.scene.base, options.scene.path, options.scene.fill
-    name = base.named if base.folder is None else "hf"  # the digests of its files identify it, wherever they lie
-    files = {**_shared_files(options.scene), **base.files}
+    files = {"calibration": base.calib, "camera file": path.cameras, "path file": path.path, "weights": fill.file}
+    files |= {"LaMa": installed("lama") if fill.texture == "lama" else None, **base.files}
+    prints = {kind: fingerprint(file, kind) for kind, file in files.items() if file is not None}
+    name = base.named if base.folder is None else "hf"  # digests identify the folder, wherever it lies
     # Windows and compilation change only the last bits of results.
     base = dataclasses.replace(base, name=name, depth=None, calib=None, checkpoint=None, windows=None, compiled=False)
     path = dataclasses.replace(path, cameras=None, path=None)
-    choices: list[object] = [dataclasses.asdict(base), dataclasses.asdict(path), fill.weights, fill.texture, fill.mode]
-    choices += [options.lens, options.render, options.keep_base, options.depth_out, options.keep_frame]
-    prints = {kind: fingerprint(file, kind) for kind, file in files.items()}
-    return digest_of([spackle.__version__, choices, prints])
-
-
-def _shared_files(options: Options) -> dict[str, Path]:
-    """The files, apart from the base's, that all photos share, by kind."""
-    path, fill = options.path, options.fill
-    files = {"calibration": options.base.calib, "camera file": path.cameras, "path file": path.path}
-    files |= {"weights": fill.file, "LaMa": installed("lama") if fill.texture == "lama" else None}
-    return {kind: file for kind, file in files.items() if file is not None}
-
-
-@contextlib.contextmanager
-def compiled_ahead(renderer: Renderer, log: Callable[[str], None]) -> Iterator[None]:
-    """During the block a second process compiles the kernels that are needed last, unless they are on disk.
-
-    Numba compiles one kernel at a time in a process, so a thread would not help.
-    """
-    if device_of(renderer).type != "cpu" or is_compiled(blend_tiles):
-        yield
-        return
-    log("first use: kernels are compiled for this processor, which takes about half a minute, once")
-    words = [sys.executable, "-c", f"from {__name__} import compile_kernels; compile_kernels()"]
-    quiet = subprocess.DEVNULL
-    with subprocess.Popen(words, stdin=quiet, stdout=quiet, stderr=quiet) as helper:
-        try:
-            yield
-        finally:
-            helper.kill()
-
-
-@torch.no_grad()
-def compile_kernels() -> None:
-    """Complete a small view, which compiles all kernels of completion, in another order than the main process does."""
-    torch.set_num_threads(1)
-    camera = Camera.from_focal(SIDE, SIDE, SIDE)
-    aside = torch.eye(4)
-    aside[0, 3] = -0.4
-    moved = dataclasses.replace(camera, world_to_camera=aside)
-    depth = torch.full((SIDE, SIDE), 2.0)
-    depth[SIDE // 4 : -SIDE // 4, SIDE // 4 : -SIDE // 4] = 1.0
-    rgb, hole = torch.rand(SIDE, SIDE, 3), depth < 2
-    match_patches(rgb, hole, 1 / depth)
-    shape = camera.pixel_centers().flatten(0, 1), 1 / depth.flatten(), torch.zeros(SIDE**2, 2)
-    base = surface_gaussians(camera, *shape, 0.6, rgb.flatten(0, 1), torch.full((SIDE**2,), 0.9))
-    guard = OcclusionGuard.of(get_renderer("cpu").render(base, camera), camera)
-    free_factors(base, moved.position, [guard])
-    assert len(fill_scene(FillContext(base, camera, get_renderer("cpu")), [moved, camera]).aux)
-    lift(rgb, depth_of_array(depth[::2, ::2].numpy(), Path("depth")), camera)  # of another size, as lite's is
+    choices = [dataclasses.asdict(each) for each in (base, path, options.photo)]
+    return digest_of([spackle.__version__, *choices, fill.weights, fill.texture, fill.mode, prints])

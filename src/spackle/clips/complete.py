@@ -20,7 +20,6 @@ from spackle.clips.temporal import (
 )
 from spackle.device import Precision
 from spackle.gaussians import Gaussians
-from spackle.progress import timed
 from spackle.render import Renderer
 from spackle.render.protocol import Rendering
 from spackle.residual import ResidualNet, hole_mask
@@ -71,7 +70,6 @@ class ClipCompleter:
     network: ResidualNet | None = None
     precision: Precision = "auto"
     overscan: float = 0.0  # fraction by which the view's focal length exceeds the photo's
-    seconds: dict[str, float] = dataclasses.field(default_factory=dict)  # time of each stage
     _past: _Past | None = None
     _count: int = 0
 
@@ -81,28 +79,25 @@ class ClipCompleter:
 
         ValueError if depths and focal length allow no path.
         """
-        with timed("depth", self.seconds):
-            base, guard, now, past = self._aligned(rgb, prediction)
+        base, guard, now, past = self._aligned(rgb, prediction)
         even = prediction.camera.even()
         disparity = prediction.disparity if self.disparity is None else self.disparity
         (camera,) = trajectory(self.trajectory, even, disparity, now.depths, self.frames, only=self._count)
         camera = camera.zoomed(1 + self.overscan)
-        with timed("complete", self.seconds):
-            before, aux = self.renderer.render(base, camera), Gaussians.empty()
-            alone = before
-            if self.fill:
-                parts = (base, prediction.camera, self.renderer, self.network)
-                # Without texture, which would flicker: each frame would find other patches.
-                context = FillContext(*parts, texture=None, precision=self.precision)
-                filled = fill_view(context, camera, [guard], before)
-                aux, alone = filled.aux, filled.rendering
+        before, aux = self.renderer.render(base, camera), Gaussians.empty()
+        alone = before
+        if self.fill:
+            parts = (base, prediction.camera, self.renderer, self.network)
+            # Without texture, which would flicker: each frame would find other patches.
+            context = FillContext(*parts, texture=None, precision=self.precision)
+            filled = fill_view(context, camera, [guard], before)
+            aux, alone = filled.aux, filled.rendering
         drawn, memory = CompletedView(camera, (base, aux), alone, before, alone, cut=past is not self._past), None
         if self.fill:
-            with timed("carry", self.seconds):
-                memory_before = None if past is None else past.memory
-                views = (before, alone)
-                aux, memory = propagate_colors(base, aux, camera, self.renderer, views, memory_before, self.flow)
-                drawn = dataclasses.replace(drawn, gaussians=(base, aux), view=memory.view)
+            memory_before = None if past is None else past.memory
+            views = (before, alone)
+            aux, memory = propagate_colors(base, aux, camera, self.renderer, views, memory_before, self.flow)
+            drawn = dataclasses.replace(drawn, gaussians=(base, aux), view=memory.view)
         self._past = dataclasses.replace(now, memory=memory)
         self._count += 1
         return drawn

@@ -24,7 +24,7 @@ from spackle.files import write_whole
 from spackle.formats.html import as_json, single_html
 from spackle.formats.scene_files import scene_kind
 from spackle.image import PHOTO_SUFFIXES, check_shape, read_image
-from spackle.photo_results import REPORT, predict_photo
+from spackle.photo_results import REPORT, PhotoOptions, predict_photo
 from spackle.pipeline import Fill, FillOptions, Options, Pipeline
 from spackle.progress import Reporter, Step
 from spackle.render import get_renderer
@@ -120,8 +120,8 @@ class SceneWork:
             self.opened = Pipeline.open(chosen)
         pipeline = dataclasses.replace(self.opened, options=chosen)
         lens = options.model_dump(include={"focal_px", "focal_mm", "fov"})
-        keep, film = options.keep_frame, "video.mp4" in options.files
-        predict_photo(job.folder / job.source, job.results, pipeline, teller, lens=lens, keep_frame=keep, render=film)
+        wanted = PhotoOptions(lens, render="video.mp4" in options.files, keep_frame=options.keep_frame)
+        predict_photo(job.folder / job.source, job.results, pipeline, teller, wanted)
         report = json.loads((job.results / REPORT).read_text(encoding="utf-8"))
         return ROUGH if report["base"]["name"] == LiteBase.name else ""
 
