@@ -1,4 +1,4 @@
-"""SHARP in small sizes with weights that anyone can make, and the picture that its golden numbers belong to."""
+"""SHARP in small sizes with deterministic weights, and the picture of the golden numbers."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ DATA = Path(__file__).parent / "data"
 
 
 def tiny_weights(config: SharpConfig = MICRO) -> dict[str, Tensor]:
-    """A whole state dict, with what inference never uses."""
     return deterministic_weights(expected_shapes(config))
 
 
@@ -32,7 +31,7 @@ def write_tiny(path: Path, config: SharpConfig = MICRO) -> Path:
 
 
 def micro_network() -> SharpNetwork:
-    """131,072 Gaussians from 512² pixels, in float32."""
+    """A network that predicts 131,072 Gaussians from 512² pixels, in float32."""
     network = SharpNetwork(MICRO).eval().requires_grad_(False)
     weights = tiny_weights()
     network.load_state_dict({name: weights[name] for name in network.state_dict()})
@@ -40,7 +39,7 @@ def micro_network() -> SharpNetwork:
 
 
 def gaussians_of(config: SharpConfig) -> int:
-    """How many come out."""
+    """The number of Gaussians that the network predicts."""
     return LAYERS * (config.side // STRIDE) ** 2
 
 

@@ -1,4 +1,4 @@
-"""Depth maps: every format read back, every decision between depth and disparity, every bad file."""
+"""Depth maps: each format is read back, depth and disparity are told apart, and bad files are refused."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def test_middlebury(tmp_path: Path, suffix: str, beside: bool) -> None:
     assert found.K is not None
     assert found.K.tolist() == [[1000.5, 0, 30.25], [0, 1000.5, 20.5], [0, 0, 1]]
     np.save(tmp_path / "depth.npy", ramp())
-    assert load_depth(tmp_path / "depth.npy").quantity == "depth"  # though a calibration lies beside it
+    assert load_depth(tmp_path / "depth.npy").quantity == "depth"  # although the folder has a calibration
     same(load_depth(name, calib=calib, focal_px=2001), 2 * expected, 1e-6)
 
 
@@ -145,7 +145,7 @@ def test_bad_calibrations(tmp_path: Path, text: str) -> None:
 
 
 def greys(values: NDArray[Any], mode: str) -> bytes:
-    """Numbers 0..1 as a picture, as other programs write depth."""
+    """Numbers 0..1 as a grey picture."""
     if mode == "I;16":
         return png((values * 65535).round().astype(np.uint16))
     buffer = io.BytesIO()
@@ -165,7 +165,7 @@ SLOPE = np.tile(np.linspace(0, 1, 100), (60, 1))
         (greys(SLOPE, "RGBA"), 1 / 255),  # as ComfyUI
         (greys(SLOPE, "RGB"), 1 / 255),
         (as_bytes(SLOPE), None),
-        (as_bytes(np.float32(70 * SLOPE - 3)), None),  # as MiDaS says it
+        (as_bytes(np.float32(70 * SLOPE - 3)), None),  # as MiDaS
         (pfm(np.float32(0.01 * SLOPE + 5)), None),
     ],
 )
@@ -190,14 +190,11 @@ def test_relative_maps(tmp_path: Path, content: bytes, step: float | None, kind:
     ("content", "options", "says"),
     [
         (greys(SLOPE, "L"), {}, "an 8-bit PNG holds no metres: give 16 bits, or --depth-kind near-white"),
-        (greys(SLOPE, "L"), {"kind": "metric"}, "an 8-bit PNG holds no metres"),
         (greys(SLOPE, "I;16"), {}, "fill the range of 16 bits, .*: give --depth-kind near-white"),
         (greys(SLOPE, "RGBA"), {}, "mode RGBA holds no millimetres: give --depth-kind near-white"),
         (greys(SLOPE, "L"), {"kind": "disparity"}, "its folder has no calibration: give --calib"),
         (as_bytes(SLOPE), {"kind": "near-white", "near": 3.0, "far": 2.0}, "--near 3, --far 2: give two distances"),
-        (as_bytes(SLOPE), {"kind": "near-white", "near": 0.0}, "--near 0, --far 15: give two distances"),
         (as_bytes(np.ones((9, 9))), {"kind": "near-black"}, "the same nearly everywhere"),
-        (as_bytes(np.full((9, 9), np.nan)), {"kind": "near-black"}, "the same nearly everywhere"),
         (png(np.zeros((4, 4, 3), np.uint8) + np.uint8([200, 9, 9])), {"kind": "near-white"}, "a colour picture"),
         (b"hello there, I am text", {"kind": "near-white"}, "not an image"),
     ],
@@ -208,15 +205,6 @@ def test_maps_of_another_kind_are_refused(tmp_path: Path, content: bytes, option
         load_depth(tmp_path / "map", **options)
 
 
-def test_millimetres_far_away_are_no_relative_map(tmp_path: Path) -> None:
-    stored = np.tile(np.linspace(800, 60_000, 100).astype(np.uint16), (9, 1))
-    stored[0] = 65535  # unknown
-    (tmp_path / "map").write_bytes(png(stored))
-    assert float(load_depth(tmp_path / "map").depth.max()) == 60
-    (tmp_path / "map").write_bytes(greys(SLOPE, "I;16"))
-    assert float(load_depth(tmp_path / "map", kind="metric").depth.max()) > 60
-
-
 def npy_claiming(shape: str, descr: str = "<f4") -> bytes:
     header = f"{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + b"\0" * 64
@@ -224,7 +212,6 @@ def npy_claiming(shape: str, descr: str = "<f4") -> bytes:
 
 NOISE = np.random.default_rng(0).integers(1, 60_000, (64, 64)).astype(np.uint16)
 BAD = {
-    "empty": (b"", "empty"),
     "text": (b"hello there, I am text", "not a depth map"),
     "cut npy": (as_bytes(ramp())[:-5], "cut off"),
     "huge npy": (npy_claiming("(1000000, 1000000)"), "too large"),
@@ -234,13 +221,9 @@ BAD = {
     "all NaN": (as_bytes(np.full((4, 4), np.nan)), "all-invalid"),
     "negative": (as_bytes(np.array([[1.0, -2.0], [-0.5, np.nan]])), "2 of 4 values are negative"),
     "millimetres": (as_bytes(NOISE), "divide them by 1000"),
-    "cut npz": (zipped(as_bytes(NOISE))[:200], "damaged"),
     "bomb": (zipped(npy_claiming("(100000, 100000)")), "too large"),
-    "cut pfm": (pfm(ramp())[:-1], "cut off"),
     "colour pfm": (b"PF\n2 2\n-1\n" + b"\0" * 48, "three channels"),
     "cut png": (png(NOISE)[:2000], "damaged"),
-    "8 bits": (png(np.full((4, 4), 9, np.uint8)), "8-bit"),
-    "colour png": (png(np.zeros((4, 4, 3), np.uint8)), "mode RGB"),
 }
 
 

@@ -59,7 +59,7 @@ def test_the_published_vit_s_has_these_tensors() -> None:
 
 
 @pytest.mark.parametrize(("name", "tokens", "step"), [("small", 35, 2), ("large", 120, 6), ("square", 1369, 2)])
-def test_maps_are_the_originals(base: MogeBase, name: str, tokens: int, step: int) -> None:
+def test_maps_agree_with_the_original(base: MogeBase, name: str, tokens: int, step: int) -> None:
     image = waves(*SIZES[name])
     output = base.ask(image, tokens, SIZES[name])
     agrees(output.points[::step, ::step], f"{name}_points")
@@ -80,7 +80,7 @@ def test_maps_are_the_originals(base: MogeBase, name: str, tokens: int, step: in
         ("large_infer_fov45", 120, 45, 6),
     ],
 )
-def test_depth_lens_and_mask_are_the_originals(
+def test_depth_focal_length_and_mask_agree_with_the_original(
     base: MogeBase, name: str, tokens: int, fov: float | None, step: int
 ) -> None:
     height, width = SIZES[name.partition("_")[0]]
@@ -101,7 +101,7 @@ def test_focal_length_and_shift_alone() -> None:
         agrees(view.focal_px / HALF, f"solver_{name}_focal_converged")
         agrees(view.shift, f"solver_{name}_shift_converged")
     output = scene(0.5, scale=2.0)
-    output.points[30:60, 1::5, 2] = 0.2  # where the solver does not look; they end behind the camera
+    output.points[30:60, 1::5, 2] = 0.2  # not among the solver's samples; these points end behind the camera
     view = to_view(output, 160, 90)
     agrees(view.shift, "post_shift_converged")
     assert np.array_equal(solid(view), GOLDEN["post_mask"])
@@ -114,7 +114,9 @@ def photo_of(rgb: Tensor) -> Photo:
     return Photo(rgb, 120.0, "default 30 mm", Path("photo.png"))
 
 
-def test_whose_lens_counts_and_where_the_sky_goes(base: MogeBase, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_whose_focal_length_is_used_and_the_distance_of_the_sky(
+    base: MogeBase, monkeypatch: pytest.MonkeyPatch
+) -> None:
     photo, output = photo_of(torch.from_numpy(picture(160, 90)) / 255), scene(0.5, scale=2.0)
     monkeypatch.setattr(base, "ask", lambda *given: output)
     for source in ("--focal-px", "EXIF"):
@@ -124,7 +126,7 @@ def test_whose_lens_counts_and_where_the_sky_goes(base: MogeBase, monkeypatch: p
     assert (seen.camera.focal[0], seen.lens_source) == (pytest.approx(1.3 * HALF, rel=1e-6), "MoGe")
     assert float(seen.gaussians.means[:, 2].max()) == pytest.approx(SKY * 8, rel=0.02)
     points = output.points
-    for factor in (-1, 30, 0.03):  # no lens turns a photo over, sees 174° or only 2°
+    for factor in (-1, 30, 0.03):  # mirrored, 174° and 2°
         output = dataclasses.replace(output, points=points * torch.tensor([factor, factor, 1]))
         assert (base.predict(photo).camera.focal[0], base.predict(photo).lens_source) == (120, "")
     output.mask_logits.fill_(-1)
@@ -146,7 +148,7 @@ def test_the_same_photo_gives_the_same_scene_and_bf16_nearly_so(checkpoint: Path
 def test_predict_takes_a_checkpoint_and_a_clip_keeps_one_lens(
     checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Though the network sees another lens in each frame."""
+    """The network estimates another focal length for each frame."""
     words = ("--base", "moge", "-c", checkpoint, "-o", tmp_path)
     done = run("predict", write_photo(tmp_path / "photo.png", 160, 90), *words, "--frames", 2)
     assert (done.code, report_of(tmp_path / "photo")["base"]["name"]) == (0, "moge"), done.err
@@ -167,7 +169,7 @@ def test_predict_takes_a_checkpoint_and_a_clip_keeps_one_lens(
 
 
 def changed(change: Callable[[dict[str, Any]], None], bytes_less: int = 0) -> Callable[[Path], None]:
-    """Write weights without numbers and with other settings."""
+    """A function that writes a checkpoint with changed settings and no weights."""
 
     def write(path: Path) -> None:
         content = copy.deepcopy(TINY)

@@ -1,4 +1,4 @@
-"""Tiles: what they lose, where they may lie, and that nothing of them shows."""
+"""Tiles: the detail that they lose, the places that they may cover, and that no grid is visible."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CPU = CpuRenderer()
 
 
 def ground(height: int = 27, width: int = 38) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """A picture with detail in places, a plane with a bump, and some pixels that are not free."""
+    """A partly detailed picture, a plane with a bump, its slope, and a mask of free pixels."""
     torch.manual_seed(1)
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     picture = (0.3 + 0.01 * x)[..., None] + 0.2 * torch.rand(height, width, 3) * (x + y > 36)[..., None]
@@ -35,7 +35,7 @@ def ground(height: int = 27, width: int = 38) -> tuple[Tensor, Tensor, Tensor, T
 
 
 def losses(picture: Tensor, height: int, width: int) -> Tensor:
-    """[H/height, W/width] what tiles of one size lose, by PyTorch's bilinear interpolation of their means."""
+    """[H/height, W/width] losses of tiles of one size, by PyTorch's bilinear interpolation of their means."""
     rows, columns = picture.shape[0] // height * height, picture.shape[1] // width * width
     inside = picture[:rows, :columns].permute(2, 0, 1)[None].double()
     smooth = interpolate(avg_pool2d(inside, (height, width)), size=(rows, columns), mode="bilinear")
@@ -43,7 +43,7 @@ def losses(picture: Tensor, height: int, width: int) -> Tensor:
 
 
 @pytest.mark.parametrize("level", [1, 2, 3])
-def test_blocks_lose_what_interpolated_means_miss(level: int) -> None:
+def test_a_blocks_loss_is_its_difference_from_interpolated_means(level: int) -> None:
     picture, inverse, slope, free = ground()
     lost = Quadtree(picture, inverse, slope, free, LEVELS, EDGE).lost[level - 1]
     side, (rows, columns) = 2**level, lost.shape[:2]
@@ -96,7 +96,7 @@ def test_a_cut_covers_every_pixel_once_and_no_other_costs_less(worth: float) -> 
             side = max(part.height, part.width)
             shape = 0 if part.height == part.width else 1 if part.height < part.width else 2
             lost = tree.lost[side.bit_length() - 2][..., shape]
-            shares = 1 if shape == 0 else 2  # two halves lose together what is noted for them
+            shares = 1 if shape == 0 else 2  # the stored loss belongs to both halves together
             at = part.rows[mine] * part.height // side, part.columns[mine] * part.width // side
             cost += float(lost[at].sum()) / shares
         assert cost + worth * count == pytest.approx(best(3, row, column), rel=1e-3)
@@ -112,7 +112,7 @@ def test_means_of_tiles_are_those_of_their_pixels() -> None:
 
 @pytest.mark.parametrize("slant", [0.0, 0.3])
 @pytest.mark.parametrize("rise", [0.0, 0.4])
-def test_no_grid_shows_where_tiles_of_several_sizes_meet(slant: float, rise: float) -> None:
+def test_no_grid_is_visible_between_tiles_of_several_sizes(slant: float, rise: float) -> None:
     height, width = 120, 160
     y, x = torch.meshgrid(torch.arange(height) / height, torch.arange(width) / width, indexing="ij")
     smooth = (0.3 + rise * x)[..., None].expand(height, width, 3)

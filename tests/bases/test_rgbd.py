@@ -1,4 +1,4 @@
-"""The rgbd base: sharp and closed from the photo's eye, and no rubber sheet from the side."""
+"""The rgbd base: sharp and without holes at the photo's camera, and with open disocclusions from the side."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ def eroded(mask: Tensor, pixels: int) -> Tensor:
 
 
 def in_frame(camera: Camera, points: Tensor, margin: float = 0.0) -> Tensor:
-    """Which world points a camera has in its frame, a margin in pixels inside its border."""
+    """A mask of the world points that lie in a camera's frame, at least `margin` pixels from the border."""
     uv, z = camera.project(points)
     size = torch.tensor([camera.width, camera.height]).to(uv)
     return ((uv > margin) & (uv < size - margin)).all(-1) & (z > 0)
 
 
 def shows_plane(scene: Scene, camera: Camera) -> Tensor:
-    """[H, W] which of a view's pixels see the plane of `slanted_plane` well inside of the photo."""
+    """[H, W] mask of a view's pixels that show the plane of `slanted_plane` well inside the photo."""
     inverse = 1 / scene.depth.double()
     slope = torch.stack([inverse[0, -1] - inverse[0, 0], inverse[-1, 0] - inverse[0, 0]])
     slope = slope / torch.tensor([scene.camera.width - 1, scene.camera.height - 1])
@@ -69,7 +69,7 @@ def test_pixels_come_first_then_mixed_ones_then_the_backing() -> None:
 
 
 @pytest.mark.parametrize("scene", [wall(), box_before_wall(), slanted_plane(1.5, 6, 0), slanted_plane(1.5, 6, 1)])
-def test_from_the_photos_eye_the_photo_is_whole(scene: Scene) -> None:
+def test_at_the_photos_camera_the_photo_has_no_holes(scene: Scene) -> None:
     view = CPU.render(scene.lift(LEVELS).gaussians, scene.camera)
     assert hole_area_ratio(view.alpha) == 0
     assert psnr(view.rgb, scene.rgb) > 29
@@ -87,20 +87,20 @@ def test_odd_and_tiny_photos_are_lifted(size: tuple[int, int]) -> None:
 
 
 def test_missing_depth_is_filled_from_behind_and_reported() -> None:
-    """A strip without depth beside a box, as a stereo camera leaves it."""
+    """Beside a box is a strip without depth, as in the maps of stereo cameras."""
     scene = box_before_wall()
     strip = torch.zeros_like(scene.depth, dtype=torch.bool)
     strip[24:48, 28:32] = True  # the wall's last columns before the box
     found = dataclasses.replace(scene, depth=torch.where(strip, 0.0, scene.depth)).lift(levels=0)
     assert found.notes["depth_filled"] == pytest.approx(24 * 4 / (72 * 96), abs=1e-4)
     z = found.gaussians.means[: 72 * 96, 2].reshape(72, 96)
-    elsewhere = eroded(~strip, 1)  # the pixels beside it may count as mixed ones
+    elsewhere = eroded(~strip, 1)  # pixels beside the strip may become mixed pixels
     assert torch.equal(z[elsewhere], scene.lift(levels=0).gaussians.means[: 72 * 96, 2].reshape(72, 96)[elsewhere])
     assert float(z[strip].min()) > 5.99  # the wall's depth is 6, the box's 2
     assert wall().lift().notes["depth_filled"] == 0
 
 
-def test_the_lens_is_the_calibrations_else_the_photos() -> None:
+def test_the_intrinsics_come_from_the_calibration_else_from_the_photo() -> None:
     scene = wall()
     photo = Photo(scene.rgb, scene.camera.focal[0], "--focal-px", Path("photo.png"))
     assert torch.equal(RgbdBase(scene.depth_map).predict(photo).camera.K, photo.camera.K)
@@ -112,7 +112,7 @@ def test_the_lens_is_the_calibrations_else_the_photos() -> None:
     uv, _ = found.camera.project(found.gaussians.means)
     assert float((2 * uv - (2 * uv).round()).abs().max()) < 2e-3  # centres of pixels, or their borders
     torch.testing.assert_close(torch.stack([uv.amin(0), uv.amax(0)]), torch.tensor([[0.5, 0.5], [63.5, 47.5]]))
-    # Nothing moves where a frame has been cut off.
+    # Cropping a frame moves nothing.
     framed = dataclasses.replace(photo, rgb=photo.rgb[6:-4, 2:-10], frame=PhotoFrame(2, 6, 10, 4))
     inside = RgbdBase(half).predict(framed)
     assert inside.camera.K.tolist() == [[140, 0, 28], [0, 140, 19], [0, 0, 1]]
@@ -124,7 +124,7 @@ def test_the_lens_is_the_calibrations_else_the_photos() -> None:
 
 @pytest.mark.parametrize("disparity", [0.1, 0.2, 0.5])
 @pytest.mark.parametrize("side", [0, 1])
-def test_what_a_box_uncovers_is_a_hole_and_nothing_else(disparity: float, side: int) -> None:
+def test_the_holes_are_the_regions_that_a_box_uncovers(disparity: float, side: int) -> None:
     near, far = 2.0, 6.0
     scene = box_before_wall(near, far)
     base = scene.lift(LEVELS).gaussians
@@ -150,7 +150,7 @@ def test_what_a_box_uncovers_is_a_hole_and_nothing_else(disparity: float, side: 
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize("kind", ["swipe", "shake"])
 def test_slanted_ground_has_no_pinholes(axis: int, kind: str) -> None:
-    """A floor (axis 0) and a side wall (axis 1) that run from 1.5 m to 6 m, at disparity 0.5."""
+    """A floor (axis 0) and a side wall (axis 1), from 1.5 m to 6 m, at disparity 0.5."""
     scene = slanted_plane(1.5, 6, axis)
     base = scene.lift(LEVELS).gaussians
     for camera in trajectory(kind, scene.camera, 0.5, DepthRange.of(base), frames=9):  # type: ignore[arg-type]
@@ -160,7 +160,7 @@ def test_slanted_ground_has_no_pinholes(axis: int, kind: str) -> None:
 
 
 def test_rounded_disparities_leave_no_stairs() -> None:
-    """Whole disparities cut a slanted wall into slices; undone, it stays closed from the side."""
+    """Integer disparities cut a slanted wall into slices with gaps, unless they are smoothed."""
     scene = slanted_plane(2, 4, 1)
     quantum = 0.005
     stored = (1 / scene.depth / quantum).round() * quantum
@@ -174,7 +174,7 @@ def test_rounded_disparities_leave_no_stairs() -> None:
         assert float(holes.float().mean()) < 0.002
 
 
-def test_the_motorcycle_is_reproduced_and_its_occlusions_stay() -> None:
+def test_the_motorcycle_is_reproduced_and_its_disocclusions_are_holes() -> None:
     pair, found = motorcycle(), motorcycle_base()
     scene, view = pair.left, CPU.render(found.gaussians, found.camera)
     assert found.notes["depth_filled"] == pytest.approx(0.0735, abs=1e-3)

@@ -1,4 +1,4 @@
-"""SHARP's decoder as it is trained: exact gradients, and a file of its own that predicts beside its checkpoint."""
+"""SHARP's trained decoder: exact gradients, and a file that predicts together with its checkpoint."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from spackle.training.direct_ft import TunableSharp, normalised_camera
 CPU = torch.device("cpu")
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
 CAMERA = Camera.from_focal(FOCAL, WIDTH, HEIGHT)
-NUDGE = 3e-4  # how far weights are moved to see what becomes of it
+NUDGE = 3e-4  # step of the finite differences
 
 
 @pytest.fixture(scope="module")
 def owner(tmp_path_factory: pytest.TempPathFactory) -> Owner:
-    """A checkpoint of SHARP from 512² pixels."""
+    """A checkpoint of SHARP with an input of 512² pixels."""
     path = tmp_path_factory.mktemp("tuning") / "sharp.safetensors"
     save_file(deterministic_weights(expected_shapes(MICRO)), path)
     return Owner(path, hashlib.sha256(path.read_bytes()).hexdigest())
@@ -42,7 +42,6 @@ def owner(tmp_path_factory: pytest.TempPathFactory) -> Owner:
 
 @pytest.fixture(scope="module")
 def base(owner: Owner) -> TunableSharp:
-    """To be read only."""
     return TunableSharp.load(owner.path, torch.float32, CPU)
 
 
@@ -54,12 +53,12 @@ def gaussians_from(weights: Path) -> Gaussians:
     return SharpBase.load(weights, precision="fp32", device="cpu").predict(photo()).gaussians
 
 
-def test_gaussians_before_metres_are_drawn_as_they_are_in_metres(base: TunableSharp) -> None:
+def test_normalised_gaussians_render_like_gaussians_in_metres(base: TunableSharp) -> None:
     with torch.no_grad():
         before = base.gaussians(base.network.gaussian_decoder(), base.encode(photo().rgb, CAMERA))
     after = SharpBase(base.network).predict(photo()).gaussians
     aside = CAMERA.looking(torch.tensor([0.2, -0.1, 0.1]), torch.tensor([0.0, 0.0, 4.0]))
-    # The second one has pixels that are not square, as after rounding to a working size.
+    # The second camera has pixels that are not square, as after rounding to a working size.
     for view in (CAMERA, shifted(CAMERA, 0.3).resized(WIDTH, HEIGHT + 6), aside):
         one = get_renderer().render(before, normalised_camera(view, CAMERA))
         other = get_renderer().render(after, view)
@@ -69,7 +68,7 @@ def test_gaussians_before_metres_are_drawn_as_they_are_in_metres(base: TunableSh
 
 @pytest.mark.parametrize("name", ["prediction_head.", "feature_model.texture_head.", "feature_model.decoder."])
 def test_gradients_to_weights_are_those_of_finite_differences(base: TunableSharp, name: str) -> None:
-    """Along the gradient itself, without rendering: its cut-offs are steps, which no gradient sees."""
+    """The step goes along the gradient, without rendering: the renderer's cut-offs have no gradient."""
     decoder = copy.deepcopy(base.network.gaussian_decoder()).let_learn()
     encoded = base.encode(photo().rgb, CAMERA)
 

@@ -1,4 +1,4 @@
-"""Silhouettes in two layers: what is found, what is blended, and what is lifted."""
+"""Silhouettes in two layers: finding both surfaces, blending them, and lifting them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ CPU = CpuRenderer()
 
 
 def steps(seed: int, height: int = 15, width: int = 17) -> tuple[Image, Image, Image]:
-    """Inverse depth with steps along random lines, slopes, and colours that follow it with blur and noise."""
+    """Inverse depth with steps along random lines, its slopes, and blurred noisy colours that follow the depth."""
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[:height, :width]
     inverse = 0.2 + 0.002 * x + 0.001 * rng.random((height, width))
@@ -42,7 +42,7 @@ def steps(seed: int, height: int = 15, width: int = 17) -> tuple[Image, Image, I
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_kernels_agree_with_the_python_they_are_written_in(seed: int) -> None:
+def test_compiled_kernels_agree_with_plain_python(seed: int) -> None:
     made, rng = steps(seed), np.random.default_rng(seed)
     spots = (rng.random((40, 5)) * [17, 15, 2, 2, 0.5] + [0, 0, 0.4, 0.4, 0.4]).astype(np.float32)
 
@@ -68,7 +68,7 @@ def test_rings_are_distances_to_the_nearest_step(seed: int) -> None:
 
 
 def blended() -> Scene:
-    """A dark box before a bright wall, its border halfway between pixels' sides: photo of four times the resolution."""
+    """A dark box in front of a bright wall, rendered at four times the resolution; its left border halves pixels."""
     fine = box_before_wall(width=384, height=288, focal=320)
     near = fine.depth < 3
     near[:, 128:130] = False  # the left border lies half a pixel further in
@@ -79,29 +79,28 @@ def blended() -> Scene:
 
 
 def wall_beside(scene: Scene) -> list[Tensor]:
-    """[N, 3] colours of the wall in views from both sides; from the photo's eye the lifted scene is the photo."""
+    """[N, 3] colours of the wall in views from both sides."""
     base = scene.lift(LEVELS).gaussians
     assert psnr(CPU.render(base, scene.camera).rgb, scene.rgb) > 32
     views = [CPU.render(base, view) for view in extremes(scene.camera, 0.3, DepthRange.of(base))]
     return [seen.rgb[(seen.depth > 5) & (seen.alpha > 0.95)] for seen in views]
 
 
-def test_a_mixed_pixel_is_taken_apart_and_put_together_again() -> None:
+def test_a_mixed_pixel_is_separated_into_both_colours() -> None:
     scene = blended()
     colors = srgb_to_linear(scene.rgb)
     found = find_layers((1 / scene.depth).numpy(), np.zeros((72, 96, 2), np.float32), colors.numpy())
-    column = found.alpha[30:42, 32]  # the pixels of which the box has a half
+    column = found.alpha[30:42, 32]  # the box covers half of these pixels
     assert column == pytest.approx(0.5, abs=0.06)
     assert found.alpha[30:42, 36] == pytest.approx(0) or found.ring[36, 36] == 0
     near, far = srgb_to_linear(torch.tensor([[0.1, 0.1, 0.4], [0.8, 0.9, 0.5]])).numpy()
     assert np.abs(found.color[0, 30:42, 32] - near).max() < 0.05
     assert np.abs(found.color[1, 30:42, 32] - far).max() < 0.05
     for wall in wall_beside(scene):
-        assert float(wall.amin()) > 0.42  # nothing of the box's colour stays on the wall
+        assert float(wall.amin()) > 0.42  # the wall shows none of the box's colour
 
 
-def test_a_sharpened_fringe_goes_with_the_thing() -> None:
-    """Brighter than the wall along a dark box; on the wall it would be a thin line as soon as the camera moves."""
+def test_a_sharpened_fringe_belongs_to_the_near_surface() -> None:
     scene = blended()
     scene.rgb[:, 31][scene.depth[:, 32] < 3] = torch.tensor([1.0, 1.0, 0.9])
     for wall in wall_beside(scene):
@@ -122,7 +121,7 @@ def test_opacities_blend_to_the_shares(seed: int) -> None:
         assert 1 - passes * (1 - opacity[y, x]) == pytest.approx(layers.alpha[y, x], abs=0.03)
 
 
-def test_a_mixture_is_what_the_renderer_shows() -> None:
+def test_a_mixture_is_the_renderers_picture() -> None:
     torch.manual_seed(0)
     n, camera = 300, Camera.from_focal(40, 40, 300)  # more rows than one thread takes
     uv, spread = torch.rand(n, 2) * torch.tensor([44, 308]) - 4, 0.4 + 3 * torch.rand(n, 2)
@@ -134,8 +133,7 @@ def test_a_mixture_is_what_the_renderer_shows() -> None:
 
 
 @pytest.mark.parametrize("cells", [2, 3, 7])
-def test_a_photo_all_of_steps_is_closed_and_no_larger(cells: int) -> None:
-    """Two Gaussians a pixel, and a backing for four."""
+def test_a_photo_full_of_steps_has_no_holes_and_few_gaussians(cells: int) -> None:
     y, x = torch.meshgrid(torch.arange(42) // cells, torch.arange(50) // cells, indexing="ij")
     near = ((x + y) % 2).bool()
     colors = torch.where(near[..., None], 0.9, 0.1) + 0.05 * torch.rand(42, 50, 3)

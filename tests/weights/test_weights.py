@@ -26,7 +26,7 @@ from spackle.weights.download import Progress, download
 CONTENT = random.Random(5).randbytes(1_000_003)
 SHA256 = hashlib.sha256(CONTENT).hexdigest()
 BREAK = 400_000  # bytes before a connection breaks
-CLOSED = "http://127.0.0.1:1/weights.pt"  # nobody listens at a port below 1024 that no service has
+CLOSED = "http://127.0.0.1:1/weights.pt"  # a port at which nobody listens
 
 
 @pytest.fixture(autouse=True)
@@ -98,7 +98,7 @@ def test_a_later_call_requests_only_the_rest(site: Site, target: Path, knows_ran
 
 
 @pytest.mark.parametrize("size", [BREAK, len(CONTENT), len(CONTENT) + 1])
-def test_the_beginning_of_another_file_is_dropped(site: Site, target: Path, size: int) -> None:
+def test_a_part_of_another_file_is_discarded(site: Site, target: Path, size: int) -> None:
     target.with_name("weights.pt.part").write_bytes(random.Random(6).randbytes(size))
     fetches(site.url, target)
     assert ranges(site)[-1] is None
@@ -116,16 +116,16 @@ def test_the_beginning_of_another_file_is_dropped(site: Site, target: Path, size
         ({"status": 302, "headers": {"Location": "file:///etc/hostname"}}, ("HTTP 302",)),
     ],
 )
-def test_answers_that_are_not_the_file(
+def test_answers_other_than_the_file_are_refused(
     site: Site, target: Path, server: dict[str, Any], words: tuple[str, ...]
 ) -> None:
     for name, value in server.items():
         setattr(site, name, value)
     refused(site.url, target, site.url, *words)
-    assert bool(os.listdir(target.parent)) is ("10 bytes early" in words)  # all that came is kept
+    assert bool(os.listdir(target.parent)) is ("10 bytes early" in words)  # the received bytes are kept
 
 
-def test_a_server_that_hangs_or_is_none(site: Site, target: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_servers_that_hang_are_refused(site: Site, target: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "TIMEOUT", 0.2)
     site.hang_after = 200_000
     refused(site.url, target, site.url, "no connection (timed out)")
@@ -158,7 +158,7 @@ def test_places_that_cannot_be_written(site: Site, target: Path, monkeypatch: py
     fetches(site.url, target)
 
 
-def test_the_entries_are_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_entries_of_published_weights(monkeypatch: pytest.MonkeyPatch) -> None:
     for entry in PUBLISHED.values():
         assert re.fullmatch("[0-9a-f]{64}", entry.sha256)
         assert re.fullmatch(f"https://.*{re.escape(Path(entry.file).name)}", entry.address)
@@ -169,10 +169,10 @@ def test_the_entries_are_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     assert PUBLISHED["sharp"].address == PUBLISHED["sharp"].url
 
 
-def test_damage_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_damaged_weights_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     publish(monkeypatch, "sharp", CONTENT)
     file = tmp_path / SHARP_FILE
-    for content in (CONTENT, CONTENT[:-1]):  # what has another size is somebody's own
+    for content in (CONTENT, CONTENT[:-1]):  # a file of another size counts as the user's file
         file.write_bytes(content)
         check_undamaged(file)
         assert weights_digest(file) == hashlib.sha256(content).hexdigest()
@@ -189,7 +189,7 @@ def test_the_folder_of_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     for name in ("SPACKLE_WEIGHTS", "XDG_CACHE_HOME"):
         monkeypatch.delenv(name, raising=False)
     for variable, value, folder in (
-        ("XDG_CACHE_HOME", "relative", ".cache/spackle/weights"),  # to be ignored, says its standard
+        ("XDG_CACHE_HOME", "relative", ".cache/spackle/weights"),  # ignored, as the XDG standard demands
         ("XDG_CACHE_HOME", str(tmp_path / "cache"), "cache/spackle/weights"),
         ("SPACKLE_WEIGHTS", "~/mine", "mine"),
     ):
@@ -199,7 +199,7 @@ def test_the_folder_of_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 @pytest.fixture
 def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder of weights, not there yet, where the site's content is what Apple published."""
+    """The folder of weights, which does not exist yet; the site's content counts as Apple's weights."""
     monkeypatch.setenv("SPACKLE_WEIGHTS", str(tmp_path / "weights"))
     publish(monkeypatch, "sharp", CONTENT)
     return tmp_path / "weights"
@@ -234,7 +234,7 @@ def test_get_shows_the_terms_once_and_does_nothing_twice(site: Site, weights: Pa
     assert file.read_bytes() == CONTENT
 
 
-def test_get_to_a_place_of_your_own(site: Site, weights: Path, tmp_path: Path) -> None:
+def test_get_to_another_folder_or_file(site: Site, weights: Path, tmp_path: Path) -> None:
     for output, path in (("a/b", f"a/b/{SHARP_FILE}"), ("a/c.pt", "a/c.pt"), ("a/d.PT", "a/d.PT")):
         assert "--checkpoint" in gets("sharp", "--url", site.url, "-o", tmp_path / output).err
         assert (tmp_path / path).read_bytes() == CONTENT
@@ -247,18 +247,17 @@ def test_get_to_a_place_of_your_own(site: Site, weights: Path, tmp_path: Path) -
         ("nothing", None, "weights nothing: unknown: there are sharp"),
         ("sharp", CLOSED, "no connection (Connection refused): check network"),
         ("sharp", "http://me:secret@127.0.0.1:1/", "password"),
-        ("moge", CLOSED, "weights moge: unknown: there are sharp"),
         ("lama", None, "bytes instead of 205,669,692"),
     ],
 )
-def test_get_in_one_line_where_it_fails(site: Site, weights: Path, name: str, url: str | None, said: str) -> None:
+def test_get_fails_in_one_line(site: Site, weights: Path, name: str, url: str | None, said: str) -> None:
     result = get(name, "--url", url or site.url)
     assert result.code == 2
     assert said in result.lines[-1]
     assert not weights.exists()
 
 
-def test_list_says_what_is_here(weights: Path) -> None:
+def test_list_tells_which_weights_are_on_this_machine(weights: Path) -> None:
     weights.mkdir()
     for content, said in ((None, "not here"), (CONTENT, "whole 1.0 MB"), (CONTENT[:-1], "damaged")):
         if content is not None:
