@@ -16,7 +16,7 @@ from spackle.errors import InputError, reason_in_a_line
 DIED = "the worker process died, most likely for want of memory"
 Event = Mapping[str, Any]
 Tell = Callable[[Event], None]
-Work = Callable[[Any, Tell], None]  # pickled, like its tasks; raises InputError if a task cannot be done
+Work = Callable[[Any, Tell], None]  # pickled, like tasks; raises InputError if a task cannot be done
 
 
 class TaskProcess:

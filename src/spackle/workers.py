@@ -1,4 +1,4 @@
-"""Divide jobs between processes of this machine; each process sets up once."""
+"""Divide jobs between processes of this machine."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import torch
 from spackle.errors import InputError
 from spackle.task_process import end_with_parent
 
-QUEUED = 2  # jobs per process: the current one and the next; more would hold more uncollected results in memory
+QUEUED = 2  # jobs per process: the current and the next job; more jobs would keep more results in memory
 
 
 @contextlib.contextmanager
@@ -36,13 +36,13 @@ def threads_of_torch(count: int) -> Iterator[None]:
 def at_work(
     open_worker: Callable[[], Any], jobs: Sequence[Any], stop: Callable[[], bool], *, count: int, threads: int
 ) -> Iterator[Iterator[Any]]:
-    """Yield the results of jobs as they arrive, in any order. Each process takes one of the GPUs.
+    """Yield the results of jobs as they arrive, in any order. Each process uses one GPU.
 
     Args:
         open_worker: makes an object whose `make(job)` returns a job's result; called once in each process. The
             function, jobs and results are pickled.
         stop: whether the user has asked the command to end; the death of a process then only ends the results.
-        count: number of processes; a single worker runs in this process.
+        count: number of processes; with 1, jobs run in this process.
         threads: torch's threads in each process.
 
     Raises:
@@ -79,7 +79,9 @@ def _results(pool: ProcessPoolExecutor, jobs: Sequence[Any], most: int, stop: Ca
             ) from error
 
 
-_open_worker: Callable[[], Any]  # set in each worker process; called by its first job, which can report errors
+_open_worker: Callable[
+    [], Any
+]  # set in each worker process; the first job calls it, because only jobs can report errors
 
 
 def _start(threads: int, open_worker: Callable[[], Any], numbers: Any) -> None:

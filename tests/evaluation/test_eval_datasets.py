@@ -1,4 +1,4 @@
-"""The evaluation's datasets: small trees in the official formats, a point that must land on its pixel, and scales."""
+"""Datasets of the evaluation: small trees in the official formats, projections of known points, and scales."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ POINTS = np.array([[x, y, 4 + 0.5 * x + 0.2 * y] for x in (-1.0, -0.3, 0.4, 1.1)
 
 @dataclasses.dataclass(frozen=True)
 class Eye:
-    """A camera in the world that knows nothing of ours: OpenCV axes, the first pixel's corner is (0, 0)."""
+    """A camera that uses no code of the package: OpenCV axes, the first pixel's corner is (0, 0)."""
 
     at: tuple[float, float, float]
     turn: float = 0.0  # radians to the right
@@ -56,7 +56,7 @@ EYES = [Eye((0, 0, 0)), Eye((0.4, 0, 0), -0.06), Eye((0, 0.5, 0.1), 0.05), Eye((
 
 
 def stored(name: str, scene: Path) -> Path:
-    """A scene in its dataset's format: photos of `WIDTH` by `HEIGHT`; WildRGB-D's are the eyes', in a smaller world."""
+    """A stored scene with photos of `WIDTH` by `HEIGHT`; WildRGB-D's has the cameras `EYES`, with smaller distances."""
     return Path(shutil.copytree(DATA / "datasets" / name, scene))
 
 
@@ -67,7 +67,7 @@ def middlebury_2014(scene: Path, truth: str = "disp0.pfm") -> Path:
 
 
 def colmap(folder: Path, photos: Path, kind: str) -> None:
-    """A model of all points as all eyes see them, as text or binary; see the comments of the text."""
+    """A model of `POINTS` and `EYES`, as text or binary."""
     for number in range(len(EYES)):
         write_photo(photos / f"DSC_{number:04d}.JPG", WIDTH, HEIGHT)
     folder.mkdir(parents=True)
@@ -76,7 +76,7 @@ def colmap(folder: Path, photos: Path, kind: str) -> None:
 
 
 def lens(model: int, *numbers: float) -> bytes:
-    """A cameras.bin."""
+    """Content of a cameras.bin."""
     return struct.pack(f"<QiiQQ{len(numbers)}d", 1, 4, model, WIDTH, HEIGHT, *numbers)
 
 
@@ -93,7 +93,7 @@ def tanks(scene: Path, *, sparse: str = "sparse/0", kind: str = ".bin") -> Path:
 
 
 def llff(scene: Path, eyes: Sequence[Eye] = EYES, *, bounds: bool = True, sparse: bool = False) -> Path:
-    """Photos at a quarter of the size that the poses are for."""
+    """A scene whose photos have a quarter of the size in the poses."""
     for k in range(len(eyes)):
         write_photo(scene / "images_4" / f"image{k:03d}.png", WIDTH // 4, HEIGHT // 4)
     if bounds:
@@ -133,7 +133,7 @@ def test_each_tree_is_read_by_its_dataset(there: str, tmp_path: Path) -> None:
     found = read_cases(there, tmp_path / "data")
     names = [case.name for case in found]
     assert len(set(names)) == len(names) == {"middlebury": 1, "booster": 2}.get(there, len(EYES))
-    assert [case.name for case in read_cases(there, scene)] == names  # a scene alone is a root too
+    assert [case.name for case in read_cases(there, scene)] == names  # a scene can be the root
     assert all(case.photo.is_file() and all(view.photo.is_file() for view in case.seconds) for case in found)
     assert load_case(found[0]).seconds
 
@@ -168,7 +168,7 @@ def test_a_lost_or_damaged_file_is_named(name: str, file: str, content: str | No
 
 def test_odd_poses_and_bent_lenses_are_refused(tmp_path: Path) -> None:
     assert "no such folder" in error_of("llff", tmp_path / "nowhere")
-    assert "no scene of llff at or below it: expected SCENE/poses_bounds.npy" in error_of("llff", tmp_path)
+    assert "no scene of llff in this folder or below: expected SCENE/poses_bounds.npy" in error_of("llff", tmp_path)
     path = TREES["llff"](tmp_path / "poses") / "poses_bounds.npy"
     table = np.load(path)
     table[2, :3] = 1e30  # no rotation
@@ -176,15 +176,15 @@ def test_odd_poses_and_bent_lenses_are_refused(tmp_path: Path) -> None:
     assert "poses_bounds.npy: image002.png: " in error_of("llff", tmp_path / "poses")
     cameras = tanks(tmp_path / "tanks/Truck") / "sparse/0/cameras.bin"
     cameras.write_bytes(lens(2, FOCAL, WIDTH / 2, HEIGHT / 2, 0.4))
-    assert "bends the corners by over 2%: undistort" in error_of("tanks", tmp_path / "tanks")
+    assert "distorts the corners by over 2%: undistort" in error_of("tanks", tmp_path / "tanks")
     cameras.write_bytes(lens(5, *[1.0] * 8))
-    assert "lens model 5 is not a pinhole" in error_of("tanks", tmp_path / "tanks")
+    assert "camera model 5 is not a pinhole" in error_of("tanks", tmp_path / "tanks")
 
 
 def assert_pair(case: Case, disparity: float, z: float, x: int = 30, y: int = 9) -> tuple[torch.Tensor, torch.Tensor]:
-    """The centre of a left pixel must be seen `disparity` pixels further left, at the depth that is known there.
+    """Check that the right camera sees the centre of a left pixel `disparity` pixels further left, at depth `z`.
 
-    Returns where depth is known [H, W], and K.
+    Returns the pixels with known depth [H, W], and K.
     """
     assert case.camera is not None
     assert case.depth is not None
@@ -205,9 +205,9 @@ def test_middlebury_2014(tmp_path: Path) -> None:
     assert [case.name for case in found] == ["Art", "Piano-perfect"]
     for case in found:
         valid, K = assert_pair(case, 5.0, FOCAL * 0.193001 / (5.0 + 3.5))
-        assert (float(K[0, 2]), bool(valid[0, 0])) == (20.75, False)  # the file counts from the first pixel's middle
+        assert (float(K[0, 2]), bool(valid[0, 0])) == (20.75, False)  # in the file (0, 0) is the first pixel's middle
     middlebury_2014(tmp_path / "trainingH/Art")
-    assert "give the folder of one size" in error_of("middlebury", tmp_path)
+    assert "give the folder of a single size" in error_of("middlebury", tmp_path)
 
 
 def test_booster(tmp_path: Path) -> None:
@@ -315,20 +315,20 @@ def test_files_that_are_no_photos_of_the_case(tmp_path: Path) -> None:
     middlebury_2014(tmp_path / "Piano")
     (case,) = read_cases("middlebury", tmp_path)
     write_photo(tmp_path / "Piano/im1.png", HEIGHT, WIDTH)
-    with pytest.raises(InputError, match=r"im1\.png: 36×48 pixels upright, but its calibration is for 48×36"):
+    with pytest.raises(InputError, match=r"im1\.png: 36×48 pixels upright, but the calibration is for 48×36"):
         load_case(case)
     lonely = load_case(Case("lonely", write_photo(tmp_path / "lonely.png", WIDTH, HEIGHT)))
     assert (lonely.camera.width, lonely.photo.focal_source, lonely.seconds) == (WIDTH, "default 30 mm", ())
 
 
 def ramp(height: int = 60, width: int = 80, spoilt: float = 0.0) -> torch.Tensor:
-    """A depth map, with a share of it five times as far."""
+    """A depth map; a share of the pixels is five times as far."""
     depth = torch.linspace(2, 5, height)[:, None].expand(height, width)
     return torch.where(torch.rand(depth.shape, generator=torch.Generator().manual_seed(0)) < spoilt, 5 * depth, depth)
 
 
 def aligned(z_base: torch.Tensor, unseen: slice = slice(0), **known: Any) -> float:
-    """By a base that shows nothing in some columns."""
+    """The scale for a base without pixels in some columns."""
     seen = torch.ones_like(z_base, dtype=torch.bool)
     seen[:, unseen] = False
     return align(Case("case", Path("photo.png"), Camera.from_focal(100.0, 160, 120), **known), z_base, seen)
@@ -358,7 +358,7 @@ def test_bounds_are_the_last_resort_and_nothing_is_an_error() -> None:
     ("turn", "off", "tolerance"), [(0.0, (9.0, -4.0), 1e-3), (0.2, (0.0, 0.0), 1e-3), (0.05, (1.0, 0.5), 0.02)]
 )
 def test_a_second_camera_in_the_bases_world(turn: float, off: tuple[float, float], tolerance: float) -> None:
-    """The same pixel at the same relative depth must be seen at the same place through either camera."""
+    """Both cameras must project the same pixel at the same relative depth to the same place."""
     base, scale = Camera.from_focal(40.0, 48, 36), 2.5
     K = base.K.clone()
     K[:2, 2] += torch.tensor(off)

@@ -29,7 +29,9 @@ def dataset_build(
     ],
     output: Annotated[
         Path,
-        typer.Option("-o", "--output", metavar="OUT", help="The dataset's folder; an unfinished build in it resumes."),
+        typer.Option(
+            "-o", "--output", metavar="OUT", help="Folder of the dataset; the command resumes an unfinished build."
+        ),
     ],
     images: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Folder of a COCO JSON's photos; default: the JSON's.")
@@ -48,13 +50,15 @@ def dataset_build(
     ] = None,
     checkpoint: Annotated[Path | None, typer.Option("-c", "--checkpoint", help="Weights of the base.")] = None,
     precision: PrecisionOption = "auto",
-    views: Annotated[int, typer.Option(min=2, max=100, help="Number of views of each photo, its own included.")] = 20,
+    views: Annotated[
+        int, typer.Option(min=2, max=100, help="Number of views of each photo, including the photo's camera.")
+    ] = 20,
     trajectory: Annotated[
-        SharpTrajectoryName | None, typer.Option(help="Camera path; default: a random one for each photo.")
+        SharpTrajectoryName | None, typer.Option(help="Camera path; default: a random path for each photo.")
     ] = None,
     disparity: Annotated[
         tuple[float, float],
-        typer.Option(metavar="LO HI", help="Range of disparities from which the camera's move is drawn at random."),
+        typer.Option(metavar="LO HI", help="Smallest and greatest disparity of the random camera paths."),
     ] = (0.1, 0.6),
     inpainter: Annotated[
         str, typer.Option(help="What completes the views: exemplar, lama, opencv, propainter; geometry; or none.")
@@ -66,9 +70,11 @@ def dataset_build(
         int | None,
         typer.Option(help="Long side in pixels at which the inpainter works; default: propainter 640, lama 1024."),
     ] = None,
-    workers: Annotated[int, typer.Option(min=1, max=1024, help="Number of processes, each with its own base.")] = 1,
+    workers: Annotated[
+        int, typer.Option(min=1, max=1024, help="Number of processes, each with a copy of the base's network.")
+    ] = 1,
     threads: Annotated[
-        int, typer.Option(min=1, max=1024, help="Threads of each process; they change SHARP's last bits.")
+        int, typer.Option(min=1, max=1024, help="Threads of each process; SHARP's last bits depend on their number.")
     ] = 2,
     shard_size: Annotated[int, typer.Option(min=1, max=1_000_000, help="Number of photos in a tar file.")] = 50,
     device: DeviceOption = "auto",
@@ -101,7 +107,7 @@ def dataset_build(
 
 @dataset.command("info")
 def dataset_info(location: DatasetArgument) -> None:
-    """Say what a dataset holds: counts, sizes, holes of each view, configuration."""
+    """Print a dataset's counts, sizes, holes of each view, and configuration."""
     from rich.console import Console
 
     from spackle.dataset.inspect import show_info

@@ -28,8 +28,8 @@ Limit = Annotated[
 DatasetName = Annotated[
     str, typer.Option(metavar="NAME", help="Dataset: middlebury, booster, wildrgbd, tanks, eth3d or llff.")
 ]
-Folder = Annotated[Path, typer.Argument(metavar="FOLDER", help="Where the dataset was unpacked.")]
-BaseName = Annotated[str, typer.Option(help="sharp, moge, depth, lite, hf:NAME, or rgbd with the dataset's own depth.")]
+Folder = Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the unpacked dataset.")]
+BaseName = Annotated[str, typer.Option(help="sharp, moge, depth, lite, hf:NAME, or rgbd with the dataset's depth.")]
 Checkpoint = Annotated[Path | None, typer.Option("-c", "--checkpoint", help="Weights of the base.")]
 Residual = Annotated[
     str | None,
@@ -49,7 +49,7 @@ Output = Annotated[
         "-o",
         "--output",
         metavar="OUT",
-        help="Folder for the results, where an unfinished run resumes; default: by dataset and protocol.",
+        help="Folder for the results; an unfinished run resumes. [default: named by dataset and protocol]",
     ),
 ]
 Html = Annotated[bool, typer.Option("--html", help="Also write report.html, one page with all results.")]
@@ -130,7 +130,7 @@ def evaluate(
     if options.near and given is not None and given.name == "COMMANDLINE":
         raise InputError(
             f"--disparity {disparity}: --protocol near-view renders the views of the true second photos: "
-            "leave one of them out"
+            "leave one of the two options out"
         )
     results = output or Path(f"evaluation-{dataset}-{protocol}")
     if run(options, results, Reporter(verbose, as_json=as_json), html) == "stopped":
@@ -157,7 +157,7 @@ def figures(
     ],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="F", help="Folder for the files.")],
     rows: Annotated[
-        int, typer.Option(min=1, max=100, help="Number of images in a figure; each folder gives at least one.")
+        int, typer.Option(min=1, max=100, help="Number of images in a figure, but at least one from each folder.")
     ] = 6,
 ) -> None:
     """Draw the paper's figures of views: PDF, PNG, and captions in figures.tex."""
@@ -188,7 +188,7 @@ def bench(
     as_json: JsonOption = False,
     verbose: VerboseOption = False,
 ) -> None:
-    """Count and time what Spackle adds to the base, as in the paper's tables: rows.jsonl, bench.md, bench.tex."""
+    """Count the Gaussians and measure the time that Spackle adds to a base: rows.jsonl, bench.md, bench.tex."""
     from spackle.bases.settings import BaseSettings
     from spackle.evaluation.bench import TIMED
     from spackle.evaluation.bench import bench as run

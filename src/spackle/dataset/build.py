@@ -49,7 +49,7 @@ class DatasetOptions:
     """The options of `spackle dataset build`; the command line checks the bounds of its numbers."""
 
     base: BaseSettings
-    images: Path | None = None  # folder of the photos that a COCO JSON names
+    images: Path | None = None  # folder of a COCO JSON's photos
     sample: int | None = None  # number of photos; None: all
     seed: int = 0  # for the choice of photos and paths
     views: int = 20  # per photo, including the photo's camera, as in the paper
@@ -88,7 +88,7 @@ class DatasetOptions:
             )
 
     def depth_of(self, photo: PhotoFile) -> Path | None:
-        """A photo's depth map, in the photo's subfolder of --depth if there is one; None without --depth."""
+        """A photo's depth map, from the photo's subfolder of --depth or else --depth itself; None without --depth."""
         folder = self.base.depth
         if not isinstance(folder, Path):
             return None
@@ -140,7 +140,7 @@ def _completion(options: DatasetOptions, inpainter: Inpainter | None) -> dict[st
 
 
 def build_dataset(source: Path, output: Path, options: DatasetOptions, reporter: Reporter) -> str:
-    """Build a dataset from a folder of photos or from COCO annotations, or resume that build.
+    """Build a dataset from a folder of photos or from COCO annotations, or resume an earlier build.
 
     Returns:
         "complete", or "stopped" by Ctrl-C.

@@ -17,7 +17,7 @@ from spackle.progress import Step
 
 SUFFIXES = (*PHOTO_SUFFIXES, ".gif", ".bmp")
 MIN_SIDE = 32  # pixels: no depth can be recognised in smaller images
-NAMED = 5  # the most missing files that the log names
+NAMED = 5  # the log names at most this number of missing files
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,7 +36,7 @@ class PhotoFile:
 
 
 def find_photos(source: Path, folder: Path | None, log: Callable[[str], None]) -> tuple[Path, list[str]]:
-    """Find a dataset's photos; returns their folder, and their sorted names relative to it.
+    """Find a dataset's photos; returns the folder, and the photos' sorted names relative to the folder.
 
     Args:
         source: a folder, whose subfolders are included, or a COCO file `{"images": [{"file_name": …}, …]}`.
@@ -67,7 +67,9 @@ def _named_by_coco(source: Path, folder: Path | None, log: Callable[[str], None]
     unique = sorted({Path(name).as_posix() for name in names})
     present = [name for name in unique if os.path.isfile(root / name)]
     if not present:
-        raise InputError(f"{source}: none of its {len(unique)} images is in {root}: give their folder with --images")
+        raise InputError(
+            f"{source}: none of the {len(unique)} named images is in {root}: give the images' folder with --images"
+        )
     if missing := sorted(set(unique) - set(present)):
         listed = ", ".join((*missing[:NAMED], *(["…"] if len(missing) > NAMED else [])))
         log(f"{len(missing)} images that {source} names are not in {root}: {listed}")

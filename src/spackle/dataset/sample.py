@@ -1,4 +1,4 @@
-"""Encode a photo with its views as part of a tar archive, and decode it; see docs/dataset.md.
+"""Encode and decode a photo with its views as part of a tar archive; see docs/dataset.md.
 
 The same sample always has the same bytes. The loss in colours, opacity and depth is invisible; the loss in Gaussians is
 less than 1e-3 of a pixel; masks and cameras are exact.
@@ -97,7 +97,7 @@ class PhotoGroup:
 
     @staticmethod
     def of(key: str, data: bytes, where: str) -> PhotoGroup:
-        """Split a photo's part of a shard into its files; InputError if it is damaged."""
+        """Split a photo's part of a shard into files; InputError for damaged bytes."""
         files: dict[str, bytes] = {}
         with reading(where, "not a photo of a dataset, or damaged: {reason}"):
             at = 0
@@ -117,7 +117,7 @@ class PhotoGroup:
         return len(self.holes)
 
     def view(self, index: int) -> DatasetView:
-        """Decode one view; InputError if one of its files is missing or damaged."""
+        """Decode one view; InputError if a file is missing or damaged."""
         with reading(f"{self.where}: view {index}", "cannot be read: {reason}"):
             facts = self.facts["views"][index]
             rgb, target = (decode_rgb(self._file(index, kind)) for kind in ("rgb", "target"))
@@ -143,7 +143,7 @@ class PhotoGroup:
 
     @functools.cached_property
     def base(self) -> Gaussians:
-        """Decode the photo's Gaussians; InputError if they are missing or damaged."""
+        """Decode the photo's Gaussians; InputError if the file is missing or damaged."""
         with reading(f"{self.where}: Gaussians", "cannot be read: {reason}"):
             return decode_gaussians(self.files[f"{self.key}.base.safetensors"])
 

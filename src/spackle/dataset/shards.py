@@ -17,7 +17,7 @@ from spackle.errors import InputError, reading
 from spackle.files import atomic_path, digest_of
 
 NAME = "manifest.json"
-FORMAT = 1  # version of shards and manifest; others are refused
+FORMAT = 1  # version of shards and manifest; other versions are refused
 Bytes = Annotated[int, Field(ge=0, le=1 << 40)]
 Share = Annotated[float, Field(ge=0, le=1)]
 
@@ -85,7 +85,7 @@ class Manifest(BaseModel, frozen=True, extra="ignore", strict=True):
 
 
 def open_in(location: str | os.PathLike[str], name: str) -> IO[bytes]:
-    """Open a seekable file in a folder or at an fsspec address (s3://bucket/dataset); InputError if that fails."""
+    """Open a seekable file in a folder or at an fsspec address (s3://bucket/dataset); InputError if opening fails."""
     place = f"{str(location).rstrip('/')}/{name}"
     package = "an address needs fsspec (pip install fsspec), and perhaps a package for its protocol"
     with (
@@ -102,13 +102,15 @@ def open_in(location: str | os.PathLike[str], name: str) -> IO[bytes]:
 
 
 def load_manifest(location: str | os.PathLike[str]) -> Manifest:
-    """Read the manifest of a dataset; InputError if it is missing, damaged, or of another format."""
+    """Read the manifest of a dataset; InputError for a missing or damaged file, or another format."""
     where = f"{str(location).rstrip('/')}/{NAME}"
     with open_in(location, NAME) as file, reading(where, "damaged, or no manifest of a dataset: {reason}"):
         text = file.read()
         content = json.loads(text)
         if content["format"] != FORMAT:
-            raise InputError(f"{where}: format {content['format']!r} is unknown: this version reads {FORMAT}")
+            raise InputError(
+                f"{where}: format {content['format']!r} is unknown: this version of Spackle reads format {FORMAT}"
+            )
         recorded = content.pop("sha256")
         manifest = Manifest.model_validate_json(text)
         if not digest_of(content) == manifest.digest == recorded:
@@ -144,13 +146,14 @@ def write_shard(parts: Sequence[tuple[str, Path]], target: Path, passed_over: Se
 
 
 class DatasetFiles(Dataset[PhotoGroup]):
-    """The photos of a dataset as a torch `Dataset` with random access; its items are encoded.
+    """The encoded photos of a dataset as a torch `Dataset` with random access.
 
-    A DataLoader with `batch_size=None` can shuffle and prefetch them, a DistributedSampler divide them between ranks.
+    A DataLoader with `batch_size=None` can shuffle and prefetch photos; a DistributedSampler can divide photos between
+    ranks.
     """
 
     def __init__(self, location: str | os.PathLike[str]) -> None:
-        """Open a dataset in a folder or at a URL for fsspec; InputError unless it is finished."""
+        """Open a dataset in a folder or at a URL for fsspec; InputError for an unfinished dataset."""
         self.location = location
         self.manifest = load_manifest(location)
         if not self.manifest.complete:
@@ -169,6 +172,6 @@ class DatasetFiles(Dataset[PhotoGroup]):
             data = file.read(sample.size)
         if hashlib.sha256(data).hexdigest() != sample.sha256:
             raise InputError(
-                f"{where}: sample {sample.key} ({sample.photo}) is damaged: `spackle dataset verify` says more"
+                f"{where}: sample {sample.key} ({sample.photo}) is damaged: `spackle dataset verify` lists all damage"
             )
         return PhotoGroup.of(sample.key, data, f"{where}: sample {sample.key}")

@@ -74,7 +74,7 @@ class ViewStack:
     """A photo's Gaussians, rendered from V cameras."""
 
     prediction: BasePrediction
-    cameras: Sequence[Camera]  # the first one is the photo's
+    cameras: Sequence[Camera]  # the first camera is the photo's
     rgb: Tensor  # [V, H, W, 3] sRGB in 0..1, over black
     depth: Tensor  # [V, H, W] expected z; 0 where alpha is 0
     alpha: Tensor  # [V, H, W] opacity
@@ -160,7 +160,7 @@ def _looked_up(points: Tensor, camera: Camera, rgb: Tensor, inverse_depth: Tenso
 def paint_video(inpainter: Inpainter, views: ViewStack) -> Tensor:
     """Paint the views' holes as one video, whose frames are ordered along the path.
 
-    The photo's own view is inserted at the position that lengthens the path least.
+    The photo's view is inserted at the position that lengthens the path least.
     """
     eyes = torch.stack([camera.position.double() for camera in views.cameras])
     others = list(range(1, len(eyes)))

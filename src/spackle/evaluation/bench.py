@@ -34,7 +34,7 @@ from spackle.residual import ResidualNet
 from spackle.scene_fill import FillContext
 
 FILES = ("bench.md", "bench.tex")
-# The keys that a benchmark's configuration takes from an evaluation's.
+# Keys of an evaluation's configuration that a benchmark's configuration has, too.
 SHARED = ("dataset", "title", "terms", "images", "side", "disparities", "base", "residual", "device")
 TOTAL = "total"
 MS = 1000.0
@@ -48,7 +48,7 @@ Times = dict[tuple[str, str], Values]  # (task, stage) → milliseconds
 
 
 def bench(options: EvaluateOptions, runs: int, base_runs: int | None, output: Path, reporter: Reporter) -> str:
-    """Time a dataset, or resume that; returns "complete", or "stopped" after Ctrl-C.
+    """Time a dataset, or resume an earlier run; returns "complete", or "stopped" after Ctrl-C.
 
     Writes rows.jsonl, bench.md, bench.tex and images/ into `output`. A folder holds the times of one machine only. The
     base is timed `base_runs` times (None: once for SHARP, which is slow, else `runs` times), all later stages `runs`
@@ -125,9 +125,9 @@ def time_case(case: Case, evaluation: Evaluation, config: Mapping[str, Any]) -> 
 
 
 def view_numbers(base: int, added: int, seconds: Mapping[str, Values]) -> dict[str, float]:
-    """The numbers in tables that follow from a view's numbers of Gaussians and the seconds of each stage in each run.
+    """A view's numbers for tables, from counts of Gaussians and the seconds of each stage in each run.
 
-    These are counts, milliseconds (medians over runs), shares (not percent) and views per second.
+    Returns counts, milliseconds (medians over runs), shares (not percent) and views per second.
     """
     before, extra = (sum(MS * float(np.median(seconds[stage])) for stage in stages) for stages in (BASE_PATH, EXTRA))
     return {
@@ -143,7 +143,7 @@ def view_numbers(base: int, added: int, seconds: Mapping[str, Values]) -> dict[s
 
 
 def count_parameters(residual: ResidualNet | None) -> dict[str, float]:
-    """Count parameters: SHARP's checkpoint (702.31 M), its part used in inference, the residual, the residual's share.
+    """Count parameters: SHARP's checkpoint (702.31 M), the part for inference, the residual, the residual's share.
 
     Inference uses neither SHARP's classifiers nor the part that aligns depths.
     """
@@ -157,7 +157,7 @@ def count_parameters(residual: ResidualNet | None) -> dict[str, float]:
 
 
 def measure(runs: int, tasks: Mapping[str, Task], device: torch.device = CPU, *, warm: bool = False) -> Times:
-    """Milliseconds of each task (stage "total") and of its stages, in each run.
+    """Milliseconds of each task (stage "total") and of each stage of a task, in each run.
 
     A task gets a function and calls it with a stage's name when the stage ends; stages of the same name within a run
     add up. A stage ends when the device has done its work. The tasks take turns, so that a busy machine slows all

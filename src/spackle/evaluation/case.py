@@ -71,7 +71,7 @@ class LoadedCase:
 
 
 def load_case(case: Case, max_side: int = MAX_SIDE) -> LoadedCase:
-    """Read the photos of a case and resize them and their cameras to `working_size`.
+    """Read the photos of a case; resize photos and cameras to `working_size`.
 
     Views have even sides, so a second photo with an odd side loses its last row or column.
 
@@ -106,7 +106,7 @@ def _check_shape(path: Path, photo: Photo, camera: Camera) -> None:
     """InputError unless the photo has the aspect ratio for which its camera was calibrated."""
     if abs(photo.width * camera.height / (photo.height * camera.width) - 1) > SHAPE_TOLERANCE:
         raise InputError(
-            f"{path}: {photo.width}×{photo.height} pixels upright, but its calibration is for "
+            f"{path}: {photo.width}×{photo.height} pixels upright, but the calibration is for "
             f"{camera.width}×{camera.height}: the photo was cropped or turned, unpack it again"
         )
 
@@ -115,7 +115,7 @@ def known_depth(case: Case) -> DepthMap:
     """A case's depth map, or a map of its points: each pixel of the case's camera gets its nearest point.
 
     Raises:
-        InputError: the case has neither, or a file of it cannot be used.
+        InputError: the case has neither depth nor points, or a file cannot be used.
     """
     if case.depth is not None:
         return case.depth()

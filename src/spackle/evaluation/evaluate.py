@@ -43,7 +43,7 @@ from spackle.training.losses import load_features
 from spackle.weights import weights_digest, weights_digests
 
 BASE = BaseSettings("sharp")
-LARGE_SIDE = 1280  # long side of the paper's large views: its added Gaussians are (1280 / 1536)² of HAR × grid at 1536
+LARGE_SIDE = 1280  # long side of the paper's large views: the paper adds (1280 / 1536)² of HAR × grid at 1536
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,7 +56,7 @@ class EvaluateOptions:
     methods: Sequence[str] = ("base", "paper", "spackle")
     disparities: Sequence[float] = DISPARITIES  # of the large views
     metrics: Sequence[str] | None = None  # None: all metrics of the protocol
-    base: BaseSettings = BASE  # the paper's; its precision and device also apply to the residual
+    base: BaseSettings = BASE  # the paper's; precision and device also apply to the residual
     residual: str | None = None  # a file, or "seeds"; None: the shipped weights, if any
     direct_ft: Path | None = None  # weights of the method direct-ft
     inpainter: str = "opencv"  # of the method inpaint2d
@@ -82,7 +82,7 @@ class EvaluateOptions:
 
     @property
     def opened(self) -> BaseSettings:
-        """The base's settings; a base that takes no precision gets none, and then only the residual uses it."""
+        """The base's settings. If a base has no precision option, only the residual uses the precision."""
         without = self.base.named in ("rgbd", "lite")
         return dataclasses.replace(self.base, precision="auto") if without else self.base
 
@@ -99,7 +99,7 @@ class EvaluateOptions:
             raise InputError(f"--methods: none is given: choose from {', '.join(METHODS)}")
         self.opened.check(one=True)
         if self.residual == "none":
-            raise InputError("--residual none: there would be nothing to evaluate: add --methods base instead")
+            raise InputError("--residual none: leaves holes open, like --methods base: give one of the two")
         if "direct-ft" in self.methods and (self.base.name != "sharp" or self.direct_ft is None):
             raise InputError(
                 "--methods direct-ft: is SHARP with further training: add --base sharp, and --direct-ft FILE with the "
@@ -122,12 +122,12 @@ def parse_disparities(text: str) -> tuple[float, ...]:
     try:
         return tuple(dict.fromkeys(map(float, split_words(text))))
     except ValueError as error:
-        raise InputError(f"--disparity {text}: not numbers: give them with commas, such as 0.3,0.4,0.5") from error
+        raise InputError(f"--disparity {text}: not numbers: give numbers with commas, such as 0.3,0.4,0.5") from error
 
 
 @dataclasses.dataclass(frozen=True)
 class Evaluation:
-    """A dataset's cases, and what all of them are evaluated with."""
+    """A dataset's cases, and the objects that all cases share."""
 
     options: EvaluateOptions
     cases: Sequence[Case]
@@ -141,18 +141,18 @@ class Evaluation:
     metrics: dict[str, str]  # for each wanted metric the package that measures it, or why the metric is not run
 
     def open(self, loaded: LoadedCase) -> OpenedBase:
-        """The base of a case: a network, or else the case's depth or points; InputError if it has neither."""
+        """The base of a case: a network, or else the case's depth or points; InputError without any."""
         network = self.options.base.network
         return self.base if network else open_loaded(RgbdBase(known_depth(loaded.case)))
 
     def context(self, prediction: BasePrediction) -> FillContext:
-        """Join a photo's base Gaussians with what fills the holes of its views."""
+        """The context in which the holes of a photo's views are filled."""
         fill = self.renderer, self.network
         return FillContext(prediction.gaussians, prediction.camera, *fill, precision=self.options.base.precision)
 
 
 def open_evaluation(options: EvaluateOptions, more_metrics: Sequence[str] = ()) -> Evaluation:
-    """Check the options and load what all images share; a base's networks are loaded with the first image.
+    """Check the options and open base, networks and metrics; a base's networks are loaded with the first image.
 
     `more_metrics` are measured besides the options' metrics. InputError if an option, the dataset, weights or a
     package cannot be used.
@@ -241,7 +241,7 @@ def _configuration(
 
 
 def evaluate(options: EvaluateOptions, output: Path, reporter: Reporter, html: bool = False) -> str:
-    """Evaluate a dataset, or resume that; returns "complete", or "stopped" after Ctrl-C.
+    """Evaluate a dataset, or resume an earlier run; returns "complete", or "stopped" after Ctrl-C.
 
     Writes rows.jsonl, tables.md, tables.tex, worst.png, best.png and images/ into `output`, and with `html` also
     report.html. InputError if options, dataset or folder cannot be used, if `output` holds another evaluation, or if
@@ -340,12 +340,12 @@ def _align(loaded: LoadedCase, prediction: BasePrediction, evaluation: Evaluatio
 def merge_tables(folders: Sequence[Path], output: Path, reporter: Reporter, html: bool = False) -> None:
     """Write joint tables of finished evaluations and benchmarks into `output`, with `html` also report.html.
 
-    InputError if a folder has no results, results do not go together, or the output cannot be written to.
+    InputError if a folder has no results, results cannot share tables, or the output cannot be written to.
     """
     if html:
         check_matplotlib("--html")
     runs = [load_run(folder) for folder in folders]
-    tables = make_tables(runs, whole=True)  # raises for results that do not go together, before anything is written
+    tables = make_tables(runs, whole=True)  # raises for results that cannot share tables, before files are written
     files = (*FILES, *([REPORT] if html else []))
     with results_folder(output, files, alone=True):
         write_tables(tables, output)

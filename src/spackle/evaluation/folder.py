@@ -36,7 +36,7 @@ from spackle.progress import Reporter, asked_to_stop
 CONFIG, ROWS, IMAGES = "config.json", "rows.jsonl", "images"
 FORMAT = 3
 DAMAGED = "not of `spackle evaluate` or `spackle bench` ({reason}): run it again"
-# From index and case to the case's rows and the files that it wrote.
+# From index and case to the case's rows and written files.
 Measure = Callable[[int, Case], tuple[list[Row], list[Path]]]
 
 
@@ -47,7 +47,7 @@ def write_rows(rows: Iterable[Row], path: Path) -> None:
 
 
 def load_run(folder: Path) -> Run:
-    """Read the finished results in a folder; InputError if there are none, or a file is damaged."""
+    """Read the finished results in a folder; InputError for missing results or a damaged file."""
     if not (folder / ROWS).is_file():
         state = "not finished: run its command again" if (folder / CONFIG).is_file() else "no results"
         raise InputError(f"{folder}: {state}: {ROWS} is missing")
@@ -69,7 +69,7 @@ def earlier_metrics(folder: Path) -> list[str]:
 
 
 def image_file(output: Path, index: int, name: str, suffix: str) -> Path:
-    """The path of the file with an image's rows (.json), or with one of its pictures (.METHOD.webp)."""
+    """The path of the file with an image's rows (.json), or with a picture (.METHOD.webp)."""
     return output / IMAGES / f"{index:05d}-{re.sub(r'[^A-Za-z0-9.-]+', '_', name)[-80:]}{suffix}"
 
 
@@ -107,7 +107,7 @@ def measure_images(
                 if index and not begun:
                     reporter.log(f"{output}: going on, {index} of {len(cases)} images are done")
                 begun, start = True, time.perf_counter()
-                (output / ROWS).unlink(missing_ok=True)  # its numbers are no longer the folder's
+                (output / ROWS).unlink(missing_ok=True)  # results are incomplete from now on
                 try:
                     done, files = measure(index, case)
                 except BaseError:  # every other image would fail too, as when memory is too small

@@ -1,4 +1,4 @@
-"""The methods compared (methods.json), which render new viewpoints of a photo from the same base prediction."""
+"""The compared methods (methods.json): each renders new viewpoints of a photo from the same base prediction."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class MethodView(NamedTuple):
     aux: Gaussians | None  # added for the view; None if the method has no aux Gaussians
 
 
-Fill = Callable[[Camera, Rendering], MethodView]  # from a view's camera and the base's rendering of it
+Fill = Callable[[Camera, Rendering], MethodView]  # from a view's camera and the base's rendering of the view
 
 
 class MethodFacts(NamedTuple):
@@ -60,7 +60,7 @@ def make_method(
     Args:
         name: a name in `METHODS`.
         cameras: of all views of a setting, because a method may complete all views together.
-        context: the base, and what fills the holes of its views.
+        context: the base, the network and the renderer.
         inpainter: for inpaint2d.
         direct_ft: for direct-ft: the fine-tuned base's Gaussians, and the factor that converts camera positions to the
             unit of these Gaussians.
@@ -87,7 +87,7 @@ def make_method(
     if name == "spackle-scene":
         scene = fill_scene(context, cameras, exact=True).aux
         return on_top(lambda camera, before: scene)
-    if name in ("spackle", "seeds"):  # views are completed one by one (paper, section 3.4)
+    if name in ("spackle", "seeds"):  # each view is completed separately (paper, section 3.4)
         return partial(_per_view, context if name == "spackle" else context.seeds_alone, guard)
     if name == "inpaint2d":
         assert inpainter is not None

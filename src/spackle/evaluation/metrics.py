@@ -24,7 +24,7 @@ from spackle.filters import blurred, greatest_around
 from spackle.training.losses import hole_psnr
 
 OWN = "own"
-NOTICE = "pyiqa: PolyForm Noncommercial licence 1.0.0; several of the networks that it fetches are for research only"
+NOTICE = "pyiqa: PolyForm Noncommercial licence 1.0.0; several of its networks are for research only"
 NOT_INSTALLED = "pyiqa is not installed: pip install 'spackle-nvs[eval]'"
 WINDOW, SIGMA = 11, 1.5  # SSIM's window, in pixels (Wang et al. 2004)
 C1, C2 = 0.01**2, 0.03**2  # SSIM's constants K1 = 0.01, K2 = 0.03, for values in 0..1
@@ -120,9 +120,9 @@ def open_metrics(names: Sequence[str], device: str, download: bool) -> tuple[dic
     """Load metrics by their names in `DEFINITIONS`; a missing package or missing weights are no error.
 
     Args:
-        names: metrics to load; pyiqa is imported only if there are any.
+        names: metrics to load; pyiqa is imported only for a non-empty list.
         device: "cpu" or "cuda".
-        download: let pyiqa download missing weights; if False, its network access is blocked while it loads.
+        download: let pyiqa download missing weights; if False, network access is blocked while pyiqa loads.
 
     Returns:
         The metrics that were loaded; and for each name pyiqa's version, or the reason why the metric is "not run".
@@ -144,7 +144,7 @@ def open_metrics(names: Sequence[str], device: str, download: bool) -> tuple[dic
                 network = pyiqa.create_metric(name, device=torch.device(device), **(DEFINITIONS[name].options or {}))
             metrics[name], states[name] = _measure_by(network), f"pyiqa {pyiqa.__version__}"
         except Exception as error:  # a foreign package may raise anything; the report gets one line
-            why = f"pyiqa cannot load it: {reason_in_a_line(error)}"
+            why = f"pyiqa cannot load this metric: {reason_in_a_line(error)}"
             if not download:
                 why += " (--download-metrics lets pyiqa fetch missing weights)"
             states[name] = f"{NOT_RUN}: {why}"

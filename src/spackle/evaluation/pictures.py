@@ -27,7 +27,7 @@ from spackle.progress import Reporter
 
 WORST, BEST = "worst.png", "best.png"
 SHEET_CELL, SHEET_FONT, CASES = 320, 14, 6  # pixels, pixels, rows of a contact sheet
-# Images are ranked by the first of these metrics that the method has.
+# Images are ranked by the first metric of a protocol that the method has.
 ORDER = {"near-view": ("distance", "lpips", "psnr_hole"), "large-view": ("clipiqa", "musiq", "har", "har_before")}
 NAMES = {"psnr_hole": "PSNR in the hole ↑", "har": "HAR ↓", "har_before": "the base's HAR ↓"}
 LARGE_SIDE = 960  # the most pixels on a stored picture's longer side
@@ -55,7 +55,7 @@ class Cell(NamedTuple):
 def draw_grid(
     titles: Sequence[str], rows: Sequence[tuple[str, Sequence[Cell]]], cell: int, font: int, heading: str = ""
 ) -> Image.Image:
-    """Draw rows of pictures below the titles of their columns; each row has its caption above it.
+    """Draw rows of pictures below the titles of their columns; each row is below its caption.
 
     Args:
         titles: titles of the columns.
@@ -126,12 +126,12 @@ class Ranking(NamedTuple):
     """Images from best to worst."""
 
     names: list[str]
-    criterion: str  # the metric and method by which they are ranked
+    criterion: str  # the metric and method of the ranking
     values: dict[str, float]
 
 
 def rank(run: Run) -> Ranking | None:
-    """Rank a run's images by Spackle if it was run, else by the last method; None if nothing was measured."""
+    """Rank a run's images by the method spackle, or else the last method; None if nothing was measured."""
     method = "spackle" if "spackle" in run.methods else run.methods[-1]
     for metric in ORDER[str(run.config["protocol"])]:
         if values := run.by_image(metric, method):
@@ -176,7 +176,7 @@ def evenly(count: int, most: int) -> list[int]:
 
 
 class PaperFigure(NamedTuple):
-    """A figure like one of the paper's."""
+    """A figure in the paper's layout."""
 
     name: str
     columns: Sequence[str]  # names of pictures; methods that no run has are left out
@@ -194,7 +194,7 @@ def make_figures(folders: Sequence[Path], rows: int, output: Path, reporter: Rep
     Each image appears as its view with the largest hole. A figure has at most `rows` images, but at least one per run.
 
     Raises:
-        InputError: a folder has no results, or no large-view evaluation has its pictures.
+        InputError: a folder has no results, or no large-view evaluation has pictures.
     """
     runs = [(load_run(folder), folder) for folder in folders]
     runs = [(run, folder) for run, folder in runs if not run.timed and not run.near]
@@ -206,7 +206,7 @@ def make_figures(folders: Sequence[Path], rows: int, output: Path, reporter: Rep
     if not made:
         raise InputError(f"{folders[0]}: nothing to draw: give folders of `spackle evaluate` with --disparity 0.6")
     for name in [figure.name for figure in FIGURES if figure.name not in made]:
-        reporter.log(f"no figure {name}: no large-view run has its pictures")
+        reporter.log(f"no figure {name}: no large-view run has the pictures of its methods")
     files = [f"{name}.{end}" for name in made for end in ("pdf", "png")]
     with results_folder(output, (*files, CAPTIONS), alone=True):
         for name, (image, _) in made.items():
@@ -239,7 +239,7 @@ def _draw(figure: PaperFigure, runs: Sequence[tuple[Run, Path]], most: int) -> t
 
 def _cell(run: Run, image: str, name: str, pictures: dict[str, Image.Image], figure: PaperFigure) -> Cell:
     """A picture with marks: boxes around holes for the base, the share of added Gaussians for methods."""
-    if name == HOLE:  # framed, because it may be white on a white page
+    if name == HOLE:  # framed, because a hole may be white on a white page
         width, height = pictures[name].size
         ImageDraw.Draw(pictures[name]).rectangle((0, 0, width - 1, height - 1), outline="grey")
     if HOLE in figure.columns:
@@ -269,7 +269,7 @@ def _latex(figure: PaperFigure, runs: Sequence[Run], bases: str, ours: str) -> s
     """LaTeX for a figure across both columns, with its caption."""
     settings = dict.fromkeys(max(run.settings, key=float) for run in runs)
     weights = dict.fromkeys(run.config["residual"]["weights"] for run in runs)
-    says = {"shipped": "The residual has the weights that ship with Spackle, which the paper's recipe did not make."}
+    says = {"shipped": "The residual has the weights that ship with Spackle, which the paper's recipe did not train."}
     says["seeds"] = "The residual has no weights: its deltas are 0."
     caption = figure.caption.format(
         views=f"disparity {', '.join(settings)}",

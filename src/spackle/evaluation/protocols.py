@@ -24,7 +24,7 @@ from spackle.scene_fill import FillContext
 from spackle.training.losses import FeatureNet, hole_distance
 
 MIN_PIXELS = 8  # the least number of pixels for a scale
-BOUNDS_QUANTILES = (0.001, 0.999)  # the quantiles of point depths that LLFF's near and far are
+BOUNDS_QUANTILES = (0.001, 0.999)  # LLFF's near and far bounds are these quantiles of the depths of points
 TRUTH, INPUT, HOLE = "truth", "input", "hole"  # names of pictures beside the methods
 
 
@@ -66,7 +66,7 @@ def large_views(prediction: BasePrediction, disparities: Sequence[float], side: 
     and both sides are even, as the paper's counts of dense grids imply.
 
     Raises:
-        InputError: no Gaussian is in front of the camera, or there is no path with such a disparity.
+        InputError: no Gaussian is in front of the camera, or the disparity is impossible.
     """
     try:
         camera, reach = prediction.camera, DepthRange.of(prediction.gaussians)
@@ -81,18 +81,18 @@ def large_views(prediction: BasePrediction, disparities: Sequence[float], side: 
 
 
 def align(case: Case, z_base: Tensor, seen: Tensor) -> float:
-    """The scale between the units of length, z_dataset = scale · z_base: the median over pixels where both are known.
+    """The ratio of the units of length, z_dataset / z_base: the median over pixels with known depth in both.
 
-    The dataset's depth map is used; without a map its points; without points its bounds. A metric base and a metric
+    The dataset's depth comes from a depth map, or else from points, or else from bounds. A metric base and a metric
     dataset are aligned too, because a network's metres are rarely exact.
 
     Args:
         case: the case, in the dataset's unit.
         z_base: [H, W] the base's depth at the input camera, at any size with the photo's aspect ratio.
-        seen: [H, W] bool, the pixels where that depth is valid.
+        seen: [H, W] bool, the pixels with a valid depth of the base.
 
     Raises:
-        InputError: no depth of the case is known, or too little of it where the base's depth is valid.
+        InputError: too few pixels have known depth in both.
     """
     seen = seen & torch.isfinite(z_base) & (z_base > 0)
     ratios = [_depth_ratios(case.depth(), z_base, seen)] if case.depth else []
@@ -120,7 +120,7 @@ def to_base(view: Camera, photo: Camera, base: Camera, scale: float) -> Camera:
     If the base's principal point or focal length differs from the dataset's, the base's scene is sheared: the same
     pixel at the same depth is another point. The returned camera projects the base's points to the pixels where `view`
     projects the dataset's. The result is exact if the two cameras look in the same direction, as in rectified pairs, or
-    have the same intrinsics; otherwise it is exact up to a skew of the pixel grid.
+    have the same intrinsics; otherwise the result is exact up to a skew of the pixel grid.
 
     Args:
         view: in the input photo's frame and the dataset's unit.
@@ -159,7 +159,7 @@ def _depth_ratios(known: DepthMap, z_base: Tensor, seen: Tensor) -> Tensor:
 
 def _point_ratios(case: Case, points: Points, z_base: Tensor, seen: Tensor) -> Tensor:
     """Ratios of dataset depth to base depth; each point uses the pixel of the base in which the point lies."""
-    assert case.camera is not None  # the points are in its pixels
+    assert case.camera is not None  # points are in pixels of this camera
     height, width = z_base.shape
     cells = (points.uv * torch.tensor([width / case.camera.width, height / case.camera.height])).floor().long()
     inside = ((cells >= 0) & (cells < torch.tensor([width, height]))).all(1)

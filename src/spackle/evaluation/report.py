@@ -34,10 +34,10 @@ if TYPE_CHECKING:
 
 REPORT = "report.html"
 MOST, LEAST = 8, 2  # the most images on a page, and the least of each evaluation
-# A slider shows the first `MOST_SHOWN` of these that exist; all methods would make the page too large.
+# A slider shows the first `MOST_SHOWN` existing pictures of this list, to limit the page's size.
 SHOWN = ("base", "spackle", TRUTH, "inpaint2d", "paper", "seeds", "direct-ft", "spackle-scene", "dense")
 MOST_SHOWN = 6
-# The columns of a method's means, in this order; a column is left out if it was not measured.
+# The columns of a method's means, in order; a column without numbers is left out.
 COLUMNS: dict[str, tuple[str, Callable[[float], str]]] = {
     "psnr_hole": ("PSNR in the hole ↑", "{:.2f}".format),
     "ssim_hole": ("SSIM in the hole ↑", "{:.4f}".format),
@@ -114,7 +114,7 @@ def _part(run: Run, folder: Path, count: int) -> dict[str, Any]:
 
 
 def means_table(run: Run, rows: Iterable[Row]) -> Table:
-    """Means of metrics over a run's images: a row for each method, grouped by setting if there are several."""
+    """Means of metrics over a run's images: a row for each method, grouped by setting if there are several settings."""
     values = pivot((row for row in rows if row.metric in COLUMNS), "setting", "method", "metric")
     settings = list(dict.fromkeys(setting for setting, *_ in values))
     keys = [key for key in COLUMNS if any(metric == key for *_, metric in values)]
@@ -174,7 +174,7 @@ class Plot(NamedTuple):
     """A plot with title and texts."""
 
     title: str
-    alt: str  # text for readers who cannot see it
+    alt: str  # text for readers who cannot see the plot
     svg: bytes
     note: str
 
@@ -209,7 +209,9 @@ def _draw(
     from matplotlib.figure import Figure
 
     with rc_context(RC), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # matplotlib warns about letters that its font lacks; the browser has them
+        warnings.simplefilter(
+            "ignore"
+        )  # matplotlib warns about letters without a glyph; the browser's font has these letters
         figure = Figure(figsize=(WIDTH, height), layout="constrained")
         axes = figure.subplots()
         for one in series:
@@ -244,7 +246,7 @@ def holes_plot(run: Run) -> Plot | None:
     positive = [value for value in values if value > 0]
 
     def finish(axes: Axes) -> None:
-        """Set a logarithmic y axis; if a HAR is zero, the axis becomes linear near zero to show it."""
+        """Set a logarithmic y axis; if a HAR is zero, the axis is linear near zero."""
         if len(positive) == len(values):
             axes.set_yscale("log")
         elif positive:
@@ -258,7 +260,7 @@ def holes_plot(run: Run) -> Plot | None:
 
 
 def scenes_plot(run: Run, metric: str) -> Plot | None:
-    """A metric of each scene by each method; scenes are ranked by Spackle if it was run, else by the last method."""
+    """A metric of each scene by each method; scenes are ranked by the method spackle, or else the last method."""
     values = {method: by_image for method in run.methods if (by_image := run.by_image(metric, method))}
     if not values:
         return None

@@ -1,4 +1,4 @@
-"""Measured numbers and the paper's (paper.json), one row per number; tables are pivots of rows."""
+"""Measured numbers and the paper's numbers (paper.json), one row per number; tables are pivots of rows."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ DISPARITIES = tuple(map(float, SETTINGS))
 
 
 class Row(NamedTuple):
-    """One number. If it describes an image as a whole, setting, view and method are empty."""
+    """One number. For a number of a whole image, setting, view and method are empty."""
 
-    dataset: str  # its name in the paper's tables
+    dataset: str  # the dataset's name in the paper's tables
     image: str
     setting: str  # "0.3" (a disparity), or "near"
     view: str
@@ -145,5 +145,5 @@ def paper_rows(label: str) -> tuple[Row, ...]:
 
 
 def setting_title(setting: str, pattern: str = "{}") -> str:
-    """The title of a setting: "S1" for "0.3", or a pattern filled with "S1" and "0.3"; "disparity 0.6" for others."""
+    """The title of a setting: "S1" for "0.3", or `pattern` filled with "S1" and "0.3"; else "disparity 0.6"."""
     return pattern.format(f"S{SETTINGS.index(setting) + 1}", setting) if setting in SETTINGS else f"disparity {setting}"

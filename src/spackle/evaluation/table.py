@@ -23,7 +23,7 @@ class Table:
     caption: str
     heads: Sequence[tuple[str, str]]  # for each column the head of its group ("" without a group) and the column's head
     bodies: Sequence[Sequence[Cells]]  # groups of rows, with a rule between groups
-    words: int = 1  # text columns on the left; with two or more, the first one shows a group's name in its first row
+    words: int = 1  # text columns on the left; the first of several shows a group's name in the group's first row
     notes: Sequence[str] = ()
 
 
@@ -47,7 +47,7 @@ TEXTS: dict[str, Text] = {
 
 
 def mark_best(values: Sequence[float | None], texts: Sequence[str], lower: bool) -> list[str]:
-    """Make the text of the best value bold, and texts equal to this text; no text is bold if all texts are equal."""
+    """Make the text of the best value bold, and equal texts, too; no text is bold if all texts are equal."""
     known = {value: text for value, text in zip(values, texts, strict=True) if value is not None}
     if len(set(known.values())) < 2:
         return list(texts)

@@ -36,7 +36,7 @@ FILES = ("tables.md", "tables.tex")
 TABLES, NOTES = load_data("tables.json").values()
 EFFICIENCY, EXPANDED = "tab:efficiency_gaussian_overhead", "tab:expanded_efficiency_gaussian_overhead"
 FROM_PAPER = " (paper)"  # the end of the method's name in the paper's rows
-# Derived metrics: a metric over another one of the same method, or of the named method.
+# Derived metrics: a metric over a second metric of the same method, or of a third entry's method.
 RATIOS = {
     "aux_per_cell": ("aux", "hole_cells", ""),
     "reduction": ("har", "har_before", ""),  # 1 minus this ratio (paper, eq. 11)
@@ -63,7 +63,7 @@ Values = Mapping[tuple[str, ...], Sequence[Value]]  # by method, setting and met
 def make_tables(runs: Sequence[Run], *, whole: bool = False) -> list[Table]:
     """Make the tables for which the runs have numbers; with `whole`, all of the paper's.
 
-    Counts of Gaussians and times come from benchmarks; for datasets without one, counts come from their large views.
+    Counts of Gaussians and times come from benchmarks; for datasets without a benchmark, counts come from large views.
 
     Raises:
         InputError: two runs have the same dataset, protocol and base, or runs differ in their disparities.
@@ -71,7 +71,7 @@ def make_tables(runs: Sequence[Run], *, whole: bool = False) -> list[Table]:
     keys = [(str(run.config["protocol"]), run.title, run.base) for run in runs]
     for protocol, title, base in keys:
         if keys.count((protocol, title, base)) > 1:
-            raise InputError(f"two results for {title} under {protocol} with the base {base}: give one of them")
+            raise InputError(f"two results for {title} under {protocol} with the base {base}: give one of the two")
     of = {"near": [run for run in runs if run.near]}
     of["large"] = [run for run in runs if not run.near and not run.timed]
     of["cost"] = [run for run in runs if run.timed]
@@ -132,7 +132,7 @@ def _notes(spec: Mapping[str, Any], runs: Sequence[Run]) -> list[str]:
 def _weights(run: Run) -> str:
     residual = run.config["residual"]
     if not residual["sha256"]:
-        return "the residual has no weights, its deltas are 0"
+        return "the residual has no weights (deltas are 0)"
     given = residual["weights"] == "given"
     origin = "given weights" if given else "the residual has the weights that ship with Spackle"
     return f"{origin} ({residual['sha256'][:8]})"
@@ -160,7 +160,7 @@ def _timed_notes(run: Run) -> list[str]:
 
 
 def _columns(spec: Mapping[str, Any], settings: Iterable[str], over: str = "") -> list[Column]:
-    """A table's columns at each setting; if the pattern `over` is given, it makes the head of each setting."""
+    """A table's columns at each setting; a pattern `over` makes the head of each setting."""
     columns = []
     for setting in settings:
         for group, title, metric, *text in spec["columns"]:
@@ -218,7 +218,7 @@ def _datasets(runs: Sequence[Run]) -> list[str]:
 
 
 def grouped(name: str, rows: Sequence[Cells]) -> list[Cells]:
-    """Prepend a column with the rows' common name, which only the first row shows."""
+    """Prepend a column with the rows' common name in the first row."""
     return [(EMPTY if k else name, *cells) for k, cells in enumerate(rows)]
 
 

@@ -51,18 +51,18 @@ def read_cases(name: str, root: Path) -> list[Case]:
     """
     dataset = DATASETS[name]
     if not root.is_dir():
-        raise InputError(f"{root}: no such folder: give the one that {name} was unpacked in")
+        raise InputError(f"{root}: no such folder: give the folder of the unpacked dataset {name}")
     if root.name in ("", ".."):  # a scene is named after its folder
         root = root.resolve()
     folders = sorted(_scenes(root, dataset), key=lambda folder: (folder.name, folder.as_posix()))
     if not folders:
-        raise InputError(f"{root}: no scene of {name} at or below it: expected {dataset.expected}")
+        raise InputError(f"{root}: no scene of {name} in this folder or below: expected {dataset.expected}")
     scenes: dict[str, Path] = {}
     for folder in folders:
         scene = posed_photos.category_and_scene(folder) if name == "wildrgbd" else folder.name
         other = scenes.setdefault(scene, folder)
         if other is not folder:
-            raise InputError(f"{folder}: {other} has the same scene name: give the folder of one size or part alone")
+            raise InputError(f"{folder}: {other} has the same scene name: give the folder of a single size or part")
     return dataset.cases(scenes)
 
 

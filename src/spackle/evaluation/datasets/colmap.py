@@ -20,11 +20,10 @@ from spackle.gaussians import quat_to_matrix
 
 Array = NDArray[Any]
 
-# Lenses that distort the corner by more than this fraction of the long side are refused. Smaller distortion is ignored:
-# photos from close viewpoints share it, so a distortion of 1 % changes the shift between corresponding pixels by only a
-# few percent.
+# The greatest accepted distortion of a corner, over the long side. Smaller distortion is ignored, because photos from
+# close viewpoints are distorted alike: 1 % changes the shift between corresponding pixels by a few percent.
 MAX_BEND = 0.02
-MAX_ERROR_PX = 2.0  # the greatest accepted reprojection error of a point, a mean over its photos
+MAX_ERROR_PX = 2.0  # the greatest accepted reprojection error of a point, as mean over photos
 # Name and number of parameters by COLMAP's model id; other models are too far from a pinhole.
 MODELS = {0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8)}
 POINT_2D = np.dtype([("uv", "<f8", (2,)), ("id", "<i8")])  # id -1: no point
@@ -49,7 +48,7 @@ class Model:
     xyz: Array  # [m, 3] positions in the world
 
     def points(self, view: ColmapView) -> Points:
-        """The reliable points that a view sees, with their depth in it."""
+        """The reliable points that a view sees, with their depth in the view."""
         _, seen, known = np.intersect1d(view.ids, self.ids, assume_unique=True, return_indices=True)
         z = view.camera.to_camera(torch.from_numpy(self.xyz[known]))[:, 2]
         front = z > 0
@@ -57,7 +56,7 @@ class Model:
 
 
 def model_folder(scene: Path) -> Path:
-    """The folder of a scene's model: sparse/0, sparse, or these in dense/, where COLMAP's undistorter puts it."""
+    """The folder of a scene's model: sparse/0 or sparse, possibly in dense/ as by COLMAP's undistorter."""
     for place in (scene / name for name in ("sparse/0", "sparse", "dense/sparse/0", "dense/sparse")):
         if any((place / f"cameras{end}").is_file() for end in (".bin", ".txt")):
             return place
@@ -91,7 +90,7 @@ def read_model(folder: Path) -> Model:
 def _lens(path: Path, model: int | str, width: int, height: int, parameters: list[float]) -> Camera:
     name, count = next((m for key, m in MODELS.items() if model in (key, m[0])), ("", -1))
     if len(parameters) != count:
-        raise InputError(f"{path}: lens model {model} is not a pinhole: undistort the photos with COLMAP first")
+        raise InputError(f"{path}: camera model {model} is not a pinhole: undistort the photos with COLMAP first")
     single = name.startswith(("SIMPLE", "RADIAL"))
     fx, fy, cx, cy, *bend = [parameters[0], *parameters] if single else parameters
     K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
@@ -102,7 +101,7 @@ def _lens(path: Path, model: int | str, width: int, height: int, parameters: lis
     radial = sum(abs(k) * square ** (n + 1) for n, k in enumerate(bend[:2])) * float(np.hypot(*corner))
     tangential = 3 * sum(map(abs, bend[2:])) * square
     if not (radial + tangential) * max(fx, fy) <= MAX_BEND * max(width, height):  # also refuses NaN
-        raise InputError(f"{path}: this lens bends the corners by over {MAX_BEND:.0%}: undistort the photos first")
+        raise InputError(f"{path}: this camera distorts the corners by over {MAX_BEND:.0%}: undistort the photos first")
     return lens
 
 
@@ -129,7 +128,7 @@ def _cameras_bin(path: Path) -> Iterator[tuple[Any, ...]]:
     (count,), at = struct.unpack_from("<Q", data), 8
     for _ in range(count):
         key, model, width, height = struct.unpack_from("<iiQQ", data, at)
-        number = MODELS[model][1] if model in MODELS else 0  # the length of other models is unknown; they are refused
+        number = MODELS[model][1] if model in MODELS else 0  # the length of other models is unknown
         yield key, model, width, height, list(struct.unpack_from(f"<{number}d", data, at + 24))
         at += 24 + 8 * number
 

@@ -1,4 +1,4 @@
-"""Posed photos of one scene: a choice of them, their second views, and their cases."""
+"""Posed photos of one scene: choice of frames, second views, and cases."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from spackle.camera import Camera
 from spackle.evaluation.case import Case, Points, SecondView
 from spackle.evaluation.datasets.colmap import Model
 
-MAX_NEAR = 3  # the most second views of a photo that count as near
+MAX_NEAR = 3  # a photo has at most this number of near second views
 BASELINES = (0.05, 0.25)  # distance of the cameras over the photo's middle depth; Middlebury's pairs have 0.05 to 0.2
 MAX_TURN = 30.0  # the greatest angle between the optical axes, in degrees
 MIN_SHARED = 0.3  # the least fraction of the photo's points that a near view sees too
@@ -52,9 +52,9 @@ def posed_by(scene: Path, model: Model, photos: Sequence[Path]) -> list[Posed]:
 def make_cases(views: Sequence[Posed], wanted: Iterable[int] | None = None) -> list[Case]:
     """Make cases of photos: all other photos are second views, in the case's frame, with the nearest camera first.
 
-    At most three second views count as near, the nearest that qualify. A view qualifies if its camera is 5 % to 25 % of
-    the photo's middle depth away, is turned by at most 30°, and sees at least 30 % of the photo's points. If points are
-    unknown, each camera must instead see the middle of the other's view. A photo may have no near view.
+    At most three second views count as near: the nearest views that qualify. A view qualifies if its camera is 5 % to
+    25 % of the photo's middle depth away, is turned by at most 30°, and sees at least 30 % of the photo's points. If
+    points are unknown, each camera must instead see the middle of the other's view. A photo may have no near view.
 
     Args:
         views: all photos of a scene.
@@ -88,7 +88,7 @@ def _at(camera: Camera, world_to_camera: Tensor) -> Camera:
 def _sees_the_same(view: Posed, other: Posed) -> bool:
     if view.ids is not None and other.ids is not None:
         return len(np.intersect1d(view.ids, other.ids, assume_unique=True)) >= MIN_SHARED * max(1, len(view.ids))
-    for one, two in ((view.camera, other), (other.camera, view)):  # does one see the middle of the other's image?
+    for one, two in ((view.camera, other), (other.camera, view)):  # each camera must see the middle of the other image
         size = torch.tensor([two.camera.width, two.camera.height], dtype=torch.float64)
         uv, z = one.project(two.camera.unproject(size / 2, torch.tensor(two.depth, dtype=torch.float64)))
         if not bool((z > 0) & (uv >= 0).all() & (uv <= torch.tensor([one.width, one.height])).all()):
@@ -99,7 +99,7 @@ def _sees_the_same(view: Posed, other: Posed) -> bool:
 def spread(scenes: Sequence[str], frames: Callable[[str], Sequence[int]], count: int) -> dict[str, list[int]]:
     """Choose at most `count` frames, spread evenly over the scenes and, within a scene, over its frames.
 
-    Each scene gives an equal share of the frames, or all frames that it has; with more scenes than `count`, evenly
+    Each scene gives an equal share of the frames, or all its frames; with more scenes than `count`, evenly
     spaced scenes give one frame each.
 
     Args:

@@ -44,7 +44,7 @@ def eth3d_cases(scenes: Mapping[str, Path]) -> list[Case]:
     """Cases of ETH3D: the undistorted DSLR photos of the training scenes.
 
     `SCENE/dslr_calibration_undistorted/{cameras,images,points3D}.txt` and `SCENE/images/dslr_images_undistorted/*.JPG`.
-    The model is metric, because it was aligned to laser scans; its sparse points give the scale. The dense ground truth
+    The model was aligned to laser scans, so its sparse points are metric. The dense ground truth
     belongs to the distorted photos and is not used. For second views see `make_cases`. The 13 training scenes have the
     paper's 454 images.
     """
@@ -62,7 +62,7 @@ def tanks_cases(scenes: Mapping[str, Path]) -> list[Case]:
     """Cases of scenes with `SCENE/images` and `SCENE/sparse/0`, the usual layout for COLMAP and 3D Gaussian splatting.
 
     `SCENE/sparse` without the 0, and `SCENE/dense/{images,sparse}`, are read too. The camera must be close to a
-    pinhole; `colmap image_undistorter` makes such cameras. The dataset's own archives have no such models, only `.log`
+    pinhole; `colmap image_undistorter` makes such cameras. The dataset's archives have no such models, only `.log`
     poses without intrinsics, which are not read. The unit of length is arbitrary.
 
     `spread` takes 512 photos from all scenes; second views come from all photos, see `make_cases`. The paper's 331,776
@@ -85,7 +85,7 @@ def _tanks_views(scene: Path) -> list[Posed]:
 
 
 def llff_cases(scenes: Mapping[str, Path]) -> list[Case]:
-    """Eight scenes with `poses_bounds.npy`, `sparse/0`, or both, and photos in `images_4`, `images` or `images_8`.
+    """Cases of scenes with `poses_bounds.npy`, `sparse/0`, or both, and photos in `images_4`, `images` or `images_8`.
 
     A COLMAP model, from which the dataset's poses were made, gives cameras and points. The near and far bounds are used
     only if the model has no points, or there is no model; then the middle depth is half way between the bounds in
@@ -108,7 +108,7 @@ def _llff_views(scene: Path) -> list[Posed]:
         files = _match(scene, [view.name for view in model.views], photos)
         return [dataclasses.replace(v, bounds=bounds.get(v.photo)) for v in posed_by(scene, model, files)]
     views = []
-    for photo, row in zip(photos, rows, strict=True):  # a scene has one or the other
+    for photo, row in zip(photos, rows, strict=True):  # there are bounds, because there is no model
         near, far = bounds[photo]
         camera = _camera_of_row(row, f"{path}: {photo.name}")
         middle = 2 / (1 / near + 1 / far)
@@ -159,12 +159,12 @@ def wildrgbd_cases(scenes: Mapping[str, Path]) -> list[Case]:
 
     `CATEGORY/scenes/SCENE/` has `rgb/00000.png`, `depth/00000.png` (mm), `metadata` and `cam_poses.txt`.
 
-    `metadata` is JSON with w, h, and K column by column, for pixel centres at integers, as in the dataset's own tool.
+    `metadata` is JSON with w, h, and K column by column, for pixel centres at integers, as in the dataset's tool.
     `cam_poses.txt` has a line for each frame: its number and the 16 numbers of camera-to-world, OpenCV convention.
 
-    `spread` takes 512 frames; with 512 scenes or more, one from each scene used. Second views come from all frames of
-    the scene, see `make_cases`, which gets 0.8 m as the middle depth. Photos of 640×480 or 480×640 keep their size and
-    have the paper's 76,800 cells.
+    `spread` takes 512 frames; with 512 scenes or more, one frame of each. Second views come from all frames of the
+    scene, see `make_cases`, with 0.8 m as the middle depth. Photos of 640×480 or 480×640 keep their size and have the
+    paper's 76,800 cells.
     """
     read: dict[str, list[Posed]] = {}
 

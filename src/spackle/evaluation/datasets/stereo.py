@@ -41,7 +41,7 @@ def _pair(
 
 
 def _cameras(lens: Calibration, size: tuple[int, int]) -> tuple[Camera, Camera]:
-    """The cameras of the left and the right photo, in the left one's frame."""
+    """The cameras of the left and the right photo, in the left camera's frame."""
     K, pose = lens.K, torch.eye(4)
     K[0, 2] += lens.doffs_px
     pose[0, 3] = -lens.baseline_m
@@ -70,7 +70,7 @@ def _depth_by(lens: Calibration, path: Path, read: Callable[[], NDArray[Any]]) -
             z = torch.from_numpy((reach / (stored + lens.doffs_px)).astype(np.float32))
         valid = torch.from_numpy(np.isfinite(stored) & (stored > 0)) & torch.isfinite(z) & (z > 0)
         if not valid.any():
-            raise InputError(f"{path}: not one pixel has a disparity: the file is damaged, or of another dataset")
+            raise InputError(f"{path}: no pixel has a disparity: the file is damaged, or of another dataset")
         return DepthMap(z.where(valid, 0.0), valid, lens.K, None, "disparity", path)
 
     return depth
@@ -95,7 +95,7 @@ def pair_of_2014(folder: Path) -> Case:
 
 
 def middlebury_cases(scenes: Mapping[str, Path]) -> list[Case]:
-    """One case for each scene; the second view is the true right photo.
+    """A case for each scene; the second view is the right photo.
 
     A scene's folder has `im0.png` with `calib.txt` (2014 at full size; MiddEval3 at full, half or quarter size), or a
     `scene.json`, which describes any rectified pair. `X-imperfect` is skipped if there is `X-perfect`; test scenes are
@@ -168,7 +168,7 @@ class StereoPair:
 
 
 def load_motorcycle() -> StereoPair:
-    """Load Middlebury's Motorcycle from scikit-image; InputError if that is not installed."""
+    """Load Middlebury's Motorcycle from scikit-image; InputError if scikit-image is not installed."""
     try:
         from skimage.data import stereo_motorcycle
     except ImportError as error:
