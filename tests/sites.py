@@ -17,7 +17,6 @@ class Site:
 
     url: str
     content: bytes
-    others: dict[str, bytes] = dataclasses.field(default_factory=dict)  # contents by file name
     ranges: bool = True
     status: int = 200
     headers: dict[str, str | None] = dataclasses.field(default_factory=dict)  # None omits a header
@@ -59,7 +58,7 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         site = self.server.site
         site.requests.append({**self.headers, "path": self.path})
-        content = site.others.get(self.path.rpartition("/")[2], site.content)
+        content = site.content
         wanted = re.fullmatch(r"bytes=(\d+)-", self.headers.get("Range", ""))
         start = int(wanted[1]) if wanted and site.ranges else 0
         status, body = site.status, content[start:]

@@ -132,7 +132,7 @@ def test_every_module_imports_without_optional_packages() -> None:
 
 # Modules beside the way from a photo to its scene: other bases, phones' depth, the page, clips, video frames.
 ASIDE = ("bases.lite", "bases.hf", "bases.moge", "bases.photo_depth", "formats.html", "clips", "video_frames")
-MOST_FILES, MOST_LINES = 52, 10_600  # to be lowered, and never raised
+MOST_FILES, MOST_LINES = 51, 9_900  # may only be lowered
 
 
 def test_the_way_from_photo_to_scene_stays_short() -> None:

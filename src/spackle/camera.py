@@ -117,14 +117,14 @@ def look_at(eye: Tensor, target: Tensor, up: Tensor | None = None) -> Tensor:
     forward, down = target - eye, eye.new_tensor([0.0, 1.0, 0.0])
     distance = float(forward.norm())
     if distance <= SHORTEST_LOOK * max(1e-3, float(torch.cat([eye, target]).abs().max())):
-        raise ValueError("eye and target coincide, so there is no direction to look in")
+        raise ValueError("eye and target coincide: move one of them")
     if up is not None:
         if float(up.norm()) < 1e-9:
             raise ValueError("up has no length")
         down = -up.double() / up.double().norm()
     right = torch.linalg.cross(down, forward)
     if float(right.norm()) < LEAST_TILT * distance:
-        raise ValueError("up lies along the view, so it does not say which way is up")
+        raise ValueError("up is parallel to the viewing direction: give another up")
     forward, right = forward / forward.norm(), right / right.norm()
     rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
     matrix = torch.eye(4, dtype=torch.float64)

@@ -49,7 +49,7 @@ class DepthRange:
         z = gaussians.means[:, 2].detach().double().cpu().numpy()
         z = z[z > 0]
         if z.size == 0:
-            raise ValueError("no Gaussian stands in front of the camera")
+            raise ValueError("no Gaussian is in front of the camera")
         near, focus = np.quantile(z, [NEAR_QUANTILE, FOCUS_QUANTILE])  # torch's quantile takes at most 16 M values
         return DepthRange(float(near), max(MIN_FOCUS_M, float(focus)))
 

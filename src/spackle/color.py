@@ -58,7 +58,7 @@ class DepthColors:
         looks = cameras[:: max(1, len(cameras) // LOOKS)]
         inverse = torch.cat([_inverse_in_frame(means, camera) for camera in looks]).double()
         if len(inverse) == 0:
-            raise ValueError("nothing of the scene is in view")
+            raise ValueError("no Gaussian is in view")
         low, high = torch.quantile(inverse, torch.tensor([FARTHEST, NEAREST], dtype=torch.float64)).tolist()
         return DepthColors(1 / high, 1 / low)
 

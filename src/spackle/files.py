@@ -87,7 +87,7 @@ def check_writable(path: str | os.PathLike[str]) -> Path:
         target = Path(os.path.realpath(path))
         if target.exists() and not target.is_file():
             kind = "a folder" if target.is_dir() else "not a plain file"
-            raise InputError(f"{path}: cannot write: this is {kind}; give a file name")
+            raise InputError(f"{path}: cannot write: {kind}; give a file name")
         if not target.parent.is_dir():
             raise InputError(f"{path}: cannot write: the folder {target.parent} does not exist; create it first")
         if not os.access(target.parent, os.W_OK | os.X_OK):

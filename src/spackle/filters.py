@@ -127,7 +127,7 @@ def far_fill(
         ValueError: nothing is known.
     """
     if not bool(known.any()):
-        raise ValueError("nothing to fill from: no pixel is known")
+        raise ValueError("no pixel is known")
     # Channels last, because a hole's pixels are scattered in memory.
     depths = inverse_depth.detach().cpu().float().clone(memory_format=torch.contiguous_format)
     others = values.detach().cpu().float().permute(1, 2, 0).clone(memory_format=torch.contiguous_format)

@@ -328,7 +328,7 @@ def _to_rgb(image: Image.Image, path: str | os.PathLike[str]) -> Tensor:
     if image.mode in ("F", "I") or image.mode.startswith("I;16"):  # one channel with more than 8 bits
         values = np.asarray(image)
         if image.mode == "F" or values.min() < 0 or values.max() > 65535:
-            raise InputError(f"{path}: pixels of 32 bits are not a photo: save it with 8 or 16 bits a channel")
+            raise InputError(f"{path}: pixels of 32 bits: save the photo with 8 or 16 bits per channel")
         grey = torch.from_numpy(values.astype(np.float32)).div_(65535)
         return grey[..., None].expand(-1, -1, 3).contiguous()
     profile = image.info.get("icc_profile")

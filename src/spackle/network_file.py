@@ -114,7 +114,7 @@ def check_finite(network: nn.Module, path: str | os.PathLike[str], advice: str) 
     # A finite sum is a cheap proof; the sum of finite numbers may overflow.
     broken = [name for name, t in network.state_dict().items() if not (t.sum().isfinite() or t.isfinite().all())]
     if broken:
-        raise InputError(f"{path}: holds numbers that are not finite ({_some(broken)}): {advice}")
+        raise InputError(f"{path}: contains numbers that are not finite ({_some(broken)}): {advice}")
 
 
 def _some(names: list[str]) -> str:
@@ -134,7 +134,7 @@ def read_tensors(path: str | os.PathLike[str], advice: str) -> dict[str, Tensor]
     with _reading_weights(path, advice):
         tensors = _read(path)
         if not tensors:
-            raise ValueError("it holds no named tensors")
+            raise ValueError("no named tensors")
     return tensors
 
 
@@ -146,7 +146,7 @@ def read_checkpoint(path: str | os.PathLike[str], name: str, advice: str) -> tup
     with _reading_weights(path, advice):
         root = _read_archive(path)
         if not isinstance(root, dict) or name not in root:
-            raise ValueError(f"it holds no {name}")
+            raise ValueError(f"no {name}")
         return root[name], _tensors(root)
 
 
@@ -175,13 +175,13 @@ def _read(path: str | os.PathLike[str]) -> dict[str, Tensor]:
         with safe_open(path, framework="pt") as opened:
             return {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118  # it is no dict
     if not head.startswith(b"\x80"):
-        raise ValueError("it is neither safetensors nor PyTorch's")
+        raise ValueError("neither safetensors nor PyTorch's format")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             loaded = torch.load(path, map_location="cpu", weights_only=True)  # the format of PyTorch before 1.6
     except pickle.UnpicklingError as error:
-        raise ValueError("a bare pickle that holds more than tensors; nothing in it was run") from error
+        raise ValueError("a bare pickle with more than tensors; nothing in the pickle was run") from error
     tensors = {name: x for name, x in loaded.items() if isinstance(name, str) and isinstance(x, Tensor)}
     dense = {name: x for name, x in tensors.items() if (x.layout, x.device.type) == (torch.strided, "cpu")}
     return {name: Tensor.detach(x) for name, x in dense.items()}  # without attributes that replace methods
@@ -195,7 +195,7 @@ def _read_archive(path: str | os.PathLike[str]) -> object:
             raise ValueError("a zip archive without the pickle of a network")
         root = names[0].removesuffix("data.pkl")
         if archive.getinfo(names[0]).file_size > MAX_PICKLE:
-            raise ValueError("its pickle is too large for a network")
+            raise ValueError("the pickle is too large for a network")
         has_checksums = any(record.CRC for record in archive.infolist())  # torch.save can omit them
         if has_checksums and (damaged := archive.testzip()) is not None:
             raise ValueError(f"damaged at {damaged}")
@@ -247,7 +247,7 @@ class _Unpickler(pickle._Unpickler):  # in Python; the one in C allocates any am
         numbers = torch.empty(0, dtype=STORAGES[storage.kind])
         size = count * numbers.itemsize
         if record.compress_type != zipfile.ZIP_STORED or record.flag_bits & 1 or record.file_size != size:
-            raise ValueError(f"storage {str(key)[:20]} is packed or has not the {size} bytes that its tensor needs")
+            raise ValueError(f"storage {str(key)[:20]} is compressed, or has not the {size} bytes of its tensor")
         with open(self._path, "rb") as file:
             file.seek(record.header_offset + 26)
             name, more = struct.unpack("<2H", file.read(4))  # lengths of the fields before the numbers
@@ -268,6 +268,6 @@ def _tensors(root: object) -> dict[str, Tensor]:
             fields = {name: child for name, child in fields.items() if isinstance(name, str)}
             nodes += len(fields)
             if nodes > MAX_NODES or len(path) > MAX_PATH:
-                raise ValueError("its objects are too many or too deep, or contain themselves")
+                raise ValueError("objects that are too many or too deep, or contain themselves")
             waiting += [(f"{path}.{name}" if path else name, child) for name, child in fields.items()]
     return found

@@ -89,7 +89,7 @@ class Spackle:
     ) -> Scene:
         """Turn a photo into a scene without holes along a camera path; see `spackle.predict`."""
         if depth is not None and self._given:
-            raise InputError("predict takes the photo's depth, or a base that needs none, but not both")
+            raise InputError('a depth map and a base are given: give only one of the two, or base="rgbd"')
         lens = {"focal_px": focal_px, "focal_mm": focal_mm, "fov": fov}
         if isinstance(photo, Photo) and lens != dict.fromkeys(lens):
             raise InputError("a loaded photo has a focal length already: give focal_px, focal_mm or fov to load_photo")

@@ -54,7 +54,13 @@ class Stereo:
 
         Principal points are shifted so that points at depth `convergence` have the same position in both images.
         """
-        return _moved(camera, -self.ipd / 2, self.convergence), _moved(camera, self.ipd / 2, self.convergence)
+        views = []
+        for right in (-self.ipd / 2, self.ipd / 2):
+            K, matrix = camera.K.clone(), camera.world_to_camera.clone()
+            matrix[0, 3] -= right
+            K[0, 2] += K[0, 0] * (right / self.convergence)
+            views.append(dataclasses.replace(camera, K=K, world_to_camera=matrix))
+        return views[0], views[1]
 
     def pack(self, left: Tensor, right: Tensor) -> Tensor:
         """Combine the eyes' images [H, W, 3], sRGB, in one frame.
@@ -88,13 +94,6 @@ def anaglyph(left: Tensor, right: Tensor) -> Tensor:
     one, other = srgb_to_linear(left), srgb_to_linear(right)
     mixed = one @ one.new_tensor(DUBOIS_LEFT).T + other @ other.new_tensor(DUBOIS_RIGHT).T
     return linear_to_srgb(mixed)
-
-
-def _moved(camera: Camera, right: float, convergence: float) -> Camera:
-    K, matrix = camera.K.clone(), camera.world_to_camera.clone()
-    matrix[0, 3] -= right
-    K[0, 2] += K[0, 0] * (right / convergence)
-    return dataclasses.replace(camera, K=K, world_to_camera=matrix)
 
 
 def _halved(picture: Tensor, side: bool) -> Tensor:
@@ -143,14 +142,14 @@ class VideoOptions:
             if value is None:
                 continue
             if self.stereo is None:
-                raise InputError(f"{option} {value:g}: is for two eyes: add --stereo, or leave it out")
+                raise InputError(f"{option} {value:g} needs --stereo: add --stereo, or leave {option} out")
             if not value > 0 or (option == "--ipd" and value > MAX_IPD):
                 raise InputError(f"{option} must be a positive number, got {value:g}")
         if self.compare and self.stereo is not None:
-            raise InputError(f"--compare: has two pictures already: leave --stereo {self.stereo} out")
+            raise InputError(f"--compare and --stereo {self.stereo} are given together: leave one of them out")
         if self.show == "depth" and self.stereo == "anaglyph":
             raise InputError(
-                "--show depth: an anaglyph mixes the colours that stand for depth: give --stereo sbs or ou"
+                "--show depth: an anaglyph would mix the colours that stand for depth: give --stereo sbs or ou"
             )
 
     def _blame(self, option: str, loop: int | None) -> None:

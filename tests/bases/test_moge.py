@@ -187,7 +187,7 @@ def changed(change: Callable[[dict[str, Any]], None], bytes_less: int = 0) -> Ca
         (lambda path: path.write_bytes(pickle.dumps({"model": 1})), "not a zip file"),
         (lambda path: save_file({"a": torch.zeros(1)}, path), "not a zip file"),
         (changed(lambda c: None, bytes_less=1000), "not a zip file"),
-        (lambda path: torch.save({"model": {"a": torch.zeros(1)}}, path), "holds no model_config"),
+        (lambda path: torch.save({"model": {"a": torch.zeros(1)}}, path), "no model_config"),
         (lambda path: torch.save({"model_config": Path("a"), "model": {}}, path), "not a published kind"),
         (changed(lambda c: c["encoder"].update(backbone="dinov2_vitg14_reg")), "dinov2_vitg14_reg"),
         (changed(lambda c: c["neck"].update(resamplers=["pixel_shuffle"] * 4)), "a resampler is 'pixel_shuffle'"),

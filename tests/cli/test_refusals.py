@@ -20,7 +20,7 @@ BOTH = [
     ("--fps nan", "--fps nan"),
     ("--fps 60 --format gif", "--fps 60"),
     ("--loop 0", "--loop 0"),
-    ("--ipd 0.06", "--ipd 0.06: is for two eyes"),
+    ("--ipd 0.06", "--ipd 0.06 needs --stereo"),
     ("--stereo sbs --ipd 0", "--ipd must be"),
     ("--stereo ou --convergence -1", "--convergence must be"),
     ("--stereo anaglyph --show depth", "anaglyph"),

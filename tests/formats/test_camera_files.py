@@ -98,7 +98,7 @@ BAD_PATHS: list[tuple[Any, str]] = [
     (key("eye", [1e7, 0, 0]), "keyframes.1.eye.0: "),
     (key("roll", 3), "keyframes.1.roll: "),
     (key("target", [0.2, 0, 0]), "keyframe 1: eye and target coincide"),
-    (key("up", [0.2, 0, -3]), "keyframe 1: up lies along the view"),
+    (key("up", [0.2, 0, -3]), "keyframe 1: up is parallel to the viewing direction"),
     (key("fov", 179), "keyframe 1: fov must be from 1 to 170"),
     (key("time", 0), "times must increase, by a microsecond at least: keyframe 1 is at 0 s"),
 ]

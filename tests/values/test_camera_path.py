@@ -96,7 +96,11 @@ def test_a_closed_path_does_not_repeat_its_first_view() -> None:
 def test_impossible_views_between_keyframes_are_refused() -> None:
     for first, second, says in (
         (Keyframe(0, (0, 0, 0), (0, 0, 2)), Keyframe(1, (0, 0, 4), (0, 0, 2)), r"at 0\.5 s.*coincide.*add a keyframe"),
-        (Keyframe(0, (0, 0, 0), (0, 1, 1)), Keyframe(1, (0, 0, 0), (0, 1, -1)), "up lies along the view"),
+        (
+            Keyframe(0, (0, 0, 0), (0, 1, 1)),
+            Keyframe(1, (0, 0, 0), (0, 1, -1)),
+            "up is parallel to the viewing direction",
+        ),
     ):
         with pytest.raises(PathError, match=says):
             KeyframePath((first, second)).cameras(CAMERA, 3, DEPTHS)
@@ -203,5 +207,5 @@ def test_choose_move_finds_the_largest_disparity_within_the_limit(usual: float, 
     assert chosen.disparity == pytest.approx(max(within, default=min(usual, 0.04)), abs=0.0101)
     assert chosen.notes["uncovered"] == pytest.approx(uncovered(chosen.disparity), abs=0.01)
     assert chosen.notes["usual_disparity"] == usual
-    with pytest.raises(InputError, match=r"^photo\.png: no camera path: no Gaussian stands in front"):
+    with pytest.raises(InputError, match=r"^photo\.png: no camera path: no Gaussian is in front"):
         choose_move(dataclasses.replace(prediction, gaussians=gaussians.select(slice(0, 0))), renderer, photo)
