@@ -11,7 +11,7 @@ from torch import Tensor
 
 from spackle.camera import Camera
 from spackle.residual import Seeds, ViewFeatures
-from spackle.residual.epipolar_walk import SAME_DEPTH
+from spackle.residual.base_values import SAME_DEPTH
 from spackle.residual.network import Rim, find_rim
 from spackle.residual.view_features import cell_centers
 

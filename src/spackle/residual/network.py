@@ -13,8 +13,7 @@ from spackle.crop import Crop, crops_around
 from spackle.device import Precision, own_arithmetic, pick_dtype
 from spackle.filters import broadly_blurred
 from spackle.patches import TONE_CELLS, Patches, match_patches
-from spackle.residual.base_values import Seeds, inside_photo, seen_in_photo
-from spackle.residual.epipolar_walk import walk
+from spackle.residual.base_values import Seeds, inside_photo, seen_in_photo, walk
 from spackle.residual.view_features import ViewFeatures
 
 ALIKE = 1.4  # a far rim whose inverse depth exceeds the seed's by more than this factor is ignored
