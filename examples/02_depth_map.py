@@ -1,4 +1,4 @@
-"""A photo and its depth map: the scene is as good as the map.
+"""A scene from a photo and its depth map.
 
 python examples/02_depth_map.py photo.png depth.png out
 """
@@ -13,10 +13,10 @@ import spackle
 
 def main(photo: Path, depth: Path, out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
-    scene = spackle.predict(photo, depth, fov=60, disparity=0.2)  # a PNG of 16 bits holds millimetres
+    scene = spackle.predict(photo, depth, fov=60, disparity=0.2)  # a 16-bit PNG has millimetres
     scene.save(out / "scene.ply")
 
-    # An array or a tensor [H, W] in metres does as well; 0 and NaN are unknown.
+    # The depth can also be an array or a tensor [H, W] in metres; 0 and NaN mean unknown.
     metres = scene.depth_map().numpy()
     again = spackle.predict(photo, np.where(metres > 0, metres, np.nan), fov=60, disparity=0.2)
     print(f"{len(scene.base):,} Gaussians from the file, {len(again.base):,} from the scene's own depth")

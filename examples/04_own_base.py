@@ -14,7 +14,7 @@ from spackle.bases.lift import lift
 
 
 class Street:
-    """A depth that falls from 20 m at the top of the picture to 2 m at the bottom: put your own network here."""
+    """Depth from 20 m at the top of the photo to 2 m at the bottom, in place of a network."""
 
     name = "street"
 

@@ -1,8 +1,8 @@
-"""Fill the holes of a scene that another tool made of a photo, such as SHARP's PLY.
+"""Fill the holes of a scene that another tool made from a photo, such as a PLY of SHARP.
 
 python examples/05_scene_of_another_tool.py scene.ply photo.jpg completed.ply
 
-The Gaussians have to lie in the frame of the photo's camera: x right, y down, z forward, the eye at the origin.
+The Gaussians must be in the frame of the photo's camera: x right, y down, z forward, camera at the origin.
 """
 
 import sys
@@ -13,7 +13,7 @@ import spackle
 
 def main(file: Path, photo: Path, out: Path) -> None:
     gaussians = spackle.load_ply(file)
-    camera = spackle.load_photo(photo).camera  # its lens is EXIF's; give fov=... where that is missing
+    camera = spackle.load_photo(photo).camera  # the focal length comes from EXIF; if EXIF has none, give fov=...
 
     before = spackle.Scene(gaussians, gaussians.select(slice(0)), camera)
     path = before.path("swipe", disparity=0.3)
@@ -22,7 +22,7 @@ def main(file: Path, photo: Path, out: Path) -> None:
 
     holes = [spackle.hole_area_ratio(each.render(path[0]).alpha) for each in (before, scene)]
     print(f"holes at the left end of the path: {holes[0]:.1%} -> {holes[1]:.2%}")
-    scene.save(out, disparity=0.3)  # the first Gaussians are those of the file, bit for bit
+    scene.save(out, disparity=0.3)  # the first Gaussians are equal to the Gaussians of the file, bit for bit
 
 
 if __name__ == "__main__":

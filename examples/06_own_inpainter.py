@@ -1,4 +1,4 @@
-"""An inpainter of your own paints the widest views, and its colours become Gaussians.
+"""Your own inpainter paints the widest views, and the painted colours become Gaussians.
 
 python examples/06_own_inpainter.py photo.jpg out
 """
@@ -16,12 +16,12 @@ from spackle.scene_fill.texture import painted_texture
 
 
 class MeanColor(PlainInpainter):
-    """Fill every hole with the mean of the visible colours: put a diffusion model here."""
+    """Fills every hole with the mean of the visible colours, in place of a diffusion model."""
 
     name, version = "mean", "1"
 
     def paint(self, rgb: Tensor, hole: Tensor, inverse_depth: Tensor) -> Tensor:
-        """The views' colours [V, H, W, 3], with their holes [V, H, W] filled."""
+        """Fill the holes [V, H, W] of views [V, H, W, 3]."""
         return torch.where(hole[..., None], rgb[~hole].mean(dim=0), rgb)
 
 

@@ -1,4 +1,4 @@
-"""Videos of one scene: built-in paths, keyframes from a file, and cameras of your own.
+"""Videos of a scene along built-in paths, along keyframes from a file, and by your own cameras.
 
 python examples/07_video_paths.py scene.ply out
 """
@@ -26,7 +26,7 @@ def main(file: Path, out: Path) -> None:
     save_video((view.rgb for view in scene.frames(cameras)), out / "keyframes.mp4")
 
     def at(x: float) -> spackle.Camera:
-        """The photo's camera, x metres to the right."""
+        """The photo's camera, moved by x metres to the right."""
         pose = scene.camera.world_to_camera.clone()
         pose[0, 3] -= x
         return dataclasses.replace(scene.camera.even(), world_to_camera=pose)

@@ -16,9 +16,9 @@ def main(file: Path, out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
     scene = spackle.Scene.load(file)
     depth = DepthRange.of(scene.base)
-    ipd = default_ipd(scene.camera, depth)  # 0.065 for a metric scene that begins 1.8 m away, at a 30 mm lens
+    ipd = default_ipd(scene.camera, depth)  # metres; 0.065 if the nearest surface is 1.8 m away
 
-    pair = Stereo("sbs", ipd, convergence=depth.focus)  # objects at this depth appear in the screen's plane
+    pair = Stereo("sbs", ipd, convergence=depth.focus)  # objects at this depth appear at the depth of the screen
     path = scene.path("swipe", disparity=0.05, frames=24)
     eyes = (scene.frames(pair.eyes(camera)) for camera in path)
     save_video((pair.pack(*(view.rgb for view in views)) for views in eyes), out / "sbs.mp4", fps=24)

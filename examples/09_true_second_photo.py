@@ -1,4 +1,4 @@
-"""How close is a completed view to the photo that a second camera took from there?
+"""Compare a completed view with a photo that a second camera took from the same position.
 
 python examples/09_true_second_photo.py out
 

@@ -1,8 +1,8 @@
-"""The renderer is differentiable: fit the colours of the aux Gaussians to a true photo of the hole.
+"""Fit the colours of aux Gaussians to a true photo with the differentiable renderer.
 
 python examples/10_gradients.py out
 
-Training a residual network works the same way, with many photos, and a network in place of the colours.
+A residual network is trained in the same way, with many photos, and with a network in place of the colours.
 """
 
 import dataclasses

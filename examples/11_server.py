@@ -1,8 +1,8 @@
-"""An app of your own that completes photos under /spackle, beside its other pages.
+"""Your own web app with Spackle's page under /spackle.
 
 python examples/11_server.py folder 8000
 
-In this example everybody who reaches the port may send photos: control access in your app.
+This example accepts photos from everybody who can reach the port: control access in your app.
 """
 
 import contextlib
@@ -17,7 +17,7 @@ from spackle.web import create_app
 
 
 def app(folder: Path) -> FastAPI:
-    """Your app, with Spackle's page and HTTP interface mounted below it."""
+    """Your app, with Spackle's page and HTTP interface mounted under /spackle."""
     scenes = create_app(folder)
 
     @contextlib.asynccontextmanager

@@ -1,9 +1,9 @@
-"""A dataset of your photos, a residual network that learns from it, and a photo completed by that network.
+"""Make a dataset of your photos, train a residual network with the dataset, and complete a photo by the network.
 
 python examples/12_train.py photos out
 
-Give three or more photos; they take a few minutes on two cores. The dataset and training guides list the options for
-real runs.
+Give three or more photos; this takes a few minutes on two cores. The guides on datasets and training list the options
+for real runs.
 """
 
 import subprocess

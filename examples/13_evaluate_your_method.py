@@ -1,4 +1,4 @@
-"""A method of your own beside ours, measured against a true second photo.
+"""Evaluate your own method beside Spackle's methods, against a true second photo.
 
 python examples/13_evaluate_your_method.py    # needs pip install 'spackle-nvs[demo]'
 """
@@ -18,7 +18,7 @@ from spackle.evaluation.rows import Row
 
 
 def mean_color(camera: spackle.Camera, before: spackle.Rendering) -> MethodView:
-    """Your method: it gets a view and the base's render of it, and returns a picture."""
+    """Your method: gets a view and the base rendered from this view, and returns an image."""
     hole = spackle.hole_mask(before.alpha)
     return MethodView(torch.where(hole[..., None], before.rgb[~hole].mean(dim=0), before.rgb), None, None)
 

@@ -1,7 +1,7 @@
 """Spackle's nodes for ComfyUI: copy or link this folder into ComfyUI/custom_nodes, and install Spackle beside ComfyUI.
 
-IMAGE is [B, H, W, 3] sRGB in 0..1 and MASK [B, H, W] in 0..1, as ComfyUI has them; depth is an IMAGE in greys. SPLAT is
-ComfyUI's own type of Gaussians: batches of N with linear scales, quaternions wxyz and spherical harmonics of sRGB.
+ComfyUI's type IMAGE is [B, H, W, 3] sRGB in 0..1, and MASK is [B, H, W] in 0..1; depth is a grey IMAGE. ComfyUI's type
+SPLAT is a batch of N Gaussians with linear scales, quaternions wxyz and spherical harmonics of sRGB.
 """
 
 from __future__ import annotations
@@ -36,31 +36,31 @@ TRAJECTORY = (list(TRAJECTORIES), {"default": "rotate-forward"})
 
 
 class LoadBase:
-    """What turns an image into Gaussians."""
+    """Loads a base, which turns an image into Gaussians."""
 
     CATEGORY, FUNCTION = "Spackle", "load"
     RETURN_TYPES: ClassVar = ("SPACKLE_BASE",)
 
     @classmethod
     def INPUT_TYPES(cls) -> dict[str, Any]:
-        """`checkpoint` is a file of the base's weights; empty takes what `spackle weights get` brought."""
+        """`checkpoint` is a file of the base's weights; if empty, the download of `spackle weights get` is used."""
         names = [AUTO, *AUTO_NETWORKS]
         return {"required": {"name": (names,)}, "optional": {"checkpoint": ("STRING", {"default": ""})}}
 
     def load(self, name: str, checkpoint: str = "") -> tuple[OpenedBase]:
-        """InputError for a base that is not here, or a file that is not its weights."""
+        """InputError if the base is not installed, or the checkpoint does not hold the base's weights."""
         return (open_base(BaseSettings(name, checkpoint=Path(checkpoint) if checkpoint else None)),)
 
 
 class PredictScene:
-    """The Gaussians of the first image, with its holes still open."""
+    """Predicts the Gaussians of the first image, without filling holes."""
 
     CATEGORY, FUNCTION = "Spackle", "predict"
     RETURN_TYPES: ClassVar = ("SPACKLE_SCENE",)
 
     @classmethod
     def INPUT_TYPES(cls) -> dict[str, Any]:
-        """`fov` 0 is a 30 mm lens; `depth` is a relative map, from `near` to `far` metres, and replaces the base."""
+        """`fov` 0 means a 30 mm lens; `depth`, a relative map from `near` to `far` metres, replaces the base."""
         metres = {"min": 0.01, "max": 1000.0, "step": 0.1}
         optional = {
             "depth": ("IMAGE",),
@@ -81,7 +81,7 @@ class PredictScene:
         far: float = FAR_M,
         fov: float = 0.0,
     ) -> tuple[Scene]:
-        """InputError for an image that the base cannot use."""
+        """InputError if the base cannot use the image."""
         rgb = image[0, ..., :3].detach().float().cpu().clamp(0, 1)
         height, width = rgb.shape[:2]
         lens = focal_length("image", width, height, {}, focal_px=None, focal_mm=None, fov=fov or None)
@@ -103,19 +103,19 @@ class CompleteScene:
 
     @classmethod
     def INPUT_TYPES(cls) -> dict[str, Any]:
-        """`disparity`: how far the camera goes; 0.3 is large."""
+        """`disparity` is the size of the camera movement; 0.3 is large."""
         given = {"scene": ("SPACKLE_SCENE",), "trajectory": TRAJECTORY, "disparity": DISPARITY}
         return {"required": {**given, "fill": (list(FILLS),)}}
 
     def complete(self, scene: Scene, trajectory: TrajectoryKind, disparity: float, fill: Any) -> tuple[Scene]:
-        """The base's Gaussians stay as they are, and new ones are added."""
+        """Add Gaussians in the holes; base Gaussians do not change."""
         cameras = scene.path(trajectory, disparity)
         made = complete_scene(BasePrediction(scene.base, scene.camera, {}), cameras, fill=fill)
         return (dataclasses.replace(made, disparity=disparity),)
 
 
 class RenderView:
-    """Views along a path: pictures, what is still hole, and depth in greys, near is white."""
+    """Renders views along a path: images, masks of remaining holes, and depth, with near surfaces in white."""
 
     CATEGORY, FUNCTION = "Spackle", "render"
     RETURN_TYPES: ClassVar = ("IMAGE", "MASK", "IMAGE")
@@ -123,7 +123,7 @@ class RenderView:
 
     @classmethod
     def INPUT_TYPES(cls) -> dict[str, Any]:
-        """`frames` views are a batch."""
+        """`frames` is the number of views in the batch."""
         frames = ("INT", {"default": PATH_FRAMES, "min": 1, "max": 1000})
         given = {"scene": ("SPACKLE_SCENE",), "trajectory": TRAJECTORY, "disparity": DISPARITY, "frames": frames}
         return {"required": given}
@@ -131,7 +131,7 @@ class RenderView:
     def render(
         self, scene: Scene, trajectory: TrajectoryKind, disparity: float, frames: int
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """[frames, H, W, 3], [frames, H, W] and [frames, H, W, 3], at the photo's size made even."""
+        """Images [frames, H, W, 3], masks [frames, H, W] and depth [frames, H, W, 3]."""
         cameras = scene.path(trajectory, disparity, frames)
         renderer = get_renderer()
         views = [scene.render(camera, renderer) for camera in cameras]
@@ -142,18 +142,18 @@ class RenderView:
 
 
 class ToSplat:
-    """The scene as ComfyUI's own nodes take it."""
+    """Converts a scene into the type SPLAT of ComfyUI's nodes."""
 
     CATEGORY, FUNCTION = "Spackle", "convert"
     RETURN_TYPES: ClassVar = ("SPLAT",)
 
     @classmethod
     def INPUT_TYPES(cls) -> dict[str, Any]:
-        """Base and aux become one."""
+        """The SPLAT has base and aux Gaussians."""
         return {"required": {"scene": ("SPACKLE_SCENE",)}}
 
     def convert(self, scene: Scene) -> tuple[Any]:
-        """A batch of one, x right, y down, z forward from the photo's camera."""
+        """A batch with one set, with x right, y down, z forward from the photo's camera."""
         from comfy_api.latest import Types  # ComfyUI's own
 
         means, quats, scales, opacities, colors = (t.detach().float().cpu() for t in scene.gaussians.tensors)
@@ -165,21 +165,21 @@ class ToSplat:
 
 
 class FromSplat:
-    """The Gaussians of other nodes as a scene, whose holes may then be filled."""
+    """Converts Gaussians of other nodes into a scene, so that its holes can be filled."""
 
     CATEGORY, FUNCTION = "Spackle", "convert"
     RETURN_TYPES: ClassVar = ("SPACKLE_SCENE",)
 
     @classmethod
     def INPUT_TYPES(cls) -> dict[str, Any]:
-        """The camera stands at the origin and looks along z; `fov` 0 is a 30 mm lens."""
+        """The camera is at the origin and looks along z; `fov` 0 means a 30 mm lens."""
         side = {"min": 16, "max": 8192}
         size = {"width": ("INT", {"default": 1280, **side}), "height": ("INT", {"default": 720, **side})}
         fov = ("FLOAT", {"default": 0.0, "min": 0.0, "max": 170.0})
         return {"required": {"splat": ("SPLAT",), **size, "fov": fov}}
 
     def convert(self, splat: Any, width: int, height: int, fov: float) -> tuple[Scene]:
-        """The first of a batch, in the colours of degree 0."""
+        """The first set of a batch, with colours of degree 0."""
         count = splat.positions.shape[1] if splat.counts is None else int(splat.counts[0])
         parts = (splat.positions, splat.rotations, splat.scales, splat.opacities, splat.sh)
         means, quats, scales, opacities, harmonics = (part[0, :count].detach().float().cpu() for part in parts)
@@ -190,7 +190,7 @@ class FromSplat:
 
 
 class SaveScene:
-    """Writes the scene into ComfyUI's output folder; the image is the scene from the photo's own place."""
+    """Writes the scene into ComfyUI's output folder, and returns the view of the photo's camera."""
 
     CATEGORY, FUNCTION, OUTPUT_NODE = "Spackle", "save", True
     RETURN_TYPES: ClassVar = ("STRING", "IMAGE")
@@ -198,12 +198,12 @@ class SaveScene:
 
     @classmethod
     def INPUT_TYPES(cls) -> dict[str, Any]:
-        """The file is NAME_00001.FORMAT, and so on."""
+        """Files are named NAME_00001.FORMAT, NAME_00002.FORMAT, ..."""
         name = ("STRING", {"default": "spackle"})
         return {"required": {"scene": ("SPACKLE_SCENE",), "name": name, "format": (list(FORMATS),)}}
 
     def save(self, scene: Scene, name: str, format: str) -> dict[str, Any]:
-        """No file is replaced."""
+        """Write a new file; existing files are kept."""
         folder, stem = _output_folder(), Path(name).name or "spackle"
         count = next(k for k in range(1, 100_000) if not (folder / f"{stem}_{k:05d}{format}").exists())
         file = folder / f"{stem}_{count:05d}{format}"
