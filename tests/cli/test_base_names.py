@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from command import Run, refuses, report_of, run
 from evaluation_data import write_boxes
 from photos import write_depth, write_photo
 from safetensors.torch import load_file, save_file
-from stand_in import StandIn, predict, write_model
+from stand_in import StandIn, predict
 
 import spackle
 from spackle.bases import BasePrediction, Progress
@@ -67,19 +66,6 @@ def sha256(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def test_a_dataset_of_lite_and_of_a_model(tmp_path: Path, shipped: Path, hub: list[dict[str, Any]]) -> None:
-    model = write_model(tmp_path / "models" / "small")
-    digests = {name: sha256(model / name) for name in ("config.json", "model.safetensors")}
-    for base, name, weights in (("lite", "lite", sha256(shipped)), (f"hf:{model}", "hf:small", digests)):
-        succeeds(build(tmp_path / name, "--base", base))
-        manifest = load_manifest(tmp_path / name / "out")
-        assert (manifest.complete, len(manifest.samples)) == (True, 1)
-        said = manifest.config["base"]
-        assert (said["name"], said["weights"]) == (name, weights)
-        assert str(tmp_path) not in (tmp_path / name / "out" / "manifest.json").read_text()
-    assert [asked["model"] for asked in hub] == [str(model)]
-
-
 @pytest.mark.usefixtures("hub")
 def test_a_dataset_skips_bad_photos_and_stops_without_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     work, short = StandIn.predict, True
@@ -98,21 +84,6 @@ def test_a_dataset_skips_bad_photos_and_stops_without_memory(tmp_path: Path, mon
     succeeds(result := build(tmp_path, "--base", "hf:me/small"))
     assert "b.png: the model predicts 0 for every pixel" in result.err
     assert [sample.photo for _, sample in load_manifest(tmp_path / "out").samples] == ["a.png"]
-
-
-def test_an_evaluation_of_lite_and_of_a_model(
-    tmp_path: Path, stereo: Path, shipped: Path, hub: list[dict[str, Any]]
-) -> None:
-    for base, weights in (("lite", sha256(shipped)), ("hf:me/small", None)):
-        out = tmp_path / base
-        root = ("--dataset", "middlebury", stereo, "-o", out, "--precision", "fp32")
-        words = ("--methods", "base", "--metrics", "none", "--disparity", "0.3")
-        succeeds(run("evaluate", *root, *words, "--base", base))
-        said = json.loads((out / "config.json").read_text())["base"]
-        assert (said["name"], said["title"], said["weights"]) == (base, base, weights)
-        assert "not SHARP, so not the paper's base" in said["says"]
-        assert f"| {base} alone |" in (out / "tables.md").read_text()
-    assert hub == [{"model": "me/small", "precision": "fp32", "device": None}]
 
 
 def test_results_that_must_name_their_base_refuse_auto(tmp_path: Path, stereo: Path) -> None:
@@ -185,21 +156,6 @@ def test_disparity_of_the_person_else_of_the_photo(tmp_path: Path) -> None:
     for file, options in zip(files, ((), ("--disparity", 0.14)), strict=True):
         succeeds(run("render", tmp_path / "out" / "photo" / "scene.ply", "-o", file, "--frames", 3, *options))
     assert files[0].read_bytes() == files[1].read_bytes()
-
-
-@pytest.mark.parametrize("when", ["load", "predict"])
-def test_a_folder_goes_on_with_lite_if_memory_is_short(
-    tmp_path: Path, made: dict[str, Path], photos: Path, monkeypatch: pytest.MonkeyPatch, when: str
-) -> None:
-    def hungry(*args: object, **options: object) -> None:
-        raise MemoryShort("not enough memory for SHARP")
-
-    install(made, tmp_path)
-    monkeypatch.setattr(SharpBase if when == "load" else StandIn, when, hungry)
-    result = predict(tmp_path, photos)
-    assert [line for line in result.lines if "not enough memory" in line] == result.lines[:1]
-    refuses(predict(tmp_path, photos, "--base", "sharp"), "not enough memory for SHARP")
-    assert [report_of(tmp_path / "out" / name)["base"]["name"] for name in "ab"] == ["lite", "lite"]
 
 
 def test_a_base_that_cannot_be_loaded_stops_a_folder_at_once(

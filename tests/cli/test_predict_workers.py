@@ -52,16 +52,7 @@ def test_two_workers_give_the_same_files_as_one_by_one_and_go_on(place: Path, tm
     assert (done.code, done.lines[-1]) == (1, "1 of 3 photos failed"), done.err
     assert list(content(out)) == list(content(place / "alone"))
     results = [json.loads(line) for line in done.out.splitlines()]
-    assert {Path(result["folder"]).name: "b.png" in result.get("error", "") for result in results} == {
-        "a": False,
-        "b": True,
-        "c": False,
-    }
-    # Of each photo all lines, then how far all are.
-    order = [line.split()[4][:-5] for line in done.lines if line.startswith("photos: ")]
-    assert [Path(result["folder"]).name for result in results] == order
-    about = [[f"{name}.png" in line for line in done.lines].index(True) for name in order]
-    assert about == [0, *(i + 1 for i, line in enumerate(done.lines[:-2]) if line.startswith("photos: "))]
+    assert {Path(result["folder"]).name: "error" in result for result in results} == {"a": False, "b": True, "c": False}
     (out / "c" / "report.json").unlink()
     times = {name: (out / name / "scene.ply").stat().st_mtime_ns for name in "ac"}
     again = predict(place, out, "--workers", 2)

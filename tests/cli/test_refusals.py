@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from command import FILES, SHORT, names_in, refuses, run
@@ -18,57 +16,41 @@ INPUTS = {"predict": ("photo.png", "--depth", "depth.npy"), "render": ("scene.pl
 # Options of a command, and what the line about them says.
 BOTH = [
     ("--fps nan", "--fps nan"),
-    ("--fps 60 --format gif", "--fps 60"),
     ("--loop 0", "--loop 0"),
     ("--ipd 0.06", "--ipd 0.06 needs --stereo"),
     ("--stereo sbs --ipd 0", "--ipd must be"),
-    ("--stereo ou --convergence -1", "--convergence must be"),
     ("--stereo anaglyph --show depth", "anaglyph"),
     ("--stereo sbs --ipd 5 --convergence 1", "smaller --ipd"),
     ("--stereo sbs --size 8000x8000", "8192"),
-    ("--size 0x0", "--size"),
     ("--size 2:3", "--size 2:3: give width and height up to 8192, such as 1280x720, 16:9"),
     ("--overscan 0.6", "--overscan must be between 0 and 0.5"),
-    ("--cameras views.json --overscan 0.1", "--overscan 0.1"),
     ("--disparity 3", "--disparity"),
     ("--trajectory rotate_back", "'rotate_back' is not one of 'swipe', 'shake', 'rotate', 'rotate-forward'"),
     ("--path bad.json", "bad.json: keyframe 1: eye and target coincide"),
-    ("--path none.json", "none.json: no such path file"),
-    ("--path good.json --trajectory swipe", "--trajectory swipe"),
     ("--path good.json --disparity 0.2", "--disparity 0.2"),
     ("--path good.json --cameras views.json", "--cameras"),
     ("--cameras nowhere.json", "nowhere.json"),
-    ("--cameras empty.json", "empty.json"),
     ("--cameras views.json --size 64x48", "--size"),
-    ("--cameras views.json --disparity 0.3", "--disparity 0.3"),
-    ("--cameras views.json --trajectory rotate_forward", "--trajectory rotate-forward"),
     ("--cameras views.json --frames 9", "--frames 9"),
 ]
 PREDICT = [
-    *((f"--focal-px {value}", "--focal-px") for value in ("-50", "nan", "1e39", "50 --fov 60")),
-    *((f"--focal-mm {value}", "--focal-mm") for value in ("0", "1e308")),
-    *((f"--fov {value}", "--fov") for value in ("0", "180")),
-    *((f"--disparity {value}", "--disparity") for value in ("-0.1", "nan")),
+    *((f"--focal-px {value}", "--focal-px") for value in ("nan", "1e39", "50 --fov 60")),
+    ("--focal-mm 0", "--focal-mm"),
+    ("--fov 180", "--fov"),
     *((f"--frames {value}", "--frames") for value in ("0", "1000000", "many")),
-    *((f"--seconds {value}", "--seconds") for value in ("0", "1e9", "2 --frames 9")),
+    *((f"--seconds {value}", "--seconds") for value in ("0", "2 --frames 9")),
     *((f"--sharp {value}", "--sharp") for value in ("windows=1", "windws=1", "windows=many", "compile")),
     *((f"--residual {file}.safetensors", f"{file}.safetensors") for file in ("nowhere", "bad")),
     *((f"{option} 0", option) for option in ("--workers", "--threads")),
     ("--depth-out depth.tiff", "depth.tiff"),
     ("--depth-out a/depth.npy", "--depth-out a/depth.npy"),
-    ("--precision bf16", "--precision"),
     ("--base sharp9", "--base"),
     ("--device cuda", "--device"),
     ("-c weights.pt", "-c"),
-    ("--calib nowhere.txt", "nowhere.txt"),
-    ("--mode x", "--mode"),
-    ("--nonsense", "--nonsense"),
     ("--cameras sizes.json", "--no-render"),
-    ("--cameras large.json", "large.json"),
     ("--cameras extreme.json", "extreme.json"),
     ("--depth wrong.npy", "wrong.npy"),
     ("--depth disp0.npy", "disp0.npy"),  # without a calibration
-    (f"--depth {300 * 'x'}", 300 * "x"),  # a name that no file system takes
 ]
 RENDER = [
     ("--focal-px inf", "--focal-px"),
@@ -89,10 +71,8 @@ def place(tmp_path: Path, pair: tuple[Path, Path], scene: Path, monkeypatch: pyt
     for name, target in (("good", [0, 0, 4]), ("bad", [0.2, 0, 0])):
         keys = [{"time": time, "eye": [0.2 * time, 0, 0], "target": target} for time in (0, 1)]
         Path(f"{name}.json").write_text(json.dumps({"keyframes": keys}))
-    Path("empty.json").write_text('{"frames": []}')
     camera_file(tmp_path / "views.json", rights=[0.2])
     camera_file(tmp_path / "sizes.json", rights=[0.2, 0.4], sizes=[(64, 48), (32, 24)])
-    camera_file(tmp_path / "large.json", rights=[0.2], sizes=[(8194, 48)])
     camera_file(tmp_path / "extreme.json", rights=[0.2], focal=1e-20)
     write_depth(tmp_path / "wrong.npy", metres(48, 64))
     write_depth(tmp_path / "disp0.npy")
@@ -116,21 +96,21 @@ def test_an_input_has_to_be_named(tmp_path: Path) -> None:
     refuses(run("predict", write_photo(tmp_path / "a.png"), "--base", "rgbd", "-o", tmp_path / "out"), "--depth")
 
 
-@pytest.mark.parametrize("kind", ["missing", "empty", "text", "an empty folder", "a pipe", "too long a name"])
+@pytest.mark.parametrize("kind", ["missing", "text", "an empty folder", "a pipe"])
 def test_files_that_are_no_photo_and_no_depth_map(tmp_path: Path, pair: tuple[Path, Path], kind: str) -> None:
-    bad = tmp_path / ("x" * 300 if kind == "too long a name" else "bad.png")
+    bad = tmp_path / "bad.png"
     if kind == "a pipe":
         os.mkfifo(bad)
     elif kind == "an empty folder":
         bad.mkdir()
-    elif kind in ("empty", "text"):
-        bad.write_text("a photo" if kind == "text" else "")
+    elif kind == "text":
+        bad.write_text("a photo")
     for photo, depth in ((bad, pair[1]), (pair[0], bad)):
         refuses(run("predict", photo, "--depth", depth, "-o", tmp_path / "new" / "out", *SHORT), bad)
     assert not (tmp_path / "new").exists()
 
 
-@pytest.mark.parametrize("kind", ["file", "file/deep", "long", *sorted(FILES)])
+@pytest.mark.parametrize("kind", ["file", "file/deep", "scene.ply"])
 def test_outputs_that_cannot_be_written(tmp_path: Path, pair: tuple[Path, Path], scene: Path, kind: str) -> None:
     (tmp_path / "file").write_text("in the way")
     command = ("predict", pair[0], "--depth", pair[1], *SHORT, "-o")
@@ -139,30 +119,17 @@ def test_outputs_that_cannot_be_written(tmp_path: Path, pair: tuple[Path, Path],
         refuses(run(*command, tmp_path / "out"), kind)
         assert names_in(tmp_path / "out" / "photo") == {kind}  # known before the first file was written
         return
-    before, out = names_in(tmp_path), tmp_path / ("new/" + "x" * 300 if kind == "long" else kind)
+    before, out = names_in(tmp_path), tmp_path / kind
     refuses(run(*command, out), "output folder", "-o")
     refuses(run("render", scene, "-o", out, *SHORT), "output folder")
     assert (names_in(tmp_path), (tmp_path / "file").read_text()) == (before, "in the way")
 
 
-def mirrored(body: bytes) -> bytes:
-    """The scene behind the camera."""
-    table = np.frombuffer(body, "<f4").reshape(-1, 17).copy()
-    table[:, 2] *= -1
-    return table.tobytes()
-
-
-@pytest.mark.parametrize(
-    ("header", "data"),
-    [
-        pytest.param(str, lambda body: body[:-1], id="cut off"),
-        pytest.param(str, mirrored, id="all behind the camera"),
-        pytest.param(lambda head: head.replace("spackle_camera", "spackle_camera 1"), bytes, id="camera"),
-        pytest.param(lambda head: "\x00" + head, bytes, id="no scene"),
-    ],
-)
-def test_bad_scenes(tmp_path: Path, scene: Path, header: Callable[[str], str], data: Callable[[bytes], bytes]) -> None:
-    path = damaged_scene(scene, tmp_path / "bad.ply", header, data)
-    for file in (path, tmp_path / "missing.ply"):
+def test_bad_scenes(tmp_path: Path, scene: Path) -> None:
+    cut_off = damaged_scene(scene, tmp_path / "cut.ply", str, lambda body: body[:-1])
+    camera = damaged_scene(
+        scene, tmp_path / "bad.ply", lambda head: head.replace("spackle_camera", "spackle_camera 1"), bytes
+    )
+    for file in (cut_off, camera, tmp_path / "missing.ply"):
         refuses(run("render", file, "-o", tmp_path / "out", *SHORT), file)
     assert not (tmp_path / "out").exists()

@@ -142,8 +142,7 @@ def test_a_frame_that_fails_is_named_and_nothing_is_left(tmp_path: Path) -> None
         next(clip_frames(opened))
 
 
-REFUSED = ["--cameras v.json", "--mode view", "--no-render", "--depth a.npy", "--stereo sbs", "--format gif", "no cv2"]
-REFUSED += ["--workers 2", "--fill lama", "--path p.json"]
+REFUSED = ["--cameras v.json", "--no-render", "--depth a.npy", "--stereo sbs", "--format gif", "no cv2"]
 
 
 @pytest.mark.parametrize("option", REFUSED)

