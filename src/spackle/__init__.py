@@ -41,7 +41,7 @@ if TYPE_CHECKING:  # for editors and type checkers
     from spackle.session import Spackle as Spackle
     from spackle.session import predict as predict
 
-__version__ = "0.1.0"  # the only place: pyproject.toml reads it here
+__version__ = "0.1.0"  # pyproject.toml reads this line
 
 # A name is imported at its first use, so that `spackle --help` does not wait for torch.
 _NAMES = {

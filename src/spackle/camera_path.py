@@ -87,7 +87,7 @@ def trajectory(
         frames: number of cameras.
         looped: make a path that repeats without a jump: swipe also returns, and the other paths, whose last frame
             equals their first, lose their last frame.
-        only: compute one camera, the one at this index.
+        only: index of the only camera to compute; None computes all cameras.
 
     Raises:
         ValueError: an unknown path, a disparity outside 0..2, or less than one frame.
@@ -165,11 +165,11 @@ class KeyframePath:
     """A smooth path through keyframes.
 
     Each coordinate of eye, target and up, and the logarithm of the focal length, is a monotone cubic in time
-    (Fritsch and Butland): it passes through every keyframe, and stays between the values of two neighbours.
+    (Fritsch and Butland), which passes through every keyframe and stays between the values of neighbours.
     """
 
     keys: tuple[Keyframe, ...]  # at least two, at increasing times
-    closed: bool = False  # whether the path returns from the last keyframe to the first, in the mean time step
+    closed: bool = False  # whether the path returns to its first keyframe, within the mean time between keyframes
     unit: PathUnit = "metres"  # "disparity": lengths are multiples of the offset for --disparity 1
 
     def __post_init__(self) -> None:
@@ -194,7 +194,7 @@ class KeyframePath:
     def cameras(self, camera: Camera, frames: int, depth_range: DepthRange) -> list[Camera]:
         """Views at equal time steps, of the size of the photo's `camera`, which is at the origin.
 
-        An open path includes both its ends; a closed path does not repeat its first frame at its end. `depth_range`
+        An open path includes both its ends; a closed path does not end with its first frame. `depth_range`
         determines the length of the unit "disparity".
 
         Raises:

@@ -41,7 +41,7 @@ INFERNO = (
 
 @dataclasses.dataclass(frozen=True)
 class DepthColors:
-    """A scale of colours between two depths; depths beyond get the colour of the nearer end."""
+    """A scale of colours between two depths; depths outside of the scale get the colour of its nearer end."""
 
     near: float  # depth of the brightest colour
     far: float  # depth of the darkest colour

@@ -110,7 +110,7 @@ def _cut(blocks: Mask, crop: Crop, reach: int) -> list[Crop]:
 
 
 def _least(blocks: Mask, crop: Crop, reach: int) -> int:
-    """Lower bound, for all cuts of a rectangle, of the number of blocks that the network processes."""
+    """Lower bound for the number of blocks that the network must process, however the rectangle is cut."""
     near = np.zeros_like(blocks)
     near[crop.slices] = blocks[crop.slices]
     return int(greatest_around(torch.from_numpy(near), reach).sum())

@@ -101,7 +101,7 @@ def write_json(content: Mapping[str, Any], path: Path) -> None:
 
 
 def files_in(folder: Path, endings: tuple[str, ...], *, below: bool = False) -> list[Path]:
-    """List, sorted, a folder's visible files whose names end in one of `endings`; `below` adds those in subfolders."""
+    """List, sorted, a folder's visible files whose names end in one of `endings`; `below` includes subfolders."""
     with reading(folder, "cannot read the folder: {reason}", OSError):
         os.scandir(folder).close()
     found = []
@@ -176,7 +176,7 @@ def results_folder(path: Path, files: Sequence[str] = (), *, alone: bool = False
             yield
     finally:
         for folder in missing:
-            with contextlib.suppress(OSError):  # it is not empty
+            with contextlib.suppress(OSError):  # the folder is not empty
                 folder.rmdir()
 
 
@@ -238,7 +238,7 @@ def photo_digest(path: Path) -> str:
 
 
 def remove_half_written(*folders: Path, files: Sequence[str] | None = None) -> None:
-    """Delete temporary files of killed runs: those of the named `files`, or, in locked folders, all (None)."""
+    """Delete temporary files that killed runs have left for `files`; None deletes all, which needs locked folders."""
     for folder in folders:
         for file in folder.iterdir():
             match = LEFTOVER.fullmatch(file.name)

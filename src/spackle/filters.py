@@ -19,7 +19,7 @@ FAR = 1 << 14  # distance, in pixels, of a pixel that does not exist
 FAR_BIAS = 80.0  # preference for the far side of a rim: a sample 5 % nearer than the fill has the weight 1/50
 SWEEPS = 12  # relaxation sweeps at each resolution
 
-MIN_TRUST = 1e-6  # least weight of a rim sample, which matters if a hole has only a near rim
+MIN_TRUST = 1e-6  # least weight of a rim sample; a hole with only a near rim needs a weight above 0
 MAX_EXPONENT = 30.0  # keeps weights within single precision
 LIGHTEST, HEAVIEST = (np.float32(np.exp(sign * MAX_EXPONENT)) for sign in (-1, 1))
 AROUND = 4  # neighbours of a pixel
@@ -61,7 +61,7 @@ def greatest_around(image: Tensor, reach: int) -> Tensor:
     size = 2 * reach + 1
     image = pad(image, (reach,) * 4, value=0 if image.dtype == torch.bool else -math.inf)
     for dim in (-1, -2):
-        width = 1  # of the window; doubling it is faster on a CPU than pooling
+        width = 1  # window size so far; doubling is faster on a CPU than pooling
         while width < size:
             step = min(width, size - width)
             count = image.shape[dim] - step
@@ -110,9 +110,9 @@ def far_fill(
 ) -> tuple[Tensor, Tensor]:
     """Fill the unknown part of an inverse depth image and of further values, mostly from the far side of each hole.
 
-    A moving camera uncovers the surface behind, so a hole between a near and a far surface belongs to the far one. From
-    coarse to fine, an interpolated guess is relaxed to a membrane over the rim, in which a rim sample has the weight
-    min(1, fill / sample)^far_bias.
+    A moving camera uncovers the surface behind, so a hole between a near and a far surface belongs to the far surface.
+    From coarse to fine, an interpolated guess is relaxed to a membrane over the rim, with the weight
+    min(1, fill / sample)^far_bias for a rim sample.
 
     Args:
         inverse_depth: [H, W], positive at known pixels.

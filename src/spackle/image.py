@@ -90,8 +90,8 @@ def load_photo(
     """Read a JPEG, PNG, WebP, HEIC, TIFF or any other image that Pillow opens.
 
     The photo is rotated as EXIF asks, and converted to sRGB from an embedded profile. Transparent pixels become white.
-    Only the first frame of an animation is read. Without `focal_px`, `focal_mm` and `fov`, the focal length is taken
-    from EXIF, or that of a 30 mm lens.
+    Only the first frame of an animation is read. Without `focal_px`, `focal_mm` and `fov`, the focal length comes from
+    EXIF; a photo without EXIF gets a 35 mm equivalent of 30 mm.
 
     Args:
         path: the file.

@@ -8,7 +8,7 @@ import numpy as np
 from torch import Tensor
 
 NARROWEST, WIDEST = 2, 0.25  # bounds for the width of a side: in pixels, and as a share of the photo's side
-NOISE, STEP = 9 / 255, 20 / 255  # differences from the frame's colour: at most in the frame, at least beyond its edge
+NOISE, STEP = 9 / 255, 20 / 255  # mean difference from the frame's colour: at most in the frame, at least beyond
 STRAIGHT = 0.8  # least share of an edge's pixels that differ by STEP
 EDGE_PX = 6  # width of a blurred edge
 

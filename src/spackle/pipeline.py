@@ -204,10 +204,10 @@ def complete(
         cameras: the views.
         mode: "scene" makes one set of aux Gaussians for all views, see `fill_scene`; "view" makes one for each view,
             and leaves `Scene.aux` empty.
-        exact: in scene mode: no view between these views will be rendered.
+        exact: in scene mode, whether only these views will be rendered, and no views between them.
         network: the residual network, by default Spackle's; None fills the holes by the seeds alone.
         fill: see `open_texture`; "none" keeps the holes.
-        renderer: by default the CPU's.
+        renderer: by default the CPU renderer.
         precision: number type of the network.
         progress: called with (views done, all views).
     """

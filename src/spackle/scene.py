@@ -50,7 +50,7 @@ class Scene:
 
         Args:
             path: the file.
-            focal_px: focal length in pixels; by default the stored one, else that of a 30 mm lens.
+            focal_px: focal length in pixels; by default the stored focal length, or a 35 mm equivalent of 30 mm.
             fov: horizontal field of view in degrees, instead of `focal_px`.
         """
         return Scene.of_file(load_scene(Path(path)), focal_px, fov)
@@ -93,7 +93,7 @@ class Scene:
 
         Args:
             trajectory: see `spackle.camera_path.trajectory`.
-            disparity: by default the scene's.
+            disparity: by default `Scene.disparity`.
             frames: number of cameras.
             looped: make a path that repeats without a jump.
         """
@@ -189,7 +189,7 @@ class Scene:
             loop: see `spackle.formats.VideoWriter`.
             overscan: relative gain in focal length, which hides most of the fill beyond the photo's border.
             format: "mp4", "webm", "gif" or "webp"; by default the path's suffix, or mp4 for an open file.
-            renderer: by default the CPU's.
+            renderer: by default the CPU renderer.
         """
         if format is None and isinstance(target, str | os.PathLike):
             check_video(target, fps, loop)

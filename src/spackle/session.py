@@ -53,7 +53,7 @@ class Spackle:
         Args:
             base: a name as for `--base`, or a loaded base, such as `SharpBase.load(weights)`. "auto" takes the best
                 base for each photo: a depth map, SHARP or MoGe if their weights have been downloaded, or the rough
-                lite. The logger "spackle" gets the choice.
+                lite. The choice is logged to the logger "spackle".
             residual: a weight file, a loaded network, "seeds" to fill without a network, or "none" to keep the holes;
                 None takes the weights that come with Spackle.
             fill: source of the texture in the holes, see `spackle.pipeline.open_texture`; "none" keeps the holes.

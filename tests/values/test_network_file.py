@@ -49,6 +49,9 @@ def write_parameters(tensors: Weights, path: Path) -> None:
     torch.save(OrderedDict(tensors | parameters | {"epoch": 3, "list": [1]}), path)
 
 
+WRITERS = [save_file, torch.save, write_script, write_old, write_parameters]
+
+
 def read(path: Path) -> Weights:
     return read_tensors(path, "give another")
 
@@ -64,7 +67,7 @@ def refusal(path: Path) -> str:
     return line
 
 
-@pytest.mark.parametrize("write", [save_file, torch.save, write_script, write_old, write_parameters])
+@pytest.mark.parametrize("write", WRITERS)
 def test_every_format_is_read(tmp_path: Path, write: Callable[[Weights, Path], None]) -> None:
     write(WHOLE, tmp_path / "weights")
     found = read(tmp_path / "weights")
