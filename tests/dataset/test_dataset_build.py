@@ -236,16 +236,3 @@ def test_the_papers_recipe_learns_from_a_dataset(whole: Path, tmp_path: Path) ->
     assert (report["ended"], report["step"], report["recipe"]["network"]) == ("steps", 1, "sharp-decoder")
     assert 0 < report["samples"]["train"] <= 9
     assert report["hole_psnr"]["untrained"] + 3 < report["hole_psnr"]["colours of the targets"]
-
-
-def test_targets_that_the_untrained_network_draws_are_refused(copy: Path, tmp_path: Path) -> None:
-    manifest = load_manifest(copy)
-    manifest.model_copy(update={"config": {**manifest.config, "inpainter": {"name": "geometry"}}}).save(copy)
-    options = (f"data.pseudo={copy}", "loss.features=none")
-    done = run("train", "--recipe", "paper", "-o", tmp_path / "out", *options)
-    refuses(
-        done,
-        f"{copy}: built with --inpainter geometry",
-        "teach nothing: build another dataset with --inpainter propainter",
-    )
-    assert not (tmp_path / "out").exists()

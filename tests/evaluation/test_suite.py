@@ -1,4 +1,4 @@
-"""`benchmarks/suite.py`: its sections measure what they say, the naive renderer draws what ours draws, and NIQE."""
+"""`benchmarks/suite.py`: its sections, and the naive renderer, which draws the same picture as ours."""
 
 from __future__ import annotations
 
@@ -17,13 +17,9 @@ SIDE = 64
 PEAKS = {suite.PRODUCT.format("fp32"): 1e6, suite.PRODUCT.format("bf16"): 4e6, suite.COPY: 2e6}
 
 
-def rows_of(section: suite.Section) -> dict[str, suite.Timed]:
-    return {row.name: row for row in section[0]}
-
-
 def test_the_renderers_section_and_the_naive_renderers_picture() -> None:
-    section = suite.renderer_section(2, SIDE, PEAKS)
-    found, facts = rows_of(section), section[1]
+    timed, facts = suite.renderer_section(2, SIDE, PEAKS)
+    found = {row.name: row for row in timed}
     whole, naive = found["whole call: RGB, depth, alpha"], found["naive: whole call"]
     assert found["naive over ours"].values == pytest.approx(naive.values / whole.values)
     scene, camera = photo_scene(SIDE)
@@ -34,7 +30,7 @@ def test_the_renderers_section_and_the_naive_renderers_picture() -> None:
     assert whole.limit_ms == pytest.approx((count * 56 + SIDE * SIDE * 20) / 2e6)
 
 
-def test_sections_are_gathered_and_what_cannot_run_is_named(tmp_path: Path) -> None:
+def test_sections_are_gathered_and_missing_weights_are_named(tmp_path: Path) -> None:
     words = ["-o", str(tmp_path / "out"), "--side", str(SIDE), "--runs", "1"]
     suite.main([*words, "--only", "renderer,completion,sharp"])
     assert names_in(tmp_path / "out") == {"suite.json", "suite.md"}
