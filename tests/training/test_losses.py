@@ -245,7 +245,7 @@ def test_what_is_not_a_networks_weights_is_refused(squeezed: dict[str, np.ndarra
             load_features(name, path)
 
     assert load_features("none", None) is None
-    refused("resnet50", None, "name the file")
+    refused("resnet50", None, "loss.features_path: missing")
     refused("squeezenet", tmp_path / "missing.npz", "no such weight file")
     for change, said in (
         ({"conv1.w": squeezed["conv1.w"][:, :, :3, :3]}, "1 of another shape (conv1.weight"),

@@ -146,7 +146,7 @@ def fill_scene(
     enough = 0 if exact else FEW_HOLES
     visited = order if exact else order[: max(LEAST_VISITS, len(order) // 2)]
     guards = {-1: context.photo_guard()}
-    for index in reversed(order[:WIDEST]):  # the widest last: it is completed first
+    for index in reversed(order[:WIDEST]):  # the widest view last, because it is completed first
         view = stage.look(cameras[index])
         guards[index] = OcclusionGuard.of(view, cameras[index], threshold)
     pictures, filled = dict[int, Tensor](), 0
@@ -313,7 +313,7 @@ class _Stage:
         self._renderer, self._device, self._sets = context.renderer, device_of(context.renderer), [context.base]
 
     def look(self, camera: Camera, rendering: Rendering | None = None) -> Rendering:
-        """The rendering from a camera, copied to the CPU; if `rendering` is given, it is not rendered again."""
+        """The rendering from a camera, copied to the CPU; if `rendering` is given, nothing is rendered."""
         drawn = self._renderer.render(self._sets, camera) if rendering is None else rendering.to(self._device)
         self._camera, self._drawn = camera, drawn
         return drawn.to(PROCESSOR)

@@ -66,7 +66,7 @@ def patch_blocks(patches: Patches, blocks: Tensor) -> Tensor:
     """Fill the masked cells of an image, [H, W, k, k, c] by cell, with blocks from elsewhere in the image.
 
     A filled block is a weighted mean of the blocks that the matches of its cell and of the eight neighbours propose;
-    better matches weigh more. It keeps details that `Patches.rgb`, a vote of whole patches, loses.
+    better matches weigh more. `Patches.rgb`, a vote of whole patches, loses fine detail.
     """
     height, width = patches.mismatch.shape
     sources = torch.stack([blocks, blocks.flip(1, 3)])

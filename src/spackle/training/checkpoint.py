@@ -63,7 +63,7 @@ class Checkpoint:
 
 def save_checkpoint(checkpoint: Checkpoint, folder: Path) -> None:
     """Write checkpoint.pt; if the disk is full, raise InputError and keep the previous checkpoint."""
-    buffer = io.BytesIO()  # torch's own writer hides that a disk is full
+    buffer = io.BytesIO()  # torch.save to a file hides that the disk is full
     torch.save({**vars(checkpoint), "progress": dataclasses.asdict(checkpoint.progress)}, buffer)
     with atomic_path(folder / CHECKPOINT) as temporary:
         temporary.write_bytes(buffer.getbuffer())

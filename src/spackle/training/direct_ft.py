@@ -43,7 +43,7 @@ class TunableSharp:
     """SHARP with frozen weights, and a trainable decoder `network.gaussian_decoder()` in float32."""
 
     network: SharpNetwork
-    precision: torch.dtype  # frozen weights are stored in it, the decoder is autocast to it
+    precision: torch.dtype  # of frozen weights, and of the decoder under autocast
 
     @staticmethod
     def load(path: str | os.PathLike[str], precision: torch.dtype, device: torch.device) -> TunableSharp:
@@ -153,7 +153,7 @@ class DirectFt(ViewTask):
         return render_photo(network, self.base, batch, self.renderer)
 
     def export(self, network: nn.Module, path: Path) -> None:
-        """Write the decoder in float32, for `spackle predict --base sharp -c`, and a link to its checkpoint."""
+        """Write the decoder in float32, for `spackle predict --base sharp -c`, and a link to SHARP's checkpoint."""
         write_whole(path, decoder_bytes(network, self.owner))
         link_owner(self.owner, path.parent)
 

@@ -130,7 +130,10 @@ def load_features(
     if name == "none":
         return None
     if path is None:
-        raise InputError(f"{name}: the file of weights is not given: name the file, or choose none")
+        raise InputError(
+            f"loss.features_path: missing: give the weights of {name}, download the weights of resnet50 with "
+            "`spackle weights get features`, or choose loss.features=none"
+        )
     network: FeatureNet = ResNet50() if name == "resnet50" else SqueezeNet()
     advice = f"give another file with {name}'s weights"
     tensors = read_tensors(path, advice) if name == "resnet50" else _read_npz(path, advice)

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from spackle.camera_path import MAX_DISPARITY
 from spackle.device import Precision
@@ -131,16 +131,6 @@ class Recipe(AnyRecipe):
     network: Annotated[Literal["unet", "sharp-decoder"], FREE] = "unet"  # architecture of the residual
     init: Path | None = None  # initial weights; sharp-decoder also takes SHARP's checkpoint
 
-    @model_validator(mode="after")
-    def _has_features(self) -> Recipe:
-        name = self.loss.features
-        if name != "none" and self.loss.features_file is None:
-            raise ValueError(
-                f"loss.features_path: missing; give the weights of {name}, download the weights of resnet50 with "
-                "`spackle weights get features`, or choose loss.features=none"
-            )
-        return self
-
 
 R = TypeVar("R", bound=AnyRecipe)
 
@@ -215,8 +205,6 @@ def _first_problem(error: ValidationError) -> str:
     """A message that names the key of the first invalid value, and what the value must be."""
     first = error.errors()[0]
     key = ".".join(str(name)[:60] for name in first["loc"])
-    if first["type"] == "value_error":
-        return str(first["ctx"]["error"])
     if first["type"] == "extra_forbidden":
         return f"{key}: there is no such key"
     return f"{key}: {first['msg'][0].lower()}{first['msg'][1:]}, not {shown(first['input'])}".removeprefix(": ")

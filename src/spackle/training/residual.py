@@ -77,10 +77,8 @@ class ViewTask(Task):
         return total_loss(**tensors, recipe=self.recipe.loss, features=self.features)
 
     def measure(self, network: nn.Module, batch: Any) -> dict[str, list[float]]:
-        """Measure each view.
-
-        The measures are the loss and its terms, as means over the batch; hole_psnr in dB, inside the hole against the
-        target; seen_psnr in dB, outside of the hole against the base; har_before and har_after, the shares of holes.
+        """Values for each view: loss and terms (batch means), PSNR in dB in the hole (against the target) and outside
+        (against the base), share of hole pixels before and after completion.
         """
         views = self.complete(network, batch)
         loss, terms = self._loss_of(views)
@@ -143,8 +141,8 @@ def training_cells(features: ViewFeatures, least: int = MIN_AUX) -> Tensor:
 def first_network(name: str, init: Path | None = None) -> ResidualNet:
     """The initial network of a run: untrained, or read from the file `init`.
 
-    The file holds weights of the same network. For "sharp-decoder" it may also be SHARP's checkpoint: the decoder is
-    read, stem and heads stay untrained. InputError if the file is missing, broken or foreign.
+    The file holds weights of the same network, or for "sharp-decoder" SHARP's checkpoint, whose decoder is read; stem and
+    heads then stay untrained. InputError if the file is missing, broken or foreign.
     """
     if init is None:
         return open_residual(name)

@@ -120,7 +120,7 @@ def reverse_view(prediction: BasePrediction, photo: Tensor, viewer: Camera, rend
 def seen_from(gaussians: Gaussians, viewer: Camera, depth: Tensor) -> Tensor:
     """[N] bool: the Gaussians in front of the greatest rendered `depth` [H, W] of 3×3 pixels around their centres.
 
-    One pixel would not do: at an outline, the nearer depth covers pixels of the farther surface.
+    The depth of one pixel is not enough: at an outline, the nearer depth covers pixels of the farther surface.
     """
     around = max_pool2d(depth[None, None], 3, stride=1, padding=1)[0, 0]
     uv, z = viewer.project(gaussians.means)
@@ -167,7 +167,7 @@ def right_view(rng: np.random.Generator, folders: Sequence[Path], renderer: Rend
 
 
 def open_pseudo(location: str | os.PathLike[str]) -> DatasetFiles:
-    """Open a pseudo-supervised dataset (appendix, "Dataset"); InputError if it cannot teach anything."""
+    """Open a pseudo-supervised dataset (appendix, "Dataset"); InputError if no target is useful."""
     files = DatasetFiles(location)
     name = files.manifest.config.get("inpainter", {}).get("name")
     if name in NO_TARGETS:
