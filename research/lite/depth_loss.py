@@ -16,10 +16,10 @@ from torch.nn.functional import interpolate
 from spackle.bases.lite import network_size
 from spackle.training.recipe import RecipePart, Share
 
-FARTHEST = 0.02  # over the median inverse depth: what is farther, mostly sky, counts as this far
+FARTHEST = 0.02  # part of the median inverse depth: farther surfaces, mostly sky, get this value
 NEAREST = 20.0
-AT_MOST = 2.0  # greater errors in log inverse depth count as this: the truth there is more often wrong than difficult
-STEEPEST = 1.0  # the same for differences between neighbours
+AT_MOST = 2.0  # larger errors in log inverse depth are reduced to this: they are mostly errors of the true depth
+STEEPEST = 1.0  # upper bound for errors of differences between neighbours
 SCALES = (1, 2, 4, 8)  # strides between neighbours in the loss term steps
 
 
@@ -103,7 +103,7 @@ def _median(x: Tensor, valid: Tensor) -> Tensor:
     return torch.stack(values)[:, None, None]
 
 
-FARTHEST_FACTOR = 2.0  # an aligned depth is at most this many times the farthest true one
+FARTHEST_FACTOR = 2.0  # upper bound of an aligned depth, as multiple of the farthest true depth
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,7 +138,7 @@ def align(values: Tensor, true: Tensor) -> Tensor:
 
 
 def vertical_ramp(height: int, width: int) -> Tensor:
-    """[H, W] a guess that needs no photo: what is lower in the picture is nearer."""
+    """[H, W] a guess without photo: lower pixels are nearer."""
     return (torch.arange(height) + 0.5)[:, None].expand(height, width)
 
 
@@ -162,7 +162,7 @@ class DepthJudge:
 
     @torch.no_grad()
     def measure(self, network: nn.Module, frame: Frame) -> dict[str, float]:
-        """`MEASURES` of a frame: scores at the frame's size, the loss at the network's."""
+        """`MEASURES` of a frame: scores at the frame's size, the loss at the network's output size."""
         batch = self._batch(frame)
         predicted = self._run(network, batch.rgb)
         truth, valid = batch.inverse_depth.to(self.device), batch.valid.to(self.device)

@@ -39,14 +39,14 @@ class Turning:
     degrees: tuple[float, float, float]  # standard deviations of yaw, pitch and roll
 
 
-MEASURED = Turning((1.0, 1.6), (4.0, 4.0, 4.0))  # few scenes must look like many
+MEASURED = Turning((1.0, 1.6), (4.0, 4.0, 4.0))  # strong, because scenes are few
 MADE = Turning((1.0, 1.4), (2.0, 2.0, 3.0))  # synthetic scenes vary in their cameras already
-GUESSED = Turning((1.0, 1.4), (3.0, 3.0, 4.0))  # there are many photos
+GUESSED = Turning((1.0, 1.4), (3.0, 3.0, 4.0))  # weak, because photos are many
 MINGLED_SCALE = (-0.2, 0.8)  # range of the logarithm of the front frame's median inverse depth over the back frame's
 
 
 def turned(rng: Rng, frame: Frame, height: int, width: int, turning: Turning) -> Frame:
-    """The frame as seen by a camera at the same place with another direction; mirrored half of the time.
+    """The frame seen by a camera at the same position with another direction; mirrored in half of all cases.
 
     The image depends on the direction alone; inverse depth changes by the known ratio of z in both cameras.
     """
@@ -81,7 +81,7 @@ def _rotation(angles: NDArray[Any]) -> NDArray[Any]:
 
 
 def mingled(rng: Rng, back: Frame, front: Frame) -> Frame:
-    """Merge two frames of one size: each pixel shows the one that is nearer there, at a random relative scale.
+    """Merge two frames of one size at a random relative scale: each pixel shows the nearer frame.
 
     Outlines, textures and depth are real; only the combination is not.
     """
@@ -99,7 +99,7 @@ def mingled(rng: Rng, back: Frame, front: Frame) -> Frame:
 
 
 def relit(rng: Rng, rgb: Tensor) -> Tensor:
-    """[3, H, W] as in other light and by another camera: brightness, tint, contrast, glare, grey, blur, noise."""
+    """[3, H, W] with random brightness, tint, contrast, glare, grey, blur and noise."""
     tint = np.exp(rng.normal(0, 0.12, (3, 1, 1)) + rng.normal(0, 0.2)).astype(np.float32)
     rgb = rgb * torch.from_numpy(tint)
     mean = rgb.mean((1, 2), keepdim=True)
@@ -120,11 +120,11 @@ SAME = 1.05  # neighbours belong to one surface if their depths differ by a smal
 
 
 def warp_to_right(depth: Tensor, valid: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
-    """Move each pixel's depth to its position in the right photo; of several at one position the nearest stays.
+    """Move each pixel's depth to its position in the right photo; the nearest of several depths at a position is kept.
 
     Args:
-        depth: [H, W] in the left photo; it is the same in the right camera, because the cameras' axes are parallel.
-        valid: [H, W] bool, where it is known.
+        depth: [H, W] in the left photo; both cameras have parallel axes and the same depth.
+        valid: [H, W] bool: pixels with known depth.
         shift: [H, W] in pixels, positive to the right; usually negative.
 
     Returns:
@@ -144,7 +144,7 @@ def warp_to_right(depth: Tensor, valid: Tensor, shift: Tensor) -> tuple[Tensor, 
 
 
 def _close_cracks(depth: NDArray[np.float32]) -> None:
-    """Fill a pixel between two of one surface with that surface, if it is empty or shows something behind."""
+    """Fill an empty or farther pixel between two pixels of one surface with this surface."""
     left, middle, right = depth[:, :-2], depth[:, 1:-1], depth[:, 2:]
     nearer, farther = np.minimum(left, right), np.maximum(left, right)
     crack = (farther < SAME * nearer) & (middle > SAME * farther)
@@ -190,7 +190,7 @@ class Group:
 
 
 def of_camera(camera: RgbdFolder, held: float) -> tuple[list[Measured], list[Measured]]:
-    """A folder's frames for training, and those for validation, which are the last ones by name.
+    """A folder's frames for training, and its last frames by name for validation.
 
     Args:
         camera: the folder and its unit.

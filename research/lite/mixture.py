@@ -128,8 +128,8 @@ class Mixture:
 
 
 LOOKS_PX = (128 * 160, 192 * 256, 256 * 320, 352 * 480)  # in both orientations; much smaller sizes agree less
-UNSURE = 0.12  # greatest deviation, in logarithms, of predictions by all sizes and networks for a guess to count
-STEEP = 0.25  # nor does a guess count where it changes by more between pixels: predicted outlines are blurred
+UNSURE = 0.12  # a guess is ignored in pixels where predictions of all sizes and networks differ by more (logarithm)
+STEEP = 0.25  # a guess is ignored in pixels with a larger change to neighbours, because predicted outlines are blurred
 
 
 @dataclasses.dataclass(frozen=True)
@@ -175,7 +175,7 @@ class GuessedPhotos:
 
 
 def sure_inverse_depth(looks: Tensor) -> Tensor:
-    """[h, w] the geometric mean of predictions, given as logarithms [n, h, w]; 0 where they differ or it is steep."""
+    """[h, w] the geometric mean of predictions, given as logarithms [n, h, w]; 0 in pixels that differ or are steep."""
     looks = looks - looks.flatten(1).median(1).values[:, None, None]
     mean = looks.mean(0)
     around = max_pool2d(mean[None], 3, 1, 1) + max_pool2d(-mean[None], 3, 1, 1)

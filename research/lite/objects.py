@@ -1,4 +1,4 @@
-"""Placed and rotated solids, and objects of synthetic scenes, which are several solids on one spot."""
+"""Solids of synthetic scenes, and objects that consist of several solids."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def anyhow(rng: Rng) -> Array:
 
 
 def solid(rng: Rng, kind: int, center: Array, axes: Array, texture: int | None = None, *, casts: bool = True) -> Solid:
-    """A solid; without `texture` it gets a random one that covers all of its surface."""
+    """A solid; None as `texture` means a random texture without gaps."""
     skin = int(rng.integers(WHOLE)) if texture is None else texture
     many = (2.0, 1.0) if kind in (ELLIPSOID, CYLINDER) else (1.0, 1.0)
     return Solid(kind, _f(center), _f(axes), skin, many, casts)
@@ -157,14 +157,14 @@ def plant(rng: Rng, foot: Array, size: float) -> list[Solid]:
 
 
 def sticks(rng: Rng, foot: Array, size: float) -> list[Solid]:
-    """Pens in a cup: thin, leaning, each at its own depth."""
+    """Pens in a cup: thin, leaning, at different depths."""
     cup = pole(rng, foot, 0.8 * size, 0.3 * size, np.eye(3))
     tilts = (turn(rng.uniform(-3, 3)) @ lean(rng.normal(0, 0.3)) for _ in range(rng.integers(1, 6)))
     return [cup, *(pole(rng, foot, size * rng.uniform(1.2, 2.2), 0.04 * size, axes) for axes in tilts)]
 
 
 def flat(rng: Rng, foot: Array, size: float) -> list[Solid]:
-    """A cut-out on its edge: a cone, a ring, a lattice, or the outline of some thing."""
+    """An upright cut-out: a cone, a ring, a lattice, or the outline of an object."""
     texture = int(rng.choice((PEAK, PEAK, RING, LATTICE, cut(rng))))
     wide, tall = size * rng.uniform(0.4, 1.0), size * rng.uniform(0.5, 1.2)
     axes = turn(rng.normal(0, 0.5)) @ nod(rng.normal(0, 0.15))

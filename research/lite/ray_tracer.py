@@ -1,6 +1,6 @@
 """Render simple solids with exact depth, one ray for each sample.
 
-Splats would blur depth at outlines; a ray has the depth of the one surface that it hits.
+Unlike splats, rays do not blur depth at outlines.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def trace(
 
     Args:
         solids: the solids of the scene.
-        textures: [T, S, S, 4] colours 0..1 and coverage; rays pass through where coverage is below 0.5.
+        textures: [T, S, S, 4] colours 0..1 and coverage; rays pass through coverage below 0.5.
         rays: [N, 3] directions; distances are in units of their length.
         light: [3] unit vector towards the light.
         ambient: share of ambient light.

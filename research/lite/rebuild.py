@@ -3,7 +3,7 @@
     python research/lite/rebuild.py -o OUT data.photos=PHOTOS data.stereo=PAIRS \\
         data.rgbd.0.folder=KITCHEN data.rgbd.1.folder=OFFICE data.validation_stereo=OTHER_PAIRS
 
-OUT gets a folder for each run, and lite.safetensors. The same command resumes after a killed one. KEY=VALUE override
+OUT gets a folder for each run, and lite.safetensors. The same command resumes a killed run. KEY=VALUE override
 values in every run.
 """
 

@@ -1,4 +1,4 @@
-"""The recipe of a training run of the lite base, and the files that it names."""
+"""The recipe of a training run of the lite base, and the recipe's files."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ Scale = Annotated[float, Field(ge=0.1, le=2)]
 
 
 class LiteShares(RecipePart):
-    """The share of pictures from each source; shares need not add up to 1, and a source without data gets none."""
+    """Relative shares of the pictures from each source; a source without data gets no share."""
 
     made: Share = 0.4
     stereo: Share = 0.28
     rgbd: Share = 0.14
-    guessed: Share = 0.18  # if there is a teacher
+    guessed: Share = 0.18  # only with a teacher
 
 
 class LiteData(RecipePart):
@@ -50,7 +50,7 @@ class LiteData(RecipePart):
     rgbd: Annotated[tuple[RgbdFolder, ...], FREE] = ()  # their focal lengths are not used
     stereo: Place = None  # a folder of scenes, each with a scene.json
     made: Count = 4900  # number of synthetic scenes
-    teacher: Path | None = None  # weights of an earlier run, whose guesses for `photos` are also trained on
+    teacher: Path | None = None  # weights of an earlier run; its predictions for `photos` become training data
     guesses: Count = 1500  # at most this number of photos
     shares: LiteShares = LiteShares()
     size: tuple[Side, Side] = (256, 320)  # height and width of pictures; swapped in a fifth of the steps
@@ -64,7 +64,7 @@ class LiteData(RecipePart):
 
 
 class LiteOptim(OptimRecipe):
-    """The optimiser as for the other methods, and other rates for the pretrained encoder."""
+    """Settings of the optimiser, and of the pretrained encoder."""
 
     encoder_rate: Annotated[float, Field(ge=0, le=10)] = 0.2  # factor on the encoder's learning rate
     # How many of the encoder's first stages are frozen, with its stem; 0: nothing is frozen.

@@ -30,7 +30,7 @@ from objects import (
 from ray_tracer import BOX, CYLINDER, ELLIPSOID, SHEET, Solid
 from textures import LATTICE, LEAVES, WHOLE
 
-Scene = tuple[list[Solid], float]  # the solids, and by which angle the camera looks down
+Scene = tuple[list[Solid], float]  # the solids, and the downward angle of the camera
 
 
 def room(rng: Rng) -> Scene:
@@ -189,7 +189,7 @@ def _canopy(rng: Rng, eye: float) -> list[Solid]:
 
 
 def _eaves(rng: Rng, eye: float) -> list[Solid]:
-    """A roof above the camera that ends in front of it, with beams and posts at its edge."""
+    """A roof above the camera, with an edge in front of the camera, beams and posts."""
     rise, edge = rng.uniform(0.7, 2.2), rng.uniform(1.5, 9)
     axes, wide = turn(rng.normal(0, 0.4)), rng.uniform(2, 8)
     x = rng.normal(0, 0.4) * wide
@@ -310,7 +310,7 @@ def shelf(rng: Rng) -> Scene:
 
 
 def _cloth(rng: Rng, floor: float, away: float) -> list[Solid]:
-    """A hanging cloth: narrow sheets, edge to edge, rotated alternately like folds."""
+    """A hanging cloth: narrow adjoining sheets, rotated alternately like folds."""
     skin, made = int(rng.integers(WHOLE)), list[Solid]()
     tall, x, z = away * rng.uniform(0.2, 0.6), rng.uniform(-0.7, 0.3) * away, away
     back = nod(rng.uniform(-0.5, 0.1))

@@ -21,11 +21,11 @@ from spackle.training.sources import Photos
 
 Things = list[list[Solid]]
 MOST = 64  # more than a scene's number of objects
-FARTHEST_M = 100.0  # farther is sky, which would otherwise determine the scale
+FARTHEST_M = 100.0  # farther pixels are sky, which would otherwise determine the scale
 
 
 def _pavement(rng: Rng) -> tuple[list[Solid], Things, float]:
-    """The background, the objects in front of it, and by which angle the camera looks down."""
+    """Background, objects in front of the background, and the downward angle of the camera."""
     eye = rng.uniform(1.1, 2.3)
     axes = turn(math.radians(rng.uniform(-20, 20)))
     behind = [ground(rng, axes, np.array([0.0, eye, 200.0]), 300.0, 300.0, repeats=200.0)]

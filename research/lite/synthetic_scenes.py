@@ -1,4 +1,4 @@
-"""Synthetic scenes with exact depth and textures cut from photos; rendered once, and stored several to a file."""
+"""Synthetic scenes with exact depth and textures cut from photos, stored with several scenes per file."""
 
 from __future__ import annotations
 
@@ -42,8 +42,7 @@ def synthetic_scene(rng: Rng, photos: Photos, height: int, width: int) -> tuple[
     Args:
         rng: the source of all random choices.
         photos: gives photos, from which textures are cut.
-        height: in pixels.
-        width: likewise.
+        height, width: in pixels.
     """
     picture = drawn(rng, photos, height, width, KINDS[int(rng.choice(len(KINDS), p=[share for _, share in KINDS]))][0])
     return picture.rgb, picture.inverse_depth
@@ -98,7 +97,7 @@ Warn = Callable[[str], None]
 
 
 class PhotoDraw:
-    """Draws random photos; an unreadable one is reported once, and another one is drawn."""
+    """Draws random photos; unreadable photos are reported once and skipped."""
 
     def __init__(self, files: Sequence[Path], warn: Warn) -> None:
         self.files, self.warn, self.bad = files, warn, set[Path]()
@@ -128,11 +127,11 @@ class SyntheticScenes:
     count: int
 
     def fill(self, progress: Callable[[int, int], None], warn: Warn) -> None:
-        """Make missing scenes. A damaged file is reported and replaced; one with too few scenes is replaced silently.
+        """Make missing scenes. Damaged files are reported and replaced; too short files are replaced silently.
 
         Args:
             progress: called with the number of scenes that exist.
-            warn: called with what was skipped or made anew.
+            warn: called with a message about each skipped photo and replaced file.
 
         Raises:
             InputError: nothing can be written, or no photo can be read.

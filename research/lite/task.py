@@ -37,7 +37,7 @@ ENDS = (0.02, 0.98)  # quantiles that get the first and the last colour
 
 
 def colored(values: Tensor, low: float, high: float, known: Tensor | None = None) -> Tensor:
-    """[H, W, 3] sRGB of values [H, W]; those up to `low` get the first colour, those from `high` the last."""
+    """[H, W, 3] sRGB of values [H, W]; values up to `low` get the first colour, values from `high` the last colour."""
     place = ((values - low) / max(high - low, 1e-12)).clamp(0, 1) * (len(VIRIDIS) - 1)
     below = place.long().clamp_max(len(VIRIDIS) - 2)
     colors = torch.lerp(VIRIDIS[below], VIRIDIS[below + 1], (place - below)[..., None])
@@ -51,7 +51,7 @@ def ends(values: Tensor) -> tuple[float, float]:
 
 
 class LiteTask(Task):
-    """Its items are indices in a batch, drawn anew in each step; its validation items are groups of frames."""
+    """Trains the lite base; items are indices in a batch, validation items are groups of frames."""
 
     name: ClassVar[str] = "lite"
     aim: ClassVar[str] = "abs_rel"
@@ -70,7 +70,7 @@ class LiteTask(Task):
         sources: list[tuple[Source, float]] = []
 
         def make(what: str, folder: Path, fill: Callable[[Step, Warn], None]) -> None:
-            """Make files in the first process; the others wait for it and use them."""
+            """Make files in the first process; all other processes wait for the files."""
             if rank() == 0:
                 make_folder(folder)
                 log(f"{what} in {folder}")

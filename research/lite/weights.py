@@ -127,11 +127,11 @@ def _network_of(path: Path, size: Size) -> LiteNet:
 
 @torch.no_grad()
 def balanced(network: LiteNet) -> LiteNet:
-    """Rescale weights in place to similar magnitudes; the function stays the same.
+    """Rescale weights in place to similar magnitudes, without a change of the network's function.
 
-    During training the decoder's features grow and its last weights shrink, until the optimiser's steps are large
-    relative to these weights and the run diverges. Levels are linear but for ReLU, so a factor can move from one level
-    to the next.
+    During training, the decoder's features grow and the last weights shrink, until steps of the optimiser are too large
+    for these weights and the run diverges. Levels are linear except for ReLU: a factor can move from one level to the
+    next.
     """
     spreads: list[float] = []
     hooks = [fuse.register_forward_hook(lambda *call: spreads.append(float(call[2].std()))) for fuse in network.fuse]
@@ -152,10 +152,10 @@ def balanced(network: LiteNet) -> LiteNet:
 
 
 def freeze(network: LiteNet, stages: int) -> LiteNet:
-    """Freeze the encoder's stem and first stages, and the depthwise convolutions of the others.
+    """Freeze the encoder's stem and first stages, and the depthwise convolutions of all other stages.
 
-    These are a sixteenth of its weights, but would take two thirds of a step's time on a CPU. If `stages` is 0, nothing
-    is frozen.
+    Depthwise convolutions have a sixteenth of the encoder's weights, but would take two thirds of a step's time on a
+    CPU. If `stages` is 0, nothing is frozen.
     """
     if stages:
         for part in (network.encoder.stem, *network.encoder.stages[:stages]):
@@ -190,7 +190,7 @@ def save_networks(networks: Sequence[LiteNet], path: Path) -> None:
 
 
 def _stored(name: str, value: Tensor) -> dict[str, Tensor]:
-    """A weight as it is stored, by name; in eight bits its scales are a second tensor."""
+    """The stored tensors of a weight by name: the weight, and for eight bits the scales."""
     if value.dim() < 4 or value[0].numel() < FEW:
         return {name: value.half().contiguous()}
     scale = value.abs().amax((1, 2, 3)) / STEPS

@@ -141,8 +141,8 @@ def training_cells(features: ViewFeatures, least: int = MIN_AUX) -> Tensor:
 def first_network(name: str, init: Path | None = None) -> ResidualNet:
     """The initial network of a run: untrained, or read from the file `init`.
 
-    The file holds weights of the same network, or for "sharp-decoder" SHARP's checkpoint, whose decoder is read; stem and
-    heads then stay untrained. InputError if the file is missing, broken or foreign.
+    The file holds weights of the same network. For "sharp-decoder", SHARP's checkpoint is also accepted: the decoder is
+    read, stem and heads stay untrained. InputError if the file is missing, broken or foreign.
     """
     if init is None:
         return open_residual(name)
