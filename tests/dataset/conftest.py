@@ -1,4 +1,4 @@
-"""A dataset that several files read."""
+"""Small photos with depth maps, and a dataset of these photos."""
 
 from __future__ import annotations
 
@@ -11,13 +11,12 @@ from dataset_builds import build, write_inputs
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Five photos and their depth."""
     return write_inputs(tmp_path_factory.mktemp("dataset"))
 
 
 @pytest.fixture(scope="module")
 def whole(place: Path) -> Path:
-    """A dataset of them, built in one go by one process."""
+    """A dataset built by one process without interruption."""
     done = build(place, place / "whole")
     assert done.code == 0, done.err
     return place / "whole"
@@ -25,5 +24,5 @@ def whole(place: Path) -> Path:
 
 @pytest.fixture
 def copy(whole: Path, tmp_path: Path) -> Path:
-    """The dataset, to be damaged."""
+    """A copy of the dataset, which tests may damage."""
     return shutil.copytree(whole, tmp_path / "copy")

@@ -80,7 +80,7 @@ build._Build._keep = dying"""
         time.sleep(0.05)
 
 
-def test_ctrl_c_ends_after_the_photo_at_work(
+def test_ctrl_c_ends_after_the_current_photo(
     whole: Path, place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     make = Maker.make
@@ -123,7 +123,7 @@ def test_odd_photos_are_used_and_bad_ones_are_named(tmp_path: Path) -> None:
     (folder / "cut.png").write_bytes((folder / "one.png").read_bytes()[:900])
     (folder / "empty.jpg").write_bytes(b"")
     (folder / "notes.txt").write_text("not a photo")
-    for name in ("grey", "moving", "one"):  # and none for cmyk
+    for name in ("grey", "moving", "one"):  # cmyk has no depth map
         write_depth(tmp_path / "depth" / f"{name}.npy", metres(72, 54))
     done = build(tmp_path, tmp_path / "out", "--views", 2)
     assert done.code == 0, done.err

@@ -28,7 +28,9 @@ from spackle.render import get_renderer
 from spackle.residual import hole_mask
 
 
-@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")  # its own
+@pytest.mark.filterwarnings(
+    "ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning"
+)  # webdataset leaves files open
 def test_a_shard_is_a_plain_tar_that_webdataset_reads(whole: Path) -> None:
     with tarfile.open(whole / "shard-000000.tar") as archive:
         members = archive.getmembers()
@@ -55,7 +57,7 @@ def test_views_are_read_as_they_were_rendered(whole: Path, place: Path) -> None:
         assert torch.equal(sample.mask, hole_mask(sample.rendering.alpha))
         assert float(sample.mask.double().mean()) == view["hole"]
         assert torch.equal(sample.target[~sample.mask], sample.rendering.rgb[~sample.mask])
-        if bool(sample.mask.any()):  # no hole is left black
+        if bool(sample.mask.any()):  # holes are painted
             assert float(sample.target[sample.mask].amax(-1).min()) > 0.2
     first = group.view(0)
     assert torch.equal(first.camera.world_to_camera, torch.eye(4))

@@ -1,4 +1,4 @@
-"""Small scenes that several files evaluate on."""
+"""Small scenes for evaluations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`spackle bench`: counts, sums, layouts, the paper's numbers, folders, bad options."""
+"""`spackle bench`: counts, sums, tables, the paper's numbers, folders."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from spackle.residual.architectures import UNet, open_residual
 from spackle.scene_fill import FillContext, fill_view
 
 EXPANDED = "tab:expanded_efficiency_gaussian_overhead"
-PAPER_LABELS = {table["label"] for table in PAPER["tables"]}  # all six
+PAPER_LABELS = {table["label"] for table in PAPER["tables"]}  # the paper's six tables
 STAGE_MS = {"base": 1000.0, "view": 400.0, "photo": 1.0, "completion": 13.0}
 
 
@@ -38,7 +38,7 @@ def cost(added: int = 20, factor: float = 1.0) -> dict[str, float]:
 
 
 def results(title: str = "Middlebury", factor: float = 1.0) -> Results:
-    """Three images, the second twice as slow and the third four times, and one that failed."""
+    """A run of three images, the second twice as slow and the third four times as slow, and one failed image."""
     config: dict[str, Any] = {"kind": "bench", "protocol": "bench", "methods": list(bench.TIMED), "title": title}
     config |= {"disparities": [0.3, 0.4, 0.5], "runs": 3, "base_runs": 1, "side": 1280, "device": "cuda"}
     config["base"] = {"title": "SHARP", "says": "a network", "device": "cpu"}

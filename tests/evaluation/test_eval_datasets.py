@@ -255,7 +255,9 @@ def test_points_land_on_their_pixels(name: str, make: Callable[[Path], Path], sc
             torch.testing.assert_close(z / scale, expected[:, 2], atol=1e-4, rtol=1e-5)
         if case.points is not None:
             points = case.points()
-            expected = torch.tensor([eye.pixel(point) for point in POINTS]).float()  # none of 7 px error
+            expected = torch.tensor(
+                [eye.pixel(point) for point in POINTS]
+            ).float()  # the model's point with an error of 7 px is left out
             torch.testing.assert_close(points.uv, expected[:, :2], atol=1e-4, rtol=0)
             torch.testing.assert_close(points.z, expected[:, 2], atol=1e-4, rtol=0)
 
@@ -266,7 +268,7 @@ def test_second_views_are_the_nearest_but_not_the_same(tmp_path: Path) -> None:
     llff(tmp_path / "fern", eyes)
     first = read_cases("llff", tmp_path)[0]
     assert [view.name for view in first.seconds if view.near] == ["fern/image002", "fern/image003", "fern/image004"]
-    assert len(first.seconds) == len(eyes) - 1  # all, the nearest first
+    assert len(first.seconds) == len(eyes) - 1  # all other photos, the nearest first
     assert [view.name for view in first.seconds][::6] == ["fern/image001", "fern/image006"]
     settings: dict[str, Any] = {"base": BaseSettings("lite"), "metrics": (), "residual": "seeds"}
     for choice, count in (("all", 7), ("nearest", 3)):

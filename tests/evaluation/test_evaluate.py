@@ -50,7 +50,7 @@ def test_psnr_and_ssim_are_scikit_images() -> None:
     whole, full = theirs.structural_similarity(image.numpy(), truth.numpy(), channel_axis=-1, full=True, **options)
     found = ssim_map(image, truth)
     mask, nothing = torch.zeros(2, *image.shape[:2], dtype=torch.bool)
-    mask[:20, -30:] = True  # up to the border, where half of a hole may be
+    mask[:20, -30:] = True  # also at the border, because holes are often there
     assert ssim_average(found) == pytest.approx(whole, abs=1e-6)
     assert ssim_average(found, mask) == pytest.approx(full[:20, -30:].mean(), abs=1e-6)
     for ours, part in ((psnr(image, truth), np.s_[:]), (psnr(image, truth, mask), np.s_[:20, -30:])):
@@ -185,12 +185,12 @@ def test_each_method_starts_from_the_same_base() -> None:
         assert seeds < 0.5 * whole
         assert cells == pytest.approx(holes * whole, rel=0.05)  # the paper's HAR × grid
         assert cells < pixels <= 6 * cells
-    assert scene[0].aux is scene[1].aux  # one set for both
+    assert scene[0].aux is scene[1].aux  # both views share a set
     double = dataclasses.replace(context.base, means=2 * context.base.means, scales=2 * context.base.scales)
     fill = make_method("direct-ft", cameras, context, direct_ft=lambda: (double, 2.0))
     for camera, before in zip(cameras, renderings, strict=True):
         difference = (fill(camera, before).rgb - before.rgb).abs()
-        assert float(difference.max()) <= 1e-3  # from the same place, in another unit
+        assert float(difference.max()) <= 1e-3  # the same viewpoint, in another unit of length
 
 
 def test_large_views_end_a_swipe_and_a_failed_metric_is_a_remark() -> None:
@@ -238,7 +238,7 @@ def test_large_views_from_files_to_tables(scenes: Path, tmp_path: Path, monkeypa
     assert done.code == 0, done.err
     assert names_in(tmp_path) == OUTPUTS
     found = load_run(tmp_path)
-    ending = [line.split() for line in done.lines[-2 - 2 * len(found.methods) :]]  # a table, and where the rest is
+    ending = [line.split() for line in done.lines[-2 - 2 * len(found.methods) :]]  # a table of means, and the folder
     assert ending[0] == ["NIQE", "↓", "MUSIQ", "↑", "HAR", "↓", "added", "GS"]
     niqe, har = (f"{mean_of(found, '0.3', 'base', metric):.4f}" for metric in ("niqe", "har"))
     assert ending[1] == ["S1", "base", "(rgbd)", niqe, har, "0"]
@@ -247,7 +247,7 @@ def test_large_views_from_files_to_tables(scenes: Path, tmp_path: Path, monkeypa
         before = mean_of(found, setting, "base", "har")
         assert before > 0.02
         for method in ("seeds", "paper", "spackle", "spackle-scene"):
-            most = 0.5 if method == "paper" else 0.05  # of one pass, and of two
+            most = 0.5 if method == "paper" else 0.05  # one pass, or two passes
             assert mean_of(found, setting, method, "har") < most * before
             assert mean_of(found, setting, method, "merged") > mean_of(found, setting, "base", "merged")
         dark, filled = (mean_of(found, setting, method, "niqe") for method in ("base", "spackle"))

@@ -96,7 +96,7 @@ def _only(folder: Path) -> Path:
 
 
 def _say(line: str) -> None:
-    one_line(line).encode()  # as a report does
+    one_line(line).encode()  # a report encodes its lines
 
 
 def _writes(name: str, data: bytes | str) -> Maker:

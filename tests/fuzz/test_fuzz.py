@@ -40,13 +40,13 @@ def npz(side: int) -> bytes:
     return file.getvalue()
 
 
-def test_small_files_that_announce_much_stay_below_the_bound(tmp_path: Path) -> None:
+def test_small_files_with_a_large_announced_size_stay_below_the_bound(tmp_path: Path) -> None:
     small = png("RGB", 64)
     at = small.index(b"IDAT")
     cases = [
         ("pictures", "a.gif", gif(9_999)),
         *(("pictures", "a.png", png(mode, side)) for mode, side in (("L", 9_999), ("RGB", 5_600))),
-        ("pictures", "a.png", small[: at - 4] + b"\xff" * 4 + small[at:]),  # data of 4 GB, it says
+        ("pictures", "a.png", small[: at - 4] + b"\xff" * 4 + small[at:]),  # the header announces 4 GB
         ("depth", "a.png", png("I;16", 9_999)),
         ("depth", "a.npz", npz(5_600)),
     ]
