@@ -22,10 +22,11 @@ import torch
 from clips import moving, write_clip
 from photos import calibration, metres, picture, write_depth, write_photo
 from PIL import Image
+from safetensors.torch import save_file
 from scenes import random_gaussians
 from test_camera_files import CAMERAS, PATH
 from test_eval_datasets import EYES, eth3d, llff, stored, tanks
-from test_network_file import WHOLE, WRITERS
+from test_network_file import WHOLE, write_old, write_parameters, write_script
 
 from spackle.bases.depth_map import load_depth
 from spackle.bases.photo_depth.layouts import load_photo_depth
@@ -265,7 +266,9 @@ READERS: dict[str, Reader] = {
     "recipes": Reader([_writes("a.yaml", RECIPE)], lambda folder: load_recipe(Recipe, _only(folder))),
     "coco": Reader([_coco], lambda folder: find_photos(folder / "a.json", folder / "images", _say)),
     "datasets": Reader([_dataset], _read_dataset),
-    "weights": Reader([_checkpoint, *map(_weights, WRITERS)], _read_weights),
+    "weights": Reader(
+        [_checkpoint, *map(_weights, (save_file, torch.save, write_script, write_old, write_parameters))], _read_weights
+    ),
     "clips": Reader(
         [
             *(_clip("a.mp4"), _clip("a.mkv", sound="aac"), _clip("a.avi", codec="mpeg4")),

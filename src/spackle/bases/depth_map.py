@@ -59,7 +59,6 @@ class DepthMap:
 
     @property
     def range_in_words(self) -> str:
-        """The range of the depths, in words."""
         near, middle, far = np.quantile(self.depth[self.valid].numpy(), [EXTREMES[0], 0.5, EXTREMES[1]])
         return f"{near:.3g} m near, {middle:.3g} m median, {far:.3g} m far"
 

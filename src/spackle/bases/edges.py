@@ -24,8 +24,6 @@ Bools = NDArray[np.bool_]
 
 @dataclasses.dataclass(frozen=True)
 class Edges:
-    """The depth edges of a map."""
-
     step: Floats  # [h, w] height, in inverse depth, of the smeared edge around a pixel; 0 outside of smeared edges
     across: Bools  # [h, w] an edge runs between a pixel and its right neighbour
     down: Bools  # [h, w] an edge runs between a pixel and its lower neighbour
@@ -47,7 +45,6 @@ def find_edges(inverse_depth: Floats, known: Bools, focal: tuple[float, float]) 
 
 @kernel
 def _rows(inverse_depth: Any, known: Any, steepest: float) -> Any:
-    """Find the edges along rows: `step` and `across` of `Edges`."""
     height, width = inverse_depth.shape
     step = np.zeros((height, width), np.float32)
     across = np.zeros((height, width), np.bool_)

@@ -196,8 +196,6 @@ def _lower_linear(network: nn.Module, dtype: torch.dtype) -> None:
 
 
 def _processed(processor: Any, kind: str) -> Prepare:
-    """Preprocessing by an image processor of transformers."""
-
     def prepare(rgb: Tensor) -> tuple[Tensor, Window]:
         image = Image.fromarray((rgb * 255).round().to(torch.uint8).numpy())
         pixels = torch.as_tensor(processor(images=image, return_tensors="pt")["pixel_values"])

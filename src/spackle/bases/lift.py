@@ -129,7 +129,6 @@ def smoothed(inverse_depth: Floats, known: Bools, step: Floats | np.float32) -> 
 
 @kernel
 def _relax(depths: Any, low: Any, high: Any, apart: Any) -> None:
-    """Smooth `depths` in place, between `low` and `high`."""
     height, width = depths.shape
     for _ in range(SWEEPS):
         for y in range(height):

@@ -73,8 +73,6 @@ class MBConv(nn.Module):
 
 
 class Encoder(nn.Module):
-    """An EfficientNet-Lite without its head."""
-
     def __init__(self, size: Size) -> None:
         super().__init__()
         self.size = size

@@ -9,7 +9,7 @@ import contextlib
 import dataclasses
 import functools
 import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 
 from spackle.bases import Base, BasePrediction, Progress
@@ -30,6 +30,7 @@ from spackle.weights import check_undamaged
 LOG = logging.getLogger("spackle")
 Log = Callable[[str], None]
 Stage = Callable[[str], AbstractContextManager[Progress]]
+UNTIMED: Stage = lambda name: contextlib.nullcontext(lambda done, total: None)  # noqa: E731
 ORDER = {  # candidates of `auto`: the name in reports and the log, and the reason that is given if it is missing
     RGBD: ("the depth in the photo", "no depth in the photo"),
     "sharp": ("SHARP", "no SHARP weights here"),
@@ -113,11 +114,6 @@ class ResolvedBase:
     note: str = ""  # for the user, if `auto` chose this base for the first time
 
 
-@contextlib.contextmanager
-def _untimed(stage: str) -> Iterator[Progress]:
-    yield lambda done, total: None
-
-
 class OpenedBase:
     """Turns photos into Gaussians. The first photo that needs a network loads it for all others."""
 
@@ -130,7 +126,7 @@ class OpenedBase:
         self._notes: set[str] = set()  # given for earlier photos
 
     def predict(
-        self, photo: Photo, depth: Depth = None, *, log: Log = LOG.warning, stage: Stage = _untimed
+        self, photo: Photo, depth: Depth = None, *, log: Log = LOG.warning, stage: Stage = UNTIMED
     ) -> tuple[BasePrediction, ResolvedBase]:
         """A photo's Gaussians by the first candidate that works.
 

@@ -93,8 +93,6 @@ def _fitted(samples: _Samples, colors: Tensor, single: Tensor, corrected: Tensor
 
 
 class _Surface(NamedTuple):
-    """A surface at each pixel."""
-
     depth: Tensor  # [H, W] inverse
     slope: Tensor  # [H, W, 2]
     color: Tensor  # [H, W, 3] linear RGB
@@ -215,7 +213,6 @@ def blended_opacities(alpha: Floats, ring: NDArray[np.uint8]) -> Floats:
 
 @kernel
 def _thin(alpha: Any, ring: Any, result: Any) -> None:
-    """One iteration of `blended_opacities`, in place."""
     height, width = alpha.shape
     for y in range(height):
         for x in range(width):
@@ -245,7 +242,6 @@ def mixture(spots: Floats, colors: Tensor, height: int, width: int) -> Tensor:
 
 @kernel
 def _mix(start: int, stop: int, spots: Any, colors: Any, image: Any) -> None:
-    """Blend the rows start..stop, nearest Gaussians first."""
     width = image.shape[1]
     half = np.float32(0.5)
     passes = np.ones((stop - start, width), np.float32)

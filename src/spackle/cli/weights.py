@@ -31,7 +31,7 @@ def weights_get(
     from spackle.files import results_folder
     from spackle.progress import Reporter
     from spackle.weights import file_digest, published_weights, weights_folder
-    from spackle.weights.download import check_url, download
+    from spackle.weights.download import download
 
     reporter, entry = Reporter(as_json=as_json), published_weights(name)
     path = (output or weights_folder()) / entry.file
@@ -40,12 +40,10 @@ def weights_get(
     summary = f"{name}: {decimal(entry.bytes)}, SHA-256 {entry.sha256}"
     new = force or not os.path.isfile(path)
     if new:
-        address = url or entry.address
-        check_url(address)
         for line in entry.notice:
             reporter.log(line)
         with results_folder(path.parent, [path.name], alone=True), reporter.transfer(name) as step:
-            download(address, path, entry.bytes, entry.sha256, step)
+            download(url or entry.address, path, entry.bytes, entry.sha256, step)
         reporter.log(f"{summary} -> {path}" + ("" if output is None else f"; {entry.option}"))
     else:
         with reporter.stage("check"):

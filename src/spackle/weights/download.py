@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator
 from http.client import HTTPException, HTTPResponse, responses
 from pathlib import Path
 from urllib.error import HTTPError, URLError
-from urllib.parse import urlsplit
 from urllib.request import Request, build_opener
 
 from spackle.errors import InputError, reason_in_a_line
@@ -23,7 +22,7 @@ Progress = Callable[[int, int], None]  # (bytes done, bytes in all)
 
 
 def download(url: str, path: str | os.PathLike[str], size: int, sha256: str, progress: Progress | None = None) -> None:
-    """Fetch `url` (http or https, without a password) to `path` in an existing folder.
+    """Fetch `url` to `path` in an existing folder.
 
     The bytes are collected in NAME.part; the complete file then replaces an existing file. After a broken connection, a
     kill or Ctrl-C the next call requests only the missing bytes. `progress` counts the bytes of earlier calls too.
@@ -31,7 +30,6 @@ def download(url: str, path: str | os.PathLike[str], size: int, sha256: str, pro
     Raises:
         InputError: the file cannot be fetched or written, or has other content.
     """
-    check_url(url)
     target = check_writable(path)
     part = target.with_name(f"{target.name}.part")
     try:
@@ -48,17 +46,6 @@ def download(url: str, path: str | os.PathLike[str], size: int, sha256: str, pro
     except OSError as error:
         reason = reason_in_a_line(error)
         raise InputError(f"{path}: cannot write: {reason}: make room or choose another folder") from error
-
-
-def check_url(url: str) -> None:
-    """InputError unless `url` begins with http:// or https:// and has no user name or password."""
-    with contextlib.suppress(ValueError):  # for a port that is no number
-        parts = urlsplit(url)
-        good = parts.scheme in ("http", "https") and parts.hostname and parts.port != 0
-        if good and "@" not in url and url.isprintable() and " " not in url:
-            return
-    shown = "the address (not shown)" if "@" in url else repr(url)
-    raise InputError(f"{shown}: give an address that begins with https:// or http://, without user name and password")
 
 
 def _receive(url: str, part: Path, size: int, progress: Progress) -> None:
@@ -97,9 +84,10 @@ def _network(url: str) -> Iterator[None]:
         with error:
             status = f"the server answers HTTP {error.code} {responses.get(error.code, '')}".rstrip()
         raise InputError(f"{url}: {status}: check the address, or try again later") from error
-    except (OSError, HTTPException) as error:
+    except (OSError, HTTPException, ValueError) as error:  # ValueError: no address
         reason = reason_in_a_line(error.reason if isinstance(error, URLError) else error)
-        raise InputError(f"{url}: no connection ({reason}): check network and https_proxy, then {AGAIN}") from error
+        problem = f"no connection ({reason}): check address, network and https_proxy"
+        raise InputError(f"{url}: {problem}, then {AGAIN}") from error
 
 
 def _first_byte(url: str, response: HTTPResponse, present: int, size: int) -> int:

@@ -125,7 +125,6 @@ def focal_and_shift(points: Floats, places: Floats, focal: float | None = None) 
         return focal or 1.0, 0.0
 
     def at(shift: float) -> tuple[float, Floats, Floats]:
-        """The focal length, the projections for f = 1 and the residuals, [N, 2] each."""
         with np.errstate(all="ignore"):  # a shift may put a point into the camera
             seen = points[:, :2] / (points[:, 2:] + shift)
             best = focal or float((seen * places).sum() / (seen * seen).sum())

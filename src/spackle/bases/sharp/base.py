@@ -78,7 +78,6 @@ class SharpBase:
                 memory is short. Nothing in the file is executed.
             ValueError: an unknown precision.
         """
-        check_windows("windows", windows)  # before anything is read
         target = pick_device(device)
         network = load_network(path, pick_dtype(precision, target), target)
         return SharpBase(network, windows=windows, compiled=compiled, weights=Path(path).name)

@@ -34,13 +34,11 @@ class SharpConfig:
     window: int = 384  # side in pixels of a transformer's input, a multiple of 8 tokens
 
     @property
-    def side(self) -> int:
-        """Side in pixels of the network's square input."""
+    def side(self) -> int:  # of the network's square input, in pixels
         return 4 * self.window
 
     @property
-    def grid(self) -> int:
-        """Number of tokens along a window's side."""
+    def grid(self) -> int:  # number of tokens along a window's side
         return self.window // self.patch
 
 
@@ -179,7 +177,6 @@ class SlidingPyramid(nn.Module):
         ]
 
     def _encode(self, windows: Tensor, batch: int, progress: Progress | None) -> tuple[Tensor, list[Tensor]]:
-        """Features of all windows, and tapped features of the full-size windows, `batch` windows at a time."""
         found: list[list[Tensor]] = [[] for _ in range(1 + len(self.taps))]
         for start in range(0, len(windows), batch):
             features, tapped = self.patch_encoder(windows[start : start + batch], self.taps)
@@ -212,7 +209,6 @@ def merge(maps: Tensor, trim: int) -> Tensor:
 
 
 def _project_and_double(dim_in: int, dim_middle: int, dim_out: int, doublings: int) -> nn.Sequential:
-    """A projection, then transposed convolutions that double the size, all without bias."""
     layers: list[nn.Module] = [nn.Conv2d(dim_in, dim_middle, 1, bias=False)]
     for index in range(doublings):
         layers.append(nn.ConvTranspose2d(dim_out if index else dim_middle, dim_out, 2, stride=2, bias=False))

@@ -195,7 +195,6 @@ class DepthNetwork(nn.Module):
         )
 
     def disparity(self, maps: list[Tensor]) -> Tensor:
-        """Disparity [1, 2, side, side] ≥ 0, float32, from the encoder's maps."""
         out: Tensor = self.head(self.decoder(maps))
         return out
 

@@ -93,7 +93,6 @@ def _column(columns: Any, k: int, i: int) -> Any:
 
 @kernel
 def _turn(p: Any, q: Any) -> Any:
-    """Rotate two columns in their plane, by 45° at most, so that they become orthogonal."""
     skew, lead = 2.0 * _dot(p, q), _dot(q, q) - _dot(p, p)
     tangent = skew / (abs(lead) + math.sqrt(lead * lead + skew * skew) + LEAST)
     tangent = -tangent if lead < 0.0 else tangent
