@@ -1,4 +1,4 @@
-"""Clips seen from a moving camera: calm where nothing was seen."""
+"""Clips rendered from a moving camera: alignment of depth, propagated colours."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ CPU = CpuRenderer()
 def test_a_hole_moves_as_the_camera_does() -> None:
     camera = Camera.from_focal(90, 96, 64)
     inverse = torch.full((64, 96), 0.2)
-    inverse[20:44, 30:50] = 0.8  # something near that goes its own way
+    inverse[20:44, 30:50] = 0.8  # a near object with its own motion
     hole = torch.zeros(64, 96, dtype=torch.bool)
     hole[20:44, 50:66] = True
     point = camera.unproject(pixel_grid(inverse), 1 / inverse)
@@ -46,7 +46,7 @@ def test_a_hole_moves_as_the_camera_does() -> None:
 def test_depth_of_another_scale_and_shift_is_brought_back() -> None:
     then = 0.2 + 0.5 * torch.rand(64, 96, generator=torch.Generator().manual_seed(0))
     now = (then - 0.03) / 1.3
-    now[:12] = 1.5  # what has come between
+    now[:12] = 1.5  # a new near object
     found = Track(torch.zeros(64, 96, 2), torch.ones(64, 96, dtype=torch.bool))
     torch.testing.assert_close(align_depth(now, then, found).of(now)[12:], then[12:], rtol=0.02, atol=0.0)
     assert align_depth(now, then, dataclasses.replace(found, sure=torch.zeros_like(found.sure))) == DepthAlignment()
@@ -68,7 +68,6 @@ WALL, BOX = 6.0, 2.0
 
 
 def paint(points: Tensor) -> Tensor:
-    """The wall's colour at [..., 3]."""
     x, y = points[..., 0], points[..., 1]
     parts = [torch.sin(3 * x + y), torch.sin(2.5 * y - x), torch.cos(2 * x + 2 * y)]
     return (torch.tensor([0.35, 0.45, 0.6]) + 0.15 * torch.stack(parts, -1)).clamp(0, 1)
@@ -80,7 +79,6 @@ def lifted(rgb: Tensor, depth: Tensor) -> BasePrediction:
 
 
 def frame_of(right: float) -> tuple[Camera, Tensor, BasePrediction]:
-    """A frame of a box before a wall, taken by a camera on its way."""
     camera = Camera.from_focal(80, 96, 72)
     camera = camera.looking(torch.tensor([right, 0.0, 0.0]), torch.tensor([right, 0.0, 1.0]))
     wall, front = cast(camera, WALL), cast(camera, BOX)
@@ -92,7 +90,7 @@ def frame_of(right: float) -> tuple[Camera, Tensor, BasePrediction]:
 def test_propagated_holes_are_calmer_and_no_worse() -> None:
     completer = ClipCompleter("rotate", 0.3, 80, CPU, OpenCV("this").flow, align=False)
     past: tuple[CompletedView, Camera] | None = None
-    flickers, errors = torch.zeros(2), torch.zeros(2)  # alone, and with the past
+    flickers, errors = torch.zeros(2), torch.zeros(2)  # of frames completed alone, and with colours of earlier frames
     for index in range(8):
         taken_by, rgb, prediction = frame_of(-0.10 + 0.025 * index)
         drawn = completer.add(rgb, prediction)

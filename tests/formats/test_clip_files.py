@@ -1,4 +1,4 @@
-"""Clips as files: read as they are, written with their times and sound; bad ones are one line."""
+"""Files of clips."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_a_gif_with_one_picture_is_a_photo(tmp_path: Path) -> None:
 
 
 def cut_off(path: Path) -> None:
-    save_video(torch.rand(12, 48, 64, 3, generator=torch.Generator().manual_seed(0)), path)  # its index comes first
+    save_video(torch.rand(12, 48, 64, 3, generator=torch.Generator().manual_seed(0)), path)  # index first
     path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
 
 
@@ -87,7 +87,7 @@ def listing(path: Path) -> None:
     path.write_text("ffconcat version 1.0\nfile other.mp4\n")
 
 
-BAD: dict[str, Callable[[Path], object]] = {  # by what is said of them
+BAD: dict[str, Callable[[Path], object]] = {  # by a part of the message
     "not a video": lambda path: path.write_text("no clip"),
     "damaged": lambda path: path.write_bytes(write_clip(path, moving(4)).read_bytes()[:-200]),
     "truncated": cut_off,

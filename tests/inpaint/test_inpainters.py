@@ -1,4 +1,4 @@
-"""The registry of inpainters, and what each keeps to whose weights or package are here."""
+"""The registry of inpainters, and inpainters without networks."""
 
 from __future__ import annotations
 

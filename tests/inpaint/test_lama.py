@@ -1,4 +1,4 @@
-"""LaMa: its published arithmetic, its files, and what of a picture it looks at and paints."""
+"""LaMa: the network, its files, crops around holes."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from spackle.inpaint.lama import MARGIN, LamaInpainter, LamaNetwork, expected_sh
 from spackle.weights import PUBLISHED
 
 Weights = dict[str, Tensor]
-GOLDEN = dict(np.load(Path(__file__).parents[1] / "data" / "lama_golden.npz"))  # of the original class and `made_input`
+GOLDEN = dict(np.load(Path(__file__).parents[1] / "data" / "lama_golden.npz"))  # of the original code
 
 
 def made_input(height: int, width: int) -> Tensor:
-    """[1, 4, H, W]: waves with two holes, and the holes."""
+    """[1, 4, H, W]: waves with two holes, and the mask."""
     y, x = torch.meshgrid(torch.arange(height) / height, torch.arange(width) / width, indexing="ij")
     hole = (x > 0.6) | (((x - 0.3).abs() < 0.1) & ((y - 0.5).abs() < 0.25))
     return torch.cat([waves(height, width) * ~hole, hole[None, None]], 1)
@@ -38,7 +38,6 @@ def _one_thread() -> None:
 
 @pytest.fixture(scope="module")
 def weights() -> Weights:
-    """Of a network of one block, an eighth as wide as the published one."""
     return lama_weights(8, 1)
 
 
@@ -57,7 +56,7 @@ def test_the_network_is_the_original(name: str, size: tuple[int, ...], height: i
     golden, network, x = torch.from_numpy(GOLDEN[name]), LamaNetwork(lama_weights(*size)), made_input(height, width)
     logits = network.logits(x)
     torch.testing.assert_close(logits[0, :, ::step, ::step], golden, rtol=0, atol=1e-5 * float(golden.abs().max()))
-    rgb = torch.where(x[:, 3:] > 0, torch.nan, x[:, :3])  # in a hole there may be anything
+    rgb = torch.where(x[:, 3:] > 0, torch.nan, x[:, :3])  # colours in a hole are ignored
     torch.testing.assert_close(network(rgb, x[:, 3:] > 0), logits.sigmoid(), rtol=0, atol=1e-5)
 
 
@@ -79,7 +78,7 @@ def test_published_files_are_read(weights: Weights, tmp_path: Path, prefix: str)
     halves = {name: x.half() for name, x in weights.items()}
     torch.save(named(prefix, halves) | others, path)
     network = load_network(path)
-    path.write_bytes(bytes(path.stat().st_size))  # nothing of it is needed any more
+    path.write_bytes(bytes(path.stat().st_size))  # the file is no longer needed
     expected = LamaNetwork({name: x.float() for name, x in halves.items()})
     assert torch.equal(network.logits(X), expected.logits(X))
 
@@ -104,7 +103,6 @@ def test_other_networks_are_a_line(
 
 
 def views(height: int, width: int, *holes: tuple[int, int, int, int]) -> tuple[Tensor, Tensor, Tensor]:
-    """One view of waves with rectangular holes of black, and no depth."""
     rgb, hole = made_input(height, width)[:, :3].permute(0, 2, 3, 1), torch.zeros(1, height, width, dtype=torch.bool)
     for top, left, bottom, right in holes:
         hole[:, top:bottom, left:right] = True
@@ -112,7 +110,7 @@ def views(height: int, width: int, *holes: tuple[int, int, int, int]) -> tuple[T
 
 
 def sizes_given(inpainter: LamaInpainter) -> list[tuple[int, ...]]:
-    """The sizes of what the network is given from now on."""
+    """A list that receives the sizes of all further inputs of the network."""
     sizes: list[tuple[int, ...]] = []
     inpainter._network.register_forward_pre_hook(lambda network, inputs: sizes.append(tuple(inputs[1].shape[2:])))
     return sizes
@@ -148,17 +146,17 @@ def test_large_crops_are_reduced_and_no_hole_is_lost(file: Path) -> None:
     assert bool((painted[hole] > 0).all())
     assert inpainter.version == "1, long side 128"
     known = shown[~holes.expand_as(shown)]
-    torch.testing.assert_close(known, torch.full_like(known, 0.25))  # no black of the hole
-    assert int(holes.sum()) == 2 * 44  # of a row of a hundred pixels, at 0.43
+    torch.testing.assert_close(known, torch.full_like(known, 0.25))  # without black from the hole
+    assert int(holes.sum()) == 2 * 44  # a row of a hundred pixels, reduced to 0.43
 
 
 def test_groups_of_holes() -> None:
     hole = torch.zeros(500, 900, dtype=torch.bool)
     assert groups_of(hole) == []
-    hole[10:20, 10:20] = hole[30:40, 18:60] = hole[400:, 850:] = True  # two near each other, and one far away
+    hole[10:20, 10:20] = hole[30:40, 18:60] = hole[400:, 850:] = True  # two near groups, and a far one
     boxes = [[(c.top, c.left, c.bottom, c.right) for c in group] for group in groups_of(hole)]
     assert boxes == [[(0, 0, 48, 64), (0, 0, 176, 192)], [(400, 848, 512, 912), (272, 720, 500, 900)]]
-    hole[:, :3] = hole[:, -3:] = hole[:3] = hole[-3:] = True  # around everything
+    hole[:, :3] = hole[:, -3:] = hole[:3] = hole[-3:] = True
     assert len(groups_of(hole)) == 1
     speckled = torch.rand(700, 800, generator=torch.Generator().manual_seed(0)) > 0.9999
     counts = torch.zeros(700, 800)

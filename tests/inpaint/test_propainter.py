@@ -1,7 +1,4 @@
-"""ProPainter with random weights, from their files to painted views, over a stand-in for torchvision.
-
-The networks are the published ones in full size, on the smallest pictures that they take.
-"""
+"""ProPainter with random weights in full size, with a stand-in for torchvision."""
 
 from __future__ import annotations
 
@@ -43,7 +40,7 @@ def test_holes_grow_by_steps() -> None:
 
 @pytest.fixture(scope="module")
 def package(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """pytorchcv beside a torchvision that has one layer, without its offsets."""
+    """pytorchcv with a stand-in for torchvision: one layer, without offsets."""
     pytest.importorskip("pytorchcv")
     place = tmp_path_factory.mktemp("stand_in")
     (place / "torchvision").mkdir()
@@ -63,7 +60,7 @@ def forget_package() -> None:
 
 @pytest.fixture(scope="module")
 def weights(package: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Files as they are published, with random numbers in half precision to save room."""
+    """Files with published names and random weights in half precision."""
     from pytorchcv.models.propainter import propainter
     from pytorchcv.models.propainter_rfc import propainter_rfc
     from pytorchcv.models.raft import raft_things
@@ -79,12 +76,10 @@ def weights(package: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def inpainter(weights: Path) -> PropainterInpainter:
-    """With random weights."""
     return PropainterInpainter(InpainterOptions(weights, device="cpu"))
 
 
 def views_of(count: int, height: int, width: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Pictures, holes at their right, and no depth."""
     rgb = torch.rand(count, height, width, 3, generator=torch.Generator().manual_seed(0))
     hole = torch.zeros(count, height, width, dtype=torch.bool)
     hole[:, 20:60, -40:-9] = True
@@ -92,7 +87,7 @@ def views_of(count: int, height: int, width: int) -> tuple[Tensor, Tensor, Tenso
 
 
 class Video:
-    """In place of the networks: says what they were given, and paints the holes grey."""
+    """Replaces the networks: records the inputs, and paints holes grey."""
 
     given: list[tuple[Tensor, Tensor]]
 

@@ -1,4 +1,4 @@
-"""The GPU renderer: its own arithmetic over a stand-in for gsplat, and over gsplat itself where there is a GPU."""
+"""The GPU renderer, with a stand-in for gsplat, and on a GPU with gsplat."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ def gpu(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Gspl
     if request.param == "gsplat":
         try:
             return GsplatRenderer()
-        except InputError as error:  # no GPU, no gsplat, no compiler for it
+        except InputError as error:
             pytest.skip(str(error))
     monkeypatch.setattr(cuda, "load_gsplat", lambda device: gsplat_stand_in)
     return GsplatRenderer("cpu")
 
 
 def agree(one: Rendering, other: Rendering) -> None:
-    """Equal but at the thresholds, where a difference of the last digit means one splat more or less."""
+    """Equal except for pixels at a threshold, where the last digit decides whether a Gaussian is drawn."""
     same = ((one.rgb - other.rgb).abs().amax(-1) < 2e-4) & ((one.alpha - other.alpha).abs() < 1e-4)
     assert float(same.float().mean()) > 0.97
     torch.testing.assert_close(one.rgb, other.rgb, atol=2e-2, rtol=0)
@@ -157,7 +157,7 @@ def test_a_scene_travels_once_while_nobody_changes_it() -> None:
     assert material(kept) is not again
     torch.testing.assert_close(material(kept).colors, kept.colors)
     asking = Gaussians(*(tensor.clone().requires_grad_() for tensor in BASE.tensors))
-    assert material(asking) is not material(asking)  # it changes at every step of a training
+    assert material(asking) is not material(asking)
     with torch.inference_mode():
         passing = Gaussians(*(tensor.clone() for tensor in BASE.tensors))
         assert material(passing) is not material(passing)
@@ -167,7 +167,7 @@ def test_a_scene_travels_once_while_nobody_changes_it() -> None:
 
 
 def modules(backend: object) -> dict[str, Any]:
-    """What importing gsplat gives."""
+    """Stand-ins for the modules of gsplat."""
     gsplat, inner, built = (ModuleType(name) for name in ("gsplat", "gsplat.cuda", "gsplat.cuda._backend"))
     vars(built)["_C"], vars(inner)["_backend"] = backend, built
     vars(gsplat).update(cuda=inner)

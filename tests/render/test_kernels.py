@@ -1,4 +1,4 @@
-"""Kept machine code is used again, but never after what it was made from has changed."""
+"""The cache of compiled kernels is invalid after a change of a kernel's sources."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def doubled(x):
 
 
 def run(folder: Path, side: int = 10, factor: int = 2, flags: str = "nsz afn") -> list[int]:
-    """What the kernel says, how often it came from the disk, and how often it was compiled."""
+    """The kernel's result, the number of cache hits, and the number of compilations."""
     sources = {"number": f"SIDE = {side}\n", "helper": HELPER.format(factor=factor), "user": USER}
     for name, text in sources.items():
         path = folder / f"{name}.py"
@@ -48,7 +48,6 @@ def run(folder: Path, side: int = 10, factor: int = 2, flags: str = "nsz afn") -
 
 
 def test_what_a_kernel_was_made_from_is_noticed(tmp_path: Path) -> None:
-    """Numbers and kernels of another file, and the way to compile."""
     assert run(tmp_path) == [60, 0, 1]
     assert run(tmp_path, flags="afn nsz") == [60, 1, 0]
     assert run(tmp_path, flags="contract") == [60, 0, 1]

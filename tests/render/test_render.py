@@ -1,4 +1,4 @@
-"""The CPU renderer against hand-computed cases, and against its plain twin."""
+"""The CPU renderer against hand-computed values, and against the reference renderer."""
 
 import dataclasses
 import math
@@ -44,7 +44,7 @@ def backward(view: Rendering) -> None:
 
 
 def sturdy_pixels(gaussians: Gaussians, camera: Camera, eps2d: float) -> torch.Tensor:
-    """Pixels [H, W] where no Gaussian is within rounding of a threshold, at which the image may jump."""
+    """[H, W] bool: pixels in which no Gaussian is close to a threshold."""
     raw = falloff(front_to_back(gaussians.to(dtype=torch.float64), camera), camera, eps2d)
 
     def near(values: torch.Tensor, threshold: float, width: float) -> torch.Tensor:
@@ -89,7 +89,7 @@ def test_the_nearer_of_two_covers_the_farther_one(renderer):
     assert float(view.depth[16, 16]) == pytest.approx((0.6 * 2 + 0.2 * 4) / 0.8)
     torch.testing.assert_close(view.rgb[16, 16], linear_to_srgb(torch.tensor([0.6, 0.2, 0.0])), atol=1e-6, rtol=0)
     red, green = ball(opacity=0.9, color=(1.0, 0.0, 0.0)), ball(opacity=0.9, color=(0.0, 1.0, 0.0))
-    middle = renderer.render([red, green], CAMERA).rgb[16, 16]  # equally deep: in the order in which they came
+    middle = renderer.render([red, green], CAMERA).rgb[16, 16]  # Gaussians of equal depth keep their order
     assert middle[0] > middle[1]
 
 
@@ -114,19 +114,18 @@ def test_nothing_is_drawn_behind_the_near_plane_or_of_no_gaussians(renderer):
 def test_eps2d_widens_the_projected_covariance(renderer):
     alpha = renderer.render(ball(), CAMERA, eps2d=0.3).alpha
     assert float(alpha[16, 18]) == pytest.approx(0.5 * math.exp(-4 / (2 * 4.3)), abs=1e-6)
-    assert not renderer.render(ball(sigma=0.0), CAMERA).alpha.any()  # without extent
+    assert not renderer.render(ball(sigma=0.0), CAMERA).alpha.any()
     alpha = renderer.render(ball(sigma=0.0), CAMERA, eps2d=0.5).alpha
     assert alpha[16, 16:18].tolist() == pytest.approx([0.5, 0.5 * math.exp(-1)], abs=1e-6)
 
 
-# A rotation may be of any length.
 BAD = [*product(range(5), (math.nan, math.inf, -math.inf)), *product((0, 2, 3, 4), (1e38, -1e38))]
 
 
 @pytest.mark.parametrize(("field", "bad"), BAD)
 def test_bad_values_are_skipped_and_spoil_nothing(field, bad):
     camera = turned_camera(50, 40, 45.0)
-    scene = random_scene(1, 300, camera)  # more than the projection takes at once
+    scene = random_scene(1, 300, camera)  # more than a block of the projection
     spoiled = [t.clone() for t in scene.tensors]
     spoiled[field][::2] = bad
     assert same_bits(CPU.render(Gaussians(*spoiled), camera), CPU.render(scene.select(slice(1, None, 2)), camera))
@@ -146,7 +145,7 @@ def test_what_cannot_be_drawn_is_refused():
 
 @st.composite
 def scenes(draw: st.DrawFn) -> tuple[Gaussians, Camera, float, float]:
-    """Gaussians, a camera, its eps2d and how solid they are."""
+    """Gaussians, a camera, eps2d, and the share of opaque Gaussians."""
     camera = turned_camera(draw(st.integers(1, 50)), draw(st.integers(1, 50)), draw(st.floats(20, 90)))
     solidity, eps2d = draw(st.sampled_from([1.0, 10.0])), draw(st.sampled_from([0.0, 0.3]))
     return random_scene(draw(SEEDS), draw(st.integers(1, 80)), camera, solidity), camera, eps2d, solidity
@@ -181,7 +180,6 @@ def test_any_number_of_blocks_matches_the_twin(count):
 
 @pytest.mark.parametrize("stretch", [(1e3, 1, 1), (1, 1e3, 1), (1, 1, 1e-9), (1e3, 1e3, 1e-6)])
 def test_needles_and_discs_seen_edge_on_match_the_twin(stretch):
-    """Their covariances have no digit to spare."""
     camera = turned_camera(50, 40, 45.0)
     scene = random_scene(5, 60, camera)
     thin = dataclasses.replace(scene, scales=scene.scales * torch.tensor(stretch), opacities=0.2 * scene.opacities)
@@ -193,7 +191,7 @@ def test_needles_and_discs_seen_edge_on_match_the_twin(stretch):
 def test_gradients_match_the_twin(scene):
     gaussians, camera, eps2d, _ = scene
     sturdy = sturdy_pixels(gaussians, camera, eps2d)
-    # In any one weighting the pixels' shares may cancel; in none of several they hardly can.
+    # With one weighting, contributions of pixels may cancel; with several weightings, this is unlikely.
     weights = torch.randn(4, *sturdy.shape, 5, generator=torch.Generator().manual_seed(len(gaussians)))
     weights *= sturdy[..., None]
     gradients = []
@@ -317,7 +315,7 @@ def test_results_repeat_bit_for_bit_whatever_the_number_of_threads():
             results.append([*view.tensors, *(t.grad for t in leaf.tensors)])
     finally:
         torch.set_num_threads(threads)
-    with ThreadPoolExecutor(4) as pool:  # and two Python threads may render at once
+    with ThreadPoolExecutor(4) as pool:  # several Python threads render at once
         together = list(pool.map(lambda _: CPU.render(scene, camera), range(8)))
     for result in results[1:] + [[*view.tensors] for view in together]:
         assert all(torch.equal(one, other) for one, other in zip(results[0], result, strict=False))

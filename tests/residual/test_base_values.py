@@ -1,4 +1,4 @@
-"""Base values extend what lies behind; beyond the photo's border floors stay level and walls stay walls."""
+"""Base values of holes behind objects, and beyond the photo's border."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_where_nothing_is_seen_seeds_make_a_grey_wall() -> None:
 
 
 def room() -> tuple[ViewFeatures, Tensor, Tensor]:
-    """What the view shows of a floor and a wall without end; the inverse depth of all cells, and which are floor."""
+    """Features of an endless floor and wall, inverse depth of all cells, and the floor's cells [h, w] bool."""
     rays = VIEW.unproject(cell_centers(VIEW), torch.ones(VIEW.height // CELL, VIEW.width // CELL)) - VIEW.position
     reach = torch.where(rays[..., 1] > 0, GROUND / rays[..., 1].clamp_min(1e-6), torch.inf)
     floor, depth = reach < BACK / rays[..., 2], torch.minimum(reach, BACK / rays[..., 2])
@@ -79,13 +79,13 @@ def test_beyond_the_border_a_floor_stays_level_and_a_wall_a_wall() -> None:
     for surface, color in ((floor, FLOOR), (~floor, WALL)):
         assert float((seeds.rgb - color).abs().mean(-1)[beyond & surface].mean()) < 0.12
     within = make_seeds(dataclasses.replace(features, inverse_depth=torch.ones_like(inverse_depth)), VIEW, VIEW)
-    assert float((within.inverse_depth - 1).abs().max()) < 0.02  # a view of the photo's own frame has no border
+    assert float((within.inverse_depth - 1).abs().max()) < 0.02  # the photo's own view has no border
 
 
 def test_what_is_nearer_than_the_border_is_not_extended() -> None:
     features, _, _ = room()
     near, edge = torch.zeros_like(features.mask), int((~features.mask[20]).nonzero().max())
-    near[20:28, edge - 10 : edge + 6] = True  # before the wall, and over the photo's border
+    near[20:28, edge - 10 : edge + 6] = True  # in front of the wall, across the photo's border
     red = torch.where(near[..., None], torch.tensor([0.9, 0.1, 0.1]), features.rgb)
     inverse, alpha = torch.where(near, 0.22, features.inverse_depth), torch.where(near, 1.0, features.alpha)
     seeds = make_seeds(ViewFeatures(red, inverse, alpha, features.mask & ~near), VIEW, PHOTO)

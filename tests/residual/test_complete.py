@@ -1,4 +1,4 @@
-"""The paper's method for one view, held to eqs. 2 to 9 written out cell by cell; bounds of what deltas do."""
+"""The paper's method for one view, compared with eqs. 2 to 9 written cell by cell."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def sigmoid(x: float) -> float:
 
 
 def augmented(seeds: Seeds, row: int, column: int, delta: list[float], camera: Camera) -> Gaussians:
-    """g_i of eq. 5: the base values of a cell, moved by its delta (as SHARP composes its own)."""
+    """g_i of eq. 5: the base values of a cell plus the deltas, composed as in SHARP."""
     u, v = (float(x) + d for x, d in zip(seeds.uv[row, column], delta[:2], strict=True))
     relative = float(seeds.inverse_depth[row, column]) / seeds.unit
     inverse = seeds.unit * math.log1p(math.expm1(relative) * math.exp(0.1 * delta[2]))  # softplus(softplus⁻¹ + δ)
@@ -53,7 +53,7 @@ def augmented(seeds: Seeds, row: int, column: int, delta: list[float], camera: C
 
 
 def paper(base: Gaussians, camera: Camera, photo: Camera, f_res: ResidualNet) -> tuple[Gaussians, Rendering]:
-    """𝒢̃_aug(v) and the final view."""
+    """𝒢̃_aug(v), and the final view."""
     view = R.render(base, camera)  # eqs. 2 and 3
     holes = [[float(a) < 0.95 for a in row] for row in view.alpha]  # eq. 4
     features = ViewFeatures.of(view)
@@ -80,7 +80,7 @@ def test_a_view_is_completed_as_the_equations_say(size: tuple[int, int]) -> None
     for name in ("means", "quats", "scales", "opacities", "colors"):
         one, other = (getattr(part, name).view(len(aux), -1) for part in (aux, expected))
         same = torch.isclose(one, other, rtol=2e-3, atol=2e-3).all(-1).float().mean()
-        # A circle has no first axis: the last bit decides where its frame points.
+        # The rotation of a circular Gaussian depends on the last bit.
         assert float(same) > (0.95 if name == "quats" else 0.999), name
     found = CPU.render([base, aux], camera)
     assert float((found.rgb - final.rgb).abs().mean()) < 1e-3
@@ -105,7 +105,7 @@ def test_without_holes_or_network_there_is_nothing_or_the_seeds(name: str) -> No
     assert len(complete_view(base, scene.camera, scene.camera, CPU, None)) == 0
     camera = away(scene.camera)
     seeds, untrained = (complete_view(base, camera, scene.camera, CPU, f_res) for f_res in (None, open_residual(name)))
-    assert len(seeds) == 24 * 18  # every cell: nothing is seen there
+    assert len(seeds) == 24 * 18  # all cells
     torch.testing.assert_close(seeds.means, untrained.means, rtol=1e-3, atol=1e-3)
 
 
@@ -127,7 +127,7 @@ def test_no_deltas_and_zero_deltas_both_give_the_seeds() -> None:
     assert len(compose(SEEDS.select(torch.zeros(20, dtype=torch.bool)), zeros[:0], VIEW)) == 0
     extremes = dataclasses.replace(SEEDS, rgb=(DRAWN[:, 5:] > 0.5).float())  # black and white
     found = linear_to_srgb(compose(extremes, zeros, VIEW).colors)
-    assert float((found - extremes.rgb).abs().max()) <= COLOR_MARGIN * 1.01  # within a step of 8 bits
+    assert float((found - extremes.rgb).abs().max()) <= COLOR_MARGIN * 1.01  # within one step of 8-bit colour
 
 
 @pytest.mark.parametrize("by", [-1e4, -20.0, -1.0, 1.0, 20.0, 1e4])
@@ -136,8 +136,8 @@ def test_deltas_keep_bounds(by: float) -> None:
     deltas[:, 2] = deltas[:, 10:] = by
     after = compose(SEEDS, deltas, VIEW)
     _, z = VIEW.project(after.means)
-    assert float(z.min()) > 0  # never behind the eye
-    assert bool(((z < 1 / SEEDS.inverse_depth) == (by > 0)).all())  # inverse depth: more is nearer
+    assert float(z.min()) > 0  # never behind the camera
+    assert bool(((z < 1 / SEEDS.inverse_depth) == (by > 0)).all())  # a larger inverse depth is nearer
     for one, other in ((BEFORE.colors, after.colors), (BEFORE.opacities, after.opacities)):
         assert 0 <= float(other.min()) <= float(other.max()) <= 1
         assert bool(((other > one) == (by > 0)).all())

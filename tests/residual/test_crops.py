@@ -1,4 +1,4 @@
-"""f_res where it is needed: crops around the holes say what the whole says."""
+"""f_res on crops around holes gives the same deltas as on the whole view."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_each_masked_cell_is_in_one_crop_with_a_margin(
 
 def test_crops_give_what_the_whole_picture_gives() -> None:
     depth = torch.full((96, 640), 4.0)
-    depth[20:70, 40:90] = 2.0  # a board before the left end of a long wall, seen from the side
+    depth[20:70, 40:90] = 2.0  # a board in front of a long wall
     scene = Scene(texture(96, 640), depth, Camera.from_focal(500, 640, 96))
     base = scene.base()
     view = features_of(base, extremes(scene.camera, 0.1, DepthRange.of(base))[1], scene.camera)
@@ -51,7 +51,7 @@ def test_crops_give_what_the_whole_picture_gives() -> None:
     one = predict_deltas(whole, *view, "fp32", dense=True)
     other, bf16 = predict_deltas(cropped, *view, "fp32"), predict_deltas(shipped(), *view, "bf16")
     assert 0 < cropped.cells < 0.8 * whole.cells == 0.8 * mask.numel()
-    assert bool(one.any(-1)[::47, ::53].all())  # dense deltas are those of every cell
+    assert bool(one.any(-1)[::47, ::53].all())
     assert not bf16[~mask].any()
     difference = (other - one)[mask].abs()
     assert float(difference.max()) < 0.01

@@ -1,4 +1,4 @@
-"""What the network sees at a hole's far rim: by hand, and against a walk written plainly."""
+"""Values at a hole's far rim, against hand-computed values and a walk in plain Python."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from spackle.residual.view_features import cell_centers
 HEIGHT, WIDTH = 12, 20  # cells
 CAMERA = Camera.from_focal(40.0, 2 * WIDTH, 2 * HEIGHT)
 SIDEWAYS = (0.3, 0.0, 0.0)
-# A colour that tells the column.
+# The colour encodes the column.
 RAMP = (torch.arange(WIDTH).float() / 100).expand(HEIGHT, WIDTH)[..., None].repeat(1, 1, 3)
 
 
 def moved(*eye: float, width: int = WIDTH, height: int = HEIGHT) -> Camera:
-    """The camera with its eye elsewhere, looking the same way."""
+    """The camera at another position with the same direction."""
     matrix = torch.eye(4)
     matrix[:3, 3] = -torch.tensor(eye)
     return dataclasses.replace(CAMERA, world_to_camera=matrix, width=2 * width, height=2 * height)
@@ -37,7 +37,7 @@ def rim_of(mask: Tensor, inverse_depth: Tensor, rgb: Tensor, *eye: float) -> Rim
 
 
 def row_of(first: int, last: int, depth: Tensor) -> tuple[list[int], list[int], list[int]]:
-    """Columns that the hole of columns first..last sees at its rim, those mirrored there, and the distances."""
+    """For a hole in columns first..last: the columns found at the rim, the mirrored columns, and the distances."""
     mask = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
     mask[:, first : last + 1] = True
     rim = rim_of(mask, depth.expand(HEIGHT, WIDTH).contiguous(), RAMP, *SIDEWAYS)
@@ -52,18 +52,18 @@ def test_after_a_sideways_move_a_row_extends_its_farther_side() -> None:
     assert row_of(8, 11, torch.where(right, 0.5, 0.1)) == ([7] * 4, [6, 5, 4, 3], [1, 2, 3, 4])
     assert row_of(8, 11, torch.where(right, 0.5, 1.0)) == ([12] * 4, [16, 15, 14, 13], [4, 3, 2, 1])
     assert row_of(15, 19, ones) == ([14] * 5, [13, 12, 11, 10, 9], [1, 2, 3, 4, 5])  # one rim
-    assert row_of(0, 19, ones) == (list(range(20)), list(range(20)), [0] * 20)  # none: the seeds stay
+    assert row_of(0, 19, ones) == (list(range(20)), list(range(20)), [0] * 20)  # no rim: seeds are kept
     _, mirrored, _ = row_of(8, 11, torch.where(torch.arange(WIDTH) < 6, 0.2 * SAME_DEPTH * 1.01, 0.2))
-    assert mirrored in ([6, 7, 7, 7], [16, 15, 14, 13])  # another surface is not mirrored; both sides are as far
+    assert mirrored in ([6, 7, 7, 7], [16, 15, 14, 13])  # other surfaces are not mirrored
 
 
 def plain_rim(mask: Tensor, depth: Tensor, rgb: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Colour and distance, cell by cell, the epipole found from two points of one line of sight."""
+    """Colour and distance, cell by cell; two points on a ray give the epipolar line."""
     color, distance = rgb.clone(), torch.zeros(HEIGHT, WIDTH)
     centers = cell_centers(camera)
     for y, x in mask.nonzero().tolist():
         here = camera.unproject(centers[y, x].double(), torch.tensor(3.0, dtype=torch.float64))
-        other, _ = camera.project(here + 0.01 * (here - CAMERA.position.double()))  # the photo sees both at one place
+        other, _ = camera.project(here + 0.01 * (here - CAMERA.position.double()))  # on one ray
         line = other - centers[y, x]
         dx, dy = (line / line.norm()).tolist()
         best = math.inf
@@ -77,7 +77,7 @@ def plain_rim(mask: Tensor, depth: Tensor, rgb: Tensor, camera: Camera) -> tuple
                         best = float(depth[v, u])
                         color[y, x], distance[y, x] = rgb[v, u], k
                     break
-        if 1.4 * float(depth[y, x]) < best < math.inf:  # what stands in front does not continue behind
+        if 1.4 * float(depth[y, x]) < best < math.inf:  # a nearer surface does not continue into the hole
             color[y, x] = rgb[y, x]
     return color, distance
 
@@ -90,6 +90,6 @@ def test_any_move_agrees_with_a_plain_walk(eye: tuple[float, float, float]) -> N
     rgb = torch.rand(HEIGHT, WIDTH, 3, generator=generator)
     rim = rim_of(mask, depth, rgb, *eye)
     color, distance = plain_rim(mask, depth, rgb, moved(*eye))
-    # A line through the corner of a cell may round to either side.
+    # A line through a cell's corner may round to either side.
     same = (rim.distance == distance) & (rim.rgb == color).all(-1)
     assert float(same[mask].float().mean()) > 0.97

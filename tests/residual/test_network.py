@@ -1,4 +1,4 @@
-"""f_res (eq. 5) and what it is given: the mask of a view (eq. 4) and what its cells show."""
+"""f_res (eq. 5), and its input: the mask of a view (eq. 4), and the view's features."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_a_hole_is_where_alpha_is_below_the_threshold() -> None:
 
 
 def plain_cell(view: Rendering, row: int, column: int) -> tuple[list[float], float, float, bool]:
-    """One cell of the cues in plain Python; an odd last row or column counts twice."""
+    """The features of a cell in plain Python; an odd last row or column counts twice."""
     height, width = view.alpha.shape
     pixels = [(min(2 * row + dy, height - 1), min(2 * column + dx, width - 1)) for dy in (0, 1) for dx in (0, 1)]
     alphas = [float(view.alpha[p]) for p in pixels]
@@ -71,7 +71,7 @@ def test_the_network_takes_any_size_and_does_not_mix_a_batch(name: str, size: tu
         deltas, alone = network(features), torch.cat([network(f[None]) for f in features])
     assert deltas.shape == (2, DELTA_CHANNELS, *size)
     assert bool((deltas != 0).any())
-    assert not open_residual(name)(features).any()  # untrained: the view is the seeds
+    assert not open_residual(name)(features).any()  # untrained networks give zero
     torch.testing.assert_close(deltas, alone, rtol=1e-3, atol=1e-4)
 
 
@@ -92,7 +92,7 @@ def test_the_networks_input_knows_no_unit_of_length() -> None:
 @pytest.mark.parametrize("name", ARCHITECTURES)
 def test_a_file_says_its_architecture_and_gives_the_same_network(name: str, tmp_path: Path) -> None:
     network, path = random_network(name=name).half().float().eval(), tmp_path / "weights.safetensors"
-    channels_last(network)  # as it is read, so that sums have one order
+    channels_last(network)  # the memory format of loaded networks, so that sums have one order
     tensors = {key: value.half().contiguous() for key, value in network.state_dict().items()}
     save_file(tensors, path, {NOTE: name})
     loaded = load_residual(path)
@@ -112,7 +112,7 @@ def test_a_file_says_its_architecture_and_gives_the_same_network(name: str, tmp_
 def test_the_photo_is_seen_where_a_cells_point_lies_in_it() -> None:
     camera = Camera.from_focal(40, 64, 48)
     pose = torch.eye(4)
-    pose[0, 3] = -0.8  # two metres away everything moves by 16 pixels, 8 cells
+    pose[0, 3] = -0.8  # at two metres, a shift of 16 pixels or 8 cells
     photo, nowhere = torch.rand(48, 64, 3, generator=torch.Generator().manual_seed(0)), torch.zeros(24, 32, 3)
     cells = photo.unflatten(1, (32, 2)).unflatten(0, (24, 2)).mean((1, 3))
     view = dataclasses.replace(camera, world_to_camera=pose)

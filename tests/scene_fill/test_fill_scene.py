@@ -1,4 +1,4 @@
-"""Completion: of one view, and of a path by one set of aux Gaussians, whichever frames are looked at."""
+"""Completion of one view, and of a path with one set of aux Gaussians."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_a_view_of_nothing_at_all_becomes_a_wall(size: tuple[int, int], network:
 def test_the_widest_view_comes_first_and_a_beginning_is_spread() -> None:
     camera = Camera.from_focal(50, 40, 30)
     order = farthest_first([shifted(camera, x) for x in (-1.0, -0.2, 0.0, 0.6, 1.1)], camera)
-    assert order == [4, 0, 3, 1, 2]  # the photo's own place counts as visited
+    assert order == [4, 0, 3, 1, 2]  # the photo's camera counts as visited
     assert sorted(farthest_first([camera] * 3, camera)) == [0, 1, 2]
 
 
@@ -94,7 +94,7 @@ def test_an_underlay_is_hidden_and_closes_neighbours_holes() -> None:
     without, both = (CPU.render([context.base, filling, *more], camera) for more in ([], [beneath]))
     assert psnr(both.rgb[seen], before.rgb[seen]) >= 48
     assert psnr(both.rgb, without.rgb) >= 45
-    # It lies around the holes and nowhere in them.
+    # The underlay lies around the holes, not in them.
     uv, z = camera.project(beneath.means)
     column, row = (uv / 2).floor().long().unbind(-1)
     assert bool((z > 0).all())
@@ -151,7 +151,7 @@ def test_an_underlay_shows_nowhere_beyond_the_photos_border(monkeypatch: pytest.
 
 
 class Counting(CpuRenderer):
-    """A renderer that keeps the cameras that whole pictures are taken by."""
+    """A renderer that records the cameras of all whole renderings."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -171,11 +171,11 @@ def test_every_second_frame_is_visited_and_all_are_closed(kind: TrajectoryKind) 
     views = [*path, *extremes(context.photo_camera, 0.3, DepthRange.of(context.base))]  # as the command line adds them
     filled = fill_scene(context, views, progress=lambda done, total: calls.append((done, total)))
     visits = len(views) // 2
-    assert len(counting.cameras) == visits + WIDEST  # the photo and the widest first, for their guards
+    assert len(counting.cameras) == visits + WIDEST  # the photo and the widest views, for guards
     assert calls == [(k, visits) for k in range(1, visits + 1)]
     after = [CPU.render([context.base, filled.aux], camera) for camera in views]
     assert len(filled.pictures) > 3
-    for index, picture in filled.pictures.items():  # as the finished scene is drawn, bit for bit
+    for index, picture in filled.pictures.items():  # equal to the final scene, bit for bit
         assert torch.equal(picture, to_bytes(after[index].rgb))
     left = [hole_area_ratio(view.alpha) for view in after]
     assert max(left) <= 2e-3

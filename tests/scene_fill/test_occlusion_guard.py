@@ -1,4 +1,4 @@
-"""Aux Gaussians slide behind what other views show, and the eye that asked for them sees no difference."""
+"""Occlusion guards move aux Gaussians behind the surfaces that other views show."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 
 def plain_push(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) -> tuple[list[float], list[int]]:
-    """The factors and the survivors of `push_behind`, one Gaussian at a time."""
+    """The factors and indices of the Gaussians that `push_behind` keeps, in plain Python."""
 
     def blocked(point: Tensor, covariance: Tensor) -> bool:
         for guard in guards:
@@ -72,7 +72,7 @@ def plain_push(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) ->
 
 
 def random_aux(count: int, seed: int) -> Gaussians:
-    """Gaussians all around the origin, some behind it."""
+    """Random Gaussians around the origin."""
     generator = torch.Generator().manual_seed(seed)
     means = 6 * torch.randn(count, 3, generator=generator)
     quats, drawn = torch.randn(count, 4, generator=generator), torch.rand(count, 7, generator=generator)
@@ -113,7 +113,7 @@ def test_pits_are_closed_as_a_plain_loop_closes_them(seed: int, share: float) ->
     depth, cells = 1 + torch.rand(9, 75, generator=generator), torch.rand(9, 75, generator=generator) < share
     cells[0, 0] = True
     found, places = without_pits(depth[cells], cells), cells.nonzero()
-    near = (places[:, None] - places).abs().amax(-1) <= round(75 * PIT)  # chosen cells around each chosen one
+    near = (places[:, None] - places).abs().amax(-1) <= round(75 * PIT)
     farthest = torch.where(near, depth[cells], 0).amax(1)
     assert torch.equal(found, torch.where(near, farthest, torch.inf).amin(1))
     assert (found >= depth[cells]).all()

@@ -1,4 +1,4 @@
-"""Colours of blobs: those that the blended picture shows, from patches of the view or from an inpainter."""
+"""Colours of filled holes, from patches of the view or from an inpainter."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from spackle.surface import PIXEL_SPREAD
 
 @pytest.mark.parametrize("period", [4.0, 6.0, 8.0])  # pixels
 def test_sharpened_blobs_make_up_for_their_overlap(period: float) -> None:
-    """On a rough wall: where blobs lie one behind the other in a row, the nearer ones also shift the picture."""
+    """The wall is rough, because rows of Gaussians at increasing depth would shift the image."""
     camera = Camera.from_focal(80, 96, 72)
     uv = camera.pixel_centers()
     x, y = (2 * torch.pi / period * uv).unbind(-1)
@@ -45,11 +45,11 @@ def test_sharpened_blobs_make_up_for_their_overlap(period: float) -> None:
         return float(((shown - shown.mean((0, 1))) * truth).sum() / truth.square().sum())
 
     assert strength(wanted) < 0.96
-    assert 1.05 < strength(room.sharpened(wanted)) < 1.6  # more than one: for what votes have blurred
+    assert 1.05 < strength(room.sharpened(wanted)) < 1.6  # more than 1, to balance the blur of votes
 
 
 class Paint(PlainInpainter):
-    """Paints a ramp of colours that no scene here has, and keeps what it was asked for."""
+    """Paints a ramp of colours, and records the inputs."""
 
     name, version = "paint", "1"
 
@@ -81,15 +81,15 @@ def test_a_painted_picture_is_asked_for_once_and_seen(size: tuple[int, int], thr
     inner = ~greatest_around(~hole, 2)
     assert int(inner.sum()) > 2000
     assert float((filled.rendering.rgb - ramp(*hole.shape))[inner].abs().mean()) < 0.01
-    assert bool((filled.aux.colors.sum(-1) > 0).all())  # no black where a cell is masked by a threshold of its own
+    assert bool((filled.aux.colors.sum(-1) > 0).all())  # no black cells
     painter.asked.clear()
     path = trajectory("rotate-forward", context.photo_camera, 0.4, DepthRange.of(context.base), 9)
     assert len(fill_scene(context, path, exact=True).aux)
-    assert len(painter.asked) == OPPOSITE  # the widest, and no others
+    assert len(painter.asked) == OPPOSITE  # only the widest views
 
 
 def hole_view() -> tuple[HoleView, FillContext, Camera]:
-    """A view of the box, its structure random."""
+    """A view of the box with random structure."""
     context, camera = box_view(0.3)
     view = CPU.render(context.base, camera)
     features, seeds, _ = features_of(view, camera, context.photo_camera)
@@ -99,7 +99,7 @@ def hole_view() -> tuple[HoleView, FillContext, Camera]:
 
 
 def flat_view(mask: Tensor, rgb: Tensor, pixels: Tensor, beyond: Tensor, matches: Tensor) -> HoleView:
-    """A view [h, w] of a wall, with all that its hole shows given."""
+    """A view [h, w] of a wall."""
     flat, nothing = torch.ones(mask.shape), torch.zeros(mask.shape)
     features = ViewFeatures(rgb, flat, flat, mask)
     seeds = Seeds(torch.zeros(*mask.shape, 2), flat, torch.zeros(*mask.shape, 2), rgb)
@@ -134,7 +134,7 @@ def test_beyond_the_border_the_nearest_cells_are_extended() -> None:
 
 
 def test_texture_is_no_stronger_than_what_is_around_the_hole() -> None:
-    """A calm wall and a lively one: noise that is as strong everywhere fits in one hole and not in the other."""
+    """Of a plain and a rough wall, only the rough wall gets strong noise."""
     mask = torch.zeros(48, 96, dtype=torch.bool)
     mask[16:32, 12:36] = mask[16:32, 60:84] = True
     noise = 0.1 * torch.randn(96, 192, 3, generator=torch.Generator().manual_seed(0))

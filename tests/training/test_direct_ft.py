@@ -1,4 +1,4 @@
-"""The naive decoupled baseline: SHARP's own decoder learns, all else stays, and what comes out predicts."""
+"""The naive decoupled baseline, which trains SHARP's decoder."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ run: {validate_every: 4, save_every: 2, log_every: 1}
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Weights, a dataset that was built with them, and a recipe."""
+    """Weights of SHARP, a dataset built with these weights, and a recipe."""
     place = tmp_path_factory.mktemp("direct")
     weights = deterministic_weights(expected_shapes(MICRO))
     weights["prediction_head.texture_prediction_head.bias"][-2:] = 6.0  # opaque: the photo's own view has no holes
@@ -58,7 +58,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def whole(place: Path) -> Path:
-    """The folder of a run of four steps in one go."""
+    """The folder of an uninterrupted run of four steps."""
     done = train(place, place / "whole")
     assert done.code == 0, done.err
     return place / "whole"
@@ -74,7 +74,7 @@ def train(place: Path, output: Path, *more: object) -> Run:
 
 
 def weights_of(file: Path) -> dict[str, Tensor]:
-    """Of the whole network that a checkpoint, or a decoder with a link to one, stands for."""
+    """The weights of the whole network, from a checkpoint or a trained decoder."""
     return TunableSharp.load(file, torch.float32, CPU).network.state_dict()
 
 
@@ -119,13 +119,13 @@ def test_a_run_leaves_weights_that_predict_pictures_and_a_report(place: Path, wh
 
 @pytest.mark.slow
 def test_two_processes_find_the_gradient_of_one(place: Path, tmp_path: Path) -> None:
-    """Two photos each: gradients are added up within a process, and then put together."""
+    """Each process adds the gradients of two photos."""
     options = ["optim.steps=1", "optim.batch=16", "run.validate_every=1"]
     run_two(arguments(place, tmp_path / "two", *options))
     assert train(place, tmp_path / "one", *options).code == 0
     one, two = (state(tmp_path / name).optimizer["state"] for name in ("one", "two"))
     assert one.keys() == two.keys()
-    # Weights would not do: the optimiser's first step makes as much of a gradient's noise as of a gradient.
+    # Weights cannot be compared: the optimiser's first step amplifies a gradient's noise.
     mine, yours = (torch.cat([part["exp_avg"].flatten() for part in found.values()]) for found in (one, two))
     assert float((mine - yours).norm()) < 1e-3 * float(mine.norm())
 
@@ -157,7 +157,7 @@ def test_a_step_has_the_own_view_and_a_photo_teaches_or_judges(place: Path) -> N
 def test_what_cannot_be_trained_is_said_in_a_line(
     place: Path, whole: Path, tmp_path: Path, options: list[str], said: str
 ) -> None:
-    for key, name in (("base", "rgbd"), ("inpainter", "geometry")):  # a dataset of that
+    for key, name in (("base", "rgbd"), ("inpainter", "geometry")):
         if f"{{place}}/{name}" in str(options):
             manifest = load_manifest(shutil.copytree(place / "data", place / name))
             manifest.model_copy(update={"config": {**manifest.config, key: {"name": name}}}).save(place / name)
@@ -175,7 +175,7 @@ def test_without_c_sharp_comes_from_the_folder_of_weights(
     words = ("train", "--method", "direct-ft", "--recipe", place / "recipe.yaml", "-o", tmp_path / "out")
     refuses(run(*words), "spackle weights get sharp")
     (tmp_path / "weights").mkdir()
-    shutil.copy(place / "sharp.safetensors", tmp_path / "weights" / "sharp_2572gikvuh.pt")  # its content tells its kind
+    shutil.copy(place / "sharp.safetensors", tmp_path / "weights" / "sharp_2572gikvuh.pt")
     assert run(*words, "optim.steps=1").code == 0
 
 

@@ -1,4 +1,4 @@
-"""The four losses and the reported distances against numbers worked out by hand; the networks that they look with."""
+"""Losses and distances against hand-computed numbers, and the feature networks."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ PAPER = LossRecipe()
 
 
 class Pixels:
-    """Features that are the image itself, once for each factor."""
+    """Features: the image times each factor."""
 
     name = "pixels"
 
@@ -78,7 +78,7 @@ def test_a_blurred_color_loss_averages_within_the_hole() -> None:
 def test_alpha_is_clamped_cross_entropy_towards_one() -> None:
     alpha, hole = torch.tensor([[[0.5, 0.9]], [[0.25, 0.25]]]), torch.tensor([[[True, False]], [[True, True]]])
     assert alpha_loss(alpha, hole).item() == pytest.approx((0.693147 + 1.386294) / 2)
-    alpha = torch.tensor([[[0.0, 1 / 255]]], requires_grad=True)  # nothing, and a faint splat, which has a gradient
+    alpha = torch.tensor([[[0.0, 1 / 255]]], requires_grad=True)  # a faint splat has a gradient
     loss = alpha_loss(alpha, ~NO_HOLE)
     loss.backward()
     assert loss.item() == pytest.approx((6.907755 + 5.541264) / 2)  # -log 0.001 and -log(1/255)
@@ -172,7 +172,7 @@ def test_distance_weighs_cells_by_their_share_of_the_hole() -> None:
         def __call__(self, images: Tensor) -> list[Tensor]:
             return [F.max_pool2d(images, 2)]
 
-    # The left cell is hole by 3/4 and sees (1, 1, 0), of target and prediction; the right one, by 1/4, is right.
+    # The hole covers 3/4 of the left cell, which is wrong, and 1/4 of the right cell, which is right.
     assert hole_distance(Halved(), rgb, target, hole) == pytest.approx(0.75 * (2 - math.sqrt(2)))
 
 
@@ -181,7 +181,7 @@ def test_distance_weighs_cells_by_their_share_of_the_hole() -> None:
 
 @pytest.fixture(scope="module")
 def resnet() -> dict[str, Tensor]:
-    """Random weights, with statistics that are not those of a fresh network, and a classifier."""
+    """Random weights and statistics, and a classifier."""
     torch.manual_seed(0)
     state = dict(ResNet50().state_dict())
     for name, value in state.items():
@@ -192,10 +192,10 @@ def resnet() -> dict[str, Tensor]:
 
 @pytest.fixture
 def squeezed() -> dict[str, np.ndarray]:
-    """Random weights by Caffe's names."""
+    """Random weights with Caffe's names."""
     rng = np.random.default_rng(0)
     shapes = {"conv1": (96, 3, 7, 7), "conv10": (1000, 512, 1, 1)}
-    # Inputs, squeezed and expanded channels of fire2 to fire9, as the paper of SqueezeNet has them in its table 1.
+    # Input, squeezed and expanded channels of fire2 to fire9 (table 1 of SqueezeNet's paper).
     fires = [(96, 16, 64), (128, 16, 64), (128, 32, 128), (256, 32, 128), (256, 48, 192), (384, 48, 192)]
     for number, (inside, squeeze, expand) in enumerate([*fires, (384, 64, 256), (512, 64, 256)], 2):
         shapes[f"fire{number}/conv1x1_1"] = (squeeze, inside, 1, 1)
@@ -231,7 +231,7 @@ def test_squeezenet_has_caffes_sizes_and_input(squeezed: dict[str, np.ndarray], 
     squeezenet = load_features("squeezenet", tmp_path / "squeeze.npz")
     assert isinstance(squeezenet, SqueezeNet)
     shapes = [tuple(m.shape[1:]) for m in squeezenet(torch.rand(1, 3, 227, 227))]
-    assert shapes == [(96, 111, 111), (256, 55, 55), (512, 27, 27), (512, 13, 13)]  # table 1, 227 for its 224
+    assert shapes == [(96, 111, 111), (256, 55, 55), (512, 27, 27), (512, 13, 13)]  # table 1, with 227 in place of 224
     image = torch.rand(3, 48, 48, generator=torch.Generator().manual_seed(2))
     bgr = 255 * image.numpy()[::-1] - np.array([104, 117, 123])[:, None, None]
     window = bgr[:, 2 * 4 : 2 * 4 + 7, 2 * 9 : 2 * 9 + 7]
@@ -249,7 +249,7 @@ def test_what_is_not_a_networks_weights_is_refused(squeezed: dict[str, np.ndarra
     refused("squeezenet", tmp_path / "missing.npz", "no such weight file")
     for change, said in (
         ({"conv1.w": squeezed["conv1.w"][:, :, :3, :3]}, "1 of another shape (conv1.weight"),
-        ({"conv1.w": np.array([{}])}, "not a file of weights"),  # an object: would have to be unpickled
+        ({"conv1.w": np.array([{}])}, "not a file of weights"),  # an object would have to be unpickled
     ):
         np.savez(tmp_path / "other.npz", **(squeezed | change))
         refused("squeezenet", tmp_path / "other.npz", said)

@@ -1,4 +1,4 @@
-"""Recipes: what the files say, what is refused, and what a step does by them."""
+"""Recipes, schedules, and the order of samples."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Samples: holes where geometry says so, crops that show what the whole does, files that come back as they were."""
+"""Sources of views with holes, crops and files of samples."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from spackle.training.samples import (
 from spackle.training.samples import random_crops as crops_of
 
 CPU = CpuRenderer()
-RIM_PX = 2  # blobs are no pixels: what stands in front hides so much more or less than a line says
+RIM_PX = 2  # tolerance for the size of Gaussians at outlines
 
 
 def grow(mask: Tensor, pixels: int = 1) -> Tensor:
@@ -48,7 +48,7 @@ def grow(mask: Tensor, pixels: int = 1) -> Tensor:
 
 
 def outline(scene: Scene) -> Tensor:
-    """[H, W] bool: the pixels at the photo's depth edges, where blobs of both sides mix."""
+    """[H, W] bool: pixels at depth edges."""
     far, near = (max_pool2d(sign * scene.depth[None], 3, stride=1, padding=1)[0] for sign in (1, -1))
     return far + near > 0.5
 
@@ -58,27 +58,23 @@ def looking(camera: Camera, *eye: float) -> Camera:
 
 
 def surface(scene: Scene) -> Tensor:
-    """[H, W, 3]: the points that a photo's pixels show."""
+    """[H, W, 3]: the points of the pixels."""
     return scene.camera.unproject(scene.camera.pixel_centers(), scene.depth)
 
 
 def outside(scene: Scene, viewer: Camera, margin: float = 0.0) -> Tensor:
-    """[H, W] bool: the photo's pixels more than `margin` pixels outside another camera's frame."""
+    """[H, W] bool: pixels whose points lie more than `margin` pixels outside of another camera's frame."""
     uv, z = viewer.project(surface(scene))
     size = torch.tensor([viewer.width, viewer.height])
     return ((uv < -margin) | (uv > size + margin)).any(-1) | (z <= 0)
 
 
 def hidden(scene: Scene, viewer: Camera) -> Tensor:
-    """[H, W] bool: the pixels of a photo of surfaces that face it whose line to a camera's eye meets another of them.
-
-    Only what the photo shows can stand in the way, so the line's point at each layer's depth must fall
-    on a pixel of that layer.
-    """
+    """[H, W] bool: pixels of frontal surfaces whose line to another camera meets another surface of the photo."""
     points, eye, (height, width) = surface(scene), viewer.position, scene.depth.shape
     covered = torch.zeros(height, width, dtype=torch.bool)
     for z in scene.depth.unique():
-        share = (z - eye[2]) / (points[..., 2] - eye[2])  # of the way from the eye to the point
+        share = (z - eye[2]) / (points[..., 2] - eye[2])  # of the line from the camera to the point
         uv, _ = scene.camera.project(eye + share[..., None] * (points - eye))
         column, row = uv.floor().long().unbind(-1)
         between = (column >= 0) & (row >= 0) & (column < width) & (row < height) & (share > 0) & (share < 0.999)
@@ -118,7 +114,6 @@ def test_the_photos_camera_sees_no_hole_one_turned_away_no_base() -> None:
 def test_a_plane_seen_from_the_side_stays_closed(
     near: float, far: float, axis: int, eye: tuple[float, float, float]
 ) -> None:
-    """Up to the steepest slope that counts as a surface: three percent of the depth for each pixel."""
     scene = slanted_plane(near, far, axis)
     viewer = looking(scene.camera, *eye)
     beside, hole = outside(scene, viewer), reverse(scene, viewer).hole
@@ -156,7 +151,7 @@ def test_a_completed_crop_is_a_part_of_the_completed_view(
     assert torch.equal(crop.target, whole.target[part])
     assert torch.equal(crop.hole, whole.hole[part])
     assert torch.equal(crop.seeds.uv, cell_centers(crop.camera))
-    # It needs fewer Gaussians for the same picture, and completed, it is the crop of the completed view.
+    # Fewer Gaussians give the same image; the completed crop equals the crop of the completed view.
     assert len(crop.base) < 0.7 * len(whole.base)
     inside = tile_mask(crop.tiles, CELL * side, CELL * side)
     drawn = CPU.render(crop.base, crop.camera, tiles=crop.tiles)
@@ -172,7 +167,7 @@ def test_a_completed_crop_is_a_part_of_the_completed_view(
     expected = CPU.render([whole.base, aux], whole.camera)
     found = CPU.render([crop.base, crop_aux], crop.camera, tiles=crop.tiles, onto=crop.rendering)
     assert crop.hole.any()
-    assert (found.rgb - whole.rendering.rgb[part]).abs()[crop.hole].max() > 0.05  # aux does something
+    assert (found.rgb - whole.rendering.rgb[part]).abs()[crop.hole].max() > 0.05  # aux Gaussians are visible
     assert (found.rgb - expected.rgb[part]).abs()[inside].max() < 3e-5
     assert (found.alpha - expected.alpha[part]).abs()[inside].max() < 1e-5
     assert torch.equal(found.rgb[~inside], whole.rendering.rgb[part][~inside])
@@ -199,7 +194,7 @@ def test_random_crops_have_holes_and_lie_within_the_picture(width: int, height: 
 @pytest.mark.parametrize("size", [(1, 9), (7, 8), (8, 8), (14, 13)])
 def test_enough_cells_and_masked_ones_first(size: tuple[int, int], share: float) -> None:
     mask = torch.rand(size) < share
-    alpha = (4 * torch.rand(size)).round() / 4  # many alike
+    alpha = (4 * torch.rand(size)).round() / 4  # many equal values
     cells = training_cells(ViewFeatures(torch.zeros(*size, 3), torch.zeros(size), alpha, mask))
     assert (cells | ~mask).all()
     assert int(cells.sum()) == max(int(mask.sum()), min(MIN_AUX, mask.numel()))
@@ -215,7 +210,7 @@ PALETTE = torch.tensor([[0.9, 0.1, 0.1], [0.1, 0.8, 0.2], [0.2, 0.2, 0.9], [0.9,
 @pytest.mark.parametrize("seed", range(8))
 def test_a_cut_out_stands_before_what_it_covers(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     def composite(objects: int) -> tuple[Tensor, Tensor]:
-        """Of photos of one colour each; with one more, those before it stay the same."""
+        """A composite of photos with one colour each; more objects do not change earlier objects."""
         monkeypatch.setattr(sources, "OBJECTS", (objects, objects))
         colors = iter(PALETTE)
         return sources.composite(np.random.default_rng(seed), lambda rng: next(colors).expand(150, 200, 3), 120, 160)
@@ -227,7 +222,7 @@ def test_a_cut_out_stands_before_what_it_covers(seed: int, monkeypatch: pytest.M
         assert 0.5 / 8.0 * 0.99 < next_inverse.min() < next_inverse.max() < 1.2 / 0.7
         moved = next_inverse != inverse
         painted = (next_rgb - rgb).abs().amax(-1) > 1e-4
-        if not painted.any():  # too small, too large or too near: left out
+        if not painted.any():  # too small, too large or too near
             assert not moved.any()
             continue
         assert (next_inverse > 1.03 * inverse)[moved].all()
@@ -243,7 +238,6 @@ def test_a_cut_out_stands_before_what_it_covers(seed: int, monkeypatch: pytest.M
 
 
 def test_a_sample_comes_back_small_and_shows_the_same(tmp_path: Path) -> None:
-    """With two Gaussians a pixel in sight, about as many as SHARP has on COCO's photos."""
     scene = box_before_wall(width=272, height=204, focal=226)
     view, base = shifted(scene.camera.resized(192, 144), 0.4), scene.base()
     target = (255 * CPU.render(base, view).rgb).round() / 255
@@ -273,7 +267,7 @@ def test_a_sample_comes_back_small_and_shows_the_same(tmp_path: Path) -> None:
 
 
 def fill(folder: Path, killed_at: int | None = None) -> tuple[list[str], list[float]]:
-    """The samples of five views of a box, some of which have no hole, and from where these views were made."""
+    """Files of the samples of five views, and the camera positions of the views made in this call."""
     asked: list[float] = []
 
     def view(rng: np.random.Generator, number: int) -> Sample:
@@ -302,8 +296,8 @@ def test_a_killed_fill_goes_on_to_the_same_files(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         fill(part, killed_at=3)
     assert contents(part) == {name: data for name, data in expected.items() if name < "000003"}
-    (part / "000001.done").unlink()  # killed before its marker was written
-    (part / files[0]).unlink()  # lost since then
+    (part / "000001.done").unlink()  # killed before the marker was written
+    (part / files[0]).unlink()  # deleted
     (part / "000002.done").write_text("")  # a power cut
     assert fill(part) == (files, asked)
     assert contents(part) == expected
@@ -334,11 +328,11 @@ def test_frames_of_a_depth_camera_have_their_units(tmp_path: Path, unit_m: float
         sources.load_frame(color, unit_m)
 
 
-WALL_PX, BOX_PX, DOFFS = 4, 12, 3.0  # disparities; what the file says is less by `doffs`
+WALL_PX, BOX_PX, DOFFS = 4, 12, 3.0  # disparities; the file's values are smaller by `doffs`
 
 
 def write_stereo(folder: Path, width: int = 96, height: int = 72, **changes: Any) -> Path:
-    """A box before a wall in two photos: in the right one each lies its disparity further to the left."""
+    """Write a stereo pair of a box in front of a wall."""
     for side, name in enumerate(("left", "right")):
         wall, box = (side * (d - int(DOFFS)) for d in (WALL_PX, BOX_PX))
         image = texture(height, width + 16, (0.2, 0.4, 0.7))[:, wall : wall + width].clone()
@@ -354,7 +348,7 @@ def write_stereo(folder: Path, width: int = 96, height: int = 72, **changes: Any
 
 
 def test_a_pair_gives_the_right_photo_and_in_reverse_the_left(tmp_path: Path) -> None:
-    folder = write_stereo(tmp_path, disparity="maps/left.npy")  # which may lie in another folder
+    folder = write_stereo(tmp_path, disparity="maps/left.npy")  # in another folder
     (folder / "maps").mkdir()
     (folder / "disparity.npy").rename(folder / "maps" / "left.npy")
     sample = sources.right_view(np.random.default_rng(0), [folder], CPU)
@@ -366,7 +360,7 @@ def test_a_pair_gives_the_right_photo_and_in_reverse_the_left(tmp_path: Path) ->
     depth = sample.rendering.depth
     assert torch.allclose(depth[10:20, 10:80], torch.tensor(80 * 0.3 / WALL_PX), rtol=0.01)
     assert torch.allclose(depth[30:42, 36:50], torch.tensor(80 * 0.3 / BOX_PX), rtol=0.01)
-    # The wall beside the box's right side was hidden, and its last column lay outside the left photo.
+    # Hidden in the left photo: the wall beside the box's right side, and the last column.
     expected = torch.zeros_like(sample.hole)
     expected[24:48, 64 - 9 : 64 - 1] = True
     expected[:, 95:] = True

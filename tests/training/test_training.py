@@ -1,4 +1,4 @@
-"""Training: a run that is cut off ends as one that is not, processes that share a batch learn the same, and so on."""
+"""Training runs of the residual network."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ run: {validate_every: 6, save_every: 3, log_every: 1}
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recipe, its photos and, from the first run on, its samples."""
+    """A folder with a recipe, photos and, after the first run, samples."""
     place = tmp_path_factory.mktemp("training")
     (place / "photos").mkdir()
     for number in range(3):
@@ -60,14 +60,14 @@ def done(place: Path) -> Run:
 
 @pytest.fixture(scope="module")
 def whole(place: Path, done: Run) -> Path:
-    """The folder of a run of six steps, in one go."""
+    """The folder of an uninterrupted run of six steps."""
     assert done.code == 0, done.err
     return place / "whole"
 
 
 @pytest.fixture
 def out(whole: Path, tmp_path: Path) -> Path:
-    """Its copy, to go on in."""
+    """A copy of the folder `whole`."""
     return shutil.copytree(whole, tmp_path / "out")
 
 
@@ -163,7 +163,7 @@ def test_two_processes_learn_what_one_does(place: Path, tmp_path: Path) -> None:
     assert train(place, tmp_path / "one", *options).code == 0
     assert_same_weights(tmp_path / "two", tmp_path / "one", 1e-5)
     one, two = (state(tmp_path / name).progress.history[0] for name in ("one", "two"))
-    assert two == pytest.approx(one, rel=1e-4)  # blobs at nearly one depth may swap
+    assert two == pytest.approx(one, rel=1e-4)  # Gaussians of nearly equal depth may swap
 
 
 @pytest.mark.parametrize(

@@ -196,11 +196,11 @@ def test_a_killed_run_goes_on_and_ends_as_if_nothing_had_been(
 
 def test_a_folder_belongs_to_one_recipe_and_one_method(place: Path, whole: tuple[Path, Run], tmp_path: Path) -> None:
     out = shutil.copytree(whole[0], tmp_path / "out")
-    assert "another recipe (data.made differs)" in train(place, out, "data.made=4").lines[-1]
+    assert "other settings (data.made" in train(place, out, "data.made=4").lines[-1]
     more = shutil.copytree(place / "kitchen", tmp_path / "kitchen")
     shutil.copy(more / "0.color.jpg", more / "6.color.jpg")
     done = train(place, out, f"data.rgbd.0.folder={more}")
-    assert "another recipe (the files that data names differs)" in done.lines[-1]
+    assert "other settings (the data's files)" in done.lines[-1]
     done = run("train", "--recipe", place / "recipe.yaml", "-o", out)
     assert (done.code, len(done.lines)) == (2, 1)
     assert "recipe.yaml: data.validation_stereo: there is no such key" in done.err
