@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -15,12 +15,11 @@ from spackle.bases.open import OpenedBase, ResolvedBase, open_base
 from spackle.bases.settings import BaseSettings
 from spackle.camera import Camera
 from spackle.camera_path import KeyframePath
-from spackle.device import Precision
 from spackle.errors import InputError
 from spackle.gaussians import Gaussians
 from spackle.image import Photo
 from spackle.inpaint import InpainterOptions, get_inpainter
-from spackle.progress import Reporter
+from spackle.progress import Reporter, Step
 from spackle.render import Renderer, get_renderer
 from spackle.residual.architectures import SHIPPED, load_residual, shipped_network
 from spackle.residual.network import ResidualNet
@@ -120,23 +119,30 @@ class Pipeline:
 
     def complete(self, photo: Photo, reporter: Reporter) -> CompletedPhoto:
         """Complete the scene of a photo at its full size; InputError if the photo or its depth map cannot be used."""
-        base, fill = self.options.base, self.options.fill
+        fill, precision = self.options.fill, self.options.base.precision
         prediction, choice = self.predict(photo, reporter)
         views = plan_views(prediction, self.options.path, photo.path, self.given_views, self.keyframes)
-        texture = open_texture(fill.texture)
-        gaussians, camera = prediction.gaussians, prediction.camera
-        context = FillContext(gaussians, camera, self.renderer, self.network, texture, precision=base.precision)
+        base, camera, texture = prediction.gaussians, prediction.camera, open_texture(fill.texture)
+        context = FillContext(base, camera, self.renderer, self.network, texture, precision=precision)
+        saved_view, by_view, pictures = None, None, dict[int, Tensor]()
         with reporter.stage("complete") as step:
-            chosen = views.looked_at if fill.mode == "scene" else range(len(views.cameras))
-            cameras = [views.cameras[index] for index in chosen] if fill.texture != "none" else []
-            scene, drawn = fill_views(context, cameras, fill.mode, self.given_views is not None, step)
-            pictures = {chosen[index]: picture for index, picture in drawn.items()}
-        if not scene.aux.finite:
+            if fill.mode == "scene" or fill.texture == "none":
+                chosen = [] if fill.texture == "none" else views.looked_at
+                filled = fill_scene(context, [views.cameras[k] for k in chosen], self.given_views is not None, step)
+                aux = filled.aux
+                if views.maker.plain:
+                    pictures = {chosen[k]: picture for k, picture in filled.pictures.items()}
+            else:
+                by_view = tuple(_fill_each(context, views.cameras, step))
+                eye = camera.position.double()
+                far = {name: (views.cameras[k].position.double() - eye).norm() for name, k in views.measured.items()}
+                saved_view = max(far, key=lambda name: float(far[name]))  # a file holds one set of aux Gaussians
+                aux = by_view[views.measured[saved_view]]
+        if not aux.finite:
             source = self.options.path.cameras or photo.path
             raise InputError(f"{source}: views too extreme to complete: check their K")
-        scene = dataclasses.replace(scene, disparity=self._disparity(prediction))
-        done = CompletedPhoto(photo, prediction, choice, views, scene, pictures if views.maker.plain else {})
-        return done if scene.by_view is None else _with_farthest_view(done)
+        scene = Scene(base, aux, camera, by_view, self._disparity(prediction))
+        return CompletedPhoto(photo, prediction, choice, views, scene, pictures, saved_view)
 
     def predict(self, photo: Photo, reporter: Reporter) -> tuple[BasePrediction, ResolvedBase]:
         """Predict the photo's Gaussians, and choose the size of the camera's movement; also return the chosen base."""
@@ -174,67 +180,38 @@ def move_in_words(prediction: BasePrediction) -> str:
     return f"camera moves by disparity {reach:g}{of}: {invented:.1%} of the widest view is invented{more}"
 
 
-def _with_farthest_view(done: CompletedPhoto) -> CompletedPhoto:
-    """Take the aux Gaussians of the measured view that is farthest from the photo, because a file holds one set."""
-    views, by_view = done.views, done.scene.by_view
-    assert by_view is not None
-    eye = done.prediction.camera.position.double()
-    far = {name: float((views.cameras[k].position.double() - eye).norm()) for name, k in views.measured.items()}
-    name = max(far, key=lambda name: far[name])
-    scene = dataclasses.replace(done.scene, aux=by_view[views.measured[name]])
-    return dataclasses.replace(done, scene=scene, saved_view=name)
+def _fill_each(context: FillContext, cameras: Sequence[Camera], step: Step) -> Iterator[Gaussians]:
+    guards = [context.photo_guard()]
+    for index, camera in enumerate(cameras):
+        yield fill_view(context, camera, guards).aux
+        step(index + 1, len(cameras))
 
 
 def complete(
     prediction: BasePrediction,
     cameras: Sequence[Camera],
     *,
-    mode: Mode = "scene",
     exact: bool = False,
     network: ResidualNet | Literal["shipped"] | None = "shipped",
     fill: Fill = "auto",
     renderer: Renderer | None = None,
-    precision: Precision = "auto",
     progress: Callable[[int, int], None] | None = None,
 ) -> Scene:
-    """Fill the holes of all views.
+    """Fill the holes of all views by one set of aux Gaussians, see `fill_scene`.
 
     Args:
         prediction: a base's result.
         cameras: the views.
-        mode: "scene" makes one set of aux Gaussians for all views, see `fill_scene`; "view" makes one for each view,
-            and leaves `Scene.aux` empty.
-        exact: in scene mode, whether only these views will be rendered, and no views between them.
+        exact: whether only these views will be rendered, and no views between them.
         network: the residual network, by default Spackle's; None fills the holes by the seeds alone.
         fill: see `open_texture`; "none" keeps the holes.
         renderer: by default the CPU renderer.
-        precision: number type of the network.
         progress: called with (views done, all views).
     """
     chosen = shipped_network() if network == "shipped" else network
-    texture, drawer = open_texture(fill), renderer or get_renderer()
-    context = FillContext(prediction.gaussians, prediction.camera, drawer, chosen, texture, precision=precision)
-    return fill_views(context, cameras if fill != "none" else (), mode, exact, progress)[0]
-
-
-def fill_views(
-    context: FillContext,
-    cameras: Sequence[Camera],
-    mode: Mode,
-    exact: bool,
-    progress: Callable[[int, int], None] | None,
-) -> tuple[Scene, Mapping[int, Tensor]]:
-    """Fill the holes of views; also return pictures [H, W, 3] uint8, by index, of the views that were rendered."""
-    base, camera = context.base, context.photo_camera
-    if mode == "scene" or not cameras:
-        filled = fill_scene(context, cameras, exact, progress)
-        return Scene(base, filled.aux, camera), filled.pictures
-    guards, by_view = [context.photo_guard()], []
-    for index, view in enumerate(cameras):
-        by_view.append(fill_view(context, view, guards).aux)
-        if progress:
-            progress(index + 1, len(cameras))
-    return Scene(base, Gaussians.empty(), camera, tuple(by_view)), {}
+    base, camera = prediction.gaussians, prediction.camera
+    context = FillContext(base, camera, renderer or get_renderer(), chosen, open_texture(fill))
+    return Scene(base, fill_scene(context, cameras if fill != "none" else (), exact, progress).aux, camera)
 
 
 def resolved(fill: Fill) -> Fill:

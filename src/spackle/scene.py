@@ -100,13 +100,13 @@ class Scene:
         usual = USUAL_DISPARITY if self.disparity is None else self.disparity
         return scene_path(self.base, self.camera, trajectory, usual if disparity is None else disparity, frames, looped)
 
-    def along(self, keyframes: KeyframePath, frames: int | None = None, fps: float = 30) -> list[Camera]:
-        """Cameras through keyframes (see `spackle.formats.load_path`), by default for the whole path at `fps`.
+    def along(self, keyframes: KeyframePath, frames: int | None = None) -> list[Camera]:
+        """Cameras through keyframes (see `spackle.formats.load_path`), by default 30 for each second.
 
         Raises:
             ValueError: a view between two keyframes is impossible.
         """
-        count = frames or keyframes.frame_count(fps)
+        count = frames or keyframes.frame_count(30)
         return keyframes.cameras(self.camera.even(), count, DepthRange.of(self.base))
 
     def render(self, camera: Camera, renderer: Renderer | None = None) -> Rendering:
