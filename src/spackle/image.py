@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+import pillow_heif
 import torch
 from numpy.typing import NDArray
 from PIL import Image, ImageCms, ImageOps, UnidentifiedImageError
@@ -24,6 +25,7 @@ from spackle.files import check_file
 from spackle.photo_frame import PhotoFrame, find_frame
 
 T = TypeVar("T")
+pillow_heif.register_heif_opener()
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".heic", ".heif", ".tif", ".tiff")
 MAX_PIXELS = 100_000_000  # a larger image would take more than a gigabyte as float32
@@ -267,16 +269,12 @@ def read_image(path: str | os.PathLike[str], read: Callable[[Image.Image], T]) -
     check_file(path, "photo")
     with reading(path, "cannot be decoded ({reason}): the file is damaged or cut off"), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about broken EXIF
-        if "HEIF" not in Image.OPEN:
-            import pillow_heif
-
-            pillow_heif.register_heif_opener()
         try:
             with _BoundedFile(open(path, "rb", buffering=0)) as file, Image.open(file) as image:
                 check_pixels(image.width, image.height, file.size, path)
                 return read(image)
         except Image.DecompressionBombError:
-            raise InputError(f"{path}: more than 100 megapixels: shrink it first") from None
+            raise InputError(f"{path}: more than 100 megapixels: shrink the image first") from None
         except UnidentifiedImageError:
             raise InputError(f"{path}: not an image of a known format: give a JPEG, PNG, WebP, HEIC or TIFF") from None
 
@@ -293,10 +291,8 @@ def check_pixels(width: int, height: int, size: int, path: str | os.PathLike[str
     """Raise an InputError if an image in a file of `size` bytes would take too much memory."""
     most = min(MAX_PIXELS, max(SMALL_PIXELS, PIXELS_A_BYTE * size))
     if width * height > most:
-        raise InputError(
-            f"{path}: {width}×{height} is too large (at most {most // 10**6} megapixels in {size:,} bytes): "
-            "shrink it first"
-        )
+        limit = f"at most {most // 10**6} megapixels in {size:,} bytes"
+        raise InputError(f"{path}: {width}×{height} is too large ({limit}): shrink the image first")
 
 
 def _upright(image: Image.Image) -> Image.Image:

@@ -239,10 +239,9 @@ class FrameMaker:
     def note(self, name: str, camera: Camera, frames: int) -> dict[str, object]:
         """The report's entry for the video."""
         width, height = self.frame_size(self.sized(camera))
-        stereo: dict[str, object] | None = None
-        if self.stereo is not None:
-            convergence = self.stereo.convergence if math.isfinite(self.stereo.convergence) else None  # JSON has no inf
-            stereo = {"layout": self.stereo.layout, "ipd": self.stereo.ipd, "convergence": convergence}
+        stereo = None if self.stereo is None else dataclasses.asdict(self.stereo)
+        if stereo is not None and math.isinf(stereo["convergence"]):
+            stereo["convergence"] = None  # JSON has no infinity
         return {
             "file": name,
             "frames": frames,

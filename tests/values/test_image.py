@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pillow_heif
 import pytest
 import torch
 from PIL import Image, ImageCms, ImageOps, TiffImagePlugin
@@ -45,7 +44,6 @@ TURNED = [*(("jpg", orientation) for orientation in range(1, 9)), ("png", 6), ("
 
 @pytest.mark.parametrize(("suffix", "orientation"), [*TURNED, ("bmp", 1)])
 def test_common_formats_are_read_upright(tmp_path: Path, suffix: str, orientation: int) -> None:
-    pillow_heif.register_heif_opener()
     path, turned = tmp_path / f"photo.{suffix}", picture(64, 32)
     tags = {} if suffix == "bmp" else {"exif": exif(orientation, film=26)}
     turned.save(path, **tags, **({"lossless": True} if suffix == "webp" else {"quality": 95}))
