@@ -24,7 +24,7 @@ pytest.importorskip("cv2")
 CPU = CpuRenderer()
 
 
-def test_a_hole_moves_as_the_camera_does() -> None:
+def test_flow_in_a_hole_follows_the_camera() -> None:
     camera = Camera.from_focal(90, 96, 64)
     inverse = torch.full((64, 96), 0.2)
     inverse[20:44, 30:50] = 0.8  # a near object with its own motion
@@ -43,7 +43,7 @@ def test_a_hole_moves_as_the_camera_does() -> None:
     torch.testing.assert_close(motion[~hole], seen[~hole], atol=1e-3, rtol=0)
 
 
-def test_depth_of_another_scale_and_shift_is_brought_back() -> None:
+def test_scale_and_shift_of_depth_are_recovered() -> None:
     then = 0.2 + 0.5 * torch.rand(64, 96, generator=torch.Generator().manual_seed(0))
     now = (then - 0.03) / 1.3
     now[:12] = 1.5  # a new near object
@@ -52,7 +52,7 @@ def test_depth_of_another_scale_and_shift_is_brought_back() -> None:
     assert align_depth(now, then, dataclasses.replace(found, sure=torch.zeros_like(found.sure))) == DepthAlignment()
 
 
-def test_aligned_gaussians_look_the_same_from_the_photos_eye() -> None:
+def test_aligned_gaussians_look_the_same_from_the_photos_camera() -> None:
     scene = box_before_wall()
     base, alignment = scene.base(), DepthAlignment(1.2, 0.05)
     moved = alignment.of_gaussians(base)
@@ -87,7 +87,7 @@ def frame_of(right: float) -> tuple[Camera, Tensor, BasePrediction]:
     return camera, rgb, lifted(rgb, torch.where(box, BOX, WALL))
 
 
-def test_propagated_holes_are_calmer_and_no_worse() -> None:
+def test_propagated_colours_flicker_less_with_no_larger_error() -> None:
     completer = ClipCompleter("rotate", 0.3, 80, CPU, OpenCV("this").flow, align=False)
     past: tuple[CompletedView, Camera] | None = None
     flickers, errors = torch.zeros(2), torch.zeros(2)  # of frames completed alone, and with colours of earlier frames
@@ -110,7 +110,7 @@ def test_propagated_holes_are_calmer_and_no_worse() -> None:
 
 
 @pytest.mark.parametrize("fill", [True, False])
-def test_another_shot_starts_anew_and_holes_may_stay(fill: bool) -> None:
+def test_a_cut_resets_the_state_and_holes_can_be_kept(fill: bool) -> None:
     completer = ClipCompleter("rotate", None, 20, CPU, OpenCV("this").flow, fill=fill)
     _, rgb, prediction = frame_of(0.0)
     noise = torch.rand(72, 96, 3, generator=torch.Generator().manual_seed(0))

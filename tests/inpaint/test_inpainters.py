@@ -11,7 +11,7 @@ from spackle.inpaint import INPAINTERS, InpainterOptions, get_inpainter, inpaint
 
 
 @pytest.mark.parametrize("name", sorted(name for name in INPAINTERS if not inpainter_class(name).network))
-def test_only_the_holes_change_and_every_time_in_the_same_way(name: str) -> None:
+def test_only_holes_change_and_results_repeat(name: str) -> None:
     if name == "opencv":
         pytest.importorskip("cv2")
     rgb = torch.rand(2, 24, 33, 3, generator=torch.Generator().manual_seed(0)) / 2 + 0.25
@@ -27,7 +27,7 @@ def test_only_the_holes_change_and_every_time_in_the_same_way(name: str) -> None
     assert torch.equal(inpainter.paint(rgb[1:], hole[1:], inverse_depth[1:]), rgb[1:])
 
 
-def test_an_unknown_inpainter_is_a_line() -> None:
+def test_an_unknown_inpainter_is_refused() -> None:
     with pytest.raises(InputError, match="inpainter nobody: unknown"):
         get_inpainter("nobody", InpainterOptions())
 

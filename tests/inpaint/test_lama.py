@@ -52,7 +52,7 @@ def file(weights: Weights, tmp_path_factory: pytest.TempPathFactory) -> Path:
     ("name", "size", "height", "width", "step"),
     [("tiny", (16, 3), 64, 96, 4), pytest.param("full", (), 192, 256, 8, marks=pytest.mark.slow)],
 )
-def test_the_network_is_the_original(name: str, size: tuple[int, ...], height: int, width: int, step: int) -> None:
+def test_the_network_matches_the_original(name: str, size: tuple[int, ...], height: int, width: int, step: int) -> None:
     golden, network, x = torch.from_numpy(GOLDEN[name]), LamaNetwork(lama_weights(*size)), made_input(height, width)
     logits = network.logits(x)
     torch.testing.assert_close(logits[0, :, ::step, ::step], golden, rtol=0, atol=1e-5 * float(golden.abs().max()))
@@ -93,7 +93,7 @@ DIFFERENT: list[tuple[dict[str, Tensor | None], str]] = [
 
 
 @pytest.mark.parametrize(("change", "said"), DIFFERENT)
-def test_other_networks_are_a_line(
+def test_other_networks_are_refused(
     weights: Weights, tmp_path: Path, change: dict[str, Tensor | None], said: str
 ) -> None:
     tensors = {name: x for name, x in (weights | change).items() if x is not None}
@@ -116,7 +116,7 @@ def sizes_given(inpainter: LamaInpainter) -> list[tuple[int, ...]]:
     return sizes
 
 
-def test_only_holes_change_and_only_their_surroundings_are_seen(file: Path) -> None:
+def test_only_holes_change_and_the_network_gets_crops(file: Path) -> None:
     inpainter = LamaInpainter(InpainterOptions(file, device="cpu"))
     seen = sizes_given(inpainter)
     rgb, hole, depth = views(60, 700, (20, 10, 40, 20), (0, 690, 60, 700))
@@ -165,7 +165,7 @@ def test_groups_of_holes() -> None:
     assert bool((counts[speckled] == 1).all())
 
 
-def test_what_goes_wrong_is_a_line(file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_errors_are_one_line(file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SPACKLE_WEIGHTS", str(tmp_path))
     with pytest.raises(InputError, match="spackle weights get lama"):
         get_inpainter("lama", InpainterOptions())

@@ -31,7 +31,7 @@ class DeformConv2d(nn.Conv2d):
 OURS = ("torchvision", "pytorchcv.models.propainter")  # modules that hold the convolution
 
 
-def test_holes_grow_by_steps() -> None:
+def test_holes_are_dilated_by_steps() -> None:
     hole = torch.zeros(1, 1, 20, 20)
     hole[0, 0, 10, 8] = 1
     y, x = torch.meshgrid(torch.arange(20), torch.arange(20), indexing="ij")
@@ -106,7 +106,7 @@ def video(package: None, monkeypatch: pytest.MonkeyPatch) -> type[Video]:
     return Video
 
 
-def test_the_networks_paint_holes_alone(inpainter: PropainterInpainter) -> None:
+def test_the_networks_paint_only_holes(inpainter: PropainterInpainter) -> None:
     rgb, hole, unknown = (x[:, :64, -64:] for x in views_of(2, 64, 64))
     painted = inpainter.paint(rgb, hole, unknown)
     assert torch.equal(painted[~hole], rgb[~hole])
@@ -117,7 +117,7 @@ def test_the_networks_paint_holes_alone(inpainter: PropainterInpainter) -> None:
     assert "S-Lab" in inpainter.notice
 
 
-def test_what_the_networks_are_given(video: type[Video], inpainter: PropainterInpainter) -> None:
+def test_inputs_of_the_networks(video: type[Video], inpainter: PropainterInpainter) -> None:
     rgb, hole, unknown = views_of(4, 113, 150)
     painted = inpainter.paint(rgb, hole, unknown)
     frames, masks = video.given[0]
@@ -133,7 +133,7 @@ def test_what_the_networks_are_given(video: type[Video], inpainter: PropainterIn
     assert torch.equal(inpainter.paint(rgb, torch.zeros_like(hole), unknown), rgb)
 
 
-def test_colours_that_are_none_are_refused(
+def test_colours_that_are_not_finite_are_refused(
     video: type[Video], inpainter: PropainterInpainter, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     views = views_of(2, 113, 150)
@@ -149,7 +149,7 @@ def test_colours_that_are_none_are_refused(
         inpainter.paint(*views)
 
 
-def test_weights_that_are_not_there_are_told(tmp_path: Path) -> None:
+def test_missing_weights_are_refused(tmp_path: Path) -> None:
     published = [f"{name}-0000-d74fed4b.pth" for name in NETWORKS]
     for given, files, said in (
         (None, [], "give a folder with one file for each of raft_things, .* unpacked from https"),
@@ -164,7 +164,7 @@ def test_weights_that_are_not_there_are_told(tmp_path: Path) -> None:
     assert [file.name for file in weight_files(tmp_path).values()] == published
 
 
-def test_without_its_package_propainter_is_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_package_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pytorchcv", None)
     with pytest.raises(InputError, match=re.escape("pip install 'spackle-nvs[propainter]'")):
         get_inpainter("propainter", InpainterOptions())

@@ -46,7 +46,7 @@ def agree(one: Rendering, other: Rendering) -> None:
     torch.testing.assert_close(one.depth[same], other.depth[same], rtol=2e-3, atol=0)
 
 
-def test_it_draws_what_the_processors_renderer_draws(gpu: GsplatRenderer) -> None:
+def test_images_match_the_cpu_renderer(gpu: GsplatRenderer) -> None:
     for camera in (SCENE.camera, SIDE):
         for eps2d in (0.0, 0.3):
             found = gpu.render(BASE, camera, eps2d=eps2d)
@@ -57,7 +57,7 @@ def test_it_draws_what_the_processors_renderer_draws(gpu: GsplatRenderer) -> Non
     assert float(gpu.render(opaque, SCENE.camera).alpha.max()) == pytest.approx(ALPHA_MAX, abs=1e-5)
 
 
-def test_sets_are_drawn_as_one_without_what_is_not_finite(gpu: GsplatRenderer) -> None:
+def test_sets_are_drawn_together_without_bad_gaussians(gpu: GsplatRenderer) -> None:
     whole, empty = gpu.render(BASE, SIDE), Gaussians.empty()
     assert same_bits(gpu.render([BASE.select(slice(0, 100)), empty, BASE.select(slice(100, None))], SIDE), whole)
     broken = dataclasses.replace(BASE, means=BASE.means.clone())
@@ -65,7 +65,7 @@ def test_sets_are_drawn_as_one_without_what_is_not_finite(gpu: GsplatRenderer) -
     assert same_bits(gpu.render(broken, SIDE), gpu.render(BASE.select(torch.arange(len(BASE)) != 7), SIDE))
 
 
-def test_nothing_is_drawn_without_gsplat_which_dies_of_it(gpu: GsplatRenderer) -> None:
+def test_empty_sets_are_not_passed_to_gsplat(gpu: GsplatRenderer) -> None:
     empty = Gaussians.empty()
     for tiles in (None, TILES):
         for sets in ([], empty, [empty, empty]):
@@ -74,7 +74,7 @@ def test_nothing_is_drawn_without_gsplat_which_dies_of_it(gpu: GsplatRenderer) -
             assert not any(bool(image.any()) for image in view.tensors)
 
 
-def test_gradients_are_those_of_the_processors_renderer(gpu: GsplatRenderer) -> None:
+def test_gradients_match_the_cpu_renderer(gpu: GsplatRenderer) -> None:
     small = box_before_wall(width=24, height=20, focal=22)
     weights = torch.rand(20, 24, generator=torch.Generator().manual_seed(0))
     found = []
@@ -87,7 +87,7 @@ def test_gradients_are_those_of_the_processors_renderer(gpu: GsplatRenderer) -> 
         assert float((one - other).norm() / other.norm()) < 0.02
 
 
-def test_wanted_tiles_are_drawn_and_the_others_stay_bit_for_bit(gpu: GsplatRenderer) -> None:
+def test_only_wanted_tiles_change(gpu: GsplatRenderer) -> None:
     whole, under = gpu.render(BASE, SIDE), CPU.render(BASE, SCENE.camera)
     mask = TILES.repeat_interleave(16, 0).repeat_interleave(16, 1)[:35, :45]
     black = Rendering(*(torch.zeros_like(image) for image in whole.tensors))
@@ -100,7 +100,7 @@ def test_wanted_tiles_are_drawn_and_the_others_stay_bit_for_bit(gpu: GsplatRende
         gpu.render(BASE, SIDE, tiles=TILES[:2])
 
 
-def test_views_drawn_together_are_those_drawn_alone_bit_for_bit(gpu: GsplatRenderer) -> None:
+def test_a_batch_of_views_equals_single_views_bit_for_bit(gpu: GsplatRenderer) -> None:
     scenes = [[BASE, BASE.select(slice(0, 50))], [], [Gaussians.empty(), BASE.select(slice(40, None))]]
     cameras, tiles = [SIDE, SIDE, SCENE.camera], [None, TILES, TILES]
     onto = [None, None, CPU.render(BASE, SCENE.camera)]
@@ -114,7 +114,7 @@ def test_views_drawn_together_are_those_drawn_alone_bit_for_bit(gpu: GsplatRende
         gpu.render_batch([[BASE]] * 2, [SIDE, SIDE.resized(40, 40)])
 
 
-def test_covariances_are_single_precision_whatever_the_caller_has_set() -> None:
+def test_covariances_are_float32_under_autocast() -> None:
     expected = BASE.to(dtype=torch.float64).covariances()[:, (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)]
     with torch.autocast("cpu", torch.bfloat16):
         found = upper_covariances(BASE)
@@ -122,7 +122,7 @@ def test_covariances_are_single_precision_whatever_the_caller_has_set() -> None:
     torch.testing.assert_close(found.double(), expected, rtol=1e-5, atol=1e-5 * float(expected.abs().max()))
 
 
-def test_too_little_memory_is_a_line(gpu: GsplatRenderer, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_shortage_of_memory_is_reported(gpu: GsplatRenderer, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
         patch.setattr(cuda, "MOST_ENTRIES", 10)
         with pytest.raises(MemoryShort, match=f"{len(BASE):,} Gaussians at 45×35"):
@@ -145,7 +145,7 @@ def test_the_stand_in_has_gsplats_own_signatures() -> None:
         assert positional == list(theirs)[: len(positional)], name
 
 
-def test_a_scene_travels_once_while_nobody_changes_it() -> None:
+def test_an_unchanged_scene_is_uploaded_once() -> None:
     store = SetStore(torch.device("cpu"))
     material = store.material
     kept = Gaussians(*(tensor.clone() for tensor in BASE.tensors))
@@ -181,7 +181,7 @@ UNUSABLE: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("says", UNUSABLE)
-def test_a_gsplat_that_cannot_be_used_is_a_line_and_auto_falls_back(
+def test_an_unusable_gsplat_is_refused_and_auto_falls_back(
     says: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
@@ -194,7 +194,7 @@ def test_a_gsplat_that_cannot_be_used_is_a_line_and_auto_falls_back(
     assert str(caught.value) in caplog.text
 
 
-def test_auto_takes_a_gpu_that_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_auto_uses_an_available_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     for name, module in modules(object()).items():
         monkeypatch.setitem(sys.modules, name, module)

@@ -47,7 +47,7 @@ def run(folder: Path, side: int = 10, factor: int = 2, flags: str = "nsz afn") -
     return [int(word) for word in done.stdout.split()]
 
 
-def test_what_a_kernel_was_made_from_is_noticed(tmp_path: Path) -> None:
+def test_a_kernel_is_compiled_again_after_a_change(tmp_path: Path) -> None:
     assert run(tmp_path) == [60, 0, 1]
     assert run(tmp_path, flags="afn nsz") == [60, 1, 0]
     assert run(tmp_path, flags="contract") == [60, 0, 1]

@@ -60,7 +60,7 @@ def tile_mask(tiles: torch.Tensor, camera: Camera) -> torch.Tensor:
 
 
 @BOTH
-def test_one_gaussian_has_its_opacity_at_its_centre_and_a_bell_around_it(renderer):
+def test_one_gaussian_matches_its_formula(renderer):
     view = renderer.render(ball(), CAMERA)
     for dx, dy in [(0, 0), (2, 0), (0, -3), (1, 4)]:
         alpha = 0.5 * math.exp(-(dx * dx + dy * dy) / (2 * 2**2))
@@ -72,7 +72,7 @@ def test_one_gaussian_has_its_opacity_at_its_centre_and_a_bell_around_it(rendere
 
 @BOTH
 @pytest.mark.parametrize("opacity", [0.004, 0.3, 1.0])
-def test_the_footprint_ends_where_the_contribution_is_too_faint(renderer, opacity):
+def test_faint_contributions_are_skipped(renderer, opacity):
     view = renderer.render(ball(opacity=opacity), CAMERA)
     squared = (CAMERA.pixel_centers() - 16.5).square().sum(dim=-1)
     drawn = opacity * torch.exp(-squared / 8) >= ALPHA_MIN
@@ -94,7 +94,7 @@ def test_the_nearer_of_two_covers_the_farther_one(renderer):
 
 
 @BOTH
-def test_the_gaussian_that_would_fill_a_pixel_is_not_drawn(renderer):
+def test_blending_stops_before_a_pixel_is_full(renderer):
     stack = [ball(z=z, opacity=1.0, color=(0.5, z / 10, 0.0)) for z in (2.0, 3.0, 4.0)]
     view = renderer.render(stack, CAMERA)
     assert float(view.alpha[16, 16]) == pytest.approx(ALPHA_MAX, abs=1e-6)
@@ -102,7 +102,7 @@ def test_the_gaussian_that_would_fill_a_pixel_is_not_drawn(renderer):
 
 
 @BOTH
-def test_nothing_is_drawn_behind_the_near_plane_or_of_no_gaussians(renderer):
+def test_gaussians_before_the_near_plane_are_skipped(renderer):
     empty = Gaussians.empty()
     for drawn in (ball(z=-2.0), ball(z=0.0), ball(z=0.009), empty, [], [empty, empty]):
         view = renderer.render(drawn, CAMERA)
@@ -123,7 +123,7 @@ BAD = [*product(range(5), (math.nan, math.inf, -math.inf)), *product((0, 2, 3, 4
 
 
 @pytest.mark.parametrize(("field", "bad"), BAD)
-def test_bad_values_are_skipped_and_spoil_nothing(field, bad):
+def test_bad_values_are_skipped(field, bad):
     camera = turned_camera(50, 40, 45.0)
     scene = random_scene(1, 300, camera)  # more than a block of the projection
     spoiled = [t.clone() for t in scene.tensors]
@@ -134,7 +134,7 @@ def test_bad_values_are_skipped_and_spoil_nothing(field, bad):
     assert all(t.grad.isfinite().all() for t in leaf.tensors)
 
 
-def test_what_cannot_be_drawn_is_refused():
+def test_bad_tiles_and_devices_are_refused():
     for renderer in (CPU, TWIN):
         with pytest.raises(ValueError, match="tiles has shape"):
             renderer.render(ball(), CAMERA, tiles=torch.ones(2, 2, dtype=torch.bool))
@@ -164,7 +164,7 @@ def held_to_the_twin(gaussians: Gaussians, camera: Camera, eps2d: float) -> Rend
 
 @settings(max_examples=25, deadline=None)
 @given(scenes())
-def test_images_match_the_twin(scene):
+def test_images_match_the_reference(scene):
     gaussians, camera, eps2d, _ = scene
     fast = held_to_the_twin(gaussians, camera, eps2d)
     parts = [gaussians.select(slice(0, 9)), Gaussians.empty(), gaussians.select(slice(9, None))]
@@ -172,14 +172,14 @@ def test_images_match_the_twin(scene):
 
 
 @pytest.mark.parametrize("count", [0, BLOCK - 1, BLOCK, BLOCK + 1, 3 * BLOCK + 50])
-def test_any_number_of_blocks_matches_the_twin(count):
+def test_any_number_of_blocks_matches_the_reference(count):
     camera = turned_camera(50, 40, 45.0)
     scene = random_scene(count, count, camera, sizes=(1e-2, 4.0))
     held_to_the_twin(dataclasses.replace(scene, opacities=0.05 * scene.opacities), camera, 0.0)
 
 
 @pytest.mark.parametrize("stretch", [(1e3, 1, 1), (1, 1e3, 1), (1, 1, 1e-9), (1e3, 1e3, 1e-6)])
-def test_needles_and_discs_seen_edge_on_match_the_twin(stretch):
+def test_needles_and_edge_on_discs_match_the_reference(stretch):
     camera = turned_camera(50, 40, 45.0)
     scene = random_scene(5, 60, camera)
     thin = dataclasses.replace(scene, scales=scene.scales * torch.tensor(stretch), opacities=0.2 * scene.opacities)
@@ -188,7 +188,7 @@ def test_needles_and_discs_seen_edge_on_match_the_twin(stretch):
 
 @settings(max_examples=15, deadline=None)
 @given(scenes())
-def test_gradients_match_the_twin(scene):
+def test_gradients_match_the_reference(scene):
     gaussians, camera, eps2d, _ = scene
     sturdy = sturdy_pixels(gaussians, camera, eps2d)
     # With one weighting, contributions of pixels may cancel; with several weightings, this is unlikely.
@@ -219,7 +219,7 @@ def test_gradients_survive_long_lists_of_faint_gaussians():
         torch.testing.assert_close(one.double(), other, rtol=1e-4, atol=1e-4 * float(other.abs().max()))
 
 
-def test_the_twins_gradients_are_those_of_finite_differences():
+def test_reference_gradients_match_finite_differences():
     camera = turned_camera(7, 6, 6.0)
     scene = random_scene(3, 4, camera, dtype=torch.float64)
     assert sturdy_pixels(scene, camera, 0.1).all()
@@ -231,7 +231,7 @@ def test_the_twins_gradients_are_those_of_finite_differences():
     assert torch.autograd.gradcheck(images, with_grad(scene).tensors, eps=1e-7, atol=1e-5)
 
 
-def test_approximations_hold_over_their_whole_range():
+def test_approximated_functions_are_accurate():
     powers = np.linspace(-30, 2, 4001, dtype=np.float32)
     found = np.array([exp2(x) for x in powers])
     np.testing.assert_allclose(found, np.exp2(powers.astype(np.float64)), rtol=5e-7)
@@ -249,7 +249,7 @@ def test_approximations_hold_over_their_whole_range():
 
 @settings(max_examples=15, deadline=None)
 @given(scenes(), SEEDS)
-def test_chosen_tiles_match_the_full_image_and_no_other_is_touched(scene, tile_seed):
+def test_wanted_tiles_match_the_full_image(scene, tile_seed):
     gaussians, camera, eps2d, _ = scene
     shape = -(-camera.height // TILE), -(-camera.width // TILE)
     tiles = torch.rand(shape, generator=torch.Generator().manual_seed(tile_seed)) < 0.5
@@ -270,7 +270,7 @@ def test_chosen_tiles_match_the_full_image_and_no_other_is_touched(scene, tile_s
 
 @settings(max_examples=15, deadline=None)
 @given(scenes(), SEEDS)
-def test_other_tiles_than_those_touched_do_not_change(scene, more_seed):
+def test_untouched_tiles_do_not_change(scene, more_seed):
     gaussians, camera, _, solidity = scene
     more = random_scene(more_seed, 5, camera, solidity)
     before, after = CPU.render(gaussians, camera), CPU.render([gaussians, more], camera)
@@ -282,7 +282,7 @@ def test_other_tiles_than_those_touched_do_not_change(scene, more_seed):
     assert not touched_tiles(more.select(torch.zeros(len(more), dtype=torch.bool)), camera).any()
 
 
-def test_gradients_pass_through_kept_tiles_only():
+def test_gradients_of_tiles():
     camera = turned_camera(40, 40, 40.0)
     leaf = with_grad(random_scene(4, 50, camera))
     tiles = torch.zeros(3, 3, dtype=torch.bool)
@@ -301,7 +301,7 @@ def test_gradients_pass_through_kept_tiles_only():
         torch.testing.assert_close(one.grad, other.grad)
 
 
-def test_results_repeat_bit_for_bit_whatever_the_number_of_threads():
+def test_results_do_not_depend_on_the_number_of_threads():
     camera = turned_camera(130, 100, 100.0)
     scene = random_scene(6, 2000, camera)
     results = []

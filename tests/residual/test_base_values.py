@@ -26,7 +26,7 @@ GROUND, BACK = 1.0, 6.0  # y of the floor and z of the wall
 
 @settings(deadline=None, max_examples=40)
 @given(st.integers(0, 2**32 - 1), st.tuples(*[st.integers(1, 40)] * 2))
-def test_seeds_of_any_view_lie_behind_what_is_seen(seed: int, size: tuple[int, int]) -> None:
+def test_seeds_lie_behind_visible_surfaces(seed: int, size: tuple[int, int]) -> None:
     features, camera = ViewFeatures.of(random_view(seed, *size)), Camera.from_focal(25, size[1], size[0])
     seeds = make_seeds(features, camera, camera)
     assert all(bool(t.isfinite().all()) for t in (seeds.uv, seeds.inverse_depth, seeds.slope, seeds.rgb))
@@ -40,7 +40,7 @@ def test_seeds_of_any_view_lie_behind_what_is_seen(seed: int, size: tuple[int, i
         assert torch.equal(getattr(chosen, name), getattr(seeds, name)[features.mask])
 
 
-def test_the_photos_frame_is_found_point_by_point() -> None:
+def test_inside_photo_matches_projected_points() -> None:
     photo = Camera.from_focal(25, 40, 30)
     camera = photo.looking(torch.tensor([0.4, -0.2, 0.1]), torch.tensor([0.1, 0.2, 3.0]))
     inverse = 0.1 + torch.rand(15, 20, generator=torch.Generator().manual_seed(0))
@@ -50,7 +50,7 @@ def test_the_photos_frame_is_found_point_by_point() -> None:
     assert torch.equal(inside_photo(inverse, camera, photo), expected)
 
 
-def test_where_nothing_is_seen_seeds_make_a_grey_wall() -> None:
+def test_seeds_of_an_empty_view_are_a_grey_wall() -> None:
     camera = Camera.from_focal(20, 5, 3)
     seeds = make_seeds(ViewFeatures.of(Rendering(torch.zeros(3, 5, 3), *torch.zeros(2, 3, 5))), camera, camera)
     assert (seeds.uv.shape, seeds.uv[1, 2].tolist()) == ((2, 3, 2), [5.0, 3.0])
@@ -69,7 +69,7 @@ def room() -> tuple[ViewFeatures, Tensor, Tensor]:
     return ViewFeatures(rgb * ~mask[..., None], ~mask / depth, (~mask).float(), mask), 1 / depth, floor
 
 
-def test_beyond_the_border_a_floor_stays_level_and_a_wall_a_wall() -> None:
+def test_floor_and_wall_are_extended_beyond_the_border() -> None:
     features, inverse_depth, floor = room()
     seeds, beyond = make_seeds(features, VIEW, PHOTO), features.mask
     assert float(beyond.float().mean()) > 0.2
@@ -82,7 +82,7 @@ def test_beyond_the_border_a_floor_stays_level_and_a_wall_a_wall() -> None:
     assert float((within.inverse_depth - 1).abs().max()) < 0.02  # the photo's own view has no border
 
 
-def test_what_is_nearer_than_the_border_is_not_extended() -> None:
+def test_nearer_objects_are_not_extended_beyond_the_border() -> None:
     features, _, _ = room()
     near, edge = torch.zeros_like(features.mask), int((~features.mask[20]).nonzero().max())
     near[20:28, edge - 10 : edge + 6] = True  # in front of the wall, across the photo's border

@@ -69,7 +69,7 @@ def paper(base: Gaussians, camera: Camera, photo: Camera, f_res: ResidualNet) ->
 
 
 @pytest.mark.parametrize("size", [(48, 36), (47, 35)])
-def test_a_view_is_completed_as_the_equations_say(size: tuple[int, int]) -> None:
+def test_a_completed_view_matches_the_equations(size: tuple[int, int]) -> None:
     scene = box_before_wall(width=size[0], height=size[1], focal=40)
     base, network = scene.base(), random_network()
     camera = extremes(scene.camera, 0.3, DepthRange.of(base))[1]
@@ -87,7 +87,7 @@ def test_a_view_is_completed_as_the_equations_say(size: tuple[int, int]) -> None
     assert float((found.alpha - final.alpha).abs().mean()) < 1e-3
 
 
-def test_cells_are_as_many_as_holes_and_the_paper_keeps_64() -> None:
+def test_the_number_of_gaussians_matches_the_paper() -> None:
     scene = box_before_wall(width=96, height=72)
     base, size = scene.base(), 48 * 36
     for side, disparity in ((0, 0.2), (1, 0.5)):
@@ -99,7 +99,7 @@ def test_cells_are_as_many_as_holes_and_the_paper_keeps_64() -> None:
 
 
 @pytest.mark.parametrize("name", ["unet", "sharp-decoder"])
-def test_without_holes_or_network_there_is_nothing_or_the_seeds(name: str) -> None:
+def test_no_holes_give_nothing_and_no_network_the_seeds(name: str) -> None:
     scene = box_before_wall(width=48, height=36, focal=40)
     base = scene.base()
     assert len(complete_view(base, scene.camera, scene.camera, CPU, None)) == 0
@@ -116,7 +116,7 @@ SEEDS = Seeds(UV, 0.1 + DRAWN[:, 2], 0.01 * (DRAWN[:, 3:5] - 0.5), 0.1 + 0.8 * D
 BEFORE = compose(SEEDS, None, VIEW)
 
 
-def test_no_deltas_and_zero_deltas_both_give_the_seeds() -> None:
+def test_zero_deltas_give_the_seeds() -> None:
     zeros = torch.zeros(20, DELTA_CHANNELS)
     for one, other in zip(BEFORE.tensors, compose(SEEDS, zeros, VIEW).tensors, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)

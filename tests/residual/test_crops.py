@@ -40,7 +40,7 @@ def test_each_masked_cell_is_in_one_crop_with_a_margin(
     assert sum(outer.area for _, outer in pairs) <= mask.numel()
 
 
-def test_crops_give_what_the_whole_picture_gives() -> None:
+def test_crops_give_the_deltas_of_the_whole_view() -> None:
     depth = torch.full((96, 640), 4.0)
     depth[20:70, 40:90] = 2.0  # a board in front of a long wall
     scene = Scene(texture(96, 640), depth, Camera.from_focal(500, 640, 96))

@@ -47,7 +47,7 @@ def row_of(first: int, last: int, depth: Tensor) -> tuple[list[int], list[int], 
     return rgb, mirrored, rim.distance[5, mask[5]].int().tolist()
 
 
-def test_after_a_sideways_move_a_row_extends_its_farther_side() -> None:
+def test_a_sideways_move_finds_the_farther_side_of_a_row() -> None:
     right, ones = torch.arange(WIDTH) >= 8, torch.ones(WIDTH)
     assert row_of(8, 11, torch.where(right, 0.5, 0.1)) == ([7] * 4, [6, 5, 4, 3], [1, 2, 3, 4])
     assert row_of(8, 11, torch.where(right, 0.5, 1.0)) == ([12] * 4, [16, 15, 14, 13], [4, 3, 2, 1])
@@ -83,7 +83,7 @@ def plain_rim(mask: Tensor, depth: Tensor, rgb: Tensor, camera: Camera) -> tuple
 
 
 @pytest.mark.parametrize("eye", [SIDEWAYS, (-0.2, 0.31, 0.0), (0.1, -0.05, 0.6), (0.013, 0.007, -0.5)])
-def test_any_move_agrees_with_a_plain_walk(eye: tuple[float, float, float]) -> None:
+def test_any_move_matches_a_plain_walk(eye: tuple[float, float, float]) -> None:
     generator = torch.Generator().manual_seed(3)
     mask = torch.rand(HEIGHT, WIDTH, generator=generator) < 0.6
     depth = 0.1 + torch.rand(HEIGHT, WIDTH, generator=generator)

@@ -27,7 +27,7 @@ from spackle.training.residual import first_network
 ARCHITECTURES = ("unet", "sharp-decoder")
 
 
-def test_a_hole_is_where_alpha_is_below_the_threshold() -> None:
+def test_hole_mask_and_ratio() -> None:
     alpha = torch.tensor([[0.0, 0.9499, 0.95, 1.0]])
     assert hole_mask(alpha).tolist() == [[True, True, False, False]]
     assert (hole_area_ratio(alpha), hole_area_ratio(alpha, threshold=0.5)) == (0.5, 0.25)
@@ -75,7 +75,7 @@ def test_the_network_takes_any_size_and_does_not_mix_a_batch(name: str, size: tu
     torch.testing.assert_close(deltas, alone, rtol=1e-3, atol=1e-4)
 
 
-def test_the_networks_input_knows_no_unit_of_length() -> None:
+def test_the_networks_input_does_not_depend_on_the_unit() -> None:
     context, camera = box_view()
     view, found = CPU.render(context.base, camera), []
     for unit in (1.0, 1000.0):
@@ -90,7 +90,7 @@ def test_the_networks_input_knows_no_unit_of_length() -> None:
 
 
 @pytest.mark.parametrize("name", ARCHITECTURES)
-def test_a_file_says_its_architecture_and_gives_the_same_network(name: str, tmp_path: Path) -> None:
+def test_a_loaded_network_equals_the_saved_one(name: str, tmp_path: Path) -> None:
     network, path = random_network(name=name).half().float().eval(), tmp_path / "weights.safetensors"
     channels_last(network)  # the memory format of loaded networks, so that sums have one order
     tensors = {key: value.half().contiguous() for key, value in network.state_dict().items()}
@@ -109,7 +109,7 @@ def test_a_file_says_its_architecture_and_gives_the_same_network(name: str, tmp_
             load_residual(path)
 
 
-def test_the_photo_is_seen_where_a_cells_point_lies_in_it() -> None:
+def test_colours_of_the_photo_at_projected_points() -> None:
     camera = Camera.from_focal(40, 64, 48)
     pose = torch.eye(4)
     pose[0, 3] = -0.8  # at two metres, a shift of 16 pixels or 8 cells
@@ -121,7 +121,7 @@ def test_the_photo_is_seen_where_a_cells_point_lies_in_it() -> None:
     assert not seen[:, 24:].any()
 
 
-def test_the_paper_architecture_starts_as_sharps_decoder(made: dict[str, Path]) -> None:
+def test_the_papers_network_starts_with_sharps_decoder(made: dict[str, Path]) -> None:
     network = first_network("sharp-decoder", made["sharp"])
     assert isinstance(network, SharpDecoder)
     theirs = read_tensors(made["sharp"], "give others")

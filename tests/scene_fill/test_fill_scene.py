@@ -39,7 +39,7 @@ def path_of(
 
 
 @pytest.mark.parametrize("network", [False, True])
-def test_a_completed_view_is_that_of_drawing_everything(network: bool) -> None:
+def test_a_completed_view_equals_a_full_rendering(network: bool) -> None:
     context, camera = box_view(0.4)
     context = dataclasses.replace(context, network=random_network() if network else None)
     filled = fill_view(context, camera)
@@ -51,7 +51,7 @@ def test_a_completed_view_is_that_of_drawing_everything(network: bool) -> None:
 
 @pytest.mark.parametrize(("size", "network"), [((64, 48), False), ((63, 47), True)])
 @pytest.mark.parametrize("empty", [False, True])
-def test_a_view_of_nothing_at_all_becomes_a_wall(size: tuple[int, int], network: bool, empty: bool) -> None:
+def test_an_empty_view_is_filled_with_a_wall(size: tuple[int, int], network: bool, empty: bool) -> None:
     scene = wall(4.0, *size)
     base, camera = (Gaussians.empty(), scene.camera) if empty else (scene.base(), away(scene.camera))
     aux = fill_view(FillContext(base, scene.camera, CPU, UNet() if network else None), camera).aux
@@ -60,7 +60,7 @@ def test_a_view_of_nothing_at_all_becomes_a_wall(size: tuple[int, int], network:
     assert holes_of(camera, base, aux) < 0.01
 
 
-def test_the_widest_view_comes_first_and_a_beginning_is_spread() -> None:
+def test_the_order_of_views() -> None:
     camera = Camera.from_focal(50, 40, 30)
     order = farthest_first([shifted(camera, x) for x in (-1.0, -0.2, 0.0, 0.6, 1.1)], camera)
     assert order == [4, 0, 3, 1, 2]  # the photo's camera counts as visited
@@ -81,7 +81,7 @@ def test_no_aux_gaussian_of_a_scene_hides_the_photo() -> None:
     assert bool((z[inside] > depth[y[inside], x[inside]] * 1.0005).all())
 
 
-def test_an_underlay_is_hidden_and_closes_neighbours_holes() -> None:
+def test_an_underlay_is_hidden_and_closes_holes_of_neighbours() -> None:
     context, _ = box_view(width=160, height=120)
     path = path_of(context)
     index = farthest_first(path, context.photo_camera)[0]
@@ -111,7 +111,7 @@ def test_an_underlay_is_hidden_and_closes_neighbours_holes() -> None:
     assert len(fill_scene(context, [camera] * 2, exact=True).aux) > len(alone)
 
 
-def test_no_underlay_is_seen_in_the_other_views_holes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_underlay_is_not_visible_in_the_opposite_view(monkeypatch: pytest.MonkeyPatch) -> None:
     green = torch.tensor([0.0, 1.0, 0.0])
 
     def painted(*given: Any) -> Gaussians:
@@ -134,7 +134,7 @@ def test_no_underlay_is_seen_in_the_other_views_holes(monkeypatch: pytest.Monkey
     assert float((found[:, 1] > found[:, ::2].amax(-1)).float().mean()) < 0.01
 
 
-def test_an_underlay_shows_nowhere_beyond_the_photos_border(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_underlay_is_not_visible_beyond_the_border(monkeypatch: pytest.MonkeyPatch) -> None:
     context, _ = box_view()
     sides = extremes(context.photo_camera, 0.6, DepthRange.of(context.base))
     aux = fill_scene(context, sides, exact=True).aux
@@ -164,7 +164,7 @@ class Counting(CpuRenderer):
 
 
 @pytest.mark.parametrize("kind", ["rotate-forward", "rotate", "swipe"])
-def test_every_second_frame_is_visited_and_all_are_closed(kind: TrajectoryKind) -> None:
+def test_half_of_the_frames_are_visited_and_all_are_filled(kind: TrajectoryKind) -> None:
     counting, calls = Counting(), list[tuple[int, int]]()
     context = dataclasses.replace(box_view(width=160, height=120)[0], renderer=counting)
     path = path_of(context, kind)
@@ -189,7 +189,7 @@ def test_every_second_frame_is_visited_and_all_are_closed(kind: TrajectoryKind) 
     assert all(any(camera is seen for seen in counting.cameras) for camera in path[::5])
 
 
-def test_motorcycle_is_closed_and_nothing_that_was_seen_changes() -> None:
+def test_motorcycle_is_filled_and_visible_pixels_stay() -> None:
     pair, found = motorcycle(), motorcycle_base()
     context = FillContext(found.gaussians, found.camera, CPU)
     aux = fill_view(context, pair.right).aux

@@ -97,7 +97,7 @@ def test_pushing_matches_a_plain_loop(seed: int) -> None:
         assert torch.equal(getattr(found, name), getattr(aux, name)[kept])
 
 
-def test_nothing_is_pushed_without_a_reason() -> None:
+def test_visible_gaussians_are_not_moved() -> None:
     aux, eye = random_aux(5, 0), torch.zeros(3)
     assert same_bits(push_behind(aux, eye, []), aux)
     guard = OcclusionGuard(Camera.from_focal(20, 16, 12), torch.full((12, 16), 5.0))
@@ -108,7 +108,7 @@ def test_nothing_is_pushed_without_a_reason() -> None:
 
 @PROPERTY
 @given(SEEDS, st.floats(0.2, 1))
-def test_pits_are_closed_as_a_plain_loop_closes_them(seed: int, share: float) -> None:
+def test_closing_of_depths_matches_a_plain_loop(seed: int, share: float) -> None:
     generator = torch.Generator().manual_seed(seed)
     depth, cells = 1 + torch.rand(9, 75, generator=generator), torch.rand(9, 75, generator=generator) < share
     cells[0, 0] = True

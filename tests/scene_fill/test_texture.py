@@ -30,7 +30,7 @@ from spackle.surface import PIXEL_SPREAD
 
 
 @pytest.mark.parametrize("period", [4.0, 6.0, 8.0])  # pixels
-def test_sharpened_blobs_make_up_for_their_overlap(period: float) -> None:
+def test_sharpening_balances_overlap(period: float) -> None:
     """The wall is rough, because rows of Gaussians at increasing depth would shift the image."""
     camera = Camera.from_focal(80, 96, 72)
     uv = camera.pixel_centers()
@@ -67,7 +67,7 @@ def ramp(height: int, width: int) -> Tensor:
 
 
 @pytest.mark.parametrize(("size", "threshold"), [((96, 72), 0.95), ((95, 71), 0.98)])
-def test_a_painted_picture_is_asked_for_once_and_seen(size: tuple[int, int], threshold: float) -> None:
+def test_painted_textures_are_visible(size: tuple[int, int], threshold: float) -> None:
     context, camera = box_view(0.3, width=size[0], height=size[1])
     painter = Paint(InpainterOptions())
     texture = functools.partial(painted_texture, painter)
@@ -107,7 +107,7 @@ def flat_view(mask: Tensor, rgb: Tensor, pixels: Tensor, beyond: Tensor, matches
     return HoleView(Rendering(pixels, flat, flat), features, seeds, rim, patches, torch.full_like(rgb, 0.5))
 
 
-def test_the_texture_leaves_low_frequencies_to_the_structure() -> None:
+def test_texture_has_no_low_frequencies() -> None:
     view, _, _ = hole_view()
     bad = dataclasses.replace(view.patches, mismatch=view.patches.mismatch + 100)
     found, plain = (exemplar_texture(dataclasses.replace(view, patches=patches)) for patches in (view.patches, bad))
@@ -117,7 +117,7 @@ def test_the_texture_leaves_low_frequencies_to_the_structure() -> None:
     assert torch.equal(room.in_cells(plain)[~mask], room.in_cells(view.rendering.rgb)[~mask])
 
 
-def test_beyond_the_border_the_nearest_cells_are_extended() -> None:
+def test_colours_at_the_border_are_extended() -> None:
     view, context, camera = hole_view()
     features, seeds, beyond = view.features, view.seeds, view.rim.beyond
     uv, z = context.photo_camera.project(camera.unproject(seeds.uv, 1 / seeds.inverse_depth))
@@ -133,7 +133,7 @@ def test_beyond_the_border_the_nearest_cells_are_extended() -> None:
     assert float(changed[far].mean()) < 0.3 * float(changed[near].mean())
 
 
-def test_texture_is_no_stronger_than_what_is_around_the_hole() -> None:
+def test_texture_is_no_stronger_than_around_the_hole() -> None:
     """Of a plain and a rough wall, only the rough wall gets strong noise."""
     mask = torch.zeros(48, 96, dtype=torch.bool)
     mask[16:32, 12:36] = mask[16:32, 60:84] = True
@@ -147,7 +147,7 @@ def test_texture_is_no_stronger_than_what_is_around_the_hole() -> None:
     assert float(factors.max()) <= 1
 
 
-def test_blocks_are_those_of_the_matches_around_a_cell() -> None:
+def test_blocks_are_weighted_means_of_matches() -> None:
     subject, rng = Subject(24, 31), np.random.default_rng(3)
     places, costs = np.full((24, 31, 3), -1, np.int32), np.zeros((24, 31), np.float32)
     places[tuple(subject.cells.T)], costs[tuple(subject.cells.T)] = subject.places, subject.costs

@@ -78,7 +78,7 @@ def weights_of(file: Path) -> dict[str, Tensor]:
     return TunableSharp.load(file, torch.float32, CPU).network.state_dict()
 
 
-def test_the_first_views_are_those_of_the_dataset(place: Path) -> None:
+def test_untrained_views_equal_the_datasets_views(place: Path) -> None:
     base = TunableSharp.load(place / "sharp.safetensors", torch.float32, CPU)
     group = DatasetFiles(place / "data")[0]
     views = [group.view(index) for index in range(group.views)]
@@ -91,7 +91,7 @@ def test_the_first_views_are_those_of_the_dataset(place: Path) -> None:
     assert torch.equal(batch.alpha < 0.95, batch.hole)
 
 
-def test_the_loss_falls_and_nothing_but_the_decoder_changes(place: Path, tmp_path: Path) -> None:
+def test_the_loss_falls_and_only_the_decoder_changes(place: Path, tmp_path: Path) -> None:
     options = ("data.views=1", "optim.steps=6", "optim.lr=2e-3", "optim.min_lr=2e-3", "optim.ema=0")
     losses = losses_of(train(place, tmp_path / "out", *options))
     assert sum(losses[-2:]) < 0.7 * sum(losses[:2])
@@ -102,7 +102,7 @@ def test_the_loss_falls_and_nothing_but_the_decoder_changes(place: Path, tmp_pat
     assert sum(not name.startswith(PARTS) for name in before) > 100
 
 
-def test_a_run_leaves_weights_that_predict_pictures_and_a_report(place: Path, whole: Path, tmp_path: Path) -> None:
+def test_results_of_a_run(place: Path, whole: Path, tmp_path: Path) -> None:
     report = json.loads((whole / "run.json").read_text())
     assert (report["method"], report["ended"], report["step"]) == ("direct-ft", "steps", 4)
     assert report["checkpoint"]["sha256"] == hashlib.sha256((place / "sharp.safetensors").read_bytes()).hexdigest()
@@ -118,7 +118,7 @@ def test_a_run_leaves_weights_that_predict_pictures_and_a_report(place: Path, wh
 
 
 @pytest.mark.slow
-def test_two_processes_find_the_gradient_of_one(place: Path, tmp_path: Path) -> None:
+def test_two_processes_compute_the_gradient_of_one(place: Path, tmp_path: Path) -> None:
     """Each process adds the gradients of two photos."""
     options = ["optim.steps=1", "optim.batch=16", "run.validate_every=1"]
     run_two(arguments(place, tmp_path / "two", *options))
@@ -130,7 +130,7 @@ def test_two_processes_find_the_gradient_of_one(place: Path, tmp_path: Path) -> 
     assert float((mine - yours).norm()) < 1e-3 * float(mine.norm())
 
 
-def test_a_step_has_the_own_view_and_a_photo_teaches_or_judges(place: Path) -> None:
+def test_views_of_a_step_and_division_of_photos(place: Path) -> None:
     drawn = [drawn_views([0, step], VIEWS) for step in range(20)]
     assert all(views[0] == 0 and len(set(views)) == VIEWS_AT_ONCE for views in drawn)
     assert {view for views in drawn for view in views} == set(range(VIEWS))
@@ -154,9 +154,7 @@ def test_a_step_has_the_own_view_and_a_photo_teaches_or_judges(place: Path) -> N
         (["--method", "residual"], "sharp.safetensors: --method residual learns without a base"),
     ],
 )
-def test_what_cannot_be_trained_is_said_in_a_line(
-    place: Path, whole: Path, tmp_path: Path, options: list[str], said: str
-) -> None:
+def test_unusable_input_is_refused(place: Path, whole: Path, tmp_path: Path, options: list[str], said: str) -> None:
     for key, name in (("base", "rgbd"), ("inpainter", "geometry")):
         if f"{{place}}/{name}" in str(options):
             manifest = load_manifest(shutil.copytree(place / "data", place / name))
@@ -168,7 +166,7 @@ def test_what_cannot_be_trained_is_said_in_a_line(
     assert not (tmp_path / "out").exists()
 
 
-def test_without_c_sharp_comes_from_the_folder_of_weights(
+def test_the_default_checkpoint_is_the_downloaded_one(
     place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("SPACKLE_WEIGHTS", str(tmp_path / "weights"))
@@ -179,7 +177,7 @@ def test_without_c_sharp_comes_from_the_folder_of_weights(
     assert run(*words, "optim.steps=1").code == 0
 
 
-def test_a_folder_belongs_to_one_method_and_one_network(place: Path, whole: Path, tmp_path: Path) -> None:
+def test_a_folder_with_another_method_or_network_is_refused(place: Path, whole: Path, tmp_path: Path) -> None:
     out = shutil.copytree(whole, tmp_path / "out")
     done = run("train", "--recipe", place / "recipe.yaml", "-o", out, "data.cells=16")
     refuses(done, f"{out}: holds a run with other settings (--method")

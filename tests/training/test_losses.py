@@ -111,7 +111,7 @@ def test_perceptual_sums_feature_and_gram_terms_of_layers(factors: tuple[float, 
 
 
 @pytest.mark.parametrize(("size", "seen"), [(4, (3, 4)), (16, (12, 16)), (None, (6, 8))])
-def test_perceptual_resizes_and_looks_only_near_the_hole(size: int | None, seen: tuple[int, int]) -> None:
+def test_perceptual_resizes_and_compares_only_near_the_hole(size: int | None, seen: tuple[int, int]) -> None:
     sizes = []
 
     class Watching(Pixels):
@@ -239,7 +239,7 @@ def test_squeezenet_has_caffes_sizes_and_input(squeezed: dict[str, np.ndarray], 
     np.testing.assert_allclose(squeezenet(image[None])[0][0, :, 4, 9].numpy(), cell, rtol=1e-4, atol=1e-3)
 
 
-def test_what_is_not_a_networks_weights_is_refused(squeezed: dict[str, np.ndarray], tmp_path: Path) -> None:
+def test_files_of_other_networks_are_refused(squeezed: dict[str, np.ndarray], tmp_path: Path) -> None:
     def refused(name: Any, path: Path | None, said: str) -> None:
         with pytest.raises(InputError, match=rf"(?=.*{re.escape(said)})(?=.*{re.escape(str(path or ''))})"):
             load_features(name, path)

@@ -18,7 +18,7 @@ PLAIN = "loss: {features: none}"
 
 
 @pytest.mark.parametrize("name", ["cpu", "direct_ft", "paper", "reverse_view"])
-def test_packaged_recipes_have_the_papers_weights_but_cpu(name: str) -> None:
+def test_packaged_recipes(name: str) -> None:
     recipe = load_recipe(Recipe, name, ["loss.features_path=weights"])
     papers = {"color": 10, "alpha": 0.5, "perceptual": 1, "preserve": 5, "color_blur": 0, "gram": 1}
     assert (vars(recipe.loss).items() >= papers.items()) == (name != "cpu")
@@ -30,7 +30,7 @@ def test_packaged_recipes_have_the_papers_weights_but_cpu(name: str) -> None:
         assert (recipe.loss.features, recipe.loss.feature_size, recipe.data.views) == ("resnet50", 512, 20_000)
 
 
-def test_resnet50_comes_from_the_folder_of_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_resnet50_is_found_in_the_folder_of_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SPACKLE_WEIGHTS", str(tmp_path))
     assert load_recipe(Recipe, "paper").loss.features_file is None
     fetched = tmp_path / published_weights("features").file
@@ -38,7 +38,7 @@ def test_resnet50_comes_from_the_folder_of_weights(tmp_path: Path, monkeypatch: 
     assert load_recipe(Recipe, "paper").loss.features_file == fetched
 
 
-def test_a_command_overrides_the_recipes_file(tmp_path: Path) -> None:
+def test_overrides(tmp_path: Path) -> None:
     text = """
         data:
           photos: some/photos
@@ -70,7 +70,7 @@ def test_a_command_overrides_the_recipes_file(tmp_path: Path) -> None:
         ("data: {rgbd: []}", "data.rgbd.0.folder=a", "data.rgbd.0.folder=a: no place for it"),
     ],
 )
-def test_what_cannot_be_is_named_with_its_file_or_option(
+def test_bad_values_are_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, override: str, named: str
 ) -> None:
     monkeypatch.setenv("SPACKLE_WEIGHTS", str(tmp_path))
@@ -84,7 +84,7 @@ def test_what_cannot_be_is_named_with_its_file_or_option(
         load_recipe(Recipe, "cpus")
 
 
-def test_runs_differ_by_what_is_learned_not_by_length(tmp_path: Path) -> None:
+def test_differences_ignore_the_length_of_a_run(tmp_path: Path) -> None:
     path = tmp_path / "recipe.yaml"
     path.write_text(PLAIN)
     one = load_recipe(Recipe, path).model_dump(mode="json")
@@ -96,7 +96,7 @@ def test_runs_differ_by_what_is_learned_not_by_length(tmp_path: Path) -> None:
     assert json.loads(json.dumps(one)) == one
 
 
-def test_learning_rate_and_average_follow_their_schedules() -> None:
+def test_schedules() -> None:
     optim = OptimRecipe(lr=1.0, min_lr=0.1, warmup=4, steps=14)
     assert [learning_rate(step, optim) for step in range(4)] == pytest.approx([0.25, 0.5, 0.75, 1])
     assert learning_rate(4, optim) == pytest.approx(1)
@@ -109,7 +109,7 @@ def test_learning_rate_and_average_follow_their_schedules() -> None:
 
 
 @pytest.mark.parametrize(("count", "batch"), [(10, 4), (3, 5)])
-def test_an_epoch_is_a_permutation_whatever_the_batch(count: int, batch: int) -> None:
+def test_an_epoch_is_a_permutation(count: int, batch: int) -> None:
     picks = [pick for step in range(count) for pick in samples_of_step(step, count, batch, seed=3)]
     epochs = [picks[start : start + count] for start in range(0, len(picks), count)]
     assert all(sorted(epoch) == list(range(count)) for epoch in epochs)

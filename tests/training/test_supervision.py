@@ -87,7 +87,7 @@ def reverse(scene: Scene, viewer: Camera) -> Sample:
 
 
 @pytest.mark.parametrize("eye", [(0.35, 0.0, 0.0), (-0.35, 0.0, 0.0), (0.25, -0.2, 0.15), (-0.2, 0.2, -0.3)])
-def test_holes_are_what_a_line_to_the_eye_says(eye: tuple[float, float, float]) -> None:
+def test_holes_are_pixels_hidden_from_the_virtual_camera(eye: tuple[float, float, float]) -> None:
     scene = box_before_wall()
     viewer = looking(scene.camera, *eye)
     behind, beside = hidden(scene, viewer), outside(scene, viewer)
@@ -99,7 +99,7 @@ def test_holes_are_what_a_line_to_the_eye_says(eye: tuple[float, float, float]) 
     assert not (~hole & outside(scene, viewer, margin=1)).any()
 
 
-def test_the_photos_camera_sees_no_hole_one_turned_away_no_base() -> None:
+def test_views_without_holes_or_without_base() -> None:
     scene, box, small = wall(), box_before_wall(), box_before_wall(width=31, height=64)
     closed, empty = reverse(scene, scene.camera), reverse(scene, away(scene.camera))
     assert not closed.hole.any()
@@ -111,9 +111,7 @@ def test_the_photos_camera_sees_no_hole_one_turned_away_no_base() -> None:
 
 @pytest.mark.parametrize(("near", "far", "axis"), [(3.0, 3.001, 1), (2.0, 6.0, 1), (1.5, 5.0, 0)])
 @pytest.mark.parametrize("eye", [(0.6, 0.0, 0.0), (0.0, 0.5, 0.0), (0.4, -0.3, 0.3)])
-def test_a_plane_seen_from_the_side_stays_closed(
-    near: float, far: float, axis: int, eye: tuple[float, float, float]
-) -> None:
+def test_a_slanted_plane_has_no_holes(near: float, far: float, axis: int, eye: tuple[float, float, float]) -> None:
     scene = slanted_plane(near, far, axis)
     viewer = looking(scene.camera, *eye)
     beside, hole = outside(scene, viewer), reverse(scene, viewer).hole
@@ -137,7 +135,7 @@ def whole(request: pytest.FixtureRequest) -> Sample:
 
 
 @pytest.mark.parametrize(("row", "column"), [(0, 0), (32, 48), (13, 27), (7, 20)])  # corners, and off the tiles' grid
-def test_a_completed_crop_is_a_part_of_the_completed_view(
+def test_a_completed_crop_equals_a_part_of_the_completed_view(
     whole: Sample, row: int, column: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     side = 24  # cells
@@ -192,7 +190,7 @@ def test_random_crops_have_holes_and_lie_within_the_picture(width: int, height: 
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 1.0])
 @pytest.mark.parametrize("size", [(1, 9), (7, 8), (8, 8), (14, 13)])
-def test_enough_cells_and_masked_ones_first(size: tuple[int, int], share: float) -> None:
+def test_training_cells(size: tuple[int, int], share: float) -> None:
     mask = torch.rand(size) < share
     alpha = (4 * torch.rand(size)).round() / 4  # many equal values
     cells = training_cells(ViewFeatures(torch.zeros(*size, 3), torch.zeros(size), alpha, mask))
@@ -208,7 +206,7 @@ PALETTE = torch.tensor([[0.9, 0.1, 0.1], [0.1, 0.8, 0.2], [0.2, 0.2, 0.9], [0.9,
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_a_cut_out_stands_before_what_it_covers(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cut_out_is_nearer_than_its_background(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     def composite(objects: int) -> tuple[Tensor, Tensor]:
         """A composite of photos with one colour each; more objects do not change earlier objects."""
         monkeypatch.setattr(sources, "OBJECTS", (objects, objects))
@@ -237,7 +235,7 @@ def test_a_cut_out_stands_before_what_it_covers(seed: int, monkeypatch: pytest.M
 # Files --------------------------------------------------------------------------------------------
 
 
-def test_a_sample_comes_back_small_and_shows_the_same(tmp_path: Path) -> None:
+def test_a_sample_file_is_small_and_renders_the_same(tmp_path: Path) -> None:
     scene = box_before_wall(width=272, height=204, focal=226)
     view, base = shifted(scene.camera.resized(192, 144), 0.4), scene.base()
     target = (255 * CPU.render(base, view).rgb).round() / 255
@@ -284,7 +282,7 @@ def fill(folder: Path, killed_at: int | None = None) -> tuple[list[str], list[fl
     return [file.name for file in files], asked
 
 
-def test_a_killed_fill_goes_on_to_the_same_files(tmp_path: Path) -> None:
+def test_making_samples_resumes_with_the_same_files(tmp_path: Path) -> None:
     def contents(folder: Path) -> dict[str, bytes]:
         return {file.name: file.read_bytes() for file in folder.iterdir()}
 
@@ -312,7 +310,7 @@ def pixels(photo: Path) -> Tensor:
 
 
 @pytest.mark.parametrize("unit_m", [0.001, 0.0002])
-def test_frames_of_a_depth_camera_have_their_units(tmp_path: Path, unit_m: float) -> None:
+def test_frames_of_a_depth_camera(tmp_path: Path, unit_m: float) -> None:
     stored = np.round(metres(96, 72) / unit_m).astype(np.uint16)
     stored[2:5, 2:5], stored[60:63, 80:83] = 0, 65535  # unknown
     color, depth = tmp_path / "frame-0.color.jpg", tmp_path / "frame-0.depth.png"
@@ -347,7 +345,7 @@ def write_stereo(folder: Path, width: int = 96, height: int = 72, **changes: Any
     return folder
 
 
-def test_a_pair_gives_the_right_photo_and_in_reverse_the_left(tmp_path: Path) -> None:
+def test_targets_of_a_stereo_pair(tmp_path: Path) -> None:
     folder = write_stereo(tmp_path, disparity="maps/left.npy")  # in another folder
     (folder / "maps").mkdir()
     (folder / "disparity.npy").rename(folder / "maps" / "left.npy")
@@ -382,7 +380,7 @@ def test_a_pair_gives_the_right_photo_and_in_reverse_the_left(tmp_path: Path) ->
         ({"disparity": "narrow.npy"}, "narrow.npy is 20×72 but photo"),
     ],
 )
-def test_a_pair_that_cannot_be_used_is_named(tmp_path: Path, changes: dict[str, Any], said: str) -> None:
+def test_unusable_pairs_are_refused(tmp_path: Path, changes: dict[str, Any], said: str) -> None:
     folder = write_stereo(tmp_path, **changes)
     write_photo(folder / "small.png", 32, 24)
     np.save(folder / "narrow.npy", np.full((72, 20), 4, np.float32))

@@ -79,7 +79,7 @@ def train(place: Path, output: Path, *more: str) -> Run:
     return run(*arguments(place, output, *more))
 
 
-def test_a_run_leaves_weights_pictures_and_a_report(whole: Path, done: Run) -> None:
+def test_results_of_a_run(whole: Path, done: Run) -> None:
     assert names_in(whole) >= {"checkpoint.pt", "best.safetensors", "last.safetensors", "run.json", "pictures"}
     report = json.loads((whole / "run.json").read_text())
     assert (report["ended"], report["step"]) == ("steps", 6)
@@ -96,9 +96,7 @@ def test_a_run_leaves_weights_pictures_and_a_report(whole: Path, done: Run) -> N
         assert all(name in events.read_bytes() for name in (b"train/color", b"train/lr", b"validation/har_after"))
 
 
-def test_the_papers_architecture_learns_from_sharps_and_predicts(
-    place: Path, made: dict[str, Path], tmp_path: Path
-) -> None:
+def test_the_papers_network_starts_from_sharp_and_predicts(place: Path, made: dict[str, Path], tmp_path: Path) -> None:
     out = tmp_path / "out"
     done = train(place, out, "network=sharp-decoder", f"init={made['sharp']}", "optim.steps=2")
     assert done.code == 0, done.err
@@ -114,7 +112,7 @@ def test_the_papers_architecture_learns_from_sharps_and_predicts(
     refuses(refused, "set network=sharp-decoder")
 
 
-def test_ctrl_c_leaves_a_checkpoint_that_leads_to_the_same_end(
+def test_a_run_resumes_after_ctrl_c_with_the_same_result(
     place: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out, rate = tmp_path / "out", training.learning_rate
@@ -134,7 +132,7 @@ def test_ctrl_c_leaves_a_checkpoint_that_leads_to_the_same_end(
     assert (out / "best.safetensors").read_bytes() == (whole / "best.safetensors").read_bytes()
 
 
-def test_a_folder_belongs_to_one_recipe_and_one_process(place: Path, out: Path) -> None:
+def test_a_folder_with_another_recipe_is_refused(place: Path, out: Path) -> None:
     with hold(out / ".lock"):
         assert "another run is at work" in train(place, out, "optim.steps=7").err
     refuses(train(place, out, "optim.lr=2e-3"), "holds a run with other settings (optim.lr)")
@@ -147,9 +145,7 @@ def test_a_folder_belongs_to_one_recipe_and_one_process(place: Path, out: Path) 
     refuses(train(place, out), "checkpoint.pt: cannot be read", "--overwrite starts anew")
 
 
-def test_a_run_without_improvement_ends_and_needs_no_tensorboard(
-    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_without_improvement_ends(place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "tensorboard", None)
     done = train(place, tmp_path / "out", "run.validate_every=1", "run.patience=2", "run.min_delta=100")
     assert (done.code, "pip install 'spackle-nvs[train]'" in done.err) == (0, True), done.err
@@ -157,7 +153,7 @@ def test_a_run_without_improvement_ends_and_needs_no_tensorboard(
     assert (report["ended"], report["best_step"], report["stale"]) == ("patience", 1, 2)
 
 
-def test_two_processes_learn_what_one_does(place: Path, tmp_path: Path) -> None:
+def test_two_processes_give_the_result_of_one(place: Path, tmp_path: Path) -> None:
     options = ["optim.steps=2", "optim.batch=4", "run.validate_every=2"]
     run_two(arguments(place, tmp_path / "two", *options))
     assert train(place, tmp_path / "one", *options).code == 0
@@ -177,7 +173,7 @@ def test_two_processes_learn_what_one_does(place: Path, tmp_path: Path) -> None:
         (["run.device=cuda"], "device 'cuda': torch finds no CUDA device"),
     ],
 )
-def test_what_cannot_be_trained_is_said_in_a_line(place: Path, tmp_path: Path, options: list[str], said: str) -> None:
+def test_unusable_input_is_refused(place: Path, tmp_path: Path, options: list[str], said: str) -> None:
     if options == ["run.device=cuda"] and torch.cuda.is_available():
         pytest.skip("there is a GPU")
     folders = {name: tmp_path / name for name in ("empty", "broken")}
@@ -190,7 +186,7 @@ def test_what_cannot_be_trained_is_said_in_a_line(place: Path, tmp_path: Path, o
     assert not (tmp_path / "out" / "checkpoint.pt").exists()
 
 
-def test_a_gradient_that_is_no_number_ends_the_run(place: Path, whole: Path, tmp_path: Path) -> None:
+def test_a_gradient_that_is_not_finite_ends_the_run(place: Path, whole: Path, tmp_path: Path) -> None:
     cache = shutil.copytree(place / "cache", tmp_path / "cache")
     for path in cache.glob("*/train/*.safetensors"):
         sample = load_sample(path)
@@ -202,7 +198,7 @@ def test_a_gradient_that_is_no_number_ends_the_run(place: Path, whole: Path, tmp
 
 
 @pytest.mark.parametrize("name", ["unet", "sharp-decoder"])
-def test_gradients_reach_the_whole_network_and_not_the_base(name: str) -> None:
+def test_gradients_reach_the_whole_network_but_not_the_base(name: str) -> None:
     scene = box_before_wall(width=96, height=80)
     base = Gaussians(*(t.clone().requires_grad_() for t in scene.base().tensors))
     view = shifted(scene.camera, 0.3)
@@ -216,7 +212,7 @@ def test_gradients_reach_the_whole_network_and_not_the_base(name: str) -> None:
     assert all(p.grad is not None and bool(p.grad.any()) for p in network.parameters())
 
 
-def test_the_loss_falls_on_samples_that_are_seen_again(place: Path, tmp_path: Path) -> None:
+def test_the_loss_falls(place: Path, tmp_path: Path) -> None:
     options = ("data.views=2", "optim.steps=12", "optim.warmup=0", "optim.min_lr=1e-4", "optim.ema=0.5")
     losses = losses_of(train(place, tmp_path / "out", *options))
     assert len(losses) == 12
