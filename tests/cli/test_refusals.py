@@ -54,7 +54,6 @@ PREDICT = [
 ]
 RENDER = [
     ("--focal-px inf", "--focal-px"),
-    ("--fov 60 --cameras views.json", "--fov"),
     ("-o film.avi", "film.avi: not a kind of video"),
     ("-o a.gif --format webm", "--format webm"),
     ("-o a.mp4 --cameras sizes.json", "sizes.json"),

@@ -1,4 +1,4 @@
-"""The command line: one thin function for each command, one file for each group."""
+"""The command line. Functions declare the options of commands; each imports its work when it runs."""
 
 from __future__ import annotations
 
@@ -13,55 +13,30 @@ import threading
 from typing import Annotated, NoReturn
 
 import typer
-from typer.core import TyperGroup
 from typer.exceptions import TyperException
 
 from spackle.cli import commands, dataset, evaluate, train, weights
 from spackle.cli.options import INTERRUPTED
 from spackle.errors import InputError, one_line
 
-EXAMPLES = (
-    ("spackle predict photo.jpg -o out", "a scene, a video, a report"),
-    ("spackle view photo.jpg", "look at it in the browser"),
-    ("spackle export out/photo/scene.ply -o photo.html", "one file to send"),
-)
-RESEARCH = ("train", "dataset", "evaluate", "tables", "figures", "bench")
-WIDTH = 80
-
-
-class Overview(TyperGroup):
-    """The command group; its help shows examples, then a line for each command, with the commands in RESEARCH last."""
-
-    def format_help(self, ctx: typer.Context, formatter: object) -> None:  # type: ignore[override]
-        """Write the help, in 24 lines of 80 characters."""
-        write = formatter.write  # type: ignore[attr-defined]
-        rows = [(name, command) for name in self.list_commands(ctx) if (command := self.get_command(ctx, name))]
-        indent = max(len(name) for name, _ in rows) + 4
-        write(f"{self.help}\n")
-        for line, meaning in EXAMPLES:
-            write(f"  {line:<50}{meaning}\n")
-        for title, wanted in (("Commands", False), ("Research", True)):
-            write(f"\n{title}:\n")
-            for name, command in rows:
-                if (name in RESEARCH) == wanted:
-                    write(f"  {name:<{indent - 2}}{command.get_short_help_str(WIDTH - indent)}\n")
-        write("\n-h after a command lists its options; --install-completion completes words in this shell.\n")
-
-
 app = typer.Typer(
     name="spackle",
-    cls=Overview,
-    help="One photo in, a 3D Gaussian scene out that survives a large camera move.",
+    help="""One photo in, a 3D Gaussian scene out that survives a large camera move.
+
+    \b
+    spackle predict photo.jpg -o out                     a scene, a video, a report
+    spackle view photo.jpg                               the scene in the browser
+    spackle export out/photo/scene.ply -o photo.html     one file to send
+    """,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    rich_markup_mode=None,  # its panels leave only a third of the width for the text
+    rich_markup_mode=None,  # panels would leave only a third of the width for the text
     # Users may type the names of options and choices with underscores.
     context_settings={
         "help_option_names": ["-h", "--help"],
         "token_normalize_func": lambda name: name.replace("_", "-"),
     },
 )
-
 
 app.command(short_help="Turn photos, or a clip, into completed scenes and videos")(commands.predict)
 app.command(short_help="View a scene, or a photo that becomes one, in the browser")(commands.view)
@@ -97,7 +72,7 @@ def everywhere(
 
 
 def main() -> None:
-    """Entry point: bad input is one line and exit code 2."""
+    """Entry point; bad input prints one line and ends with exit code 2."""
     # Otherwise idle threads of torch spin, which slows completion down by a factor of three to five on busy cores.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     # Otherwise the garbage collector scans the 200,000 objects of torch and numba too often.

@@ -15,15 +15,15 @@ from spackle.errors import InputError, check_name
 if TYPE_CHECKING:  # torch takes seconds to load
     from spackle.views import PathOptions
 
-INTERRUPTED = 130  # what shells report of a command that Ctrl-C ended
+INTERRUPTED = 130  # exit code after Ctrl-C, as shells report it
 
-# The names of `TrajectoryKind`; underscores are accepted, too: rotate_forward.
+# The names of `TrajectoryKind`.
 SharpTrajectoryName = Literal["swipe", "shake", "rotate", "rotate-forward"]
 TrajectoryName = Literal[SharpTrajectoryName, "vertical", "orbit", "dolly-zoom"]
 PrecisionName = Literal["auto", "fp32", "bf16"]
 DepthKindName = Literal["auto", "metric", "disparity", "near-white", "near-black"]
 PrecisionOption = Annotated[PrecisionName, typer.Option(help="Precision of the base's network.")]
-DeviceOption = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Where to compute.")]
+DeviceOption = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Device of networks and renderer.")]
 FovOption = Annotated[float | None, typer.Option(help="Horizontal field of view in degrees.")]
 HostOption = Annotated[
     str,
@@ -31,19 +31,19 @@ HostOption = Annotated[
 ]
 PortOption = Annotated[int, typer.Option(metavar="N", min=0, max=65535, help="Port of the server; 0: any free one.")]
 KeepFrameOption = Annotated[
-    bool, typer.Option("--keep-frame", help="Keep a scan's margin or letterbox bars, which are otherwise cropped.")
+    bool, typer.Option("--keep-frame", help="Keep a scan's margin or letterbox bars, which are cropped by default.")
 ]
 DepthKindOption = Annotated[
     DepthKindName,
     typer.Option(
         hidden=True,
-        help="What the numbers in --depth mean. metric: metres, or millimetres in a 16-bit PNG; disparity: that of a "
+        help="What the numbers in --depth mean. metric: metres, or millimetres in a 16-bit PNG; disparity: pixels of a "
         "calibrated pair; near-white: relative depth, near is bright, as MiDaS, Depth Anything and ComfyUI write it; "
-        "near-black: relative, near is dark. auto: metric, or a disparity map with its calibration beside it.",
+        "near-black: relative depth, near is dark. auto: disparity if there is a calibration, else metric.",
     ),
 ]
-JsonOption = Annotated[bool, typer.Option("--json", help="For scripts: print each result or error as a line of JSON.")]
-VerboseOption = Annotated[bool, typer.Option("-v", "--verbose", help="Say how long each stage takes.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print each result or error as a line of JSON.")]
+VerboseOption = Annotated[bool, typer.Option("-v", "--verbose", help="Print the duration of each stage.")]
 CheckpointOption = Annotated[
     Path | None, typer.Option("-c", "--checkpoint", metavar="FILE", help="Weights of sharp (or auto), moge or lite.")
 ]
@@ -52,15 +52,15 @@ SharpOption = Annotated[
     typer.Option(
         "--sharp",
         metavar="KEY=VALUE",
-        help="Speed of SHARP. windows=N: N of its 35 windows at once; 1 takes the least memory (default: 5, on a GPU "
-        "all). compile=yes: use torch.compile, which takes minutes once and pays off for many photos.",
+        help="Speed of SHARP. windows=N: compute N of the 35 windows at once; 1 takes the least memory (default: 5, on "
+        "a GPU all). compile=yes: use torch.compile, which takes minutes once and speeds up many photos.",
         hidden=True,
     ),
 ]
 
 
 def _help_all(context: typer.Context, asked: bool) -> None:
-    """Show the hidden options, too."""
+    """Print the help with hidden options."""
     if asked:
         for parameter in context.command.params:
             if isinstance(parameter, TyperOption):
@@ -109,7 +109,7 @@ def path_options(
     ] = None,
     cameras: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.json", hidden=True, help="Complete exactly these views instead of a path."),
+        typer.Option(metavar="FILE.json", hidden=True, help="Complete the views in a file instead of a path."),
     ] = None,
     frames: Annotated[int | None, typer.Option(hidden=True, help="Number of frames, instead of --seconds.")] = None,
     seconds: Annotated[
@@ -134,7 +134,7 @@ def path_options(
         typer.Option(
             metavar="SHARE",
             hidden=True,
-            help="Lengthen the lens by this fraction, so that most of what lies beyond the photo is not seen.",
+            help="Increase the focal length by this fraction, which hides most of the area beyond the photo's border.",
             show_default="0.05; 0 with --path and --cameras",
         ),
     ] = None,
@@ -145,7 +145,7 @@ def path_options(
     fit: Annotated[
         Literal["pad", "blur", "crop"],
         typer.Option(
-            hidden=True, help="How a view fits another aspect ratio in --size: black or blurred margins, or cropped."
+            hidden=True, help="How to reach the aspect ratio of --size: by black margins, blurred margins, or cropping."
         ),
     ] = "pad",
     show: Annotated[
@@ -159,7 +159,7 @@ def path_options(
     ipd: Annotated[
         float | None,
         typer.Option(
-            metavar="METRES", hidden=True, help="Distance of the two eyes.", show_default="chosen for the scene's depth"
+            metavar="METRES", hidden=True, help="Distance of the eyes.", show_default="chosen for the scene's depth"
         ),
     ] = None,
     convergence: Annotated[
@@ -167,12 +167,12 @@ def path_options(
         typer.Option(
             metavar="METRES",
             hidden=True,
-            help="Depth of what appears at the screen.",
-            show_default="that of what the path looks at",
+            help="Depth that appears in the plane of the screen.",
+            show_default="depth of the point that the camera looks at",
         ),
     ] = None,
 ) -> PathOptions:
-    """The options of camera path and video, as one value.
+    """Collect the options of camera path and video.
 
     Raises:
         InputError: an option would have no effect, because --path or --cameras sets the views.
@@ -182,16 +182,10 @@ def path_options(
     from spackle.views import PathOptions
 
     useless: dict[str, object] = {"--trajectory": trajectory, "--disparity": disparity, "--overscan": overscan}
-    if path is not None:
-        reason = f"--path {path}: is a camera path of its own"
-    elif cameras is not None:
-        reason = f"--cameras {cameras}: gives the views themselves"
-        useless |= {"--frames": frames, "--seconds": seconds}
-    else:
-        reason, useless = "", {}
+    useless |= {} if cameras is None else {"--frames": frames, "--seconds": seconds}
     for option, value in useless.items():
-        if value is not None:
-            raise InputError(f"{reason}: leave {option} {value} out")
+        if value is not None and (path, cameras) != (None, None):
+            raise InputError(f"{option} {value}: has no effect, because --path or --cameras sets the views")
     pixels = None if size is None else parse_size(size)
     video = VideoOptions(video_format, fps, loop, pixels, fit, show, stereo, ipd, convergence)
     kind, zoom = trajectory or "rotate-forward", OVERSCAN if overscan is None else overscan
@@ -199,7 +193,7 @@ def path_options(
 
 
 def with_path_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Add --help-all and the options of `path_options`, which the command gets as its one parameter `path`."""
+    """Add --help-all and the options of `path_options` to a command; it gets these options as the argument `path`."""
     declared, shared = (
         inspect.signature(function, eval_str=True, locals={"PathOptions": object}).parameters
         for function in (command, path_options)

@@ -34,12 +34,12 @@ LOOPBACK = "127.0.0.1"
 
 
 class Place(NamedTuple):
-    """Where the app listens, and whether a browser opens."""
+    """Address of the server."""
 
     host: str
     port: int  # 0: any free port
     token: str | None
-    browser: bool  # whether to open the page in one
+    browser: bool  # whether to open the page in a browser
 
 
 def view(
@@ -53,8 +53,10 @@ def view(
     """Show a scene or a photo, or an empty page, until the user stops the server; then delete all scenes.
 
     Depth, calibration and `lens` (`focal_px` and `fov`) belong to the target; `usual` (disparity, keep_frame,
-    depth_kind) holds for all photos that the page sends. InputError for a target that is neither photo nor scene, or an
-    option that cannot be used.
+    depth_kind) holds for all photos that the page sends.
+
+    Raises:
+        InputError: the target is neither photo nor scene, or an option cannot be used.
     """
     PathOptions(disparity=usual["disparity"]).check()  # type: ignore[arg-type]
     name = "Spackle"
@@ -91,8 +93,6 @@ def _checked(target: Path, settings: BaseSettings, lens: Mapping[str, float | No
     photo.check_shape()
     if settings.depth is not None:
         open_base(settings).load(photo)
-    if settings.checkpoint is not None:
-        check_file(settings.checkpoint, "file of weights")
     return target.name
 
 

@@ -1,4 +1,4 @@
-"""Compressed PLY, PlayCanvas's format: 16 bytes for each Gaussian, quantised within the bounds of its chunk of 256."""
+"""Compressed PLY, PlayCanvas's format: 16 bytes for each Gaussian, quantised within bounds that 256 Gaussians share."""
 
 from __future__ import annotations
 
@@ -31,12 +31,10 @@ _VERTEX_NAMES = ["packed_position", "packed_rotation", "packed_scale", "packed_c
 
 
 def encode_compressed_ply(scene: SceneFile) -> bytes:
-    """Encode a scene as a compressed PLY, in its own axes, with the same comments as `save_ply`.
+    """Encode a scene as a compressed PLY, in the same axes, with the same comments as `save_ply`.
 
-    The base's Gaussians stay first; within base and aux, neighbours in space become neighbours in the file.
-
-    Raises:
-        ValueError: a Gaussian is not finite.
+    The base's Gaussians come first; within base and aux, neighbours in space become neighbours in the file. ValueError
+    if a Gaussian is not finite.
     """
     columns, count, border = Columns.of(scene.gaussians), len(scene.gaussians), scene.base_count or 0
     order = np.concatenate([morton_order(columns.means[:border]), border + morton_order(columns.means[border:])])
@@ -60,10 +58,10 @@ def encode_compressed_ply(scene: SceneFile) -> bytes:
 
 
 def morton_order(means: Floats) -> NDArray[np.int64]:
-    """Indices [N] that order points [N, 3] along Morton's curve, which keeps neighbours together."""
+    """Indices [N] that sort points [N, 3] along Morton's curve, so that neighbours stay together."""
     if not len(means):
         return np.zeros(0, np.int64)
-    # Of logarithms: otherwise a single distant point would put all near ones into one cell.
+    # Logarithms, because a single distant point would otherwise put all near points into one cell.
     places = np.sign(means) * np.log1p(np.abs(means.astype(np.float64)))
     low = places.min(axis=0)
     span = np.maximum(places.max(axis=0) - low, 1e-30)
@@ -79,7 +77,7 @@ def _spread(bits: NDArray[np.uint32]) -> NDArray[np.uint32]:
 
 
 def _normalised(values: Floats, starts: NDArray[np.int64]) -> tuple[Floats, Floats]:
-    """Values [N, 3] as fractions 0..1 of their chunk's bounds, and the bounds [chunks, 6]: minima, then maxima."""
+    """Values [N, 3] as fractions 0..1 between their chunk's bounds, and the bounds [chunks, 6]: minima, maxima."""
     low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
     rows = np.arange(len(values)) // CHUNK
     wide = low.astype(np.float64)  # the bounds' difference may overflow float32
@@ -89,7 +87,7 @@ def _normalised(values: Floats, starts: NDArray[np.int64]) -> tuple[Floats, Floa
 
 
 def _packed(shares: Floats, widths: tuple[int, ...]) -> NDArray[np.uint32]:
-    """Pack fractions 0..1 [N, k] into words [N], each rounded to its number of bits; the first has the highest bits."""
+    """Pack fractions 0..1 [N, k] into words [N], each rounded to its number of bits; the first is the highest."""
     word = np.zeros(len(shares), np.uint32)
     for column, width in zip(shares.T, widths, strict=True):
         word = word << np.uint32(width) | np.round(column * np.float32(2**width - 1)).astype(np.uint32)
@@ -97,7 +95,7 @@ def _packed(shares: Floats, widths: tuple[int, ...]) -> NDArray[np.uint32]:
 
 
 def decode_compressed_ply(chunks: NDArray[Any], rows: NDArray[Any]) -> Columns:
-    """Decode Gaussians, in the file's order, from its two tables; ValueError if the tables do not fit together."""
+    """Decode Gaussians from a file's two tables; ValueError if the tables do not fit together."""
     if missing := set(_CHUNK_NAMES[:12]) - set(chunks.dtype.names or ()):
         raise ValueError(f"its chunks have no {min(missing)}")
     if len(chunks) * CHUNK < len(rows):
@@ -127,5 +125,5 @@ def _between(shares: Floats, chunks: NDArray[Any], names: list[str]) -> Floats:
     """The inverse of `_normalised`; `names` are the properties with the chunks' bounds: three minima, three maxima."""
     bounds = np.stack([chunks[name] for name in names], axis=1).astype(np.float64)
     low, high = np.split(bounds[np.arange(len(shares)) // CHUNK], 2, axis=1)
-    with np.errstate(over="ignore", invalid="ignore"):  # values that are not finite are counted later
+    with np.errstate(over="ignore", invalid="ignore"):  # `Columns.gaussians` refuses infinite values
         return (low + shares * (high - low)).astype(np.float32)

@@ -21,17 +21,17 @@ LARGEST_FILE = 2**32 - 1  # bytes that a .glb can announce
 ROW = 64  # bytes for each Gaussian
 FLOAT, UNSIGNED_SHORT, ARRAY_BUFFER, POINTS = 5126, 5123, 34962, 0
 UNMOVED = np.eye(4).ravel().tolist()
-NEAR_PLANE = 0.01  # of the photo's camera; glTF requires one, but Spackle does not use it
+NEAR_PLANE = 0.01  # glTF requires a near plane
 
 
 def encode_glb(scene: SceneFile) -> bytes:
     """Encode a scene as binary glTF, in the same order: y up, z backward, linear scales, sRGB colours as harmonics.
 
-    COLOR_0, linear by glTF's definition, lets viewers without the extension show points. The photo's camera becomes a
-    glTF camera; parameters that glTF cannot express, and the base's count, go into `extras`.
+    Viewers without the extension show points, with the linear colours of COLOR_0. The photo's camera becomes a glTF
+    camera. `extras` hold the base's count and the camera's parameters that glTF cannot express.
 
     Raises:
-        InputError: there are no Gaussians, or more than 4 GiB of them.
+        InputError: there are no Gaussians, or more than 4 GiB of Gaussians.
         ValueError: a Gaussian is not finite.
     """
     count = len(scene.gaussians)
@@ -51,7 +51,7 @@ def encode_glb(scene: SceneFile) -> bytes:
 
 
 def _attributes(columns: Columns) -> dict[str, NDArray[Any]]:
-    """The Gaussians' attributes, in the file's order; each has a multiple of four bytes."""
+    """The Gaussians' attributes; each has a multiple of four bytes."""
     linear = srgb_to_linear(torch.from_numpy(columns.srgb)).numpy()
     rgba = np.concatenate([linear, columns.opacities[:, None]], axis=1)
     return {

@@ -1,4 +1,4 @@
-"""Prepare a scene for the viewer's web page: a description, Gaussians of 20 bytes each, and the page as one file."""
+"""A scene for the page: a description, Gaussians of 20 bytes each, and the page as one file."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from spackle.formats.scene_files import smallest_three
 from spackle.gaussians import Gaussians
 
 SAMPLES = 121  # positions along a path, between which the page interpolates linearly
-USUAL, FOREIGN = 0.3, 0.6  # disparity limit if none is stored: of a completed scene, of another program's scene
-LEAST, MOST = 0.01, 1.0
+USUAL, FOREIGN = 0.3, 0.6  # disparity limit of a completed scene, and of another program's, if none is stored
+LEAST, MOST = 0.01, 1.0  # bounds of the disparity limit
 BYTES = 20  # byte planes: 9 of centres, 3 of scales, 4 of rotations, 3 of colours, 1 of opacity
-SMALLEST_SCALE, LARGEST_SCALE = 1e-7, 1e5  # scales are clamped, so that outliers do not cost the others precision
-BLOCK = 1 << 16  # Gaussians that are packed at a time, so few that they stay in the cache
+SMALLEST_SCALE, LARGEST_SCALE = 1e-7, 1e5  # bounds of scales, because an outlier would cost the others precision
+BLOCK = 1 << 16  # Gaussians that are packed at a time, which fit the cache
 
 STYLE = '<link rel="stylesheet" href="viewer.css">'
 SCRIPT = '<script src="viewer.js" defer></script>'
@@ -46,22 +46,22 @@ def page_scene(
 ) -> PageScene:
     """Prepare a scene for the page.
 
-    The description's `paths` hold two lists of eye positions [SAMPLES, 3] in metres for each trajectory. The eye is at
+    The description's `paths` have two lists of positions [SAMPLES, 3] in metres for each trajectory. The camera is at
     still + disparity · moving, because sideways motion grows with the disparity and forward motion does not.
 
     Args:
         name: the scene's name on the page.
         base: the base's Gaussians.
         aux: the Gaussians that completion added; may be empty.
-        camera: the photo's, at the world's origin.
+        camera: the photo's camera, at the world's origin.
         disparity: the disparity for which the scene was completed; it limits the page's camera.
-        note: a remark for the user; the part before the semicolon is always shown.
+        note: a note for the user; the page always shows the part before the semicolon.
 
     Raises:
         InputError: no Gaussian lies in front of the camera.
     """
     if not bool((base.means[:, 2] > 0).any()):
-        raise InputError(f"{name}: no Gaussian stands in front of the photo's camera: nothing can be shown")
+        raise InputError(f"{name}: no Gaussian lies in front of the photo's camera: nothing can be shown")
     depths = DepthRange.of(base)
     free = min(max((USUAL if len(aux) else FOREIGN) if disparity is None else disparity, LEAST), MOST)
     files, layers = {}, []
@@ -84,10 +84,7 @@ def page_scene(
 
 
 def _path(kind: TrajectoryKind, camera: Camera, depths: DepthRange) -> dict[str, list[list[float]]]:
-    """Eye positions at disparity 0 (`still`), and their change for a disparity of 1 (`moving`).
-
-    They are rounded to nine digits, which are precise enough and keep the page small.
-    """
+    """Camera positions at disparity 0 (`still`), and their change for a disparity of 1 (`moving`), in nine digits."""
     still, wide = (
         torch.stack([each.position for each in trajectory(kind, camera.to("cpu", torch.float64), far, depths, SAMPLES)])
         for far in (0.0, 1.0)
@@ -101,12 +98,12 @@ def encode_layer(gaussians: Gaussians) -> tuple[bytes, float, float]:
     """Pack N Gaussians for the page as byte planes, which compress well.
 
     Planes of N bytes each: x, y, z as the upper 24 bits of a float32, three planes each, lowest byte first; the
-    logarithms of the three scales; the index of the quaternion's largest component (wxyz), which is made positive, and
-    the other three components, ±127 for ±1/√2; red, green, blue in sRGB; opacity. Rounding off the last 8 bits moves a
-    centre by 2⁻¹⁶ of its distance to the photo's eye: a hundredth of a pixel.
+    logarithms of the three scales; the index of the quaternion's largest component (wxyz), which is made positive; the
+    other three components, ±127 for ±1/√2; red, green, blue in sRGB; opacity. 24 bits move a centre by at most 2⁻¹⁶ of
+    its distance to the photo's camera, which is a hundredth of a pixel.
 
     Returns:
-        The bytes [BYTES, N]; the logarithm of the scale for byte 0; the logarithm's increase for each step.
+        The bytes [BYTES, N]; the logarithm of the scale for byte 0; the increase of the logarithm per step.
     """
     means, quats, scales, opacities, colors = (t.detach().to("cpu", torch.float32) for t in gaussians.tensors)
     low, step = _scale_range(scales)
@@ -137,7 +134,7 @@ def _bytes(values: Tensor) -> NDArray[np.uint8]:
 
 
 def as_json(value: object) -> bytes:
-    """JSON in ASCII that is safe inside HTML, whatever strings it contains."""
+    """JSON in ASCII that is safe inside HTML."""
     text = json.dumps(value, allow_nan=False)
     for character in "<>&":
         text = text.replace(character, f"\\u{ord(character):04x}")
@@ -145,13 +142,13 @@ def as_json(value: object) -> bytes:
 
 
 def single_html(scene: PageScene) -> bytes:
-    """The page with a scene embedded, which opens from a disk or an e-mail and never fetches anything."""
+    """The page with a scene embedded; it opens from a disk or an e-mail and fetches nothing."""
     page, css, js = (page_file(name).decode() for name in ("index.html", "viewer.css", "viewer.js"))
     held = {name: base64.b64encode(gzip.compress(data, 6, mtime=0)).decode() for name, data in scene.files.items()}
     data = as_json({"description": scene.description, "files": held}).decode()
     style, script = f"<style>{css}</style>", f"<script>{js}</script>"
     embedded = f'<script type="application/json" id="spackle-scene">{data}</script>'
-    policy = (  # only these scripts and styles run, and the page fetches nothing
+    policy = (  # allows only these scripts and styles
         f"default-src 'none'; script-src {_digest(js)} 'wasm-unsafe-eval'; style-src {_digest(css)}; worker-src blob:; "
         "img-src data: blob:; media-src blob:; form-action 'none'; base-uri 'none'"
     )

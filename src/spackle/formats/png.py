@@ -15,7 +15,7 @@ from spackle.files import atomic_path
 
 
 def thumbnail(picture: Tensor, side: int) -> Tensor:
-    """Shrink an image [H, W, C] to at most `side` pixels on its longer side; a pixel is the mean of those it covers."""
+    """Shrink an image [H, W, C] to at most `side` pixels on its longer side, by averaging pixels."""
     height, width = picture.shape[:2]
     scale = min(1.0, side / max(height, width))
     size = max(1, round(height * scale)), max(1, round(width * scale))
@@ -45,4 +45,4 @@ def save_gray_png(gray: Tensor, path: str | os.PathLike[str]) -> None:
 
 def _save(image: Image.Image, path: str | os.PathLike[str]) -> None:
     with atomic_path(path) as temporary:
-        image.save(temporary, format="PNG", compress_level=4)  # takes half the time of level 6, for files 1 % larger
+        image.save(temporary, format="PNG", compress_level=4)  # level 6 takes twice the time for files 1 % smaller

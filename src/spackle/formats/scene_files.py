@@ -1,4 +1,4 @@
-"""Scene files: their content, and the formats in which scenes are written and read."""
+"""The content of scene files, and the table of formats."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ SMALLEST_QUAT = 1e-12  # a shorter quaternion has no direction
 
 @dataclasses.dataclass(frozen=True)
 class SceneFile:
-    """The content of a scene's file; most formats store only Gaussians."""
+    """The content of a scene file; most formats store only Gaussians."""
 
     path: Path
     gaussians: Gaussians
     camera: Camera | None = None  # the photo's
     base_count: int | None = None
-    disparity: float | None = None  # the disparity for which it was completed
-    harmonics: int = 0  # number of coefficients above degree 0 of each Gaussian, which are left out
+    disparity: float | None = None  # the disparity for which the scene was completed
+    harmonics: int = 0  # number of coefficients above degree 0 of each Gaussian, which are not read
 
     @property
     def untilted_camera(self) -> Camera | None:
-        """The camera if `at_origin`, else None: a PLY's comment stores no pose."""
+        """The camera if it is `at_origin`, else None, because a PLY's comment stores no pose."""
         return self.camera if self.camera is not None and at_origin(self.camera) else None
 
 
@@ -50,7 +50,7 @@ def at_origin(camera: Camera) -> bool:
 
 @dataclasses.dataclass(frozen=True)
 class Columns:
-    """N Gaussians as float32 NumPy columns, in the units that file formats share, and in the axes of their scene."""
+    """N Gaussians as float32 NumPy columns, in the units that file formats share."""
 
     means: Floats  # [N, 3]
     quats: Floats  # [N, 4] unit length, wxyz
@@ -61,25 +61,24 @@ class Columns:
     @staticmethod
     @torch.no_grad()
     def of(gaussians: Gaussians) -> Columns:
-        """Columns of a scene; colours are clamped to 0..1, and quaternions of length 0 become (1, 0, 0, 0).
+        """Convert a scene; colours are clamped to 0..1, and quaternions of length 0 become (1, 0, 0, 0).
 
-        Raises:
-            ValueError: a Gaussian is not finite.
+        ValueError if a Gaussian is not finite.
         """
         means, quats, scales, opacities, colors = (t.detach().to("cpu", torch.float32) for t in gaussians.tensors)
         for name, tensor in zip(vars(gaussians), (means, quats, scales.clamp(-1, 1), opacities, colors), strict=True):
-            if not torch.isfinite(tensor).all():  # a scale may be infinite: it is clamped to the largest one
+            if not torch.isfinite(tensor).all():  # infinite scales are clamped below
                 raise ValueError(f"{name} of these Gaussians are not all finite")
         quats = quats / quats.abs().amax(-1, keepdim=True).clamp_min(1.0)  # their squares may overflow
         norm = torch.linalg.vector_norm(quats, dim=-1, keepdim=True)
         unit = torch.where(norm < SMALLEST_QUAT, torch.tensor([1.0, 0, 0, 0]), quats / norm.clamp_min(SMALLEST_QUAT))
-        # NumPy's logarithm: torch's would be split among threads, and wait for them at every block of a PLY.
+        # NumPy's logarithm, because torch would start threads for every block of a PLY.
         log_scales = np.log(np.clip(scales.numpy(), SMALLEST_SCALE, LARGEST_SCALE))
         srgb = linear_to_srgb(colors).numpy()
         return Columns(means.numpy(), unit.numpy(), log_scales, opacities.clamp(0, 1).numpy(), srgb)
 
     def gaussians(self) -> Gaussians:
-        """The scene as Gaussians; ValueError if one is not finite."""
+        """Convert to Gaussians; ValueError if a Gaussian is not finite."""
         with np.errstate(over="ignore", invalid="ignore"):
             columns = self.means, self.quats, np.exp(self.log_scales), self.opacities, self.srgb
         count = len(self.means)
@@ -95,7 +94,7 @@ class Columns:
         return (self.srgb - np.float32(0.5)) / np.float32(SH_C0)
 
     def flipped(self) -> Columns:
-        """Turn by 180° about x, to y up and z backward, as in OpenGL and glTF."""
+        """Rotate the scene by 180° about x, so that y points up and z backward, as in OpenGL and glTF."""
         means, quats = self.means * _FLIP[1:], self.quats * _FLIP
         return dataclasses.replace(self, means=means, quats=quats)
 
@@ -110,8 +109,8 @@ OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # row k: a quat
 def smallest_three(quats: Floats) -> tuple[NDArray[np.int64], Floats]:
     """The index [N] of the largest component of unit quaternions [N, 4], and the other components [N, 3], in order.
 
-    A quaternion and its negative are the same rotation; the one whose largest component is positive is taken. That
-    component follows from the other three, which are at most √½.
+    Quaternions are negated if their largest component is negative, which does not change the rotation. The largest
+    component then follows from the other three, which are at most √½.
     """
     largest = np.abs(quats).argmax(axis=1)
     sign = np.where(np.take_along_axis(quats, largest[:, None], axis=1) < 0, np.float32(-1), np.float32(1))
@@ -147,7 +146,7 @@ SPLAT_ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 
 
 
 def encode_splat(scene: SceneFile) -> bytes:
-    """Encode a scene, in its order and axes, as a .splat file of antimatter15's viewer: only 32 bytes per Gaussian.
+    """Encode a scene as a .splat file of antimatter15's viewer, with 32 bytes per Gaussian, in the same order and axes.
 
     Colours, opacities and rotations are rounded to bytes. ValueError if a Gaussian is not finite.
     """
@@ -169,8 +168,7 @@ def decode_splat(data: bytes) -> Columns:
 
 
 Encoder = Callable[[SceneFile], bytes]
-# The module and function that encode each format, imported when a file is first written in it. A new format takes one
-# file and one line here. The first suffix that matches a name is used.
+# Module and function that encode each format; the first suffix that matches a file name counts.
 SCENE_ENCODERS = {
     ".compressed.ply": "spackle.formats.compressed_ply:encode_compressed_ply",
     ".ply": "spackle.formats.ply:encode_ply",
@@ -180,8 +178,7 @@ SCENE_ENCODERS = {
     ".glb": "spackle.formats.gltf:encode_glb",
 }
 
-
-# The function that decodes each format, as in SCENE_ENCODERS; .ply and .compressed.ply are read by `PlyFile`.
+# Module and function that decode each format; `PlyFile` reads .ply and .compressed.ply.
 SCENE_DECODERS = {
     ".spz": "spackle.formats.spz:decode_spz",
     ".splat": "spackle.formats.scene_files:decode_splat",
@@ -189,11 +186,11 @@ SCENE_DECODERS = {
 }
 SCENE_SUFFIXES = (".ply", *SCENE_DECODERS)
 STARTS = {b"ply": ".ply", b"\x1f\x8b": ".spz", b"PK": ".sog"}  # a .splat has no signature
-WRITTEN_ONLY = (".glb", ".html")
+WRITTEN_ONLY = (".glb", ".html")  # formats that Spackle writes and does not read
 
 
 def scene_kind(path: Path) -> str | None:
-    """The suffix of a file's format, found from its first bytes, else from its name; None if it is no scene."""
+    """The suffix of a scene's format, by the file's first bytes, else by its name; None if the file is no scene."""
     check_file(path, "scene")
     with open(path, "rb") as file:
         start = file.read(4)
@@ -205,7 +202,7 @@ def load_scene(path: Path) -> SceneFile:
     """Read a scene in any format of SCENE_SUFFIXES; InputError if the file has another format or is damaged."""
     kind = scene_kind(path)
     if kind in WRITTEN_ONLY:
-        raise InputError(f"{path}: {kind} files are written, not read: give the scene.ply that it was made of")
+        raise InputError(f"{path}: {kind} files cannot be read: give the scene.ply from which the file was exported")
     if kind not in SCENE_DECODERS:
         ply: SceneFile = import_module("spackle.formats.ply").PlyFile(path).scene()
         return ply
@@ -217,7 +214,7 @@ def load_scene(path: Path) -> SceneFile:
 
 
 def function_named(name: str) -> Any:
-    """Import a function by its name in a table, "module:function"."""
+    """Import the function "module:function"."""
     module, _, function = name.partition(":")
     return getattr(import_module(module), function)
 

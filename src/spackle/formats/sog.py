@@ -24,17 +24,17 @@ from spackle.formats.scene_files import (
     smallest_three,
 )
 
-LARGEST_SIDE = 16_380  # largest multiple of four that a WebP image's side can have
-LARGEST_MEMBER = 1 << 28  # bytes; a larger file in the archive is refused
+LARGEST_SIDE = 16_380  # of a WebP image, a multiple of four
+LARGEST_MEMBER = 1 << 28  # largest file in the archive, in bytes
 CODES = 256  # entries of a codebook
 BINS = 1 << 16  # bins into which values are sorted to build a codebook
 EVEN = 0.25  # fraction of the codes that are spaced evenly
-EFFORT = {"lossless": True, "exact": True, "quality": 25, "method": 1}  # exact: colours stay where opacity is 0
-EPOCH = (1980, 1, 1, 0, 0, 0)  # the archive's bytes do not depend on when it was made
+EFFORT = {"lossless": True, "exact": True, "quality": 25, "method": 1}  # exact: keeps colours if opacity is 0
+EPOCH = (1980, 1, 1, 0, 0, 0)  # a constant, so that the same scene gives the same bytes
 
 
 def encode_sog(scene: SceneFile) -> bytes:
-    """Encode a scene as a bundled SOG file, in its own order and axes.
+    """Encode a scene as a bundled SOG file, in the same order and axes.
 
     Positions have 16 bits for each axis, spaced logarithmically from 0; scales and colours are looked up in codebooks.
 
@@ -83,8 +83,8 @@ def encode_sog(scene: SceneFile) -> bytes:
 def codebook(values: Floats) -> tuple[Floats, NDArray[np.uint8]]:
     """A codebook [256] for values [N, 3] with small squared error, and each value's code.
 
-    The density of codes follows the cube root of the values' density, which is optimal for many codes; a quarter of the
-    codes is spread evenly, for rare values. If there are at most 256 different values, each gets its own code.
+    The density of codes follows the cube root of the values' density, which is optimal for many codes. A quarter of the
+    codes is evenly spaced, for rare values. Up to 256 different values get a code each.
     """
     low, high = float(values.min()), float(values.max())
     bins = np.minimum((values - low) * (BINS / max(high - low, 1e-30)), BINS - 1).astype(np.int32)
@@ -104,7 +104,7 @@ def codebook(values: Floats) -> tuple[Floats, NDArray[np.uint8]]:
 
 
 def _means(means: Floats) -> tuple[NDArray[np.uint16], Floats, Floats]:
-    """Quantise the logarithms of positions [N, 3] to 0..65535 within their bounds; returns these too, [3] each."""
+    """Quantise the logarithms of positions [N, 3] to 0..65535; also returns their lower and upper bounds, [3] each."""
     logs = np.copysign(np.log1p(np.abs(means)), means)
     low, high = logs.min(axis=0), logs.max(axis=0)
     span = np.maximum(high - low, np.float32(1e-30))
@@ -123,7 +123,7 @@ def _webp(rgba: NDArray[np.uint8], width: int) -> bytes:
 
 
 def decode_sog(data: bytes) -> Columns:
-    """Decode a bundled SOG file of version 2; any error if it is damaged, ValueError for another version."""
+    """Decode a bundled SOG file of version 2; any exception if the file is damaged or of another version."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
 
         def member(name: str) -> bytes:
@@ -155,7 +155,7 @@ def decode_sog(data: bytes) -> Columns:
         np.array(meta[key]["codebook"], np.float32).reshape(CODES)[codes[:, :3]]
         for key, codes in (("scales", scales), ("sh0", sh0))
     )
-    with np.errstate(over="ignore"):  # values that are not finite are counted later
+    with np.errstate(over="ignore"):  # `Columns.gaussians` refuses infinite values
         means = np.copysign(np.expm1(np.abs(logs)), logs)
     turns = from_smallest_three(largest, from_shares(fractions(quats[:, :3], 255)))
     srgb = np.clip(harmonics * np.float32(SH_C0) + np.float32(0.5), 0, 1)

@@ -26,27 +26,27 @@ from spackle.gaussians import Gaussians
 MAGIC, VERSION = 0x5053474E, 3
 HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, degree of harmonics, fractional bits, flags, reserved
 ROW = 20  # bytes for each Gaussian
-LARGEST = 2**23 - 1  # largest value of a coordinate, which has 24 bits
+LARGEST = 2**23 - 1  # largest coordinate, which has 24 bits
 FEWEST_BITS, MOST_BITS = 1, 23  # fractional bits of a coordinate
-NEAR_STEPS = 2048  # the near distance is at least so many steps of the grid
-NEAR_SHARE = 0.01  # the near distance is this quantile of the Gaussians' distances
+NEAR_STEPS = 2048  # least number of grid steps in the near distance
+NEAR_SHARE = 0.01  # quantile of the Gaussians' distances that is the near distance
 COLOR_SCALE = 0.15  # colours are stored with room below 0 and above 1
-HARMONICS = (0, 9, 24, 45)  # numbers that each Gaussian has above degree 0, by the degree
+MAX_DEGREE = 3  # of spherical harmonics
 GZIP, WINDOW = 16, 15
-EFFORT = 5  # 6 takes twice the time for files 1 % smaller
+EFFORT = 5  # level 6 takes twice the time for files 1 % smaller
 MAX_COUNT = 10_000_000  # most Gaussians that the format's own library reads
 
-# Repeated bytes deflate well. Bits too fine to be visible are therefore rounded away, at the finest of the levels
-# in _DETAILS with which a file has at most 1/8 of the PLY's size.
+# Rounded values deflate better. A file uses the finest of the levels in _DETAILS that keeps its size within 1/8 of the
+# PLY's size.
 LIMIT = 8.5  # bytes for each Gaussian; the PLY has 68
-SMALL = 1 << 14  # bytes; a file up to this size is never rounded more
-SAMPLE, SAMPLES = 1 << 13, 8  # the levels are first tried on so many consecutive Gaussians at so many places
-SAMPLED_LIMIT = 8.7  # short pieces deflate a little worse than the whole
+SMALL = 1 << 14  # bytes; smaller files need no further rounding
+SAMPLE, SAMPLES = 1 << 13, 8  # consecutive Gaussians in a sample, and number of samples, with which levels are tried
+SAMPLED_LIMIT = 8.7  # bytes for each Gaussian of a sample; samples deflate a little worse than the file
 
 
 class _Detail(NamedTuple):
     position: float  # step in standard deviations of the Gaussian's middle axis
-    quat_bits: int  # bits that are kept, of 9, of each of the three smaller components
+    quat_bits: int  # bits, of 9, that are kept of each of the three smaller components
     scale_step: int  # step of a scale's logarithm, in sixteenths
     opacity_step: int  # step in 255ths
 
@@ -58,8 +58,8 @@ _DETAILS += [_Detail(1 / 2, 5, 2, 4), _Detail(1 / 2, 4, 2, 4), _Detail(1 / 2, 4,
 def encode_spz(scene: SceneFile) -> bytes:
     """Encode a scene as an SPZ file of version 3, in the same order, with y up and z backward as the format requires.
 
-    Positions are rounded to a grid that suits near Gaussians, see `spz_grid`. Gaussians beyond the grid's range are
-    scaled towards the origin, from which they look the same.
+    Positions are rounded to a grid (see `spz_grid`). Gaussians outside the grid's range are moved towards the origin
+    and shrunk, which does not change the view from the origin.
 
     Raises:
         InputError: there are more Gaussians than readers accept.
@@ -81,7 +81,7 @@ def encode_spz(scene: SceneFile) -> bytes:
 
 
 def spz_grid(gaussians: Gaussians) -> tuple[int, int]:
-    """The number of fractional bits of an SPZ file's positions, and of Gaussians beyond the grid's range."""
+    """The number of fractional bits of positions, and the number of Gaussians outside the grid's range."""
     means = gaussians.means.detach().to("cpu").double().numpy()
     if not len(means):
         return 12, 0
@@ -94,7 +94,7 @@ def spz_grid(gaussians: Gaussians) -> tuple[int, int]:
 
 
 def _within(columns: Columns, bits: int) -> Columns:
-    """Scale Gaussians beyond the grid's range about the origin, in position and size, until they fit."""
+    """Shrink positions and sizes of Gaussians outside the grid's range towards the origin, until they fit."""
     reach = np.abs(columns.means).max(axis=1, initial=0).astype(np.float64)
     factor = np.minimum(1, LARGEST / 2.0**bits / np.maximum(reach, 1e-30))[:, None]
     means, log_scales = columns.means * factor, columns.log_scales + np.log(factor)
@@ -102,7 +102,7 @@ def _within(columns: Columns, bits: int) -> Columns:
 
 
 def _finest(columns: Columns, bits: int) -> int:
-    """Index of the finest level of rounding at which deflated samples keep to the size limit, else of the coarsest."""
+    """Index of the finest level of rounding that keeps deflated samples within SAMPLED_LIMIT, else of the coarsest."""
     count = len(columns.means)
     starts = np.unique(np.linspace(0, max(0, count - SAMPLE), SAMPLES).astype(np.int64))
     rows = np.concatenate([np.arange(start, min(start + SAMPLE, count)) for start in starts])
@@ -120,7 +120,7 @@ def _sections(columns: Columns, bits: int, detail: _Detail) -> list[bytes]:
     scales = np.clip(scales, 0, 255).astype(np.uint8)
     colors = (columns.srgb - np.float32(0.5)) * np.float32(COLOR_SCALE * 255 / SH_C0) + np.float32(127.5)
     step = detail.opacity_step
-    ball = (scales == scales[:, :1]).all(axis=1, keepdims=True)  # a sphere looks the same however it is turned
+    ball = (scales == scales[:, :1]).all(axis=1, keepdims=True)  # the rotation of a sphere is invisible
     quats = np.where(ball, np.array([1, 0, 0, 0], np.float32), columns.quats)
     return [
         _positions(columns, bits, detail.position).tobytes(),
@@ -132,7 +132,7 @@ def _sections(columns: Columns, bits: int, detail: _Detail) -> list[bytes]:
 
 
 def _positions(columns: Columns, bits: int, share: float) -> NDArray[np.uint8]:
-    """[N, 9] bytes: 24-bit fixed point; the step is the largest power of two up to `share` times the middle axis."""
+    """Positions as bytes [N, 9]: 24-bit fixed point, in steps of up to `share` times the Gaussian's middle axis."""
     a, b, c = columns.log_scales.T
     middle = np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c))
     exponent = np.floor(middle / np.float32(np.log(2)) + np.float32(np.log2(share) + bits))
@@ -145,7 +145,7 @@ def _positions(columns: Columns, bits: int, share: float) -> NDArray[np.uint8]:
 def _rotations(quats: Floats, bits: int) -> NDArray[np.uint32]:
     """Pack unit quaternions wxyz into words [N].
 
-    A word holds the index of the largest of xyzw, then sign and 9 bits of each other component, rounded to `bits`.
+    A word has the index of the largest of xyzw, then a sign and 9 bits for each other component, rounded to `bits`.
     """
     largest, others = smallest_three(quats[:, [1, 2, 3, 0]])
     step = 2 ** (9 - bits)
@@ -157,21 +157,19 @@ def _rotations(quats: Floats, bits: int) -> NDArray[np.uint32]:
 
 
 def _deflated(data: bytes) -> bytes:
-    """Compress to one gzip member; the same data always gives the same bytes."""
     deflater = zlib.compressobj(EFFORT, zlib.DEFLATED, GZIP + WINDOW, 9)
     return deflater.compress(data) + deflater.flush()
 
 
 def decode_spz(data: bytes) -> Columns:
-    """Decode the Gaussians of an SPZ file, with y down and z forward; harmonics above degree 0 are left out.
+    """Decode the Gaussians of an SPZ file, with y down and z forward, and colours of degree 0.
 
-    Raises ValueError, or zlib's error, for another version or a damaged file. Never inflates more than the header
-    announces.
+    ValueError or zlib.error for another version or a damaged file. Never inflates more than the header announces.
     """
     inflater = zlib.decompressobj(GZIP + WINDOW)
     head = inflater.decompress(data, HEADER.size)
     magic, version, count, degree, bits, _, _ = HEADER.unpack(head)
-    if magic != MAGIC or version not in (2, 3) or degree >= len(HARMONICS) or count > MAX_COUNT:
+    if magic != MAGIC or version not in (2, 3) or degree > MAX_DEGREE or count > MAX_COUNT:
         raise ValueError(f"version {version} with {count:,} Gaussians and harmonics of degree {degree}")
     widths = (9, 1, 3, 3, 4 if version == 3 else 3)  # bytes of `_sections`
     body = inflater.decompress(inflater.unconsumed_tail, max(1, count * sum(widths)))
@@ -186,7 +184,7 @@ def decode_spz(data: bytes) -> Columns:
         fields = words >> np.array([20, 10, 0], np.uint32)
         sizes = (fields & 511).astype(np.float32) / np.float32(511 * 2**0.5)
         xyzw = from_smallest_three(words[:, 0] >> 30, np.where(fields & 512, -sizes, sizes))
-    else:  # w is always the component that is computed from the others
+    else:  # version 2 omits w
         xyzw = from_smallest_three(np.full(count, 3), fractions(turns, 255) * 2 - 1)
     means, log_scales = (fixed / 2.0**bits).astype(np.float32), fractions(scales, 16) - 10
     opacities = fractions(alphas[:, 0], 255)
