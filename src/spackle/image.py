@@ -70,13 +70,13 @@ class Photo:
     @property
     def framed_size(self) -> tuple[int, int]:
         """Width and height before the border was cropped."""
-        left, top, right, bottom = self.frame.widths if self.frame else (0, 0, 0, 0)
+        left, top, right, bottom = self.frame or (0, 0, 0, 0)
         return round(self.width + left + right), round(self.height + top + bottom)
 
     @property
     def camera(self) -> Camera:
         """The photo's camera, at the world's origin; cropping a border shifts the principal point."""
-        left, top, right, bottom = self.frame.widths if self.frame else (0, 0, 0, 0)
+        left, top, right, bottom = self.frame or (0, 0, 0, 0)
         camera = Camera.from_focal(self.focal_px, self.width, self.height)
         return camera.cropped((left - right) / 2, (top - bottom) / 2, self.width, self.height)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 from torch import Tensor
@@ -13,8 +13,7 @@ STRAIGHT = 0.8  # least share of an edge's pixels that differ by STEP
 EDGE_PX = 6  # width of a blurred edge
 
 
-@dataclasses.dataclass(frozen=True)
-class PhotoFrame:
+class PhotoFrame(NamedTuple):
     """The widths of a frame's four sides in pixels; 0 for a side without frame."""
 
     left: float
@@ -23,14 +22,9 @@ class PhotoFrame:
     bottom: float
 
     @property
-    def widths(self) -> tuple[float, float, float, float]:
-        """Left, top, right, bottom."""
-        return self.left, self.top, self.right, self.bottom
-
-    @property
     def note(self) -> str:
         """A line for the log."""
-        widths = ", ".join(f"{width:g}" for width in self.widths)
+        widths = ", ".join(f"{width:g}" for width in self)
         return f"a frame ({widths} pixels: left, top, right, bottom) is cut off"
 
     def scaled(self, across: float, down: float) -> PhotoFrame:
@@ -68,5 +62,5 @@ def find_frame(rgb: Tensor) -> PhotoFrame | None:
         if alike[side] and alike[side + 2]:
             frame = PhotoFrame(*alike.tolist())
             inner = find_frame(frame.inside(rgb, *down.shape[1::-1]))  # such as a line inside a mount
-            return PhotoFrame(*(alike + (inner.widths if inner else 0)).tolist())
+            return PhotoFrame(*(alike + (inner or (0, 0, 0, 0))).tolist())
     return None

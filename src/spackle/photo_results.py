@@ -96,7 +96,7 @@ def predict_photo(
             "request": request,
         }
         size = {"width": scene.camera.width, "height": scene.camera.height}
-        frame = {} if photo.frame is None else {"frame_cut_off": dataclasses.asdict(photo.frame)}
+        frame = {} if photo.frame is None else {"frame_cut_off": photo.frame._asdict()}
         report["photo"] = {"file": path.name, **size, **frame}
         report["base"] |= done.prediction.notes
         report["residual"]["fill"] = options.fill.texture

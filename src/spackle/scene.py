@@ -12,6 +12,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from spackle import camera_path
 from spackle.bases import USUAL_DISPARITY
 from spackle.camera import Camera
 from spackle.camera_path import OVERSCAN, DepthRange, KeyframePath, TrajectoryKind
@@ -25,7 +26,7 @@ from spackle.image import focal_length
 from spackle.render import Renderer, get_renderer
 from spackle.render.protocol import Rendering
 from spackle.residual.view_features import hole_mask
-from spackle.views import PATH_FRAMES, SECONDS, scene_path
+from spackle.views import PATH_FRAMES, SECONDS
 
 DEFAULT_SIZE = (1280, 720)  # width and height for a file that stores no camera
 
@@ -98,7 +99,8 @@ class Scene:
             looped: make a path that repeats without a jump.
         """
         usual = USUAL_DISPARITY if self.disparity is None else self.disparity
-        return scene_path(self.base, self.camera, trajectory, usual if disparity is None else disparity, frames, looped)
+        reach, depths = usual if disparity is None else disparity, DepthRange.of(self.base)
+        return camera_path.trajectory(trajectory, self.camera.even(), reach, depths, frames, looped)
 
     def along(self, keyframes: KeyframePath, frames: int | None = None) -> list[Camera]:
         """Cameras through keyframes (see `spackle.formats.load_path`), by default 30 for each second.

@@ -136,8 +136,11 @@ class VideoOptions:
 
     def check(self) -> None:
         """Raise an InputError for options that contradict each other."""
-        self._blame(f"--fps {self.rate:g}", None)
-        self._blame(f"--loop {self.loop}", self.loop)
+        for option, loop in ((f"--fps {self.rate:g}", None), (f"--loop {self.loop}", self.loop)):
+            try:
+                check_video(name := f"video{self.suffix}", self.rate, loop)
+            except InputError as error:
+                raise InputError(f"{option}: {str(error).removeprefix(f'{name}: ')}") from error
         for option, value in {"--ipd": self.ipd, "--convergence": self.convergence}.items():
             if value is None:
                 continue
@@ -151,13 +154,6 @@ class VideoOptions:
             raise InputError(
                 "--show depth: an anaglyph would mix the colours that stand for depth: give --stereo sbs or ou"
             )
-
-    def _blame(self, option: str, loop: int | None) -> None:
-        """Raise an InputError that begins with `option` if the format does not allow the rate or `loop`."""
-        try:
-            check_video(name := f"video{self.suffix}", self.rate, loop)
-        except InputError as error:
-            raise InputError(f"{option}: {str(error).removeprefix(f'{name}: ')}") from error
 
     def for_file(self, file: Path) -> VideoOptions:
         """Set the format by a file's suffix; InputError if --format contradicts the suffix."""

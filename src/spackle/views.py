@@ -36,18 +36,6 @@ MAX_OVERSCAN = 0.5
 MEASURED_KEYFRAMES = 16  # largest number of keyframes whose holes are reported
 
 
-def scene_path(
-    base: Gaussians,
-    camera: Camera,
-    kind: TrajectoryKind,
-    disparity: float,
-    frames: int = PATH_FRAMES,
-    looped: bool = False,
-) -> list[Camera]:
-    """The cameras of a `trajectory`, of the photo's size with both sides made even."""
-    return trajectory(kind, camera.even(), disparity, DepthRange.of(base), frames, looped)
-
-
 @dataclasses.dataclass(frozen=True)
 class PathOptions:
     """Options of the camera path, and of the video along it."""
@@ -110,7 +98,8 @@ class PathOptions:
         given = self.frames or (self.seconds and round(self.seconds * self.video.rate))
         if keyframes is None:
             count = given or max(1, round(SECONDS * self.video.rate))
-            path = scene_path(gaussians, camera, self.trajectory, self.reach(disparity), count, looped=True)
+            reach, depths = self.reach(disparity), DepthRange.of(gaussians)
+            path = trajectory(self.trajectory, camera.even(), reach, depths, count, looped=True)
             return [view.zoomed(1 + self.overscan) for view in path]
         count = given or keyframes.frame_count(self.video.rate)
         if count > MAX_FRAMES:
@@ -186,16 +175,21 @@ def plan_views(
     Raises:
         InputError: the depths and the focal length of the photo `source` allow no camera path.
     """
-    gaussians, camera = prediction.gaussians, prediction.camera
+    gaussians, camera, even = prediction.gaussians, prediction.camera, prediction.camera.even()
     path_cameras, others, unseen, every = given or [], dict[str, Camera](), list[Camera](), 1
     if not given:
         with reading(source, NO_PATH, ValueError), reading(path.path, "{reason}", PathError):
             path_cameras = path.fly(gaussians, camera, keyframes, prediction.disparity)
             reach, depths = path.reach(prediction.disparity), DepthRange.of(gaussians)
-            others = _measured(reach, camera.even(), depths, keyframes)
+            if keyframes is None:
+                others = dict(zip((f"{-reach:g}", f"+{reach:g}"), extremes(even, reach, depths), strict=True))
+            else:
+                keys = keyframes.at([key.time for key in keyframes.keys], even, depths)
+                step = math.ceil(len(keys) / MEASURED_KEYFRAMES)
+                others = {f"keyframe {k}": keys[k] for k in range(0, len(keys), step)}
             # Other programs render without overscan, so views with the photo's focal length are filled too.
             if keyframes is None and path.trajectory in ("shake", "rotate", "vertical"):
-                unseen = trajectory("rotate", camera.even(), reach, depths, frames=5)[:4:2]
+                unseen = trajectory("rotate", even, reach, depths, frames=5)[:4:2]
         every = 1 if keyframes else max(1, len(path_cameras) // PATH_FRAMES)
     maker = FrameMaker.of(path.video, gaussians, path_cameras, source)
     middles = given if given and maker.stereo else []  # pictures are taken midway between the eyes
@@ -207,13 +201,3 @@ def plan_views(
     measured = {name: last + k for k, name in enumerate(others)} or {str(k): k for k in range(len(eyes))}
     looked_at = [*range(first), *itertools.chain(*frames[::every]), *range(first + each * len(eyes), len(cameras))]
     return PlannedViews(cameras, measured, frames, len(given or []), maker, looked_at)
-
-
-def _measured(
-    disparity: float, camera: Camera, depths: DepthRange, keyframes: KeyframePath | None
-) -> dict[str, Camera]:
-    if keyframes is None:
-        return dict(zip((f"{-disparity:g}", f"+{disparity:g}"), extremes(camera, disparity, depths), strict=True))
-    keys = keyframes.at([key.time for key in keyframes.keys], camera, depths)
-    step = math.ceil(len(keys) / MEASURED_KEYFRAMES)
-    return {f"keyframe {index}": keys[index] for index in range(0, len(keys), step)}

@@ -56,7 +56,7 @@ def test_a_frame_is_found_on_the_sides_that_have_it(widths: Sequence[int], color
     noise = np.random.default_rng(0).normal(0, 1.5 / 255, whole.shape)
     for frame in (found(whole), found(whole + noise, quality=75)):
         assert frame is not None
-        for ours, wanted in zip(frame.widths, widths, strict=True):
+        for ours, wanted in zip(frame, widths, strict=True):
             assert (ours == 0) if wanted == 0 else wanted <= ours <= wanted + 4
 
 
@@ -64,7 +64,7 @@ def test_a_line_between_mount_and_picture_belongs_to_the_frame() -> None:
     inner = framed(scene(), (3, 3, 3, 3), (0.0, 0.0, 0.0))
     frame = found(framed(inner, (12, 12, 12, 12), (1.0, 1.0, 1.0)))
     assert frame is not None
-    assert min(frame.widths) >= 15
+    assert min(frame) >= 15
 
 
 Y, X = (grid[..., None] for grid in np.mgrid[:HEIGHT, :WIDTH])
@@ -98,7 +98,7 @@ def test_a_crop_keeps_the_camera(tmp_path: Path) -> None:
     whole, photo = load_photo(path), load_photo(path, keep_frame=False)
     assert whole.frame is None
     assert photo.frame is not None
-    left, top, *_ = (round(width) for width in photo.frame.widths)
+    left, top, *_ = (round(width) for width in photo.frame)
     assert (whole.width, whole.height) == whole.framed_size == photo.framed_size
     inside = whole.camera.cropped(left, top, photo.width, photo.height)
     assert torch.equal(photo.rgb, whole.rgb[top : top + photo.height, left : left + photo.width])

@@ -12,11 +12,10 @@ from hypothesis import strategies as st
 from scenes import box_before_wall
 
 from spackle.camera import Camera
-from spackle.camera_path import DepthRange
+from spackle.camera_path import DepthRange, trajectory
 from spackle.color import INFERNO, UNKNOWN_GREY, DepthColors, linear_to_srgb, srgb_to_linear
 from spackle.render import CpuRenderer
 from spackle.video_frames import FrameMaker, Stereo, VideoOptions, anaglyph, default_ipd
-from spackle.views import scene_path
 
 CAMERA = Camera.from_focal(60, 64, 48)
 
@@ -80,7 +79,7 @@ def test_depth_colours_are_linear_in_inverse_depth() -> None:
 def test_depth_colours_of_a_video_share_one_scale() -> None:
     scene = box_before_wall(near=2.0, far=6.0)
     base = scene.base()
-    path = scene_path(base, scene.camera, "rotate-forward", 0.3, 5)
+    path = trajectory("rotate-forward", scene.camera, 0.3, DepthRange.of(base), 5)
     scale = DepthColors.over(base, path)
     assert (scale.near, scale.far) == pytest.approx((2.0, 6.0), rel=0.25)
     film = FrameMaker.of(VideoOptions(show="depth"), base, path, Path("x"))

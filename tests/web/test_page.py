@@ -30,7 +30,6 @@ from spackle.formats.html import PageScene, page_file, page_scene, single_html
 from spackle.pipeline import complete
 from spackle.render import CpuRenderer
 from spackle.scene import Scene
-from spackle.views import scene_path
 from spackle.web.guard import MAX_BYTES
 from spackle.web.work import SceneWork
 
@@ -44,7 +43,8 @@ VIEW = ("swipe", 0.3, 1.0)  # far to the right, where there are holes
 def box() -> Scene:
     """A small scene, completed by the seeds."""
     prediction = box_before_wall(width=64, height=48, focal=53).lift()
-    return complete(prediction, scene_path(prediction.gaussians, prediction.camera, "swipe", 0.35, 4), network=None)
+    depths = DepthRange.of(prediction.gaussians)
+    return complete(prediction, trajectory("swipe", prediction.camera.even(), 0.35, depths, 4), network=None)
 
 
 @functools.cache
