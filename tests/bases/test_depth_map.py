@@ -216,7 +216,7 @@ BAD = {
     "cut npy": (as_bytes(ramp())[:-5], "cut off"),
     "huge npy": (npy_claiming("(1000000, 1000000)"), "too large"),
     "three axes": (as_bytes(np.ones((2, 3, 3), np.float32)), "shape"),
-    "zero size": (as_bytes(np.ones((0, 5), np.float32)), "empty"),
+    "zero size": (as_bytes(np.ones((0, 5), np.float32)), "shape"),
     "objects": (as_bytes(np.array([[None, 1]], dtype=object)), "object"),
     "all NaN": (as_bytes(np.full((4, 4), np.nan)), "all-invalid"),
     "negative": (as_bytes(np.array([[1.0, -2.0], [-0.5, np.nan]])), "2 of 4 values are negative"),

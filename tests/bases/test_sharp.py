@@ -274,5 +274,7 @@ def test_without_a_compiler_the_option_is_refused(monkeypatch: pytest.MonkeyPatc
     with pytest.raises(spackle.InputError, match=r"compile=yes: SHARP cannot be compiled \(No working C\+\+"):
         base.predict(PHOTO)
     error = torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
-    with pytest.raises(spackle.InputError, match="not enough memory for the network: try --sharp windows=1"):
+    with pytest.raises(
+        spackle.InputError, match="not enough memory for the network: try --sharp windows=1 and --precision bf16"
+    ):
         base.predict(PHOTO)

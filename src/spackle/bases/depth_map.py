@@ -140,8 +140,8 @@ def load_depth(
     if lens and focal_px is not None:
         lens = dataclasses.replace(lens, focal_px=focal_px)
     stored, is_png = read_array(path)
-    if kind == "auto" and lens is None and is_png:
-        _check_metric(stored, path)
+    if kind == "auto" and lens is None and is_png and _fills_16_bits(stored):
+        raise InputError(f"{path}: its values fill the range of 16 bits, as relative depth does: {WHICH}")
     return _depth_map(stored, is_png, lens, Path(path))
 
 
@@ -202,11 +202,9 @@ def relative_depth(
     return DepthMap(metres.where(valid, 0.0), valid, None, step and step * unit, quantity, Path(path))
 
 
-def _check_metric(stored: Array, path: StrPath) -> None:
-    """InputError if a PNG's values fill the range of 16 bits, as relative depth does and millimetres do not."""
+def _fills_16_bits(stored: Array) -> bool:
     known = stored[(stored > 0) & (stored < 65535)]
-    if known.size and known.min() < FILLED * 65535 and known.max() > (1 - FILLED) * 65535:
-        raise InputError(f"{path}: its values fill the range of 16 bits, as relative depth does: {WHICH}")
+    return bool(known.size and known.min() < FILLED * 65535 and known.max() > (1 - FILLED) * 65535)
 
 
 def is_depth(metres: Tensor) -> Tensor:
@@ -350,10 +348,8 @@ def read_array(path: StrPath, *, grey: bool = False) -> tuple[Array, bool]:
 
 
 def _check_size(shape: tuple[int, ...], path: StrPath) -> None:
-    if len(shape) != 2:
+    if len(shape) != 2 or min(shape) < 1:
         raise InputError(f"{path}: an array of shape {shape} is not a depth map: give [height, width]")
-    if min(shape) < 1:
-        raise InputError(f"{path}: an array of shape {shape} is empty: give another depth map")
     check_pixels(shape[1], shape[0], os.path.getsize(path), path)
 
 

@@ -58,15 +58,11 @@ class Quadtree:
     def __init__(
         self, picture: Tensor, inverse_depth: Tensor, slope: Tensor, free: Tensor, levels: int, steepest: float
     ) -> None:
-        """Measure all blocks.
+        """Measure the losses of all blocks in `picture` [H, W, 3] sRGB.
 
-        Args:
-            picture: [H, W, 3] sRGB, in which losses are measured.
-            inverse_depth: [H, W].
-            slope: [H, W, 2] derivative of the inverse depth by pixel x and y.
-            free: [H, W] bool: the pixels that may share a Gaussian.
-            levels: number of block sizes; 0 gives every pixel its own Gaussian.
-            steepest: the greatest relative change of inverse depth across a tile.
+        `slope` [H, W, 2] is the derivative of `inverse_depth` [H, W] by pixel x and y, `free` [H, W] bool marks the
+        pixels that may share a Gaussian, `levels` is the number of block sizes, and `steepest` the greatest relative
+        change of inverse depth across a tile.
         """
         self.shape = inverse_depth.shape
         self.lost: list[Tensor] = []  # [H/side, W/side, 3] for each level: as one tile, as flat and as tall halves

@@ -229,11 +229,8 @@ def _thin(alpha: Any, ring: Any, result: Any) -> None:
 def mixture(spots: Floats, colors: Tensor, height: int, width: int) -> Tensor:
     """The picture [H, W, 3] of N Gaussians at the photo's camera, blended like the renderer blends.
 
-    Args:
-        spots: [N, 5] centre x and y, standard deviation along x and y, all in pixels, and opacity; nearest first.
-        colors: [N, 3] linear RGB.
-        height: height of the picture.
-        width: width of the picture.
+    `spots` [N, 5], nearest first: centre x and y and standard deviations along x and y in pixels, and opacity. `colors`
+    [N, 3] are linear RGB.
     """
     image = np.zeros((height, width, 3), np.float32)
     run_chunks(lambda a, b: _mix(a, b, spots, colors.numpy(), image), height, grain=128)

@@ -29,6 +29,7 @@ from spackle.network_file import Shapes, load_strict, read_note, read_tensors
 
 WINDOWS_AT_ONCE = 5  # enough to keep two cores or a small GPU busy
 ADVICE = "give SHARP's checkpoint as it was downloaded"
+LESS_MEMORY = "try --sharp windows=1 and --precision bf16"
 NOTE = "spackle.gaussian_decoder"  # a decoder file's only metadata key, as JSON: safetensors shuffles several keys
 PARTS = ("feature_model.", "prediction_head.")  # prefixes of the names of a decoder's tensors
 _ENCODER = "monodepth_model.monodepth_predictor.encoder."
@@ -65,17 +66,16 @@ class SharpBase:
         """Read a checkpoint.
 
         Args:
-            path: Apple's .pt file, a safetensors file with the same names, or the decoder that
-                `spackle train --method direct-ft` wrote, which names the checkpoint that has the other weights.
+            path: Apple's .pt file, a safetensors file with the same names, or a decoder that
+                `spackle train --method direct-ft` wrote; see `load_network`.
             precision: number type of the heavy arithmetic; auto is bf16 if the hardware multiplies it natively.
-            windows: how many of a photo's 35 windows go through the transformer at once; None: 5 on a CPU, all on a
+            windows: number of a photo's 35 windows that the transformer processes at once; None: 5 on a CPU, all on a
                 GPU. The last bits of the result depend on this number.
             compiled: let `torch.compile` compile the network at the first photo, which takes minutes.
             device: cpu or a CUDA device; None: CUDA if available.
 
         Raises:
-            InputError: the device is missing, the file does not hold SHARP's weights, `windows` is out of range, or
-                memory is short. Nothing in the file is executed.
+            InputError: a file, device or number of windows that cannot be used, or too little memory.
             ValueError: an unknown precision.
         """
         target = pick_device(device)
@@ -93,20 +93,12 @@ class SharpBase:
         return "bf16" if self.network.feature_model.fusion.out_conv.weight.dtype == torch.bfloat16 else "fp32"
 
     def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
-        """Two layers of Gaussians in metres, the nearer layer first, in row-major order.
-
-        `progress` is called with the number of windows done and the number of all windows. InputError if memory is
-        short.
-        """
-        with enough_memory(*self._advice):
+        """Two layers of Gaussians in metres, the nearer layer first, row by row; InputError if memory is short."""
+        with enough_memory(LESS_MEMORY):
             gaussians = to_metric(self.infer(photo, progress), photo)
         camera = Camera.from_focal(photo.focal_px, photo.width, photo.height)
         notes: dict[str, float | int | str] = {"precision": self.precision, "weights": self.weights}
         return BasePrediction(gaussians, camera.resized(*working_size(photo.width, photo.height)), notes)
-
-    @property
-    def _advice(self) -> list[str]:
-        return [] if self.windows == 1 else ["try --sharp windows=1"]
 
     @torch.no_grad()
     def infer(self, photo: Photo, progress: Progress | None = None) -> SharpOutput:
@@ -118,7 +110,7 @@ class SharpBase:
             if self.compiled:
                 network = self._compiled_network = self._compiled_network or compile_forward(self.network)
                 problem = "SHARP cannot be compiled ({reason}): leave the option out"
-                with reading("--sharp compile=yes", problem, RuntimeError), enough_memory(*self._advice):
+                with reading("--sharp compile=yes", problem, RuntimeError), enough_memory(LESS_MEMORY):
                     output = network(image, factor, self.windows, progress)
             else:
                 output = self.network(image, factor, self.windows, progress)
@@ -156,10 +148,8 @@ def load_network(path: str | os.PathLike[str], dtype: torch.dtype, device: torch
     """A frozen network from Apple's .pt file, or a safetensors file with the same names, on a device.
 
     The size, published or tiny, follows from the shapes. If a file holds only a trained Gaussian decoder, the other
-    weights come from the checkpoint that it names. The heavy arithmetic is in `dtype`, float32 or bfloat16.
-
-    Raises:
-        InputError: a missing, broken or foreign file, or too little memory. Nothing in the file is executed.
+    weights come from the checkpoint that it names. The heavy arithmetic is in `dtype`, float32 or bfloat16. InputError
+    for a missing, broken or foreign file, or too little memory. Nothing in the file is executed.
     """
     tensors: Mapping[str, Tensor] = read_tensors(path, ADVICE)
     if (owner := owner_of(path)) is not None:
@@ -170,8 +160,7 @@ def load_network(path: str | os.PathLike[str], dtype: torch.dtype, device: torch
     sizes = {(1, 1 + config.grid**2, config.embed): config for config in CONFIGS.values()}
     with torch.device("meta"):
         network = SharpNetwork(sizes.get(positions, CONFIGS["full"]))
-    advice = ["try --precision bf16"] if dtype == torch.float32 else []  # which takes half as much
-    with enough_memory(*advice):
+    with enough_memory(LESS_MEMORY):
         convert = functools.partial(set_precision, dtype=dtype)
         load_strict(network, tensors, path, ADVICE, prepare=convert)
         return network.to(device)
