@@ -225,7 +225,7 @@ def test_two_processes_learn_what_one_does(place: Path, tmp_path: Path) -> None:
     ("options", "said"),
     [
         (["data.photos=/nowhere"], "/nowhere: no such folder, but data.photos names it"),
-        (["data.photos={empty}"], "there is nothing in it: looked for photos"),
+        (["data.photos={empty}"], "contains no photos: set data.photos to another folder"),
         (["data.teacher=/nowhere"], "/nowhere: no such file, but data.teacher names it"),
         (["data.photos=null", "data.stereo=null", "data.rgbd=[]"], "the recipe has no data: give data.photos=FOLDER"),
         (["data.rgbd=[]", "data.validation_stereo=null"], "the recipe has nothing to judge the network by"),
@@ -235,10 +235,9 @@ def test_two_processes_learn_what_one_does(place: Path, tmp_path: Path) -> None:
         (["data.scales=[]"], "data.scales: tuple should have at least 1 item"),
         (["data.scales=[0]"], "data.scales.0: input should be greater than or equal to 0.1, not 0"),
         (["network=lite1"], "network: input should be 'lite0' or 'lite2', not 'lite1'"),
-        (["data.photo=x"], "data.photo: there is no such key; there are photos, rgbd, stereo, made"),
-        (["loss.features=none"], "loss.features: there is no such key; there are factor, line, steps"),
+        (["data.photo=x"], "data.photo: there is no such key"),
+        (["loss.features=none"], "loss.features: there is no such key"),
         (["optim.frozen=8"], "optim.frozen: input should be less than or equal to 7, not 8"),
-        (["optim.min_lr=0.1"], "optim: min_lr 0.1 is above lr 0.001"),
         (["optim.batch=0"], "optim.batch"),
         (["encoder={place}/recipe.yaml"], "recipe.yaml: no weights of EfficientNet-Lite2 for PyTorch: give encoder="),
         (["encoder=/nowhere.pth"], "/nowhere.pth: no weights of EfficientNet-Lite2"),
@@ -282,7 +281,7 @@ def test_a_frame_that_cannot_be_read_is_passed_over_unless_there_is_no_other(
     assert "kitchen/0.color.jpg: none of 4 frames can be read" in done.lines[-1]
 
 
-def test_pictures_that_make_a_loss_that_is_no_number_are_named(
+def test_a_loss_that_is_not_finite_ends_the_run(
     place: Path, whole: tuple[Path, Run], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     batch = Mixture.batch
@@ -294,8 +293,7 @@ def test_pictures_that_make_a_loss_that_is_no_number_are_named(
     monkeypatch.setattr(Mixture, "batch", broken)
     done = train(place, tmp_path / "out")
     assert done.code == 2
-    assert "out: step 0 gave numbers that are not finite (loss, " in done.lines[-1]
-    assert " among " in done.lines[-1]
+    assert "out: step 0: loss, " in done.lines[-1]
     assert not (tmp_path / "out" / "checkpoint.pt").exists()
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+import functools
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
@@ -23,12 +24,12 @@ from spackle.render.protocol import Rendering
 from spackle.residual.architectures import NOTE, SharpDecoder, decoder_size, load_residual, open_residual
 from spackle.residual.complete import compose
 from spackle.residual.network import ResidualNet, network_input
-from spackle.residual.view_features import CELL, ViewFeatures, hole_area_ratio
+from spackle.residual.view_features import ViewFeatures, hole_area_ratio
 from spackle.training.losses import hole_psnr, load_features, total_loss
 from spackle.training.recipe import Recipe
 from spackle.training.samples import Sample, digest_of_samples, load_sample, make_samples
 from spackle.training.sources import find_sources
-from spackle.training.train import Task, rank
+from spackle.training.train import Task
 
 MIN_AUX = 64  # least number of aux Gaussians in a view (paper, "Training Details and Loss Weights")
 PICTURED = 6  # number of views in a picture
@@ -99,29 +100,23 @@ class ViewTask(Task):
 
 
 def complete_samples(
-    network: nn.Module | None, samples: Sequence[Sample], renderer: Renderer, precision: torch.dtype = torch.float32
+    network: nn.Module, samples: Sequence[Sample], renderer: Renderer, precision: torch.dtype = torch.float32
 ) -> ViewBatch:
-    """Complete samples of one size with the network's Gaussians, or without a network with the seeds' Gaussians.
-
-    Gradients reach the network alone. Its convolutions compute in `precision`.
-    """
+    """Complete samples of one size; only the network, whose convolutions compute in `precision`, gets gradients."""
     device = device_of(renderer)
     # Masks are read before the samples move to the renderer's device: reading them later would wait for a GPU.
     cells = [training_cells(sample.features).flatten().nonzero()[:, 0] for sample in samples]
     tiles = [sample.tiles for sample in samples]
-    fields: Sequence[Tensor | None] = [None] * len(samples)
-    if network is not None:
-        inputs = torch.cat([network_input(sample.features, sample.seeds, sample.rim) for sample in samples])
-        inputs = inputs.to(next(network.parameters()).device)
-        with torch.autocast(inputs.device.type, precision, enabled=precision != torch.float32):
-            deltas = network(inputs.contiguous(memory_format=torch.channels_last))
-        fields = list(deltas.float().to(device))
+    inputs = torch.cat([network_input(sample.features, sample.seeds, sample.rim) for sample in samples])
+    inputs = inputs.to(next(network.parameters()).device)
+    with torch.autocast(inputs.device.type, precision, enabled=precision != torch.float32):
+        fields = network(inputs.contiguous(memory_format=torch.channels_last)).float().to(device)
     samples = [sample.to(device) for sample in samples]
     scenes = []
     for sample, field, chosen in zip(samples, fields, cells, strict=True):
         index = chosen.to(device, non_blocking=True)
-        deltas = None if field is None else field.flatten(1).T[index]
-        scenes.append([sample.base, compose(sample.seeds.select(index), deltas, sample.camera)])
+        aux = compose(sample.seeds.select(index), field.flatten(1).T[index], sample.camera)
+        scenes.append([sample.base, aux])
     cameras, onto = [sample.camera for sample in samples], [sample.rendering for sample in samples]
     views = render_batch(renderer, scenes, cameras, tiles=tiles, onto=onto)
     return ViewBatch.of((view, s.rendering.rgb, s.target, s.hole) for view, s in zip(views, samples, strict=True))
@@ -174,13 +169,8 @@ class ResidualTask(ViewTask):
 
     def prepare(self, output: Path, reporter: Reporter) -> dict[str, Any]:
         """Make the missing samples."""
-        data, skipped = self.recipe.data, set[str]()
-
-        def skip(reason: str) -> None:
-            if reason not in skipped:
-                reporter.log(f"skipped: {reason}")
-            skipped.add(reason)
-
+        data = self.recipe.data
+        skip = functools.cache(lambda reason: reporter.log(f"skipped: {reason}"))  # each reason is logged once
         folder = data.cache or output / CACHE
         make_folder(folder)
         # Training and validation use different seeds, and different photos of a dataset.
@@ -196,30 +186,14 @@ class ResidualTask(ViewTask):
             )
         self.items, self.validation_items = len(self.learned), len(self.validation)
         reporter.log(f"{self.items} training samples, {self.validation_items} validation samples")
-        limits = self.limits() if rank() == 0 else {}  # only the first process writes run.json
-        samples = {"train": self.items, "validation": self.validation_items, "digest": self.digest}
-        return {"samples": samples, "hole_psnr": limits}
-
-    @torch.no_grad()
-    def limits(self) -> dict[str, float]:
-        """Mean hole_psnr in dB of validation samples without a network, and of seeds in the colours of targets."""
-        found: dict[str, list[float]] = {"untrained": [], "colours of the targets": []}
-        for item in range(self.validation_items):
-            (sample,) = self.batch(None, [item])
-            height, width = sample.features.mask.shape
-            colors = sample.target.view(height, CELL, width, CELL, 3).mean((1, 3))
-            told = dataclasses.replace(sample, seeds=dataclasses.replace(sample.seeds, rgb=colors))
-            for decibels, known in zip(found.values(), (sample, told), strict=True):
-                views = self.complete(None, [known])
-                decibels.append(hole_psnr(views.rgb[0], views.target[0], views.hole[0]))
-        return {name: sum(decibels) / len(decibels) for name, decibels in found.items()}
+        return {"samples": {"train": self.items, "validation": self.validation_items, "digest": self.digest}}
 
     def batch(self, step: int | None, items: Sequence[int]) -> list[Sample]:
         """Read samples; InputError if one cannot be read."""
         files = self.validation if step is None else self.learned
         return [load_sample(files[item]) for item in items]
 
-    def complete(self, network: nn.Module | None, batch: Sequence[Sample]) -> ViewBatch:
+    def complete(self, network: nn.Module, batch: Sequence[Sample]) -> ViewBatch:
         return complete_samples(network, batch, self.renderer, self.precision)
 
     def export(self, network: nn.Module, path: Path) -> None:

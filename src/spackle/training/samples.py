@@ -198,11 +198,8 @@ class Source(NamedTuple):
 
 def digest_of_samples(data: DataRecipe, sources: Sequence[Source]) -> str:
     """Twelve digits that identify the content of samples, whatever their number and paths."""
-    facts = data.model_dump(mode="json")
-    for name in ("photos", "stereo", "pseudo", "cache", "views", "validation_views"):
-        facts.pop(name)
-    for camera in facts["rgbd"]:
-        camera.pop("folder")
+    others = dict.fromkeys(("photos", "stereo", "pseudo", "cache", "views", "validation_views"), True)
+    facts = data.model_dump(mode="json", exclude={**others, "rgbd": {"__all__": {"folder"}}})
     names = [name for source in sources for name in source.names]
     return short_digest((SAMPLES_VERSION, facts, [source.share for source in sources], names))
 
