@@ -18,7 +18,7 @@ def fully_fused_projection(
     width: int, height: int, eps2d: float = 0.3, near_plane: float = 0.01, far_plane: float = 1e10, *,
     opacities: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, None]:  # fmt: skip
-    """Radii [C, N, 2] int, means [C, N, 2], depths [C, N], conics [C, N, 3]; anything where the radii are 0."""
+    """Radii [C, N, 2] int, means [C, N, 2], depths [C, N], conics [C, N, 3]; radii are 0 for invisible Gaussians."""
     assert quats is scales is None
     assert covars is not None
     assert opacities is not None
@@ -47,7 +47,7 @@ def fully_fused_projection(
     low, high = means2d - radii, means2d + radii
     inside = (high > 0).all(-1) & (low[..., 0] < width) & (low[..., 1] < height)
     seen = inside & (z >= near_plane) & (z <= far_plane) & (det > 0) & (opacities >= ALPHA_MIN)
-    rubbish = torch.where(seen[..., None], means2d, torch.nan)  # as the kernel, which does not write there
+    rubbish = torch.where(seen[..., None], means2d, torch.nan)  # the kernel does not write these elements
     return (radii * seen[..., None]).detach().nan_to_num(0).int(), rubbish, z, conics, None
 
 
@@ -56,7 +56,7 @@ def isect_tiles(
     packed: bool = False, n_images: int | None = None, image_ids: Tensor | None = None,
     gaussian_ids: Tensor | None = None,
 ) -> tuple[None, Tensor, Tensor]:  # fmt: skip
-    """Of packed Gaussians [nnz] keys [M] (image and tile; sorted by depth, too) and ids [M], sorted."""
+    """Keys [M] (image and tile) and ids [M] of packed Gaussians, sorted by key and depth."""
     assert packed
     assert n_images is not None
     assert image_ids is not None

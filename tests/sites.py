@@ -42,7 +42,7 @@ def serve(content: bytes) -> Iterator[Site]:
 
 
 class _Server(ThreadingHTTPServer):
-    daemon_threads = False  # so that closing waits for them
+    daemon_threads = False  # closing the server waits for its threads
     site: Site
 
     def handle_error(self, request: Any, client_address: Any) -> None:

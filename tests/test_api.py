@@ -59,7 +59,7 @@ def test_every_public_name_is_there_and_no_other() -> None:
         spackle.nonsense  # noqa: B018
 
 
-def test_files_names_and_values_are_the_same_input(scene: spackle.Scene, pair: tuple[Path, Path]) -> None:
+def test_paths_and_loaded_values_give_the_same_scene(scene: spackle.Scene, pair: tuple[Path, Path]) -> None:
     photo, depth = pair
     loaded = spackle.load_photo(photo), spackle.load_depth(depth)
     assert same_bits(spackle.predict(*loaded).gaussians, scene.gaussians)
@@ -94,7 +94,7 @@ def test_a_photo_and_its_depth_in_every_form(pair: tuple[Path, Path], tmp_path: 
     portrait = portraits.apple_jpeg(portraits.codes(), portraits.apple_xmp())
     assert isinstance(portrait, bytes)
     (tmp_path / "portrait.jpg").write_bytes(portrait)
-    assert same_bits(session.predict(portrait).base, session.predict(tmp_path / "portrait.jpg").base)  # with its depth
+    assert same_bits(session.predict(portrait).base, session.predict(tmp_path / "portrait.jpg").base)
 
 
 @pytest.mark.parametrize(
@@ -121,7 +121,7 @@ def test_bad_input_is_refused_in_a_short_message(photo: Any, options: Any, words
     assert len(str(caught.value)) <= 300
 
 
-def test_scenes_go_to_open_files(scene: spackle.Scene, tmp_path: Path) -> None:
+def test_scenes_are_written_to_open_files(scene: spackle.Scene, tmp_path: Path) -> None:
     scene.save(tmp_path / "scene.ply")
     saved, exported, video = io.BytesIO(), io.BytesIO(), io.BytesIO()
     scene.save(saved)
@@ -182,4 +182,4 @@ def test_complete_fills_the_given_views(scene: spackle.Scene, tmp_path: Path) ->
     assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
     assert all(spackle.hole_area_ratio(made.render(camera).alpha) < 2e-3 for camera in cameras)
     seeds = spackle.complete(prediction, cameras, exact=True, network=None)
-    assert 10 < psnr(made.render(cameras[0]).rgb, seeds.render(cameras[0]).rgb) < 60  # the weights matter
+    assert 10 < psnr(made.render(cameras[0]).rgb, seeds.render(cameras[0]).rgb) < 60  # the weights change the picture

@@ -58,7 +58,7 @@ def test_examples_of_a_photo(photo: Path, tmp_path: Path) -> None:
     assert {path.suffix for path in (tmp_path / "1").iterdir()} == {".mp4", ".ply", ".html"}
     main_of(4)(photo, tmp_path / "4")
     own = spackle.Scene.load(tmp_path / "4" / "scene.ply")
-    assert float(own.base.means[:, 2].median()) == pytest.approx(11, abs=3)  # between 2 and 20 m
+    assert float(own.base.means[:, 2].median()) == pytest.approx(11, abs=3)  # the depths are between 2 and 20 m
     main_of(6)(photo, tmp_path / "6.mp4")
     assert frames(tmp_path / "6.mp4") > 30
 
@@ -85,7 +85,7 @@ def test_examples_of_videos(scene: Path, tmp_path: Path) -> None:
     assert frames(tmp_path / "sbs.mp4") == 24
     files = (tmp_path / "anaglyph.png", scene.with_name("photo.png"))
     glasses, photo = (np.asarray(Image.open(file), float) for file in files)
-    assert np.abs(glasses[..., 0] - photo[..., 0]).mean() > 5  # of 255
+    assert np.abs(glasses[..., 0] - photo[..., 0]).mean() > 5  # in 0..255
 
 
 @pytest.mark.slow

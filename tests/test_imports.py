@@ -130,7 +130,7 @@ def test_every_module_imports_without_optional_packages() -> None:
     assert int(subprocess.run(command, capture_output=True, text=True, check=True).stdout) == len(FILES) - 2
 
 
-# Modules beside the way from a photo to its scene: other bases, phones' depth, the page, clips, video frames.
+# Modules that a reader of the pipeline may skip: other bases, phones' depth, the page, clips, video frames.
 ASIDE = ("bases.lite", "bases.hf", "bases.moge", "bases.photo_depth", "formats.html", "clips", "video_frames")
 MOST_FILES, MOST_LINES = 51, 9_900  # may only be lowered
 

@@ -50,7 +50,7 @@ def train(place: Path) -> Words:
 
 
 def same_files(one: Path, other: Path) -> None:
-    """All files are equal, except for times."""
+    """Compare all files, except for the times in JSON."""
 
     def timeless(content: Any) -> Any:
         if isinstance(content, dict):
@@ -92,7 +92,7 @@ def test_ten_kills_change_nothing(
     assert process.wait() == 0
     lasts = time.monotonic() - start
     while kills < 10:
-        if process.returncode == 0:  # complete: begin again
+        if process.returncode == 0:  # the run is complete: begin again
             same(whole, killed)
             shutil.rmtree(killed)
         assert (runs := runs + 1) < 100, f"only {kills} kills: a run lasts {begins} to {lasts} s"

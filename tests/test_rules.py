@@ -68,7 +68,7 @@ def test_rule_2_each_aux_gaussian_comes_from_a_masked_cell(name: str, right: flo
     aux = fill_view(subject, camera, [subject.photo_guard()] if guarded else []).aux
     uv, z = camera.project(aux.means)
     column, row = (uv / 2).floor().long().unbind(-1)
-    beside = (uv - cell_centers(camera)[row, column]).abs()  # from the centre of the cell
+    beside = (uv - cell_centers(camera)[row, column]).abs()  # 0 at a cell's centre, 0.5 at a pixel's centre
     torch.testing.assert_close(torch.where(beside > 0.25, beside - 0.5, beside), 0 * beside, rtol=0, atol=0.02)
     most = CELL**2 + PASSES
     assert bool((z > 0).all())
@@ -88,7 +88,7 @@ def test_rule_3_a_view_without_holes_renders_as_the_base(name: str, network: boo
     assert len(aux) == 0
     assert len(fill_scene(subject, [subject.photo_camera] * 2).aux) == 0
     hidden = fill_view(subject, away(subject.photo_camera)).aux
-    assert len(hidden) > 0  # out of sight
+    assert len(hidden) > 0  # behind the photo's camera
     for more in (aux, hidden):
         assert same_bits(CPU.render([subject.base, more], subject.photo_camera), photo)
         assert same_bits(CPU.render(Gaussians.cat([subject.base, more]), subject.photo_camera), photo)

@@ -55,7 +55,7 @@ def test_a_pair_is_measured_and_compared(pairs: Path, capsys: pytest.CaptureFixt
 
 def test_sign_test() -> None:
     assert scoreboard.sign_test(5, 5) == 1
-    assert scoreboard.sign_test(9, 1) == pytest.approx(22 / 1024)  # 2 (1 + 10) of 2¹⁰
+    assert scoreboard.sign_test(9, 1) == pytest.approx(22 / 1024)  # 2 · (1 + 10) / 2¹⁰
     assert scoreboard.sign_test(0, 11) == pytest.approx(2 / 2048)
     before, now = {"a": {"x": 1.0}, "b": {"x": 2.0}, "c": {"x": 7.0}}, {"a": {"x": 2.0}, "b": {"x": 1.5}}
     assert scoreboard.change("x", before, now) == (1.5, 1.75, 1, 1)

@@ -31,7 +31,7 @@ from spackle.render import CpuRenderer
 from spackle.residual import hole_area_ratio
 from spackle.views import PathOptions, choose_move, plan_views
 
-PHOTO = Camera.from_focal(500, 400, 300)  # the diagonal of W/f and H/f is exactly one
+PHOTO = Camera.from_focal(500, 400, 300)  # hypot(W/f, H/f) = 1
 RANGE = DepthRange(near=2.0, focus=4.0)
 CAMERA = Camera.from_focal(60, 64, 48)
 DEPTHS = DepthRange(near=1.5, focus=4.0)
@@ -63,7 +63,7 @@ def test_the_interpolation_is_scipys_monotone_cubic() -> None:
     scipy = pytest.importorskip("scipy.interpolate")
     rng = np.random.default_rng(0)
     times, values = np.cumsum(rng.uniform(0.1, 2, 9)), rng.normal(size=(9, 3))
-    wanted = np.linspace(times[1], times[-2], 200)  # at the very ends the textbooks differ
+    wanted = np.linspace(times[1], times[-2], 200)  # SciPy computes other slopes at the two ends
     expected = scipy.PchipInterpolator(times, values)(wanted)
     np.testing.assert_allclose(interpolate(times, values, wanted), expected, atol=1e-12)
 
@@ -83,7 +83,7 @@ def test_frames_reach_the_keyframes_and_the_focal_length_changes() -> None:
 
 def test_a_closed_path_does_not_repeat_its_first_view() -> None:
     path = KeyframePath(KEYS, closed=True)
-    assert (path.seconds, path.frame_count(10)) == (3, 30)  # two steps of 1 s in the mean, and one back
+    assert (path.seconds, path.frame_count(10)) == (3, 30)  # the way back takes the mean of the two steps, 1 s
     eyes = torch.stack([view.position for view in path.cameras(CAMERA, 30, DEPTHS)])
     jumps = (eyes - eyes.roll(1, 0)).norm(dim=1)
     assert float(jumps[0]) < 2 * float(jumps.median())

@@ -22,14 +22,14 @@ PATTERNS = {
 
 
 @pytest.mark.parametrize(("depth", "expected"), [(0.2, [8, 7, 6, 5, 4, 3, 2, 1, 0, 19]), (0.3, range(10, 20))])
-def test_a_hole_starts_mirrored_where_the_surface_is_the_same(depth: float, expected: list[int]) -> None:
+def test_holes_start_as_mirror_images_of_the_same_surface(depth: float, expected: list[int]) -> None:
     ramp, hole = np.arange(20, dtype=np.float32)[None, :, None].repeat(3, -1), np.arange(20)[None] >= 10
     room._mirror(ramp, hole, np.where(hole, depth, 0).astype(np.float32), nearest_known(hole))
     assert ramp[0, :, 0].tolist() == [*range(10), *expected]
 
 
 @pytest.mark.parametrize("size", [(24, 31), (33, 26)])
-def test_costs_are_the_formulas_and_a_search_nears_the_best(size: tuple[int, int]) -> None:
+def test_costs_match_the_formula_and_searches_approach_the_minimum(size: tuple[int, int]) -> None:
     subject = Subject(*size)
     cells, places, costs = subject.cells, subject.places, subject.costs
     assert set(places[:, 0]) == {0, 1}
@@ -46,14 +46,14 @@ def test_costs_are_the_formulas_and_a_search_nears_the_best(size: tuple[int, int
 
 
 def punched(name: str) -> tuple[Tensor, Tensor, Tensor]:
-    """A pattern, the same with its mean in a hole, and the hole."""
+    """A pattern, the pattern with its mean colour in a hole, and the hole."""
     rgb, hole = torch.from_numpy(PATTERNS[name][..., None] * [1, 0.8, 0.6]).float(), torch.zeros(Y.shape) > 0
     hole[40:66, 45:71] = True
     return rgb, torch.where(hole[..., None], rgb[~hole].mean(0), rgb), hole
 
 
 @pytest.mark.parametrize(("name", "behind"), [("stripes", 1.0), ("bricks", 0.99), ("bricks", 0.9)])
-def test_a_texture_is_extended_alike_by_any_number_of_threads(name: str, behind: float) -> None:
+def test_textures_are_extended_equally_by_any_number_of_threads(name: str, behind: float) -> None:
     truth, guess, hole = punched(name)
     threads, found = torch.get_num_threads(), []
     try:
@@ -73,7 +73,7 @@ EDGES |= {"no source": (60, 60, np.s_[::5]), "deep": (12, 1100, np.s_[:, 20:])}
 
 
 @pytest.mark.parametrize("name", EDGES)
-def test_whatever_the_hole_colours_are_the_pictures(name: str) -> None:
+def test_extreme_holes_get_colours_of_the_picture(name: str) -> None:
     height, width, where = EDGES[name]
     rgb = torch.rand(height, width, 3, generator=torch.Generator().manual_seed(0)) / 2
     hole = torch.zeros(height, width, dtype=torch.bool)

@@ -46,12 +46,12 @@ FRAMES = [
     ((3, 14, 20, 4), (0.95, 0.92, 0.85)),  # a mount of different widths
     ((0, 25, 0, 25), (0.0, 0.0, 0.0)),
     ((30, 0, 31, 0), (0.1, 0.15, 0.45)),
-    ((8, 12, 9, 0), (1.0, 1.0, 1.0)),  # a caption takes the fourth side
+    ((8, 12, 9, 0), (1.0, 1.0, 1.0)),  # the fourth side has a caption
 ]
 
 
 @pytest.mark.parametrize(("widths", "color"), FRAMES)
-def test_a_frame_is_found_on_the_sides_that_have_it(widths: Sequence[int], color: Sequence[float]) -> None:
+def test_frames_are_found_on_their_sides(widths: Sequence[int], color: Sequence[float]) -> None:
     whole = framed(scene(), widths, color)
     noise = np.random.default_rng(0).normal(0, 1.5 / 255, whole.shape)
     for frame in (found(whole), found(whole + noise, quality=75)):
@@ -105,4 +105,4 @@ def test_a_crop_keeps_the_camera(tmp_path: Path) -> None:
     assert torch.equal(photo.camera.K, inside.K)
     small, full = resize_photo(photo, 90), photo.camera
     torch.testing.assert_close(small.camera.K, full.resized(small.width, small.height).K, rtol=0.01, atol=0.01)
-    assert load_photo(path, fov=60, keep_frame=False).frame is None  # the field of view belongs to the whole photo
+    assert load_photo(path, fov=60, keep_frame=False).frame is None  # a field of view is that of the uncropped photo
