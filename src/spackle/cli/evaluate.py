@@ -41,7 +41,9 @@ Side = Annotated[
 ]
 Disparity = Annotated[
     str,
-    typer.Option(metavar="A,B,…", help="Disparities of the large views, with commas; default: the paper's S1, S2, S3."),
+    typer.Option(
+        metavar="A,B,…", help="Disparities of the large views, with commas (by default the paper's S1, S2, S3)."
+    ),
 ]
 Output = Annotated[
     Path | None,

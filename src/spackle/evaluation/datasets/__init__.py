@@ -46,8 +46,8 @@ def read_cases(name: str, root: Path) -> list[Case]:
     """All cases of a dataset at or below `root`, in an order that depends on names alone.
 
     Raises:
-        InputError: there is no such folder, no scene of the dataset in it (the message names the expected files), two
-            scenes have the same name, or a scene's files are missing or damaged.
+        InputError: there is no such folder, scene (the message names the expected files) or photo, two scenes have the
+            same name, or a scene's files are missing or damaged.
     """
     dataset = DATASETS[name]
     if not root.is_dir():
@@ -63,7 +63,9 @@ def read_cases(name: str, root: Path) -> list[Case]:
         other = scenes.setdefault(scene, folder)
         if other is not folder:
             raise InputError(f"{folder}: {other} has the same scene name: give the folder of a single size or part")
-    return dataset.cases(scenes)
+    if not (cases := dataset.cases(scenes)):
+        raise InputError(f"{root}: the scenes of {name} have no photos with a pose: unpack the dataset again")
+    return cases
 
 
 def _scenes(folder: Path, dataset: EvalDataset, depth: int = MAX_DEPTH) -> Iterator[Path]:
