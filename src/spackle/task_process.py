@@ -41,19 +41,13 @@ class TaskProcess:
         """Do a task; returns None, or a line with the reason for a failure."""
         try:
             self._pipe.send(task)
-            while not isinstance(event := self._pipe.recv(), Ended):
+            while isinstance(event := self._pipe.recv(), Mapping):
                 tell(event)
         except (EOFError, OSError):
             self.kill()
             return DIED
-        return event.error
-
-
-class Ended:
-    """The last message about a task."""
-
-    def __init__(self, error: str | None) -> None:
-        self.error = error
+        error: str | None = event
+        return error
 
 
 def _serve(pipe: connection.Connection, work: Work) -> None:
@@ -70,7 +64,7 @@ def _serve(pipe: connection.Connection, work: Work) -> None:
         except Exception as bug:  # or too little memory: the next task may succeed
             traceback.print_exc()
             error = f"internal error: {type(bug).__name__}: {reason_in_a_line(bug)}"
-        pipe.send(Ended(error))
+        pipe.send(error)  # ends the task
 
 
 def end_with_parent() -> None:

@@ -175,13 +175,8 @@ class Plot(NamedTuple):
 
     title: str
     alt: str  # text for readers who cannot see the plot
-    svg: bytes
+    address: str  # the plot as a data URL
     note: str
-
-    @property
-    def address(self) -> str:
-        """The plot as a data URL."""
-        return f"data:image/svg+xml;base64,{base64.b64encode(self.svg).decode()}"
 
 
 def check_matplotlib(option: str) -> None:
@@ -224,7 +219,8 @@ def _draw(
         figure.legend(loc="outside lower left", frameon=False, ncols=1)
         file = io.BytesIO()
         figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None})
-    return Plot(title, f"{title}. {', '.join(one.title for one in series)}", file.getvalue(), note)
+    address = f"data:image/svg+xml;base64,{base64.b64encode(file.getvalue()).decode()}"
+    return Plot(title, f"{title}. {', '.join(one.title for one in series)}", address, note)
 
 
 def holes_plot(run: Run) -> Plot | None:

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from spackle.camera import Camera
 from spackle.evaluation.case import Case, Points, SecondView
@@ -74,15 +73,14 @@ def make_cases(views: Sequence[Posed], wanted: Iterable[int] | None = None) -> l
         fits &= axes @ axes[index] >= math.cos(math.radians(MAX_TURN))
         order = sorted(set(range(len(views))) - {index}, key=lambda k: (float(apart[k]), views[k].name))
         near = set(itertools.islice((k for k in order if fits[k] and _sees_the_same(view, views[k])), MAX_NEAR))
-        placed = (poses @ torch.linalg.inv(poses[index])).float()
-        seconds = tuple(SecondView(views[k].name, views[k].photo, _at(cameras[k], placed[k]), k in near) for k in order)
-        camera = _at(cameras[index], torch.eye(4))
+        moved = (poses @ torch.linalg.inv(poses[index])).float()
+        placed = [
+            dataclasses.replace(camera, world_to_camera=pose) for camera, pose in zip(cameras, moved, strict=True)
+        ]
+        seconds = tuple(SecondView(views[k].name, views[k].photo, placed[k], k in near) for k in order)
+        camera = dataclasses.replace(cameras[index], world_to_camera=torch.eye(4))
         cases.append(Case(view.name, view.photo, camera, None, view.points, view.bounds, seconds))
     return cases
-
-
-def _at(camera: Camera, world_to_camera: Tensor) -> Camera:
-    return dataclasses.replace(camera, world_to_camera=world_to_camera)
 
 
 def _sees_the_same(view: Posed, other: Posed) -> bool:
