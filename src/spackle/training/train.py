@@ -133,134 +133,121 @@ def train(
         checkpoint = None if overwrite else find_checkpoint(output, task.name, recipe, task.digest, reporter.log)
         facts = task.prepare(output, reporter)
         wait_for_ranks()  # all processes have looked for a checkpoint, so an old run may be deleted
-        with reading(output, "cannot write: {reason}", OSError):
-            if overwrite and rank() == 0:
-                remove_run(output)
-            why, step = _learn(recipe, task, output, checkpoint, facts, device, reporter)
-        reporter.log(f"{END[why]}, step {step} -> {output}")
-        return why
+        stack.enter_context(reading(output, "cannot write: {reason}", OSError))
+        if overwrite and rank() == 0:
+            remove_run(output)
 
+        optim, run = recipe.optim, recipe.run
+        network: nn.Module = task.network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+        average = copy.deepcopy(network).requires_grad_(False)
+        wrapped = DistributedDataParallel(network) if rank_count() > 1 else network
+        optimizer = AdamW(task.groups(), optim.lr, betas=optim.betas, weight_decay=optim.weight_decay)
+        progress, stopped = Progress(), False
+        if checkpoint:
+            with reading(output, "the checkpoint has another network ({reason}): choose another -o, or --overwrite"):
+                network.load_state_dict(checkpoint.network)
+                average.load_state_dict(checkpoint.average)
+                optimizer.load_state_dict(checkpoint.optimizer)
+            progress = checkpoint.progress
+        facts |= {"method": task.name, "aim": task.aim, "recipe": recipe.model_dump(mode="json")}
+        facts |= {"processes": rank_count(), "versions": versions(), "hardware": hardware(device)}
 
-def _learn(
-    recipe: AnyRecipe,
-    task: Task,
-    folder: Path,
-    checkpoint: Checkpoint | None,
-    facts: dict[str, Any],
-    device: torch.device,
-    reporter: Reporter,
-) -> tuple[str, int]:
-    """Run the training loop; returns why the loop ended, and the number of steps."""
-    optim, run = recipe.optim, recipe.run
-    network: nn.Module = task.network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
-    average = copy.deepcopy(network).requires_grad_(False)
-    wrapped = DistributedDataParallel(network) if rank_count() > 1 else network
-    optimizer = AdamW(task.groups(), optim.lr, betas=optim.betas, weight_decay=optim.weight_decay)
-    progress, stopped = Progress(), False
-    if checkpoint:
-        with reading(folder, "the checkpoint has another network ({reason}): choose another folder, or --overwrite"):
-            network.load_state_dict(checkpoint.network)
-            average.load_state_dict(checkpoint.average)
-            optimizer.load_state_dict(checkpoint.optimizer)
-        progress = checkpoint.progress
-    facts |= {"method": task.name, "aim": task.aim, "recipe": recipe.model_dump(mode="json")}
-    facts |= {"processes": rank_count(), "versions": versions(), "hardware": hardware(device)}
+        def ended() -> str:
+            """Why the run ends now; empty if the run continues."""
+            if progress.step >= optim.steps:
+                return "steps"
+            return "patience" if progress.stale >= run.patience else "stopped" if stopped else ""
 
-    def ended() -> str:
-        """Why the run ends now; empty if the run continues."""
-        if progress.step >= optim.steps:
-            return "steps"
-        return "patience" if progress.stale >= run.patience else "stopped" if stopped else ""
+        def report(ended: str | None = None) -> None:
+            if rank() == 0:
+                write_json({**facts, "ended": ended, **dataclasses.asdict(progress)}, output / RUN)
 
-    def report(ended: str | None = None) -> None:
-        if rank() == 0:
-            write_json({**facts, "ended": ended, **dataclasses.asdict(progress)}, folder / RUN)
+        def parts(step: int) -> list[list[int]]:
+            """The items of this process at a step, divided into passes through the network."""
+            items = samples_of_step(step, task.items, task.items_a_step, run.seed, rank(), rank_count())
+            size = task.at_once or len(items)
+            return [items[start : start + size] for start in range(0, len(items), size)]
 
-    def parts(step: int) -> list[list[int]]:
-        """The items of this process at a step, divided into passes through the network."""
-        items = samples_of_step(step, task.items, task.items_a_step, run.seed, rank(), rank_count())
-        size = task.at_once or len(items)
-        return [items[start : start + size] for start in range(0, len(items), size)]
+        def curves(group: str, values: Mapping[str, float]) -> None:
+            for name, value in values.items():
+                if logs is not None:
+                    logs.add_scalar(f"{group}/{name}", value, progress.step)
 
-    def curves(group: str, values: Mapping[str, float]) -> None:
-        for name, value in values.items():
-            if logs is not None:
-                logs.add_scalar(f"{group}/{name}", value, progress.step)
+        todo = ((step, part) for step in range(progress.step, optim.steps) for part in parts(step))
+        with (
+            open_logs(output, progress.step, reporter.log) if rank() == 0 else contextlib.nullcontext() as logs,
+            contextlib.closing(made_ahead(lambda key: task.batch(*key), todo)) as batches,
+            reporter.steps("train", progress.step, optim.steps) as tell,
+            asked_to_stop(alone=rank_count() == 1) as asked,
+        ):
+            begun, before, recent = time.perf_counter(), progress.seconds, list[dict[str, float]]()
+            while not ended():
+                step = progress.step
 
-    todo = ((step, part) for step in range(progress.step, optim.steps) for part in parts(step))
-    with (
-        open_logs(folder, progress.step, reporter.log) if rank() == 0 else contextlib.nullcontext() as logs,
-        contextlib.closing(made_ahead(lambda key: task.batch(*key), todo)) as batches,
-        reporter.steps("train", progress.step, optim.steps) as tell,
-        asked_to_stop(alone=rank_count() == 1) as asked,
-    ):
-        begun, before, recent = time.perf_counter(), progress.seconds, list[dict[str, float]]()
-        while not ended():
-            step = progress.step
+                # Forward and backward: parts add up gradients; after the last part, processes average gradients
+                optimizer.zero_grad(set_to_none=True)
+                sums: dict[str, Tensor] = {}
+                for number, part in enumerate(split := parts(step), 1):
+                    share = len(part) * rank_count() / task.items_a_step
+                    alone = rank_count() > 1 and number < len(split)
+                    with wrapped.no_sync() if alone else contextlib.nullcontext():  # type: ignore[operator]
+                        loss, terms = task.loss(wrapped, next(batches))
+                        (share * loss).backward()  # type: ignore[no-untyped-call]
+                    for name, value in {"loss": loss.detach(), **terms}.items():
+                        sums[name] = sums.get(name, 0.0) + share * value.double()
+                sums["gradient"] = clip_grad_norm_(network.parameters(), optim.clip).double()
+                mine = dict(zip(sums, torch.stack(list(sums.values())).tolist(), strict=True))
+                totals = sum_of_ranks({**mine, "stop": float(asked())}, device)
+                stopped = totals.pop("stop") > 0
+                numbers = {name: total / rank_count() for name, total in totals.items()}
+                if bad := [name for name, value in numbers.items() if not math.isfinite(value)]:
+                    raise InputError(f"{output}: step {step}: {', '.join(bad)} not finite: lower optim.lr")
 
-            # Forward and backward: parts add up their gradients, which are averaged over processes after the last part
-            optimizer.zero_grad(set_to_none=True)
-            sums: dict[str, Tensor] = {}
-            for number, part in enumerate(split := parts(step), 1):
-                share = len(part) * rank_count() / task.items_a_step
-                alone = rank_count() > 1 and number < len(split)
-                with wrapped.no_sync() if alone else contextlib.nullcontext():  # type: ignore[operator]
-                    loss, terms = task.loss(wrapped, next(batches))
-                    (share * loss).backward()  # type: ignore[no-untyped-call]
-                for name, value in {"loss": loss.detach(), **terms}.items():
-                    sums[name] = sums.get(name, 0.0) + share * value.double()
-            sums["gradient"] = clip_grad_norm_(network.parameters(), optim.clip).double()
-            mine = dict(zip(sums, torch.stack(list(sums.values())).tolist(), strict=True))
-            totals = sum_of_ranks({**mine, "stop": float(asked())}, device)
-            stopped = totals.pop("stop") > 0
-            numbers = {name: total / rank_count() for name, total in totals.items()}
-            if bad := [name for name, value in numbers.items() if not math.isfinite(value)]:
-                raise InputError(f"{folder}: step {step}: {', '.join(bad)} not finite: lower optim.lr")
+                # Step
+                rate = learning_rate(step, optim)
+                for group in optimizer.param_groups:
+                    group["lr"] = group.get("lr_scale", 1.0) * rate
+                optimizer.step()
+                with torch.no_grad():
+                    for mean, weight in zip(average.parameters(), network.parameters(), strict=True):
+                        mean.lerp_(weight, 1 - ema_decay(step, optim.ema))
+                progress.step, progress.seconds = step + 1, before + time.perf_counter() - begun
+                recent.append({**numbers, "lr": rate})
+                last = progress.step == optim.steps
 
-            # Step
-            rate = learning_rate(step, optim)
-            for group in optimizer.param_groups:
-                group["lr"] = group.get("lr_scale", 1.0) * rate
-            optimizer.step()
-            with torch.no_grad():
-                for mean, weight in zip(average.parameters(), network.parameters(), strict=True):
-                    mean.lerp_(weight, 1 - ema_decay(step, optim.ema))
-            progress.step, progress.seconds = step + 1, before + time.perf_counter() - begun
-            recent.append({**numbers, "lr": rate})
-            last = progress.step == optim.steps
+                # Log
+                if progress.step % run.log_every == 0 or last:
+                    numbers = {name: sum(each[name] for each in recent) / len(recent) for name in recent[0]}
+                    curves("train", numbers)
+                    tell(progress.step, f"loss {numbers['loss']:.4f}")
+                    recent = []
 
-            # Log
-            if progress.step % run.log_every == 0 or last:
-                numbers = {name: sum(each[name] for each in recent) / len(recent) for name in recent[0]}
-                curves("train", numbers)
-                tell(progress.step, f"loss {numbers['loss']:.4f}")
-                recent = []
+                # Validate the averaged weights, and export them if they are the best so far
+                if progress.step % run.validate_every == 0 or last:
+                    measures = validate(task, average, device)
+                    best = progress.validated(measures, task.aim, run.min_delta)
+                    if rank() == 0:
+                        sheet = task.picture(average)
+                        (output / PICTURES).mkdir(exist_ok=True)
+                        save_png(sheet, output / PICTURES / f"{progress.step:07d}.png")
+                        if best:
+                            task.export(average, output / BEST)
+                        curves("validation", measures)
+                        if logs is not None:
+                            logs.add_image("views", sheet.clamp(0, 1), progress.step, dataformats="HWC")
+                        values = ", ".join(f"{name} {value:.4f}" for name, value in measures.items())
+                        reporter.log(f"step {progress.step}: validation {values} (best step: {progress.best_step})")
+                        report()
 
-            # Validate the averaged weights, and export them if they are the best so far
-            if progress.step % run.validate_every == 0 or last:
-                measures = validate(task, average, device)
-                best = progress.validated(measures, task.aim, run.min_delta)
-                if rank() == 0:
-                    sheet = task.picture(average)
-                    (folder / PICTURES).mkdir(exist_ok=True)
-                    save_png(sheet, folder / PICTURES / f"{progress.step:07d}.png")
-                    if best:
-                        task.export(average, folder / BEST)
-                    curves("validation", measures)
-                    if logs is not None:
-                        logs.add_image("views", sheet.clamp(0, 1), progress.step, dataformats="HWC")
-                    values = ", ".join(f"{name} {value:.4f}" for name, value in measures.items())
-                    reporter.log(f"step {progress.step}: validation {values} (best step: {progress.best_step})")
+                # Save
+                if rank() == 0 and (progress.step % run.save_every == 0 or ended()):
+                    task.export(average, output / LAST)
+                    states = network.state_dict(), average.state_dict(), optimizer.state_dict()
+                    save_checkpoint(Checkpoint(progress, *states, facts["recipe"], task.digest, task.name), output)
                     report()
-
-            # Save
-            if rank() == 0 and (progress.step % run.save_every == 0 or ended()):
-                task.export(average, folder / LAST)
-                states = network.state_dict(), average.state_dict(), optimizer.state_dict()
-                save_checkpoint(Checkpoint(progress, *states, facts["recipe"], task.digest, task.name), folder)
-                report()
-    report(ended())
-    return ended(), progress.step
+        report(ended())
+        reporter.log(f"{END[ended()]}, step {progress.step} -> {output}")
+        return ended()
 
 
 @torch.no_grad()
