@@ -32,7 +32,6 @@ MAX_ZOOM = 0.15  # forward motion of rotate-forward, in units of z_near
 MIN_FOV, MAX_FOV = 1.0, 170.0  # degrees
 UP = (0.0, -1.0, 0.0)
 LEAST_STEP = 1e-6  # least time between two keyframes, in seconds
-STILL = 1e-100  # smaller slopes count as 0, because their inverse would overflow
 Array = NDArray[np.float64]
 
 
@@ -259,7 +258,7 @@ def _inner_tangents(steps: Array, slopes: Array) -> Array:
     """Tangents [K − 2, C]: weighted harmonic means of the slopes on both sides; 0 if the signs differ."""
     before, after = slopes[:-1], slopes[1:]
     first, second = steps[1:] * 2 + steps[:-1], steps[1:] + 2 * steps[:-1]
-    agree = (before * after > 0) & (np.minimum(np.abs(before), np.abs(after)) > STILL)
+    agree = before * after > 0
     safe_before, safe_after = np.where(agree, before, 1), np.where(agree, after, 1)
     mean = (first + second) / (first / safe_before + second / safe_after)
     tangents: Array = np.where(agree, mean, 0.0)

@@ -63,10 +63,6 @@ class Photo:
     def width(self) -> int:
         return int(self.rgb.shape[1])
 
-    def check_shape(self) -> None:
-        """Raise an InputError for a photo that is too small or too narrow to show a scene."""
-        check_shape(self.width, self.height, self.path)
-
     @property
     def framed_size(self) -> tuple[int, int]:
         """Width and height before the border was cropped."""
@@ -280,7 +276,7 @@ def read_image(path: str | os.PathLike[str], read: Callable[[Image.Image], T]) -
 
 
 def check_shape(width: int, height: int, path: str | os.PathLike[str]) -> None:
-    """Raise an InputError for a size that is too small or too narrow to show a scene."""
+    """Raise an InputError for a photo that is too small or too narrow to show a scene."""
     short, long = sorted((width, height))
     if short < LEAST_SIDE or long > MOST_ASPECT * short:
         wanted = f"at least {LEAST_SIDE} pixels a side, and at most {MOST_ASPECT} times as long as wide"

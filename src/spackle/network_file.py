@@ -54,8 +54,7 @@ def load_strict(
     Args:
         network: the network, which may be on the meta device.
         tensors: the file's tensors, see `read_tensors`.
-        path: the file, for messages.
-        advice: what to do about a wrong file, for messages.
+        path, advice: name of the file, and what to do about a wrong file, for messages.
         prepare: converts the filled network in place, before tensors are copied from the file.
 
     Raises:

@@ -17,7 +17,7 @@ from spackle.camera import Camera
 from spackle.camera_path import KeyframePath
 from spackle.errors import InputError
 from spackle.gaussians import Gaussians
-from spackle.image import Photo
+from spackle.image import Photo, check_shape
 from spackle.inpaint import InpainterOptions, get_inpainter
 from spackle.progress import Reporter, Step
 from spackle.render import Renderer, get_renderer
@@ -146,7 +146,7 @@ class Pipeline:
 
     def predict(self, photo: Photo, reporter: Reporter) -> tuple[BasePrediction, ResolvedBase]:
         """Predict the photo's Gaussians, and choose the size of the camera's movement; also return the chosen base."""
-        photo.check_shape()
+        check_shape(photo.width, photo.height, photo.path)
         name = photo.path.name
         if photo.frame is not None:
             reporter.log(f"{name}: {photo.frame.note}; --keep-frame keeps it")

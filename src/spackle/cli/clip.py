@@ -14,7 +14,7 @@ from spackle.clips.complete import ClipCompleter, CompletedView
 from spackle.clips.files import ClipWriter, clip_frames, read_clip
 from spackle.errors import InputError
 from spackle.files import file_records, results_folder, whole_set, write_json
-from spackle.image import Photo, focal_length, resize_photo
+from spackle.image import Photo, check_shape, focal_length, resize_photo
 from spackle.inpaint.plain import OpenCV
 from spackle.photo_results import PhotoOptions, shared_report
 from spackle.pipeline import Options, Pipeline, move_in_words
@@ -92,7 +92,7 @@ def predict_clip(
             pictures = clip_frames(clip)
             for index in range(len(clip)):
                 photo = Photo(next(pictures), *focal, path / NAME.format(index))
-                photo.check_shape()
+                check_shape(photo.width, photo.height, photo.path)
                 prediction, choice = base.predict(photo, log=reporter.log)
                 if first is None:  # its base, disparity and focal length hold for all frames
                     if completer.disparity is None:

@@ -21,7 +21,7 @@ from spackle.cli.saved_scene import page_name
 from spackle.errors import InputError, reading
 from spackle.files import check_file
 from spackle.formats.scene_files import scene_kind
-from spackle.image import load_photo
+from spackle.image import check_shape, load_photo
 from spackle.progress import Reporter, asked_to_stop
 from spackle.scene import Scene
 from spackle.views import PathOptions
@@ -90,7 +90,7 @@ def _checked(target: Path, settings: BaseSettings, lens: Mapping[str, float | No
         Scene.load(target, **lens)
         return page_name(target)
     photo = load_photo(target, keep_frame=keep_frame or settings.depth is not None, **lens)
-    photo.check_shape()
+    check_shape(photo.width, photo.height, photo.path)
     if settings.depth is not None:
         open_base(settings).load(photo)
     return target.name
