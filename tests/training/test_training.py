@@ -142,7 +142,7 @@ def test_a_folder_with_another_recipe_is_refused(place: Path, out: Path) -> None
     assert state(out).progress.step == 1
     assert names_in(out / "pictures") == {"0000001.png"}
     (out / "checkpoint.pt").write_bytes((out / "checkpoint.pt").read_bytes()[:1000])
-    refuses(train(place, out), "checkpoint.pt: cannot be read", "--overwrite starts anew")
+    refuses(train(place, out), "checkpoint.pt: cannot be read", "--overwrite starts a new run")
 
 
 def test_a_run_without_improvement_ends(place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -74,7 +74,7 @@ def load_checkpoint(folder: Path) -> Checkpoint | None:
     path = folder / CHECKPOINT
     if not path.exists():
         return None
-    with reading(path, "cannot be read ({reason}): --overwrite starts anew"):
+    with reading(path, "cannot be read ({reason}): --overwrite starts a new run"):
         state = torch.load(path, map_location="cpu", weights_only=True)
         return Checkpoint(**{**state, "progress": Progress(**state["progress"])})
 
@@ -90,7 +90,7 @@ def find_checkpoint(output: Path, method: str, recipe: AnyRecipe, digest: str, l
     if changed:
         raise InputError(
             f"{output}: holds a run with other settings ({', '.join(changed)}): choose another folder with -o, "
-            "or --overwrite to start anew"
+            "or start a new run with --overwrite"
         )
     log(f"{output}: resuming from step {checkpoint.progress.step}")
     return checkpoint

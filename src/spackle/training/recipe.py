@@ -173,7 +173,7 @@ def load_recipe(kind: type[R], path: str | os.PathLike[str], overrides: Sequence
         key, equals, value = override.partition("=")
         if not equals or not key:
             raise InputError(f"{override!r}: neither an option nor key=value, such as optim.steps=100")
-        with reading(override, f"no place for it in {path} ({{reason}})"):
+        with reading(override, f"{path} has no such key ({{reason}})"):
             _set(content, key.split("."), _parse(value, override))
     try:
         return kind.model_validate(content)

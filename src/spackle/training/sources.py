@@ -176,7 +176,7 @@ def open_pseudo(location: str | os.PathLike[str]) -> DatasetFiles:
             "--inpainter propainter, exemplar or lama"
         )
     if not any(views_with_holes(files, photo) for photo in range(len(files))):
-        raise InputError(f"{location}: no view in it has a hole: build it with a wider --disparity")
+        raise InputError(f"{location}: no view has a hole: build the dataset with a wider --disparity")
     return files
 
 
