@@ -44,7 +44,6 @@ class DatasetView:
 
     key: str  # the photo's key in its dataset
     index: int  # the view's number; 0 is the photo's camera
-    kind: str  # the kind of camera path
     photo: Tensor  # [h, w, 3] sRGB at its working size
     photo_camera: Camera
     camera: Camera  # the view's
@@ -125,7 +124,6 @@ class PhotoGroup:
             view = DatasetView(
                 key=self.key,
                 index=index,
-                kind=self.facts["trajectory"]["kind"],
                 photo=decode_rgb(self.files[f"{self.key}.photo.png"]),
                 photo_camera=camera_of(self.facts["photo_camera"], self.where),
                 camera=camera_of(facts, self.where),

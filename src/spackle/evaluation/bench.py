@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import statistics
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -22,9 +21,9 @@ from spackle.device import hardware, versions
 from spackle.evaluation.case import Case, load_case
 from spackle.evaluation.evaluate import EvaluateOptions, Evaluation, open_evaluation
 from spackle.evaluation.folder import ROWS, measure_images, write_rows
-from spackle.evaluation.methods import METHODS, make_method
+from spackle.evaluation.methods import make_method
 from spackle.evaluation.protocols import large_views
-from spackle.evaluation.rows import BASE_PATH, EXTRA, NOTE, Row, mean, pivot, setting_title
+from spackle.evaluation.rows import BASE_PATH, EXTRA, NOTE, Row
 from spackle.evaluation.tables import make_tables, write_tables
 from spackle.files import results_folder
 from spackle.gaussians import Gaussians
@@ -77,10 +76,6 @@ def bench(options: EvaluateOptions, runs: int, base_runs: int | None, output: Pa
         write_rows(run.rows, output / ROWS)
     count, total = len(run.measured), len(run.images)
     reporter.log(f"{run.title}: {count} of {total} images -> {output}")
-    overheads = pivot((row for row in run.rows if row.metric == "overhead"), "method", "setting")
-    for (method, setting), values in overheads.items():
-        overhead = mean(values, statistics.median).value or 0.0
-        reporter.log(f"overhead of {METHODS[method].title} {setting_title(setting)}: {100 * overhead:.2f} %")
     reporter.result({"folder": output, "images": total, "measured": count})
     return "complete"
 

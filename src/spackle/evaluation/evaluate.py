@@ -15,7 +15,7 @@ import spackle
 from spackle.bases import BasePrediction
 from spackle.bases.lift import RgbdBase
 from spackle.bases.open import OpenedBase, open_base, open_loaded
-from spackle.bases.settings import NETWORKS, BaseSettings
+from spackle.bases.settings import BaseSettings
 from spackle.camera_path import MAX_DISPARITY
 from spackle.device import hardware, pick_device, pick_dtype, versions
 from spackle.errors import InputError, check_name
@@ -184,8 +184,7 @@ def open_evaluation(options: EvaluateOptions, more_metrics: Sequence[str] = ()) 
 
 
 def _cases_of(options: EvaluateOptions) -> list[Case]:
-    """The cases to evaluate, with the second views to compare; InputError if the dataset does not fit the options."""
-    where = f"{options.root}: {options.dataset}"
+    """The cases to evaluate, with the second views to compare."""
     cases, limit = read_cases(options.dataset, options.root), options.limit
     if limit is not None and limit < len(cases):  # evenly spaced
         cases = [cases[(2 * k + 1) * len(cases) // (2 * limit)] for k in range(limit)]
@@ -193,11 +192,6 @@ def _cases_of(options: EvaluateOptions) -> list[Case]:
         cases = [dataclasses.replace(case, seconds=()) for case in cases]
     elif options.second_views == "nearest":
         cases = [dataclasses.replace(case, seconds=tuple(s for s in case.seconds if s.near)) for case in cases]
-    if options.near and not any(case.seconds for case in cases):
-        raise InputError(f"{where}: has no second photos: take --protocol large-view")
-    if not options.base.network and not any(case.depth or case.points for case in cases):
-        problem = "has neither depth maps nor points, which --base rgbd needs"
-        raise InputError(f"{where}: {problem}: take {', '.join(NETWORKS)}")
     return cases
 
 
