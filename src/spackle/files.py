@@ -29,6 +29,9 @@ BLOCK = 1 << 20  # bytes that are hashed at once
 def check_file(path: str | os.PathLike[str], kind: str) -> int:
     """Return the size in bytes of a plain, non-empty file; for anything else raise an InputError that names `kind`."""
     with reading(repr(str(path)), "cannot be read: {reason}", OSError, ValueError):
+        if re.match(r"(https?|ftp|s3|gs):/", str(path)):  # a Path has lost the second slash
+            address = re.sub(":/+", "://", str(path), count=1)
+            raise InputError(f"{address}: an address, not a file: download it first and give the name of the {kind}")
         if not os.path.exists(path):
             raise InputError(f"{path}: no such {kind}: check the name")
         if not os.path.isfile(path):

@@ -92,6 +92,8 @@ def test_options_that_cannot_be(place: Path, command: str, options: str, says: s
 def test_an_input_has_to_be_named(tmp_path: Path) -> None:
     refuses(run("predict"), "PHOTO")
     refuses(run("render", "-o", tmp_path / "out"), "SCENE")
+    address = "https://example.com/a.jpg"
+    refuses(run("predict", address), f"{address}: an address, not a file: download it first")
     refuses(run("predict", write_photo(tmp_path / "a.png"), "--base", "rgbd", "-o", tmp_path / "out"), "--depth")
 
 

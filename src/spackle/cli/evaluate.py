@@ -29,7 +29,7 @@ DatasetName = Annotated[
     str, typer.Option(metavar="NAME", help="Dataset: middlebury, booster, wildrgbd, tanks, eth3d or llff.")
 ]
 Folder = Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the unpacked dataset.")]
-BaseName = Annotated[str, typer.Option(help="sharp, moge, depth, lite, hf:NAME, or rgbd with the dataset's depth.")]
+BaseName = Annotated[str, typer.Option(help="sharp, moge, lite, hf:NAME, or rgbd with the dataset's depth.")]
 Checkpoint = Annotated[Path | None, typer.Option("-c", "--checkpoint", help="Weights of the base.")]
 Residual = Annotated[
     str | None,
