@@ -117,28 +117,28 @@ def extended_segments(packet: bytes, part: int = 1000) -> tuple[str, list[bytes]
     ]
 
 
-def multi_picture(photo: bytes, *others: bytes, order: str = "<", shift: int = 0) -> bytes:
+def multi_picture(photo: bytes, *others: bytes, shift: int = 0) -> bytes:
     """A JPEG with further JPEGs after it, listed in the Multi-Picture Format with offsets that are wrong by `shift`."""
     count = 1 + len(others)
     place, at = 10, len(photo) + 8 + 50 + 16 * count  # of the byte order mark, and of the second picture
-    entries = struct.pack(f"{order}IIIHH", 0x20030000, at, 0, 0, 0)
+    entries = struct.pack(">IIIHH", 0x20030000, at, 0, 0, 0)
     for other in others:
-        entries += struct.pack(f"{order}IIIHH", 0, len(other), at - place + shift, 0, 0)
+        entries += struct.pack(">IIIHH", 0, len(other), at - place + shift, 0, 0)
         at += len(other)
-    head = {"<": b"II*\0", ">": b"MM\0*"}[order] + struct.pack(f"{order}IH", 8, 3)
-    head += struct.pack(f"{order}HHI4s", 0xB000, 7, 4, b"0100") + struct.pack(f"{order}HHII", 0xB001, 4, 1, count)
-    head += struct.pack(f"{order}HHIII", 0xB002, 7, 16 * count, 50, 0)
+    head = b"MM\0*" + struct.pack(">IH", 8, 3)
+    head += struct.pack(">HHI4s", 0xB000, 7, 4, b"0100") + struct.pack(">HHII", 0xB001, 4, 1, count)
+    head += struct.pack(">HHIII", 0xB002, 7, 16 * count, 50, 0)
     return with_segments(photo, segment(0xE2, b"MPF\0" + head + entries)) + b"".join(others)
 
 
-def apple_jpeg(map_: NDArray[np.uint8], packet: bytes | None = None, orientation: int = 1, order: str = "<") -> bytes:
+def apple_jpeg(map_: NDArray[np.uint8], packet: bytes | None = None, orientation: int = 1) -> bytes:
     """A portrait as iPhones write it: the depth map comes after a gain map and a matte."""
     other = jpeg(np.flipud(map_))
     gain_map = with_segments(other, xmp_segment(xmp("><apdi:StoredFormat>1278226488</apdi:StoredFormat>", APPLE)))
     said = apple_xmp("L008", more="<apdi:AuxiliaryImageType>depth</apdi:AuxiliaryImageType>")
     matte = with_segments(other, xmp_segment(said))
     depth = with_segments(jpeg(map_), xmp_segment(apple_xmp() if packet is None else packet))
-    return multi_picture(jpeg(picture(), orientation), gain_map, matte, depth, order=order)
+    return multi_picture(jpeg(picture(), orientation), gain_map, matte, depth)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -87,21 +87,16 @@ def layouts_read() -> Iterator[tuple[str, bytes, NDArray[Any], str, float, str]]
             ("", between(0.1, 1), "disparity", 0.9 / 255, "assumed to be 1 to 10 m)"),
         ):
             yield f"HEIC, {kind!r}: {words}", hevc(codes(), information=words, kind=kind), depth, *rest
-    for order in "<>":
-        data = portraits.apple_jpeg(codes(), order=order)
-        yield f"JPEG, Apple's {order}", data, between(0.5, 3, gray(portraits.jpeg(codes()))), *apple
+    yield "JPEG, Apple's", portraits.apple_jpeg(codes()), between(0.5, 3, gray(portraits.jpeg(codes()))), *apple
     for name, make in ANDROID.items():
         inverse, linear = ("disparity", 1.875 / 255), ("depth", 7.5 / 255)
         for image, said, depth, *rest in (
             (png(codes()), Range(unit="Meters"), INVERSE, *inverse, "Depth, in meters)"),
-            (png(codes()), Range(style="RangeLinear"), LINEAR, *linear, "Depth, in m)"),
-            (png(codes()), Range(500, 8000, unit="mm"), INVERSE, *inverse, "in mm)"),
-            (png(codes()), Range(2, 0.125, unit="Diopters"), LINEAR, *linear, "in diopters)"),
+            (png(codes()), Range(500, 8000, "RangeLinear", unit="mm"), LINEAR, *linear, "in mm)"),
             (png(codes()), Range(2, 0.125, "RangeLinear", unit="Diopters"), INVERSE, *inverse, "in diopters)"),
             (png(codes()), Range(0.5, 8, unit="parsec"), INVERSE, *inverse, "Depth, unit unknown)"),
             (png(SIXTEEN_BITS), Range(), between(2, 1 / 8, SIXTEEN_BITS / 65535), "disparity", 1.875 / 65535, "in m)"),
             (LOSSY, Range(), between(2, 1 / 8, gray(LOSSY)), "disparity", None, "in m)"),
-            (png(codes()), Range(50, 800), 100 * INVERSE, "disparity", 0.01875 / 255, "in m)"),
         ):
             yield f"{name}, {said}", make(image, said), depth, *rest
 
@@ -202,10 +197,8 @@ def test_photos_without_depth(tmp_path: Path) -> None:
     for name, data in files.items():
         assert load_photo_depth(portraits.write(tmp_path / name, data)) is None, name
     assert load_photo_depth(write_photo(tmp_path / "photo.png")) is None
-    for name in ("nowhere.jpg", "empty.jpg"):
-        (tmp_path / "empty.jpg").write_bytes(b"")
-        with pytest.raises(InputError, match=name):
-            load_photo_depth(tmp_path / name)
+    with pytest.raises(InputError, match="no such photo"):
+        load_photo_depth(tmp_path / "nowhere.jpg")
 
 
 def test_damaged_maps_and_maps_without_a_meaning_are_refused(tmp_path: Path) -> None:
