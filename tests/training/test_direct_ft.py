@@ -17,7 +17,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 from training_runs import losses_of, one_thread, run_two, state
 
-from spackle.bases.sharp.base import PARTS, expected_shapes
+from spackle.bases.sharp.base import expected_shapes
 from spackle.bases.sharp.encoder import MICRO
 from spackle.dataset import DatasetFiles
 from spackle.dataset.shards import load_manifest
@@ -29,6 +29,7 @@ pytest.importorskip("yaml")
 __all__ = ["one_thread"]  # a fixture
 
 CPU = torch.device("cpu")
+PARTS = ("feature_model.", "prediction_head.")  # of SHARP, which direct-ft trains
 WIDTH, HEIGHT, VIEWS = 64, 48, 5
 RECIPE = """
 data: {pseudo: %s, validation_views: 5}

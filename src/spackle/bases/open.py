@@ -23,9 +23,7 @@ from spackle.bases.settings import AUTO, HF, NETWORKS, RGBD, ROUGH, BaseSettings
 from spackle.bases.sharp.base import SharpBase
 from spackle.device import MemoryShort
 from spackle.errors import InputError
-from spackle.files import check_file
 from spackle.image import Photo
-from spackle.weights import check_undamaged
 
 LOG = logging.getLogger("spackle")
 Log = Callable[[str], None]
@@ -52,8 +50,6 @@ def open_base(settings: BaseSettings) -> OpenedBase:
     InputError for an option that the base cannot use, or a missing file.
     """
     settings.check()
-    for file in settings.files.values():
-        check_file(file, "file of weights")
     why = f"--base {settings.named}" if settings.name != AUTO else "--depth" if settings.depth is not None else "-c"
     return OpenedBase(ORDER if settings.named == AUTO else {settings.named: (why, "")}, settings, {})
 
@@ -72,7 +68,6 @@ def _load_network(name: str, settings: BaseSettings) -> Base | None:
         return LiteBase.load(settings.checkpoint, device=device)
     if (file := settings.files.get(name)) is None:
         return None
-    check_undamaged(file)
     if name == "moge":
         return MogeBase.load(file, device=device, precision=precision)
     windows, compiled = settings.windows, settings.compiled

@@ -30,7 +30,7 @@ def weights_get(
 
     from spackle.files import results_folder
     from spackle.progress import Reporter
-    from spackle.weights import file_digest, published_weights, weights_folder
+    from spackle.weights import published_weights, weights_digest, weights_folder
     from spackle.weights.download import download
 
     reporter, entry = Reporter(as_json=as_json), published_weights(name)
@@ -43,11 +43,11 @@ def weights_get(
         for line in entry.notice:
             reporter.log(line)
         with results_folder(path.parent, [path.name], alone=True), reporter.transfer(name) as step:
-            download(url or entry.address, path, entry.bytes, entry.sha256, step)
+            download(url or entry.url, path, entry.bytes, entry.sha256, step)
         reporter.log(f"{summary} -> {path}" + ("" if output is None else f"; {entry.option}"))
     else:
         with reporter.stage("check"):
-            if file_digest(path) != entry.sha256:
+            if weights_digest(path) != entry.sha256:
                 raise InputError(
                     f"{path}: damaged, or a file of yours: SHA-256 is not {entry.sha256}: --force replaces it"
                 )

@@ -33,7 +33,7 @@ from spackle.training.recipe import Recipe
 from spackle.training.residual import ViewBatch, ViewTask
 from spackle.training.samples import short_digest
 from spackle.training.sources import divided_photos, open_pseudo
-from spackle.weights import check_undamaged, installed, weights_digest
+from spackle.weights import installed, weights_digest
 
 VIEWS_AT_ONCE = 4  # views of a photo in a step; they share one pass through the encoder, the most expensive part
 
@@ -121,7 +121,6 @@ class DirectFt(ViewTask):
         read_tensors(path, "give SHARP's checkpoint")  # without the numbers; refuses other files
         if owner_of(path) is not None:
             raise InputError(f"-c {path}: an already trained decoder: give the original checkpoint of SHARP")
-        check_undamaged(path)
         self.owner = Owner(path, weights_digest(path))
         self.files = open_pseudo(data.pseudo)
         base = self.files.manifest.config.get("base", {})

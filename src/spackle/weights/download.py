@@ -93,15 +93,12 @@ def _network(url: str) -> Iterator[None]:
 def _first_byte(url: str, response: HTTPResponse, present: int, size: int) -> int:
     """The offset at which an answer begins: after the present bytes, or 0 if the server sends the whole file.
 
-    InputError if the answer is no file, or a file of another size than `size`.
+    InputError if the file has another size than `size`.
     """
     rest = re.fullmatch(r"bytes (\d+)-\d+/(\d+)", response.headers["Content-Range"] or "")
+    done, total = 0, size if response.length is None else response.length
     if response.status == 206 and rest and int(rest[1]) == present:
         done, total = present, int(rest[2])
-    elif response.status == 200 and response.headers.get_content_type() != "text/html":
-        done, total = 0, size if response.length is None else response.length
-    else:
-        raise InputError(f"{url}: the server's answer is not a file: check the address in a browser")
     if total != size:
         raise InputError(f"{url}: another file: {total:,} bytes instead of {size:,}: give another address")
     return done

@@ -31,7 +31,6 @@ WINDOWS_AT_ONCE = 5  # enough to keep two cores or a small GPU busy
 ADVICE = "give SHARP's checkpoint as it was downloaded"
 LESS_MEMORY = "try --sharp windows=1 and --precision bf16"
 NOTE = "spackle.gaussian_decoder"  # a decoder file's only metadata key, as JSON: safetensors shuffles several keys
-PARTS = ("feature_model.", "prediction_head.")  # prefixes of the names of a decoder's tensors
 _ENCODER = "monodepth_model.monodepth_predictor.encoder."
 # Prefixes of tensors that are never read: the transformers' classifiers, and a U-Net that only training uses.
 UNUSED = (f"{_ENCODER}patch_encoder.head.", f"{_ENCODER}image_encoder.head.", "depth_alignment.")
@@ -197,11 +196,8 @@ def decoder_bytes(decoder: nn.Module, owner: Owner) -> bytes:
 def link_owner(owner: Owner, folder: Path) -> None:
     """Put a link to a checkpoint into the folder of its decoders, under a name that no other file has."""
     link = folder / owner.places[0]
-    with contextlib.suppress(OSError):  # if the file system has no links, the user must copy the checkpoint
-        if link.is_symlink() and not link.exists():  # the checkpoint has moved
-            link.unlink()
-        if not link.exists():
-            link.symlink_to(owner.path.absolute())
+    with contextlib.suppress(OSError):  # the link exists, or the file system has none: then the user copies the file
+        link.symlink_to(owner.path.absolute())
 
 
 def owner_of(path: str | os.PathLike[str]) -> Owner | None:
@@ -231,10 +227,4 @@ def _with_owner(decoder: Mapping[str, Tensor], path: str | os.PathLike[str], own
             f"{path}: trained on a checkpoint with the SHA-256 {one_line(owner.sha256)[:64]}, but {home} has another: "
             f"put the right {name} into the folder"
         )
-    whole = read_tensors(home, ADVICE)
-    if wrong := sorted({name for name in whole if name.startswith(PARTS)} ^ decoder.keys()):
-        raise InputError(
-            f"{path}: not the decoder of {home}: {len(wrong)} names differ, e.g. {one_line(wrong[0])[:120]}: "
-            "give what `spackle train --method direct-ft` wrote"
-        )
-    return {**whole, **decoder}
+    return {**read_tensors(home, ADVICE), **decoder}
