@@ -132,7 +132,7 @@ def test_every_module_imports_without_optional_packages() -> None:
 
 # Modules that a reader of the pipeline may skip: other bases, phones' depth, the page, clips, video frames.
 ASIDE = ("bases.lite", "bases.hf", "bases.moge", "bases.photo_depth", "formats.html", "clips", "video_frames")
-MOST_FILES, MOST_LINES = 51, 9_900  # may only be lowered
+MOST_FILES, MOST_LINES = 50, 9_700  # may only be lowered
 
 
 def test_the_way_from_photo_to_scene_stays_short() -> None:

@@ -8,7 +8,6 @@ import io
 import json
 import logging
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -138,31 +137,17 @@ class Reporter:
 
 
 class LogReporter(Reporter):
-    """Logs to the logger "spackle"; with `progress`, draws a bar on one line of the standard error."""
+    """Logs to the logger "spackle"; with `progress`, draws a bar on the standard error."""
 
     def __init__(self, progress: bool = False) -> None:
-        super().__init__()
-        self._progress, self._log = progress, logging.getLogger("spackle")
+        super().__init__(console=Console(stderr=True, force_terminal=progress, force_jupyter=False))
+        self._log = logging.getLogger("spackle")
 
     def log(self, line: str) -> None:
         self._log.info(line)
 
     def warn(self, line: str) -> None:
         self._log.warning(line)
-
-    @contextlib.contextmanager
-    def stage(self, name: str) -> Iterator[Step]:
-        """Draw the progress of the stages "base" and "complete", in terminals and notebooks alike."""
-        start, drawn = time.monotonic(), self._progress and name in ("base", "complete")
-
-        def draw(done: int, total: int) -> None:
-            if drawn:
-                bar = "█" * (20 * done // total) if total else ""
-                print(f"\r{name:<10}{bar:<20} {done}/{total} {time.monotonic() - start:.0f} s", end="", file=sys.stderr)
-
-        yield draw
-        if drawn:
-            print(file=sys.stderr)
 
 
 class Notes(Reporter):

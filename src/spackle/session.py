@@ -142,7 +142,7 @@ def predict(
         keep_frame: keep a uniform frame around a picture, which is otherwise cropped unless depth or a focal length is
             given.
         focal_px, focal_mm, fov: the focal length, see `load_photo`.
-        progress: draw progress on one line of the standard error.
+        progress: draw a bar on the standard error.
 
     Raises:
         InputError: a photo, a depth map, a name or weights that cannot be used; `base` together with `depth`, or a
