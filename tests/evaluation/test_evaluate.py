@@ -321,7 +321,6 @@ def test_a_run_resumes_to_the_same_bytes_and_runs_share_tables(scenes: Path, tmp
         (("--base", "auto"), "--base auto"),
         (("--metrics", "psnr"), "add --protocol near-view"),
         (("--disparity", "0.3,x"), "not numbers"),
-        (("--disparity", "0.3", "--protocol", "near-view"), "--disparity 0.3: --protocol near-view"),
         (("--disparity", "3"), "up to 2"),
         (("--methods", "direct-ft"), "add --base sharp, and --direct-ft FILE"),
         (("--methods", ","), "none is given"),

@@ -17,7 +17,6 @@ from spackle.cli.options import (
     VerboseOption,
     sharp_speed,
 )
-from spackle.errors import InputError
 
 UNFIT = re.compile(r"[^\w.-]+")  # characters that are replaced in a folder's name
 
@@ -58,7 +57,6 @@ Html = Annotated[bool, typer.Option("--html", help="Also write report.html, one 
 
 
 def evaluate(
-    context: typer.Context,
     folder: Folder,
     dataset: DatasetName,
     protocol: Annotated[
@@ -128,12 +126,6 @@ def evaluate(
         limit=limit,
         download=download_metrics,
     )
-    given = context.get_parameter_source("disparity")
-    if options.near and given is not None and given.name == "COMMANDLINE":
-        raise InputError(
-            f"--disparity {disparity}: --protocol near-view renders the views of the true second photos: "
-            "leave one of the two options out"
-        )
     results = output or Path(f"evaluation-{dataset}-{protocol}")
     if run(options, results, Reporter(verbose, as_json=as_json), html) == "stopped":
         raise typer.Exit(INTERRUPTED)

@@ -40,7 +40,6 @@ from spackle.residual import MASK_THRESHOLD
 from spackle.weights import weights_digest, weights_digests
 from spackle.workers import at_work
 
-MAX_PHOTOS = 1_000_000  # a photo's key has six digits
 PARTS = "parts"  # folder in the output for samples that are not in a shard yet
 
 
@@ -153,11 +152,6 @@ def build_dataset(source: Path, output: Path, options: DatasetOptions, reporter:
     if maker.inpainter is not None and maker.inpainter.notice:
         reporter.log(maker.inpainter.notice)
     root, names = find_photos(source, options.images, reporter.log)
-    if options.sample is None and len(names) > MAX_PHOTOS:
-        raise InputError(
-            f"{source}: {len(names):,} photos are too many for a dataset (at most {MAX_PHOTOS:,}): "
-            "give --sample, or build several"
-        )
     with reporter.stage("photos") as step:
         photos = choose(root, names, options.sample, options.seed, reporter.log, step)
     config = configuration(options, photos, maker.inpainter)

@@ -89,12 +89,11 @@ SIGNS = {
     "±": r"$\pm$", "−": "$-$", "–": "--", "…": r"\ldots{}", "σ": r"$\sigma$", "<": "$<$", ">": "$>$", "≥": r"$\geq$",
     "†": r"$\dagger$", "‡": r"$\ddagger$", "→": r"$\to$",
 }  # fmt: skip
-LAST_LETTER = "\u017f"  # the last letter in pdfLaTeX's usual fonts; names of scenes may have other letters
 
 
 def tex(text: str) -> str:
     """Escape text for LaTeX; text between ** becomes bold."""
-    safe = "".join(SIGNS.get(sign, sign if " " <= sign <= LAST_LETTER else "?") for sign in text)
+    safe = "".join(SIGNS.get(sign, sign) for sign in text)
     return re.sub(r"\*\*(.+?)\*\*", r"\\textbf{\1}", safe)
 
 
