@@ -144,39 +144,32 @@ def expected_shapes(width: int = WIDTH, blocks: int = BLOCKS) -> Shapes:
     """Names and shapes of the published tensors, without `num_batches_tracked`."""
     shapes: Shapes = {}
 
-    def conv(name: str, *shape: int, bias: bool = False, transposed: bool = False) -> None:
-        shapes[f"{name}.weight"] = shape
+    def add(conv: str, norm: str | None, *shape: int, bias: bool = False, transposed: bool = False) -> None:
+        """Add a convolution, and the batch norm `norm` of its outputs."""
+        shapes[f"{conv}.weight"], outputs = shape, (shape[transposed],)
         if bias:
-            shapes[f"{name}.bias"] = (shape[transposed],)
-
-    def norm(name: str, channels: int) -> None:
-        shapes.update({f"{name}.{key}": (channels,) for key in ("weight", "bias", "running_mean", "running_var")})
+            shapes[f"{conv}.bias"] = outputs
+        if norm:
+            shapes.update({f"{norm}.{key}": outputs for key in ("weight", "bias", "running_mean", "running_var")})
 
     deep = 8 * width
     near, far, half = deep // LOCAL, deep - deep // LOCAL, (deep - deep // LOCAL) // 2
-    conv("model.1.ffc.convl2l", width, 4, 7, 7)
-    norm("model.1.bn_l", width)
+    add("model.1.ffc.convl2l", "model.1.bn_l", width, 4, 7, 7)
     for stage, channels in ((2, 2 * width), (3, 4 * width)):
-        conv(f"model.{stage}.ffc.convl2l", channels, channels // 2, 3, 3)
-        norm(f"model.{stage}.bn_l", channels)
+        add(f"model.{stage}.ffc.convl2l", f"model.{stage}.bn_l", channels, channels // 2, 3, 3)
     for name, channels in (("l", near), ("g", far)):
-        conv(f"model.4.ffc.convl2{name}", channels, deep // 2, 3, 3)
-        norm(f"model.4.bn_{name}", channels)
+        add(f"model.4.ffc.convl2{name}", f"model.4.bn_{name}", channels, deep // 2, 3, 3)
     for name in _layer_names(blocks):
-        conv(f"{name}.ffc.convl2l", near, near, 3, 3)
-        conv(f"{name}.ffc.convl2g", far, near, 3, 3)
-        conv(f"{name}.ffc.convg2l", near, far, 3, 3)
-        conv(f"{name}.ffc.convg2g.conv1.0", half, far, 1, 1)
-        norm(f"{name}.ffc.convg2g.conv1.1", half)
-        conv(f"{name}.ffc.convg2g.fu.conv_layer", far, far, 1, 1)
-        norm(f"{name}.ffc.convg2g.fu.bn", far)
-        conv(f"{name}.ffc.convg2g.conv2", far, half, 1, 1)
-        norm(f"{name}.bn_l", near)
-        norm(f"{name}.bn_g", far)
+        spectral = f"{name}.ffc.convg2g"
+        add(f"{name}.ffc.convl2l", f"{name}.bn_l", near, near, 3, 3)
+        add(f"{name}.ffc.convl2g", f"{name}.bn_g", far, near, 3, 3)
+        add(f"{name}.ffc.convg2l", None, near, far, 3, 3)
+        add(f"{spectral}.conv1.0", f"{spectral}.conv1.1", half, far, 1, 1)
+        add(f"{spectral}.fu.conv_layer", f"{spectral}.fu.bn", far, far, 1, 1)
+        add(f"{spectral}.conv2", None, far, half, 1, 1)
     for stage, channels in zip(_up_stages(blocks), (deep, deep // 2, deep // 4), strict=True):
-        conv(f"model.{stage}", channels, channels // 2, 3, 3, bias=True, transposed=True)
-        norm(f"model.{stage + 1}", channels // 2)
-    conv(f"model.{_last_stage(blocks)}", 3, width, 7, 7, bias=True)
+        add(f"model.{stage}", f"model.{stage + 1}", channels, channels // 2, 3, 3, bias=True, transposed=True)
+    add(f"model.{_last_stage(blocks)}", None, 3, width, 7, 7, bias=True)
     return shapes
 
 
