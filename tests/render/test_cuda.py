@@ -16,7 +16,7 @@ from scenes import box_before_wall, same_bits, shifted
 from spackle.device import MemoryShort
 from spackle.errors import InputError
 from spackle.gaussians import Gaussians
-from spackle.render import CpuRenderer, cuda, get_renderer, render_batch
+from spackle.render import CpuRenderer, cuda, get_renderer
 from spackle.render.cuda import GsplatRenderer, SetStore, load_gsplat, upper_covariances
 from spackle.render.protocol import ALPHA_MAX, Rendering
 
@@ -104,12 +104,12 @@ def test_a_batch_of_views_equals_single_views_bit_for_bit(gpu: GsplatRenderer) -
     scenes = [[BASE, BASE.select(slice(0, 50))], [], [Gaussians.empty(), BASE.select(slice(40, None))]]
     cameras, tiles = [SIDE, SIDE, SCENE.camera], [None, TILES, TILES]
     onto = [None, None, CPU.render(BASE, SCENE.camera)]
-    together = render_batch(gpu, scenes, cameras, tiles=tiles, onto=onto)
+    together = gpu.render_batch(scenes, cameras, tiles=tiles, onto=onto)
     views = list(zip(scenes, cameras, tiles, onto, strict=True))
     alone = [gpu.render(sets, camera, tiles=tile, onto=under) for sets, camera, tile, under in views]
     assert all(map(same_bits, together, alone))
-    for one, other in zip(together, render_batch(CPU, scenes, cameras, tiles=tiles, onto=onto), strict=True):
-        agree(one, other)
+    for one, (sets, camera, tile, under) in zip(together, views, strict=True):
+        agree(one, CPU.render(sets, camera, tiles=tile, onto=under))
     with pytest.raises(ValueError, match="one size"):
         gpu.render_batch([[BASE]] * 2, [SIDE, SIDE.resized(40, 40)])
 

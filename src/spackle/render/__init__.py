@@ -1,19 +1,15 @@
 """Renderers turn Gaussians and a camera into colour, depth and opacity."""
 
 import logging
-from collections.abc import Sequence
 from importlib import import_module
 
 import torch
-from torch import Tensor
 
-from spackle.camera import Camera
 from spackle.errors import InputError
-from spackle.gaussians import Gaussians
 from spackle.render.cpu import CpuRenderer, touched_tiles
-from spackle.render.protocol import TILE, Renderer, Rendering
+from spackle.render.protocol import TILE, Renderer
 
-__all__ = ["TILE", "CpuRenderer", "Renderer", "device_of", "get_renderer", "render_batch", "touched_tiles"]
+__all__ = ["TILE", "CpuRenderer", "Renderer", "device_of", "get_renderer", "touched_tiles"]
 
 LOG = logging.getLogger("spackle")
 
@@ -34,22 +30,6 @@ def get_renderer(device: str = "auto") -> Renderer:
                 raise
             LOG.warning("rendering on the CPU: %s", error)
     return CpuRenderer()
-
-
-def render_batch(
-    renderer: Renderer,
-    scenes: Sequence[Sequence[Gaussians]],
-    cameras: Sequence[Camera],
-    *,
-    tiles: Sequence[Tensor | None],
-    onto: Sequence[Rendering | None],
-) -> list[Rendering]:
-    """Render several views of one size, see `Renderer.render`; on a GPU in one batch."""
-    if hasattr(renderer, "render_batch"):
-        together: list[Rendering] = renderer.render_batch(scenes, cameras, tiles=tiles, onto=onto)
-        return together
-    views = zip(scenes, cameras, tiles, onto, strict=True)
-    return [renderer.render(sets, camera, tiles=wanted, onto=under) for sets, camera, wanted, under in views]
 
 
 def device_of(renderer: Renderer) -> torch.device:

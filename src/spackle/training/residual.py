@@ -19,7 +19,7 @@ from spackle.files import make_folder, write_whole
 from spackle.formats.png import sheet
 from spackle.network_file import load_strict, read_tensors
 from spackle.progress import Reporter
-from spackle.render import Renderer, device_of, get_renderer, render_batch
+from spackle.render import Renderer, device_of, get_renderer
 from spackle.render.protocol import Rendering
 from spackle.residual.architectures import NOTE, SharpDecoder, decoder_size, load_residual, open_residual
 from spackle.residual.complete import compose
@@ -118,7 +118,11 @@ def complete_samples(
         aux = compose(sample.seeds.select(index), field.flatten(1).T[index], sample.camera)
         scenes.append([sample.base, aux])
     cameras, onto = [sample.camera for sample in samples], [sample.rendering for sample in samples]
-    views = render_batch(renderer, scenes, cameras, tiles=tiles, onto=onto)
+    if hasattr(renderer, "render_batch"):  # on a GPU
+        views = renderer.render_batch(scenes, cameras, tiles=tiles, onto=onto)
+    else:
+        parts = zip(scenes, cameras, tiles, onto, strict=True)
+        views = [renderer.render(sets, camera, tiles=wanted, onto=under) for sets, camera, wanted, under in parts]
     return ViewBatch.of((view, s.rendering.rgb, s.target, s.hole) for view, s in zip(views, samples, strict=True))
 
 
