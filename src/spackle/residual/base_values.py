@@ -118,13 +118,9 @@ def fill_around(
 ) -> tuple[Tensor, Tensor]:
     """Inverse depth [h, w] and colours [3, h, w] of all cells, extended beyond the photo's border.
 
-    Args:
-        features: of the view.
-        across: [h, w] inverse depth, with holes filled from all sides.
-        uv: [h, w, 2] pixels of the cells.
-        known: [h, w] bool: cells from which values are propagated.
-        inside: [h, w] bool: cells that project into the photo; their holes are filled from the far surface.
-        camera, photo_camera: of the view and of the photo.
+    `across` [h, w] is the inverse depth with holes filled from all sides, `uv` [h, w, 2] the pixels of the cells.
+    Values are propagated from the cells `known` ([h, w] bool). Cells `inside` ([h, w] bool) project into the photo;
+    their holes are filled from the far surface.
     """
     mask, bias, colors = features.mask, FAR_BIAS * inside, features.rgb.movedim(-1, 0)
     beyond = mask & ~inside

@@ -220,17 +220,8 @@ def make_samples(
 ) -> list[Path]:
     """Make the missing samples of the first `views` views in a folder; returns the files of all samples in order.
 
-    Args:
-        data: the number of crops per view and their size.
-        sources: each view comes from one of these, drawn by share. A single source may have fewer views.
-        folder: a folder for the samples, which several recipes may share.
-        seed: determines the views.
-        views: number of views. The processes of a run divide them.
-        progress: called with (number of views done, number of views) of this process.
-        warn: called with the reason if a view cannot be made.
-
-    Raises:
-        InputError: no file can be written, or no view gave a sample.
+    `seed` determines the views; the processes of a run divide them. `warn` is called with the reason if a view cannot
+    be made. InputError if no file can be written, or no view gave a sample.
     """
     folder.mkdir(parents=True, exist_ok=True)
     if len(sources) == 1 and sources[0].views is not None:
