@@ -60,14 +60,10 @@ def test_a_photo_becomes_a_scene(server: Served) -> None:
     assert (server.ask(f"{SCENES}/{id}").status, folder.exists()) == (404, False)
 
 
-def test_programs_learn_the_interface(server: Served) -> None:
-    schema = server.ask("/api/v1/openapi.json").json
-    assert {path: set(methods) for path, methods in schema["paths"].items()} == {
-        SCENES: {"post"},
-        f"{SCENES}/{{id}}": {"get", "delete"},
-        f"{SCENES}/{{id}}/events": {"get"},
-        f"{SCENES}/{{id}}/files/{{file}}": {"get"},
-    }
+def test_the_interface_is_described(server: Served) -> None:
+    paths = server.ask("/api/v1/openapi.json").json["paths"]
+    below = ("", "/{id}", "/{id}/events", "/{id}/files/{file}")
+    assert set(paths) == {f"{SCENES}{path}" for path in below}
     docs = server.ask("/docs").body.decode()
     assert all(word in docs for word in ("DELETE", "keep_frame", "scene.spz"))
     assert "http" not in docs.lower().replace("http interface", "")  # nothing is fetched from elsewhere

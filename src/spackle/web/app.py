@@ -25,7 +25,7 @@ from starlette.staticfiles import StaticFiles
 
 import spackle
 from spackle.bases.settings import AUTO
-from spackle.errors import InputError, check_name, one_line
+from spackle.errors import InputError, one_line
 from spackle.formats.html import page_file
 from spackle.image import PHOTO_SUFFIXES
 from spackle.task_process import Work
@@ -94,7 +94,7 @@ def create_app(
         docs_url=None,
         redoc_url=None,
         lifespan=until_the_end,
-        exception_handlers={HTTPException: refused, RequestValidationError: unknown},
+        exception_handlers=dict.fromkeys((HTTPException, RequestValidationError, InputError), answered),
     )
     app.state.jobs = jobs
     app.add_middleware(Guard, access=access, max_bytes=max_bytes)
@@ -184,28 +184,23 @@ def create_app(
 
 
 def accept(form: FormData, folder: Path, jobs: Jobs, bases: list[str]) -> Job:
-    """Decode a form's photo and add its job; HTTPException if it is refused."""
+    """Decode a form's photo and add its job; HTTPException for a bad form, InputError for a file that is no photo."""
     photo, depth, text = form.get("photo"), form.get("depth"), form.get("options") or "{}"
     if len(form.getlist("photo")) != 1 or not isinstance(photo, UploadFile) or not isinstance(text, str):
         raise HTTPException(422, "send one photo as the file `photo`, and the options as the text `options`")
     name = shown_name(photo.filename or "")
     try:
         options = SceneOptions.model_validate_json(text)
-        check_name("base", options.base or bases[0], bases)
     except ValidationError as error:
         first = error.errors()[0]
-        raise HTTPException(
-            422, one_line(f"{'.'.join(map(str, ('options', *first['loc'])))}: {first['msg']}")
-        ) from error
-    except InputError as error:
-        raise HTTPException(422, str(error)) from error
+        line = f"{'.'.join(map(str, ('options', *first['loc'])))}: {first['msg']}"
+        raise HTTPException(422, one_line(line)) from error
+    if options.base not in (None, *bases):
+        raise HTTPException(422, one_line(f"base {options.base}: unknown: there are {', '.join(bases)}"))
     source, of_depth = _saved(photo, folder, "source", name, PHOTO_SUFFIXES), None
     if isinstance(depth, UploadFile) and depth.filename:
         of_depth = _saved(depth, folder, "depth", "depth map", DEPTH_SUFFIXES)
-    try:
-        check_photo(folder / source, name, folder / PREVIEW)
-    except InputError as error:
-        raise HTTPException(415, str(error)) from error
+    check_photo(folder / source, name, folder / PREVIEW)
     return jobs.add(folder, name, source, of_depth, options.model_dump(exclude_unset=True))
 
 
@@ -225,11 +220,12 @@ def shown_name(given: str) -> str:
     return "".join(character for character in last if character.isprintable()).strip()[-MAX_NAME:]
 
 
-async def refused(request: Request, error: Any) -> JSONResponse:
-    return JSONResponse({"error": error.detail}, error.status_code, error.headers)
-
-
-async def unknown(request: Request, error: Any) -> JSONResponse:
+async def answered(request: Request, error: Any) -> JSONResponse:
+    """The answer to a refused request, with the reason in one line."""
+    if isinstance(error, HTTPException):
+        return JSONResponse({"error": error.detail}, error.status_code, error.headers)
+    if isinstance(error, InputError):
+        return JSONResponse({"error": str(error)}, 415)
     return JSONResponse({"error": "there is nothing with that name"}, 404)
 
 
