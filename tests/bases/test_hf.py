@@ -37,7 +37,6 @@ MODELS: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
     for name, entry in json.loads((Path(__file__).parents[1] / "data" / "depth_models.json").read_text()).items()
 }  # tiny models of the published kinds: class, settings, and the image processor's settings
 RELATIVE = ("relative", "dpt")
-LIFT = "spackle.bases.lift.lift"
 Folders = dict[str, Path]  # by the names in `MODELS`
 
 

@@ -15,7 +15,7 @@ from weights import save_networks
 
 import spackle
 from spackle.bases import NEAREST_M
-from spackle.bases.lite import FARTHEST, INPUT_SCALES, SCALE, SHIPPED, LiteBase, LiteNet, load_networks, merged
+from spackle.bases.lite import FARTHEST, SCALE, SHIPPED, LiteBase, LiteNet, load_networks
 from spackle.errors import InputError
 from spackle.image import Photo
 
@@ -44,15 +44,6 @@ def test_depth_of_a_real_photo_beats_a_ramp_and_a_plane() -> None:
     for guess in (vertical_ramp(*depth.shape), torch.ones_like(depth)):
         assert found.abs_rel < 0.9 * score_depth(guess, depth, valid).abs_rel
     assert found.delta > 0.8
-
-
-def test_a_mirrored_photo_has_mirrored_depth() -> None:
-    rgb, *_ = motorcycle()
-    seen, mirrored = (shipped().at_scales(picture, INPUT_SCALES) for picture in (rgb, rgb.flip(1)))
-    tilt = [scale.tilt for scale in INPUT_SCALES]
-    assert float((merged(mirrored, tilt) - merged(seen, tilt).flip(1)).abs().mean()) < 0.02
-    both = torch.tensor([scale.mirrored for scale in INPUT_SCALES])
-    torch.testing.assert_close(mirrored[both], seen[both].flip(2), rtol=1e-3, atol=1e-4)
 
 
 def test_the_same_photo_gives_the_same_scene_and_its_colours() -> None:

@@ -11,7 +11,7 @@ from scenes import psnr
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, max_pool2d
 
-from spackle.bases.quadtree import BEND, LEVELS, Quadtree, Tiles
+from spackle.bases.quadtree import BEND, LEVELS, Quadtree
 from spackle.bases.splats import layered_gaussians
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, extremes
@@ -100,14 +100,6 @@ def test_a_cut_covers_every_pixel_once_and_no_other_costs_less(worth: float) -> 
             at = part.rows[mine] * part.height // side, part.columns[mine] * part.width // side
             cost += float(lost[at].sum()) / shares
         assert cost + worth * count == pytest.approx(best(3, row, column), rel=1e-3)
-
-
-def test_means_of_tiles_are_those_of_their_pixels() -> None:
-    image = torch.rand(9, 11, 2)
-    tiles = Tiles(2, 4, torch.tensor([0, 3]), torch.tensor([1, 0]))
-    expected = torch.stack([image[:2, 4:8].mean((0, 1)), image[6:8, :4].mean((0, 1))])
-    torch.testing.assert_close(tiles.means(image), expected)
-    assert tiles.centers().tolist() == [[6.0, 1.0], [2.0, 7.0]]
 
 
 @pytest.mark.parametrize("slant", [0.0, 0.3])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 
 import numpy as np
 import pytest
@@ -16,12 +15,12 @@ from torch.nn.functional import avg_pool2d, max_pool2d
 from spackle.bases import silhouettes, splats
 from spackle.bases.quadtree import LEVELS
 from spackle.bases.silhouettes import find_layers
-from spackle.bases.splats import WEIGHTS, blended_opacities, layered_gaussians, mixture
+from spackle.bases.splats import blended_opacities, layered_gaussians, mixture
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, extremes
 from spackle.color import linear_to_srgb, srgb_to_linear
 from spackle.render import CpuRenderer
-from spackle.surface import OPACITY, surface_gaussians
+from spackle.surface import surface_gaussians
 
 Image = np.ndarray
 CPU = CpuRenderer()
@@ -105,20 +104,6 @@ def test_a_sharpened_fringe_belongs_to_the_near_surface() -> None:
     scene.rgb[:, 31][scene.depth[:, 32] < 3] = torch.tensor([1.0, 1.0, 0.9])
     for wall in wall_beside(scene):
         assert float(wall[:, 2].amax()) < 0.6
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_opacities_blend_to_the_shares(seed: int) -> None:
-    inverse, slope, colors = steps(seed)
-    layers = find_layers(inverse, slope, colors)
-    opacity = blended_opacities(layers.alpha, layers.ring)
-    for y, x in np.argwhere((layers.ring > 0) & (opacity > 0) & (opacity < 1)):
-        passes = 1.0
-        for k, (dy, dx) in enumerate(itertools.product((-1, 0, 1), repeat=2)):
-            v, u = min(max(y + dy, 0), inverse.shape[0] - 1), min(max(x + dx, 0), inverse.shape[1] - 1)
-            if k != 4 and layers.ring[v, u]:
-                passes *= 1 - OPACITY * WEIGHTS[k] * opacity[v, u]
-        assert 1 - passes * (1 - opacity[y, x]) == pytest.approx(layers.alpha[y, x], abs=0.03)
 
 
 def test_a_mixture_is_the_renderers_picture() -> None:

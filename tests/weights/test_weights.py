@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import json
 import os
@@ -130,22 +129,6 @@ def test_servers_that_hang_are_refused(site: Site, target: Path, monkeypatch: py
     with socket.create_server(("127.0.0.1", 0)) as silent:
         refused(f"http://127.0.0.1:{silent.getsockname()[1]}/", target.with_name("other"), "timed out")
     refused(site.url.replace("http:", "https:"), target, "SSL")
-
-
-def test_places_that_cannot_be_written(site: Site, target: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = target.parent
-    refused(site.url, folder, "a folder")
-    refused(site.url, folder / "missing" / "a.pt", "a.pt", "does not exist")
-    refused(site.url, folder / ("a" * 252), "too long", "choose another folder")  # with .part it is
-    assert site.requests == []
-
-    def full(descriptor: int) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "fsync", full)
-        refused(site.url, target, "No space left on device: make room or choose")
-    fetches(site.url, target)
 
 
 def test_the_entries_of_published_weights() -> None:

@@ -83,10 +83,7 @@ class DepthMap:
 
 
 def find_depth(depth: Path, photo: Path) -> Path:
-    """The depth map of a photo: the file `depth`, or the file with the photo's name in the folder `depth`.
-
-    InputError if the folder has no such file.
-    """
+    """The file `depth`, or the depth map with the photo's name in the folder `depth`; InputError if it is missing."""
     if not os.path.isdir(depth):
         return depth
     for name in (photo.name, photo.stem):  # a.jpg.npy before a.npy, because a.npy may belong to a.png
@@ -126,9 +123,8 @@ def load_depth(
         near: nearest depth of a relative map, in metres.
         far: farthest depth of a relative map, in metres.
 
-    Raises:
-        InputError: the map is missing, broken, too large, misshapen, negative or entirely unknown, or it looks
-            relative and `kind` is auto.
+    InputError for a map that is missing, broken, too large, misshapen, negative or entirely unknown; also if `kind` is
+    auto and the map looks relative.
     """
     check_file(path, "depth map")
     if kind in RELATIVE:

@@ -223,10 +223,7 @@ def settle(sampled: Sampled, rgb: Floats) -> Floats:
     at their outlines. In a smeared edge the change of the smeared depth is added, so that the paths from both sides
     meet in the middle of the edge if the photo shows no outline. The depth of each side is extended along its surface.
     In a hole, a start pixel nearer than the hole's far side costs extra, because most holes are background that is
-    hidden from a second camera.
-
-    Returns:
-        Inverse depth [H, W]; settled pixels are unchanged.
+    hidden from a second camera. Returns inverse depth [H, W]; settled pixels are unchanged.
     """
     depth, hole = sampled.inverse_depth.copy(), sampled.state == HOLE
     for state in (OPEN, HOLE):

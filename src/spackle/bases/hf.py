@@ -59,8 +59,7 @@ class HfBase:
         """Read a model from a folder, or as owner/name from the hub's cache, else the hub; none of its code is run.
 
         At the precision auto, matrix products are bf16 if the hardware multiplies it natively. InputError for a device,
-        package, model or file that is missing, broken or unknown, and for too little memory; ValueError for an unknown
-        precision.
+        package, model or file that is missing, broken or unknown, and for too little memory.
         """
         target = pick_device(device)
         dtype, name, source = pick_dtype(precision, target), f"hf:{model}", os.path.expanduser(model)
@@ -126,10 +125,8 @@ def meaning_of(settings: Mapping[str, Any], name: str) -> Meaning:
 def to_depth_map(raw: Tensor, meaning: Meaning, focal: float, name: str, photo: Path) -> DepthMap:
     """Convert a model's output [h, w] float32 to metres; pixels without a positive finite depth are not valid.
 
-    Canonical disparity depends on `focal`, the photo's focal length over its width; messages name `name` and `photo`.
-
-    Raises:
-        InputError: the output has no finite number, none above zero, or the same one everywhere.
+    Canonical disparity depends on `focal`, the photo's focal length over its width. InputError, which names `name` and
+    `photo`, if the output has no positive number or is constant.
     """
     known = torch.isfinite(raw)
     low, high = (float(extreme) for extreme in raw[known].aminmax()) if known.any() else (math.nan, math.nan)
@@ -162,10 +159,7 @@ def _transformers() -> Any:
 
 
 def _read(transformers: Any, source: str, name: str, *, from_hub: bool) -> tuple[nn.Module, Prepare, Meaning]:
-    """A float32 network from safetensors, its preprocessing, and the meaning of its output.
-
-    No code of the model runs. OSError if a file is missing.
-    """
+    """A float32 network from safetensors, its preprocessing, and its output's meaning; OSError for a missing file."""
     files = {"local_files_only": not from_hub, "trust_remote_code": False}
     settings, _ = transformers.PretrainedConfig.get_config_dict(source, **files)
     meaning, kind = meaning_of(settings, name), str(settings["model_type"])  # before weights are loaded

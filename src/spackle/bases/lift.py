@@ -62,12 +62,9 @@ def lift(rgb: Tensor, depth: DepthMap, camera: Camera, levels: int = LEVELS) -> 
 
     Args:
         rgb: [H, W, 3] sRGB in 0..1.
-        depth: of any size with the photo's aspect ratio.
+        depth: of any size with the photo's aspect ratio; InputError if no pixel has a depth.
         camera: the photo's camera, at the world's origin.
         levels: number of tile sizes. All pixels of a tile share one Gaussian; with 0, every pixel has its own.
-
-    Raises:
-        InputError: no pixel has a depth.
     """
     rgb = rgb.detach().float().contiguous()
     values = depth.depth.detach().float()
@@ -95,10 +92,7 @@ DEVIATIONS = 2.0  # a value may change by this number of the noise's standard de
 
 
 def noise_level(inverse_depth: Floats, known: Bools) -> float:
-    """Standard deviation of the noise of most pixels, relative to the inverse depth.
-
-    The second difference by y and then by x is zero on planes and straight edges; the median ignores other pixels.
-    """
+    """Standard deviation of most pixels' noise, relative to the inverse depth, by second differences in y and x."""
     if min(inverse_depth.shape) < 3:
         return 0.0
     bend, seen = inverse_depth, known

@@ -45,10 +45,7 @@ class BaseError(InputError):
 
 
 def open_base(settings: BaseSettings) -> OpenedBase:
-    """A base by its settings; networks are loaded when the first photo needs them.
-
-    InputError for an option that the base cannot use, or a missing file.
-    """
+    """A base by its settings, whose network is loaded for the first photo; InputError for unsuitable settings."""
     settings.check()
     why = f"--base {settings.named}" if settings.name != AUTO else "--depth" if settings.depth is not None else "-c"
     return OpenedBase(ORDER if settings.named == AUTO else {settings.named: (why, "")}, settings, {})
@@ -125,15 +122,13 @@ class OpenedBase:
     ) -> tuple[BasePrediction, ResolvedBase]:
         """A photo's Gaussians by the first candidate that works.
 
+        InputError if this photo or its depth cannot be used; BaseError if no photo can be used.
+
         Args:
             photo: at its full size.
             depth: this photo's depth, used instead of the settings' depth; for rgbd only.
             log: gets a line for each candidate that fails.
             stage: times the stages "prepare", in which a base is loaded, and "base", in which it predicts.
-
-        Raises:
-            InputError: this photo or its depth cannot be used.
-            BaseError: the base cannot be used for any photo.
         """
         reasons, failures = list[str](), list[str]()
         for name, (title, absence) in self.candidates.items():
@@ -171,10 +166,7 @@ class OpenedBase:
         return prediction, ResolvedBase(name, why, tuple(failures), note if new else "")
 
     def load(self, photo: Photo, depth: Depth = None, name: str | None = None) -> Base | None:
-        """Load the candidate `name`, or the first one; None if the photo has no depth, or the machine no weights.
-
-        InputError if it cannot be loaded.
-        """
+        """Load the candidate `name` (else the first); None without depth or weights, InputError if loading fails."""
         name = name or next(iter(self.candidates))
         if name == RGBD and name not in self._loaded:
             return _lift(self._settings, photo, depth)

@@ -47,12 +47,8 @@ def find_layers(inverse_depth: Floats, slope: Floats, colors: Floats) -> Layers:
 
     A lens blurs a silhouette, so that a pixel or two on each side show both surfaces. Both surfaces are continued
     across the step, with colours from pixels that show one surface alone. The map's outline, which may lie a pixel or
-    two beside the photo's outline, is shifted to it.
-
-    Args:
-        inverse_depth: [H, W].
-        slope: [H, W, 2] derivative of the inverse depth by pixel x and y.
-        colors: [H, W, 3] linear RGB of the photo.
+    two beside the photo's outline, is shifted to it. `slope` [H, W, 2] is the derivative of `inverse_depth` [H, W] by
+    pixel x and y; `colors` [H, W, 3] are the photo's linear RGB.
     """
     height, width = inverse_depth.shape
     ring, levels = _rings(inverse_depth)

@@ -40,14 +40,9 @@ SWEEPS = 3  # number of iterations that correct colours, and of those that corre
 def layered_gaussians(inverse_depth: Tensor, colors: Tensor, camera: Camera, levels: int = LEVELS) -> Gaussians:
     """Gaussians, about one and at most 2.25 per pixel, that blend to the photo at the photo's camera.
 
-    They come in this order: single pixels, row by row, on the surface that covers most of the pixel; tiles of up to 8×8
-    pixels; the other surface of mixed pixels; the backing.
-
-    Args:
-        inverse_depth: [H, W], positive everywhere.
-        colors: [H, W, 3] linear RGB.
-        camera: the photo's camera.
-        levels: number of tile sizes; 0 gives one Gaussian per pixel and one backing Gaussian per 2×2 pixels.
+    `inverse_depth` [H, W] is positive everywhere, `colors` [H, W, 3] are linear RGB, and `levels` is the number of tile
+    sizes. The Gaussians come in this order: single pixels, row by row, on the surface that covers most of the pixel;
+    tiles of up to 8×8 pixels; the other surface of mixed pixels; the backing.
     """
     slope = surface_slope(inverse_depth)
     layers = find_layers(*(image.contiguous().numpy() for image in (inverse_depth, slope, colors)))
@@ -121,8 +116,6 @@ class _Surface(NamedTuple):
 
 
 class _Pixels(NamedTuple):
-    """The surfaces of a photo's pixels."""
-
     most: _Surface  # the surface that covers most of a pixel
     rest: _Surface  # the other surface; valid if `mixed`
     mixed: Tensor  # [H, W] bool
@@ -201,10 +194,7 @@ REACH = np.sqrt(-2 * np.log(FAINT))  # an alpha of 1 falls to FAINT at this numb
 
 
 def blended_opacities(alpha: Floats, ring: NDArray[np.uint8]) -> Floats:
-    """Opacities [H, W] with which Gaussians and their neighbours together cover the share alpha [H, W] of each pixel.
-
-    `ring` [H, W] is 0 for a pixel that shows one surface alone.
-    """
+    """Opacities [H, W] with which Gaussians and their neighbours together cover the share alpha [H, W] of pixels."""
     result = alpha.copy()
     for _ in range(SWEEPS):
         _thin(alpha, ring, result)

@@ -26,9 +26,7 @@ def download(url: str, path: str | os.PathLike[str], size: int, sha256: str, pro
 
     The bytes are collected in NAME.part; the complete file then replaces an existing file. After a broken connection, a
     kill or Ctrl-C the next call requests only the missing bytes. `progress` counts the bytes of earlier calls too.
-
-    Raises:
-        InputError: the file cannot be fetched or written, or has other content.
+    InputError if the file cannot be fetched or written, or has other content.
     """
     target = check_writable(path)
     part = target.with_name(f"{target.name}.part")
@@ -91,10 +89,7 @@ def _network(url: str) -> Iterator[None]:
 
 
 def _first_byte(url: str, response: HTTPResponse, present: int, size: int) -> int:
-    """The offset at which an answer begins: after the present bytes, or 0 if the server sends the whole file.
-
-    InputError if the file has another size than `size`.
-    """
+    """The offset at which an answer begins: 0 if the server sends the whole file; InputError for another size."""
     rest = re.fullmatch(r"bytes (\d+)-\d+/(\d+)", response.headers["Content-Range"] or "")
     done, total = 0, size if response.length is None else response.length
     if response.status == 206 and rest and int(rest[1]) == present:

@@ -51,10 +51,7 @@ class MogeBase:
     def load(
         cls, path: str | os.PathLike[str], *, precision: Precision = "auto", device: torch.device | str | None = None
     ) -> MogeBase:
-        """Read MoGe-2's model.pt; the precision auto means bfloat16 if the hardware multiplies it natively.
-
-        InputError for a missing device, a foreign or broken file, or too little memory.
-        """
+        """Read MoGe-2's model.pt; InputError for a missing device, a foreign or broken file, or too little memory."""
         target = pick_device(device)
         dtype = pick_dtype(precision, target)
         with enough_memory():
@@ -98,10 +95,7 @@ class MogeBase:
 
 
 def to_view(output: MogeOutput, width: int, height: int, focal_px: float | None = None) -> MogeView:
-    """Convert the output for a width×height photo to metres; a shift along z lets each point project to its pixel.
-
-    The focal length (in pixels of the photo) is estimated together with the shift, unless it is given.
-    """
+    """Convert the output for a width×height photo to metres, by the shift and focal length of `focal_and_shift`."""
     rows, columns = output.mask_logits.shape
     half_diagonal = math.hypot(width, height) / 2
     down, right = (torch.arange(SAMPLES) * n // SAMPLES for n in (rows, columns))

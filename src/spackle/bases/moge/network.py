@@ -206,11 +206,10 @@ def view_plane(rows: int, columns: int, aspect: float) -> Tensor:
 
 
 def load_network(path: str | os.PathLike[str], dtype: torch.dtype) -> MogeNetwork:
-    """A frozen network from MoGe-2's model.pt, on the CPU.
+    """A frozen network from MoGe-2's model.pt, on the CPU; InputError for a wrong file or too little memory.
 
     Residual blocks compute in `dtype`, float32 or bfloat16, and add to float32 features, because bfloat16's eight bits
-    would turn slanted surfaces into stairs. InputError for a missing, broken or foreign file, or too little memory.
-    Nothing in the file is executed.
+    would turn slanted surfaces into stairs. Nothing in the file is executed.
     """
     config, tensors = read_checkpoint(path, "model_config", ADVICE)
     with reading(path, f"not a published kind of MoGe-2 ({{reason}}): {ADVICE}"), torch.device("meta"):

@@ -77,7 +77,7 @@ def turn_of_depth_item(data: bytes) -> str | None:
         properties = _properties(meta[b"iprp"])
     except (struct.error, KeyError, IndexError, ValueError, StopIteration):
         return None
-    depth = [boxes for boxes in properties.values() if _is_depth(boxes)]
+    depth = [boxes for boxes in properties.values() if _types(boxes) & _DEPTH_TYPES]
     if len(depth) != 1:
         return None
     # A decoder applies the map's turn. Apple turns the picture and leaves the map as the sensor saw it.
@@ -114,9 +114,8 @@ def _properties(iprp: memoryview) -> dict[int, list[tuple[bytes, memoryview]]]:
     return found
 
 
-def _is_depth(properties: list[tuple[bytes, memoryview]]) -> bool:
-    types = {bytes(body[4:]).partition(b"\0")[0] for kind, body in properties if kind == b"auxC"}
-    return bool(types & _DEPTH_TYPES)
+def _types(properties: list[tuple[bytes, memoryview]]) -> set[bytes]:
+    return {bytes(body[4:]).partition(b"\0")[0] for kind, body in properties if kind == b"auxC"}
 
 
 def _turn(properties: list[tuple[bytes, memoryview]]) -> str | None:

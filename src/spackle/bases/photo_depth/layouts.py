@@ -82,10 +82,7 @@ def load_photo_depth(path: StrPath) -> DepthMap | None:
 
     In HEIC this reads an auxiliary depth image with Apple's XMP or HEVC's depth information; in JPEG, Apple's auxiliary
     pictures, Android's Dynamic Depth and the older GDepth. `DepthMap.note` says which format it was and how reliable
-    the metres are. The picture itself is not decoded.
-
-    Raises:
-        InputError: the file is missing, or the photo's depth map is broken.
+    the metres are. The picture itself is not decoded. InputError for a missing file or a broken depth map.
     """
     check_file(path, "photo")
     try:

@@ -62,7 +62,7 @@ class SharpBase:
         compiled: bool = False,
         device: torch.device | str | None = None,
     ) -> SharpBase:
-        """Read a checkpoint.
+        """Read a checkpoint; InputError for an unusable file, device or number of windows, or too little memory.
 
         Args:
             path: Apple's .pt file, a safetensors file with the same names, or a decoder that
@@ -72,10 +72,6 @@ class SharpBase:
                 GPU. The last bits of the result depend on this number.
             compiled: let `torch.compile` compile the network at the first photo, which takes minutes.
             device: cpu or a CUDA device; None: CUDA if available.
-
-        Raises:
-            InputError: a file, device or number of windows that cannot be used, or too little memory.
-            ValueError: an unknown precision.
         """
         target = pick_device(device)
         network = load_network(path, pick_dtype(precision, target), target)

@@ -77,10 +77,7 @@ MLP_RATIO = 4
 
 
 class VisionTransformer(nn.Module):
-    """ViT with a class token, learned positions and scaled residuals (DINOv2's), without its classifier.
-
-    Tokens stay in float32: each block adds small values to large ones, which bfloat16 would round away.
-    """
+    """DINOv2's ViT without classifier; tokens stay float32, because bfloat16 would round away small residuals."""
 
     def __init__(self, config: SharpConfig) -> None:
         super().__init__()

@@ -42,10 +42,7 @@ class Residual(nn.Module):
 
 
 class GroupNorm(nn.GroupNorm):
-    """torch's group norm, but exact on a CPU, where torch's float32 sums over half a million pixels lose three digits.
-
-    Each row is summed first, and the sums of the rows are added in float64.
-    """
+    """torch's group norm with exact sums on a CPU, where float32 sums of half a million pixels lose three digits."""
 
     def forward(self, x: Tensor) -> Tensor:
         """Normalise [1, C, H, W]; the shape stays the same."""
@@ -106,10 +103,7 @@ class Decoder(nn.Module):
         self.fusions = nn.ModuleList(Fusion(width, doubles=level > 0) for level in range(len(dims)))
 
     def forward(self, maps: Sequence[Tensor], features: Tensor | None = None) -> Tensor:
-        """Fuse maps, listed from fine to coarse, [1, dims[i], H/2^i, W/2^i], into [1, width, H, W].
-
-        The coarsest map is added to `features`. SHARP gives no `features` and skips the layers for this addition.
-        """
+        """Fuse maps [1, dims[i], H/2^i, W/2^i], fine to coarse, and still coarser `features` into [1, width, H, W]."""
         for level in reversed(range(len(maps))):
             projected = self.convs[level](maps[level])
             fuse = self.fusions[level]
@@ -124,8 +118,6 @@ HIDDEN = 32  # channels before the last layer of the depth head
 
 @dataclasses.dataclass(frozen=True)
 class SharpOutput:
-    """The network's output for one picture."""
-
     start: InitialGaussians  # Gaussians on the two surfaces
     deltas: Tensor  # [14, 2, side/2, side/2] float32 changes of these Gaussians
 
@@ -223,8 +215,6 @@ class FeatureNetwork(nn.Module):
 
 
 class PredictionHead(nn.Module):
-    """Computes deltas from features."""
-
     def __init__(self, width: int) -> None:
         super().__init__()
         self.geometry_prediction_head = ExactConv(width, GEOMETRY * LAYERS, 1)
@@ -327,8 +317,7 @@ def _rows(attribute: Tensor) -> Tensor:
 def compile_forward(network: SharpNetwork, backend: str = "inductor") -> SharpNetwork:
     """A twin of the network with the same weights, which `torch.compile` compiles at the first call.
 
-    Compilation needs a C++ compiler on a CPU and Triton on a GPU, else the first call raises a RuntimeError. All 48
-    blocks of the two transformers share one compilation. The `backend` "eager" compiles nothing.
+    The first call raises a RuntimeError without a C++ compiler on a CPU, or without Triton on a GPU.
     """
     twin = copy.deepcopy(network, {id(weight): weight for weight in network.parameters()})
     depth: DepthNetwork = twin.monodepth_model.monodepth_predictor  # type: ignore[assignment]

@@ -26,9 +26,8 @@ def stretch_gaussians(gaussians: Gaussians, stretch: tuple[float, float, float])
     orthogonal (one-sided Jacobi); then the columns' lengths are the new scales, and their directions are the new axes.
     The covariance itself is never formed, because squared scales would lose the small scales.
 
-    Returns:
-        N Gaussians with descending scales and unit quats with w ≥ 0; a zero quat counts as no rotation. Opacities and
-        colors are the same tensors; means, quats and scales are detached from autograd.
+    The result has descending scales and unit quats with w ≥ 0; a zero quat counts as no rotation. Opacities and colors
+    are the same tensors; means, quats and scales are detached from autograd.
     """
     means, quats, scales = (t.detach() for t in gaussians.tensors[:3])
     source = quats.contiguous().numpy(), scales.contiguous().numpy()
