@@ -108,6 +108,9 @@ def test_middlebury(tmp_path: Path, suffix: str, beside: bool) -> None:
     assert found.K.tolist() == [[1000.5, 0, 30.25], [0, 1000.5, 20.5], [0, 0, 1]]
     np.save(tmp_path / "depth.npy", ramp())
     assert load_depth(tmp_path / "depth.npy").quantity == "depth"  # although the folder has a calibration
+    np.save(tmp_path / "motorcycle_disp.npy", ramp())
+    with pytest.raises(InputError, match="--calib"):
+        load_depth(tmp_path / "motorcycle_disp.npy")
     same(load_depth(name, calib=calib, focal_px=2001), 2 * expected, 1e-6)
 
 
@@ -236,22 +239,6 @@ def test_bad_maps(tmp_path: Path, kind: str) -> None:
         load_depth(path)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("name", "options", "problem"),
-    [
-        ("none.npy", {}, "no such depth map"),
-        ("", {}, "not a plain file"),
-        ("motorcycle_disp.npy", {}, "--calib"),
-        ("motorcycle_disp.npy", {"calib": "none.txt"}, "no such calibration"),
-    ],
-)
-def test_paths_and_names(tmp_path: Path, name: str, options: dict[str, Any], problem: str) -> None:
-    for file in ("motorcycle_disp.npy", "depth.npy"):
-        np.save(tmp_path / file, ramp())
-    with pytest.raises(InputError, match=problem):
-        load_depth(tmp_path / name, **options)
 
 
 def test_shape_against_the_photo(tmp_path: Path) -> None:

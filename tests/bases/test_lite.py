@@ -80,9 +80,6 @@ def test_stored_weights_are_small_and_only_rounded(tmp_path: Path) -> None:
             assert bool((off <= rows / 254 * 1.001 + 1e-7).all())
     count = sum(weight.numel() for network in networks for weight in network.parameters())
     assert (tmp_path / "two.safetensors").stat().st_size < 1.1 * count
-    save_networks(read, tmp_path / "again.safetensors")
-    for one, other in zip(read, load_networks(tmp_path / "again.safetensors"), strict=True):
-        torch.testing.assert_close(one.state_dict(), other.state_dict(), rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize(

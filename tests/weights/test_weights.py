@@ -195,22 +195,6 @@ def test_get_to_another_folder_or_file(site: Site, weights: Path, tmp_path: Path
     assert not weights.exists()
 
 
-@pytest.mark.parametrize(
-    ("name", "url", "said"),
-    [
-        ("nothing", None, "weights nothing: unknown: there are sharp"),
-        ("sharp", CLOSED, "no connection (Connection refused): check address"),
-        ("sharp", "a.pt", "a.pt: no connection (unknown url type: 'a.pt')"),
-        ("lama", None, "bytes instead of 205,669,692"),
-    ],
-)
-def test_get_fails_in_one_line(site: Site, weights: Path, name: str, url: str | None, said: str) -> None:
-    result = get(name, "--url", url or site.url)
-    assert result.code == 2
-    assert said in result.lines[-1]
-    assert not weights.exists()
-
-
 def test_list_tells_which_weights_are_on_this_machine(weights: Path) -> None:
     weights.mkdir()
     for content, said in ((None, "not here"), (CONTENT, "whole 1.0 MB"), (CONTENT[:-1], "damaged")):
