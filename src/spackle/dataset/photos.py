@@ -17,7 +17,6 @@ from spackle.progress import Step
 
 SUFFIXES = (*PHOTO_SUFFIXES, ".gif", ".bmp")
 MIN_SIDE = 32  # pixels: no depth can be recognised in smaller images
-NAMED = 5  # the log names at most this number of missing files
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,8 +70,7 @@ def _named_by_coco(source: Path, folder: Path | None, log: Callable[[str], None]
             f"{source}: none of the {len(unique)} named images is in {root}: give the images' folder with --images"
         )
     if missing := sorted(set(unique) - set(present)):
-        listed = ", ".join((*missing[:NAMED], *(["…"] if len(missing) > NAMED else [])))
-        log(f"{len(missing)} images that {source} names are not in {root}: {listed}")
+        log(f"{len(missing)} images that {source} names are not in {root}, such as {missing[0]}")
     return root, present
 
 

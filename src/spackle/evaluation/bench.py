@@ -72,7 +72,7 @@ def bench(options: EvaluateOptions, runs: int, base_runs: int | None, output: Pa
         run = measure_images(evaluation.cases, measure_one, output, config, about, options.root, reporter)
         if run is None:
             return "stopped"
-        write_tables(make_tables([run]), output, FILES, run.label_suffix)
+        write_tables(make_tables([run]), output, FILES, f":{run.title}-bench".lower())
         write_rows(run.rows, output / ROWS)
     count, total = len(run.measured), len(run.images)
     reporter.log(f"{run.title}: {count} of {total} images -> {output}")

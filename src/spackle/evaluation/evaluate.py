@@ -267,7 +267,7 @@ def evaluate(options: EvaluateOptions, output: Path, reporter: Reporter, html: b
         run = measure_images(evaluation.cases, measure, output, evaluation.config, about, options.root, reporter)
         if run is None:
             return "stopped"
-        write_tables(make_tables([run]), output, suffix=run.label_suffix)
+        write_tables(make_tables([run]), output, suffix=f":{run.title}-{options.protocol}".lower())
         write_sheets(run, output)
         if html:
             write_whole(output / REPORT, make_report([(run, output)]).encode())

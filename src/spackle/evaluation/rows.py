@@ -80,11 +80,6 @@ class Run:
         return str(self.config["base"]["title"])
 
     @property
-    def label_suffix(self) -> str:
-        """The suffix that makes the LaTeX labels of this run's tables unique."""
-        return f":{self.title}-{self.config['protocol']}".lower()
-
-    @property
     def timed(self) -> bool:
         return bool(self.config["kind"] == "bench")
 
