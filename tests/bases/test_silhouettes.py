@@ -10,7 +10,7 @@ import torch
 from plain_cleanup import uncompiled
 from scenes import Scene, box_before_wall, psnr
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, max_pool2d
+from torch.nn.functional import avg_pool2d
 
 from spackle.bases import silhouettes, splats
 from spackle.bases.quadtree import LEVELS
@@ -56,14 +56,6 @@ def test_compiled_kernels_agree_with_plain_python(seed: int) -> None:
         plain = arrays()
     for one, other in zip(compiled, plain, strict=True):
         np.testing.assert_allclose(one, other, rtol=2e-3, atol=2e-4)
-
-
-@pytest.mark.parametrize("seed", [1, 2])
-def test_rings_are_distances_to_the_nearest_step(seed: int) -> None:
-    ring = torch.from_numpy(find_layers(*steps(seed)).ring)
-    within = [max_pool2d((ring == 1).float()[None], 2 * n + 1, 1, n)[0] > 0 for n in range(silhouettes.REACH)]
-    expected = torch.where(within[-1], silhouettes.REACH + 1 - torch.stack(within).sum(0), 0)
-    assert torch.equal(ring.long(), expected)
 
 
 def blended() -> Scene:

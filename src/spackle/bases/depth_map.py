@@ -254,7 +254,7 @@ def _find_calibration(path: Path, calib: StrPath | None) -> Calibration | None:
     if stem.startswith("disp") and text.is_file():
         return _read_calib(text)
     if stem.startswith("disp") or stem.endswith(("disp", "disparity")):
-        raise InputError(f"{path}: by its name a disparity map: give its calibration with --calib, or rename the file")
+        raise InputError(f"{path}: the name announces a disparity map: give its calibration with --calib, or rename it")
     return None
 
 

@@ -56,7 +56,7 @@ class HfBase:
 
     @staticmethod
     def load(model: str, *, device: str | None = None, precision: Precision = "auto") -> HfBase:
-        """Read a model from a folder, or as owner/name from the hub's cache, else the hub; none of its code is run.
+        """Read a model from a folder, or by owner/name from the hub's cache or the hub; no code of the model runs.
 
         At the precision auto, matrix products are bf16 if the hardware multiplies it natively. InputError for a device,
         package, model or file that is missing, broken or unknown, and for too little memory.
@@ -79,8 +79,8 @@ class HfBase:
     def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
         """Gaussians of the pixels of the photo at its working size, as `lift` makes them.
 
-        If neither the photo's file nor the user gives the focal length, a model that predicts it does. InputError if
-        the model fails on this photo, its output is no depth, or memory is short.
+        If the focal length is unknown, the model's estimate is used. InputError if the model fails on this photo, its
+        output is no depth, or memory is short.
         """
         photo = resize_photo(photo)
         problem = f"{self.name} fails ({{reason}}): give another photo or model"
@@ -180,7 +180,7 @@ def _read(transformers: Any, source: str, name: str, *, from_hub: bool) -> tuple
 
 
 def _lower_linear(network: nn.Module, dtype: torch.dtype) -> None:
-    """Let the linear layers, where a transformer spends its time, multiply in `dtype`; they take and give float32."""
+    """Let the linear layers, which take most of the time, multiply in `dtype`; their inputs and outputs are float32."""
     # The last layers are convolutions and stay float32: eight bits would turn slanted surfaces into stairs.
     for module in network.modules():
         if type(module) is nn.Linear and dtype != torch.float32:

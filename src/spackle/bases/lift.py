@@ -23,7 +23,7 @@ from spackle.surface import EDGE
 
 
 class RgbdBase:
-    """Lifts a photo by a depth map that came with it."""
+    """Lifts a photo with the photo's depth map."""
 
     name = "rgbd"
 

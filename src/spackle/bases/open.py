@@ -41,7 +41,7 @@ NO_DEPTH = (
 
 
 class BaseError(InputError):
-    """The base cannot be used for any photo: trying another photo or another base is pointless."""
+    """The base cannot be used for any photo, so trying another photo is pointless."""
 
 
 def open_base(settings: BaseSettings) -> OpenedBase:
