@@ -1,4 +1,4 @@
-"""Write a photo's scene, video and report to a folder. The command line and the server call `predict_photo`."""
+"""Write a photo's scene, video and report to a folder; used by the command line and the server."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ def _measure_holes(done: CompletedPhoto, renderer: Renderer) -> list[dict[str, A
 def shared_report(
     photo: Photo, prediction: BasePrediction, choice: ResolvedBase, pipeline: Pipeline, reporter: Reporter
 ) -> dict[str, Any]:
-    """The fields that the reports of a photo and of a clip share, ready for JSON."""
+    """Fields of the reports of photos and clips, ready for JSON."""
     path, weights = pipeline.options.path, pipeline.options.fill.weights
     given = path.cameras or path.path
     report: dict[str, Any] = {
@@ -176,7 +176,7 @@ def shared_report(
 
 
 def earlier_report(folder: Path) -> dict[str, Any]:
-    """An earlier run's report; empty if there is none, or it is damaged."""
+    """The report of an earlier run; empty if the report is missing or damaged."""
     try:
         report = json.loads((folder / REPORT).read_text(encoding="utf-8"))
     except (OSError, ValueError):

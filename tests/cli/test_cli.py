@@ -104,7 +104,7 @@ def test_info_says_what_a_file_is(tmp_path: Path, scene: Path, pair: tuple[Path,
     Image.fromarray((1000 * metres()).astype(np.uint16)).save(depth)
     expected = {
         scene: ("scene (.ply)", "base", "64×48, focal length 55.5 px, 60.0° wide", "--disparity 0.07", "spackle view"),
-        spz: ("scene (.spz)", "does not tell base from aux", "none is stored", "spackle view"),
+        spz: ("scene (.spz)", "number of base Gaussians unknown", "not stored", "spackle view"),
         pair[0]: ("photo", "64×48", "(default 30 mm)", "none inside", f"spackle predict {pair[0]} -o out"),
         pair[1]: ("depth map", "64×48", "2 m near, 6 m median, 6 m far", "0.0%", f"--depth {pair[1]}"),
         depth: ("depth map", "2 m near"),

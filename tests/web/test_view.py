@@ -137,18 +137,11 @@ def closed(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("closed")
-@pytest.mark.parametrize(
-    ("name", "content", "why"),
-    [
-        ("written.glb", b"anything", "scene.ply"),  # a format that is written, not read
-        ("scene.jpg", b"ply\nformat binary_little_endian 1.0\nend_header\n", "not a Gaussian scene"),
-        ("missing.jpg", None, "no such photo or scene"),
-    ],
-)
-def test_files_that_are_neither_scene_nor_photo(tmp_path: Path, name: str, content: bytes | None, why: str) -> None:
-    if content is not None:
-        (tmp_path / name).write_bytes(content)
-    refuses(run("view", tmp_path / name), name, why)
+def test_files_that_are_neither_scene_nor_photo(tmp_path: Path) -> None:
+    (tmp_path / "written.glb").write_bytes(b"anything")  # a format that cannot be read
+    (tmp_path / "scene.jpg").write_bytes(b"ply\nformat binary_little_endian 1.0\nend_header\n")
+    for name, why in {"written.glb": "scene.ply", "scene.jpg": "Gaussian scene", "no.jpg": "no such photo"}.items():
+        refuses(run("view", tmp_path / name), name, why)
 
 
 @pytest.mark.usefixtures("closed")

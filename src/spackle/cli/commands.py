@@ -1,4 +1,4 @@
-"""Options of `spackle predict`, `render`, `export`, `view`, `serve` and `demo`; each imports its work as it runs."""
+"""Options of `spackle predict`, `render`, `export`, `info`, `view`, `serve` and `demo`."""
 
 from __future__ import annotations
 
@@ -44,18 +44,18 @@ def predict(
         str,
         typer.Option(
             metavar="NAME",
-            help="What turns the photo into Gaussians. rgbd: its depth map; sharp: Apple's network; moge: MoGe-2, with "
-            "metric depth and the lens; lite: small networks that come with Spackle, of rough depth; hf:OWNER/NAME or "
-            "hf:FOLDER: a depth model of transformers. auto: a depth map that is given or in the photo, else sharp "
-            "or moge if `spackle weights get` has downloaded them, else lite.",
+            help="Base, which turns the photo into Gaussians. rgbd: a depth map; sharp: Apple's network; moge: MoGe-2, "
+            "with metric depth and focal length; lite: small networks inside Spackle, with rough depth; hf:OWNER/NAME "
+            "or hf:FOLDER: a depth model of transformers. auto: the given depth map, or the one in the photo's file, "
+            "else sharp or moge if their weights are downloaded, else lite.",
         ),
     ] = "auto",
     depth: Annotated[
         Path | None,
         typer.Option(
             metavar="PATH_OR_FOLDER",
-            help="Depth of the photo: .npy, .npz, .pfm (metres), 16-bit .png (mm), Middlebury disparity, or a grey "
-            "picture with --depth-kind.",
+            help="Depth of the photo: .npy, .npz, .pfm (metres), 16-bit .png (mm), a Middlebury disparity map, or a "
+            "grey picture with --depth-kind.",
         ),
     ] = None,
     depth_kind: DepthKindOption = "auto",
@@ -78,12 +78,12 @@ def predict(
         ),
     ] = None,
     calib: Annotated[
-        Path | None, typer.Option(hidden=True, metavar="FILE", help="calib.txt of a disparity map, if not beside it.")
+        Path | None, typer.Option(hidden=True, metavar="FILE", help="calib.txt of a disparity map in another folder.")
     ] = None,
     checkpoint: CheckpointOption = None,
     precision: Annotated[
         PrecisionName,
-        typer.Option(hidden=True, help="Precision of the base's network; auto: bf16 if the hardware multiplies it."),
+        typer.Option(hidden=True, help="Precision of the base's network; auto: bf16 if the hardware supports it."),
     ] = "auto",
     sharp: SharpOption = None,
     residual: Annotated[
@@ -91,20 +91,20 @@ def predict(
         typer.Option(
             metavar="PATH|seeds|none",
             hidden=True,
-            help="Weights of the residual. seeds: fill without weights; none: holes stay open. Default: Spackle's own.",
+            help="Weights of the residual. seeds: no network; none: no fill. Default: the weights in the package.",
         ),
     ] = None,
     fill: Annotated[
         Literal["auto", "network", "exemplar", "lama", "none"],
         typer.Option(
-            help="Texture in the holes. lama: by LaMa (`spackle weights get lama`); exemplar: patches of the photo; "
-            "network: no texture; none: holes stay open; auto: lama if its weights are here, else exemplar."
+            help="Texture in the holes. lama: LaMa (`spackle weights get lama`); exemplar: patches of the photo; "
+            "network: no texture; none: no fill; auto: lama if its weights are downloaded, else exemplar."
         ),
     ] = "auto",
     render: Annotated[bool, typer.Option(help="Write a video.")] = True,
     keep_base: Annotated[
         bool,
-        typer.Option("--keep-base", hidden=True, help="Also write base.ply, the Gaussians of what the photo shows."),
+        typer.Option("--keep-base", hidden=True, help="Also write base.ply, the Gaussians of the base."),
     ] = False,
     depth_out: Annotated[
         str | None,
@@ -115,16 +115,17 @@ def predict(
     path: PathOptions,
     mode: Annotated[
         Literal["scene", "view"],
-        typer.Option(hidden=True, help="scene: one set of Gaussians for all views; view: one for each (the paper's)."),
+        typer.Option(
+            hidden=True,
+            help="scene: one set of aux Gaussians for all views; view: a set for each view.",
+        ),
     ] = "scene",
     device: DeviceOption = "auto",
     focal_px: Annotated[float | None, typer.Option(hidden=True, help="Focal length in pixels of the photo.")] = None,
     focal_mm: Annotated[float | None, typer.Option(help="Focal length in mm, 35 mm equivalent.")] = None,
     fov: FovOption = None,
     keep_frame: KeepFrameOption = False,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="With several photos, redo those whose results exist.")
-    ] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Predict photos again whose results exist.")] = False,
     workers: Annotated[
         int,
         typer.Option(
@@ -149,7 +150,7 @@ def predict(
 ) -> None:
     """Turn photos into completed 3D scenes: scene.ply, video.mp4 and report.json for each.
 
-    A photo alone is enough. A depth map, or weights from `spackle weights get depth` or `sharp`, give better geometry.
+    A depth map, or weights from `spackle weights get depth` or `sharp`, improve the geometry.
     """
     from spackle.bases.settings import BaseSettings
     from spackle.cli.photos import PredictOptions, predict_all
@@ -171,10 +172,10 @@ def predict(
 def render(
     *,
     scene: Annotated[Path, typer.Argument(metavar="SCENE", help="A 3D Gaussian scene.")],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="A folder, or name.mp4|webm|gif|webp.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="A folder, or a video file.")],
     compare: Annotated[
         bool,
-        typer.Option("--compare", help="Show the base with its holes on the left, the completed scene on the right."),
+        typer.Option("--compare", help="Show the base, with holes, on the left, and the completed scene on the right."),
     ] = False,
     path: PathOptions,
     focal_px: Annotated[float | None, typer.Option(help="Focal length in pixels of the video.")] = None,
@@ -199,8 +200,8 @@ def export(
             "-o",
             "--output",
             metavar="FILE",
-            help="Output file; its suffix is the format: .ply, .compressed.ply, .spz, .splat, .sog, .glb, or .html "
-            "(a page with the scene in it). May be given several times.",
+            help="Output file; the suffix sets the format: .ply, .compressed.ply, .spz, .splat, .sog, .glb, or .html "
+            "(a page with the scene). The option may be repeated.",
         ),
     ],
     as_json: JsonOption = False,
@@ -216,7 +217,7 @@ def info(
     files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Scenes, photos, depth maps or clips.")],
     as_json: JsonOption = False,
 ) -> None:
-    """Say what a file is: its size, range, Gaussians and camera, and what to do with it."""
+    """Describe files: size, depth range, Gaussians and camera, and commands that take the file."""
     from spackle.cli.info import show_info
     from spackle.progress import Reporter
 
@@ -227,18 +228,16 @@ def info(
 def view(
     target: Annotated[
         Path | None,
-        typer.Argument(metavar="SCENE_OR_PHOTO", help="A scene, or a photo to complete; without it the page is empty."),
+        typer.Argument(metavar="SCENE_OR_PHOTO", help="A scene, or a photo to complete; by default the page is empty."),
     ] = None,
-    base: Annotated[
-        str, typer.Option(metavar="NAME", help="What turns photos into Gaussians, as for `spackle predict`.")
-    ] = "auto",
+    base: Annotated[str, typer.Option(metavar="NAME", help="Base, as for `spackle predict`.")] = "auto",
     depth: Annotated[Path | None, typer.Option(metavar="FILE", help="Depth of the photo.")] = None,
     depth_kind: DepthKindOption = "auto",
     checkpoint: CheckpointOption = None,
     disparity: Annotated[
         float | None,
         typer.Option(
-            help="How far to the side photos are completed, as a disparity from 0 to 2; 0.3 is large.",
+            help="How far the camera moves to the side, as a disparity from 0 to 2; 0.3 is large.",
             show_default="chosen for each photo, at most 0.15 with lite, else 0.3",
         ),
     ] = None,
@@ -254,13 +253,13 @@ def view(
         typer.Option(
             "--token/--no-token",
             help="Put a secret token into the page's address. With --no-token everybody on this machine can open the "
-            "page, but nobody can send it a photo.",
+            "page, and nobody can send photos.",
         ),
     ] = True,
     as_json: JsonOption = False,
     verbose: VerboseOption = False,
 ) -> None:
-    """View a scene, or complete photos and view them, on a page in the browser. Ctrl-C ends it."""
+    """View a scene, or complete photos, on a page in the browser. Ctrl-C ends the server."""
     from spackle.bases.settings import BaseSettings
     from spackle.cli import serve as app
     from spackle.progress import Reporter
@@ -292,25 +291,23 @@ def serve(
             help="Number of processes that share the photos, each with its own copy of the base's network.",
         ),
     ] = 1,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="Folder for photos and scenes.")] = Path(
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="Folder of photos and scenes.")] = Path(
         "spackle-scenes"
     ),
-    keep: Annotated[float, typer.Option(min=0, metavar="DAYS", help="Remove a scene after this number of days.")] = 7,
+    keep: Annotated[float, typer.Option(min=0, metavar="DAYS", help="Delete scenes after this number of days.")] = 7,
     quota: Annotated[
-        float, typer.Option(min=0, metavar="GB", help="Remove the oldest scenes when all together take more.")
+        float, typer.Option(min=0, metavar="GB", help="Delete the oldest scenes if all scenes take more.")
     ] = 20,
     waiting: Annotated[
-        int, typer.Option(min=1, metavar="N", help="Number of photos that may wait; further ones are refused.")
+        int, typer.Option(min=1, metavar="N", help="Number of photos that may wait; more photos are refused.")
     ] = 32,
-    base: Annotated[
-        str, typer.Option(metavar="NAME", help="What turns photos into Gaussians, as for `spackle predict`.")
-    ] = "auto",
+    base: Annotated[str, typer.Option(metavar="NAME", help="Base, as for `spackle predict`.")] = "auto",
     checkpoint: CheckpointOption = None,
     device: DeviceOption = "auto",
     as_json: JsonOption = False,
     verbose: VerboseOption = False,
 ) -> None:
-    """Complete photos for programs, over HTTP, with a page for people (see docs/http.md). Ctrl-C ends it."""
+    """Complete photos for programs, over HTTP, and on a page (see docs/http.md). Ctrl-C ends the server."""
     from spackle.bases.settings import BaseSettings
     from spackle.cli import serve as app
     from spackle.progress import Reporter
@@ -332,7 +329,7 @@ def demo(
     as_json: JsonOption = False,
     verbose: VerboseOption = False,
 ) -> None:
-    """Complete the Middlebury Motorcycle photo and compare with the true second photo (needs scikit-image)."""
+    """Complete Middlebury's Motorcycle photo and compare with the true second photo (needs scikit-image)."""
     from spackle.cli.demo import run_demo
     from spackle.progress import Reporter
 

@@ -1,4 +1,4 @@
-"""`spackle info`: what a file is, and what one can do with it."""
+"""`spackle info`: describe a file, and name commands that take the file."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Facts = dict[str, object]
 
 
 def show_info(path: Path, reporter: Reporter) -> None:
-    """Print what a scene, photo, depth map or clip is; InputError for another file."""
+    """Describe a scene, photo, depth map or clip; InputError for other files."""
     check_file(path, "scene, photo, depth map or clip")
     if scene_kind(path):
         facts = scene_facts(path)
@@ -41,30 +41,30 @@ def is_depth(path: Path) -> bool:
         with Image.open(path) as image:
             return image.mode.startswith("I")
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
-        return False  # the reader of photos reports what is wrong with it
+        return False  # the reader of photos reports the error
 
 
 def scene_facts(path: Path) -> Facts:
     scene = load_scene(path)
     count, base = len(scene.gaussians), scene.base_count
-    parts = "the file does not tell base from aux" if base is None else f"{base:,} base, {count - base:,} aux"
+    parts = "number of base Gaussians unknown" if base is None else f"{base:,} base, {count - base:,} aux"
     facts: Facts = {"kind": f"scene ({scene_kind(path)})", "Gaussians": f"{count:,} ({parts})"}
     depths = scene.gaussians.means[:, 2].double().numpy()
     near, middle, far = np.quantile(depths, [EXTREMES[0], 0.5, EXTREMES[1]])
-    facts["depth"] = f"{near:.3g} near, {middle:.3g} median, {far:.3g} far, in metres if the scene's base was metric"
+    facts["depth"] = f"{near:.3g} near, {middle:.3g} median, {far:.3g} far (metres if the base is metric)"
     facts["camera"] = (
-        "none is stored: give --fov, and --size to `spackle render`" if scene.camera is None else lens_of(scene.camera)
+        "not stored: give --fov, and --size to `spackle render`" if scene.camera is None else lens_of(scene.camera)
     )
     if scene.disparity is not None:
         facts["completed"] = f"for --disparity {scene.disparity:g}"
     if scene.harmonics:
-        facts["harmonics"] = f"{scene.harmonics} of each Gaussian above degree 0, which are left out"
-    facts["next"] = f"spackle view {path}; `spackle render` makes a video of it, `spackle export` other formats"
+        facts["harmonics"] = f"{scene.harmonics} of each Gaussian above degree 0, not read"
+    facts["next"] = f"spackle view {path}; `spackle render` makes a video, `spackle export` other formats"
     return facts
 
 
 def lens_of(camera: Camera) -> str:
-    """A camera in words."""
+    """Size and focal length of a camera in words."""
     focal = camera.focal[0]
     fov = math.degrees(2 * math.atan(camera.width / 2 / focal))
     return f"{camera.width}×{camera.height}, focal length {focal:.1f} px, {fov:.1f}° wide"
@@ -90,7 +90,7 @@ def photo_facts(path: Path) -> Facts:
     facts: Facts = {"kind": "photo", "size": f"{photo.width}×{photo.height}"}
     facts["camera"] = f"{lens_of(photo.camera)} ({photo.focal_source})"
     if photo.frame is not None:
-        facts["frame"] = "a uniform frame is cut off; --keep-frame keeps it"
+        facts["frame"] = "a uniform frame is cropped; --keep-frame keeps the frame"
     inside = load_photo_depth(path)
     facts["depth"] = "none inside" if inside is None else f"inside: {inside.note}; {inside.range_in_words}"
     return facts | {"next": f"spackle predict {path} -o out; spackle view {path}"}

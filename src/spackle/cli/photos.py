@@ -173,7 +173,7 @@ class Predictor:
     output: Path
     options: PredictOptions
     shared: str  # digest of what the results of all photos depend on
-    single: bool  # there is one photo, which is always redone; an error ends the command
+    single: bool  # True: a single photo is always predicted again, and an error ends the command
     pipeline: Pipeline
     verbose: bool
 
@@ -183,7 +183,7 @@ class Predictor:
         return Predictor(output, options, shared, False, options.open(), verbose)
 
     def is_done(self, photo: NamedPhoto) -> bool:
-        """Whether the results of an earlier run with the same input and options are still complete."""
+        """Whether an earlier run with the same input and options has left complete results."""
         folder = self.output / photo.name
         earlier = {} if self.single or self.options.overwrite else earlier_report(folder)
         with contextlib.suppress(InputError):  # `predict` reports a missing file
@@ -195,7 +195,7 @@ class Predictor:
         return False
 
     def request(self, photo: NamedPhoto) -> str:
-        """A digest of all that a photo's results depend on; InputError if the photo or its depth map is missing."""
+        """A digest of the input of a photo's results; InputError if the photo or depth map is missing."""
         files, depth = [fingerprint(photo.path, "photo")], self.options.scene.base.depth
         if isinstance(depth, Path):
             depth = find_depth(depth, photo.path)
@@ -208,7 +208,7 @@ class Predictor:
         return Predicted(photo.path.name, not self.predict(photo, notes), notes.said)
 
     def left(self, photos: Iterable[NamedPhoto], reporter: Reporter) -> Iterator[NamedPhoto]:
-        """The photos that are not done yet; logs those that are."""
+        """The photos without complete results; logs photos that are skipped."""
         for photo in photos:
             if self.is_done(photo):
                 reporter.log(f"{photo.path.name}: done already (--overwrite does it again)")
@@ -232,7 +232,7 @@ class Predictor:
 
 
 def _shared_digest(options: PredictOptions) -> str:
-    """A digest of everything that the results of all photos depend on; InputError for a missing file."""
+    """A digest of version, options and files that all photos share; InputError for a missing file."""
     base, path, fill = options.scene.base, options.scene.path, options.scene.fill
     files = {"calibration": base.calib, "camera file": path.cameras, "path file": path.path, "weights": fill.file}
     files |= {"LaMa": installed("lama") if fill.texture == "lama" else None, **base.files}
