@@ -238,3 +238,4 @@ def test_the_papers_recipe_learns_from_a_dataset(whole: Path, tmp_path: Path) ->
     report = json.loads((tmp_path / "out" / "run.json").read_text())
     assert (report["ended"], report["step"], report["recipe"]["network"]) == ("steps", 1, "sharp-decoder")
     assert 0 < report["samples"]["train"] <= 9
+    assert report["hole_psnr"]["untrained"] + 3 < report["hole_psnr"]["colours of the targets"]

@@ -24,12 +24,12 @@ from spackle.render.protocol import Rendering
 from spackle.residual.architectures import NOTE, SharpDecoder, decoder_size, load_residual, open_residual
 from spackle.residual.complete import compose
 from spackle.residual.network import ResidualNet, network_input
-from spackle.residual.view_features import ViewFeatures, hole_area_ratio
+from spackle.residual.view_features import CELL, ViewFeatures, hole_area_ratio
 from spackle.training.losses import hole_psnr, load_features, total_loss
 from spackle.training.recipe import Recipe
 from spackle.training.samples import Sample, digest_of_samples, load_sample, make_samples
 from spackle.training.sources import find_sources
-from spackle.training.train import Task
+from spackle.training.train import Task, rank
 
 MIN_AUX = 64  # least number of aux Gaussians in a view (paper, "Training Details and Loss Weights")
 PICTURED = 6  # number of views in a picture
@@ -190,7 +190,27 @@ class ResidualTask(ViewTask):
             )
         self.items, self.validation_items = len(self.learned), len(self.validation)
         reporter.log(f"{self.items} training samples, {self.validation_items} validation samples")
-        return {"samples": {"train": self.items, "validation": self.validation_items, "digest": self.digest}}
+        samples = {"train": self.items, "validation": self.validation_items, "digest": self.digest}
+        return {"samples": samples, "hole_psnr": self.limits() if rank() == 0 else {}}  # only rank 0 writes run.json
+
+    @torch.no_grad()
+    def limits(self) -> dict[str, float]:
+        """Mean hole PSNR in dB of validation samples with an untrained network, and of seeds with the targets' colours.
+
+        A run can raise PSNR only from the first value towards the second.
+        """
+        with torch.random.fork_rng(devices=[]):
+            network = open_residual(self.recipe.network).to(device_of(self.renderer))
+        decibels: dict[str, list[float]] = {"untrained": [], "colours of the targets": []}
+        for item in range(self.validation_items):
+            (sample,) = self.batch(None, [item])
+            height, width = sample.features.mask.shape
+            colors = sample.target.view(height, CELL, width, CELL, 3).mean((1, 3))
+            best = dataclasses.replace(sample, seeds=dataclasses.replace(sample.seeds, rgb=colors))
+            for values, case in zip(decibels.values(), (sample, best), strict=True):
+                views = self.complete(network, [case])
+                values.append(hole_psnr(views.rgb[0], views.target[0], views.hole[0]))
+        return {name: sum(values) / len(values) for name, values in decibels.items()}
 
     def batch(self, step: int | None, items: Sequence[int]) -> list[Sample]:
         """Read samples; InputError if one cannot be read."""
