@@ -1,4 +1,4 @@
-"""The server with nothing behind it, and clients that behave well or not, over real sockets of this machine."""
+"""A server whose worker only pretends to complete photos, and clients over sockets of this machine."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ PHOTO = saved("PNG")
 
 
 def form(content: bytes = PHOTO, name: str = "photo.png", **fields: Any) -> bytes:
-    """A multipart body; a field's value is text, or a pair of a file's name and bytes."""
+    """A multipart body; the value of a field is text, or a pair (file name, bytes)."""
     parts = b""
     for field, value in {"photo": (name, content), **fields}.items():
         file, data = value if isinstance(value, tuple) else (None, value.encode())
@@ -48,7 +48,7 @@ def form(content: bytes = PHOTO, name: str = "photo.png", **fields: Any) -> byte
 
 @dataclasses.dataclass(frozen=True)
 class Reply:
-    """One answer."""
+    """The answer to a request."""
 
     status: int
     headers: dict[str, str]
@@ -61,10 +61,10 @@ class Reply:
 
 @dataclasses.dataclass(frozen=True)
 class Served:
-    """A server of this process, or one elsewhere."""
+    """A running server."""
 
     port: int
-    root: str = ""  # of the paths: the token
+    root: str = ""  # prefix of paths, with the token
     jobs: Jobs = None  # type: ignore[assignment]
 
     def ask(self, path: str = "/", method: str = "GET", body: bytes | None = None, **headers: str) -> Reply:
@@ -90,7 +90,7 @@ class Served:
         return connection
 
     def raw(self, data: bytes) -> tuple[int, bytes]:
-        """The status and the body that the server has for these bytes, however wrong; 0 where it just hangs up."""
+        """Status and body of the answer to these bytes; status 0 if the server closes the connection."""
         with self.dial(data) as connection:
             head, _, body = answer_of(connection).partition(b"\r\n\r\n")
             return int(head.split()[1]) if head else 0, body
@@ -121,14 +121,14 @@ def served(
 
 
 def answer_of(connection: socket.socket) -> bytes:
-    """Everything until the server hangs up."""
+    """All bytes until the server closes the connection."""
     with contextlib.suppress(ConnectionResetError):
         return b"".join(iter(lambda: connection.recv(1 << 16), b""))
     return b""
 
 
 def request(target: str, *headers: str, method: str = "GET", host: str = "localhost") -> bytes:
-    """The head of a request, after which the connection ends."""
+    """The head of a request that closes the connection."""
     lines = [f"{method} {target} HTTP/1.1", f"Host: {host}", "Connection: close", *headers]
     return ("\r\n".join(lines) + "\r\n\r\n").encode("latin-1")
 
@@ -141,5 +141,5 @@ def post(length: int, *headers: str, method: str = "POST") -> bytes:
 def eventually(condition: Callable[[], object], within: float = 20.0) -> None:
     end = time.monotonic() + within
     while not condition():
-        assert time.monotonic() < end, "it did not come"
+        assert time.monotonic() < end, "the condition stayed false"
         time.sleep(0.01)

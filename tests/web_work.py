@@ -1,4 +1,4 @@
-"""What stands for the network in worker processes: what it does is in the photo's name."""
+"""A worker function that takes no time; the photo's name chooses success, an error or a crash."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from spackle.errors import InputError
 
 
 def work(task: Any, tell: Any) -> None:
-    """The scene's one layer is the photo's bytes, and a further file holds its name."""
+    """Write a scene with one layer, the photo's bytes; other files contain their name."""
     job, file = task
     if file is not None:
         (job.results / file).write_text(file)

@@ -1,4 +1,4 @@
-"""One ordinary prediction, which the tests of the commands share."""
+"""A prediction that the tests of commands share."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from photos import write_pair
 
 @pytest.fixture(scope="session")
 def plain(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Run]:
-    """The folder of the prediction, which no test may change, and what the command printed."""
+    """The folder of the prediction, which no test may change, and the command's output."""
     folder = tmp_path_factory.mktemp("plain")
     result = predicted(*write_pair(folder), folder / "out")
     return folder / "out" / "photo", result

@@ -1,4 +1,4 @@
-"""Bases on the command line: what `auto` takes for a folder, and a base by its name in datasets and evaluations."""
+"""Bases on the command line: `auto` for a folder, and names of bases in datasets and evaluations."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def _quick(shipped: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def hub(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
-    """Models of the hub without a hub; holds what was asked for."""
+    """Stand-ins for models of the hub; the list has the requests."""
     asked: list[dict[str, Any]] = []
 
     def load(model: str, **options: Any) -> StandIn:
@@ -107,7 +107,7 @@ def photos(tmp_path: Path) -> Path:
 
 
 def install(made: dict[str, Path], tmp_path: Path) -> Path:
-    """Weights of SHARP where a download puts them."""
+    """Put weights of SHARP into the folder for downloads."""
     (tmp_path / "weights").mkdir(exist_ok=True)
     return Path(shutil.copy(made["sharp"], tmp_path / "weights"))
 

@@ -1,4 +1,4 @@
-"""The command in a process of its own, what it says, and what a terminal sees."""
+"""The command as a process: help, interruption, messages and JSON."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`spackle predict`: what a prediction leaves behind, and how a folder of photos is worked through."""
+"""`spackle predict`: files of a prediction, and folders of photos."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from spackle.weights import published_weights
 
 
 def hashes(folder: Path) -> dict[str, object]:
-    """What a report says of its files, once that is found true."""
+    """The records of a report's files, after a check against the files."""
     files = report_of(folder)["files"]
     for name, record in files.items():
         data = (folder / name).read_bytes()

@@ -1,4 +1,4 @@
-"""What cannot be is one line of `spackle predict` and `spackle render`, and nothing is left behind."""
+"""Bad input to `spackle predict` and `spackle render` prints one line and leaves no files."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from photos import camera_file, damaged_scene, metres, write_depth, write_photo
 from safetensors.torch import save_file
 
 INPUTS = {"predict": ("photo.png", "--depth", "depth.npy"), "render": ("scene.ply",)}
-# Options of a command, and what the line about them says.
+# Options of both commands, and a part of the error message.
 BOTH = [
     ("--fps nan", "--fps nan"),
     ("--loop 0", "--loop 0"),

@@ -1,4 +1,4 @@
-"""`spackle predict --base sharp` as people use it, with a small checkpoint."""
+"""`spackle predict --base sharp` with a small checkpoint."""
 
 from __future__ import annotations
 

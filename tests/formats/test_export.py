@@ -1,4 +1,4 @@
-"""Export: every format read back by a plain reader of its own, and what the command says."""
+"""Export: independent readers compare every format with the scene; messages of the command."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ from spackle.scene import Scene
 
 CPU = CpuRenderer()
 BOX = box_before_wall(width=64, height=48, focal=54)
-# What a format's rounding leaves of a small scene: dB between renders, and the greatest error of a position in
-# standard deviations, of a scale's logarithm, of an axis' direction, of sRGB and of opacity.
+# Bounds of a format's rounding: PSNR between renders, and the largest errors of position (in standard deviations), of
+# the logarithm of a scale, of an axis, of sRGB and of opacity.
 BOUNDS = {
     "compressed.ply": (50, 0.1, 0.01, 0.005, 0.003, 0.003),
     "spz": (43, 0.04, 0.04, 0.01, 0.008, 0.003),
@@ -51,12 +51,12 @@ def encode(kind: str, gaussians: Gaussians, camera: Camera | None = None, base_c
 
 
 def read(kind: str, data: bytes) -> Gaussians:
-    """By the plainest reader of the format."""
+    """Read with an independent reader."""
     return gaussians_of(FORMATS[kind](data), flipped=kind in ("spz", "glb"))
 
 
 def in_file_order(kind: str, gaussians: Gaussians, base_count: int = 0) -> Gaussians:
-    """A compressed PLY puts neighbours together."""
+    """The Gaussians in the file's order; a compressed PLY sorts them by position."""
     if kind != "compressed.ply":
         return gaussians
     parts = [gaussians.select(slice(0, base_count)), gaussians.select(slice(base_count, None))]
@@ -64,7 +64,7 @@ def in_file_order(kind: str, gaussians: Gaussians, base_count: int = 0) -> Gauss
 
 
 def looks(found: Gaussians, gaussians: Gaussians, *cameras: Camera) -> float:
-    """The least PSNR of what cameras see of two scenes."""
+    """The lowest PSNR between renders of two scenes."""
     return min(psnr(CPU.render(found, camera).rgb, CPU.render(gaussians, camera).rgb) for camera in cameras)
 
 
@@ -229,7 +229,7 @@ def scene(tmp_path: Path) -> Path:
 
 
 def export(scene: Path, *names: str) -> str:
-    """Write files beside the scene, and what was said."""
+    """Write files beside the scene, and return the log."""
     text = io.StringIO()
     export_scene(scene, [scene.parent / name for name in names], Reporter(console=Console(file=text, width=300)))
     return text.getvalue()

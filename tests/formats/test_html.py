@@ -25,7 +25,7 @@ BOX = box_before_wall(width=64, height=48, focal=53)
 
 
 def decoded(data: bytes, low: float, step: float) -> Gaussians:
-    """The plain twin of the page's own reading, as the docstring of `encode_layer` has it."""
+    """Decode a layer in plain Python, by the docstring of `encode_layer`."""
     count = len(data) // BYTES
     planes = np.frombuffer(data, np.uint8).reshape(BYTES, count).astype(np.int64)
     rows = []
@@ -42,7 +42,7 @@ def decoded(data: bytes, low: float, step: float) -> Gaussians:
 
 
 def random_gaussians(count: int = 200) -> Gaussians:
-    """Near things and a sky, thin and thick, turned every way."""
+    """Near and far Gaussians of all shapes and rotations."""
     torch.manual_seed(3)
     means = torch.randn(count, 3) * torch.logspace(-1, 4, count)[:, None]
     scales = torch.exp(torch.rand(count, 3) * 14 - 9)

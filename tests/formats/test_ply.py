@@ -28,7 +28,7 @@ GIVEN = [*PROPERTIES[:3], *PROPERTIES[6:]]  # SHARP writes no normals
 
 
 def raw(gaussians: Gaussians, linear: bool = False) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """What a file stores for GIVEN, [N, 14], in plain double arithmetic."""
+    """The values of the properties GIVEN, [N, 14], in float64."""
     m, q, s, o, c = (t.double() for t in gaussians.tensors)
     sh = ((c if linear else linear_to_srgb(c)) - 0.5) / 0.28209479177387814
     return np.asarray(torch.cat([m, sh, torch.logit(o)[:, None], s.log(), q], dim=1))
@@ -36,7 +36,7 @@ def raw(gaussians: Gaussians, linear: bool = False) -> np.ndarray[Any, np.dtype[
 
 def ply(rows: Any, names: list[str], kind: str = "float", order: str = "binary_little_endian", tail: bytes = b"",
         head: str = "", after: str = "") -> bytes:  # fmt: skip
-    """A file with one vertex element, and whatever comes before and after."""
+    """A file with one vertex element, between other header lines and data."""
     rows = np.asarray(rows, dtype=np.float64)
     header = f"ply\nformat {order} 1.0\ncomment made by a test\n{head}element vertex {len(rows)}\n"
     header += "".join(f"property {kind} {name}\n" for name in names) + after + "end_header\n"
@@ -64,7 +64,7 @@ def close(a: Gaussians, b: Gaussians) -> None:
 
 
 def written(path: Path) -> np.ndarray[Any, np.dtype[np.float32]]:
-    """What a reader that shares no code with ours finds in a file, [N, 17]."""
+    """The rows of a file, [N, 17], by an independent reader."""
     ply = read_ply(path)
     assert ply.names == PROPERTIES
     return np.frombuffer(ply.body, "<f4").reshape(ply.count, -1)

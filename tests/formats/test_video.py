@@ -22,7 +22,7 @@ from spackle.formats.depth import save_depth
 
 
 def frames(count: int, height: int, width: int) -> list[Tensor]:
-    """A smooth picture that moves."""
+    """Frames of a smooth moving picture."""
     y, x = torch.meshgrid(torch.linspace(0, 1, height), torch.linspace(0, 1, width), indexing="ij")
     return [torch.stack([x * (20 - k) / 20, y, 0.5 + 0.3 * torch.sin(x + y + k / 5)], dim=-1) for k in range(count)]
 
@@ -148,7 +148,7 @@ def test_an_animation_says_how_often_it_plays(tmp_path: Path, name: str) -> None
 
 
 def test_a_gif_keeps_rare_colours_and_spreads_a_gradient(tmp_path: Path) -> None:
-    """One palette for all frames: a small orange lamp stays orange, and grey steps are not seen as bands."""
+    """A small orange lamp stays orange, and a grey gradient shows no bands."""
     ramp, orange = torch.linspace(0.1, 0.6, 160), torch.tensor([1.0, 0.5, 0.1])
     pictures = [ramp[:, None].repeat(90, 1, 3) for _ in range(3)]
     for k, picture in enumerate(pictures):

@@ -1,4 +1,4 @@
-"""The page: what it is given, what it shows in a real browser, and that it asks nobody for anything."""
+"""The page in a real browser: views, controls, and no requests to other hosts."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def browser() -> Iterator[Any]:
 
 @dataclasses.dataclass(frozen=True)
 class Opened:
-    """A page, and what it said and asked for."""
+    """A page, with console messages and requested addresses."""
 
     page: Any
     said: list[str]
@@ -101,7 +101,7 @@ def opened(browser: Any, url: str) -> Opened:
 
 
 def settled(page: Any, promise: str) -> None:
-    """Wait for a promise of the page, no longer than for all else (`evaluate` waits for ever)."""
+    """Wait for a promise of the page, with a timeout (`evaluate` has none)."""
     page.wait_for_function(f"{promise}.then(() => true)")
 
 
@@ -119,7 +119,7 @@ def shown(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Op
 
 @pytest.fixture
 def page(shown: Opened) -> Any:
-    """The same page as it was at first."""
+    """The page in its first state."""
     first = "spackle.setCompare(null), spackle.setHeat(false), spackle.setLayers('both'), spackle.setView(...view)"
     shown.page.evaluate(f"(view) => Promise.all([{first}])", list(VIEW))
     return shown.page
@@ -136,20 +136,20 @@ def picture(page: Any, width: int, height: int) -> Tensor:
 
 
 def canvas(page: Any) -> Tensor:
-    """What is on the screen where the canvas is."""
+    """A screenshot of the canvas."""
     settled(page, "spackle.settled()")
     return pixels(page.locator("#view").screenshot())
 
 
 def camera_of(page: Any, width: int, height: int) -> Camera:
-    """Ours, where the page's eye is."""
+    """A camera of Spackle at the position of the page's camera."""
     eye = torch.tensor(page.evaluate("spackle.pose().eye"))
     focus = torch.tensor([0.0, 0.0, DepthRange.of(box().base).focus])
     return box().camera.resized(width, height).zoomed(1 + OVERSCAN).looking(eye, focus)
 
 
 def hole_and_rest(page: Any, height: int, width: int) -> tuple[Tensor, Tensor]:
-    """[H, W] bool each: surely in the base's hole, and surely outside of it and of the rounded corners."""
+    """Two masks [H, W]: pixels inside the base's hole, and pixels outside, both without edges and rounded corners."""
     alpha = CPU.render(box().base, camera_of(page, width, height)).alpha[None, None]
     pool: Callable[[Tensor], Tensor] = lambda x: torch.nn.functional.max_pool2d(x, 9, 1, 4)[0, 0]  # noqa: E731
     inside = torch.zeros(height, width, dtype=torch.bool)

@@ -1,4 +1,4 @@
-"""The server as programs, browsers, strangers and broken clients meet it, each over a real socket of this machine."""
+"""The server's answers to programs, browsers, strangers and broken clients, over sockets of this machine."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ def test_a_photo_becomes_a_scene(server: Served) -> None:
     )
     told = server.events(id)
     assert (told[-1]["state"], told[-1]["error"], told[-1]["line"]) == ("done", None, "focal length <50> px")
-    assert server.events(id) == told[-1:]  # again: a page that comes late
+    assert server.events(id) == told[-1:]  # for a page that asks later
     state = server.ask(f"{SCENES}/{id}").json
     assert (state["state"], state["error"], state["share"], "source" in state) == ("done", None, None, False)
-    assert state["files"] == ["photo.jpg"]  # no such thing as page.json
+    assert state["files"] == ["photo.jpg"]  # without page.json
     page = server.ask(f"{SCENES}/{id}/files/page.json").json
     assert (page["depth"], page["options"]) == ("depth", {"base": "auto", "frames": 3})
     assert server.ask(f"{SCENES}/{id}/files/base.splats").body == PHOTO
@@ -85,7 +85,7 @@ def test_options_are_checked(server: Served, options: str, why: str) -> None:
     assert (reply.status, why in reply.json["error"]) == (422, True), reply.body
 
 
-def test_every_answer_says_what_a_browser_may_do_with_it(server: Served) -> None:
+def test_every_answer_has_the_security_headers(server: Served) -> None:
     wanted = {"x-content-type-options": "nosniff", "referrer-policy": "no-referrer", "cache-control": "no-store"}
     wanted |= {"cross-origin-resource-policy": "same-origin", "server": "spackle"}  # no versions
     for reply in (server.ask(), server.ask("/no"), server.ask("/", "PUT"), server.ask(Host="evil.example")):
@@ -127,13 +127,13 @@ MALFORMED = [
 
 
 @pytest.mark.parametrize(("data", "status"), REFUSED, ids=lambda value: repr(value)[:60])
-def test_what_is_foreign_or_no_route_is_refused(server: Served, data: bytes, status: int) -> None:
+def test_foreign_requests_and_unknown_paths_are_refused(server: Served, data: bytes, status: int) -> None:
     answer, body = server.raw(data)
     assert (answer, set(json.loads(body))) == (status, {"error"})
 
 
 @pytest.mark.parametrize("data", MALFORMED, ids=lambda value: repr(value)[:60])
-def test_what_is_malformed_is_refused(server: Served, data: bytes) -> None:
+def test_malformed_requests_are_refused(server: Served, data: bytes) -> None:
     assert server.raw(data)[0] == 400
     assert server.ask().status == 200
 
@@ -156,7 +156,7 @@ def test_a_token_is_asked_for_on_every_request(server: Served, tmp_path: Path) -
     assert bare.ask(SCENES, "POST", form()).status == bare.ask(f"{SCENES}/{id}", "DELETE").status == 401
     assert bare.ask(f"{SCENES}/{id}", Authorization="Bearer s3cret").status == 200
     assert bare.ask(SCENES, "POST", form(), Authorization="Bearer s3cret").status == 202
-    with served(tmp_path, token=None) as free:  # everybody on this machine may look, and nobody write
+    with served(tmp_path, token=None) as free:  # everybody on this machine may read, nobody may write
         assert (free.ask().status, free.ask("/page.json").json, free.send().status) == (200, {"upload": None}, 401)
 
 
@@ -184,7 +184,9 @@ def test_an_upload_is_bounded_while_it_comes(server: Served) -> None:
     assert set(server.jobs.folder.iterdir()) == waiting
 
 
-def test_a_slow_or_vanishing_client_leaves_its_place(server: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slow_or_vanished_client_frees_its_place(
+    server: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("spackle.web.app.UPLOAD_S", 0.5)
     before = set(server.jobs.folder.iterdir())
     for gone in (False, True):
@@ -199,7 +201,7 @@ def test_a_slow_or_vanishing_client_leaves_its_place(server: Served, monkeypatch
 
 
 def png_claiming(width: int, height: int) -> bytes:
-    """A photo that says it has that size."""
+    """A PNG whose header states this size."""
     head = b"IHDR" + struct.pack(">II", width, height) + PHOTO[24:29]
     return PHOTO[:12] + head + struct.pack(">I", zlib.crc32(head)) + PHOTO[33:]
 
@@ -215,7 +217,7 @@ def png_claiming(width: int, height: int) -> bytes:
     ],
     ids=lambda value: repr(value)[:20],
 )
-def test_what_is_a_photo_is_found_out_by_decoding(server: Served, content: bytes | str, why: str | None) -> None:
+def test_photos_are_recognised_by_decoding(server: Served, content: bytes | str, why: str | None) -> None:
     pillow_heif.register_heif_opener()
     if isinstance(content, str):
         assert server.send(saved(content), "a.heic").status == 202
@@ -236,7 +238,7 @@ def test_a_name_is_safe_to_show() -> None:
     ("how", "error"),
     [("bad", "bad.png: no depth at all"), ("bug", "internal error: KeyError: 'oh'"), ("die", DIED)],
 )
-def test_what_goes_wrong_is_told_in_a_line(server: Served, how: str, error: str) -> None:
+def test_an_error_is_one_line(server: Served, how: str, error: str) -> None:
     id = server.send(name=f"{how}.png").json["id"]
     assert server.events(id)[-1]["error"] == error
     assert server.ask(f"{SCENES}/{id}").json["error"] == error
@@ -276,7 +278,7 @@ def test_a_photo_at_work_can_be_removed(server: Served) -> None:
 
 
 def test_the_example_mounts_the_app(tmp_path: Path) -> None:
-    """In an app of somebody else, with the real pipeline."""
+    """The example runs as a process, with the real pipeline."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
 

@@ -1,4 +1,4 @@
-"""`spackle view` and `spackle serve` as people use them: a page that opens, photos that become scenes, and an end."""
+"""`spackle view` and `spackle serve`: the page opens, photos become scenes, and signals end the server."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ def served_at(url: str) -> tuple[Served, str]:
 
 
 def page_of(server: Served, id: str) -> Any:
-    """What the page draws once the scene is done."""
+    """The description of a finished scene, as the page loads it."""
     assert server.events(id)[-1]["error"] is None
     return server.ask(f"{SCENES}/{id}/files/page.json").json
 
 
 @pytest.fixture
 def visit(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Run]:
-    """Runs `spackle view` until a browser, which is a function here, has seen enough; then a signal ends it."""
+    """Run `spackle view` with a function as the browser; a signal ends the command when the function returns."""
     monkeypatch.setenv("BROWSER", "anything")
 
     def run_view(browse: Callable[[Served, str], object], *arguments: object, end: int = signal.SIGINT) -> Run:
