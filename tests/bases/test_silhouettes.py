@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -10,17 +11,17 @@ import torch
 from plain_cleanup import uncompiled
 from scenes import Scene, box_before_wall, psnr
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
+from torch.nn.functional import avg_pool2d, max_pool2d
 
 from spackle.bases import silhouettes, splats
 from spackle.bases.quadtree import LEVELS
 from spackle.bases.silhouettes import find_layers
-from spackle.bases.splats import blended_opacities, layered_gaussians, mixture
+from spackle.bases.splats import WEIGHTS, blended_opacities, layered_gaussians, mixture
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, extremes
 from spackle.color import linear_to_srgb, srgb_to_linear
 from spackle.render import CpuRenderer
-from spackle.surface import surface_gaussians
+from spackle.surface import OPACITY, surface_gaussians
 
 Image = np.ndarray
 CPU = CpuRenderer()
@@ -117,3 +118,25 @@ def test_a_photo_full_of_steps_has_no_holes_and_few_gaussians(cells: int) -> Non
     base = layered_gaussians(torch.where(near, 0.5, 0.2), colors, Camera.from_focal(60, 50, 42))
     assert 42 * 50 <= len(base) <= 42 * 50 * 9 // 4
     assert float(CPU.render(base, Camera.from_focal(60, 50, 42)).alpha.min()) > 0.95
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_rings_are_distances_to_the_nearest_step(seed: int) -> None:
+    ring = torch.from_numpy(find_layers(*steps(seed)).ring)
+    within = [max_pool2d((ring == 1).float()[None], 2 * n + 1, 1, n)[0] > 0 for n in range(silhouettes.REACH)]
+    expected = torch.where(within[-1], silhouettes.REACH + 1 - torch.stack(within).sum(0), 0)
+    assert torch.equal(ring.long(), expected)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_opacities_blend_to_the_shares(seed: int) -> None:
+    inverse, slope, colors = steps(seed)
+    layers = find_layers(inverse, slope, colors)
+    opacity = blended_opacities(layers.alpha, layers.ring)
+    for y, x in np.argwhere((layers.ring > 0) & (opacity > 0) & (opacity < 1)):
+        passes = 1.0
+        for k, (dy, dx) in enumerate(itertools.product((-1, 0, 1), repeat=2)):
+            v, u = min(max(y + dy, 0), inverse.shape[0] - 1), min(max(x + dx, 0), inverse.shape[1] - 1)
+            if k != 4 and layers.ring[v, u]:
+                passes *= 1 - OPACITY * WEIGHTS[k] * opacity[v, u]
+        assert 1 - passes * (1 - opacity[y, x]) == pytest.approx(layers.alpha[y, x], abs=0.03)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import fuzz
 import numpy as np
+import pytest
 from PIL import Image
 
 
@@ -17,6 +18,13 @@ def run(*arguments: object) -> str:
     done = subprocess.run([sys.executable, fuzz.__file__, *map(str, arguments)], capture_output=True, text=True)
     assert done.returncode == 0, f"{done.stdout}{done.stderr}: python tests/fuzz/fuzz.py --replay shows one again"
     return done.stdout
+
+
+@pytest.mark.parametrize("count", [150, pytest.param(3000, marks=pytest.mark.slow)])
+def test_damaged_files_leave_no_thread_no_file_and_no_memory_behind(count: int) -> None:
+    for line in run("-n", count, "--held", "--readers", "clips", "pictures", "depth").splitlines():
+        threads, files, megabytes = map(int, line.split()[1:])
+        assert (threads, files, megabytes < 40) == (0, 0, True), line
 
 
 def test_damaged_files_are_refused_in_time_and_in_memory() -> None:
