@@ -184,9 +184,7 @@ def test_an_upload_is_bounded_while_it_comes(server: Served) -> None:
     assert set(server.jobs.folder.iterdir()) == waiting
 
 
-def test_a_slow_or_vanished_client_frees_its_place(
-    server: Served, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_slow_or_vanished_client_frees_its_place(server: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("spackle.web.app.UPLOAD_S", 0.5)
     before = set(server.jobs.folder.iterdir())
     for gone in (False, True):

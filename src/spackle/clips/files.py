@@ -87,6 +87,15 @@ def read_clip(
         InputError: the file is not a clip, truncated, damaged, without video, or of an unknown codec.
     """
     check_file(path, "clip")
+    try:
+        return _read_clip(path, first, progress)
+    except InputError as error:
+        message, cause = str(error), error.__cause__
+    # The first error's traceback refers to the decoder, whose threads would live as long as the error.
+    raise InputError(message) from (cause and cause.with_traceback(None))
+
+
+def _read_clip(path: str | os.PathLike[str], first: int | None, progress: Callable[[int, int], None] | None) -> Clip:
     ticks: list[Fraction | None] = []
     frame = None
     with _opened(path) as (container, stream):
