@@ -164,7 +164,7 @@ def against_cpu(options: argparse.Namespace) -> Iterator[str]:
 def sanitizer(options: argparse.Namespace) -> Iterator[str]:
     """no invalid memory access in forward and backward passes, with tiles and batches"""
     renderer()
-    words = "gradients or tiles or together"
+    words = "gradients or tiles or together or batch"
     command = ["compute-sanitizer", "--tool", "memcheck", "--error-exitcode", "1"]
     yield list(run(*command, sys.executable, "-m", "pytest", TESTS, "-q", "-k", words))[-1]
 
@@ -185,7 +185,7 @@ def counted_waits(call: Callable[[], object]) -> list[str]:
 
 
 def waits(options: argparse.Namespace) -> Iterator[str]:
-    """the host waits for the GPU once between photo and scene: to get the scene"""
+    """the host waits for the GPU only at the end: to get the five tensors of the scene"""
     base, photo = sharp(options)
     places = counted_waits(lambda: base.predict(photo))
     yield f"{len(places)} waits: {', '.join(places)}"
@@ -200,7 +200,11 @@ def precisions(options: argparse.Namespace) -> Iterator[str]:
     ]  # fmt: skip
     for name, precision, compiled in ways:
         base, photo = sharp(options, precision, compiled=compiled)
-        found[name] = to_metric(base.infer(photo), photo).means
+        try:
+            found[name] = to_metric(base.infer(photo), photo).means
+        except InputError as error:  # the network cannot be compiled
+            yield f"{name}: {error}"
+            continue
         tasks[name] = lambda _, base=base, photo=photo: base.predict(photo)  # type: ignore[misc]
     for name, means in found.items():
         apart = (means - found["fp32"]).norm(dim=-1) / found["fp32"].norm(dim=-1)

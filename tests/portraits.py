@@ -170,15 +170,23 @@ def gdepth_jpeg(image: bytes, said: Range = Range(), orientation: int = 1, part:
 
 
 def dynamic_jpeg(
-    image: bytes, said: Range = Range(unit="Meters"), orientation: int = 1, extended: bool = False
+    image: bytes,
+    said: Range = Range(unit="Meters"),
+    orientation: int = 1,
+    extended: bool = False,
+    *,
+    padding: int = 0,
+    length: int | None = None,
+    trailer: bytes = b"",
+    primary: int = 0,
 ) -> bytes:
     """The map behind the photo and another item; a directory in the (extended) XMP lists all three."""
     other, uri = jpeg(codes()[::-1]), "android/depthmap"
     depth = {"DepthMap:ItemSemantic": "Depth", **said.properties("DepthMap"), "DepthMap:DepthURI": uri}
     entries: list[dict[str, object]] = [
-        {"Item:Mime": "image/jpeg", "Item:Length": 0, "Item:DataURI": "primary_image"},
+        {"Item:Mime": "image/jpeg", "Item:Length": primary, "Item:DataURI": "primary_image", "Item:Padding": padding},
         {"Item:Mime": "image/jpeg", "Item:Length": len(other), "Item:DataURI": "android/gainmap"},
-        {"Item:Mime": "image/png", "Item:Length": len(image), "Item:DataURI": uri},
+        {"Item:Mime": "image/png", "Item:Length": len(image) if length is None else length, "Item:DataURI": uri},
     ]
     resource = 'rdf:parseType="Resource"'
     if extended:  # as Pixels have it
@@ -195,7 +203,7 @@ def dynamic_jpeg(
     if extended:
         digest, parts = extended_segments(packet)
         segments = [xmp_segment(xmp(f' xmpNote:HasExtendedXMP="{digest}">', GDEPTH.split()[1])), *parts]
-    return with_segments(jpeg(picture(), orientation), *segments) + other + image
+    return with_segments(jpeg(picture(), orientation), *segments) + b"\0" * padding + other + image + trailer
 
 
 HEVC = b"urn:mpeg:hevc:2015:auxid:2"

@@ -16,7 +16,7 @@ from typing import Any, Literal
 import torch
 
 import spackle
-from spackle.errors import InputError
+from spackle.errors import InputError, check_name
 
 # Torch reports a shortage of memory also by plain RuntimeErrors, whose messages contain one of these phrases.
 _SHORTAGES = ("DefaultCPUAllocator", "not enough memory", "allocate memory", "out of memory", "_ALLOC_FAILED")
@@ -85,6 +85,7 @@ PRECISIONS = ("auto", "fp32", "bf16")
 
 def pick_dtype(precision: Precision, device: torch.device) -> torch.dtype:
     """The dtype for a precision on a device; "auto" is bfloat16 on hardware that multiplies bfloat16."""
+    check_name("--precision", precision, PRECISIONS)
     if precision == "auto":
         return torch.bfloat16 if multiplies_bf16(device) else torch.float32
     return torch.float32 if precision == "fp32" else torch.bfloat16

@@ -93,7 +93,7 @@ def predict_photo(
             "disparity": scene.disparity,
             "video": video,
             "hole_area_ratio": holes,
-            "request": request,
+            "request": request if done.choice.lasting else None,  # None: the next run predicts the photo again
         }
         size = {"width": scene.camera.width, "height": scene.camera.height}
         frame = {} if photo.frame is None else {"frame_cut_off": photo.frame._asdict()}

@@ -112,6 +112,9 @@ def test_middlebury(tmp_path: Path, suffix: str, beside: bool) -> None:
     with pytest.raises(InputError, match="--calib"):
         load_depth(tmp_path / "motorcycle_disp.npy")
     same(load_depth(name, calib=calib, focal_px=2001), 2 * expected, 1e-6)
+    for focal in (0, -3, np.nan):
+        with pytest.raises(InputError, match="give a focal length above 0"):
+            load_depth(name, calib=calib, focal_px=focal)
 
 
 def test_scene_json(tmp_path: Path) -> None:

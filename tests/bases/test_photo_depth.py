@@ -138,6 +138,20 @@ def test_a_map_without_a_unit_gets_a_plausible_scale(tmp_path: Path, make: Calla
     assert linear.quantum == pytest.approx(float(linear.depth.max() - linear.depth.min()) / 255, rel=1e-5)
 
 
+def test_dynamic_depth_finds_its_item_whatever_the_lengths_mean(tmp_path: Path) -> None:
+    expected = found(tmp_path, portraits.dynamic_jpeg(png(codes()))).depth
+    for data in (
+        portraits.dynamic_jpeg(png(codes()), padding=37),
+        portraits.dynamic_jpeg(png(codes()), padding=37, extended=True, trailer=b"camera's own bytes"),
+        portraits.dynamic_jpeg(png(codes()), length=0),  # to the end of the file
+        portraits.dynamic_jpeg(png(codes()), padding=37).replace(b'Item:Padding="37"', b'Item:Padding="0" '),
+        portraits.dynamic_jpeg(png(codes()), trailer=b"x" * 99).replace(b'Item:Padding="0"', b'Item:Padding="9"'),
+        portraits.dynamic_jpeg(png(codes()), trailer=b"x" * 99, primary=5000),
+        portraits.dynamic_jpeg(png(codes())).replace(b"\xff\xd9", b"\xff\0"),  # a photo without an end
+    ):
+        assert torch.equal(found(tmp_path, data).depth, expected)
+
+
 def test_disparity_below_zero_is_far_and_depth_of_zero_is_unknown(tmp_path: Path) -> None:
     depth = found(tmp_path, portraits.heic(codes(), apple_xmp(ends=(-0.1, 2.45))))
     assert bool(depth.valid.all())

@@ -33,6 +33,7 @@ from spackle.bases.sharp.encoder import (
 from spackle.bases.sharp.network import GroupNorm, SharpNetwork, compile_forward, compose, make_start
 from spackle.bases.sharp.unproject import stretch_gaussians
 from spackle.device import enough_memory, multiplies_bf16, own_arithmetic, pick_device, pick_dtype
+from spackle.errors import InputError
 from spackle.image import Photo, load_photo
 from spackle.render import CpuRenderer
 
@@ -164,6 +165,8 @@ def test_auto_is_bf16_if_the_hardware_multiplies_it(monkeypatch: pytest.MonkeyPa
     assert multiplies_bf16(CPU) is native
     assert pick_dtype("auto", CPU) == (torch.bfloat16 if native else torch.float32)
     assert (pick_dtype("fp32", CPU), pick_dtype("bf16", CPU)) == (torch.float32, torch.bfloat16)
+    with pytest.raises(InputError, match="--precision fp16: unknown"):
+        pick_dtype("fp16", CPU)  # type: ignore[arg-type]
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: (8 if native else 7, 0))
     assert multiplies_bf16(torch.device("cuda")) is native  # from Ampere on
 

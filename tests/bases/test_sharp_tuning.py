@@ -6,6 +6,7 @@ import copy
 import hashlib
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -98,27 +99,29 @@ def test_a_decoders_file_finds_its_checkpoint(owner: Owner, base: TunableSharp, 
     assert all(map(torch.equal, gaussians_from(best).tensors, expected))
     beside.unlink()
     beside.write_bytes(b"another")
-    for _ in range(2):  # the link counts more than the file's name
-        link_owner(owner, tmp_path)
+    for where in (tmp_path / "moved", owner.path, owner.path):  # a dead link is renewed, and counts more than the name
+        link_owner(Owner(where, owner.sha256), tmp_path)
     assert all(map(torch.equal, gaussians_from(best).tensors, expected))
 
 
 @pytest.mark.parametrize(
-    ("beside", "noted", "said"),
+    ("beside", "noted", "missing", "said"),
     [
-        (None, True, r"trained on sharp\.safetensors, which is not in this folder: put"),
-        (b"another", True, "trained on a checkpoint with the SHA-256"),
-        (None, False, "does not say which checkpoint it was trained on"),
+        (None, True, "", r"trained on sharp\.safetensors, which is not in this folder: put"),
+        (b"another", True, "", "trained on a checkpoint with the SHA-256"),
+        (..., True, "feature_model.fusion.out_conv.bias", r"1 names differ, e\.g\. feature_model\.fusion"),
+        (None, False, "", "does not say which checkpoint it was trained on"),
     ],
 )
-def test_a_decoder_without_its_checkpoint_is_refused(
-    owner: Owner, base: TunableSharp, tmp_path: Path, beside: bytes | None, noted: bool, said: str
+def test_a_decoder_without_its_checkpoint_or_a_tensor_is_refused(
+    owner: Owner, base: TunableSharp, tmp_path: Path, beside: Any, noted: bool, missing: str, said: str
 ) -> None:
     decoder = base.network.gaussian_decoder().state_dict()
     facts = {"checkpoint": "/elsewhere/sharp.safetensors", "sha256": owner.sha256}
     note = {NOTE: json.dumps(facts) if noted else "{}"}
-    save_file({name: tensor.contiguous() for name, tensor in decoder.items()}, tmp_path / "best.safetensors", note)
+    tensors = {name: tensor.contiguous() for name, tensor in decoder.items() if name != missing}
+    save_file(tensors, tmp_path / "best.safetensors", note)
     if beside is not None:
-        (tmp_path / "sharp.safetensors").write_bytes(beside)
+        (tmp_path / "sharp.safetensors").write_bytes(owner.path.read_bytes() if beside is ... else beside)
     with pytest.raises(InputError, match=said):
         SharpBase.load(tmp_path / "best.safetensors")

@@ -158,6 +158,25 @@ def test_disparity_of_the_person_else_of_the_photo(tmp_path: Path) -> None:
     assert files[0].read_bytes() == files[1].read_bytes()
 
 
+@pytest.mark.parametrize("when", ["load", "predict"])
+def test_a_photo_is_done_again_if_memory_was_short_for_a_better_base(
+    tmp_path: Path, made: dict[str, Path], photos: Path, monkeypatch: pytest.MonkeyPatch, when: str
+) -> None:
+    def hungry(*args: object, **options: object) -> None:
+        raise MemoryShort("not enough memory for SHARP")
+
+    install(made, tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr(SharpBase if when == "load" else StandIn, when, hungry)
+        succeeds(predict(tmp_path, photos))
+    for name in "ab":
+        report = report_of(tmp_path / "out" / name)
+        assert (report["base"]["name"], report["request"]) == ("lite", None)
+    assert "done already" not in predict(tmp_path, photos).err
+    assert report_of(tmp_path / "out" / "b")["base"]["name"] == "sharp"
+    assert "done already" in predict(tmp_path, photos).err
+
+
 def test_a_base_that_cannot_be_loaded_stops_a_folder_at_once(
     tmp_path: Path, made: dict[str, Path], photos: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

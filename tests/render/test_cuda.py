@@ -158,17 +158,18 @@ def test_an_unchanged_scene_is_uploaded_once() -> None:
     assert len(store._kept) == 0
 
 
-def modules(backend: object) -> dict[str, Any]:
+def modules(version: str, backend: object) -> dict[str, Any]:
     """Stand-ins for the modules of gsplat."""
     gsplat, inner, built = (ModuleType(name) for name in ("gsplat", "gsplat.cuda", "gsplat.cuda._backend"))
     vars(built)["_C"], vars(inner)["_backend"] = backend, built
-    vars(gsplat).update(cuda=inner)
+    vars(gsplat).update(cuda=inner, __version__=version)
     return {module.__name__: module for module in (gsplat, inner, built)}
 
 
 UNUSABLE: dict[str, dict[str, Any]] = {
     r"gsplat.*: pip install 'spackle-nvs\[cuda\]'": {"gsplat": None},
-    "it has no kernels": modules(None),
+    "its version is 1.6.0, not 1.5": modules("1.6.0", object()),
+    "it has no kernels": modules("1.5.3", None),
 }
 
 
@@ -188,7 +189,7 @@ def test_an_unusable_gsplat_is_refused_and_auto_falls_back(
 
 def test_auto_uses_an_available_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    for name, module in modules(object()).items():
+    for name, module in modules("1.5.3", object()).items():
         monkeypatch.setitem(sys.modules, name, module)
     assert load_gsplat(torch.device("cuda")).__name__ == "gsplat"
     assert isinstance(get_renderer("auto"), GsplatRenderer)

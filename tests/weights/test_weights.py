@@ -10,6 +10,7 @@ import re
 import socket
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -33,6 +34,7 @@ def _without_network_habits(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("http_proxy", "https_proxy", "all_proxy", "no_proxy"):
         monkeypatch.delenv(name, raising=False)
         monkeypatch.delenv(name.upper(), raising=False)
+    monkeypatch.delenv("HF_ENDPOINT", raising=False)
 
 
 @pytest.fixture
@@ -110,6 +112,7 @@ def test_a_part_of_another_file_is_discarded(site: Site, target: Path, size: int
         ({"content": CONTENT + b"more"}, ("another file: 1,000,007 bytes instead of 1,000,003",)),
         ({"content": CONTENT[::-1]}, ("not the SHA-256", SHA256, "another address")),
         ({"drops": [len(CONTENT) - 10]}, ("10 bytes early", "try again")),
+        ({"headers": {"Content-Type": "text/html; charset=utf-8"}}, ("the server's answer is not a file",)),
         ({"status": 302, "headers": {"Location": "file:///etc/hostname"}}, ("HTTP 302",)),
     ],
 )
@@ -122,6 +125,12 @@ def test_answers_other_than_the_file_are_refused(
     assert bool(os.listdir(target.parent)) is ("10 bytes early" in words)  # the received bytes are kept
 
 
+def test_a_full_disk_is_refused(site: Site, target: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=1))
+    refused(site.url, target, str(target.parent), "make room")
+    assert os.listdir(target.parent) == []
+
+
 def test_servers_that_hang_are_refused(site: Site, target: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "TIMEOUT", 0.2)
     site.hang_after = 200_000
@@ -131,11 +140,15 @@ def test_servers_that_hang_are_refused(site: Site, target: Path, monkeypatch: py
     refused(site.url.replace("http:", "https:"), target, "SSL")
 
 
-def test_the_entries_of_published_weights() -> None:
+def test_the_entries_of_published_weights(monkeypatch: pytest.MonkeyPatch) -> None:
     for entry in PUBLISHED.values():
         assert re.fullmatch("[0-9a-f]{64}", entry.sha256)
         assert re.fullmatch(f"https://.*{re.escape(Path(entry.file).name)}", entry.url)
         assert all((entry.purpose, entry.licence, entry.notice, entry.option))
+        assert entry.address == entry.url
+    monkeypatch.setenv("HF_ENDPOINT", "https://mirror.example/hub/")
+    assert PUBLISHED["depth"].address.startswith("https://mirror.example/hub/Ruicheng/moge-2-vits-normal/resolve/")
+    assert PUBLISHED["sharp"].address == PUBLISHED["sharp"].url
 
 
 def test_the_folder_of_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -127,6 +127,8 @@ def load_depth(
     auto and the map looks relative.
     """
     check_file(path, "depth map")
+    if focal_px is not None and not 1 / LARGEST <= focal_px <= LARGEST:
+        raise InputError(f"--focal-px {focal_px:g}: give a focal length above 0, in pixels")
     if kind in RELATIVE:
         stored, _ = read_array(path, grey=True)
         return relative_depth(stored, kind, path, near, far)

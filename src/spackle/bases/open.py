@@ -104,6 +104,7 @@ class ResolvedBase:
     why: str
     failures: tuple[str, ...] = ()  # name and error of each candidate that failed before
     note: str = ""  # for the user, if `auto` chose this base for the first time
+    lasting: bool = True  # False: memory was short for a better base, which may work in the next run
 
 
 class OpenedBase:
@@ -114,7 +115,8 @@ class OpenedBase:
     ) -> None:
         """`candidates` are tried in their order (see `ORDER`); `loaded` maps names to networks already loaded."""
         self.candidates, self._settings, self._loaded = candidates, settings, loaded
-        self._failed: dict[str, str] = {}  # candidates that no photo can use, with the reason
+        # Candidates that no photo can use: the reason, and whether memory was short.
+        self._failed: dict[str, tuple[str, bool]] = {}
         self._notes: set[str] = set()  # given for earlier photos
 
     def predict(
@@ -130,7 +132,7 @@ class OpenedBase:
             log: gets a line for each candidate that fails.
             stage: times the stages "prepare", in which a base is loaded, and "base", in which it predicts.
         """
-        reasons, failures = list[str](), list[str]()
+        reasons, failures = list[tuple[str, bool]](), list[str]()
         for name, (title, absence) in self.candidates.items():
             base: Base | None = None
             try:
@@ -138,7 +140,7 @@ class OpenedBase:
                     with stage("prepare"):
                         base = self.load(photo, depth, name)
                 if base is None:
-                    reasons.append(self._failed.get(name, absence))
+                    reasons.append(self._failed.get(name, (absence, False)))
                     continue
                 with stage("base") as progress:
                     prediction = base.predict(photo, progress)
@@ -153,17 +155,18 @@ class OpenedBase:
                     raise BaseError(str(error)) from error
                 if name == list(self.candidates)[-1]:
                     raise
-                reasons.append(f"{title} cannot be used")
+                reasons.append((f"{title} cannot be used", isinstance(error, MemoryShort)))
                 failures.append(f"{title}: {error}")
                 log(f"{photo.path.name}: going on without {title}: {error}")
                 if for_good:
                     self._failed[name] = reasons[-1]
                     self._loaded.pop(name, None)  # frees its memory
-        why = ", ".join(reasons) or title
+        why = ", ".join(reason for reason, _ in reasons) or title
+        lasting = not any(short for _, short in reasons)
         note = f"base {name} ({why})" + (f": {ROUGH}" if name == "lite" else "")
         new = len(self.candidates) > 1 and note not in self._notes
         self._notes.add(note)
-        return prediction, ResolvedBase(name, why, tuple(failures), note if new else "")
+        return prediction, ResolvedBase(name, why, tuple(failures), note if new else "", lasting)
 
     def load(self, photo: Photo, depth: Depth = None, name: str | None = None) -> Base | None:
         """Load the candidate `name` (else the first); None without depth or weights, InputError if loading fails."""

@@ -43,7 +43,7 @@ def weights_get(
         for line in entry.notice:
             reporter.log(line)
         with results_folder(path.parent, [path.name], alone=True), reporter.transfer(name) as step:
-            download(url or entry.url, path, entry.bytes, entry.sha256, step)
+            download(url or entry.address, path, entry.bytes, entry.sha256, step)
         reporter.log(f"{summary} -> {path}" + ("" if output is None else f"; {entry.option}"))
     else:
         with reporter.stage("check"):

@@ -187,6 +187,9 @@ def load_gsplat(device: torch.device) -> ModuleType:
         raise InputError("--device cuda: PyTorch sees no NVIDIA GPU on this machine; use --device cpu")
     with reading("--device cuda", f"gsplat cannot be used ({{reason}}): {INSTALL}, or use --device cpu"):
         import gsplat
+
+        if not gsplat.__version__.startswith("1.5."):  # another version may clamp alpha elsewhere
+            raise RuntimeError(f"its version is {gsplat.__version__}, not 1.5")
         from gsplat.cuda import _backend
 
         if _backend._C is None:

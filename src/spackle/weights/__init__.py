@@ -11,6 +11,8 @@ from pathlib import Path
 from spackle.errors import check_name
 from spackle.files import check_file, sha256_of
 
+HUB = "https://huggingface.co"
+
 
 @dataclasses.dataclass(frozen=True)
 class PublishedWeights:
@@ -25,6 +27,11 @@ class PublishedWeights:
     licence: str  # in a few words
     notice: Sequence[str]  # lines that are printed before the download
     option: str  # the option that takes a copy in another folder
+
+    @property
+    def address(self) -> str:
+        """The file's address; HF_ENDPOINT names a mirror of Hugging Face."""
+        return self.url.replace(HUB, os.environ.get("HF_ENDPOINT", "").rstrip("/") or HUB)
 
 
 _FACTS = json.loads(Path(__file__).with_name("published.json").read_text(encoding="utf-8"))

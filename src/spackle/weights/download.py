@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import shutil
 from collections.abc import Callable, Iterator
 from http.client import HTTPException, HTTPResponse, responses
 from pathlib import Path
@@ -58,6 +59,8 @@ def _receive(url: str, part: Path, size: int, progress: Progress) -> None:
         response: HTTPResponse = build_opener().open(Request(url, headers=headers), timeout=TIMEOUT)
     with response:
         done = _first_byte(url, response, present, size)
+        if 0 < shutil.disk_usage(part.parent).free < size - present:  # some network folders report 0
+            raise InputError(f"{part.parent}: {size / 1e9:.1f} GB are needed: make room or choose another folder")
         with open(part, "ab") as file:
             file.truncate(done)
             progress(done, size)
@@ -89,7 +92,9 @@ def _network(url: str) -> Iterator[None]:
 
 
 def _first_byte(url: str, response: HTTPResponse, present: int, size: int) -> int:
-    """The offset at which an answer begins: 0 if the server sends the whole file; InputError for another size."""
+    """The offset at which an answer begins: 0 if the server sends the whole file; InputError for another answer."""
+    if response.headers.get_content_type() == "text/html":
+        raise InputError(f"{url}: the server's answer is not a file: check the address in a browser")
     rest = re.fullmatch(r"bytes (\d+)-\d+/(\d+)", response.headers["Content-Range"] or "")
     done, total = 0, size if response.length is None else response.length
     if response.status == 206 and rest and int(rest[1]) == present:

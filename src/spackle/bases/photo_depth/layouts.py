@@ -7,6 +7,7 @@ import contextlib
 import dataclasses
 import io
 import math
+import re
 import warnings
 from pathlib import Path
 from typing import Any, cast
@@ -180,7 +181,7 @@ def _quantity(tree: Element) -> Quantity | None:
 GDEPTH = "{http://ns.google.com/photos/1.0/depthmap/}"
 MAP, ITEM = (f"{{http://ns.google.com/photos/dd/1.0/{name}/}}" for name in ("depthmap", "item"))
 _UNITS_M = {"m": 1.0, "meter": 1.0, "meters": 1.0, "mm": 0.001, "millimeters": 0.001}
-_PICTURE_STARTS = (b"\xff\xd8\xff", b"\x89PNG")
+_PICTURE_START, _PICTURE_ENDS = re.compile(rb"\xff\xd8\xff|\x89PNG"), (b"\xff\xd9", b"IEND\xaeB`\x82")
 
 
 def _find_android(data: bytes, image: JpegImageFile) -> tuple[bytes, Scale] | None:
@@ -223,14 +224,17 @@ def android_scale(node: Element, space: str, layout: str) -> Scale:
 
 
 def _item(data: bytes, tree: Element, uri: str) -> bytes:
-    """The picture of an item in the photo's directory, which lists the items at the file's end in their order."""
+    """The picture of an item in the photo's directory, which lists in their order the items at the file's end."""
     entries = [node for node in tree.iter() if (get(node, f"{ITEM}Mime") or get(node, f"{ITEM}Length")) is not None]
     index = next((i for i, node in enumerate(entries) if get(node, f"{ITEM}DataURI") == uri), None)
     if index is not None:
         lengths = [int(number(node, f"{ITEM}Length") or 0) for node in entries[index:]]
-        begin = len(data) - sum(lengths)
-        if begin > 0 and lengths[0] > 0 and data.startswith(_PICTURE_STARTS, begin):
-            return data[begin : begin + lengths[0]]
+        last = len(data) - sum(lengths)  # the item begins here, or earlier if other bytes follow the items
+        for begin in reversed([found.start() for found in _PICTURE_START.finditer(data, 1) if found.start() <= last]):
+            if lengths[0] and (begin == last or data.endswith(_PICTURE_ENDS, begin, begin + lengths[0])):
+                return data[begin : begin + lengths[0]]
+            if not lengths[0] and data.endswith((*_PICTURE_ENDS, b"\0"), 0, begin):  # it ends with the file
+                return data[begin:]
     raise ValueError("the photo's directory of items does not lead to a picture")
 
 

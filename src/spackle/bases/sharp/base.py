@@ -193,6 +193,8 @@ def link_owner(owner: Owner, folder: Path) -> None:
     """Put a link to a checkpoint into the folder of its decoders, under a name that no other file has."""
     link = folder / owner.places[0]
     with contextlib.suppress(OSError):  # the link exists, or the file system has none: then the user copies the file
+        if link.is_symlink() and not link.exists():  # the checkpoint has moved
+            link.unlink()
         link.symlink_to(owner.path.absolute())
 
 
@@ -223,4 +225,8 @@ def _with_owner(decoder: Mapping[str, Tensor], path: str | os.PathLike[str], own
             f"{path}: trained on a checkpoint with the SHA-256 {one_line(owner.sha256)[:64]}, but {home} has another: "
             f"put the right {name} into the folder"
         )
-    return {**read_tensors(home, ADVICE), **decoder}
+    whole = read_tensors(home, ADVICE)
+    trained = {name for name in whole if name.startswith(("feature_model.", "prediction_head."))}
+    if wrong := sorted(trained ^ decoder.keys()):
+        raise InputError(f"{path}: not a decoder of {home}: {len(wrong)} names differ, e.g. {one_line(wrong[0])[:120]}")
+    return {**whole, **decoder}
