@@ -9,16 +9,17 @@ import os
 import re
 import secrets
 import shutil
+import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from spackle.errors import InputError, reading, reason_in_a_line
 
-try:
+if sys.platform == "win32":
+    import msvcrt
+else:
     import fcntl
-except ImportError:  # on Windows, where two runs are not kept apart
-    fcntl = None  # type: ignore[assignment]
 
 LEFTOVER = re.compile(r"\.(.+)\.[0-9a-f]{12}(\.\w+)")  # pattern of the temporary names that `atomic_path` gives
 MAX_HASHED = 200_000_000  # bytes; a larger file is recognised by its size and modification time
@@ -58,6 +59,8 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     temporary = target.with_name(f".{target.stem[:50]}.{secrets.token_hex(6)}{target.suffix}")
     try:
         yield temporary
+        with open(temporary, "rb+") as file:
+            os.fsync(file.fileno())  # a power cut must not leave a name without content
         os.replace(temporary, target)
     except OSError as error:
         if error.filename not in (None, str(temporary)):
@@ -135,16 +138,21 @@ def hold(path: Path) -> Iterator[None]:
     """Lock the file `path` during the block; the lock of a killed process is released.
 
     Raises:
-        BlockingIOError: another process has locked the file.
-        OSError: the file cannot be created, or the file system has no locks.
+        InputError: another process has locked the file, the file cannot be created, or the file system has no locks.
     """
+    busy = "another run is at work in this folder: wait for its end, end it, or choose another folder with -o"
     with contextlib.ExitStack() as stack:
         is_ours = False
         while not is_ours:
-            file = stack.enter_context(open(path, "ab"))
-            if fcntl is not None:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            with contextlib.suppress(FileNotFoundError):  # the last holder deleted the file before we locked it
+            # The last holder may delete the file, and the empty folder, before we lock the file.
+            with reading(path, "cannot lock: {reason}", OSError), contextlib.suppress(FileNotFoundError):
+                make_folder(path.parent)
+                file = stack.enter_context(open(path, "ab"))
+                with reading(path.parent, busy, OSError if sys.platform == "win32" else BlockingIOError):
+                    if sys.platform == "win32":
+                        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+                    else:
+                        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 is_ours = os.path.samestat(os.fstat(file.fileno()), os.stat(path))
         try:
             yield
@@ -160,18 +168,14 @@ def results_folder(path: Path, files: Sequence[str] = (), *, alone: bool = False
     Temporary files of killed runs are deleted. `alone` locks the folder during the block.
 
     Raises:
-        InputError: `files` cannot be written, or another run has locked the folder.
+        InputError: `files` cannot be written, or the folder cannot be locked.
     """
     missing = [folder for folder in (path, *path.parents) if not os.path.exists(folder)]
     try:
         with contextlib.ExitStack() as stack:
             make_folder(path)
             if alone:
-                try:
-                    stack.enter_context(hold(path / LOCK))
-                except BlockingIOError as error:
-                    advice = "wait for its end, end it, or choose another folder with -o"
-                    raise InputError(f"{path}: another run is at work in this folder: {advice}") from error
+                stack.enter_context(hold(path / LOCK))
             for name in files:
                 check_writable(path / name)
             with contextlib.suppress(OSError):

@@ -34,9 +34,9 @@ def threads_of_torch(count: int) -> Iterator[None]:
 
 @contextlib.contextmanager
 def at_work(
-    open_worker: Callable[[], Any], jobs: Sequence[Any], stop: Callable[[], bool], *, count: int, threads: int
+    open_worker: Callable[[], Any], jobs: Sequence[Any], stop: Callable[[], bool], count: int, threads: int, gpu: bool
 ) -> Iterator[Iterator[Any]]:
-    """Yield the results of jobs as they arrive, in any order. Each process uses one GPU.
+    """Yield the results of jobs as they arrive, in any order.
 
     Args:
         open_worker: makes an object whose `make(job)` returns a job's result; called once in each process. The
@@ -44,6 +44,7 @@ def at_work(
         stop: whether the user has asked the command to end; the death of a process then only ends the results.
         count: number of processes; with 1, jobs run in this process.
         threads: torch's threads in each process.
+        gpu: whether each process uses one GPU.
 
     Raises:
         InputError: no job can be done, or a process has died.
@@ -54,9 +55,9 @@ def at_work(
             yield map(open_worker().make, jobs)
         return
     spawn = multiprocessing.get_context("spawn")  # torch's threads do not survive a fork
-    numbers = spawn.SimpleQueue()  # each process takes one number, which chooses its GPU
+    numbers = spawn.SimpleQueue()  # each process takes one number, which chooses its GPU; None: no GPU
     for number in range(count):
-        numbers.put(number)
+        numbers.put(number if gpu else None)
     pool = ProcessPoolExecutor(count, spawn, initializer=_start, initargs=(threads, open_worker, numbers))
     try:
         yield _results(pool, jobs, QUEUED * count, stop)
@@ -85,14 +86,14 @@ _open_worker: Callable[
 
 
 def _start(threads: int, open_worker: Callable[[], Any], numbers: Any) -> None:
-    """Set up a process: it ignores Ctrl-C, ends with the main process, and takes a GPU."""
+    """Set up a process: it ignores Ctrl-C, ends with the main process, and takes a GPU by `numbers`."""
     global _open_worker
     _open_worker = functools.cache(open_worker)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=end_with_parent, daemon=True).start()
     torch.set_num_threads(threads)
-    if torch.cuda.device_count() > 1:
-        torch.cuda.set_device(numbers.get() % torch.cuda.device_count())
+    if (number := numbers.get()) is not None and torch.cuda.device_count() > 1:
+        torch.cuda.set_device(number % torch.cuda.device_count())
 
 
 def _make(job: Any) -> Any:

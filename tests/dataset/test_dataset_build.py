@@ -183,6 +183,8 @@ def test_no_usable_photo_is_a_line(tmp_path: Path) -> None:
         (("--disparity", 0.1, 9), "--disparity 0.1 9"), (("--base", "sharp"), "--depth"),
         (("--depth", __file__), f"--depth {__file__}: no such folder"),
         (("--inpainter", "nobody"), "--inpainter nobody"), (("--inpainter", "propainter"), "inpainter propainter"),
+        (("--inpainter", "geometry", "--inpainter-weights", "w"), "geometry takes neither --inpainter-weights"),
+        (("--inpainter", "opencv", "--inpainter-side", 320), "opencv takes neither --inpainter-weights"),
         (("--inpainter", "propainter", "--inpainter-side", 64), "--inpainter-side must be between 128 and 1536"),
     ],
 )  # fmt: skip
@@ -197,6 +199,8 @@ def test_another_configuration_and_a_held_folder_are_refused(whole: Path, place:
     assert content(copy) == content(whole)
     with hold(copy / ".lock"):
         refuses(build(place, copy), "another run is at work")
+    (copy / ".lock").mkdir()
+    refuses(build(place, copy), ".lock: cannot lock: Is a directory")
 
 
 def test_sharp_needs_no_depth(made: dict[str, Path], tmp_path: Path) -> None:

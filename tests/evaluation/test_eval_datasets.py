@@ -177,6 +177,8 @@ def test_odd_poses_and_bent_lenses_are_refused(tmp_path: Path) -> None:
     cameras = tanks(tmp_path / "tanks/Truck") / "sparse/0/cameras.bin"
     cameras.write_bytes(lens(2, FOCAL, WIDTH / 2, HEIGHT / 2, 0.4))
     assert "distorts the corners of photos: undistort" in error_of("tanks", tmp_path / "tanks")
+    cameras.write_bytes(lens(2, 20 * FOCAL, WIDTH / 2, HEIGHT / 2, 0.4))  # the corners of a long lens are near the axis
+    assert read_cases("tanks", tmp_path / "tanks")
     cameras.write_bytes(lens(5, *[1.0] * 8))
     assert "camera model 5 is not a pinhole" in error_of("tanks", tmp_path / "tanks")
 
@@ -281,12 +283,13 @@ def test_second_views_are_the_nearest_but_not_the_same(tmp_path: Path) -> None:
 def test_frames_are_spread_evenly() -> None:
     sizes = {"Barn": 10, "Church": 1000, "Truck": 100}
     taken = spread(list(sizes), lambda name: range(sizes[name]), 60)
-    assert {name: len(frames) for name, frames in taken.items()} == {"Barn": 10, "Church": 20, "Truck": 20}
+    assert {name: len(frames) for name, frames in taken.items()} == {"Barn": 10, "Church": 25, "Truck": 25}
     assert [np.ptp(np.diff(frames)) for frames in taken.values()] == [0, 0, 0]
+    assert sum(map(len, spread(list(sizes), lambda name: range(sizes[name]), 5000).values())) == 1110
     scenes = [f"{group}/scene_{k:03d}" for group, n in (("apple", 200), ("box", 30), ("car", 5)) for k in range(n)]
-    more = spread(scenes, lambda scene: range(300), 47)  # with more scenes than frames
-    assert list(more.values()) == [[150]] * 47
-    assert list(more) == scenes[::5]
+    more = spread(scenes, lambda scene: range(300), 45)  # with more scenes than frames each category gets its share
+    assert list(more.values()) == [[150]] * 45
+    assert list(more) == [*scenes[:20], *scenes[200:220], *scenes[230:]]
 
 
 def test_working_sizes_give_the_papers_dense_counts() -> None:

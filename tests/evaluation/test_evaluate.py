@@ -206,6 +206,8 @@ def test_large_views_end_a_swipe_and_a_failed_metric_is_a_remark() -> None:
     assert {row.value for row in rows if row.metric == "remark"} == {"niqe failed: svd did not converge"}
     assert [row.value for row in rows if row.metric == "niqe"] == [None] * 4
     assert {row[:2] for row in rows} == {("Boxes", "box")}
+    known = results("Boxes", False, lambda image: LARGE)
+    assert make_tables([dataclasses.replace(known, rows=[*known.rows, *rows])])
     assert pictures["base"].shape == pictures["hole"].shape == (72, 96, 3)  # both sides even
 
 

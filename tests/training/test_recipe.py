@@ -45,9 +45,10 @@ def test_overrides(tmp_path: Path) -> None:
           rgbd: [{folder: kitchen, focal_px: 585}]
           disparity: [0, 1e-1]
         loss: {features: none, feature_size: null}
+        run:
         init: weights.safetensors
     """
-    overrides = ["optim.steps=1000", "data.rgbd.0.focal_px=600", "optim.lr=2e-4", "init=null", "run.log_every=7"]
+    overrides = ["optim.steps=1e3", "data.rgbd.0.focal_px=600", "optim.lr=2e-4", "init=null", "run.log_every=7"]
     (tmp_path / "recipe.yaml").write_text(text)
     recipe = load_recipe(Recipe, tmp_path / "recipe.yaml", overrides)
     assert recipe.data.photos == Path("some/photos")
@@ -66,6 +67,9 @@ def test_overrides(tmp_path: Path) -> None:
         ("[1, 2]", "", "recipe.yaml: input should be a valid dictionary or instance of Recipe, not [1, 2]"),
         ("optim: {steps: " + "[" * 60_000, "", "recipe.yaml: not YAML"),
         (f"{'x' * 1000}: 1", "", f"recipe.yaml: {'x' * 60}: there is no such key"),
+        ("data: {disparity: [0.5, 0.1]}", "", "data.disparity: must ascend, not [0.5, 0.1]"),
+        (PLAIN, "optim.min_lr=0.5", "optim: min_lr must be at most lr, not {'min_lr': 0.5}"),
+        (PLAIN, "loss.dilation=4", "loss.dilation: must be odd, not 4"),
         (PLAIN, "quick", "'quick': neither an option nor key=value"),
         ("data: {rgbd: []}", "data.rgbd.0.folder=a", "data.rgbd.0.folder=a: "),
     ],

@@ -18,7 +18,7 @@ from holes import random_network
 from photos import picture
 from PIL import Image
 from scenes import box_before_wall, shifted, tensors_of
-from training_runs import assert_same_weights, one_thread, run_two, state
+from training_runs import assert_same_weights, losses_of, one_thread, run_two, state
 
 from spackle.files import hold
 from spackle.gaussians import Gaussians
@@ -210,3 +210,9 @@ def test_gradients_reach_the_whole_network_but_not_the_base(name: str) -> None:
     total_loss(**vars(complete_samples(network, [sample], get_renderer())), recipe=LossRecipe())[0].backward()
     assert all(tensor.grad is None for tensor in base.tensors)
     assert all(p.grad is not None and bool(p.grad.any()) for p in network.parameters())
+
+
+def test_the_loss_falls_on_samples_that_are_seen_again(place: Path, tmp_path: Path) -> None:
+    options = ("data.views=2", "optim.steps=12", "optim.warmup=0", "optim.min_lr=1e-4", "optim.ema=0.5")
+    losses = losses_of(train(place, tmp_path / "out", *options))
+    assert sum(losses[-3:]) < 0.7 * sum(losses[:3])

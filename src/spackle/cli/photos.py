@@ -92,7 +92,8 @@ def predict_all(given: Sequence[Path], output: Path, options: PredictOptions, re
                 failed = sum(not predictor.predict(photo, reporter) for photo in left)
         else:
             open_predictor = partial(Predictor.open, output, options, shared, reporter.verbose)
-            failed = _predict_by_workers(open_predictor, list(left), len(named), count, threads, reporter)
+            gpu = options.scene.base.device != "cpu"
+            failed = _predict_by_workers(open_predictor, list(left), len(named), count, threads, gpu, reporter)
     if failed:
         reporter.log(f"{failed} of {len(named)} photos failed")
     else:
@@ -130,6 +131,7 @@ def _predict_by_workers(
     total: int,
     count: int,
     threads: int,
+    gpu: bool,
     reporter: Reporter,
 ) -> int:
     """Predict photos by workers, print the messages about each finished photo, and return how many photos failed.
@@ -143,7 +145,7 @@ def _predict_by_workers(
     with (
         asked_to_stop(alone=True) as stop,
         reporter.steps("photos", ready, total) as step,
-        at_work(open_predictor, left, stop, count=count, threads=threads) as results,
+        at_work(open_predictor, left, stop, count=count, threads=threads, gpu=gpu) as results,
     ):
         for done, result in enumerate(results, ready + 1):
             for what in result.said:

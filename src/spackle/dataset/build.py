@@ -33,7 +33,7 @@ from spackle.files import (
     write_whole,
 )
 from spackle.image import load_photo, resize_photo
-from spackle.inpaint import INPAINTERS, Inpainter, InpainterOptions, get_inpainter
+from spackle.inpaint import INPAINTERS, Inpainter, InpainterOptions, get_inpainter, inpainter_class
 from spackle.progress import Reporter, asked_to_stop, counted
 from spackle.render import get_renderer
 from spackle.residual import MASK_THRESHOLD
@@ -79,6 +79,9 @@ class DatasetOptions:
         if isinstance(depth, Path) and not depth.is_dir():  # a single map would fit one photo only
             raise InputError(f"--depth {depth}: no such folder: give a folder with a depth map for each photo")
         check_name("--inpainter", self.inpainter, COMPLETIONS)
+        takes = self.inpainter in INPAINTERS and inpainter_class(self.inpainter).network
+        if not takes and (self.inpainter_weights or self.inpainter_side) is not None:
+            raise InputError(f"--inpainter {self.inpainter} takes neither --inpainter-weights nor --inpainter-side")
         low, high = self.disparity
         if not 0 < low <= high <= MAX_DISPARITY:
             raise InputError(
@@ -249,8 +252,9 @@ class _Build:
         with self.reporter.stage("photos") as step, asked_to_stop(alone=True) as stop:
             for number in range(-(-len(self.photos) // self.size)):
                 self._write_shard(number)
-            make, options = partial(Maker, self.options), self.options
-            with at_work(make, jobs, stop, count=options.workers, threads=options.threads) as results:
+            options, gpu = self.options, self.options.base.device != "cpu"
+            make = partial(Maker, options)
+            with at_work(make, jobs, stop, count=options.workers, threads=options.threads, gpu=gpu) as results:
                 for done, result in enumerate(results, ready + 1):
                     self._keep(result)
                     self._write_shard(result.index // self.size)

@@ -206,8 +206,10 @@ def measure_views(
                     numbers.append(("hole_cells", share * hole.numel() / CELL**2))
                 row = image._replace(setting=setting, view=view.name, method=name)
                 for metric, value in (*numbers, *gauges.measure(rgb, truth, hole)):
-                    finite = isinstance(value, str) or math.isfinite(value)
-                    rows.append(row._replace(metric=metric, value=value if finite else None))
+                    if isinstance(value, str):  # a remark on the image, without setting and method
+                        rows.append(image._replace(metric=metric, value=value))
+                    else:
+                        rows.append(row._replace(metric=metric, value=value if math.isfinite(value) else None))
             if share > largest:
                 largest, pictures = share, shown | ({} if truth is None else {TRUTH: truth})
     return rows, pictures

@@ -92,8 +92,8 @@ SIGNS = {
 
 
 def tex(text: str) -> str:
-    """Escape text for LaTeX; text between ** becomes bold."""
-    safe = "".join(SIGNS.get(sign, sign) for sign in text)
+    """Escape text for LaTeX; characters that its fonts lack become "?", and text between ** becomes bold."""
+    safe = "".join(SIGNS.get(sign, sign if " " <= sign <= "\u017f" else "?") for sign in text)
     return re.sub(r"\*\*(.+?)\*\*", r"\\textbf{\1}", safe)
 
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from spackle.camera_path import MAX_DISPARITY
 from spackle.device import Precision
@@ -18,19 +19,38 @@ from spackle.weights import installed
 PACKAGED = Path(__file__).parent / "recipes"
 FREE = "free"  # marks keys that may change when a run resumes; samples are compared by digest, not by these keys
 
+
+def _rule(text: str, holds: Callable[[Any], bool]) -> AfterValidator:
+    """A validator that refuses a value for which `holds` is false; the message is `text`."""
+
+    def check(value: Any) -> Any:
+        if not holds(value):
+            raise ValueError(text)
+        return value
+
+    return AfterValidator(check)
+
+
+# YAML reads 1e3 as text.
+Whole = Annotated[int, BeforeValidator(lambda v: float(v) if re.fullmatch(r"\d+(\.\d*)?[eE]\+?\d+", str(v)) else v)]
 Share = Annotated[float, Field(ge=0, le=1e6)]
-Count = Annotated[int, Field(ge=1, le=1_000_000)]  # file names of samples have six digits
+Count = Annotated[Whole, Field(ge=1, le=1_000_000)]  # file names of samples have six digits
 Beta = Annotated[float, Field(ge=0, lt=1)]
 Disparity = Annotated[float, Field(ge=0, le=MAX_DISPARITY)]
-Interval = Annotated[int, Field(ge=1), FREE]  # steps
+Interval = Annotated[Whole, Field(ge=1), FREE]  # steps
 Place = Annotated[Path | None, FREE]
-Seed = Annotated[int, Field(ge=0, le=2**31 - 2)]
+Seed = Annotated[Whole, Field(ge=0, le=2**31 - 2)]
 
 
 class RecipePart(BaseModel):
-    """A section of a recipe."""
+    """A section of a recipe; an empty section has the defaults."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _not_empty(cls, value: Any) -> Any:
+        return {} if value is None else value
 
 
 class RgbdFolder(RecipePart):
@@ -59,10 +79,11 @@ class DataRecipe(RecipePart):
     stereo: Place = None  # a folder of scenes, each with a scene.json
     pseudo: Place = None  # a dataset that `spackle dataset build` made
     shares: Shares = Shares()
-    disparity: tuple[Disparity, Disparity] = (0.1, 0.6)  # least and greatest disparity of the virtual camera
+    # Least and greatest disparity of the virtual camera.
+    disparity: Annotated[tuple[Disparity, Disparity], _rule("must ascend", lambda of: of[0] <= of[1])] = (0.1, 0.6)
     views: Count = 20_000  # the paper: 20 views of 1,000 photos
-    crops: Annotated[int, Field(ge=1, le=100)] = 3  # most crops of a view
-    cells: Annotated[int, Field(ge=16, le=768)] = 96  # cells of 2×2 pixels along a crop's side
+    crops: Annotated[Whole, Field(ge=1, le=100)] = 3  # most crops of a view
+    cells: Annotated[Whole, Field(ge=16, le=768)] = 96  # cells of 2×2 pixels along a crop's side
     validation_views: Count = 100
     cache: Place = None  # a folder for the samples; None: inside the output
     seed: Seed = 0  # for the samples alone: runs that differ only in run.seed share samples
@@ -78,8 +99,8 @@ class LossRecipe(RecipePart):
     features: Literal["resnet50", "squeezenet", "none"] = "resnet50"
     features_path: Place = None
     # Longer side in pixels to which crops are resized for the feature network; None: not resized.
-    feature_size: Annotated[int, Field(ge=64, le=4096)] | None = 512
-    dilation: Annotated[int, Field(ge=1, le=1001)] = 21  # pixels, odd
+    feature_size: Annotated[Whole, Field(ge=64, le=4096)] | None = 512
+    dilation: Annotated[Whole, Field(ge=1, le=1001), _rule("must be odd", lambda side: side % 2 == 1)] = 21  # pixels
     color_blur: Annotated[float, Field(ge=0, le=64)] = 0.0  # standard deviation in pixels, see `color_loss`
     gram: Share = 1.0  # weight of Gram matrices within the perceptual term
 
@@ -94,9 +115,9 @@ class OptimRecipe(RecipePart):
 
     lr: Annotated[float, Field(gt=0, le=1)] = 1.6e-4
     min_lr: Annotated[float, Field(ge=0, le=1)] = 1.6e-5
-    warmup: Annotated[int, Field(ge=0)] = 10_000  # steps
+    warmup: Annotated[Whole, Field(ge=0)] = 10_000  # steps
     steps: Interval = 100_000
-    batch: Annotated[int, Field(ge=1, le=100_000)] = 16  # crops per step, over all processes
+    batch: Annotated[Whole, Field(ge=1, le=100_000)] = 16  # crops per step, over all processes
     betas: tuple[Beta, Beta] = (0.9, 0.999)
     weight_decay: Annotated[float, Field(ge=0, le=10)] = 1e-4
     clip: Annotated[float, Field(gt=0)] = 1.0  # largest norm of the gradient
@@ -119,7 +140,7 @@ class RunRecipe(RecipePart):
 class AnyRecipe(RecipePart):
     """The sections that all recipes have."""
 
-    optim: OptimRecipe = OptimRecipe()
+    optim: Annotated[OptimRecipe, _rule("min_lr must be at most lr", lambda o: o.min_lr <= o.lr)] = OptimRecipe()
     run: RunRecipe = RunRecipe()
 
 
@@ -207,4 +228,5 @@ def _first_problem(error: ValidationError) -> str:
     key = ".".join(str(name)[:60] for name in first["loc"])
     if first["type"] == "extra_forbidden":
         return f"{key}: there is no such key"
-    return f"{key}: {first['msg'][0].lower()}{first['msg'][1:]}, not {shown(first['input'])}".removeprefix(": ")
+    message = first["msg"].removeprefix("Value error, ")
+    return f"{key}: {message[0].lower()}{message[1:]}, not {shown(first['input'])}".removeprefix(": ")

@@ -20,9 +20,9 @@ from spackle.gaussians import quat_to_matrix
 
 Array = NDArray[Any]
 
-# The greatest accepted coefficient of distortion. Smaller distortion is ignored, because photos from close viewpoints
-# are distorted alike: the shift between corresponding pixels changes by a few percent.
-MAX_DISTORTION = 0.1
+# The greatest accepted distortion at a photo's corner, as a fraction of the long side. Smaller distortion is ignored,
+# because photos from close viewpoints are distorted alike.
+MAX_DISTORTION = 0.02
 MAX_ERROR_PX = 2.0  # the greatest accepted reprojection error of a point, as mean over photos
 # Name and number of parameters by COLMAP's model id; other models are too far from a pinhole.
 MODELS = {0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8)}
@@ -95,7 +95,12 @@ def _lens(path: Path, model: int | str, width: int, height: int, parameters: lis
     fx, fy, cx, cy, *bend = [parameters[0], *parameters] if single else parameters
     K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
     lens = checked_camera(K, torch.eye(4, dtype=torch.float64), width, height, f"{path}: a lens", dtype=torch.float64)
-    if not all(abs(value) <= MAX_DISTORTION for value in bend):  # also refuses NaN
+    corner = np.array([max(cx, width - cx) / fx, max(cy, height - cy) / fy])
+    square = float(corner @ corner)
+    # k1, k2 distort radially; p1, p2 shift a point at radius r by at most 3 (|p1| + |p2|) r².
+    radial = sum(abs(k) * square ** (n + 1.5) for n, k in enumerate(bend[:2]))
+    shift = radial + 3 * sum(map(abs, bend[2:])) * square
+    if not shift * max(fx, fy) <= MAX_DISTORTION * max(width, height):  # also refuses NaN
         raise InputError(f"{path}: the camera distorts the corners of photos: undistort the photos first")
     return lens
 

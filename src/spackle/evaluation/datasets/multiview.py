@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import dataclasses
 import itertools
 import math
@@ -95,22 +96,28 @@ def _sees_the_same(view: Posed, other: Posed) -> bool:
 
 
 def spread(scenes: Sequence[str], frames: Callable[[str], Sequence[int]], count: int) -> dict[str, list[int]]:
-    """Choose at most `count` frames, spread evenly over the scenes and, within a scene, over its frames.
+    """Choose `count` frames, or all if there are fewer, spread evenly over the scenes and over the frames of a scene.
 
-    Each scene gives an equal share of the frames, or all its frames; with more scenes than `count`, evenly
-    spaced scenes give one frame each.
+    Scenes give one frame each in turn, until `count` frames are reached; scenes without further frames are left out.
+    With more scenes than `count`, the categories of scenes named CATEGORY/SCENE give one scene each in turn.
 
     Args:
-        scenes: names, in order.
+        scenes: names, in order; the scenes of a category are neighbours.
         frames: returns a scene's frames in order; called only for scenes that are used.
 
     Returns:
         The scenes that are used, in order, each with its frames in order.
     """
-    turns = [scenes[k * len(scenes) // count] for k in range(count)]
-    picked = {}
-    for scene in dict.fromkeys(turns):
-        held, share = frames(scene), turns.count(scene)
-        share = min(share, len(held))
-        picked[scene] = [held[(2 * k + 1) * len(held) // (2 * share)] for k in range(share)]
-    return picked
+    categories = (list(names) for _, names in itertools.groupby(scenes, lambda name: name.partition("/")[0]))
+    held = {scene: frames(scene) for scene in _in_turn(categories)[:count]}
+    shares = collections.Counter(_in_turn([scene] * len(held[scene]) for scene in held)[:count])
+    return {
+        scene: [held[scene][(2 * k + 1) * len(held[scene]) // (2 * shares[scene])] for k in range(shares[scene])]
+        for scene in scenes
+        if scene in shares
+    }
+
+
+def _in_turn(lists: Iterable[Sequence[str]]) -> list[str]:
+    """The first items of all lists, then the second items, and so on."""
+    return [item for items in itertools.zip_longest(*lists) for item in items if item is not None]
