@@ -75,6 +75,8 @@ def test_paths_and_loaded_values_give_the_same_scene(scene: spackle.Scene, pair:
 def test_an_argument_works_by_its_earlier_name(scene: spackle.Scene) -> None:
     with pytest.warns(DeprecationWarning, match="trajectory= now"):
         assert len(scene.path(kind="swipe", frames=3)) == 3
+    with pytest.warns(DeprecationWarning, match="trajectory= now"):
+        scene.save_video(io.BytesIO(), kind="swipe", frames=1)
 
 
 def test_a_photo_and_its_depth_in_every_form(pair: tuple[Path, Path], tmp_path: Path) -> None:

@@ -169,6 +169,7 @@ class Scene:
         """A viewer with the scene, `height` pixels high, which a notebook displays as the value of a cell."""
         return InlinePage(single_html(self.page("scene")).decode(), height)
 
+    @renamed(kind="trajectory")
     def save_video(
         self,
         target: Target,

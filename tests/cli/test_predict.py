@@ -203,12 +203,12 @@ def test_a_bad_photo_of_a_folder_stops_nothing_else(tmp_path: Path) -> None:
     assert result.lines[-1] == "4 of 7 photos failed"
 
 
-def test_several_photos_and_a_folder_share_a_run(tmp_path: Path) -> None:
-    names = ("a.png", "more/b.jpg")
+def test_several_photos_a_folder_and_a_pattern_share_a_run(tmp_path: Path) -> None:
+    names = ("a.png", "more/b.jpg", "wild1.png", "wild2.png")
     photos, out = [write_photo(tmp_path / name) for name in names], tmp_path / "out"
-    given = (photos[0], tmp_path / "more", "--depth", write_depth(tmp_path / "d.npy"))
+    given = (photos[0], tmp_path / "more", tmp_path / "w*[0-9].png", "--depth", write_depth(tmp_path / "d.npy"))
     result = run("predict", *given, "-o", out, *SHORT)
-    assert (result.code, names_in(out)) == (0, {"a", "b"}), result.err
+    assert (result.code, names_in(out)) == (0, {"a", "b", "wild1", "wild2"}), result.err
     scene = f"Look at {out / 'NAME' / 'video.mp4'}, or into the scene: spackle view {out / 'NAME' / 'scene.ply'}"
     assert result.lines[-1] == scene
     refuses(run("predict", photos[1], write_photo(tmp_path / "other" / "b.jpg"), "-o", out), "has the same name")

@@ -235,6 +235,13 @@ def export(scene: Path, *names: str) -> str:
     return text.getvalue()
 
 
+def test_a_scene_never_overwrites_itself(scene: Path) -> None:
+    (scene.parent / "link.ply").symlink_to(scene)
+    for name in ("scene.ply", "link.ply"):
+        with pytest.raises(InputError, match="is the scene itself"):
+            export(scene, name)
+
+
 def test_all_formats_at_once(scene: Path, tmp_path: Path) -> None:
     names = [*(f"out{suffix}" for suffix in (*SCENE_ENCODERS, *PAGE)), "A.SPLAT"]
     export(scene, *names)

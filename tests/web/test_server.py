@@ -5,10 +5,12 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import os
 import socket
 import struct
 import subprocess
 import sys
+import time
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -99,30 +101,33 @@ def test_every_answer_has_the_security_headers(server: Served) -> None:
 UNKNOWN = [
     "/none",
     "/../../etc/passwd",
+    "//etc/passwd",
     "/..\\..\\etc\\passwd",
     "/viewer.js%00",
     f"{SCENES}/0123456789abcdef/files/scene.ply",
-    f"{SCENES}/%2e%2e/files/scene.ply",
-    f"{SCENES}/0123456789abcdef/files/..%2f..%2fetc%2fpasswd",
-    f"{SCENES}/0123456789abcdef/files/job.json",
+    *(f"{SCENES}/{id}/files/scene.ply" for id in ("..", "%2e%2e", ".new-1")),
+    *(f"{SCENES}/0123456789abcdef/files/{name}" for name in ("..%2fetc%2fpasswd", "%252e%252e%252fpasswd", "job.json")),
 ]
-HOSTS = ["evil.example", "localhost.evil.example", "10.0.0.7", "localhost:x"]
+HOSTS = ["evil.example", "localhost.evil.example", "10.0.0.7", "localhost:x", "[::1"]
 PAGES = [f"Origin: {page}" for page in ("http://evil.example", "null", "http://localhost:1", "")]
 SITES = [f"Sec-Fetch-Site: {site}" for site in ("cross-site", "same-site")]
 SENT = form()
 REFUSED = [
     *((request(f"/s3cret{target}"), 404) for target in UNKNOWN),
     *((request("/s3cret/", host=host), 403) for host in HOSTS),
-    (post(len(SENT)).replace(b"localhost", b"evil.example") + SENT, 403),
+    *((post(len(SENT)).replace(b"localhost", host.encode()) + SENT, 403) for host in HOSTS),
     *((request("/s3cret/", header), 403) for header in PAGES + SITES),
+    *((post(len(SENT), header) + SENT, 403) for header in PAGES + SITES),
     *((request(f"/s3cret{path}", method=method), 405) for method, path in (("PUT", "/"), ("FOO", SCENES))),
 ]
 MALFORMED = [
     b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03\r\n\r\n",  # TLS
+    b"GET / HTTP/1.1 and more\r\n\r\n",
+    b"GET /" + 70_000 * b"a" + b" HTTP/1.1\r\n\r\n",
     b"GET / HTTP/1.1\r\nConnection: close\r\n\r\n",  # no host
     *(request("/", header) for header in ("Host: evil.example", "no colon")),
     *(post(5, header) for header in ("Content-Length: 6", "Transfer-Encoding: chunked, chunked")),
-    *(post(0).replace(b"Length: 0", f"Length: {text}".encode()) for text in ("-1", "x")),
+    *(post(0).replace(b"Length: 0", f"Length: {text}".encode()) for text in ("-1", "x", "9" * 30)),
 ]
 
 
@@ -196,6 +201,38 @@ def test_a_slow_or_vanished_client_frees_its_place(server: Served, monkeypatch: 
             else:
                 assert answer_of(connection).split()[1] == b"408"
             eventually(lambda: set(server.jobs.folder.iterdir()) == before)
+
+
+def test_the_connection_of_a_silent_or_deaf_client_is_closed(server: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("spackle.web.app.SILENT_S", 0.3)
+    monkeypatch.setattr("spackle.web.guard.SEND_S", 0.5)
+    with server.dial(b"GET / HTTP/1.1\r\nHost: local") as silent:
+        assert answer_of(silent) == b""
+    content = bytes(30_000_000)  # more than the socket's buffers hold
+    id = server.send().json["id"]
+    assert server.events(id)
+    (server.jobs.folder / id / "results" / "base.splats").write_bytes(content)
+    with server.dial(request(f"/s3cret{SCENES}/{id}/files/base.splats")) as deaf:
+        deaf.recv(12)
+        time.sleep(2)
+        assert len(answer_of(deaf)) < len(content)
+    assert len(server.ask(f"{SCENES}/{id}/files/base.splats").body) == len(content)
+
+
+def test_jobs_leave_no_thread_no_file_and_no_memory_behind(server: Served) -> None:
+    def done(photos: int) -> list[int]:
+        for k in range(photos):
+            id = server.send(name="bad.png" if k % 3 == 0 else "photo.png").json["id"]
+            assert server.events(id)[-1]["ended"]
+            assert server.ask(f"{SCENES}/{id}", "DELETE").status == 204
+        eventually(lambda: len(os.listdir("/proc/self/fd")) <= files)
+        return [len(os.listdir("/proc/self/task")), int(Path("/proc/self/statm").read_text().split()[1]) >> 8]
+
+    files = 1000
+    threads, megabytes = done(6)
+    files = len(os.listdir("/proc/self/fd"))
+    more, now = done(9)
+    assert (more <= threads, now < megabytes + 20) == (True, True), (threads, more, megabytes, now)
 
 
 def png_claiming(width: int, height: int) -> bytes:

@@ -201,6 +201,11 @@ def test_get_shows_the_terms_once_and_does_nothing_twice(site: Site, weights: Pa
     assert file.read_bytes() == CONTENT
 
 
+def test_get_without_a_network_prints_one_line(weights: Path) -> None:
+    offline = get("sharp", "--url", CLOSED)
+    assert (offline.code, len(offline.lines)) == (2, 1), offline.err
+
+
 def test_get_to_another_folder_or_file(site: Site, weights: Path, tmp_path: Path) -> None:
     for output, path in (("a/b", f"a/b/{SHARP_FILE}"), ("a/c.pt", "a/c.pt"), ("a/d.PT", "a/d.PT")):
         assert "--checkpoint" in gets("sharp", "--url", site.url, "-o", tmp_path / output).err

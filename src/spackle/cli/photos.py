@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import glob
 import os
 import shlex
 from collections import Counter
@@ -104,13 +105,14 @@ def predict_all(given: Sequence[Path], output: Path, options: PredictOptions, re
 
 
 def find_photos(given: Sequence[Path]) -> list[NamedPhoto]:
-    """The given photos, and the photos in given folders sorted by name, each with the name of its results.
+    """The photos that are given by name, by a pattern such as "*.png", or by folder, each with the name of its results.
 
     InputError for a folder without photos, and for two photos whose results would have the same name.
     """
     photos: list[Path] = []
     for path in given:
-        found = files_in(path, PHOTO_SUFFIXES) if os.path.isdir(path) else [path]
+        matches = [] if os.path.lexists(path) else map(Path, sorted(glob.glob(str(path))))
+        found = files_in(path, PHOTO_SUFFIXES) if os.path.isdir(path) else list(matches) or [path]
         if not found:
             raise InputError(f"{path}: no photos in this folder (looked for {', '.join(PHOTO_SUFFIXES)})")
         photos += found

@@ -146,6 +146,8 @@ def export_scene(scene: Path, outputs: Sequence[Path], reporter: Reporter) -> No
     with contextlib.ExitStack() as folders:
         for output in outputs:
             folders.enter_context(results_folder(output.parent, [output.name]))
+            if os.path.realpath(output) == os.path.realpath(scene):
+                raise InputError(f"{output}: this is the scene itself: give the output another name")
         loaded = load_scene(scene)
         if rest := loaded.harmonics:
             reporter.log(f"{scene}: {rest} spherical harmonics of each Gaussian, above degree 0, are left out")

@@ -22,6 +22,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import FormData, UploadFile
 from starlette.exceptions import HTTPException
 from starlette.staticfiles import StaticFiles
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 import spackle
 from spackle.bases.settings import AUTO
@@ -41,6 +42,7 @@ POLL_S = 0.1  # seconds between two checks whether a state has changed
 UPLOAD_S = 300.0  # seconds that an upload may take, because it holds a place in the queue
 MAX_NAME = 80  # characters
 CONNECTIONS = 512  # open at a time; further ones are refused
+SILENT_S = 10.0  # seconds that a client may take to send the head of a request
 WORK, KEEP = SceneWork(), Keep()
 FILE = {"type": "string", "format": "binary"}
 UPLOAD: dict[str, Any] = {  # not declared as a form: FastAPI would read it before the queue has a place
@@ -234,7 +236,7 @@ def server_of(app: FastAPI) -> uvicorn.Server:
     return uvicorn.Server(
         uvicorn.Config(
             app,
-            http="h11",
+            http=PatientProtocol,
             ws="none",
             log_config=None,
             log_level="critical",
@@ -244,3 +246,18 @@ def server_of(app: FastAPI) -> uvicorn.Server:
             timeout_graceful_shutdown=1,  # seconds for clients that still watch a photo
         )
     )
+
+
+class PatientProtocol(H11Protocol):
+    """Closes the connection of a client that sends no complete head of a request for a while."""
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        self._check(self)
+
+    def _check(self, before: object) -> None:
+        waiting = self.cycle is None or self.cycle.response_complete
+        if self.transport.is_closing() or (waiting and self.cycle is before):
+            self.transport.abort()  # `close` would first send data that nobody reads
+        else:
+            self.loop.call_later(SILENT_S, self._check, self.cycle if waiting else self)

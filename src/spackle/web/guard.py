@@ -6,6 +6,7 @@ name. The headers Host, Origin and Sec-Fetch-Site reveal such a request.
 
 from __future__ import annotations
 
+import asyncio
 import hmac
 import ipaddress
 import logging
@@ -24,6 +25,7 @@ from spackle.errors import one_line
 LOG = logging.getLogger("spackle.web")
 HOST = re.compile(r"(\[[0-9a-f:.%]+\]|[0-9a-z._-]+)(?::\d{1,5})?", re.IGNORECASE)
 OWN_SITES = {"same-origin", "none"}  # none: an address that a person typed, or a bookmark
+SEND_S = 20.0  # seconds that a client may take to read a part of an answer
 MAX_BYTES = 200_000_000  # of an upload: photo and depth map
 # The page loads scripts and styles from this server only and sends nothing elsewhere; no other page can frame it.
 HEADERS = {
@@ -118,7 +120,7 @@ class Guard:
                 MutableHeaders(scope=message).update(HEADERS)
                 path = scope["path"].replace((self.access and self.access.token) or "/", "…", 1)
                 LOG.debug(one_line(f"{scope['method']} {path} {message['status']}"))
-            await send(message)
+            await asyncio.wait_for(send(message), SEND_S)
 
         try:
             admitted = scope if self.access is None else self.access.admitted(scope, headers)
@@ -126,8 +128,8 @@ class Guard:
             await self.app(admitted, bounded, answer)
         except HTTPException as error:
             await JSONResponse({"error": error.detail}, error.status_code)(scope, receive, answer)
-        except ClientDisconnect:
-            LOG.debug("a client disconnected")
+        except (asyncio.TimeoutError, ClientDisconnect):
+            LOG.debug("a client disconnected, or does not read its answer")
         except Exception:
             LOG.exception("this went wrong:")
             raise
