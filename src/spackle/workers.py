@@ -80,9 +80,8 @@ def _results(pool: ProcessPoolExecutor, jobs: Sequence[Any], most: int, stop: Ca
             ) from error
 
 
-_open_worker: Callable[
-    [], Any
-]  # set in each worker process; the first job calls it, because only jobs can report errors
+# Set in each worker process; the first job calls it, because only jobs can report errors.
+_open_worker: Callable[[], Any]
 
 
 def _start(threads: int, open_worker: Callable[[], Any], numbers: Any) -> None:

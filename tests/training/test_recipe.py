@@ -68,7 +68,7 @@ def test_overrides(tmp_path: Path) -> None:
         ("optim: {steps: " + "[" * 60_000, "", "recipe.yaml: not YAML"),
         (f"{'x' * 1000}: 1", "", f"recipe.yaml: {'x' * 60}: there is no such key"),
         ("data: {disparity: [0.5, 0.1]}", "", "data.disparity: must ascend, not [0.5, 0.1]"),
-        (PLAIN, "optim.min_lr=0.5", "optim: min_lr must be at most lr, not {'min_lr': 0.5}"),
+        (PLAIN, "optim.min_lr=0.5", "optim: min_lr must be <= lr, not {'min_lr': 0.5}"),
         (PLAIN, "loss.dilation=4", "loss.dilation: must be odd, not 4"),
         (PLAIN, "quick", "'quick': neither an option nor key=value"),
         ("data: {rgbd: []}", "data.rgbd.0.folder=a", "data.rgbd.0.folder=a: "),

@@ -252,8 +252,7 @@ class _Build:
         with self.reporter.stage("photos") as step, asked_to_stop(alone=True) as stop:
             for number in range(-(-len(self.photos) // self.size)):
                 self._write_shard(number)
-            options, gpu = self.options, self.options.base.device != "cpu"
-            make = partial(Maker, options)
+            make, options, gpu = partial(Maker, self.options), self.options, self.options.base.device != "cpu"
             with at_work(make, jobs, stop, count=options.workers, threads=options.threads, gpu=gpu) as results:
                 for done, result in enumerate(results, ready + 1):
                     self._keep(result)

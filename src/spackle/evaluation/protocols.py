@@ -104,9 +104,7 @@ def align(case: Case, z_base: Tensor, seen: Tensor) -> float:
     if case.bounds is not None and seen.any():
         # The geometric mean of the scales that match the nearest and the farthest depth.
         z = z_base[seen].double().sort().values
-        scales = [
-            known / float(z[round(q * (len(z) - 1))]) for known, q in zip(case.bounds, BOUNDS_QUANTILES, strict=True)
-        ]
+        scales = [b / float(z[round(q * (len(z) - 1))]) for b, q in zip(case.bounds, BOUNDS_QUANTILES, strict=True)]
         return math.sqrt(math.prod(scales))
     raise InputError(
         f"{case.name}: the base's scale cannot be found: the dataset's depth is unknown, or the dataset's and the "
@@ -206,10 +204,9 @@ def measure_views(
                     numbers.append(("hole_cells", share * hole.numel() / CELL**2))
                 row = image._replace(setting=setting, view=view.name, method=name)
                 for metric, value in (*numbers, *gauges.measure(rgb, truth, hole)):
-                    if isinstance(value, str):  # a remark on the image, without setting and method
-                        rows.append(image._replace(metric=metric, value=value))
-                    else:
-                        rows.append(row._replace(metric=metric, value=value if math.isfinite(value) else None))
+                    finite = isinstance(value, str) or math.isfinite(value)
+                    of = image if metric == REMARK else row  # a remark has no setting and no method
+                    rows.append(of._replace(metric=metric, value=value if finite else None))
             if share > largest:
                 largest, pictures = share, shown | ({} if truth is None else {TRUTH: truth})
     return rows, pictures

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from spackle.camera_path import MAX_DISPARITY
 from spackle.device import Precision
@@ -31,6 +31,8 @@ def _rule(text: str, holds: Callable[[Any], bool]) -> AfterValidator:
     return AfterValidator(check)
 
 
+T = TypeVar("T")
+Section = Annotated[T, BeforeValidator(lambda value: {} if value is None else value)]  # an empty section has defaults
 # YAML reads 1e3 as text.
 Whole = Annotated[int, BeforeValidator(lambda v: float(v) if re.fullmatch(r"\d+(\.\d*)?[eE]\+?\d+", str(v)) else v)]
 Share = Annotated[float, Field(ge=0, le=1e6)]
@@ -43,14 +45,9 @@ Seed = Annotated[Whole, Field(ge=0, le=2**31 - 2)]
 
 
 class RecipePart(BaseModel):
-    """A section of a recipe; an empty section has the defaults."""
+    """A section of a recipe."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _not_empty(cls, value: Any) -> Any:
-        return {} if value is None else value
 
 
 class RgbdFolder(RecipePart):
@@ -78,7 +75,7 @@ class DataRecipe(RecipePart):
     rgbd: Annotated[tuple[RgbdFolder, ...], FREE] = ()
     stereo: Place = None  # a folder of scenes, each with a scene.json
     pseudo: Place = None  # a dataset that `spackle dataset build` made
-    shares: Shares = Shares()
+    shares: Section[Shares] = Shares()
     # Least and greatest disparity of the virtual camera.
     disparity: Annotated[tuple[Disparity, Disparity], _rule("must ascend", lambda of: of[0] <= of[1])] = (0.1, 0.6)
     views: Count = 20_000  # the paper: 20 views of 1,000 photos
@@ -140,15 +137,17 @@ class RunRecipe(RecipePart):
 class AnyRecipe(RecipePart):
     """The sections that all recipes have."""
 
-    optim: Annotated[OptimRecipe, _rule("min_lr must be at most lr", lambda o: o.min_lr <= o.lr)] = OptimRecipe()
-    run: RunRecipe = RunRecipe()
+    optim: Annotated[Section[OptimRecipe], _rule("min_lr must be <= lr", lambda o: o.min_lr <= o.lr)] = (
+        OptimRecipe()
+    )
+    run: Section[RunRecipe] = RunRecipe()
 
 
 class Recipe(AnyRecipe):
     """The recipe of a training run of the residual or of direct-ft."""
 
-    data: DataRecipe = DataRecipe()
-    loss: LossRecipe = LossRecipe()
+    data: Section[DataRecipe] = DataRecipe()
+    loss: Section[LossRecipe] = LossRecipe()
     network: Annotated[Literal["unet", "sharp-decoder"], FREE] = "unet"  # architecture of the residual
     init: Path | None = None  # initial weights; sharp-decoder also takes SHARP's checkpoint
 

@@ -95,11 +95,9 @@ def _lens(path: Path, model: int | str, width: int, height: int, parameters: lis
     fx, fy, cx, cy, *bend = [parameters[0], *parameters] if single else parameters
     K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
     lens = checked_camera(K, torch.eye(4, dtype=torch.float64), width, height, f"{path}: a lens", dtype=torch.float64)
-    corner = np.array([max(cx, width - cx) / fx, max(cy, height - cy) / fy])
-    square = float(corner @ corner)
+    square = (max(cx, width - cx) / fx) ** 2 + (max(cy, height - cy) / fy) ** 2  # radius r of the corner, squared
     # k1, k2 distort radially; p1, p2 shift a point at radius r by at most 3 (|p1| + |p2|) r².
-    radial = sum(abs(k) * square ** (n + 1.5) for n, k in enumerate(bend[:2]))
-    shift = radial + 3 * sum(map(abs, bend[2:])) * square
+    shift = sum(abs(k) * square ** (n + 1.5) for n, k in enumerate(bend[:2])) + 3 * sum(map(abs, bend[2:])) * square
     if not shift * max(fx, fy) <= MAX_DISTORTION * max(width, height):  # also refuses NaN
         raise InputError(f"{path}: the camera distorts the corners of photos: undistort the photos first")
     return lens

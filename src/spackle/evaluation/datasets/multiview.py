@@ -75,9 +75,7 @@ def make_cases(views: Sequence[Posed], wanted: Iterable[int] | None = None) -> l
         order = sorted(set(range(len(views))) - {index}, key=lambda k: (float(apart[k]), views[k].name))
         near = set(itertools.islice((k for k in order if fits[k] and _sees_the_same(view, views[k])), MAX_NEAR))
         moved = (poses @ torch.linalg.inv(poses[index])).float()
-        placed = [
-            dataclasses.replace(camera, world_to_camera=pose) for camera, pose in zip(cameras, moved, strict=True)
-        ]
+        placed = [dataclasses.replace(one, world_to_camera=pose) for one, pose in zip(cameras, moved, strict=True)]
         seconds = tuple(SecondView(views[k].name, views[k].photo, placed[k], k in near) for k in order)
         camera = dataclasses.replace(cameras[index], world_to_camera=torch.eye(4))
         cases.append(Case(view.name, view.photo, camera, None, view.points, view.bounds, seconds))
@@ -95,7 +93,7 @@ def _sees_the_same(view: Posed, other: Posed) -> bool:
     return True
 
 
-def spread(scenes: Sequence[str], frames: Callable[[str], Sequence[int]], count: int) -> dict[str, list[int]]:
+def spread(scenes: Sequence[str], frames: Callable[[str], Sequence[int]], count: int) -> dict[str, Sequence[int]]:
     """Choose `count` frames, or all if there are fewer, spread evenly over the scenes and over the frames of a scene.
 
     Scenes give one frame each in turn, until `count` frames are reached; scenes without further frames are left out.
@@ -111,11 +109,9 @@ def spread(scenes: Sequence[str], frames: Callable[[str], Sequence[int]], count:
     categories = (list(names) for _, names in itertools.groupby(scenes, lambda name: name.partition("/")[0]))
     held = {scene: frames(scene) for scene in _in_turn(categories)[:count]}
     shares = collections.Counter(_in_turn([scene] * len(held[scene]) for scene in held)[:count])
-    return {
-        scene: [held[scene][(2 * k + 1) * len(held[scene]) // (2 * shares[scene])] for k in range(shares[scene])]
-        for scene in scenes
-        if scene in shares
-    }
+    for scene, share in shares.items():
+        held[scene] = [held[scene][(2 * k + 1) * len(held[scene]) // (2 * share)] for k in range(share)]
+    return {scene: held[scene] for scene in scenes if scene in shares}
 
 
 def _in_turn(lists: Iterable[Sequence[str]]) -> list[str]:
