@@ -257,7 +257,7 @@ def make_folder(path: Path) -> None:
     """Create a folder for results if it is missing; InputError if the folder cannot be created or written."""
     with reading(path, "cannot create this output folder: {reason}; choose another with -o", OSError, ValueError):
         path.mkdir(parents=True, exist_ok=True)
-    if not os.access(path, os.W_OK | os.X_OK):
+    if not os.access(path, os.W_OK | os.X_OK) and path.exists():  # another run may have just removed the folder
         raise InputError(f"{path}: this output folder is not writable; choose another with -o")
 
 

@@ -137,9 +137,7 @@ class RunRecipe(RecipePart):
 class AnyRecipe(RecipePart):
     """The sections that all recipes have."""
 
-    optim: Annotated[Section[OptimRecipe], _rule("min_lr must be <= lr", lambda o: o.min_lr <= o.lr)] = (
-        OptimRecipe()
-    )
+    optim: Annotated[Section[OptimRecipe], _rule("min_lr must be <= lr", lambda o: o.min_lr <= o.lr)] = OptimRecipe()
     run: Section[RunRecipe] = RunRecipe()
 
 
