@@ -93,10 +93,8 @@ def test_a_photo_and_its_depth_in_every_form(pair: tuple[Path, Path], tmp_path: 
         made = session.predict(photo, form, trajectory="swipe").base
         assert len(made) == len(expected.base)
         torch.testing.assert_close(made.means, expected.base.means, rtol=2e-3, atol=2e-3)
-    portrait = portraits.apple_jpeg(portraits.codes(), portraits.apple_xmp())
-    assert isinstance(portrait, bytes)
-    (tmp_path / "portrait.jpg").write_bytes(portrait)
-    assert same_bits(session.predict(portrait).base, session.predict(tmp_path / "portrait.jpg").base)
+    portrait = portraits.write(tmp_path / "portrait.jpg", portraits.PORTRAIT)
+    assert same_bits(session.predict(portraits.PORTRAIT).base, session.predict(portrait).base)
 
 
 @pytest.mark.parametrize(

@@ -65,7 +65,7 @@ def photo(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def portrait(tmp_path: Path) -> Path:
-    return portraits.write(tmp_path / "portrait.jpg", portraits.apple_jpeg(portraits.codes()))
+    return portraits.write(tmp_path / "portrait.jpg", portraits.PORTRAIT)
 
 
 def pick(path: Path, log: list[str] | None = None, /, **settings: Any) -> tuple[BasePrediction, ResolvedBase]:
@@ -151,8 +151,8 @@ def test_the_focal_length_comes_from_the_user_then_the_map_then_the_photo(tmp_pa
 
 
 def test_auto_goes_on_if_the_depth_in_the_photo_is_broken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    image, log = portraits.png(portraits.codes()), list[str]()
-    photo = portraits.write(tmp_path / "photo.jpg", portraits.gdepth_jpeg(image[:60] + bytes(30) + image[90:]))
+    log = list[str]()
+    photo = portraits.write(tmp_path / "photo.jpg", portraits.PORTRAITS["bad: GDepth, broken map"])
     choice = pick(photo, log)[1]
     assert (choice.base, choice.why) == ("lite", f"the depth in the photo cannot be used, {NO_SHARP}")
     assert choice.failures[0].startswith(f"the depth in the photo: {photo}: ")

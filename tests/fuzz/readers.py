@@ -249,10 +249,10 @@ READERS: dict[str, Reader] = {
     ),
     "portraits": Reader(
         [
-            _writes("a.jpg", portraits.apple_jpeg(portraits.codes())),
-            _writes("a.jpg", portraits.gdepth_jpeg(portraits.png(portraits.codes()))),
-            _writes("a.jpg", portraits.dynamic_jpeg(portraits.png(portraits.codes()))),
-            _writes("a.heic", portraits.heic(portraits.codes(), portraits.apple_xmp())),
+            _writes("a.jpg", portraits.PORTRAIT),
+            _writes("a.jpg", portraits.PORTRAITS["GDepth, extended: inverse, metres"]),
+            _writes("a.jpg", portraits.PORTRAITS["Dynamic Depth: inverse, metres"]),
+            _writes("a.heic", portraits.PORTRAITS["HEIC, Apple's disparity"]),
         ],
         lambda folder: load_photo_depth(_only(folder)),
     ),

@@ -16,7 +16,7 @@ from urllib.parse import urlsplit
 import pytest
 from command import Run, refuses, report_of, run
 from photos import write_pair, write_photo
-from portraits import apple_jpeg, codes
+from portraits import PORTRAIT
 from scenes import box_before_wall
 from web_client import SCENES, Served
 
@@ -103,7 +103,7 @@ def test_a_photo_is_completed_as_predict_completes_it(
         seen.append(page_of(server, id))
         film = server.ask(f"{SCENES}/{id}/files/shake.mp4")
         assert (film.status, film.body[4:8]) == (200, b"ftyp")
-        seen.append(page_of(server, server.send(apple_jpeg(codes()), "my other.jpg").json["id"]))
+        seen.append(page_of(server, server.send(PORTRAIT, "my other.jpg").json["id"]))
         seen.append(page_of(server, server.send(name="rough.png").json["id"]))
 
     result = visit(browse, photo, *given)
