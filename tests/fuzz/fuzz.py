@@ -29,8 +29,7 @@ from typing import Any
 import numpy as np
 
 HERE = Path(__file__).resolve().parent
-ROOMS = [HERE.parent / room for room in ("", "evaluation", "formats", "values")]  # folders with builders of files
-sys.path[:0] = map(str, [HERE, *ROOMS, HERE.parents[1] / "src"])
+sys.path[:0] = map(str, [HERE, HERE.parents[1] / "src"])
 
 SECONDS, BYTES = 10, 1_500_000_000  # the limits of a case
 FAILURES = Path("fuzz-failures")
@@ -120,19 +119,24 @@ def save(name: str, number: int, files: Files, path: Path) -> Path:
     return path
 
 
+def read(name: str, files: Files, place: Path) -> None:
+    from readers import READERS
+
+    for file, data in files.items():
+        (place / file).parent.mkdir(parents=True, exist_ok=True)
+        (place / file).write_bytes(data)
+    READERS[name](place)
+
+
 def problem_of(name: str, files: Files) -> str | None:
     """A text about a forbidden behaviour of a reader; None if there is none."""
     from av import FFmpegError
-    from readers import READERS
 
     from spackle.errors import InputError
 
     with tempfile.TemporaryDirectory() as place:
-        for file, data in files.items():
-            Path(place, file).parent.mkdir(parents=True, exist_ok=True)
-            Path(place, file).write_bytes(data)
         try:
-            READERS[name].read(Path(place))
+            read(name, files, Path(place))
         except InputError as error:
             links: list[BaseException] = [error]
             while cause := links[-1].__cause__ or links[-1].__context__:
@@ -186,14 +190,12 @@ def run_cases(name: str, seeds: Sequence[Files], numbers: range, case: Path, sai
 
 def seeds_of(name: str) -> list[Files]:
     """Valid files for a reader."""
-    from readers import READERS, contents
+    from readers import sealed, valid_files
 
-    seeds: list[Files] = []
-    for make in READERS[name].makers:  # also loads all modules, before memory is bounded
+    seeds = valid_files(name)
+    for files in seeds:  # also loads all modules, before memory is bounded
         with tempfile.TemporaryDirectory() as place:
-            make(Path(place))
-            seeds.append(contents(Path(place)))
-        problem_of(name, seeds[-1])
+            read(name, sealed(files), Path(place))
     return seeds
 
 
