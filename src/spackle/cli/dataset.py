@@ -7,13 +7,7 @@ from typing import Annotated
 
 import typer
 
-from spackle.cli.options import (
-    INTERRUPTED,
-    DeviceOption,
-    PrecisionOption,
-    SharpTrajectoryName,
-    VerboseOption,
-)
+from spackle.cli.options import INTERRUPTED, DeviceOption, PrecisionOption, SharpTrajectoryName, VerboseOption
 
 dataset = typer.Typer(help="Build and inspect training data: views with holes, and targets.", no_args_is_help=True)
 

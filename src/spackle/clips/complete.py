@@ -10,14 +10,7 @@ from torch import Tensor
 from spackle.bases import BasePrediction
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, TrajectoryKind, trajectory
-from spackle.clips.temporal import (
-    DepthAlignment,
-    Flow,
-    FrameMemory,
-    align_depth,
-    propagate_colors,
-    track,
-)
+from spackle.clips.temporal import DepthAlignment, Flow, FrameMemory, align_depth, propagate_colors, track
 from spackle.device import Precision
 from spackle.gaussians import Gaussians
 from spackle.render import Renderer

@@ -235,11 +235,7 @@ def _fill(
 
 
 def _propose(
-    context: FillContext,
-    view: Rendering,
-    features: ViewFeatures,
-    camera: Camera,
-    guards: Sequence[OcclusionGuard],
+    context: FillContext, view: Rendering, features: ViewFeatures, camera: Camera, guards: Sequence[OcclusionGuard]
 ) -> tuple[Gaussians, Seeds]:
     """Gaussians of the masked cells, behind the guards' surfaces; and the seeds for `rim_underlay`.
 

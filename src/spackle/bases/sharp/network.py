@@ -15,14 +15,7 @@ from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, max_pool2d, softplus
 
 from spackle.bases import Progress
-from spackle.bases.sharp.encoder import (
-    LAYERS,
-    STRIDE,
-    ExactConv,
-    SharpConfig,
-    SlidingPyramid,
-    TransformerBlock,
-)
+from spackle.bases.sharp.encoder import LAYERS, STRIDE, ExactConv, SharpConfig, SlidingPyramid, TransformerBlock
 from spackle.color import srgb_to_linear
 from spackle.gaussians import Gaussians
 
