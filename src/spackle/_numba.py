@@ -38,6 +38,12 @@ def inlined_kernel(function: Callable[..., R]) -> Callable[..., R]:
     return _compiled(function, _FASTMATH, forceinline=True)
 
 
+def is_compiled(function: Callable[..., Any]) -> bool:
+    """Whether a kernel's machine code is on disk, or cannot be kept there."""
+    kept = _kept(function)
+    return kept is None or bool(kept._load_index())
+
+
 def _compiled(function: Callable[..., R], fastmath: set[str], **more: Any) -> Callable[..., R]:
     compiled = numba.njit(cache=True, nogil=True, fastmath=fastmath, error_model="numpy", **more)(function)
     kept = _kept(compiled)

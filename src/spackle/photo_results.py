@@ -168,6 +168,7 @@ def shared_report(
         "base": {"name": choice.base, "chosen": choice.why, "gaussians": len(prediction.gaussians)},
         "residual": {"weights": weights},
         "views": given.name if given else path.trajectory,
+        "disparity_source": None if given else "photo" if path.disparity is None else "--disparity",
         "seconds": {**reporter.seconds, "total": round(sum(reporter.seconds.values()), 3)},
     }
     if choice.failures:

@@ -48,7 +48,7 @@ def pixels(path: Path) -> np.ndarray:
 def test_predict_writes_a_scene_a_video_and_a_report(plain: tuple[Path, Run]) -> None:
     folder, result = plain
     assert (result.out, "\x1b" in result.err) == ("", False)
-    assert all(line.startswith("photo.png: ") for line in result.lines[:-1])
+    assert all(line.startswith(("photo.png: ", "first use: ")) for line in result.lines[:-1])
     assert "aux Gaussians" in result.lines[-2]
     look = f"Look at {folder / 'video.mp4'}, or into the scene: spackle view {folder / 'scene.ply'}"
     assert result.lines[-1] == look
@@ -65,7 +65,7 @@ def test_predict_writes_a_scene_a_video_and_a_report(plain: tuple[Path, Run]) ->
     assert (report["focal_source"], report["mode"], report["disparity"]) == ("default 30 mm", "scene", 0.07)
     assert report["focal_px"] == pytest.approx(film_to_pixels(30, WIDTH, HEIGHT), abs=1e-3)
     assert report["photo"] == {"file": "photo.png", "width": WIDTH, "height": HEIGHT}
-    assert report["views"] == "rotate-forward"
+    assert (report["views"], report["disparity_source"]) == ("rotate-forward", "photo")
     assert [view["view"] for view in report["hole_area_ratio"]] == ["-0.07", "+0.07"]
     for view in report["hole_area_ratio"]:
         assert 0.1 < view["before"] < 0.13

@@ -22,7 +22,7 @@ from photos import write_pair
 from PIL import Image
 from scenes import box_before_wall, psnr
 from torch import Tensor
-from web_client import served
+from web_client import eventually, served
 
 from spackle.camera import Camera
 from spackle.camera_path import OVERSCAN, SHARP_TRAJECTORIES, DepthRange, TrajectoryKind, trajectory
@@ -236,6 +236,22 @@ def test_hand_and_keys_move_the_eye_within_the_limit(page: Any) -> None:
     assert page.evaluate("spackle.pose().eye") == [0, 0, 0]
     view.press("ArrowDown")
     assert page.evaluate("spackle.pose().eye") == pytest.approx([0, 0.05 * unit, 0])
+
+
+@pytest.mark.parametrize("size", [(1440, 900), (390, 844)])
+def test_the_whole_photo_and_every_control_has_room(page: Any, size: tuple[int, int]) -> None:
+    before = page.viewport_size
+    page.set_viewport_size({"width": size[0], "height": size[1]})
+    if page.locator("#more").is_visible() and not page.locator("#rest").is_visible():
+        page.locator("#more").click(force=True)
+    inside = " && ".join(f"frame.client{side} <= area.client{side}" for side in ("Width", "Height"))
+    eventually(lambda: page.evaluate(inside))
+    for box in [each.bounding_box() for each in page.locator("button, select, #view").all() if each.is_visible()]:
+        assert (box["x"] >= 0, box["y"] >= 0) == (True, True)
+        assert (box["x"] + box["width"] <= size[0], box["y"] + box["height"] <= size[1]) == (True, True), box
+    photo = page.locator("#view").bounding_box()
+    assert photo["width"] / photo["height"] == pytest.approx(64 / 48, rel=0.01)
+    page.set_viewport_size(before)
 
 
 def test_a_photo_is_sent_to_the_server_and_watched(browser: Any, tmp_path: Path) -> None:

@@ -172,6 +172,7 @@ def test_one_photo_of_a_known_kind_and_usable_size_is_accepted(server: Served) -
     Image.new("RGB", (1, 1)).save(tiny, "PNG")
     reply = server.send(tiny.getvalue())
     assert (reply.status, "photo.png: 1×1 is too small" in reply.json["error"]) == (415, True), reply.body
+    assert server.send(b"").status == server.send(depth=("d.npy", b"")).status == 400
     two = form().rsplit(b"--", 2)[0] + form(name="b.png")
     assert server.ask(SCENES, "POST", two).status == 422
 

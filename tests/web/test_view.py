@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import signal
 import socket
@@ -140,7 +141,15 @@ def closed(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_files_that_are_neither_scene_nor_photo(tmp_path: Path) -> None:
     (tmp_path / "written.glb").write_bytes(b"anything")  # a format that cannot be read
     (tmp_path / "scene.jpg").write_bytes(b"ply\nformat binary_little_endian 1.0\nend_header\n")
-    for name, why in {"written.glb": "scene.ply", "scene.jpg": "Gaussian scene", "no.jpg": "no such photo"}.items():
+    behind = dataclasses.replace(base := box_before_wall().base(), means=-base.means)
+    save_ply(behind, tmp_path / "behind.ply")
+    known = {
+        "written.glb": "scene.ply",
+        "scene.jpg": "Gaussian scene",
+        "no.jpg": "no such photo",
+        "behind.ply": "front",
+    }
+    for name, why in known.items():
         refuses(run("view", tmp_path / name), name, why)
 
 
@@ -152,9 +161,9 @@ def test_bad_options(tmp_path: Path) -> None:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         bad = ["--base shrap", "--disparity 7", "--fov 200", "--depth none.npy", f"--port {taken.getsockname()[1]}"]
-        for option in (*bad, "--port 70000", "--host no.such.host.invalid"):
+        for option in (*bad, "-c no.safetensors", "--port 70000", "--host no.such.host.invalid"):
             name, value = option.split()
-            refuses(run("view", photo, name, value), value if name == "--depth" else name)
+            refuses(run("view", photo, name, value), value if name in ("--depth", "-c") else name)
 
 
 def test_a_service_ends_at_once_whatever_it_is_at(tmp_path: Path) -> None:

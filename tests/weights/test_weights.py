@@ -140,6 +140,14 @@ def test_servers_that_hang_are_refused(site: Site, target: Path, monkeypatch: py
     refused(site.url.replace("http:", "https:"), target, "SSL")
 
 
+@pytest.mark.parametrize("url", ["", "a.pt", "file:///a", "ftp://a/b", "http://", "https://[/", "http://a:b/"])
+def test_other_addresses_and_passwords_are_refused(target: Path, url: str) -> None:
+    refused(url, target, url)
+    with pytest.raises(InputError, match="password") as caught:
+        fetch(f"http://me:secret@127.0.0.1:1/{url}", target)
+    assert "secret" not in str(caught.value)
+
+
 def test_the_entries_of_published_weights(monkeypatch: pytest.MonkeyPatch) -> None:
     for entry in PUBLISHED.values():
         assert re.fullmatch("[0-9a-f]{64}", entry.sha256)

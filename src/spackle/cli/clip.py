@@ -138,7 +138,8 @@ def predict_clip(
             },
             "aux": {"gaussians": round(mean(frame["aux"] for frame in frames))},  # of a frame
             "disparity": options.path.reach(first[1].disparity),
-            "hole_area_ratio": {end: mean(frame[end] for frame in frames) for end in ("before", "after")},
+            "hole_area_ratio": {end: mean(frame[end] for frame in frames) for end in ("before", "after")}
+            | {"worst_after": max(frame["after"] for frame in frames)},
         }
         report["files"] = file_records(new, [new / FILES[0]])
         write_json(report, new / FILES[-1])

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import spackle
+from spackle._numba import is_compiled
 from spackle.bases.depth_map import calibrations_beside, find_depth
 from spackle.bases.open import BaseError
 from spackle.cli.clip import FILES as CLIP_FILES
@@ -27,6 +28,8 @@ from spackle.image import PHOTO_SUFFIXES
 from spackle.photo_results import REPORT, PhotoOptions, earlier_report, predict_photo
 from spackle.pipeline import Options, Pipeline
 from spackle.progress import Notes, Reporter, asked_to_stop
+from spackle.render import device_of
+from spackle.render.blend import blend_tiles
 from spackle.video_frames import video_problem
 from spackle.weights import installed
 from spackle.workers import at_work, threads_of_torch
@@ -71,17 +74,21 @@ def predict_all(given: Sequence[Path], output: Path, options: PredictOptions, re
     count = min(options.workers, len(named))
     threads = options.threads or max(1, thread_count() // count)
     single = len(given) == len(named) == 1 and not os.path.isdir(given[0])
-    if clips := [photo.path for photo in named if is_clip(photo.path)]:
-        if not single:
-            raise InputError(f"{clips[0]}: is a clip: give it alone, without other photos or clips")
-        pipeline = Pipeline.open(clip_options(options.scene, options.photo, options.workers))
+    clips = [photo.path for photo in named if is_clip(photo.path)]
+    if clips and not single:
+        raise InputError(f"{clips[0]}: is a clip: give it alone, without other photos or clips")
+    pipeline = (
+        options.open() if not clips else Pipeline.open(clip_options(options.scene, options.photo, options.workers))
+    )
+    if device_of(pipeline.renderer).type == "cpu" and not is_compiled(blend_tiles):
+        reporter.log("first use: kernels are compiled for this processor, which takes about half a minute, once")
+    if clips:
         check_file(clips[0], "clip")
         folder = output / named[0].name
         with results_folder(output):
             predict_clip(clips[0], folder, pipeline, options.photo.lens, reporter)
         reporter.log(f"Look at {folder / CLIP_FILES[0]}")
         return 0
-    pipeline = options.open()
     if single:
         check_file(named[0].path, "photo")
     shared = _shared_digest(options)

@@ -87,10 +87,13 @@ def _checked(target: Path, settings: BaseSettings, lens: Mapping[str, float | No
     if scene_kind(target):
         if settings.depth is not None:
             raise InputError(f"--depth {settings.depth}: {target.name} is a scene already: leave the option out")
-        Scene.load(target, **lens)
+        with reading(target, "cannot be viewed: {reason}: give the lens with --fov", ValueError):
+            Scene.load(target, **lens).page(target.name)
         return page_name(target)
     photo = load_photo(target, keep_frame=keep_frame or settings.depth is not None, **lens)
     check_shape(photo.width, photo.height, photo.path)
+    if settings.checkpoint is not None:
+        check_file(settings.checkpoint, "file of weights")
     if settings.depth is not None:
         open_base(settings).load(photo)
     return target.name

@@ -211,6 +211,8 @@ def _saved(upload: UploadFile, folder: Path, stem: str, name: str, suffixes: tup
     suffix = PurePosixPath(upload.filename or "").suffix.lower()
     if suffix not in suffixes:
         raise HTTPException(415, f"{name}: this kind of file is not accepted: give {', '.join(suffixes)}")
+    if not upload.size:
+        raise HTTPException(400, f"{name}: the file is empty")
     with (folder / f"{stem}{suffix}").open("xb") as file:
         shutil.copyfileobj(upload.file, file)
     return f"{stem}{suffix}"

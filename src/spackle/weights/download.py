@@ -29,6 +29,10 @@ def download(url: str, path: str | os.PathLike[str], size: int, sha256: str, pro
     kill or Ctrl-C the next call requests only the missing bytes. `progress` counts the bytes of earlier calls too.
     InputError if the file cannot be fetched or written, or has other content.
     """
+    if re.match("[^/]*//[^/]*@", url):
+        raise InputError("an address with a user name or password (not shown): give one that needs no login")
+    if not re.match("https?://", url):
+        raise InputError(f"{url!r}: not an address to download from: give one that begins with https:// or http://")
     target = check_writable(path)
     part = target.with_name(f"{target.name}.part")
     try:
