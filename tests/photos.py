@@ -1,4 +1,4 @@
-"""Small photos, depth maps, scenes and cameras on disk, and an independent reader of PLY."""
+"""Small photos, clips, depth maps, scenes and cameras on disk, and an independent reader of PLY."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 WIDTH, HEIGHT = 64, 48
+CLIPS = Path(__file__).parent / "data" / "clips"  # of 10 frames per second; in each `picture` moves to the right
 
 
 def picture(width: int = WIDTH, height: int = HEIGHT) -> NDArray[np.uint8]:

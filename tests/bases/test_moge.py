@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from clips import moving, write_clip
 from command import report_of, run
 from moge_weights import FULL, HALF, TINY, scene, shapes_of, waves, write_tiny
-from photos import picture, write_photo
+from photos import CLIPS, picture, write_photo
 from safetensors.torch import save_file
 from scenes import same_bits
 from torch import Tensor
@@ -162,9 +161,9 @@ def test_predict_takes_a_checkpoint_and_a_clip_keeps_one_lens(
 
     monkeypatch.setattr(MogeBase, "ask", ask)
     monkeypatch.setattr("spackle.bases.lift.lift", lambda *given: (seen.append(given[2].focal[0]), lift(*given))[1])
-    done = run("predict", write_clip(tmp_path / "clip.mp4", moving(3, 90, 160)), *words, "--residual", "none")
-    assert (done.code, report_of(tmp_path / "clip")["focal_source"]) == (0, "MoGe"), done.err
-    assert f"moves by disparity {report_of(tmp_path / 'clip')['disparity']:g}" in done.err
+    done = run("predict", CLIPS / "large.mp4", *words, "--residual", "none")
+    assert (done.code, report_of(tmp_path / "large")["focal_source"]) == (0, "MoGe"), done.err
+    assert f"moves by disparity {report_of(tmp_path / 'large')['disparity']:g}" in done.err
     assert seen == pytest.approx([1.3 * HALF] * 3, rel=1e-5)
 
 

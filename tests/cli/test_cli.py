@@ -12,9 +12,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from clips import moving, write_clip
 from command import FILES, SHORT, Run, names_in, refuses, report_of, run
-from photos import metres, write_depth, write_photo
+from photos import CLIPS, metres, write_depth, write_photo
 from PIL import Image
 
 import spackle
@@ -99,7 +98,7 @@ def test_every_command_has_a_help() -> None:
 
 
 def test_info_says_what_a_file_is(tmp_path: Path, scene: Path, pair: tuple[Path, Path]) -> None:
-    spz, clip, depth = tmp_path / "a.spz", write_clip(tmp_path / "c.mp4", moving(3, 16, 24)), tmp_path / "mm.png"
+    spz, clip, depth = tmp_path / "a.spz", CLIPS / "small.mp4", tmp_path / "mm.png"
     assert run("export", scene, "-o", spz).code == 0
     Image.fromarray((1000 * metres()).astype(np.uint16)).save(depth)
     expected = {
