@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import shutil
 import struct
-from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -56,23 +55,12 @@ EYES = [Eye((0, 0, 0)), Eye((0.4, 0, 0), -0.06), Eye((0, 0.5, 0.1), 0.05), Eye((
 
 
 def stored(name: str, scene: Path) -> Path:
-    """A stored scene with photos of `WIDTH` by `HEIGHT`; WildRGB-D's has the cameras `EYES`, with smaller distances."""
+    """A stored scene with photos of `WIDTH` by `HEIGHT`.
+
+    WildRGB-D's has the cameras `EYES`, with smaller distances; LLFF's, ETH3D's and Tanks and Temples' have `EYES` and,
+    as COLMAP models, `POINTS`; LLFF's photos have a quarter of the size in the poses.
+    """
     return Path(shutil.copytree(DATA / "datasets" / name, scene))
-
-
-def middlebury_2014(scene: Path, truth: str = "disp0.pfm") -> Path:
-    """A plane with disparity 5 at quarter size."""
-    (stored("middlebury", scene) / "disp0.pfm").rename(scene / truth)
-    return scene
-
-
-def colmap(folder: Path, photos: Path, kind: str) -> None:
-    """A model of `POINTS` and `EYES`, as text or binary."""
-    for number in range(len(EYES)):
-        write_photo(photos / f"DSC_{number:04d}.JPG", WIDTH, HEIGHT)
-    folder.mkdir(parents=True)
-    for file in (DATA / "colmap").glob(f"*{kind}"):
-        shutil.copy(file, folder)
 
 
 def lens(model: int, *numbers: float) -> bytes:
@@ -80,42 +68,13 @@ def lens(model: int, *numbers: float) -> bytes:
     return struct.pack(f"<QiiQQ{len(numbers)}d", 1, 4, model, WIDTH, HEIGHT, *numbers)
 
 
-def eth3d(scene: Path) -> Path:
-    colmap(scene / "dslr_calibration_undistorted", scene / "images/dslr_images_undistorted", ".txt")
-    path = scene / "dslr_calibration_undistorted/images.txt"
-    path.write_text(path.read_text().replace("DSC", "dslr_images_undistorted/DSC"))
-    return scene
-
-
-def tanks(scene: Path, *, sparse: str = "sparse/0", kind: str = ".bin") -> Path:
-    colmap(scene / sparse, scene / sparse.partition("sparse")[0] / "images", kind)
-    return scene
-
-
-def llff(scene: Path, eyes: Sequence[Eye] = EYES, *, bounds: bool = True, sparse: bool = False) -> Path:
-    """A scene whose photos have a quarter of the size in the poses."""
-    for k in range(len(eyes)):
-        write_photo(scene / "images_4" / f"image{k:03d}.png", WIDTH // 4, HEIGHT // 4)
-    if bounds:
-        rows = []
-        for eye in eyes:
-            right, down, forward, at = eye.to_world[:3].T
-            matrix = np.stack([down, right, -forward, at, [HEIGHT, WIDTH, FOCAL]], axis=1)
-            rows.append([*matrix.ravel(), 3.0, 6.0])
-        np.save(scene / "poses_bounds.npy", np.array(rows))
-    if sparse:
-        colmap(scene / "sparse/0", scene / "images", ".bin")
-        (scene / "sparse/0/cameras.bin").write_bytes(lens(2, FOCAL, WIDTH / 2, HEIGHT / 2, 0.001))
-    return scene
-
-
-TREES: dict[str, Callable[[Path], Path]] = {
-    "middlebury": lambda root: middlebury_2014(root / "Piano-perfect"),
-    "booster": lambda root: stored("booster", root / "train/balanced/Bathroom"),
-    "wildrgbd": lambda root: stored("wildrgbd", root / "apple/scenes/scene_000"),
-    "eth3d": lambda root: eth3d(root / "courtyard"),
-    "llff": lambda root: llff(root / "fern"),
-    "tanks": lambda root: tanks(root / "Truck"),
+PLACES = {
+    "middlebury": "Piano-perfect",
+    "booster": "train/balanced/Bathroom",
+    "wildrgbd": "apple/scenes/scene_000",
+    "eth3d": "courtyard",
+    "llff": "llff_fern",
+    "tanks": "Truck",
 }
 
 
@@ -127,9 +86,9 @@ def error_of(name: str, root: Path) -> str:
     return message
 
 
-@pytest.mark.parametrize("there", TREES)
+@pytest.mark.parametrize("there", PLACES)
 def test_each_tree_is_read_by_its_dataset(there: str, tmp_path: Path) -> None:
-    scene = TREES[there](tmp_path / "data")
+    scene = stored(there, tmp_path / "data" / PLACES[there])
     found = read_cases(there, tmp_path / "data")
     names = [case.name for case in found]
     assert len(set(names)) == len(names) == {"middlebury": 1, "booster": 2}.get(there, len(EYES))
@@ -138,12 +97,12 @@ def test_each_tree_is_read_by_its_dataset(there: str, tmp_path: Path) -> None:
     assert load_case(found[0]).seconds
 
 
-MIDDLEBURY, BOOSTER, WILD = "Piano-perfect", "train/balanced/Bathroom", "apple/scenes/scene_000"
+MIDDLEBURY, BOOSTER, WILD = (PLACES[name] for name in ("middlebury", "booster", "wildrgbd"))
 MODEL = "courtyard/dslr_calibration_undistorted"
 BROKEN: list[tuple[str, str, str | None, str]] = [  # dataset, file, its content (None: no file), the message
     ("middlebury", f"{MIDDLEBURY}/disp0.pfm", None, "no disp0GT.pfm or disp0.pfm"),
     ("booster", f"{BOOSTER}/disp_00.npy", None, "give train/balanced"),
-    ("llff", "fern/images_4/image001.png", None, "5 rows, but there are 4 photos"),
+    ("llff", "llff_fern/images_4/image001.png", None, "5 rows, but there are 4 photos"),
     ("tanks", "Truck/sparse/0/cameras.bin", None, "expected cameras, images, points3D"),
     ("eth3d", f"{MODEL}/images.txt", None, "images.txt: "),
     ("middlebury", f"{MIDDLEBURY}/calib.txt", "cam0=[1 2]\n", "calib.txt: "),
@@ -151,7 +110,7 @@ BROKEN: list[tuple[str, str, str | None, str]] = [  # dataset, file, its content
     ("wildrgbd", f"{WILD}/metadata", '{"w": 4, "h": 3, "K": [1, 2]}', "metadata: "),
     ("wildrgbd", f"{WILD}/cam_poses.txt", "0 1 2 3\n", "cam_poses.txt: "),
     ("eth3d", f"{MODEL}/cameras.txt", "4 PINHOLE 48 36 40 40\n", "cameras.txt: "),
-    ("llff", "fern/poses_bounds.npy", "not NumPy", "poses_bounds.npy: "),
+    ("llff", "llff_fern/poses_bounds.npy", "not NumPy", "poses_bounds.npy: "),
     ("tanks", "Truck/sparse/0/points3D.bin", "\xff" * 30, "points3D.bin: "),
     ("wildrgbd", f"{WILD}/cam_poses.txt", "0 " + "0 " * 16 + "\n1 " + "1 " * 16, "cam_poses.txt: "),
 ]
@@ -159,7 +118,7 @@ BROKEN: list[tuple[str, str, str | None, str]] = [  # dataset, file, its content
 
 @pytest.mark.parametrize(("name", "file", "content", "says"), BROKEN)
 def test_a_lost_or_damaged_file_is_named(name: str, file: str, content: str | None, says: str, tmp_path: Path) -> None:
-    TREES[name](tmp_path)
+    stored(name, tmp_path / PLACES[name])
     (tmp_path / file).unlink()
     if content is not None:
         (tmp_path / file).write_bytes(content.encode("latin-1"))
@@ -169,12 +128,12 @@ def test_a_lost_or_damaged_file_is_named(name: str, file: str, content: str | No
 def test_odd_poses_and_bent_lenses_are_refused(tmp_path: Path) -> None:
     assert "no such folder" in error_of("llff", tmp_path / "nowhere")
     assert "no scene of llff in this folder or below: expected SCENE/poses_bounds.npy" in error_of("llff", tmp_path)
-    path = TREES["llff"](tmp_path / "poses") / "poses_bounds.npy"
+    path = stored("llff", tmp_path / "poses" / "fern") / "poses_bounds.npy"
     table = np.load(path)
     table[2, :3] = 1e30  # no rotation
     np.save(path, table)
     assert "poses_bounds.npy: image002.png: " in error_of("llff", tmp_path / "poses")
-    cameras = tanks(tmp_path / "tanks/Truck") / "sparse/0/cameras.bin"
+    cameras = stored("tanks", tmp_path / "tanks/Truck") / "sparse/0/cameras.bin"
     cameras.write_bytes(lens(2, FOCAL, WIDTH / 2, HEIGHT / 2, 0.4))
     assert "distorts the corners of photos: undistort" in error_of("tanks", tmp_path / "tanks")
     cameras.write_bytes(lens(2, 20 * FOCAL, WIDTH / 2, HEIGHT / 2, 0.4))  # the corners of a long lens are near the axis
@@ -201,19 +160,20 @@ def assert_pair(case: Case, disparity: float, z: float, x: int = 30, y: int = 9)
 
 def test_middlebury_2014(tmp_path: Path) -> None:
     for name, truth in (("Piano-perfect", "disp0.pfm"), ("Piano-imperfect", "disp0.pfm"), ("Art", "disp0GT.pfm")):
-        middlebury_2014(tmp_path / "trainingQ" / name, truth)
-    middlebury_2014(tmp_path / "testQ/Djembe", "none")
+        known = stored("middlebury", tmp_path / "trainingQ" / name) / "disp0.pfm"
+        known.rename(known.with_name(truth))
+    (stored("middlebury", tmp_path / "testQ/Djembe") / "disp0.pfm").unlink()
     found = read_cases("middlebury", tmp_path)
     assert [case.name for case in found] == ["Art", "Piano-perfect"]
     for case in found:
         valid, K = assert_pair(case, 5.0, FOCAL * 0.193001 / (5.0 + 3.5))
         assert (float(K[0, 2]), bool(valid[0, 0])) == (20.75, False)  # in the file (0, 0) is the first pixel's middle
-    middlebury_2014(tmp_path / "trainingH/Art")
+    stored("middlebury", tmp_path / "trainingH/Art")
     assert "give the folder of a single size" in error_of("middlebury", tmp_path)
 
 
 def test_booster(tmp_path: Path) -> None:
-    scene = TREES["booster"](tmp_path)
+    scene = stored("booster", tmp_path / BOOSTER)
     stored("booster", tmp_path / "train/unbalanced/Bathroom")
     (scene / "camera_00/im0.png").write_bytes(b"no picture")  # affects no other photo
     first, second = read_cases("booster", tmp_path)
@@ -226,20 +186,16 @@ def test_booster(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "make", "scale"),
+    ("name", "tree", "scale"),
     [
-        ("wildrgbd", TREES["wildrgbd"], 0.15),
-        ("eth3d", TREES["eth3d"], 1.0),
-        ("tanks", TREES["tanks"], 1.0),
-        ("tanks", lambda root: tanks(root / "Truck", sparse="sparse", kind=".txt"), 1.0),
-        ("tanks", lambda root: tanks(root / "Truck", sparse="dense/sparse"), 1.0),
-        ("llff", TREES["llff"], 1.0),
-        ("llff", lambda root: llff(root / "fern", sparse=True), 1.0),
-        ("llff", lambda root: llff(root / "llff_fern", sparse=True, bounds=False), 1.0),
+        ("wildrgbd", "wildrgbd", 0.15),
+        ("eth3d", "eth3d", 1.0),
+        *(("tanks", tree, 1.0) for tree in ("tanks", "tanks-text", "tanks-dense")),
+        *(("llff", tree, 1.0) for tree in ("llff", "llff-sparse", "llff-colmap")),  # poses, a model too, a model only
     ],
 )
-def test_points_land_on_their_pixels(name: str, make: Callable[[Path], Path], scale: float, tmp_path: Path) -> None:
-    make(tmp_path)
+def test_points_land_on_their_pixels(name: str, tree: str, scale: float, tmp_path: Path) -> None:
+    stored(tree, tmp_path / PLACES[name])
     found = read_cases(name, tmp_path)
     names = [case.name for case in found]
     assert names == sorted(names)
@@ -265,12 +221,11 @@ def test_points_land_on_their_pixels(name: str, make: Callable[[Path], Path], sc
 
 
 def test_second_views_are_the_nearest_but_not_the_same(tmp_path: Path) -> None:
-    beside = [0.0, 0.01, 0.3, 0.35, 0.4, 0.5, 3.0]  # at a middle depth of 4: 0.2 to 1 is near
-    eyes = [Eye((x, 0, 0)) for x in beside] + [Eye((0.25, 0, 0), 1.0)]
-    llff(tmp_path / "fern", eyes)
+    # Cameras at x = 0, 0.01, 0.3, 0.35, 0.4, 0.5, 3, and at 0.25 turned by one radian; the middle depth is 4.
+    stored("llff-beside", tmp_path / "fern")
     first = read_cases("llff", tmp_path)[0]
     assert [view.name for view in first.seconds if view.near] == ["fern/image002", "fern/image003", "fern/image004"]
-    assert len(first.seconds) == len(eyes) - 1  # all other photos, the nearest first
+    assert len(first.seconds) == 7  # all other photos, the nearest first
     assert [view.name for view in first.seconds][::6] == ["fern/image001", "fern/image006"]
     settings: dict[str, Any] = {"base": BaseSettings("lite"), "metrics": (), "residual": "seeds"}
     for choice, count in (("all", 7), ("nearest", 3)):
@@ -300,7 +255,7 @@ def test_working_sizes_give_the_papers_dense_counts() -> None:
 
 
 def test_photos_and_cameras_are_brought_to_the_working_size(tmp_path: Path) -> None:
-    llff(tmp_path / "fern")
+    stored("llff", tmp_path / "fern")
     case = read_cases("llff", tmp_path)[0]
     big = dataclasses.replace(case, photo=write_photo(tmp_path / "big.png", 96, 72))
     seconds = [dataclasses.replace(case.seconds[0], photo=write_photo(tmp_path / "odd.png", 36, 27))]
@@ -317,7 +272,7 @@ def test_photos_and_cameras_are_brought_to_the_working_size(tmp_path: Path) -> N
 
 
 def test_files_that_are_no_photos_of_the_case(tmp_path: Path) -> None:
-    middlebury_2014(tmp_path / "Piano")
+    stored("middlebury", tmp_path / "Piano")
     (case,) = read_cases("middlebury", tmp_path)
     write_photo(tmp_path / "Piano/im1.png", HEIGHT, WIDTH)
     with pytest.raises(InputError, match=r"im1\.png: 36×48 pixels upright, but the calibration is for 48×36"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import shutil
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import pytest
 import torch
 from photos import metres, picture, write_depth, write_photo
 from PIL import Image
-from scenes import Scene, away, box_before_wall, psnr, shifted, slanted_plane, tensors_of, texture, wall
+from scenes import Scene, away, box_before_wall, psnr, shifted, slanted_plane, tensors_of, wall
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
@@ -319,29 +320,21 @@ def test_frames_of_a_depth_camera(tmp_path: Path, unit_m: float) -> None:
         sources.load_frame(color, unit_m)
 
 
-WALL_PX, BOX_PX, DOFFS = 4, 12, 3.0  # disparities; the file's values are smaller by `doffs`
+WALL_PX, BOX_PX = 4, 12  # disparities; the file's values are smaller by 3, its `doffs_px`
 
 
-def write_stereo(folder: Path, width: int = 96, height: int = 72, **changes: Any) -> Path:
-    """Write a stereo pair of a box in front of a wall."""
-    for side, name in enumerate(("left", "right")):
-        wall, box = (side * (d - int(DOFFS)) for d in (WALL_PX, BOX_PX))
-        image = texture(height, width + 16, (0.2, 0.4, 0.7))[:, wall : wall + width].clone()
-        image[24:48, 40 - box : 64 - box] = texture(height, width + 16, (0.8, 0.3, 0.2))[24:48, 40:64]
-        Image.fromarray((255 * image).round().byte().numpy()).save(folder / f"{name}.png")
-    disparity = np.full((height, width), WALL_PX - DOFFS, np.float32)
-    disparity[24:48, 40:64] = BOX_PX - DOFFS
-    np.save(folder / "disparity.npy", disparity)
-    facts = {"left": "left.png", "right": "right.png", "disparity": "disparity.npy"}
-    facts |= {"focal_px": 80.0, "cx": 47.0, "cy": 36.5, "doffs_px": DOFFS, "baseline_m": 0.3, **changes}
-    (folder / "scene.json").write_text(json.dumps(facts))
+def write_stereo(folder: Path, **changes: Any) -> Path:
+    """Write a stereo pair of a box in front of a wall, with changes in scene.json."""
+    shutil.copytree(Path(__file__).parents[1] / "data" / "stereo", folder, dirs_exist_ok=True)
+    facts = json.loads((folder / "scene.json").read_text())
+    (folder / "scene.json").write_text(json.dumps({**facts, **changes}))
     return folder
 
 
 def test_targets_of_a_stereo_pair(tmp_path: Path) -> None:
-    folder = write_stereo(tmp_path, disparity="maps/left.npy")  # in another folder
+    folder = write_stereo(tmp_path, disparity="maps/left.npz")  # in another folder
     (folder / "maps").mkdir()
-    (folder / "disparity.npy").rename(folder / "maps" / "left.npy")
+    (folder / "disparity.npz").rename(folder / "maps" / "left.npz")
     sample = sources.right_view(np.random.default_rng(0), [folder], CPU)
     right = pixels(folder / "right.png")
     assert torch.equal(sample.target, right)
