@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import math
+import numbers
 import os
 import warnings
 from collections.abc import Callable
@@ -161,7 +162,7 @@ def focal_length(
     if len(named) > 1:
         raise InputError(f"{' and '.join(named)} are given together: give one of them")
     for name, value in named.items():
-        if not (math.isfinite(value) and value > 0):
+        if not (isinstance(value, numbers.Real) and math.isfinite(value) and value > 0):
             raise InputError(f"{name} must be a positive number, got {value!r}")
         if name == "--fov" and value >= 180:
             raise InputError(f"--fov must lie between 0 and 180 degrees, got {value}")

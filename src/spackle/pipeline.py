@@ -165,6 +165,10 @@ class Pipeline:
             reporter.log(f"{name}: {move_in_words(prediction)}")
         if depth_range := prediction.notes.get("depth_range"):
             reporter.log(f"{name}: its depth is {depth_range}")
+        if missing := float(prediction.notes.get("depth_filled", 0)):
+            reporter.log(f"{name}: {missing:.1%} of the depth was missing and has been filled")
+        if self.options.base.depth is not None and (size := prediction.notes.get("depth_resampled_from")):
+            reporter.log(f"{name}: the depth map is {size}, and was resampled to the photo's size")
         return prediction, choice
 
     def _disparity(self, prediction: BasePrediction) -> float | None:

@@ -86,6 +86,14 @@ def test_no_control_character_of_a_name_reaches_the_terminal(tmp_path: Path) -> 
     assert r"a\x1b]0;owned\x07\x9b2J  \u202e\udcff.png" in result.err
 
 
+def test_a_full_standard_output_is_reported_in_one_line(scene: Path, tmp_path: Path) -> None:
+    words = [*COMMAND, "export", str(scene), "-o", str(tmp_path / "a.splat"), "--json"]
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(words, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.splitlines()[-1] == "error: cannot write to the standard output: No space left on device"
+
+
 def test_every_command_has_a_help() -> None:
     named = {"predict": "PHOTO", "export": "--output", "view": "SCENE_OR_PHOTO"}  # in the examples
     for command in COMMANDS:

@@ -13,6 +13,7 @@ from command import FILES, SHORT, Run, decode, names_in, predicted, refuses, rep
 from photos import (
     HEIGHT,
     WIDTH,
+    box,
     camera_file,
     metres,
     picture,
@@ -253,6 +254,14 @@ def test_two_runs_never_share_a_folder(tmp_path: Path, pair: tuple[Path, Path]) 
     out.mkdir()
     (out / ".lock").touch()  # of a killed run
     predicted(pair[0].parent, pair[1], out)
+
+
+def test_missing_depth_and_a_map_of_another_size_are_mentioned(tmp_path: Path) -> None:
+    depth = np.where(box(640, 480), np.nan, 3).astype(np.float32)
+    photo, depth_file = write_photo(tmp_path / "a.png"), write_depth(tmp_path / "d.npy", depth)
+    said = predicted(photo, depth_file, tmp_path / "out", "--no-render").err
+    assert "% of the depth was missing and has been filled" in said
+    assert "the depth map is 640×480, and was resampled" in said
 
 
 def test_a_frame_is_cut_off_unless_geometry_is_given(tmp_path: Path) -> None:

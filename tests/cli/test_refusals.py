@@ -48,12 +48,14 @@ PREDICT = [
     ("--device cuda", "--device"),
     ("-c weights.pt", "-c"),
     ("--cameras sizes.json", "--no-render"),
+    *((f"--no-render {option}", option.split()[0]) for option in ("--fps 24.0", "--loop 2", "--format webm")),
     ("--cameras extreme.json", "extreme.json"),
     ("--depth wrong.npy", "wrong.npy"),
     ("--depth disp0.npy", "disp0.npy"),  # without a calibration
 ]
 RENDER = [
     ("--focal-px inf", "--focal-px"),
+    ("--fov 60 --cameras views.json", "--fov"),
     ("-o film.avi", "film.avi: not a kind of video"),
     ("-o a.gif --format webm", "--format webm"),
     ("-o a.mp4 --cameras sizes.json", "sizes.json"),

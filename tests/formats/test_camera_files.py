@@ -60,6 +60,11 @@ def test_reads_the_documented_format(tmp_path: Path) -> None:
     assert len(load_cameras(write(tmp_path / "c.json", at("world_to_camera", 0, 0, 1.0003)))) == 1  # nearly rigid
 
 
+def test_a_byte_order_mark_is_ignored(tmp_path: Path) -> None:
+    for content, load in ((CAMERAS, load_cameras), (PATH, load_path)):
+        assert load(write(tmp_path / "c.json", "\ufeff" + json.dumps(content)))
+
+
 def test_a_path_file_is_read(tmp_path: Path) -> None:
     keys = [FIRST, SECOND | {"up": [0, -1, 0.1], "fov": 50}]
     path = load_path(write(tmp_path / "p.json", {"keyframes": keys, "closed": True, "unit": "disparity"}))

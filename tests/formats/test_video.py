@@ -171,11 +171,16 @@ UNKNOWN = [
 
 
 @pytest.mark.parametrize(("name", "fps", "loop", "said"), UNKNOWN)
-def test_what_a_format_does_not_know_is_refused(tmp_path: Path, name: str, fps: float, loop: int, said: str) -> None:
+def test_what_a_format_does_not_know_is_refused(
+    tmp_path: Path, name: str, fps: float, loop: int, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with pytest.raises(InputError, match=said):
         VideoWriter(tmp_path / name, fps, loop)
     with pytest.raises(InputError, match="too large"), VideoWriter(tmp_path / "b.webp") as writer:
         writer.add(torch.zeros(1, 16_384, 3))
+    monkeypatch.setattr("spackle.formats.video.MAX_GIF_PIXELS", 1000)
+    with pytest.raises(InputError, match="write an mp4"):
+        save_video(frames(2, 20, 30), tmp_path / "b.gif")
     assert not os.listdir(tmp_path)
 
 

@@ -81,6 +81,7 @@ def main() -> None:
         signal.signal(signal.SIGTERM, _end)
     try:
         code = app(standalone_mode=False)
+        sys.stdout.flush()
     except InputError as error:
         _fail(str(error))
     except TyperException as error:  # an unknown option, or text in place of a number
@@ -88,6 +89,11 @@ def main() -> None:
             print(error.format_message(), file=sys.stderr)
             sys.exit(2)
         _fail(error.format_message())
+    except OSError as error:
+        if error.filename is not None:
+            raise
+        print(f"error: cannot write to the standard output: {error.strerror or error}", file=sys.stderr)
+        sys.exit(2)
     if code == INTERRUPTED:
         print("interrupted", file=sys.stderr)
     sys.exit(code)

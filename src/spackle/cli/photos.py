@@ -52,6 +52,9 @@ class PredictOptions:
             if Path(name).name != name:
                 raise InputError(f"--depth-out {name}: give a name without a folder: the file lies beside scene.ply")
         pipeline, path = Pipeline.open(self.scene), self.scene.path
+        unused = [name for name in ("format", "fps", "loop") if getattr(path.video, name) is not None]
+        if unused and not self.photo.render:
+            raise InputError(f"--{unused[0]}: --no-render writes no video: leave one of them out")
         if self.photo.render and pipeline.given_views and (problem := video_problem(pipeline.given_views)):
             raise InputError(f"{path.cameras}: {problem}, so they make no video: add --no-render for pictures only")
         return pipeline

@@ -54,6 +54,8 @@ def render_scene(
     elif (mimetypes.guess_type(output.name)[0] or "").startswith(("video/", "image/")):
         raise InputError(f"{output}: not a kind of video that can be written: end the name with {', '.join(FORMATS)}")
     path.check()
+    if path.cameras is not None and any(lens.values()):
+        raise InputError(f"--cameras {path.cameras}: its views have their own lenses: leave --fov and --focal-px out")
     renderer = get_renderer(device)
     with reporter.stage("load"):
         given, keyframes = path.load()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -150,7 +151,7 @@ def _read(model: type[M], path: str | os.PathLike[str], kind: str) -> M:
     if check_file(path, kind) > MAX_BYTES:
         raise InputError(f"{path}: too long for a {kind} (at most {MAX_BYTES >> 20} MiB): is it the right file?")
     try:
-        return model.model_validate_json(Path(path).read_bytes())
+        return model.model_validate_json(Path(path).read_bytes().removeprefix(codecs.BOM_UTF8))
     except ValidationError as error:
         raise InputError(f"{path}: {_first_problem(error)}") from error
 

@@ -26,6 +26,7 @@ from spackle.errors import InputError
 from spackle.files import atomic_path, check_writable
 
 MAX_REPEATS = 1000  # for files that store every repetition
+MAX_GIF_PIXELS = 300 * 1536 * 1152  # of all frames, which take 4 bytes a pixel of memory
 MAX_PLAYS = 65_535  # GIF's and WebP's counters have 16 bits
 BT709, LIMITED_RANGE = 1, 1  # FFmpeg's numbers, the same for primaries, transfer and matrix
 
@@ -132,6 +133,9 @@ class VideoWriter:
             self._shape = frame.shape
         if frame.shape != self._shape:
             raise ValueError(f"frame {self.frames} is {tuple(frame.shape)}, the first one was {tuple(self._shape)}")
+        if self._kind is GIF and (self.frames + 1) * frame.shape.numel() // 3 > MAX_GIF_PIXELS:
+            most = f"at most {MAX_GIF_PIXELS // 10**6} megapixels in all frames of a GIF"
+            raise InputError(f"{self.path}: {most}: write an mp4, or fewer or smaller frames")
         self._wait()
         self._encoding = self._aside.submit(self._encoder.add, to_bytes(frame).numpy())
         self.frames += 1
