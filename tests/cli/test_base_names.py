@@ -181,3 +181,12 @@ def test_a_base_that_cannot_be_loaded_stops_a_folder_at_once(
     tmp_path: Path, made: dict[str, Path], photos: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     refuses(predict(tmp_path, photos, "--base", "lite", "-c", made["sharp"]), made["sharp"])
+    sharp = install(made, tmp_path)
+
+    def change(path: Path, **options: object) -> StandIn:
+        sharp.write_bytes(sharp.read_bytes() + b"more")
+        return StandIn("sharp")
+
+    monkeypatch.setattr(SharpBase, "load", change)
+    result = predict(tmp_path, photos, "--base", "sharp")
+    assert (result.code, result.lines[-1].endswith("changed while this was running: start again")) == (2, True)

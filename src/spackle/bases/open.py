@@ -115,6 +115,7 @@ class OpenedBase:
     ) -> None:
         """`candidates` are tried in their order (see `ORDER`); `loaded` maps names to networks already loaded."""
         self.candidates, self._settings, self._loaded = candidates, settings, loaded
+        self._times = {file: file.stat().st_mtime_ns for file in settings.files.values() if file.is_file()}
         # Candidates that no photo can use: the reason, and whether memory was short.
         self._failed: dict[str, tuple[str, bool]] = {}
         self._notes: set[str] = set()  # given for earlier photos
@@ -175,6 +176,8 @@ class OpenedBase:
             return _lift(self._settings, photo, depth)
         if name not in self._loaded:
             self._loaded[name] = _load_network(name, self._settings)
+            if any(not file.is_file() or file.stat().st_mtime_ns != time for file, time in self._times.items()):
+                raise BaseError("a file of weights changed while this was running: start again")
         return self._loaded[name]
 
     def only(self, choice: ResolvedBase) -> OpenedBase:
