@@ -108,7 +108,7 @@ def test_a_photo_and_its_depth_in_every_form(pair: tuple[Path, Path], tmp_path: 
         (object(), {}, "a path, bytes"),
         (np.zeros((48, 64, 3)), {"depth": np.zeros((48, 64), complex)}, "metres"),
         (np.zeros((48, 64, 3)), {"depth": np.zeros((48, 64))}, "all-invalid"),
-        (np.zeros((48, 64, 3)), {"base": "lite", "depth": np.ones((48, 64))}, "only one of the two"),
+        (np.zeros((48, 64, 3)), {"base": "lite", "depth": np.ones((48, 64))}, "leave one of them out"),
         (np.zeros((48, 64, 3)), {"base": "sharpest"}, "sharp"),
         (np.zeros((48, 64, 3)), {"fov": "60"}, "--fov must be a positive number, got '60'"),
         (np.zeros((48, 64, 3)), {"residual": "no" * 9000}, "no such weight file"),

@@ -54,7 +54,7 @@ def _compiled(function: Callable[..., R], fastmath: set[str], **more: Any) -> Ca
 
 
 def _surroundings(function: Callable[..., Any]) -> str:
-    """A hash of the numbers and kernels in a function's module; numba itself checks only the module's own text."""
+    """A hash of the numbers and kernels that a module defines or imports; numba checks only the module's text."""
     seen = []
     for name, value in sorted(function.__globals__.items()):
         if isinstance(value, Dispatcher):

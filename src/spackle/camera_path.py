@@ -53,7 +53,7 @@ class DepthRange:
         return DepthRange(float(near), max(MIN_FOCUS_M, float(focus)))
 
     def towards(self, other: DepthRange, part: float) -> DepthRange:
-        """Interpolate to another range by `part` (0..1), on a logarithmic scale."""
+        """Interpolate on a logarithmic scale between this range (`part` 0) and another range (`part` 1)."""
         near, focus = (a * (b / a) ** part for a, b in ((self.near, other.near), (self.focus, other.focus)))
         return DepthRange(near, focus)
 
@@ -84,8 +84,8 @@ def trajectory(
         disparity: the widest offset, see `max_offset`.
         depth_range: depths of the base's Gaussians.
         frames: number of cameras.
-        looped: make a path that repeats without a jump: swipe also returns, and the other paths, whose last frame
-            equals their first, lose their last frame.
+        looped: make a path that repeats without a jump. Swipe then also returns. The other paths already end where they
+            begin, so their last frame, which repeats the first, is left out.
         only: index of the only camera to compute; None computes all cameras.
 
     Raises:
@@ -163,8 +163,8 @@ class Keyframe:
 class KeyframePath:
     """A smooth path through keyframes.
 
-    Each coordinate of eye, target and up, and the logarithm of the focal length, is a monotone cubic in time
-    (Fritsch and Butland), which passes through every keyframe and stays between the values of neighbours.
+    Eye, target, up and the logarithm of the focal length follow monotone cubics in time (Fritsch and Butland). The
+    cubics pass through all keyframes, and stay between the values of two successive keyframes.
     """
 
     keys: tuple[Keyframe, ...]  # at least two, at increasing times
@@ -191,7 +191,7 @@ class KeyframePath:
         return max(1, round(self.seconds * fps) + (not self.closed))
 
     def cameras(self, camera: Camera, frames: int, depth_range: DepthRange) -> list[Camera]:
-        """Views at equal time steps, of the size of the photo's `camera`, which is at the origin.
+        """Views at equal time steps; their size is that of `camera`, the photo's camera at the origin.
 
         An open path includes both its ends; a closed path does not end with its first frame. `depth_range`
         determines the length of the unit "disparity".
@@ -234,9 +234,9 @@ def _look_at(*vectors: Sequence[float] | Array) -> Tensor:
 
 
 def interpolate(times: Array, values: Array, wanted: Array, period: float | None = None) -> Array:
-    """Evaluate at times `wanted` [M] the monotone cubics through `values` [K, C] at increasing `times` [K].
+    """Interpolate `values` [K, C], given at increasing `times` [K], at the times `wanted` [M] by monotone cubics.
 
-    Returns [M, C]. With a period, the first value recurs at times[0] + period.
+    Returns [M, C]. With a period, the curves are closed: they return to the first value at times[0] + period.
     """
     if period is not None:
         times = np.concatenate([times[-1:] - period, times, times[:2] + period])
@@ -255,7 +255,7 @@ def interpolate(times: Array, values: Array, wanted: Array, period: float | None
 
 
 def _inner_tangents(steps: Array, slopes: Array) -> Array:
-    """Tangents [K − 2, C]: weighted harmonic means of the slopes on both sides; 0 if the signs differ."""
+    """Tangents [K − 2, C]: weighted harmonic means of the slopes before and after a point; 0 if the signs differ."""
     before, after = slopes[:-1], slopes[1:]
     first, second = steps[1:] * 2 + steps[:-1], steps[1:] + 2 * steps[:-1]
     agree = before * after > 0

@@ -41,14 +41,14 @@ INFERNO = (
 
 @dataclasses.dataclass(frozen=True)
 class DepthColors:
-    """A scale of colours between two depths; depths outside of the scale get the colour of its nearer end."""
+    """A scale of colours between two depths; a depth outside of the scale gets the colour of the closest end."""
 
     near: float  # depth of the brightest colour
     far: float  # depth of the darkest colour
 
     @staticmethod
     def over(gaussians: Gaussians, cameras: Sequence[Camera]) -> DepthColors:
-        """The scale that spans the depths in a set of views, except for 0.2 % at either end.
+        """The scale for the depths in a set of views, without the nearest and the farthest 0.2 %.
 
         Raises:
             ValueError: no Gaussian is in a view.

@@ -65,11 +65,11 @@ def crops_around(mask: Tensor, step: int, margin: int = MARGIN) -> list[tuple[Cr
     Args:
         mask: [h, w] bool.
         step: the network's stride; outer rectangles begin at multiples of the stride.
-        margin: number of cells around the masked cells that the network needs.
+        margin: number of cells that the network needs around each masked cell.
 
     Returns:
         Pairs (inner, outer) of rectangles; outer includes the margin. The inner rectangles contain each masked cell
-        exactly once. If cropping saves little, the only pair consists of the whole grid twice.
+        exactly once. If cropping saves little, there is one pair, and both its rectangles are the whole grid.
     """
     cells: Mask = mask.cpu().numpy()
     whole = Crop(0, 0, *cells.shape)

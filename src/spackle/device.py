@@ -41,7 +41,7 @@ def pick_device(device: torch.device | str | None) -> torch.device:
     if target.type == "cuda" and not present:
         raise InputError(f"{shown}: torch finds no CUDA device: give cpu, or install a torch and a driver for CUDA")
     if target.type == "cuda" and (target.index or 0) >= torch.cuda.device_count():
-        raise InputError(f"{shown}: the last CUDA device is cuda:{torch.cuda.device_count() - 1}: give that or another")
+        raise InputError(f"{shown}: there is no such CUDA device: give at most cuda:{torch.cuda.device_count() - 1}")
     return target
 
 
@@ -100,7 +100,7 @@ def multiplies_bf16(device: torch.device) -> bool:
 
 
 def thread_count() -> int:
-    """Number of threads: torch's, so that one setting controls both."""
+    """The number of threads; it is torch's, so that one setting controls torch and Spackle's kernels."""
     return torch.get_num_threads()
 
 
@@ -135,7 +135,7 @@ def run_chunks(function: Callable[[int, int], object], total: int, grain: int | 
 
 @functools.cache
 def _threads(process: int) -> ThreadPoolExecutor:
-    """A process's thread pool, which, unlike numba's loops, works for several Python threads and after a fork."""
+    """The thread pool of a process; unlike numba's loops, it works for several Python threads and after a fork."""
     return ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix=f"spackle-{process}")
 
 

@@ -92,4 +92,4 @@ def check_name(option: str, name: str, known: Iterable[str]) -> None:
         return
     near = difflib.get_close_matches(name.lower(), names, n=1, cutoff=0.5)
     advice = f"did you mean {near[0]}? There" if near else "there"
-    raise InputError(f"{option} {name}: unknown: {advice} are {', '.join(names)}")
+    raise InputError(f"{option} {name} is unknown: {advice} are {', '.join(names)}")

@@ -93,7 +93,7 @@ def check_writable(path: str | os.PathLike[str]) -> Path:
         target = Path(os.path.realpath(path))
         if target.exists() and not target.is_file():
             kind = "a folder" if target.is_dir() else "not a plain file"
-            raise InputError(f"{path}: cannot write: {kind}; give a file name")
+            raise InputError(f"{path}: cannot write, because this is {kind}: give a file name")
         if not target.parent.is_dir():
             raise InputError(f"{path}: cannot write: the folder {target.parent} does not exist; create it first")
         if not os.access(target.parent, os.W_OK | os.X_OK):
@@ -107,7 +107,7 @@ def write_json(content: Mapping[str, Any], path: Path) -> None:
 
 
 def files_in(folder: Path, endings: tuple[str, ...], *, below: bool = False) -> list[Path]:
-    """List, sorted, a folder's visible files whose names end in one of `endings`; `below` includes subfolders."""
+    """A sorted list of a folder's visible files whose names end in one of `endings`; `below` includes subfolders."""
     with reading(folder, "cannot read the folder: {reason}", OSError):
         os.scandir(folder).close()
     found = []
@@ -221,7 +221,7 @@ def file_records(folder: Path, files: Iterable[Path]) -> dict[str, dict[str, obj
 def as_recorded(folder: Path, report: str, records: object) -> bool:
     """Whether a folder still holds the files that a report lists by `file_records`.
 
-    Sizes are compared; the content is hashed if a file is newer than the report, as in a copied folder.
+    Sizes are compared. Contents are compared too if a file is newer than the report, as in a copied folder.
     """
     if not isinstance(records, Mapping) or not records:
         return False
@@ -245,7 +245,7 @@ def photo_digest(path: Path) -> str:
 
 
 def remove_half_written(*folders: Path, files: Sequence[str] | None = None) -> None:
-    """Delete temporary files that killed runs have left for `files`; None deletes all, which needs locked folders."""
+    """Delete temporary files that killed runs have left for `files`; None deletes all, but needs locked folders."""
     for folder in folders:
         for file in folder.iterdir():
             match = LEFTOVER.fullmatch(file.name)

@@ -88,7 +88,7 @@ def distance_to(near: NDArray[np.int32]) -> Tensor:
 
 @kernel
 def _propagate_nearest(hole: Any, near: Any) -> None:
-    """Give each cell the nearest cell of a neighbour if that is nearer, in four sweeps of alternating direction."""
+    """In four sweeps, give each pixel of a hole a neighbour's known pixel if that is nearer than its own."""
     height, width = hole.shape
     for turn in range(4):
         for i in range(height):
@@ -111,8 +111,8 @@ def far_fill(
     """Fill the unknown part of an inverse depth image and of further values, mostly from the far side of each hole.
 
     A moving camera uncovers the surface behind, so a hole between a near and a far surface belongs to the far surface.
-    From coarse to fine, an interpolated guess is relaxed to a membrane over the rim, with the weight
-    min(1, fill / sample)^far_bias for a rim sample.
+    From coarse to fine, each level interpolates a guess, and relaxes it to a membrane that the rim holds. A rim sample
+    has the weight min(1, fill / sample)^far_bias, with the inverse depths `fill` in the hole and `sample` at the rim.
 
     Args:
         inverse_depth: [H, W], positive at known pixels.
@@ -207,7 +207,7 @@ def _far_weight(relative: Any, bias: Any) -> Any:
 def _find_holes(known: Any, count: int) -> Any:
     """Flat positions of the n hole pixels, numbers [n, 4] of their neighbours, and flat positions of the rim's pixels.
 
-    Numbers count the hole's pixels first, then the rim's; at the image's border a pixel is its own neighbour.
+    Pixels of the rim have higher numbers than those of the hole. At the image's border, a pixel is its own neighbour.
     """
     height, width = known.shape
     holes, links = np.empty(count, np.int32), np.empty((count, AROUND), np.int32)

@@ -49,7 +49,7 @@ class Gaussians:
 
     @staticmethod
     def cat(parts: Iterable[Gaussians]) -> Gaussians:
-        """Join sets in order: the first set's Gaussians stay first, bit for bit."""
+        """Join sets in the given order, without changing a bit."""
         columns = zip(*(part.tensors for part in parts), strict=True)
         return Gaussians(*(torch.cat(column) for column in columns))
 

@@ -95,9 +95,9 @@ def load_photo(
     Args:
         path: the file.
         focal_px: focal length in pixels of the upright photo.
-        focal_mm: 35 mm equivalent of the focal length, by the diagonal.
+        focal_mm: 35 mm equivalent of the focal length, computed from the diagonal.
         fov: horizontal field of view in degrees.
-        keep_frame: keep a uniform border, which is otherwise cropped unless a focal length is given.
+        keep_frame: keep a uniform border. Otherwise the border is cropped, unless a focal length is given.
 
     Raises:
         InputError: the file is missing, broken or too large, or the focal length is invalid.
@@ -115,7 +115,7 @@ def load_photo(
 def photo_of_picture(
     picture: Image.Image | NDArray[Any] | Tensor, *, keep_frame: bool = True, **lens: float | None
 ) -> Photo:
-    """A photo from a PIL image, or from [H, W, 3] sRGB as uint8 or floats in 0..1; `lens` as for `load_photo`."""
+    """A photo from a PIL image, or from [H, W, 3] sRGB (uint8, or floats in 0..1); for `lens` see `load_photo`."""
     path, exif = Path("photo"), dict[int, object]()
     if isinstance(picture, Image.Image):
         check_pixels(picture.width, picture.height, MAX_PIXELS, path)
@@ -227,7 +227,7 @@ def film_to_pixels(focal_mm: float, width: int, height: int) -> float:
 def focal_from_exif(tags: dict[int, object], width: int, height: int) -> float | None:
     """Focal length in pixels of a width×height photo from EXIF tags (number → value), or None.
 
-    The 35 mm equivalent comes first, then the focal length with the sensor's pixel pitch, then the focal length alone.
+    Sources, best first: the 35 mm equivalent; the focal length and the sensor's pixel pitch; the focal length alone.
     """
 
     def plausible(mm: float) -> bool:

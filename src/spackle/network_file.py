@@ -54,8 +54,8 @@ def load_strict(
     Args:
         network: the network, which may be on the meta device.
         tensors: the file's tensors, see `read_tensors`.
-        path, advice: name of the file, and what to do about a wrong file, for messages.
-        prepare: converts the filled network in place, before tensors are copied from the file.
+        path, advice: the file's name, and what to do about a wrong file; both are parts of messages.
+        prepare: changes the filled network in place; tensors that it leaves mapped from the file are copied afterwards.
 
     Raises:
         InputError: tensors are missing, unknown, of another shape, or not finite.
@@ -104,7 +104,7 @@ def check_tensors(
     problems = [f"{len(names)} {kind} ({_some(names)})" for kind, names in kinds.items() if names]
     if problems:
         raise InputError(
-            f"{path}: another network's weights: of {len(expected)} tensors {'; '.join(problems)}: {advice}"
+            f"{path}: another network's weights ({'; '.join(problems)}; {len(expected)} tensors are expected): {advice}"
         )
 
 

@@ -184,7 +184,7 @@ def _hash(value: Any) -> Any:
 
 @reordering_kernel
 def _patch_cost(padded: Any, weights: Any, source: Any, y: int, x: int, v: int, u: int, bound: Any) -> Any:
-    """Weighted mean of the squared differences of two patches; infinite as soon as it must exceed the bound."""
+    """Weighted mean of the squared differences of two patches; infinite if the mean exceeds the bound."""
     total, mass = np.float32(0), np.float32(0)
     for j in range(SIDE):
         for i in range(SIDE):
@@ -234,7 +234,7 @@ def _search(
     start: int, stop: int, cells: Any, numbers: Any, before: Any, worth: Any, valid: Any, pool: Any, jump: int,
     seed: Any, padded: Any, weights: Any, own: Any, sources: Any, traits: Any, offset: Any, places: Any, costs: Any,
 ) -> None:  # fmt: skip
-    """Improve the matches of cells start..stop: try neighbours' matches, a random patch, and patches ever nearer."""
+    """Improve the matches of cells start..stop: try neighbours' matches, a random patch, and patches near the best."""
     mirrors, height, width = valid.shape
     for n in range(start, stop):
         y, x = cells[n]

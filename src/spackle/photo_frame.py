@@ -42,7 +42,7 @@ class PhotoFrame(NamedTuple):
 def find_frame(rgb: Tensor) -> PhotoFrame | None:
     """The uniform frame of an sRGB picture [H, W, 3] in 0..1, or None.
 
-    Only opposite sides of one colour with straight inner edges count, because a false frame would crop the picture.
+    Two opposite sides must have one colour and straight inner edges, because a false frame would crop the picture.
     """
     across, down = rgb.numpy().swapaxes(0, 1), rgb.numpy()
     inwards = (across, down, across[::-1], down[::-1])  # lines [N, M, 3] from the left, the top, the right, the bottom

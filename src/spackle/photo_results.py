@@ -158,7 +158,7 @@ def _measure_holes(done: CompletedPhoto, renderer: Renderer) -> list[dict[str, A
 def shared_report(
     photo: Photo, prediction: BasePrediction, choice: ResolvedBase, pipeline: Pipeline, reporter: Reporter
 ) -> dict[str, Any]:
-    """Fields of the reports of photos and clips, ready for JSON."""
+    """The fields that reports of photos and of clips have in common, ready for JSON."""
     path, weights = pipeline.options.path, pipeline.options.fill.weights
     given = path.cameras or path.path
     report: dict[str, Any] = {

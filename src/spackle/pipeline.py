@@ -84,7 +84,7 @@ class Options:
 
 @dataclasses.dataclass(frozen=True)
 class CompletedPhoto:
-    """A photo's scene, with the results of the stages before."""
+    """A photo's scene, and the results from which it was made."""
 
     photo: Photo  # at its full size
     prediction: BasePrediction

@@ -1,4 +1,4 @@
-"""Progress of long work: bars on a terminal, lines in a log; and the end of long work at Ctrl-C."""
+"""Show the progress of long work as bars on a terminal or lines in a log, and end long work at Ctrl-C."""
 
 from __future__ import annotations
 

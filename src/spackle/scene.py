@@ -187,7 +187,7 @@ class Scene:
         Args:
             target: a path, or a file that is open for writing bytes.
             trajectory, disparity: see `path`.
-            frames: number of frames, by default 4 seconds.
+            frames: number of frames; by default, the video lasts 4 seconds.
             fps: frames per second.
             loop: see `spackle.formats.VideoWriter`.
             overscan: relative gain in focal length, which hides most of the fill beyond the photo's border.

@@ -52,8 +52,8 @@ class Spackle:
 
         Args:
             base: a name as for `--base`, or a loaded base, such as `SharpBase.load(weights)`. "auto" takes the best
-                base for each photo: a depth map, SHARP or MoGe if their weights have been downloaded, or the rough
-                lite. The choice is logged to the logger "spackle".
+                base for each photo: a depth map, SHARP or MoGe if their weights have been downloaded, or else
+                "lite", which is rough. The choice is logged to the logger "spackle".
             residual: a weight file, a loaded network, "seeds" to fill without a network, or "none" to keep the holes;
                 None takes the weights that come with Spackle.
             fill: source of the texture in the holes, see `spackle.pipeline.open_texture`; "none" keeps the holes.
@@ -89,7 +89,7 @@ class Spackle:
     ) -> Scene:
         """Turn a photo into a scene without holes along a camera path; see `spackle.predict`."""
         if depth is not None and self._given:
-            raise InputError('a depth map and a base are given: give only one of the two, or base="rgbd"')
+            raise InputError('a depth map and a base are given: leave one of them out, or give base="rgbd"')
         lens = {"focal_px": focal_px, "focal_mm": focal_mm, "fov": fov}
         if isinstance(photo, Photo) and lens != dict.fromkeys(lens):
             raise InputError("a loaded photo has a focal length already: give focal_px, focal_mm or fov to load_photo")
@@ -131,16 +131,16 @@ def predict(
 
     Args:
         photo: a path, the bytes of a file, an open file, a PIL picture, a loaded photo, or an array or tensor
-            [H, W, 3] of sRGB, uint8 or floats in 0..1.
-        depth: the photo's depth: a path, bytes or an open file in a format of `load_depth`, an array or tensor [H, W]
+            [H, W, 3] of sRGB as uint8 or as floats in 0..1.
+        depth: the photo's depth as a path, bytes or an open file in a format of `load_depth`, an array or tensor [H, W]
             in metres (0, NaN or inf: unknown), or a loaded depth map.
         base, residual, fill, device, renderer: see `Spackle`.
         trajectory: the path for which the scene is completed, in addition to the leftmost and rightmost views.
         disparity: size of the camera's movement, see `spackle.camera_path.max_offset`; None lets `choose_move` decide,
             with a limit of 0.15 for lite and 0.3 for other bases.
         depth_kind: the meaning of a depth map's numbers, see `spackle.load_depth`.
-        keep_frame: keep a uniform frame around a picture, which is otherwise cropped unless depth or a focal length is
-            given.
+        keep_frame: keep a uniform frame around a picture. Otherwise the frame is cropped, unless depth or a focal
+            length is given.
         focal_px, focal_mm, fov: the focal length, see `load_photo`.
         progress: draw a bar on the standard error.
 
@@ -164,7 +164,7 @@ def predict(
 
 @contextlib.contextmanager
 def _photo(source: PhotoSource, **options: Any) -> Iterator[Photo]:
-    """Load the photo; bytes get a temporary file during the block, from which a base can read the photo's depth."""
+    """Load the photo; during the block, bytes lie in a temporary file, from which a base can read the photo's depth."""
     if isinstance(source, Photo):
         yield source
     elif isinstance(source, Image.Image | np.ndarray | Tensor):
@@ -188,7 +188,7 @@ def _depth(source: DepthSource, kind: DepthKind) -> Iterator[Path | DepthMap]:
 
 @contextlib.contextmanager
 def _as_file(source: str | os.PathLike[str] | bytes | BinaryIO, kind: str) -> Iterator[Path]:
-    """A path to the source's bytes; messages call a temporary file `kind`."""
+    """A path to the source's bytes; messages contain `kind` instead of the name of a temporary file."""
     if isinstance(source, str | os.PathLike):
         yield Path(source)
         return

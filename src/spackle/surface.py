@@ -60,7 +60,7 @@ def surface_gaussians(
 
 
 def _principal_axes(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-    """Frames [N, 3, 3] (columns: axes of the ellipse a·cos t + b·sin t, normal) and in-plane lengths [N, 2]."""
+    """Axes and normals of the ellipses a·cos t + b·sin t, as columns [N, 3, 3], and the lengths of the axes [N, 2]."""
     theta = 0.5 * torch.atan2(2 * (a * b).sum(-1), (a * a).sum(-1) - (b * b).sum(-1))[:, None]
     p = a * theta.cos() + b * theta.sin()
     q = b * theta.cos() - a * theta.sin()
@@ -72,8 +72,8 @@ def _principal_axes(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
 def surface_slope(inverse_depth: Tensor) -> Tensor:
     """Derivative of the inverse depth by pixel x and y, [H, W, 2], that never crosses a depth edge.
 
-    The inverse depth of a plane is linear in the pixel, so the differences to both neighbours agree. If they differ,
-    the flatter one is used; if even the flatter one is steep, the slope is 0.
+    The inverse depth of a plane changes linearly across the image, so the differences to both neighbours agree. If
+    they differ, the smaller one is used; if even the smaller one is large, the slope is 0.
 
     Args:
         inverse_depth: [H, W] float32 or float64, positive everywhere; gradients do not pass.

@@ -65,8 +65,8 @@ class Stereo:
     def pack(self, left: Tensor, right: Tensor) -> Tensor:
         """Combine the eyes' images [H, W, 3], sRGB, in one frame.
 
-        sbs [H, 2W, 3] has the left eye on the left, ou [2H, W, 3] on top; the half variants squeeze the frame to
-        [H, W, 3] (an odd side grows by one); anaglyph is for glasses with the red filter on the left eye.
+        In sbs [H, 2W, 3] the left eye is on the left, in ou [2H, W, 3] on top. The half variants squeeze the frame to
+        [H, W, 3] (an odd side grows by one). Anaglyph is for glasses with the red filter on the left eye.
         """
         if self.layout == "anaglyph":
             return anaglyph(left, right)
@@ -97,7 +97,7 @@ def anaglyph(left: Tensor, right: Tensor) -> Tensor:
 
 
 def _halved(picture: Tensor, side: bool) -> Tensor:
-    """Halve an image's width (if `side`) or height in linear light."""
+    """Halve an image's width (`side`) or its height (not `side`), in linear light."""
     height, width = picture.shape[:2]
     size = (height, (width + 1) // 2) if side else ((height + 1) // 2, width)
     light = srgb_to_linear(picture).permute(2, 0, 1)[None]
@@ -160,7 +160,7 @@ class VideoOptions:
         suffix = file.suffix.lower()
         meant = "mp4" if suffix in (".m4v", ".mov") else cast(VideoFormat, suffix[1:])
         if self.format not in (None, meant):
-            raise InputError(f"--format {self.format}: {file} is a name for {meant}: leave one of them out")
+            raise InputError(f"--format {self.format}: the name {file} means {meant}: leave one of them out")
         return dataclasses.replace(self, format=meant)
 
 
@@ -205,7 +205,7 @@ class FrameMaker:
         return (camera,) if self.stereo is None else self.stereo.eyes(camera)
 
     def frame(self, views: Sequence[Rendering]) -> Tensor:
-        """One frame [H, W, 3], sRGB, from renderings of `eyes`, or, with `compare`, of base and scene."""
+        """One sRGB frame [H, W, 3] from renderings of `eyes`; with `compare`, from renderings of base and scene."""
         pictures = [v.rgb if self.depth is None else self.depth(v.depth, v.alpha >= COVERED) for v in views]
         if self.canvas is not None:
             pictures = [with_margins(picture, *self.canvas, self.options.fit == "blur") for picture in pictures]

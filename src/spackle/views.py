@@ -83,13 +83,13 @@ class PathOptions:
     def fly(
         self, gaussians: Gaussians, camera: Camera, keyframes: KeyframePath | None, disparity: float = USUAL_DISPARITY
     ) -> list[Camera]:
-        """The cameras of a video through keyframes or along the trajectory, of the photo's size made even.
+        """The cameras of a video through keyframes or along the trajectory; sides of odd size grow by a pixel.
 
         Args:
             gaussians: the scene, whose depths determine the path's length.
             camera: the photo's camera.
             keyframes: the keyframes of --path.
-            disparity: default for the options' disparity.
+            disparity: used if the options give no disparity.
 
         Raises:
             PathError: the keyframes give no usable path.
@@ -130,10 +130,10 @@ NO_PATH = "no camera path: {reason}: check the depth map and the focal length"
 
 @torch.no_grad()
 def choose_move(prediction: BasePrediction, renderer: Renderer, source: Path) -> BasePrediction:
-    """Replace the prediction's disparity by the largest one whose holes stay within `prediction.uncovered`.
+    """Replace the prediction's disparity by the largest one with a hole-area ratio of at most `prediction.uncovered`.
 
-    The usual disparity is the upper limit. Holes are the mean hole-area ratio (eq. 11) of the leftmost and the
-    rightmost view, measured in coarse renderings. The notes get this ratio and the usual disparity.
+    The usual disparity is the upper limit. Coarse renderings measure the mean hole-area ratio (eq. 11) of the
+    leftmost and the rightmost view. The ratio and the usual disparity are added to the notes.
 
     Raises:
         InputError: the depths and the focal length of the photo `source` allow no camera path.

@@ -41,7 +41,7 @@ def at_work(
     Args:
         open_worker: makes an object whose `make(job)` returns a job's result; called once in each process. The
             function, jobs and results are pickled.
-        stop: whether the user has asked the command to end; the death of a process then only ends the results.
+        stop: whether the user has asked the command to end; if so, a dead process is no error, but ends the results.
         count: number of processes; with 1, jobs run in this process.
         threads: torch's threads in each process.
         gpu: whether each process uses one GPU.
@@ -76,7 +76,7 @@ def _results(pool: ProcessPoolExecutor, jobs: Sequence[Any], most: int, stop: Ca
     except BrokenProcessPool as error:
         if not stop():
             raise InputError(
-                "a worker process died, most likely for want of memory: take fewer --workers; the same command resumes"
+                "a worker process died, probably because memory ran out: give fewer --workers; the same command resumes"
             ) from error
 
 
@@ -85,7 +85,7 @@ _open_worker: Callable[[], Any]
 
 
 def _start(threads: int, open_worker: Callable[[], Any], numbers: Any) -> None:
-    """Set up a process: it ignores Ctrl-C, ends with the main process, and takes a GPU by `numbers`."""
+    """Set up a process: it ignores Ctrl-C, ends with the main process, and takes the GPU of the next of `numbers`."""
     global _open_worker
     _open_worker = functools.cache(open_worker)
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -28,7 +28,7 @@ def test_only_holes_change_and_results_repeat(name: str) -> None:
 
 
 def test_an_unknown_inpainter_is_refused() -> None:
-    with pytest.raises(InputError, match="inpainter nobody: unknown"):
+    with pytest.raises(InputError, match="inpainter nobody is unknown"):
         get_inpainter("nobody", InpainterOptions())
 
 

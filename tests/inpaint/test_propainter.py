@@ -153,8 +153,8 @@ def test_missing_weights_are_refused(tmp_path: Path) -> None:
     published = [f"{name}-0000-d74fed4b.pth" for name in NETWORKS]
     for given, files, said in (
         (None, [], "give a folder with one file for each of raft_things, .* unpacked from https"),
-        (tmp_path / "missing", [], "has 0 files raft_things"),
-        (tmp_path, [*published, "propainter.safetensors"], "has 2 files propainter-"),
+        (tmp_path / "missing", [], "holds 0 files named raft_things"),
+        (tmp_path, [*published, "propainter.safetensors"], "holds 2 files named propainter-"),
     ):
         for name in files:
             (tmp_path / name).write_bytes(b"")

@@ -180,7 +180,7 @@ def test_other_files_are_refused(tmp_path: Path, content: object) -> None:
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"linear.bias": None}, "of 2 tensors 1 missing (linear.bias): give another"),
+        ({"linear.bias": None}, "(1 missing (linear.bias); 2 tensors are expected): give another"),
         ({f"more{n}": torch.ones(1) for n in range(5)}, "5 unknown (more0, more1, more2, and 2 more)"),
         ({"linear.bias": torch.ones(3)}, "1 of another shape (linear.bias [3] instead of [2])"),
         ({"linear.bias": torch.ones(2).int()}, "1 not of floats (linear.bias)"),

@@ -79,7 +79,7 @@ def test_the_interface_is_described(server: Served) -> None:
         ('{"disparity": 3}', "disparity"),
         ('{"files": ["../../etc/passwd"]}', "files"),
         ('{"path": 1}', "path: Extra"),
-        ('{"base": "hf:/etc"}', "base hf:/etc: unknown"),
+        ('{"base": "hf:/etc"}', "base hf:/etc is unknown"),
     ],
 )
 def test_options_are_checked(server: Served, options: str, why: str) -> None:

@@ -83,9 +83,9 @@ class LamaInpainter:
 
 
 def groups_of(hole: Tensor) -> list[tuple[Crop, Crop]]:
-    """Rectangles around groups of holes [H, W], each with the larger crop for the network.
+    """Rectangles around groups of holes [H, W], each with the larger crop that the network receives.
 
-    Two rectangles are merged if they touch, or if a common crop has fewer pixels than two crops.
+    Two rectangles are merged if they touch, or if one common crop has no more pixels than the two crops.
     """
 
     def seen(group: Crop) -> Crop:
@@ -115,7 +115,7 @@ def padded(x: Tensor) -> Tensor:
 
 
 def load_network(path: Path) -> LamaNetwork:
-    """Load the network, of any width and depth, from TorchScript (as data), `torch.save` or safetensors.
+    """Load the network, of any width and depth, from TorchScript (without running code), `torch.save` or safetensors.
 
     Names of tensors may begin with the path to the generator; tensors of other networks are ignored. InputError if the
     file is missing or broken, or holds another network.
@@ -186,7 +186,7 @@ def _last_stage(blocks: int) -> int:
 
 
 class LamaNetwork(nn.Module):
-    """Predicts colours for the holes of an image whose sides are multiples of 8, at least 16; for inference alone.
+    """Predicts colours in the holes of an image; for inference only. Sides must be multiples of 8, and at least 16.
 
     Batch norms are folded into the convolutions before them; memory is channels-last.
     """

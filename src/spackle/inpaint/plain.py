@@ -27,7 +27,7 @@ class PlainInpainter:
 
 
 class ExemplarInpainter(PlainInpainter):
-    """Paints each view by itself by PatchMatch, with patches of the view; holes start with the far rim's colours."""
+    """Fills each view with patches of this view (PatchMatch); the search starts from the colours of the far rim."""
 
     name = "exemplar"
     version = "1"
@@ -84,7 +84,7 @@ def _bytes(rgb: Tensor) -> Tensor:
 
 
 class OpencvInpainter(PlainInpainter):
-    """Paints each view by itself by Telea's method: fast, without depth."""
+    """Paints each view separately with Telea's method, which is fast and ignores depth."""
 
     name = "opencv"
 

@@ -69,7 +69,7 @@ class PropainterInpainter:
         return torch.where(hole[..., None], painted, rgb)
 
     def _fill(self, frames: Tensor, holes: Tensor) -> Tensor:
-        """Repaint frames [V, 3, h, w] in 0..1 in and around the holes [V, 1, h, w], 1 in a hole."""
+        """Repaint frames [V, 3, h, w] (values 0..1) in and around the holes; `holes` [V, 1, h, w] is 1 in a hole."""
         from pytorchcv.models.propainter_stream import ProPainterIterator, TensorSequencer
 
         count, _, height, width = frames.shape
@@ -115,15 +115,15 @@ def _network(name: str, file: Path) -> nn.Module:
 
 
 def weight_files(folder: Path | None) -> dict[str, Path]:
-    """The files NAME.pth, NAME-….pth or .safetensors of all `NETWORKS` in a folder; InputError unless one file each."""
+    """The file NAME.pth, NAME-….pth or .safetensors of each of `NETWORKS`; InputError for a missing or second file."""
     files = {}
     for network in NETWORKS:
         pattern = rf"{network}(-.*)?\.(pth|safetensors)"
         found = [] if folder is None else [file for file in folder.glob("*") if re.fullmatch(pattern, file.name)]
         if len(found) != 1:
             raise InputError(
-                f"--inpainter-weights {folder}: has {len(found)} files {network}-….pth: give a folder with one file "
-                f"for each of {', '.join(NETWORKS)}, unpacked from {SOURCE}"
+                f"--inpainter-weights {folder}: holds {len(found)} files named {network}-….pth: give a folder with one "
+                f"file for each of {', '.join(NETWORKS)}, unpacked from {SOURCE}"
             )
         files[network] = found[0]
     return files

@@ -171,7 +171,7 @@ def pixel_index(row: int, column: int) -> int:
 
 @kernel
 def blend_splats(state: Array, records: Array, count: int, left: int, top: int) -> None:
-    """Draw the first `count` records into a tile; in a separate function, constants stay in registers."""
+    """Draw the first `count` records into a tile; a separate function, so that constants stay in registers."""
     for index in range(count):
         blend_splat(state, records[index], left, top)
 
@@ -214,7 +214,7 @@ def store_color(state: Array, left: int, top: int, rows: int, columns: int, imag
 
 @kernel
 def blend_tiles(first: int, last: int, tiles: Array, lists: TileLists, records: Array, images: Arrays) -> None:
-    """Draw the tiles first..last of `tiles` [K] into images: rgb [H, W, 3], depth, alpha, linear colour or empty."""
+    """Draw the tiles first..last of `tiles` [K] into the images rgb, depth, alpha and (unless empty) linear colour."""
     ids, starts = lists
     columns = (images[1].shape[1] + TILE - 1) // TILE
     state, near = np.empty(STATE, np.float32), np.empty((CHECK_EVERY, RECORD), np.float32)

@@ -61,7 +61,7 @@ class Drawing:
     images: Arrays  # float32: rgb [H, W, 3] sRGB, depth [H, W], alpha [H, W], linear colour [H, W, 3] or [0, 0, 3]
 
     def rendering(self) -> Rendering:
-        """The images as tensors that share memory."""
+        """The images as tensors that share the arrays' memory."""
         return Rendering(*(torch.from_numpy(image) for image in self.images[:3]))
 
 
@@ -104,7 +104,7 @@ def as_array(tensor: Tensor) -> Array:
 
 
 def wanted_tiles(view: KernelCamera, tiles: Tensor | None) -> Array:
-    """The tiles to draw [rows, columns] bool; all for None."""
+    """The tiles to draw, [rows, columns] bool; if `tiles` is None, all tiles."""
     if tiles is None:
         return np.ones(view.tiles, np.bool_)
     check_tiles(tiles, view.height, view.width)

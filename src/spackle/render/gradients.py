@@ -1,7 +1,7 @@
 """The gradient of a rendering.
 
-Each tile is drawn again in chunks of Gaussians. The Gaussians of a chunk are then visited back to front, which gives
-gradients of the splats, and from these the gradients of the Gaussians.
+Each tile is drawn again in chunks of Gaussians. The Gaussians of a chunk are then visited back to front. This gives
+gradients of the projected Gaussians, from which the gradients of the Gaussians follow.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def draw(sets: Sequence[Gaussians], view: KernelCamera, wanted: Array, onto: Ren
 
 
 class Draw(torch.autograd.Function):
-    """Draws sets of Gaussians, given as flat sequence of tensors, over three images."""
+    """Draws sets of Gaussians over three images; the sets are given as one flat sequence of tensors."""
 
     @staticmethod
     def forward(ctx: Any, view: KernelCamera, wanted: Array, *tensors: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
@@ -176,7 +176,7 @@ def pass_row(work: Array, offset: np.uint64, notes: Array, note: np.uint64, look
 def gather_row(
     work: Array, offset: np.uint64, notes: Array, note: np.uint64, center: np.float32, look: Numbers
 ) -> tuple[np.float32, np.float32, np.float32, np.float32, np.float32, np.float32, np.float32]:
-    """Step back over a row of a Gaussian, and return the sums (see SUMS, without dy) over the row's pixels."""
+    """Step back over a row of a Gaussian; return its sums over pixels, those of SUMS that do not contain dy."""
     red, green, blue, depth = look
     sum_v, sum_vu, sum_vuu = ZERO, ZERO, ZERO
     sum_red, sum_green, sum_blue, sum_depth = ZERO, ZERO, ZERO, ZERO
@@ -207,7 +207,7 @@ def gather_row(
 def walk_back(
     work: Array, notes: Array, note: np.uint64, record: Array, left: int, top: int, wanted: bool, sums: Array
 ) -> None:
-    """Step back over a Gaussian, whose notes begin at `note`; if `wanted`, add to `sums` [SUMS]."""
+    """Step back over a Gaussian, whose saved values begin at `note`; if `wanted`, add its sums to `sums` [SUMS]."""
     x, y, slope, _, fall, height, _, half_height, depth, red, green, blue = in_tile(record, left, top)
     look, (first, last) = (red, green, blue, depth), span_of(y, half_height)
     for row in range(first, last):
@@ -258,7 +258,7 @@ def backward_tile(room: Arrays, records: Array, ids: Array, wanted: Array, left:
     """Compute the gradients of a tile with the list `ids` [n], for the entries `wanted` [n] bool.
 
     Args:
-        room: three buffers: [WORKSPACE] with loaded gradients, [NOTES], [CHUNK] for the start of each Gaussian's notes.
+        room: [WORKSPACE], filled by `load_gradients`; [NOTES]; and [CHUNK] for the start of each Gaussian's notes.
         sums: [m, SUMS], one row for each wanted entry.
     """
     work, notes, first_notes = room
@@ -292,7 +292,7 @@ def backward_tiles(
 ) -> None:  # fmt: skip
     """Compute the gradients of the tiles first..last of `tiles` [K], for the entries `wanted` [E] bool.
 
-    `slots` [T + 1] int64 has the start of each tile's rows in `sums` [M, SUMS], initially zeros.
+    `slots` [T + 1] int64 has the start of each tile's rows in `sums` [M, SUMS]; `sums` must be zero at first.
     """
     room = np.empty(WORKSPACE, np.float32), np.empty(NOTES, np.float32), np.empty(CHUNK, np.uint64)
     columns = (images[1].shape[1] + TILE - 1) // TILE
@@ -306,7 +306,7 @@ def backward_tiles(
 
 @kernel
 def collect_sums(first: int, last: int, share: int, rows: Array, sums: Array, table: Array) -> None:
-    """Add `sums` [M, SUMS] to the rows first·share to last·share of the table [G, SUMS]; `rows` [M] are the places."""
+    """Add `sums` [M, SUMS] to the rows `rows` [M] of the table [G, SUMS], but only to rows first·share..last·share."""
     for slot in range(len(rows)):
         row = rows[slot]
         if first * share <= row < last * share:
@@ -346,7 +346,7 @@ def project_backward(
 
 @kernel
 def splat_backward(row: Array, factors: Numbers, eps2d: float, factor_grad: Array) -> tuple[float, float]:
-    """Turn sums over pixels into gradients of the factor M, written to `factor_grad`, and of the centre, returned.
+    """Turn sums over pixels into gradients of the factor M (written to `factor_grad`) and of the centre (returned).
 
     For a pixel at d from the centre, ∂ln(alpha)/∂centre = p and ∂ln(alpha)/∂Σ = ½ p pᵀ with p = Σ⁻¹ d
     = (A·u, D·dy - k·A·u), with A = Σyy/det, D = 1/Σyy and the slope k = Σxy/Σyy.

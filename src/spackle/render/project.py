@@ -52,7 +52,7 @@ class KernelCamera(NamedTuple):
 
     @staticmethod
     def of(camera: Camera, eps2d: float) -> KernelCamera:
-        """Read a camera's matrices; the bounds are gsplat's."""
+        """Read a camera's matrices; the bounds for the Jacobian are those of gsplat."""
         K = camera.K.detach().double().cpu().numpy()
         pose = np.ascontiguousarray(camera.world_to_camera.detach().double().cpu().numpy()[:3])
         fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]

@@ -58,8 +58,8 @@ def blend(gaussians: Gaussians, camera: Camera, eps2d: float) -> Rendering:
 def project_covariances(gaussians: Gaussians, camera: Camera, eps2d: float) -> Tensor:
     """Image-space covariances J W Σ Wᵀ Jᵀ + eps2d·I, [N, 2, 2].
 
-    J is the projection's Jacobian at the centre; far outside of the image, at the border of a frame of 1.3 times the
-    image's size, as in gsplat.
+    J is the projection's Jacobian at the centre. As in gsplat, a centre far outside of the image is first moved to the
+    border of a frame of 1.3 times the image's size.
     """
     x, y, z = camera.to_camera(gaussians.means).unbind(-1)
     (fx, fy), K = camera.focal, camera.K.to(x)

@@ -183,7 +183,7 @@ def load_residual(path: str | os.PathLike[str]) -> ResidualNet:
 
 
 def decoder_size(tensors: Mapping[str, Tensor]) -> SharpConfig:
-    """SHARP's size, judged by the tensors of a file; the published size if the file holds no decoder."""
+    """The size of the SHARP decoder in a file, from its tensors; the published size if there is no decoder."""
     last = tensors.get("feature_model.fusion.out_conv.bias")
     width = FULL.gaussian_width if last is None else last.numel()
     return next((config for config in CONFIGS.values() if config.gaussian_width == width), FULL)

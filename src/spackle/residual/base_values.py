@@ -72,7 +72,7 @@ def inside_photo(inverse_depth: Tensor, camera: Camera, photo_camera: Camera) ->
 def seen_in_photo(
     photo: Tensor, elsewhere: Tensor, inverse_depth: Tensor, camera: Camera, photo_camera: Camera
 ) -> Tensor:
-    """[h, w, 3] sRGB: the colour of the photo [H, W, 3] at the point of each cell; outside of the photo `elsewhere`."""
+    """[h, w, 3] sRGB: the colour of the photo [H, W, 3] at each cell's point; `elsewhere` outside of the photo."""
     place, z = _place_in_photo(inverse_depth, camera, photo_camera)
     cells = avg_pool2d(photo.cpu().movedim(-1, 0)[None], CELL, ceil_mode=True, count_include_pad=False)
     grid = (2 * place / z.clamp_min(LEAST) - 1).clamp(-2, 2).to(cells)[None]
@@ -81,7 +81,7 @@ def seen_in_photo(
 
 
 def _place_in_photo(inverse_depth: Tensor, camera: Camera, photo_camera: Camera) -> tuple[Tensor, Tensor]:
-    """Points of cells projected into the photo: (x, y)·z [h, w, 2] with x and y in 0..1 inside, and z [h, w, 1]."""
+    """Project cells' points into the photo: (x, y)·z [h, w, 2] and z [h, w, 1]; in the photo x and y are in 0..1."""
     rays, motion = _rays_in_photo(cell_centers(camera).double(), camera, photo_camera)
     points, lens = rays + inverse_depth[..., None] * motion[:3, 3], photo_camera.K.cpu().double()
     place, z = points[..., :2] * lens.diagonal()[:2] + points[..., 2:] * lens[:2, 2], points[..., 2:]
@@ -161,16 +161,16 @@ def walk(
 
     Args:
         uv: [h, w, 2] pixels of the cells.
-        values: [h, w, c] to read at the rim.
+        values: [h, w, c], read at the rim.
         inverse_depth: [h, w], positive.
         mask: [h, w] bool.
         camera: of the view.
         eye: [3] position of the other camera; its projection into the view is the epipole.
 
     Returns:
-        Values [h, w, c] at the far rim; values [h, w, c] at the cell's mirror image beyond the rim, or at the rim if
-        the mirror image lies on another surface; distance [h, w] to the rim in cells. Unmasked cells, and cells whose
-        line meets no surface, have their own values and distance 0.
+        Values [h, w, c] at the far rim; values [h, w, c] at the cell's mirror image beyond the rim; distance [h, w] to
+        the rim in cells. If the mirror image lies on another surface, the rim's values replace it. Unmasked cells, and
+        cells whose line meets no surface, have their own values and distance 0.
     """
     eye = eye.double()
     # Homogeneous, because the epipole may lie at infinity.
@@ -225,7 +225,7 @@ def _line(epipole: Any, u: float, v: float) -> Any:
 
 @kernel
 def _steps_to_rim(mask: Any, y: int, x: int, dy: float, dx: float) -> int:
-    """The number of steps of one cell to the first unmasked cell; 0 if the image ends before."""
+    """The number of one-cell steps to the first unmasked cell; 0 if the steps leave the image first."""
     height, width = mask.shape
     k = 1
     while True:

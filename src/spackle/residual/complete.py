@@ -53,7 +53,7 @@ def complete_view(
         renderer: ℛ.
         network: f_res, on any device; None: all deltas are 0.
         threshold: τ_α.
-        least: if fewer cells are masked, the `least` least opaque cells are used (paper, training details: 64).
+        least: if fewer cells are masked, this number of the least opaque cells is used (paper, training details: 64).
         rendering: ℛ(𝒢_base, v), if already available.
         photo: I as [H, W, 3] sRGB, for a network that `sees_photo`; None: the rendering of the base.
         precision: of the network; auto is bfloat16 if the hardware multiplies it natively.

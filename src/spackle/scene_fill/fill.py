@@ -44,7 +44,7 @@ EVERY = (slice(None, None, COARSE),) * 2  # the cells that have an underlay Gaus
 
 @dataclasses.dataclass(frozen=True)
 class FillContext:
-    """The base of a photo, and all settings that fill the holes of its views."""
+    """The base of a photo, and all settings for filling the holes of its views."""
 
     base: Gaussians
     photo_camera: Camera
@@ -129,8 +129,8 @@ def fill_scene(
 
     Views are visited in the order of `farthest_first`. Each view is rendered with base Gaussians and all earlier aux
     Gaussians, and then gets new aux Gaussians in its holes and beneath the rims of its holes. New Gaussians lie behind
-    all surfaces that the photo, the widest views and earlier views show. The two widest views get their rim underlays
-    last: one view may show, and fill better, what lies beneath a rim of the other view.
+    all surfaces that the photo, the widest views and earlier views show. The rims of the first two views get
+    underlays once both views are filled, because one view may show, and fill better, what the other's rims hide.
 
     Args:
         context: the photo's base and the settings of the fill.

@@ -48,7 +48,7 @@ def push_behind(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) -
 
 
 def moved_away(aux: Gaussians, eye: Tensor, factors: Tensor) -> Gaussians:
-    """Scale N Gaussians about the eye [3] by factors [N], without change from the eye; factor 0 removes a Gaussian."""
+    """Scale Gaussians about the eye [3] by factors [N]; the eye sees no change. Factor 0 removes a Gaussian."""
     eye, factor = beside(eye, aux.means), factors[:, None]
     moved = dataclasses.replace(aux, means=eye + factor * (aux.means - eye), scales=aux.scales * factor)
     return moved.select(factors > 0)
@@ -80,7 +80,7 @@ def free_factors(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) 
 
 
 def without_pits(depths: Tensor, cells: Tensor) -> Tensor:
-    """Depths [n] of the cells `cells` ([h, w] bool), after a morphological closing that removes narrow near spots."""
+    """Depths [n] of the cells `cells` ([h, w] bool), after a morphological closing that removes narrow near parts."""
     reach = max(1, round(PIT * cells.shape[1]))
     grid = depths.new_zeros(cells.shape)
     grid[cells] = depths

@@ -63,10 +63,10 @@ def painted_texture(painter: Inpainter, view: HoleView) -> Tensor:
 
 
 def patch_blocks(patches: Patches, blocks: Tensor) -> Tensor:
-    """Fill the masked cells of an image, [H, W, k, k, c] by cell, with blocks from elsewhere in the image.
+    """Fill the blocks [H, W, k, k, c] of an image's masked cells with blocks from elsewhere in the image.
 
-    A filled block is a weighted mean of the blocks that the matches of its cell and of the eight neighbours propose;
-    better matches weigh more. `Patches.rgb`, a vote of whole patches, loses fine detail.
+    The matches of a cell and of its eight neighbours each propose a block. The filled block is the weighted mean of
+    these blocks; better matches weigh more. `Patches.rgb`, a vote of whole patches, loses fine detail.
     """
     height, width = patches.mismatch.shape
     sources = torch.stack([blocks, blocks.flip(1, 3)])
@@ -122,7 +122,7 @@ def extended(view: HoleView) -> Tensor:
 
 
 def sharpened(wanted: Tensor) -> Tensor:
-    """Colours [H, W, c] of Gaussians that, blurred by overlap, show the wanted colours [H, W, c]; by Jacobi steps."""
+    """Colours [H, W, c] that Gaussians need to show the `wanted` colours although they overlap; by Jacobi steps."""
     colors = wanted
     for _ in range(STEPS):
         colors = colors + wanted - blurred(colors, OVERLAP_PX)

@@ -198,7 +198,7 @@ def accept(form: FormData, folder: Path, jobs: Jobs, bases: list[str]) -> Job:
         line = f"{'.'.join(map(str, ('options', *first['loc'])))}: {first['msg']}"
         raise HTTPException(422, one_line(line)) from error
     if options.base not in (None, *bases):
-        raise HTTPException(422, one_line(f"base {options.base}: unknown: there are {', '.join(bases)}"))
+        raise HTTPException(422, one_line(f"base {options.base} is unknown: there are {', '.join(bases)}"))
     source, of_depth = _saved(photo, folder, "source", name, PHOTO_SUFFIXES), None
     if isinstance(depth, UploadFile) and depth.filename:
         of_depth = _saved(depth, folder, "depth", "depth map", DEPTH_SUFFIXES)
