@@ -6,7 +6,7 @@ import functools
 
 import torch
 from scenes import box_before_wall
-from torch import Tensor, nn
+from torch import Tensor
 
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, extremes
@@ -64,18 +64,3 @@ def shipped() -> ResidualNet:
     network = shipped_network()
     assert network is not None
     return network
-
-
-class CountingNetwork(ResidualNet):
-    """Counts the cells that a network processes."""
-
-    name, sees_photo, local = "counting", False, True
-
-    def __init__(self, network: nn.Module) -> None:
-        super().__init__()
-        self.network, self.cells = network, 0
-
-    def forward(self, features: Tensor) -> Tensor:
-        self.cells += features[0, 0].numel()
-        out: Tensor = self.network(features)
-        return out

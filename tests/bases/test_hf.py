@@ -24,7 +24,7 @@ from torch.nn.functional import interpolate
 
 from spackle.bases import NEAREST_M, hf
 from spackle.bases.depth_map import DepthMap
-from spackle.bases.hf import FARTHEST_M, HfBase, meaning_of, to_depth_map
+from spackle.bases.hf import FARTHEST_M, HfBase, meaning_of
 from spackle.bases.lift import lift
 from spackle.errors import InputError
 from spackle.image import DEFAULT_FOCAL_MM, Photo
@@ -142,24 +142,6 @@ def test_depth_lies_where_the_photo_shows_it(
         first, last = (int(seen.nonzero().flatten()[end]) for end in (0, -1))
         assert pixel * first == pytest.approx(sides[1], abs=within * pixel)
         assert pixel * (last + 1) == pytest.approx(sides[2], abs=within * pixel)
-
-
-def test_relative_disparity_runs_from_30_m_to_1_5_m() -> None:
-    def relative(raw: Tensor) -> DepthMap:
-        return to_depth_map(raw, "relative disparity", 1.0, "hf:x", Path("photo.png"))
-
-    raw = torch.linspace(0, 7, 101).expand(50, 101).contiguous()
-    found = relative(raw)
-    assert (float(found.depth.min()), float(found.depth.max())) == pytest.approx((1.5, 30.0))
-    assert found.quantity == "disparity"
-    steps = (1 / found.depth[0]).diff()
-    torch.testing.assert_close(steps, steps.mean().expand(100), rtol=1e-3, atol=0)  # planes stay planes
-    torch.testing.assert_close(relative(1000 * raw).depth, found.depth)
-    wall = relative(5 + 0.05 * torch.rand(40, 50, generator=torch.Generator().manual_seed(0))).depth  # from the front
-    assert 1.5 <= float(wall.min()) < float(wall.max()) < 1.6
-    raw = torch.tensor([[0.5, 1.0, 2.0, 0.0, 1e9]])  # Depth Pro's scale goes by the focal length in photo widths
-    found = to_depth_map(raw, "canonical disparity", 0.8, "hf:x", Path("photo.png"))
-    torch.testing.assert_close(found.depth, torch.tensor([[1.6, 0.8, 0.4, 1e4, 1e-4]]))  # its limits: 10 km, 0.1 mm
 
 
 def test_depth_pro_gives_an_unknown_focal_length_and_scales_its_depth_to_a_known_one(

@@ -160,7 +160,6 @@ def test_slanted_ground_has_no_pinholes(axis: int, kind: str) -> None:
 
 
 def test_rounded_disparities_leave_no_stairs() -> None:
-    """Integer disparities cut a slanted wall into slices with gaps, unless they are smoothed."""
     scene = slanted_plane(2, 4, 1)
     quantum = 0.005
     stored = (1 / scene.depth / quantum).round() * quantum

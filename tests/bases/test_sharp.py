@@ -138,7 +138,6 @@ def test_odd_photos_become_gaussians_in_front_of_their_camera(tmp_path: Path, na
 
 
 def test_depth_goes_with_focal_length_over_width() -> None:
-    """Depths grow with the focal length; sideways positions do not."""
     base = SharpBase(micro_network())
     rgb = torch.rand(20, 30, 3)
     near, far = (base.predict(Photo(rgb, f, "EXIF", Path("a.jpg"))).gaussians.means for f in (30.0, 60.0))

@@ -110,17 +110,6 @@ def test_views_without_holes_or_without_base() -> None:
         assert not crops_of(view, np.random.default_rng(0), 3, 16)
 
 
-@pytest.mark.parametrize(("near", "far", "axis"), [(3.0, 3.001, 1), (2.0, 6.0, 1), (1.5, 5.0, 0)])
-@pytest.mark.parametrize("eye", [(0.6, 0.0, 0.0), (0.0, 0.5, 0.0), (0.4, -0.3, 0.3)])
-def test_a_slanted_plane_has_no_holes(near: float, far: float, axis: int, eye: tuple[float, float, float]) -> None:
-    scene = slanted_plane(near, far, axis)
-    viewer = looking(scene.camera, *eye)
-    beside, hole = outside(scene, viewer), reverse(scene, viewer).hole
-    assert int((~beside).sum()) > 10_000
-    assert not (hole & ~grow(beside)).any()
-    assert not (~hole & outside(scene, viewer, margin=1)).any()
-
-
 # Crops --------------------------------------------------------------------------------------------
 
 

@@ -115,9 +115,3 @@ def test_a_hole_between_near_and_far_is_filled_from_the_far_side(turned: bool, f
     assert float(filled[~known].median()) < 0.3
     assert float(alike[~known].mean()) == pytest.approx(0.6, abs=0.05)
     assert float(propagated[0][~known].mean()) < 0.3
-
-
-def test_without_known_pixels_nothing_is_filled() -> None:
-    inverse, values, _ = random_scene(4, 8, 8)
-    with pytest.raises(ValueError, match="no pixel is known"):
-        far_fill(inverse, values, torch.zeros(8, 8, dtype=torch.bool))

@@ -10,7 +10,6 @@ from scenes import psnr
 from torch import Tensor
 
 from spackle import patches as room
-from spackle.filters import nearest_known
 from spackle.patches import JUMPS, match_patches
 
 Y, X = np.indices((100, 117))
@@ -19,13 +18,6 @@ PATTERNS = {
     "stripes": 0.5 + 0.3 * np.sin(0.7 * X + 0.1 * Y),
     "bricks": np.where((Y % 8 < 2) | ((X + 7 * (Y // 8 % 2)) % 14 < 2), 0.8, 0.3),
 }
-
-
-@pytest.mark.parametrize(("depth", "expected"), [(0.2, [8, 7, 6, 5, 4, 3, 2, 1, 0, 19]), (0.3, range(10, 20))])
-def test_holes_start_as_mirror_images_of_the_same_surface(depth: float, expected: list[int]) -> None:
-    ramp, hole = np.arange(20, dtype=np.float32)[None, :, None].repeat(3, -1), np.arange(20)[None] >= 10
-    room._mirror(ramp, hole, np.where(hole, depth, 0).astype(np.float32), nearest_known(hole))
-    assert ramp[0, :, 0].tolist() == [*range(10), *expected]
 
 
 @pytest.mark.parametrize("size", [(24, 31), (33, 26)])
