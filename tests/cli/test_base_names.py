@@ -95,7 +95,7 @@ def test_results_that_must_name_their_base_refuse_auto(tmp_path: Path, stereo: P
         run("bench", *root),
     ):
         refuses(result, "--base auto is not allowed here, because the results name their base")
-    refuses(build(tmp_path, "--base", "rgbd"), "give --depth FOLDER; sharp, moge, lite, hf:NAME_OR_FOLDER need none")
+    refuses(build(tmp_path, "--base", "rgbd"), "--depth FOLDER; sharp, moge, lite, hf:NAME_OR_FOLDER need no depth")
     assert not (tmp_path / "out").exists()
 
 

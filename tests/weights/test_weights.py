@@ -109,8 +109,8 @@ def test_a_part_of_another_file_is_discarded(site: Site, target: Path, size: int
     ("server", "words"),
     [
         ({"status": 404}, ("HTTP 404", "check the address, or try again later")),
-        ({"content": CONTENT + b"more"}, ("another file: 1,000,007 bytes instead of 1,000,003",)),
-        ({"content": CONTENT[::-1]}, ("not the SHA-256", SHA256, "another address")),
+        ({"content": CONTENT + b"more"}, ("the file has 1,000,007 bytes instead of 1,000,003",)),
+        ({"content": CONTENT[::-1]}, ("SHA-256 is not", SHA256, "another address")),
         ({"drops": [len(CONTENT) - 10]}, ("10 bytes early", "try again")),
         ({"headers": {"Content-Type": "text/html; charset=utf-8"}}, ("the server's answer is not a file",)),
         ({"status": 302, "headers": {"Location": "file:///etc/hostname"}}, ("HTTP 302",)),

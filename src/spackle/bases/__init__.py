@@ -35,7 +35,7 @@ class Base(Protocol):
     name: str
 
     def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
-        """Gaussians of the surfaces that are visible in the photo, and no others.
+        """Predict Gaussians only for the surfaces that are visible in the photo.
 
         Args:
             photo: at its full size. The prediction's camera has the working size (see `working_size`).

@@ -113,7 +113,7 @@ def load_depth(
     disparity if `calib` is given, if a `scene.json` in the same folder names the file as its `disparity`, or if the
     file's name starts with "disp" and the same folder has a Middlebury `calib.txt`.
 
-    A relative map has one of these formats, or is any grey picture; see `relative_depth`.
+    Besides these formats, a relative map may be any grey picture; see `relative_depth`.
 
     Args:
         path: the file.
@@ -175,7 +175,7 @@ def relative_depth(
     far: float = FAR_M,
     step: float | None = None,
 ) -> DepthMap:
-    """Convert inverse depth (near-white) or depth (near-black) [H, W], known up to scale and shift, to metres.
+    """Convert inverse depth (near-white) or depth (near-black) [H, W] of unknown scale and shift to metres.
 
     The 1 % and 99 % quantiles become `near` and `far`; NaN and inf mean unknown. `step` is the quantisation step of
     `stored`. InputError (naming `path`) if nearly all depths are equal, or unless 0 < `near` < `far`.
@@ -256,7 +256,7 @@ def _find_calibration(path: Path, calib: StrPath | None) -> Calibration | None:
     if stem.startswith("disp") and text.is_file():
         return _read_calib(text)
     if stem.startswith("disp") or stem.endswith(("disp", "disparity")):
-        raise InputError(f"{path}: the name announces a disparity map: give its calibration with --calib, or rename it")
+        raise InputError(f"{path}: the name announces a disparity map: give --calib, or rename the map")
     return None
 
 
@@ -309,7 +309,7 @@ def _as_disparity(stored: Array, is_png: bool, lens: Calibration, path: StrPath)
     height, width = stored.shape
     if lens.size and max(abs(lens.size[0] / width - 1), abs(lens.size[1] / height - 1)) > CALIBRATED_SIZE_TOLERANCE:
         calibrated = f"{lens.size[0]}×{lens.size[1]}"
-        raise InputError(f"{path}: {width}×{height} pixels, but the calibration is for {calibrated}: scale both alike")
+        raise InputError(f"{path}: {width}×{height} pixels, its calibration is for {calibrated}: give matching files")
     valid = np.isfinite(stored) & (stored != lens.invalid)
     if is_png:
         valid &= stored > 0
@@ -327,7 +327,7 @@ def grid_step(values: Array) -> float | None:
 
 
 def read_array(path: StrPath, *, grey: bool = False) -> tuple[Array, bool]:
-    """The stored numbers [H, W] of a depth map, and whether it is a PNG; InputError for an unknown format.
+    """The stored numbers [H, W] of a depth map, and whether the file is a PNG; InputError for an unknown format.
 
     With `grey`, other picture formats are read too, and three nearly equal channels count as one.
     """

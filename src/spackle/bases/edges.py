@@ -32,11 +32,11 @@ class Edges:
 def find_edges(inverse_depth: Floats, known: Bools, focal: tuple[float, float]) -> Edges:
     """Find sharp and smeared depth edges along the rows and the columns of inverse depth [h, w].
 
-    Only at an edge does the slope of the inverse depth rise to a peak and fall again. A peak is an edge if it exceeds
-    the slopes on both sides, if it is steeper than `STEEPEST` (which depends on `focal`, horizontal and vertical, in
-    pixels of the map), and if it changes the inverse depth by more than the share `EDGE` beyond the slopes on both
-    sides. The pixels between the two feet of the peak belong to the smeared edge. No edge is found beside unknown
-    pixels (`known` [h, w] false).
+    The slope of the inverse depth rises to a peak and falls again only at an edge. A peak is an edge if it is steeper
+    than a surface of slope `STEEPEST`; `focal` (horizontal, vertical) is in pixels of the map. The inverse depth must
+    also change by more than the share `EDGE`, in addition to the change that the slopes on both sides explain. The
+    pixels between the two feet of the peak belong to the smeared edge. No edge is found beside unknown pixels (`known`
+    [h, w] false).
     """
     step, across = _rows(inverse_depth, known, STEEPEST / focal[0])
     columns, below = _rows(np.ascontiguousarray(inverse_depth.T), np.ascontiguousarray(known.T), STEEPEST / focal[1])
@@ -122,8 +122,8 @@ def sample(inverse_depth: Floats, known: Bools, edges: Edges, height: int, width
 
     Between four map pixels of one surface the inverse depth is interpolated bilinearly, so a plane stays a plane. If an
     edge runs between these four, or one of them lies in a smeared edge, the photo's pixel stays open. If unknown map
-    pixels have more than half of the weight, the photo's pixel is a hole. But if the photo's pixel covers the centre of
-    a map pixel outside of smeared edges, it gets that pixel's depth, extended along the surface.
+    pixels have more than half of the weight, the photo's pixel is a hole. But a pixel of the photo that covers the
+    centre of a map pixel outside of smeared edges gets the map pixel's depth, extended along the surface.
     """
     sound = known & (edges.step == 0)
     across = _flattest(inverse_depth, sound, edges.across)
@@ -141,7 +141,7 @@ def sample(inverse_depth: Floats, known: Bools, edges: Edges, height: int, width
 
 @kernel
 def _flattest(inverse_depth: Any, sound: Any, edge: Any) -> Any:
-    """The flattest slope near each pixel along its row; right beside a smeared edge the slope is too steep."""
+    """The flattest slope near each pixel in its row, because right beside a smeared edge the slope is too steep."""
     height, width = inverse_depth.shape
     slope = np.zeros((height, width), np.float32)
     for y in range(height):
@@ -220,7 +220,7 @@ def settle(sampled: Sampled, rgb: Floats) -> Floats:
     """Give every open pixel, then every hole pixel, the depth of the known pixel to which its cheapest path leads.
 
     A path costs its length plus the change of sRGB [H, W, 3] along it, so that depth spreads within objects and stops
-    at their outlines. In a smeared edge the change of the smeared depth is added, so that the paths from both sides
+    at their outlines. In a smeared edge the change of the smeared depth adds to the cost. So the paths from both sides
     meet in the middle of the edge if the photo shows no outline. The depth of each side is extended along its surface.
     In a hole, a start pixel nearer than the hole's far side costs extra, because most holes are background that is
     hidden from a second camera. Returns inverse depth [H, W]; settled pixels are unchanged.

@@ -53,7 +53,7 @@ class RgbdBase:
 
 
 def lift_guess(photo: Photo, depth: DepthMap, camera: Camera) -> BasePrediction:
-    """Lift a photo, with its outermost lines replaced, by the depth that a network predicts."""
+    """Lift a photo with the depth that a network predicts; the photo's outermost lines are replaced first."""
     return lift(pad_edge(photo.rgb), depth, camera)
 
 
@@ -92,7 +92,7 @@ DEVIATIONS = 2.0  # a value may change by this number of the noise's standard de
 
 
 def noise_level(inverse_depth: Floats, known: Bools) -> float:
-    """Standard deviation of most pixels' noise, relative to the inverse depth, by second differences in y and x."""
+    """The noise of most pixels, from second differences: its standard deviation relative to the inverse depth."""
     if min(inverse_depth.shape) < 3:
         return 0.0
     bend, seen = inverse_depth, known
@@ -107,9 +107,9 @@ def noise_level(inverse_depth: Floats, known: Bools) -> float:
 def smoothed(inverse_depth: Floats, known: Bools, step: Floats | np.float32) -> Floats:
     """The smoothest inverse depth [h, w] that its noise and its quantisation step (a number, or [h, w]) allow.
 
-    Each known value is replaced by the mean of its neighbours on both sides. It changes by at most half a quantisation
-    step, or `DEVIATIONS` of the noise. A neighbour that differs by more than three times this limit belongs to another
-    surface. If the noise is as large as depth edges, it counts as content, such as leaves or meshes.
+    Each known value is replaced by the mean of its neighbours on both sides. The change is limited to half a
+    quantisation step, or to `DEVIATIONS` of the noise if this is more. A neighbour that differs by over three times the
+    limit belongs to another surface. Noise as large as depth edges is kept as content, such as leaves or meshes.
     """
     noise = noise_level(inverse_depth, known)
     reach = np.maximum(step / 2, DEVIATIONS * noise * (noise <= EDGE) * inverse_depth)

@@ -56,7 +56,7 @@ class SameConv(nn.Conv2d):
 
 
 class MBConv(nn.Module):
-    """MBConv: a 1×1 convolution to more channels, a depthwise one, one to fewer; adds the input if shapes agree."""
+    """MBConv: convolutions 1×1 (to more channels), depthwise, 1×1 (to fewer); adds the input if the shapes agree."""
 
     def __init__(self, inputs: int, outputs: int, kernel: int, stride: int, expansion: int) -> None:
         super().__init__()
@@ -131,7 +131,7 @@ class LiteNet(nn.Module):
         self.head = nn.Sequential(nn.Conv2d(DECODER[0], 16, 3, padding=1), nn.ReLU(), nn.Conv2d(16, 1, 1))
 
     def forward(self, rgb: Tensor) -> Tensor:
-        """[B, 3, H, W] sRGB in 0..1, sides multiples of 32, to log inverse depth [B, H/2, W/2] up to a constant."""
+        """[B, 3, H, W] sRGB in 0..1 to log inverse depth [B, H/2, W/2] up to a constant; 32 must divide H and W."""
         *finer, coarsest = self.encoder(rgb)
         # The place of an object in the picture tells much about the object's distance.
         x = self.top(torch.cat([coarsest, _places(coarsest)], dim=1))
@@ -223,7 +223,7 @@ COARSE = (3, 4)  # an output's low frequencies are its means in 3×4 cells, with
 
 
 class LiteBase:
-    """Lifts the depth that small networks estimate: a plausible parallax, no measurement."""
+    """Lifts the depth that small networks estimate; it gives a plausible parallax, but is no measurement."""
 
     name = "lite"
 
@@ -289,6 +289,6 @@ def network_size(height: int, width: int, pixels: int) -> tuple[int, int]:
 
 
 def scaled_size(height: int, width: int, scale: float) -> tuple[int, int]:
-    """(height, width) times about `scale`, rounded to a size that a network accepts."""
+    """The size closest to `scale` times (height, width) that a network accepts."""
     tall, wide = (max(STRIDE, round(side * scale / STRIDE) * STRIDE) for side in (height, width))
     return tall, wide

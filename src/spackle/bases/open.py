@@ -1,6 +1,6 @@
 """Open a base by its settings, and turn photos into Gaussians with it.
 
-`auto` tries the depth in the photo's file, then SHARP, MoGe and lite, as far as their weights are on this machine.
+`auto` tries the depth in the photo's file, then SHARP, MoGe and lite, if their weights are on this machine.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def _lift(settings: BaseSettings, photo: Photo, depth: Depth) -> Base | None:
         source = load_photo_depth(photo.path)
     if source is None:
         if settings.named == RGBD:
-            raise InputError(f"{photo.path}: {NO_DEPTH}; {', '.join(NETWORKS)} need none")
+            raise InputError(f"{photo.path}: {NO_DEPTH}; {', '.join(NETWORKS)} need no depth")
         return None
     if isinstance(source, DepthMap):
         found, read = source, None
@@ -108,7 +108,7 @@ class ResolvedBase:
 
 
 class OpenedBase:
-    """Turns photos into Gaussians. The first photo that needs a network loads it for all others."""
+    """Turns photos into Gaussians. A network is loaded when a photo first needs it, and kept for later photos."""
 
     def __init__(
         self, candidates: Mapping[str, tuple[str, str]], settings: BaseSettings, loaded: dict[str, Base | None]
@@ -170,7 +170,7 @@ class OpenedBase:
         return prediction, ResolvedBase(name, why, tuple(failures), note if new else "", lasting)
 
     def load(self, photo: Photo, depth: Depth = None, name: str | None = None) -> Base | None:
-        """Load the candidate `name` (else the first); None without depth or weights, InputError if loading fails."""
+        """Load the candidate `name`, or else the first; None without depth or weights, InputError if loading fails."""
         name = name or next(iter(self.candidates))
         if name == RGBD and name not in self._loaded:
             return _lift(self._settings, photo, depth)

@@ -51,8 +51,8 @@ class Quadtree:
     """Blocks of 2×2, 4×4, … pixels, and the detail that each block would lose as one tile or as two halves.
 
     A loss is the squared difference between pixels and bilinearly interpolated tile means, summed over pixels and
-    averaged over channels. A steep block becomes no tile. Nor does a block if a pixel in it, or within one block side
-    around it, is not free or lies off the block's plane, because a tile's Gaussian reaches that far.
+    averaged over channels. A block made into a tile must not be steep. Its pixels, and those within one block side
+    around it, must be free and in the block's plane, because a tile's Gaussian reaches that far.
     """
 
     def __init__(

@@ -106,7 +106,7 @@ class BaseSettings:
         return {name: file for name, file in found.items() if file is not None}
 
     def check(self, *, one: bool = False) -> None:
-        """InputError for an unknown base or an option that the base cannot use; with `one` also for the base `auto`."""
+        """InputError for an unknown base or an option that the base cannot use; if `one`, also for the base `auto`."""
         if one and self.name == AUTO:
             known = ", ".join((RGBD, *NETWORKS))
             raise InputError(f"--base {AUTO} is not allowed here, because the results name their base: give {known}")

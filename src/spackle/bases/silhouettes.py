@@ -227,11 +227,11 @@ def _match(start: int, stop: int, colors: Any, ring: Any, inside: Any, color: An
 
 @kernel
 def _unmix(colors: Any, ring: Any, inside: Any, alpha: Any, color: Any, texture: Any) -> None:
-    """Change both colours in place so that they mix to the photo's colour, but no more than texture explains.
+    """Change both colours in place so that they mix to the photo's colour; the texture limits the change.
 
-    If this fails, a pixel gets the share of the closest mixture of the unchanged colours. A pixel far from any mixture,
-    such as the shaded edge of a round object, belongs to one surface alone. The fringe that a sharpening camera draws
-    along an outline is assigned to the near surface, because it would stay visible on the background.
+    If this limit is too low, the colours stay unchanged, and alpha becomes that of their closest mixture. A pixel far
+    from any mixture, such as the shaded edge of a round object, belongs to one surface alone. The fringe of a
+    sharpening camera along an outline counts as the near surface, because it would stay visible on the background.
     """
     height, width = ring.shape
     rest = np.zeros(3, np.float32)

@@ -1,6 +1,6 @@
 """Turn a photo with a depth at every pixel into Gaussians that blend to the photo.
 
-There is one for each pixel or tile, a second one at silhouettes, and a backing behind them.
+Each pixel or tile has one Gaussian, pixels at silhouettes have a second one, and a backing lies behind all of them.
 """
 
 from __future__ import annotations

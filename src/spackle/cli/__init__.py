@@ -1,4 +1,4 @@
-"""The command line. Functions declare the options of commands; each imports its work when it runs."""
+"""The command line. Functions declare the options of commands; they import the code of a command only when it runs."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ def clip_options(scene: Options, photo: PhotoOptions, workers: int) -> Options:
 def predict_clip(
     path: Path, folder: Path, pipeline: Pipeline, lens: Mapping[str, float | None], reporter: Reporter
 ) -> None:
-    """Predict one clip into `folder`: video.mp4 with as many frames, and report.json; `lens` as for `load_photo`.
+    """Write video.mp4, with as many frames as the clip, and report.json to `folder`; `lens` as for `load_photo`.
 
     Raises:
         InputError: the clip, a frame, a depth map or the folder cannot be used.

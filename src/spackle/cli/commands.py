@@ -78,7 +78,7 @@ def predict(
         ),
     ] = None,
     calib: Annotated[
-        Path | None, typer.Option(hidden=True, metavar="FILE", help="calib.txt of a disparity map in another folder.")
+        Path | None, typer.Option(hidden=True, metavar="FILE", help="calib.txt, if it is not in the map's folder.")
     ] = None,
     checkpoint: CheckpointOption = None,
     precision: Annotated[
@@ -125,7 +125,7 @@ def predict(
     focal_mm: Annotated[float | None, typer.Option(help="Focal length in mm, 35 mm equivalent.")] = None,
     fov: FovOption = None,
     keep_frame: KeepFrameOption = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Predict photos again whose results exist.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Predict again even if results exist.")] = False,
     workers: Annotated[
         int,
         typer.Option(
@@ -259,7 +259,7 @@ def view(
     as_json: JsonOption = False,
     verbose: VerboseOption = False,
 ) -> None:
-    """View a scene, or complete photos, on a page in the browser. Ctrl-C ends the server."""
+    """Open a page in the browser that shows a scene or completes photos. Ctrl-C ends the server."""
     from spackle.bases.settings import BaseSettings
     from spackle.cli import serve as app
     from spackle.progress import Reporter
@@ -296,7 +296,7 @@ def serve(
     ),
     keep: Annotated[float, typer.Option(min=0, metavar="DAYS", help="Delete scenes after this number of days.")] = 7,
     quota: Annotated[
-        float, typer.Option(min=0, metavar="GB", help="Delete the oldest scenes if all scenes take more.")
+        float, typer.Option(min=0, metavar="GB", help="Delete the oldest scenes if all take more space.")
     ] = 20,
     waiting: Annotated[
         int, typer.Option(min=1, metavar="N", help="Number of photos that may wait; more photos are refused.")
@@ -307,7 +307,7 @@ def serve(
     as_json: JsonOption = False,
     verbose: VerboseOption = False,
 ) -> None:
-    """Complete photos for programs, over HTTP, and on a page (see docs/http.md). Ctrl-C ends the server."""
+    """Serve an HTTP interface and a page that complete photos (see docs/http.md). Ctrl-C ends the server."""
     from spackle.bases.settings import BaseSettings
     from spackle.cli import serve as app
     from spackle.progress import Reporter

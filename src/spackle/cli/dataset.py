@@ -28,7 +28,7 @@ def dataset_build(
         ),
     ],
     images: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Folder of a COCO JSON's photos; default: the JSON's.")
+        Path | None, typer.Option(metavar="FOLDER", help="Folder of a COCO JSON's photos; default: the JSON's folder.")
     ] = None,
     sample: Annotated[
         int | None, typer.Option(min=1, max=1_000_000, help="Number of photos, chosen at random; default: all.")
@@ -68,7 +68,7 @@ def dataset_build(
         int, typer.Option(min=1, max=1024, help="Number of processes, each with a copy of the base's network.")
     ] = 1,
     threads: Annotated[
-        int, typer.Option(min=1, max=1024, help="Threads of each process; SHARP's last bits depend on their number.")
+        int, typer.Option(min=1, max=1024, help="Threads of each process; the number changes SHARP's last bits.")
     ] = 2,
     shard_size: Annotated[int, typer.Option(min=1, max=1_000_000, help="Number of photos in a tar file.")] = 50,
     device: DeviceOption = "auto",
@@ -122,7 +122,7 @@ def dataset_verify(location: DatasetArgument) -> None:
 @dataset.command("preview")
 def dataset_preview(
     location: DatasetArgument,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="A folder for the two files.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="Folder for the sheet and the video.")],
     photos: Annotated[int, typer.Option(min=1, help="Number of photos.")] = 3,
     views: Annotated[int, typer.Option(min=1, help="Number of views of each photo.")] = 6,
 ) -> None:

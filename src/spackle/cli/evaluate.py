@@ -32,7 +32,7 @@ BaseName = Annotated[str, typer.Option(help="sharp, moge, lite, hf:NAME, or rgbd
 Checkpoint = Annotated[Path | None, typer.Option("-c", "--checkpoint", help="Weights of the base.")]
 Residual = Annotated[
     str | None,
-    typer.Option(metavar="PATH|seeds", help="Weights of the residual; default: shipped ones, else seeds."),
+    typer.Option(metavar="PATH|seeds", help="Weights of the residual; default: those in the package, else seeds."),
 ]
 Side = Annotated[
     int | None,
@@ -172,7 +172,7 @@ def bench(
     sharp: SharpOption = None,
     residual: Residual = None,
     limit: Limit = None,
-    runs: Annotated[int, typer.Option(min=1, max=1000, help="Number of timed runs of everything after the base.")] = 5,
+    runs: Annotated[int, typer.Option(min=1, max=1000, help="Number of timed runs of all steps after the base.")] = 5,
     base_runs: Annotated[
         int | None,
         typer.Option(min=1, max=1000, help="Number of timed runs of the base. [default: 1 for sharp, else as --runs]"),

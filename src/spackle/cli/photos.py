@@ -209,7 +209,7 @@ class Predictor:
         return False
 
     def request(self, photo: NamedPhoto) -> str:
-        """A digest of the input of a photo's results; InputError if the photo or depth map is missing."""
+        """A digest of all that a photo's results depend on; InputError if the photo or depth map is missing."""
         files, depth = [fingerprint(photo.path, "photo")], self.options.scene.base.depth
         if isinstance(depth, Path):
             depth = find_depth(depth, photo.path)

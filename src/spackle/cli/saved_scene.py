@@ -122,7 +122,7 @@ def _fly(
     keyframes: KeyframePath | None,
     lens: Mapping[str, float | None],
 ) -> list[Camera]:
-    """The cameras of a path around the stored camera; `lens` replaces the stored focal length, 30 mm a missing one."""
+    """The cameras of a path around the stored camera; focal length: that of `lens`, else the stored one, else 30 mm."""
     camera, new_lens = loaded.camera, any(value is not None for value in lens.values())
     if camera is None or new_lens:
         width, height = path.video.size or ((camera.width, camera.height) if camera else DEFAULT_SIZE)

@@ -93,7 +93,7 @@ def extend_flow(found: Track, inverse_depth: Tensor, known: Tensor, camera: Came
     """Extend the flow into holes: the camera's motion, plus the deviation from that motion at a hole's far rim.
 
     Args:
-        found: the flow; reliable flow is kept in the pixels `known`.
+        found: the flow; where it is reliable and `known` is true, it is kept.
         inverse_depth: [H, W], positive; in holes the depth of the filling.
         known: [H, W] bool: pixels outside of holes.
         camera: of the frame.
@@ -205,9 +205,9 @@ def _trust(hole: Tensor, share: Tensor, weight: Tensor) -> Tensor:
 
 
 def behind(before: Rendering, own: Rendering, hole: Tensor) -> tuple[Tensor, Tensor]:
-    """Linear light [H, W, 3] and inverse depth [H, W] of a view; in holes of the aux Gaussians alone.
+    """Linear light [H, W, 3] and inverse depth [H, W] of a view; in holes, only those of the aux Gaussians.
 
-    `before` is the rendering of the base, `own` of base and aux Gaussians.
+    `before` is the rendering of the base, `own` the rendering of base and aux Gaussians.
     """
     share = (own.alpha - before.alpha).clamp_min(THIN)
     there, now = srgb_to_linear(before.rgb), srgb_to_linear(own.rgb)
@@ -220,7 +220,7 @@ def behind(before: Rendering, own: Rendering, hole: Tensor) -> tuple[Tensor, Ten
 
 
 def _recall(past: FrameMemory, uv: Tensor, inverse_depth: Tensor) -> tuple[Tensor, Tensor]:
-    """Light [H, W, 3] of the previous view at pixels uv [H, W, 2], without nearer surfaces, and its trust [H, W]."""
+    """Light [H, W, 3] and trust [H, W] of the previous view at its pixels uv [H, W, 2], nearer surfaces left out."""
     height, width = past.trust.shape
     corner = (uv - 0.5).floor()
     part = uv - 0.5 - corner
@@ -240,7 +240,7 @@ def _recall(past: FrameMemory, uv: Tensor, inverse_depth: Tensor) -> tuple[Tenso
 
 
 def _beside(change: Tensor, hole: Tensor, weight: Tensor, inverse_depth: Tensor) -> Tensor:
-    """Spread the change [H, W, 3] of propagated pixels over new pixels; the change falls to 0 at the rim."""
+    """Spread the change [H, W, 3] of propagated pixels over new pixels; it falls to 0 at the hole's rim."""
     carried = weight > CARRIED
     known = ~hole | carried
     values = torch.where(carried[..., None], change, 0.0).permute(2, 0, 1)
@@ -288,7 +288,7 @@ class DepthAlignment:
         return torch.where(front, 1 / self.of(1 / depth.where(front, 1.0)), depth / self.scale)
 
     def of_gaussians(self, gaussians: Gaussians) -> Gaussians:
-        """Move and scale Gaussians along the rays of a camera at the origin, whose image does not change."""
+        """Move and scale Gaussians along rays from the origin; the image of a camera at the origin does not change."""
         if self == DepthAlignment():
             return gaussians
         z = gaussians.means[:, 2]

@@ -74,7 +74,7 @@ class DatasetOptions:
         depth = self.base.depth
         if depth is None and not self.base.network:
             raise InputError(
-                f"--base {self.base.name} needs the photos' depth: give --depth FOLDER; {', '.join(NETWORKS)} need none"
+                f"--base {self.base.name} needs depth: give --depth FOLDER; {', '.join(NETWORKS)} need no depth"
             )
         if isinstance(depth, Path) and not depth.is_dir():  # a single map would fit one photo only
             raise InputError(f"--depth {depth}: no such folder: give a folder with a depth map for each photo")

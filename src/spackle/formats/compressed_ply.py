@@ -31,7 +31,7 @@ _VERTEX_NAMES = ["packed_position", "packed_rotation", "packed_scale", "packed_c
 
 
 def encode_compressed_ply(scene: SceneFile) -> bytes:
-    """Encode a scene as a compressed PLY, in the same axes, with the same comments as `save_ply`.
+    """Encode a scene as a compressed PLY; the axes stay the same, and the comments are those of `save_ply`.
 
     The base's Gaussians come first; within base and aux, neighbours in space become neighbours in the file. ValueError
     if a Gaussian is not finite.
@@ -87,7 +87,7 @@ def _normalised(values: Floats, starts: NDArray[np.int64]) -> tuple[Floats, Floa
 
 
 def _packed(shares: Floats, widths: tuple[int, ...]) -> NDArray[np.uint32]:
-    """Pack fractions 0..1 [N, k] into words [N], each rounded to its number of bits; the first is the highest."""
+    """Pack fractions 0..1 [N, k] into words [N]; each is rounded to its width, the first takes the highest bits."""
     word = np.zeros(len(shares), np.uint32)
     for column, width in zip(shares.T, widths, strict=True):
         word = word << np.uint32(width) | np.round(column * np.float32(2**width - 1)).astype(np.uint32)

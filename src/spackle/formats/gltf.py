@@ -25,7 +25,7 @@ NEAR_PLANE = 0.01  # glTF requires a near plane
 
 
 def encode_glb(scene: SceneFile) -> bytes:
-    """Encode a scene as binary glTF, in the same order: y up, z backward, linear scales, sRGB colours as harmonics.
+    """Encode a scene as binary glTF: order as in the scene, y up, z backward, linear scales, sRGB colours as harmonics.
 
     Viewers without the extension show points, with the linear colours of COLOR_0. The photo's camera becomes a glTF
     camera. `extras` hold the base's count and the camera's parameters that glTF cannot express.

@@ -84,7 +84,7 @@ def page_scene(
 
 
 def _path(kind: TrajectoryKind, camera: Camera, depths: DepthRange) -> dict[str, list[list[float]]]:
-    """Camera positions at disparity 0 (`still`), and their change for a disparity of 1 (`moving`), in nine digits."""
+    """Camera positions at disparity 0 (`still`), and their change for a disparity of 1 (`moving`), to nine digits."""
     still, wide = (
         torch.stack([each.position for each in trajectory(kind, camera.to("cpu", torch.float64), far, depths, SAMPLES)])
         for far in (0.0, 1.0)
@@ -97,10 +97,10 @@ def _path(kind: TrajectoryKind, camera: Camera, depths: DepthRange) -> dict[str,
 def encode_layer(gaussians: Gaussians) -> tuple[bytes, float, float]:
     """Pack N Gaussians for the page as byte planes, which compress well.
 
-    Planes of N bytes each: x, y, z as the upper 24 bits of a float32, three planes each, lowest byte first; the
-    logarithms of the three scales; the index of the quaternion's largest component (wxyz), which is made positive; the
-    other three components, ±127 for ±1/√2; red, green, blue in sRGB; opacity. 24 bits move a centre by at most 2⁻¹⁶ of
-    its distance to the photo's camera, which is a hundredth of a pixel.
+    A plane has N bytes. Nine planes hold x, y and z: the upper 24 bits of a float32, lowest byte first. The others hold
+    the logarithms of the three scales; the index of the quaternion's largest component (wxyz), which is made positive;
+    the other three components, ±127 for ±1/√2; red, green, blue in sRGB; opacity. Rounding to 24 bits moves a centre by
+    at most 2⁻¹⁶ of its distance to the photo's camera, which is a hundredth of a pixel.
 
     Returns:
         The bytes [BYTES, N]; the logarithm of the scale for byte 0; the increase of the logarithm per step.

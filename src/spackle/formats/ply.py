@@ -154,9 +154,9 @@ class PlyFile:
     def gaussians(self) -> Gaussians:
         """Read the scene; colours become linear RGB.
 
-        Properties may have any order and type; spherical harmonics above degree 0 (f_rest) are ignored.
-        SHARP's `color_space` states whether colours are sRGB (0) or linear (1). Without `color_space`, a file with
-        SHARP's camera is read as linear, as SHARP does, and any other file as sRGB.
+        Properties may have any order and type; spherical harmonics above degree 0 (f_rest) are ignored. SHARP's
+        `color_space` states whether colours are sRGB (0) or linear (1). Without `color_space`, colours count as linear
+        if the file has SHARP's camera (SHARP reads them so), else as sRGB.
 
         Raises:
             InputError: there are no Gaussians, or some contain NaN or inf. An infinite opacity logit is allowed: SHARP

@@ -146,7 +146,7 @@ SPLAT_ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 
 
 
 def encode_splat(scene: SceneFile) -> bytes:
-    """Encode a scene as a .splat file of antimatter15's viewer, with 32 bytes per Gaussian, in the same order and axes.
+    """Encode a scene as a .splat file of antimatter15's viewer, with 32 bytes per Gaussian; order and axes are kept.
 
     Colours, opacities and rotations are rounded to bytes. ValueError if a Gaussian is not finite.
     """

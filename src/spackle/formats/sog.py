@@ -34,7 +34,7 @@ EPOCH = (1980, 1, 1, 0, 0, 0)  # a constant, so that the same scene gives the sa
 
 
 def encode_sog(scene: SceneFile) -> bytes:
-    """Encode a scene as a bundled SOG file, in the same order and axes.
+    """Encode a scene as a bundled SOG file; the order of the Gaussians and the axes stay the same.
 
     Positions have 16 bits for each axis, spaced logarithmically from 0; scales and colours are looked up in codebooks.
 

@@ -102,7 +102,7 @@ def _within(columns: Columns, bits: int) -> Columns:
 
 
 def _finest(columns: Columns, bits: int) -> int:
-    """Index of the finest level of rounding that keeps deflated samples within SAMPLED_LIMIT, else of the coarsest."""
+    """Index of the finest rounding that keeps deflated samples within SAMPLED_LIMIT; the coarsest if none does."""
     count = len(columns.means)
     starts = np.unique(np.linspace(0, max(0, count - SAMPLE), SAMPLES).astype(np.int64))
     rows = np.concatenate([np.arange(start, min(start + SAMPLE, count)) for start in starts])

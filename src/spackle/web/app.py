@@ -68,7 +68,7 @@ def create_app(
     access: Access | None = None,
     max_bytes: int = MAX_BYTES,
 ) -> FastAPI:
-    """An app for a server, or to mount in another app, which then controls access.
+    """An app to serve alone, or to mount in another app, which must then control access.
 
     The worker processes start at once and end with the app; if another app mounts this one, call
     `app.state.jobs.close()` at the end. Unfinished photos resume when an app next opens the folder.
@@ -79,7 +79,7 @@ def create_app(
         workers: number of processes, each of which holds the base's network.
         keep: limits of the folder: age and size of scenes, and number of waiting photos.
         access: token and host that requests are checked against; None leaves checks to the caller.
-        max_bytes: largest upload, with its depth map.
+        max_bytes: size limit of an upload, including its depth map.
     """
     jobs = Jobs(folder, work, workers, keep)
     bases = work.bases if isinstance(work, SceneWork) else [AUTO]
@@ -155,7 +155,7 @@ def create_app(
 
     @app.get(SCENES + "/{id}/files/{file}", response_class=FileResponse)
     async def get_file(id: str, file: FileName | PagePart) -> FileResponse:
-        """A file of a finished scene; a file that the options left out is made now."""
+        """A file of a finished scene; a file that does not exist yet is made on demand."""
         job = job_of(id)
         path = (job.folder if file == PREVIEW else job.results) / file
         if not path.is_file():

@@ -1,6 +1,6 @@
 """The outermost layer of the app: checks access and the size of uploads.
 
-A stranger's page can make a browser send requests to this machine, with DNS rebinding even under the stranger's host
+A stranger's page can make a browser send requests to this machine; by DNS rebinding, even under the stranger's host
 name. The headers Host, Origin and Sec-Fetch-Site reveal such a request.
 """
 

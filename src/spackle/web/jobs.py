@@ -51,7 +51,7 @@ class SceneState(BaseModel):
 
 
 class Job(SceneState):
-    """A photo's state with fields for the server alone; RECORD stores all but the folder."""
+    """A photo's state, and fields that only the server uses; RECORD stores every field except the folder."""
 
     source: str  # the photo: a name in the job's folder, or an absolute path
     depth: str | None = None
@@ -114,7 +114,7 @@ class Jobs:
 
     @contextlib.contextmanager
     def place(self) -> Iterator[Path]:
-        """Reserve a place in the queue while a photo is received into the yielded folder; 429 if the queue is full."""
+        """Reserve a place in the queue, and yield a folder that receives the photo; 429 if the queue is full."""
         with self._lock:
             waiting = self._receiving + sum(job.state == "queued" for job in self._jobs.values())
             if waiting >= self.keep.waiting:

@@ -1,4 +1,4 @@
-"""The work of a worker process: from a photo or scene to the page's data and the files for download."""
+"""The work of a worker process: turn a photo or scene into the page's data and files to download."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class SceneWork:
 
     @property
     def bases(self) -> list[str]:
-        """The bases that a client may choose: the server's, "auto", and the bases whose weights are on this machine."""
+        """The bases that a client may choose: the server's base, "auto", and those with weights on this machine."""
         return list(dict.fromkeys([self.base.name, AUTO, *BaseSettings().files]))
 
     def __call__(self, task: tuple[Job, str | None], tell: Tell) -> None:
@@ -106,7 +106,7 @@ class SceneWork:
             raise InputError(teller.cleaned(str(error))) from error
 
     def _complete(self, job: Job, options: SceneOptions, teller: Teller) -> str:
-        """Make the files of `predict_photo` from a photo; returns a note for the user."""
+        """Complete a photo: make the files of `predict_photo`; returns a note for the user."""
         settings = self.base
         if job.depth is not None:
             depth, kind = job.folder / job.depth, options.depth_kind

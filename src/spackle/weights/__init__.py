@@ -59,7 +59,7 @@ def installed(name: str) -> Path | None:
 
 
 def weights_digests(files: Mapping[str, Path]) -> str | dict[str, str] | None:
-    """`weights_digest` of a network's files: a digest of one file, a dict by name of several, None without files."""
+    """The digest of a network's file; a dict from name to digest if it has several files, None if it has none."""
     digests = {name: weights_digest(file) for name, file in files.items()}
     return digests if len(digests) > 1 else next(iter(digests.values()), None)
 

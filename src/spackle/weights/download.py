@@ -45,14 +45,14 @@ def download(url: str, path: str | os.PathLike[str], size: int, sha256: str, pro
                 return
             part.unlink()
             if not continued:
-                raise InputError(f"{url}: wrong content, not the SHA-256 {sha256}: give another address")
+                raise InputError(f"{url}: the content's SHA-256 is not {sha256}: give another address")
     except OSError as error:
         reason = reason_in_a_line(error)
         raise InputError(f"{path}: cannot write: {reason}: make room or choose another folder") from error
 
 
 def _receive(url: str, part: Path, size: int, progress: Progress) -> None:
-    """Complete `part` to `size` bytes; follows redirects and the settings https_proxy and no_proxy."""
+    """Complete `part` to `size` bytes; follows redirects, and obeys https_proxy and no_proxy."""
     present = part.stat().st_size if part.exists() else 0
     if present == size:
         return
@@ -104,5 +104,5 @@ def _first_byte(url: str, response: HTTPResponse, present: int, size: int) -> in
     if response.status == 206 and rest and int(rest[1]) == present:
         done, total = present, int(rest[2])
     if total != size:
-        raise InputError(f"{url}: another file: {total:,} bytes instead of {size:,}: give another address")
+        raise InputError(f"{url}: the file has {total:,} bytes instead of {size:,}: give another address")
     return done

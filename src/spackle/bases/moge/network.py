@@ -121,7 +121,7 @@ def resampler(kind: str, inputs: int, outputs: int) -> nn.Sequential:
 
 
 class Pyramid(nn.Module):
-    """Features from coarse to fine: each level adds its input to the upsampled output of the coarser one."""
+    """Features from coarse to fine: each level adds its input to the upsampled features of the coarser level."""
 
     def __init__(self, config: Mapping[str, Any]) -> None:
         super().__init__()
@@ -143,7 +143,7 @@ class Pyramid(nn.Module):
         self.resamplers = nn.ModuleList(map(resampler, config["resamplers"], widths[:-1], widths[1:]))
 
     def forward(self, inputs: Sequence[Tensor]) -> list[Tensor]:
-        """The outputs of all levels [1, C, 2^l·h, 2^l·w] from one input of the same size for each level."""
+        """The outputs of all levels [1, C, 2^l·h, 2^l·w]; each level's input has the same height and width."""
         outputs: list[Tensor] = []
         carried: Tensor | None = None
         for level, x in enumerate(inputs):
@@ -157,7 +157,7 @@ class MogeNetwork(nn.Module):
     """Predicts points, mask and metric scale from a photo."""
 
     def __init__(self, config: Mapping[str, Any]) -> None:
-        """Build the network for a checkpoint's `model_config`; raises any exception for an unpublished kind."""
+        """Build the network for a checkpoint's `model_config`; an unpublished kind can raise any exception."""
         super().__init__()
         self.least_tokens, self.most_tokens = map(int, config["num_tokens_range"])
         self.plain_exp = {"exp": True, "sinh_exp": False}[config["remap_output"]]

@@ -69,7 +69,7 @@ Boxes = Iterator[tuple[bytes, memoryview]]
 
 
 def turn_of_depth_item(data: bytes) -> str | None:
-    """The turn that a HEIF's depth map still needs after decoding; None without exactly one map or for broken boxes."""
+    """The turn that a HEIF's depth map still needs after decoding; None for broken boxes, no map or several maps."""
     try:
         content = next(body for kind, body in _boxes(memoryview(data)) if kind == b"meta")
         meta = dict(_boxes(content[4:]))

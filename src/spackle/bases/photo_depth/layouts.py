@@ -43,7 +43,7 @@ USUAL_M = 3.0  # the median after rescaling
 
 @dataclasses.dataclass(frozen=True)
 class Scale:
-    """A linear map from the codes of a picture to values."""
+    """A linear function from the numbers that a picture stores (codes) to depths or disparities."""
 
     quantity: Quantity
     first: float  # value of code 0: metres of depth, or 1/m of disparity
@@ -62,7 +62,7 @@ class CodedDepth:
     turn: str = ""  # the steps that make the codes upright, see `containers.BY_ORIENTATION`
 
     def decode(self) -> tuple[Array, float]:
-        """Metres [H, W] (0 or less: unknown), and the step between the codes that occur, in the stored quantity."""
+        """Metres [H, W] (0 or less: unknown), and the quantisation step of the stored depth or disparity."""
         first, last = self.scale.first, self.scale.last
         if not (math.isfinite(first) and math.isfinite(last)) or first == last or max(first, last) <= 0:
             raise ValueError(f"it announces a {self.scale.quantity} from {first:g} to {last:g}")
@@ -97,7 +97,7 @@ def load_photo_depth(path: StrPath) -> DepthMap | None:
             return None if coded is None else _depth_map(coded, Path(path))
     except Exception as error:  # untrusted bytes can raise any exception in a decoder
         problem = f"the depth map in the photo cannot be used ({reason_in_a_line(error)})"
-        raise InputError(f"{path}: {problem}: give another one with --depth FILE, or use --base lite") from error
+        raise InputError(f"{path}: {problem}: give another depth map with --depth FILE, or use --base lite") from error
 
 
 def _depth_map(coded: CodedDepth, path: Path) -> DepthMap:
@@ -154,7 +154,7 @@ def _is_about(packet: bytes, space: str) -> bool:
 
 
 def apple_scale(packet: bytes) -> Scale | None:
-    """The scale that an XMP packet states for a depth map; None if it describes none, or states no range."""
+    """The scale that an XMP packet states for a depth map; None if it is about something else, or states no range."""
     if not _is_about(packet, PIXELS):
         return None
     tree = parse_xmp(packet)
@@ -185,7 +185,7 @@ _PICTURE_START, _PICTURE_ENDS = re.compile(rb"\xff\xd8\xff|\x89PNG"), (b"\xff\xd
 
 
 def _find_android(data: bytes, image: JpegImageFile) -> tuple[bytes, Scale] | None:
-    """The picture with the depth map that a JPEG's XMP holds or points to, and its scale; None without a map."""
+    """Find the depth map's picture, which a JPEG's XMP holds or points to, and its scale; None without a depth map."""
     main, extended = xmp_of(image), extended_xmp_of(image)
     if not any(_is_about(packet, space) for space in (GDEPTH, MAP) for packet in (main, extended)):
         return None
@@ -203,7 +203,7 @@ def _find_android(data: bytes, image: JpegImageFile) -> tuple[bytes, Scale] | No
 
 
 def android_scale(node: Element, space: str, layout: str) -> Scale:
-    """The scale of codes that run linearly, from near to far, in depth or in inverse depth; ValueError without one."""
+    """The scale of codes linear in depth or in inverse depth, from near to far; ValueError if it is unknown."""
     near, far = number(node, f"{space}Near"), number(node, f"{space}Far")
     if near is None or far is None:
         raise ValueError("Near or Far is missing")
@@ -224,7 +224,7 @@ def android_scale(node: Element, space: str, layout: str) -> Scale:
 
 
 def _item(data: bytes, tree: Element, uri: str) -> bytes:
-    """The picture of an item in the photo's directory, which lists in their order the items at the file's end."""
+    """The picture of an item in the photo's directory; the items lie at the file's end, in the directory's order."""
     entries = [node for node in tree.iter() if (get(node, f"{ITEM}Mime") or get(node, f"{ITEM}Length")) is not None]
     index = next((i for i, node in enumerate(entries) if get(node, f"{ITEM}DataURI") == uri), None)
     if index is not None:

@@ -179,7 +179,7 @@ class Owner:
 
     @property
     def places(self) -> tuple[str, str]:
-        """The names tried for the checkpoint in a decoder's folder: the link of `link_owner`, and its own name."""
+        """Possible names of the checkpoint in a decoder's folder: `link_owner`'s link, and the file's own name."""
         return f"trained-on-{one_line(Path(self.sha256).name)[:12]}.link", self.path.name
 
 

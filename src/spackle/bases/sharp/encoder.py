@@ -89,7 +89,7 @@ class VisionTransformer(nn.Module):
         self.norm = nn.LayerNorm(config.embed, eps=NORM_EPS)
 
     def forward(self, windows: Tensor, taps: tuple[int, ...] = ()) -> tuple[Tensor, list[Tensor]]:
-        """Normalised features [B, C, G, G] of windows [B, 3, S, S] in -1..1, and raw ones after the blocks `taps`."""
+        """Normalised features [B, C, G, G] of windows [B, 3, S, S] in -1..1, and raw features after blocks `taps`."""
         tokens = self.patch_embed["proj"](windows).flatten(2).transpose(1, 2)
         tokens = torch.cat([self.cls_token.expand(len(tokens), -1, -1), tokens], dim=1) + self.pos_embed
         tapped = []
@@ -194,7 +194,7 @@ def cut(image: Tensor, window: int, count: int) -> Tensor:
 
 
 def merge(maps: Tensor, trim: int) -> Tensor:
-    """The inverse of `cut` for feature maps [n², C, G, G]; a map loses `trim` cells at each side with a neighbour."""
+    """The inverse of `cut` for feature maps [n², C, G, G]; beside a neighbour, `trim` cells of a map are cut off."""
     count = int(len(maps) ** 0.5)
     size = maps.shape[-1]
     spans = [slice(trim if i else 0, size - trim if i < count - 1 else size) for i in range(count)]

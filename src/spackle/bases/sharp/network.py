@@ -56,13 +56,13 @@ class GroupNorm(nn.GroupNorm):
 
 
 def plain_residual(dim: int) -> Residual:
-    """A residual block of two 3×3 convolutions, each after a ReLU; the first ReLU keeps its input."""
+    """A residual block of two 3×3 convolutions, each after a ReLU; the first ReLU does not overwrite its input."""
     first, second = (nn.Conv2d(dim, dim, 3, padding=1) for _ in range(2))
     return Residual(nn.ReLU(), first, nn.ReLU(inplace=True), second)
 
 
 def normed_residual(dim: int, out: int) -> Residual:
-    """A residual block of two 3×3 convolutions with group norms, half as wide inside."""
+    """A residual block of two 3×3 convolutions with group norms; the first has half as many output channels."""
     first, second = nn.Conv2d(dim, out // 2, 3, padding=1), nn.Conv2d(out // 2, out, 3, padding=1)
     norms = GroupNorm(GROUPS, dim), GroupNorm(GROUPS, out // 2)
     return Residual(norms[0], nn.ReLU(inplace=True), first, norms[1], nn.ReLU(inplace=True), second)
@@ -141,7 +141,7 @@ class SharpNetwork(nn.Module):
         """Predict from the photo, stretched to [1, 3, side, side] sRGB in 0..1, float32.
 
         `disparity_factor` is the focal length over the width in the photo's pixels. `batch` windows go through the
-        transformer at once; `progress` gets the number of windows done, and that of all windows.
+        transformer at once; `progress` gets the number of windows done and the number of all windows.
         """
         encoded = self.encode(image, disparity_factor, batch, progress)
         deltas: Tensor = self.gaussian_decoder()(encoded.picture, encoded.maps)
@@ -188,7 +188,7 @@ GEOMETRY, TEXTURE = 3, 11  # delta channels: offset; scale 3, quaternion 4, colo
 
 
 class FeatureNetwork(nn.Module):
-    """Computes features for the deltas from the pyramid, the picture and its disparity."""
+    """Computes features from the pyramid, the picture and its disparity; deltas are predicted from these features."""
 
     def __init__(self, config: SharpConfig) -> None:
         super().__init__()

@@ -42,7 +42,7 @@ def stretch_gaussians(gaussians: Gaussians, stretch: tuple[float, float, float])
 def stretch_chunk(
     start: int, stop: int, quats: Any, scales: Any, stretch: Any, new_quats: Any, new_scales: Any
 ) -> None:
-    """Stretch Gaussians start..stop (quats [N, 4], scales [N, 3]) in float64, block by block, into two such arrays."""
+    """Stretch Gaussians start..stop (quats [N, 4], scales [N, 3]) block by block in float64; fills the new arrays."""
     columns = np.zeros((9, BLOCK))
     for first in range(start, stop, BLOCK):
         count = min(BLOCK, stop - first)
