@@ -219,7 +219,7 @@ def file_records(folder: Path, files: Iterable[Path]) -> dict[str, dict[str, obj
 
 
 def as_recorded(folder: Path, report: str, records: object) -> bool:
-    """Whether a folder still holds the files that a report lists by `file_records`.
+    """Whether a folder still holds the files whose `file_records` a report contains.
 
     Sizes are compared. Contents are compared too if a file is newer than the report, as in a copied folder.
     """

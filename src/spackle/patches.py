@@ -105,7 +105,7 @@ def _pyramid(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> list[_Level]
 
 @kernel
 def _mirror(rgb: Any, hole: Any, depth: Any, near: Any) -> None:
-    """Fill each hole cell, in place, with its mirror image at the nearest known cell if the depths are similar."""
+    """Fill each hole cell, in place, with its mirror image about the nearest known cell, if both depths are similar."""
     height, width = hole.shape
     for y in range(height):
         for x in range(width):

@@ -32,7 +32,7 @@ class PhotoFrame(NamedTuple):
         return PhotoFrame(self.left * across, self.top * down, self.right * across, self.bottom * down)
 
     def inside(self, picture: Tensor, width: int, height: int) -> Tensor:
-        """Cut the frame of a width×height photo off a picture [H, W, ...] of the photo at any size."""
+        """Cut the frame off a picture [H, W, ...] of any size; the frame is in pixels of a width×height photo."""
         rows, columns = picture.shape[:2]
         left, right = (round(side * columns / width) for side in (self.left, self.right))
         top, bottom = (round(side * rows / height) for side in (self.top, self.bottom))

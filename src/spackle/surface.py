@@ -40,7 +40,7 @@ def surface_gaussians(
         uv: [N, 2] pixel positions.
         inverse_depth: [N] 1/z.
         slope: [N, 2] derivative of the inverse depth by pixel x and y.
-        spread: standard deviation in pixels of `camera`: [N], or [N, 2] along pixel x and y, or one number.
+        spread: standard deviation in pixels of `camera`, as [N], as [N, 2] along pixel x and y, or as one number.
         colors: [N, 3] linear RGB.
         opacities: [N].
     """

@@ -13,7 +13,7 @@ from typing import Any
 
 from spackle.errors import InputError, reason_in_a_line
 
-DIED = "the worker process died, most likely for want of memory"
+DIED = "the worker process died, probably because memory ran out"
 Event = Mapping[str, Any]
 Tell = Callable[[Event], None]
 Work = Callable[[Any, Tell], None]  # pickled, like tasks; raises InputError if a task cannot be done

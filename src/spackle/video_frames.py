@@ -275,7 +275,7 @@ def cover(camera: Camera, width: int, height: int) -> Camera:
 
 
 def with_margins(picture: Tensor, width: int, height: int, blurred: bool) -> Tensor:
-    """Centre an image [h, w, 3] in one of [height, width, 3]; margins are black, or a blurred copy of the image."""
+    """Centre an image [h, w, 3] in another [height, width, 3]; margins are black, or a blurred copy of the image."""
     h, w = picture.shape[:2]
     if (w, h) == (width, height):
         return picture

@@ -170,7 +170,7 @@ def plan_views(
     given: list[Camera] | None = None,
     keyframes: KeyframePath | None = None,
 ) -> PlannedViews:
-    """Plan the given views, or a path whose holes are measured at its two extremes or at its keyframes.
+    """Plan the given views, or a path's; a path's holes are measured at its two extremes or at its keyframes.
 
     Raises:
         InputError: the depths and the focal length of the photo `source` allow no camera path.

@@ -85,7 +85,7 @@ _open_worker: Callable[[], Any]
 
 
 def _start(threads: int, open_worker: Callable[[], Any], numbers: Any) -> None:
-    """Set up a process: it ignores Ctrl-C, ends with the main process, and takes the GPU of the next of `numbers`."""
+    """Set up a process: it ignores Ctrl-C, ends with the main process, and chooses its GPU by the next of `numbers`."""
     global _open_worker
     _open_worker = functools.cache(open_worker)
     signal.signal(signal.SIGINT, signal.SIG_IGN)

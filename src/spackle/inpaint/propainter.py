@@ -100,7 +100,7 @@ def dilated(holes: Tensor) -> Tensor:
 
 
 def _network(name: str, file: Path) -> nn.Module:
-    """A frozen network with the weights of a file, whose unknown tensors are ignored."""
+    """A frozen network with a file's weights; unknown tensors in the file are ignored."""
     from pytorchcv.models.propainter import propainter
     from pytorchcv.models.propainter_rfc import propainter_rfc
     from pytorchcv.models.raft import raft_things

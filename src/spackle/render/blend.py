@@ -56,7 +56,7 @@ def exp2(x: np.float32) -> np.float32:
 
 @kernel
 def alpha_of(power: np.float32) -> np.float32:
-    """Alpha, 2^power: clamped from above, and 0 below the threshold."""
+    """Alpha = 2^power, clamped from above; 0 below the threshold."""
     alpha = min(exp2(max(power, LOWEST)), LIMIT)
     return alpha if alpha >= FAINT else ZERO
 

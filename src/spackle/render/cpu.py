@@ -167,7 +167,7 @@ def even_spans(total: int, parts: int) -> Array:
 
 
 def starts_of(counts: Array) -> Array:
-    """Start positions [C, B] of items, ordered by bucket and then by piece, from the numbers of items [C, B]."""
+    """Start positions [C, B] from the numbers of items [C, B]; items are ordered by bucket, then by piece."""
     flat = counts.T.reshape(-1)
     return np.ascontiguousarray((np.cumsum(flat) - flat).reshape(counts.shape[::-1]).T)
 

@@ -118,7 +118,7 @@ def fill_around(
 ) -> tuple[Tensor, Tensor]:
     """Inverse depth [h, w] and colours [3, h, w] of all cells, extended beyond the photo's border.
 
-    `across` [h, w] is the inverse depth with holes filled from all sides, `uv` [h, w, 2] the pixels of the cells.
+    `across` [h, w] is the inverse depth with holes filled from all sides; `uv` [h, w, 2] are the cells' pixels.
     Values are propagated from the cells `known` ([h, w] bool). Cells `inside` ([h, w] bool) project into the photo;
     their holes are filled from the far surface.
     """

@@ -1,6 +1,6 @@
 """Complete one view, or all views of a path with one set of aux Gaussians.
 
-The renderer and the network run on the renderer's device, all other code runs on the CPU.
+The renderer and the network run on the renderer's device; all other code runs on the CPU.
 """
 
 from __future__ import annotations
