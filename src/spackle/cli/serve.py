@@ -53,7 +53,7 @@ def view(
     """Show a scene or a photo, or an empty page, until the user stops the server; then delete all scenes.
 
     Depth, calibration and `lens` (`focal_px` and `fov`) belong to the target; `usual` (disparity, keep_frame,
-    depth_kind) holds for all photos that the page sends.
+    depth_kind) applies to all photos that the page sends.
 
     Raises:
         InputError: the target is neither photo nor scene, or an option cannot be used.

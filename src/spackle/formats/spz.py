@@ -56,7 +56,7 @@ _DETAILS += [_Detail(1 / 2, 5, 2, 4), _Detail(1 / 2, 4, 2, 4), _Detail(1 / 2, 4,
 
 
 def encode_spz(scene: SceneFile) -> bytes:
-    """Encode a scene as an SPZ file of version 3, in the same order, with y up and z backward as the format requires.
+    """Encode a scene as an SPZ file of version 3, in the scene's order; y up and z backward as the format requires.
 
     Positions are rounded to a grid (see `spz_grid`). Gaussians outside the grid's range are moved towards the origin
     and shrunk, which does not change the view from the origin.
@@ -145,7 +145,7 @@ def _positions(columns: Columns, bits: int, share: float) -> NDArray[np.uint8]:
 def _rotations(quats: Floats, bits: int) -> NDArray[np.uint32]:
     """Pack unit quaternions wxyz into words [N].
 
-    A word has the index of the largest of xyzw, then a sign and 9 bits for each other component, rounded to `bits`.
+    A word has the index of the largest of xyzw, then a sign and 9 bits, rounded to `bits`, for each other component.
     """
     largest, others = smallest_three(quats[:, [1, 2, 3, 0]])
     step = 2 ** (9 - bits)

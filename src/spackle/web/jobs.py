@@ -202,7 +202,7 @@ class Jobs:
             self._change(id, stage=event["stage"], share=event["done"] / total if total else None)
 
     def _end(self, id: str, error: str | None) -> None:
-        """Record a job's end on the disk, then publish the end; delete the photo."""
+        """Record a job's end on the disk, then tell clients; delete the photo."""
         with self._lock:
             if (job := self._jobs.get(id)) is None:
                 return

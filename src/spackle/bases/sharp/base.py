@@ -199,7 +199,7 @@ def link_owner(owner: Owner, folder: Path) -> None:
 
 
 def owner_of(path: str | os.PathLike[str]) -> Owner | None:
-    """The checkpoint that a decoder's file names; None for another file, InputError if a decoder's file names none."""
+    """The checkpoint that a decoder's file names; None for another file, InputError if the name is missing."""
     note = read_note(path, NOTE)
     if note is None:
         return None
