@@ -15,7 +15,7 @@ import pytest
 import torch
 from command import names_in, refuses, run
 from dataset_builds import SHORT, build, content, dying_build, is_alive, write_inputs
-from photos import metres, picture, write_depth
+from photos import picture
 from PIL import Image
 
 from spackle.dataset import DatasetFiles
@@ -111,20 +111,7 @@ def test_a_lost_shard_is_made_again(whole: Path, place: Path, copy: Path) -> Non
 
 
 def test_odd_photos_are_used_and_bad_ones_are_named(tmp_path: Path) -> None:
-    folder = tmp_path / "photos"
-    folder.mkdir()
-    image = Image.fromarray(picture(72, 54))
-    image.convert("L").save(folder / "grey.png")
-    image.convert("CMYK").save(folder / "cmyk.jpg")
-    image.save(folder / "moving.gif", save_all=True, append_images=[image.rotate(90)])
-    image.resize((8, 8)).save(folder / "tiny.png")
-    image.save(folder / "one.png")
-    shutil.copy(folder / "one.png", folder / "two.png")
-    (folder / "cut.png").write_bytes((folder / "one.png").read_bytes()[:900])
-    (folder / "empty.jpg").write_bytes(b"")
-    (folder / "notes.txt").write_text("not a photo")
-    for name in ("grey", "moving", "one"):  # cmyk has no depth map
-        write_depth(tmp_path / "depth" / f"{name}.npy", metres(72, 54))
+    shutil.copytree(Path(__file__).parents[1] / "data" / "odd_photos", tmp_path, dirs_exist_ok=True)
     done = build(tmp_path, tmp_path / "out", "--views", 2)
     assert done.code == 0, done.err
     manifest = load_manifest(tmp_path / "out")

@@ -190,9 +190,9 @@ def run_cases(name: str, seeds: Sequence[Files], numbers: range, case: Path, sai
 
 def seeds_of(name: str) -> list[Files]:
     """Valid files for a reader."""
-    from readers import sealed, valid_files
+    from readers import sealed, stored_files
 
-    seeds = valid_files(name)
+    seeds = stored_files(name)
     for files in seeds:  # also loads all modules, before memory is bounded
         with tempfile.TemporaryDirectory() as place:
             read(name, sealed(files), Path(place))

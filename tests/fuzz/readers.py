@@ -37,8 +37,8 @@ Files = dict[str, bytes]  # name in the case's folder → content
 DATA = Path(__file__).resolve().parents[1] / "data" / "fuzz"
 
 
-def valid_files(name: str) -> list[Files]:
-    """Sets of valid files for a reader, each from a folder 0, 1, … of its archive; `sealed` packs .npz and .spz."""
+def stored_files(name: str) -> list[Files]:
+    """Sets of files for a reader, each from a folder 0, 1, … of its archive; `sealed` packs .npz and .spz."""
     found: dict[str, Files] = collections.defaultdict(dict)
     with tarfile.open(DATA / f"{name}.tar.xz") as archive:
         for member in archive:
