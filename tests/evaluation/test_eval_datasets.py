@@ -169,7 +169,7 @@ def test_middlebury_2014(tmp_path: Path) -> None:
         valid, K = assert_pair(case, 5.0, FOCAL * 0.193001 / (5.0 + 3.5))
         assert (float(K[0, 2]), bool(valid[0, 0])) == (20.75, False)  # in the file (0, 0) is the first pixel's middle
     stored("middlebury", tmp_path / "trainingH/Art")
-    assert "give the folder of a single size" in error_of("middlebury", tmp_path)
+    assert "give a folder with a single size" in error_of("middlebury", tmp_path)
 
 
 def test_booster(tmp_path: Path) -> None:

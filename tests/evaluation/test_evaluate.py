@@ -313,7 +313,7 @@ def test_a_run_resumes_to_the_same_bytes_and_runs_share_tables(scenes: Path, tmp
     for file, content in (("rows.jsonl", "[1]\n"), ("config.json", '{"format": 2}')):
         damaged = shutil.copytree(one, tmp_path / f"damaged {file}")
         (damaged / file).write_text(content)
-        refuses(run("tables", damaged, "-o", both), file, "run it again")
+        refuses(run("tables", damaged, "-o", both), file, "run the command again")
 
 
 @pytest.mark.parametrize(

@@ -149,7 +149,7 @@ def test_views_of_a_step_and_division_of_photos(place: Path) -> None:
         (["data.pseudo={place}/rgbd"], "rgbd: built with the base rgbd"),
         (["data.pseudo={place}/geometry"], "built with --inpainter geometry, whose targets teach nothing"),
         (["-c", "{place}/other.safetensors"], "other.safetensors"),
-        (["-c", "{place}/whole/best.safetensors"], "best.safetensors: an already trained decoder"),
+        (["-c", "{place}/whole/best.safetensors"], "best.safetensors: holds an already trained decoder"),
         (["optim.batch=6"], "optim.batch=6: give a multiple of 4 views"),
         (["init=weights.safetensors"], "leave out init and other data"),
         (["--method", "residual"], "sharp.safetensors: --method residual learns without a base"),

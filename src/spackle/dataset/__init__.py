@@ -1,4 +1,4 @@
-"""The pseudo-supervised dataset (paper, appendix): views of photos, with holes and completed targets, in shards."""
+"""The pseudo-supervised dataset (paper, appendix): photos' views with holes, and completed targets, in shards."""
 
 from spackle.dataset.sample import DatasetView, PhotoGroup
 from spackle.dataset.shards import DatasetFiles

@@ -85,12 +85,11 @@ class DatasetOptions:
         low, high = self.disparity
         if not 0 < low <= high <= MAX_DISPARITY:
             raise InputError(
-                f"--disparity {low:g} {high:g}: give the smaller number, then the greater, above 0 and up to "
-                f"{MAX_DISPARITY:g}"
+                f"--disparity {low:g} {high:g}: give two numbers above 0 and up to {MAX_DISPARITY:g}, the smaller first"
             )
 
     def depth_of(self, photo: PhotoFile) -> Path | None:
-        """A photo's depth map, from the photo's subfolder of --depth or else --depth itself; None without --depth."""
+        """A photo's depth map: in the photo's subfolder of --depth, or else in --depth itself; None without --depth."""
         folder = self.base.depth
         if not isinstance(folder, Path):
             return None
@@ -145,7 +144,7 @@ def build_dataset(source: Path, output: Path, options: DatasetOptions, reporter:
     """Build a dataset from a folder of photos or from COCO annotations, or resume an earlier build.
 
     Returns:
-        "complete", or "stopped" by Ctrl-C.
+        How the build ended: "complete", or "stopped" by Ctrl-C.
 
     Raises:
         InputError: options, photos or folders cannot be used, or `output` holds another dataset.

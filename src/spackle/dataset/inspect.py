@@ -90,7 +90,7 @@ def _shard_problems(location: str | os.PathLike[str], shard: ShardEntry) -> Iter
 
 
 def preview_dataset(location: str, output: Path, photos: int, views: int, reporter: Reporter) -> None:
-    """Write a sheet (base, mask and target of some views of some photos) and a video of a path, base beside target.
+    """Write a sheet of base, mask and target for some views of some photos, and a video that shows base beside target.
 
     InputError if the dataset is unfinished or damaged, or the folder cannot be written to.
     """

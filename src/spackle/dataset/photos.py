@@ -30,7 +30,7 @@ class PhotoFile:
 
     @property
     def key(self) -> str:
-        """The photo's number as text, with which the names of the photo's files in the dataset begin."""
+        """The photo's number as text; the names of the photo's files in the dataset begin with this key."""
         return f"{self.index:06d}"
 
 

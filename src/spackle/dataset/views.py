@@ -1,6 +1,6 @@
 """The views of a photo along a controlled camera path, and their completed targets (paper, appendix).
 
-An inpainter paints the targets so that all views agree, or one completed scene is rendered, or holes stay black.
+An inpainter paints the holes so that all views agree, or one completed scene fills the holes, or they stay black.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def draw_path(
 def path_cameras(
     kind: SharpTrajectory, disparity: float, camera: Camera, depth_range: DepthRange, views: int
 ) -> list[Camera]:
-    """`views` different cameras: the photo's `camera` (of the views' size), then cameras along the path.
+    """Choose `views` different cameras: first the photo's `camera` (of the views' size), then cameras along the path.
 
     A path may pass through the photo's camera position, and a closed path ends where it begins. So the path is sampled
     with extra frames, and repeated views are dropped. ValueError if the path is impossible, or the camera does not
@@ -148,7 +148,7 @@ def paint_in_turn(inpainter: Inpainter, views: ViewStack, renderer: Renderer) ->
 
 
 def _looked_up(points: Tensor, camera: Camera, rgb: Tensor, inverse_depth: Tensor) -> tuple[Tensor, Tensor]:
-    """Colours [n, 3] of points [n, 3] in a view [H, W, 3] with inverse depth [H, W]; [n] bool: the visible points."""
+    """Colours [n, 3] of points [n, 3] in a view [H, W, 3] with inverse depth [H, W], and whether each is seen [n]."""
     uv, z = camera.project(points)
     place = 2 * uv / uv.new_tensor([camera.width, camera.height]) - 1
     images = torch.cat([rgb, inverse_depth[..., None]], -1).permute(2, 0, 1)

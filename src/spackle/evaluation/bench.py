@@ -49,9 +49,9 @@ Times = dict[tuple[str, str], Values]  # (task, stage) → milliseconds
 def bench(options: EvaluateOptions, runs: int, base_runs: int | None, output: Path, reporter: Reporter) -> str:
     """Time a dataset, or resume an earlier run; returns "complete", or "stopped" after Ctrl-C.
 
-    Writes rows.jsonl, bench.md, bench.tex and images/ into `output`. A folder holds the times of one machine only. The
-    base is timed `base_runs` times (None: once for SHARP, which is slow, else `runs` times), all later stages `runs`
-    times.
+    Writes rows.jsonl, bench.md, bench.tex and images/ into `output`. A folder holds the times of one machine only.
+    Later stages are timed `runs` times, the base `base_runs` times. None means once for SHARP, which is slow, else
+    `runs` times.
 
     Raises:
         InputError: options, dataset or folder cannot be used, `output` holds another benchmark, or memory is too small
@@ -138,7 +138,7 @@ def view_numbers(base: int, added: int, seconds: Mapping[str, Values]) -> dict[s
 
 
 def count_parameters(residual: ResidualNet | None) -> dict[str, float]:
-    """Count parameters: SHARP's checkpoint (702.31 M), the part for inference, the residual, the residual's share.
+    """Parameters of SHARP's checkpoint (702.31 M), of its part for inference and of the residual; the residual's share.
 
     Inference uses neither SHARP's classifiers nor the part that aligns depths.
     """
@@ -152,11 +152,11 @@ def count_parameters(residual: ResidualNet | None) -> dict[str, float]:
 
 
 def measure(runs: int, tasks: Mapping[str, Task], device: torch.device = CPU, *, warm: bool = False) -> Times:
-    """Milliseconds of each task (stage "total") and of each stage of a task, in each run.
+    """Time each task (stage "total") and each stage of a task in milliseconds, in each run.
 
     A task gets a function and calls it with a stage's name when the stage ends; stages of the same name within a run
     add up. A stage ends when the device has done its work. The tasks take turns, so that a busy machine slows all
-    tasks alike. Unless the tasks are `warm`, an untimed run comes first, which compiles and warms up.
+    tasks alike. Unless the tasks are `warm`, an untimed run comes first, for compilation and warm-up.
     """
 
     def now() -> float:

@@ -76,7 +76,7 @@ def load_case(case: Case, max_side: int = MAX_SIDE) -> LoadedCase:
     Views have even sides, so a second photo with an odd side loses its last row or column.
 
     Raises:
-        InputError: a photo is missing, no image, or differs from its camera in aspect ratio.
+        InputError: a photo is missing or is no image, or its aspect ratio differs from its camera's.
     """
     full = load_photo(case.photo)
     if case.camera is not None:

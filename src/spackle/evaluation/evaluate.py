@@ -99,10 +99,10 @@ class EvaluateOptions:
             raise InputError(f"--methods: none is given: choose from {', '.join(METHODS)}")
         self.opened.check(one=True)
         if self.residual == "none":
-            raise InputError("--residual none: leaves holes open, like --methods base: give one of the two")
+            raise InputError("--residual none: leaves the holes open: give --methods base instead")
         if "direct-ft" in self.methods and (self.base.name != "sharp" or self.direct_ft is None):
             raise InputError(
-                "--methods direct-ft: is SHARP with further training: add --base sharp, and --direct-ft FILE with the "
+                "--methods direct-ft: is SHARP after further training: add --base sharp, and --direct-ft FILE with the "
                 "weights of `spackle train --method direct-ft`"
             )
         for value in self.disparities:
@@ -282,7 +282,7 @@ def evaluate(options: EvaluateOptions, output: Path, reporter: Reporter, html: b
 
 
 def measure_case(case: Case, evaluation: Evaluation) -> tuple[list[Row], dict[str, Tensor]]:
-    """Measure an image: its rows, and images [H, W, 3]: the photo, and the views of `measure_views`.
+    """Measure an image. Returns its rows, and pictures [H, W, 3]: the photo and the views of `measure_views`.
 
     InputError if a file is missing or cannot be used; BaseError if the base would fail for every image.
     """
@@ -332,7 +332,7 @@ def _align(loaded: LoadedCase, prediction: BasePrediction, evaluation: Evaluatio
 
 
 def merge_tables(folders: Sequence[Path], output: Path, reporter: Reporter, html: bool = False) -> None:
-    """Write joint tables of finished evaluations and benchmarks into `output`, with `html` also report.html.
+    """Write joint tables of finished evaluations and benchmarks into `output`; with `html`, write report.html too.
 
     InputError if a folder has no results, results cannot share tables, or the output cannot be written to.
     """

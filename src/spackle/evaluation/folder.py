@@ -35,7 +35,7 @@ from spackle.progress import Reporter, asked_to_stop
 
 CONFIG, ROWS, IMAGES = "config.json", "rows.jsonl", "images"
 FORMAT = 3
-DAMAGED = "not of `spackle evaluate` or `spackle bench` ({reason}): run it again"
+DAMAGED = "not written by `spackle evaluate` or `spackle bench` ({reason}): run the command again"
 # From index and case to the case's rows and written files.
 Measure = Callable[[int, Case], tuple[list[Row], list[Path]]]
 
@@ -139,7 +139,7 @@ def _open_folder(output: Path, config: Mapping[str, Any], about: Mapping[str, An
         with reading(path, "damaged, or not JSON ({reason}): choose another -o"):
             old = json.loads(path.read_text("utf-8"))
         if not isinstance(old, dict) or (old.pop("format", None), old.get("kind")) != (FORMAT, kind):
-            raise InputError(f"{path}: not of `spackle {kind}`: choose another -o")
+            raise InputError(f"{path}: not written by `spackle {kind}`: choose another -o")
         old.pop("about", None)
         if lines := differences(old, json.loads(json.dumps(config))):
             raise InputError(f"{output}: holds results of other options ({'; '.join(lines)}): choose another -o")

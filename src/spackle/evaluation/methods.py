@@ -59,11 +59,11 @@ def make_method(
 
     Args:
         name: a name in `METHODS`.
-        cameras: of all views of a setting, because a method may complete all views together.
+        cameras: the cameras of all views of a setting, because a method may complete all views together.
         context: the base, the network and the renderer.
         inpainter: for inpaint2d.
-        direct_ft: for direct-ft: the fine-tuned base's Gaussians, and the factor that converts camera positions to the
-            unit of these Gaussians.
+        direct_ft: for direct-ft; gives the fine-tuned base's Gaussians, and the factor that converts camera positions
+            to the unit of these Gaussians.
     """
     context = context.placed
     guard = context.photo_guard() if name in ("spackle", "seeds", "dense") else None

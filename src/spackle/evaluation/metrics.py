@@ -152,7 +152,7 @@ def open_metrics(names: Sequence[str], device: str, download: bool) -> tuple[dic
 
 
 def _measure_by(network: Callable[..., Any]) -> Metric:
-    """Make a metric of a pyiqa network, which returns one number, possibly NaN."""
+    """Make a metric from a pyiqa network; the metric gives one number, possibly NaN."""
 
     def measure(picture: Tensor, truth: Tensor | None = None) -> float:
         images = [image.clamp(0, 1).permute(2, 0, 1)[None].float() for image in (picture, truth) if image is not None]

@@ -1,4 +1,4 @@
-"""Pictures of an evaluation: the stored ones, contact sheets, and the paper's figures (`spackle figures`)."""
+"""Pictures of an evaluation: pictures of each image, contact sheets, and the paper's figures (`spackle figures`)."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ def rank(run: Run) -> Ranking | None:
 
 
 def write_sheets(run: Run, folder: Path) -> None:
-    """Write best.png and worst.png: six images by each method, and the truth. Writes nothing without a ranking."""
+    """Write best.png and worst.png: six images, each by all methods, with the truth. Without a ranking, do nothing."""
     ranking = rank(run)
     if ranking is None:
         return
@@ -191,7 +191,7 @@ TITLES = {INPUT: "Input", HOLE: "Occluded regions", "direct-ft": "Direct FT"}
 def make_figures(folders: Sequence[Path], rows: int, output: Path, reporter: Reporter) -> None:
     """Draw figures from large-view evaluations as PDF and PNG, and write their captions for LaTeX.
 
-    Each image appears as its view with the largest hole. A figure has at most `rows` images, but at least one per run.
+    Each image is shown in its view with the largest hole. A figure has at most `rows` images, but at least one per run.
 
     Raises:
         InputError: a folder has no results, or no large-view evaluation has pictures.

@@ -62,8 +62,8 @@ def large_views(prediction: BasePrediction, disparities: Sequence[float], side: 
     """The views of the paper's controlled rendering (section 4.1): the two ends of the `swipe` path at each disparity.
 
     At disparity m the camera moves sideways by m · ‖(W/f, H/f)‖ · z_near, once to the left and once to the right, and
-    looks at the focus point; the paper does not say so. Intrinsics are the photo's. The long side is at most `side`,
-    and both sides are even, as the paper's counts of dense grids imply.
+    looks at the focus point. The paper does not state this rule. Intrinsics are the photo's. The long side is at most
+    `side`. Both sides are even, which the paper's counts of dense grids imply.
 
     Raises:
         InputError: no Gaussian is in front of the camera, or the disparity is impossible.
@@ -177,8 +177,8 @@ def measure_views(
     """Measure every method on every view of a base; a method gets all cameras of a setting at once.
 
     Returns:
-        Rows, with dataset and image as in the row `image`; and pictures [H, W, 3] of the view with the largest hole:
-        the hole (white), the view by each method, and the truth, if known.
+        Rows, whose dataset and image are copied from the row `image`. Also pictures [H, W, 3] of the view with the
+        largest hole: the hole in white, the view by each method, and the truth if known.
     """
     rows: list[Row] = []
     pictures: dict[str, Tensor] = {}

@@ -185,7 +185,7 @@ def check_matplotlib(option: str) -> None:
 
 
 def plots_of(run: Run) -> list[Plot]:
-    """The plots of an evaluation for which it has numbers."""
+    """All plots that can be drawn from an evaluation's numbers."""
     made = [scenes_plot(run, metric) for metric in SCENE_PLOTS] if run.near else [holes_plot(run)]
     return [plot for plot in made if plot]
 
@@ -224,7 +224,7 @@ def _draw(
 
 
 def holes_plot(run: Run) -> Plot | None:
-    """HAR against disparity, before and after completion, with the paper's; None if nothing was measured."""
+    """HAR against disparity, before and after completion, with the paper's values; None if nothing was measured."""
 
     def means(rows: Iterable[Row], metric: str, method: str) -> list[tuple[float, float]]:
         chosen = (row for row in rows if (row.method, row.metric, row.dataset) == (method, metric, run.title))

@@ -30,7 +30,7 @@ DISPARITIES = tuple(map(float, SETTINGS))
 
 
 class Row(NamedTuple):
-    """One number. For a number of a whole image, setting, view and method are empty."""
+    """One number. A number of a whole image has an empty setting, view and method."""
 
     dataset: str  # the dataset's name in the paper's tables
     image: str
@@ -55,7 +55,7 @@ def mean(values: Sequence[Value], of: Callable[[list[float]], float] = statistic
 
 
 def pivot(rows: Iterable[Row], *columns: str) -> dict[tuple[str, ...], list[Value]]:
-    """Group the values of rows by the rows' entries in these columns."""
+    """Group the values of rows by the rows' entries in `columns`."""
     groups: dict[tuple[str, ...], list[Value]] = {}
     for row in rows:
         groups.setdefault(tuple(getattr(row, column) for column in columns), []).append(row.value)
@@ -140,5 +140,5 @@ def paper_rows(label: str) -> tuple[Row, ...]:
 
 
 def setting_title(setting: str, pattern: str = "{}") -> str:
-    """The title of a setting: "S1" for "0.3", or `pattern` filled with "S1" and "0.3"; else "disparity 0.6"."""
+    """The title of a setting: `pattern` filled with "S1" and "0.3" for "0.3"; "disparity 0.6" if not in the paper."""
     return pattern.format(f"S{SETTINGS.index(setting) + 1}", setting) if setting in SETTINGS else f"disparity {setting}"

@@ -28,7 +28,7 @@ class Table:
 
 
 def _ratio(value: float) -> str:
-    """Four decimals, as in the paper; two significant digits if the value would round to zero."""
+    """Four decimals, as in the paper; two significant digits where four decimals would show zero."""
     return f"{value:.1e}" if 0 < value < 0.5e-4 else f"{value:.4f}"
 
 
@@ -47,7 +47,7 @@ TEXTS: dict[str, Text] = {
 
 
 def mark_best(values: Sequence[float | None], texts: Sequence[str], lower: bool) -> list[str]:
-    """Make the text of the best value bold, and equal texts, too; no text is bold if all texts are equal."""
+    """Make the best value's text bold, and all texts equal to that text; if all are equal, none becomes bold."""
     known = {value: text for value, text in zip(values, texts, strict=True) if value is not None}
     if len(set(known.values())) < 2:
         return list(texts)

@@ -1,4 +1,4 @@
-"""The paper's six tables and one more, as pivots of rows; the paper's numbers are rows beside ours.
+"""The paper's six tables and one more, made as pivots of rows; the paper's numbers stand beside ours.
 
 tables.json has titles, captions, columns (group, title, metric, number format) and notes.
 """
@@ -61,7 +61,7 @@ Values = Mapping[tuple[str, ...], Sequence[Value]]  # by method, setting and met
 
 
 def make_tables(runs: Sequence[Run], *, whole: bool = False) -> list[Table]:
-    """Make the tables for which the runs have numbers; with `whole`, all of the paper's.
+    """Make the tables for which the runs have numbers; with `whole`, make all tables of the paper.
 
     Counts of Gaussians and times come from benchmarks; for datasets without a benchmark, counts come from large views.
 
@@ -107,7 +107,7 @@ def method_name(run: Run, method: str, title: str = "") -> str:
 
 
 def _notes(spec: Mapping[str, Any], runs: Sequence[Run]) -> list[str]:
-    """Notes below a table, with repetitions: views, bases, rows, weights, metrics, missing images, times."""
+    """Notes below a table, some of them repeated: views, bases, rows, weights, metrics, missing images, times."""
     names = dict.fromkeys(name for column in spec["columns"] if (name := metric_name(column[2])))
     rows = {method: spec.get("rows", {}).get(method) for run in runs for method in _row_names(spec, run)}
     notes = [NOTES[run.config["second_views"] if run.near else "large"].format(**run.config) for run in runs]
@@ -160,7 +160,7 @@ def _timed_notes(run: Run) -> list[str]:
 
 
 def _columns(spec: Mapping[str, Any], settings: Iterable[str], over: str = "") -> list[Column]:
-    """A table's columns at each setting; a pattern `over` makes the head of each setting."""
+    """A table's columns, once for each setting; `over` is a pattern for the heading above a setting's columns."""
     columns = []
     for setting in settings:
         for group, title, metric, *text in spec["columns"]:
@@ -225,7 +225,7 @@ def grouped(name: str, rows: Sequence[Cells]) -> list[Cells]:
 def _rows(
     label: str, spec: Mapping[str, Any], runs: Sequence[Run], dataset: str, columns: Sequence[Column]
 ) -> list[tuple[str, str, list[str]]]:
-    """A dataset's rows, ours (or "not run") and then the paper's: name, number of images, and cells of each."""
+    """A dataset's rows, ours (or "not run") before the paper's; a row is a name, a number of images, and cells."""
     rows = []
     for run in (run for run in runs if run.title == dataset):
         names, of = _row_names(spec, run), f"/{IMAGES[dataset]}" if dataset in IMAGES else ""
@@ -240,7 +240,7 @@ def _rows(
 
 
 def _dataset_table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], settings: Sequence[str]) -> Layout:
-    """A table with rows for each dataset's methods and the paper's; its columns are repeated for each disparity."""
+    """A table with rows for our methods and the paper's, by dataset; the columns are repeated for each disparity."""
     columns = _columns(spec, settings, "" if settings == [NEAR] else "{}: disparity {}")
     heads = [("", "Dataset"), ("", "Method"), ("", "n"), *((column.group, column.title) for column in columns)]
     of = {dataset: _rows(label, spec, runs, dataset, columns) for dataset in _datasets(runs)}
@@ -265,7 +265,7 @@ def _near_table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], settin
 
 
 def _overhead_table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], settings: Sequence[str]) -> Layout:
-    """A table of added Gaussians for each dataset and on average, and of medians of the datasets' median times."""
+    """A table of added Gaussians, by dataset and on average; times are medians of the datasets' medians."""
     counts = _columns(spec, settings, "{}: disparity {}")
     of = {dataset: _rows(EXPANDED, spec, runs, dataset, counts) for dataset in _datasets(runs)}
     bodies = [grouped(dataset, [(name, *cells) for name, _, cells in rows]) for dataset, rows in of.items()]

@@ -103,7 +103,7 @@ def remove_run(output: Path) -> None:
 
 
 def open_logs(folder: Path, first: int, log: Log) -> AbstractContextManager[Any]:
-    """A context with TensorBoard's `SummaryWriter`, which hides values after step `first`; None if not installed."""
+    """Open TensorBoard's writer as a context, and hide stored values after step `first`; None without TensorBoard."""
     try:
         import tensorboard  # noqa: F401  # if it is missing, torch's import raises another error
         from torch.utils.tensorboard import SummaryWriter

@@ -1,7 +1,7 @@
 """The paper's naive decoupled baseline ("Direct FT"): SHARP's own decoder is trained in place of the residual.
 
-Targets and losses are those of the residual. Each step includes the photo's own view: only "the non-Spackle training
-path" has losses at the input view ("Training Details and Loss Weights").
+Targets and losses are those of the residual. Each step includes the photo's own view, because the paper has losses at
+the input view only in "the non-Spackle training path" ("Training Details and Loss Weights").
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ class DirectFt(ViewTask):
     at_once = 1
 
     def __init__(self, recipe: Recipe, device: torch.device, checkpoint: Path | None = None) -> None:
-        """Check that checkpoint (None: the downloaded one) and dataset match, without loading the network.
+        """Check that the dataset matches the checkpoint (None: the downloaded one), without loading the network.
 
         InputError if the recipe, the checkpoint or the dataset cannot be used.
         """
@@ -120,7 +120,7 @@ class DirectFt(ViewTask):
             raise InputError(f"--method direct-ft: {MISSING['sharp']}")
         read_tensors(path, "give SHARP's checkpoint")  # without the numbers; refuses other files
         if owner_of(path) is not None:
-            raise InputError(f"-c {path}: an already trained decoder: give the original checkpoint of SHARP")
+            raise InputError(f"-c {path}: holds an already trained decoder: give the original checkpoint of SHARP")
         self.owner = Owner(path, weights_digest(path))
         self.files = open_pseudo(data.pseudo)
         base = self.files.manifest.config.get("base", {})
@@ -158,6 +158,6 @@ class DirectFt(ViewTask):
 
 
 def drawn_views(seed: Sequence[int], views: int) -> list[int]:
-    """Numbers of up to `VIEWS_AT_ONCE` views of a photo: the photo's own view, 0, and random other views."""
+    """Numbers of up to `VIEWS_AT_ONCE` views of a photo: 0 for the photo's own view, then random other views."""
     others = 1 + np.random.default_rng(seed).permutation(views - 1)[: VIEWS_AT_ONCE - 1]
     return [0, *sorted(others.tolist())]

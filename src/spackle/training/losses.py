@@ -1,8 +1,8 @@
 """The four terms of eq. 12, two measures of a filled hole's error, and the feature networks.
 
 Arguments of the terms: `rgb` [B, H, W, 3] sRGB 0..1 and `alpha` [B, H, W] of completed views, the base's view
-`base_rgb` [B, H, W, 3], the `target` [B, H, W, 3], the `hole` [B, H, W] bool. A term is a mean over pixels of an image,
-then over images. An image without such pixels gives a differentiable 0.
+`base_rgb` [B, H, W, 3], the `target` [B, H, W, 3], the `hole` [B, H, W] bool. A term averages over an image's pixels
+inside or outside of the hole, then over images. An image without such pixels counts as a differentiable 0.
 """
 
 from __future__ import annotations
@@ -159,8 +159,8 @@ def _channels(numbers: tuple[float, ...], images: Tensor) -> Tensor:
 def color_loss(rgb: Tensor, target: Tensor, hole: Tensor, blur: float = 0.0) -> Tensor:
     """[] mean |rgb - target| over a hole's pixels and the channels.
 
-    With `blur` > 0 the difference is first blurred within the hole, by a Gaussian of this standard deviation in pixels;
-    the perceptual term alone then determines texture.
+    With `blur` > 0 a Gaussian with this standard deviation in pixels first blurs the difference within the hole. The
+    perceptual term alone then determines texture.
     """
     apart = torch.where(hole[..., None], rgb - target, 0)
     if blur > 0:
@@ -192,14 +192,14 @@ def perceptual_loss(
 ) -> Tensor:
     """[] differences of features and of Gram matrices near the hole, summed over layers.
 
-    F and T are a layer's features [C, h, w] of prediction and target, divided by the root mean square of T; w [h, w] is
-    the fraction of each cell that the dilated hole covers. A layer adds
+    F and T are a layer's features [C, h, w] of prediction and target, divided by the root mean square of T. The weight
+    w [h, w] is the fraction of each cell that the dilated hole covers. A layer adds
 
         sum(w |F - T|) / (C sum(w))  +  gram · mean |G(F) - G(T)|,    G(F) = (F w) F^T / sum(w),  [C, C].
 
     Args:
         features: the network.
-        rgb, target, hole: as in all terms. Outside of the dilated hole, the target replaces the prediction.
+        rgb, target, hole: as in the other terms. Outside of the dilated hole, the target replaces the prediction.
         dilation: side in pixels of the max-pool that dilates the hole.
         size: longer side in pixels to which images are resized for the network; None: not resized.
         gram: weight of the Gram matrices.
@@ -276,7 +276,7 @@ def covered(mask: Tensor, features: Tensor) -> Tensor:
 
 
 def _mean_of_images(values: Tensor, where: Tensor) -> Tensor:
-    """[] mean of values [B, H, W], 0 outside of the mask `where`, over each image's mask, then over images."""
+    """[] mean over each image's mask `where`, then over images, of values [B, H, W] that are 0 outside of the mask."""
     return (values.sum((1, 2)) / where.sum((1, 2)).clamp_min(1)).mean()
 
 

@@ -108,7 +108,7 @@ class LossRecipe(RecipePart):
 
 
 class OptimRecipe(RecipePart):
-    """AdamW with linear warm-up, then a cosine (paper, "Training Details and Loss Weights")."""
+    """AdamW with a linear warm-up, then a cosine decay (paper, "Training Details and Loss Weights")."""
 
     lr: Annotated[float, Field(gt=0, le=1)] = 1.6e-4
     min_lr: Annotated[float, Field(ge=0, le=1)] = 1.6e-5
@@ -154,7 +154,7 @@ R = TypeVar("R", bound=AnyRecipe)
 
 
 def differences(stored: Mapping[str, Any], recipe: RecipePart, above: str = "") -> list[str]:
-    """Keys, without `FREE` keys, in which a recipe differs from the `model_dump` of another; prefixed by `above`."""
+    """Keys in which a recipe differs from a `stored` model_dump, prefixed by `above`; `FREE` keys are ignored."""
     fields, now = type(recipe).model_fields, recipe.model_dump(mode="json")
     keys = [above + name for name, value in stored.items() if name not in fields and value is not None]
     for name, field in fields.items():

@@ -78,8 +78,8 @@ class ViewTask(Task):
         return total_loss(**tensors, recipe=self.recipe.loss, features=self.features)
 
     def measure(self, network: nn.Module, batch: Any) -> dict[str, list[float]]:
-        """Values for each view: loss and terms (batch means), PSNR in dB in the hole (against the target) and outside
-        (against the base), share of hole pixels before and after completion.
+        """Values for each view: the loss and its terms (means of the batch), and the share of hole pixels before and
+        after completion. PSNR in dB compares the hole with the target, and the other pixels with the base.
         """
         views = self.complete(network, batch)
         loss, terms = self._loss_of(views)
@@ -102,7 +102,7 @@ class ViewTask(Task):
 def complete_samples(
     network: nn.Module, samples: Sequence[Sample], renderer: Renderer, precision: torch.dtype = torch.float32
 ) -> ViewBatch:
-    """Complete samples of one size; only the network, whose convolutions compute in `precision`, gets gradients."""
+    """Complete samples of one size. Only the network gets gradients; its convolutions compute in `precision`."""
     device = device_of(renderer)
     # Masks are read before the samples move to the renderer's device: reading them later would wait for a GPU.
     cells = [training_cells(sample.features).flatten().nonzero()[:, 0] for sample in samples]
@@ -141,7 +141,7 @@ def first_network(name: str, init: Path | None = None) -> ResidualNet:
     """The initial network of a run: untrained, or read from the file `init`.
 
     The file holds weights of the same network. For "sharp-decoder", SHARP's checkpoint is also accepted: the decoder is
-    read, stem and heads stay untrained. InputError if the file is missing, broken or foreign.
+    read, stem and heads stay untrained. InputError if the file is missing, broken or of another network.
     """
     if init is None:
         return open_residual(name)
@@ -153,7 +153,7 @@ def first_network(name: str, init: Path | None = None) -> ResidualNet:
         return sharp
     network = load_residual(init)
     if network.name != name:
-        raise InputError(f"{init}: weights of the network {network.name}: set network={network.name}, or another init")
+        raise InputError(f"{init}: has weights of network {network.name}: set network={network.name} or another init")
     return network
 
 
@@ -195,7 +195,7 @@ class ResidualTask(ViewTask):
 
     @torch.no_grad()
     def limits(self) -> dict[str, float]:
-        """Mean hole PSNR in dB of validation samples with an untrained network, and of seeds with the targets' colours.
+        """Mean hole PSNR in dB of validation samples: untrained, then with seeds in the targets' colours.
 
         A run can raise PSNR only from the first value towards the second.
         """

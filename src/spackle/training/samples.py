@@ -218,10 +218,10 @@ def make_samples(
     progress: Step,
     warn: Callable[[str], None],
 ) -> list[Path]:
-    """Make the missing samples of the first `views` views in a folder; returns the files of all samples in order.
+    """Make the samples of the first `views` views that a folder lacks; returns the files of all samples in order.
 
-    `seed` determines the views; the processes of a run divide them. `warn` is called with the reason if a view cannot
-    be made. InputError if no file can be written, or no view gave a sample.
+    `seed` determines the views; the processes of a run share the work. `warn` is called with the reason if a view
+    cannot be made. InputError if no file can be written, or no view gave a sample.
     """
     folder.mkdir(parents=True, exist_ok=True)
     if len(sources) == 1 and sources[0].views is not None:

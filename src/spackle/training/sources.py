@@ -45,7 +45,7 @@ def find_sources(data: DataRecipe, renderer: Renderer, *, validation: bool) -> l
     shares, sources = data.shares, list[Source]()
 
     def add(name: str, share: float, folder: Path, files: Sequence[Path], draw: Draw | None = None) -> None:
-        """Add reverse views of the photos that `draw` gives, or for None the right views of stereo pairs."""
+        """Add a source: reverse views of the photos from `draw`, or right views of stereo pairs if `draw` is None."""
 
         def view(rng: np.random.Generator, index: int) -> Sample:
             return (
@@ -118,9 +118,9 @@ def reverse_view(prediction: BasePrediction, photo: Tensor, viewer: Camera, rend
 
 
 def seen_from(gaussians: Gaussians, viewer: Camera, depth: Tensor) -> Tensor:
-    """[N] bool: the Gaussians in front of the greatest rendered `depth` [H, W] of 3×3 pixels around their centres.
+    """[N] bool: the Gaussians no farther than the greatest rendered `depth` [H, W] of the 3×3 pixels around them.
 
-    The depth of one pixel is not enough: at an outline, the nearer depth covers pixels of the farther surface.
+    One pixel's depth is not enough: at an outline, the pixel of a farther Gaussian may show the nearer surface.
     """
     around = max_pool2d(depth[None, None], 3, stride=1, padding=1)[0, 0]
     uv, z = viewer.project(gaussians.means)
@@ -133,8 +133,8 @@ def seen_from(gaussians: Gaussians, viewer: Camera, depth: Tensor) -> Tensor:
 def with_backing(seen: Tensor, gaussians: Gaussians, camera: Camera) -> Tensor:
     """Extend `seen` [N] to backing Gaussians, which lie behind their surface by design (`spackle.bases.lift.lift`).
 
-    A backing Gaussian counts as seen if the farthest of the four pixels around the Gaussian is seen. Of a lifted
-    photo's Gaussians, the first H · W belong to pixels; of all others, backing Gaussians lie at corners of pixels.
+    A backing Gaussian counts as seen if the farthest of the four pixels around the Gaussian is seen. A lifted photo's
+    first H · W Gaussians belong to pixels; among the rest, backing Gaussians are those at corners of pixels.
     """
     width, height = camera.width, camera.height
     uv, z = camera.project(gaussians.means)
@@ -309,7 +309,7 @@ def random_crop(rng: np.random.Generator, photo: Tensor, height: int, width: int
 
 
 def _background(rng: np.random.Generator, height: int, width: int) -> Tensor:
-    """Inverse depth [H, W] of a wall, at random with ground or a second wall."""
+    """Inverse depth [H, W] of a wall, in some cases with the ground or a second wall."""
     far = 1.0 / rng.uniform(*BACKGROUND_M)
     plane = far * (1 + _tilt(rng, height, width, 0.3))
     if rng.random() < 0.5:  # the ground: inverse depth grows linearly below the horizon

@@ -252,7 +252,7 @@ def train(
 
 @torch.no_grad()
 def validate(task: Task, network: nn.Module, device: torch.device) -> dict[str, float]:
-    """Means of a task's measures over all validation items, without values that are not finite.
+    """Means of a task's measures over all validation items; values that are not finite are left out.
 
     The processes divide the items, and each process gets the same means.
     """

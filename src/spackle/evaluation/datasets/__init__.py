@@ -46,8 +46,8 @@ def read_cases(name: str, root: Path) -> list[Case]:
     """All cases of a dataset at or below `root`, in an order that depends on names alone.
 
     Raises:
-        InputError: there is no such folder, scene (the message names the expected files) or photo, two scenes have the
-            same name, or a scene's files are missing or damaged.
+        InputError: there is no such folder, no scene (the message names the expected files) or no photo; two scenes
+            have the same name; or a scene's files are missing or damaged.
     """
     dataset = DATASETS[name]
     if not root.is_dir():
@@ -62,7 +62,7 @@ def read_cases(name: str, root: Path) -> list[Case]:
         scene = posed_photos.category_and_scene(folder) if name == "wildrgbd" else folder.name
         other = scenes.setdefault(scene, folder)
         if other is not folder:
-            raise InputError(f"{folder}: {other} has the same scene name: give the folder of a single size or part")
+            raise InputError(f"{folder}: same scene name as {other}: give a folder with a single size or part")
     if not (cases := dataset.cases(scenes)):
         raise InputError(f"{root}: the scenes of {name} have no photos with a pose: unpack the dataset again")
     return cases

@@ -56,7 +56,7 @@ class Model:
 
 
 def model_folder(scene: Path) -> Path:
-    """The folder of a scene's model: sparse/0 or sparse, possibly in dense/ as by COLMAP's undistorter."""
+    """The folder of a scene's model: sparse/0 or sparse, in the scene or in dense/ (from COLMAP's undistorter)."""
     for place in (scene / name for name in ("sparse/0", "sparse", "dense/sparse/0", "dense/sparse")):
         if any((place / f"cameras{end}").is_file() for end in (".bin", ".txt")):
             return place
@@ -64,7 +64,7 @@ def model_folder(scene: Path) -> Path:
 
 
 def read_model(folder: Path) -> Model:
-    """Read cameras, images and points3D; the binary files if there is a cameras.bin.
+    """Read cameras, images and points3D from binary files if there is a cameras.bin, else from text files.
 
     Raises:
         InputError: a file is missing or damaged, or a lens is too far from a pinhole.
@@ -132,7 +132,7 @@ def _cameras_bin(path: Path) -> Iterator[tuple[Any, ...]]:
 
 
 def _images_bin(path: Path) -> Iterator[tuple[list[float], int, str, Array]]:
-    """Yield quaternion wxyz with translation, camera, name, POINT_2D [n]."""
+    """Yield each photo's pose (quaternion wxyz, translation), camera, name and POINT_2D [n]."""
     data = path.read_bytes()
     (count,), at = struct.unpack_from("<Q", data), 8
     for _ in range(count):

@@ -50,7 +50,7 @@ def posed_by(scene: Path, model: Model, photos: Sequence[Path]) -> list[Posed]:
 
 
 def make_cases(views: Sequence[Posed], wanted: Iterable[int] | None = None) -> list[Case]:
-    """Make cases of photos: all other photos are second views, in the case's frame, with the nearest camera first.
+    """Make a case of each wanted photo; all others become second views in the case's frame, the nearest camera first.
 
     At most three second views count as near: the nearest views that qualify. A view qualifies if its camera is 5 % to
     25 % of the photo's middle depth away, is turned by at most 30°, and sees at least 30 % of the photo's points. If
@@ -96,8 +96,8 @@ def _sees_the_same(view: Posed, other: Posed) -> bool:
 def spread(scenes: Sequence[str], frames: Callable[[str], Sequence[int]], count: int) -> dict[str, Sequence[int]]:
     """Choose `count` frames, or all if there are fewer, spread evenly over the scenes and over the frames of a scene.
 
-    Scenes give one frame each in turn, until `count` frames are reached; scenes without further frames are left out.
-    With more scenes than `count`, the categories of scenes named CATEGORY/SCENE give one scene each in turn.
+    Scenes take turns to give one frame each, until there are `count` frames; scenes without further frames are skipped.
+    If there are more scenes than `count`, categories take turns to give one scene each (names are CATEGORY/SCENE).
 
     Args:
         scenes: names, in order; the scenes of a category are neighbours.

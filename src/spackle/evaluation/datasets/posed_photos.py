@@ -88,9 +88,9 @@ def llff_cases(scenes: Mapping[str, Path]) -> list[Case]:
     """Cases of scenes with `poses_bounds.npy`, `sparse/0`, or both, and photos in `images_4`, `images` or `images_8`.
 
     A COLMAP model, from which the dataset's poses were made, gives cameras and points. The near and far bounds are used
-    only if the model has no points, or there is no model; then the middle depth is half way between the bounds in
-    inverse depth. Photos of the model are matched to files by name, else by order; rows of `poses_bounds.npy` always by
-    order. The unit of length is arbitrary. For second views see `make_cases`.
+    only if there is no model, or the model has no points. Without a model, the middle depth is half way between the
+    bounds in inverse depth. Photos of the model are matched to files by name, else by order. Rows of `poses_bounds.npy`
+    are matched by order. The unit of length is arbitrary. For second views see `make_cases`.
 
     The paper's 190,512 cells correspond to `images_4` (1008×756); `images` (4032×3024) would give 1536×1152.
     """
@@ -117,7 +117,7 @@ def _llff_views(scene: Path) -> list[Posed]:
 
 
 def _read_bounds(path: Path, count: int) -> NDArray[Any]:
-    """[count, 17]: for each photo, sorted by name, a 3×5 matrix, the nearest and the farthest depth."""
+    """Read a row of 17 numbers for each photo, sorted by name: a 3×5 matrix, the nearest and the farthest depth."""
     with reading(path, "not LLFF's table ({reason}): expected finite floats, [photos, 17]"):
         table: NDArray[Any] = np.load(path, allow_pickle=False)
         if table.ndim != 2 or table.shape[1] != 17 or table.dtype.kind != "f" or not np.isfinite(table).all():
@@ -159,12 +159,12 @@ def wildrgbd_cases(scenes: Mapping[str, Path]) -> list[Case]:
 
     `CATEGORY/scenes/SCENE/` has `rgb/00000.png`, `depth/00000.png` (mm), `metadata` and `cam_poses.txt`.
 
-    `metadata` is JSON with w, h, and K column by column, for pixel centres at integers, as in the dataset's tool.
-    `cam_poses.txt` has a line for each frame: its number and the 16 numbers of camera-to-world, OpenCV convention.
+    `metadata` is JSON with w, h and K. K is stored column by column, and pixel centres are at integers. `cam_poses.txt`
+    has a line for each frame: its number, then camera-to-world as 16 numbers, in OpenCV's convention.
 
-    `spread` takes 512 frames; with 512 scenes or more, one frame of each. Second views come from all frames of the
-    scene, see `make_cases`, with 0.8 m as the middle depth. Photos of 640×480 or 480×640 keep their size and have the
-    paper's 76,800 cells.
+    `spread` takes 512 frames; if there are 512 scenes or more, 512 scenes give one frame each. Second views come from
+    all frames of the scene, see `make_cases`, with 0.8 m as the middle depth. Photos of 640×480 or 480×640 keep their
+    size and have the paper's 76,800 cells.
     """
     read: dict[str, list[Posed]] = {}
 

@@ -61,7 +61,7 @@ def _from_corner(lens: Calibration) -> Calibration:
 
 
 def _depth_by(lens: Calibration, path: Path, read: Callable[[], NDArray[Any]]) -> Callable[[], DepthMap]:
-    """A reader of z = focal · baseline / (disparity + doffs); disparities in pixels of 0 or less are unknown."""
+    """A reader of z = focal · baseline / (disparity + doffs); disparities are in pixels; 0 or less: unknown."""
 
     def depth() -> DepthMap:
         stored = read()
@@ -97,16 +97,16 @@ def pair_of_2014(folder: Path) -> Case:
 def middlebury_cases(scenes: Mapping[str, Path]) -> list[Case]:
     """A case for each scene; the second view is the right photo.
 
-    A scene's folder has `im0.png` with `calib.txt` (2014 at full size; MiddEval3 at full, half or quarter size), or a
-    `scene.json`, which describes any rectified pair. `X-imperfect` is skipped if there is `X-perfect`; test scenes are
-    skipped, because they have no ground truth. The paper's 23 scenes are those of 2014.
+    A scene's folder has either `im0.png` and `calib.txt` (2014 at full size; MiddEval3 at full, half or quarter size),
+    or a `scene.json`, which can describe any rectified pair. `X-imperfect` is skipped if there is `X-perfect`; test
+    scenes are skipped, because they have no ground truth. The paper's 23 scenes are those of 2014.
     """
     names = [name for name in scenes if name.replace("-imperfect", "-perfect") not in scenes.keys() - {name}]
     return [_middlebury_case(scenes[name]) for name in names]
 
 
 def _middlebury_case(folder: Path) -> Case:
-    """A case from `scene.json` (pixel centres at half-integers, lengths possibly nominal), or as of 2014."""
+    """A case from `scene.json` (pixel centres at half-integers; lengths may be nominal), or from the files of 2014."""
     path = folder / "scene.json"
     if not path.exists():
         return pair_of_2014(folder)
@@ -121,12 +121,12 @@ def _middlebury_case(folder: Path) -> Case:
 
 
 def booster_cases(scenes: Mapping[str, Path]) -> list[Case]:
-    """Cases of 12-megapixel stereo scenes with glass and mirrors: a case for each left photo, that is, for each light.
+    """Cases of 12-megapixel stereo scenes with glass and mirrors: one for each left photo, that is, each lighting.
 
     Left photos are `train/balanced/SCENE/camera_00/im*.png` of 4112×3008 pixels; right photos have the same names in
-    `camera_02`. One `disp_00.npy` and one `calib_00-02.xml` (OpenCV: proj_matL, proj_matR, baselineLR in millimetres)
-    serve all lights. Test scenes, which have no ground truth, and unbalanced scenes, whose right camera differs, are
-    skipped. At the working size the photos have 1536×1124 pixels and the paper's 431,616 cells.
+    `camera_02`. All photos of a scene share one `disp_00.npy` and one `calib_00-02.xml` (OpenCV: proj_matL, proj_matR,
+    baselineLR in millimetres). Test scenes are skipped because they have no ground truth, unbalanced scenes because
+    their right camera differs. At the working size the photos have 1536×1124 pixels and the paper's 431,616 cells.
     """
     return [case for scene in scenes.values() for case in _lights_of(scene)]
 
