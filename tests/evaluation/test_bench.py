@@ -134,5 +134,5 @@ def test_from_files_to_tables(scenes: Path, tmp_path: Path) -> None:
             bases = [base for base in values["base_gaussians", "", ""] for _ in range(2)]
             added = zip(bases, values["aux", setting, method], strict=True)
             assert values["merged", setting, method] == [base + aux for base, aux in added]
-    refuses(run(*words, "--runs", 3, "--limit", 2), "of other options (base_runs: 2 -> 3; runs: 2 -> 3)")
+    refuses(run(*words, "--runs", 3, "--limit", 2), "with other options (base_runs: 2 -> 3; runs: 2 -> 3)")
     refuses(run("evaluate", *words[1:], "--metrics", "none"), "config.json: not written by `spackle evaluate`")

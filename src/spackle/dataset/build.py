@@ -230,7 +230,7 @@ class _Build:
             Manifest(config=config, shards=(), complete=False).save(output)
         manifest = load_manifest(output)
         if lines := differences(manifest.config, config):
-            raise InputError(f"{output}: holds a dataset of other options ({'; '.join(lines)}): choose another -o")
+            raise InputError(f"{output}: holds a dataset with other options ({'; '.join(lines)}): choose another -o")
         make_folder(output / PARTS)
         remove_half_written(output, output / PARTS)
         sizes = {path.name: path.stat().st_size for path in output.iterdir() if path.is_file()}

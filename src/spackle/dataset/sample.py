@@ -56,7 +56,7 @@ def pack_sample(key: str, photo: Tensor, stack: ViewStack, targets: Tensor, fact
     """Pack a photo for a tar archive: KEY.json, KEY.photo.png, KEY.base.safetensors, then five files per view.
 
     The bytes have no end-of-archive mark and record no time, owner or machine. `photo` [h, w, 3] (at its working size)
-    and `targets` [V, H, W, 3] are sRGB; `facts` go into the JSON and must have the mask's "threshold" and the
+    and `targets` [V, H, W, 3] are sRGB; `facts` become part of the JSON, and must hold "threshold" (of the mask) and
     "trajectory".
     """
     files: list[tuple[str, bytes]] = []

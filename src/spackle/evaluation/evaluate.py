@@ -141,7 +141,7 @@ class Evaluation:
     metrics: dict[str, str]  # for each wanted metric the package that measures it, or why the metric is not run
 
     def open(self, loaded: LoadedCase) -> OpenedBase:
-        """The base of a case: a network, or else the case's depth or points; InputError without any."""
+        """The base of a case: a network, or else the case's depth or points; InputError if there is none."""
         network = self.options.base.network
         return self.base if network else open_loaded(RgbdBase(known_depth(loaded.case)))
 

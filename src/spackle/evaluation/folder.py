@@ -142,7 +142,7 @@ def _open_folder(output: Path, config: Mapping[str, Any], about: Mapping[str, An
             raise InputError(f"{path}: not written by `spackle {kind}`: choose another -o")
         old.pop("about", None)
         if lines := differences(old, json.loads(json.dumps(config))):
-            raise InputError(f"{output}: holds results of other options ({'; '.join(lines)}): choose another -o")
+            raise InputError(f"{output}: holds results with other options ({'; '.join(lines)}): choose another -o")
     write_json({"format": FORMAT, **config, "about": about}, path)
 
 

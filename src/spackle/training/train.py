@@ -287,7 +287,7 @@ def learning_rate(step: int, optim: OptimRecipe) -> float:
 
 
 def ema_decay(step: int, decay: float) -> float:
-    """The weight of the old average at a step; the new weights get the rest."""
+    """The share of the old average at a step; the new weights get the rest."""
     return min(decay, (step + 1) / (step + EMA_START))
 
 

@@ -67,7 +67,7 @@ def read_model(folder: Path) -> Model:
     """Read cameras, images and points3D from binary files if there is a cameras.bin, else from text files.
 
     Raises:
-        InputError: a file is missing or damaged, or a lens is too far from a pinhole.
+        InputError: a file is missing or damaged, or a lens differs too much from a pinhole.
     """
     damaged = "not a COLMAP file ({reason}): the file is missing, damaged or cut off"
     binary = (folder / "cameras.bin").is_file()
