@@ -40,12 +40,7 @@ class PhotoOptions:
 
 
 def predict_photo(
-    path: Path,
-    folder: Path,
-    pipeline: Pipeline,
-    reporter: Reporter,
-    wanted: PhotoOptions,
-    request: str | None = None,
+    path: Path, folder: Path, pipeline: Pipeline, reporter: Reporter, wanted: PhotoOptions, request: str | None = None
 ) -> None:
     """Predict one photo into `folder`: scene.ply, report.json, and the files that `wanted` and --cameras add.
 

@@ -259,9 +259,7 @@ def _stereo(options: VideoOptions, gaussians: Gaussians, camera: Camera) -> Ster
         ipd = default_ipd(camera, depths) if ipd is None else ipd
         convergence = depths.focus if convergence is None else convergence
     if camera.focal[0] * ipd / convergence > camera.width:
-        raise ValueError(
-            f"eyes {ipd:g} apart and a screen at {convergence:g}: give a smaller --ipd or a larger --convergence"
-        )
+        raise ValueError(f"eyes {ipd:g} apart, screen at {convergence:g}: give a smaller --ipd or larger --convergence")
     return Stereo(options.stereo, ipd, convergence)
 
 

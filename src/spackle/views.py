@@ -58,9 +58,7 @@ class PathOptions:
             raise InputError(f"--frames must be between 1 and {MAX_FRAMES}, got {self.frames}")
         if self.seconds is not None:
             if self.frames is not None:
-                raise InputError(
-                    f"--seconds {self.seconds:g}: --frames {self.frames} sets the length already: leave one out"
-                )
+                raise InputError(f"--seconds {self.seconds:g}: --frames {self.frames} sets the length: leave one out")
             if not 1 <= self.seconds * self.video.rate <= MAX_FRAMES:
                 raise InputError(f"--seconds must give 1 to {MAX_FRAMES} frames, got {self.seconds:g}")
         if self.cameras is not None and self.path is not None:

@@ -35,9 +35,7 @@ ORDER = {  # candidates of `auto`: the name in reports and the log, and the reas
     "moge": ("MoGe", "no MoGe weights here"),
     "lite": ("lite", ""),
 }
-NO_DEPTH = (
-    "--base rgbd needs depth, and the photo has none inside: give --depth FILE, or --depth FOLDER for many photos"
-)
+NO_DEPTH = "--base rgbd needs depth, and the photo has none inside: give --depth FILE, or FOLDER for many photos"
 
 
 class BaseError(InputError):

@@ -50,9 +50,7 @@ def clip_options(scene: Options, photo: PhotoOptions, workers: int) -> Options:
         if given:
             raise InputError(f"--{option}: not for a clip: leave the option out, see docs/clips.md")
     if depth is not None and not (isinstance(depth, Path) and depth.is_dir()):
-        raise InputError(
-            f"--depth {depth}: for a clip, give a folder of maps: {NAME.format(0)}.npy for the first frame"
-        )
+        raise InputError(f"--depth {depth}: a clip needs a folder of maps: {NAME.format(0)}.npy for the first frame")
     OpenCV("a clip, whose motion has to be followed,")
     if fill.fill == "auto":  # opens no inpainter
         fill = dataclasses.replace(fill, fill="network")

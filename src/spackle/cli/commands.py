@@ -33,10 +33,7 @@ if TYPE_CHECKING:  # torch takes seconds to load
 @with_path_options
 def predict(
     *,
-    photos: Annotated[
-        list[Path],
-        typer.Argument(metavar="PHOTO...", help="Photos, or folders of photos; or one clip."),
-    ],
+    photos: Annotated[list[Path], typer.Argument(metavar="PHOTO...", help="Photos, folders of photos, or one clip.")],
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="OUT", help="Results go to OUT/PHOTO_NAME/.")
     ] = Path("out"),
@@ -103,22 +100,16 @@ def predict(
     ] = "auto",
     render: Annotated[bool, typer.Option(help="Write a video.")] = True,
     keep_base: Annotated[
-        bool,
-        typer.Option("--keep-base", hidden=True, help="Also write base.ply, the Gaussians of the base."),
+        bool, typer.Option("--keep-base", hidden=True, help="Also write base.ply, the Gaussians of the base.")
     ] = False,
     depth_out: Annotated[
         str | None,
-        typer.Option(
-            metavar="NAME", hidden=True, help="Also write the photo's depth: depth.png (mm), .npy or .exr (m)."
-        ),
+        typer.Option(metavar="NAME", hidden=True, help="Also write the depth: depth.png (mm), .npy or .exr (m)."),
     ] = None,
     path: PathOptions,
     mode: Annotated[
         Literal["scene", "view"],
-        typer.Option(
-            hidden=True,
-            help="scene: one set of aux Gaussians for all views; view: a set for each view.",
-        ),
+        typer.Option(hidden=True, help="scene: one set of aux Gaussians for all views; view: a set for each view."),
     ] = "scene",
     device: DeviceOption = "auto",
     focal_px: Annotated[float | None, typer.Option(hidden=True, help="Focal length in pixels of the photo.")] = None,
@@ -277,11 +268,7 @@ def serve(
     port: PortOption = 8080,
     token: Annotated[
         str | None,
-        typer.Option(
-            help="The token that clients must send.",
-            show_default="a new one",
-            envvar="SPACKLE_TOKEN",
-        ),
+        typer.Option(help="The token that clients must send.", show_default="a new one", envvar="SPACKLE_TOKEN"),
     ] = None,
     workers: Annotated[
         int,

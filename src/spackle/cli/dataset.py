@@ -23,9 +23,7 @@ def dataset_build(
     ],
     output: Annotated[
         Path,
-        typer.Option(
-            "-o", "--output", metavar="OUT", help="Folder of the dataset; the command resumes an unfinished build."
-        ),
+        typer.Option("-o", "--output", metavar="OUT", help="The dataset's folder; an unfinished build is resumed."),
     ],
     images: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Folder of a COCO JSON's photos; default: the JSON's folder.")

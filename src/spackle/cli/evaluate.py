@@ -21,9 +21,7 @@ from spackle.cli.options import (
 UNFIT = re.compile(r"[^\w.-]+")  # characters that are replaced in a folder's name
 
 # Options of both `evaluate` and `bench`.
-Limit = Annotated[
-    int | None, typer.Option(min=1, max=1_000_000, help="Evaluate this number of images, spread over the dataset.")
-]
+Limit = Annotated[int | None, typer.Option(min=1, max=1_000_000, help="Number of images, spread over the dataset.")]
 DatasetName = Annotated[
     str, typer.Option(metavar="NAME", help="Dataset: middlebury, booster, wildrgbd, tanks, eth3d or llff.")
 ]
@@ -41,7 +39,7 @@ Side = Annotated[
 Disparity = Annotated[
     str,
     typer.Option(
-        metavar="A,B,…", help="Disparities of the large views, with commas (by default the paper's S1, S2, S3)."
+        metavar="A,B,…", help="Disparities of the large views, with commas (default: the paper's S1, S2, S3)."
     ),
 ]
 Output = Annotated[

@@ -103,9 +103,7 @@ def path_options(
     ] = None,
     path: Annotated[
         Path | None,
-        typer.Option(
-            "--path", metavar="FILE.json", hidden=True, help="Fly through the keyframes of a file, see docs/video.md."
-        ),
+        typer.Option("--path", metavar="FILE.json", hidden=True, help="Keyframes of a path, see docs/video.md."),
     ] = None,
     cameras: Annotated[
         Path | None,
@@ -116,8 +114,7 @@ def path_options(
         float | None, typer.Option(help="Length of the video in seconds.", show_default="4, or the duration of --path")
     ] = None,
     video_format: Annotated[
-        Literal["mp4", "webm", "gif", "webp"] | None,
-        typer.Option("--format", help="Video format.", show_default="mp4"),
+        Literal["mp4", "webm", "gif", "webp"] | None, typer.Option("--format", help="Video format.", show_default="mp4")
     ] = None,
     fps: Annotated[float | None, typer.Option(help="Frames a second.", show_default="30", hidden=True)] = None,
     loop: Annotated[
@@ -145,7 +142,7 @@ def path_options(
     fit: Annotated[
         Literal["pad", "blur", "crop"],
         typer.Option(
-            hidden=True, help="How to reach the aspect ratio of --size: by black margins, blurred margins, or cropping."
+            hidden=True, help="How to reach the aspect ratio of --size: black or blurred margins, or cropping."
         ),
     ] = "pad",
     show: Annotated[
@@ -158,9 +155,7 @@ def path_options(
     ] = None,
     ipd: Annotated[
         float | None,
-        typer.Option(
-            metavar="METRES", hidden=True, help="Distance of the eyes.", show_default="chosen for the scene's depth"
-        ),
+        typer.Option(metavar="METRES", hidden=True, help="Distance of the eyes.", show_default="by the scene's depth"),
     ] = None,
     convergence: Annotated[
         float | None,

@@ -104,7 +104,7 @@ def serve(folder: Path, work: SceneWork, workers: int, keep: Keep, place: Place,
     work.base.check()
     with listening(folder, work, workers, keep, place, reporter) as (_, urls):
         reporter.log(
-            f"token: {place.token} (send it as `Authorization: Bearer TOKEN`, or use the address with the token in it)"
+            f"token: {place.token} (send it as `Authorization: Bearer TOKEN`, or use the address, which has it)"
         )
         announce("HTTP interface, and its page", urls, place, reporter)
 

@@ -48,9 +48,7 @@ def weights_get(
     else:
         with reporter.stage("check"):
             if weights_digest(path) != entry.sha256:
-                raise InputError(
-                    f"{path}: damaged, or a file of yours: SHA-256 is not {entry.sha256}: --force replaces it"
-                )
+                raise InputError(f"{path}: damaged, or a file of yours: SHA-256 is not {entry.sha256}: use --force")
         reporter.log(f"{summary}, already downloaded and intact: {path}")
     reporter.result({"name": name, "file": path, "bytes": entry.bytes, "sha256": entry.sha256, "downloaded": new})
 

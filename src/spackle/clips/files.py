@@ -150,11 +150,7 @@ def _decoded(
 ) -> Iterator[av.VideoFrame]:
     """Decode frames, which must all have the same size."""
     size, count, packets = None, 0, 0
-    with reading(
-        path,
-        "damaged or truncated ({reason}): give a whole clip, or fewer --frames",
-        *DECODING,
-    ):
+    with reading(path, "damaged or truncated ({reason}): give a whole clip, or fewer --frames", *DECODING):
         for packet in container.demux(stream):
             packets += packet.size > 0
             for frame in packet.decode():

@@ -66,9 +66,7 @@ def _named_by_coco(source: Path, folder: Path | None, log: Callable[[str], None]
     unique = sorted({Path(name).as_posix() for name in names})
     present = [name for name in unique if os.path.isfile(root / name)]
     if not present:
-        raise InputError(
-            f"{source}: none of the {len(unique)} named images is in {root}: give the images' folder with --images"
-        )
+        raise InputError(f"{source}: none of the {len(unique)} images is in {root}: give their folder with --images")
     if missing := sorted(set(unique) - set(present)):
         log(f"{len(missing)} images that {source} names are not in {root}, such as {missing[0]}")
     return root, present

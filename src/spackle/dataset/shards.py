@@ -108,9 +108,7 @@ def load_manifest(location: str | os.PathLike[str]) -> Manifest:
         text = file.read()
         content = json.loads(text)
         if content["format"] != FORMAT:
-            raise InputError(
-                f"{where}: format {content['format']!r} is unknown: this version of Spackle reads format {FORMAT}"
-            )
+            raise InputError(f"{where}: format {content['format']!r} is unknown: this Spackle reads format {FORMAT}")
         recorded = content.pop("sha256")
         manifest = Manifest.model_validate_json(text)
         if not digest_of(content) == manifest.digest == recorded:
@@ -171,7 +169,5 @@ class DatasetFiles(Dataset[PhotoGroup]):
             file.seek(sample.offset)
             data = file.read(sample.size)
         if hashlib.sha256(data).hexdigest() != sample.sha256:
-            raise InputError(
-                f"{where}: sample {sample.key} ({sample.photo}) is damaged: `spackle dataset verify` lists all damage"
-            )
+            raise InputError(f"{where}: sample {sample.key} ({sample.photo}) is damaged: see `spackle dataset verify`")
         return PhotoGroup.of(sample.key, data, f"{where}: sample {sample.key}")

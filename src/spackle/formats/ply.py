@@ -141,9 +141,7 @@ class PlyFile:
         with open(path, "rb") as file:
             head = file.read(MAX_HEADER_BYTES)
         if head.split(b"\n", 1)[0].rstrip() != b"ply":
-            raise InputError(
-                f"{path}: not a PLY file: its first line must be 'ply' (`spackle predict` makes one of a photo)"
-            )
+            raise InputError(f"{path}: not a PLY file: its first line must be 'ply' (`spackle predict` makes one)")
         end = re.search(rb"\n[ \t]*end_header[ \t\r]*\n", head)
         if end is None:
             raise InputError(f"{path}: the header has no end: the file is damaged or cut off")
@@ -184,9 +182,7 @@ class PlyFile:
             for part, columns in zip(parts, _SLICES, strict=True):
                 part[start : start + BLOCK] = torch.from_numpy(table[columns, : len(rows)].T)
         if broken:
-            raise InputError(
-                f"{self.path}: {broken} of {vertex.count} Gaussians are not finite: export the scene again"
-            )
+            raise InputError(f"{self.path}: {broken} of {vertex.count} Gaussians are not finite: export it again")
         means, colors, opacities, scales, quats = parts
         return Gaussians(means, quats, scales, opacities[:, 0], colors)
 

@@ -187,9 +187,7 @@ def divided_photos(files: DatasetFiles, data: DataRecipe) -> tuple[list[int], li
     """
     photos, per_photo = len(files), len(files.samples[0][1].holes)
     if photos < 2:
-        raise InputError(
-            f"{data.pseudo}: has a single photo, but training and validation need different photos: build a larger one"
-        )
+        raise InputError(f"{data.pseudo}: has one photo, but training and validation need two: build a larger one")
     order = [int(place) for place in np.random.default_rng(data.seed).permutation(photos)]
     held = min(max(1, data.validation_views // per_photo), photos // 2)
     return order[held:][: max(1, data.views // per_photo)], order[:held]

@@ -74,9 +74,7 @@ class Access(NamedTuple):
         may_ask = scope["method"] in ("GET", "HEAD") if self.token is None else path == "/healthz"
         if not may_ask and not self._is_token(headers.get("authorization", "").removeprefix("Bearer ")):
             closed = "this page takes no photos: it was opened without a token"
-            raise HTTPException(
-                401, "this needs the token that the server printed when it started" if self.token else closed
-            )
+            raise HTTPException(401, "this needs the token that the server printed" if self.token else closed)
         return scope
 
     def _is_own(self, name: str) -> bool:
