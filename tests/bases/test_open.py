@@ -100,7 +100,7 @@ def test_weights_and_options_reach_sharp(
     given = write_tiny(tmp_path / "mine.pt")
     choice = pick(photo, checkpoint=given)[1]
     assert (choice.base, choice.why, quick.pop()["path"]) == ("sharp", "-c", given)
-    words: dict[str, Any] = {"precision": "fp32", "windows": 9, "compiled": True}
+    words: dict[str, Any] = {"precision": "fp32", "windows": 9}
     assert pick(photo, **words)[1].base == "sharp"
     assert quick == [{"path": sharp, "device": None, **words}]
     assert pick(portrait, **words)[1].base == "rgbd"
@@ -221,7 +221,7 @@ def test_given_depth_has_no_fallback(tmp_path: Path, photo: Path, portrait: Path
     [
         ({"name": "lite", "depth": Path("d.npy")}, "--depth d.npy: the lite base"),
         ({"name": "hf:a/b", "checkpoint": Path("x.pt")}, "-c x.pt: the hf base"),
-        ({"name": "hf:a/b", "compiled": True}, "--sharp compile=yes: the hf base"),
+        ({"name": "hf:a/b", "windows": 1}, "--sharp windows=1: the hf base"),
         ({"name": "hf:"}, "names no model"),
         ({"name": "shrap"}, r"did you mean sharp\?"),
         ({"name": "sharp"}, "spackle weights get sharp.*-c FILE"),

@@ -1,4 +1,4 @@
-"""SHARP's network against the original's results, in other precisions and batches, and compiled."""
+"""SHARP's network against the original's results, and in other precisions and batches."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from PIL import Image
 from scenes import psnr
 from sharp_weights import DATA, MICRO, gaussians_of, micro_network, tiny_weights, waves, write_tiny
 from torch import Tensor, nn
-from torch._dynamo.utils import counters
 
 import spackle
 from spackle.bases.sharp import SharpBase
@@ -25,12 +24,11 @@ from spackle.bases.sharp.encoder import (
     TINY,
     WINDOWS,
     SharpConfig,
-    TransformerBlock,
     cut,
     merge,
     set_precision,
 )
-from spackle.bases.sharp.network import GroupNorm, SharpNetwork, compile_forward, compose, make_start
+from spackle.bases.sharp.network import GroupNorm, SharpNetwork, compose, make_start
 from spackle.bases.sharp.unproject import stretch_gaussians
 from spackle.device import enough_memory, multiplies_bf16, own_arithmetic, pick_device, pick_dtype
 from spackle.errors import InputError
@@ -236,38 +234,3 @@ def test_the_number_of_windows_at_once_changes_nothing(options: dict[str, Any], 
     expected = SharpBase(micro_network(), windows=35).infer(PHOTO)
     torch.testing.assert_close(found.start.disparity_map, expected.start.disparity_map, rtol=1e-5, atol=1e-6)
     torch.testing.assert_close(found.deltas, expected.deltas, rtol=1e-4, atol=1e-4)
-
-
-def test_a_compiled_forward_shares_the_weights_of_its_network() -> None:
-    network = micro_network()
-    twin = compile_forward(network, backend="eager")
-    assert all(module._compiled_call_impl is None for module in network.modules())
-    assert all(a is b for a, b in zip(twin.parameters(), network.parameters(), strict=True))
-    tokens = torch.randn(2, 65, MICRO.embed, generator=torch.Generator().manual_seed(0))
-    one, other = (next(m for m in n.modules() if isinstance(m, TransformerBlock)) for n in (twin, network))
-    with torch.no_grad():
-        torch.testing.assert_close(one(tokens), other(tokens), rtol=1e-5, atol=1e-5)
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore")  # PyTorch warns about its own calls
-@pytest.mark.parametrize("backend", ["eager", "inductor"])
-def test_a_compiled_forward_gives_the_same_results(backend: str) -> None:
-    network = micro_network()
-    before = counters["stats"]["unique_graphs"]
-    with torch.no_grad():
-        found = compile_forward(network, backend)(waves(MICRO.side), 0.8, 5)
-        expected = network(waves(MICRO.side), 0.8, 5)
-    torch.testing.assert_close(found.deltas, expected.deltas, rtol=1e-4, atol=1e-4)
-    torch.testing.assert_close(found.start.disparity_map, expected.start.disparity_map, rtol=1e-5, atol=1e-6)
-    assert counters["stats"]["unique_graphs"] - before <= 5  # blocks for five windows and for one, and three parts
-
-
-def test_without_a_compiler_the_option_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*arguments: object) -> Any:
-        raise RuntimeError("No working C++ compiler found in\n  torch._inductor.config.cpp.cxx")
-
-    monkeypatch.setattr("spackle.bases.sharp.base.compile_forward", lambda network: fail)
-    base = SharpBase(micro_network(), compiled=True)
-    with pytest.raises(spackle.InputError, match=r"compile=yes: SHARP cannot be compiled \(No working C\+\+"):
-        base.predict(PHOTO)

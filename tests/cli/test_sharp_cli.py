@@ -43,7 +43,7 @@ def test_other_weights_do_a_folder_again_but_other_speed_does_not(
     assert run(*arguments).code == 0
     with monkeypatch.context() as patch:
         patch.setattr(SharpBase, "load", lambda *args, **options: pytest.fail("loaded"))
-        assert run(*arguments, "--sharp", "windows=9", "--sharp", "compile=yes").err.count("done already") == 1
+        assert run(*arguments, "--sharp", "windows=9").err.count("done already") == 1
     changed = tiny_weights(MICRO)
     changed["prediction_head.texture_prediction_head.bias"] += 0.1
     torch.save(changed, weights)

@@ -65,8 +65,7 @@ def _load_network(name: str, settings: BaseSettings) -> Base | None:
         return None
     if name == "moge":
         return MogeBase.load(file, device=device, precision=precision)
-    windows, compiled = settings.windows, settings.compiled
-    return SharpBase.load(file, precision=precision, windows=windows, compiled=compiled, device=device)
+    return SharpBase.load(file, precision=precision, windows=settings.windows, device=device)
 
 
 def _lift(settings: BaseSettings, photo: Photo, depth: Depth) -> Base | None:

@@ -65,7 +65,6 @@ class BaseSettings:
     checkpoint: Path | None = None  # weights of SHARP, MoGe or lite
     precision: Precision = "auto"  # of the network
     windows: int | None = None  # number of windows that SHARP computes at once; 1 takes the least memory
-    compiled: bool = False  # run SHARP by torch.compile
     device: str = "auto"
 
     @property
@@ -123,7 +122,7 @@ class BaseSettings:
             "--far": self.far,
             "-c": self.checkpoint,
             "--precision": None if self.precision == "auto" else self.precision,
-            "--sharp": "compile=yes" if self.compiled else self.windows and f"windows={self.windows}",
+            "--sharp": self.windows and f"windows={self.windows}",
         }
         kind = self.named.partition(":")[0]
         for option, value in options.items():

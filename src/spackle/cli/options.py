@@ -52,8 +52,7 @@ SharpOption = Annotated[
     typer.Option(
         "--sharp",
         metavar="KEY=VALUE",
-        help="Speed of SHARP. windows=N: compute N of the 35 windows at once; 1 takes the least memory (default: 5, on "
-        "a GPU all). compile=yes: use torch.compile, which takes minutes once and speeds up many photos.",
+        help="windows=N: SHARP computes N of its 35 windows at once (default 5, on a GPU all); 1 takes least memory.",
         hidden=True,
     ),
 ]
@@ -75,17 +74,14 @@ HelpAllOption = Annotated[
 
 
 def sharp_speed(words: Sequence[str] | None) -> dict[str, Any]:
-    """`windows` and `compiled` of `BaseSettings` from the values of --sharp; InputError for other values."""
+    """`windows` of `BaseSettings` from the values of --sharp; InputError for other values."""
     speed: dict[str, Any] = {}
     for word in words or ():
         key, _, value = word.partition("=")
-        check_name("--sharp", key, ("windows", "compile"))
-        if key == "windows" and value.isdecimal():
-            speed["windows"] = int(value)
-        elif key == "compile" and value in ("yes", "no"):
-            speed["compiled"] = value == "yes"
-        else:
-            raise InputError(f"--sharp {word}: give windows=N, compile=yes or compile=no")
+        check_name("--sharp", key, ("windows",))
+        if not value.isdecimal():
+            raise InputError(f"--sharp {word}: give windows=N")
+        speed["windows"] = int(value)
     return speed
 
 

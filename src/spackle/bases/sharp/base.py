@@ -17,7 +17,7 @@ from torch.nn.functional import interpolate
 
 from spackle.bases import BasePrediction, Progress
 from spackle.bases.sharp.encoder import CONFIGS, WINDOWS, SharpConfig, set_precision
-from spackle.bases.sharp.network import SharpNetwork, SharpOutput, compile_forward, compose
+from spackle.bases.sharp.network import SharpNetwork, SharpOutput, compose
 from spackle.bases.sharp.unproject import stretch_gaussians
 from spackle.camera import Camera
 from spackle.device import Precision, enough_memory, own_arithmetic, pick_device, pick_dtype
@@ -42,16 +42,12 @@ class SharpBase:
 
     name = "sharp"
 
-    def __init__(
-        self, network: SharpNetwork, *, windows: int | None = None, compiled: bool = False, weights: str = ""
-    ) -> None:
+    def __init__(self, network: SharpNetwork, *, windows: int | None = None, weights: str = "") -> None:
         """Use a loaded network on its device; `weights` is the name of the weights in the report."""
         check_windows("windows", windows)
         self.network = network
         self.windows = windows or usual_windows(self.device)
         self.weights = weights
-        self.compiled = compiled
-        self._compiled_network: SharpNetwork | None = None
 
     @staticmethod
     def load(
@@ -59,7 +55,6 @@ class SharpBase:
         *,
         precision: Precision = "auto",
         windows: int | None = None,
-        compiled: bool = False,
         device: torch.device | str | None = None,
     ) -> SharpBase:
         """Read a checkpoint; InputError for an unusable file, device or number of windows, or too little memory.
@@ -70,12 +65,11 @@ class SharpBase:
             precision: number type of the heavy arithmetic; auto is bf16 if the hardware multiplies it natively.
             windows: number of a photo's 35 windows that the transformer processes at once; None: 5 on a CPU, all on a
                 GPU. The last bits of the result depend on this number.
-            compiled: let `torch.compile` compile the network at the first photo, which takes minutes.
             device: cpu or a CUDA device; None: CUDA if available.
         """
         target = pick_device(device)
         network = load_network(path, pick_dtype(precision, target), target)
-        return SharpBase(network, windows=windows, compiled=compiled, weights=Path(path).name)
+        return SharpBase(network, windows=windows, weights=Path(path).name)
 
     @property
     def device(self) -> torch.device:
@@ -101,14 +95,7 @@ class SharpBase:
         image = to_square(photo.rgb.to(self.device, non_blocking=True), self.network.config.side)
         with own_arithmetic(self.device):
             factor = photo.focal_px / photo.width
-            output: SharpOutput
-            if self.compiled:
-                network = self._compiled_network = self._compiled_network or compile_forward(self.network)
-                problem = "SHARP cannot be compiled ({reason}): leave the option out"
-                with reading("--sharp compile=yes", problem, RuntimeError), enough_memory(LESS_MEMORY):
-                    output = network(image, factor, self.windows, progress)
-            else:
-                output = self.network(image, factor, self.windows, progress)
+            output: SharpOutput = self.network(image, factor, self.windows, progress)
         return output
 
 

@@ -5,7 +5,6 @@ Modules are named as in the checkpoint.
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import math
 from collections.abc import Sequence
@@ -15,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, max_pool2d, softplus
 
 from spackle.bases import Progress
-from spackle.bases.sharp.encoder import LAYERS, STRIDE, ExactConv, SharpConfig, SlidingPyramid, TransformerBlock
+from spackle.bases.sharp.encoder import LAYERS, STRIDE, ExactConv, SharpConfig, SlidingPyramid
 from spackle.color import srgb_to_linear
 from spackle.gaussians import Gaussians
 
@@ -305,16 +304,3 @@ def _inverse_softplus(y: Tensor) -> Tensor:
 def _rows(attribute: Tensor) -> Tensor:
     """[C, 2, H, W] to [2·H·W, C]."""
     return attribute.flatten(1).T.contiguous()
-
-
-def compile_forward(network: SharpNetwork, backend: str = "inductor") -> SharpNetwork:
-    """A twin of the network with the same weights, which `torch.compile` compiles at the first call.
-
-    The first call raises a RuntimeError without a C++ compiler on a CPU, or without Triton on a GPU.
-    """
-    twin = copy.deepcopy(network, {id(weight): weight for weight in network.parameters()})
-    depth: DepthNetwork = twin.monodepth_model.monodepth_predictor  # type: ignore[assignment]
-    blocks = [module for module in twin.modules() if isinstance(module, TransformerBlock)]
-    for module in (*blocks, depth.decoder, depth.head, twin.feature_model):
-        module.compile(backend=backend, dynamic=False)
-    return twin
