@@ -94,5 +94,4 @@ def refuses(result: Run, *named: object) -> None:
 
 def decode(video: Path) -> list[av.VideoFrame]:
     with av.open(str(video)) as container:
-        assert container.streams.video[0].codec_context.name == "h264"
         return list(container.decode(video=0))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import copy
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -10,27 +10,14 @@ from typing import Any
 import numpy as np
 import torch
 from random_weights import deterministic_weights
+from sharp_weights import DATA
+from sharp_weights import waves as planes
 from torch import Tensor
 
 from spackle.bases.moge.network import MogeNetwork, MogeOutput
 
-
-def settings(features: int, widths: list[int], blocks: tuple[list[int], list[int]], scale: list[int]) -> dict[str, Any]:
-    """A `model_config` with a ViT-S; blocks of the neck, and of the heads."""
-    shared: dict[str, Any] = {"dim_res_blocks": widths, "res_block_in_norm": "none", "res_block_hidden_norm": "none"}
-    shared["resamplers"] = ["conv_transpose"] * 3 + ["bilinear"]
-    neck = {"dim_in": [features + 2, 2, 2, 2, 2], "dim_out": None, "num_res_blocks": blocks[0]} | shared
-    heads = {
-        f"{name}_head": {"dim_in": widths, "dim_out": [None] * 4 + [out], "num_res_blocks": blocks[1]} | shared
-        for name, out in (("points", 3), ("mask", 1))
-    }
-    encoder = {"backbone": "dinov2_vits14", "intermediate_layers": [5, 11], "dim_out": features}
-    more = {"scale_head": {"dims": [384, *scale, 1]}, "remap_output": "exp", "num_tokens_range": [35, 120]}
-    return copy.deepcopy({"encoder": encoder, "neck": neck, **heads, **more})
-
-
-TINY = settings(32, [32, 24, 16, 12, 8], ([0, 2, 1, 1, 0], [0, 1, 1, 1, 0]), [16, 16])
-FULL = settings(384, [384, 256, 128, 64, 32], ([0, 1, 1, 1, 0], [0, 1, 1, 1, 0]), [384, 384])
+CONFIGS = json.loads((DATA / "moge_configs.json").read_text())  # each is a `model_config` with a ViT-S
+TINY, FULL = CONFIGS["tiny"], CONFIGS["full"]
 
 
 def shapes_of(config: dict[str, Any]) -> dict[str, tuple[int, ...]]:
@@ -56,10 +43,7 @@ def write_tiny(path: Path) -> Path:
 
 def waves(height: int, width: int) -> Tensor:
     """[H, W, 3] sRGB."""
-    y, x = np.mgrid[:height, :width] / np.array([height, width]).reshape(2, 1, 1)
-    red, green = np.sin(2 * np.pi * (3 * x + 2 * y)), np.cos(2 * np.pi * (5 * x * y + y))
-    blue = np.sin(40 * x) * np.cos(30 * y) / 2 + x / 2
-    return torch.from_numpy((0.5 + np.stack([red, green, blue], axis=-1) / 2).astype(np.float32))
+    return planes(height, width)[0].permute(1, 2, 0).contiguous()
 
 
 HALF = math.hypot(160, 90) / 2  # half the diagonal of this scene

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -83,32 +82,12 @@ def read_ply(path: Path) -> Ply:
     return ply
 
 
-def damaged_scene(
-    scene: Path, path: Path, header: Callable[[str], str], data: Callable[[bytes], bytes] = lambda body: body
-) -> Path:
-    """Copy a scene with a changed header and changed data."""
-    head, end, body = scene.read_bytes().partition(b"end_header\n")
-    path.write_bytes(header(head.decode("ascii")).encode("ascii") + end + data(body))
-    return path
-
-
-def camera_file(
-    path: Path, rights: list[float], sizes: list[tuple[int, int]] | None = None, focal: float = 55.0
-) -> Path:
+def camera_file(path: Path, rights: list[float], sizes: list[tuple[int, int]] | None = None) -> Path:
     """Write untilted cameras at these distances to the right of the photo's camera."""
     frames = []
     for right, (width, height) in zip(rights, sizes or [(WIDTH, HEIGHT)] * len(rights), strict=True):
-        K = [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]
+        K = [[55.0, 0, width / 2], [0, 55.0, height / 2], [0, 0, 1]]
         pose = [[1, 0, 0, -right], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
         frames.append({"K": K, "world_to_camera": pose, "width": width, "height": height})
     path.write_text(json.dumps({"frames": frames}))
-    return path
-
-
-def calibration(path: Path, focal: float, baseline_mm: float, doffs: float) -> Path:
-    """Write Middlebury's calib.txt."""
-    matrix = f"[{focal} 0 {WIDTH / 2}; 0 {focal} {HEIGHT / 2}; 0 0 1]"
-    path.write_text(
-        f"cam0={matrix}\ncam1={matrix}\ndoffs={doffs}\nbaseline={baseline_mm}\nwidth={WIDTH}\nheight={HEIGHT}\n"
-    )
     return path

@@ -116,15 +116,6 @@ def test_each_optional_package_is_wrapped_by_one_file(package: str) -> None:
     assert len(users) <= (2 if package == "skimage" else 1), users
 
 
-def test_no_other_command_waits_for_the_server() -> None:
-    def users(*names: str) -> set[str]:
-        return {module_of(path) for path in FILES if any(m.startswith(names) for m in imports_of(path))}
-
-    assert {room_of(user) for user in users("fastapi", "starlette", "uvicorn")} == {"web"}
-    others = {user for user in users("spackle.web") if room_of(user) != "web"}
-    assert others == {"spackle.cli.serve", "spackle.cli.commands"}
-
-
 def test_every_module_imports_without_optional_packages() -> None:
     command = [sys.executable, "-c", WITHOUT_OPTIONAL, *OPTIONAL]
     assert int(subprocess.run(command, capture_output=True, text=True, check=True).stdout) == len(FILES) - 2

@@ -11,7 +11,7 @@ import numpy as np
 import portraits
 import pytest
 import torch
-from photos import HEIGHT, WIDTH, calibration, metres, write_depth, write_photo
+from photos import HEIGHT, WIDTH, metres, write_depth, write_photo
 from scenes import same_bits
 from sharp_weights import gaussians_of, write_tiny
 from stand_in import SHARP_FILE, StandIn, write_model
@@ -134,7 +134,9 @@ def test_the_chosen_base_predicts_all_frames_of_a_clip(photo: Path, portrait: Pa
 def test_the_focal_length_comes_from_the_user_then_the_map_then_the_photo(tmp_path: Path, photo: Path) -> None:
     disparity, ours_px = tmp_path / "disp0.npy", load_photo(photo, focal_px=60)
     np.save(disparity, (80 * 0.2 / metres() - 1.5).astype(np.float32))
-    calibration(tmp_path / "calib.txt", 80, 200, 1.5)
+    lens = f"[80 0 {WIDTH / 2}; 0 80 {HEIGHT / 2}; 0 0 1]"
+    facts = f"cam0={lens}\ncam1={lens}\ndoffs=1.5\nbaseline=200\nwidth={WIDTH}\nheight={HEIGHT}\n"
+    (tmp_path / "calib.txt").write_text(facts)
     loaded, front = load_depth(disparity), slice(0, WIDTH * HEIGHT)
     for depth in (disparity, loaded):
         prediction, _ = pick(photo, depth=depth)

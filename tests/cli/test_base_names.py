@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 import shutil
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -32,25 +30,6 @@ def _quick(shipped: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(SharpBase, "load", lambda path, **options: StandIn("sharp"))
 
 
-@pytest.fixture
-def hub(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
-    """Stand-ins for models of the hub; the list has the requests."""
-    asked: list[dict[str, Any]] = []
-
-    def load(model: str, **options: Any) -> StandIn:
-        asked.append({"model": model, **options})
-        return StandIn(f"hf:{model}")
-
-    monkeypatch.setattr(HfBase, "load", load)
-    return asked
-
-
-@pytest.fixture
-def stereo(tmp_path: Path) -> Path:
-    write_boxes(tmp_path / "middlebury" / "Ball", 0)
-    return tmp_path / "middlebury"
-
-
 def build(tmp_path: Path, *words: object) -> Run:
     """`spackle dataset build` of one photo."""
     write_photo(tmp_path / "photos" / "a.png")
@@ -62,11 +41,6 @@ def succeeds(result: Run) -> None:
     assert result.code == 0, result.err
 
 
-def sha256(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-@pytest.mark.usefixtures("hub")
 def test_a_dataset_skips_bad_photos_and_stops_without_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     work, short = StandIn.predict, True
 
@@ -78,6 +52,7 @@ def test_a_dataset_skips_bad_photos_and_stops_without_memory(tmp_path: Path, mon
         return work(self, photo, progress)
 
     write_photo(tmp_path / "photos" / "b.png", 80, 60)
+    monkeypatch.setattr(HfBase, "load", lambda model, **options: StandIn(f"hf:{model}"))
     monkeypatch.setattr(StandIn, "predict", picky)
     refuses(build(tmp_path, "--base", "hf:me/small"), "not enough memory")
     short = False
@@ -86,8 +61,9 @@ def test_a_dataset_skips_bad_photos_and_stops_without_memory(tmp_path: Path, mon
     assert [sample.photo for _, sample in load_manifest(tmp_path / "out").samples] == ["a.png"]
 
 
-def test_results_that_must_name_their_base_refuse_auto(tmp_path: Path, stereo: Path) -> None:
-    root = ("--dataset", "middlebury", stereo, "-o", tmp_path / "out", "--base", "auto")
+def test_results_that_must_name_their_base_refuse_auto(tmp_path: Path) -> None:
+    write_boxes(tmp_path / "middlebury" / "Ball", 0)
+    root = ("--dataset", "middlebury", tmp_path / "middlebury", "-o", tmp_path / "out", "--base", "auto")
     for result in (
         build(tmp_path, "--base", "auto"),
         build(tmp_path, "--base", "auto", "--depth", tmp_path / "photos"),

@@ -95,14 +95,10 @@ def test_a_full_standard_output_is_reported_in_one_line(scene: Path, tmp_path: P
 
 
 def test_every_command_has_a_help() -> None:
-    named = {"predict": "PHOTO", "export": "--output", "view": "SCENE_OR_PHOTO"}  # in the examples
     for command in COMMANDS:
         result = run(command, "--help")
         assert (result.code, f"spackle {command}" in result.out.splitlines()[0]) == (0, True)
-        assert named.get(command, "") in result.out
-    first, everything = (run("predict", option).out.splitlines() for option in ("--help", "--help-all"))
-    counts = [sum(line.startswith("  -") for line in lines) for lines in (first, everything)]
-    assert counts[0] <= 20 < counts[1]
+    assert "--sharp" in run("predict", "--help-all").out
 
 
 def test_info_says_what_a_file_is(tmp_path: Path, scene: Path, pair: tuple[Path, Path]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from pathlib import Path
 
@@ -49,10 +48,6 @@ def test_the_demo_fills_the_hole_better_than_2d_inpainting(tmp_path: Path, monke
     assert 0.02 < before < 0.5
     assert after <= 0.03 * before
     assert report["right_camera"]["har_after"] <= 0.03 * report["right_camera"]["har_before"]
-    for name, score in psnr.items():  # the table has the report's numbers
-        row = next(line for line in result.err.splitlines() if name in line)
-        printed = [float(number) for number in re.findall(r"(\d+\.\d+)", row)]
-        assert printed == pytest.approx([score["in_hole"], score["outside"]], abs=0.006)
 
 
 def test_without_scikit_image_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import os
+import shutil
 from pathlib import Path
 
 import pytest
-import torch
 from command import FILES, SHORT, names_in, refuses, run
-from photos import camera_file, damaged_scene, metres, write_depth, write_photo
-from safetensors.torch import save_file
+from photos import write_photo
 
 INPUTS = {"predict": ("photo.png", "--depth", "depth.npy"), "render": ("scene.ply",)}
 # Options of both commands, and a part of the error message.
@@ -67,16 +65,9 @@ ROWS = [(command, *row) for command, rows in (("predict", BOTH + PREDICT), ("ren
 def place(tmp_path: Path, pair: tuple[Path, Path], scene: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with a photo, its depth, a scene, and files that cannot be used."""
     monkeypatch.chdir(tmp_path)
-    Path("scene.ply").write_bytes(scene.read_bytes())
-    save_file({"stem.weight": torch.zeros(3)}, "bad.safetensors")
-    for name, target in (("good", [0, 0, 4]), ("bad", [0.2, 0, 0])):
-        keys = [{"time": time, "eye": [0.2 * time, 0, 0], "target": target} for time in (0, 1)]
-        Path(f"{name}.json").write_text(json.dumps({"keyframes": keys}))
-    camera_file(tmp_path / "views.json", rights=[0.2])
-    camera_file(tmp_path / "sizes.json", rights=[0.2, 0.4], sizes=[(64, 48), (32, 24)])
-    camera_file(tmp_path / "extreme.json", rights=[0.2], focal=1e-20)
-    write_depth(tmp_path / "wrong.npy", metres(48, 64))
-    write_depth(tmp_path / "disp0.npy")
+    shutil.copytree(Path(__file__).parents[1] / "data" / "refused", tmp_path, dirs_exist_ok=True)
+    shutil.copy(scene, "scene.ply")
+    shutil.copy(pair[1], "disp0.npy")
     return tmp_path
 
 
@@ -94,6 +85,7 @@ def test_options_that_cannot_be(place: Path, command: str, options: str, says: s
 def test_an_input_has_to_be_named(tmp_path: Path) -> None:
     refuses(run("predict"), "PHOTO")
     refuses(run("render", "-o", tmp_path / "out"), "SCENE")
+    refuses(run("render", tmp_path / "missing.ply", "-o", tmp_path / "out"), tmp_path / "missing.ply")
     address = "https://example.com/a.jpg"
     refuses(run("predict", address), f"{address}: an address, not a file: download it first")
     refuses(run("predict", write_photo(tmp_path / "a.png"), "--base", "rgbd", "-o", tmp_path / "out"), "--depth")
@@ -126,13 +118,3 @@ def test_outputs_that_cannot_be_written(tmp_path: Path, pair: tuple[Path, Path],
     refuses(run(*command, out), "output folder", "-o")
     refuses(run("render", scene, "-o", out, *SHORT), "output folder")
     assert (names_in(tmp_path), (tmp_path / "file").read_text()) == (before, "in the way")
-
-
-def test_bad_scenes(tmp_path: Path, scene: Path) -> None:
-    cut_off = damaged_scene(scene, tmp_path / "cut.ply", str, lambda body: body[:-1])
-    camera = damaged_scene(
-        scene, tmp_path / "bad.ply", lambda head: head.replace("spackle_camera", "spackle_camera 1"), bytes
-    )
-    for file in (cut_off, camera, tmp_path / "missing.ply"):
-        refuses(run("render", file, "-o", tmp_path / "out", *SHORT), file)
-    assert not (tmp_path / "out").exists()

@@ -21,26 +21,19 @@ def weights(tmp_path: Path) -> Path:
     return write_tiny(tmp_path / "micro.safetensors", MICRO)
 
 
-def test_a_photo_alone_becomes_a_scene_a_video_and_a_report(tmp_path: Path, weights: Path) -> None:
-    photo = write_photo(tmp_path / "photo.png")
-    result = run("predict", photo, "-o", tmp_path / "out", *SHORT, "--base", "sharp", "-c", weights)
-    assert result.code == 0, result.err
-    assert names_in(tmp_path / "out" / "photo") == FILES
-    report = report_of(tmp_path / "out" / "photo")
+def test_a_photo_becomes_a_scene_and_is_done_again_for_other_weights_but_not_for_other_speed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_photo(tmp_path / "photos" / "a.png")
+    weights, folder = write_tiny(tmp_path / "w.pt", MICRO), tmp_path / "out" / "a"
+    arguments = ("predict", tmp_path / "photos", "-o", tmp_path / "out", "--base", "sharp", "-c", weights, *SHORT)
+    assert (run(*arguments).code, names_in(folder)) == (0, FILES)
+    report = report_of(folder)
     native = pick_dtype("auto", torch.device("cpu")) == torch.bfloat16
     expected = {"name": "sharp", "chosen": "--base sharp", "gaussians": gaussians_of(MICRO)}
     expected |= {"precision": "bf16" if native else "fp32", "weights": weights.name, "usual_disparity": 0.3}
     assert report["base"].items() >= expected.items()
     assert all(row["after"] < 0.01 < row["before"] for row in report["hole_area_ratio"])
-
-
-def test_other_weights_do_a_folder_again_but_other_speed_does_not(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write_photo(tmp_path / "photos" / "a.png")
-    weights = write_tiny(tmp_path / "w.pt", MICRO)
-    arguments = ("predict", tmp_path / "photos", "-o", tmp_path / "out", "--base", "sharp", "-c", weights, *QUICK)
-    assert run(*arguments).code == 0
     with monkeypatch.context() as patch:
         patch.setattr(SharpBase, "load", lambda *args, **options: pytest.fail("loaded"))
         assert run(*arguments, "--sharp", "windows=9").err.count("done already") == 1
@@ -49,7 +42,7 @@ def test_other_weights_do_a_folder_again_but_other_speed_does_not(
     torch.save(changed, weights)
     result = run(*arguments, "--precision", "fp32", "--sharp", "windows=1")
     assert (result.code, "done already" in result.err) == (0, False)
-    assert report_of(tmp_path / "out" / "a")["base"]["precision"] == "fp32"
+    assert report_of(folder)["base"]["precision"] == "fp32"
 
 
 @pytest.mark.parametrize("wrong", [("missing.png", "out"), ("a.png", "out", "--focal-px", 1e9), ("a.png", "a.png")])

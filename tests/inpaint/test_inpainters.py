@@ -6,7 +6,6 @@ import pytest
 import torch
 from scenes import psnr
 
-from spackle.errors import InputError
 from spackle.inpaint import INPAINTERS, InpainterOptions, get_inpainter, inpainter_class
 
 
@@ -25,11 +24,6 @@ def test_only_holes_change_and_results_repeat(name: str) -> None:
     assert 0.2 < float(painted[hole].min()) < float(painted[hole].max()) < 0.8
     assert torch.equal(inpainter.paint(rgb, hole, inverse_depth), painted)
     assert torch.equal(inpainter.paint(rgb[1:], hole[1:], inverse_depth[1:]), rgb[1:])
-
-
-def test_an_unknown_inpainter_is_refused() -> None:
-    with pytest.raises(InputError, match="inpainter nobody is unknown"):
-        get_inpainter("nobody", InpainterOptions())
 
 
 def test_exemplar_extends_a_pattern_also_without_depth() -> None:

@@ -131,14 +131,8 @@ def test_an_empty_page_offers_photos(visit: Callable[..., Run]) -> None:
     assert visit(browse).code == 130
 
 
-@pytest.fixture
-def closed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No page may open."""
+def test_bad_files_and_options(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("spackle.cli.serve.announce", lambda *_: pytest.fail("there is a page"))
-
-
-@pytest.mark.usefixtures("closed")
-def test_files_that_are_neither_scene_nor_photo(tmp_path: Path) -> None:
     (tmp_path / "written.glb").write_bytes(b"anything")  # a format that cannot be read
     (tmp_path / "scene.jpg").write_bytes(b"ply\nformat binary_little_endian 1.0\nend_header\n")
     behind = dataclasses.replace(base := box_before_wall().base(), means=-base.means)
@@ -151,10 +145,6 @@ def test_files_that_are_neither_scene_nor_photo(tmp_path: Path) -> None:
     }
     for name, why in known.items():
         refuses(run("view", tmp_path / name), name, why)
-
-
-@pytest.mark.usefixtures("closed")
-def test_bad_options(tmp_path: Path) -> None:
     photo = write_photo(tmp_path / "photo.png")
     refuses(run("view", photo, "--host", "0.0.0.0", "--no-token"), "--no-token")
     with socket.socket() as taken:
