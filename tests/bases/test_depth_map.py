@@ -192,55 +192,45 @@ def test_relative_maps(tmp_path: Path, content: bytes, step: float | None, kind:
         assert f"{min(start, end):.2g}"[:2] in found.range_in_words
 
 
-@pytest.mark.parametrize(
-    ("content", "options", "says"),
-    [
-        (greys(SLOPE, "L"), {}, "an 8-bit PNG holds no metres: give 16 bits, or --depth-kind near-white"),
-        (greys(SLOPE, "I;16"), {}, "fill the range of 16 bits, .*: give --depth-kind near-white"),
-        (greys(SLOPE, "RGBA"), {}, "mode RGBA holds no millimetres: give --depth-kind near-white"),
-        (greys(SLOPE, "L"), {"kind": "disparity"}, "its folder has no calibration: give --calib"),
-        (as_bytes(SLOPE), {"kind": "near-white", "near": 3.0, "far": 2.0}, "--near 3, --far 2: give two distances"),
-        (as_bytes(np.ones((9, 9))), {"kind": "near-black"}, "the same nearly everywhere"),
-        (png(np.zeros((4, 4, 3), np.uint8) + np.uint8([200, 9, 9])), {"kind": "near-white"}, "a colour picture"),
-        (b"hello there, I am text", {"kind": "near-white"}, "not an image"),
-    ],
-)
-def test_maps_of_another_kind_are_refused(tmp_path: Path, content: bytes, options: Any, says: str) -> None:
-    (tmp_path / "map").write_bytes(content)
-    with pytest.raises(InputError, match=rf"{says}.*"):
-        load_depth(tmp_path / "map", **options)
-
-
 def npy_claiming(shape: str, descr: str = "<f4") -> bytes:
     header = f"{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + b"\0" * 64
 
 
 NOISE = np.random.default_rng(0).integers(1, 60_000, (64, 64)).astype(np.uint16)
-BAD = {
-    "text": (b"hello there, I am text", "not a depth map"),
-    "cut npy": (as_bytes(ramp())[:-5], "cut off"),
-    "huge npy": (npy_claiming("(1000000, 1000000)"), "too large"),
-    "three axes": (as_bytes(np.ones((2, 3, 3), np.float32)), "shape"),
-    "zero size": (as_bytes(np.ones((0, 5), np.float32)), "shape"),
-    "objects": (as_bytes(np.array([[None, 1]], dtype=object)), "object"),
-    "all NaN": (as_bytes(np.full((4, 4), np.nan)), "all-invalid"),
-    "negative": (as_bytes(np.array([[1.0, -2.0], [-0.5, np.nan]])), "2 of 4 values are negative"),
-    "millimetres": (as_bytes(NOISE), "divide them by 1000"),
-    "bomb": (zipped(npy_claiming("(100000, 100000)")), "too large"),
-    "colour pfm": (b"PF\n2 2\n-1\n" + b"\0" * 48, "three channels"),
-    "cut png": (png(NOISE)[:2000], "damaged"),
-}
+KINDS: list[tuple[bytes, dict[str, Any], str]] = [  # content, options, message
+    (greys(SLOPE, "L"), {}, "an 8-bit PNG holds no metres: give 16 bits, or --depth-kind near-white"),
+    (greys(SLOPE, "I;16"), {}, "fill the range of 16 bits, .*: give --depth-kind near-white"),
+    (greys(SLOPE, "RGBA"), {}, "mode RGBA holds no millimetres: give --depth-kind near-white"),
+    (greys(SLOPE, "L"), {"kind": "disparity"}, "its folder has no calibration: give --calib"),
+    (as_bytes(SLOPE), {"kind": "near-white", "near": 3.0, "far": 2.0}, "--near 3, --far 2: give two distances"),
+    (as_bytes(np.ones((9, 9))), {"kind": "near-black"}, "the same nearly everywhere"),
+    (png(np.zeros((4, 4, 3), np.uint8) + np.uint8([200, 9, 9])), {"kind": "near-white"}, "a colour picture"),
+    (b"hello there, I am text", {"kind": "near-white"}, "not an image"),
+    (b"hello there, I am text", {}, "not a depth map"),
+    (as_bytes(ramp())[:-5], {}, "cut off"),
+    (npy_claiming("(1000000, 1000000)"), {}, "too large"),
+    (as_bytes(np.ones((2, 3, 3), np.float32)), {}, "shape"),
+    (as_bytes(np.ones((0, 5), np.float32)), {}, "shape"),
+    (as_bytes(np.array([[None, 1]], dtype=object)), {}, "object"),
+    (as_bytes(np.full((4, 4), np.nan)), {}, "all-invalid"),
+    (as_bytes(np.array([[1.0, -2.0], [-0.5, np.nan]])), {}, "2 of 4 values are negative"),
+    (as_bytes(NOISE), {}, "divide them by 1000"),
+    (zipped(npy_claiming("(100000, 100000)")), {}, "too large"),
+    (b"PF\n2 2\n-1\n" + b"\0" * 48, {}, "three channels"),
+    (png(NOISE)[:2000], {}, "damaged"),
+]
 
 
-@pytest.mark.parametrize("kind", BAD)
-def test_bad_maps(tmp_path: Path, kind: str) -> None:
-    content, says = BAD[kind]
+@pytest.mark.parametrize(("content", "options", "says"), KINDS)
+def test_maps_that_are_damaged_or_of_another_kind_are_refused(
+    tmp_path: Path, content: bytes, options: Any, says: str
+) -> None:
     path = tmp_path / "map.dat"
     path.write_bytes(content)
-    with pytest.raises(InputError, match=says) as caught:
-        load_depth(path)
-    assert str(path) in str(caught.value)
+    with pytest.raises(InputError, match=rf"{says}.*") as caught:
+        load_depth(path, **options)
+    assert "near" in options or str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
 
 

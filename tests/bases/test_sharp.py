@@ -19,13 +19,9 @@ from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.base import PARAMETERS, UNUSED, expected_shapes, load_network, to_metric
 from spackle.bases.sharp.encoder import (
     FULL,
-    FULL_WINDOWS,
-    HALF_WINDOWS,
     TINY,
     WINDOWS,
     SharpConfig,
-    cut,
-    merge,
     set_precision,
 )
 from spackle.bases.sharp.network import GroupNorm, SharpNetwork, compose, make_start
@@ -86,16 +82,6 @@ def test_bf16_renders_the_same_picture_to_45_db() -> None:
     views = [CpuRenderer().render(stretch_gaussians(gaussians, STRETCH), camera).rgb for gaussians in sets]
     assert psnr(*views) > 45
     assert not torch.equal(*views)
-
-
-@pytest.mark.parametrize(("side", "count"), [(1536, FULL_WINDOWS), (768, HALF_WINDOWS)])
-def test_windows_are_cut_and_merged_without_a_seam(side: int, count: int) -> None:
-    image = waves(side)
-    windows = cut(image, 384, count)
-    assert windows.shape == (count**2, 3, 384, 384)
-    assert torch.equal(windows[1, :, :, 0], image[0, :, :384, (side - 384) // (count - 1)])  # the second goes right
-    overlap = 384 - (side - 384) // (count - 1)
-    assert torch.equal(merge(windows, overlap // 2), image)
 
 
 @pytest.mark.parametrize("channels_last", [False, True])

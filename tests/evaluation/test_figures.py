@@ -12,8 +12,6 @@ from evaluation_data import write_boxes
 from PIL import Image
 from sharp_weights import MICRO, write_tiny
 
-from spackle.evaluation.pictures import hole_boxes
-
 
 def check_latex(*files: Path) -> None:
     """Braces and environments are closed, labels are unique, and all rows of a table have the same columns."""
@@ -62,17 +60,3 @@ def test_both_figures_and_all_tables_are_latex(tmp_path: Path) -> None:
     check_latex(*files)  # one document can include all files
     refuses(run("figures", near, "-o", tmp_path / "none"), "nothing to draw", "--disparity 0.6")
     assert not (tmp_path / "none").exists()
-
-
-def test_boxes_contain_hole_pixels_and_other_pixels() -> None:
-    mask = np.zeros((120, 160), np.uint8)
-    mask[:, 130:] = 255  # beyond the photo's border
-    mask[40:80, 30:45] = 255
-    boxes = hole_boxes(Image.fromarray(mask))
-    assert len(boxes) == 2
-    for left, top, right, bottom in boxes:
-        assert 0 <= left < right <= 1
-        assert 0 <= top < bottom <= 1
-        part = mask[round(top * 120) : round(bottom * 120), round(left * 160) : round(right * 160)] > 0
-        assert 0.2 < part.mean() < 0.8
-    assert hole_boxes(Image.fromarray(0 * mask)) == []

@@ -12,7 +12,6 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from spackle.camera import Camera
-from spackle.render.protocol import Rendering
 from spackle.residual import CELL, ViewFeatures, make_seeds
 from spackle.residual.base_values import BLOB_CELLS, inside_photo
 from spackle.residual.view_features import cell_centers
@@ -48,14 +47,6 @@ def test_inside_photo_matches_projected_points() -> None:
     expected = (z > 0) & ((place >= 0) & (place < torch.tensor([40, 30]))).all(-1)
     assert 10 < int(expected.sum()) < 290
     assert torch.equal(inside_photo(inverse, camera, photo), expected)
-
-
-def test_seeds_of_an_empty_view_are_a_grey_wall() -> None:
-    camera = Camera.from_focal(20, 5, 3)
-    seeds = make_seeds(ViewFeatures.of(Rendering(torch.zeros(3, 5, 3), *torch.zeros(2, 3, 5))), camera, camera)
-    assert (seeds.uv.shape, seeds.uv[1, 2].tolist()) == ((2, 3, 2), [5.0, 3.0])
-    assert torch.equal(seeds.inverse_depth, torch.full((2, 3), 0.1))
-    assert torch.equal(seeds.rgb, torch.full((2, 3, 3), 0.5))
 
 
 def room() -> tuple[ViewFeatures, Tensor, Tensor]:

@@ -17,7 +17,7 @@ from spackle.color import linear_to_srgb, srgb_to_linear
 from spackle.gaussians import Gaussians
 from spackle.render.protocol import Rendering
 from spackle.render.reference import ReferenceRenderer
-from spackle.residual import ResidualNet, Seeds, ViewFeatures, complete_view, hole_area_ratio, make_seeds
+from spackle.residual import ResidualNet, Seeds, ViewFeatures, complete_view, make_seeds
 from spackle.residual.architectures import open_residual
 from spackle.residual.complete import compose
 from spackle.residual.network import COLOR_MARGIN, DELTA_CHANNELS, find_rim, network_input
@@ -87,13 +87,9 @@ def test_a_completed_view_matches_the_equations(size: tuple[int, int]) -> None:
     assert float((found.alpha - final.alpha).abs().mean()) < 1e-3
 
 
-def test_the_number_of_gaussians_matches_the_paper() -> None:
+def test_the_least_number_of_gaussians() -> None:
     scene = box_before_wall(width=96, height=72)
-    base, size = scene.base(), 48 * 36
-    for side, disparity in ((0, 0.2), (1, 0.5)):
-        camera = extremes(scene.camera, disparity, DepthRange.of(base))[side]
-        har = hole_area_ratio(CPU.render(base, camera).alpha)
-        assert len(complete_view(base, camera, scene.camera, CPU, None)) / (har * size) == pytest.approx(1, abs=0.05)
+    base = scene.base()
     for network in (None, random_network()):
         assert len(complete_view(base, scene.camera, scene.camera, CPU, network, least=64)) == 64
 

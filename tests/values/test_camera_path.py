@@ -29,7 +29,7 @@ from spackle.errors import InputError
 from spackle.gaussians import Gaussians
 from spackle.render import CpuRenderer
 from spackle.residual import hole_area_ratio
-from spackle.views import PathOptions, choose_move, plan_views
+from spackle.views import choose_move
 
 PHOTO = Camera.from_focal(500, 400, 300)  # hypot(W/f, H/f) = 1
 RANGE = DepthRange(near=2.0, focus=4.0)
@@ -174,21 +174,6 @@ def test_a_looped_path_continues_at_its_beginning(kind: TrajectoryKind) -> None:
 def test_impossible_paths_are_refused(kind: str, disparity: float, frames: int, says: str) -> None:
     with pytest.raises(ValueError, match=says):
         trajectory(kind, PHOTO, disparity, RANGE, frames)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(("kind", "more"), [("swipe", 0), ("rotate-forward", 0), ("shake", 2), ("rotate", 2)])
-def test_overscan_zooms_and_views_without_overscan_are_filled_too(kind: TrajectoryKind, more: int) -> None:
-    prediction = box_before_wall().lift()
-    paths = [PathOptions(kind, frames=8, overscan=overscan) for overscan in (0, 0.2)]
-    plans = [plan_views(prediction, path, Path("photo.png")) for path in paths]
-    for exact, longer in zip(*(plan.cameras[:8] for plan in plans), strict=True):
-        assert torch.equal(exact.world_to_camera, longer.world_to_camera)
-        K = exact.K.clone()
-        K[:2, :2] *= 1.2
-        assert torch.equal(longer.K, K)
-    assert all(torch.equal(one.K, other.K) for one, other in zip(*(plan.cameras[8:] for plan in plans), strict=True))
-    assert [len(plan.cameras) for plan in plans] == [8 + more + 2] * 2
-    assert plans[1].measured == {"-0.3": 8 + more, "+0.3": 9 + more}
 
 
 @pytest.mark.parametrize(("usual", "allowed"), [(0.3, 0.5), (0.3, 0.06), (0.15, 0.03), (0.3, 0.001), (0.02, 0.001)])
