@@ -148,7 +148,6 @@ def test_an_animation_says_how_often_it_plays(tmp_path: Path, name: str) -> None
 
 
 def test_a_gif_keeps_rare_colours_and_spreads_a_gradient(tmp_path: Path) -> None:
-    """A small orange lamp stays orange, and a grey gradient shows no bands."""
     ramp, orange = torch.linspace(0.1, 0.6, 160), torch.tensor([1.0, 0.5, 0.1])
     pictures = [ramp[:, None].repeat(90, 1, 3) for _ in range(3)]
     for k, picture in enumerate(pictures):
