@@ -86,17 +86,6 @@ def error_of(name: str, root: Path) -> str:
     return message
 
 
-@pytest.mark.parametrize("there", PLACES)
-def test_each_tree_is_read_by_its_dataset(there: str, tmp_path: Path) -> None:
-    scene = stored(there, tmp_path / "data" / PLACES[there])
-    found = read_cases(there, tmp_path / "data")
-    names = [case.name for case in found]
-    assert len(set(names)) == len(names) == {"middlebury": 1, "booster": 2}.get(there, len(EYES))
-    assert [case.name for case in read_cases(there, scene)] == names  # a scene can be the root
-    assert all(case.photo.is_file() and all(view.photo.is_file() for view in case.seconds) for case in found)
-    assert load_case(found[0]).seconds
-
-
 MIDDLEBURY, BOOSTER, WILD = (PLACES[name] for name in ("middlebury", "booster", "wildrgbd"))
 MODEL = "courtyard/dslr_calibration_undistorted"
 BROKEN: list[tuple[str, str, str | None, str]] = [  # dataset, file, its content (None: no file), the message
@@ -198,7 +187,7 @@ def test_points_land_on_their_pixels(name: str, tree: str, scale: float, tmp_pat
     stored(tree, tmp_path / PLACES[name])
     found = read_cases(name, tmp_path)
     names = [case.name for case in found]
-    assert names == sorted(names)
+    assert names == sorted(names) == [case.name for case in read_cases(name, tmp_path / PLACES[name])]
     assert sum(len(case.seconds) for case in found) > 5
     for case, eye in zip(found, EYES, strict=True):
         assert case.camera is not None

@@ -178,10 +178,8 @@ def test_the_default_checkpoint_is_the_downloaded_one(
     assert run(*words, "optim.steps=1").code == 0
 
 
-def test_a_folder_with_another_method_or_network_is_refused(place: Path, whole: Path, tmp_path: Path) -> None:
+def test_a_folder_with_another_network_is_refused(place: Path, whole: Path, tmp_path: Path) -> None:
     out = shutil.copytree(whole, tmp_path / "out")
-    done = run("train", "--recipe", place / "recipe.yaml", "-o", out, "data.cells=16")
-    refuses(done, f"{out}: holds a run with other settings (--method")
     saved = torch.load(out / "checkpoint.pt", weights_only=True)
     name = "prediction_head.geometry_prediction_head.weight"
     saved["network"][name] = saved["network"][name][:2].clone()

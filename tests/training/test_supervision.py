@@ -20,6 +20,7 @@ from torch.nn.functional import max_pool2d
 
 from spackle.camera import Camera
 from spackle.errors import InputError
+from spackle.filters import greatest_around
 from spackle.render import CpuRenderer
 from spackle.render.protocol import tile_mask
 from spackle.residual.complete import compose
@@ -44,8 +45,7 @@ RIM_PX = 2  # tolerance for the size of Gaussians at outlines
 
 
 def grow(mask: Tensor, pixels: int = 1) -> Tensor:
-    side = 2 * pixels + 1
-    return max_pool2d(mask.float()[None, None], side, stride=1, padding=pixels)[0, 0] > 0
+    return greatest_around(mask, pixels)
 
 
 def outline(scene: Scene) -> Tensor:
