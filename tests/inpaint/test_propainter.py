@@ -14,13 +14,7 @@ from torch import Tensor, nn
 
 from spackle.errors import InputError
 from spackle.inpaint import InpainterOptions, get_inpainter
-from spackle.inpaint.propainter import (
-    DILATION,
-    NETWORKS,
-    PropainterInpainter,
-    dilated,
-    weight_files,
-)
+from spackle.inpaint.propainter import DILATION, NETWORKS, PropainterInpainter, dilated, weight_files
 
 OPS = """
 from torch import nn

@@ -39,11 +39,8 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
 def test_a_photo_becomes_a_scene(server: Served) -> None:
     reply = server.send(name="my photo.png", depth=("d.npy", b"depth"), options='{"base": "auto", "frames": 3}')
     id = reply.json["id"]
-    assert (reply.status, reply.headers["location"], reply.json["name"]) == (
-        202,
-        f"/s3cret{SCENES}/{id}",
-        "my photo.png",
-    )
+    expected = (202, f"/s3cret{SCENES}/{id}", "my photo.png")
+    assert (reply.status, reply.headers["location"], reply.json["name"]) == expected
     told = server.events(id)
     assert (told[-1]["state"], told[-1]["error"], told[-1]["line"]) == ("done", None, "focal length <50> px")
     assert server.events(id) == told[-1:]  # for a page that asks later
@@ -314,7 +311,6 @@ def test_a_photo_at_work_can_be_removed(server: Served) -> None:
 
 
 def test_the_example_mounts_the_app(tmp_path: Path) -> None:
-    """The example runs as a process, with the real pipeline."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
 
