@@ -54,7 +54,7 @@ def _compiled(function: Callable[..., R], fastmath: set[str], **more: Any) -> Ca
 
 
 def _surroundings(function: Callable[..., Any]) -> str:
-    """A hash of the numbers and kernels that a module defines or imports; numba checks only the module's text."""
+    """A hash of the numbers and kernels that a module has; numba notices only changes of the module's own text."""
     seen = []
     for name, value in sorted(function.__globals__.items()):
         if isinstance(value, Dispatcher):

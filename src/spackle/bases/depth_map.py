@@ -178,7 +178,7 @@ def relative_depth(
     """Convert inverse depth (near-white) or depth (near-black) [H, W] of unknown scale and shift to metres.
 
     The 1 % and 99 % quantiles become `near` and `far`; NaN and inf mean unknown. `step` is the quantisation step of
-    `stored`. InputError (naming `path`) if nearly all depths are equal, or unless 0 < `near` < `far`.
+    `stored`. InputError (naming `path`) if nearly all depths are equal, or if not 0 < `near` < `far`.
     """
     if not 0 < near < far < LARGEST:
         raise InputError(f"--near {near:g}, --far {far:g}: give two distances in metres, the nearer one first")
@@ -320,7 +320,7 @@ def _as_disparity(stored: Array, is_png: bool, lens: Calibration, path: StrPath)
 
 def grid_step(values: Array) -> float | None:
     """The step of the integer grid on which all values lie; None if a value is not an integer."""
-    if values.max() > 1 << 53 or not np.array_equal(values, np.round(values)):
+    if float(values.max()) > 1 << 53 or not np.array_equal(values, np.round(values)):
         return None
     distinct = np.unique(values.astype(np.int64))
     return float(np.gcd.reduce(np.diff(distinct))) if len(distinct) >= MIN_DISTINCT else 1.0

@@ -229,7 +229,7 @@ def _match(start: int, stop: int, colors: Any, ring: Any, inside: Any, color: An
 def _unmix(colors: Any, ring: Any, inside: Any, alpha: Any, color: Any, texture: Any) -> None:
     """Change both colours in place so that they mix to the photo's colour; the texture limits the change.
 
-    If this limit is too low, the colours stay unchanged, and alpha becomes that of their closest mixture. A pixel far
+    If the limit allows no exact mixture, the colours stay unchanged, and alpha gives the closest one. A pixel far
     from any mixture, such as the shaded edge of a round object, belongs to one surface alone. The fringe of a
     sharpening camera along an outline counts as the near surface, because it would stay visible on the background.
     """

@@ -27,7 +27,7 @@ DeviceOption = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Devi
 FovOption = Annotated[float | None, typer.Option(help="Horizontal field of view in degrees.")]
 HostOption = Annotated[
     str,
-    typer.Option(metavar="H", help="Address of the server; 0.0.0.0 admits everybody in the network with the token."),
+    typer.Option(metavar="H", help="Address of the server; 0.0.0.0 admits everybody in the network who has the token."),
 ]
 PortOption = Annotated[int, typer.Option(metavar="N", min=0, max=65535, help="Port of the server; 0: any free one.")]
 KeepFrameOption = Annotated[

@@ -56,7 +56,7 @@ class PredictOptions:
         if unused and not self.photo.render:
             raise InputError(f"--{unused[0]}: --no-render writes no video: leave one of them out")
         if self.photo.render and pipeline.given_views and (problem := video_problem(pipeline.given_views)):
-            raise InputError(f"{path.cameras}: {problem}, so they make no video: add --no-render for pictures only")
+            raise InputError(f"{path.cameras}: {problem}, so no video can be made: add --no-render for pictures only")
         return pipeline
 
 

@@ -80,7 +80,7 @@ def render_scene(
     problem = video_problem([maker.sized(camera) for camera in cameras])
     if problem and not names:
         hint = "give a folder with -o for pictures only" if given else "give --size"
-        raise InputError(f"{path.cameras or scene}: {problem}, so they make no video: {hint}")
+        raise InputError(f"{path.cameras or scene}: {problem}, so no video can be made: {hint}")
     holes: list[float] = []
     with results_folder(target.parent, [*names, target.name]), reporter.stage("video") as step:
 

@@ -50,8 +50,8 @@ def bench(options: EvaluateOptions, runs: int, base_runs: int | None, output: Pa
     """Time a dataset, or resume an earlier run; returns "complete", or "stopped" after Ctrl-C.
 
     Writes rows.jsonl, bench.md, bench.tex and images/ into `output`. A folder holds the times of one machine only.
-    Later stages are timed `runs` times, the base `base_runs` times. None means once for SHARP, which is slow, else
-    `runs` times.
+    Later stages are timed `runs` times, the base `base_runs` times. If `base_runs` is None, SHARP is timed
+    once, because it is slow, and other bases `runs` times.
 
     Raises:
         InputError: options, dataset or folder cannot be used, `output` holds another benchmark, or memory is too small

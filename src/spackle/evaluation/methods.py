@@ -62,8 +62,8 @@ def make_method(
         cameras: the cameras of all views of a setting, because a method may complete all views together.
         context: the base, the network and the renderer.
         inpainter: for inpaint2d.
-        direct_ft: for direct-ft; gives the fine-tuned base's Gaussians, and the factor that converts camera positions
-            to the unit of these Gaussians.
+        direct_ft: needed by the method direct-ft; returns the fine-tuned base's Gaussians, and the factor that
+            converts camera positions to the unit of these Gaussians.
     """
     context = context.placed
     guard = context.photo_guard() if name in ("spackle", "seeds", "dense") else None

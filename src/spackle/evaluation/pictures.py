@@ -238,7 +238,7 @@ def _draw(figure: PaperFigure, runs: Sequence[tuple[Run, Path]], most: int) -> t
 
 
 def _cell(run: Run, image: str, name: str, pictures: dict[str, Image.Image], figure: PaperFigure) -> Cell:
-    """A picture with marks: boxes around holes for the base, the share of added Gaussians for methods."""
+    """A picture with marks: the base's holes get boxes, a method's picture the share of added Gaussians."""
     if name == HOLE:  # framed, because a hole may be white on a white page
         width, height = pictures[name].size
         ImageDraw.Draw(pictures[name]).rectangle((0, 0, width - 1, height - 1), outline="grey")

@@ -1,4 +1,4 @@
-"""A table of texts, and its output as Markdown and LaTeX; report.html writes HTML."""
+"""A table of texts, written as Markdown and LaTeX; the template report.html writes it as HTML."""
 
 from __future__ import annotations
 

@@ -139,7 +139,7 @@ def replay_row(work: Array, offset: np.uint64, notes: Array, note: np.uint64, pe
 
 @kernel
 def replay(work: Array, notes: Array, records: Array, ids: Array, left: int, top: int, first_notes: Array) -> int:
-    """Draw a chunk of Gaussians again; `first_notes` [CHUNK] receives the start of each Gaussian's notes.
+    """Draw a chunk of Gaussians again; `first_notes` [CHUNK] receives each Gaussian's first row in `notes`.
 
     Returns the number of Gaussians that were drawn until the tile was full.
     """

@@ -44,7 +44,7 @@ def complete_view(
 ) -> Gaussians:
     """𝒢̃_aug of a view (eq. 7): one Gaussian for each masked cell.
 
-    A cell is masked if its first pixel is masked. About HAR × grid cells are then masked, as in the paper's tables.
+    A cell is masked if its first pixel is masked. So about HAR times all cells are masked, as in the paper's tables.
 
     Args:
         base: 𝒢_base, N Gaussians in the world's frame.

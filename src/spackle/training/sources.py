@@ -45,7 +45,7 @@ def find_sources(data: DataRecipe, renderer: Renderer, *, validation: bool) -> l
     shares, sources = data.shares, list[Source]()
 
     def add(name: str, share: float, folder: Path, files: Sequence[Path], draw: Draw | None = None) -> None:
-        """Add a source: reverse views of the photos from `draw`, or right views of stereo pairs if `draw` is None."""
+        """Add a source: reverse views of photos that `draw` makes, or the right views of stereo pairs if it is None."""
 
         def view(rng: np.random.Generator, index: int) -> Sample:
             return (

@@ -1,6 +1,6 @@
 """The training loop: batch, forward, losses, step, validate, save.
 
-A `Task` defines the network, the data and the loss. Processes that torchrun starts train one network together.
+A `Task` defines the network, the data and the loss. Several processes, started by torchrun, train one network together.
 """
 
 from __future__ import annotations

@@ -74,7 +74,7 @@ class Jobs:
         work: takes (job, file) and reports {stage, done, total} or {line}. If `file` is None, `work` makes a scene of
             the photo; else it adds this file to a finished scene.
         workers: number of processes for photos; another process adds files to finished scenes.
-        keep: limits of the folder.
+        keep: limits of age, size and number, see `create_app`.
     """
 
     def __init__(self, folder: Path, work: Work, workers: int, keep: Keep) -> None:
