@@ -1,7 +1,4 @@
-"""The four functions of gsplat 1.5.3 that Spackle calls, in plain PyTorch.
-
-They refuse all inputs that gsplat refuses, misreads or crashes on.
-"""
+"""The four functions of gsplat 1.5.3 that Spackle calls, in PyTorch; they refuse all inputs that gsplat cannot take."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Independent readers of the export formats, written from the formats' specifications.
-
-Each turns a file's bytes into columns of means, quats (wxyz), scales, opacities and sRGB, in the file's axes.
-"""
+"""Independent readers of the formats, from bytes to means, quats (wxyz), scales, opacities, sRGB in the file's axes."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""Photos with a depth map inside, and damaged ones.
-
-libheif encoded the pictures of HEIC files without loss, and their boxes follow the standards. JPEG files have the
-layouts of Apple, GDepth and Dynamic Depth.
-"""
+"""Photos with a depth map inside, in the layouts of Apple, GDepth and Dynamic Depth, and damaged ones."""
 
 from __future__ import annotations
 

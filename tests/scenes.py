@@ -112,10 +112,7 @@ def random_scene(
     dtype: torch.dtype = torch.float32,
     sizes: tuple[float, float] = (0.6, 12.0),
 ) -> Gaussians:
-    """Gaussians in and around the view, some behind the camera, at clearly different depths.
-
-    `solidity` raises opacities. `sizes` are the least and the greatest standard deviation in the image, in pixels.
-    """
+    """Gaussians at different depths around the view; `sizes` bound their standard deviations in pixels."""
     generator = torch.Generator().manual_seed(seed)
 
     def uniform(*shape: int) -> Tensor:

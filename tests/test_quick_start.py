@@ -85,7 +85,6 @@ def test_the_python_of_the_quick_start_works_by_the_wheel(environment: Path, pla
 
 @pytest.mark.slow
 def test_programs_are_type_checked_by_the_wheel(environment: Path, tmp_path: Path) -> None:
-    pytest.importorskip("mypy")
     program = Path(shutil.copy(Path(__file__).parent / "data" / "typed_program.py", tmp_path))
     options = ["--strict", "--no-error-summary", "--python-executable", environment / "python"]
     checker = [sys.executable, "-m", "mypy", *options, program]

@@ -33,7 +33,6 @@ def sum_of(run: Run, method: str, metric: str) -> float:
 
 @pytest.mark.slow
 def test_the_papers_chain_gives_its_tables_and_figures(tmp_path: Path) -> None:
-    pytest.importorskip("yaml")
     out, before = tmp_path / "out", os.times()
     done = subprocess.run([sys.executable, ROOT / "benchmarks/reproduce.py", "-o", out], capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr + (out / "log.txt").read_text()[-2000:]

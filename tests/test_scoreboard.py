@@ -70,11 +70,3 @@ def test_each_mechanism_is_in_the_package(name: str) -> None:
                 there = [vars(module)[target.rpartition(".")[2]] for module in scoreboard.holders(target)]
                 assert there[0] is not own[0]
             assert own == [vars(module)[target.rpartition(".")[2]] for module in scoreboard.holders(target)]
-
-
-@pytest.mark.slow
-def test_every_mechanism_can_be_switched_off(pairs: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    runs = run(pairs, "--ledger")
-    assert set(runs) == {"default", *scoreboard.MECHANISMS}
-    rows = capsys.readouterr().out.splitlines()
-    assert all(any(row.startswith(f"| {name} |") for row in rows) for name in scoreboard.MECHANISMS)

@@ -110,7 +110,6 @@ def test_a_ball_in_front_of_a_wall_keeps_its_shape(radius: float, behind: float)
 @pytest.mark.parametrize("factor", [(1.0, 1.0), (1.25, 1.25), (3.3, 2.9), (4.0, 4.0), (12.0, 12.0), (0.7, 0.7)])
 @pytest.mark.parametrize("slope", [(0.0, 1.0), (1.0, 0.0), (-0.4, 0.7)])
 def test_a_plane_stays_that_plane_at_any_size(factor: tuple[float, float], slope: tuple[float, float]) -> None:
-    """The photo is noise, which must not show in the depth."""
 
     def plane(rows: int, columns: int) -> Tensor:
         x, y = (torch.arange(columns) + 0.5) / columns, (torch.arange(rows) + 0.5) / rows
@@ -182,7 +181,6 @@ def test_the_noise_of_a_slanted_plane_is_measured(noise: float) -> None:
 
 
 def test_a_clean_map_is_not_smoothed() -> None:
-    """The second differences of a mesh in front of a wall are large everywhere, but they are no noise."""
     mesh = torch.full((60, 80), 0.2)
     mesh[::5] = mesh[1::5] = mesh[:, ::5] = mesh[:, 1::5] = 1.0
     for inverse in (1 / box_before_wall().depth, sphere(30, 1.0), 1 / slanted_plane(1.5, 6, 0).depth, mesh):

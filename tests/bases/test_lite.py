@@ -67,7 +67,6 @@ def test_a_photo_of_any_shape_has_finite_depth(shape: tuple[int, int]) -> None:
 
 
 def test_stored_weights_are_small_and_only_rounded(tmp_path: Path) -> None:
-    """The quantisation step is 1/127 of an output's largest weight, so the error is at most half a step."""
     assert SHIPPED.stat().st_size <= 12_000_000
     assert [network.encoder.size for network in load_networks(SHIPPED)] == ["lite0", "lite2"]
     networks = [LiteNet("lite2"), LiteNet("lite0")]

@@ -146,11 +146,9 @@ def test_the_same_photo_gives_the_same_scene_and_bf16_nearly_so(checkpoint: Path
 def test_predict_takes_a_checkpoint_and_a_clip_keeps_one_lens(
     checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The network estimates another focal length for each frame."""
     words = ("--base", "moge", "-c", checkpoint, "-o", tmp_path)
     done = run("predict", write_photo(tmp_path / "photo.png", 160, 90), *words, "--frames", 2)
     assert (done.code, report_of(tmp_path / "photo")["base"]["name"]) == (0, "moge"), done.err
-    pytest.importorskip("cv2")
     lenses, seen = iter((1.3, 0.9, 1.1)), list[float]()
 
     def ask(*given: Any) -> MogeOutput:

@@ -79,7 +79,6 @@ def test_odd_and_tiny_photos_are_lifted(size: tuple[int, int]) -> None:
 
 
 def test_missing_depth_is_filled_from_behind_and_reported() -> None:
-    """Beside a box is a strip without depth, as in the maps of stereo cameras."""
     scene = box_before_wall()
     strip = torch.zeros_like(scene.depth, dtype=torch.bool)
     strip[24:48, 28:32] = True  # the wall's last columns before the box
@@ -142,7 +141,6 @@ def test_the_holes_are_the_regions_that_a_box_uncovers(disparity: float, side: i
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize("kind", ["swipe", "shake"])
 def test_slanted_ground_has_no_pinholes(axis: int, kind: str) -> None:
-    """A floor (axis 0) and a side wall (axis 1), from 1.5 m to 6 m, at disparity 0.5."""
     scene = slanted_plane(1.5, 6, axis)
     base = scene.lift(LEVELS).gaussians
     for camera in trajectory(kind, scene.camera, 0.5, DepthRange.of(base), frames=9):  # type: ignore[arg-type]

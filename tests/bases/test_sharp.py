@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from photos import picture
-from PIL import Image
 from scenes import psnr
 from sharp_weights import DATA, MICRO, gaussians_of, micro_network, tiny_weights, waves, write_tiny
 from torch import Tensor, nn
@@ -28,7 +26,7 @@ from spackle.bases.sharp.network import GroupNorm, SharpNetwork, compose, make_s
 from spackle.bases.sharp.unproject import stretch_gaussians
 from spackle.device import enough_memory, multiplies_bf16, own_arithmetic, pick_device, pick_dtype
 from spackle.errors import InputError
-from spackle.image import Photo, load_photo
+from spackle.image import Photo
 from spackle.render import CpuRenderer
 
 CPU = torch.device("cpu")
@@ -99,26 +97,6 @@ def test_group_norm_is_exact_over_half_a_million_pixels(channels_last: bool) -> 
 def test_extreme_depths_make_finite_gaussians() -> None:
     for extreme in (1e-8, 1e9):
         assert compose(make_start(waves(8), torch.full((1, 2, 8, 8), extreme)), torch.zeros(14, 2, 4, 4)).finite
-
-
-@pytest.mark.parametrize(("name", "size"), [("one.png", (1, 1)), ("long.png", (10_000, 10))])
-def test_odd_photos_become_gaussians_in_front_of_their_camera(tmp_path: Path, name: str, size: tuple[int, int]) -> None:
-    image = Image.fromarray(picture()).resize(size)
-    image.save(tmp_path / name)
-    seen: list[tuple[int, int]] = []
-    base = SharpBase(micro_network(), weights="w.pt")
-    prediction = base.predict(load_photo(tmp_path / name), lambda done, total: seen.append((done, total)))
-    assert prediction.notes == {"precision": "fp32", "weights": "w.pt"}
-    camera, gaussians = prediction.camera, prediction.gaussians
-    assert (camera.width, camera.height) == ((1536, 2) if name == "long.png" else image.size)
-    assert len(gaussians) == gaussians_of(MICRO)
-    assert seen[-1] == (35, 35)
-    uv, z = camera.project(gaussians.means)
-    assert gaussians.finite
-    assert bool((z > 0).all())
-    inside = (uv >= -1) & (uv <= torch.tensor([camera.width + 1, camera.height + 1]))
-    assert bool(inside.all())
-    assert float(CpuRenderer().render(gaussians, camera).alpha.mean()) > 0.5
 
 
 def test_depth_goes_with_focal_length_over_width() -> None:

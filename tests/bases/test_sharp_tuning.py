@@ -68,7 +68,6 @@ def test_normalised_gaussians_render_like_gaussians_in_metres(base: TunableSharp
 
 @pytest.mark.parametrize("name", ["prediction_head.", "feature_model.texture_head.", "feature_model.decoder."])
 def test_gradients_to_weights_are_those_of_finite_differences(base: TunableSharp, name: str) -> None:
-    """The step goes along the gradient, without rendering: the renderer's cut-offs have no gradient."""
     decoder = copy.deepcopy(base.network.gaussian_decoder()).let_learn()
     encoded = base.encode(photo().rgb, CAMERA)
 

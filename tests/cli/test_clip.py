@@ -20,7 +20,6 @@ from spackle.inpaint.plain import OpenCV
 from spackle.render import CpuRenderer
 from spackle.residual import hole_mask
 
-pytest.importorskip("cv2")
 CPU = CpuRenderer()
 
 

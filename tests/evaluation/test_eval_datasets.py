@@ -132,10 +132,7 @@ def test_odd_poses_and_bent_lenses_are_refused(tmp_path: Path) -> None:
 
 
 def assert_pair(case: Case, disparity: float, z: float, x: int = 30, y: int = 9) -> tuple[torch.Tensor, torch.Tensor]:
-    """Check that the right camera sees the centre of a left pixel `disparity` pixels further left, at depth `z`.
-
-    Returns the pixels with known depth [H, W], and K.
-    """
+    """Check where the right camera sees the centre of a left pixel; returns the pixels with known depth, and K."""
     assert case.camera is not None
     assert case.depth is not None
     known, K = case.depth(), case.camera.K
@@ -307,7 +304,6 @@ def test_bounds_are_the_last_resort_and_nothing_is_an_error() -> None:
     ("turn", "off", "tolerance"), [(0.0, (9.0, -4.0), 1e-3), (0.2, (0.0, 0.0), 1e-3), (0.05, (1.0, 0.5), 0.02)]
 )
 def test_a_second_camera_in_the_bases_world(turn: float, off: tuple[float, float], tolerance: float) -> None:
-    """Both cameras must project the same pixel at the same relative depth to the same place."""
     base, scale = Camera.from_focal(40.0, 48, 36), 2.5
     K = base.K.clone()
     K[:2, 2] += torch.tensor(off)

@@ -19,8 +19,6 @@ from scenes import psnr
 from spackle.clips.files import clip_frames, is_clip, read_clip
 from spackle.errors import InputError
 
-pytest.importorskip("cv2")
-
 
 def moving(count: int, height: int = 48, width: int = 64) -> list[NDArray[np.uint8]]:
     """Frames of a picture that moves to the right by one pixel per frame."""

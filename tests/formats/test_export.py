@@ -133,7 +133,6 @@ def test_scenes_are_read_as_the_plainest_reader_does(tmp_path: Path, kind: str, 
 
 
 def test_other_programs_spz() -> None:
-    """Version 2 has a byte for each of a rotation's xyz; harmonics above degree 0 follow the rest."""
     found = load_scene(Path(__file__).parents[1] / "data" / "version_2.spz").gaussians
     flipped = torch.tensor([[0.5, 0.5, 0.5, -0.5], [1.0, 0, 0, 0], [0.6, 0, -0.8, 0]])
     torch.testing.assert_close(quat_to_matrix(found.quats), quat_to_matrix(flipped), atol=0.02, rtol=0)
@@ -300,7 +299,6 @@ def agree(found: Gaussians, expected: Gaussians, turn: float) -> None:
 
 @pytest.mark.parametrize("kind", [kind for kind in FORMATS if kind != "glb"])  # which it writes but does not read
 def test_splat_transform_reads_the_scene(kind: str, tmp_path: Path) -> None:
-    """PlayCanvas's command; SPLAT_TRANSFORM may name its bin/cli.mjs."""
     given, found = os.environ.get("SPLAT_TRANSFORM"), shutil.which("splat-transform")
     if not (given or found):
         pytest.skip("splat-transform is not installed: npm install -g @playcanvas/splat-transform")
@@ -317,7 +315,6 @@ def test_splat_transform_reads_the_scene(kind: str, tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["spz", "compressed.ply"])
 def test_gsply_reads_the_scene_and_we_what_it_writes(kind: str, tmp_path: Path) -> None:
-    """It compiles its reader when it is first used, and leaves SPZ's axes as they are."""
     gsply = pytest.importorskip("gsply")
     path = tmp_path / f"a.{kind}"
     path.write_bytes(encode(kind, random_gaussians(50)))

@@ -29,7 +29,6 @@ def test_damaged_files_are_refused_in_time_and_in_memory() -> None:
 
 
 def test_small_files_with_a_large_announced_size_stay_below_the_bound(tmp_path: Path) -> None:
-    """Pictures of 9,999² and 5,600² pixels, depth maps of this size, and a PNG whose header announces 4 GB."""
     cases = [(name, files) for name in ("pictures", "depth") for files in stored_files(f"large_{name}")]
     assert all(len(data) < 1_000_000 for _, files in cases for data in files.values())
     saved = [fuzz.save(name, 0, files, tmp_path / f"{k}") for k, (name, files) in enumerate(cases)]

@@ -11,8 +11,6 @@ from spackle.inpaint import INPAINTERS, InpainterOptions, get_inpainter, inpaint
 
 @pytest.mark.parametrize("name", sorted(name for name in INPAINTERS if not inpainter_class(name).network))
 def test_only_holes_change_and_results_repeat(name: str) -> None:
-    if name == "opencv":
-        pytest.importorskip("cv2")
     rgb = torch.rand(2, 24, 33, 3, generator=torch.Generator().manual_seed(0)) / 2 + 0.25
     hole = torch.zeros(2, 24, 33, dtype=torch.bool)
     hole[0, 4:13, 10:20] = hole[0, :, -3:] = True

@@ -30,7 +30,6 @@ from spackle.surface import PIXEL_SPREAD
 
 @pytest.mark.parametrize("period", [4.0, 6.0, 8.0])  # pixels
 def test_sharpening_balances_overlap(period: float) -> None:
-    """The wall is rough, because rows of Gaussians at increasing depth would shift the image."""
     camera = Camera.from_focal(80, 96, 72)
     uv = camera.pixel_centers()
     x, y = (2 * torch.pi / period * uv).unbind(-1)

@@ -25,7 +25,6 @@ from spackle.render import get_renderer
 from spackle.training.direct_ft import VIEWS_AT_ONCE, DirectFt, TunableSharp, drawn_views, render_photo
 from spackle.training.recipe import Recipe, load_recipe
 
-pytest.importorskip("yaml")
 __all__ = ["one_thread"]  # a fixture
 
 CPU = torch.device("cpu")
@@ -120,7 +119,6 @@ def test_results_of_a_run(place: Path, whole: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_two_processes_compute_the_gradient_of_one(place: Path, tmp_path: Path) -> None:
-    """Each process adds the gradients of two photos."""
     options = ["optim.steps=1", "optim.batch=16", "run.validate_every=1"]
     run_two(arguments(place, tmp_path / "two", *options))
     assert train(place, tmp_path / "one", *options).code == 0

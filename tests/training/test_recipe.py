@@ -13,7 +13,6 @@ from spackle.training.recipe import OptimRecipe, Recipe, RgbdFolder, differences
 from spackle.training.train import ema_decay, learning_rate, samples_of_step
 from spackle.weights import published_weights
 
-pytest.importorskip("yaml")
 PLAIN = "loss: {features: none}"
 
 

@@ -30,7 +30,6 @@ from spackle.training.recipe import LossRecipe, OptimRecipe
 from spackle.training.residual import complete_samples
 from spackle.training.samples import Sample, load_sample, save_sample
 
-pytest.importorskip("yaml")
 __all__ = ["one_thread"]  # a fixture
 
 RECIPE = """

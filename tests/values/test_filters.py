@@ -88,7 +88,6 @@ def test_known_pixels_stay_and_filled_ones_are_within_their_range(
 
 @pytest.mark.parametrize("bias", [0.0, 5.0, 80.0])
 def test_a_relaxed_fill_is_a_membrane_over_the_rim(bias: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each filled pixel is the mean of its neighbours, with the weight min(1, fill / sample)^bias for rim pixels."""
     monkeypatch.setattr(filters, "SWEEPS", 4000)
     inverse, values, known = random_scene(7, 11, 13, 0.7)
     biases = bias * torch.rand(11, 13, generator=torch.Generator().manual_seed(1))
