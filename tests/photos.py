@@ -30,7 +30,6 @@ def box(width: int = WIDTH, height: int = HEIGHT) -> NDArray[np.bool_]:
 
 
 def metres(width: int = WIDTH, height: int = HEIGHT, near: float = 2.0, far: float = 6.0) -> NDArray[np.float32]:
-    """Depth of `picture`, [H, W]."""
     return np.where(box(width, height), near, far).astype(np.float32)
 
 

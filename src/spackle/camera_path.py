@@ -154,6 +154,9 @@ class Keyframe:
 
     def __post_init__(self) -> None:
         """Raise a PathError if the keyframe describes no view, for instance if eye and target coincide."""
+        numbers = (self.time, *self.eye, *self.target, *self.up, *([] if self.fov is None else [self.fov]))
+        if not all(map(math.isfinite, numbers)):
+            raise PathError("every number must be finite")
         if self.fov is not None and not MIN_FOV <= self.fov <= MAX_FOV:
             raise PathError(f"fov must be from {MIN_FOV:g} to {MAX_FOV:g} degrees, got {self.fov:g}")
         _look_at(self.eye, self.target, self.up)
@@ -179,6 +182,8 @@ class KeyframePath:
             if not other.time - one.time >= LEAST_STEP:
                 order = f"keyframe {index + 1} is at {other.time:g} s, the one before at {one.time:g} s"
                 raise PathError(f"times must increase, by a microsecond at least: {order}")
+        if self.unit not in get_args(PathUnit):
+            raise PathError(f"unknown unit {self.unit!r}: choose {' or '.join(get_args(PathUnit))}")
 
     @property
     def seconds(self) -> float:

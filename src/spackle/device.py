@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 
@@ -80,7 +80,7 @@ def own_arithmetic(device: torch.device) -> Iterator[None]:
 
 
 Precision = Literal["auto", "fp32", "bf16"]
-PRECISIONS = ("auto", "fp32", "bf16")
+PRECISIONS: tuple[Precision, ...] = get_args(Precision)
 
 
 def pick_dtype(precision: Precision, device: torch.device) -> torch.dtype:

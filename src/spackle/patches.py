@@ -20,7 +20,7 @@ from torch.nn.functional import avg_pool2d
 
 from spackle._numba import kernel, reordering_kernel
 from spackle.device import run_chunks
-from spackle.filters import blurred, greatest_around, nearest_known
+from spackle.filters import blurred, distance_to, greatest_around, nearest_known
 
 RADIUS = 3  # patches have 7×7 cells
 SIDE = 2 * RADIUS + 1
@@ -90,7 +90,7 @@ def _pyramid(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> list[_Level]
     while True:
         traits = [TONE_WEIGHT * blurred(tone, max(TONE_CELLS / 2 ** len(levels), 0.5)), DEPTH_WEIGHT * depth]
         weights = np.zeros([size + 2 * RADIUS for size in hole.shape], np.float32)
-        inside = np.hypot(*(nearest_known(hole.numpy()) - np.indices(hole.shape)).astype(np.float32))
+        inside = distance_to(nearest_known(hole.numpy())).numpy()
         weights[RADIUS:-RADIUS, RADIUS:-RADIUS] = np.maximum(np.float32(FADING) ** inside, FAINTEST_CELL)
         picture, marks = (image.contiguous().numpy() for image in (rgb, torch.cat(traits, dim=-1)))
         levels.append(_Level(picture, marks, hole.numpy(), weights))

@@ -32,16 +32,6 @@ from spackle.errors import one_line
 Step = Callable[[int, int], None]  # (done, of how many)
 
 
-@contextlib.contextmanager
-def timed(stage: str, seconds: dict[str, float]) -> Iterator[None]:
-    """Add the block's duration to `seconds[stage]`."""
-    start = time.perf_counter()
-    try:
-        yield
-    finally:
-        seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - start
-
-
 def counted(count: int, thing: str) -> str:
     """`1 shard`, `2 shards`."""
     return f"{count:,} {thing}{'' if count == 1 else 's'}"

@@ -164,5 +164,7 @@ def test_a_base_that_cannot_be_loaded_stops_a_folder_at_once(
         return StandIn("sharp")
 
     monkeypatch.setattr(SharpBase, "load", change)
-    result = predict(tmp_path, photos, "--base", "sharp")
-    assert (result.code, result.lines[-1].endswith("changed while this was running: start again")) == (2, True)
+    for words in (("--base", "sharp"), ()):
+        result = predict(tmp_path, photos, *words)
+        assert (result.code, result.lines[-1].endswith("changed while this was running: start again")) == (2, True)
+        assert "going on without" not in result.err

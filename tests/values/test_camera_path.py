@@ -94,13 +94,12 @@ def test_a_closed_path_does_not_repeat_its_first_view() -> None:
 
 
 def test_impossible_views_between_keyframes_are_refused() -> None:
+    with pytest.raises(PathError, match="must be finite"):
+        Keyframe(0, (float("nan"), 0, 0), TARGET)
+    eye = (0, 0, 0)
     for first, second, says in (
-        (Keyframe(0, (0, 0, 0), (0, 0, 2)), Keyframe(1, (0, 0, 4), (0, 0, 2)), r"at 0\.5 s.*coincide.*add a keyframe"),
-        (
-            Keyframe(0, (0, 0, 0), (0, 1, 1)),
-            Keyframe(1, (0, 0, 0), (0, 1, -1)),
-            "up is parallel to the viewing direction",
-        ),
+        (Keyframe(0, eye, (0, 0, 2)), Keyframe(1, (0, 0, 4), (0, 0, 2)), r"at 0\.5 s.*coincide.*add a keyframe"),
+        (Keyframe(0, eye, (0, 1, 1)), Keyframe(1, eye, (0, 1, -1)), "up is parallel to the viewing direction"),
     ):
         with pytest.raises(PathError, match=says):
             KeyframePath((first, second)).cameras(CAMERA, 3, DEPTHS)

@@ -18,6 +18,7 @@ from PIL import Image
 from torch import Tensor
 
 from spackle.bases import NEAREST_M
+from spackle.camera import Camera
 from spackle.errors import InputError, reading, shown
 from spackle.files import check_file
 from spackle.image import check_pixels, read_image
@@ -227,6 +228,13 @@ class Calibration:
     def K(self) -> Tensor:
         """[3, 3] intrinsics of the left camera, in pixels."""
         return torch.tensor([[self.focal_px, 0.0, self.cx], [0.0, self.focal_px, self.cy], [0.0, 0.0, 1.0]])
+
+    def cameras(self, width: int, height: int) -> tuple[Camera, Camera]:
+        """The cameras of the left and the right photo, in the left camera's frame."""
+        K, pose = self.K, torch.eye(4)
+        K[0, 2] += self.doffs_px
+        pose[0, 3] = -self.baseline_m
+        return Camera(self.K, torch.eye(4), width, height), Camera(K, pose, width, height)
 
     def check(self, path: StrPath) -> Calibration:
         """Return this calibration; InputError, naming the file, if its numbers are impossible."""

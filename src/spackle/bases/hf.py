@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
 from spackle.bases import NEAREST_M, BasePrediction, Progress, believed_lens, nearest
-from spackle.bases.depth_map import DepthMap
+from spackle.bases.depth_map import DepthMap, is_depth
 from spackle.bases.lift import lift_guess
 from spackle.camera import Camera
 from spackle.device import Precision, enough_memory, own_arithmetic, pick_device, pick_dtype
@@ -141,7 +141,7 @@ def to_depth_map(raw: Tensor, meaning: Meaning, focal: float, name: str, photo: 
         depth = 1 / ((1 - share) / FARTHEST_M + share / NEAREST_M)
     else:
         depth = 1 / (raw / focal).clamp(1e-4, 1e4)  # in 1/m: Depth Pro's own limits
-    valid = known & (depth > 0) & torch.isfinite(1 / depth)
+    valid = known & is_depth(depth)
     return DepthMap(depth.where(valid, 0.0), valid, None, None, "depth" if meaning == "metres" else "disparity", photo)
 
 

@@ -151,7 +151,7 @@ class OpenedBase:
                 for_good = shared and (base is None or isinstance(error, MemoryShort))  # another photo does not help
                 if for_good and len(self.candidates) == 1:
                     raise BaseError(str(error)) from error
-                if name == list(self.candidates)[-1]:
+                if name == list(self.candidates)[-1] or isinstance(error, BaseError):
                     raise
                 reasons.append((f"{title} cannot be used", isinstance(error, MemoryShort)))
                 failures.append(f"{title}: {error}")

@@ -13,7 +13,7 @@ from spackle.bases.depth_map import DEPTH_KINDS, RELATIVE, DepthKind, DepthMap
 from spackle.bases.sharp.base import check_windows
 from spackle.device import PRECISIONS, Precision
 from spackle.errors import InputError, check_name
-from spackle.weights import PUBLISHED, weights_folder
+from spackle.weights import PUBLISHED, installed
 
 AUTO, RGBD = "auto", "rgbd"
 HF = "hf:"  # before a folder, or a Hugging Face model's owner/name
@@ -47,9 +47,9 @@ MISSING = {  # what to do if a base's weights are missing
 
 def _weights_here(name: str) -> Path | None:
     """The file with a base's weights on this machine; None if it is missing."""
-    folder = weights_folder()
-    places = {"sharp": folder / PUBLISHED["sharp"].file, "moge": folder / PUBLISHED["depth"].file, "lite": lite.SHIPPED}
-    return places[name] if name in places and places[name].is_file() else None
+    if name == "lite":
+        return lite.SHIPPED if lite.SHIPPED.is_file() else None
+    return installed({"sharp": "sharp", "moge": "depth"}[name]) if name in MISSING else None
 
 
 @dataclasses.dataclass(frozen=True)

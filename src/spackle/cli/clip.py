@@ -31,11 +31,9 @@ NAME = "{:06d}"
 def clip_options(scene: Options, photo: PhotoOptions, workers: int) -> Options:
     """The pipeline's options for a clip; InputError for an option that does not apply to a clip."""
     depth, path, fill = scene.base.depth, scene.path, scene.fill
-    plain = VideoOptions(format=path.video.format)
+    plain = vars(VideoOptions())
     unfit = {
-        **{
-            each.name: getattr(path.video, each.name) != getattr(plain, each.name) for each in dataclasses.fields(plain)
-        },
+        **{name: value != plain[name] for name, value in vars(path.video).items()},
         "cameras": path.cameras is not None,
         "path": path.path is not None,
         "seconds": path.seconds is not None,

@@ -252,7 +252,7 @@ def _shared_digest(options: PredictOptions) -> str:
     files |= {"LaMa": installed("lama") if fill.texture == "lama" else None, **base.files}
     prints = {kind: fingerprint(file, kind) for kind, file in files.items() if file is not None}
     name = base.named if base.folder is None else "hf"  # digests identify the folder, wherever it lies
-    # Windows and compilation change only the last bits of results.
+    # The number of windows changes only the last bits of results.
     base = dataclasses.replace(base, name=name, depth=None, calib=None, checkpoint=None, windows=None)
     path = dataclasses.replace(path, cameras=None, path=None)
     choices = [dataclasses.asdict(each) for each in (base, path, options.photo)]

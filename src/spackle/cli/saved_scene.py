@@ -54,7 +54,8 @@ def render_scene(
     elif (mimetypes.guess_type(output.name)[0] or "").startswith(("video/", "image/")):
         raise InputError(f"{output}: not a kind of video that can be written: end the name with {', '.join(FORMATS)}")
     path.check()
-    if path.cameras is not None and any(lens.values()):
+    new_lens = any(value is not None for value in lens.values())
+    if path.cameras is not None and new_lens:
         raise InputError(f"--cameras {path.cameras}: its views have their own lenses: leave --fov and --focal-px out")
     renderer = get_renderer(device)
     with reporter.stage("load"):
@@ -72,7 +73,7 @@ def render_scene(
                 f"{scene.name}: {far} goes beyond the {reach:g} for which the scene was completed: "
                 f"`spackle predict {far}` completes a photo that far"
             )
-        if not given and loaded.camera is None and not any(lens.values()):
+        if not given and loaded.camera is None and not new_lens:
             reporter.log(f"{scene.name}: no camera stored: {DEFAULT_FOCAL_MM:g} mm assumed, --fov gives another lens")
         maker = FrameMaker.of(path.video, base, cameras, scene)
     target = output if single else output / f"{scene.stem}{path.video.suffix}"

@@ -152,7 +152,8 @@ def listener_at(host: str, port: int) -> socket.socket:
         # asyncio avoids delays of 40 ms (TCP_NODELAY) only if the socket names its protocol.
         listener = socket.socket(family, kind, protocol)
         try:
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            if sys.platform != "win32":  # there, another program could take the same port
+                listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             listener.bind(address)
             listener.listen(128)
         except OSError:

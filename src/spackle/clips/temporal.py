@@ -179,7 +179,7 @@ def propagate_colors(
     made_up, inverse_depth = behind(before, own, hole)
     share = torch.where(hole, own.alpha - before.alpha, 1.0).clamp_min(0)
     start = FrameMemory(own, made_up, inverse_depth, _trust(hole, share, torch.zeros_like(share)))
-    found = None if past is None else track(own.rgb, past.view.rgb, flow)
+    found = None if past is None or not bool(hole.any()) else track(own.rgb, past.view.rgb, flow)
     if past is None or found is None or not found.same_shot(~hole):
         return aux, start
     motion = extend_flow(found, inverse_depth, ~hole, camera)

@@ -75,7 +75,8 @@ class Manifest(BaseModel, frozen=True, extra="ignore", strict=True):
         return digest_of(self._content())
 
     def save(self, folder: Path) -> None:
-        text = json.dumps(self._content() | {"sha256": self.digest}, indent=1, sort_keys=True, allow_nan=False)
+        content = self._content()
+        text = json.dumps(content | {"sha256": digest_of(content)}, indent=1, sort_keys=True, allow_nan=False)
         with atomic_path(folder / NAME) as temporary:
             temporary.write_text(text + "\n", encoding="utf-8")
 

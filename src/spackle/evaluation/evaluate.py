@@ -21,6 +21,7 @@ from spackle.device import hardware, pick_device, pick_dtype, versions
 from spackle.errors import InputError, check_name
 from spackle.evaluation.case import Case, LoadedCase, known_depth, load_case
 from spackle.evaluation.datasets import DATASETS, read_cases
+from spackle.evaluation.datasets.multiview import spaced
 from spackle.evaluation.folder import ROWS, earlier_metrics, image_file, load_run, measure_images, write_rows
 from spackle.evaluation.methods import METHODS, make_method
 from spackle.evaluation.metrics import DEFAULT_METRICS, DEFINITIONS, METRICS, NOTICE, OWN, open_metrics
@@ -186,8 +187,8 @@ def open_evaluation(options: EvaluateOptions, more_metrics: Sequence[str] = ()) 
 def _cases_of(options: EvaluateOptions) -> list[Case]:
     """The cases to evaluate, with the second views to compare."""
     cases, limit = read_cases(options.dataset, options.root), options.limit
-    if limit is not None and limit < len(cases):  # evenly spaced
-        cases = [cases[(2 * k + 1) * len(cases) // (2 * limit)] for k in range(limit)]
+    if limit is not None and limit < len(cases):
+        cases = spaced(cases, limit)
     if not options.near:
         cases = [dataclasses.replace(case, seconds=()) for case in cases]
     elif options.second_views == "nearest":

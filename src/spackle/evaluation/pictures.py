@@ -113,7 +113,8 @@ def save_picture(picture: Tensor, path: Path) -> None:
 
 def kept_pictures(run: Run, folder: Path, image: str) -> dict[str, Path]:
     """The stored pictures of an image: by each method, then "truth", "input" and "hole"."""
-    files = {name: image_file(folder, run.images.index(image), image, f".{name}.webp") for name in (*METHODS, *OTHERS)}
+    index = run.images.index(image)
+    files = {name: image_file(folder, index, image, f".{name}.webp") for name in (*METHODS, *OTHERS)}
     return {name: path for name, path in files.items() if path.is_file()}
 
 

@@ -204,9 +204,8 @@ def _draw(
     from matplotlib.figure import Figure
 
     with rc_context(RC), warnings.catch_warnings():
-        warnings.simplefilter(
-            "ignore"
-        )  # matplotlib warns about letters without a glyph; the browser's font has these letters
+        # matplotlib warns about letters without a glyph; the browser's font has these letters.
+        warnings.simplefilter("ignore")
         figure = Figure(figsize=(WIDTH, height), layout="constrained")
         axes = figure.subplots()
         for one in series:

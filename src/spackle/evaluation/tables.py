@@ -114,10 +114,7 @@ def _notes(spec: Mapping[str, Any], runs: Sequence[Run]) -> list[str]:
     notes += [f"Base {run.base}: {run.config['base']['says']}." for run in runs]
     said = [f"{title or METHODS[method].title}: {METHODS[method].says}" for method, title in rows.items()]
     notes += [f"Rows: {'; '.join(said)}."] if said else []
-    for run in runs:
-        weights = _weights(run)
-        given = run.config["residual"]["weights"] == "given"
-        notes.append(f"Residual: {weights}." if given else NOTES["recipe"].format(residual=weights))
+    notes += [_residual_note(run) for run in runs]
     notes += [f"{METRICS[name].title[:-2]}: {METRICS[name].definition}." for name in names]
     for run in runs:
         states = {name: str(run.about.get("metrics", {}).get(name)) for name in names}
@@ -129,13 +126,15 @@ def _notes(spec: Mapping[str, Any], runs: Sequence[Run]) -> list[str]:
     return notes + [note for run in runs if run.timed for note in _timed_notes(run)]
 
 
-def _weights(run: Run) -> str:
+def _residual_note(run: Run) -> str:
     residual = run.config["residual"]
-    if not residual["sha256"]:
-        return "the residual has no weights (deltas are 0)"
-    given = residual["weights"] == "given"
-    origin = "given weights" if given else "the residual has the weights that ship with Spackle"
-    return f"{origin} ({residual['sha256'][:8]})"
+    digest = str(residual["sha256"])[:8]
+    if residual["weights"] == "given":
+        return f"Residual: given weights ({digest})."
+    shipped = f"the residual has the weights that ship with Spackle ({digest})"
+    weights = shipped if residual["sha256"] else "the residual has no weights (deltas are 0)"
+    note: str = NOTES["recipe"].format(residual=weights)
+    return note
 
 
 def _timed_notes(run: Run) -> list[str]:

@@ -214,15 +214,12 @@ class StreamEncoder:
 
     def _encode(self, picture: av.VideoFrame | None) -> None:
         """Encode a frame; None: the video ends."""
-        pictures = [picture] if self._palette is None else [*self._palette.push(picture)]
-        for each in pictures:
+        for each in [picture] if self._palette is None else self._palette.push(picture):
             self._write(self._stream.encode(each))
 
     def finish(self) -> None:
         """Write the packets that the encoder still holds, and repeat all packets as often as needed."""
         self._encode(None)
-        if self._palette is not None:
-            self._write(self._stream.encode(None))
         for repetition in range(1, self._plays):
             for packet in self._packets:
                 before, after = (self._ticks(packet, plays) for plays in (repetition - 1, repetition))
@@ -262,11 +259,13 @@ class PaletteFilter:
         graph.configure()
         self._graph = graph
 
-    def push(self, frame: av.VideoFrame | None) -> Iterator[av.VideoFrame]:
-        """Take a frame in "bgra" (None at the end), and yield the frames that are ready."""
+    def push(self, frame: av.VideoFrame | None) -> Iterator[av.VideoFrame | None]:
+        """Take a frame in "bgra" (None at the end), and yield the frames that are ready, at the end None."""
         self._source.push(frame)
         with contextlib.suppress(av.BlockingIOError, av.EOFError):
             while True:
                 ready = self._sink.pull()
                 assert isinstance(ready, av.VideoFrame)
                 yield ready
+        if frame is None:
+            yield None

@@ -116,10 +116,12 @@ def _network(name: str, file: Path) -> nn.Module:
 
 def weight_files(folder: Path | None) -> dict[str, Path]:
     """The file NAME.pth, NAME-….pth or .safetensors of each of `NETWORKS`; InputError for a missing or second file."""
+    if folder is None:
+        raise InputError(f"inpainter propainter: no weights: give --inpainter-weights FOLDER, unpacked from {SOURCE}")
     files = {}
     for network in NETWORKS:
         pattern = rf"{network}(-.*)?\.(pth|safetensors)"
-        found = [] if folder is None else [file for file in folder.glob("*") if re.fullmatch(pattern, file.name)]
+        found = [file for file in folder.glob("*") if re.fullmatch(pattern, file.name)]
         if len(found) != 1:
             raise InputError(
                 f"--inpainter-weights {folder}: holds {len(found)} files named {network}-….pth: give a folder with one "

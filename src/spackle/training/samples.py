@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import functools
 import hashlib
+import itertools
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -227,13 +228,19 @@ def make_samples(
     if len(sources) == 1 and sources[0].views is not None:
         views = min(views, sources[0].views)
     shares = np.array([source.share for source in sources])
-    rngs = [np.random.default_rng([seed, index]) for index in range(views)]
-    choices = [int(rng.choice(len(sources), p=shares / shares.sum())) for rng in rngs]
+
+    def drawn(index: int) -> tuple[int, np.random.Generator]:
+        """The source of a view, and the generator for the rest of the view."""
+        rng = np.random.default_rng([seed, index])
+        return int(rng.choice(len(sources), p=shares / shares.sum())), rng
+
+    counts = [itertools.count() for _ in sources]
+    places = [next(counts[drawn(index)[0]]) for index in range(views)]  # numbers of the views in their sources
     mine = range(*(views * part // rank_count() for part in (rank(), rank() + 1)))  # one process reads a photo's views
     for done, index in enumerate(mine, 1):
         if _crop_files(folder, index) is None:
-            source, rng, crops = sources[choices[index]], rngs[index], list[Sample]()
-            place = choices[:index].count(choices[index])  # number of the view in its source
+            choice, rng = drawn(index)
+            source, place, crops = sources[choice], places[index], list[Sample]()
             try:
                 view = source.view(rng, place if source.views is None else place % source.views)
                 crops = random_crops(view, rng, data.crops, data.cells)

@@ -243,12 +243,8 @@ def load_pair(folder: Path) -> tuple[Tensor, Tensor, DepthMap, Camera, Camera]:
         raise InputError(f"{folder}: the two photos differ in size")
     depth = load_depth(names[2], calib=scene)
     depth.check_shape(left.shape[0], left.shape[1], names[0])
-    K, right_K, moved = lens.K, lens.K, torch.eye(4)
-    right_K[0, 2] += lens.doffs_px
-    moved[0, 3] = -lens.baseline_m
     height, width = left.shape[:2]
-    cameras = Camera(K, torch.eye(4), width, height), Camera(right_K, moved, width, height)
-    return left, right, depth, *cameras
+    return left, right, depth, *lens.cameras(width, height)
 
 
 # Photos without depth -----------------------------------------------------------------------------

@@ -96,7 +96,7 @@ def create_app(
         docs_url=None,
         redoc_url=None,
         lifespan=until_the_end,
-        exception_handlers=dict.fromkeys((HTTPException, RequestValidationError, InputError), answered),
+        exception_handlers=dict.fromkeys((HTTPException, RequestValidationError), answered),
     )
     app.state.jobs = jobs
     app.add_middleware(Guard, access=access, max_bytes=max_bytes)
@@ -186,7 +186,7 @@ def create_app(
 
 
 def accept(form: FormData, folder: Path, jobs: Jobs, bases: list[str]) -> Job:
-    """Decode a form's photo and add its job; HTTPException for a bad form, InputError for a file that is no photo."""
+    """Decode a form's photo and add its job; HTTPException for a bad form or a file that is no photo."""
     photo, depth, text = form.get("photo"), form.get("depth"), form.get("options") or "{}"
     if len(form.getlist("photo")) != 1 or not isinstance(photo, UploadFile) or not isinstance(text, str):
         raise HTTPException(422, "send one photo as the file `photo`, and the options as the text `options`")
@@ -202,7 +202,10 @@ def accept(form: FormData, folder: Path, jobs: Jobs, bases: list[str]) -> Job:
     source, of_depth = _saved(photo, folder, "source", name, PHOTO_SUFFIXES), None
     if isinstance(depth, UploadFile) and depth.filename:
         of_depth = _saved(depth, folder, "depth", "depth map", DEPTH_SUFFIXES)
-    check_photo(folder / source, name, folder / PREVIEW)
+    try:
+        check_photo(folder / source, name, folder / PREVIEW)
+    except InputError as error:
+        raise HTTPException(415, str(error)) from error
     return jobs.add(folder, name, source, of_depth, options.model_dump(exclude_unset=True))
 
 
@@ -228,8 +231,6 @@ async def answered(request: Request, error: Any) -> JSONResponse:
     """The answer to a refused request, with the reason in one line."""
     if isinstance(error, HTTPException):
         return JSONResponse({"error": error.detail}, error.status_code, error.headers)
-    if isinstance(error, InputError):
-        return JSONResponse({"error": str(error)}, 415)
     return JSONResponse({"error": "there is nothing with that name"}, 404)
 
 

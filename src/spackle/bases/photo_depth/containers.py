@@ -1,4 +1,4 @@
-"""Read what an untrusted JPEG, HEIF or XMP holds beside the picture, within limits on its size."""
+"""Read what an untrusted JPEG, HEIF or XMP holds beside the picture."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -23,6 +23,7 @@ MAX_NEAR = 3  # a photo has at most this number of near second views
 BASELINES = (0.05, 0.25)  # distance of the cameras over the photo's middle depth; Middlebury's pairs have 0.05 to 0.2
 MAX_TURN = 30.0  # the greatest angle between the optical axes, in degrees
 MIN_SHARED = 0.3  # the least fraction of the photo's points that a near view sees too
+T = TypeVar("T")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,9 +110,12 @@ def spread(scenes: Sequence[str], frames: Callable[[str], Sequence[int]], count:
     categories = (list(names) for _, names in itertools.groupby(scenes, lambda name: name.partition("/")[0]))
     held = {scene: frames(scene) for scene in _in_turn(categories)[:count]}
     shares = collections.Counter(_in_turn([scene] * len(held[scene]) for scene in held)[:count])
-    for scene, share in shares.items():
-        held[scene] = [held[scene][(2 * k + 1) * len(held[scene]) // (2 * share)] for k in range(share)]
-    return {scene: held[scene] for scene in scenes if scene in shares}
+    return {scene: spaced(held[scene], shares[scene]) for scene in scenes if scene in shares}
+
+
+def spaced(items: Sequence[T], count: int) -> list[T]:
+    """Choose `count` evenly spaced items: the middle item of each of `count` equal parts."""
+    return [items[(2 * k + 1) * len(items) // (2 * count)] for k in range(count)]
 
 
 def _in_turn(lists: Iterable[Sequence[str]]) -> list[str]:

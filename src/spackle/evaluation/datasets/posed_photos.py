@@ -78,7 +78,9 @@ def _tanks_views(scene: Path) -> list[Posed]:
     folder = model_folder(scene)
     model = read_model(folder)
     top = scene / "dense" if "dense" in folder.relative_to(scene).parts else scene
-    return posed_by(scene, model, [top / "images" / view.name for view in model.views])
+    posed = posed_by(scene, model, [top / "images" / view.name for view in model.views])
+    names = [Path(view.name).with_suffix("").as_posix() for view in model.views]  # stems may repeat in subfolders
+    return [dataclasses.replace(v, name=f"{scene.name}/{name}") for v, name in zip(posed, names, strict=True)]
 
 
 # --- LLFF

@@ -36,16 +36,8 @@ def _pair(
     """A case of the left photo, with the right photo as second view; in `lens`, (0, 0) is the first pixel's corner."""
     if size is None:  # the photo cannot be read: its evaluation reports why
         return Case(name, left, depth=depth)
-    cameras = _cameras(lens, size)
+    cameras = lens.cameras(*size)
     return Case(name, left, cameras[0], depth=depth, seconds=(SecondView("right", right, cameras[1]),))
-
-
-def _cameras(lens: Calibration, size: tuple[int, int]) -> tuple[Camera, Camera]:
-    """The cameras of the left and the right photo, in the left camera's frame."""
-    K, pose = lens.K, torch.eye(4)
-    K[0, 2] += lens.doffs_px
-    pose[0, 3] = -lens.baseline_m
-    return Camera(lens.K, torch.eye(4), *size), Camera(K, pose, *size)
 
 
 def _size_of(*photos: Path) -> tuple[int, int] | None:
@@ -178,4 +170,4 @@ def load_motorcycle() -> StereoPair:
     lens = Calibration(MOTORCYCLE_FOCAL, cx, cy, MOTORCYCLE_DOFFS, MOTORCYCLE_BASELINE)
     first, second = (torch.from_numpy(photo.astype(np.float32) / 255) for photo in (left, right))
     depth = _depth_by(lens, Path("Motorcycle"), lambda: disparity)()
-    return StereoPair(first, second, depth, *_cameras(lens, disparity.shape[::-1]))
+    return StereoPair(first, second, depth, *lens.cameras(*disparity.shape[::-1]))
