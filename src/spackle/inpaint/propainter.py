@@ -116,16 +116,15 @@ def _network(name: str, file: Path) -> nn.Module:
 
 def weight_files(folder: Path | None) -> dict[str, Path]:
     """The file NAME.pth, NAME-….pth or .safetensors of each of `NETWORKS`; InputError for a missing or second file."""
+    advice = f"give a folder with one file for each of {', '.join(NETWORKS)}, unpacked from {SOURCE}"
     if folder is None:
-        raise InputError(f"inpainter propainter: no weights: give --inpainter-weights FOLDER, unpacked from {SOURCE}")
+        raise InputError(f"inpainter propainter: --inpainter-weights is missing: {advice}")
     files = {}
     for network in NETWORKS:
         pattern = rf"{network}(-.*)?\.(pth|safetensors)"
         found = [file for file in folder.glob("*") if re.fullmatch(pattern, file.name)]
         if len(found) != 1:
-            raise InputError(
-                f"--inpainter-weights {folder}: holds {len(found)} files named {network}-….pth: give a folder with one "
-                f"file for each of {', '.join(NETWORKS)}, unpacked from {SOURCE}"
-            )
+            what = f"holds {len(found)} files named {network}-….pth"
+            raise InputError(f"--inpainter-weights {folder}: {what}: {advice}")
         files[network] = found[0]
     return files
