@@ -23,7 +23,7 @@ from spackle.render import Renderer, device_of, get_renderer
 from spackle.render.protocol import Rendering
 from spackle.residual.architectures import NOTE, SharpDecoder, decoder_size, load_residual, open_residual
 from spackle.residual.complete import compose
-from spackle.residual.network import ResidualNet, network_input
+from spackle.residual.network import ResidualNet
 from spackle.residual.view_features import CELL, ViewFeatures, hole_area_ratio
 from spackle.training.losses import hole_psnr, load_features, total_loss
 from spackle.training.recipe import Recipe
@@ -107,8 +107,7 @@ def complete_samples(
     # Masks are read before the samples move to the renderer's device: reading them later would wait for a GPU.
     cells = [training_cells(sample.features).flatten().nonzero()[:, 0] for sample in samples]
     tiles = [sample.tiles for sample in samples]
-    inputs = torch.cat([network_input(sample.features, sample.seeds, sample.rim) for sample in samples])
-    inputs = inputs.to(next(network.parameters()).device)
+    inputs = torch.cat([sample.inputs for sample in samples]).to(next(network.parameters()).device)
     with torch.autocast(inputs.device.type, precision, enabled=precision != torch.float32):
         fields = network(inputs.contiguous(memory_format=torch.channels_last)).float().to(device)
     samples = [sample.to(device) for sample in samples]
@@ -215,7 +214,10 @@ class ResidualTask(ViewTask):
     def batch(self, step: int | None, items: Sequence[int]) -> list[Sample]:
         """Read samples; InputError if one cannot be read."""
         files = self.validation if step is None else self.learned
-        return [load_sample(files[item]) for item in items]
+        samples = [load_sample(files[item]) for item in items]
+        for sample in samples:
+            _ = sample.inputs, sample.tiles  # computed in this thread, so that the training loop does not wait for them
+        return samples
 
     def complete(self, network: nn.Module, batch: Sequence[Sample]) -> ViewBatch:
         return complete_samples(network, batch, self.renderer, self.precision)

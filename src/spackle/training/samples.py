@@ -28,7 +28,7 @@ from spackle.progress import Step
 from spackle.render import CpuRenderer
 from spackle.render.protocol import TILE, Rendering
 from spackle.residual.base_values import Seeds, make_seeds
-from spackle.residual.network import Rim, find_rim
+from spackle.residual.network import Rim, find_rim, network_input
 from spackle.residual.view_features import CELL, ViewFeatures, cell_centers, hole_mask
 from spackle.training.recipe import DataRecipe
 from spackle.training.train import rank, rank_count, wait_for_ranks
@@ -76,7 +76,12 @@ class Sample:
         """[H, W] bool: the hole, Q in eq. 6."""
         return hole_mask(self.rendering.alpha)
 
-    @property
+    @functools.cached_property
+    def inputs(self) -> Tensor:
+        """[1, C, h, w]: the network's input; the sample must be on the CPU."""
+        return network_input(self.features, self.seeds, self.rim)
+
+    @functools.cached_property
     def tiles(self) -> Tensor:
         """[ceil(H/16), ceil(W/16)] bool: tiles of the renderer that aux Gaussians can touch."""
         near = greatest_around(self.hole, REACH_PX)

@@ -173,10 +173,11 @@ def train(
                 if logs is not None:
                     logs.add_scalar(f"{group}/{name}", value, progress.step)
 
+        readers = 1 if device.type == "cpu" else max(1, (os.cpu_count() or 1) // (2 * rank_count()))
         todo = ((step, part) for step in range(progress.step, optim.steps) for part in parts(step))
         with (
             open_logs(output, progress.step, reporter.log) if rank() == 0 else contextlib.nullcontext() as logs,
-            contextlib.closing(made_ahead(lambda key: task.batch(*key), todo)) as batches,
+            contextlib.closing(made_ahead(lambda key: task.batch(*key), todo, readers)) as batches,
             reporter.steps("train", progress.step, optim.steps) as tell,
             asked_to_stop(alone=rank_count() == 1) as asked,
         ):
@@ -267,13 +268,13 @@ def validate(task: Task, network: nn.Module, device: torch.device) -> dict[str, 
     return {name: total / counts[name] for name, total in totals.items() if counts[name]}
 
 
-def made_ahead(make: Callable[[K], V], keys: Iterable[K]) -> Generator[V, None, None]:
-    """Yield `make(key)` for each key, in order; a thread computes the next value in advance."""
-    with ThreadPoolExecutor(1, thread_name_prefix="batches") as worker:
+def made_ahead(make: Callable[[K], V], keys: Iterable[K], threads: int) -> Generator[V, None, None]:
+    """Yield `make(key)` for each key, in order; each thread computes one value in advance."""
+    with ThreadPoolExecutor(threads, thread_name_prefix="batches") as workers:
         begun = deque[Future[V]]()
         for key in keys:
-            begun.append(worker.submit(make, key))
-            if len(begun) > 1:
+            begun.append(workers.submit(make, key))
+            if len(begun) > threads:
                 yield begun.popleft().result()
         yield from (last.result() for last in begun)
 
