@@ -46,7 +46,7 @@ from spackle.gaussians import Gaussians
 from spackle.image import Photo
 from spackle.render import CpuRenderer, Renderer, get_renderer
 from spackle.render.blend import blend_tiles
-from spackle.render.cpu import BLEND_GRAIN, list_tiles, project, sort_by_depth, wanted_tiles
+from spackle.render.cpu import BLEND_GRAIN, list_tiles, project, sort_tiles, wanted_tiles
 from spackle.render.project import KernelCamera
 from spackle.residual import ResidualNet, hole_area_ratio
 from spackle.residual.architectures import load_residual
@@ -121,15 +121,15 @@ def render_in_laps(scene: Gaussians, camera: Camera, lap: Lap) -> None:
     """Do what `spackle.render.cpu.draw` does, with a lap after each step."""
     view = KernelCamera.of(camera, 0.0)
     wanted = wanted_tiles(view, None)
-    splats, spans = project([scene], view, wanted)
+    splats = project([scene], view, wanted)
     lap("project")
-    order = sort_by_depth(splats.keys, splats.ids, spans)
-    lap("sort")
-    lists = list_tiles(order, splats.boxes, wanted)
+    lists = list_tiles(splats.boxes, wanted)
     lap("bin")
+    tiles = np.flatnonzero(wanted)
+    run_chunks(lambda a, b: sort_tiles(a, b, tiles, lists, splats.records), len(tiles), BLEND_GRAIN)
+    lap("sort")
     size = camera.height, camera.width
     images = tuple(np.zeros(shape, np.float32) for shape in ((*size, 3), size, size, (0, 0, 3)))
-    tiles = np.flatnonzero(wanted)
     run_chunks(lambda a, b: blend_tiles(a, b, tiles, lists, splats.records, images), len(tiles), BLEND_GRAIN)
     lap("blend")
 

@@ -106,7 +106,7 @@ CHECK_EVERY = 16  # Gaussians per batch; after each batch, blending ends if the 
 
 
 class TileLists(NamedTuple):
-    """The Gaussians of each tile, front to back."""
+    """The Gaussians of each tile, front to back once the tile has been drawn."""
 
     ids: Array  # [E] int32, all lists one after the other
     starts: Array  # [T + 1] int64, the start of each tile's list

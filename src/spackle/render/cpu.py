@@ -1,4 +1,4 @@
-"""The CPU renderer: project, sort, assign to tiles, blend; `gradients` adds the backward pass."""
+"""The CPU renderer: project, assign to tiles, sort, blend; `gradients` adds the backward pass."""
 
 from __future__ import annotations
 
@@ -10,19 +10,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spackle._numba import Array, kernel
+from spackle._numba import Array, inlined_kernel, kernel
 from spackle.camera import Camera
-from spackle.device import run_chunks, thread_count
+from spackle.device import run_chunks
 from spackle.gaussians import Gaussians
 from spackle.render.blend import TileLists, blend_tiles
-from spackle.render.project import RECORD, Arrays, KernelCamera, Splats, count_before, project_chunk
+from spackle.render.project import DEPTH, RECORD, Arrays, KernelCamera, Splats, count_before, project_chunk
 from spackle.render.protocol import Rendering, check_tiles
 
 PROJECT_GRAIN = 1 << 16  # Gaussians a thread projects at a time
 BLEND_GRAIN = 64  # tiles a thread blends at a time
-DIGIT_BITS = 11  # three digits hold the 31 bits of a positive float
+DIGITS, DIGIT_BITS = 4, 8  # of a sort key, which has 32 bits
 BUCKETS = 1 << DIGIT_BITS
-MASK = BUCKETS - 1
 
 
 class CpuRenderer:
@@ -81,7 +80,12 @@ def draw(
         images = tuple(np.array(as_array(image)) for image in onto.tensors)
     images = (*images, linear)
     tiles = np.flatnonzero(wanted)
-    run_chunks(lambda a, b: blend_tiles(a, b, tiles, lists, splats.records, images), len(tiles), BLEND_GRAIN)
+
+    def chunk(start: int, stop: int) -> None:  # sorting and blending of a few tiles share the cache
+        sort_tiles(start, stop, tiles, lists, splats.records)
+        blend_tiles(start, stop, tiles, lists, splats.records, images)
+
+    run_chunks(chunk, len(tiles), BLEND_GRAIN)
     return Drawing(view, wanted, splats, lists, images)
 
 
@@ -93,9 +97,9 @@ def touched_tiles(gaussians: Gaussians, camera: Camera) -> Tensor:
 
 
 def deal_out(sets: Sequence[Gaussians], view: KernelCamera, wanted: Array) -> tuple[Splats, TileLists]:
-    """Project and sort Gaussians, and assign them to tiles."""
-    splats, spans = project(sets, view, wanted)
-    return splats, list_tiles(sort_by_depth(splats.keys, splats.ids, spans), splats.boxes, wanted)
+    """Project Gaussians, and assign them to tiles."""
+    splats = project(sets, view, wanted)
+    return splats, list_tiles(splats.boxes, wanted)
 
 
 def as_array(tensor: Tensor) -> Array:
@@ -111,144 +115,106 @@ def wanted_tiles(view: KernelCamera, tiles: Tensor | None) -> Array:
     return tiles.detach().to(device="cpu", dtype=torch.bool).contiguous().numpy()
 
 
-def project(sets: Sequence[Gaussians], view: KernelCamera, wanted: Array) -> tuple[Splats, Array]:
-    """Project Gaussians, and keep those that touch wanted tiles.
-
-    Returns:
-        The splats, and the spans (start, count) [C, 2] of used keys and ids.
-    """
+def project(sets: Sequence[Gaussians], view: KernelCamera, wanted: Array) -> Splats:
+    """Project Gaussians; those that touch wanted tiles get records."""
     n, before, first = sum(len(part) for part in sets), count_before(wanted), 0
-    records, boxes = np.empty((n, RECORD), np.float32), np.empty((n, 4), np.uint16)
-    splats = Splats(records, boxes, np.empty(n, np.uint32), np.empty(n, np.int32))
-    spans: list[tuple[int, int]] = []
+    splats = Splats(np.empty((n, RECORD), np.float32), np.empty((n, 4), np.uint16))
     for part in sets:
         scene = tuple(as_array(tensor) for tensor in part.tensors)
 
         def chunk(start: int, stop: int, first: int = first, scene: Arrays = scene) -> None:
-            spans.append((first + start, project_chunk(start, stop, first, scene, view, before, splats)))
+            project_chunk(start, stop, first, scene, view, before, splats)
 
         run_chunks(chunk, len(part), PROJECT_GRAIN)
         first += len(part)
-    return splats, np.array(sorted(spans), np.int64).reshape(-1, 2)
+    return splats
 
 
-def sort_by_depth(keys: Array, ids: Array, spans: Array) -> Array:
-    """Sort Gaussians front to back; Gaussians of equal depth keep their order.
+@kernel
+def sort_tiles(first: int, last: int, tiles: Array, lists: TileLists, records: Array) -> None:
+    """Sort the lists of the tiles first..last of `tiles` [K] front to back; Gaussians of equal depth keep their order.
 
-    Args:
-        keys: [N] uint32, the bits of positive floats; overwritten.
-        ids: [N] int32; overwritten.
-        spans: [C, 2] int64, the used pieces (start, count) of keys and ids.
-
-    Returns:
-        [M] int32, the ids in the order of keys; M is the sum of all counts.
+    Depths are positive, so their bits have the same order. A radix sort skips digits that a tile's depths share.
     """
-    total = int(spans[:, 1].sum())
-    items, others = (keys, ids), (np.empty(total, np.uint32), np.empty(total, np.int32))
-    for shift in range(0, 32, DIGIT_BITS):
-        _sort_digit(items, spans, shift, others)
-        items, others = others, items
-        spans = even_spans(total, len(spans))
-    return items[1][:total]
+    (ids, starts), depth_bits, longest = lists, records.view(np.uint32), 0
+    for k in range(first, last):
+        longest = max(longest, starts[tiles[k] + 1] - starts[tiles[k]])
+    keys, sorted_keys = np.empty(longest, np.uint32), np.empty(longest, np.uint32)
+    items, sorted_items = np.empty(longest, np.int32), np.empty(longest, np.int32)
+    places = np.empty((DIGITS, BUCKETS), np.uint32)  # unsigned, so that no check for negative indices is compiled
+    for k in range(first, last):
+        own = ids[starts[tiles[k]] : starts[tiles[k] + 1]]
+        places[:] = 0
+        for n in range(len(own)):
+            items[n], keys[n] = own[n], depth_bits[np.uint64(own[n]), DEPTH]
+            for digit in range(DIGITS):
+                places[digit, digit_of(keys[n], digit)] += np.uint32(1)
+        for digit in range(DIGITS):
+            starts_of, total = places[digit], np.uint32(0)
+            if len(own) == 0 or starts_of[digit_of(keys[0], digit)] == len(own):
+                continue
+            for bucket in range(BUCKETS):
+                count = starts_of[bucket]
+                starts_of[bucket] = total
+                total += count
+            for n in range(len(own)):
+                value = digit_of(keys[n], digit)
+                place = starts_of[value]
+                sorted_keys[place], sorted_items[place] = keys[n], items[n]
+                starts_of[value] = place + np.uint32(1)
+            keys, sorted_keys, items, sorted_items = sorted_keys, keys, sorted_items, items
+        own[:] = items[: len(own)]
 
 
-def _sort_digit(items: Arrays, spans: Array, shift: int, into: Arrays) -> None:
-    """Sort (keys, ids) by the digit at bit `shift`; items with equal digits keep their order."""
-    counts = np.zeros((len(spans), BUCKETS), np.int64)
-    run_chunks(lambda a, b: count_digits(a, b, spans, items[0], shift, counts), len(spans), 1)
-    positions = starts_of(counts)
-    run_chunks(lambda a, b: scatter(a, b, spans, items, shift, positions, into), len(spans), 1)
+@inlined_kernel
+def digit_of(key: np.uint32, digit: int) -> np.uint32:
+    """Digit number `digit` of a key, the lowest first."""
+    return np.uint32((key >> np.uint32(DIGIT_BITS * digit)) & np.uint32(BUCKETS - 1))
 
 
-def even_spans(total: int, parts: int) -> Array:
-    """Divide 0..total into equal pieces (start, count), [parts, 2] int64."""
-    edges = np.linspace(0, total, parts + 1).astype(np.int64)
-    return np.stack([edges[:-1], np.diff(edges)], axis=1)
-
-
-def starts_of(counts: Array) -> Array:
-    """Start positions [C, B] from the numbers of items [C, B]; items are ordered by bucket, then by piece."""
-    flat = counts.T.reshape(-1)
-    return np.ascontiguousarray((np.cumsum(flat) - flat).reshape(counts.shape[::-1]).T)
-
-
-@kernel
-def count_digits(first: int, last: int, spans: Array, keys: Array, shift: int, counts: Array) -> None:
-    """Count the occurrences of each digit in the keys of pieces first..last."""
-    for piece in range(first, last):
-        row = counts[piece]
-        for i in range(spans[piece, 0], spans[piece, 0] + spans[piece, 1]):
-            row[(keys[i] >> np.uint32(shift)) & np.uint32(MASK)] += 1
-
-
-@kernel
-def scatter(first: int, last: int, spans: Array, items: Arrays, shift: int, positions: Array, into: Arrays) -> None:
-    """Move the keys and ids of pieces first..last to their sorted positions."""
-    (keys, ids), (sorted_keys, sorted_ids) = items, into
-    for piece in range(first, last):
-        row = positions[piece]
-        for i in range(spans[piece, 0], spans[piece, 0] + spans[piece, 1]):
-            digit = (keys[i] >> np.uint32(shift)) & np.uint32(MASK)
-            place = row[digit]
-            row[digit] = place + 1
-            sorted_keys[place] = keys[i]
-            sorted_ids[place] = ids[i]
-
-
-def list_tiles(order: Array, boxes: Array, wanted: Array) -> TileLists:
-    """Assign the sorted Gaussians to tiles.
+def list_tiles(boxes: Array, wanted: Array) -> TileLists:
+    """List the Gaussians of each tile, in their own order.
 
     Args:
-        order: [M] int32, visible Gaussians front to back.
         boxes: [N, 4] uint16, the tiles that each Gaussian touches.
         wanted: [rows, columns] bool; lists of other tiles are empty.
     """
-    parts = thread_count()
-    spans = even_spans(len(order), parts)
+    parts = -(-len(boxes) // PROJECT_GRAIN)
     counts = np.zeros((parts, wanted.size), np.int64)
-    sorted_boxes = np.empty((len(order), 4), np.uint16)
-    run_chunks(lambda a, b: count_entries(a, b, spans, order, boxes, wanted, sorted_boxes, counts), parts, 1)
+    run_chunks(lambda a, b: count_entries(a, b, boxes, wanted, counts), parts, 1)
     starts = np.concatenate([[0], np.cumsum(counts.sum(axis=0))])
-    positions = starts_of(counts)
+    positions = starts[:-1] + np.cumsum(counts, axis=0) - counts  # of each part's first entry
     ids = np.empty(starts[-1], np.int32)
-    run_chunks(lambda a, b: write_entries(a, b, spans, order, sorted_boxes, wanted, positions, ids), parts, 1)
+    run_chunks(lambda a, b: write_entries(a, b, boxes, wanted, positions, ids), parts, 1)
     return TileLists(ids, starts)
 
 
 @kernel
-def count_entries(
-    first: int, last: int, spans: Array, order: Array, boxes: Array, wanted: Array, sorted_boxes: Array, counts: Array
-) -> None:
-    """Count the entries of each tile in pieces first..last of the order, and copy the boxes in this order."""
+def count_entries(first: int, last: int, boxes: Array, wanted: Array, counts: Array) -> None:
+    """Count the entries of each tile from the parts first..last of the Gaussians."""
     columns, flat = wanted.shape[1], wanted.reshape(-1)
-    for piece in range(first, last):
-        row_counts = counts[piece]
-        for place in range(spans[piece, 0], spans[piece, 0] + spans[piece, 1]):
-            k = np.uint64(place)  # unsigned, so that no check for negative indices is compiled
-            i = np.uint64(order[k])
-            left, right, top, bottom = boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3]
-            sorted_boxes[k, 0], sorted_boxes[k, 1], sorted_boxes[k, 2], sorted_boxes[k, 3] = left, right, top, bottom
-            # With bounds read from memory the compiler emits scalar loops, which are faster for a box of a few tiles.
-            for row in range(sorted_boxes[k, 2], sorted_boxes[k, 3]):
-                for column in range(sorted_boxes[k, 0], sorted_boxes[k, 1]):
+    for part in range(first, last):
+        row_counts = counts[part]
+        for i in range(part * PROJECT_GRAIN, min((part + 1) * PROJECT_GRAIN, len(boxes))):
+            k = np.uint64(i)  # unsigned, so that no check for negative indices is compiled
+            for row in range(boxes[k, 2], boxes[k, 3]):
+                for column in range(boxes[k, 0], boxes[k, 1]):
                     tile = np.uint64(row * columns + column)
                     if flat[tile]:
                         row_counts[tile] += 1
 
 
 @kernel
-def write_entries(
-    first: int, last: int, spans: Array, order: Array, sorted_boxes: Array, wanted: Array, positions: Array, ids: Array
-) -> None:
-    """Write the entries of each tile from pieces first..last of the order."""
+def write_entries(first: int, last: int, boxes: Array, wanted: Array, positions: Array, ids: Array) -> None:
+    """Write the entries of each tile from the parts first..last of the Gaussians."""
     columns, flat = wanted.shape[1], wanted.reshape(-1)
-    for piece in range(first, last):
-        places = positions[piece]
-        for place in range(spans[piece, 0], spans[piece, 0] + spans[piece, 1]):
-            k = np.uint64(place)
-            for row in range(sorted_boxes[k, 2], sorted_boxes[k, 3]):
-                for column in range(sorted_boxes[k, 0], sorted_boxes[k, 1]):
+    for part in range(first, last):
+        places = positions[part]
+        for i in range(part * PROJECT_GRAIN, min((part + 1) * PROJECT_GRAIN, len(boxes))):
+            k = np.uint64(i)
+            for row in range(boxes[k, 2], boxes[k, 3]):
+                for column in range(boxes[k, 0], boxes[k, 1]):
                     tile = np.uint64(row * columns + column)
                     if flat[tile]:
-                        ids[np.uint64(places[tile])] = order[k]
+                        ids[np.uint64(places[tile])] = i
                         places[tile] += 1

@@ -1,4 +1,4 @@
-"""Project Gaussians to the image: each visible Gaussian gets a record, a box of tiles and a sort key.
+"""Project Gaussians to the image: each visible Gaussian gets a record and a box of tiles.
 
 The arithmetic runs on a block of Gaussians in vector registers; records are then written one by one.
 """
@@ -73,8 +73,6 @@ class Splats(NamedTuple):
 
     records: Array  # [N, RECORD] float32
     boxes: Array  # [N, 4] uint16, touched tiles: first column, last, first row, last (exclusive)
-    keys: Array  # [N] uint32, the bits of the depth of visible Gaussians, at the front of each chunk
-    ids: Array  # [N] int32, the Gaussians of the keys
 
 
 @inlined_kernel
@@ -93,24 +91,19 @@ def count_before(wanted: Array) -> Array:
 @kernel
 def project_chunk(
     start: int, stop: int, first: int, scene: Arrays, camera: KernelCamera, wanted_before: Array, splats: Splats
-) -> int:
+) -> None:
     """Project the Gaussians start..stop of a set, whose first Gaussian has the index `first` among all sets.
 
-    A Gaussian that touches no wanted tile is invisible. Keys and ids of visible Gaussians begin at first + start.
-
-    Returns:
-        The number of visible Gaussians.
+    A Gaussian that touches no wanted tile gets no record.
     """
     means, quats, scales, opacities, colors = scene
-    found = first + start
     block = np.empty(BUFFER, np.float32)
     for begin in range(start, stop, BLOCK):
         end = min(begin + BLOCK, stop)
         # For flat arrays, the compiler knows the stride between a Gaussian's numbers.
         shapes = means[begin:end].reshape(-1), quats[begin:end].reshape(-1), scales[begin:end].reshape(-1)
         measure_block(block, *shapes, opacities[begin:end], camera)
-        found = pack_block(block, colors[begin:end].reshape(-1), first + begin, found, wanted_before, splats)
-    return found - first - start
+        pack_block(block, colors[begin:end].reshape(-1), first + begin, wanted_before, splats)
 
 
 @kernel
@@ -227,17 +220,13 @@ def cover(center: float, extent: float, size: int) -> tuple[np.int32, np.int32]:
 
 
 @kernel
-def pack_block(block: Array, colors: Array, first: int, found: int, wanted_before: Array, splats: Splats) -> int:
-    """Write boxes of the projected Gaussians `first`, `first` + 1, …; for visible Gaussians also records, keys, ids.
-
-    The first key goes to position `found`; returns the position of the next key.
-    """
-    records, boxes, keys, ids = splats
-    depth_bits = keys.view(np.float32)
+def pack_block(block: Array, colors: Array, first: int, wanted_before: Array, splats: Splats) -> None:
+    """Write boxes of the projected Gaussians `first`, `first` + 1, …, and records of those that touch wanted tiles."""
+    records, boxes = splats
     for k in range(len(colors) // 3):
-        i, i3, out, place = np.uint64(k), np.uint64(3 * k), np.uint64(first + k), np.uint64(found)
+        i, i3, out = np.uint64(k), np.uint64(3 * k), np.uint64(first + k)
         right = np.uint32(block[i + np.uint64(RIGHT * BLOCK)])
-        boxes[out, 0], boxes[out, 1] = 0, 0
+        boxes[out, 0], boxes[out, 1], boxes[out, 2], boxes[out, 3] = 0, 0, 0, 0
         red, green, blue = colors[i3], colors[i3 + ONCE], colors[i3 + TWICE]
         light = abs(red) + abs(green) + abs(blue)
         if right == 0 or not light < FINITE:
@@ -251,10 +240,6 @@ def pack_block(block: Array, colors: Array, first: int, found: int, wanted_befor
         for plane in range(DEPTH + 1):
             record[plane] = block[i + np.uint64(plane * BLOCK)]
         record[RED], record[GREEN], record[BLUE] = red, green, blue
-        depth_bits[place] = record[DEPTH]
-        ids[place] = out
-        found += 1
-    return found
 
 
 @inlined_kernel
