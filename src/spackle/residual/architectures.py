@@ -16,6 +16,7 @@ from torch.nn.functional import interpolate, pad
 
 from spackle.bases.sharp.encoder import CONFIGS, FULL, ExactConv, SharpConfig
 from spackle.bases.sharp.network import FeatureNetwork
+from spackle.crop import Crop
 from spackle.errors import InputError, one_line
 from spackle.network_file import channels_last, load_strict, read_note, read_tensors
 from spackle.residual.network import (
@@ -38,6 +39,7 @@ SHIPPED = Path(__file__).parent.parent / "weights" / "residual.safetensors"
 NOTE = "spackle.residual"  # metadata key of the architecture's name; a file without this key holds a UNet
 WIDTHS = (48, 80, 128, 256, 256)  # channels of the U-Net from the finest grid to the coarsest
 COARSE_BLOCKS = 3  # residual blocks on the coarsest grid
+FINEST_REACH = 4  # cells: a U-Net's last layers hold four convolutions of 3×3, two of the decoder and two of a head
 STEM_WIDTH = 48  # channels of the decoder's stem: its 0.24 M parameters complete the paper's 8.02 M
 STEM_GAIN = 3.0  # features are of order 0.3
 
@@ -80,19 +82,23 @@ class UNet(ResidualNet):
         self.texture = _head(WIDTHS[0], TEXTURE_CHANNELS + len(KNOWN_COLORS))
         _initialise(self)
 
-    def forward(self, features: Tensor) -> Tensor:
-        height, width = features.shape[-2:]
+    def forward(self, features: Tensor, inner: Crop | None = None) -> Tensor:
+        """Deltas of the cells in `inner`, by default of all cells."""
+        inner = inner or Crop(0, 0, *features.shape[-2:])
         x = self.stem(padded(features[:, :RIM_CHANNELS]))
-        skips = []
+        near, skips = inner.grown(FINEST_REACH, 1, *x.shape[-2:]), []
         for encode, down in zip(self.encode, self.down, strict=True):
             x = encode(x)
             skips.append(x)
             x = down(x)
         x = self.coarse(x)
         for skip, up, decode in reversed(list(zip(skips, self.up, self.decode, strict=True))):
-            fine = interpolate(up(x), scale_factor=2, mode="bilinear", align_corners=False)
-            x = decode(fine.add_(skip))
-        heads = torch.cat([self.geometry(x), self.texture(x)], dim=1)[..., :height, :width]
+            x = interpolate(up(x), scale_factor=2, mode="bilinear", align_corners=False).add_(skip)
+            if skip is skips[0]:
+                x = x[(..., *near.slices)].contiguous(memory_format=torch.channels_last)
+            x = decode(x)
+        heads = torch.cat([self.geometry(x), self.texture(x)], dim=1)
+        heads, features = heads[(..., *inner.moved(-near.top, -near.left).slices)], features[(..., *inner.slices)]
         # The last outputs are weights of the known colours.
         deltas, shares = torch.split(heads, [DELTA_CHANNELS, len(KNOWN_COLORS)], dim=1)
         copied = sum(shares[:, k : k + 1] * features[:, colors] for k, colors in enumerate(KNOWN_COLORS))

@@ -106,7 +106,9 @@ class ResidualNet(nn.Module):
 
     name: ClassVar[str]  # in recipes and weight files
     sees_photo: ClassVar[bool]  # whether the features include the photo
-    local: ClassVar[bool]  # whether a cell's deltas are the same in every crop with enough context around the cell
+    # Whether a cell's deltas are the same in every crop with enough context around the cell. If so, `forward` takes the
+    # crop whose deltas are wanted as a second argument.
+    local: ClassVar[bool]
 
 
 @torch.no_grad()
@@ -134,11 +136,12 @@ def predict_deltas(
     chosen = torch.ones_like(view.mask) if dense else view.mask
     whole = (Crop(0, 0, *view.mask.shape),) * 2
     field = view.alpha.new_zeros(*view.mask.shape, DELTA_CHANNELS)
-    features = network_input(view, seeds, rim)
+    features, local = network_input(view, seeds, rim), getattr(network, "local", True)
     # One autocast block around all crops: the weights are converted once.
     with own_arithmetic(device), torch.autocast(device.type, dtype, enabled=dtype != torch.float32):
-        for inner, outer in crops_around(chosen, STRIDE) if getattr(network, "local", True) else [whole]:
+        for inner, outer in crops_around(chosen, STRIDE) if local else [whole]:
             part = features[(..., *outer.slices)].contiguous(memory_format=torch.channels_last).to(device)
-            deltas = network(part)[0].permute(1, 2, 0)[inner.moved(-outer.top, -outer.left).slices]
-            field[inner.slices] = torch.where(chosen[inner.slices][..., None], deltas.float().cpu(), 0)
+            deltas = network(part, inner.moved(-outer.top, -outer.left)) if local else network(part)
+            deltas = deltas[0].permute(1, 2, 0).float().cpu()
+            field[inner.slices] = torch.where(chosen[inner.slices][..., None], deltas, 0)
     return field
