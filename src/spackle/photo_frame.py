@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 NARROWEST, WIDEST = 2, 0.25  # bounds for the width of a side: in pixels, and as a share of the photo's side
@@ -47,14 +48,19 @@ def find_frame(rgb: Tensor) -> PhotoFrame | None:
     across, down = rgb.numpy().swapaxes(0, 1), rgb.numpy()
     inwards = (across, down, across[::-1], down[::-1])  # lines [N, M, 3] from the left, the top, the right, the bottom
     colors = np.stack([np.median(lines[0], axis=0) for lines in inwards])
+    limits = [int(WIDEST * len(lines)) for lines in inwards]
     widths = np.zeros(4, int)
-    differences = [
-        np.abs(lines[: int(WIDEST * len(lines))] - c).max(-1) for lines, c in zip(inwards, colors, strict=True)
-    ]
-    plain = [int((lines.mean(1) <= NOISE).cumprod().sum()) for lines in differences]
-    for side, lines in enumerate(differences):
+
+    def apart(side: int, start: int, stop: int) -> NDArray[np.float32]:
+        """Differences of the lines start..stop of a side from its colour; no further lines are read."""
+        differences = np.abs(inwards[side][start : min(stop, limits[side])] - colors[side])
+        return cast("NDArray[np.float32]", differences.max(-1))
+
+    plain = [next((n for n in range(limits[k]) if apart(k, n, n + 1).mean() > NOISE), limits[k]) for k in range(4)]
+    for side in range(4):
         before, after = plain[1 - side % 2], plain[3 - side % 2]  # widths of the two adjacent sides
-        edge = (lines[plain[side] :, before : lines.shape[1] - after] > STEP)[:EDGE_PX].mean(1)
+        lines = apart(side, plain[side], plain[side] + EDGE_PX)
+        edge = (lines[:, before : lines.shape[1] - after] > STEP).mean(1)
         if plain[side] >= NARROWEST and edge.max(initial=0.0) >= STRAIGHT:
             widths[side] = plain[side] + int((edge >= 0.95 * edge.max()).argmax()) + 1
     for side in (0, 1):
