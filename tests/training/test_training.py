@@ -8,6 +8,7 @@ import math
 import shutil
 import signal
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -179,10 +180,14 @@ def test_unusable_input_is_refused(place: Path, tmp_path: Path, options: list[st
     for folder in folders.values():
         folder.mkdir()
     shutil.copy(place / "photos" / "broken.jpg", folders["broken"])
-    filled = [option.format(**folders) for option in options]
-    done = train(place, tmp_path / "out", *filled, f"data.cache={tmp_path}/cache")
+    done = train(place, tmp_path / "out", *(each.format(**folders) for each in options), f"data.cache={tmp_path}/cache")
     assert (done.code, said in done.lines[-1]) == (2, True), done.err
     assert not (tmp_path / "out" / "checkpoint.pt").exists()
+
+
+def test_batches_of_several_threads_keep_their_order() -> None:
+    found = training.made_ahead(lambda key: (time.sleep(0.01 * (3 - key % 4)), key)[1], range(12), 4)
+    assert list(found) == list(range(12))
 
 
 def test_a_gradient_that_is_not_finite_ends_the_run(place: Path, whole: Path, tmp_path: Path) -> None:
