@@ -106,10 +106,8 @@ def test_the_papers_network_starts_from_sharp_and_predicts(place: Path, made: di
     Image.open(place / "photos" / "0.png").resize((96, 72)).save(tmp_path / "photo.png")
     Image.new("I;16", (96, 72), 2000).save(tmp_path / "photo.depth.png")
     predict = ("predict", f"{tmp_path}/photo.png", "--depth", f"{tmp_path}/photo.depth.png", "-o", f"{tmp_path}/scene")
-    predicted = run(*predict, "--residual", f"{out}/best.safetensors")
-    assert predicted.code == 0, predicted.err
-    refused = train(place, tmp_path / "other", f"init={out}/best.safetensors")
-    refuses(refused, "set network=sharp-decoder")
+    assert run(*predict, "--residual", f"{out}/best.safetensors").code == 0
+    refuses(train(place, tmp_path / "other", f"init={out}/best.safetensors"), "set network=sharp-decoder")
 
 
 def test_a_run_resumes_after_ctrl_c_with_the_same_result(
@@ -125,8 +123,7 @@ def test_a_run_resumes_after_ctrl_c_with_the_same_result(
     with monkeypatch.context() as patch:
         patch.setattr(training, "learning_rate", interrupted)
         assert train(place, out).code == 130
-    assert state(out).progress.step == 2
-    assert json.loads((out / "run.json").read_text())["ended"] == "stopped"
+    assert (state(out).progress.step, json.loads((out / "run.json").read_text())["ended"]) == (2, "stopped")
     assert train(place, out).code == 0
     assert_same_weights(out, whole)
     assert (out / "best.safetensors").read_bytes() == (whole / "best.safetensors").read_bytes()
@@ -136,10 +133,9 @@ def test_a_folder_with_another_recipe_is_refused(place: Path, out: Path) -> None
     with hold(out / ".lock"):
         assert "another run is at work" in train(place, out, "optim.steps=7").err
     refuses(train(place, out, "optim.lr=2e-3"), "holds a run with other settings (optim.lr)")
-    assert train(place, out, "run.validate_every=2", "optim.steps=7").code == 0
-    assert state(out).progress.step == 7
-    assert train(place, out, "optim.lr=2e-3", "optim.steps=1", "--overwrite").code == 0
-    assert state(out).progress.step == 1
+    assert (train(place, out, "run.validate_every=2", "optim.steps=7").code, state(out).progress.step) == (0, 7)
+    done = train(place, out, "optim.lr=2e-3", "optim.steps=1", "--overwrite")
+    assert (done.code, state(out).progress.step) == (0, 1)
     assert names_in(out / "pictures") == {"0000001.png"}
     (out / "checkpoint.pt").write_bytes((out / "checkpoint.pt").read_bytes()[:1000])
     refuses(train(place, out), "checkpoint.pt: cannot be read", "--overwrite starts a new run")
@@ -186,8 +182,7 @@ def test_unusable_input_is_refused(place: Path, tmp_path: Path, options: list[st
 
 
 def test_batches_of_several_threads_keep_their_order() -> None:
-    found = training.made_ahead(lambda key: (time.sleep(0.01 * (3 - key % 4)), key)[1], range(12), 4)
-    assert list(found) == list(range(12))
+    assert list(training.made_ahead(lambda n: (time.sleep(0.01 * (3 - n % 4)), n)[1], range(12), 4)) == [*range(12)]
 
 
 def test_a_gradient_that_is_not_finite_ends_the_run(place: Path, whole: Path, tmp_path: Path) -> None:
