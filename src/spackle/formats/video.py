@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import math
 import os
+from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from fractions import Fraction
@@ -28,6 +29,7 @@ from spackle.files import atomic_path, check_writable
 MAX_REPEATS = 1000  # for files that store every repetition
 MAX_GIF_PIXELS = 300 * 1536 * 1152  # of all frames, which take 4 bytes a pixel of memory
 MAX_PLAYS = 65_535  # GIF's and WebP's counters have 16 bits
+QUEUE = 4  # frames that may wait to be encoded; some frames are made at once, others take long
 BT709, LIMITED_RANGE = 1, 1  # FFmpeg's numbers, the same for primaries, transfer and matrix
 
 
@@ -92,7 +94,7 @@ class VideoWriter:
 
     .mp4, .m4v, .mov (H.264) and .webm (VP9) are yuv420p with BT.709 colours, and play while they load. An odd width or
     height grows by one: the last column or row is repeated. .gif has one palette for all frames, which are in
-    memory until the end; .webp is lossy. A thread encodes a frame while the caller makes the next one.
+    memory until the end; .webp is lossy. A thread encodes frames while the caller makes the next ones.
     """
 
     _encoder: StreamEncoder
@@ -115,7 +117,7 @@ class VideoWriter:
         self.frames = 0
         self._plays = self._kind.loop if loop is None else loop
         self._rate = max(Fraction(fps).limit_denominator(1001), Fraction(1, 1001))  # 29.97 is 30000/1001
-        self._encoding: Future[None] | None = None
+        self._encoding = deque[Future[None]]()
         self._stack = contextlib.ExitStack()
 
     def __enter__(self: W) -> W:
@@ -136,14 +138,14 @@ class VideoWriter:
         if self._kind is GIF and (self.frames + 1) * frame.shape.numel() // 3 > MAX_GIF_PIXELS:
             most = f"at most {MAX_GIF_PIXELS // 10**6} megapixels in all frames of a GIF"
             raise InputError(f"{self.path}: {most}: write an mp4, or fewer or smaller frames")
-        self._wait()
-        self._encoding = self._aside.submit(self._encoder.add, to_bytes(frame).numpy())
+        self._wait(QUEUE - 1)
+        self._encoding.append(self._aside.submit(self._encoder.add, to_bytes(frame).numpy()))
         self.frames += 1
 
-    def _wait(self) -> None:
-        """Wait until the last frame is encoded; raises the encoder's error."""
-        if self._encoding is not None:
-            self._encoding.result()
+    def _wait(self, most: int) -> None:
+        """Wait until at most `most` frames are left to encode; raises the encoder's error."""
+        while len(self._encoding) > most:
+            self._encoding.popleft().result()
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -154,7 +156,7 @@ class VideoWriter:
         with self._stack:  # closes the file and renames it, or removes it
             if self.frames == 0:
                 raise ValueError(f"{self.path}: a video needs at least one frame")
-            self._wait()
+            self._wait(0)
             self._encoder.finish()
 
     def _open(self, height: int, width: int) -> StreamEncoder:

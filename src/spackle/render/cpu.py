@@ -89,10 +89,11 @@ def draw(
     return Drawing(view, wanted, splats, lists, images)
 
 
-def touched_tiles(gaussians: Gaussians, camera: Camera) -> Tensor:
+def touched_tiles(gaussians: Gaussians | Sequence[Gaussians], camera: Camera) -> Tensor:
     """[ceil(H/16), ceil(W/16)] bool: tiles with pixels that these Gaussians can change."""
     view = KernelCamera.of(camera, 0.0)
-    _, lists = deal_out([gaussians], view, wanted_tiles(view, None))
+    sets = [gaussians] if isinstance(gaussians, Gaussians) else gaussians
+    _, lists = deal_out(sets, view, wanted_tiles(view, None))
     return torch.from_numpy(np.diff(lists.starts) > 0).reshape(view.tiles)
 
 

@@ -145,10 +145,10 @@ def fill_scene(
     order, stage = farthest_first(cameras, context.photo_camera), _Stage(placed)
     enough = 0 if exact else FEW_HOLES
     visited = order if exact else order[: max(LEAST_VISITS, len(order) // 2)]
-    guards = {-1: context.photo_guard()}
-    for index in reversed(order[:WIDEST]):  # the widest view last, because it is completed first
-        view = stage.look(cameras[index])
-        guards[index] = OcclusionGuard.of(view, cameras[index], threshold)
+    guards, bare = {-1: context.photo_guard()}, dict[int, Rendering]()
+    for index in order[:WIDEST]:
+        bare[index] = stage.look(cameras[index])
+        guards[index] = OcclusionGuard.of(bare[index], cameras[index], threshold)
     pictures, filled = dict[int, Tensor](), 0
     aux = [Gaussians.empty()]
     waiting: list[tuple[int, Gaussians]] = []  # a view's index, and the Gaussians beneath its rims
@@ -160,7 +160,8 @@ def fill_scene(
         return [push_behind(rims, cameras[index].position, others(index)) for index, rims in waiting]
 
     for count, index in enumerate(visited):
-        camera, view = cameras[index], stage.look(cameras[index]) if count else view
+        camera = cameras[index]
+        view = stage.look(camera, bare.pop(index, None))
         holes = hole_area_ratio(view.alpha, threshold)
         if holes <= enough:
             pictures[index] = to_bytes(view.rgb)
@@ -308,18 +309,26 @@ class _Stage:
     def __init__(self, context: FillContext) -> None:
         self._renderer, self._device, self._sets = context.renderer, device_of(context.renderer), [context.base]
 
-    def look(self, camera: Camera, rendering: Rendering | None = None) -> Rendering:
-        """The rendering from a camera, copied to the CPU; if `rendering` is given, nothing is rendered."""
-        drawn = self._renderer.render(self._sets, camera) if rendering is None else rendering.to(self._device)
-        self._camera, self._drawn = camera, drawn
-        return drawn.to(PROCESSOR)
+    def look(self, camera: Camera, bare: Rendering | None = None) -> Rendering:
+        """The rendering from a camera, copied to the CPU; `bare`, if given, is the rendering of the base alone."""
+        self._camera = camera
+        if bare is None:
+            self._drawn = self._renderer.render(self._sets, camera)
+            return self._drawn.to(PROCESSOR)
+        self._drawn = bare.to(self._device)
+        return self._redraw(self._sets[1:])
 
     def add(self, *sets: Gaussians) -> None:
         self._sets += [part.to(self._device) for part in sets]
 
     def look_again(self, new: Gaussians) -> Rendering:
-        """Add Gaussians, and render from the last camera again; only tiles that the Gaussians touch are redrawn."""
+        """Add Gaussians, and render from the last camera again."""
         self.add(new)
+        return self._redraw([new])
+
+    def _redraw(self, new: Sequence[Gaussians]) -> Rendering:
+        """Render again from the last camera; only tiles that the Gaussians in `new` touch are redrawn."""
         tiles = touched_tiles(new, self._camera)
-        self._drawn = self._renderer.render(self._sets, self._camera, tiles=tiles, onto=self._drawn)
+        if bool(tiles.any()):
+            self._drawn = self._renderer.render(self._sets, self._camera, tiles=tiles, onto=self._drawn)
         return self._drawn.to(PROCESSOR)
