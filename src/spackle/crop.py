@@ -13,7 +13,7 @@ from spackle.filters import greatest_around
 
 Mask = NDArray[np.bool_]
 
-MARGIN = 48  # cells; farther cells change a delta of the shipped weights by 1/10 of bfloat16's rounding error
+MARGIN = 32  # cells; farther cells change a delta of the shipped weights by less than bfloat16's rounding does
 WHOLE = 0.8  # if crops cover more than this fraction of the grid, the whole grid is used instead
 NEARLY = 1.1  # a rectangle is not cut if its area is below this multiple of the least possible area
 CALL_BLOCKS = 8  # fixed cost of a crop, in blocks of step×step cells

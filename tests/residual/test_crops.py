@@ -52,5 +52,5 @@ def test_crops_give_the_deltas_of_the_whole_view() -> None:
     assert bool(one.any(-1)[::47, ::53].all())
     assert not bf16[~mask].any()
     difference = (other - one)[mask].abs()
-    assert float(difference.max()) < 0.01
+    assert float(difference.max()) < 0.02
     assert float(difference.mean()) < min(1e-3, 0.1 * float((bf16 - other)[mask].abs().mean()))
