@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from spackle._numba import kernel
 from spackle.camera import Camera
 from spackle.gaussians import Gaussians
 
@@ -83,5 +86,18 @@ def to_bytes(image: Tensor) -> Tensor:
     """Round values in 0..1 to uint8 on the CPU; values outside are clamped, NaN becomes 0, and uint8 is kept."""
     if image.dtype == torch.uint8:
         return image.detach().cpu()
-    scaled = image.detach().float().mul(255)
-    return scaled.nan_to_num_(0.0).clamp_(0, 255).round_().to("cpu", torch.uint8)
+    values = image.detach().float().contiguous()
+    if values.device.type != "cpu":
+        return values.mul(255).nan_to_num_(0.0).clamp_(0, 255).round_().to("cpu", torch.uint8)
+    result = torch.empty(values.shape, dtype=torch.uint8)
+    _round(values.numpy().reshape(-1), result.numpy().reshape(-1))
+    return result
+
+
+@kernel
+def _round(values: Any, result: Any) -> None:
+    """Write 255 times the values, rounded, in one pass; both arrays are flat."""
+    for i in range(len(values)):
+        scaled = values[i] * np.float32(255)
+        scaled = min(scaled, np.float32(255)) if scaled > 0 else np.float32(0)  # a comparison with NaN is false
+        result[i] = np.uint8(np.rint(scaled))
