@@ -264,3 +264,8 @@ def test_a_model_in_the_hubs_cache_needs_no_network(
     for name in ("owner/name", "owner/absent", "./absent", "a b/c", ""):
         with pytest.raises(InputError, match=f"^hf:{name}: cannot be loaded .+$"):
             HfBase.load(name)
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", False)
+    monkeypatch.setattr("huggingface_hub.hf_hub_url", lambda model, file: "http://127.0.0.1:9")
+    monkeypatch.setattr("time.sleep", lambda _: pytest.fail("it waits and tries again"))
+    with pytest.raises(InputError, match=r"refused.*: check name and network"):
+        HfBase.load("owner/absent")

@@ -64,13 +64,16 @@ class HfBase:
         target = pick_device(device)
         dtype, name, source = pick_dtype(precision, target), f"hf:{model}", os.path.expanduser(model)
         transformers = _transformers()
-        problem = "cannot be loaded ({reason}): give a folder with all its files, or owner/name of another model"
+        problem = "cannot be loaded ({reason}): check name and network, or give a folder with all the model's files"
         with reading(name, problem), enough_memory("give a smaller model"):
             try:
                 network, prepare, meaning = _read(transformers, source, name, from_hub=False)
             except OSError:  # the hub's cache lacks a file
                 if os.path.isdir(source):
                     raise
+                import huggingface_hub  # comes with transformers, which would ask six times: half a minute offline
+
+                huggingface_hub.get_hf_file_metadata(huggingface_hub.hf_hub_url(source, "config.json"))
                 network, prepare, meaning = _read(transformers, source, name, from_hub=True)
             _lower_linear(network, dtype)
             network.to(target)
