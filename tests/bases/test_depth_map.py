@@ -21,6 +21,7 @@ from spackle.errors import InputError
 
 CALIB = "cam0=[1000.5 0 30.25; 0 1000.5 20.5; 0 0 1]\ncam1=[1000.5 0 40.25; 0 1000.5 20.5; 0 0 1]\n doffs= 10.0\n"
 CALIB += "baseline=200.0\nwidth=8\nheight=6\nisint=0\n"
+EXR, BAD_EXR = Path(__file__).parents[1] / "data" / "exr", ("lossy", "integers", "tiled")
 
 
 def ramp(height: int = 6, width: int = 8) -> NDArray[np.float32]:
@@ -64,7 +65,7 @@ def test_npy(tmp_path: Path, dtype: str, order: Any) -> None:
     assert (found.K, found.quantum, found.quantity) == (None, None, "depth")
 
 
-def test_npz_and_pfm(tmp_path: Path) -> None:
+def test_npz_and_pfm_and_exr(tmp_path: Path) -> None:
     for endian in "<>":
         (tmp_path / "d.pfm").write_bytes(pfm(ramp(), endian))
         same(load_depth(tmp_path / "d.pfm"), ramp())
@@ -75,6 +76,8 @@ def test_npz_and_pfm(tmp_path: Path) -> None:
     same(load_depth(tmp_path / "named.npz"), ramp())
     with pytest.raises(InputError, match="none is called depth"):
         load_depth(tmp_path / "none.npz")
+    for path in (EXR / "good").iterdir():  # written by OpenEXR
+        same(load_depth(path), ramp(30, 40), 1e-3 if "half" in path.name or "grey" in path.name else 0)
 
 
 def test_millimetre_png(tmp_path: Path) -> None:
@@ -219,6 +222,8 @@ KINDS: list[tuple[bytes, dict[str, Any], str]] = [  # content, options, message
     (zipped(npy_claiming("(100000, 100000)")), {}, "too large"),
     (b"PF\n2 2\n-1\n" + b"\0" * 48, {}, "three channels"),
     (png(NOISE)[:2000], {}, "damaged"),
+    ((EXR / "good" / "zips, depth.exr").read_bytes()[:-1], {}, "the last rows are missing"),
+    *(((EXR / "bad" / f"{name}.exr").read_bytes(), {}, f"an? .*{name}.*: (give|save)") for name in BAD_EXR),
 ]
 
 

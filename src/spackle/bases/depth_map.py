@@ -1,4 +1,4 @@
-"""Read depth maps: metres in NumPy, PNG and PFM files, Middlebury's disparities, and relative depth in any picture."""
+"""Read depth maps: metres in NumPy, PNG, PFM or EXR, Middlebury's disparities, and relative depth in any picture."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ import zipfile
 from pathlib import Path
 from typing import IO, Any, Literal, get_args
 
+import av
 import numpy as np
 import torch
+from av.video.codeccontext import VideoCodecContext
 from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
@@ -31,7 +33,9 @@ DepthKind = Literal["auto", "metric", "disparity", "near-white", "near-black"]
 DEPTH_KINDS: tuple[DepthKind, ...] = get_args(DepthKind)
 RELATIVE: tuple[DepthKind, ...] = ("near-white", "near-black")
 
-SUFFIXES = (".npy", ".npz", ".png", ".pfm")
+SUFFIXES = (".npy", ".npz", ".png", ".pfm", ".exr")
+EXR_MAGIC = b"\x76\x2f\x31\x01"
+EXR_ROWS = {0: 1, 1: 1, 2: 1, 3: 16, 4: 32}  # rows in a block, by compression: FFmpeg decodes some others wrongly
 MAX_TEXT_BYTES = 1 << 16  # a calibration is a few lines
 PNG_UNIT_M = 0.001
 LARGEST = 1e9  # largest number in a calibration: the square of 1e9 still fits float32
@@ -107,8 +111,9 @@ def load_depth(
 ) -> DepthMap:
     """Read a depth map, a disparity map with its calibration, or a relative map.
 
-    Depth is stored in metres in `.npy`, `.npz` (one array, or the key `depth`) and `.pfm`: 0, NaN and inf mean unknown.
-    A 16-bit `.png` stores millimetres: 0 and 65535 mean unknown. The content decides the format.
+    Depth is stored in metres in `.npy`, `.npz` (one array, or the key `depth`), `.pfm` and `.exr` (the channel depth,
+    Z, V, Y or R): 0, NaN and inf mean unknown. A 16-bit `.png` stores millimetres: 0 and 65535 mean unknown. The
+    content decides the format.
 
     Disparity d becomes depth = baseline · focal / (d + doffs); inf (in a PNG also 0) means unknown. A file holds
     disparity if `calib` is given, if a `scene.json` in the same folder names the file as its `disparity`, or if the
@@ -229,6 +234,10 @@ class Calibration:
         """[3, 3] intrinsics of the left camera, in pixels."""
         return torch.tensor([[self.focal_px, 0.0, self.cx], [0.0, self.focal_px, self.cy], [0.0, 0.0, 1.0]])
 
+    def depth(self, disparity: Array, path: Path) -> DepthMap:
+        """The depth map of an array of disparities in pixels; 0 or less: unknown."""
+        return _depth_map(np.where(disparity > 0, disparity, np.inf), False, self, path)
+
     def cameras(self, width: int, height: int) -> tuple[Camera, Camera]:
         """The cameras of the left and the right photo, in the left camera's frame."""
         K, pose = self.K, torch.eye(4)
@@ -339,18 +348,23 @@ def read_array(path: StrPath, *, grey: bool = False) -> tuple[Array, bool]:
 
     With `grey`, other picture formats are read too, and three nearly equal channels count as one.
     """
-    readers = {b"\x93NUMPY": _read_npy, b"PK\x03\x04": _read_npz, b"Pf": _read_pfm, b"PF": _read_pfm}
+    readers = {b"\x93NUM": _read_npy, b"PK\x03\x04": _read_npz, EXR_MAGIC: _read_exr}
     with reading(path, "cannot be decoded ({reason}): the file is damaged or cut off"), open(path, "rb") as file:
-        start = file.read(8)
+        start = file.read(4)
         file.seek(0)
         if start.startswith(b"\x89PNG"):
             return read_image(path, lambda image: _png_values(image, path, grey)), True
-        for magic, read in readers.items():
-            if start.startswith(magic):
-                return read(file, path), False
+        if start.startswith(b"PF"):
+            raise InputError(f"{path}: a PFM with three channels is not a depth map: give one channel (Pf)")
+        if start.startswith(b"Pf"):
+            return read_image(path, lambda image: np.array(image)), False
+        if read := readers.get(start):
+            return read(file, path), False
     if grey:
         return read_image(path, lambda image: _png_values(image, path, grey)), False
-    raise InputError(f"{path}: not a depth map: give .npy, .npz or .pfm in metres, or a 16-bit .png in millimetres")
+    raise InputError(
+        f"{path}: not a depth map: give .npy, .npz, .pfm or .exr in metres, or a 16-bit .png in millimetres"
+    )
 
 
 def _check_size(shape: tuple[int, ...], path: StrPath) -> None:
@@ -393,12 +407,33 @@ def _read_npz(file: IO[bytes], path: StrPath) -> Array:
             return _read_npy(member, path)
 
 
-def _read_pfm(file: IO[bytes], path: StrPath) -> Array:
-    """Read a PFM file, which stores rows from the bottom up; the sign of its scale gives the byte order."""
-    kind, size, scale = (file.readline(64).split() for _ in range(3))
-    if kind == [b"PF"]:
-        raise InputError(f"{path}: a PFM with three channels is not a depth map: give one channel (Pf)")
-    (width, height), endian = map(int, size), "<" if float(scale[0]) < 0 else ">"
-    _check_size((height, width), path)
-    values = np.frombuffer(file.read(4 * width * height), f"{endian}f4").reshape(height, width)
-    return np.ascontiguousarray(values[::-1], np.float32)
+def _read_exr(file: IO[bytes], path: StrPath) -> Array:
+    """Read the channel depth, Z, V, Y or R by FFmpeg, which knows only Y: the last letters of names are changed."""
+    data, at, header = bytearray(file.read()), 8, dict[bytes, slice]()
+    if data[5] & 0x1A:
+        raise InputError(f"{path}: a tiled or deep EXR, or one with several parts: give one plain picture")
+    while data[at]:
+        name, kind, _ = data[at : at + 600].split(b"\0", 2)
+        start = at + len(name) + len(kind) + 6
+        at = start + int.from_bytes(data[start - 4 : start], "little")
+        header[bytes(name)] = slice(start, at)
+    (compression,), listed = data[header[b"compression"]], header[b"channels"]
+    if compression not in EXR_ROWS:
+        raise InputError(f"{path}: an EXR with lossy or new compression: save it with ZIP or PIZ, or uncompressed")
+    left, top, right, bottom = np.frombuffer(data[header[b"displayWindow"]], "<i4").tolist()
+    _check_size((bottom - top + 1, right - left + 1), path)
+    _, top, _, bottom = np.frombuffer(data[header[b"dataWindow"]], "<i4").tolist()
+    last = int(np.frombuffer(data, "<u8", (bottom - top) // EXR_ROWS[compression] + 1, at + 1).max())
+    if last + 8 + int.from_bytes(data[last + 4 : last + 8], "little") > len(data):  # FFmpeg would read zeros
+        raise EOFError("the last rows are missing")
+    channels = list(re.finditer(rb"([^\0]+)\0.{16}", data[listed], re.DOTALL))
+    depth = max(channels, key=lambda each: (b"depth" in each[1].lower(), b"RYVZ".find(each[1][-1:])))
+    for channel in channels:
+        data[listed.start + channel.end(1) - 1] = ord("Y" if channel is depth else "?")
+    decoder = VideoCodecContext.create("exr", "r")
+    decoder.options = {"layer": depth[1][:-1].decode()}
+    picture = decoder.decode(av.Packet(bytes(data)))[0]
+    if picture.format.name not in ("grayf16le", "grayf32le"):
+        raise InputError(f"{path}: an EXR of integers: give metres as half or float")
+    pixel = np.dtype("<f2" if "16" in picture.format.name else "<f4")
+    return np.frombuffer(bytes(picture.planes[0]), pixel).reshape(picture.height, -1)[:, : picture.width]

@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -50,22 +49,6 @@ def _size_of(*photos: Path) -> tuple[int, int] | None:
 
 def _from_corner(lens: Calibration) -> Calibration:
     return replace(lens, cx=lens.cx + HALF_PIXEL, cy=lens.cy + HALF_PIXEL)
-
-
-def _depth_by(lens: Calibration, path: Path, read: Callable[[], NDArray[Any]]) -> Callable[[], DepthMap]:
-    """A reader of z = focal · baseline / (disparity + doffs); disparities are in pixels; 0 or less: unknown."""
-
-    def depth() -> DepthMap:
-        stored = read()
-        with np.errstate(all="ignore"):  # unknown disparities may have any value
-            reach = float(lens.K[0, 0]) * lens.baseline_m
-            z = torch.from_numpy((reach / (stored + lens.doffs_px)).astype(np.float32))
-        valid = torch.from_numpy(np.isfinite(stored) & (stored > 0)) & torch.isfinite(z) & (z > 0)
-        if not valid.any():
-            raise InputError(f"{path}: no pixel has a disparity: the file is damaged, or of another dataset")
-        return DepthMap(z.where(valid, 0.0), valid, lens.K, None, "disparity", path)
-
-    return depth
 
 
 def pair_of_2014(folder: Path) -> Case:
@@ -128,8 +111,8 @@ def _lights_of(scene: Path) -> list[Case]:
     lens, truth = _read_opencv(scene / "calib_00-02.xml"), scene / "disp_00.npy"
     if not truth.is_file():
         raise InputError(f"{truth}: no such disparity map: give train/balanced; Booster's test scenes have none")
-    depth, size = _depth_by(lens, truth, lambda: read_array(truth)[0]), _size_of(*photos)
-    return [_pair(f"{scene.name}/{p.stem}", p, rights / p.name, lens, size, depth) for p in photos]
+    size, read = _size_of(*photos), lambda: lens.depth(read_array(truth)[0], truth)
+    return [_pair(f"{scene.name}/{p.stem}", p, rights / p.name, lens, size, read) for p in photos]
 
 
 def _read_opencv(path: Path) -> Calibration:
@@ -169,5 +152,4 @@ def load_motorcycle() -> StereoPair:
     cx, cy = MOTORCYCLE_CX, MOTORCYCLE_CY
     lens = Calibration(MOTORCYCLE_FOCAL, cx, cy, MOTORCYCLE_DOFFS, MOTORCYCLE_BASELINE)
     first, second = (torch.from_numpy(photo.astype(np.float32) / 255) for photo in (left, right))
-    depth = _depth_by(lens, Path("Motorcycle"), lambda: disparity)()
-    return StereoPair(first, second, depth, *lens.cameras(*disparity.shape[::-1]))
+    return StereoPair(first, second, lens.depth(disparity, Path("Motorcycle")), *lens.cameras(*disparity.shape[::-1]))
