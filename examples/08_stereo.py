@@ -8,7 +8,7 @@ from pathlib import Path
 
 import spackle
 from spackle.camera_path import DepthRange
-from spackle.formats import save_png, save_video
+from spackle.formats import save_png
 from spackle.video_frames import Stereo, default_ipd
 
 
@@ -18,12 +18,9 @@ def main(file: Path, out: Path) -> None:
     depth = DepthRange.of(scene.base)
     ipd = default_ipd(scene.camera, depth)  # metres; 0.065 if the nearest surface is 1.8 m away
 
-    pair = Stereo("sbs", ipd, convergence=depth.focus)  # objects at this depth appear at the depth of the screen
-    path = scene.path("swipe", disparity=0.05, frames=24)
-    eyes = (scene.frames(pair.eyes(camera)) for camera in path)
-    save_video((pair.pack(*(view.rgb for view in views)) for views in eyes), out / "sbs.mp4", fps=24)
+    scene.save_video(out / "sbs.mp4", "swipe", disparity=0.05, fps=24, seconds=1, stereo="sbs", ipd=ipd)
 
-    glasses = Stereo("anaglyph", ipd, convergence=depth.focus)
+    glasses = Stereo("anaglyph", ipd, convergence=depth.focus)  # what is at this depth appears in the screen's plane
     left, right = scene.frames(glasses.eyes(scene.camera))
     save_png(glasses.pack(left.rgb, right.rgb), out / "anaglyph.png")
 

@@ -84,7 +84,7 @@ def test_a_photo_and_its_depth_in_every_form(pair: tuple[Path, Path], tmp_path: 
     pixels, metres_of = np.asarray(Image.open(photo).convert("RGB")), spackle.load_depth(depth)
     depths = [depth.read_bytes(), io.BytesIO(depth.read_bytes()), metres_of.depth.numpy(), metres_of.depth.double()]
     photos = [photo.read_bytes(), io.BytesIO(photo.read_bytes()), Image.open(photo), pixels]
-    photos += [torch.from_numpy(pixels / 255)]
+    photos += [(tensor := torch.from_numpy(pixels / 255)), tensor.movedim(2, 0)]
     session = spackle.Spackle(residual="seeds")
     expected = session.predict(photo, depth)
     for form in photos:
@@ -103,7 +103,8 @@ def test_a_photo_and_its_depth_in_every_form(pair: tuple[Path, Path], tmp_path: 
         (b"\xff\xd8" + bytes(100_000), {}, "photo: not an image"),
         ("x" * 100_000, {}, "xxx"),
         (io.StringIO("x" * 100_000), {}, "binary mode"),
-        (np.zeros((48, 64)), {}, "[height, width, 3]"),
+        (np.zeros((48, 64)), {}, "[H, W, 3]"),
+        (np.zeros((3, 64, 3)), {}, "[3, H, W]"),
         (np.full((48, 64, 3), 200.0), {}, "from 200 to 200"),
         (object(), {}, "a path, bytes"),
         (np.zeros((48, 64, 3)), {"depth": np.zeros((48, 64), complex)}, "metres"),
@@ -127,11 +128,11 @@ def test_scenes_are_written_to_open_files(scene: spackle.Scene, tmp_path: Path) 
     saved, exported, video = io.BytesIO(), io.BytesIO(), io.BytesIO()
     scene.save(saved)
     scene.export(exported, "spz")
-    scene.save_video(video, "swipe", frames=3)
+    scene.save_video(video, "swipe", seconds=0.1, size="80x40", stereo="sbs")
     assert saved.getvalue() == (tmp_path / "scene.ply").read_bytes() == scene.to_bytes("ply")
     assert exported.getvalue() == scene.to_bytes("spz")
     with av.open(io.BytesIO(video.getvalue())) as container:
-        assert len(list(container.decode(video=0))) == 3
+        assert [(frame.width, frame.height) for frame in container.decode(video=0)] == [(160, 40)] * 3
     off = (scene.depth_map() / torch.from_numpy(metres()) - 1).abs()
     assert float((off < 0.05).float().mean()) > 0.9  # except at outlines
     with pytest.raises(spackle.InputError, match="which format"):

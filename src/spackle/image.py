@@ -115,7 +115,7 @@ def load_photo(
 def photo_of_picture(
     picture: Image.Image | NDArray[Any] | Tensor, *, keep_frame: bool = True, **lens: float | None
 ) -> Photo:
-    """A photo from a PIL image, or from [H, W, 3] sRGB (uint8, or floats in 0..1); for `lens` see `load_photo`."""
+    """A photo from a PIL image, or sRGB [H, W, 3] or [3, H, W] (uint8, floats in 0..1); for `lens` see `load_photo`."""
     path, exif = Path("photo"), dict[int, object]()
     if isinstance(picture, Image.Image):
         check_pixels(picture.width, picture.height, MAX_PIXELS, path)
@@ -124,8 +124,9 @@ def photo_of_picture(
             rgb = _to_rgb(_upright(picture), path)
     else:
         values = picture.detach().cpu() if isinstance(picture, Tensor) else torch.from_numpy(np.array(picture))
-        if values.ndim != 3 or values.shape[2] != 3 or not values.numel():
-            raise InputError(f"{path}: a picture of shape {shown(tuple(values.shape))}: give [height, width, 3]")
+        if values.ndim != 3 or (values.shape[0] == 3) == (values.shape[2] == 3) or not values.numel():
+            raise InputError(f"{path}: a picture of shape {shown(tuple(values.shape))}: give [H, W, 3] or [3, H, W]")
+        values = values.movedim(0, 2) if values.shape[0] == 3 else values
         check_pixels(values.shape[1], values.shape[0], MAX_PIXELS, path)
         if values.dtype != torch.uint8 and not values.is_floating_point():
             raise InputError(f"{path}: colours as {values.dtype}: give uint8, or floats from 0 to 1")

@@ -26,7 +26,8 @@ from spackle.image import focal_length
 from spackle.render import Renderer, get_renderer
 from spackle.render.protocol import Rendering
 from spackle.residual.view_features import hole_mask
-from spackle.views import PATH_FRAMES, SECONDS
+from spackle.video_frames import Fit, FrameMaker, Show, StereoLayout, VideoOptions, parse_size
+from spackle.views import PATH_FRAMES, PathOptions
 
 DEFAULT_SIZE = (1280, 720)  # width and height for a file that stores no camera
 
@@ -54,15 +55,15 @@ class Scene:
             focal_px: focal length in pixels; by default the stored focal length, or a 35 mm equivalent of 30 mm.
             fov: horizontal field of view in degrees, instead of `focal_px`.
         """
-        return Scene.of_file(load_scene(Path(path)), focal_px, fov)
+        return Scene.of_file(load_scene(Path(path)), focal_px=focal_px, fov=fov)
 
     @staticmethod
-    def of_file(file: SceneFile, focal_px: float | None = None, fov: float | None = None) -> Scene:
-        """The scene in a loaded file; see `load`."""
+    def of_file(file: SceneFile, size: tuple[int, int] | None = None, **lens: float | None) -> Scene:
+        """The scene in a loaded file; see `load`. `size` is the camera's size if a lens is given, or none is stored."""
         gaussians, camera = file.gaussians, file.camera
-        if camera is None or focal_px is not None or fov is not None:
-            width, height = (camera.width, camera.height) if camera else DEFAULT_SIZE
-            focal, _ = focal_length(file.path, width, height, {}, focal_px=focal_px, focal_mm=None, fov=fov)
+        if camera is None or any(value is not None for value in lens.values()):
+            width, height = size or ((camera.width, camera.height) if camera else DEFAULT_SIZE)
+            focal, _ = focal_length(file.path, width, height, {}, **lens)
             given = Camera.from_focal(focal, width, height)
             pose = given.world_to_camera if camera is None else camera.world_to_camera
             camera = dataclasses.replace(given, world_to_camera=pose)
@@ -181,30 +182,48 @@ class Scene:
         overscan: float = OVERSCAN,
         format: str | None = None,
         renderer: Renderer | None = None,
+        *,
+        seconds: float | None = None,
+        size: str | tuple[int, int] | None = None,
+        fit: Fit = "pad",
+        show: Show = "color",
+        stereo: StereoLayout | None = None,
+        ipd: float | None = None,
+        convergence: float | None = None,
+        compare: bool = False,
     ) -> None:
-        """Write a video of a camera path that repeats without a jump; see `path`.
+        """Write a video of a camera path that repeats without a jump, as `spackle render` does; see `path`.
 
         Args:
             target: a path, or a file that is open for writing bytes.
             trajectory, disparity: see `path`.
-            frames: number of frames; by default, the video lasts 4 seconds.
+            frames, seconds: number of frames or duration; by default, the video lasts 4 seconds.
             fps: frames per second.
             loop: see `spackle.formats.VideoWriter`.
             overscan: relative gain in focal length, which hides most of the fill beyond the photo's border.
             format: "mp4", "webm", "gif" or "webp"; by default the path's suffix, or mp4 for an open file.
             renderer: by default the CPU renderer.
+            size, fit, show, stereo, ipd, convergence, compare: see the options of `spackle render`; `size` is
+                "1280x720", "16:9" or (width, height).
+
+        Raises:
+            InputError: an option is impossible, or contradicts another one.
         """
-        if format is None and isinstance(target, str | os.PathLike):
-            check_video(target, fps, loop)
-            count = max(1, round(SECONDS * fps)) if frames is None else frames
-            cameras = self.path(trajectory, disparity, count, looped=True)
-            views = self.frames((camera.zoomed(1 + overscan) for camera in cameras), renderer)
-            save_video((view.rgb for view in views), target, fps, loop)
-            return
+        named = format is None and isinstance(target, str | os.PathLike)
+        pixels = None if size is None else parse_size(size if isinstance(size, str) else "x".join(map(str, size)))
         with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / f"video.{format or 'mp4'}"
-            self.save_video(path, trajectory, disparity, frames, fps, loop, overscan, renderer=renderer)
-            write_whole(target, path.read_bytes())
+            file = Path(target) if named else Path(folder) / f"video.{format or 'mp4'}"  # type: ignore[arg-type]
+            check_video(file, fps, loop)
+            video = VideoOptions(None, fps, loop, pixels, fit, show, stereo, ipd, convergence, compare).for_file(file)
+            path = PathOptions(trajectory, disparity, None, None, frames, seconds, video, overscan)
+            path.check()
+            cameras = path.fly(self.base, self.camera, None, self.disparity)
+            maker = FrameMaker.of(video, self.base, cameras, file)
+            parts = [[self.base]] * compare + [[self.base, self.aux]]
+            used = renderer or get_renderer()
+            save_video((maker.render(parts, camera, used)[0] for camera in cameras), file, fps, loop)
+            if not named:
+                write_whole(target, file.read_bytes())
 
 
 @dataclasses.dataclass(frozen=True)

@@ -131,7 +131,7 @@ def predict(
 
     Args:
         photo: a path, the bytes of a file, an open file, a PIL picture, a loaded photo, or an array or tensor
-            [H, W, 3] of sRGB as uint8 or as floats in 0..1.
+            [H, W, 3] or [3, H, W] of sRGB as uint8 or as floats in 0..1.
         depth: the photo's depth as a path, bytes or an open file in a format of `load_depth`, an array or tensor [H, W]
             in metres (0, NaN or inf: unknown), or a loaded depth map.
         base, residual, fill, device, renderer: see `Spackle`.

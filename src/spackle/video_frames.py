@@ -19,7 +19,7 @@ from spackle.color import DepthColors, linear_to_srgb, srgb_to_linear
 from spackle.errors import InputError
 from spackle.formats.video import FORMATS, check_video
 from spackle.gaussians import Gaussians
-from spackle.render.protocol import Rendering
+from spackle.render.protocol import Renderer, Rendering
 
 VideoFormat = Literal["mp4", "webm", "gif", "webp"]
 Show = Literal["color", "depth"]
@@ -203,6 +203,15 @@ class FrameMaker:
     def eyes(self, camera: Camera) -> tuple[Camera, ...]:
         """The camera itself, or the cameras of a stereo view's left and right eye."""
         return (camera,) if self.stereo is None else self.stereo.eyes(camera)
+
+    def render(
+        self, parts: Sequence[list[Gaussians]], camera: Camera, renderer: Renderer
+    ) -> tuple[Tensor, list[Rendering]]:
+        """A frame, and renderings of each of `parts` (base and scene with `compare`, else the scene) by each eye."""
+        with torch.no_grad():
+            eyes = [self.sized(eye) for eye in self.eyes(camera)]
+            views = [renderer.render(part, eye) for part in parts for eye in eyes]
+            return self.frame(views), views
 
     def frame(self, views: Sequence[Rendering]) -> Tensor:
         """One sRGB frame [H, W, 3] from renderings of `eyes`; with `compare`, from renderings of base and scene."""

@@ -79,7 +79,7 @@ class PathOptions:
         return default if self.disparity is None else self.disparity
 
     def fly(
-        self, gaussians: Gaussians, camera: Camera, keyframes: KeyframePath | None, disparity: float = USUAL_DISPARITY
+        self, gaussians: Gaussians, camera: Camera, keyframes: KeyframePath | None, disparity: float | None
     ) -> list[Camera]:
         """The cameras of a video through keyframes or along the trajectory; sides of odd size grow by a pixel.
 
@@ -87,7 +87,7 @@ class PathOptions:
             gaussians: the scene, whose depths determine the path's length.
             camera: the photo's camera.
             keyframes: the keyframes of --path.
-            disparity: used if the options give no disparity.
+            disparity: used if the options give no disparity; None: the usual one.
 
         Raises:
             PathError: the keyframes give no usable path.
@@ -96,7 +96,7 @@ class PathOptions:
         given = self.frames or (self.seconds and round(self.seconds * self.video.rate))
         if keyframes is None:
             count = given or max(1, round(SECONDS * self.video.rate))
-            reach, depths = self.reach(disparity), DepthRange.of(gaussians)
+            reach, depths = self.reach(USUAL_DISPARITY if disparity is None else disparity), DepthRange.of(gaussians)
             path = trajectory(self.trajectory, camera.even(), reach, depths, count, looped=True)
             return [view.zoomed(1 + self.overscan) for view in path]
         count = given or keyframes.frame_count(self.video.rate)

@@ -10,26 +10,22 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-import torch
 from rich.filesize import decimal
 from torch import Tensor
 
-from spackle.bases import USUAL_DISPARITY
-from spackle.camera import Camera
-from spackle.camera_path import KeyframePath, PathError
-from spackle.errors import InputError
+from spackle.camera_path import PathError
+from spackle.errors import InputError, reading
 from spackle.files import results_folder, write_whole
 from spackle.formats import save_png, save_video
 from spackle.formats.html import single_html
 from spackle.formats.scene_files import Encoder, SceneFile, encoder_of, load_scene
 from spackle.formats.spz import LARGEST, spz_grid
 from spackle.formats.video import FORMATS
-from spackle.gaussians import Gaussians
-from spackle.image import DEFAULT_FOCAL_MM, focal_length
+from spackle.image import DEFAULT_FOCAL_MM
 from spackle.progress import Reporter
 from spackle.render import get_renderer
 from spackle.residual import hole_area_ratio
-from spackle.scene import DEFAULT_SIZE, Scene
+from spackle.scene import Scene
 from spackle.video_frames import FrameMaker, video_problem
 from spackle.views import PathOptions
 
@@ -61,12 +57,16 @@ def render_scene(
     with reporter.stage("load"):
         given, keyframes = path.load()
         loaded = load_scene(scene)
-        gaussians, reach, base_count = loaded.gaussians, loaded.disparity, loaded.base_count
-        if path.video.compare and (base_count is None or base_count >= len(gaussians)):
+        whole = Scene.of_file(loaded, path.video.size, **lens)
+        base, aux, reach = whole.base, whole.aux, whole.disparity
+        if path.video.compare and not len(aux):
             raise InputError(f"{scene}: --compare needs a completed scene, such as the scene.ply of `spackle predict`")
-        base = gaussians.select(slice(0, base_count))  # path lengths depend on the depths of the base
-        parts = [base, gaussians] if path.video.compare else [gaussians]
-        cameras = given or _fly(loaded, base, path, keyframes, lens)
+        parts = [[base]] * path.video.compare + [[base, aux]]
+        if new_lens or reach is None:
+            path = dataclasses.replace(path, overscan=0)
+        impossible = "no camera path: {reason}: give views with --cameras"
+        with reading(scene, impossible, ValueError), reading(path.path, "{reason}", PathError):
+            cameras = given or path.fly(base, whole.camera, keyframes, reach)
         if reach is not None and (path.disparity or 0) > reach:
             far = f"--disparity {path.disparity:g}"
             reporter.log(
@@ -88,11 +88,9 @@ def render_scene(
         def frames() -> Iterator[Tensor]:
             """Render the frames, and save each as a picture if pictures are wanted."""
             for index, camera in enumerate(cameras):
-                with torch.no_grad():
-                    eyes = [maker.sized(eye) for eye in maker.eyes(camera)]
-                    views = [renderer.render([part], eye) for part in parts for eye in eyes]
-                    frame = maker.frame(views)
-                holes.append(max(hole_area_ratio(view.alpha) for view in views[-len(eyes) :]))
+                frame, views = maker.render(parts, camera, renderer)
+                completed = views[1:] if path.video.compare else views
+                holes.append(max(hole_area_ratio(view.alpha) for view in completed))
                 if names:
                     save_png(frame, target.parent / names[index])
                 yield frame
@@ -103,40 +101,17 @@ def render_scene(
                 pass
         else:
             save_video(frames(), target, path.video.rate, path.video.loop)
-    seconds = reporter.seconds["video"]
-    result = {"gaussians": len(gaussians), "frames": len(cameras), "seconds": seconds, "open": round(max(holes), 5)}
+    seconds, total = reporter.seconds["video"], len(loaded.gaussians)
+    result = {"gaussians": total, "frames": len(cameras), "seconds": seconds, "open": round(max(holes), 5)}
     if max(holes) > TOLERATED:
         reporter.log(f"{scene.name}: holes take up to {max(holes):.1%} of a frame")
     if problem:
         reporter.log(f"{path.cameras}: {problem}: pictures only, no video")
         reporter.result({"folder": output, **result})
     else:
-        count = f"{len(gaussians):,} Gaussians, {len(cameras)} frames"
+        count = f"{total:,} Gaussians, {len(cameras)} frames"
         reporter.log(f"{scene.name}: {count} in {seconds:.1f} s -> {target}")
         reporter.result({"file": target, **result})
-
-
-def _fly(
-    loaded: SceneFile,
-    base: Gaussians,
-    path: PathOptions,
-    keyframes: KeyframePath | None,
-    lens: Mapping[str, float | None],
-) -> list[Camera]:
-    """The cameras of a path around the stored camera; focal length: that of `lens`, else the stored one, else 30 mm."""
-    camera, new_lens = loaded.camera, any(value is not None for value in lens.values())
-    if camera is None or new_lens:
-        width, height = path.video.size or ((camera.width, camera.height) if camera else DEFAULT_SIZE)
-        focal, _ = focal_length(loaded.path, width, height, {}, focal_mm=None, **lens)
-        camera = Camera.from_focal(focal, width, height)
-    if new_lens or loaded.disparity is None:
-        path = dataclasses.replace(path, overscan=0)
-    try:
-        return path.fly(base, camera, keyframes, USUAL_DISPARITY if loaded.disparity is None else loaded.disparity)
-    except PathError as error:
-        raise InputError(f"{path.path}: {error}") from error
-    except ValueError as error:
-        raise InputError(f"{loaded.path}: no camera path: {error}: give views with --cameras") from error
 
 
 def export_scene(scene: Path, outputs: Sequence[Path], reporter: Reporter) -> None:
