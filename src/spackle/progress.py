@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import copy
-import io
 import json
 import logging
 import signal
@@ -144,7 +143,7 @@ class Notes(Reporter):
     """Collects the messages of a worker, which the main process prints."""
 
     def __init__(self, verbose: bool = False) -> None:
-        super().__init__(verbose, Console(file=io.StringIO(), force_terminal=False))
+        super().__init__(verbose, Console(quiet=True, force_terminal=False))
         self.said: list[str | Mapping[str, object]] = []
 
     def result(self, values: Mapping[str, object]) -> None:

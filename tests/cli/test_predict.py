@@ -10,17 +10,7 @@ import numpy as np
 import pytest
 import torch
 from command import FILES, SHORT, Run, decode, names_in, predicted, refuses, report_of, run
-from photos import (
-    HEIGHT,
-    WIDTH,
-    box,
-    camera_file,
-    metres,
-    picture,
-    read_ply,
-    write_depth,
-    write_photo,
-)
+from photos import HEIGHT, WIDTH, box, camera_file, metres, picture, read_ply, write_depth, write_photo
 from PIL import Image
 from safetensors.torch import save_file
 

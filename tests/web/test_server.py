@@ -76,7 +76,8 @@ def test_the_interface_is_described(server: Served) -> None:
         ('{"disparity": 3}', "disparity"),
         ('{"files": ["../../etc/passwd"]}', "files"),
         ('{"path": 1}', "path: Extra"),
-        ('{"base": "hf:/etc"}', "base hf:/etc is unknown"),
+        ('{"base": "hf:/etc"}', "base hf:/etc: unknown"),
+        ('{"base": "sharp"}', "`spackle weights get sharp`"),
     ],
 )
 def test_options_are_checked(server: Served, options: str, why: str) -> None:
@@ -268,8 +269,7 @@ def test_a_name_is_safe_to_show() -> None:
 
 
 @pytest.mark.parametrize(
-    ("how", "error"),
-    [("bad", "bad.png: no depth at all"), ("bug", "internal error: KeyError: 'oh'"), ("die", DIED)],
+    ("how", "error"), [("bad", "bad.png: no depth at all"), ("bug", "internal error: KeyError: 'oh'"), ("die", DIED)]
 )
 def test_an_error_is_one_line(server: Served, how: str, error: str) -> None:
     id = server.send(name=f"{how}.png").json["id"]

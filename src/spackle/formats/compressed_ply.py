@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spackle.formats.ply import ply_header
+from spackle.formats.ply import PACKED, ply_header
 from spackle.formats.scene_files import (
     Columns,
     Floats,
@@ -27,7 +27,6 @@ _CHUNK_NAMES = [
     *(f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"),
 ]
 PLACE_BITS, TURN_BITS, COLOR_BITS = (11, 10, 11), (10, 10, 10), (8, 8, 8, 8)
-_VERTEX_NAMES = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
 
 
 def encode_compressed_ply(scene: SceneFile) -> bytes:
@@ -41,9 +40,9 @@ def encode_compressed_ply(scene: SceneFile) -> bytes:
     columns = columns.select(order)
     scales = np.clip(columns.log_scales, -LARGEST_LOG_SCALE, LARGEST_LOG_SCALE)
     starts = np.arange(0, count, CHUNK)
-    tables = ("chunk", len(starts), "float", _CHUNK_NAMES), ("vertex", count, "uint", _VERTEX_NAMES)
+    tables = ("chunk", len(starts), "float", _CHUNK_NAMES), ("vertex", count, "uint", PACKED)
     chunks = np.zeros((len(starts), len(_CHUNK_NAMES)), "<f4")
-    rows = np.zeros((count, len(_VERTEX_NAMES)), "<u4")
+    rows = np.zeros((count, len(PACKED)), "<u4")
     if count:
         places, chunks[:, 0:6] = _normalised(columns.means, starts)
         sizes, chunks[:, 6:12] = _normalised(scales, starts)
@@ -100,7 +99,7 @@ def decode_compressed_ply(chunks: NDArray[Any], rows: NDArray[Any]) -> Columns:
         raise ValueError(f"its chunks have no {min(missing)}")
     if len(chunks) * CHUNK < len(rows):
         raise ValueError(f"{len(chunks)} chunks for {len(rows)} vertices")
-    places, turns, sizes, colors = (np.array(rows[name], np.uint32) for name in _VERTEX_NAMES)
+    places, turns, sizes, colors = (np.array(rows[name], np.uint32) for name in PACKED)
     rgba = _unpacked(colors, COLOR_BITS)
     srgb = _between(rgba[:, :3], chunks, _CHUNK_NAMES[12:]) if "min_r" in (chunks.dtype.names or ()) else rgba[:, :3]
     return Columns(

@@ -36,7 +36,7 @@ SMALLEST_OPACITY, LARGEST_OPACITY = 1e-12, 1 - 2.0**-24  # bounds that keep the 
 BLOCK = 8192
 
 _READ = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2"]
-_PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
+PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
 _READ += ["rot_0", "rot_1", "rot_2", "rot_3"]
 _WRITTEN = [*_READ[:3], "nx", "ny", "nz", *_READ[3:]]
 _SLICES = slice(0, 3), slice(3, 6), slice(6, 7), slice(7, 10), slice(10, 14)  # means, f_dc, opacity, scales, rot
@@ -277,7 +277,7 @@ class PlyFile:
         named = [element for element in self.elements if element.name == "vertex"]
         if len(named) != 1:
             raise InputError(f"{self.path}: holds {len(named)} elements called vertex: not a Gaussian scene")
-        read = _PACKED if "packed_position" in dict(named[0].fields) else _READ
+        read = PACKED if "packed_position" in dict(named[0].fields) else _READ
         missing = [name for name in read if name not in dict(named[0].fields)]
         if missing:
             raise InputError(f"{self.path}: not a Gaussian scene: its vertices have no {', '.join(missing)}")

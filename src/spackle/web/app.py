@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import os
 import re
 import shutil
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal, get_args
 
@@ -25,7 +24,8 @@ from starlette.staticfiles import StaticFiles
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 import spackle
-from spackle.bases.settings import AUTO
+from spackle.bases.depth_map import SUFFIXES
+from spackle.bases.settings import AUTO, MISSING
 from spackle.errors import InputError, one_line
 from spackle.formats.html import page_file
 from spackle.image import PHOTO_SUFFIXES
@@ -36,8 +36,7 @@ from spackle.web.work import PREVIEW, Download, FileName, SceneOptions, SceneWor
 
 PagePart = Literal["page.json", "base.splats", "aux.splats", "photo.jpg"]  # files that the page draws
 SCENES = "/api/v1/scenes"
-FILES = [PREVIEW, *get_args(Download), *get_args(Video)]  # files that a state lists
-DEPTH_SUFFIXES = (".npy", ".npz", ".png", ".pfm")  # of depth maps, as for `spackle predict --depth`
+FILES = sorted([PREVIEW, *get_args(Download), *get_args(Video)])  # files that a state lists
 POLL_S = 0.1  # seconds between two checks whether a state has changed
 UPLOAD_S = 300.0  # seconds that an upload may take, because it holds a place in the queue
 MAX_NAME = 80  # characters
@@ -51,7 +50,7 @@ UPLOAD: dict[str, Any] = {  # not declared as a form: FastAPI would read it befo
         "required": ["photo"],
         "properties": {
             "photo": {**FILE, "description": f"One of {', '.join(PHOTO_SUFFIXES)}."},
-            "depth": {**FILE, "description": f"Its depth map, one of {', '.join(DEPTH_SUFFIXES)}."},
+            "depth": {**FILE, "description": f"Its depth map, one of {', '.join(SUFFIXES)}."},
             "options": SceneOptions.model_json_schema(),
         },
     },
@@ -82,7 +81,7 @@ def create_app(
         max_bytes: size limit of an upload, including its depth map.
     """
     jobs = Jobs(folder, work, workers, keep)
-    bases = work.bases if isinstance(work, SceneWork) else [AUTO]
+    bases: Callable[[], list[str]] = getattr(work, "bases", lambda: [AUTO])
 
     @contextlib.asynccontextmanager
     async def until_the_end(app: FastAPI) -> AsyncIterator[None]:
@@ -102,12 +101,11 @@ def create_app(
     app.add_middleware(Guard, access=access, max_bytes=max_bytes)
     decoding = asyncio.Lock()  # one photo at a time: decoding a large one takes a gigabyte
 
+    def path_of(job: Job, file: str) -> Path:
+        return (job.folder if file == PREVIEW else job.results) / file
+
     def with_files(job: Job) -> SceneState:
-        names = set[str]()
-        for folder in (job.folder, job.results):
-            with contextlib.suppress(FileNotFoundError):  # another request may have deleted it
-                names.update(os.listdir(folder))
-        return job.model_copy(update={"files": sorted(names.intersection(FILES))})
+        return job.model_copy(update={"files": [file for file in FILES if path_of(job, file).is_file()]})
 
     def job_of(id: str) -> Job:
         if (job := jobs.get(id)) is None:
@@ -124,7 +122,7 @@ def create_app(
                 raise HTTPException(408, "the photo arrived too slowly") from None
             try:
                 async with decoding:
-                    job = await run_in_threadpool(accept, form, new, jobs, bases)
+                    job = await run_in_threadpool(accept, form, new, jobs, bases())
             finally:
                 await form.close()
         response.headers["Location"] = f"{request.scope['root_path']}{SCENES}/{job.id}"
@@ -157,7 +155,7 @@ def create_app(
     async def get_file(id: str, file: FileName | PagePart) -> FileResponse:
         """A file of a finished scene; a file that does not exist yet is made on demand."""
         job = job_of(id)
-        path = (job.folder if file == PREVIEW else job.results) / file
+        path = path_of(job, file)
         if not path.is_file():
             if job.state != "done":
                 raise HTTPException(409, job.error or "this scene is not done yet")
@@ -170,7 +168,7 @@ def create_app(
     @app.get("/page.json", include_in_schema=False)
     async def get_page_state() -> dict[str, object]:
         writes = access is None or access.token is not None
-        upload = {"suffixes": PHOTO_SUFFIXES, "max_bytes": max_bytes, "bases": bases} if writes else None
+        upload = {"suffixes": PHOTO_SUFFIXES, "max_bytes": max_bytes, "bases": bases()} if writes else None
         return {"upload": upload}
 
     @app.get("/healthz", include_in_schema=False)
@@ -198,10 +196,11 @@ def accept(form: FormData, folder: Path, jobs: Jobs, bases: list[str]) -> Job:
         line = f"{'.'.join(map(str, ('options', *first['loc'])))}: {first['msg']}"
         raise HTTPException(422, one_line(line)) from error
     if options.base not in (None, *bases):
-        raise HTTPException(422, one_line(f"base {options.base} is unknown: there are {', '.join(bases)}"))
+        why = MISSING.get(options.base or "", f"unknown: there are {', '.join(bases)}")
+        raise HTTPException(422, one_line(f"base {options.base}: {why}"))
     source, of_depth = _saved(photo, folder, "source", name, PHOTO_SUFFIXES), None
     if isinstance(depth, UploadFile) and depth.filename:
-        of_depth = _saved(depth, folder, "depth", "depth map", DEPTH_SUFFIXES)
+        of_depth = _saved(depth, folder, "depth", "depth map", SUFFIXES)
     try:
         check_photo(folder / source, name, folder / PREVIEW)
     except InputError as error:

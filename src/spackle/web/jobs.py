@@ -85,7 +85,6 @@ class Jobs:
         self._jobs: dict[str, Job] = {}  # a change replaces a job by a new one
         self._work, self._processes, self._of_thread = work, list[TaskProcess](), threading.local()
         self._running: dict[str, TaskProcess] = {}  # by job
-        self._receiving = 0  # photos
         self._photos, self._files = ThreadPoolExecutor(workers), ThreadPoolExecutor(1)
         self._photos.submit(self._process)  # starts while the first photo is uploaded
         self._take_up()
@@ -115,20 +114,17 @@ class Jobs:
     @contextlib.contextmanager
     def place(self) -> Iterator[Path]:
         """Reserve a place in the queue, and yield a folder that receives the photo; 429 if the queue is full."""
+        folder = self.folder / f"{NEW}{secrets.token_hex(8)}"
         with self._lock:
-            waiting = self._receiving + sum(job.state == "queued" for job in self._jobs.values())
+            waiting = len([*self.folder.glob(f"{NEW}*")]) + sum(job.state == "queued" for job in self._jobs.values())
             if waiting >= self.keep.waiting:
                 line = f"too many photos are waiting: try again in {RETRY_S} seconds"
                 raise HTTPException(429, line, {"Retry-After": str(RETRY_S)})
-            self._receiving += 1
-        folder = self.folder / f"{NEW}{secrets.token_hex(8)}"
-        try:
             folder.mkdir()
+        try:
             yield folder
         finally:
             shutil.rmtree(folder, ignore_errors=True)  # `add` has renamed the folder of an accepted photo
-            with self._lock:
-                self._receiving -= 1
 
     def add(self, folder: Path, name: str, source: str, depth: str | None, options: dict[str, Any]) -> Job:
         """Add a job for a photo in a folder that `place` yielded; `source` and `depth` may be absolute paths."""

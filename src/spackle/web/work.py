@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import io
 import json
 import os
 from collections.abc import Iterator, Mapping
@@ -75,7 +74,6 @@ class SceneWork:
     verbose: bool = False
     opened: Pipeline | None = None
 
-    @property
     def bases(self) -> list[str]:
         """The bases that a client may choose: the server's base, "auto", and those with weights on this machine."""
         return list(dict.fromkeys([self.base.name, AUTO, *BaseSettings().files]))
@@ -142,7 +140,7 @@ class Teller(Reporter):
     """Reports log lines and progress to the server, with the photo's name in place of paths."""
 
     def __init__(self, job: Job, tell: Tell, verbose: bool) -> None:
-        super().__init__(verbose, Console(file=io.StringIO(), force_terminal=False))
+        super().__init__(verbose, Console(quiet=True, force_terminal=False))
         self._job, self._tell = job, tell
 
     def cleaned(self, line: str) -> str:
