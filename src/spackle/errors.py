@@ -8,7 +8,7 @@ import functools
 import reprlib
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -23,8 +23,22 @@ class InputError(ValueError):
 
 def reason_in_a_line(error: object) -> str:
     """The text of a library's exception, at most 200 characters, for the middle of a message."""
+    if callable(getattr(error, "errors", None)):  # of pydantic
+        return first_problem(error)
     text = getattr(error, "strerror", None) or error  # the system's text, without error number and file name
     return one_line(" ".join(str(text).split()))[:200] or type(error).__name__
+
+
+def first_problem(error: Any) -> str:
+    """The key of the first value that pydantic refuses, and what the value must be."""
+    first = error.errors()[0]
+    if first["type"] == "extra_forbidden":
+        problem = "there is no such key"
+    else:
+        message = first["msg"].removeprefix("Value error, ")
+        given = "" if first["type"] in ("missing", "json_invalid") else f", not {shown(first['input'])}"
+        problem = f"{message[0].lower()}{message[1:]}{given}"
+    return ": ".join(filter(None, (".".join(str(name)[:60] for name in first["loc"]), problem)))
 
 
 @contextlib.contextmanager

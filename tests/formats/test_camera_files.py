@@ -77,7 +77,7 @@ def test_a_path_file_is_read(tmp_path: Path) -> None:
 
 BAD: list[tuple[Any, str]] = [
     ("", "empty"),
-    ("{" * 1000, "Invalid JSON"),
+    ("{" * 1000, "invalid JSON"),
     ({"frames": []}, "frames: "),
     (changed(CAMERAS, "frames", to=[FRAME] * 10_001), "at most 10000"),
     (changed(CAMERAS, "frames", 0, "K", to=None), "frames.0.K: "),

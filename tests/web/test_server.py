@@ -72,10 +72,10 @@ def test_the_interface_is_described(server: Served) -> None:
 @pytest.mark.parametrize(
     ("options", "why"),
     [
-        ("{", "options: Invalid JSON"),
+        ("{", "options: invalid JSON"),
         ('{"disparity": 3}', "disparity"),
         ('{"files": ["../../etc/passwd"]}', "files"),
-        ('{"path": 1}', "path: Extra"),
+        ('{"path": 1}', "path: there is no such key"),
         ('{"base": "hf:/etc"}', "base hf:/etc: unknown"),
         ('{"base": "sharp"}', "`spackle weights get sharp`"),
     ],

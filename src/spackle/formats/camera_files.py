@@ -79,10 +79,8 @@ def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
 
 def camera_of(facts: Mapping[str, Any], where: str) -> Camera:
     """A camera from its entry in a JSON file; InputError, beginning with `where`, if the camera is impossible."""
-    try:
+    with reading(where, "{reason}", ValidationError):
         frame = _Frame.model_validate(facts)
-    except ValidationError as error:
-        raise InputError(f"{where}: {_first_problem(error)}") from error
     return _camera(frame, frame.width, frame.height, where)
 
 
@@ -150,13 +148,5 @@ def load_path(path: str | os.PathLike[str]) -> KeyframePath:
 def _read(model: type[M], path: str | os.PathLike[str], kind: str) -> M:
     if check_file(path, kind) > MAX_BYTES:
         raise InputError(f"{path}: too long for a {kind} (at most {MAX_BYTES >> 20} MiB): is it the right file?")
-    try:
+    with reading(path, "{reason}", ValidationError):
         return model.model_validate_json(Path(path).read_bytes().removeprefix(codecs.BOM_UTF8))
-    except ValidationError as error:
-        raise InputError(f"{path}: {_first_problem(error)}") from error
-
-
-def _first_problem(error: ValidationError) -> str:
-    """The place of the first invalid value, and what the value must be."""
-    first = error.errors()[0]
-    return ": ".join(filter(None, (".".join(str(name)[:60] for name in first["loc"]), first["msg"])))

@@ -12,7 +12,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 
 from spackle.camera_path import MAX_DISPARITY
 from spackle.device import Precision
-from spackle.errors import InputError, reading, shown
+from spackle.errors import InputError, reading
 from spackle.files import check_file
 from spackle.weights import installed
 
@@ -193,10 +193,8 @@ def load_recipe(kind: type[R], path: str | os.PathLike[str], overrides: Sequence
             raise InputError(f"{override!r}: neither an option nor key=value, such as optim.steps=100")
         with reading(override, f"{path} has no such key ({{reason}})"):
             _set(content, key.split("."), _parse(value, override))
-    try:
+    with reading(path, "{reason}", ValidationError):
         return kind.model_validate(content)
-    except ValidationError as error:
-        raise InputError(f"{path}: {_first_problem(error)}") from error
 
 
 def _parse(text: str, where: object) -> Any:
@@ -217,13 +215,3 @@ def _set(content: Any, keys: Sequence[str], value: object) -> None:
         elif isinstance(content, dict) and not isinstance(content.get(index), (dict, list)):
             content[index] = {}
         content = content[index]
-
-
-def _first_problem(error: ValidationError) -> str:
-    """A message that names the key of the first invalid value, and what the value must be."""
-    first = error.errors()[0]
-    key = ".".join(str(name)[:60] for name in first["loc"])
-    if first["type"] == "extra_forbidden":
-        return f"{key}: there is no such key"
-    message = first["msg"].removeprefix("Value error, ")
-    return f"{key}: {message[0].lower()}{message[1:]}, not {shown(first['input'])}".removeprefix(": ")

@@ -26,7 +26,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 import spackle
 from spackle.bases.depth_map import SUFFIXES
 from spackle.bases.settings import AUTO, MISSING
-from spackle.errors import InputError, one_line
+from spackle.errors import InputError, first_problem, one_line
 from spackle.formats.html import page_file
 from spackle.image import PHOTO_SUFFIXES
 from spackle.task_process import Work
@@ -192,9 +192,7 @@ def accept(form: FormData, folder: Path, jobs: Jobs, bases: list[str]) -> Job:
     try:
         options = SceneOptions.model_validate_json(text)
     except ValidationError as error:
-        first = error.errors()[0]
-        line = f"{'.'.join(map(str, ('options', *first['loc'])))}: {first['msg']}"
-        raise HTTPException(422, one_line(line)) from error
+        raise HTTPException(422, one_line(f"options: {first_problem(error)}")) from error
     if options.base not in (None, *bases):
         why = MISSING.get(options.base or "", f"unknown: there are {', '.join(bases)}")
         raise HTTPException(422, one_line(f"base {options.base}: {why}"))
