@@ -108,7 +108,7 @@ def create_app(
         return job.model_copy(update={"files": [file for file in FILES if path_of(job, file).is_file()]})
 
     def job_of(id: str) -> Job:
-        if (job := jobs.get(id)) is None:
+        if (job := jobs.by_id.get(id)) is None:
             raise HTTPException(404, "there is no such scene")
         return job
 
@@ -143,7 +143,7 @@ def create_app(
         """Server-sent events: the state, now and whenever it changes, until the photo is done or failed."""
         seen: Job | None = None
         while seen is None or seen.ended is None:
-            if (state := jobs.get(id)) is None:
+            if (state := jobs.by_id.get(id)) is None:
                 yield SceneState(id=id, name="", state="failed", error="there is no such scene", ended=0)
                 return
             if state is not seen:

@@ -67,14 +67,10 @@ class Job(SceneState):
 
 
 class Jobs:
-    """The jobs in a folder, and the processes that work on them.
+    """The jobs in a folder, by id, and the processes that work on them; for the arguments see `create_app`.
 
-    Args:
-        folder: holds a folder for each job; InputError if another server uses it.
-        work: takes (job, file) and reports {stage, done, total} or {line}. If `file` is None, `work` makes a scene of
-            the photo; else it adds this file to a finished scene.
-        workers: number of processes for photos; another process adds files to finished scenes.
-        keep: limits of age, size and number, see `create_app`.
+    `work` takes (job, file) and reports {stage, done, total} or {line}. If `file` is None, `work` makes a scene of the
+    photo; else it adds this file to a finished scene, in one more process.
     """
 
     def __init__(self, folder: Path, work: Work, workers: int, keep: Keep) -> None:
@@ -82,7 +78,7 @@ class Jobs:
         self._held = contextlib.ExitStack()
         self._held.enter_context(results_folder(folder, alone=True))
         self._lock, self._closed = threading.RLock(), threading.Event()
-        self._jobs: dict[str, Job] = {}  # a change replaces a job by a new one
+        self.by_id: dict[str, Job] = {}  # a change replaces a job by a new one
         self._work, self._processes, self._of_thread = work, list[TaskProcess](), threading.local()
         self._running: dict[str, TaskProcess] = {}  # by job
         self._photos, self._files = ThreadPoolExecutor(workers), ThreadPoolExecutor(1)
@@ -97,26 +93,23 @@ class Jobs:
                 shutil.rmtree(folder, ignore_errors=True)
             with contextlib.suppress(OSError, ValueError):
                 job = Job.model_validate_json((folder / RECORD).read_bytes())
-                self._jobs[job.id] = job.model_copy(update={"folder": folder})
-        for job in sorted(self._jobs.values(), key=lambda job: job.created):
+                self.by_id[job.id] = job.model_copy(update={"folder": folder})
+        for job in sorted(self.by_id.values(), key=lambda job: job.created):
             if job.ended is None:
                 self._change(job.id, state="queued")
                 self._photos.submit(self._run, job.id)
 
-    def get(self, id: str) -> Job | None:
-        return self._jobs.get(id)
-
     def _change(self, id: str, **values: object) -> None:
         with self._lock:
-            if id in self._jobs:  # `remove` may have deleted the job
-                self._jobs[id] = self._jobs[id].model_copy(update=values)
+            if id in self.by_id:  # `remove` may have deleted the job
+                self.by_id[id] = self.by_id[id].model_copy(update=values)
 
     @contextlib.contextmanager
     def place(self) -> Iterator[Path]:
         """Reserve a place in the queue, and yield a folder that receives the photo; 429 if the queue is full."""
         folder = self.folder / f"{NEW}{secrets.token_hex(8)}"
         with self._lock:
-            waiting = len([*self.folder.glob(f"{NEW}*")]) + sum(job.state == "queued" for job in self._jobs.values())
+            waiting = len([*self.folder.glob(f"{NEW}*")]) + sum(job.state == "queued" for job in self.by_id.values())
             if waiting >= self.keep.waiting:
                 line = f"too many photos are waiting: try again in {RETRY_S} seconds"
                 raise HTTPException(429, line, {"Retry-After": str(RETRY_S)})
@@ -131,7 +124,7 @@ class Jobs:
         id = folder.name.removeprefix(NEW)
         job = Job(id=id, name=name, source=source, depth=depth, options=options, folder=folder)
         job.save()
-        self._jobs[id] = job = job.model_copy(update={"folder": folder.rename(self.folder / id)})
+        self.by_id[id] = job = job.model_copy(update={"folder": folder.rename(self.folder / id)})
         self._photos.submit(self._run, id)
         return job
 
@@ -142,7 +135,7 @@ class Jobs:
     def remove(self, id: str) -> None:
         """Delete a job and its files, and kill the process that works on it."""
         with self._lock:
-            job = self._jobs.pop(id, None)
+            job = self.by_id.pop(id, None)
             if process := self._running.pop(id, None):
                 process.kill()
         if job:
@@ -172,10 +165,10 @@ class Jobs:
         """Give a photo to the thread's process, and wait for the scene."""
         process = self._process()
         with self._lock:
-            if self._closed.is_set() or id not in self._jobs:
+            if self._closed.is_set() or id not in self.by_id:
                 return
             self._change(id, state="running")
-            self._running[id], job = process, self._jobs[id]
+            self._running[id], job = process, self.by_id[id]
         try:
             shutil.rmtree(job.results, ignore_errors=True)
             job.results.mkdir()
@@ -200,7 +193,7 @@ class Jobs:
     def _end(self, id: str, error: str | None) -> None:
         """Record a job's end on the disk, then tell clients; delete the photo."""
         with self._lock:
-            if (job := self._jobs.get(id)) is None:
+            if (job := self.by_id.get(id)) is None:
                 return
             end = {"state": "failed" if error else "done", "error": error, "ended": time.time()}
             ended = job.model_copy(update={**end, "stage": None, "share": None})
@@ -209,7 +202,7 @@ class Jobs:
                 for file in (job.source, job.depth):
                     if file is not None and not os.path.isabs(file):
                         (job.folder / file).unlink(missing_ok=True)
-            self._jobs[id] = ended
+            self.by_id[id] = ended
         if error:
             LOG.error("error: %s", error)
 
@@ -222,7 +215,7 @@ class Jobs:
         """Remove jobs that are too old, and the oldest jobs while the folder is too large."""
         ended = [
             (job.ended, sum(file.stat().st_size for file in job.folder.rglob("*")), job.id)
-            for job in [*self._jobs.values()]
+            for job in [*self.by_id.values()]
             if job.ended
         ]
         total = sum(size for _, size, _ in ended)
