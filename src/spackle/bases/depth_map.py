@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 import math
 import os
@@ -388,13 +389,15 @@ def _png_values(image: Image.Image, path: StrPath, grey: bool) -> Array:
 
 def _read_npy(file: IO[bytes], path: StrPath) -> Array:
     """Read one array without unpickling; the header's size must match the bytes that the file holds."""
-    old = np.lib.format.read_magic(file) == (1, 0)
+    start = io.BytesIO(file.read(1 << 16))  # a damaged header may announce 4 GB of itself
+    old = np.lib.format.read_magic(start) == (1, 0)
     read_header = np.lib.format.read_array_header_1_0 if old else np.lib.format.read_array_header_2_0
-    shape, fortran, dtype = read_header(file)
+    shape, fortran, dtype = read_header(start)
     if dtype.kind not in "fiu":
         raise InputError(f"{path}: an array of {dtype} is not a depth map: give float32 metres")
     _check_size(shape, path)
-    values = np.frombuffer(file.read(math.prod(shape) * dtype.itemsize), dtype)
+    count = math.prod(shape)
+    values = np.frombuffer(start.read() + file.read(count * dtype.itemsize), dtype, count)
     return np.ascontiguousarray(values.reshape(shape, order="F" if fortran else "C"), dtype.newbyteorder("="))
 
 
@@ -431,7 +434,7 @@ def _read_exr(file: IO[bytes], path: StrPath) -> Array:
     for channel in channels:
         data[listed.start + channel.end(1) - 1] = ord("Y" if channel is depth else "?")
     decoder = VideoCodecContext.create("exr", "r")
-    decoder.options = {"layer": depth[1][:-1].decode()}
+    decoder.options = {"layer": depth[1][:-1].decode(), "threads": "1"}  # threads would live as long as an error
     picture = decoder.decode(av.Packet(bytes(data)))[0]
     if picture.format.name not in ("grayf16le", "grayf32le"):
         raise InputError(f"{path}: an EXR of integers: give metres as half or float")
