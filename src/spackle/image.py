@@ -124,9 +124,9 @@ def photo_of_picture(
             rgb = _to_rgb(_upright(picture), path)
     else:
         values = picture.detach().cpu() if isinstance(picture, Tensor) else torch.from_numpy(np.array(picture))
-        if values.ndim != 3 or (values.shape[0] == 3) == (values.shape[2] == 3) or not values.numel():
+        if values.ndim != 3 or 3 not in (values.shape[0], values.shape[2]) or not values.numel():
             raise InputError(f"{path}: a picture of shape {shown(tuple(values.shape))}: give [H, W, 3] or [3, H, W]")
-        values = values.movedim(0, 2) if values.shape[0] == 3 else values
+        values = values if values.shape[2] == 3 else values.movedim(0, 2)
         check_pixels(values.shape[1], values.shape[0], MAX_PIXELS, path)
         if values.dtype != torch.uint8 and not values.is_floating_point():
             raise InputError(f"{path}: colours as {values.dtype}: give uint8, or floats from 0 to 1")

@@ -213,12 +213,13 @@ class Scene:
         pixels = None if size is None else parse_size(size if isinstance(size, str) else "x".join(map(str, size)))
         with tempfile.TemporaryDirectory() as folder:
             file = Path(target) if named else Path(folder) / f"video.{format or 'mp4'}"  # type: ignore[arg-type]
-            check_video(file, fps, loop)
+            shown = file if named else Path(file.name)
+            check_video(shown, fps, loop)
             video = VideoOptions(None, fps, loop, pixels, fit, show, stereo, ipd, convergence, compare).for_file(file)
             path = PathOptions(trajectory, disparity, None, None, frames, seconds, video, overscan)
             path.check()
             cameras = path.fly(self.base, self.camera, None, self.disparity)
-            maker = FrameMaker.of(video, self.base, cameras, file)
+            maker = FrameMaker.of(video, self.base, cameras, shown)
             parts = [[self.base]] * compare + [[self.base, self.aux]]
             used = renderer or get_renderer()
             save_video((maker.render(parts, camera, used)[0] for camera in cameras), file, fps, loop)

@@ -7,7 +7,7 @@ import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, cast
+from typing import Literal, cast, get_args
 
 import torch
 from torch import Tensor
@@ -16,7 +16,7 @@ from torch.nn.functional import adaptive_avg_pool2d, interpolate
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange
 from spackle.color import DepthColors, linear_to_srgb, srgb_to_linear
-from spackle.errors import InputError
+from spackle.errors import InputError, check_name
 from spackle.formats.video import FORMATS, check_video
 from spackle.gaussians import Gaussians
 from spackle.render.protocol import Renderer, Rendering
@@ -135,7 +135,11 @@ class VideoOptions:
         return FORMATS[self.suffix].loop if self.loop is None else self.loop
 
     def check(self) -> None:
-        """Raise an InputError for options that contradict each other."""
+        """Raise an InputError for unknown names, and for options that contradict each other."""
+        check_name("--fit", self.fit, get_args(Fit))
+        check_name("--show", self.show, get_args(Show))
+        if self.stereo is not None:
+            check_name("--stereo", self.stereo, get_args(StereoLayout))
         for option, loop in ((f"--fps {self.rate:g}", None), (f"--loop {self.loop}", self.loop)):
             try:
                 check_video(name := f"video{self.suffix}", self.rate, loop)

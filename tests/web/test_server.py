@@ -76,7 +76,7 @@ def test_the_interface_is_described(server: Served) -> None:
         ('{"disparity": 3}', "disparity"),
         ('{"files": ["../../etc/passwd"]}', "files"),
         ('{"path": 1}', "path: there is no such key"),
-        ('{"base": "hf:/etc"}', "base hf:/etc: unknown"),
+        ('{"base": "hf:/etc"}', "base hf:/etc on this server: unknown"),
         ('{"base": "sharp"}', "`spackle weights get sharp`"),
     ],
 )

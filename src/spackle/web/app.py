@@ -195,7 +195,7 @@ def accept(form: FormData, folder: Path, jobs: Jobs, bases: list[str]) -> Job:
         raise HTTPException(422, one_line(f"options: {first_problem(error)}")) from error
     if options.base not in (None, *bases):
         why = MISSING.get(options.base or "", f"unknown: there are {', '.join(bases)}")
-        raise HTTPException(422, one_line(f"base {options.base}: {why}"))
+        raise HTTPException(422, one_line(f"base {options.base} on this server: {why}"))
     source, of_depth = _saved(photo, folder, "source", name, PHOTO_SUFFIXES), None
     if isinstance(depth, UploadFile) and depth.filename:
         of_depth = _saved(depth, folder, "depth", "depth map", SUFFIXES)

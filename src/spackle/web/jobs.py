@@ -124,7 +124,8 @@ class Jobs:
         id = folder.name.removeprefix(NEW)
         job = Job(id=id, name=name, source=source, depth=depth, options=options, folder=folder)
         job.save()
-        self.by_id[id] = job = job.model_copy(update={"folder": folder.rename(self.folder / id)})
+        with self._lock:  # `place` counts folders and jobs
+            self.by_id[id] = job = job.model_copy(update={"folder": folder.rename(self.folder / id)})
         self._photos.submit(self._run, id)
         return job
 
