@@ -23,7 +23,7 @@ BOTH = [
     ("--size 2:3", "--size 2:3: give width and height up to 8192, such as 1280x720, 16:9"),
     ("--overscan 0.6", "--overscan must be between 0 and 0.5"),
     ("--disparity 3", "--disparity"),
-    ("--trajectory rotate_back", "'rotate_back' is not one of 'swipe', 'shake', 'rotate', 'rotate-forward'"),
+    ("--trajectory rotate_back", "'--trajectory': 'rotate_back' is not one of 'swipe', 'shake', 'rotate'"),
     ("--path bad.json", "bad.json: keyframe 1: eye and target coincide"),
     ("--path good.json --disparity 0.2", "--disparity 0.2"),
     ("--path good.json --cameras views.json", "--cameras"),

@@ -88,7 +88,7 @@ def main() -> None:
         if type(error).__name__ == "NoArgsIsHelpError":  # no arguments: print the help
             print(error.format_message(), file=sys.stderr)
             sys.exit(2)
-        _fail(error.format_message())
+        _fail(error.format_message().replace("Value error, ", ""))  # pydantic's words, which typer keeps
     except OSError as error:
         if error.filename is not None:
             raise
