@@ -46,8 +46,8 @@ SIZES = [(48, 64), (47, 65)]
 def test_a_video_decodes_to_what_went_in_and_plays_while_it_loads(
     tmp_path: Path, name: str, codec: str, index: bytes, height: int, width: int
 ) -> None:
-    given, path = frames(7, height, width), tmp_path / name
-    save_video(iter(given), path, fps=25, loop=2)
+    given, path, reused = frames(7, height, width), tmp_path / name, torch.empty(height, width, 3, dtype=torch.uint8)
+    save_video((reused.copy_(255 * frame) for frame in given), path, fps=25, loop=2)
     kind, shown, colors = decoded(path)
     assert kind == codec
     assert [round(frame.time * 25) for frame in shown] == list(range(14))  # each repetition is stored

@@ -140,7 +140,8 @@ class VideoWriter:
             most = f"at most {MAX_GIF_PIXELS // 10**6} megapixels in all frames of a GIF"
             raise InputError(f"{self.path}: {most}: write an mp4, or fewer or smaller frames")
         self._wait(QUEUE - 1)
-        self._encoding.append(self._aside.submit(self._encoder.add, to_bytes(frame).numpy()))
+        pixels = np.array(to_bytes(frame).numpy())  # a copy, because the caller may reuse a frame of bytes
+        self._encoding.append(self._aside.submit(self._encoder.add, pixels))
         self.frames += 1
 
     def _wait(self, most: int) -> None:
