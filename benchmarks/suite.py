@@ -55,7 +55,7 @@ from spackle.scene_fill import FillContext, fill_scene, fill_view
 LIMIT_RUNS = 7  # the least number of runs, of which the fastest counts
 MATRIX_SIDE, COPY_MB = 2048, 256
 PRODUCT, COPY = "matrix product, {}", "copy of memory"
-RENDER_STAGES = ("project", "sort", "bin", "blend")
+RENDER_STAGES = ("project", "bin", "sort", "blend")
 GAUSSIAN_BYTES, PIXEL_BYTES = 4 * (3 + 4 + 3 + 1 + 3), 4 * (3 + 1 + 1)
 VIDEO_RUNS, FRAMES, DISPARITY = 3, 60, 0.3
 LIFT, COMPLETE, DRAW, ENCODE = "photo and depth to Gaussians", "completion of the path", "frames drawn", "video encoded"

@@ -36,8 +36,8 @@ def first_problem(error: Any) -> str:
         problem = "there is no such key"
     else:
         message = first["msg"].removeprefix("Value error, ")
-        given = "" if first["type"] in ("missing", "json_invalid") else f", not {shown(first['input'])}"
-        problem = f"{message[0].lower()}{message[1:]}{given}"
+        quoted = first["type"] not in ("missing", "json_invalid", "too_long", "too_short")
+        problem = f"{message[0].lower()}{message[1:]}" + f", not {shown(first['input'])}" * quoted
     return ": ".join(filter(None, (".".join(str(name)[:60] for name in first["loc"]), problem)))
 
 

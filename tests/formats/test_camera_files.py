@@ -115,7 +115,7 @@ def test_a_bad_file_is_refused_with_the_reason(tmp_path: Path, content: Any, say
     with pytest.raises(InputError) as caught:
         (load_path if "keyframes" in content else load_cameras)(path)
     assert str(caught.value).startswith(f"{path}: ")
-    assert says in str(caught.value)
+    assert (says in str(caught.value), str(caught.value).count(", not ") < 2) == (True, True)
 
 
 def test_a_file_that_is_missing_or_too_large_is_refused(tmp_path: Path) -> None:

@@ -74,7 +74,7 @@ def test_the_interface_is_described(server: Served) -> None:
     [
         ("{", "options: invalid JSON"),
         ('{"disparity": 3}', "disparity"),
-        ('{"files": ["../../etc/passwd"]}', "files"),
+        ('{"files": ["../../etc/passwd"]}', "files.0: input should be 'scene.ply'"),
         ('{"path": 1}', "path: there is no such key"),
         ('{"base": "hf:/etc"}', "base hf:/etc on this server: unknown"),
         ('{"base": "sharp"}', "`spackle weights get sharp`"),

@@ -143,13 +143,12 @@ def test_bad_files_and_options(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         refuses(run("view", tmp_path / name), name, why)
     photo = write_photo(tmp_path / "photo.png")
     refuses(run("view", photo, "--host", "0.0.0.0", "--no-token"), "--no-token")
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
+    with socket.create_server(("127.0.0.1", 0)) as taken:
         bad = ["--base shrap", "--disparity 7", "--fov 200", "--depth none.npy", f"--port {taken.getsockname()[1]}"]
         for option in (*bad, "-c no.safetensors", "--port 70000", "--host no.such.host.invalid"):
             name, value = option.split()
-            refuses(run("view", photo, name, value), value if name in ("--depth", "-c") else name)
+            refuses(done := run("view", photo, name, value), value if name in ("--depth", "-c") else name)
+            assert done.err.count("127.0.0.1") < 2
 
 
 def test_a_service_ends_at_once_whatever_it_is_at(tmp_path: Path) -> None:

@@ -430,7 +430,8 @@ def _read_exr(file: IO[bytes], path: StrPath) -> Array:
     if last + 8 + int.from_bytes(data[last + 4 : last + 8], "little") > len(data):  # FFmpeg would read zeros
         raise EOFError("the last rows are missing")
     channels = list(re.finditer(rb"([^\0]+)\0.{16}", data[listed], re.DOTALL))
-    depth = max(channels, key=lambda each: (b"depth" in each[1].lower(), b"RYVZ".find(each[1][-1:])))
+    # The shortest of several names: Z, not Normal.Z.
+    depth = max(channels, key=lambda each: (b"depth" in each[1].lower(), b"RYVZ".find(each[1][-1:]), -len(each[1])))
     for channel in channels:
         data[listed.start + channel.end(1) - 1] = ord("Y" if channel is depth else "?")
     decoder = VideoCodecContext.create("exr", "r")

@@ -150,7 +150,10 @@ def listener_at(host: str, port: int) -> socket.socket:
     ):
         family, *_ = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         both = family == socket.AF_INET6 and socket.has_dualstack_ipv6()
-        listener = socket.create_server((host, port), family=family, backlog=128, dualstack_ipv6=both)
+        try:
+            listener = socket.create_server((host, port), family=family, backlog=128, dualstack_ipv6=both)
+        except OSError as error:  # whose text names the address, too
+            raise OSError(error.errno, os.strerror(error.errno or 0)) from error
         # Finds the protocol, without which asyncio would not avoid delays of 40 ms (TCP_NODELAY).
         return socket.socket(fileno=listener.detach())
 

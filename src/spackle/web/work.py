@@ -38,7 +38,7 @@ Video = Literal[
     "video.mp4", "swipe.mp4", "shake.mp4", "rotate.mp4", "rotate-forward.mp4", "vertical.mp4", "orbit.mp4",
     "dolly-zoom.mp4",
 ]  # fmt: skip
-FileName = Download | Video
+FileName = Literal[Download, Video]  # one list, so that a refusal names all
 MADE: list[FileName] = ["scene.ply", "scene.spz", "scene.glb", "scene.html", "video.mp4", "report.json"]  # the default
 PAGE, PREVIEW, SIDE = "page.json", "photo.jpg", 1280  # pixels of the preview's long side
 # The formats that Pillow may decode: for EPS, for example, Pillow would start another program.
