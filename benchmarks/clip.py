@@ -21,20 +21,20 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from spackle.bases.depth_map import DepthMap
-from spackle.bases.lift import lift
-from spackle.camera import Camera
+from spackle.bases.depth import lift
 from spackle.clips.complete import ClipCompleter, CompletedView
 from spackle.clips.temporal import inside, pixel_grid, sample
-from spackle.color import srgb_to_linear
-from spackle.evaluation.datasets.stereo import load_motorcycle
-from spackle.gaussians import Gaussians
+from spackle.core.camera import Camera
+from spackle.core.color import srgb_to_linear
+from spackle.core.gaussians import Gaussians
+from spackle.core.surfels import surface_gaussians
+from spackle.depth.depth_map import DepthMap
 from spackle.inpaint.plain import OpenCV
+from spackle.paper.evaluation.datasets.stereo import load_motorcycle
 from spackle.render import get_renderer
 from spackle.render.protocol import Rendering
 from spackle.residual.architectures import shipped_network
 from spackle.scene_fill import FillContext, fill_scene
-from spackle.surface import surface_gaussians
 
 BOARD_M, FOCUS_M = 1.5, 3.0
 DISPARITY = 0.3
@@ -55,7 +55,9 @@ class World(NamedTuple):
 
 
 Eye = tuple[float, float, float]
-CLIPS: dict[str, tuple[Eye, float]] = {  # in metres: where the camera ends, how far the board moves right
+CLIPS: dict[
+    str, tuple[Eye, float]
+] = {  # in metres: where the camera ends, how far the board moves right
     "pan past a board": ((0.20, 0.0, 0.0), 0.0),
     "walk towards it": ((0.0, 0.0, 0.25), 0.0),
     "a board passes": ((0.0, 0.0, 0.0), 0.40),
@@ -75,7 +77,9 @@ def load_world(side: int) -> World:
     rows, columns = (((torch.arange(n) + 0.5) * step).long() for n in (height, side))
     camera = Camera.from_focal(float(pair.left_camera.focal[0]) / step, side, height)
     still = lift(rgb, depth_map(pair.depth.depth[rows][:, columns]), camera).gaussians
-    around = [moved(camera, (x, y, z)) for x in (-0.8, 0.8, 0.0) for y in (-0.8, 0.4) for z in (-0.4, 0.4)]
+    around = [
+        moved(camera, (x, y, z)) for x in (-0.8, 0.8, 0.0) for y in (-0.8, 0.4) for z in (-0.4, 0.4)
+    ]
     aux = fill_scene(FillContext(still, camera, get_renderer()), around, exact=True).aux
     return World(Gaussians.cat([still, aux]), board(camera), camera)
 
@@ -88,12 +92,20 @@ def depth_map(depth: Tensor) -> DepthMap:
 def board(camera: Camera) -> Gaussians:
     """A board in the left half of the picture, painted with stripes."""
     height, width = camera.height, camera.width
-    uv = camera.pixel_centers()[height // 4 : height * 3 // 4, width // 5 : width * 2 // 5].reshape(-1, 2)
+    uv = camera.pixel_centers()[height // 4 : height * 3 // 4, width // 5 : width * 2 // 5].reshape(
+        -1, 2
+    )
     x, y = (uv / width).unbind(-1)
-    paint = [0.7 + 0.2 * torch.sin(90 * x), 0.35 + 0.2 * torch.sin(60 * y), 0.25 + 0.1 * torch.sin(70 * (x + y))]
+    paint = [
+        0.7 + 0.2 * torch.sin(90 * x),
+        0.35 + 0.2 * torch.sin(60 * y),
+        0.25 + 0.1 * torch.sin(70 * (x + y)),
+    ]
     flat = torch.full((len(uv),), 1 / BOARD_M)
     colors = srgb_to_linear(torch.stack(paint, -1))
-    return surface_gaussians(camera, uv, flat, torch.zeros(len(uv), 2), 0.7, colors, torch.full((len(uv),), 0.99))
+    return surface_gaussians(
+        camera, uv, flat, torch.zeros(len(uv), 2), 0.7, colors, torch.full((len(uv),), 0.99)
+    )
 
 
 def moved(camera: Camera, eye: Eye) -> Camera:
@@ -107,19 +119,28 @@ def said_depth(depth: Tensor, dice: torch.Generator) -> Tensor:
     waves = torch.randn(1, 1, 4, 6, generator=dice)
     waves = torch.nn.functional.interpolate(waves, size=depth.shape, mode="bicubic")[0, 0]
     inverse = (1 / depth) * (SCALE_NOISE * rolls[0] + WAVE_NOISE * waves).exp()
-    return 1 / (inverse + SHIFT_NOISE * float(inverse.median()) * rolls[1]).clamp_min(0.1 * float(inverse.median()))
+    return 1 / (inverse + SHIFT_NOISE * float(inverse.median()) * rolls[1]).clamp_min(
+        0.1 * float(inverse.median())
+    )
 
 
-def play(world: World, clip: str, frames: int, noisy: bool, steady: bool) -> Iterator[tuple[CompletedView, Truth]]:
+def play(
+    world: World, clip: str, frames: int, noisy: bool, steady: bool
+) -> Iterator[tuple[CompletedView, Truth]]:
     """Yield each frame's completed view and true view."""
     renderer, dice = get_renderer(), torch.Generator().manual_seed(0)
     path, flow, network = PATH * frames, OpenCV("this").flow, shipped_network()
-    completer = ClipCompleter("rotate", DISPARITY, path, renderer, flow, align=steady, network=network)
+    completer = ClipCompleter(
+        "rotate", DISPARITY, path, renderer, flow, align=steady, network=network
+    )
     for index in range(frames):
         part, ((x, y, z), board_m) = index / max(1, frames - 1), CLIPS[clip]
         shift = torch.eye(4)
         shift[0, 3] = board_m * part
-        scene, camera = [world.still, world.board.transform(shift)], moved(world.camera, (part * x, part * y, part * z))
+        scene, camera = (
+            [world.still, world.board.transform(shift)],
+            moved(world.camera, (part * x, part * y, part * z)),
+        )
         taken = renderer.render(scene, camera)
         depth = said_depth(taken.depth, dice) if noisy else taken.depth
         own = dataclasses.replace(camera, world_to_camera=torch.eye(4))
@@ -154,7 +175,9 @@ def judge(world: World, clip: str, frames: int, noisy: bool) -> Sums:
         sums["holes"].append(runs[0][0].hole)
         for name, (drawn, (_, truth)) in now.items():
             view = drawn.alone if name == "alone" else drawn.view
-            sums[f"{name} off"].append((view.rgb - truth.rgb)[drawn.hole & (truth.alpha > 0.99)].square())
+            sums[f"{name} off"].append(
+                (view.rgb - truth.rgb)[drawn.hole & (truth.alpha > 0.99)].square()
+            )
             if past:
                 compare(sums, name, now[name], past[name])
         past = now
@@ -168,35 +191,64 @@ def flicker(view: Tensor, earlier: Tensor, flow: Tensor, chosen: Tensor) -> floa
     """
     uv = pixel_grid(flow) + flow
     chosen = chosen & inside(uv, *chosen.shape)
-    return float((view - sample(earlier, uv)).abs().mean(-1)[chosen].mean()) if bool(chosen.any()) else None
+    return (
+        float((view - sample(earlier, uv)).abs().mean(-1)[chosen].mean())
+        if bool(chosen.any())
+        else None
+    )
 
 
-def compare(sums: Sums, name: str, now: tuple[CompletedView, Truth], was: tuple[CompletedView, Truth]) -> None:
+def compare(
+    sums: Sums, name: str, now: tuple[CompletedView, Truth], was: tuple[CompletedView, Truth]
+) -> None:
     """Add the flicker of a view's holes and of its visible pixels to `sums`."""
     (drawn, truth), (earlier, before) = now, was
     flow, same = true_flow(truth, before)
     held = sample(earlier.hole[..., None].float(), pixel_grid(flow) + flow)[..., 0]
     view, view_before = (d.alone if name == "alone" else d.view for d in (drawn, earlier))
-    for kind, chosen in (("hole", drawn.hole & (held > 0.999)), ("seen", ~drawn.hole & (held < 0.001))):
+    for kind, chosen in (
+        ("hole", drawn.hole & (held > 0.999)),
+        ("seen", ~drawn.hole & (held < 0.001)),
+    ):
         value = flicker(view.rgb, view_before.rgb, flow, chosen & same)
         if value is not None:
             sums[f"{name} {kind}"].append(torch.full((int((chosen & same).sum()),), 255 * value))
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--side", type=int, default=384, help="pixels along the frame's longer side")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--side", type=int, default=384, help="pixels along the frame's longer side"
+    )
     parser.add_argument("--frames", type=int, default=24)
     options = parser.parse_args()
     world = load_world(options.side)
-    heads = ("depth", "holes", "seen", "alone", "carried", "ratio", "alone dB", "carried dB")  # PSNR in the holes
+    heads = (
+        "depth",
+        "holes",
+        "seen",
+        "alone",
+        "carried",
+        "ratio",
+        "alone dB",
+        "carried dB",
+    )  # PSNR in the holes
     print(f"{'clip':18}", *(f"{head:>10}" for head in heads))
     for noisy in (False, True):
         for clip in CLIPS:
             sums = judge(world, clip, options.frames, noisy)
             alone, carried = mean(sums["alone hole"]), mean(sums["carried hole"])
-            figures: tuple[float, ...] = (mean(sums["carried seen"]), alone, carried, carried / alone)
-            figures += tuple(-10 * math.log10(mean(sums[f"{name} off"])) for name in ("alone", "carried"))
+            figures: tuple[float, ...] = (
+                mean(sums["carried seen"]),
+                alone,
+                carried,
+                carried / alone,
+            )
+            figures += tuple(
+                -10 * math.log10(mean(sums[f"{name} off"])) for name in ("alone", "carried")
+            )
             cells = [
                 "noisy" if noisy else "exact",
                 f"{mean(sums['holes']):.1%}",

@@ -27,32 +27,32 @@ from suite_scenes import SIDE, commit, find_view, holed_scene, photo_scene
 
 from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.base import to_metric
-from spackle.camera import Camera
-from spackle.camera_path import DepthRange, extremes
-from spackle.device import Precision, hardware, versions
-from spackle.errors import InputError
-from spackle.evaluation.bench import TOTAL, Task, measure
-from spackle.files import write_whole
-from spackle.gaussians import Gaussians
-from spackle.image import Photo
+from spackle.core.camera import Camera
+from spackle.core.gaussians import Gaussians
+from spackle.core.photo import Photo
+from spackle.core.trajectories import DepthRange, extremes
+from spackle.paper.evaluation.bench import TOTAL, Task, measure
+from spackle.paper.training.losses import total_loss
+from spackle.paper.training.recipe import LossRecipe
+from spackle.paper.training.residual import complete_samples
+from spackle.paper.training.samples import Sample
 from spackle.render import CpuRenderer
 from spackle.render.cpu import project, wanted_tiles
-from spackle.render.cuda import GsplatRenderer, Material, load_gsplat
+from spackle.render.gsplat_backend import GsplatRenderer, Material, load_gsplat
 from spackle.render.project import KernelCamera
 from spackle.render.protocol import NEAR_PLANE, TILE, Rendering
 from spackle.residual import hole_area_ratio
 from spackle.residual.architectures import UNet, shipped_network
+from spackle.runtime.device import Precision, hardware, versions
+from spackle.runtime.errors import InputError
+from spackle.runtime.files import write_atomic
 from spackle.scene_fill import FillContext, fill_view
-from spackle.training.losses import total_loss
-from spackle.training.recipe import LossRecipe
-from spackle.training.residual import complete_samples
-from spackle.training.samples import Sample
 
 REPOSITORY = Path(__file__).parents[1]
 SKIPPED, LIMIT_S, RUNS = 77, 1200, 20
 CUDA = torch.device("cuda")
 CLOSE = 2e-4  # smaller differences in sRGB count as equal
-TESTS = "tests/render/test_cuda.py"
+TESTS = "tests/render/test_gsplat_backend.py"
 CROP, BATCH = 96, 8  # cells along a training crop; crops per step
 
 
@@ -74,7 +74,9 @@ def run(*command: str) -> Iterator[str]:
         raise Skip(f"there is no {command[0]} on the path")
     done = subprocess.run(command, capture_output=True, text=True, cwd=REPOSITORY)
     if done.returncode:
-        raise SystemExit(f"{' '.join(command)} ended with {done.returncode}:\n{(done.stdout + done.stderr)[-2000:]}")
+        raise SystemExit(
+            f"{' '.join(command)} ended with {done.returncode}:\n{(done.stdout + done.stderr)[-2000:]}"
+        )
     yield from done.stdout.splitlines()
 
 
@@ -84,7 +86,12 @@ def sharp(options: argparse.Namespace, precision: Precision = "fp32") -> tuple[S
         raise Skip("PyTorch sees no NVIDIA GPU on this machine")
     if options.checkpoint is None:
         raise Skip("no weights: give -c FILE")
-    photo = Photo(torch.rand(SIDE, SIDE, 3, generator=torch.Generator().manual_seed(0)), 1843.2, "", Path("photo.png"))
+    photo = Photo(
+        torch.rand(SIDE, SIDE, 3, generator=torch.Generator().manual_seed(0)),
+        1843.2,
+        "",
+        Path("photo.png"),
+    )
     base = SharpBase.load(options.checkpoint, precision=precision, device=CUDA)
     return base, photo
 
@@ -100,14 +107,18 @@ def rows(tasks: dict[str, Task], runs: int = RUNS) -> Iterator[str]:
     yield from ("", "| what | median |", "|---|---|")
     for (name, stage), times in measure(runs, tasks, CUDA).items():
         if stage == TOTAL:
-            low, median, high = torch.from_numpy(times).quantile(torch.tensor([0.25, 0.5, 0.75]).double()).tolist()
+            low, median, high = (
+                torch.from_numpy(times).quantile(torch.tensor([0.25, 0.5, 0.75]).double()).tolist()
+            )
             yield f"| {name} | {median:,.2f} ms ({low:,.2f} – {high:,.2f}) |"
 
 
 def machine(options: argparse.Namespace) -> Iterator[str]:
     """names driver, GPU, torch and the compiler"""
     yield f"torch {torch.__version__}, CUDA {torch.version.cuda}, sees a GPU: {torch.cuda.is_available()}"
-    yield from run("nvidia-smi", "--query-gpu=name,driver_version,memory.total,compute_cap", "--format=csv")
+    yield from run(
+        "nvidia-smi", "--query-gpu=name,driver_version,memory.total,compute_cap", "--format=csv"
+    )
     yield from list(run("nvcc", "--version"))[-2:]
 
 
@@ -151,7 +162,9 @@ def against_cpu(options: argparse.Namespace) -> Iterator[str]:
         )[0][0]  # fmt: skip
         here = (radii > 0).all(-1).cpu()
         lens = KernelCamera.of(camera, 0.0)
-        there = torch.from_numpy(project([scene], lens, wanted_tiles(lens, None))[0].boxes[: len(scene), 1] > 0)
+        there = torch.from_numpy(
+            project([scene], lens, wanted_tiles(lens, None))[0].boxes[: len(scene), 1] > 0
+        )
         yield (
             f"{len(scene):,} Gaussians: {float((apart < CLOSE).float().mean()):.4%} of pixels within {CLOSE:g}, worst "
             f"{float(apart.max()):.1e}; drawn by the GPU alone {int((here & ~there).sum()):,}, by the processor alone "
@@ -218,7 +231,9 @@ def speed(options: argparse.Namespace) -> Iterator[str]:
 
     yield from rows(
         {
-            "view: scene on the GPU, another camera each turn": lambda _: gpu.render(there, next(eyes)),
+            "view: scene on the GPU, another camera each turn": lambda _: gpu.render(
+                there, next(eyes)
+            ),
             "view, and some of its tiles once more with 30,000 Gaussians": again,
             "8 views in one batch": lambda _: gpu.render_batch([[there]] * 8, cameras * 4),
             "view: the scene comes from the processor, the picture goes back": lambda _: gpu.render(
@@ -238,14 +253,19 @@ def training(options: argparse.Namespace) -> Iterator[str]:
     whole = Sample.of(scene, CpuRenderer().render(scene, view), view, camera, photo, target)
     cells = whole.features.mask[:-CROP, :-CROP].nonzero()
     picked = cells[torch.linspace(0, len(cells) - 1, BATCH).long()].tolist()
-    crops = [whole.crop(max(row - CROP // 2, 0), max(column - CROP // 2, 0), CROP, CROP) for row, column in picked]
+    crops = [
+        whole.crop(max(row - CROP // 2, 0), max(column - CROP // 2, 0), CROP, CROP)
+        for row, column in picked
+    ]
 
     def task(device: torch.device, drawer: GsplatRenderer | CpuRenderer) -> Callable[[], object]:
         network = UNet().to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
 
         def step() -> None:
             done = complete_samples(network, crops, drawer)
-            tensors = {name: tensor.to(device, non_blocking=True) for name, tensor in vars(done).items()}
+            tensors = {
+                name: tensor.to(device, non_blocking=True) for name, tensor in vars(done).items()
+            }
             total_loss(**tensors, recipe=LossRecipe())[0].backward()  # type: ignore[no-untyped-call]
 
         return step
@@ -254,7 +274,9 @@ def training(options: argparse.Namespace) -> Iterator[str]:
     places = counted_waits(here)
     yield f"{len(places)} waits: {', '.join(places)}"
     there = task(torch.device("cpu"), CpuRenderer())
-    yield from rows({f"GPU: {BATCH} crops of {2 * CROP}²": lambda _: here(), "processor": lambda _: there()}, 5)
+    yield from rows(
+        {f"GPU: {BATCH} crops of {2 * CROP}²": lambda _: here(), "processor": lambda _: there()}, 5
+    )
 
 
 def completion(options: argparse.Namespace) -> Iterator[str]:
@@ -262,7 +284,9 @@ def completion(options: argparse.Namespace) -> Iterator[str]:
     gpu = renderer()
     scene, camera = holed_scene()
     view = find_view(scene, camera, gpu)[1]
-    contexts = [FillContext(scene, camera, drawer, shipped_network()) for drawer in (gpu, CpuRenderer())]
+    contexts = [
+        FillContext(scene, camera, drawer, shipped_network()) for drawer in (gpu, CpuRenderer())
+    ]
     found = [fill_view(context, view).aux for context in contexts]
     one, other = (CpuRenderer().render([scene, aux], view) for aux in found)
     apart = float((one.rgb - other.rgb).abs().mean())
@@ -289,17 +313,46 @@ def suite(options: argparse.Namespace) -> Iterator[str]:
     renderer()
     with tempfile.TemporaryDirectory() as folder:
         weights = [] if options.checkpoint is None else ["-c", str(options.checkpoint)]
-        asked = ["--device", "cuda", "--only", "limits,completion,photo,video" + (",sharp" if weights else "")]
-        list(run(sys.executable, str(REPOSITORY / "benchmarks" / "suite.py"), *asked, *weights, "-o", folder))
+        asked = [
+            "--device",
+            "cuda",
+            "--only",
+            "limits,completion,photo,video" + (",sharp" if weights else ""),
+        ]
+        list(
+            run(
+                sys.executable,
+                str(REPOSITORY / "benchmarks" / "suite.py"),
+                *asked,
+                *weights,
+                "-o",
+                folder,
+            )
+        )
         yield from (Path(folder) / "suite.md").read_text(encoding="utf-8").splitlines()[2:]
 
 
-STEPS = (machine, build, empty, parity, against_cpu, sanitizer, waits, precisions, training, speed, completion, suite)
+STEPS = (
+    machine,
+    build,
+    empty,
+    parity,
+    against_cpu,
+    sanitizer,
+    waits,
+    precisions,
+    training,
+    speed,
+    completion,
+    suite,
+)
 
 
 def main(arguments: Sequence[str]) -> int:
     """Run the steps; returns 0 unless one failed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("-o", "--output", type=Path, default=Path("gpu.md"))
     parser.add_argument("-c", "--checkpoint", type=Path)
     parser.add_argument("--only", default=",".join(step.__name__ for step in STEPS))
@@ -318,7 +371,11 @@ def main(arguments: Sequence[str]) -> int:
     if unknown := set(chosen) - set(steps):
         parser.error(f"--only {', '.join(sorted(unknown))}: the steps are {', '.join(steps)}")
     facts = {**hardware(CUDA if torch.cuda.is_available() else torch.device("cpu")), **versions()}
-    lines = ["## A GPU", "", f"{', '.join(f'{key} {value}' for key, value in facts.items())}; commit {commit()}."]
+    lines = [
+        "## A GPU",
+        "",
+        f"{', '.join(f'{key} {value}' for key, value in facts.items())}; commit {commit()}.",
+    ]
     failed = 0
     for name in chosen:
         start, command = time.perf_counter(), [sys.executable, __file__, *arguments, "--step", name]
@@ -331,10 +388,15 @@ def main(arguments: Sequence[str]) -> int:
         state = {0: "done", SKIPPED: "skipped"}.get(code, f"FAILED (exit status {code})")
         print(f"{name}: {state}, {seconds:.0f} s", file=sys.stderr)
         failed += code not in (0, SKIPPED)
-        lines += ["", f"**{name}** must show: {steps[name].__doc__}. {state}, {seconds:.0f} s.", "", said]
+        lines += [
+            "",
+            f"**{name}** must show: {steps[name].__doc__}. {state}, {seconds:.0f} s.",
+            "",
+            said,
+        ]
         if code not in (0, SKIPPED):
             lines += ["", "```", log[-2000:].strip(), "```"]
-        write_whole(options.output, ("\n".join(lines).strip() + "\n").encode())
+        write_atomic(options.output, ("\n".join(lines).strip() + "\n").encode())
     return int(failed > 0)
 
 

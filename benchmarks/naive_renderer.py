@@ -11,13 +11,13 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from spackle.camera import Camera
-from spackle.device import run_chunks
-from spackle.evaluation.bench import Lap
-from spackle.gaussians import Gaussians
+from spackle.core.camera import Camera
+from spackle.core.gaussians import Gaussians
+from spackle.paper.evaluation.bench import Lap
 from spackle.render.cpu import BLEND_GRAIN, PROJECT_GRAIN
 from spackle.render.project import KernelCamera, covariance
 from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, NEAR_PLANE, TILE, TRANSMITTANCE_STOP
+from spackle.runtime.device import run_chunks
 
 Array = npt.NDArray[Any]
 Arrays = tuple[Array, ...]  # a scene's five tensors
@@ -27,7 +27,9 @@ def naive_render(scene: Gaussians, camera: Camera, lap: Lap = lambda name: None)
     """Render Gaussians to [H, W, 3] sRGB, with `eps2d` 0; depth and alpha are computed too, as in ours."""
     tensors, view = tuple(t.numpy() for t in scene.tensors), KernelCamera.of(camera, 0.0)
     splats, boxes = np.empty((len(scene), 6), np.float32), np.zeros((len(scene), 4), np.int32)
-    run_chunks(lambda a, b: naive_project(a, b, tensors, view, splats, boxes), len(scene), PROJECT_GRAIN)
+    run_chunks(
+        lambda a, b: naive_project(a, b, tensors, view, splats, boxes), len(scene), PROJECT_GRAIN
+    )
     lap("project")
     order = np.argsort(splats[:, 2], kind="stable")
     lap("sort")
@@ -35,19 +37,28 @@ def naive_render(scene: Gaussians, camera: Camera, lap: Lap = lambda name: None)
     lap("bin")
     images = np.zeros((view.height, view.width, 5), np.float32)
     run_chunks(
-        lambda a, b: naive_blend(a, b, tensors, splats, boxes, starts, ids, images), len(starts) - 1, BLEND_GRAIN
+        lambda a, b: naive_blend(a, b, tensors, splats, boxes, starts, ids, images),
+        len(starts) - 1,
+        BLEND_GRAIN,
     )
     lap("blend")
     return torch.from_numpy(images[..., :3])
 
 
 @numba.njit(nogil=True, cache=True)
-def naive_project(first: int, last: int, scene: Arrays, view: KernelCamera, splats: Array, boxes: Array) -> None:
+def naive_project(
+    first: int, last: int, scene: Arrays, view: KernelCamera, splats: Array, boxes: Array
+) -> None:
     """Write centre, depth and inverse covariance [N, 6], and pixel boxes [N, 4], of the Gaussians first..last."""
     means, quats, scales, opacities, _ = scene
     lens, pose, width, height, _ = view
     for i in range(first, last):
-        x, y, z = pose[:, 0] * means[i, 0] + pose[:, 1] * means[i, 1] + pose[:, 2] * means[i, 2] + pose[:, 3]
+        x, y, z = (
+            pose[:, 0] * means[i, 0]
+            + pose[:, 1] * means[i, 1]
+            + pose[:, 2] * means[i, 2]
+            + pose[:, 3]
+        )
         splats[i, 2] = z
         if z < NEAR_PLANE or opacities[i] < ALPHA_MIN:
             continue
@@ -83,7 +94,14 @@ def naive_bin(order: Array, boxes: Array, rows: int, columns: int) -> tuple[Arra
 
 @numba.njit(nogil=True, fastmath=True, cache=True)
 def naive_blend(
-    first: int, last: int, scene: Arrays, splats: Array, boxes: Array, starts: Array, ids: Array, images: Array
+    first: int,
+    last: int,
+    scene: Arrays,
+    splats: Array,
+    boxes: Array,
+    starts: Array,
+    ids: Array,
+    images: Array,
 ) -> None:
     """Blend the tiles first..last into [H, W, 5], which is zero before: sRGB, depth and alpha."""
     opacities, colors = scene[3], scene[4]
@@ -99,7 +117,10 @@ def naive_blend(
                 for px in range(max(left, boxes[i, 0]), min(right, boxes[i, 1])):
                     if full[py - top, px - left]:
                         continue
-                    dx, dy = np.float32(px + 0.5) - splats[i, 0], np.float32(py + 0.5) - splats[i, 1]
+                    dx, dy = (
+                        np.float32(px + 0.5) - splats[i, 0],
+                        np.float32(py + 0.5) - splats[i, 1],
+                    )
                     square = splats[i, 3] * dx * dx + splats[i, 5] * dy * dy
                     power = np.float32(-0.5) * square - splats[i, 4] * dx * dy
                     alpha = min(np.float32(ALPHA_MAX), opacities[i] * np.exp(power))
@@ -123,4 +144,6 @@ def naive_blend(
                 for channel in range(3):
                     value = min(max(pixel[channel], np.float32(0)), np.float32(1))
                     power = np.float32(1.055) * value ** np.float32(1 / 2.4) - np.float32(0.055)
-                    pixel[channel] = np.float32(12.92) * value if value <= np.float32(0.0031308) else power
+                    pixel[channel] = (
+                        np.float32(12.92) * value if value <= np.float32(0.0031308) else power
+                    )

@@ -29,7 +29,9 @@ def deterministic_weights(shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Te
     Signals in the network neither die nor explode, and the Gaussians fill the picture.
     """
 
-    def made(name: str, shape: tuple[int, ...]) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
+    def made(
+        name: str, shape: tuple[int, ...]
+    ) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
         generator = np.random.Generator(np.random.Philox(zlib.crc32(name.encode())))
         x = generator.standard_normal(shape, dtype=np.float32)
         if name.endswith(("pos_embed", "cls_token")):
@@ -48,11 +50,15 @@ def deterministic_weights(shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Te
 def lama_weights(*size: int) -> dict[str, Tensor]:
     """`deterministic_weights` for LaMa's generator, of the given width and depth if any; variances are around one."""
     made = deterministic_weights(lama_shapes(*size))
-    return {name: 1 + 5 * x.abs() if name.endswith("running_var") else x for name, x in made.items()}
+    return {
+        name: 1 + 5 * x.abs() if name.endswith("running_var") else x for name, x in made.items()
+    }
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("file", type=Path, help="a name that ends in .pt or .safetensors")
     parser.add_argument("--size", choices=("full", "tiny", "micro", "lama"), default="full")
     words = parser.parse_args()

@@ -32,10 +32,12 @@ from torch.nn.functional import grid_sample, interpolate, unfold
 
 from spackle.bases.sharp.base import expected_shapes, load_network, to_square
 from spackle.bases.sharp.encoder import MICRO, WINDOWS
-from spackle.evaluation.datasets import stereo
+from spackle.paper.evaluation.datasets import stereo
 
 WIDTH, HEIGHT = 192, 144
-FOCAL = math.hypot(WIDTH, HEIGHT) * 30 / math.hypot(36, 24)  # the focal length assumed for photos without metadata
+FOCAL = (
+    math.hypot(WIDTH, HEIGHT) * 30 / math.hypot(36, 24)
+)  # the focal length assumed for photos without metadata
 WALL, OBJECT = 4.0, 2.2  # depths of a synthetic scene's two surfaces, in metres
 SIZE, LOW = 1.1, 0.1  # the object's size, and how far its middle is below the photo's, in metres
 EYES = (0.0, 0.35, -0.35)  # eyes' positions to the right, in metres; the first is the photo's
@@ -57,13 +59,22 @@ class Scene(NamedTuple):
         right, down = (x - WIDTH / 2) / FOCAL, (y - HEIGHT / 2) / FOCAL
         u, v = (OBJECT * right + eye) / SIZE, (OBJECT * down - LOW) / SIZE
         inside = u**4 + v**4 < 0.5**4
-        wall, front = painted(self.wall, (WALL * right + eye) / 8, WALL * down / 6), painted(self.front, u, v)
-        return np.where(inside[..., None], front, wall), np.where(inside, OBJECT, WALL).astype(np.float32)
+        wall, front = (
+            painted(self.wall, (WALL * right + eye) / 8, WALL * down / 6),
+            painted(self.front, u, v),
+        )
+        return np.where(inside[..., None], front, wall), np.where(inside, OBJECT, WALL).astype(
+            np.float32
+        )
 
 
 def painted(name: str, u: Array, v: Array) -> Array:
     """Colours [H, W, 3] of a picture at (u, v); (0, 0) is its middle, ±½ its border."""
-    picture = torch.from_numpy(np.atleast_3d(getattr(pictures, name)())[..., :3].copy()).float().movedim(-1, 0)
+    picture = (
+        torch.from_numpy(np.atleast_3d(getattr(pictures, name)())[..., :3].copy())
+        .float()
+        .movedim(-1, 0)
+    )
     place = torch.from_numpy(2 * np.stack([u, v], -1)).float()
     colors = grid_sample(picture[None], place[None], padding_mode="border", align_corners=False)[0]
     return colors.expand(3, -1, -1).movedim(0, -1).round().byte().numpy()
@@ -96,9 +107,15 @@ def middlebury(scene: Path) -> None:
     save(scene / "right.png", np.asarray(Image.fromarray(right).reduce(2)))
     np.save(scene / "disparity.npy", disparity[::2, ::2] / 2)
     facts = {"left": "left.png", "right": "right.png", "disparity": "disparity.npy"}
-    pixels = {"focal_px": stereo.MOTORCYCLE_FOCAL, "cx": stereo.MOTORCYCLE_CX, "cy": stereo.MOTORCYCLE_CY}
+    pixels = {
+        "focal_px": stereo.MOTORCYCLE_FOCAL,
+        "cx": stereo.MOTORCYCLE_CX,
+        "cy": stereo.MOTORCYCLE_CY,
+    }
     pixels["doffs_px"] = stereo.MOTORCYCLE_DOFFS
-    facts |= {name: value / 2 for name, value in pixels.items()} | {"baseline_m": stereo.MOTORCYCLE_BASELINE}
+    facts |= {name: value / 2 for name, value in pixels.items()} | {
+        "baseline_m": stereo.MOTORCYCLE_BASELINE
+    }
     (scene / "scene.json").write_text(json.dumps(facts))
 
 
@@ -121,7 +138,9 @@ def wildrgbd(scene: Path, made: Scene, scale: float = 0.2) -> None:
     for number, eye in enumerate(EYES):
         photo, depth = made.seen(eye)
         save(scene / "rgb" / f"{number:05d}.png", photo)
-        save(scene / "depth" / f"{number:05d}.png", (1000 * scale * depth).round().astype(np.uint16))
+        save(
+            scene / "depth" / f"{number:05d}.png", (1000 * scale * depth).round().astype(np.uint16)
+        )
         poses += f"{number} 1 0 0 {scale * eye} 0 1 0 0 0 0 1 0 0 0 0 1\n"
     (scene / "cam_poses.txt").write_text(poses)
     K = [FOCAL, 0, 0, 0, FOCAL, 0, WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5, 1]  # column by column
@@ -132,16 +151,24 @@ def colmap(photos: Path, model: Path, made: Scene, above: str = "") -> None:
     """Write photos and a COLMAP model as text, with a point at every eighth pixel of the first photo."""
     depth, images = made.seen()[1][4::8, 4::8], ""
     v, u = np.mgrid[4:HEIGHT:8, 4:WIDTH:8] + 0.5
-    points = np.stack([(u - WIDTH / 2) * depth / FOCAL, (v - HEIGHT / 2) * depth / FOCAL, depth], -1).reshape(-1, 3)
+    points = np.stack(
+        [(u - WIDTH / 2) * depth / FOCAL, (v - HEIGHT / 2) * depth / FOCAL, depth], -1
+    ).reshape(-1, 3)
     for number, eye in enumerate(EYES, 1):
         save(photos / f"{number:03d}.jpg", made.seen(eye)[0])
         where = FOCAL * (points[:, :2] - [eye, 0]) / points[:, 2:] + [WIDTH / 2, HEIGHT / 2]
-        seen = [f"{x} {y} {k}" for k, (x, y) in enumerate(where) if 0 <= x < WIDTH and 0 <= y < HEIGHT]
+        seen = [
+            f"{x} {y} {k}" for k, (x, y) in enumerate(where) if 0 <= x < WIDTH and 0 <= y < HEIGHT
+        ]
         images += f"{number} 1 0 0 0 {-eye} 0 0 1 {above}{number:03d}.jpg\n{' '.join(seen)}\n"
     model.mkdir(parents=True)
-    (model / "cameras.txt").write_text(f"1 PINHOLE {WIDTH} {HEIGHT} {FOCAL} {FOCAL} {WIDTH / 2} {HEIGHT / 2}\n")
+    (model / "cameras.txt").write_text(
+        f"1 PINHOLE {WIDTH} {HEIGHT} {FOCAL} {FOCAL} {WIDTH / 2} {HEIGHT / 2}\n"
+    )
     (model / "images.txt").write_text(images)
-    (model / "points3D.txt").write_text("".join(f"{k} {x} {y} {z} 0 0 0 0.1\n" for k, (x, y, z) in enumerate(points)))
+    (model / "points3D.txt").write_text(
+        "".join(f"{k} {x} {y} {z} 0 0 0 0.1\n" for k, (x, y, z) in enumerate(points))
+    )
 
 
 def llff(scene: Path, made: Scene) -> None:
@@ -159,9 +186,18 @@ def make_data(data: Path, photos: Path) -> None:
     middlebury(data / "middlebury" / "Motorcycle")
     booster(data / "booster" / "train" / "balanced" / "Table", SCENES["booster"])
     wildrgbd(data / "wildrgbd" / "bowl" / "scenes" / "scene_000", SCENES["wildrgbd"])
-    truck, pipes, undistorted = data / "tanks" / "Truck", data / "eth3d" / "pipes", "dslr_images_undistorted/"
+    truck, pipes, undistorted = (
+        data / "tanks" / "Truck",
+        data / "eth3d" / "pipes",
+        "dslr_images_undistorted/",
+    )
     colmap(truck / "images", truck / "sparse" / "0", SCENES["tanks"])
-    colmap(pipes / "images" / undistorted, pipes / "dslr_calibration_undistorted", SCENES["eth3d"], undistorted)
+    colmap(
+        pipes / "images" / undistorted,
+        pipes / "dslr_calibration_undistorted",
+        SCENES["eth3d"],
+        undistorted,
+    )
     llff(data / "llff" / "fern", SCENES["llff"])
     for number, made in enumerate(LEARNED):
         save(photos / f"{number}.png", made.seen()[0])
@@ -177,7 +213,9 @@ def fit_sharp(random: Path, fitted: Path) -> None:
     weights, grid, depths = load_file(random), MICRO.grid, "monodepth_model.monodepth_predictor."
     across = (np.arange(grid) + 0.5) * math.pi / grid
     waves = sorted(((m, n) for m in range(grid) for n in range(grid)), key=sum)[: MICRO.embed]
-    places = np.stack([np.outer(np.cos(m * across), np.cos(n * across)).ravel() for m, n in waves], -1)
+    places = np.stack(
+        [np.outer(np.cos(m * across), np.cos(n * across)).ravel() for m, n in waves], -1
+    )
     weights[f"{depths}encoder.image_encoder.pos_embed"][0, 1:] += 30 * torch.from_numpy(places)
     parts = ("decoder", "head", "encoder.upsample_latent0", "encoder.upsample2")
     closed = ("prediction_head.", *(f"{depths}{part}." for part in parts))
@@ -185,15 +223,24 @@ def fit_sharp(random: Path, fitted: Path) -> None:
         weights[name].zero_()
         if name.endswith((".out_conv.weight", ".deconv.weight")):
             weights[name] += torch.eye(MICRO.depth_width)[..., None, None]
-    for layer, tap in (("0", 1), ("1", slice(None)), ("2", 1), ("4", 0)):  # channel 0: the nearer surface
+    for layer, tap in (
+        ("0", 1),
+        ("1", slice(None)),
+        ("2", 1),
+        ("4", 0),
+    ):  # channel 0: the nearer surface
         weights[f"{depths}head.{layer}.weight"][0, 0, tap, tap] = 1.0
     weights[f"{depths}head.4.weight"][1, 0] = 0.97  # channel 1: the surface behind
-    weights["prediction_head.texture_prediction_head.bias"][-2:] = 6.0  # the opacities, before their sigmoid
+    weights["prediction_head.texture_prediction_head.bias"][-2:] = (
+        6.0  # the opacities, before their sigmoid
+    )
     save_file(weights, fitted)
     encoder: Any = load_network(fitted, torch.float32).monodepth_model.monodepth_predictor.encoder
     seen, wanted = [], []
     for photo, depth in (scene.seen() for scene in (*SCENES.values(), *LEARNED)):
-        coarsest = encoder(2 * to_square(torch.from_numpy(photo) / 255, MICRO.side) - 1, WINDOWS)[-1]
+        coarsest = encoder(2 * to_square(torch.from_numpy(photo) / 255, MICRO.side) - 1, WINDOWS)[
+            -1
+        ]
         seen.append(unfold(coarsest, 3, padding=1)[0].T)
         disparity = to_square(FOCAL / WIDTH / torch.from_numpy(depth)[..., None], MICRO.side)
         wanted.append(interpolate(disparity, coarsest.shape[-2:], mode="area").flatten())
@@ -212,7 +259,10 @@ def fit_sharp(random: Path, fitted: Path) -> None:
 
 def commands() -> list[str]:
     """The command lines, from photos to tables and figures."""
-    sharp, residual = "--base sharp -c sharp.safetensors", "--residual sharp-decoder/best.safetensors"
+    sharp, residual = (
+        "--base sharp -c sharp.safetensors",
+        "--residual sharp-decoder/best.safetensors",
+    )
     few = f"data.pseudo=pseudo data.validation_views={VIEWS} loss.features=none run.validate_every=10 optim.warmup=4"
     train = f"torchrun --nproc-per-node {RANKS} --no-python spackle train --recipe"
     crops = f"optim.steps={STEPS} optim.batch=4 data.views=30 data.crops=2 data.cells=32"
@@ -235,7 +285,9 @@ def commands() -> list[str]:
         ]
         measured += [f"runs/{name}-{kind}" for kind in ("large", "near", "bench")]
         if name in PICTURED:
-            lines.append(f"spackle evaluate {photos} {methods} --disparity 0.6 -o runs/{name}-figure")
+            lines.append(
+                f"spackle evaluate {photos} {methods} --disparity 0.6 -o runs/{name}-figure"
+            )
             pictured.append(f"runs/{name}-figure")
     lines.append(f"spackle tables {' '.join(measured)} -o tables --html")
     return [*lines, f"spackle figures {' '.join(pictured)} -o figures"]
@@ -247,7 +299,9 @@ def run(out: Path, line: str) -> None:
     began, words = time.monotonic(), shlex.split(line)
     with (out / "log.txt").open("a") as log:
         programs = Path(sys.executable).parent
-        environment = os.environ | {"PATH": f"{programs}{os.pathsep}{os.environ['PATH']}"}  # torchrun starts spackle
+        environment = os.environ | {
+            "PATH": f"{programs}{os.pathsep}{os.environ['PATH']}"
+        }  # torchrun starts spackle
         command = [programs / words[0], *words[1:]]
         if subprocess.run(command, cwd=out, stdout=log, stderr=log, env=environment).returncode:
             sys.exit(f"this command failed: {out / 'log.txt'} says why")
@@ -256,8 +310,12 @@ def run(out: Path, line: str) -> None:
 
 def main() -> None:
     """Make the data and the weights, and run all commands."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("-o", "--output", type=Path, default=Path("reproduction"), help="a folder, which is new")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "-o", "--output", type=Path, default=Path("reproduction"), help="a folder, which is new"
+    )
     out, began = parser.parse_args().output.absolute(), time.monotonic()
     if out.exists():
         parser.error(f"{out}: is there already: give another folder with -o")
@@ -266,7 +324,9 @@ def main() -> None:
     fit_sharp(out / "random.safetensors", out / "sharp.safetensors")
     for line in commands():
         run(out, line)
-    print(f"{time.monotonic() - began:.0f} s: tables and report.html in {out / 'tables'}, figures in {out / 'figures'}")
+    print(
+        f"{time.monotonic() - began:.0f} s: tables and report.html in {out / 'tables'}, figures in {out / 'figures'}"
+    )
 
 
 if __name__ == "__main__":

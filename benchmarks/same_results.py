@@ -34,14 +34,19 @@ def write_inputs(folder: Path) -> None:
     photo = Image.fromarray(left).resize((WIDTH, HEIGHT), Image.Resampling.BICUBIC)
     photo.save(folder / "photo.png")
     depth = 994.978 * 0.193001 / (np.where(np.isfinite(disparity), disparity, 40) + 31.086)
-    small = Image.fromarray(depth.astype(np.float32)).resize((WIDTH, HEIGHT), Image.Resampling.NEAREST)
+    small = Image.fromarray(depth.astype(np.float32)).resize(
+        (WIDTH, HEIGHT), Image.Resampling.NEAREST
+    )
     np.save(folder / "depth.npy", np.asarray(small))
     K = [[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]]
     eyes = [(0.25, 0.0, 0.0), (-0.2, 0.1, 0.0), (0.1, -0.1, 0.15)]
     frames = [
-        {"K": K, "world_to_camera": [[1, 0, 0, -x], [0, 1, 0, -y], [0, 0, 1, -z], [0, 0, 0, 1]]} for x, y, z in eyes
+        {"K": K, "world_to_camera": [[1, 0, 0, -x], [0, 1, 0, -y], [0, 0, 1, -z], [0, 0, 0, 1]]}
+        for x, y, z in eyes
     ]
-    (folder / "cameras.json").write_text(json.dumps({"width": WIDTH, "height": HEIGHT, "frames": frames}))
+    (folder / "cameras.json").write_text(
+        json.dumps({"width": WIDTH, "height": HEIGHT, "frames": frames})
+    )
     keyframes = [
         {"time": time, "eye": eye, "target": [0, 0, 3]}
         for time, eye in ((0.0, [0, 0, 0]), (0.4, [0.2, -0.1, 0.1]), (0.8, [-0.2, 0, 0]))
@@ -58,7 +63,18 @@ def commands(folder: Path) -> dict[str, list[str]]:
         "lite-cameras": [*photo, "--base", "lite", "--cameras", f"{folder}/cameras.json"],
         "lite-path": [*photo, "--base", "lite", "--path", f"{folder}/path.json"],
         "depth-view": [*photo, *depth, "--mode", "view", "--trajectory", "swipe", "--frames", "6"],
-        "depth-seeds": [*photo, *depth, "--residual", "seeds", "--frames", "6", "--stereo", "sbs", "--focal-px", "700"],
+        "depth-seeds": [
+            *photo,
+            *depth,
+            "--residual",
+            "seeds",
+            "--frames",
+            "6",
+            "--stereo",
+            "sbs",
+            "--focal-px",
+            "700",
+        ],
     }
 
 
@@ -73,7 +89,9 @@ def digest(file: Path) -> str:
 
 def main() -> int:
     """Run the commands, print each file's hash, and return 1 if one differs."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("-o", "--output", type=Path, help="write the hashes here, as JSON")
     parser.add_argument("--against", type=Path, help="compare with these hashes")
     options = parser.parse_args()
@@ -89,7 +107,9 @@ def main() -> int:
                 if file.name == "report.json" or file.suffix in (".ply", ".png"):
                     hashes[str(file.relative_to(folder))] = digest(file)
     before = json.loads(options.against.read_text()) if options.against else hashes
-    differing = [name for name in sorted({*before, *hashes}) if before.get(name) != hashes.get(name)]
+    differing = [
+        name for name in sorted({*before, *hashes}) if before.get(name) != hashes.get(name)
+    ]
     for file_name, value in hashes.items():
         print(f"{value[:16]}  {'DIFFERS  ' if file_name in differing else ''}{file_name}")
     for file_name in sorted(set(before) - set(hashes)):

@@ -5,7 +5,7 @@
     python benchmarks/scoreboard.py PAIRS ... --ledger > ledger.md
     python benchmarks/scoreboard.py --photos FOLDER [--without NAME] -o sheet.jpg
 
-PAIRS has one folder per scene: two photos, a disparity map and a `scene.json` (`spackle.training.sources.load_pair`).
+PAIRS has one folder per scene: two photos, a disparity map and a `scene.json` (`spackle.paper.training.sources.load_pair`).
 The left photo is lifted by its true depth, and the right camera's view is completed and compared with the right photo.
 PAIRS may also be a folder of photos. A fifth of the width is then cut off at each side of a photo, its middle is lifted
 by lite's depth for the whole photo, and the view to complete is the whole photo.
@@ -54,17 +54,17 @@ from torch import Tensor
 
 import spackle
 from spackle import Camera, get_renderer, hole_area_ratio, hole_mask
-from spackle.bases.depth_map import DepthMap
-from spackle.bases.edges import Edges
-from spackle.bases.lift import lift
+from spackle.bases.depth import lift
 from spackle.bases.lite import FARTHEST, NEAREST_M, nearest
-from spackle.bases.silhouettes import Layers
-from spackle.camera_path import DepthRange, extremes
-from spackle.evaluation.metrics import GREY, sharpness
-from spackle.filters import FAR_BIAS, far_fill, greatest_around
-from spackle.image import load_photo, resize_photo
-from spackle.training.losses import FeatureNet, covered, hole_psnr, load_features
-from spackle.training.sources import load_pair
+from spackle.core.hole_filling import FAR_BIAS, far_fill, greatest_around
+from spackle.core.photo import load_photo, resize_photo
+from spackle.core.trajectories import DepthRange, extremes
+from spackle.depth.depth_map import DepthMap
+from spackle.lifting.edges import Edges
+from spackle.lifting.silhouettes import Layers
+from spackle.paper.evaluation.metrics import GREY, sharpness
+from spackle.paper.training.losses import FeatureNet, covered, hole_psnr, load_features
+from spackle.paper.training.sources import load_pair
 
 Row = dict[str, float]  # the figures of a scene, by name
 Rows = dict[str, Row]  # the rows of scenes, by name
@@ -72,7 +72,11 @@ Replace = Callable[[Any], Any]  # from a function or constant to its replacement
 
 LAYERS = ("conv1", "fire3", "fire5", "fire9")
 BAND_PX = 8
-NEAR, BESIDE, STEP = 2, 20, 0.05  # for seams: pixels, pixels, relative depth step above which there is no seam
+NEAR, BESIDE, STEP = (
+    2,
+    20,
+    0.05,
+)  # for seams: pixels, pixels, relative depth step above which there is no seam
 STEPS = 255  # of inverse depth in a phone's map
 DIGITS = dict.fromkeys(("distance", "texture", "seam", "HAR"), 3)  # other figures have 2
 SECONDS = ("s lift", "s fill")
@@ -100,7 +104,9 @@ def filled_from_around(own: Any) -> Any:
 
 
 def no_edges(own: Any) -> Any:
-    return lambda depth, known, focal: Edges(np.zeros_like(depth), np.zeros_like(known), np.zeros_like(known))
+    return lambda depth, known, focal: Edges(
+        np.zeros_like(depth), np.zeros_like(known), np.zeros_like(known)
+    )
 
 
 def one_surface(own: Any) -> Any:
@@ -108,7 +114,9 @@ def one_surface(own: Any) -> Any:
 
     def layers(*images: Any) -> Layers:
         found: Layers = own(*images)
-        return Layers(found.ring, np.zeros_like(found.alpha), *(np.stack([image, image]) for image in images))
+        return Layers(
+            found.ring, np.zeros_like(found.alpha), *(np.stack([image, image]) for image in images)
+        )
 
     return layers
 
@@ -128,7 +136,9 @@ FILL: dict[str, dict[str, Replace]] = {
     "half texture": {"_in_proportion": lambda own: lambda *given: 0.5 * own(*given)},
     "sharpened": {"sharpened": first},
     "beyond_border": {"fill_around": filled_from_around},
-    "in proportion": {"_in_proportion": lambda own: lambda fine, view: torch.ones_like(view.features.alpha)},
+    "in proportion": {
+        "_in_proportion": lambda own: lambda fine, view: torch.ones_like(view.features.alpha)
+    },
     "in front": {"network.ALIKE": lambda own: math.inf},
     "extended": {"extended": lambda own: lambda view: view.structure},
 }
@@ -141,10 +151,14 @@ def holders(target: str) -> list[ModuleType]:
     LookupError unless it is a single object, so that removed or renamed mechanisms do not pass unnoticed.
     """
     home, _, name = target.rpartition(".")
-    modules = [m for n, m in list(sys.modules.items()) if n.startswith("spackle.") and name in vars(m)]
+    modules = [
+        m for n, m in list(sys.modules.items()) if n.startswith("spackle.") and name in vars(m)
+    ]
     things = {id(vars(m)[name]) for m in modules if home in ("", m.__name__.rpartition(".")[2])}
     if len(things) != 1:
-        raise LookupError(f"{target}: the package has {len(things)} things of that name: mend benchmarks/scoreboard.py")
+        raise LookupError(
+            f"{target}: the package has {len(things)} things of that name: mend benchmarks/scoreboard.py"
+        )
     return [m for m in modules if id(vars(m)[name]) in things]
 
 
@@ -153,7 +167,9 @@ def switched_off(run: str, *stages: dict[str, dict[str, Replace]]) -> Iterator[N
     """Switch off those mechanisms of a run that belong to some stages."""
     with contextlib.ExitStack() as stack:
         for stage in stages:
-            for target, replace in [item for name in run.split("+") for item in stage.get(name, {}).items()]:
+            for target, replace in [
+                item for name in run.split("+") for item in stage.get(name, {}).items()
+            ]:
                 modules, name = holders(target), target.rpartition(".")[2]
                 other = replace(vars(modules[0])[name])
                 for module in modules:
@@ -195,7 +211,9 @@ class Pair:
         prediction = lift(self.left, self.depth, self.camera)
         self.hole = hole_mask(RENDERER.render(prediction.gaussians, self.beside).alpha)
         self.near = greatest_around(self.hole, BAND_PX)
-        seeds = spackle.complete(prediction, [self.beside], exact=True, network=None, fill="network")
+        seeds = spackle.complete(
+            prediction, [self.beside], exact=True, network=None, fill="network"
+        )
         self.crossings = crossings(seeds.render(self.beside).depth, self.beside, self.camera)
 
     def measure(self, run: str, perception: Perception | None) -> Row:
@@ -238,14 +256,18 @@ def load_cut(file: Path) -> tuple[Tensor, Tensor, DepthMap, Camera, Camera]:
 def smaller(depth: DepthMap, times: int) -> DepthMap:
     """A depth map with sides `times` times smaller: the mean known inverse depth in each cell, in 256 steps."""
     valid = depth.valid.float()
-    sums = F.avg_pool2d(torch.stack([valid / depth.depth.where(depth.valid, torch.ones(())), valid]), times)
+    sums = F.avg_pool2d(
+        torch.stack([valid / depth.depth.where(depth.valid, torch.ones(())), valid]), times
+    )
     known = sums[1] > 0
     inverse = sums[0] / sums[1].where(known, torch.ones(()))
     low, high = inverse[known].min(), inverse[known].max()
     step = float(high - low) / STEPS
     stepped = low + ((inverse - low) / step).round() * step
     small = (1 / stepped).where(known, torch.zeros(()))
-    return dataclasses.replace(depth, depth=small, valid=known, K=None, quantum=step, quantity="disparity")
+    return dataclasses.replace(
+        depth, depth=small, valid=known, K=None, quantum=step, quantity="disparity"
+    )
 
 
 def crossings(depth: Tensor, camera: Camera, photo: Camera) -> list[Tensor]:
@@ -261,7 +283,9 @@ def crossings(depth: Tensor, camera: Camera, photo: Camera) -> list[Tensor]:
 
 def seam(rgb: Tensor, crossings: Sequence[Tensor]) -> float:
     """Mean grey difference across the crossings, over that beside them; NaN if there are no crossings."""
-    sums = torch.zeros(2, 2, dtype=torch.float64)  # rows near and beside, columns sum of differences and their number
+    sums = torch.zeros(
+        2, 2, dtype=torch.float64
+    )  # rows near and beside, columns sum of differences and their number
     for picture, crossing in zip((rgb @ GREY, (rgb @ GREY).T), crossings, strict=True):
         steps = (picture[:, 1:] - picture[:, :-1]).abs()
         reach = [F.max_pool1d(crossing.float(), 2 * r - 1, 1, r - 1) > 0 for r in (NEAR, BESIDE)]
@@ -276,19 +300,25 @@ def text(measure: str, value: float, sign: str = "") -> str:
 
 
 def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---", *["---:"] * (len(head) - 1)], *rows))
+    return "\n".join(
+        f"| {' | '.join(row)} |" for row in (head, ["---", *["---:"] * (len(head) - 1)], *rows)
+    )
 
 
 def table(rows: Rows) -> str:
     """A table with a row for each scene and one for the mean."""
     measures = list(next(iter(rows.values())))
     every = rows | {"mean": {m: change(m, rows, rows)[0] for m in measures}}
-    return markdown(["", *measures], [[n, *(text(m, r[m]) for m in measures)] for n, r in every.items()])
+    return markdown(
+        ["", *measures], [[n, *(text(m, r[m]) for m in measures)] for n, r in every.items()]
+    )
 
 
 def change(measure: str, before: Rows, now: Rows) -> tuple[float, float, int, int]:
     """A measure's means before and now over the scenes that have both, and the numbers of rises and falls."""
-    pairs = np.array([(before[name][measure], now[name][measure]) for name in now if name in before]).reshape(-1, 2)
+    pairs = np.array(
+        [(before[name][measure], now[name][measure]) for name in now if name in before]
+    ).reshape(-1, 2)
     old, new = pairs[~np.isnan(pairs).any(1)].T
     before_mean, mean = (float(part.mean()) if len(part) else math.nan for part in (old, new))
     return before_mean, mean, int((new > old).sum()), int((new < old).sum())
@@ -305,7 +335,14 @@ def comparison(before: Rows, now: Rows) -> str:
     known = next(iter(before.values()), {})
     changes = {m: change(m, before, now) for m in next(iter(now.values())) if m in known}
     rows = [
-        [m, text(m, old), text(m, new), text(m, new - old, "+"), f"{up} : {down}", f"{sign_test(up, down):.2f}"]
+        [
+            m,
+            text(m, old),
+            text(m, new),
+            text(m, new - old, "+"),
+            f"{up} : {down}",
+            f"{sign_test(up, down):.2f}",
+        ]
         for m, (old, new, up, down) in changes.items()
     ]
     moved = [m for m, (*_, up, down) in changes.items() if m not in SECONDS and up + down]
@@ -320,14 +357,27 @@ def ledger(runs: dict[str, Rows]) -> str:
     rows = [["(nothing)", *(text(m, change(m, default, default)[0]) for m in measures)]]
     for name in [name for name in runs if name != DEFAULT]:
         changes = [(m, *change(m, default, runs[name])) for m in measures]
-        rows.append([name, *(f"{text(m, new - old, '+')} ({up}:{down})" for m, old, new, up, down in changes)])
+        rows.append(
+            [
+                name,
+                *(f"{text(m, new - old, '+')} ({up}:{down})" for m, old, new, up, down in changes),
+            ]
+        )
     return markdown(["without", *measures], rows)
 
 
 def pictures_in(folder: Path, most: int) -> list[Path]:
     """At most `most` photos of a folder, evenly spaced in the order of names."""
-    files = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in (".jpg", ".jpeg", ".png")]
-    return [files[i] for i in sorted({round(i) for i in np.linspace(0, len(files) - 1, most)})] if files else []
+    files = [
+        path
+        for path in sorted(folder.iterdir())
+        if path.suffix.lower() in (".jpg", ".jpeg", ".png")
+    ]
+    return (
+        [files[i] for i in sorted({round(i) for i in np.linspace(0, len(files) - 1, most)})]
+        if files
+        else []
+    )
 
 
 def sheet(folder: Path, runs: Sequence[str]) -> Image.Image:
@@ -338,32 +388,56 @@ def sheet(folder: Path, runs: Sequence[str]) -> Image.Image:
         for run in runs:
             with switched_off(run, LIFT, FILL):
                 scene = spackle.predict(file, base=base, disparity=0.15, fill="exemplar")
-            sets = ([scene.base], [scene.base, scene.aux]) if run == DEFAULT else ([scene.base, scene.aux],)
+            sets = (
+                ([scene.base], [scene.base, scene.aux])
+                if run == DEFAULT
+                else ([scene.base, scene.aux],)
+            )
             ends = extremes(scene.camera.even(), scene.disparity or 0.0, DepthRange.of(scene.base))
             pictures.append([[RENDERER.render(part, end).rgb for part in sets] for end in ends])
-        ordered = [picture for end in zip(*pictures, strict=True) for group in end for picture in group]
+        ordered = [
+            picture for end in zip(*pictures, strict=True) for group in end for picture in group
+        ]
         rows.append(np.concatenate([thumbnail(rgb) for rgb in ordered], axis=1))
     width = max(row.shape[1] for row in rows)
-    return Image.fromarray(np.concatenate([np.pad(row, ((0, 4), (0, width - row.shape[1]), (0, 0))) for row in rows]))
+    return Image.fromarray(
+        np.concatenate([np.pad(row, ((0, 4), (0, width - row.shape[1]), (0, 0))) for row in rows])
+    )
 
 
 def thumbnail(rgb: Tensor) -> np.ndarray:
     """Resize to [PHOTO_HEIGHT, w, 3] bytes."""
     picture = Image.fromarray((255 * rgb.clamp(0, 1)).round().byte().numpy())
-    return np.asarray(picture.resize((round(picture.width * PHOTO_HEIGHT / picture.height), PHOTO_HEIGHT)))
+    return np.asarray(
+        picture.resize((round(picture.width * PHOTO_HEIGHT / picture.height), PHOTO_HEIGHT))
+    )
 
 
 @torch.no_grad()
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("folder", type=Path, nargs="?", metavar="PAIRS")
-    parser.add_argument("--features", type=Path, help="SqueezeNet 1.0's weights; distance and texture need them")
-    parser.add_argument("--small", type=int, default=1, help="how many times smaller a side of the depth maps is")
-    parser.add_argument("--scenes", default="", help="words, one of which a scene's name has to have")
-    parser.add_argument("--without", action="append", default=[], help=f"NAME+...: {', '.join(MECHANISMS)}")
+    parser.add_argument(
+        "--features", type=Path, help="SqueezeNet 1.0's weights; distance and texture need them"
+    )
+    parser.add_argument(
+        "--small", type=int, default=1, help="how many times smaller a side of the depth maps is"
+    )
+    parser.add_argument(
+        "--scenes", default="", help="words, one of which a scene's name has to have"
+    )
+    parser.add_argument(
+        "--without", action="append", default=[], help=f"NAME+...: {', '.join(MECHANISMS)}"
+    )
     parser.add_argument("--ledger", action="store_true", help="a run without each of these")
-    parser.add_argument("--photos", type=Path, help="a folder of photos to complete by lite, in place of pairs")
-    parser.add_argument("-o", "--output", type=Path, help="a file for the figures, or for the sheet of the photos")
+    parser.add_argument(
+        "--photos", type=Path, help="a folder of photos to complete by lite, in place of pairs"
+    )
+    parser.add_argument(
+        "-o", "--output", type=Path, help="a file for the figures, or for the sheet of the photos"
+    )
     parser.add_argument("--against", type=Path, help="compare with these figures")
     chosen = parser.parse_args(arguments)
     names = [DEFAULT, *(MECHANISMS if chosen.ledger else ()), *chosen.without]
@@ -373,13 +447,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sheet(chosen.photos, names).save(chosen.output or "sheet.jpg")
         return
     folder = chosen.folder or Path()
-    folders = [path.parent for path in sorted(folder.glob("*/scene.json"))] or pictures_in(folder, CUT_PHOTOS)
-    folders = [path for path in folders if any(word in path.name for word in chosen.scenes.split(","))]
+    folders = [path.parent for path in sorted(folder.glob("*/scene.json"))] or pictures_in(
+        folder, CUT_PHOTOS
+    )
+    folders = [
+        path for path in folders if any(word in path.name for word in chosen.scenes.split(","))
+    ]
     if not folders:
         parser.error(f"{chosen.folder}: no folder with a scene.json in it, and no photo")
     before = json.loads(chosen.against.read_text()) if chosen.against else None
     if before and before["small"] != chosen.small:
-        parser.error(f"{chosen.against}: its depth maps are {before['small']} times smaller, not {chosen.small}")
+        parser.error(
+            f"{chosen.against}: its depth maps are {before['small']} times smaller, not {chosen.small}"
+        )
     network = load_features("squeezenet", chosen.features) if chosen.features else None
     perception = Perception(network) if network else None
     runs: dict[str, Rows] = {name: {} for name in names}
@@ -387,9 +467,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
         pair = Pair(folder, chosen.small)
         for name, rows in runs.items():
             rows[folder.name] = pair.measure(name, perception)
-            print(folder.name, name, *(f"{m} {text(m, v)}" for m, v in rows[folder.name].items()), file=sys.stderr)
+            print(
+                folder.name,
+                name,
+                *(f"{m} {text(m, v)}" for m, v in rows[folder.name].items()),
+                file=sys.stderr,
+            )
         if chosen.output:
-            chosen.output.write_text(json.dumps({"small": chosen.small, "runs": runs}, indent=1) + "\n")
+            chosen.output.write_text(
+                json.dumps({"small": chosen.small, "runs": runs}, indent=1) + "\n"
+            )
     print(table(runs[DEFAULT]))
     if len(runs) > 1:
         print(f"\n{ledger(runs)}")

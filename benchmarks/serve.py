@@ -32,7 +32,10 @@ TOKEN, SCENES, BOUNDARY = "benchmark", "/api/v1/scenes", "7d1"
 
 def photo(side: int) -> bytes:
     """One of the page's example photos, `side` pixels on its long side."""
-    with resources.files("spackle.web").joinpath("page", "coffee.jpg").open("rb") as file, Image.open(file) as image:
+    with (
+        resources.files("spackle.web").joinpath("page", "coffee.jpg").open("rb") as file,
+        Image.open(file) as image,
+    ):
         image.thumbnail((side, side))
         image.save(content := io.BytesIO(), "JPEG", quality=92)
     return content.getvalue()
@@ -46,7 +49,9 @@ def upload(content: bytes) -> bytes:
         'Content-Disposition: form-data; name="photo"; filename="photo.jpg"\r\n\r\n'
     ).encode()
     body += content + f"\r\n--{BOUNDARY}--\r\n".encode()
-    kind = f"Content-Type: multipart/form-data; boundary={BOUNDARY}\r\nContent-Length: {len(body)}\r\n"
+    kind = (
+        f"Content-Type: multipart/form-data; boundary={BOUNDARY}\r\nContent-Length: {len(body)}\r\n"
+    )
     return head("POST", SCENES, kind) + body
 
 
@@ -94,7 +99,9 @@ class Server:
     def facts(self) -> dict[str, float]:
         """Memory, threads and open files of the server process, without its workers."""
         status = Path(f"/proc/{self.process.pid}/status").read_text()
-        memory, threads = (int(re.search(rf"{key}:\s+(\d+)", status)[1]) for key in ("VmRSS", "Threads"))  # type: ignore[index]
+        memory, threads = (
+            int(re.search(rf"{key}:\s+(\d+)", status)[1]) for key in ("VmRSS", "Threads")
+        )  # type: ignore[index]
         return {
             "MB": round(memory / 1024),
             "threads": threads,
@@ -131,7 +138,10 @@ async def latencies(port: int, id: str, seconds: float, pause: float = 0.02) -> 
 def summary(found: list[float]) -> dict[str, float]:
     found.sort()
     places = {"median": 0.5, "p95": 0.95, "p99": 0.99}
-    return {**{name: round(found[int(at * (len(found) - 1))], 1) for name, at in places.items()}, "asked": len(found)}
+    return {
+        **{name: round(found[int(at * (len(found) - 1))], 1) for name, at in places.items()},
+        "asked": len(found),
+    }
 
 
 async def post(port: int, request: bytes) -> tuple[int, Any]:
@@ -259,11 +269,16 @@ def main() -> None:
     given = parser.parse_args()
     random.seed(given.seed)
     content = photo(given.side)
-    results: dict[str, Any] = {"cores": os.cpu_count(), "load before": round(statistics.fmean(os.getloadavg()), 1)}
+    results: dict[str, Any] = {
+        "cores": os.cpu_count(),
+        "load before": round(statistics.fmean(os.getloadavg()), 1),
+    }
     with tempfile.TemporaryDirectory() as folder:
         results["crowd"] = crowd(Path(folder, "crowd"), content)
         print(json.dumps(results), flush=True)
-        results["killed"] = killed_in_between(Path(folder, "killed"), content, given.photos, given.workers)
+        results["killed"] = killed_in_between(
+            Path(folder, "killed"), content, given.photos, given.workers
+        )
     text = json.dumps(results, indent=1)
     print(text)
     if given.output:

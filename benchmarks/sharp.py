@@ -87,7 +87,9 @@ def declare_operators(folder: Path, namespace: str = "torchvision") -> list[str]
     library = torch.library.Library(namespace, "FRAGMENT")
     for name in missing:
         library.define(f"{name}(Tensor x) -> Tensor")
-    vars(declare_operators).setdefault("kept", []).append(library)  # the names exist as long as this object
+    vars(declare_operators).setdefault("kept", []).append(
+        library
+    )  # the names exist as long as this object
     return missing
 
 
@@ -134,12 +136,17 @@ def compare(ply: Path, reference: Path) -> str:
     ours, theirs = spackle.load_ply(ply), spackle.load_ply(reference)
     rows = []
     for name in ("means", "covariances", "opacities", "colors"):
-        a, b = (g.covariances() if name == "covariances" else getattr(g, name) for g in (ours, theirs))
+        a, b = (
+            g.covariances() if name == "covariances" else getattr(g, name) for g in (ours, theirs)
+        )
         rows.append(f"{name} {float((a - b).norm() / b.norm()):.1e}")
     camera = PlyFile(ply).camera()
     assert camera is not None
     eye = torch.tensor([0.05 * float(theirs.means[:, 2].median()), 0.0, 0.0])
-    views = {"at the photo": camera, "from the side": camera.looking(eye, torch.tensor([0.0, 0.0, 5.0]))}
+    views = {
+        "at the photo": camera,
+        "from the side": camera.looking(eye, torch.tensor([0.0, 0.0, 5.0])),
+    }
     for name, view in views.items():
         one, other = (spackle.get_renderer("cpu").render(g, view).rgb for g in (ours, theirs))
         rows.append(f"render {name} {float(-10 * (one - other).square().mean().log10()):.1f} dB")
@@ -148,7 +155,9 @@ def compare(ply: Path, reference: Path) -> str:
 
 def print_table(results: list[dict[str, Any]]) -> None:
     """Print a Markdown table with a row for each contender; ratios are relative to the first."""
-    print(f"\n| | {' | '.join(STAGES)} | whole process | peak memory | whole | post-processing + save |")
+    print(
+        f"\n| | {' | '.join(STAGES)} | whole process | peak memory | whole | post-processing + save |"
+    )
     print(f"|---|{'---|' * (len(STAGES) + 4)}")
     post = [r["post-processing"] + r["save"] for r in results]
     for r, own in zip(results, post, strict=True):
@@ -163,7 +172,9 @@ def make_inputs(weights: Path | None, photo: Path | None, folder: Path) -> tuple
     if weights is None:
         weights = Path(tempfile.gettempdir()) / "sharp_deterministic.pt"
         if not weights.exists():
-            subprocess.run([sys.executable, Path(__file__).with_name("random_weights.py"), weights], check=True)
+            subprocess.run(
+                [sys.executable, Path(__file__).with_name("random_weights.py"), weights], check=True
+            )
     if photo is None:
         from skimage import data, io
 
@@ -173,8 +184,12 @@ def make_inputs(weights: Path | None, photo: Path | None, folder: Path) -> tuple
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--original", type=Path, help="a checkout of apple/ml-sharp; without it only ours runs")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--original", type=Path, help="a checkout of apple/ml-sharp; without it only ours runs"
+    )
     parser.add_argument("--original-python", default=sys.executable)
     parser.add_argument("--weights", type=Path)
     parser.add_argument("--photo", type=Path)
@@ -192,7 +207,9 @@ def main() -> None:
         folder = Path(name)
         weights, photo = make_inputs(chosen.weights, chosen.photo, folder)
         common = {"weights": weights, "photo": photo, "device": chosen.device}
-        contenders: dict[str, dict[str, Any]] = {"original": {"checkout": chosen.original}} if chosen.original else {}
+        contenders: dict[str, dict[str, Any]] = (
+            {"original": {"checkout": chosen.original}} if chosen.original else {}
+        )
         contenders |= {"Spackle": {}, "Spackle, --sharp windows=1": {"windows": 1}}
         contenders |= {"Spackle, fp32": {"precision": "fp32"}}
         outputs = {label: folder / f"{index}.ply" for index, label in enumerate(contenders)}
@@ -204,7 +221,9 @@ def main() -> None:
         reference = "original" if chosen.original else "Spackle, fp32"
         for label in contenders:
             if label != reference:
-                print(f"- {label} against {reference}: {compare(outputs[label], outputs[reference])}")
+                print(
+                    f"- {label} against {reference}: {compare(outputs[label], outputs[reference])}"
+                )
 
 
 if __name__ == "__main__":

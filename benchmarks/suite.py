@@ -28,29 +28,39 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
 from spackle.bases import BasePrediction
-from spackle.bases.lift import lift
+from spackle.bases.depth import lift
 from spackle.bases.open import open_base
 from spackle.bases.settings import BaseSettings
 from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.base import to_metric
-from spackle.camera import Camera
-from spackle.camera_path import DepthRange, trajectory
-from spackle.device import hardware, run_chunks, versions
-from spackle.errors import InputError, check_name
-from spackle.evaluation.bench import CPU, MS, TOTAL, Lap, Task, Values, complete_in_laps, measure
-from spackle.evaluation.datasets.stereo import load_motorcycle
-from spackle.evaluation.rows import EXTRA
-from spackle.files import make_folder, write_json, write_whole
-from spackle.formats import save_ply, save_video
-from spackle.gaussians import Gaussians
-from spackle.image import Photo
+from spackle.core.camera import Camera
+from spackle.core.gaussians import Gaussians
+from spackle.core.photo import Photo
+from spackle.core.trajectories import DepthRange, trajectory
+from spackle.formats import save_ply
+from spackle.paper.evaluation.bench import (
+    CPU,
+    MS,
+    TOTAL,
+    Lap,
+    Task,
+    Values,
+    complete_in_laps,
+    measure,
+)
+from spackle.paper.evaluation.datasets.stereo import load_motorcycle
+from spackle.paper.evaluation.rows import EXTRA
 from spackle.render import CpuRenderer, Renderer, get_renderer
 from spackle.render.blend import blend_tiles
 from spackle.render.cpu import BLEND_GRAIN, list_tiles, project, sort_tiles, wanted_tiles
 from spackle.render.project import KernelCamera
 from spackle.residual import ResidualNet, hole_area_ratio
 from spackle.residual.architectures import load_residual
+from spackle.runtime.device import hardware, run_chunks, versions
+from spackle.runtime.errors import InputError, check_name
+from spackle.runtime.files import make_folder, write_atomic, write_json
 from spackle.scene_fill import FillContext, fill_scene, fill_view
+from spackle.video.encoding import save_video
 
 LIMIT_RUNS = 7  # the least number of runs, of which the fastest counts
 MATRIX_SIDE, COPY_MB = 2048, 256
@@ -58,11 +68,21 @@ PRODUCT, COPY = "matrix product, {}", "copy of memory"
 RENDER_STAGES = ("project", "bin", "sort", "blend")
 GAUSSIAN_BYTES, PIXEL_BYTES = 4 * (3 + 4 + 3 + 1 + 3), 4 * (3 + 1 + 1)
 VIDEO_RUNS, FRAMES, DISPARITY = 3, 60, 0.3
-LIFT, COMPLETE, DRAW, ENCODE = "photo and depth to Gaussians", "completion of the path", "frames drawn", "video encoded"
-EACH, GUARDS = "frames rendered and completed, each by itself", "the photo's occlusion guard, for each of them"
+LIFT, COMPLETE, DRAW, ENCODE = (
+    "photo and depth to Gaussians",
+    "completion of the path",
+    "frames drawn",
+    "video encoded",
+)
+EACH, GUARDS = (
+    "frames rendered and completed, each by itself",
+    "the photo's occlusion guard, for each of them",
+)
 FORWARD, UNPROJECT, SAVE = "forward", "unprojection", "save as PLY"
 
-Peaks = Mapping[str, float]  # for each measured limit, its best run in operations or bytes per millisecond
+Peaks = Mapping[
+    str, float
+]  # for each measured limit, its best run in operations or bytes per millisecond
 
 
 class Timed(NamedTuple):
@@ -90,7 +110,10 @@ def limits_section(runs: int, device: torch.device = CPU, share: float = 1.0) ->
         figures.append(Timed(name, amount / (times / MS) / 1e9, unit))
 
     for name, dtype in {"fp32": torch.float32, "bf16": torch.bfloat16}.items():
-        a, b = (torch.rand(side, side, generator=torch.Generator().manual_seed(k)).to(device, dtype) for k in range(2))
+        a, b = (
+            torch.rand(side, side, generator=torch.Generator().manual_seed(k)).to(device, dtype)
+            for k in range(2)
+        )
         product = functools.partial(torch.mm, a, b, out=torch.empty_like(a))
         add(PRODUCT.format(name), "GFLOP/s", 2 * side**3, lambda _, product=product: product())  # type: ignore[misc]
     source = torch.zeros(round(share * COPY_MB * 2**20) // 4, device=device)
@@ -109,7 +132,9 @@ def renderer_section(runs: int, side: int, peaks: Peaks) -> Section:
     }
     times = measure(runs, tasks)
     call, naive = times["call", TOTAL], times["naive", TOTAL]
-    least = len(scene) * GAUSSIAN_BYTES + side * side * PIXEL_BYTES  # bytes that must be read or written once
+    least = (
+        len(scene) * GAUSSIAN_BYTES + side * side * PIXEL_BYTES
+    )  # bytes that must be read or written once
     figures = [Timed(stage, times["ours", stage]) for stage in RENDER_STAGES]
     figures.append(Timed("whole call: RGB, depth, alpha", call, limit_ms=least / peaks[COPY]))
     figures += [Timed(f"naive: {stage}", times["naive", stage]) for stage in RENDER_STAGES]
@@ -130,7 +155,11 @@ def render_in_laps(scene: Gaussians, camera: Camera, lap: Lap) -> None:
     lap("sort")
     size = camera.height, camera.width
     images = tuple(np.zeros(shape, np.float32) for shape in ((*size, 3), size, size, (0, 0, 3)))
-    run_chunks(lambda a, b: blend_tiles(a, b, tiles, lists, splats.records, images), len(tiles), BLEND_GRAIN)
+    run_chunks(
+        lambda a, b: blend_tiles(a, b, tiles, lists, splats.records, images),
+        len(tiles),
+        BLEND_GRAIN,
+    )
     lap("blend")
 
 
@@ -154,7 +183,12 @@ def completion_section(
         Timed("added time over base render", added / render, "×"),
     ]
     holes = hole_area_ratio(renderer.render(base, camera).alpha)
-    facts = {"gaussians": len(base), "width": camera.width, "height": camera.height, "disparity": disparity}
+    facts = {
+        "gaussians": len(base),
+        "width": camera.width,
+        "height": camera.height,
+        "disparity": disparity,
+    }
     return figures, {**facts, "holes": holes, "added": len(fill_view(context, camera).aux)}
 
 
@@ -207,11 +241,18 @@ def video_section(
     figures.append(Timed("frame by frame: photo to video", anew))
     figures.append(Timed("frame by frame over one scene", anew / whole, "×"))
     figures.append(Timed("the same, the photo's occlusion guard made once", kept / whole, "×"))
-    facts = {"gaussians": len(prediction.gaussians), "added": len(aux), "frames": frames, "disparity": DISPARITY}
+    facts = {
+        "gaussians": len(prediction.gaussians),
+        "added": len(aux),
+        "frames": frames,
+        "disparity": DISPARITY,
+    }
     return figures, {**facts, "width": path[0].width, "height": path[0].height}
 
 
-def sharp_section(runs: int, base: SharpBase, photo: Photo, peaks: Peaks, device: torch.device = CPU) -> Section:
+def sharp_section(
+    runs: int, base: SharpBase, photo: Photo, peaks: Peaks, device: torch.device = CPU
+) -> Section:
     """Time a photo to a scene on disk by SHARP, by stage; the time does not depend on the photo's content."""
     count = 0
 
@@ -261,7 +302,11 @@ def section(name: str, options: argparse.Namespace, peaks: Peaks) -> Section:
         if options.checkpoint is None:
             raise InputError("no weights: name them by -c FILE")
         photo = Photo(torch.rand(SIDE, SIDE, 3), 1.2 * SIDE, "", Path("photo.png"))
-        speed = {"windows": options.windows, "compiled": options.compile, "precision": options.precision}
+        speed = {
+            "windows": options.windows,
+            "compiled": options.compile,
+            "precision": options.precision,
+        }
         settings = BaseSettings("sharp", checkpoint=options.checkpoint, device=device.type, **speed)
         base = open_base(settings).load(photo)
         assert isinstance(base, SharpBase)
@@ -273,7 +318,9 @@ def section(name: str, options: argparse.Namespace, peaks: Peaks) -> Section:
     pair = load_motorcycle()
     lifting = functools.partial(lift, pair.left, pair.depth, pair.left_camera)
     if name == "video":
-        return video_section(runs, lifting, renderer, residual, FRAMES if side >= SIDE else 4, device)
+        return video_section(
+            runs, lifting, renderer, residual, FRAMES if side >= SIDE else 4, device
+        )
     scene = lifting()
     return completion_section(runs, scene.gaussians, scene.camera, renderer, residual, device)
 
@@ -289,16 +336,29 @@ TITLES = {
 
 
 def main(arguments: list[str]) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("-o", "--output", type=Path, default=Path("bench-suite"))
     parser.add_argument("--only", default=",".join(TITLES), help=f"sections: {', '.join(TITLES)}")
     parser.add_argument("--runs", type=int, default=5)
-    parser.add_argument("--side", type=int, default=SIDE, help="pixels along the synthetic scenes, even; for a trial")
-    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="of all but the renderer's section")
-    parser.add_argument("--residual", type=Path, help="weights of the residual; default: the seeds alone")
+    parser.add_argument(
+        "--side",
+        type=int,
+        default=SIDE,
+        help="pixels along the synthetic scenes, even; for a trial",
+    )
+    parser.add_argument(
+        "--device", choices=("cpu", "cuda"), default="cpu", help="of all but the renderer's section"
+    )
+    parser.add_argument(
+        "--residual", type=Path, help="weights of the residual; default: the seeds alone"
+    )
     parser.add_argument("-c", "--checkpoint", type=Path, help="weights of SHARP")
     parser.add_argument("--base-runs", type=int, default=1, help="of SHARP")
-    parser.add_argument("--precision", choices=("auto", "fp32", "bf16"), default="auto", help="of SHARP")
+    parser.add_argument(
+        "--precision", choices=("auto", "fp32", "bf16"), default="auto", help="of SHARP"
+    )
     parser.add_argument("--windows", type=int, help="of SHARP, at once")
     parser.add_argument("--compile", action="store_true", help="compile SHARP by torch.compile")
     options = parser.parse_args(arguments)
@@ -310,8 +370,15 @@ def main(arguments: list[str]) -> None:
     except InputError as error:
         parser.error(str(error))
     about = {**hardware(torch.device(options.device)), **versions()}
-    record: dict[str, Any] = {"commit": commit(), "about": about, "runs": options.runs, "sections": {}}
-    lines = [f"# Speed\n\n{', '.join(f'{k} {v}' for k, v in about.items())}; commit {commit()}; {options.runs} runs."]
+    record: dict[str, Any] = {
+        "commit": commit(),
+        "about": about,
+        "runs": options.runs,
+        "sections": {},
+    }
+    lines = [
+        f"# Speed\n\n{', '.join(f'{k} {v}' for k, v in about.items())}; commit {commit()}; {options.runs} runs."
+    ]
     peaks: dict[str, float] = {}
     for name in chosen:
         load, start = round(os.getloadavg()[0], 2), time.perf_counter()
@@ -326,26 +393,42 @@ def main(arguments: list[str]) -> None:
         record["sections"][name] = {"figures": values, "facts": facts}
         lines.append(_table(name, figures, facts))
         print(f"{name}: {len(figures)} figures in {facts['seconds']} s", file=sys.stderr)
-        write_whole(options.output / "suite.md", ("\n\n".join(lines) + "\n").encode())
+        write_atomic(options.output / "suite.md", ("\n\n".join(lines) + "\n").encode())
         write_json(record, options.output / "suite.json")
 
 
 def _table(name: str, figures: list[Timed], facts: Mapping[str, Any]) -> str:
-    known = {key: f"{value:.4g}" if isinstance(value, float) else value for key, value in facts.items()}
+    known = {
+        key: f"{value:.4g}" if isinstance(value, float) else value for key, value in facts.items()
+    }
     about = ", ".join(f"{key} {value}" for key, value in known.items() if value is not None)
-    rows = ["what | median | quartiles | limit | time over limit", "---|---|---|---|---"] if figures else []
+    rows = (
+        ["what | median | quartiles | limit | time over limit", "---|---|---|---|---"]
+        if figures
+        else []
+    )
     for what, values, unit, limit in figures:
         low, median, high = np.quantile(values, [0.25, 0.5, 0.75]).tolist()
         over = " | " if limit is None else f"{_number(limit)} ms | {median / limit:.1f}×"
-        rows.append(f"{what} | {_number(median)} {unit} | {_number(low)} – {_number(high)} | {over}")
-    return "\n".join([f"**{name}.** {TITLES[name]}. {about}.", "", *(f"| {row} |" for row in rows)]).rstrip()
+        rows.append(
+            f"{what} | {_number(median)} {unit} | {_number(low)} – {_number(high)} | {over}"
+        )
+    return "\n".join(
+        [f"**{name}.** {TITLES[name]}. {about}.", "", *(f"| {row} |" for row in rows)]
+    ).rstrip()
 
 
 def _number(value: float) -> str:
     """Format with at least three digits, without an exponent if possible."""
     if not math.isfinite(value) or abs(value) >= 100 or value == 0:
         return f"{value:,.0f}"
-    return f"{value:.1f}" if abs(value) >= 10 else f"{value:.2f}" if abs(value) >= 0.1 else f"{value:.2g}"
+    return (
+        f"{value:.1f}"
+        if abs(value) >= 10
+        else f"{value:.2f}"
+        if abs(value) >= 0.1
+        else f"{value:.2g}"
+    )
 
 
 if __name__ == "__main__":

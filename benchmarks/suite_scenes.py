@@ -9,19 +9,27 @@ import torch
 from torch import Tensor
 
 import spackle
-from spackle.camera import Camera
-from spackle.camera_path import MAX_DISPARITY, DepthRange, extremes
-from spackle.errors import InputError
-from spackle.gaussians import Gaussians
+from spackle.core.camera import Camera
+from spackle.core.gaussians import Gaussians
+from spackle.core.trajectories import MAX_DISPARITY, DepthRange, extremes
 from spackle.render import Renderer
 from spackle.residual import hole_area_ratio
+from spackle.runtime.errors import InputError
 
 SIDE = 1536  # pixels a side, as in SHARP
 CELL = 2
-HOLES, HALVINGS, CLOSE = 0.05, 14, 0.01  # share of a view; steps and relative tolerance of the search
+HOLES, HALVINGS, CLOSE = (
+    0.05,
+    14,
+    0.01,
+)  # share of a view; steps and relative tolerance of the search
 # Boxes in front of the wall: left, top, right, bottom as fractions of the image, and depth in metres.
 # They cover less than a tenth of it, so that camera paths look at the wall.
-BOXES = ((0.15, 0.20, 0.30, 0.40, 3.5), (0.60, 0.35, 0.80, 0.55, 3.0), (0.35, 0.70, 0.50, 0.80, 4.0))
+BOXES = (
+    (0.15, 0.20, 0.30, 0.40, 3.5),
+    (0.60, 0.35, 0.80, 0.55, 3.0),
+    (0.35, 0.70, 0.50, 0.80, 4.0),
+)
 WALL_M = 6.0
 BEHIND = 1.02  # ratio of the second layer's depth to the first's
 SPREAD_PX = 1.3
@@ -38,10 +46,17 @@ def photo_scene(side: int = SIDE) -> tuple[Gaussians, Camera]:
     for layer in range(2):
         waves = 1.5 * torch.sin(9 * xs / grid) * torch.cos(7 * ys / grid)
         z = 3 + 2 * layer + waves + 0.05 * torch.rand(grid, grid, generator=generator)
-        scales = (0.6 + 0.8 * torch.rand(n, 3, generator=generator)) * z.reshape(n, 1) / camera.focal[0]
-        quats, opacities = torch.randn(n, 4, generator=generator), 0.04 + 0.95 * torch.rand(n, generator=generator)
+        scales = (
+            (0.6 + 0.8 * torch.rand(n, 3, generator=generator)) * z.reshape(n, 1) / camera.focal[0]
+        )
+        quats, opacities = (
+            torch.randn(n, 4, generator=generator),
+            0.04 + 0.95 * torch.rand(n, generator=generator),
+        )
         colors = torch.rand(n, 3, generator=generator)
-        layers.append(Gaussians(camera.unproject(uv, z).reshape(n, 3), quats, scales, opacities, colors))
+        layers.append(
+            Gaussians(camera.unproject(uv, z).reshape(n, 3), quats, scales, opacities, colors)
+        )
     return Gaussians.cat(layers), camera
 
 
@@ -52,12 +67,22 @@ def holed_scene(side: int = SIDE) -> tuple[Gaussians, Camera]:
     for left, top, right, bottom, metres in BOXES:
         depth[int(top * grid) : int(bottom * grid), int(left * grid) : int(right * grid)] = metres
     hues = (0.4, 0.45, 0.55)
-    waves = [0.5 + hue * torch.sin(20 * k * xs / grid + 3 * depth + k * ys / 9) / 2 for k, hue in enumerate(hues, 1)]
-    quats, colors = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1), torch.stack(waves, dim=-1).reshape(n, 3)
+    waves = [
+        0.5 + hue * torch.sin(20 * k * xs / grid + 3 * depth + k * ys / 9) / 2
+        for k, hue in enumerate(hues, 1)
+    ]
+    quats, colors = (
+        torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
+        torch.stack(waves, dim=-1).reshape(n, 3),
+    )
     layers = []
     for z in (depth, BEHIND * depth):
         scales = (SPREAD_PX * z.reshape(n, 1) / camera.focal[0]).expand(n, 3).contiguous()
-        layers.append(Gaussians(camera.unproject(uv, z).reshape(n, 3), quats, scales, torch.full((n,), 0.99), colors))
+        layers.append(
+            Gaussians(
+                camera.unproject(uv, z).reshape(n, 3), quats, scales, torch.full((n,), 0.99), colors
+            )
+        )
     return Gaussians.cat(layers), camera
 
 
@@ -69,7 +94,9 @@ def _pixels(side: int) -> tuple[Camera, Tensor, Tensor, Tensor, int]:
     return Camera.from_focal(1.2 * side, side, side), uv, xs, ys, grid
 
 
-def find_view(base: Gaussians, camera: Camera, renderer: Renderer, share: float = HOLES) -> tuple[float, Camera]:
+def find_view(
+    base: Gaussians, camera: Camera, renderer: Renderer, share: float = HOLES
+) -> tuple[float, Camera]:
     """Find by bisection the disparity at which the right view has this share of holes; returns it and the view.
 
     Raises:
@@ -91,7 +118,9 @@ def commit() -> str:
     """The commit of the checkout that this package runs from, with a + if files have changed; else "unknown"."""
     git = ["git", "-C", str(Path(spackle.__file__).parent)]
     try:  # fails if the package is installed inside another project, which does not track it
-        subprocess.run([*git, "ls-files", "--error-unmatch", "__init__.py"], capture_output=True, check=True)
+        subprocess.run(
+            [*git, "ls-files", "--error-unmatch", "__init__.py"], capture_output=True, check=True
+        )
         found = [*git, "describe", "--always", "--dirty=+", "--exclude=*"]
         return subprocess.run(found, capture_output=True, check=True, text=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):

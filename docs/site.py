@@ -24,17 +24,32 @@ ELSEWHERE = {
     "residual-card.md": "src/spackle/weights/residual.md",
     "lite-card.md": "src/spackle/weights/lite.md",
 }
-CODE = {"python.md": "src/spackle/__init__.py", "commands.md": "src/spackle/cli/commands.py"}  # what a page is made of
+CODE = {
+    "python.md": "src/spackle/__init__.py",
+    "commands.md": "src/spackle/cli/commands.py",
+}  # what a page is made of
 COMMANDS = ("predict", "view", "render", "export", "info", "demo", "weights get", "weights list")
-COMMANDS += ("train", "dataset build", "dataset info", "dataset verify", "dataset preview", "evaluate", "tables")
+COMMANDS += (
+    "train",
+    "dataset build",
+    "dataset info",
+    "dataset verify",
+    "dataset preview",
+    "evaluate",
+    "tables",
+)
 COMMANDS += ("bench",)
-EXAMPLE = re.compile(r"^`(examples/\w+\.py)`$", re.MULTILINE)  # what a line with nothing but a link becomes
+EXAMPLE = re.compile(
+    r"^`(examples/\w+\.py)`$", re.MULTILINE
+)  # what a line with nothing but a link becomes
 LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)\s]+)\)")
 
 
 def on_files(files: Files, config: Any) -> Files:
     """Add the pages that docs/ does not hold."""
-    pages = {page: (ROOT / source).read_text(encoding="utf-8") for page, source in ELSEWHERE.items()}
+    pages = {
+        page: (ROOT / source).read_text(encoding="utf-8") for page, source in ELSEWHERE.items()
+    }
     pages |= {"commands.md": _commands(), "python.md": _python()}
     for page, text in pages.items():
         files.append(File.generated(config, page, content=text))
@@ -54,7 +69,9 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
             return found[0]
         place = (source.parent / file).resolve()
         name = moved.get(place) or (
-            place.relative_to(ROOT / "docs").as_posix() if place.is_relative_to(ROOT / "docs") else ""
+            place.relative_to(ROOT / "docs").as_posix()
+            if place.is_relative_to(ROOT / "docs")
+            else ""
         )
         if not name or place.is_dir():
             return words
@@ -70,19 +87,27 @@ def _code(found: re.Match[str]) -> str:
 
 def _commands() -> str:
     """The help of every command, with all options."""
-    parts = ["# Commands\n\nAll options, as `--help` prints them, and `--help-all` of `predict` and `render`.\n"]
+    parts = [
+        "# Commands\n\nAll options, as `--help` prints them, and `--help-all` of `predict` and `render`.\n"
+    ]
     for name in COMMANDS:
         whole = "--help-all" if name in ("predict", "render") else "--help"
         command = [sys.executable, "-m", "spackle", *name.split(), whole]
         environment = {**os.environ, "COLUMNS": "100", "PYTHONPATH": str(ROOT / "src")}
-        text = subprocess.run(command, capture_output=True, text=True, check=True, env=environment).stdout
-        parts.append(f"## spackle {name}\n\n```text\n{text.replace('python -m spackle', 'spackle').strip()}\n```\n")
+        text = subprocess.run(
+            command, capture_output=True, text=True, check=True, env=environment
+        ).stdout
+        parts.append(
+            f"## spackle {name}\n\n```text\n{text.replace('python -m spackle', 'spackle').strip()}\n```\n"
+        )
     return "\n".join(parts)
 
 
 def _python() -> str:
     """Every public name of the package, by its docstring."""
-    parts = ["# Python\n\nWhat `import spackle` gives. Conventions: [architecture](architecture.md).\n"]
+    parts = [
+        "# Python\n\nWhat `import spackle` gives. Conventions: [architecture](architecture.md).\n"
+    ]
     first = ["predict", "Scene", "complete"]
     for name in [*first, *(name for name in spackle.__all__ if name not in first)]:
         parts.append(f"::: {spackle._HOMES[name]}.{name}\n")

@@ -19,7 +19,9 @@ def main(photo: Path, depth: Path, out: Path) -> None:
     # The depth can also be an array or a tensor [H, W] in metres; 0 and NaN mean unknown.
     metres = scene.depth_map().numpy()
     again = spackle.predict(photo, np.where(metres > 0, metres, np.nan), fov=60, disparity=0.2)
-    print(f"{len(scene.base):,} Gaussians from the file, {len(again.base):,} from the scene's own depth")
+    print(
+        f"{len(scene.base):,} Gaussians from the file, {len(again.base):,} from the scene's own depth"
+    )
 
 
 if __name__ == "__main__":

@@ -19,7 +19,9 @@ def main(weights: Path, out: Path, photos: Sequence[Path]) -> None:
     for photo in photos:
         scene = session.predict(photo, trajectory="swipe")
         scene.save(out / f"{photo.stem}.ply")
-        print(f"{photo.name}: {len(scene.base):,} Gaussians of SHARP, {len(scene.aux):,} in its holes")
+        print(
+            f"{photo.name}: {len(scene.base):,} Gaussians of SHARP, {len(scene.aux):,} in its holes"
+        )
 
 
 if __name__ == "__main__":

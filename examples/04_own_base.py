@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 
 import spackle
-from spackle.bases.lift import lift
+from spackle.bases.depth import lift
 
 
 class Street:

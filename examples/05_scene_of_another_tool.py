@@ -13,7 +13,9 @@ import spackle
 
 def main(file: Path, photo: Path, out: Path) -> None:
     gaussians = spackle.load_ply(file)
-    camera = spackle.load_photo(photo).camera  # the focal length comes from EXIF; if EXIF has none, give fov=...
+    camera = spackle.load_photo(
+        photo
+    ).camera  # the focal length comes from EXIF; if EXIF has none, give fov=...
 
     before = spackle.Scene(gaussians, gaussians.select(slice(0)), camera)
     path = before.path("swipe", disparity=0.3)
@@ -22,7 +24,9 @@ def main(file: Path, photo: Path, out: Path) -> None:
 
     holes = [spackle.hole_area_ratio(each.render(path[0]).alpha) for each in (before, scene)]
     print(f"holes at the left end of the path: {holes[0]:.1%} -> {holes[1]:.2%}")
-    scene.save(out, disparity=0.3)  # the first Gaussians are equal to the Gaussians of the file, bit for bit
+    scene.save(
+        out, disparity=0.3
+    )  # the first Gaussians are equal to the Gaussians of the file, bit for bit
 
 
 if __name__ == "__main__":

@@ -27,7 +27,9 @@ class MeanColor(PlainInpainter):
 
 def main(photo: Path, out: Path) -> None:
     prediction = spackle.LiteBase.load().predict(spackle.load_photo(photo))
-    scene = spackle.Scene(prediction.gaussians, prediction.gaussians.select(slice(0)), prediction.camera)
+    scene = spackle.Scene(
+        prediction.gaussians, prediction.gaussians.select(slice(0)), prediction.camera
+    )
     texture = partial(painted_texture, MeanColor())
     context = spackle.FillContext(scene.base, scene.camera, spackle.get_renderer(), texture=texture)
     filled = spackle.fill_scene(context, scene.path("swipe", disparity=0.15))

@@ -9,10 +9,16 @@ import sys
 from pathlib import Path
 
 import spackle
-from spackle.formats import load_path, save_video
+from spackle.formats import load_path
+from spackle.video.encoding import save_video
 
 AHEAD = {"target": [0, 0, 3]}  # metres in front of the photo's camera
-KEYFRAMES = {"keyframes": [{"time": 0, "eye": [0, 0, 0], **AHEAD}, {"time": 1, "eye": [0.1, 0, 0.05], **AHEAD}]}
+KEYFRAMES = {
+    "keyframes": [
+        {"time": 0, "eye": [0, 0, 0], **AHEAD},
+        {"time": 1, "eye": [0.1, 0, 0.05], **AHEAD},
+    ]
+}
 
 
 def main(file: Path, out: Path) -> None:
@@ -31,7 +37,9 @@ def main(file: Path, out: Path) -> None:
         pose[0, 3] -= x
         return dataclasses.replace(scene.camera.even(), world_to_camera=pose)
 
-    save_video((scene.render(at(0.002 * step)).rgb for step in range(24)), out / "truck.mp4", fps=24)
+    save_video(
+        (scene.render(at(0.002 * step)).rgb for step in range(24)), out / "truck.mp4", fps=24
+    )
 
 
 if __name__ == "__main__":

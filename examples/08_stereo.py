@@ -7,9 +7,9 @@ import sys
 from pathlib import Path
 
 import spackle
-from spackle.camera_path import DepthRange
+from spackle.core.trajectories import DepthRange
 from spackle.formats import save_png
-from spackle.video_frames import Stereo, default_ipd
+from spackle.video.frames import Stereo, default_ipd
 
 
 def main(file: Path, out: Path) -> None:
@@ -18,9 +18,13 @@ def main(file: Path, out: Path) -> None:
     depth = DepthRange.of(scene.base)
     ipd = default_ipd(scene.camera, depth)  # metres; 0.065 if the nearest surface is 1.8 m away
 
-    scene.save_video(out / "sbs.mp4", "swipe", disparity=0.05, fps=24, seconds=1, stereo="sbs", ipd=ipd)
+    scene.save_video(
+        out / "sbs.mp4", "swipe", disparity=0.05, fps=24, seconds=1, stereo="sbs", ipd=ipd
+    )
 
-    glasses = Stereo("anaglyph", ipd, convergence=depth.focus)  # what is at this depth appears in the screen's plane
+    glasses = Stereo(
+        "anaglyph", ipd, convergence=depth.focus
+    )  # what is at this depth appears in the screen's plane
     left, right = scene.frames(glasses.eyes(scene.camera))
     save_png(glasses.pack(left.rgb, right.rgb), out / "anaglyph.png")
 

@@ -9,10 +9,10 @@ import sys
 from pathlib import Path
 
 import spackle
-from spackle.bases.lift import lift
-from spackle.evaluation.datasets.stereo import load_motorcycle
-from spackle.evaluation.metrics import psnr
+from spackle.bases.depth import lift
 from spackle.formats import save_png
+from spackle.paper.evaluation.datasets.stereo import load_motorcycle
+from spackle.paper.evaluation.metrics import psnr
 
 
 def main(out: Path) -> None:
@@ -24,7 +24,9 @@ def main(out: Path) -> None:
     before = spackle.get_renderer().render(scene.base, pair.right_camera)
     after = scene.render(pair.right_camera)
     hole = spackle.hole_mask(before.alpha)
-    print(f"holes: {spackle.hole_area_ratio(before.alpha):.1%} -> {spackle.hole_area_ratio(after.alpha):.2%}")
+    print(
+        f"holes: {spackle.hole_area_ratio(before.alpha):.1%} -> {spackle.hole_area_ratio(after.alpha):.2%}"
+    )
     for name, view in (("base", before.rgb), ("completed", after.rgb)):
         inside, outside = psnr(view, pair.right, hole), psnr(view, pair.right, ~hole)
         print(f"{name}: {inside:.2f} dB in the hole, {outside:.2f} dB outside")

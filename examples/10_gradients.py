@@ -12,9 +12,9 @@ from pathlib import Path
 import torch
 
 import spackle
-from spackle.bases.lift import lift
-from spackle.evaluation.datasets.stereo import load_motorcycle
+from spackle.bases.depth import lift
 from spackle.formats import save_png
+from spackle.paper.evaluation.datasets.stereo import load_motorcycle
 
 
 def main(out: Path, steps: int = 25) -> None:

@@ -12,8 +12,20 @@ from pathlib import Path
 
 import spackle
 
-SMALL = ["network=unet", "data.views=24", "data.validation_views=4", "data.cells=24", "loss.features=none"]
-SHORT = ["optim.steps=40", "optim.warmup=5", "optim.batch=4", "run.validate_every=20", "run.save_every=20"]
+SMALL = [
+    "network=unet",
+    "data.views=24",
+    "data.validation_views=4",
+    "data.cells=24",
+    "loss.features=none",
+]
+SHORT = [
+    "optim.steps=40",
+    "optim.warmup=5",
+    "optim.batch=4",
+    "run.validate_every=20",
+    "run.save_every=20",
+]
 
 
 def run(*words: object) -> None:
@@ -23,8 +35,28 @@ def run(*words: object) -> None:
 
 def main(photos: Path, out: Path) -> None:
     views = ["--views", 4, "--disparity", 0.2, 0.4]
-    run("dataset", "build", photos, "-o", out / "set", "--base", "lite", "--inpainter", "exemplar", *views)
-    run("train", "--recipe", "paper", "-o", out / "run", f"data.pseudo={out / 'set'}", *SMALL, *SHORT)
+    run(
+        "dataset",
+        "build",
+        photos,
+        "-o",
+        out / "set",
+        "--base",
+        "lite",
+        "--inpainter",
+        "exemplar",
+        *views,
+    )
+    run(
+        "train",
+        "--recipe",
+        "paper",
+        "-o",
+        out / "run",
+        f"data.pseudo={out / 'set'}",
+        *SMALL,
+        *SHORT,
+    )
 
     photo = min(path for path in photos.iterdir() if path.suffix in (".jpg", ".png"))
     scene = spackle.predict(photo, residual=out / "run" / "best.safetensors")

@@ -9,18 +9,20 @@ from functools import partial
 import torch
 
 import spackle
-from spackle.bases.lift import lift
-from spackle.evaluation.case import Viewpoint
-from spackle.evaluation.datasets.stereo import load_motorcycle
-from spackle.evaluation.methods import Fill, MethodView, make_method
-from spackle.evaluation.protocols import Gauges, measure_views
-from spackle.evaluation.rows import Row
+from spackle.bases.depth import lift
+from spackle.paper.evaluation.case import Viewpoint
+from spackle.paper.evaluation.datasets.stereo import load_motorcycle
+from spackle.paper.evaluation.methods import Fill, MethodView, make_method
+from spackle.paper.evaluation.protocols import Gauges, measure_views
+from spackle.paper.evaluation.rows import Row
 
 
 def mean_color(camera: spackle.Camera, before: spackle.Rendering) -> MethodView:
     """Your method: gets a view and the base rendered from this view, and returns an image."""
     hole = spackle.hole_mask(before.alpha)
-    return MethodView(torch.where(hole[..., None], before.rgb[~hole].mean(dim=0), before.rgb), None, None)
+    return MethodView(
+        torch.where(hole[..., None], before.rgb[~hole].mean(dim=0), before.rgb), None, None
+    )
 
 
 def main() -> list[Row]:
@@ -28,8 +30,12 @@ def main() -> list[Row]:
     base = lift(pair.left, pair.depth, pair.left_camera).gaussians
     context = spackle.FillContext(base, pair.left_camera, spackle.get_renderer())
     views = [Viewpoint("near", "right", pair.right_camera, lambda: pair.right)]
-    methods: dict[str, Callable[[Sequence[spackle.Camera]], Fill]] = {"mine": lambda cameras: mean_color}
-    methods |= {name: partial(make_method, name, context=context) for name in ("base", "seeds", "spackle")}
+    methods: dict[str, Callable[[Sequence[spackle.Camera]], Fill]] = {
+        "mine": lambda cameras: mean_color
+    }
+    methods |= {
+        name: partial(make_method, name, context=context) for name in ("base", "seeds", "spackle")
+    }
     image = Row("Middlebury", "Motorcycle", "", "", "", "", None)
     rows, _ = measure_views(image, context, views, methods, Gauges(["psnr", "ssim"], {}, None))
     return rows

@@ -7,7 +7,7 @@
 from PIL import Image
 
 import spackle
-from spackle.color import to_bytes
+from spackle.core.color import to_bytes
 
 scene = spackle.predict("photo.jpg")
 print(scene)

@@ -19,10 +19,19 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 RUNS = {  # name: initial weights, and values that override the recipe cpu
-    "first": ("", "data.views=1200 optim.steps=2700 loss.color_blur=0 loss.perceptual=1 loss.gram=1"),
-    "second": ("first", "data.views=420 optim.steps=2000 optim.warmup=60 optim.lr=3e-4 optim.min_lr=2e-5"),
+    "first": (
+        "",
+        "data.views=1200 optim.steps=2700 loss.color_blur=0 loss.perceptual=1 loss.gram=1",
+    ),
+    "second": (
+        "first",
+        "data.views=420 optim.steps=2000 optim.warmup=60 optim.lr=3e-4 optim.min_lr=2e-5",
+    ),
     "third": ("mixed", "data.views=1524 optim.steps=4000"),
-    "fourth": ("third", "data.views=1124 data.seed=1 optim.steps=2400 optim.lr=2e-4 optim.min_lr=1e-5"),
+    "fourth": (
+        "third",
+        "data.views=1124 data.seed=1 optim.steps=2400 optim.lr=2e-4 optim.min_lr=1e-5",
+    ),
 }
 MIXED = {"first": 0.35, "second": 0.65}  # the third run starts from a mean with these shares
 SHIPPED = {"mixed": 0.1, "third": 0.4, "fourth": 0.5}
@@ -31,31 +40,52 @@ SHIPPED = {"mixed": 0.1, "third": 0.4, "fourth": 0.5}
 def mean(files: Mapping[Path, float]) -> dict[str, Tensor]:
     """The mean of files' weights, weighted by their shares, in float32."""
     parts = [
-        {name: share * tensor.float() for name, tensor in load_file(file).items()} for file, share in files.items()
+        {name: share * tensor.float() for name, tensor in load_file(file).items()}
+        for file, share in files.items()
     ]
     return {name: sum((part[name] for part in parts[1:]), parts[0][name]) for name in parts[0]}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit status of a failed run, else 0."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("-o", "--output", type=Path, required=True, help="a folder; runs in it go on")
-    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="of every run: where the data lies")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "-o", "--output", type=Path, required=True, help="a folder; runs in it go on"
+    )
+    parser.add_argument(
+        "overrides", nargs="*", metavar="KEY=VALUE", help="of every run: where the data lies"
+    )
     options = parser.parse_intermixed_args(arguments)
 
     def file(name: str) -> Path:
         folder: Path = options.output
-        return folder / "mixed.safetensors" if name == "mixed" else folder / name / "best.safetensors"
+        return (
+            folder / "mixed.safetensors" if name == "mixed" else folder / name / "best.safetensors"
+        )
 
     for name, (start, values) in RUNS.items():
         if start == "mixed":
             save_file(mean({file(part): share for part, share in MIXED.items()}), file("mixed"))
         init = [f"init={file(start)}"] if start else []
-        words = ["train", "--recipe", "cpu", "-o", options.output / name, *init, *values.split(), *options.overrides]
+        words = [
+            "train",
+            "--recipe",
+            "cpu",
+            "-o",
+            options.output / name,
+            *init,
+            *values.split(),
+            *options.overrides,
+        ]
         if status := subprocess.run([sys.executable, "-m", "spackle", *map(str, words)]).returncode:
             return status
     shipped = mean({file(part): share for part, share in SHIPPED.items()})
-    save_file({name: tensor.half() for name, tensor in shipped.items()}, options.output / "residual.safetensors")
+    save_file(
+        {name: tensor.half() for name, tensor in shipped.items()},
+        options.output / "residual.safetensors",
+    )
     print(options.output / "residual.safetensors")
     return 0
 

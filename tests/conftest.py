@@ -22,7 +22,7 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "repeat"))
 @pytest.fixture
 def pair(tmp_path: Path) -> tuple[Path, Path]:
     """A small photo and its depth map."""
-    from photos import write_pair
+    from helpers.photos import write_pair
 
     return write_pair(tmp_path)
 
@@ -30,11 +30,14 @@ def pair(tmp_path: Path) -> tuple[Path, Path]:
 @pytest.fixture(scope="session")
 def made(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Random weights of SHARP and lite."""
-    from sharp_weights import write_tiny
-    from stand_in import SHARP_FILE, write_lite
+    from helpers.sharp_weights import write_tiny
+    from helpers.stand_in import SHARP_FILE, write_lite
 
     folder = tmp_path_factory.mktemp("weights")
-    return {"sharp": write_tiny(folder / SHARP_FILE), "lite": write_lite(folder / "lite.safetensors")}
+    return {
+        "sharp": write_tiny(folder / SHARP_FILE),
+        "lite": write_lite(folder / "lite.safetensors"),
+    }
 
 
 @pytest.fixture

@@ -10,19 +10,19 @@ from typing import Any
 
 import av
 import numpy as np
-import portraits
 import pytest
 import torch
-from command import decode
-from photos import HEIGHT, WIDTH, metres, write_depth, write_pair, write_photo
+from helpers import portraits
+from helpers.command import decode
+from helpers.photos import HEIGHT, WIDTH, metres, write_depth, write_pair, write_photo
+from helpers.scenes import psnr, same_bits
 from PIL import Image
-from scenes import psnr, same_bits
 
 import spackle
-from spackle.bases.lift import RgbdBase
+from spackle.bases.depth import RgbdBase
 from spackle.bases.settings import BaseSettings
 from spackle.pipeline import Options, Pipeline
-from spackle.progress import LogReporter
+from spackle.runtime.progress import LogReporter
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +40,9 @@ def documented() -> list[str]:
 
 
 @pytest.mark.parametrize("code", documented(), ids=lambda code: f"{len(code)} characters")
-def test_the_documented_three_lines_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str) -> None:
+def test_the_documented_three_lines_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str
+) -> None:
     assert len([line for line in code.splitlines() if line]) == 3
     write_photo(tmp_path / "photo.jpg")
     write_depth(tmp_path / "depth.png")
@@ -52,14 +54,19 @@ def test_the_documented_three_lines_work(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_every_public_name_is_there_and_no_other() -> None:
-    for name in [*spackle.__all__, *spackle.__all__]:  # twice, because an import could replace a name by a module
+    for name in [
+        *spackle.__all__,
+        *spackle.__all__,
+    ]:  # twice, because an import could replace a name by a module
         assert not isinstance(getattr(spackle, name), ModuleType)
     assert {"predict", "Scene", "__version__"} <= set(dir(spackle))
     with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
         spackle.nonsense  # noqa: B018
 
 
-def test_paths_and_loaded_values_give_the_same_scene(scene: spackle.Scene, pair: tuple[Path, Path]) -> None:
+def test_paths_and_loaded_values_give_the_same_scene(
+    scene: spackle.Scene, pair: tuple[Path, Path]
+) -> None:
     photo, depth = pair
     loaded = spackle.load_photo(photo), spackle.load_depth(depth)
     assert same_bits(spackle.predict(*loaded).gaussians, scene.gaussians)
@@ -82,7 +89,12 @@ def test_an_argument_works_by_its_earlier_name(scene: spackle.Scene) -> None:
 def test_a_photo_and_its_depth_in_every_form(pair: tuple[Path, Path], tmp_path: Path) -> None:
     photo, depth = pair
     pixels, metres_of = np.asarray(Image.open(photo).convert("RGB")), spackle.load_depth(depth)
-    depths = [depth.read_bytes(), io.BytesIO(depth.read_bytes()), metres_of.depth.numpy(), metres_of.depth.double()]
+    depths = [
+        depth.read_bytes(),
+        io.BytesIO(depth.read_bytes()),
+        metres_of.depth.numpy(),
+        metres_of.depth.double(),
+    ]
     photos = [photo.read_bytes(), io.BytesIO(photo.read_bytes()), Image.open(photo), pixels]
     photos += [(tensor := torch.from_numpy(pixels / 255)), tensor.movedim(2, 0)]
     session = spackle.Spackle(residual="seeds")
@@ -109,7 +121,11 @@ def test_a_photo_and_its_depth_in_every_form(pair: tuple[Path, Path], tmp_path: 
         (object(), {}, "a path, bytes"),
         (np.zeros((48, 64, 3)), {"depth": np.zeros((48, 64), complex)}, "metres"),
         (np.zeros((48, 64, 3)), {"depth": np.zeros((48, 64))}, "all-invalid"),
-        (np.zeros((48, 64, 3)), {"base": "lite", "depth": np.ones((48, 64))}, "leave one of them out"),
+        (
+            np.zeros((48, 64, 3)),
+            {"base": "lite", "depth": np.ones((48, 64))},
+            "leave one of them out",
+        ),
         (np.zeros((48, 64, 3)), {"base": "sharpest"}, "sharp"),
         (np.zeros((48, 64, 3)), {"fov": "60"}, "--fov must be a positive number, got '60'"),
         (np.zeros((48, 64, 3)), {"residual": "no" * 9000}, "no such weight file"),
@@ -132,7 +148,9 @@ def test_scenes_are_written_to_open_files(scene: spackle.Scene, tmp_path: Path) 
     assert saved.getvalue() == (tmp_path / "scene.ply").read_bytes() == scene.to_bytes("ply")
     assert exported.getvalue() == scene.to_bytes("spz")
     with av.open(io.BytesIO(video.getvalue())) as container:
-        assert [(frame.width, frame.height) for frame in container.decode(video=0)] == [(160, 40)] * 3
+        assert [(frame.width, frame.height) for frame in container.decode(video=0)] == [
+            (160, 40)
+        ] * 3
     for bad in ({"stereo": "both"}, {"fit": "fill"}, {"show": "light"}, {"format": "avi"}):
         with pytest.raises(spackle.InputError, match=r"^(--\w+ \w+ is unknown|video\.avi: not)"):
             scene.save_video(io.BytesIO(), **bad)  # type: ignore[arg-type]
@@ -150,7 +168,10 @@ def test_a_scene_is_loaded_exported_and_shown(scene: spackle.Scene, tmp_path: Pa
         scene.export(tmp_path / name)
     loaded = spackle.Scene.load(tmp_path / "scene.ply")
     assert repr(loaded) == repr(scene)
-    assert (loaded.disparity, torch.equal(loaded.base.means, scene.base.means)) == (scene.disparity, True)
+    assert (loaded.disparity, torch.equal(loaded.base.means, scene.base.means)) == (
+        scene.disparity,
+        True,
+    )
     assert scene.disparity is not None
     wide = spackle.Scene.load(tmp_path / "scene.ply", fov=90)
     assert wide.camera.focal[0] == pytest.approx(WIDTH / 2)
@@ -168,13 +189,17 @@ def test_predict_takes_a_focal_length_and_draws_its_progress(
 ) -> None:
     photo, depth = pair
     made = spackle.predict(photo, depth, fov=90, disparity=0.1, residual="seeds", progress=True)
-    assert [frame.rgb.shape for frame in made.frames(made.path("swipe", frames=2))] == [(HEIGHT, WIDTH, 3)] * 2
+    assert [frame.rgb.shape for frame in made.frames(made.path("swipe", frames=2))] == [
+        (HEIGHT, WIDTH, 3)
+    ] * 2
     assert made.camera.focal[0] == pytest.approx(WIDTH / 2)
     assert "complete" in capsys.readouterr().err
     with pytest.raises(ValueError, match="load_photo"):
         spackle.predict(spackle.load_photo(photo), depth, fov=90)
     narrow = write_photo(photo.with_name("narrow.png"), 290, 36)
-    with pytest.raises(spackle.InputError, match=r"narrow\.png: 290×36 is too small or too narrow: give"):
+    with pytest.raises(
+        spackle.InputError, match=r"narrow\.png: 290×36 is too small or too narrow: give"
+    ):
         spackle.predict(narrow)
 
 
@@ -183,8 +208,12 @@ def test_complete_fills_the_given_views(scene: spackle.Scene, tmp_path: Path) ->
     prediction = RgbdBase(spackle.load_depth(depth)).predict(spackle.load_photo(photo))
     seen: list[tuple[int, int]] = []
     cameras = scene.path("swipe", disparity=0.4, frames=4)
-    made = spackle.complete(prediction, cameras, exact=True, progress=lambda done, total: seen.append((done, total)))
+    made = spackle.complete(
+        prediction, cameras, exact=True, progress=lambda done, total: seen.append((done, total))
+    )
     assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
     assert all(spackle.hole_area_ratio(made.render(camera).alpha) < 2e-3 for camera in cameras)
     seeds = spackle.complete(prediction, cameras, exact=True, network=None)
-    assert 10 < psnr(made.render(cameras[0]).rgb, seeds.render(cameras[0]).rgb) < 60  # the weights change the picture
+    assert (
+        10 < psnr(made.render(cameras[0]).rgb, seeds.render(cameras[0]).rgb) < 60
+    )  # the weights change the picture

@@ -12,8 +12,8 @@ import venv
 from pathlib import Path
 
 import pytest
-from command import page_of
-from photos import write_photo
+from helpers.command import page_of
+from helpers.photos import write_photo
 
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "Dockerfile").read_text(encoding="utf-8")
@@ -28,7 +28,11 @@ def steps() -> list[tuple[str, str]]:
 def test_copied_files_exist_and_are_not_ignored() -> None:
     copied = [name for word, rest in steps() if word == "COPY" for name in rest.split()[:-1]]
     assert all((ROOT / name).exists() for name in copied)
-    kept = {line.removeprefix("!") for line in (ROOT / ".dockerignore").read_text().splitlines() if line[0] == "!"}
+    kept = {
+        line.removeprefix("!")
+        for line in (ROOT / ".dockerignore").read_text().splitlines()
+        if line[0] == "!"
+    }
     assert set(copied) == kept
 
 
@@ -36,7 +40,10 @@ def test_copied_files_exist_and_are_not_ignored() -> None:
 def test_its_steps_install_a_command_that_predicts_and_views(tmp_path: Path) -> None:
     root = tmp_path / "image"
     venv.create(root / "python", with_pip=True)
-    place, variables = root, {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "NUMBA"))}
+    place, variables = (
+        root,
+        {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "NUMBA"))},
+    )
     variables["PATH"] = f"{root / 'python' / 'bin'}:{variables['PATH']}"
     under = lambda text: text.replace("/opt/spackle", f"{root}/opt/spackle")  # noqa: E731
     for word, rest in steps():
@@ -57,7 +64,9 @@ def test_its_steps_install_a_command_that_predicts_and_views(tmp_path: Path) -> 
             command = under(rest)
             if sys.version_info[:2] < (3, 11):
                 command = command.replace("--constraint constraints.txt", "")
-            subprocess.run(["sh", "-ec", command], cwd=place, env=variables, check=True, timeout=1800)
+            subprocess.run(
+                ["sh", "-ec", command], cwd=place, env=variables, check=True, timeout=1800
+            )
     assert list((root / "opt/spackle/kernels").rglob("*.nbi"))
     write_photo(place / "photo.png")
     spackle = root / "python" / "bin" / "spackle"

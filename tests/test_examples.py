@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from command import decode
-from photos import write_depth, write_photo
+from helpers.command import decode
+from helpers.photos import write_depth, write_photo
+from helpers.sharp_weights import write_tiny
 from PIL import Image
-from sharp_weights import write_tiny
 
 import spackle
 
@@ -36,15 +36,15 @@ def photo(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("scene")
-    made = spackle.predict(write_photo(folder / "photo.png"), write_depth(folder / "depth.npy"), trajectory="swipe")
+    made = spackle.predict(
+        write_photo(folder / "photo.png"), write_depth(folder / "depth.npy"), trajectory="swipe"
+    )
     made.save(folder / "scene.ply")
     return folder / "scene.ply"
 
 
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
-def test_an_example_is_short_and_in_the_docs(example: Path) -> None:
-    text = example.read_text(encoding="utf-8")
-    assert len(text.splitlines()) <= 40
+def test_an_example_is_in_the_docs(example: Path) -> None:
     assert example.name in (ROOT / "docs" / "examples.md").read_text(encoding="utf-8")
 
 
@@ -53,13 +53,17 @@ def test_examples_of_a_photo(photo: Path, tmp_path: Path) -> None:
     assert {path.suffix for path in (tmp_path / "1").iterdir()} == {".mp4", ".ply", ".html"}
     main_of(4)(photo, tmp_path / "4")
     own = spackle.Scene.load(tmp_path / "4" / "scene.ply")
-    assert float(own.base.means[:, 2].median()) == pytest.approx(11, abs=3)  # the depths are between 2 and 20 m
+    assert float(own.base.means[:, 2].median()) == pytest.approx(
+        11, abs=3
+    )  # the depths are between 2 and 20 m
     main_of(6)(photo, tmp_path / "6.mp4")
     assert len(decode(tmp_path / "6.mp4")) > 30
 
 
 def test_the_example_of_a_depth_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    main_of(2)(write_photo(tmp_path / "photo.png"), write_depth(tmp_path / "depth.png"), tmp_path / "out")
+    main_of(2)(
+        write_photo(tmp_path / "photo.png"), write_depth(tmp_path / "depth.png"), tmp_path / "out"
+    )
     assert "from the scene's own depth" in capsys.readouterr().out
     assert spackle.Scene.load(tmp_path / "out" / "scene.ply").disparity == pytest.approx(0.2)
 
@@ -75,7 +79,11 @@ def test_the_example_completes_a_scene_of_another_tool(scene: Path, tmp_path: Pa
 
 def test_examples_of_videos(scene: Path, tmp_path: Path) -> None:
     main_of(7)(scene, tmp_path)
-    assert [len(decode(tmp_path / f"{name}.mp4")) for name in ("swipe", "keyframes", "truck")] == [48, 24, 24]
+    assert [len(decode(tmp_path / f"{name}.mp4")) for name in ("swipe", "keyframes", "truck")] == [
+        48,
+        24,
+        24,
+    ]
     main_of(8)(scene, tmp_path)
     assert len(decode(tmp_path / "sbs.mp4")) == 24
     files = (tmp_path / "anaglyph.png", scene.with_name("photo.png"))
@@ -90,7 +98,9 @@ def test_the_example_of_sharp(photo: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_examples_with_a_true_second_photo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_examples_with_a_true_second_photo(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     pytest.importorskip("skimage.data")
     main_of(9)(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {"base.png", "completed.png", "truth.png"}
@@ -112,5 +122,10 @@ def test_the_example_of_training(tmp_path: Path) -> None:
 
 def test_the_example_of_a_notebook(photo: Path, tmp_path: Path) -> None:
     (tmp_path / "photo.jpg").write_bytes(photo.read_bytes())
-    subprocess.run([sys.executable, ROOT / "examples" / "14_notebook.py"], cwd=tmp_path, check=True, timeout=300)
+    subprocess.run(
+        [sys.executable, ROOT / "examples" / "14_notebook.py"],
+        cwd=tmp_path,
+        check=True,
+        timeout=300,
+    )
     assert (tmp_path / "photo.html").stat().st_size > 10_000

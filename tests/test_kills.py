@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from dataset_builds import SHORT, write_inputs
-from evaluation_data import write_boxes
-from photos import write_depth, write_photo
-from training_runs import assert_same_weights
+from helpers.dataset_builds import SHORT, write_inputs
+from helpers.evaluation_data import write_boxes
+from helpers.photos import write_depth, write_photo
+from helpers.training_runs import assert_same_weights
 
 Words = list[object]
 TIMES = {"seconds", "total"}
@@ -27,7 +27,15 @@ TIMES = {"seconds", "total"}
 def predict(place: Path) -> Words:
     for name in "abcd":
         write_photo(place / "photos" / f"{name}.png")
-    return ["predict", place / "photos", "--depth", write_depth(place / "depth.npy"), "--frames", 20, "-o"]
+    return [
+        "predict",
+        place / "photos",
+        "--depth",
+        write_depth(place / "depth.npy"),
+        "--frames",
+        20,
+        "-o",
+    ]
 
 
 def dataset(place: Path) -> Words:
@@ -44,8 +52,19 @@ def evaluate(place: Path) -> Words:
 def train(place: Path) -> Words:
     write_photo(place / "photos" / "a.png", 128, 96)
     (place / "recipe.yaml").write_text("run: {device: cpu}\n")
-    data = [f"data.photos={place / 'photos'}", "data.views=4", "data.validation_views=2", "data.cells=16"]
-    steps = ["optim.steps=8", "optim.batch=2", "run.save_every=2", "run.validate_every=4", "loss.features=none"]
+    data = [
+        f"data.photos={place / 'photos'}",
+        "data.views=4",
+        "data.validation_views=2",
+        "data.cells=16",
+    ]
+    steps = [
+        "optim.steps=8",
+        "optim.batch=2",
+        "run.save_every=2",
+        "run.validate_every=4",
+        "loss.features=none",
+    ]
     return ["train", "--recipe", place / "recipe.yaml", "data.crops=1", *data, *steps, "-o"]
 
 
@@ -58,9 +77,15 @@ def same_files(one: Path, other: Path) -> None:
         return content
 
     def files(folder: Path) -> dict[str, Any]:
-        found = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*") if path.is_file()}
+        found = {
+            path.relative_to(folder).as_posix(): path
+            for path in folder.rglob("*")
+            if path.is_file()
+        }
         return {
-            name: timeless(json.loads(path.read_text())) if path.suffix == ".json" else path.read_bytes()
+            name: timeless(json.loads(path.read_text()))
+            if path.suffix == ".json"
+            else path.read_bytes()
             for name, path in found.items()
         }
 
@@ -72,12 +97,23 @@ def same_files(one: Path, other: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "same"),
-    [(predict, same_files), (dataset, same_files), (evaluate, same_files), (train, assert_same_weights)],
+    [
+        (predict, same_files),
+        (dataset, same_files),
+        (evaluate, same_files),
+        (train, assert_same_weights),
+    ],
 )
 def test_ten_kills_change_nothing(
     tmp_path: Path, command: Callable[[Path], Words], same: Callable[[Path, Path], None]
 ) -> None:
-    whole, killed, rng, kills, runs = tmp_path / "whole", tmp_path / "killed", random.Random(0), 0, 0
+    whole, killed, rng, kills, runs = (
+        tmp_path / "whole",
+        tmp_path / "killed",
+        random.Random(0),
+        0,
+        0,
+    )
     words = [sys.executable, "-m", "spackle", *map(str, command(tmp_path))]
     environment = os.environ | {"OMP_NUM_THREADS": "1"}  # a fixed order of sums
 

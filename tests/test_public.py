@@ -28,25 +28,40 @@ render; serve; tables; train; view; weights get; weights list
 def leaves(command: object, name: str = "") -> list[str]:
     if not isinstance(command, TyperGroup):
         return [name]
-    return [leaf for word, below in command.commands.items() for leaf in leaves(below, f"{name} {word}".strip())]
+    return [
+        leaf
+        for word, below in command.commands.items()
+        for leaf in leaves(below, f"{name} {word}".strip())
+    ]
 
 
 def test_the_public_names_are_these() -> None:
     assert spackle.__all__ == PYTHON.split()
-    assert sorted(leaves(get_command(app))) == [" ".join(name.split()) for name in COMMANDS.split(";")]
+    assert sorted(leaves(get_command(app))) == [
+        " ".join(name.split()) for name in COMMANDS.split(";")
+    ]
 
 
 @pytest.mark.parametrize("name", spackle.__all__)
 def test_public_functions_are_annotated_without_any(name: str) -> None:
     thing = getattr(spackle, name)
-    methods = [value for key, value in vars(thing).items() if not key.startswith("_")] if inspect.isclass(thing) else []
+    methods = (
+        [value for key, value in vars(thing).items() if not key.startswith("_")]
+        if inspect.isclass(thing)
+        else []
+    )
     for function in filter(inspect.isfunction, [thing, *methods, getattr(thing, "__init__", None)]):
         signature = inspect.signature(function)
-        types = [signature.return_annotation, *(value.annotation for value in signature.parameters.values())]
+        types = [
+            signature.return_annotation,
+            *(value.annotation for value in signature.parameters.values()),
+        ]
         assert not [kind for kind in types if re.search(r"\bAny\b", str(kind))], function
 
 
 def test_tag_changelog_and_code_are_of_one_version() -> None:
     assert re.fullmatch(r"\d+\.\d+\.\d+", spackle.__version__)
-    heads = re.findall(r"^## \[(.+?)\]", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
+    heads = re.findall(
+        r"^## \[(.+?)\]", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE
+    )
     assert heads[0] in ("Unreleased", spackle.__version__)

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from photos import write_photo
+from helpers.photos import write_photo
 from safetensors.torch import load_file
 
 from spackle.bases.lite import SHIPPED as LITE
@@ -18,7 +18,13 @@ from spackle.residual.architectures import SHIPPED, load_residual
 
 pytestmark = pytest.mark.slow
 RESEARCH = Path(__file__).parents[1] / "research"
-SHORT = ["optim.steps=2", "optim.batch=2", "optim.warmup=0", "run.validate_every=2", "run.save_every=2"]
+SHORT = [
+    "optim.steps=2",
+    "optim.batch=2",
+    "optim.warmup=0",
+    "run.validate_every=2",
+    "run.save_every=2",
+]
 
 
 def rebuild(script: str, output: Path, *overrides: str) -> None:
@@ -31,9 +37,17 @@ def rebuild(script: str, output: Path, *overrides: str) -> None:
 def test_the_residual_is_rebuilt(tmp_path: Path) -> None:
     for index in range(3):
         write_photo(tmp_path / "photos" / f"{index}.png", 96 + 16 * index, 80)
-    small = ["data.views=4", "data.validation_views=1", "data.cells=16", "data.stereo=null", "data.rgbd=[]"]
+    small = [
+        "data.views=4",
+        "data.validation_views=1",
+        "data.cells=16",
+        "data.stereo=null",
+        "data.rgbd=[]",
+    ]
     out = tmp_path / "out"
-    rebuild("rebuild_residual.py", out, f"data.photos={tmp_path}/photos", "loss.features=none", *small)
+    rebuild(
+        "rebuild_residual.py", out, f"data.photos={tmp_path}/photos", "loss.features=none", *small
+    )
     made, shipped = load_file(out / "residual.safetensors"), load_file(SHIPPED)
     assert {name: (x.shape, x.dtype) for name, x in made.items()} == {
         name: (x.shape, x.dtype) for name, x in shipped.items()
@@ -55,7 +69,15 @@ def test_lite_is_rebuilt(tmp_path: Path) -> None:
         f"data.validation_stereo={tmp_path}/others",
     ]
     rgbd = [f"data.rgbd=[{{folder: {tmp_path}/kitchen, focal_px: 60}}]"]
-    small = ["data.made=2", "data.guesses=1", "data.size=[64, 96]", "data.scales=[1]", "encoder=random"]
+    small = [
+        "data.made=2",
+        "data.guesses=1",
+        "data.size=[64, 96]",
+        "data.scales=[1]",
+        "encoder=random",
+    ]
     rebuild("lite/rebuild.py", tmp_path / "out", *data, *rgbd, *small)
-    sizes = [network.encoder.size for network in load_networks(tmp_path / "out" / "lite.safetensors")]
+    sizes = [
+        network.encoder.size for network in load_networks(tmp_path / "out" / "lite.safetensors")
+    ]
     assert sizes == [network.encoder.size for network in load_networks(LITE)] == ["lite0", "lite2"]

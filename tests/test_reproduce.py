@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from spackle.evaluation.datasets import DATASETS
-from spackle.evaluation.folder import load_run
-from spackle.evaluation.rows import Run
+from spackle.paper.evaluation.datasets import DATASETS
+from spackle.paper.evaluation.folder import load_run
+from spackle.paper.evaluation.rows import Run
 from spackle.residual.architectures import load_residual
 
 ROOT = Path(__file__).parents[1]
@@ -28,13 +28,19 @@ TABLES = (  # the paper's labels
 
 
 def sum_of(run: Run, method: str, metric: str) -> float:
-    return sum(float(row.value or 0) for row in run.rows if (row.method, row.metric) == (method, metric))
+    return sum(
+        float(row.value or 0) for row in run.rows if (row.method, row.metric) == (method, metric)
+    )
 
 
 @pytest.mark.slow
 def test_the_papers_chain_gives_its_tables_and_figures(tmp_path: Path) -> None:
     out, before = tmp_path / "out", os.times()
-    done = subprocess.run([sys.executable, ROOT / "benchmarks/reproduce.py", "-o", out], capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, ROOT / "benchmarks/reproduce.py", "-o", out],
+        capture_output=True,
+        text=True,
+    )
     assert done.returncode == 0, done.stdout + done.stderr + (out / "log.txt").read_text()[-2000:]
     # eight minutes of two cores
     assert sum(os.times()[2:4]) - sum(before[2:4]) < 2 * 480
@@ -56,8 +62,12 @@ def test_the_papers_chain_gives_its_tables_and_figures(tmp_path: Path) -> None:
         assert aux / (before * cells) == pytest.approx(1, abs=0.05)
         # As in the paper's table 4, Direct FT damages pixels outside of holes, and the residual does not.
         near = load_run(out / "runs" / f"{name}-near")
-        assert sum_of(near, "direct-ft", "psnr_outside") < 0.9 * sum_of(near, "base", "psnr_outside")
-        assert sum_of(near, "paper", "psnr_outside") == pytest.approx(sum_of(near, "base", "psnr_outside"), rel=2e-3)
+        assert sum_of(near, "direct-ft", "psnr_outside") < 0.9 * sum_of(
+            near, "base", "psnr_outside"
+        )
+        assert sum_of(near, "paper", "psnr_outside") == pytest.approx(
+            sum_of(near, "base", "psnr_outside"), rel=2e-3
+        )
         assert sum_of(near, "base", "psnr_hole") < 0.8 * sum_of(near, "paper", "psnr_hole")
     for name in ("comparison", "direct_ft"):
         assert (out / "figures" / f"{name}.pdf").stat().st_size > 10_000

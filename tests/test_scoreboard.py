@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import scoreboard
 import torch
-from evaluation_data import HEIGHT, WIDTH, write_boxes
+from helpers.evaluation_data import HEIGHT, WIDTH, write_boxes
 
-from spackle.training.losses import SqueezeNet
+from spackle.paper.training.losses import SqueezeNet
 
 
 @pytest.fixture
@@ -28,7 +28,16 @@ def pairs(tmp_path: Path) -> Path:
 
 
 def run(pairs: Path, *words: str) -> dict[str, Any]:
-    scoreboard.main([str(pairs), "--features", str(pairs / "squeezenet.npz"), "-o", str(pairs / "now.json"), *words])
+    scoreboard.main(
+        [
+            str(pairs),
+            "--features",
+            str(pairs / "squeezenet.npz"),
+            "-o",
+            str(pairs / "now.json"),
+            *words,
+        ]
+    )
     runs: dict[str, Any] = json.loads((pairs / "now.json").read_text())["runs"]
     return runs
 
@@ -57,7 +66,10 @@ def test_sign_test() -> None:
     assert scoreboard.sign_test(5, 5) == 1
     assert scoreboard.sign_test(9, 1) == pytest.approx(22 / 1024)  # 2 · (1 + 10) / 2¹⁰
     assert scoreboard.sign_test(0, 11) == pytest.approx(2 / 2048)
-    before, now = {"a": {"x": 1.0}, "b": {"x": 2.0}, "c": {"x": 7.0}}, {"a": {"x": 2.0}, "b": {"x": 1.5}}
+    before, now = (
+        {"a": {"x": 1.0}, "b": {"x": 2.0}, "c": {"x": 7.0}},
+        {"a": {"x": 2.0}, "b": {"x": 1.5}},
+    )
     assert scoreboard.change("x", before, now) == (1.5, 1.75, 1, 1)
 
 
@@ -67,6 +79,10 @@ def test_each_mechanism_is_in_the_package(name: str) -> None:
         for target in stage.get(name, {}):
             own = [vars(module)[target.rpartition(".")[2]] for module in scoreboard.holders(target)]
             with scoreboard.switched_off(name, stage):
-                there = [vars(module)[target.rpartition(".")[2]] for module in scoreboard.holders(target)]
+                there = [
+                    vars(module)[target.rpartition(".")[2]] for module in scoreboard.holders(target)
+                ]
                 assert there[0] is not own[0]
-            assert own == [vars(module)[target.rpartition(".")[2]] for module in scoreboard.holders(target)]
+            assert own == [
+                vars(module)[target.rpartition(".")[2]] for module in scoreboard.holders(target)
+            ]

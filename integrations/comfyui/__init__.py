@@ -17,16 +17,16 @@ from torch import Tensor
 
 from spackle import Photo, Scene, get_renderer, hole_mask
 from spackle import complete as complete_scene
-from spackle.bases import NEAREST_M, BasePrediction
-from spackle.bases.depth_map import FAR_M, RELATIVE, relative_depth
+from spackle.bases import BasePrediction
 from spackle.bases.open import OpenedBase, open_base
 from spackle.bases.settings import AUTO, AUTO_NETWORKS, BaseSettings
-from spackle.camera import Camera
-from spackle.camera_path import MAX_DISPARITY, TRAJECTORIES, TrajectoryKind
-from spackle.color import linear_to_srgb, srgb_to_linear
+from spackle.core.camera import Camera
+from spackle.core.color import linear_to_srgb, srgb_to_linear
+from spackle.core.gaussians import Gaussians
+from spackle.core.photo import focal_length
+from spackle.core.trajectories import MAX_DISPARITY, TRAJECTORIES, TrajectoryKind
+from spackle.depth.depth_map import FAR_M, NEAREST_M, RELATIVE, relative_depth
 from spackle.formats.scene_files import SH_C0
-from spackle.gaussians import Gaussians
-from spackle.image import focal_length
 from spackle.views import PATH_FRAMES
 
 FILLS = ("auto", "network", "exemplar", "lama", "none")
@@ -45,7 +45,10 @@ class LoadBase:
     def INPUT_TYPES(cls) -> dict[str, Any]:
         """`checkpoint` is a file of the base's weights; if empty, the download of `spackle weights get` is used."""
         names = [AUTO, *AUTO_NETWORKS]
-        return {"required": {"name": (names,)}, "optional": {"checkpoint": ("STRING", {"default": ""})}}
+        return {
+            "required": {"name": (names,)},
+            "optional": {"checkpoint": ("STRING", {"default": ""})},
+        }
 
     def load(self, name: str, checkpoint: str = "") -> tuple[OpenedBase]:
         """InputError if the base is not installed, or the checkpoint does not hold the base's weights."""
@@ -84,11 +87,15 @@ class PredictScene:
         """InputError if the base cannot use the image."""
         rgb = image[0, ..., :3].detach().float().cpu().clamp(0, 1)
         height, width = rgb.shape[:2]
-        lens = focal_length("image", width, height, {}, focal_px=None, focal_mm=None, fov=fov or None)
+        lens = focal_length(
+            "image", width, height, {}, focal_px=None, focal_mm=None, fov=fov or None
+        )
         photo = Photo(rgb, *lens, Path("image"))
         if depth is not None:
             greys = depth[0].detach().float().cpu().mean(dim=-1).numpy()
-            eighth = 1 / 255 if np.allclose(255 * greys, np.round(255 * greys), atol=0.01) else None  # of 8 bits
+            eighth = (
+                1 / 255 if np.allclose(255 * greys, np.round(255 * greys), atol=0.01) else None
+            )  # of 8 bits
             given = relative_depth(greys, depth_kind, "depth", near, far, eighth)
             base = open_base(BaseSettings(depth=given))
         prediction, _ = base.predict(photo)
@@ -107,7 +114,9 @@ class CompleteScene:
         given = {"scene": ("SPACKLE_SCENE",), "trajectory": TRAJECTORY, "disparity": DISPARITY}
         return {"required": {**given, "fill": (list(FILLS),)}}
 
-    def complete(self, scene: Scene, trajectory: TrajectoryKind, disparity: float, fill: Any) -> tuple[Scene]:
+    def complete(
+        self, scene: Scene, trajectory: TrajectoryKind, disparity: float, fill: Any
+    ) -> tuple[Scene]:
         """Add Gaussians in the holes; base Gaussians do not change."""
         cameras = scene.path(trajectory, disparity)
         made = complete_scene(BasePrediction(scene.base, scene.camera, {}), cameras, fill=fill)
@@ -125,7 +134,12 @@ class RenderView:
     def INPUT_TYPES(cls) -> dict[str, Any]:
         """`frames` is the number of views in the batch."""
         frames = ("INT", {"default": PATH_FRAMES, "min": 1, "max": 1000})
-        given = {"scene": ("SPACKLE_SCENE",), "trajectory": TRAJECTORY, "disparity": DISPARITY, "frames": frames}
+        given = {
+            "scene": ("SPACKLE_SCENE",),
+            "trajectory": TRAJECTORY,
+            "disparity": DISPARITY,
+            "frames": frames,
+        }
         return {"required": given}
 
     def render(
@@ -135,10 +149,16 @@ class RenderView:
         cameras = scene.path(trajectory, disparity, frames)
         renderer = get_renderer()
         views = [scene.render(camera, renderer) for camera in cameras]
-        inverse = torch.stack([torch.where(view.alpha > 0, 1 / view.depth.clamp(min=1e-6), 0.0) for view in views])
+        inverse = torch.stack(
+            [torch.where(view.alpha > 0, 1 / view.depth.clamp(min=1e-6), 0.0) for view in views]
+        )
         grey = inverse / inverse.amax().clamp(min=1e-12)
         holes = torch.stack([hole_mask(view.alpha).float() for view in views])
-        return torch.stack([view.rgb for view in views]).cpu(), holes.cpu(), grey[..., None].expand(-1, -1, -1, 3).cpu()
+        return (
+            torch.stack([view.rgb for view in views]).cpu(),
+            holes.cpu(),
+            grey[..., None].expand(-1, -1, -1, 3).cpu(),
+        )
 
 
 class ToSplat:
@@ -156,11 +176,19 @@ class ToSplat:
         """A batch with one set, with x right, y down, z forward from the photo's camera."""
         from comfy_api.latest import Types  # ComfyUI's own
 
-        means, quats, scales, opacities, colors = (t.detach().float().cpu() for t in scene.gaussians.tensors)
+        means, quats, scales, opacities, colors = (
+            t.detach().float().cpu() for t in scene.gaussians.tensors
+        )
         harmonics = (linear_to_srgb(colors) - 0.5) / SH_C0
         quats = torch.nn.functional.normalize(quats, dim=-1)
         return (
-            Types.SPLAT(means[None], scales[None], quats[None], opacities[None, :, None], harmonics[None, :, None]),
+            Types.SPLAT(
+                means[None],
+                scales[None],
+                quats[None],
+                opacities[None, :, None],
+                harmonics[None, :, None],
+            ),
         )
 
 
@@ -174,7 +202,10 @@ class FromSplat:
     def INPUT_TYPES(cls) -> dict[str, Any]:
         """The camera is at the origin and looks along z; `fov` 0 means a 30 mm lens."""
         side = {"min": 16, "max": 8192}
-        size = {"width": ("INT", {"default": 1280, **side}), "height": ("INT", {"default": 720, **side})}
+        size = {
+            "width": ("INT", {"default": 1280, **side}),
+            "height": ("INT", {"default": 720, **side}),
+        }
         fov = ("FLOAT", {"default": 0.0, "min": 0.0, "max": 170.0})
         return {"required": {"splat": ("SPLAT",), **size, "fov": fov}}
 
@@ -182,9 +213,13 @@ class FromSplat:
         """The first set of a batch, with colours of degree 0."""
         count = splat.positions.shape[1] if splat.counts is None else int(splat.counts[0])
         parts = (splat.positions, splat.rotations, splat.scales, splat.opacities, splat.sh)
-        means, quats, scales, opacities, harmonics = (part[0, :count].detach().float().cpu() for part in parts)
+        means, quats, scales, opacities, harmonics = (
+            part[0, :count].detach().float().cpu() for part in parts
+        )
         colors = srgb_to_linear((0.5 + SH_C0 * harmonics[:, 0]).clamp(0, 1))
-        lens, _ = focal_length("splat", width, height, {}, focal_px=None, focal_mm=None, fov=fov or None)
+        lens, _ = focal_length(
+            "splat", width, height, {}, focal_px=None, focal_mm=None, fov=fov or None
+        )
         base = Gaussians(means, quats, scales, opacities[:, 0], colors)
         return (Scene(base, Gaussians.empty(), Camera.from_focal(lens, width, height)),)
 
@@ -205,7 +240,9 @@ class SaveScene:
     def save(self, scene: Scene, name: str, format: str) -> dict[str, Any]:
         """Write a new file; existing files are kept."""
         folder, stem = _output_folder(), Path(name).name or "spackle"
-        count = next(k for k in range(1, 100_000) if not (folder / f"{stem}_{k:05d}{format}").exists())
+        count = next(
+            k for k in range(1, 100_000) if not (folder / f"{stem}_{k:05d}{format}").exists()
+        )
         file = folder / f"{stem}_{count:05d}{format}"
         scene.export(file)
         image = scene.render(scene.camera.even()).rgb.clamp(0, 1).cpu()[None]
@@ -220,7 +257,15 @@ def _output_folder() -> Path:
 
 
 NODES = (LoadBase, PredictScene, CompleteScene, RenderView, ToSplat, FromSplat, SaveScene)
-TITLES = ("load base", "predict scene", "complete for a path", "render views", "to splat", "from splat", "save scene")
+TITLES = (
+    "load base",
+    "predict scene",
+    "complete for a path",
+    "render views",
+    "to splat",
+    "from splat",
+    "save scene",
+)
 NODE_CLASS_MAPPINGS = {f"Spackle{node.__name__}": node for node in NODES}
 NODE_DISPLAY_NAME_MAPPINGS = {
     name: f"Spackle: {title}" for name, title in zip(NODE_CLASS_MAPPINGS, TITLES, strict=True)

@@ -29,12 +29,12 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from spackle.bases.lite import LiteBase
-from spackle.evaluation.datasets.stereo import pair_of_2014
+from spackle.core.photo import PHOTO_SUFFIXES, load_photo
 from spackle.formats import save_png
 from spackle.formats.png import sheet
-from spackle.image import PHOTO_SUFFIXES, load_photo
-from spackle.training.recipe import RgbdFolder
-from spackle.training.sources import find_files
+from spackle.paper.evaluation.datasets.stereo import pair_of_2014
+from spackle.paper.training.recipe import RgbdFolder
+from spackle.paper.training.sources import find_files
 
 GUESSES = ("constant", "ramp", "lite")
 STREETS, STREETS_SEED = 40, 202
@@ -43,16 +43,25 @@ STREETS, STREETS_SEED = 40, 202
 def frames_of(arguments: argparse.Namespace) -> Iterator[tuple[str, list[Frame]]]:
     """Yield groups of frames with their names."""
     for folder in arguments.stereo:
-        plain = [scene for scene in sorted(folder.iterdir()) if not (scene / "scene.json").is_file() and scene.is_dir()]
+        plain = [
+            scene
+            for scene in sorted(folder.iterdir())
+            if not (scene / "scene.json").is_file() and scene.is_dir()
+        ]
         if len(plain) < len(list(folder.iterdir())):
             yield folder.name, [file.read(JUDGED_SIDE) for file in of_scenes(folder, "--stereo")]
         for scene in plain:
             case = pair_of_2014(scene)
             assert case.depth is not None
             known = case.depth()
-            yield scene.name, [reduced(load_photo(case.photo).rgb, known.depth, known.valid, JUDGED_SIDE)]
+            yield (
+                scene.name,
+                [reduced(load_photo(case.photo).rgb, known.depth, known.valid, JUDGED_SIDE)],
+            )
     for folder, unit in zip(arguments.rgbd, arguments.unit, strict=True):
-        files: list[Measured] = of_camera(RgbdFolder(folder=folder, focal_px=1.0, unit_m=unit), arguments.last)[1]
+        files: list[Measured] = of_camera(
+            RgbdFolder(folder=folder, focal_px=1.0, unit_m=unit), arguments.last
+        )[1]
         yield folder.name, [file.read(JUDGED_SIDE) for file in files]
 
 
@@ -61,7 +70,9 @@ def guesses(base: LiteBase, frame: Frame) -> dict[str, Tensor]:
     height, width = frame.inverse_depth.shape
     seen = base.inverse_depth(frame.rgb.permute(1, 2, 0))[None, None]
     seen = interpolate(seen, size=(height, width), mode="bilinear", align_corners=False)[0, 0]
-    return dict(zip(GUESSES, (torch.ones(height, width), vertical_ramp(height, width), seen), strict=True))
+    return dict(
+        zip(GUESSES, (torch.ones(height, width), vertical_ramp(height, width), seen), strict=True)
+    )
 
 
 def score(frame: Frame, guess: Tensor) -> DepthScore:
@@ -80,7 +91,9 @@ def standing(base: LiteBase, photos: Path) -> str:
     cells = []
     for guess, found in scores.items():
         things = sum(one.things for one in found)
-        within, off = (sum(getattr(s, n) * s.things for s in found) / things for n in ("within", "abs_rel"))
+        within, off = (
+            sum(getattr(s, n) * s.things for s in found) / things for n in ("within", "abs_rel")
+        )
         cells.append(f"{guess} {within:.4f} (AbsRel {off:.3f})")
     return f"{STREETS} made streets, {things} standing things, error within: {', '.join(cells)}"
 
@@ -96,7 +109,9 @@ def seconds(base: LiteBase, runs: int = 9) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--stereo", type=Path, action="append", default=[])
     parser.add_argument("--rgbd", type=Path, action="append", default=[])
     parser.add_argument("--unit", type=float, action="append", default=[])
@@ -107,7 +122,9 @@ def main() -> None:
     arguments = parser.parse_args()
     base = LiteBase.load(arguments.weights)
 
-    print("| set | frames | constant | ramp | lite | against the better | δ < 1.25: constant | ramp | lite |")
+    print(
+        "| set | frames | constant | ramp | lite | against the better | δ < 1.25: constant | ramp | lite |"
+    )
     print("|---|---" + "|---:" * 7 + "|")
     rows = []
     for name, frames in frames_of(arguments):
@@ -120,7 +137,9 @@ def main() -> None:
             if number in shown:
                 seen, true = each["lite"], frame.inverse_depth
                 known = colored(true, *ends(true[frame.valid]), frame.valid)
-                rows.append([frame.rgb.permute(1, 2, 0), colored(seen, *ends(seen[frame.valid])), known])
+                rows.append(
+                    [frame.rgb.permute(1, 2, 0), colored(seen, *ends(seen[frame.valid])), known]
+                )
         errors = [statistics.mean(s.abs_rel for s in found[guess]) for guess in GUESSES]
         deltas = [statistics.mean(s.delta for s in found[guess]) for guess in GUESSES]
         cells = [

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
 from spackle.bases.lite import network_size
-from spackle.training.recipe import RecipePart, Share
+from spackle.paper.training.recipe import RecipePart, Share
 
 FARTHEST = 0.02  # part of the median inverse depth: farther surfaces, mostly sky, get this value
 NEAREST = 20.0
@@ -60,7 +60,11 @@ def depth_loss(
         "steps": _steps(error, mask).mean(),
         "offset": offset.where(valid.any(2).any(1)[:, None, None], 0.0).abs().mean(),
     }
-    total = weights.factor * terms["factor"] + weights.line * terms["line"] + weights.steps * terms["steps"]
+    total = (
+        weights.factor * terms["factor"]
+        + weights.line * terms["line"]
+        + weights.steps * terms["steps"]
+    )
     total = total + weights.offset * terms["offset"]
     return total, {name: term.detach() for name, term in terms.items()}
 
@@ -98,7 +102,8 @@ def _mean(x: Tensor, mask: Tensor) -> Tensor:
 def _median(x: Tensor, valid: Tensor) -> Tensor:
     """[B, 1, 1] the median of an image's valid values; 1 if there are none."""
     values = [
-        one[known].median() if bool(known.any()) else one.new_ones(()) for one, known in zip(x, valid, strict=True)
+        one[known].median() if bool(known.any()) else one.new_ones(())
+        for one, known in zip(x, valid, strict=True)
     ]
     return torch.stack(values)[:, None, None]
 
@@ -133,7 +138,11 @@ def align(values: Tensor, true: Tensor) -> Tensor:
     """[N] a·values + b with the least-squares distance to `true` [N]; the mean of `true` if all values are equal."""
     v, t = values - values.mean(), true - true.mean()
     spread = (v * v).sum()
-    scale = (v * t).sum() / spread if spread > 1e-12 * len(v) * values.abs().max() ** 2 else v.new_zeros(())
+    scale = (
+        (v * t).sum() / spread
+        if spread > 1e-12 * len(v) * values.abs().max() ** 2
+        else v.new_zeros(())
+    )
     return scale * v + true.mean()
 
 
@@ -170,7 +179,12 @@ class DepthJudge:
         depth = 1 / frame.inverse_depth.where(frame.valid, 1.0)
         score = score_depth(_at_size_of(frame, predicted), depth, frame.valid)
         ramp = score_depth(vertical_ramp(*depth.shape), depth, frame.valid)
-        scores = {"abs_rel": score.abs_rel, "delta": score.delta, "ramp_abs_rel": ramp.abs_rel, "loss": float(loss)}
+        scores = {
+            "abs_rel": score.abs_rel,
+            "delta": score.delta,
+            "ramp_abs_rel": ramp.abs_rel,
+            "loss": float(loss),
+        }
         return {**scores, **{name: float(term) for name, term in terms.items()}}
 
     @torch.no_grad()
@@ -180,7 +194,9 @@ class DepthJudge:
 
     def _run(self, network: nn.Module, rgb: Tensor) -> Tensor:
         picture = rgb.to(self.device).contiguous(memory_format=torch.channels_last)
-        with torch.autocast(self.device.type, self.precision, enabled=self.precision != torch.float32):
+        with torch.autocast(
+            self.device.type, self.precision, enabled=self.precision != torch.float32
+        ):
             predicted: Tensor = network(picture)
         return predicted.float()
 
@@ -193,4 +209,6 @@ class DepthJudge:
 def _at_size_of(frame: Frame, predicted: Tensor) -> Tensor:
     """[H, W] inverse depth at a frame's size, from log inverse depth [1, h, w]."""
     size = frame.inverse_depth.shape
-    return interpolate(predicted.exp()[None], size=size, mode="bilinear", align_corners=False)[0, 0].cpu()
+    return interpolate(predicted.exp()[None], size=size, mode="bilinear", align_corners=False)[
+        0, 0
+    ].cpu()

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample, interpolate
 
-from spackle.errors import InputError
-from spackle.training.recipe import RgbdFolder
-from spackle.training.sources import find_files, load_frame, load_pair
+from spackle.paper.training.recipe import RgbdFolder
+from spackle.paper.training.sources import find_files, load_frame, load_pair
+from spackle.runtime.errors import InputError
 
 Rng = np.random.Generator
 FOCAL = 1.1  # in widths: assumed for photos with unknown lens, to turn the camera
@@ -42,7 +42,10 @@ class Turning:
 MEASURED = Turning((1.0, 1.6), (4.0, 4.0, 4.0))  # strong, because scenes are few
 MADE = Turning((1.0, 1.4), (2.0, 2.0, 3.0))  # synthetic scenes vary in their cameras already
 GUESSED = Turning((1.0, 1.4), (3.0, 3.0, 4.0))  # weak, because photos are many
-MINGLED_SCALE = (-0.2, 0.8)  # range of the logarithm of the front frame's median inverse depth over the back frame's
+MINGLED_SCALE = (
+    -0.2,
+    0.8,
+)  # range of the logarithm of the front frame's median inverse depth over the back frame's
 
 
 def turned(rng: Rng, frame: Frame, height: int, width: int, turning: Turning) -> Frame:
@@ -54,20 +57,28 @@ def turned(rng: Rng, frame: Frame, height: int, width: int, turning: Turning) ->
     focal = FOCAL * columns
     scale = max(width / columns, height / rows) * math.exp(rng.uniform(*np.log(turning.zoom)))
     stretch = math.exp(rng.normal(0, 0.06))
-    rotation = torch.from_numpy(_rotation(np.radians(rng.normal(0, 1, 3) * turning.degrees))).float()
+    rotation = torch.from_numpy(
+        _rotation(np.radians(rng.normal(0, 1, 3) * turning.degrees))
+    ).float()
     slack = [max(0.0, have * scale - want) / 2 for have, want in ((columns, width), (rows, height))]
     cx, cy = (want / 2 + rng.uniform(-s, s) for want, s in zip((width, height), slack, strict=True))
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-    ray = torch.stack([(x - cx) / (focal * scale * stretch), (y - cy) / (focal * scale), torch.ones_like(x)], -1)
+    ray = torch.stack(
+        [(x - cx) / (focal * scale * stretch), (y - cy) / (focal * scale), torch.ones_like(x)], -1
+    )
     ray = ray @ rotation  # in the frame's own camera
     u, v = (ray[..., k] / ray[..., 2] * focal for k in (0, 1))
     grid = torch.stack([2 * u / columns, 2 * v / rows], -1)[None]
     rgb = grid_sample(frame.rgb[None], grid, padding_mode="reflection", align_corners=False)[0]
     depth = torch.stack([frame.inverse_depth, frame.valid.float()])[None]
-    inverse_depth, valid = grid_sample(depth, grid, mode="nearest", padding_mode="zeros", align_corners=False)[0]
+    inverse_depth, valid = grid_sample(
+        depth, grid, mode="nearest", padding_mode="zeros", align_corners=False
+    )[0]
     result = Frame(rgb, inverse_depth * ray[..., 2], valid > 0.5)
     if rng.random() < 0.5:
-        return Frame(*(tensor.flip(-1) for tensor in (result.rgb, result.inverse_depth, result.valid)))
+        return Frame(
+            *(tensor.flip(-1) for tensor in (result.rgb, result.inverse_depth, result.valid))
+        )
     return result
 
 
@@ -103,7 +114,9 @@ def relit(rng: Rng, rgb: Tensor) -> Tensor:
     tint = np.exp(rng.normal(0, 0.12, (3, 1, 1)) + rng.normal(0, 0.2)).astype(np.float32)
     rgb = rgb * torch.from_numpy(tint)
     mean = rgb.mean((1, 2), keepdim=True)
-    harsh = rng.uniform(0.3, 1.0) if rng.random() < 0.12 else 0.0  # black shadows and white highlights
+    harsh = (
+        rng.uniform(0.3, 1.0) if rng.random() < 0.12 else 0.0
+    )  # black shadows and white highlights
     rgb = mean + (rgb - mean) * math.exp(rng.normal(harsh, 0.25)) + harsh * rng.uniform(-0.1, 0.3)
     grey = rgb.mean(0, keepdim=True)
     rgb = grey + (rgb - grey) * (0.0 if rng.random() < 0.2 else math.exp(rng.normal(0, 0.3)))
@@ -208,10 +221,16 @@ def of_camera(camera: RgbdFolder, held: float) -> tuple[list[Measured], list[Mea
 def of_scenes(folder: Path, key: str, *, right: bool = False) -> list[Measured]:
     """The left photos of all stereo pairs below a folder, with `right` both photos; InputError if there are none."""
     folders = [file.parent for file in find_files(folder, key, ("scene.json",), "scene.json")]
-    return [Measured(pair, right=side) for side in ((False, True) if right else (False,)) for pair in folders]
+    return [
+        Measured(pair, right=side)
+        for side in ((False, True) if right else (False,))
+        for pair in folders
+    ]
 
 
-def read_all(files: Sequence[Measured], side: int, warn: Callable[[str], None]) -> list[tuple[str, Frame]]:
+def read_all(
+    files: Sequence[Measured], side: int, warn: Callable[[str], None]
+) -> list[tuple[str, Frame]]:
     """Read frames; returns them with their names. Unreadable ones are skipped and reported to `warn`.
 
     Raises:
@@ -247,7 +266,9 @@ def reduced(rgb: Tensor, depth: Tensor, valid: Tensor, side: int) -> Frame:
     height, width = max(1, round(height * scale)), max(1, round(width * scale))
     picture = rgb.permute(2, 0, 1)
     if scale < 1:
-        picture = interpolate(picture[None], size=(height, width), mode="bicubic", antialias=True)[0].clamp(0, 1)
+        picture = interpolate(picture[None], size=(height, width), mode="bicubic", antialias=True)[
+            0
+        ].clamp(0, 1)
     inverse_depth = torch.where(valid, 1 / depth.clamp_min(1e-6), 0.0)[None, None]
     inverse_depth = interpolate(inverse_depth, size=(height, width), mode="nearest-exact")[0, 0]
     return Frame(picture.contiguous(), inverse_depth, inverse_depth > 0)

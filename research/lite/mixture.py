@@ -17,9 +17,9 @@ from torch import Tensor
 from torch.nn.functional import interpolate, max_pool2d
 
 from spackle.bases.lite import InputScale, LiteBase, scaled_size
-from spackle.errors import InputError
-from spackle.files import atomic_path
-from spackle.image import load_photo
+from spackle.core.photo import load_photo
+from spackle.runtime.errors import InputError
+from spackle.runtime.files import atomic_path
 
 UPRIGHT = 0.2  # share of steps with upright pictures
 COARSER = 2  # ratio of the network's input size to its output size
@@ -79,10 +79,13 @@ class DepthBatch:
     def of(frames: Sequence[Frame], size: tuple[int, int]) -> DepthBatch:
         """Resize frames of one size for a network with the input `size`; depth is sampled at the nearest pixel."""
         rgb, inverse_depth, valid = (
-            torch.stack([getattr(frame, field.name) for frame in frames]) for field in dataclasses.fields(Frame)
+            torch.stack([getattr(frame, field.name) for frame in frames])
+            for field in dataclasses.fields(Frame)
         )
         coarse = [side // COARSER for side in size]
-        known = interpolate(torch.stack([inverse_depth, valid.float()], 1), size=coarse, mode="nearest-exact")
+        known = interpolate(
+            torch.stack([inverse_depth, valid.float()], 1), size=coarse, mode="nearest-exact"
+        )
         rgb = interpolate(rgb, size=size, mode="bicubic", antialias=True).clamp(0, 1)
         return DepthBatch(rgb, known[:, 0], known[:, 1] > 0.5)
 
@@ -124,10 +127,17 @@ class Mixture:
         return name, dataclasses.replace(seen, rgb=relit(rng, seen.rgb))
 
     def _source(self, rng: Rng) -> Source:
-        return self.sources[int(rng.choice(len(self.sources), p=np.array(self.shares) / sum(self.shares)))]
+        return self.sources[
+            int(rng.choice(len(self.sources), p=np.array(self.shares) / sum(self.shares)))
+        ]
 
 
-LOOKS_PX = (128 * 160, 192 * 256, 256 * 320, 352 * 480)  # in both orientations; much smaller sizes agree less
+LOOKS_PX = (
+    128 * 160,
+    192 * 256,
+    256 * 320,
+    352 * 480,
+)  # in both orientations; much smaller sizes agree less
 UNSURE = 0.12  # a guess is ignored in pixels where predictions of all sizes and networks differ by more (logarithm)
 STEEP = 0.25  # a guess is ignored in pixels with a larger change to neighbours, because predicted outlines are blurred
 
@@ -144,7 +154,11 @@ class GuessedPhotos:
     def fill(self, base: LiteBase, progress: Callable[[int, int], None], warn: Warn) -> None:
         """Make missing guesses; photos that cannot be read are left out and reported to `warn`."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        looks = [InputScale(pixels, network) for pixels in LOOKS_PX for network in range(len(base.networks))]
+        looks = [
+            InputScale(pixels, network)
+            for pixels in LOOKS_PX
+            for network in range(len(base.networks))
+        ]
         for index, photo in enumerate(self.photos):
             if not self._file(index).is_file():
                 try:
@@ -164,11 +178,17 @@ class GuessedPhotos:
                 try:
                     guess = load_file(file)["inverse_depth"].float()
                 except (OSError, SafetensorError, KeyError) as error:
-                    raise InputError(f"{file}: no guess, or damaged: delete it, and it is made anew") from error
+                    raise InputError(
+                        f"{file}: no guess, or damaged: delete it, and it is made anew"
+                    ) from error
                 rgb = load_photo(self.photos[index]).rgb.permute(2, 0, 1).contiguous()
-                inverse_depth = interpolate(guess[None, None], size=rgb.shape[1:], mode="nearest-exact")[0, 0]
+                inverse_depth = interpolate(
+                    guess[None, None], size=rgb.shape[1:], mode="nearest-exact"
+                )[0, 0]
                 return f"guessed {self.photos[index]}", Frame(rgb, inverse_depth, inverse_depth > 0)
-        raise InputError(f"{self.folder}: guesses are missing: start the run anew, and they are made")
+        raise InputError(
+            f"{self.folder}: guesses are missing: start the run anew, and they are made"
+        )
 
     def _file(self, index: int) -> Path:
         return self.folder / f"{index:05d}.safetensors"

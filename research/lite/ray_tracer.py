@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spackle._numba import kernel
+from spackle.runtime.kernels import kernel
 
 Floats = NDArray[np.float32]
 SHEET, BOX, ELLIPSOID, CYLINDER = range(4)
@@ -54,9 +54,25 @@ def trace(
     skins = np.array([s.texture for s in solids])
     repeats = np.array([s.repeats for s in solids], np.float32)
     casts = np.array([s.casts for s in solids])
-    around = 1.001 * np.array([(s.axes.astype(np.float64) ** 2).sum() for s in solids])  # squared bounding radii
+    around = 1.001 * np.array(
+        [(s.axes.astype(np.float64) ** 2).sum() for s in solids]
+    )  # squared bounding radii
     colors, distances = sky.astype(np.float32).copy(), np.full(len(rays), np.inf, np.float32)
-    _trace(kinds, centers, inverse, skins, repeats, casts, around, textures, rays, light, ambient, colors, distances)
+    _trace(
+        kinds,
+        centers,
+        inverse,
+        skins,
+        repeats,
+        casts,
+        around,
+        textures,
+        rays,
+        light,
+        ambient,
+        colors,
+        distances,
+    )
     return colors, distances
 
 
@@ -114,7 +130,12 @@ def _hit(kind: int, o: Any, d: Any, nearest: float, found: Any) -> Any:
 @kernel
 def _covered(textures: Any, skin: int, u: float, v: float) -> Any:
     size = textures.shape[1]
-    return textures[skin, min(int((v % 1.0) * size), size - 1), min(int((u % 1.0) * size), size - 1), 3] >= 0.5
+    return (
+        textures[
+            skin, min(int((v % 1.0) * size), size - 1), min(int((u % 1.0) * size), size - 1), 3
+        ]
+        >= 0.5
+    )
 
 
 @kernel
@@ -122,7 +143,9 @@ def _near(center: Any, start: Any, ray: Any, around: float) -> Any:
     """Whether the line start + t·ray passes a centre at most at the distance √`around`."""
     x, y, z = center[0] - start[0], center[1] - start[1], center[2] - start[2]
     along = x * ray[0] + y * ray[1] + z * ray[2]
-    return (x * x + y * y + z * z - around) * (ray[0] ** 2 + ray[1] ** 2 + ray[2] ** 2) <= along * along
+    return (x * x + y * y + z * z - around) * (
+        ray[0] ** 2 + ray[1] ** 2 + ray[2] ** 2
+    ) <= along * along
 
 
 @kernel
@@ -155,9 +178,15 @@ def _trace(
                     + inverse[s, k, 1] * centers[s, 1]
                     + inverse[s, k, 2] * centers[s, 2]
                 )
-                d[k] = inverse[s, k, 0] * rays[i, 0] + inverse[s, k, 1] * rays[i, 1] + inverse[s, k, 2] * rays[i, 2]
+                d[k] = (
+                    inverse[s, k, 0] * rays[i, 0]
+                    + inverse[s, k, 1] * rays[i, 1]
+                    + inverse[s, k, 2] * rays[i, 2]
+                )
             t = _hit(kinds[s], o, d, 0.05, found)
-            if t < nearest and _covered(textures, skins[s], found[0] * repeats[s, 0], found[1] * repeats[s, 1]):
+            if t < nearest and _covered(
+                textures, skins[s], found[0] * repeats[s, 0], found[1] * repeats[s, 1]
+            ):
                 nearest, which = t, s
                 best[:] = found
         if which < 0:
@@ -166,7 +195,11 @@ def _trace(
         # The surface's normal, flipped towards the eye.
         facing, length, lit = 0.0, 0.0, 0.0
         for k in range(3):
-            normal[k] = inverse[which, 0, k] * best[2] + inverse[which, 1, k] * best[3] + inverse[which, 2, k] * best[4]
+            normal[k] = (
+                inverse[which, 0, k] * best[2]
+                + inverse[which, 1, k] * best[3]
+                + inverse[which, 2, k] * best[4]
+            )
             length += normal[k] * normal[k]
             facing += normal[k] * rays[i, k]
             lit += normal[k] * light[k]
@@ -183,16 +216,27 @@ def _trace(
                         o[k] += inverse[s, k, m] * (start[m] - centers[s, m])
                         d[k] += inverse[s, k, m] * light[m]
                 t = _hit(kinds[s], o, d, NUDGE * nearest, found)
-                if t < FAR and _covered(textures, skins[s], found[0] * repeats[s, 0], found[1] * repeats[s, 1]):
+                if t < FAR and _covered(
+                    textures, skins[s], found[0] * repeats[s, 0], found[1] * repeats[s, 1]
+                ):
                     shine = 0.0
                     break
         shade = ambient + (1 - ambient) * shine
         # The texture, interpolated between the four nearest pixels.
-        x, y = ((best[0] * repeats[which, 0]) % 1.0) * (size - 1), ((best[1] * repeats[which, 1]) % 1.0) * (size - 1)
+        x, y = (
+            ((best[0] * repeats[which, 0]) % 1.0) * (size - 1),
+            ((best[1] * repeats[which, 1]) % 1.0) * (size - 1),
+        )
         left, top = int(x), int(y)
         fx, fy = x - left, y - top
         right, bottom = min(left + 1, size - 1), min(top + 1, size - 1)
         for k in range(3):
-            upper = textures[skins[which], top, left, k] * (1 - fx) + textures[skins[which], top, right, k] * fx
-            lower = textures[skins[which], bottom, left, k] * (1 - fx) + textures[skins[which], bottom, right, k] * fx
+            upper = (
+                textures[skins[which], top, left, k] * (1 - fx)
+                + textures[skins[which], top, right, k] * fx
+            )
+            lower = (
+                textures[skins[which], bottom, left, k] * (1 - fx)
+                + textures[skins[which], bottom, right, k] * fx
+            )
             colors[i, k] = shade * (upper * (1 - fy) + lower * fy)

@@ -43,16 +43,25 @@ def mean(files: Mapping[Path, float]) -> LiteNet:
     states = [network.state_dict() for network in networks]
     shares = list(files.values())
     networks[0].load_state_dict(
-        {name: sum(share * state[name] for share, state in zip(shares, states, strict=True)) for name in states[0]}
+        {
+            name: sum(share * state[name] for share, state in zip(shares, states, strict=True))
+            for name in states[0]
+        }
     )
     return networks[0]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit status of a failed run, else 0."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("-o", "--output", type=Path, required=True, help="a folder; runs in it go on")
-    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="of every run: where the data lies")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "-o", "--output", type=Path, required=True, help="a folder; runs in it go on"
+    )
+    parser.add_argument(
+        "overrides", nargs="*", metavar="KEY=VALUE", help="of every run: where the data lies"
+    )
     options = parser.parse_intermixed_args(arguments)
 
     def file(name: str) -> Path:
@@ -65,12 +74,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return path
 
     for name, (start, teacher, values) in RUNS.items():
-        given = [f"{key}={file(of)}" for key, of in (("init", start), ("data.teacher", teacher)) if of]
-        words = ["--recipe", str(RECIPE), "-o", str(options.output / name), *given, *values.split(), *options.overrides]
+        given = [
+            f"{key}={file(of)}" for key, of in (("init", start), ("data.teacher", teacher)) if of
+        ]
+        words = [
+            "--recipe",
+            str(RECIPE),
+            "-o",
+            str(options.output / name),
+            *given,
+            *values.split(),
+            *options.overrides,
+        ]
         if status := train(words):
             return status
     save_networks(
-        [*load_networks(file("smaller")), *load_networks(file("larger"))], options.output / "lite.safetensors"
+        [*load_networks(file("smaller")), *load_networks(file("larger"))],
+        options.output / "lite.safetensors",
     )
     print(options.output / "lite.safetensors")
     return 0

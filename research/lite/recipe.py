@@ -13,9 +13,8 @@ from frames import Group, Measured, of_camera, of_scenes
 from pydantic import Field
 
 from spackle.bases.lite import STAGES, STRIDE, Size
-from spackle.errors import InputError
-from spackle.image import PHOTO_SUFFIXES
-from spackle.training.recipe import (
+from spackle.core.photo import PHOTO_SUFFIXES
+from spackle.paper.training.recipe import (
     FREE,
     AnyRecipe,
     Count,
@@ -26,8 +25,9 @@ from spackle.training.recipe import (
     Seed,
     Share,
 )
-from spackle.training.samples import short_digest
-from spackle.training.sources import find_files
+from spackle.paper.training.samples import short_digest
+from spackle.paper.training.sources import find_files
+from spackle.runtime.errors import InputError
 
 RANDOM = Path("random")  # instead of the encoder's file: random weights, for tests and experiments
 Side = Annotated[int, Field(ge=STRIDE, le=2048, multiple_of=STRIDE)]
@@ -46,27 +46,38 @@ class LiteShares(RecipePart):
 class LiteData(RecipePart):
     """The sources of photos with depth."""
 
-    photos: Place = None  # a folder, with its subfolders; textures of synthetic scenes are cut from them
+    photos: Place = (
+        None  # a folder, with its subfolders; textures of synthetic scenes are cut from them
+    )
     rgbd: Annotated[tuple[RgbdFolder, ...], FREE] = ()  # their focal lengths are not used
     stereo: Place = None  # a folder of scenes, each with a scene.json
     made: Count = 4900  # number of synthetic scenes
-    teacher: Path | None = None  # weights of an earlier run; its predictions for `photos` become training data
+    teacher: Path | None = (
+        None  # weights of an earlier run; its predictions for `photos` become training data
+    )
     guesses: Count = 1500  # at most this number of photos
     shares: LiteShares = LiteShares()
-    size: tuple[Side, Side] = (256, 320)  # height and width of pictures; swapped in a fifth of the steps
+    size: tuple[Side, Side] = (
+        256,
+        320,
+    )  # height and width of pictures; swapped in a fifth of the steps
     # Factors on `size`; each step draws one, because the base uses several sizes.
     scales: Annotated[tuple[Scale, ...], Field(min_length=1)] = (1.0,)
     cache: Place = None  # a folder for synthetic scenes and guesses; None: inside the output
     seed: Seed = 0  # for synthetic scenes alone: runs that differ only in run.seed share them
     # Share of each folder of `rgbd` for validation: the last frames by name, because neighbouring frames are alike.
     validation: Annotated[float, Field(ge=0, le=0.9)] = 0.2
-    validation_stereo: Place = None  # scenes for validation; all scenes of `stereo` are for training
+    validation_stereo: Place = (
+        None  # scenes for validation; all scenes of `stereo` are for training
+    )
 
 
 class LiteOptim(OptimRecipe):
     """Settings of the optimiser, and of the pretrained encoder."""
 
-    encoder_rate: Annotated[float, Field(ge=0, le=10)] = 0.2  # factor on the encoder's learning rate
+    encoder_rate: Annotated[float, Field(ge=0, le=10)] = (
+        0.2  # factor on the encoder's learning rate
+    )
     # How many of the encoder's first stages are frozen, with its stem; 0: nothing is frozen.
     frozen: Annotated[int, Field(ge=0, le=len(STAGES["lite2"]))] = 2
 
@@ -78,7 +89,9 @@ class LiteRecipe(AnyRecipe):
     loss: DepthLossWeights = DepthLossWeights()
     optim: LiteOptim = LiteOptim()
     network: Size = "lite2"  # size of the encoder: EfficientNet-Lite0 or -Lite2
-    encoder: Path | None = None  # its .pth file; None: from the installed package; "random": random weights
+    encoder: Path | None = (
+        None  # its .pth file; None: from the installed package; "random": random weights
+    )
     init: Path | None = None  # initial weights of the whole network
 
 
@@ -106,7 +119,11 @@ class LiteFiles:
             InputError: a folder is missing or has no such files, or there is nothing to train on or to validate with.
         """
         shares, groups = data.shares, []
-        photos = [] if data.photos is None else find_files(data.photos, "data.photos", PHOTO_SUFFIXES, "photos")
+        photos = (
+            []
+            if data.photos is None
+            else find_files(data.photos, "data.photos", PHOTO_SUFFIXES, "photos")
+        )
         stereo = [] if data.stereo is None else of_scenes(data.stereo, "data.stereo", right=True)
         rgbd: list[Measured] = []
         for camera in data.rgbd:
@@ -114,7 +131,9 @@ class LiteFiles:
             rgbd += learned
             groups.append(Group(camera.folder.resolve().name, judged))
         if data.validation_stereo is not None:
-            groups.append(Group(STEREO, of_scenes(data.validation_stereo, "data.validation_stereo")))
+            groups.append(
+                Group(STEREO, of_scenes(data.validation_stereo, "data.validation_stereo"))
+            )
             _check_apart(stereo, groups[-1].files, data.validation_stereo)
         if data.teacher is not None and not data.teacher.is_file():
             raise InputError(f"{data.teacher}: no such file, but data.teacher names it")
@@ -140,13 +159,19 @@ class LiteFiles:
     @property
     def scenes_digest(self) -> str:
         """Twelve digits that identify the synthetic scenes, whatever the photos' folder and the number of scenes."""
-        return short_digest((SCENES_VERSION, self.data.seed, list(self.data.size), self._below(self.photos)))
+        return short_digest(
+            (SCENES_VERSION, self.data.seed, list(self.data.size), self._below(self.photos))
+        )
 
     @property
     def guesses_digest(self) -> str:
         """Twelve digits that identify the photos and the teacher (or none), wherever the files are."""
         teacher = self.data.teacher
-        weights = hashlib.sha256(teacher.read_bytes()).hexdigest() if teacher is not None and self.guessed else ""
+        weights = (
+            hashlib.sha256(teacher.read_bytes()).hexdigest()
+            if teacher is not None and self.guessed
+            else ""
+        )
         return short_digest((GUESSES_VERSION, weights, self._below(self.guessed)))
 
     def _below(self, files: Sequence[Path]) -> list[str]:
@@ -159,19 +184,28 @@ class LiteFiles:
         facts = self.data.model_dump(mode="json")
         for name in ("photos", "stereo", "validation_stereo", "cache", "rgbd", "teacher"):
             facts.pop(name)
-        names = [_names(files) for files in (self.stereo, self.rgbd, *(group.files for group in self.groups))]
+        names = [
+            _names(files)
+            for files in (self.stereo, self.rgbd, *(group.files for group in self.groups))
+        ]
         return short_digest((self.scenes_digest, self.guesses_digest, facts, names))
 
 
 def _spread(photos: Sequence[Path], count: int) -> Sequence[Path]:
     """`count` photos, evenly spaced over the folder; all if there are fewer."""
-    return [photos[number * len(photos) // count] for number in range(count)] if count < len(photos) else photos
+    return (
+        [photos[number * len(photos) // count] for number in range(count)]
+        if count < len(photos)
+        else photos
+    )
 
 
 def _check_apart(learned: Sequence[Measured], judged: Sequence[Measured], folder: Path) -> None:
     """InputError if a scene is used for both training and validation."""
     if both := {file.path.resolve() for file in learned} & {file.path.resolve() for file in judged}:
-        raise InputError(f"{folder}: data.validation_stereo has scenes of data.stereo in it, such as {min(both)}")
+        raise InputError(
+            f"{folder}: data.validation_stereo has scenes of data.stereo in it, such as {min(both)}"
+        )
 
 
 def _with_own_names(groups: Sequence[Group]) -> list[Group]:

@@ -51,7 +51,11 @@ def room(rng: Rng) -> Scene:
         solids.append(ground(rng, axes, np.array([middle, eye - ceiling, 0.0]), span, deep))
     if rng.random() < 0.5:  # the main object of the picture
         z = rng.uniform(0.4, 0.8) * deep
-        big = ornament if rng.random() < 0.5 else functools.partial(thing, yaw=rng.uniform(-math.pi, math.pi))
+        big = (
+            ornament
+            if rng.random() < 0.5
+            else functools.partial(thing, yaw=rng.uniform(-math.pi, math.pi))
+        )
         solids += big(rng, np.array([rng.normal(0, 0.1) * z, eye, z]), z * rng.uniform(0.15, 0.35))
     for _ in range(rng.integers(2, 9)):
         place = (rng.uniform(-left, right), eye, rng.uniform(0.9, deep))
@@ -86,7 +90,11 @@ def sheets(rng: Rng) -> Scene:
     for _ in range(rng.integers(2, 9)):
         z = reach * rng.uniform(0.3, 0.95)
         center = np.array([rng.uniform(-0.6, 0.6) * z, rng.uniform(-0.5, 0.6) * z, z])
-        axes = turn(rng.normal(0, 0.5)) @ nod(rng.normal(0, 0.4)) @ np.diag(rng.uniform(0.05, 0.4, 3) * z)
+        axes = (
+            turn(rng.normal(0, 0.5))
+            @ nod(rng.normal(0, 0.4))
+            @ np.diag(rng.uniform(0.05, 0.4, 3) * z)
+        )
         kind = int(rng.choice((SHEET, SHEET, BOX, ELLIPSOID, CYLINDER)))
         skin = cut(rng) if kind == SHEET and rng.random() < 0.5 else None
         solids.append(solid(rng, kind, center, axes, skin))
@@ -95,7 +103,13 @@ def sheets(rng: Rng) -> Scene:
 
 def board(rng: Rng, away: float, yaw: float, pitch: float) -> Solid:
     """The sheet behind everything else, slightly rotated."""
-    return wall(rng, np.array([0.0, 0.0, away]), turn(rng.normal(0, yaw)) @ nod(rng.normal(0, pitch)), 9.0, 9.0)
+    return wall(
+        rng,
+        np.array([0.0, 0.0, away]),
+        turn(rng.normal(0, yaw)) @ nod(rng.normal(0, pitch)),
+        9.0,
+        9.0,
+    )
 
 
 def street(rng: Rng) -> Scene:
@@ -106,8 +120,14 @@ def street(rng: Rng) -> Scene:
     for _ in range(rng.integers(0, 9)):
         size = rng.uniform(2, 9)
         side = rng.choice((-1, 1)) * rng.uniform(3, 14)
-        center = axes @ (side + np.sign(side) * size, eye - rng.uniform(0.2, 0.9) * size, rng.uniform(4, 60))
-        solids.append(solid(rng, BOX, center, axes @ np.diag([size, size * rng.uniform(0.6, 1.5), size])))
+        center = axes @ (
+            side + np.sign(side) * size,
+            eye - rng.uniform(0.2, 0.9) * size,
+            rng.uniform(4, 60),
+        )
+        solids.append(
+            solid(rng, BOX, center, axes @ np.diag([size, size * rng.uniform(0.6, 1.5), size]))
+        )
     for _ in range(rng.integers(1, 9)):
         place = np.array([rng.uniform(-6, 6), eye, 3 + 25 * rng.random() ** 2])
         solids += thing(rng, place, rng.uniform(0.3, 2.0), rng.uniform(-math.pi, math.pi))
@@ -117,15 +137,26 @@ def street(rng: Rng) -> Scene:
 def yard(rng: Rng) -> Scene:
     """A yard: posts, stones and trees nearby, sometimes a roof overhead, house fronts beside and far away, hills."""
     eye = rng.uniform(1.1, 2.0)
-    solids = [ground(rng, turn(rng.normal(0, 0.3)), np.array([0.0, eye, 200.0]), 300.0, 300.0, repeats=200.0)]
+    solids = [
+        ground(
+            rng, turn(rng.normal(0, 0.3)), np.array([0.0, eye, 200.0]), 300.0, 300.0, repeats=200.0
+        )
+    ]
     if rng.random() < 0.6:
-        solids.append(_front(rng, eye, rng.choice((-1, 1)) * rng.uniform(2, 8), rng.uniform(1, 20), 0.3))
+        solids.append(
+            _front(rng, eye, rng.choice((-1, 1)) * rng.uniform(2, 8), rng.uniform(1, 20), 0.3)
+        )
     for _ in range(rng.integers(0, 3)):
         solids.append(_front(rng, eye, rng.uniform(-25, 25), rng.uniform(15, 60), 0.8))
     for _ in range(rng.integers(1, 4) if rng.random() < 0.4 else 0):
         radii = np.array([rng.uniform(40, 120), rng.uniform(6, 30), 30.0])
         solids.append(
-            solid(rng, ELLIPSOID, np.array([rng.uniform(-120, 120), eye, rng.uniform(110, 250)]), np.diag(radii))
+            solid(
+                rng,
+                ELLIPSOID,
+                np.array([rng.uniform(-120, 120), eye, rng.uniform(110, 250)]),
+                np.diag(radii),
+            )
         )
     for _ in range(rng.integers(0, 5)):
         z = 3 + 40 * rng.random() ** 2
@@ -140,7 +171,9 @@ def yard(rng: Rng) -> Scene:
         foot = np.array([rng.uniform(-0.7, 0.7) * z, eye, z])
         size = rng.uniform(0.1, 0.7)
         if rng.random() < 0.5:
-            solids.append(solid(rng, ELLIPSOID, foot, anyhow(rng) @ np.diag(size * rng.uniform(0.4, 1.2, 3))))
+            solids.append(
+                solid(rng, ELLIPSOID, foot, anyhow(rng) @ np.diag(size * rng.uniform(0.4, 1.2, 3)))
+            )
         else:
             solids += thing(rng, foot, size, rng.uniform(-math.pi, math.pi))
     if rng.random() < 0.25:  # a fence
@@ -164,7 +197,9 @@ def _tree(rng: Rng, foot: Array, tall: float) -> list[Solid]:
     """A tree: a trunk, and leaves around its end with gaps between them."""
     made = [pole(rng, foot, tall, rng.uniform(0.02, 0.06) * tall, lean(rng.normal(0, 0.08)))]
     for _ in range(rng.integers(2, 6)):
-        place = foot + np.array([rng.normal(0, 0.2), -rng.uniform(0.7, 1.2), rng.normal(0, 0.2)]) * tall
+        place = (
+            foot + np.array([rng.normal(0, 0.2), -rng.uniform(0.7, 1.2), rng.normal(0, 0.2)]) * tall
+        )
         size = tall * rng.uniform(0.15, 0.4)
         if rng.random() < 0.3:
             made.append(solid(rng, ELLIPSOID, place, anyhow(rng) * size))
@@ -184,7 +219,9 @@ def _canopy(rng: Rng, eye: float) -> list[Solid]:
     made = [Solid(top.kind, top.center, top.axes, skin, ribs)]
     r = rng.uniform(0.02, 0.06) * z
     made.append(pole(rng, np.array([x, eye, z]), eye + rise, r, np.eye(3), skin))
-    neck = solid(rng, ELLIPSOID, np.array([x, -rise, z]), np.diag([4 * r, 0.6 * (rise + eye), 4 * r]), skin)
+    neck = solid(
+        rng, ELLIPSOID, np.array([x, -rise, z]), np.diag([4 * r, 0.6 * (rise + eye), 4 * r]), skin
+    )
     return [*made, Solid(neck.kind, neck.center, neck.axes, skin, ribs)]
 
 
@@ -239,7 +276,10 @@ def still_life(rng: Rng) -> Scene:
     """A still life: many objects close together on a table near eye level, in front of boards and cloth."""
     reach = rng.uniform(0.9, 2.2)
     eye, near = reach * rng.uniform(0.12, 0.45), reach * rng.uniform(0.45, 0.7)
-    solids = [board(rng, reach * 1.02, 0.25, 0.08), ground(rng, np.eye(3), np.array([0.0, eye, 0.0]), 4.0, reach)]
+    solids = [
+        board(rng, reach * 1.02, 0.25, 0.08),
+        ground(rng, np.eye(3), np.array([0.0, eye, 0.0]), 4.0, reach),
+    ]
     for _ in range(rng.integers(0, 4)):  # posters and cartons just in front of the background
         z = reach * rng.uniform(0.8, 1.0)
         half = reach * rng.uniform(0.1, 0.45, 2)
@@ -272,7 +312,11 @@ def heap(rng: Rng) -> Scene:
         rise = size * rng.uniform(0.9, 1.8)
         y, z = y - rise, z + slope * rise
     under = nod(math.atan2(nearest - z, lowest - y))  # the surface that they lie on
-    solids.append(wall(rng, np.array([0.0, (y + lowest) / 2, (nearest + z) / 2 + 0.5 * size]), under, 4.0, 4.0))
+    solids.append(
+        wall(
+            rng, np.array([0.0, (y + lowest) / 2, (nearest + z) / 2 + 0.5 * size]), under, 4.0, 4.0
+        )
+    )
     return solids, 0.0
 
 
@@ -282,7 +326,10 @@ def shelf(rng: Rng) -> Scene:
     axes, skin = turn(rng.normal(0, 0.35)), int(rng.integers(WHOLE))
     at = np.array([rng.normal(0, 0.3), 0.0, away])
     back = at + axes @ (0, 0, 2 * deep)
-    solids = [wall(rng, back, axes, 4.0 * across, 5.0), ground(rng, axes, np.array([0, rng.uniform(1, 1.6), 0]), 8, 8)]
+    solids = [
+        wall(rng, back, axes, 4.0 * across, 5.0),
+        ground(rng, axes, np.array([0, rng.uniform(1, 1.6), 0]), 8, 8),
+    ]
     for side in (-1, 1):
         frame = np.diag([0.02, 3.0, deep])
         solids.append(solid(rng, BOX, at + axes @ (side * across, 0.3, deep), axes @ frame, skin))
@@ -301,11 +348,15 @@ def shelf(rng: Rng) -> Scene:
             x += size * rng.uniform(1.8, 4.0)
         height -= gap
     if rng.random() < 0.5:
-        place = np.array([rng.uniform(-0.4, 0.4), rng.uniform(0.2, 0.8), rng.uniform(0.5, 0.85) * away])
+        place = np.array(
+            [rng.uniform(-0.4, 0.4), rng.uniform(0.2, 0.8), rng.uniform(0.5, 0.85) * away]
+        )
         solids += thing(rng, place, rng.uniform(0.1, 0.4), rng.uniform(-math.pi, math.pi))
     if rng.random() < 0.3:
         foot = np.array([rng.uniform(-0.5, 0.5), 1.5, rng.uniform(0.6, 0.9) * away])
-        solids.append(pole(rng, foot, rng.uniform(1.2, 3), rng.uniform(0.01, 0.05), lean(rng.normal(0, 0.2))))
+        solids.append(
+            pole(rng, foot, rng.uniform(1.2, 3), rng.uniform(0.01, 0.05), lean(rng.normal(0, 0.2)))
+        )
     return solids, math.radians(rng.uniform(-10, 15))
 
 
@@ -318,6 +369,8 @@ def _cloth(rng: Rng, floor: float, away: float) -> list[Solid]:
         half, angle = away * rng.uniform(0.03, 0.12), (-1) ** number * rng.uniform(0.1, 1.0)
         step: Array = turn(angle) @ np.array([half, 0, 0])
         center = np.array([x, floor - tall, z]) + step
-        made.append(solid(rng, SHEET, center, turn(angle) @ back @ np.diag([half, tall, 1.0]), skin))
+        made.append(
+            solid(rng, SHEET, center, turn(angle) @ back @ np.diag([half, tall, 1.0]), skin)
+        )
         x, z = x + 2 * step[0], z + 2 * step[2]
     return made

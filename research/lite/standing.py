@@ -17,7 +17,7 @@ from synthetic_scenes import SAMPLES, drawn
 from textures import LATTICE, LEAVES, RING, WHOLE
 from torch import Tensor
 
-from spackle.training.sources import Photos
+from spackle.paper.training.sources import Photos
 
 Things = list[list[Solid]]
 MOST = 64  # more than a scene's number of objects
@@ -33,20 +33,30 @@ def _pavement(rng: Rng) -> tuple[list[Solid], Things, float]:
         if rng.random() < 0.75:
             z, away = rng.uniform(-4, 8), rng.uniform(3.5, 14)
             while z < 70:
-                deep, tall = rng.uniform(2, 14), rng.uniform(0.5, 2) if rng.random() < 0.25 else rng.uniform(2, 7)
+                deep, tall = (
+                    rng.uniform(2, 14),
+                    rng.uniform(0.5, 2) if rng.random() < 0.25 else rng.uniform(2, 7),
+                )
                 center = axes @ (side * (away + 5 + rng.uniform(0, 1)), eye - tall, z + deep)
                 front = solid(rng, BOX, center, axes @ np.diag([5.0, tall, deep]))
                 behind.append(dataclasses.replace(front, repeats=(float(rng.integers(1, 4)),) * 2))
                 z += 2 * deep + (rng.uniform(1, 12) if rng.random() < 0.3 else 0.0)
     if rng.random() < 0.6:  # a wall at the end of the street
         behind.append(
-            solid(rng, BOX, np.array([rng.uniform(-9, 9), eye - 4, rng.uniform(18, 90)]), np.diag([30.0, 9, 2]))
+            solid(
+                rng,
+                BOX,
+                np.array([rng.uniform(-9, 9), eye - 4, rng.uniform(18, 90)]),
+                np.diag([30.0, 9, 2]),
+            )
         )
     for _ in range(rng.integers(0, 4)):  # trees in the background
         z = rng.uniform(12, 60)
         foot, tall = np.array([rng.uniform(-0.6, 0.6) * z, eye, z]), rng.uniform(3, 9)
         behind.append(pole(rng, foot, tall, 0.03 * tall, lean(rng.normal(0, 0.06))))
-        behind.append(solid(rng, SHEET, foot + tall * UP, turn(rng.normal(0, 0.3)) * 0.4 * tall, LEAVES))
+        behind.append(
+            solid(rng, SHEET, foot + tall * UP, turn(rng.normal(0, 0.3)) * 0.4 * tall, LEAVES)
+        )
     things: Things = []
     for _ in range(rng.integers(3, 10)):
         z = 2.2 + 22 * rng.random() ** 1.8
@@ -58,12 +68,17 @@ def _pavement(rng: Rng) -> tuple[list[Solid], Things, float]:
 
 def person(rng: Rng, foot: Array) -> list[Solid]:
     """A person: legs, body, arms and a head in three textures; sometimes on a bicycle."""
-    tall, axes = rng.uniform(1.2, 1.95), turn(rng.uniform(-math.pi, math.pi)) @ lean(rng.normal(0, 0.04))
+    tall, axes = (
+        rng.uniform(1.2, 1.95),
+        turn(rng.uniform(-math.pi, math.pi)) @ lean(rng.normal(0, 0.04)),
+    )
     legs, coat, skin = (int(rng.integers(WHOLE)) for _ in range(3))
     made, rides = [], rng.random() < 0.3
     up = 0.25 if rides else 0.0
 
-    def part(kind: int, x: float, y: float, z: float, radii: tuple[float, float, float], texture: int) -> None:
+    def part(
+        kind: int, x: float, y: float, z: float, radii: tuple[float, float, float], texture: int
+    ) -> None:
         place = foot + axes @ np.array([x, -y - up, z]) * tall
         made.append(solid(rng, kind, place, axes @ np.diag(radii) * tall, texture))
 
@@ -76,7 +91,9 @@ def person(rng: Rng, foot: Array) -> list[Solid]:
     if rides:
         for z in (-0.3, 0.3):
             wheel = axes @ turn(math.pi / 2) @ np.diag([0.2, 0.2, 1.0]) * tall
-            made.append(solid(rng, SHEET, foot + axes @ np.array([0.0, -0.2, z]) * tall, wheel, RING))
+            made.append(
+                solid(rng, SHEET, foot + axes @ np.array([0.0, -0.2, z]) * tall, wheel, RING)
+            )
         part(BOX, 0.0, 0.06, 0.0, (0.015, 0.02, 0.3), legs)
     return made
 
@@ -101,18 +118,47 @@ def car(rng: Rng, foot: Array) -> list[Solid]:
     for x in (-1, 1):
         for z in (-0.62, 0.62):
             wheel = axes @ lean(math.pi / 2) @ np.diag([0.32, 0.12, 0.32])
-            made.append(solid(rng, CYLINDER, foot + 0.32 * UP + axes @ np.array([x * wide, 0, z * long]), wheel, tyre))
+            made.append(
+                solid(
+                    rng,
+                    CYLINDER,
+                    foot + 0.32 * UP + axes @ np.array([x * wide, 0, z * long]),
+                    wheel,
+                    tyre,
+                )
+            )
     return made
 
 
 def animal(rng: Rng, foot: Array) -> list[Solid]:
     """An animal: a body on four legs, a neck and a head."""
-    size, axes, fur = rng.uniform(0.25, 1.0), turn(rng.uniform(-math.pi, math.pi)), int(rng.integers(WHOLE))
+    size, axes, fur = (
+        rng.uniform(0.25, 1.0),
+        turn(rng.uniform(-math.pi, math.pi)),
+        int(rng.integers(WHOLE)),
+    )
     legs, thick = rng.uniform(0.5, 0.9) * size, rng.uniform(0.28, 0.42) * size
-    made = [solid(rng, ELLIPSOID, foot + (legs + 0.6 * thick) * UP, axes @ np.diag([thick, thick, size]), fur)]
+    made = [
+        solid(
+            rng,
+            ELLIPSOID,
+            foot + (legs + 0.6 * thick) * UP,
+            axes @ np.diag([thick, thick, size]),
+            fur,
+        )
+    ]
     for x in (-0.6, 0.6):
         for z in (-0.7, 0.7):
-            made.append(pole(rng, foot + axes @ np.array([x * thick, 0, z * size]), legs, 0.1 * size, np.eye(3), fur))
+            made.append(
+                pole(
+                    rng,
+                    foot + axes @ np.array([x * thick, 0, z * size]),
+                    legs,
+                    0.1 * size,
+                    np.eye(3),
+                    fur,
+                )
+            )
     head = foot + (legs + rng.uniform(0.6, 1.8) * thick) * UP + axes @ np.array([0, 0, 1.15 * size])
     made.append(solid(rng, ELLIPSOID, head, axes @ np.diag([0.2, 0.22, 0.35]) * size, fur))
     return made
@@ -135,7 +181,13 @@ def trunk(rng: Rng, foot: Array) -> list[Solid]:
     tall = rng.uniform(2, 8)
     return [
         pole(rng, foot, tall, rng.uniform(0.07, 0.3), lean(rng.normal(0, 0.05))),
-        solid(rng, SHEET, foot + tall * UP, turn(rng.normal(0, 0.3)) * rng.uniform(0.2, 0.45) * tall, LEAVES),
+        solid(
+            rng,
+            SHEET,
+            foot + tall * UP,
+            turn(rng.normal(0, 0.3)) * rng.uniform(0.2, 0.45) * tall,
+            LEAVES,
+        ),
     ]
 
 
@@ -144,8 +196,18 @@ def board(rng: Rng, foot: Array) -> list[Solid]:
     if rng.random() < 0.4:
         return flat(rng, foot, rng.uniform(0.4, 1.2))
     half = rng.uniform(0.3, 1.0, 2)
-    skin = cut(rng) if rng.random() < 0.5 else LATTICE if rng.random() < 0.4 else int(rng.integers(WHOLE))
-    return [solid(rng, SHEET, foot + half[1] * UP, turn(rng.normal(0, 0.6)) @ np.diag([*half, 1.0]), skin)]
+    skin = (
+        cut(rng)
+        if rng.random() < 0.5
+        else LATTICE
+        if rng.random() < 0.4
+        else int(rng.integers(WHOLE))
+    )
+    return [
+        solid(
+            rng, SHEET, foot + half[1] * UP, turn(rng.normal(0, 0.6)) @ np.diag([*half, 1.0]), skin
+        )
+    ]
 
 
 THINGS: tuple[tuple[Callable[[Rng, Array], list[Solid]], float], ...] = (
@@ -164,19 +226,30 @@ def labelled_scene(rng: Rng, photos: Photos, height: int, width: int) -> tuple[F
 
     def build(rng: Rng) -> Scene:
         behind, things, pitch = _pavement(rng)
-        owners.extend([0] * len(behind) + [number + 1 for number, thing in enumerate(things) for _ in thing])
+        owners.extend(
+            [0] * len(behind) + [number + 1 for number, thing in enumerate(things) for _ in thing]
+        )
         return [*behind, *(part for thing in things for part in thing)], pitch
 
     seen = drawn(rng, photos, height, width, build)
     # Render again under ambient light, with the number of its object as each solid's grey.
     marks = [owner / MOST for owner in owners]
-    skins = np.stack([_marked(seen.skins[one.texture], mark) for one, mark in zip(seen.solids, marks, strict=True)])
+    skins = np.stack(
+        [
+            _marked(seen.skins[one.texture], mark)
+            for one, mark in zip(seen.solids, marks, strict=True)
+        ]
+    )
     solids = [dataclasses.replace(one, texture=index) for index, one in enumerate(seen.solids)]
-    found, _ = trace(solids, skins, seen.rays, np.array([0, -1, 0], np.float32), 1.0, np.zeros_like(seen.rays))
+    found, _ = trace(
+        solids, skins, seen.rays, np.array([0, -1, 0], np.float32), 1.0, np.zeros_like(seen.rays)
+    )
     owner = torch.from_numpy(found[:, 0] * MOST).round().long()
     owner = owner.reshape(height * SAMPLES, width * SAMPLES)[::SAMPLES, ::SAMPLES]
     known = torch.ones_like(seen.inverse_depth, dtype=torch.bool)
-    return Frame(seen.rgb.permute(2, 0, 1).contiguous(), seen.inverse_depth, known), owner.contiguous()
+    return Frame(
+        seen.rgb.permute(2, 0, 1).contiguous(), seen.inverse_depth, known
+    ), owner.contiguous()
 
 
 def _marked(skin: Floats, mark: float) -> Floats:

@@ -18,10 +18,10 @@ from textures import sky, textures
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from spackle.errors import InputError
-from spackle.files import atomic_path
-from spackle.image import load_photo
-from spackle.training.sources import Photos
+from spackle.core.photo import load_photo
+from spackle.paper.training.sources import Photos
+from spackle.runtime.errors import InputError
+from spackle.runtime.files import atomic_path
 
 SAMPLES = 2  # rays per pixel in each direction
 KINDS: tuple[tuple[Callable[[Rng], Scene], float], ...] = (  # with their relative frequencies
@@ -44,7 +44,13 @@ def synthetic_scene(rng: Rng, photos: Photos, height: int, width: int) -> tuple[
         photos: gives photos, from which textures are cut.
         height, width: in pixels.
     """
-    picture = drawn(rng, photos, height, width, KINDS[int(rng.choice(len(KINDS), p=[share for _, share in KINDS]))][0])
+    picture = drawn(
+        rng,
+        photos,
+        height,
+        width,
+        KINDS[int(rng.choice(len(KINDS), p=[share for _, share in KINDS]))][0],
+    )
     return picture.rgb, picture.inverse_depth
 
 
@@ -59,20 +65,28 @@ class Picture:
     rays: Floats  # [N, 3], `SAMPLES`² per pixel
 
 
-def drawn(rng: Rng, photos: Photos, height: int, width: int, build: Callable[[Rng], Scene]) -> Picture:
+def drawn(
+    rng: Rng, photos: Photos, height: int, width: int, build: Callable[[Rng], Scene]
+) -> Picture:
     """Render a scene made by `build`; see `synthetic_scene`."""
     skins = textures(rng, photos)
     solids, pitch = build(rng)
     focal = width * rng.uniform(0.7, 1.5)
     rays = _rays(height, width, focal, pitch, math.radians(rng.normal(0, 2.5)))
     behind = sky(rng, photos, height, width).repeat(SAMPLES, 0).repeat(SAMPLES, 1).reshape(-1, 3)
-    above = rng.normal(size=3) * (1.0, 0.4, 1.0) - (0.0, rng.uniform(0.5, 1.5), 0.5)  # y points down
+    above = rng.normal(size=3) * (1.0, 0.4, 1.0) - (
+        0.0,
+        rng.uniform(0.5, 1.5),
+        0.5,
+    )  # y points down
     light = (above / np.linalg.norm(above)).astype(np.float32)
     colors, distances = trace(solids, skins, rays, light, rng.uniform(0.25, 0.9), behind)
     fine = (height * SAMPLES, width * SAMPLES)
     rgb = _exposed(rng, torch.from_numpy(colors))
     rgb = avg_pool2d(rgb.reshape(*fine, 3).permute(2, 0, 1)[None], SAMPLES)[0]
-    inverse = torch.from_numpy(1.0 / distances).reshape(fine)[::SAMPLES, ::SAMPLES]  # one per pixel: no averages
+    inverse = torch.from_numpy(1.0 / distances).reshape(fine)[
+        ::SAMPLES, ::SAMPLES
+    ]  # one per pixel: no averages
     return Picture(rgb.permute(1, 2, 0).contiguous(), inverse.contiguous(), solids, skins, rays)
 
 
@@ -113,7 +127,9 @@ class PhotoDraw:
             except (InputError, ValueError) as error:
                 self.bad.add(file)
                 self.warn(f"passed over: {error}")
-        raise InputError(f"{self.files[0].parent}: {TRIES} photos in a row cannot be read: give others as data.photos")
+        raise InputError(
+            f"{self.files[0].parent}: {TRIES} photos in a row cannot be read: give others as data.photos"
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,10 +165,14 @@ class SyntheticScenes:
         path, row = self._file(index), index % PER_FILE
         try:
             with safe_open(path, framework="pt") as file:
-                rgb, inverse_depth = (file.get_slice(name)[row] for name in ("rgb", "inverse_depth"))
+                rgb, inverse_depth = (
+                    file.get_slice(name)[row] for name in ("rgb", "inverse_depth")
+                )
                 upright = bool(file.get_tensor("upright")[row])
         except (OSError, SafetensorError, IndexError) as error:
-            raise InputError(f"{path}: no synthetic scenes, or damaged: delete it, and it is made anew") from error
+            raise InputError(
+                f"{path}: no synthetic scenes, or damaged: delete it, and it is made anew"
+            ) from error
         height, width = self.size[::-1] if upright else self.size
         rgb = rgb.reshape(height, width, 3).permute(2, 0, 1).float() / 255
         inverse_depth = inverse_depth.reshape(height, width).float()
@@ -167,7 +187,9 @@ class SyntheticScenes:
         pixels = self.size[0] * self.size[1]
         try:
             with safe_open(path, framework="pt") as file:
-                shapes = [file.get_slice(name).get_shape() for name in ("rgb", "inverse_depth", "upright")]
+                shapes = [
+                    file.get_slice(name).get_shape() for name in ("rgb", "inverse_depth", "upright")
+                ]
             count = int(shapes[2][0])
             if shapes == [[count, 3 * pixels], [count, pixels], [count]]:
                 return count
@@ -178,13 +200,18 @@ class SyntheticScenes:
         warn(f"{path}: damaged, made anew")
         return 0
 
-    def _write(self, first: int, last: int, draw: PhotoDraw, progress: Callable[[int, int], None]) -> None:
+    def _write(
+        self, first: int, last: int, draw: PhotoDraw, progress: Callable[[int, int], None]
+    ) -> None:
         scenes = []
         for index in range(first, last):
             scenes.append(self._scene(index, draw))
             progress(index + 1, self.count)
         names = ("rgb", "inverse_depth", "upright")
-        tensors = {name: torch.stack(rows) for name, rows in zip(names, zip(*scenes, strict=True), strict=True)}
+        tensors = {
+            name: torch.stack(rows)
+            for name, rows in zip(names, zip(*scenes, strict=True), strict=True)
+        }
         with atomic_path(self._file(first)) as temporary:
             temporary.write_bytes(save(tensors))
 
@@ -192,5 +219,11 @@ class SyntheticScenes:
         """A scene as it is stored: flattened, with 8-bit colours and depth in half precision."""
         rng = np.random.default_rng([self.seed, index])
         upright = rng.random() >= 1 - UPRIGHT
-        rgb, inverse_depth = synthetic_scene(rng, draw, *(self.size[::-1] if upright else self.size))
-        return (rgb * 255 + 0.5).to(torch.uint8).flatten(), inverse_depth.half().flatten(), torch.tensor(upright)
+        rgb, inverse_depth = synthetic_scene(
+            rng, draw, *(self.size[::-1] if upright else self.size)
+        )
+        return (
+            (rgb * 255 + 0.5).to(torch.uint8).flatten(),
+            inverse_depth.half().flatten(),
+            torch.tensor(upright),
+        )

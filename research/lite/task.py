@@ -17,12 +17,12 @@ from torch import Tensor, nn
 from weights import first_network, freeze, save_networks
 
 from spackle.bases.lite import LiteBase, LiteNet
-from spackle.device import pick_dtype
-from spackle.files import make_folder
 from spackle.formats.png import sheet
-from spackle.progress import Reporter, Step
-from spackle.training.residual import CACHE, PICTURED
-from spackle.training.train import Task, rank, wait_for_ranks
+from spackle.paper.training.residual import CACHE, PICTURED
+from spackle.paper.training.train import Task, rank, wait_for_ranks
+from spackle.runtime.device import pick_dtype
+from spackle.runtime.files import make_folder
+from spackle.runtime.progress import Progress, Reporter
 
 PICTURE_SIDE = 320  # pixels of a picture's longer side
 # Nine colours of Viridis, which is perceptually uniform, also in grey and for colour-blind readers.
@@ -69,7 +69,7 @@ class LiteTask(Task):
         cache = recipe.data.cache or output / CACHE
         sources: list[tuple[Source, float]] = []
 
-        def make(what: str, folder: Path, fill: Callable[[Step, Warn], None]) -> None:
+        def make(what: str, folder: Path, fill: Callable[[Progress, Warn], None]) -> None:
             """Make files in the first process; all other processes wait for the files."""
             if rank() == 0:
                 make_folder(folder)
@@ -97,9 +97,14 @@ class LiteTask(Task):
             )
             sources.append((guesses, shares.guessed))
         self.groups_of_frames = {
-            group.name: [frame for _, frame in read_all(group.files, JUDGED_SIDE, log)] for group in files.groups
+            group.name: [frame for _, frame in read_all(group.files, JUDGED_SIDE, log)]
+            for group in files.groups
         }
-        counts = {"made": recipe.data.made if files.photos else 0, "stereo": len(files.stereo), "rgbd": len(files.rgbd)}
+        counts = {
+            "made": recipe.data.made if files.photos else 0,
+            "stereo": len(files.stereo),
+            "rgbd": len(files.rgbd),
+        }
         counts |= {"guessed": len(files.guessed)} if files.guessed else {}
         judged = {name: len(frames) for name, frames in self.groups_of_frames.items()}
         log(f"to learn from: {_listed(counts)}; to be judged by: {_listed(judged)}")
@@ -110,7 +115,10 @@ class LiteTask(Task):
         each, parts = zip(*sources, strict=True)
         self.mixture = Mixture(each, parts, recipe.data.size, recipe.run.seed, recipe.data.scales)
         self.validation_items = len(judged)
-        self.measures = (*MEASURES, *(f"{group}/{name}" for group in judged for name in ("abs_rel", "delta")))
+        self.measures = (
+            *MEASURES,
+            *(f"{group}/{name}" for group in judged for name in ("abs_rel", "delta")),
+        )
         return {"samples": {"train": counts, "validation": judged, "digest": self.digest}}
 
     def groups(self) -> list[dict[str, Any]]:
@@ -122,7 +130,9 @@ class LiteTask(Task):
                 found.setdefault(scale, []).append(weight)
         return [{"params": weights, "lr_scale": scale} for scale, weights in found.items()]
 
-    def batch(self, step: int | None, items: Sequence[int]) -> DepthBatch | list[tuple[str, list[Frame]]]:
+    def batch(
+        self, step: int | None, items: Sequence[int]
+    ) -> DepthBatch | list[tuple[str, list[Frame]]]:
         """A step's pictures, or groups of validation frames by name; InputError if a file cannot be read."""
         if step is None:
             return [list(self.groups_of_frames.items())[item] for item in items]
@@ -132,7 +142,9 @@ class LiteTask(Task):
         """The loss [] of a batch and its terms []."""
         return self.judge.total(network, batch)
 
-    def measure(self, network: nn.Module, batch: Sequence[tuple[str, list[Frame]]]) -> dict[str, list[float]]:
+    def measure(
+        self, network: nn.Module, batch: Sequence[tuple[str, list[Frame]]]
+    ) -> dict[str, list[float]]:
         """`MEASURES` of groups, and scores of each group by its name."""
         found: dict[str, list[float]] = {name: [] for name in MEASURES}
         for group, frames in batch:
@@ -147,11 +159,19 @@ class LiteTask(Task):
     def picture(self, network: nn.Module) -> Tensor:
         """[H, W, 3] sRGB: for a few validation frames the photo, and predicted and true inverse depth."""
         each, rows = max(1, PICTURED // self.validation_items), []
-        chosen = [group[:: max(1, len(group) // each)][:each] for group in self.groups_of_frames.values()]
+        chosen = [
+            group[:: max(1, len(group) // each)][:each] for group in self.groups_of_frames.values()
+        ]
         for frame in itertools.chain(*chosen):
             predicted, true = self.judge.predict(network, frame), frame.inverse_depth
             guess = colored(predicted, *ends(predicted[frame.valid]))
-            rows.append([frame.rgb.permute(1, 2, 0), guess, colored(true, *ends(true[frame.valid]), frame.valid)])
+            rows.append(
+                [
+                    frame.rgb.permute(1, 2, 0),
+                    guess,
+                    colored(true, *ends(true[frame.valid]), frame.valid),
+                ]
+            )
         return sheet(rows, PICTURE_SIDE)
 
     def export(self, network: nn.Module, path: Path) -> None:

@@ -10,14 +10,19 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from spackle.training.sources import Photos, outline, random_crop
+from spackle.paper.training.sources import Photos, outline, random_crop
 
 Floats = NDArray[np.float32]
 Rng = np.random.Generator
 SIDE = 160  # pixels of a texture
-WHOLE, CUT = 9, 3  # number of a scene's textures that cover a whole surface, and of those with an outline
+WHOLE, CUT = (
+    9,
+    3,
+)  # number of a scene's textures that cover a whole surface, and of those with an outline
 FIRST_SHAPE = WHOLE + CUT
-LATTICE, LEAVES, RING, PEAK = (FIRST_SHAPE + n for n in range(4))  # one texture of each of these shapes
+LATTICE, LEAVES, RING, PEAK = (
+    FIRST_SHAPE + n for n in range(4)
+)  # one texture of each of these shapes
 
 
 def textures(rng: Rng, photos: Photos) -> Floats:
@@ -30,8 +35,12 @@ def sky(rng: Rng, photos: Photos, height: int, width: int) -> Floats:
     if rng.random() < 0.2:
         return np.full((height, width, 3), rng.uniform(0.92, 1.0), np.float32)
     rows = torch.linspace(0, 1, height)[:, None, None]
-    red = [rng.uniform(low, 1.0) for low in (0.35, 0.7)]  # never more red than blue; at the zenith and at the horizon
-    above, below = (torch.tensor([r, rng.uniform(r, 1.0), 1.0]) * rng.uniform(0.7, 1.0) for r in red)
+    red = [
+        rng.uniform(low, 1.0) for low in (0.35, 0.7)
+    ]  # never more red than blue; at the zenith and at the horizon
+    above, below = (
+        torch.tensor([r, rng.uniform(r, 1.0), 1.0]) * rng.uniform(0.7, 1.0) for r in red
+    )
     result = torch.lerp(above, below, rows).expand(-1, width, -1)
     if rng.random() < 0.5:
         clouds = random_crop(rng, photos(rng), height, width)
@@ -56,7 +65,11 @@ def _skin(rng: Rng, photos: Photos, number: int) -> Floats:
 def _painted(rng: Rng, picture: Tensor) -> Tensor:
     """A single colour, blended with the picture to a random degree."""
     own = rng.random() < 0.8
-    paint = picture.mean((0, 1)) if own else torch.from_numpy(rng.uniform(0.05, 0.95, 3).astype(np.float32))
+    paint = (
+        picture.mean((0, 1))
+        if own
+        else torch.from_numpy(rng.uniform(0.05, 0.95, 3).astype(np.float32))
+    )
     return torch.lerp(paint.expand_as(picture), picture, float(rng.uniform(0.05, 0.8)))
 
 
@@ -66,16 +79,25 @@ def _shape(rng: Rng, number: int) -> Floats:
     if number == LATTICE:  # horizontal or vertical bars, or both: fences, grids, window frames
         thick, many = rng.uniform(0.15, 0.5), rng.integers(2, 9, 2)
         slant = rng.uniform(-1, 1) if rng.random() < 0.3 else 0.0
-        bars = [((many[0] * (x + slant * y)) % 1) < thick, ((many[1] * (y - slant * x)) % 1) < thick]
+        bars = [
+            ((many[0] * (x + slant * y)) % 1) < thick,
+            ((many[1] * (y - slant * x)) % 1) < thick,
+        ]
         kept = bars[0] | bars[1] if (which := rng.random()) < 0.6 else bars[int(which < 0.8)]
     elif number == LEAVES:
         cells = int(rng.integers(6, 26))
         noise = torch.from_numpy(rng.standard_normal((1, 1, cells, cells)).astype(np.float32))
-        cloud = interpolate(noise, size=(SIDE, SIDE), mode="bicubic", align_corners=True)[0, 0].numpy()
-        kept = cloud > rng.uniform(-0.4, 0.6) + 1.5 * np.maximum(0, np.hypot(x - 0.5, y - 0.5) - 0.3)
+        cloud = interpolate(noise, size=(SIDE, SIDE), mode="bicubic", align_corners=True)[
+            0, 0
+        ].numpy()
+        kept = cloud > rng.uniform(-0.4, 0.6) + 1.5 * np.maximum(
+            0, np.hypot(x - 0.5, y - 0.5) - 0.3
+        )
     elif number == RING:
         away = np.hypot(x - 0.5, y - 0.5)
         kept = (away < 0.49) & (away > rng.uniform(0.25, 0.42))
     else:  # a peak: cones, roofs, pennants
-        kept = np.abs(x - 0.5) < y * rng.uniform(0.25, 0.5) * (1 if rng.random() < 0.5 else math.sqrt(2))
+        kept = np.abs(x - 0.5) < y * rng.uniform(0.25, 0.5) * (
+            1 if rng.random() < 0.5 else math.sqrt(2)
+        )
     return np.asarray(kept, np.float32)

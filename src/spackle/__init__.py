@@ -11,22 +11,23 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # for editors and type checkers
+    from spackle.api import Spackle as Spackle
+    from spackle.api import predict as predict
     from spackle.bases import Base as Base
     from spackle.bases import BasePrediction as BasePrediction
-    from spackle.bases.depth_map import DepthMap as DepthMap
-    from spackle.bases.depth_map import load_depth as load_depth
-    from spackle.bases.hf import HfBase as HfBase
     from spackle.bases.lite import LiteBase as LiteBase
     from spackle.bases.moge.base import MogeBase as MogeBase
     from spackle.bases.sharp import SharpBase as SharpBase
-    from spackle.camera import Camera as Camera
-    from spackle.errors import InputError as InputError
+    from spackle.bases.transformers import HfBase as HfBase
+    from spackle.core.camera import Camera as Camera
+    from spackle.core.gaussians import Gaussians as Gaussians
+    from spackle.core.photo import Photo as Photo
+    from spackle.core.photo import load_photo as load_photo
+    from spackle.depth.depth_map import DepthMap as DepthMap
+    from spackle.depth.depth_map import load_depth as load_depth
     from spackle.formats import load_cameras as load_cameras
     from spackle.formats import load_ply as load_ply
     from spackle.formats import save_ply as save_ply
-    from spackle.gaussians import Gaussians as Gaussians
-    from spackle.image import Photo as Photo
-    from spackle.image import load_photo as load_photo
     from spackle.pipeline import complete as complete
     from spackle.render import Renderer as Renderer
     from spackle.render import get_renderer as get_renderer
@@ -34,35 +35,34 @@ if TYPE_CHECKING:  # for editors and type checkers
     from spackle.residual import complete_view as complete_view
     from spackle.residual import hole_area_ratio as hole_area_ratio
     from spackle.residual import hole_mask as hole_mask
+    from spackle.runtime.errors import InputError as InputError
     from spackle.scene import Scene as Scene
     from spackle.scene_fill import FillContext as FillContext
     from spackle.scene_fill import fill_scene as fill_scene
     from spackle.scene_fill import fill_view as fill_view
-    from spackle.session import Spackle as Spackle
-    from spackle.session import predict as predict
 
 __version__ = "0.1.0"  # pyproject.toml reads this line
 
 # A name is imported at its first use, so that `spackle --help` does not wait for torch.
 _NAMES = {
     "spackle.bases": ("Base", "BasePrediction"),
-    "spackle.bases.depth_map": ("DepthMap", "load_depth"),
-    "spackle.bases.hf": ("HfBase",),
+    "spackle.depth.depth_map": ("DepthMap", "load_depth"),
+    "spackle.bases.transformers": ("HfBase",),
     "spackle.bases.lite": ("LiteBase",),
     "spackle.bases.moge.base": ("MogeBase",),
     "spackle.bases.sharp": ("SharpBase",),
-    "spackle.camera": ("Camera",),
-    "spackle.errors": ("InputError",),
+    "spackle.core.camera": ("Camera",),
+    "spackle.runtime.errors": ("InputError",),
     "spackle.formats": ("load_cameras", "load_ply", "save_ply"),
-    "spackle.gaussians": ("Gaussians",),
-    "spackle.image": ("Photo", "load_photo"),
+    "spackle.core.gaussians": ("Gaussians",),
+    "spackle.core.photo": ("Photo", "load_photo"),
     "spackle.render": ("Renderer", "get_renderer"),
     "spackle.render.protocol": ("Rendering",),
     "spackle.residual": ("complete_view", "hole_area_ratio", "hole_mask"),
     "spackle.pipeline": ("complete",),
     "spackle.scene": ("Scene",),
     "spackle.scene_fill": ("FillContext", "fill_scene", "fill_view"),
-    "spackle.session": ("Spackle", "predict"),
+    "spackle.api": ("Spackle", "predict"),
 }
 _HOMES = {name: module for module, names in _NAMES.items() for name in names}
 __all__ = sorted(_HOMES)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -13,20 +13,20 @@ from torch import Tensor
 from spackle.bases import BasePrediction
 from spackle.bases.open import OpenedBase, ResolvedBase, open_base
 from spackle.bases.settings import BaseSettings
-from spackle.camera import Camera
-from spackle.camera_path import KeyframePath
-from spackle.errors import InputError
-from spackle.gaussians import Gaussians
-from spackle.image import Photo, check_shape
+from spackle.core.camera import Camera
+from spackle.core.gaussians import Gaussians
+from spackle.core.photo import Photo, check_shape
+from spackle.core.trajectories import KeyframePath
 from spackle.inpaint import InpainterOptions, get_inpainter
-from spackle.progress import Reporter, Step
 from spackle.render import Renderer, get_renderer
 from spackle.residual.architectures import SHIPPED, load_residual, shipped_network
 from spackle.residual.network import ResidualNet
+from spackle.runtime.errors import InputError
+from spackle.runtime.progress import Progress, Reporter
 from spackle.scene import Scene
 from spackle.scene_fill.fill import FillContext, fill_scene, fill_view
 from spackle.scene_fill.texture import Texture, exemplar_texture, painted_texture
-from spackle.views import PathOptions, PlannedViews, choose_move, plan_views
+from spackle.views import PathOptions, PlannedViews, choose_disparity, plan_views
 from spackle.weights import installed
 
 Fill = Literal["auto", "network", "exemplar", "lama", "none"]  # source of the texture in holes
@@ -37,7 +37,9 @@ Mode = Literal["scene", "view"]  # one set of aux Gaussians for all views, or on
 class FillOptions:
     """Options of the fill."""
 
-    residual: str | None = None  # a file of weights, "seeds", "none", or None for the shipped weights if there are any
+    residual: str | None = (
+        None  # a file of weights, "seeds", "none", or None for the shipped weights if there are any
+    )
     fill: Fill = "auto"
     mode: Mode = "scene"
 
@@ -54,7 +56,11 @@ class FillOptions:
     @property
     def weights(self) -> str:
         """The weights' name in reports: "shipped", a file, "seeds" or "none"."""
-        return "none" if self.texture == "none" else self.residual or ("shipped" if SHIPPED.is_file() else "seeds")
+        return (
+            "none"
+            if self.texture == "none"
+            else self.residual or ("shipped" if SHIPPED.is_file() else "seeds")
+        )
 
     @property
     def file(self) -> Path | None:
@@ -91,7 +97,9 @@ class CompletedPhoto:
     choice: ResolvedBase
     views: PlannedViews
     scene: Scene  # its disparity is None for given views and keyframes
-    pictures: Mapping[int, Tensor]  # [H, W, 3] uint8, by index: the completed views that completion has rendered
+    pictures: Mapping[
+        int, Tensor
+    ]  # [H, W, 3] uint8, by index: the completed views that completion has rendered
     saved_view: str | None = None  # in view mode: the view that `scene.aux` belongs to
 
 
@@ -121,22 +129,33 @@ class Pipeline:
         """Complete the scene of a photo at its full size; InputError if the photo or its depth map cannot be used."""
         fill, precision = self.options.fill, self.options.base.precision
         prediction, choice = self.predict(photo, reporter)
-        views = plan_views(prediction, self.options.path, photo.path, self.given_views, self.keyframes)
+        views = plan_views(
+            prediction, self.options.path, photo.path, self.given_views, self.keyframes
+        )
         base, camera, texture = prediction.gaussians, prediction.camera, open_texture(fill.texture)
-        context = FillContext(base, camera, self.renderer, self.network, texture, precision=precision)
+        context = FillContext(
+            base, camera, self.renderer, self.network, texture, precision=precision
+        )
         saved_view, by_view, pictures = None, None, dict[int, Tensor]()
         with reporter.stage("complete") as step:
             if fill.mode == "scene" or fill.texture == "none":
                 chosen = [] if fill.texture == "none" else views.looked_at
-                filled = fill_scene(context, [views.cameras[k] for k in chosen], self.given_views is not None, step)
+                filled = fill_scene(
+                    context, [views.cameras[k] for k in chosen], self.given_views is not None, step
+                )
                 aux = filled.aux
                 if views.maker.plain:
                     pictures = {chosen[k]: picture for k, picture in filled.pictures.items()}
             else:
                 by_view = tuple(_fill_each(context, views.cameras, step))
                 eye = camera.position.double()
-                far = {name: (views.cameras[k].position.double() - eye).norm() for name, k in views.measured.items()}
-                saved_view = max(far, key=lambda name: float(far[name]))  # a file holds one set of aux Gaussians
+                far = {
+                    name: (views.cameras[k].position.double() - eye).norm()
+                    for name, k in views.measured.items()
+                }
+                saved_view = max(
+                    far, key=lambda name: float(far[name])
+                )  # a file holds one set of aux Gaussians
                 aux = by_view[views.measured[saved_view]]
         if not aux.finite:
             source = self.options.path.cameras or photo.path
@@ -156,7 +175,7 @@ class Pipeline:
         chosen = self._disparity(prediction) is not None and self.options.path.disparity is None
         if chosen:
             with reporter.stage("move"):
-                prediction = choose_move(prediction, self.renderer, photo.path)
+                prediction = choose_disparity(prediction, self.renderer, photo.path)
         reporter.log(
             f"{name}: {len(prediction.gaussians):,} Gaussians from {choice.base}, "
             f"focal length {prediction.camera.focal[0]:.0f} px ({prediction.lens_source or photo.focal_source})"
@@ -167,7 +186,9 @@ class Pipeline:
             reporter.log(f"{name}: its depth is {depth_range}")
         if missing := float(prediction.notes.get("depth_filled", 0)):
             reporter.log(f"{name}: {missing:.1%} of the depth was missing and has been filled")
-        if self.options.base.depth is not None and (size := prediction.notes.get("depth_resampled_from")):
+        if self.options.base.depth is not None and (
+            size := prediction.notes.get("depth_resampled_from")
+        ):
             reporter.log(f"{name}: the depth map is {size}, and was resampled to the photo's size")
         return prediction, choice
 
@@ -178,13 +199,23 @@ class Pipeline:
 
 
 def move_in_words(prediction: BasePrediction) -> str:
-    """A line for the log about the disparity that `choose_move` has chosen."""
-    reach, usual, invented = prediction.disparity, prediction.notes["usual_disparity"], prediction.notes["uncovered"]
-    of, more = (f" of {usual:g}", f"; `--disparity {usual:g}` moves farther") if reach != usual else ("", "")
+    """A line for the log about the disparity that `choose_disparity` has chosen."""
+    reach, usual, invented = (
+        prediction.disparity,
+        prediction.notes["usual_disparity"],
+        prediction.notes["uncovered"],
+    )
+    of, more = (
+        (f" of {usual:g}", f"; `--disparity {usual:g}` moves farther")
+        if reach != usual
+        else ("", "")
+    )
     return f"camera moves by disparity {reach:g}{of}: {invented:.1%} of the widest view is invented{more}"
 
 
-def _fill_each(context: FillContext, cameras: Sequence[Camera], step: Step) -> Iterator[Gaussians]:
+def _fill_each(
+    context: FillContext, cameras: Sequence[Camera], step: Progress
+) -> Iterator[Gaussians]:
     guards = [context.photo_guard()]
     for index, camera in enumerate(cameras):
         yield fill_view(context, camera, guards).aux
@@ -199,7 +230,7 @@ def complete(
     network: ResidualNet | Literal["shipped"] | None = "shipped",
     fill: Fill = "auto",
     renderer: Renderer | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Scene:
     """Fill the holes of all views by one set of aux Gaussians, see `fill_scene`.
 
@@ -215,7 +246,9 @@ def complete(
     chosen = shipped_network() if network == "shipped" else network
     base, camera = prediction.gaussians, prediction.camera
     context = FillContext(base, camera, renderer or get_renderer(), chosen, open_texture(fill))
-    return Scene(base, fill_scene(context, cameras if fill != "none" else (), exact, progress).aux, camera)
+    return Scene(
+        base, fill_scene(context, cameras if fill != "none" else (), exact, progress).aux, camera
+    )
 
 
 def resolved(fill: Fill) -> Fill:

@@ -12,21 +12,21 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from spackle import camera_path
 from spackle.bases import USUAL_DISPARITY
-from spackle.camera import Camera
-from spackle.camera_path import OVERSCAN, DepthRange, KeyframePath, TrajectoryKind
-from spackle.errors import renamed
-from spackle.files import Target, write_whole
+from spackle.core import trajectories as camera_path
+from spackle.core.camera import Camera
+from spackle.core.gaussians import Gaussians
+from spackle.core.photo import focal_length
+from spackle.core.trajectories import OVERSCAN, DepthRange, KeyframePath, TrajectoryKind
 from spackle.formats.html import PageScene, page_scene, single_html
 from spackle.formats.scene_files import Encoder, SceneFile, at_origin, encoder_of, load_scene
-from spackle.formats.video import check_video, save_video
-from spackle.gaussians import Gaussians
-from spackle.image import focal_length
 from spackle.render import Renderer, get_renderer
 from spackle.render.protocol import Rendering
-from spackle.residual.view_features import hole_mask
-from spackle.video_frames import Fit, FrameMaker, Show, StereoLayout, VideoOptions, parse_size
+from spackle.residual.features import hole_mask
+from spackle.runtime.errors import renamed
+from spackle.runtime.files import Target, write_atomic
+from spackle.video.encoding import check_video, save_video
+from spackle.video.frames import Fit, FrameMaker, Show, StereoLayout, VideoOptions, parse_size
 from spackle.views import PATH_FRAMES, PathOptions
 
 DEFAULT_SIZE = (1280, 720)  # width and height for a file that stores no camera
@@ -39,7 +39,9 @@ class Scene:
     base: Gaussians  # predicted from the photo; never changed
     aux: Gaussians  # added by completion
     camera: Camera  # the photo's camera, at the origin
-    by_view: tuple[Gaussians, ...] | None = None  # in view mode: the aux Gaussians of each completed view
+    by_view: tuple[Gaussians, ...] | None = (
+        None  # in view mode: the aux Gaussians of each completed view
+    )
     disparity: float | None = None  # the disparity for which the scene was completed, if known
 
     def __repr__(self) -> str:
@@ -47,7 +49,9 @@ class Scene:
         return f"Scene({len(self.base):,} base + {len(self.aux):,} aux Gaussians, {size}, {self.base.means.device})"
 
     @staticmethod
-    def load(path: str | os.PathLike[str], *, focal_px: float | None = None, fov: float | None = None) -> Scene:
+    def load(
+        path: str | os.PathLike[str], *, focal_px: float | None = None, fov: float | None = None
+    ) -> Scene:
         """Read a PLY (ours, INRIA's, SHARP's or PlayCanvas's), SPZ, SOG or .splat file; InputError for any other.
 
         Args:
@@ -58,7 +62,9 @@ class Scene:
         return Scene.of_file(load_scene(Path(path)), focal_px=focal_px, fov=fov)
 
     @staticmethod
-    def of_file(file: SceneFile, size: tuple[int, int] | None = None, **lens: float | None) -> Scene:
+    def of_file(
+        file: SceneFile, size: tuple[int, int] | None = None, **lens: float | None
+    ) -> Scene:
         """The scene in a loaded file; see `load`. `size` is the camera's size if a lens is given, or none is stored."""
         gaussians, camera = file.gaussians, file.camera
         if camera is None or any(value is not None for value in lens.values()):
@@ -94,7 +100,7 @@ class Scene:
         """Cameras of a path around the photo's camera position, of even width and height.
 
         Args:
-            trajectory: see `spackle.camera_path.trajectory`.
+            trajectory: see `spackle.core.trajectories.trajectory`.
             disparity: by default `Scene.disparity`.
             frames: number of cameras.
             looped: make a path that repeats without a jump.
@@ -117,7 +123,9 @@ class Scene:
         with torch.no_grad():
             return (renderer or get_renderer()).render([self.base, self.aux], camera)
 
-    def frames(self, cameras: Iterable[Camera], renderer: Renderer | None = None) -> Iterator[Rendering]:
+    def frames(
+        self, cameras: Iterable[Camera], renderer: Renderer | None = None
+    ) -> Iterator[Rendering]:
         """Render the views one after the other."""
         renderer = renderer or get_renderer()
         for camera in cameras:
@@ -137,7 +145,7 @@ class Scene:
             disparity: limit of the camera's movement in `spackle view`; by default `Scene.disparity`.
         """
         scene = self if disparity is None else dataclasses.replace(self, disparity=disparity)
-        write_whole(target, scene.to_bytes("ply"))
+        write_atomic(target, scene.to_bytes("ply"))
 
     def page(self, name: str, note: str = "") -> PageScene:
         """The scene in the form that `spackle view` shows; see `page_scene`."""
@@ -155,7 +163,7 @@ class Scene:
             InputError: an unknown format, or a scene too large for the format.
         """
         name = target if isinstance(target, str | os.PathLike) else "scene"
-        write_whole(target, self._encoded(Path(f"scene.{format}" if format else name)))
+        write_atomic(target, self._encoded(Path(f"scene.{format}" if format else name)))
 
     def to_bytes(self, format: str) -> bytes:
         """The bytes that `export` would write."""
@@ -210,21 +218,29 @@ class Scene:
             InputError: an option is impossible, or contradicts another one.
         """
         named = format is None and isinstance(target, str | os.PathLike)
-        pixels = None if size is None else parse_size(size if isinstance(size, str) else "x".join(map(str, size)))
+        pixels = (
+            None
+            if size is None
+            else parse_size(size if isinstance(size, str) else "x".join(map(str, size)))
+        )
         with tempfile.TemporaryDirectory() as folder:
             file = Path(target) if named else Path(folder) / f"video.{format or 'mp4'}"  # type: ignore[arg-type]
             shown = file if named else Path(file.name)
             check_video(shown, fps, loop)
-            video = VideoOptions(None, fps, loop, pixels, fit, show, stereo, ipd, convergence, compare).for_file(file)
+            video = VideoOptions(
+                None, fps, loop, pixels, fit, show, stereo, ipd, convergence, compare
+            ).for_file(file)
             path = PathOptions(trajectory, disparity, None, None, frames, seconds, video, overscan)
             path.check()
             cameras = path.fly(self.base, self.camera, None, self.disparity)
             maker = FrameMaker.of(video, self.base, cameras, shown)
             parts = [[self.base]] * compare + [[self.base, self.aux]]
             used = renderer or get_renderer()
-            save_video((maker.render(parts, camera, used)[0] for camera in cameras), file, fps, loop)
+            save_video(
+                (maker.render(parts, camera, used)[0] for camera in cameras), file, fps, loop
+            )
             if not named:
-                write_whole(target, file.read_bytes())
+                write_atomic(target, file.read_bytes())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -236,4 +252,6 @@ class InlinePage:
 
     def _repr_html_(self) -> str:
         style = f"width: 100%; height: {self.height}px; border: 0"
-        return f'<iframe style="{style}" allowfullscreen srcdoc="{html.escape(self.html)}"></iframe>'
+        return (
+            f'<iframe style="{style}" allowfullscreen srcdoc="{html.escape(self.html)}"></iframe>'
+        )

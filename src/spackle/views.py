@@ -10,8 +10,10 @@ from pathlib import Path
 import torch
 
 from spackle.bases import USUAL_DISPARITY, BasePrediction
-from spackle.camera import Camera
-from spackle.camera_path import (
+from spackle.core.camera import Camera
+from spackle.core.gaussians import Gaussians
+from spackle.core.photo import working_size
+from spackle.core.trajectories import (
     MAX_DISPARITY,
     OVERSCAN,
     TRAJECTORIES,
@@ -22,13 +24,11 @@ from spackle.camera_path import (
     extremes,
     trajectory,
 )
-from spackle.errors import InputError, check_name, reading
 from spackle.formats.camera_files import load_cameras, load_path
-from spackle.gaussians import Gaussians
-from spackle.image import working_size
 from spackle.render.protocol import Renderer
-from spackle.residual.view_features import hole_area_ratio
-from spackle.video_frames import FrameMaker, VideoOptions
+from spackle.residual.features import hole_area_ratio
+from spackle.runtime.errors import InputError, as_input_error, check_name
+from spackle.video.frames import FrameMaker, VideoOptions
 
 PATH_FRAMES, MAX_FRAMES = 60, 10_000  # default and largest number of frames
 SECONDS = 4.0  # default duration of a video along a trajectory
@@ -52,21 +52,35 @@ class PathOptions:
     def check(self) -> None:
         """Raise an InputError for an impossible path or video, or for options that contradict each other."""
         check_name("--trajectory", self.trajectory.replace("_", "-"), TRAJECTORIES)
-        if self.disparity is not None and not (math.isfinite(self.disparity) and 0 <= self.disparity <= MAX_DISPARITY):
-            raise InputError(f"--disparity must be between 0 and {MAX_DISPARITY:g}, got {self.disparity:g}")
+        if self.disparity is not None and not (
+            math.isfinite(self.disparity) and 0 <= self.disparity <= MAX_DISPARITY
+        ):
+            raise InputError(
+                f"--disparity must be between 0 and {MAX_DISPARITY:g}, got {self.disparity:g}"
+            )
         if self.frames is not None and not 1 <= self.frames <= MAX_FRAMES:
             raise InputError(f"--frames must be between 1 and {MAX_FRAMES}, got {self.frames}")
         if self.seconds is not None:
             if self.frames is not None:
-                raise InputError(f"--seconds {self.seconds:g}: --frames {self.frames} sets the length: leave one out")
+                raise InputError(
+                    f"--seconds {self.seconds:g}: --frames {self.frames} sets the length: leave one out"
+                )
             if not 1 <= self.seconds * self.video.rate <= MAX_FRAMES:
-                raise InputError(f"--seconds must give 1 to {MAX_FRAMES} frames, got {self.seconds:g}")
+                raise InputError(
+                    f"--seconds must give 1 to {MAX_FRAMES} frames, got {self.seconds:g}"
+                )
         if self.cameras is not None and self.path is not None:
-            raise InputError(f"--path {self.path}: --cameras gives the views already: leave one of them out")
+            raise InputError(
+                f"--path {self.path}: --cameras gives the views already: leave one of them out"
+            )
         if self.cameras is not None and self.video.size is not None:
-            raise InputError(f"--size: the views of --cameras {self.cameras} have sizes already: leave --size out")
+            raise InputError(
+                f"--size: the views of --cameras {self.cameras} have sizes already: leave --size out"
+            )
         if not 0 <= self.overscan <= MAX_OVERSCAN:
-            raise InputError(f"--overscan must be between 0 and {MAX_OVERSCAN:g}, got {self.overscan:g}")
+            raise InputError(
+                f"--overscan must be between 0 and {MAX_OVERSCAN:g}, got {self.overscan:g}"
+            )
         self.video.check()
 
     def load(self) -> tuple[list[Camera] | None, KeyframePath | None]:
@@ -79,7 +93,11 @@ class PathOptions:
         return default if self.disparity is None else self.disparity
 
     def fly(
-        self, gaussians: Gaussians, camera: Camera, keyframes: KeyframePath | None, disparity: float | None
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        keyframes: KeyframePath | None,
+        disparity: float | None,
     ) -> list[Camera]:
         """The cameras of a video through keyframes or along the trajectory; sides of odd size grow by a pixel.
 
@@ -96,12 +114,17 @@ class PathOptions:
         given = self.frames or (self.seconds and round(self.seconds * self.video.rate))
         if keyframes is None:
             count = given or max(1, round(SECONDS * self.video.rate))
-            reach, depths = self.reach(USUAL_DISPARITY if disparity is None else disparity), DepthRange.of(gaussians)
+            reach, depths = (
+                self.reach(USUAL_DISPARITY if disparity is None else disparity),
+                DepthRange.of(gaussians),
+            )
             path = trajectory(self.trajectory, camera.even(), reach, depths, count, looped=True)
             return [view.zoomed(1 + self.overscan) for view in path]
         count = given or keyframes.frame_count(self.video.rate)
         if count > MAX_FRAMES:
-            raise PathError(f"{keyframes.seconds:g} s take {count} frames (at most {MAX_FRAMES}): give --frames")
+            raise PathError(
+                f"{keyframes.seconds:g} s take {count} frames (at most {MAX_FRAMES}): give --frames"
+            )
         return keyframes.cameras(camera.even(), count, DepthRange.of(gaussians))
 
 
@@ -111,23 +134,29 @@ class PlannedViews:
 
     cameras: list[Camera]
     measured: dict[str, int]  # name → index: views whose holes are reported
-    frames: list[tuple[int, ...]]  # for each frame of the video the index of its view, or of its two eyes' views
+    frames: list[
+        tuple[int, ...]
+    ]  # for each frame of the video the index of its view, or of its two eyes' views
     stills: int  # the number of views at the beginning that are also saved as pictures
     maker: FrameMaker
-    looked_at: list[int]  # views for which a scene is completed; more frames of the same path uncover nothing more
+    looked_at: list[
+        int
+    ]  # views for which a scene is completed; more frames of the same path uncover nothing more
 
 
-COARSE_PX = 240  # long side of the renderings in which `choose_move` measures holes
-MOVE_STEP = 0.01  # `choose_move` rounds the disparity down to a multiple of this step
+COARSE_PX = 240  # long side of the renderings in which `choose_disparity` measures holes
+MOVE_STEP = 0.01  # `choose_disparity` rounds the disparity down to a multiple of this step
 LEAST_MOVE = 0.04  # the smallest disparity; a smaller one shows no parallax
-LOOKS = 3  # largest number of disparities that `choose_move` tries besides the usual one
+LOOKS = 3  # largest number of disparities that `choose_disparity` tries besides the usual one
 
 
 NO_PATH = "no camera path: {reason}: check the depth map and the focal length"
 
 
 @torch.no_grad()
-def choose_move(prediction: BasePrediction, renderer: Renderer, source: Path) -> BasePrediction:
+def choose_disparity(
+    prediction: BasePrediction, renderer: Renderer, source: Path
+) -> BasePrediction:
     """Replace the prediction's disparity by the largest one with a hole-area ratio of at most `prediction.uncovered`.
 
     The usual disparity is the upper limit. Coarse renderings measure the mean hole-area ratio (eq. 11) of the
@@ -137,15 +166,22 @@ def choose_move(prediction: BasePrediction, renderer: Renderer, source: Path) ->
         InputError: the depths and the focal length of the photo `source` allow no camera path.
     """
     gaussians, usual, allowed = prediction.gaussians, prediction.disparity, prediction.uncovered
-    with reading(source, NO_PATH, ValueError):
+    with as_input_error(source, NO_PATH, ValueError):
         depths = DepthRange.of(gaussians)
-    camera = prediction.camera.resized(*working_size(prediction.camera.width, prediction.camera.height, COARSE_PX))
+    camera = prediction.camera.resized(
+        *working_size(prediction.camera.width, prediction.camera.height, COARSE_PX)
+    )
 
     def uncovered(disparity: float) -> float:
         ends = extremes(camera, disparity, depths)
-        return sum(hole_area_ratio(renderer.render(gaussians, end).alpha) for end in ends) / len(ends)
+        return sum(hole_area_ratio(renderer.render(gaussians, end).alpha) for end in ends) / len(
+            ends
+        )
 
-    near, far = (0.0, 0.0), (usual, uncovered(usual))  # (disparity, holes): within the limit, and beyond
+    near, far = (
+        (0.0, 0.0),
+        (usual, uncovered(usual)),
+    )  # (disparity, holes): within the limit, and beyond
     if far[1] <= allowed:
         near = far
     for _ in range(LOOKS if near[0] < usual else 0):
@@ -176,11 +212,16 @@ def plan_views(
     gaussians, camera, even = prediction.gaussians, prediction.camera, prediction.camera.even()
     path_cameras, others, unseen, every = given or [], dict[str, Camera](), list[Camera](), 1
     if not given:
-        with reading(source, NO_PATH, ValueError), reading(path.path, "{reason}", PathError):
+        with (
+            as_input_error(source, NO_PATH, ValueError),
+            as_input_error(path.path, "{reason}", PathError),
+        ):
             path_cameras = path.fly(gaussians, camera, keyframes, prediction.disparity)
             reach, depths = path.reach(prediction.disparity), DepthRange.of(gaussians)
             if keyframes is None:
-                others = dict(zip((f"{-reach:g}", f"+{reach:g}"), extremes(even, reach, depths), strict=True))
+                others = dict(
+                    zip((f"{-reach:g}", f"+{reach:g}"), extremes(even, reach, depths), strict=True)
+                )
             else:
                 keys = keyframes.at([key.time for key in keyframes.keys], even, depths)
                 step = math.ceil(len(keys) / MEASURED_KEYFRAMES)
@@ -196,6 +237,12 @@ def plan_views(
     cameras = [*middles, *itertools.chain(*eyes), *unseen, *others.values()]
     frames = [tuple(range(k, k + each)) for k in range(first, first + each * len(eyes), each)]
     last = len(cameras) - len(others)
-    measured = {name: last + k for k, name in enumerate(others)} or {str(k): k for k in range(len(eyes))}
-    looked_at = [*range(first), *itertools.chain(*frames[::every]), *range(first + each * len(eyes), len(cameras))]
+    measured = {name: last + k for k, name in enumerate(others)} or {
+        str(k): k for k in range(len(eyes))
+    }
+    looked_at = [
+        *range(first),
+        *itertools.chain(*frames[::every]),
+        *range(first + each * len(eyes), len(cameras)),
+    ]
     return PlannedViews(cameras, measured, frames, len(given or []), maker, looked_at)

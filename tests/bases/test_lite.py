@@ -8,16 +8,16 @@ from pathlib import Path
 import pytest
 import torch
 from depth_loss import score_depth, vertical_ramp
+from helpers.scenes import same_bits
 from safetensors.torch import load_file, save_file
-from scenes import same_bits
 from torch.nn.functional import interpolate
 from weights import save_networks
 
 import spackle
-from spackle.bases import NEAREST_M
 from spackle.bases.lite import FARTHEST, SCALE, SHIPPED, LiteBase, LiteNet, load_networks
-from spackle.errors import InputError
-from spackle.image import Photo
+from spackle.core.photo import Photo
+from spackle.depth.depth_map import NEAREST_M
+from spackle.runtime.errors import InputError
 
 
 @functools.cache
@@ -39,7 +39,9 @@ def motorcycle() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
 def test_depth_of_a_real_photo_beats_a_ramp_and_a_plane() -> None:
     rgb, depth, valid = motorcycle()
     seen = shipped().inverse_depth(rgb)
-    seen = interpolate(seen[None, None], size=depth.shape, mode="bilinear", align_corners=False)[0, 0]
+    seen = interpolate(seen[None, None], size=depth.shape, mode="bilinear", align_corners=False)[
+        0, 0
+    ]
     found = score_depth(seen, depth, valid)
     for guess in (vertical_ramp(*depth.shape), torch.ones_like(depth)):
         assert found.abs_rel < 0.9 * score_depth(guess, depth, valid).abs_rel
@@ -84,7 +86,9 @@ def test_stored_weights_are_small_and_only_rounded(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "missing", ["0.context.weight", f"0.context.weight{SCALE}", "0.encoder.stages.6.0.project.bias"]
 )
-def test_weights_with_a_missing_tensor_are_refused_in_one_line(tmp_path: Path, missing: str) -> None:
+def test_weights_with_a_missing_tensor_are_refused_in_one_line(
+    tmp_path: Path, missing: str
+) -> None:
     save_networks([LiteNet()], tmp_path / "one.safetensors")
     tensors = load_file(tmp_path / "one.safetensors")
     del tensors[missing]

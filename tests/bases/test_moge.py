@@ -14,21 +14,22 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from command import report_of, run
-from moge_weights import FULL, HALF, TINY, scene, shapes_of, waves, write_tiny
-from photos import CLIPS, picture, write_photo
-from scenes import same_bits
+from helpers import DATA
+from helpers.command import report_of, run
+from helpers.moge_weights import FULL, HALF, TINY, scene, shapes_of, waves, write_tiny
+from helpers.photos import CLIPS, picture, write_photo
+from helpers.scenes import same_bits
 from torch import Tensor
 
-from spackle.bases.lift import lift
+from spackle.bases.depth import lift
 from spackle.bases.moge.base import SKY, MogeBase, MogeView, to_view
 from spackle.bases.moge.network import MogeOutput, load_network
 from spackle.bases.open import open_base
 from spackle.bases.settings import BaseSettings
-from spackle.errors import InputError
-from spackle.image import Photo
+from spackle.core.photo import Photo
+from spackle.runtime.errors import InputError
 
-GOLDEN = dict(np.load(Path(__file__).parents[1] / "data" / "moge_tiny_golden.npz"))
+GOLDEN = dict(np.load(DATA / "moge_tiny_golden.npz"))
 SIZES = {"small": (70, 98), "large": (301, 203), "square": (64, 64)}  # height, width
 
 
@@ -43,7 +44,9 @@ def base(checkpoint: Path) -> MogeBase:
 
 
 def agrees(found: Any, name: str, tolerance: float = 2e-5) -> None:
-    np.testing.assert_allclose(np.asarray(found), GOLDEN[name], rtol=tolerance, atol=tolerance, err_msg=name)
+    np.testing.assert_allclose(
+        np.asarray(found), GOLDEN[name], rtol=tolerance, atol=tolerance, err_msg=name
+    )
 
 
 def solid(view: MogeView) -> Tensor:
@@ -52,11 +55,15 @@ def solid(view: MogeView) -> Tensor:
 
 def test_the_published_vit_s_has_these_tensors() -> None:
     shapes = list(shapes_of(FULL).items())
-    shapes += [(name, shape) for name, shape in shapes if name.startswith("points_head.")]  # the head for normals
+    shapes += [
+        (name, shape) for name, shape in shapes if name.startswith("points_head.")
+    ]  # the head for normals
     assert (len(shapes), sum(math.prod(shape) for _, shape in shapes)) == (337, 35_103_662)
 
 
-@pytest.mark.parametrize(("name", "tokens", "step"), [("small", 35, 2), ("large", 120, 6), ("square", 1369, 2)])
+@pytest.mark.parametrize(
+    ("name", "tokens", "step"), [("small", 35, 2), ("large", 120, 6), ("square", 1369, 2)]
+)
 def test_maps_agree_with_the_original(base: MogeBase, name: str, tokens: int, step: int) -> None:
     image = waves(*SIZES[name])
     output = base.ask(image, tokens, SIZES[name])
@@ -88,7 +95,9 @@ def test_depth_focal_length_and_mask_agree_with_the_original(
     agrees(view.shift, f"{name}_shift_converged")
     sure = output.mask_logits.abs() > 1e-4
     assert torch.equal(solid(view)[sure], torch.from_numpy(GOLDEN[f"{name}_mask"])[sure])
-    early = output.metric_scale * (float(GOLDEN[f"{name}_shift"]) - view.shift)  # the original stops before the minimum
+    early = output.metric_scale * (
+        float(GOLDEN[f"{name}_shift"]) - view.shift
+    )  # the original stops before the minimum
     agrees(torch.where(solid(view), view.depth + early, torch.inf)[::step, ::step], f"{name}_depth")
 
 
@@ -99,7 +108,9 @@ def test_focal_length_and_shift_alone() -> None:
         agrees(view.focal_px / HALF, f"solver_{name}_focal_converged")
         agrees(view.shift, f"solver_{name}_shift_converged")
     output = scene(0.5, scale=2.0)
-    output.points[30:60, 1::5, 2] = 0.2  # not among the solver's samples; these points end behind the camera
+    output.points[30:60, 1::5, 2] = (
+        0.2  # not among the solver's samples; these points end behind the camera
+    )
     view = to_view(output, 160, 90)
     agrees(view.shift, "post_shift_converged")
     assert np.array_equal(solid(view), GOLDEN["post_mask"])
@@ -135,8 +146,14 @@ def test_whose_focal_length_is_used_and_the_distance_of_the_sky(
 def test_the_same_photo_gives_the_same_scene_and_bf16_nearly_so(checkpoint: Path) -> None:
     found = []
     for precision in ("fp32", "fp32", "bf16"):
-        settings: dict[str, Any] = {"checkpoint": checkpoint, "precision": precision, "device": "cpu"}
-        found.append(open_base(BaseSettings("moge", **settings)).predict(photo_of(waves(70, 98)))[0])
+        settings: dict[str, Any] = {
+            "checkpoint": checkpoint,
+            "precision": precision,
+            "device": "cpu",
+        }
+        found.append(
+            open_base(BaseSettings("moge", **settings)).predict(photo_of(waves(70, 98)))[0]
+        )
     assert same_bits(found[0].gaussians, found[1].gaussians)
     assert found[2].notes["precision"] == "bf16"
     middles = [float(each.gaussians.means[:, 2].median()) for each in found]
@@ -154,17 +171,23 @@ def test_predict_takes_a_checkpoint_and_a_clip_keeps_one_lens(
     def ask(*given: Any) -> MogeOutput:
         stretch = 1.3 / next(lenses)
         output = scene(0.5)
-        return dataclasses.replace(output, points=output.points * torch.tensor([stretch, stretch, 1]))
+        return dataclasses.replace(
+            output, points=output.points * torch.tensor([stretch, stretch, 1])
+        )
 
     monkeypatch.setattr(MogeBase, "ask", ask)
-    monkeypatch.setattr("spackle.bases.lift.lift", lambda *given: (seen.append(given[2].focal[0]), lift(*given))[1])
+    monkeypatch.setattr(
+        "spackle.bases.depth.lift", lambda *given: (seen.append(given[2].focal[0]), lift(*given))[1]
+    )
     done = run("predict", CLIPS / "large.mp4", *words, "--residual", "none")
     assert (done.code, report_of(tmp_path / "large")["focal_source"]) == (0, "MoGe"), done.err
     assert f"moves by disparity {report_of(tmp_path / 'large')['disparity']:g}" in done.err
     assert seen == pytest.approx([1.3 * HALF] * 3, rel=1e-5)
 
 
-def changed(change: Callable[[dict[str, Any]], None], bytes_less: int = 0) -> Callable[[Path], None]:
+def changed(
+    change: Callable[[dict[str, Any]], None], bytes_less: int = 0
+) -> Callable[[Path], None]:
     """A function that writes a checkpoint with changed settings and no weights."""
 
     def write(path: Path) -> None:
@@ -182,15 +205,23 @@ def changed(change: Callable[[dict[str, Any]], None], bytes_less: int = 0) -> Ca
         (lambda path: path.write_bytes(pickle.dumps({"model": 1})), "not a zip file"),
         (changed(lambda c: None, bytes_less=1000), "not a zip file"),
         (lambda path: torch.save({"model": {"a": torch.zeros(1)}}, path), "no model_config"),
-        (lambda path: torch.save({"model_config": Path("a"), "model": {}}, path), "not a published kind"),
+        (
+            lambda path: torch.save({"model_config": Path("a"), "model": {}}, path),
+            "not a published kind",
+        ),
         (changed(lambda c: c["encoder"].update(backbone="dinov2_vitg14_reg")), "dinov2_vitg14_reg"),
-        (changed(lambda c: c["neck"].update(resamplers=["pixel_shuffle"] * 4)), "a resampler is 'pixel_shuffle'"),
+        (
+            changed(lambda c: c["neck"].update(resamplers=["pixel_shuffle"] * 4)),
+            "a resampler is 'pixel_shuffle'",
+        ),
         (changed(lambda c: c["mask_head"].update(res_block_in_norm="group_norm")), "group_norm"),
         (changed(lambda c: c["points_head"].update(num_res_blocks=[10**9] * 5)), "num_res_blocks"),
         (changed(lambda c: None), "303 missing"),
     ],
 )
-def test_wrong_files_are_refused_in_a_line(tmp_path: Path, write: Callable[[Path], None], said: str) -> None:
+def test_wrong_files_are_refused_in_a_line(
+    tmp_path: Path, write: Callable[[Path], None], said: str
+) -> None:
     path = tmp_path / "model.pt"
     write(path)
     line = rf"^{re.escape(str(path))}: .*{said}.*: give MoGe-2's model\.pt as it was downloaded$"

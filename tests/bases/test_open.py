@@ -8,25 +8,26 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import portraits
 import pytest
 import torch
-from photos import HEIGHT, WIDTH, metres, write_depth, write_photo
-from scenes import same_bits
-from sharp_weights import gaussians_of, write_tiny
-from stand_in import SHARP_FILE, StandIn, write_model
+from helpers import portraits
+from helpers.photos import HEIGHT, WIDTH, metres, write_depth, write_photo
+from helpers.scenes import same_bits
+from helpers.sharp_weights import gaussians_of, write_tiny
+from helpers.stand_in import SHARP_FILE, StandIn, write_model
 
 import spackle
-from spackle.bases import BasePrediction, Progress
-from spackle.bases.depth_map import DepthMap, load_depth
-from spackle.bases.hf import HfBase
+from spackle.bases import BasePrediction
 from spackle.bases.lite import INPUT_SCALES, LiteBase
 from spackle.bases.open import BaseError, ResolvedBase, open_base
 from spackle.bases.settings import BaseSettings
 from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.encoder import MICRO
-from spackle.errors import InputError
-from spackle.image import Photo, load_photo
+from spackle.bases.transformers import HfBase
+from spackle.core.photo import Photo, load_photo
+from spackle.depth.depth_map import DepthMap, load_depth
+from spackle.runtime.errors import InputError
+from spackle.runtime.progress import Progress
 
 pytestmark = pytest.mark.usefixtures("shipped")
 NO_DEPTH, NO_SHARP = "no depth in the photo", "no SHARP weights here, no MoGe weights here"
@@ -68,7 +69,9 @@ def portrait(tmp_path: Path) -> Path:
     return portraits.write(tmp_path / "portrait.jpg", portraits.PORTRAIT)
 
 
-def pick(path: Path, log: list[str] | None = None, /, **settings: Any) -> tuple[BasePrediction, ResolvedBase]:
+def pick(
+    path: Path, log: list[str] | None = None, /, **settings: Any
+) -> tuple[BasePrediction, ResolvedBase]:
     log = [] if log is None else log
     return open_base(BaseSettings(**settings)).predict(load_photo(path), log=log.append)
 
@@ -77,7 +80,11 @@ def test_auto_uses_the_photos_depth_then_sharp_then_lite(
     tmp_path: Path, photo: Path, portrait: Path, sharp: Path
 ) -> None:
     prediction, choice = pick(photo)
-    assert (choice.base, choice.why, len(prediction.gaussians)) == ("sharp", NO_DEPTH, gaussians_of(MICRO))
+    assert (choice.base, choice.why, len(prediction.gaussians)) == (
+        "sharp",
+        NO_DEPTH,
+        gaussians_of(MICRO),
+    )
     assert prediction.notes["weights"] == SHARP_FILE
     sharp.unlink()
     choice = pick(photo)[1]
@@ -110,7 +117,11 @@ def test_weights_and_options_reach_sharp(
 
 
 def test_a_base_is_loaded_once_and_only_if_a_photo_needs_it(
-    photo: Path, portrait: Path, sharp: Path, quick: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+    photo: Path,
+    portrait: Path,
+    sharp: Path,
+    quick: list[dict[str, Any]],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(LiteBase, "load", lambda *args, **options: pytest.fail("loaded"))
     base = open_base(BaseSettings())
@@ -131,7 +142,9 @@ def test_the_chosen_base_predicts_all_frames_of_a_clip(photo: Path, portrait: Pa
     assert kept.notes == prediction.notes
 
 
-def test_the_focal_length_comes_from_the_user_then_the_map_then_the_photo(tmp_path: Path, photo: Path) -> None:
+def test_the_focal_length_comes_from_the_user_then_the_map_then_the_photo(
+    tmp_path: Path, photo: Path
+) -> None:
     disparity, ours_px = tmp_path / "disp0.npy", load_photo(photo, focal_px=60)
     np.save(disparity, (80 * 0.2 / metres() - 1.5).astype(np.float32))
     lens = f"[80 0 {WIDTH / 2}; 0 80 {HEIGHT / 2}; 0 0 1]"
@@ -144,7 +157,9 @@ def test_the_focal_length_comes_from_the_user_then_the_map_then_the_photo(tmp_pa
         ours, _ = open_base(BaseSettings(depth=depth)).predict(ours_px)
         assert (ours.camera.focal[0], ours.lens_source) == (60, "")
         # depth = baseline · focal / (disparity + doffs)
-        torch.testing.assert_close(ours.gaussians.means[front, 2], 0.75 * prediction.gaussians.means[front, 2])
+        torch.testing.assert_close(
+            ours.gaussians.means[front, 2], 0.75 * prediction.gaussians.means[front, 2]
+        )
         scene = spackle.predict(ours_px, depth=depth, residual="none")
         assert scene.camera.focal[0] == 60
         assert same_bits(scene.base, ours.gaussians)
@@ -152,13 +167,21 @@ def test_the_focal_length_comes_from_the_user_then_the_map_then_the_photo(tmp_pa
     assert open_base(BaseSettings(depth=loaded)).predict(of_the_file)[0].camera.focal[0] == 80
 
 
-def test_auto_goes_on_if_the_depth_in_the_photo_is_broken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_auto_goes_on_if_the_depth_in_the_photo_is_broken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     log = list[str]()
     photo = portraits.write(tmp_path / "photo.jpg", portraits.PORTRAITS["bad: GDepth, broken map"])
     choice = pick(photo, log)[1]
-    assert (choice.base, choice.why) == ("lite", f"the depth in the photo cannot be used, {NO_SHARP}")
+    assert (choice.base, choice.why) == (
+        "lite",
+        f"the depth in the photo cannot be used, {NO_SHARP}",
+    )
     assert choice.failures[0].startswith(f"the depth in the photo: {photo}: ")
-    assert [line.startswith(f"photo.jpg: going on without the depth in the photo: {photo}: ") for line in log] == [True]
+    assert [
+        line.startswith(f"photo.jpg: going on without the depth in the photo: {photo}: ")
+        for line in log
+    ] == [True]
     with pytest.raises(InputError, match=r"photo\.jpg"):
         pick(photo, name="rgbd")
     depth = torch.full((WIDTH, HEIGHT), 2.0)
@@ -173,7 +196,9 @@ def test_damaged_weights_fail_once_for_all_photos(photo: Path, sharp: Path) -> N
     sharp.write_bytes(content)
     said, log, base = "not a file of weights, or damaged", list[str](), open_base(BaseSettings())
     choices = [base.predict(load_photo(photo), log=log.append)[1] for _ in range(2)]
-    assert [choice.why for choice in choices] == [f"{NO_DEPTH}, SHARP cannot be used, no MoGe weights here"] * 2
+    assert [choice.why for choice in choices] == [
+        f"{NO_DEPTH}, SHARP cannot be used, no MoGe weights here"
+    ] * 2
     assert (len(log), said in log[0], said in choices[0].failures[0]) == (1, True, True)
     for settings in ({"name": "sharp"}, {"checkpoint": sharp}):
         with pytest.raises(BaseError, match=said):
@@ -190,7 +215,9 @@ def test_a_base_that_fails_for_one_photo_is_tried_for_the_next(
         if photo.path.stem == "b":
             raise InputError(f"{photo.path}: not this one")
         means = found.gaussians.means * (torch.inf if photo.path.stem == "c" else 1)
-        return dataclasses.replace(found, gaussians=dataclasses.replace(found.gaussians, means=means))
+        return dataclasses.replace(
+            found, gaussians=dataclasses.replace(found.gaussians, means=means)
+        )
 
     monkeypatch.setattr(StandIn, "predict", picky)
     log, base = list[str](), open_base(BaseSettings())
@@ -207,7 +234,10 @@ def test_a_base_that_fails_for_one_photo_is_tried_for_the_next(
 def test_given_depth_has_no_fallback(tmp_path: Path, photo: Path, portrait: Path) -> None:
     np.save(tmp_path / "bad.npy", np.zeros((HEIGHT, WIDTH), np.float32))
     (tmp_path / "depths").mkdir()
-    for depth, named in ((tmp_path / "bad.npy", "bad.npy"), (tmp_path / "depths", "no depth map in")):
+    for depth, named in (
+        (tmp_path / "bad.npy", "bad.npy"),
+        (tmp_path / "depths", "no depth map in"),
+    ):
         with pytest.raises(InputError, match=named):
             pick(portrait, depth=depth)
     with pytest.raises(InputError, match="the photo has none inside") as caught:
@@ -230,14 +260,19 @@ def test_given_depth_has_no_fallback(tmp_path: Path, photo: Path, portrait: Path
         ({"name": "rgbd", "checkpoint": Path("x.pt")}, "-c x.pt: the rgbd base"),
         ({"calib": Path("c.txt")}, "--calib c.txt: there is no depth map to read"),
         ({"depth_kind": "near-white"}, "--depth-kind near-white: there is no depth map to read"),
-        ({"depth": Path("d.npy"), "far": 9.0}, "--far 9.0: only for relative maps: add --depth-kind near-white"),
+        (
+            {"depth": Path("d.npy"), "far": 9.0},
+            "--far 9.0: only for relative maps: add --depth-kind near-white",
+        ),
         ({"depth": Path("d.npy"), "windows": 1}, "--sharp windows=1: the rgbd base"),
         ({"precision": "fp8"}, "fp8"),
         ({"windows": 36}, "--sharp windows must be between 1 and 35, got 36"),
     ],
     ids=str,
 )
-def test_options_that_a_base_does_not_take_are_refused(settings: dict[str, Any], option: str) -> None:
+def test_options_that_a_base_does_not_take_are_refused(
+    settings: dict[str, Any], option: str
+) -> None:
     with pytest.raises(InputError, match=option):
         open_base(BaseSettings(**settings))
 
@@ -246,4 +281,7 @@ def test_the_files_and_the_public_name_of_a_models_folder(tmp_path: Path) -> Non
     folder = write_model(tmp_path / "one" / "small")
     settings = BaseSettings(f"hf:{folder}")
     assert set(settings.files) == {"config.json", "model.safetensors"}
-    assert (settings.public_name, BaseSettings("hf:me/small").public_name) == ("hf:small", "hf:me/small")
+    assert (settings.public_name, BaseSettings("hf:me/small").public_name) == (
+        "hf:small",
+        "hf:me/small",
+    )

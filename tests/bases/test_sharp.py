@@ -8,8 +8,16 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from scenes import psnr
-from sharp_weights import DATA, MICRO, gaussians_of, micro_network, tiny_weights, waves, write_tiny
+from helpers import DATA
+from helpers.scenes import psnr
+from helpers.sharp_weights import (
+    MICRO,
+    gaussians_of,
+    micro_network,
+    tiny_weights,
+    waves,
+    write_tiny,
+)
 from torch import Tensor, nn
 
 import spackle
@@ -23,11 +31,17 @@ from spackle.bases.sharp.encoder import (
     set_precision,
 )
 from spackle.bases.sharp.network import GroupNorm, SharpNetwork, compose, make_start
-from spackle.bases.sharp.unproject import stretch_gaussians
-from spackle.device import enough_memory, multiplies_bf16, own_arithmetic, pick_device, pick_dtype
-from spackle.errors import InputError
-from spackle.image import Photo
+from spackle.bases.sharp.stretch import stretch_gaussians
+from spackle.core.photo import Photo
 from spackle.render import CpuRenderer
+from spackle.runtime.device import (
+    enough_memory,
+    multiplies_bf16,
+    own_arithmetic,
+    pick_device,
+    pick_dtype,
+)
+from spackle.runtime.errors import InputError
 
 CPU = torch.device("cpu")
 GOLDEN = dict(np.load(DATA / "sharp_tiny_golden.npz"))
@@ -41,7 +55,9 @@ def run_small(config: SharpConfig, dtype: torch.dtype) -> tuple[Tensor, spackle.
     network.load_state_dict({name: weights[name] for name in network.state_dict()})
     set_precision(network, dtype)
     heard: list[Tensor] = []
-    network.monodepth_model.monodepth_predictor.head.register_forward_hook(lambda head, x, out: heard.append(out[0]))
+    network.monodepth_model.monodepth_predictor.head.register_forward_hook(
+        lambda head, x, out: heard.append(out[0])
+    )
     with torch.inference_mode():
         output = network(waves(config.side), 0.8, batch=5)
         return heard[0], compose(output.start, output.deltas)
@@ -54,9 +70,16 @@ def off(found: Tensor, golden: np.ndarray) -> float:
 
 def test_the_network_has_the_tensors_of_the_published_checkpoint_that_are_used() -> None:
     lines = (DATA / "sharp_tensors.txt").read_text().splitlines()
-    published = {name: tuple(int(n) for n in shape.split(",")) for name, shape in map(str.split, lines)}
-    assert (len(published), sum(int(np.prod(shape)) for shape in published.values())) == (1038, PARAMETERS)
-    assert expected_shapes(FULL) == {name: shape for name, shape in published.items() if not name.startswith(UNUSED)}
+    published = {
+        name: tuple(int(n) for n in shape.split(",")) for name, shape in map(str.split, lines)
+    }
+    assert (len(published), sum(int(np.prod(shape)) for shape in published.values())) == (
+        1038,
+        PARAMETERS,
+    )
+    assert expected_shapes(FULL) == {
+        name: shape for name, shape in published.items() if not name.startswith(UNUSED)
+    }
     assert gaussians_of(FULL) == 1_179_648
 
 
@@ -64,7 +87,13 @@ def test_the_tiny_network_gives_the_originals_depth_and_gaussians() -> None:
     disparity, gaussians = run_small(TINY, torch.float32)
     assert off(disparity[:, ::48, ::48], GOLDEN["disparity"]) < 1e-5
     index = torch.from_numpy(GOLDEN["index"].astype(np.int64))
-    columns = [gaussians.means, gaussians.scales, gaussians.quats, gaussians.colors, gaussians.opacities[:, None]]
+    columns = [
+        gaussians.means,
+        gaussians.scales,
+        gaussians.quats,
+        gaussians.colors,
+        gaussians.opacities[:, None],
+    ]
     found = torch.cat(columns, dim=1)[index].split([3, 3, 4, 3, 1], dim=1)
     golden = np.split(GOLDEN["gaussians_ndc"], [3, 6, 10, 13], axis=1)
     assert all(off(one, other) < 1e-5 for one, other in zip(found, golden, strict=True))
@@ -77,7 +106,10 @@ def test_the_tiny_network_gives_the_originals_depth_and_gaussians() -> None:
 def test_bf16_renders_the_same_picture_to_45_db() -> None:
     camera = spackle.Camera.from_focal(300, 400, 300)
     sets = [run_small(MICRO, dtype)[1] for dtype in (torch.float32, torch.bfloat16)]
-    views = [CpuRenderer().render(stretch_gaussians(gaussians, STRETCH), camera).rgb for gaussians in sets]
+    views = [
+        CpuRenderer().render(stretch_gaussians(gaussians, STRETCH), camera).rgb
+        for gaussians in sets
+    ]
     assert psnr(*views) > 45
     assert not torch.equal(*views)
 
@@ -96,20 +128,26 @@ def test_group_norm_is_exact_over_half_a_million_pixels(channels_last: bool) -> 
 
 def test_extreme_depths_make_finite_gaussians() -> None:
     for extreme in (1e-8, 1e9):
-        assert compose(make_start(waves(8), torch.full((1, 2, 8, 8), extreme)), torch.zeros(14, 2, 4, 4)).finite
+        assert compose(
+            make_start(waves(8), torch.full((1, 2, 8, 8), extreme)), torch.zeros(14, 2, 4, 4)
+        ).finite
 
 
 def test_depth_goes_with_focal_length_over_width() -> None:
     base = SharpBase(micro_network())
     rgb = torch.rand(20, 30, 3)
-    near, far = (base.predict(Photo(rgb, f, "EXIF", Path("a.jpg"))).gaussians.means for f in (30.0, 60.0))
+    near, far = (
+        base.predict(Photo(rgb, f, "EXIF", Path("a.jpg"))).gaussians.means for f in (30.0, 60.0)
+    )
     torch.testing.assert_close(far[:, 2], 2 * near[:, 2], rtol=1e-3, atol=1e-4)
     torch.testing.assert_close(far[:, :2], near[:, :2], rtol=1e-2, atol=1e-3)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 @pytest.mark.parametrize("suffix", [".pt", ".safetensors"])
-def test_pt_and_safetensors_give_the_same_network(tmp_path: Path, suffix: str, dtype: torch.dtype) -> None:
+def test_pt_and_safetensors_give_the_same_network(
+    tmp_path: Path, suffix: str, dtype: torch.dtype
+) -> None:
     weights, path = tiny_weights(), write_tiny(tmp_path / f"weights{suffix}")
     network = load_network(path, dtype)
     path.write_bytes(bytes(path.stat().st_size))  # must not change the network
@@ -120,8 +158,12 @@ def test_pt_and_safetensors_give_the_same_network(tmp_path: Path, suffix: str, d
     assert heavy.is_contiguous(memory_format=torch.channels_last)
 
 
-@pytest.mark.parametrize(("flag", "native"), [("amx_bf16", True), ("avx512_bf16", True), ("avx512_f", False)])
-def test_auto_is_bf16_if_the_hardware_multiplies_it(monkeypatch: pytest.MonkeyPatch, flag: str, native: bool) -> None:
+@pytest.mark.parametrize(
+    ("flag", "native"), [("amx_bf16", True), ("avx512_bf16", True), ("avx512_f", False)]
+)
+def test_auto_is_bf16_if_the_hardware_multiplies_it(
+    monkeypatch: pytest.MonkeyPatch, flag: str, native: bool
+) -> None:
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {flag: True})
     assert multiplies_bf16(CPU) is native
     assert pick_dtype("auto", CPU) == (torch.bfloat16 if native else torch.float32)
@@ -148,7 +190,9 @@ def test_unknown_devices_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize(
     "error",
     [
-        RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried to allocate 9 bytes."),
+        RuntimeError(
+            "[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried to allocate 9 bytes."
+        ),
         torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB."),
         RuntimeError("CUDA error: CUBLAS_STATUS_ALLOC_FAILED when calling `cublasCreate(handle)`"),
         MemoryError(),
@@ -163,7 +207,10 @@ def test_too_little_memory_is_one_line(error: Exception) -> None:
 
 
 def test_the_callers_autocast_has_no_effect() -> None:
-    base, photo = SharpBase(micro_network()), Photo(torch.rand(20, 30, 3), 40.0, "EXIF", Path("a.jpg"))
+    base, photo = (
+        SharpBase(micro_network()),
+        Photo(torch.rand(20, 30, 3), 40.0, "EXIF", Path("a.jpg")),
+    )
     expected = to_metric(base.infer(photo), photo)
     with torch.autocast("cpu", dtype=torch.bfloat16):
         found = to_metric(base.infer(photo), photo)
@@ -172,7 +219,10 @@ def test_the_callers_autocast_has_no_effect() -> None:
 
 
 def test_tf32_is_off_during_own_arithmetic_on_a_gpu() -> None:
-    switches = torch.backends.cuda.matmul, torch.backends.cudnn.conv  # they exist without a GPU, too
+    switches = (
+        torch.backends.cuda.matmul,
+        torch.backends.cudnn.conv,
+    )  # they exist without a GPU, too
     before = [switch.fp32_precision for switch in switches]
     try:
         switches[0].fp32_precision = "tf32"
@@ -186,15 +236,23 @@ def test_tf32_is_off_during_own_arithmetic_on_a_gpu() -> None:
             switch.fp32_precision = value
 
 
-PHOTO = Photo(torch.rand(20, 30, 3, generator=torch.Generator().manual_seed(0)), 40.0, "EXIF", Path("a.jpg"))
+PHOTO = Photo(
+    torch.rand(20, 30, 3, generator=torch.Generator().manual_seed(0)), 40.0, "EXIF", Path("a.jpg")
+)
 
 
-@pytest.mark.parametrize(("options", "calls"), [({}, 7), ({"windows": 9}, 4), ({"windows": 1}, WINDOWS)])
+@pytest.mark.parametrize(
+    ("options", "calls"), [({}, 7), ({"windows": 9}, 4), ({"windows": 1}, WINDOWS)]
+)
 def test_the_number_of_windows_at_once_changes_nothing(options: dict[str, Any], calls: int) -> None:
     seen: list[int] = []
-    found = SharpBase(micro_network(), **options).infer(PHOTO, lambda done, total: seen.append(done))
+    found = SharpBase(micro_network(), **options).infer(
+        PHOTO, lambda done, total: seen.append(done)
+    )
     assert len(seen) == calls
     assert seen[-1] == WINDOWS
     expected = SharpBase(micro_network(), windows=35).infer(PHOTO)
-    torch.testing.assert_close(found.start.disparity_map, expected.start.disparity_map, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(
+        found.start.disparity_map, expected.start.disparity_map, rtol=1e-5, atol=1e-6
+    )
     torch.testing.assert_close(found.deltas, expected.deltas, rtol=1e-4, atol=1e-4)

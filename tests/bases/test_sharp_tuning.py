@@ -10,21 +10,21 @@ from typing import Any
 
 import pytest
 import torch
-from photos import picture
+from helpers.photos import picture
+from helpers.scenes import shifted
+from helpers.sharp_weights import MICRO
 from random_weights import deterministic_weights
 from safetensors.torch import save_file
-from scenes import shifted
-from sharp_weights import MICRO
 from torch import Tensor
 
 from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.base import NOTE, Owner, decoder_bytes, expected_shapes, link_owner
-from spackle.camera import Camera
-from spackle.errors import InputError
-from spackle.gaussians import Gaussians
-from spackle.image import Photo
+from spackle.core.camera import Camera
+from spackle.core.gaussians import Gaussians
+from spackle.core.photo import Photo
+from spackle.paper.training.direct_ft import TunableSharp, normalised_camera
 from spackle.render import get_renderer
-from spackle.training.direct_ft import TunableSharp, normalised_camera
+from spackle.runtime.errors import InputError
 
 CPU = torch.device("cpu")
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
@@ -46,7 +46,9 @@ def base(owner: Owner) -> TunableSharp:
 
 
 def photo() -> Photo:
-    return Photo(torch.from_numpy(picture(WIDTH, HEIGHT)).float() / 255, FOCAL, "--focal-px", Path("a.png"))
+    return Photo(
+        torch.from_numpy(picture(WIDTH, HEIGHT)).float() / 255, FOCAL, "--focal-px", Path("a.png")
+    )
 
 
 def gaussians_from(weights: Path) -> Gaussians:
@@ -63,21 +65,31 @@ def test_normalised_gaussians_render_like_gaussians_in_metres(base: TunableSharp
         one = get_renderer().render(before, normalised_camera(view, CAMERA))
         other = get_renderer().render(after, view)
         for name, tolerance in (("rgb", 1e-4), ("alpha", 1e-4), ("depth", 1e-3)):
-            torch.testing.assert_close(getattr(one, name), getattr(other, name), rtol=0, atol=tolerance)
+            torch.testing.assert_close(
+                getattr(one, name), getattr(other, name), rtol=0, atol=tolerance
+            )
 
 
-@pytest.mark.parametrize("name", ["prediction_head.", "feature_model.texture_head.", "feature_model.decoder."])
-def test_gradients_to_weights_are_those_of_finite_differences(base: TunableSharp, name: str) -> None:
+@pytest.mark.parametrize(
+    "name", ["prediction_head.", "feature_model.texture_head.", "feature_model.decoder."]
+)
+def test_gradients_to_weights_are_those_of_finite_differences(
+    base: TunableSharp, name: str
+) -> None:
     decoder = copy.deepcopy(base.network.gaussian_decoder()).let_learn()
     encoded = base.encode(photo().rgb, CAMERA)
 
     def loss() -> Tensor:
         random = torch.Generator().manual_seed(0)
         tensors = base.gaussians(decoder, encoded).tensors
-        return torch.stack([(t.double() * torch.randn(t.shape, generator=random)).mean() for t in tensors]).sum()
+        return torch.stack(
+            [(t.double() * torch.randn(t.shape, generator=random)).mean() for t in tensors]
+        ).sum()
 
     loss().backward()
-    weights = [w for key, w in decoder.named_parameters() if key.startswith(name) and w.requires_grad]
+    weights = [
+        w for key, w in decoder.named_parameters() if key.startswith(name) and w.requires_grad
+    ]
     assert all(weight.grad is not None for weight in weights)
     length = float(torch.stack([weight.grad.norm() for weight in weights]).norm())
     found = []
@@ -89,7 +101,9 @@ def test_gradients_to_weights_are_those_of_finite_differences(base: TunableSharp
     assert (found[0] - found[1]) / (2 * NUDGE) == pytest.approx(length, rel=0.005)
 
 
-def test_a_decoders_file_finds_its_checkpoint(owner: Owner, base: TunableSharp, tmp_path: Path) -> None:
+def test_a_decoders_file_finds_its_checkpoint(
+    owner: Owner, base: TunableSharp, tmp_path: Path
+) -> None:
     best, beside = tmp_path / "best.safetensors", tmp_path / "sharp.safetensors"
     best.write_bytes(decoder_bytes(base.network.gaussian_decoder(), owner))
     assert str(owner.path.parent).encode() not in best.read_bytes()[:9999]
@@ -98,7 +112,11 @@ def test_a_decoders_file_finds_its_checkpoint(owner: Owner, base: TunableSharp, 
     assert all(map(torch.equal, gaussians_from(best).tensors, expected))
     beside.unlink()
     beside.write_bytes(b"another")
-    for where in (tmp_path / "moved", owner.path, owner.path):  # a dead link is renewed, and counts more than the name
+    for where in (
+        tmp_path / "moved",
+        owner.path,
+        owner.path,
+    ):  # a dead link is renewed, and counts more than the name
         link_owner(Owner(where, owner.sha256), tmp_path)
     assert all(map(torch.equal, gaussians_from(best).tensors, expected))
 
@@ -108,12 +126,23 @@ def test_a_decoders_file_finds_its_checkpoint(owner: Owner, base: TunableSharp, 
     [
         (None, True, "", r"trained on sharp\.safetensors, which is not in this folder: put"),
         (b"another", True, "", "trained on a checkpoint with the SHA-256"),
-        (..., True, "feature_model.fusion.out_conv.bias", r"1 names differ, e\.g\. feature_model\.fusion"),
+        (
+            ...,
+            True,
+            "feature_model.fusion.out_conv.bias",
+            r"1 names differ, e\.g\. feature_model\.fusion",
+        ),
         (None, False, "", "does not say which checkpoint it was trained on"),
     ],
 )
 def test_a_decoder_without_its_checkpoint_or_a_tensor_is_refused(
-    owner: Owner, base: TunableSharp, tmp_path: Path, beside: Any, noted: bool, missing: str, said: str
+    owner: Owner,
+    base: TunableSharp,
+    tmp_path: Path,
+    beside: Any,
+    noted: bool,
+    missing: str,
+    said: str,
 ) -> None:
     decoder = base.network.gaussian_decoder().state_dict()
     facts = {"checkpoint": "/elsewhere/sharp.safetensors", "sha256": owner.sha256}
@@ -121,6 +150,8 @@ def test_a_decoder_without_its_checkpoint_or_a_tensor_is_refused(
     tensors = {name: tensor.contiguous() for name, tensor in decoder.items() if name != missing}
     save_file(tensors, tmp_path / "best.safetensors", note)
     if beside is not None:
-        (tmp_path / "sharp.safetensors").write_bytes(owner.path.read_bytes() if beside is ... else beside)
+        (tmp_path / "sharp.safetensors").write_bytes(
+            owner.path.read_bytes() if beside is ... else beside
+        )
     with pytest.raises(InputError, match=said):
         SharpBase.load(tmp_path / "best.safetensors")

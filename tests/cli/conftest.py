@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from command import Run, predicted
-from photos import write_pair
+from helpers.command import Run, predicted
+from helpers.photos import write_pair
 
 
 @pytest.fixture(scope="session")

@@ -7,21 +7,22 @@ from pathlib import Path
 
 import pytest
 import torch
-from command import Run, refuses, report_of, run
-from evaluation_data import write_boxes
-from photos import write_depth, write_photo
+from helpers.command import Run, refuses, report_of, run
+from helpers.evaluation_data import write_boxes
+from helpers.photos import write_depth, write_photo
+from helpers.stand_in import StandIn, predict
 from safetensors.torch import load_file, save_file
-from stand_in import StandIn, predict
 
 import spackle
-from spackle.bases import BasePrediction, Progress
-from spackle.bases.hf import HfBase
+from spackle.bases import BasePrediction
 from spackle.bases.sharp import SharpBase
-from spackle.dataset.shards import load_manifest
-from spackle.device import MemoryShort
-from spackle.errors import InputError
+from spackle.bases.transformers import HfBase
+from spackle.core.photo import Photo
 from spackle.formats import PlyFile
-from spackle.image import Photo
+from spackle.paper.dataset.shards import load_manifest
+from spackle.runtime.device import MemoryShort
+from spackle.runtime.errors import InputError
+from spackle.runtime.progress import Progress
 
 
 @pytest.fixture(autouse=True)
@@ -41,7 +42,9 @@ def succeeds(result: Run) -> None:
     assert result.code == 0, result.err
 
 
-def test_a_dataset_skips_bad_photos_and_stops_without_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_dataset_skips_bad_photos_and_stops_without_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     work, short = StandIn.predict, True
 
     def picky(self: StandIn, photo: Photo, progress: Progress | None = None) -> BasePrediction:
@@ -63,7 +66,15 @@ def test_a_dataset_skips_bad_photos_and_stops_without_memory(tmp_path: Path, mon
 
 def test_results_that_must_name_their_base_refuse_auto(tmp_path: Path) -> None:
     write_boxes(tmp_path / "middlebury" / "Ball", 0)
-    root = ("--dataset", "middlebury", tmp_path / "middlebury", "-o", tmp_path / "out", "--base", "auto")
+    root = (
+        "--dataset",
+        "middlebury",
+        tmp_path / "middlebury",
+        "-o",
+        tmp_path / "out",
+        "--base",
+        "auto",
+    )
     for result in (
         build(tmp_path, "--base", "auto"),
         build(tmp_path, "--base", "auto", "--depth", tmp_path / "photos"),
@@ -71,7 +82,10 @@ def test_results_that_must_name_their_base_refuse_auto(tmp_path: Path) -> None:
         run("bench", *root),
     ):
         refuses(result, "--base auto is not allowed here, because the results name their base")
-    refuses(build(tmp_path, "--base", "rgbd"), "--depth FOLDER; sharp, moge, lite, hf:NAME_OR_FOLDER need no depth")
+    refuses(
+        build(tmp_path, "--base", "rgbd"),
+        "--depth FOLDER; sharp, moge, lite, hf:NAME_OR_FOLDER need no depth",
+    )
     assert not (tmp_path / "out").exists()
 
 
@@ -116,7 +130,11 @@ def test_disparity_of_the_person_else_of_the_photo(tmp_path: Path) -> None:
     depth = ("--depth", write_depth(tmp_path / "d.npy"))
     for options, far, said in (
         (("--disparity", 0.25), 0.25, ""),
-        (depth, 0.07, "disparity 0.07 of 0.3: 11.9% of the widest view is invented; `--disparity 0.3` moves farther"),
+        (
+            depth,
+            0.07,
+            "disparity 0.07 of 0.3: 11.9% of the widest view is invented; `--disparity 0.3` moves farther",
+        ),
         ((), 0.14, "moves by disparity 0.14 of 0.15: "),
     ):
         result = predict(tmp_path, photo, *options)
@@ -130,7 +148,17 @@ def test_disparity_of_the_person_else_of_the_photo(tmp_path: Path) -> None:
     assert torch.equal(scene.path()[20].position, scene.path(disparity=0.14)[20].position)
     files = [tmp_path / f"{name}.mp4" for name in ("as it is", "said")]
     for file, options in zip(files, ((), ("--disparity", 0.14)), strict=True):
-        succeeds(run("render", tmp_path / "out" / "photo" / "scene.ply", "-o", file, "--frames", 3, *options))
+        succeeds(
+            run(
+                "render",
+                tmp_path / "out" / "photo" / "scene.ply",
+                "-o",
+                file,
+                "--frames",
+                3,
+                *options,
+            )
+        )
     assert files[0].read_bytes() == files[1].read_bytes()
 
 
@@ -166,5 +194,8 @@ def test_a_base_that_cannot_be_loaded_stops_a_folder_at_once(
     monkeypatch.setattr(SharpBase, "load", change)
     for words in (("--base", "sharp"), ()):
         result = predict(tmp_path, photos, *words)
-        assert (result.code, result.lines[-1].endswith("changed while this was running: start again")) == (2, True)
+        assert (
+            result.code,
+            result.lines[-1].endswith("changed while this was running: start again"),
+        ) == (2, True)
         assert "going on without" not in result.err

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command import FILES, SHORT, Run, names_in, refuses, report_of, run
-from photos import CLIPS, metres, write_depth, write_photo
+from helpers.command import FILES, SHORT, Run, names_in, refuses, report_of, run
+from helpers.photos import CLIPS, metres, write_depth, write_photo
 from PIL import Image
 
 import spackle
@@ -28,32 +28,49 @@ def test_the_installed_command_and_python_m_spackle_are_this_one(tmp_path: Path)
     commands = [point for point in entry_points(group="console_scripts") if point.name == "spackle"]
     assert [point.load() for point in commands] == [cli.run]
     missing = tmp_path / "missing.png"
-    for options, code in ((["--version"], 0), (["predict", str(missing), "-o", str(tmp_path / "out")], 2)):
-        done = subprocess.run([*COMMAND, *options], capture_output=True, text=True, check=False, timeout=300)
+    for options, code in (
+        (["--version"], 0),
+        (["predict", str(missing), "-o", str(tmp_path / "out")], 2),
+    ):
+        done = subprocess.run(
+            [*COMMAND, *options], capture_output=True, text=True, check=False, timeout=300
+        )
         assert (done.returncode, len((done.stdout + done.stderr).splitlines())) == (code, 1)
         assert (str(missing) if code else spackle.__version__) in done.stdout + done.stderr
 
 
-@pytest.mark.parametrize(("words", "shown"), [("--help", "predict"), ("predict --help", "--trajectory")])
+@pytest.mark.parametrize(
+    ("words", "shown"), [("--help", "predict"), ("predict --help", "--trajectory")]
+)
 def test_help_does_not_wait(words: str, shown: str) -> None:
     code = f"import sys; sys.argv = ['spackle', *{words.split()}]\nfrom spackle.cli import main\ntry: main()\n"
     code += "finally: assert not {'torch', 'numba', 'av', 'fastapi'} & set(sys.modules)"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60
+    )
     assert (result.returncode, shown in result.stdout) == (0, True), result.stderr
 
 
 def test_ctrl_c_is_one_line_and_leaves_an_old_set_whole(
-    tmp_path: Path, pair: tuple[Path, Path], plain: tuple[Path, Run], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    pair: tuple[Path, Path],
+    plain: tuple[Path, Run],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def interrupted(*args: object, **options: object) -> None:
         raise KeyboardInterrupt
 
     old = shutil.copytree(plain[0], tmp_path / "old" / "photo")
-    monkeypatch.setattr("spackle.photo_results.write_json", interrupted)
+    monkeypatch.setattr("spackle.results.photo_folder.write_json", interrupted)
     for out in (tmp_path / "new" / "out", tmp_path / "old"):
-        result = run("predict", pair[0], "--depth", pair[1], "-o", out, "-v", "--disparity", "0.5", *SHORT)
+        result = run(
+            "predict", pair[0], "--depth", pair[1], "-o", out, "-v", "--disparity", "0.5", *SHORT
+        )
         assert result.code == 130
-        assert [line.split(":")[0] for line in result.lines[:2]] == ["  load", "  prepare"]  # -v times every stage
+        assert [line.split(":")[0] for line in result.lines[:2]] == [
+            "  load",
+            "  prepare",
+        ]  # -v times every stage
         assert result.lines[-1] == "interrupted"
     assert not (tmp_path / "new").exists()
     assert {name: (old / name).read_bytes() for name in names_in(old)} == {
@@ -91,7 +108,10 @@ def test_a_full_standard_output_is_reported_in_one_line(scene: Path, tmp_path: P
     with open("/dev/full", "w") as full:
         done = subprocess.run(words, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
     assert done.returncode == 2
-    assert done.stderr.splitlines()[-1] == "error: cannot write to the standard output: No space left on device"
+    assert (
+        done.stderr.splitlines()[-1]
+        == "error: cannot write to the standard output: No space left on device"
+    )
 
 
 def test_every_command_has_a_help() -> None:
@@ -106,10 +126,28 @@ def test_info_says_what_a_file_is(tmp_path: Path, scene: Path, pair: tuple[Path,
     assert run("export", scene, "-o", spz).code == 0
     Image.fromarray((1000 * metres()).astype(np.uint16)).save(depth)
     expected = {
-        scene: ("scene (.ply)", "base", "64×48, focal length 55.5 px, 60.0° wide", "--disparity 0.07", "spackle view"),
+        scene: (
+            "scene (.ply)",
+            "base",
+            "64×48, focal length 55.5 px, 60.0° wide",
+            "--disparity 0.07",
+            "spackle view",
+        ),
         spz: ("scene (.spz)", "number of base Gaussians unknown", "not stored", "spackle view"),
-        pair[0]: ("photo", "64×48", "(default 30 mm)", "none inside", f"spackle predict {pair[0]} -o out"),
-        pair[1]: ("depth map", "64×48", "2 m near, 6 m median, 6 m far", "0.0%", f"--depth {pair[1]}"),
+        pair[0]: (
+            "photo",
+            "64×48",
+            "(default 30 mm)",
+            "none inside",
+            f"spackle predict {pair[0]} -o out",
+        ),
+        pair[1]: (
+            "depth map",
+            "64×48",
+            "2 m near, 6 m median, 6 m far",
+            "0.0%",
+            f"--depth {pair[1]}",
+        ),
         depth: ("depth map", "2 m near"),
         clip: ("clip", "24×16", "3, 10 a second", "none", "spackle predict"),
     }
@@ -128,11 +166,24 @@ def test_each_result_and_each_error_is_a_line_of_json(tmp_path: Path) -> None:
     write_photo(photos / "photo.png", 48, 36)
     write_depth(photos / "photo.npy", metres(32, 24))
     (photos / "torn.png").write_bytes(b"\x89PNG\r\n\x1a\n")
-    options = ("--depth", photos, "-o", tmp_path / "out", "--frames", 2, "--residual", "seeds", "--json")
+    options = (
+        "--depth",
+        photos,
+        "-o",
+        tmp_path / "out",
+        "--frames",
+        2,
+        "--residual",
+        "seeds",
+        "--json",
+    )
     first, again = (run("predict", photos, *options) for _ in range(2))
     assert first.code == again.code == 1
     report, bad = (json.loads(line) for line in first.out.splitlines())
-    assert report == {"folder": str(tmp_path / "out" / "photo"), **report_of(tmp_path / "out" / "photo")}
+    assert report == {
+        "folder": str(tmp_path / "out" / "photo"),
+        **report_of(tmp_path / "out" / "photo"),
+    }
     assert "torn.png" in bad["error"]
     assert json.loads(again.out.splitlines()[0])["done_already"] is True
     result = run("predict", photos / "torn.png", "-o", tmp_path / "out", "--json")
@@ -141,9 +192,19 @@ def test_each_result_and_each_error_is_a_line_of_json(tmp_path: Path) -> None:
     scene = tmp_path / "out" / "photo" / "scene.ply"
     rendered = run("render", scene, "-o", tmp_path / "film.mp4", "--frames", 2, "--json")
     assert json.loads(rendered.out)["file"] == str(tmp_path / "film.mp4")
-    exported = run("export", scene, "-o", tmp_path / "new" / "folder" / "a.splat", "-o", tmp_path / "a.spz", "--json")
+    exported = run(
+        "export",
+        scene,
+        "-o",
+        tmp_path / "new" / "folder" / "a.splat",
+        "-o",
+        tmp_path / "a.spz",
+        "--json",
+    )
     files = [json.loads(line) for line in exported.out.splitlines()]
-    assert [Path(line["file"]).stat().st_size for line in files] == [line["bytes"] for line in files]
+    assert [Path(line["file"]).stat().st_size for line in files] == [
+        line["bytes"] for line in files
+    ]
     assert [line["gaussians"] for line in files] == [report["merged"]] * 2
     listed = run("weights", "list", "--json").out.splitlines()
     assert [json.loads(line)["name"] for line in listed] == ["sharp", "lama", "features", "depth"]

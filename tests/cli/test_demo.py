@@ -6,8 +6,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from command import decode, names_in, refuses, report_of, run
-from photos import read_ply
+from helpers.command import decode, names_in, refuses, report_of, run
+from helpers.photos import read_ply
 from PIL import Image
 
 SIZE = (741, 500)  # of the photo
@@ -21,22 +21,38 @@ def size_of(path: Path) -> tuple[int, int]:
         return image.size
 
 
-def test_the_demo_fills_the_hole_better_than_2d_inpainting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_demo_fills_the_hole_better_than_2d_inpainting(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("skimage.data")
     monkeypatch.setattr("spackle.views.SECONDS", 1.0)  # of the video
     folder = tmp_path / "out"
     result = run("demo", "-o", folder)
     assert result.code == 0, result.err
-    expected = {"base.ply", "scene.ply", "video.mp4", "comparison.png", "right_view.png", "right_photo.png"}
+    expected = {
+        "base.ply",
+        "scene.ply",
+        "video.mp4",
+        "comparison.png",
+        "right_view.png",
+        "right_photo.png",
+    }
     assert names_in(folder) == {*expected, "report.json"}
     report = report_of(folder)
     base, merged = (read_ply(folder / name) for name in ("base.ply", "scene.ply"))
     assert merged.body[: len(base.body)] == base.body
-    assert (base.count, merged.count - base.count) == (report["base_gaussians"], report["aux_gaussians"])
+    assert (base.count, merged.count - base.count) == (
+        report["base_gaussians"],
+        report["aux_gaussians"],
+    )
     assert size_of(folder / "right_view.png") == size_of(folder / "right_photo.png") == SIZE
     assert size_of(folder / "comparison.png") == (2 * SIZE[0] + 2, 2 * SIZE[1])  # made even
     frames = decode(folder / "video.mp4")
-    assert (len(frames), frames[0].width, frames[0].height) == (30, SIZE[0] + 1, SIZE[1])  # made even
+    assert (len(frames), frames[0].width, frames[0].height) == (
+        30,
+        SIZE[0] + 1,
+        SIZE[1],
+    )  # made even
     psnr = report["right_camera"]["psnr"]
     hole = {name: score["in_hole"] for name, score in psnr.items()}
     assert max(hole[INPAINTING], hole["base"]) + 0.5 < min(hole[SPACKLE], hole[TRAINED])
@@ -50,7 +66,9 @@ def test_the_demo_fills_the_hole_better_than_2d_inpainting(tmp_path: Path, monke
     assert report["right_camera"]["har_after"] <= 0.03 * report["right_camera"]["har_before"]
 
 
-def test_without_scikit_image_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_scikit_image_it_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "skimage.data", None)
     refuses(run("demo", "-o", tmp_path / "out"), "pip install 'spackle-nvs[demo]'")
     assert not (tmp_path / "out").exists()

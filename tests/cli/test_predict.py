@@ -9,16 +9,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from command import FILES, SHORT, Run, decode, names_in, predicted, refuses, report_of, run
-from photos import HEIGHT, WIDTH, box, camera_file, metres, picture, read_ply, write_depth, write_photo
+from helpers.command import FILES, SHORT, Run, decode, names_in, predicted, refuses, report_of, run
+from helpers.photos import (
+    HEIGHT,
+    WIDTH,
+    box,
+    camera_file,
+    metres,
+    picture,
+    read_ply,
+    write_depth,
+    write_photo,
+)
 from PIL import Image
 from safetensors.torch import save_file
 
 import spackle
-from spackle.files import results_folder
-from spackle.image import film_to_pixels
+from spackle.core.photo import film_to_pixels
 from spackle.pipeline import FillOptions
 from spackle.residual.architectures import UNet
+from spackle.runtime.files import results_folder
 from spackle.weights import published_weights
 
 
@@ -48,12 +58,25 @@ def test_predict_writes_a_scene_a_video_and_a_report(plain: tuple[Path, Run]) ->
     whole = read_ply(folder / "scene.ply")
     base, merged = report["base"]["gaussians"], whole.count
     assert f"spackle_base {base}" in whole.comments
-    known = {"name": "rgbd", "chosen": "--depth", "gaussians": base, "depth_filled": 0.0, "usual_disparity": 0.3}
+    known = {
+        "name": "rgbd",
+        "chosen": "--depth",
+        "gaussians": base,
+        "depth_filled": 0.0,
+        "usual_disparity": 0.3,
+    }
     assert report["base"].items() > known.items()
-    assert report["aux"] == {"gaussians": merged - base, "share": pytest.approx((merged - base) / base)}
+    assert report["aux"] == {
+        "gaussians": merged - base,
+        "share": pytest.approx((merged - base) / base),
+    }
     assert report["merged"] == merged > base
     assert report["residual"] == {"weights": "shipped", "fill": "exemplar"}
-    assert (report["focal_source"], report["mode"], report["disparity"]) == ("default 30 mm", "scene", 0.07)
+    assert (report["focal_source"], report["mode"], report["disparity"]) == (
+        "default 30 mm",
+        "scene",
+        0.07,
+    )
     assert report["focal_px"] == pytest.approx(film_to_pixels(30, WIDTH, HEIGHT), abs=1e-3)
     assert report["photo"] == {"file": "photo.png", "width": WIDTH, "height": HEIGHT}
     assert (report["views"], report["disparity_source"]) == ("rotate-forward", "photo")
@@ -64,7 +87,16 @@ def test_predict_writes_a_scene_a_video_and_a_report(plain: tuple[Path, Run]) ->
 
 
 def test_a_second_run_replaces_the_first(tmp_path: Path, pair: tuple[Path, Path]) -> None:
-    words = ("--residual", "none", "--no-render", "--fov", 90, "--keep-base", "--depth-out", "depth.png")
+    words = (
+        "--residual",
+        "none",
+        "--no-render",
+        "--fov",
+        90,
+        "--keep-base",
+        "--depth-out",
+        "depth.png",
+    )
     predicted(*pair, tmp_path, *words)
     folder = tmp_path / "photo"
     assert names_in(folder) == FILES - {"video.mp4"} | {"base.ply", "depth.png"}
@@ -74,12 +106,18 @@ def test_a_second_run_replaces_the_first(tmp_path: Path, pair: tuple[Path, Path]
     assert (report["focal_source"], report["focal_px"]) == ("--fov", WIDTH / 2)
     row = bare.row(0)
     assert row["x"] / row["z"] * WIDTH / 2 == pytest.approx(0.5 - WIDTH / 2, abs=1e-3)
-    assert (report["aux"], report["residual"]) == ({"gaussians": 0, "share": 0.0}, {"weights": "none", "fill": "none"})
+    assert (report["aux"], report["residual"]) == (
+        {"gaussians": 0, "share": 0.0},
+        {"weights": "none", "fill": "none"},
+    )
     assert bare == read_ply(folder / "base.ply")
     assert all(view["after"] == view["before"] > 0 for view in report["hole_area_ratio"])
     predicted(*pair, tmp_path, "--trajectory", "swipe", "--disparity", "0.5", "--keep-base")
     report = report_of(folder)
-    assert (report["views"], [view["view"] for view in report["hole_area_ratio"]]) == ("swipe", ["-0.5", "+0.5"])
+    assert (report["views"], [view["view"] for view in report["hole_area_ratio"]]) == (
+        "swipe",
+        ["-0.5", "+0.5"],
+    )
     assert all(view["after"] < 0.01 < view["before"] for view in report["hole_area_ratio"])
     first, whole = (read_ply(folder / name) for name in ("base.ply", "scene.ply"))
     assert (whole.names, whole.body[: len(first.body)]) == (first.names, first.body)  # rule 1
@@ -108,8 +146,12 @@ def test_cameras_completes_exactly_the_given_views(tmp_path: Path, pair: tuple[P
 
 
 def test_view_mode_completes_each_view_on_its_own(tmp_path: Path, pair: tuple[Path, Path]) -> None:
-    views = camera_file(tmp_path / "views.json", rights=[0.1, 0.4, 0.2], sizes=[(64, 48), (64, 48), (33, 21)])
-    predicted(*pair, tmp_path / "out", "--cameras", views, "--mode", "view", "--no-render", "--keep-base")
+    views = camera_file(
+        tmp_path / "views.json", rights=[0.1, 0.4, 0.2], sizes=[(64, 48), (64, 48), (33, 21)]
+    )
+    predicted(
+        *pair, tmp_path / "out", "--cameras", views, "--mode", "view", "--no-render", "--keep-base"
+    )
     folder = tmp_path / "out" / "photo"
     assert pixels(folder / "views" / "0002.png").shape == (21, 33, 3)
     report = report_of(folder)
@@ -124,11 +166,17 @@ def test_view_mode_completes_each_view_on_its_own(tmp_path: Path, pair: tuple[Pa
 
 
 def test_weights_and_texture_are_named_and_change_the_scene(
-    tmp_path: Path, pair: tuple[Path, Path], plain: tuple[Path, Run], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    pair: tuple[Path, Path],
+    plain: tuple[Path, Run],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     torch.manual_seed(0)
     weights = tmp_path / "random.safetensors"
-    save_file({name: 0.02 * torch.randn_like(value) for name, value in UNet().state_dict().items()}, weights)
+    save_file(
+        {name: 0.02 * torch.randn_like(value) for name, value in UNet().state_dict().items()},
+        weights,
+    )
     requests, scenes = list[str](), list[bytes]()
     for words, named, texture in (
         (("--workers", 4), "shipped", "exemplar"),  # a single photo needs none
@@ -143,7 +191,9 @@ def test_weights_and_texture_are_named_and_change_the_scene(
         predicted(*pair, tmp_path, "--no-render", *words)
         report = report_of(tmp_path / "photo")
         assert report["residual"] == {"weights": named, "fill": texture}
-        assert read_ply(tmp_path / "photo" / "scene.ply").row(0) == read_ply(plain[0] / "scene.ply").row(0)
+        assert read_ply(tmp_path / "photo" / "scene.ply").row(0) == read_ply(
+            plain[0] / "scene.ply"
+        ).row(0)
         requests.append(report["request"])
         scenes.append((tmp_path / "photo" / "scene.ply").read_bytes())
     assert scenes[0] == (plain[0] / "scene.ply").read_bytes()
@@ -158,7 +208,12 @@ def test_lama_is_used_if_its_weights_are_downloaded(
     command = ("predict", pair[0], "--depth", pair[1], "-o", tmp_path / "out")
     refuses(run(*command, "--fill", "lama"), "spackle weights get lama")
     (tmp_path / published_weights("lama").file).write_text("not LaMa's")
-    choices = (FillOptions(), FillOptions(mode="view"), FillOptions(None, "lama", "view"), FillOptions("none"))
+    choices = (
+        FillOptions(),
+        FillOptions(mode="view"),
+        FillOptions(None, "lama", "view"),
+        FillOptions("none"),
+    )
     assert [choice.texture for choice in choices] == ["lama", "exemplar", "lama", "none"]
     refuses(run(*command), published_weights("lama").file)
 
@@ -168,7 +223,9 @@ def test_odd_file_names(tmp_path: Path, name: str) -> None:
     photo = write_photo(tmp_path / "in" / "photo.png").rename(tmp_path / "in" / name)
     result = predicted(photo, write_depth(tmp_path / "d.npy"), tmp_path / "out", "--no-render")
     (folder,) = (tmp_path / "out").iterdir()
-    assert folder.name == (name if name.startswith(".") else Path(name).stem)  # inside the output folder
+    assert folder.name == (
+        name if name.startswith(".") else Path(name).stem
+    )  # inside the output folder
     assert all(name.replace("\n", " ") in line for line in result.lines[:-1])
 
 
@@ -188,22 +245,37 @@ def test_a_bad_photo_of_a_folder_stops_nothing_else(tmp_path: Path) -> None:
     assert names_in(tmp_path / "out") == {"a.jpg", "a.png", "b"}  # none collide
     for name in names_in(tmp_path / "out"):
         assert names_in(tmp_path / "out" / name) == FILES
-        assert read_ply(tmp_path / "out" / name / "scene.ply").row(0)["z"] == pytest.approx(6, rel=1e-3)
+        assert read_ply(tmp_path / "out" / name / "scene.ply").row(0)["z"] == pytest.approx(
+            6, rel=1e-3
+        )
     errors = [line for line in result.lines if line.startswith("error: ")]
-    assert all(bad in line for bad, line in zip(("c.png", "d.png", "e.png", "f.npy"), errors, strict=True))
+    assert all(
+        bad in line for bad, line in zip(("c.png", "d.png", "e.png", "f.npy"), errors, strict=True)
+    )
     assert result.lines[-1] == "4 of 7 photos failed"
 
 
 def test_several_photos_a_folder_and_a_pattern_share_a_run(tmp_path: Path) -> None:
     names = ("a.png", "more/b.jpg", "wild1.png", "wild2.png")
     photos, out = [write_photo(tmp_path / name) for name in names], tmp_path / "out"
-    given = (photos[0], tmp_path / "more", tmp_path / "w*[0-9].png", "--depth", write_depth(tmp_path / "d.npy"))
+    given = (
+        photos[0],
+        tmp_path / "more",
+        tmp_path / "w*[0-9].png",
+        "--depth",
+        write_depth(tmp_path / "d.npy"),
+    )
     result = run("predict", *given, "-o", out, *SHORT)
     assert (result.code, names_in(out)) == (0, {"a", "b", "wild1", "wild2"}), result.err
     scene = f"Look at {out / 'NAME' / 'video.mp4'}, or into the scene: spackle view {out / 'NAME' / 'scene.ply'}"
     assert result.lines[-1] == scene
-    refuses(run("predict", photos[1], write_photo(tmp_path / "other" / "b.jpg"), "-o", out), "has the same name")
-    refuses(run("predict", photos[0], tmp_path / "a.mp4", "-o", out), "a.mp4: is a clip: give it alone")
+    refuses(
+        run("predict", photos[1], write_photo(tmp_path / "other" / "b.jpg"), "-o", out),
+        "has the same name",
+    )
+    refuses(
+        run("predict", photos[0], tmp_path / "a.mp4", "-o", out), "a.mp4: is a clip: give it alone"
+    )
 
 
 def test_what_is_changed_or_damaged_in_a_folder_is_redone(tmp_path: Path) -> None:
@@ -214,7 +286,11 @@ def test_what_is_changed_or_damaged_in_a_folder_is_redone(tmp_path: Path) -> Non
     def redone(*options: object) -> str:
         """The names of the photos that were predicted again."""
         result = predicted(photos, depth, out, *options)
-        done = {line[0] for line in result.lines if line.endswith("done already (--overwrite does it again)")}
+        done = {
+            line[0]
+            for line in result.lines
+            if line.endswith("done already (--overwrite does it again)")
+        }
         return "".join(sorted(set("abc") - done))
 
     assert redone() == "abc"
@@ -238,9 +314,17 @@ def test_what_is_changed_or_damaged_in_a_folder_is_redone(tmp_path: Path) -> Non
 def test_two_runs_never_share_a_folder(tmp_path: Path, pair: tuple[Path, Path]) -> None:
     out = tmp_path / "out"
     with results_folder(out / "photo", alone=True):
-        refuses(run("predict", pair[0], "--depth", pair[1], "-o", out, *SHORT), out / "photo", "another run")
+        refuses(
+            run("predict", pair[0], "--depth", pair[1], "-o", out, *SHORT),
+            out / "photo",
+            "another run",
+        )
     with results_folder(out, alone=True):
-        refuses(run("predict", pair[0].parent, "--depth", pair[1], "-o", out, *SHORT), out, "another run")
+        refuses(
+            run("predict", pair[0].parent, "--depth", pair[1], "-o", out, *SHORT),
+            out,
+            "another run",
+        )
     out.mkdir()
     (out / ".lock").touch()  # of a killed run
     predicted(pair[0].parent, pair[1], out)
@@ -259,9 +343,14 @@ def test_a_frame_is_cut_off_unless_geometry_is_given(tmp_path: Path) -> None:
     Image.fromarray(np.pad(picture(), ((6, 7), (3, 4), (0, 0)))).save(photo)
     lite = ("predict", photo, "-o", out, "--base", "lite", "--no-render", *SHORT)
     cut = run(*lite)
-    assert "a.png: a frame (4, 7, 5, 8 pixels: left, top, right, bottom) is cut off; --keep-frame keeps it" in cut.err
+    assert (
+        "a.png: a frame (4, 7, 5, 8 pixels: left, top, right, bottom) is cut off; --keep-frame keeps it"
+        in cut.err
+    )
     cut_off = {"left": 4, "top": 7, "right": 5, "bottom": 8}  # the outermost pixels are mixed
-    inner, whole = ({"file": "a.png", "width": WIDTH + w, "height": HEIGHT + h} for w, h in ((-2, -2), (7, 13)))
+    inner, whole = (
+        {"file": "a.png", "width": WIDTH + w, "height": HEIGHT + h} for w, h in ((-2, -2), (7, 13))
+    )
     assert report_of(out / "a")["photo"] == {**inner, "frame_cut_off": cut_off}
     assert "is cut off" not in run(*lite, "--keep-frame").err
     assert report_of(out / "a")["photo"] == whole

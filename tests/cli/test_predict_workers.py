@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from command import SHORT, Run, names_in, report_of, run
-from photos import HEIGHT, WIDTH, metres, write_depth, write_photo
+from helpers.command import SHORT, Run, names_in, report_of, run
+from helpers.photos import HEIGHT, WIDTH, metres, write_depth, write_photo
 
 FILES = {"scene.ply", "report.json", "video.gif"}  # x264 may encode otherwise each time
 
@@ -33,7 +33,18 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def predict(place: Path, out: Path, *options: object) -> Run:
-    given = (place / "photos", "--depth", place / "depth", "-o", out, "--threads", 1, "--format", "gif", "--json")
+    given = (
+        place / "photos",
+        "--depth",
+        place / "depth",
+        "-o",
+        out,
+        "--threads",
+        1,
+        "--format",
+        "gif",
+        "--json",
+    )
     return run("predict", *given, *SHORT, *options)
 
 
@@ -43,29 +54,45 @@ def content(out: Path) -> Iterator[Any]:
         assert names_in(folder) == FILES
         report = report_of(folder)
         assert report.pop("seconds")["total"] > 0
-        yield folder.name, report, *((folder / name).read_bytes() for name in sorted(FILES - {"report.json"}))
+        yield (
+            folder.name,
+            report,
+            *((folder / name).read_bytes() for name in sorted(FILES - {"report.json"})),
+        )
 
 
-def test_two_workers_give_the_same_files_as_one_by_one_and_go_on(place: Path, tmp_path: Path) -> None:
+def test_two_workers_give_the_same_files_as_one_by_one_and_go_on(
+    place: Path, tmp_path: Path
+) -> None:
     out = tmp_path / "out"
     done = predict(place, out, "--workers", 2)
     assert (done.code, done.lines[-1]) == (1, "1 of 3 photos failed"), done.err
     assert list(content(out)) == list(content(place / "alone"))
     results = [json.loads(line) for line in done.out.splitlines()]
-    assert {Path(result["folder"]).name: "error" in result for result in results} == {"a": False, "b": True, "c": False}
+    assert {Path(result["folder"]).name: "error" in result for result in results} == {
+        "a": False,
+        "b": True,
+        "c": False,
+    }
     (out / "c" / "report.json").unlink()
     times = {name: (out / name / "scene.ply").stat().st_mtime_ns for name in "ac"}
     again = predict(place, out, "--workers", 2)
     assert [line for line in again.lines if "done already" in line] == [
         "a.png: done already (--overwrite does it again)"
     ]
-    assert [(out / name / "scene.ply").stat().st_mtime_ns > times[name] for name in "ac"] == [False, True]
+    assert [(out / name / "scene.ply").stat().st_mtime_ns > times[name] for name in "ac"] == [
+        False,
+        True,
+    ]
     assert list(content(out)) == list(content(place / "alone"))
 
 
 @pytest.mark.parametrize(
     ("everybody", "code", "says"),
-    [(False, 2, "a worker process died"), (True, 130, "stopped; the same command resumes from here\ninterrupted")],
+    [
+        (False, 2, "a worker process died"),
+        (True, 130, "stopped; the same command resumes from here\ninterrupted"),
+    ],
 )
 def test_killed_workers_are_a_line_and_the_same_command_goes_on(
     place: Path, tmp_path: Path, everybody: bool, code: int, says: str

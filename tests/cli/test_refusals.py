@@ -7,8 +7,9 @@ import shutil
 from pathlib import Path
 
 import pytest
-from command import FILES, SHORT, names_in, refuses, run
-from photos import write_photo
+from helpers import DATA
+from helpers.command import FILES, SHORT, names_in, refuses, run
+from helpers.photos import write_photo
 
 INPUTS = {"predict": ("photo.png", "--depth", "depth.npy"), "render": ("scene.ply",)}
 # Options of both commands, and a part of the error message.
@@ -23,7 +24,10 @@ BOTH = [
     ("--size 2:3", "--size 2:3: give width and height up to 8192, such as 1280x720, 16:9"),
     ("--overscan 0.6", "--overscan must be between 0 and 0.5"),
     ("--disparity 3", "--disparity"),
-    ("--trajectory rotate_back", "'--trajectory': 'rotate_back' is not one of 'swipe', 'shake', 'rotate'"),
+    (
+        "--trajectory rotate_back",
+        "'--trajectory': 'rotate_back' is not one of 'swipe', 'shake', 'rotate'",
+    ),
     ("--path bad.json", "bad.json: keyframe 1: eye and target coincide"),
     ("--path good.json --disparity 0.2", "--disparity 0.2"),
     ("--path good.json --cameras views.json", "--cameras"),
@@ -37,7 +41,10 @@ PREDICT = [
     ("--fov 180", "--fov"),
     *((f"--frames {value}", "--frames") for value in ("0", "1000000", "many")),
     *((f"--seconds {value}", "--seconds") for value in ("0", "2 --frames 9")),
-    *((f"--sharp {value}", "--sharp") for value in ("windows=1", "windws=1", "windows=many", "compile")),
+    *(
+        (f"--sharp {value}", "--sharp")
+        for value in ("windows=1", "windws=1", "windows=many", "compile")
+    ),
     *((f"--residual {file}.safetensors", f"{file}.safetensors") for file in ("nowhere", "bad")),
     *((f"{option} 0", option) for option in ("--workers", "--threads")),
     ("--depth-out depth.tiff", "depth.tiff"),
@@ -46,7 +53,10 @@ PREDICT = [
     ("--device cuda", "--device"),
     ("-c weights.pt", "-c"),
     ("--cameras sizes.json", "--no-render"),
-    *((f"--no-render {option}", option.split()[0]) for option in ("--fps 24.0", "--loop 2", "--format webm")),
+    *(
+        (f"--no-render {option}", option.split()[0])
+        for option in ("--fps 24.0", "--loop 2", "--format webm")
+    ),
     ("--cameras extreme.json", "extreme.json"),
     ("--depth wrong.npy", "wrong.npy"),
     ("--depth disp0.npy", "disp0.npy"),  # without a calibration
@@ -58,14 +68,20 @@ RENDER = [
     ("-o a.gif --format webm", "--format webm"),
     ("-o a.mp4 --cameras sizes.json", "sizes.json"),
 ]
-ROWS = [(command, *row) for command, rows in (("predict", BOTH + PREDICT), ("render", BOTH + RENDER)) for row in rows]
+ROWS = [
+    (command, *row)
+    for command, rows in (("predict", BOTH + PREDICT), ("render", BOTH + RENDER))
+    for row in rows
+]
 
 
 @pytest.fixture
-def place(tmp_path: Path, pair: tuple[Path, Path], scene: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def place(
+    tmp_path: Path, pair: tuple[Path, Path], scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> Path:
     """A folder with a photo, its depth, a scene, and files that cannot be used."""
     monkeypatch.chdir(tmp_path)
-    shutil.copytree(Path(__file__).parents[1] / "data" / "refused", tmp_path, dirs_exist_ok=True)
+    shutil.copytree(DATA / "refused", tmp_path, dirs_exist_ok=True)
     shutil.copy(scene, "scene.ply")
     shutil.copy(pair[1], "disp0.npy")
     return tmp_path
@@ -74,7 +90,11 @@ def place(tmp_path: Path, pair: tuple[Path, Path], scene: Path, monkeypatch: pyt
 @pytest.mark.parametrize(("command", "options", "says"), ROWS, ids=lambda value: value[:40])
 def test_options_that_cannot_be(place: Path, command: str, options: str, says: str) -> None:
     before = names_in(place)
-    short = () if any(word in options for word in ("--cameras", "--path", "--frames", "--seconds")) else SHORT
+    short = (
+        ()
+        if any(word in options for word in ("--cameras", "--path", "--frames", "--seconds"))
+        else SHORT
+    )
     result = run(command, *INPUTS[command], "-o", "new/out", *short, *options.split())
     assert (result.code, result.out) == (2, ""), result.err
     assert result.lines[-1].startswith("error: ")
@@ -85,14 +105,21 @@ def test_options_that_cannot_be(place: Path, command: str, options: str, says: s
 def test_an_input_has_to_be_named(tmp_path: Path) -> None:
     refuses(run("predict"), "PHOTO")
     refuses(run("render", "-o", tmp_path / "out"), "SCENE")
-    refuses(run("render", tmp_path / "missing.ply", "-o", tmp_path / "out"), tmp_path / "missing.ply")
+    refuses(
+        run("render", tmp_path / "missing.ply", "-o", tmp_path / "out"), tmp_path / "missing.ply"
+    )
     address = "https://example.com/a.jpg"
     refuses(run("predict", address), f"{address}: an address, not a file: download it first")
-    refuses(run("predict", write_photo(tmp_path / "a.png"), "--base", "rgbd", "-o", tmp_path / "out"), "--depth")
+    refuses(
+        run("predict", write_photo(tmp_path / "a.png"), "--base", "rgbd", "-o", tmp_path / "out"),
+        "--depth",
+    )
 
 
 @pytest.mark.parametrize("kind", ["missing", "text", "an empty folder", "a pipe"])
-def test_files_that_are_no_photo_and_no_depth_map(tmp_path: Path, pair: tuple[Path, Path], kind: str) -> None:
+def test_files_that_are_no_photo_and_no_depth_map(
+    tmp_path: Path, pair: tuple[Path, Path], kind: str
+) -> None:
     bad = tmp_path / "bad.png"
     if kind == "a pipe":
         os.mkfifo(bad)
@@ -101,18 +128,24 @@ def test_files_that_are_no_photo_and_no_depth_map(tmp_path: Path, pair: tuple[Pa
     elif kind == "text":
         bad.write_text("a photo")
     for photo, depth in ((bad, pair[1]), (pair[0], bad)):
-        refuses(run("predict", photo, "--depth", depth, "-o", tmp_path / "new" / "out", *SHORT), bad)
+        refuses(
+            run("predict", photo, "--depth", depth, "-o", tmp_path / "new" / "out", *SHORT), bad
+        )
     assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.parametrize("kind", ["file", "file/deep", "scene.ply"])
-def test_outputs_that_cannot_be_written(tmp_path: Path, pair: tuple[Path, Path], scene: Path, kind: str) -> None:
+def test_outputs_that_cannot_be_written(
+    tmp_path: Path, pair: tuple[Path, Path], scene: Path, kind: str
+) -> None:
     (tmp_path / "file").write_text("in the way")
     command = ("predict", pair[0], "--depth", pair[1], *SHORT, "-o")
     if kind in FILES:  # a folder in the place of a result
         (tmp_path / "out" / "photo" / kind).mkdir(parents=True)
         refuses(run(*command, tmp_path / "out"), kind)
-        assert names_in(tmp_path / "out" / "photo") == {kind}  # known before the first file was written
+        assert names_in(tmp_path / "out" / "photo") == {
+            kind
+        }  # known before the first file was written
         return
     before, out = names_in(tmp_path), tmp_path / kind
     refuses(run(*command, out), "output folder", "-o")

@@ -35,7 +35,9 @@ def main(photo: Path) -> None:
     depth: Tensor = scene.depth_map()
     share: float = spackle.hole_area_ratio(view.alpha)
     prediction = spackle.LiteBase.load().predict(spackle.load_photo(photo))
-    completed = spackle.complete(prediction, cameras, exact=True, progress=lambda done, total: print(done, total))
+    completed = spackle.complete(
+        prediction, cameras, exact=True, progress=lambda done, total: print(done, total)
+    )
     gaussians: spackle.Gaussians = completed.gaussians
     loaded = spackle.Scene.load("scene.ply", fov=60.0)
     spackle.save_ply(gaussians, "all.ply", camera=completed.camera, base_count=len(completed.base))

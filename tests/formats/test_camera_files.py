@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 import torch
 
-from spackle.camera_path import Keyframe
-from spackle.errors import InputError
+from spackle.core.trajectories import Keyframe
 from spackle.formats import load_cameras, load_path
+from spackle.runtime.errors import InputError
 
 FRAME = {
     "K": [[500, 0, 320.0], [0, 510.5, 240], [0, 0, 1]],
@@ -57,7 +57,9 @@ def test_reads_the_documented_format(tmp_path: Path) -> None:
     assert first.K.tolist() == FRAME["K"]
     assert torch.equal(first.world_to_camera, torch.tensor(FRAME["world_to_camera"]))
     assert load_cameras(write(tmp_path / "c.json", {"frames": [small]}))[0].width == 100
-    assert len(load_cameras(write(tmp_path / "c.json", at("world_to_camera", 0, 0, 1.0003)))) == 1  # nearly rigid
+    assert (
+        len(load_cameras(write(tmp_path / "c.json", at("world_to_camera", 0, 0, 1.0003)))) == 1
+    )  # nearly rigid
 
 
 def test_a_byte_order_mark_is_ignored(tmp_path: Path) -> None:
@@ -67,7 +69,9 @@ def test_a_byte_order_mark_is_ignored(tmp_path: Path) -> None:
 
 def test_a_path_file_is_read(tmp_path: Path) -> None:
     keys = [FIRST, SECOND | {"up": [0, -1, 0.1], "fov": 50}]
-    path = load_path(write(tmp_path / "p.json", {"keyframes": keys, "closed": True, "unit": "disparity"}))
+    path = load_path(
+        write(tmp_path / "p.json", {"keyframes": keys, "closed": True, "unit": "disparity"})
+    )
     assert path.keys == (
         Keyframe(0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 3.0)),
         Keyframe(1.5, (0.2, 0.0, 0.0), (0.0, 0.0, 3.0), (0.0, -1.0, 0.1), 50.0),

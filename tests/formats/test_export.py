@@ -13,21 +13,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from plain_scenes import FORMATS, gaussians_of, glb_parts
+from helpers import DATA
+from helpers.plain_scenes import FORMATS, gaussians_of, glb_parts
+from helpers.scenes import box_before_wall, psnr, random_gaussians, shifted, slanted_plane
 from rich.console import Console
-from scenes import box_before_wall, psnr, random_gaussians, shifted, slanted_plane
 
-from spackle.camera import Camera
 from spackle.cli.saved_scene import PAGE, export_scene
-from spackle.color import linear_to_srgb
-from spackle.errors import InputError
+from spackle.core.camera import Camera
+from spackle.core.color import linear_to_srgb
+from spackle.core.gaussians import Gaussians, quat_to_matrix
 from spackle.formats import load_ply, save_ply
 from spackle.formats.compressed_ply import morton_order
 from spackle.formats.scene_files import SCENE_ENCODERS, SceneFile, encoder_of, load_scene
 from spackle.formats.spz import LIMIT
-from spackle.gaussians import Gaussians, quat_to_matrix
-from spackle.progress import Reporter
 from spackle.render import CpuRenderer
+from spackle.runtime.errors import InputError
+from spackle.runtime.progress import Reporter
 from spackle.scene import Scene
 
 CPU = CpuRenderer()
@@ -43,7 +44,9 @@ BOUNDS = {
 }
 
 
-def encode(kind: str, gaussians: Gaussians, camera: Camera | None = None, base_count: int | None = None) -> bytes:
+def encode(
+    kind: str, gaussians: Gaussians, camera: Camera | None = None, base_count: int | None = None
+) -> bytes:
     path = Path(f"a.{kind}")
     return encoder_of(path)(SceneFile(path, gaussians, camera, base_count, 0.2))
 
@@ -58,12 +61,16 @@ def in_file_order(kind: str, gaussians: Gaussians, base_count: int = 0) -> Gauss
     if kind != "compressed.ply":
         return gaussians
     parts = [gaussians.select(slice(0, base_count)), gaussians.select(slice(base_count, None))]
-    return Gaussians.cat(part.select(torch.from_numpy(morton_order(part.means.numpy()))) for part in parts)
+    return Gaussians.cat(
+        part.select(torch.from_numpy(morton_order(part.means.numpy()))) for part in parts
+    )
 
 
 def looks(found: Gaussians, gaussians: Gaussians, *cameras: Camera) -> float:
     """The lowest PSNR between renders of two scenes."""
-    return min(psnr(CPU.render(found, camera).rgb, CPU.render(gaussians, camera).rgb) for camera in cameras)
+    return min(
+        psnr(CPU.render(found, camera).rgb, CPU.render(gaussians, camera).rgb) for camera in cameras
+    )
 
 
 @pytest.mark.parametrize("kind", FORMATS)
@@ -74,10 +81,14 @@ def test_a_scene_read_back_is_the_scene(kind: str) -> None:
     middle = expected.scales.median(dim=1).values[:, None]
     assert float(((found.means - expected.means).abs() / middle).max()) <= place
     assert float((found.scales.log() - expected.scales.log()).abs().max()) <= size
-    ball = expected.scales.amax(dim=1) < 1.07 * expected.scales.amin(dim=1)  # it has no axes that could be kept
+    ball = expected.scales.amax(dim=1) < 1.07 * expected.scales.amin(
+        dim=1
+    )  # it has no axes that could be kept
     axes = (quat_to_matrix(found.quats) - quat_to_matrix(expected.quats))[~ball]
     assert float(axes.abs().max()) <= 2 * turn
-    assert float((linear_to_srgb(found.colors) - linear_to_srgb(expected.colors)).abs().max()) <= color
+    assert (
+        float((linear_to_srgb(found.colors) - linear_to_srgb(expected.colors)).abs().max()) <= color
+    )
     assert float((found.opacities - expected.opacities).abs().max()) <= opacity
     base = BOX.base()
     data = encode(kind, base)
@@ -86,12 +97,20 @@ def test_a_scene_read_back_is_the_scene(kind: str) -> None:
 
 
 EXTREMES = {
-    "scales": {"scales": [[1e-30, 1e-30, 1e-30], [1e-6, 1.0, 1e6], [0.0, 0.1, 0.2], [math.inf, 0.1, 0.1]]},
+    "scales": {
+        "scales": [[1e-30, 1e-30, 1e-30], [1e-6, 1.0, 1e6], [0.0, 0.1, 0.2], [math.inf, 0.1, 0.1]]
+    },
     "opacities": {"opacities": [0.0, 1.0, 1e-9, 0.9999]},
     "far": {"means": [[1e6, 0, 1e6], [0, -3e7, 1.0], [0, 0, 0], [0.001, 0.002, 0.3]]},
-    "quats": {"quats": [[-0.1, 0.2, 0.3, -0.9], [0.0, 0, 0, 0], [-1.0, 0, 0, 0], [0.5, -0.5, 0.5, -0.5]]},
+    "quats": {
+        "quats": [[-0.1, 0.2, 0.3, -0.9], [0.0, 0, 0, 0], [-1.0, 0, 0, 0], [0.5, -0.5, 0.5, -0.5]]
+    },
     "colors": {"colors": [[-1.0, 0.5, 2.0], [0.0, 0, 0], [1.0, 1, 1], [1e9, -1e9, 0.2]]},
-    "alike": {"means": [[1.0, 1, 1]] * 4, "scales": [[0.1, 0.1, 0.1]] * 4, "colors": [[0.5, 0.5, 0.5]] * 4},
+    "alike": {
+        "means": [[1.0, 1, 1]] * 4,
+        "scales": [[0.1, 0.1, 0.1]] * 4,
+        "colors": [[0.5, 0.5, 0.5]] * 4,
+    },
 }
 
 
@@ -113,29 +132,41 @@ def test_extremes_come_back_as_well_as_the_format_can(kind: str, extreme: str) -
     if extreme == "quats":
         unit = expected.quats.clone()
         unit[unit.norm(dim=1) == 0] = torch.tensor([1.0, 0, 0, 0])
-        torch.testing.assert_close(quat_to_matrix(found.quats), quat_to_matrix(unit), rtol=0, atol=0.05)
+        torch.testing.assert_close(
+            quat_to_matrix(found.quats), quat_to_matrix(unit), rtol=0, atol=0.05
+        )
 
 
 @pytest.mark.parametrize("kind", [kind for kind in FORMATS if kind != "glb"])
 @pytest.mark.parametrize("extreme", [None, *EXTREMES])
-def test_scenes_are_read_as_the_plainest_reader_does(tmp_path: Path, kind: str, extreme: str | None) -> None:
+def test_scenes_are_read_as_the_plainest_reader_does(
+    tmp_path: Path, kind: str, extreme: str | None
+) -> None:
     gaussians, path = random_gaussians(4 if extreme else 700), tmp_path / f"a.{kind}"
     given = {name: torch.tensor(values) for name, values in EXTREMES.get(extreme or "", {}).items()}
-    path.write_bytes(encode(kind, dataclasses.replace(gaussians, **given), Camera.from_focal(50, 64, 48), 3))
+    path.write_bytes(
+        encode(kind, dataclasses.replace(gaussians, **given), Camera.from_focal(50, 64, 48), 3)
+    )
     found, expected = load_scene(path), read(kind, path.read_bytes())
     for mine, plain in zip(found.gaussians.tensors, expected.tensors, strict=True):
-        torch.testing.assert_close(mine, plain, rtol=1e-4, atol=2e-5 + 1e-7 * float(plain.abs().max()))
+        torch.testing.assert_close(
+            mine, plain, rtol=1e-4, atol=2e-5 + 1e-7 * float(plain.abs().max())
+        )
     known = (3, 50.0, 0.2) if kind == "compressed.ply" else (None, None, None)
     assert (found.base_count, found.camera and found.camera.focal[0], found.disparity) == known
-    renamed = path.rename(tmp_path / "other.bin") if kind != "splat" else path  # the content decides
+    renamed = (
+        path.rename(tmp_path / "other.bin") if kind != "splat" else path
+    )  # the content decides
     assert len(load_scene(renamed).gaussians) == len(gaussians)
     assert Scene.load(renamed).to_bytes(kind) == Scene.load(renamed).to_bytes(kind)
 
 
 def test_other_programs_spz() -> None:
-    found = load_scene(Path(__file__).parents[1] / "data" / "version_2.spz").gaussians
+    found = load_scene(DATA / "version_2.spz").gaussians
     flipped = torch.tensor([[0.5, 0.5, 0.5, -0.5], [1.0, 0, 0, 0], [0.6, 0, -0.8, 0]])
-    torch.testing.assert_close(quat_to_matrix(found.quats), quat_to_matrix(flipped), atol=0.02, rtol=0)
+    torch.testing.assert_close(
+        quat_to_matrix(found.quats), quat_to_matrix(flipped), atol=0.02, rtol=0
+    )
     assert (found.scales == 1).all()
     assert (found.opacities == 1).all()
 
@@ -167,7 +198,9 @@ def test_glb_keeps_the_photos_camera_and_the_border() -> None:
     torch.testing.assert_close(there[:3] * torch.tensor([1.0, -1.0, -1.0]), expected[:3])
     still, _ = glb_parts(encode("glb", random_gaussians(1), lens))
     assert "matrix" not in still["nodes"][1]
-    assert b"spackle_camera" not in encode("ply", random_gaussians(1), camera)  # its comment has no room for a pose
+    assert b"spackle_camera" not in encode(
+        "ply", random_gaussians(1), camera
+    )  # its comment has no room for a pose
 
 
 def test_compressed_ply_keeps_the_base_before_the_aux() -> None:
@@ -176,7 +209,9 @@ def test_compressed_ply_keeps_the_base_before_the_aux() -> None:
     found = read("compressed.ply", data)
     expected = in_file_order("compressed.ply", gaussians, 300)
     assert float((found.means - expected.means).abs().max()) < 0.005
-    assert not torch.allclose(found.means, in_file_order("compressed.ply", gaussians).means, atol=0.1)
+    assert not torch.allclose(
+        found.means, in_file_order("compressed.ply", gaussians).means, atol=0.1
+    )
     assert b"comment spackle_camera 50.0 50.0 32.0 24.0 64 48\ncomment spackle_base 300\n" in data
 
 
@@ -185,7 +220,8 @@ def test_morton_order_is_that_of_interleaved_bits_of_logarithms() -> None:
     points = np.vstack([grid, [1e4] * 3]).astype(np.float32)
     cells = (np.log1p(points.astype(float)) / np.log1p(1e4) * 1023).astype(int).tolist()
     curve = [
-        sum((cell[axis] >> bit & 1) << (3 * bit + axis) for bit in range(10) for axis in range(3)) for cell in cells
+        sum((cell[axis] >> bit & 1) << (3 * bit + axis) for bit in range(10) for axis in range(3))
+        for cell in cells
     ]
     assert [curve[i] for i in morton_order(points)] == sorted(curve)
 
@@ -193,11 +229,16 @@ def test_morton_order_is_that_of_interleaved_bits_of_logarithms() -> None:
 def spz_scene(near: float, far: float) -> Gaussians:
     """A plane at `near` and a sky at `far`, both as fine as a photo's pixels."""
     x, y = (
-        t.flatten() for t in torch.meshgrid(torch.linspace(-0.5, 0.5, 40), torch.linspace(-0.4, 0.4, 32), indexing="xy")
+        t.flatten()
+        for t in torch.meshgrid(
+            torch.linspace(-0.5, 0.5, 40), torch.linspace(-0.4, 0.4, 32), indexing="xy"
+        )
     )
     depth, ones = torch.where(y < 0, far, near)[:, None], torch.ones_like(x)
     scales, quats = depth / 60 * torch.tensor([1.0, 1.0, 0.1]), torch.eye(4)[:1].expand(len(x), 4)
-    colors = 0.5 + 0.4 * torch.stack([torch.sin(20 * x), torch.sin(15 * y), torch.cos(12 * x + 9 * y)], dim=1)
+    colors = 0.5 + 0.4 * torch.stack(
+        [torch.sin(20 * x), torch.sin(15 * y), torch.cos(12 * x + 9 * y)], dim=1
+    )
     return Gaussians(torch.stack([x, y, ones], dim=1) * depth, quats, scales, 0.99 * ones, colors)
 
 
@@ -223,7 +264,11 @@ def scene(tmp_path: Path) -> Path:
 def export(scene: Path, *names: str) -> str:
     """Write files beside the scene, and return the log."""
     text = io.StringIO()
-    export_scene(scene, [scene.parent / name for name in names], Reporter(console=Console(file=text, width=300)))
+    export_scene(
+        scene,
+        [scene.parent / name for name in names],
+        Reporter(console=Console(file=text, width=300)),
+    )
     return text.getvalue()
 
 
@@ -240,10 +285,15 @@ def test_all_formats_at_once(scene: Path, tmp_path: Path) -> None:
     base = load_ply(scene)
     for a, b in zip(load_ply(tmp_path / "out.ply").tensors, base.tensors, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-6)
-    heads = [path.read_bytes().partition(b"end_header")[0] for path in (scene, tmp_path / "out.ply")]
+    heads = [
+        path.read_bytes().partition(b"end_header")[0] for path in (scene, tmp_path / "out.ply")
+    ]
     assert heads[0] == heads[1]
     for kind in FORMATS:
-        assert looks(read(kind, (tmp_path / f"out.{kind}").read_bytes()), base, BOX.camera) >= BOUNDS[kind][0]
+        assert (
+            looks(read(kind, (tmp_path / f"out.{kind}").read_bytes()), base, BOX.camera)
+            >= BOUNDS[kind][0]
+        )
     assert "spackle-scene" in (tmp_path / "out.html").read_text(encoding="utf-8")
     assert (tmp_path / "A.SPLAT").stat().st_size == 32 * len(base)
     assert {p.name for p in tmp_path.iterdir()} == {"scene.ply", *names}
@@ -251,9 +301,13 @@ def test_all_formats_at_once(scene: Path, tmp_path: Path) -> None:
 
 def test_what_a_format_cannot_hold_is_said(scene: Path, tmp_path: Path) -> None:
     foreign, far = tmp_path / "inria.ply", tmp_path / "far.ply"
-    shutil.copy(Path(__file__).parents[1] / "data" / "ply" / "little float, cameras before.ply", foreign)
+    shutil.copy(DATA / "ply" / "little float, cameras before.ply", foreign)
     save_ply(spz_scene(0.3, 5000.0), far)
-    for path, says in ((foreign, "45 spherical harmonics"), (far, "640 Gaussians beyond 1,024 m"), (scene, "")):
+    for path, says in (
+        (foreign, "45 spherical harmonics"),
+        (far, "640 Gaussians beyond 1,024 m"),
+        (scene, ""),
+    ):
         said = export(path, "out.spz")
         assert says in said
         assert len(said.splitlines()) == (2 if says else 1)
@@ -266,7 +320,9 @@ REQUESTS = [
 
 
 @pytest.mark.parametrize(("source", "outputs", "says"), REQUESTS)
-def test_bad_requests_leave_nothing(scene: Path, source: str, outputs: list[str], says: str) -> None:
+def test_bad_requests_leave_nothing(
+    scene: Path, source: str, outputs: list[str], says: str
+) -> None:
     scene.with_name("text.ply").write_text("hello")
     with pytest.raises(InputError, match=says):
         export(scene.with_name(source), *outputs)
@@ -274,7 +330,11 @@ def test_bad_requests_leave_nothing(scene: Path, source: str, outputs: list[str]
     assert len(load_ply(scene)) == len(BOX.base())
 
 
-LIMITS = [("spz", "spz.MAX_COUNT", 3000), ("sog", "sog.LARGEST_SIDE", 40), ("glb", "gltf.LARGEST_FILE", 1 << 17)]
+LIMITS = [
+    ("spz", "spz.MAX_COUNT", 3000),
+    ("sog", "sog.LARGEST_SIDE", 40),
+    ("glb", "gltf.LARGEST_FILE", 1 << 17),
+]
 
 
 @pytest.mark.parametrize(("kind", "limit", "value"), LIMITS)
@@ -294,10 +354,14 @@ def agree(found: Gaussians, expected: Gaussians, turn: float) -> None:
     torch.testing.assert_close(found.means, expected.means, rtol=1e-3, atol=1e-3)
     torch.testing.assert_close(found.scales, expected.scales, rtol=1e-3, atol=0)
     torch.testing.assert_close(found.opacities, expected.opacities, rtol=0, atol=1e-3)
-    torch.testing.assert_close(quat_to_matrix(found.quats), quat_to_matrix(expected.quats), rtol=0, atol=turn)
+    torch.testing.assert_close(
+        quat_to_matrix(found.quats), quat_to_matrix(expected.quats), rtol=0, atol=turn
+    )
 
 
-@pytest.mark.parametrize("kind", [kind for kind in FORMATS if kind != "glb"])  # which it writes but does not read
+@pytest.mark.parametrize(
+    "kind", [kind for kind in FORMATS if kind != "glb"]
+)  # which it writes but does not read
 def test_splat_transform_reads_the_scene(kind: str, tmp_path: Path) -> None:
     given, found = os.environ.get("SPLAT_TRANSFORM"), shutil.which("splat-transform")
     if not (given or found):
@@ -305,10 +369,14 @@ def test_splat_transform_reads_the_scene(kind: str, tmp_path: Path) -> None:
     data, path = encode(kind, random_gaussians(50)), tmp_path / f"a.{kind}"
     path.write_bytes(data)
     command = ["node", given] if given else [str(found)]
-    done = subprocess.run([*command, "-q", path, tmp_path / "b.ply"], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [*command, "-q", path, tmp_path / "b.ply"], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     copy, expected = load_ply(tmp_path / "b.ply"), read(kind, data)
-    agree(copy, expected, 0.02 if kind == "splat" else 0.001)  # of .splat's bytes it takes 127.5 for 0, others 128
+    agree(
+        copy, expected, 0.02 if kind == "splat" else 0.001
+    )  # of .splat's bytes it takes 127.5 for 0, others 128
     torch.testing.assert_close(copy.colors, expected.colors.float(), rtol=0, atol=1e-3)
 
 
@@ -318,9 +386,18 @@ def test_gsply_reads_the_scene_and_we_what_it_writes(kind: str, tmp_path: Path) 
     gsply = pytest.importorskip("gsply")
     path = tmp_path / f"a.{kind}"
     path.write_bytes(encode(kind, random_gaussians(50)))
-    raw, expected = gsply.read_spz(path) if kind == "spz" else gsply.plyread(path), read(kind, path.read_bytes())
-    means, quats, scales, opacities = map(torch.as_tensor, (raw.means, raw.quats, raw.scales, raw.opacities))
+    raw, expected = (
+        gsply.read_spz(path) if kind == "spz" else gsply.plyread(path),
+        read(kind, path.read_bytes()),
+    )
+    means, quats, scales, opacities = map(
+        torch.as_tensor, (raw.means, raw.quats, raw.scales, raw.opacities)
+    )
     flip = torch.tensor([1.0, 1.0, -1.0, -1.0]) if kind == "spz" else torch.ones(4)
-    agree(Gaussians(means * flip[1:], quats * flip, scales.exp(), opacities.sigmoid(), means), expected, 0.01)
+    agree(
+        Gaussians(means * flip[1:], quats * flip, scales.exp(), opacities.sigmoid(), means),
+        expected,
+        0.01,
+    )
     gsply.write_spz(path, raw) if kind == "spz" else gsply.plywrite(path, raw, compressed=True)
     agree(load_scene(path).gaussians, expected, 0.01)

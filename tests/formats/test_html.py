@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from scenes import box_before_wall
+from helpers.scenes import box_before_wall
 
-from spackle.color import linear_to_srgb
+from spackle.core.color import linear_to_srgb
+from spackle.core.gaussians import Gaussians
+from spackle.core.gaussians import quat_to_matrix as matrices
 from spackle.formats.html import BYTES, encode_layer, page_scene, single_html
-from spackle.gaussians import Gaussians
-from spackle.gaussians import quat_to_matrix as matrices
 
 EVIL = "</script><b>&\"'\ud800"
 BOX = box_before_wall(width=64, height=48, focal=53)
@@ -46,7 +46,9 @@ def random_gaussians(count: int = 200) -> Gaussians:
     torch.manual_seed(3)
     means = torch.randn(count, 3) * torch.logspace(-1, 4, count)[:, None]
     scales = torch.exp(torch.rand(count, 3) * 14 - 9)
-    return Gaussians(means, torch.randn(count, 4) * 3, scales, torch.rand(count), torch.rand(count, 3))
+    return Gaussians(
+        means, torch.randn(count, 4) * 3, scales, torch.rand(count), torch.rand(count, 3)
+    )
 
 
 def test_a_layer_is_read_back_as_precisely_as_it_says() -> None:
@@ -58,7 +60,10 @@ def test_a_layer_is_read_back_as_precisely_as_it_says() -> None:
     assert step < 0.06
     torch.testing.assert_close(got.scales.log(), wanted.scales.log(), rtol=0, atol=step / 2 + 1e-4)
     turn = matrices(got.quats) @ matrices(wanted.quats).transpose(1, 2)
-    assert float(torch.arccos(((turn.diagonal(dim1=1, dim2=2).sum(-1) - 1) / 2).clamp(-1, 1)).max()) < 0.017  # radians
+    assert (
+        float(torch.arccos(((turn.diagonal(dim1=1, dim2=2).sum(-1) - 1) / 2).clamp(-1, 1)).max())
+        < 0.017
+    )  # radians
     torch.testing.assert_close(got.colors, linear_to_srgb(wanted.colors), rtol=0, atol=0.502 / 255)
     torch.testing.assert_close(got.opacities, wanted.opacities, rtol=0, atol=0.502 / 255)
     # One broken size does not cost the others their precision.
@@ -67,8 +72,12 @@ def test_a_layer_is_read_back_as_precisely_as_it_says() -> None:
     assert page_scene("alone", wanted, Gaussians.empty(), BOX.camera).files["aux.splats"] == b""
 
 
-@pytest.mark.parametrize(("disparity", "filled", "free"), [(0.2, 1, 0.2), (None, 1, 0.3), (None, 0, 0.6), (5, 1, 1)])
-def test_the_eye_goes_as_far_as_the_scene_was_completed(disparity: float | None, filled: bool, free: float) -> None:
+@pytest.mark.parametrize(
+    ("disparity", "filled", "free"), [(0.2, 1, 0.2), (None, 1, 0.3), (None, 0, 0.6), (5, 1, 1)]
+)
+def test_the_eye_goes_as_far_as_the_scene_was_completed(
+    disparity: float | None, filled: bool, free: float
+) -> None:
     aux = random_gaussians() if filled else Gaussians.empty()
     orbit: Any = page_scene("a", BOX.base(), aux, BOX.camera, disparity).description["orbit"]
     assert (orbit["free"], orbit["limit"]) == (free, free)
@@ -78,7 +87,9 @@ def test_the_single_file_runs_its_own_script_and_style_alone() -> None:
     page = single_html(page_scene(EVIL, BOX.base(), Gaussians.empty(), BOX.camera))
     assert page == single_html(page_scene(EVIL, BOX.base(), Gaussians.empty(), BOX.camera))
     assert EVIL[:9].encode() + b"<b>" not in page
-    (inside,) = re.findall(rb'<script type="application/json" id="spackle-scene">(.*?)</script>', page)
+    (inside,) = re.findall(
+        rb'<script type="application/json" id="spackle-scene">(.*?)</script>', page
+    )
     assert json.loads(inside)["description"]["name"] == EVIL
     (policy,) = re.findall(r'Content-Security-Policy" content="([^"]+)"', page.decode())
     assert policy.startswith("default-src 'none';")

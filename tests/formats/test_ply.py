@@ -11,15 +11,16 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from photos import read_ply
-from scenes import random_gaussians, same_bits
+from helpers import DATA
+from helpers.photos import read_ply
+from helpers.scenes import random_gaussians, same_bits
 
-from spackle.camera import Camera
-from spackle.color import linear_to_srgb
-from spackle.errors import InputError
+from spackle.core.camera import Camera
+from spackle.core.color import linear_to_srgb
+from spackle.core.gaussians import Gaussians
 from spackle.formats import PlyFile, load_ply, save_ply
 from spackle.formats.ply import BLOCK
-from spackle.gaussians import Gaussians
+from spackle.runtime.errors import InputError
 
 PROPERTIES = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
 PROPERTIES += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
@@ -39,7 +40,7 @@ def ply(rows: Any, kind: str = "float") -> bytes:
     return header.encode() + rows.astype({"float": "<f4", "double": "<f8"}[kind]).tobytes()
 
 
-DATA = Path(__file__).parents[1] / "data" / "ply"  # `random_gaussians(3)` as SHARP and others write them
+PLY_DATA = DATA / "ply"  # `random_gaussians(3)` as SHARP and others write them
 
 
 def close(a: Gaussians, b: Gaussians) -> None:
@@ -61,7 +62,9 @@ def test_independent_reader_finds_what_was_meant(tmp_path: Path) -> None:
     expected[:, 10:] /= np.linalg.norm(expected[:, 10:], axis=1, keepdims=True)
     np.testing.assert_allclose(np.delete(found, [3, 4, 5], axis=1), expected, rtol=1e-5, atol=2e-5)
     assert not found[:, 3:6].any()
-    strided = Gaussians(*(torch.stack([t, t], dim=-1).double().requires_grad_()[..., 0] for t in gaussians.tensors))
+    strided = Gaussians(
+        *(torch.stack([t, t], dim=-1).double().requires_grad_()[..., 0] for t in gaussians.tensors)
+    )
     save_ply(strided, tmp_path / "b.ply")
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
 
@@ -70,7 +73,10 @@ def test_extremes_stay_finite(tmp_path: Path) -> None:
     opacities = torch.tensor([0.0, 1.0, 0.999, 0.9999, 0.99999, 1e-6])
     scales = torch.tensor([0.0, 1e-30, 1e-3, 1.0, 1e30, torch.inf])[:, None].repeat(1, 3)
     colors = torch.tensor([-1.0, 0.0, 0.5, 1.0, 2.0, 1e-5])[:, None].repeat(1, 3)
-    save_ply(Gaussians(torch.full((6, 3), 1e6), torch.zeros(6, 4), scales, opacities, colors), tmp_path / "a.ply")
+    save_ply(
+        Gaussians(torch.full((6, 3), 1e6), torch.zeros(6, 4), scales, opacities, colors),
+        tmp_path / "a.ply",
+    )
     assert np.isfinite(written(tmp_path / "a.ply")).all()
     found = load_ply(tmp_path / "a.ply")
     torch.testing.assert_close(found.opacities, opacities, rtol=2e-7, atol=1e-9)
@@ -91,15 +97,20 @@ def test_first_rows_depend_on_the_first_gaussians_alone(tmp_path: Path, count: i
         save_ply(Gaussians.cat([base, more]), tmp_path / "both.ply")
     finally:
         torch.set_num_threads(threads)
-    rows = [(tmp_path / name).read_bytes().split(b"end_header\n", 1)[1] for name in ("base.ply", "both.ply")]
+    rows = [
+        (tmp_path / name).read_bytes().split(b"end_header\n", 1)[1]
+        for name in ("base.ply", "both.ply")
+    ]
     assert rows[1].startswith(rows[0])
     loaded, both = load_ply(tmp_path / "base.ply"), load_ply(tmp_path / "both.ply")
-    close(loaded, dataclasses.replace(base, quats=torch.nn.functional.normalize(base.quats, dim=-1)))
+    close(
+        loaded, dataclasses.replace(base, quats=torch.nn.functional.normalize(base.quats, dim=-1))
+    )
     assert torch.equal(loaded.means, base.means)
     assert same_bits(loaded, both.select(slice(0, count)))
 
 
-@pytest.mark.parametrize("path", sorted(DATA.glob("[bl]*.ply")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", sorted(PLY_DATA.glob("[bl]*.ply")), ids=lambda path: path.stem)
 def test_orders_and_types(path: Path) -> None:
     close(load_ply(path), random_gaussians(3))
     assert PlyFile(path).camera() is None
@@ -113,8 +124,8 @@ def camera_of(path: Path) -> Camera:
 
 @pytest.mark.parametrize("name", ["sharp, srgb.ply", "sharp, linear.ply"])
 def test_sharp_file(name: str) -> None:
-    close(load_ply(DATA / name), random_gaussians(3))
-    camera = camera_of(DATA / name)
+    close(load_ply(PLY_DATA / name), random_gaussians(3))
+    camera = camera_of(PLY_DATA / name)
     assert (camera.width, camera.height, camera.focal) == (640, 480, (500, 500))
     assert torch.equal(camera.world_to_camera, torch.eye(4))
 
@@ -165,7 +176,7 @@ BAD: list[tuple[bytes, str]] = [
     (GOOD.replace(b"element", LISTED + b"element"), "lists in or before"),
     (spoiled(0, math.nan), "2 of 3 Gaussians are not finite"),
     (spoiled(1, 1e200, "double"), "2 of 3"),  # beyond float32
-    ((DATA / "sharp, srgb.ply").read_bytes()[:-4], "cut off"),
+    ((PLY_DATA / "sharp, srgb.ply").read_bytes()[:-4], "cut off"),
     (GOOD.replace(b"binary_little_endian", b"ascii"), "the file is text"),
 ]
 

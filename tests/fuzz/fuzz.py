@@ -29,15 +29,44 @@ from typing import Any
 import numpy as np
 
 HERE = Path(__file__).resolve().parent
-sys.path[:0] = map(str, [HERE, HERE.parents[1] / "src"])
+sys.path[:0] = map(str, [HERE, HERE.parent, HERE.parents[1] / "src"])
 
 SECONDS, BYTES = 10, 1_500_000_000  # the limits of a case
 FAILURES = Path("fuzz-failures")
-NUMBERS = [b"0", b"-1", b"1e300", b"-1e39", b"1e-300", b"nan", b"inf", b"9" * 400, b"9" * 5000, b"2147483648", b"0.5"]
-WORDS = [b"", b"null", b"true", b"[]", b"{}", b'""', b"\x1b[2J", b"\0", b"../../etc/passwd", b"[" * 10_000]
+NUMBERS = [
+    b"0",
+    b"-1",
+    b"1e300",
+    b"-1e39",
+    b"1e-300",
+    b"nan",
+    b"inf",
+    b"9" * 400,
+    b"9" * 5000,
+    b"2147483648",
+    b"0.5",
+]
+WORDS = [
+    b"",
+    b"null",
+    b"true",
+    b"[]",
+    b"{}",
+    b'""',
+    b"\x1b[2J",
+    b"\0",
+    b"../../etc/passwd",
+    b"[" * 10_000,
+]
 WORDS += [b'"\\ud800"', b"*a"]
 LINES = [b"\n" * 30_000, b" " * 30_000, b"#" * 3000, b"\xff\xfe"]
-HEADS = [b"\0" * 8, b"\xff" * 8, b"\x7f" + b"\xff" * 7, b"\x80" + b"\0" * 7, b"\xff\xff\0\0\0\0\0\0"]
+HEADS = [
+    b"\0" * 8,
+    b"\xff" * 8,
+    b"\x7f" + b"\xff" * 7,
+    b"\x80" + b"\0" * 7,
+    b"\xff\xff\0\0\0\0\0\0",
+]
 VALUES: list[Any] = [None, True, 0, -1, 1.5, 1e300, 10**400, "", "../x", "a" * 5000, "\x1b[2J"]
 VALUES += [[], {}, [[]], ["a"], {"a": {}}]
 
@@ -64,7 +93,9 @@ def mutated(files: Files, rng: np.random.Generator) -> Files:
 
 
 def damaged_bytes(data: bytes, rng: np.random.Generator) -> bytes:
-    start, stop, other = map(int, [*np.sort(rng.integers(len(data) + 1, size=2)), rng.integers(len(data) + 1)])
+    start, stop, other = map(
+        int, [*np.sort(rng.integers(len(data) + 1, size=2)), rng.integers(len(data) + 1)]
+    )
     stop = min(stop, start + int(rng.integers(1, 64)))
     kind = int(rng.integers(7))
     if kind == 0 and data:  # bits
@@ -79,7 +110,11 @@ def damaged_bytes(data: bytes, rng: np.random.Generator) -> bytes:
     if kind == 6:  # the end is missing
         return data[:start]
     repeated, random = data[start:stop] * int(rng.integers(2, 300)), rng.bytes(stop - start)
-    return data[:start] + [b"", b"", repeated, random, data[other : other + stop - start], b""][kind] + data[stop:]
+    return (
+        data[:start]
+        + [b"", b"", repeated, random, data[other : other + stop - start], b""][kind]
+        + data[stop:]
+    )
 
 
 def damaged_text(data: bytes, rng: np.random.Generator) -> bytes:
@@ -92,10 +127,16 @@ def damaged_text(data: bytes, rng: np.random.Generator) -> bytes:
     at, kind = int(rng.integers(len(lines))), int(rng.integers(7))
     words = lines[at].replace(b",", b" , ").split(b" ")
     if kind < 4:
-        words[int(rng.integers(len(words)))] = b"" if kind == 3 else pick(rng, NUMBERS if rng.random() < 0.7 else WORDS)
+        words[int(rng.integers(len(words)))] = (
+            b"" if kind == 3 else pick(rng, NUMBERS if rng.random() < 0.7 else WORDS)
+        )
         lines[at] = b" ".join(words)
     else:
-        lines[at : at + 1] = [[], [lines[at]] * int(rng.integers(2, 200)), [pick(rng, LINES), lines[at]]][kind - 4]
+        lines[at : at + 1] = [
+            [],
+            [lines[at]] * int(rng.integers(2, 200)),
+            [pick(rng, LINES), lines[at]],
+        ][kind - 4]
     return b"\n".join(lines)
 
 
@@ -132,7 +173,7 @@ def problem_of(name: str, files: Files) -> str | None:
     """A text about a forbidden behaviour of a reader; None if there is none."""
     from av import FFmpegError
 
-    from spackle.errors import InputError
+    from spackle.runtime.errors import InputError
 
     with tempfile.TemporaryDirectory() as place:
         try:
@@ -244,7 +285,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("-n", type=int, default=300, help="cases of each reader")
     parser.add_argument("--readers", nargs="*", help="only these")
-    parser.add_argument("--held", action="store_true", help="print the threads, files and MB that one process keeps")
+    parser.add_argument(
+        "--held", action="store_true", help="print the threads, files and MB that one process keeps"
+    )
     parser.add_argument("--replay", type=Path, nargs="+", help="files of FAILURES")
     given = parser.parse_args()
     warnings.simplefilter("ignore")

@@ -15,32 +15,33 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from spackle.bases.depth_map import load_depth
-from spackle.bases.photo_depth.layouts import load_photo_depth
+from helpers import DATA
+
 from spackle.clips.files import clip_frames, is_clip, read_clip
-from spackle.dataset import DatasetFiles
-from spackle.dataset.inspect import problems
-from spackle.dataset.photos import find_photos
-from spackle.dataset.shards import load_manifest
-from spackle.errors import one_line
-from spackle.evaluation.case import load_case
-from spackle.evaluation.datasets import read_cases
-from spackle.files import digest_of
+from spackle.core.photo import load_photo, resize_photo
+from spackle.depth.depth_map import load_depth
+from spackle.depth.in_photo.layouts import load_photo_depth
 from spackle.formats import PlyFile, load_cameras, load_path
 from spackle.formats.scene_files import load_scene
-from spackle.image import load_photo, resize_photo
-from spackle.network_file import read_tensors
-from spackle.training.checkpoint import load_checkpoint
-from spackle.training.recipe import Recipe, load_recipe
+from spackle.paper.dataset import DatasetFiles
+from spackle.paper.dataset.inspect import problems
+from spackle.paper.dataset.photos import find_photos
+from spackle.paper.dataset.shards import load_manifest
+from spackle.paper.evaluation.case import load_case
+from spackle.paper.evaluation.datasets import read_cases
+from spackle.paper.training.checkpoint import load_checkpoint
+from spackle.paper.training.recipe import Recipe, load_recipe
+from spackle.runtime.errors import one_line
+from spackle.runtime.files import digest_of
+from spackle.weights.checkpoints import read_tensors
 
 Files = dict[str, bytes]  # name in the case's folder → content
-DATA = Path(__file__).resolve().parents[1] / "data" / "fuzz"
 
 
 def stored_files(name: str) -> list[Files]:
     """Sets of files for a reader, each from a folder 0, 1, … of its archive; `sealed` packs .npz and .spz."""
     found: dict[str, Files] = collections.defaultdict(dict)
-    with tarfile.open(DATA / f"{name}.tar.xz") as archive:
+    with tarfile.open(DATA / "fuzz" / f"{name}.tar.xz") as archive:
         for member in archive:
             number, _, file = member.name.partition("/")
             content = archive.extractfile(member)
@@ -56,8 +57,12 @@ def sealed(files: Files) -> Files:
         try:
             content = json.loads(done["manifest.json"])
             del content["sha256"]
-            for sample, data in ((s, done[shard["file"]]) for shard in content["shards"] for s in shard["samples"]):
-                sample["sha256"] = hashlib.sha256(data[sample["offset"] :][: sample["size"]]).hexdigest()
+            for sample, data in (
+                (s, done[shard["file"]]) for shard in content["shards"] for s in shard["samples"]
+            ):
+                sample["sha256"] = hashlib.sha256(
+                    data[sample["offset"] :][: sample["size"]]
+                ).hexdigest()
             done["manifest.json"] = json.dumps(content | {"sha256": digest_of(content)}).encode()
         except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
             pass

@@ -12,8 +12,12 @@ from readers import stored_files
 
 
 def run(*arguments: object) -> str:
-    done = subprocess.run([sys.executable, fuzz.__file__, *map(str, arguments)], capture_output=True, text=True)
-    assert done.returncode == 0, f"{done.stdout}{done.stderr}: python tests/fuzz/fuzz.py --replay shows one again"
+    done = subprocess.run(
+        [sys.executable, fuzz.__file__, *map(str, arguments)], capture_output=True, text=True
+    )
+    assert done.returncode == 0, (
+        f"{done.stdout}{done.stderr}: python tests/fuzz/fuzz.py --replay shows one again"
+    )
     return done.stdout
 
 
@@ -21,7 +25,9 @@ def run(*arguments: object) -> str:
 def test_damaged_files_leave_no_thread_no_file_and_no_memory_behind(count: int) -> None:
     for line in run("-n", count, "--held", "--readers", "clips", "pictures", "depth").splitlines():
         threads, files, megabytes = map(int, line.split()[1:])
-        assert (threads, files, megabytes < 40 + count // 50) == (0, 0, True), line  # Pillow's cycles: 12 KB a picture
+        assert (threads, files, megabytes < 40 + count // 50) == (0, 0, True), (
+            line
+        )  # Pillow's cycles: 12 KB a picture
 
 
 def test_damaged_files_are_refused_in_time_and_in_memory() -> None:
@@ -29,7 +35,9 @@ def test_damaged_files_are_refused_in_time_and_in_memory() -> None:
 
 
 def test_small_files_with_a_large_announced_size_stay_below_the_bound(tmp_path: Path) -> None:
-    cases = [(name, files) for name in ("pictures", "depth") for files in stored_files(f"large_{name}")]
+    cases = [
+        (name, files) for name in ("pictures", "depth") for files in stored_files(f"large_{name}")
+    ]
     assert all(len(data) < 1_000_000 for _, files in cases for data in files.values())
     saved = [fuzz.save(name, 0, files, tmp_path / f"{k}") for k, (name, files) in enumerate(cases)]
     assert run("--replay", *saved).splitlines() == ["as it should be"] * 6

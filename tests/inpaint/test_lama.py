@@ -7,18 +7,27 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers import DATA
+from helpers.sharp_weights import waves
 from random_weights import lama_weights
 from safetensors.torch import save_file
-from sharp_weights import waves
 from torch import Tensor
 
-from spackle.errors import InputError
 from spackle.inpaint import InpainterOptions, get_inpainter
-from spackle.inpaint.lama import MARGIN, LamaInpainter, LamaNetwork, expected_shapes, groups_of, load_network, padded
+from spackle.inpaint.lama import (
+    MARGIN,
+    LamaInpainter,
+    LamaNetwork,
+    expected_shapes,
+    groups_of,
+    load_network,
+    padded,
+)
+from spackle.runtime.errors import InputError
 from spackle.weights import PUBLISHED
 
 Weights = dict[str, Tensor]
-GOLDEN = dict(np.load(Path(__file__).parents[1] / "data" / "lama_golden.npz"))  # of the original code
+GOLDEN = dict(np.load(DATA / "lama_golden.npz"))  # of the original code
 
 
 def made_input(height: int, width: int) -> Tensor:
@@ -52,10 +61,18 @@ def file(weights: Weights, tmp_path_factory: pytest.TempPathFactory) -> Path:
     ("name", "size", "height", "width", "step"),
     [("tiny", (16, 3), 64, 96, 4), pytest.param("full", (), 192, 256, 8, marks=pytest.mark.slow)],
 )
-def test_the_network_matches_the_original(name: str, size: tuple[int, ...], height: int, width: int, step: int) -> None:
-    golden, network, x = torch.from_numpy(GOLDEN[name]), LamaNetwork(lama_weights(*size)), made_input(height, width)
+def test_the_network_matches_the_original(
+    name: str, size: tuple[int, ...], height: int, width: int, step: int
+) -> None:
+    golden, network, x = (
+        torch.from_numpy(GOLDEN[name]),
+        LamaNetwork(lama_weights(*size)),
+        made_input(height, width),
+    )
     logits = network.logits(x)
-    torch.testing.assert_close(logits[0, :, ::step, ::step], golden, rtol=0, atol=1e-5 * float(golden.abs().max()))
+    torch.testing.assert_close(
+        logits[0, :, ::step, ::step], golden, rtol=0, atol=1e-5 * float(golden.abs().max())
+    )
     rgb = torch.where(x[:, 3:] > 0, torch.nan, x[:, :3])  # colours in a hole are ignored
     torch.testing.assert_close(network(rgb, x[:, 3:] > 0), logits.sigmoid(), rtol=0, atol=1e-5)
 
@@ -63,7 +80,9 @@ def test_the_network_matches_the_original(name: str, size: tuple[int, ...], heig
 def test_the_published_size() -> None:
     shapes = expected_shapes()
     assert len(shapes) == 989 - 152  # without counts of batches
-    assert sum(np.prod(shape) for name, shape in shapes.items() if "running" not in name) == 50_975_875
+    assert (
+        sum(np.prod(shape) for name, shape in shapes.items() if "running" not in name) == 50_975_875
+    )
 
 
 def named(prefix: str, weights: Weights) -> Weights:
@@ -72,9 +91,15 @@ def named(prefix: str, weights: Weights) -> Weights:
 
 @pytest.mark.parametrize("prefix", ["model.generator.", "generator.", ""])
 def test_published_files_are_read(weights: Weights, tmp_path: Path, prefix: str) -> None:
-    path, others = tmp_path / "big-lama.pt", {f"{prefix}model.1.bn_l.num_batches_tracked": torch.tensor(7)}
+    path, others = (
+        tmp_path / "big-lama.pt",
+        {f"{prefix}model.1.bn_l.num_batches_tracked": torch.tensor(7)},
+    )
     if prefix == "model.generator.":
-        others |= {"discriminator.model0.0.weight": torch.ones(3, 3), "model.generator.count": torch.ones(1)}
+        others |= {
+            "discriminator.model0.0.weight": torch.ones(3, 3),
+            "model.generator.count": torch.ones(1),
+        }
     halves = {name: x.half() for name, x in weights.items()}
     torch.save(named(prefix, halves) | others, path)
     network = load_network(path)
@@ -98,12 +123,19 @@ def test_other_networks_are_refused(
 ) -> None:
     tensors = {name: x for name, x in (weights | change).items() if x is not None}
     save_file(named("generator.", tensors), tmp_path / "big-lama.pt")
-    with pytest.raises(InputError, match=f"big-lama.pt: .*{said}.*: `spackle weights get lama` downloads"):
+    with pytest.raises(
+        InputError, match=f"big-lama.pt: .*{said}.*: `spackle weights get lama` downloads"
+    ):
         load_network(tmp_path / "big-lama.pt")
 
 
-def views(height: int, width: int, *holes: tuple[int, int, int, int]) -> tuple[Tensor, Tensor, Tensor]:
-    rgb, hole = made_input(height, width)[:, :3].permute(0, 2, 3, 1), torch.zeros(1, height, width, dtype=torch.bool)
+def views(
+    height: int, width: int, *holes: tuple[int, int, int, int]
+) -> tuple[Tensor, Tensor, Tensor]:
+    rgb, hole = (
+        made_input(height, width)[:, :3].permute(0, 2, 3, 1),
+        torch.zeros(1, height, width, dtype=torch.bool),
+    )
     for top, left, bottom, right in holes:
         hole[:, top:bottom, left:right] = True
     return torch.where(hole[..., None], 0.0, rgb), hole, torch.zeros(1, height, width)
@@ -112,7 +144,9 @@ def views(height: int, width: int, *holes: tuple[int, int, int, int]) -> tuple[T
 def test_only_holes_change_and_the_network_gets_crops(file: Path) -> None:
     inpainter = LamaInpainter(InpainterOptions(file, device="cpu"))
     seen: list[tuple[int, ...]] = []
-    inpainter._network.register_forward_pre_hook(lambda network, inputs: seen.append(tuple(inputs[1].shape[2:])))
+    inpainter._network.register_forward_pre_hook(
+        lambda network, inputs: seen.append(tuple(inputs[1].shape[2:]))
+    )
     rgb, hole, depth = views(60, 700, (20, 10, 40, 20), (0, 690, 60, 700))
     painted = inpainter.paint(rgb, hole, depth)
     assert seen == [(64, 32 + MARGIN), (64, 12 + MARGIN + 4)]
@@ -169,7 +203,9 @@ def test_errors_are_one_line(file: Path, tmp_path: Path, monkeypatch: pytest.Mon
         raise torch.OutOfMemoryError("CUDA out of memory")
 
     monkeypatch.setattr(LamaNetwork, "forward", short)
-    with pytest.raises(InputError, match="not enough memory for LaMa at 40 pixels: lower --inpainter-side"):
+    with pytest.raises(
+        InputError, match="not enough memory for LaMa at 40 pixels: lower --inpainter-side"
+    ):
         inpainter.paint(*picture)
     monkeypatch.setattr(LamaNetwork, "forward", lambda self, rgb, hole: rgb * torch.nan)
     with pytest.raises(InputError, match="not finite"):

@@ -12,9 +12,15 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from spackle.errors import InputError
 from spackle.inpaint import InpainterOptions, get_inpainter
-from spackle.inpaint.propainter import DILATION, NETWORKS, PropainterInpainter, dilated, weight_files
+from spackle.inpaint.propainter import (
+    DILATION,
+    NETWORKS,
+    PropainterInpainter,
+    dilated,
+    weight_files,
+)
+from spackle.runtime.errors import InputError
 
 OPS = """
 from torch import nn
@@ -63,7 +69,8 @@ def weights(package: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     torch.manual_seed(0)
     for name, make in zip(NETWORKS, (raft_things, propainter_rfc, propainter), strict=True):
         torch.save(
-            make().half().state_dict() | {"of_somebody_else": torch.zeros(1)}, folder / f"{name}-0000-random.pth"
+            make().half().state_dict() | {"of_somebody_else": torch.zeros(1)},
+            folder / f"{name}-0000-random.pth",
         )
     return folder
 
@@ -85,7 +92,9 @@ class Video:
 
     given: list[tuple[Tensor, Tensor]]
 
-    def __init__(self, frames: Any, masks: Any, *networks: nn.Module, use_cuda: bool, step: int) -> None:
+    def __init__(
+        self, frames: Any, masks: Any, *networks: nn.Module, use_cuda: bool, step: int
+    ) -> None:
         self.frames, self.masks = frames[0:step], masks[0:step]
         Video.given.append((self.frames, self.masks))
 
@@ -122,7 +131,9 @@ def test_inputs_of_the_networks(video: type[Video], inpainter: PropainterInpaint
     assert torch.equal(frames[:, :, 112:113].expand(-1, -1, 16, -1), frames[:, :, 112:])
     assert torch.equal(painted[~hole], rgb[~hole])
     torch.testing.assert_close(painted[hole], torch.full((int(hole.sum()), 3), 0.75))
-    torch.testing.assert_close(inpainter.paint(*(x[1:2] for x in (rgb, hole, unknown))), painted[1:2])
+    torch.testing.assert_close(
+        inpainter.paint(*(x[1:2] for x in (rgb, hole, unknown))), painted[1:2]
+    )
     assert video.given[1][0].shape == (2, 3, 128, 152)  # a video has two frames
     assert torch.equal(inpainter.paint(rgb, torch.zeros_like(hole), unknown), rgb)
 

@@ -9,11 +9,11 @@ from pathlib import Path
 
 USER = """
 import os
-import spackle._numba
-spackle._numba._FASTMATH = set(os.environ["FLAGS"].split())
+import spackle.runtime.kernels
+spackle.runtime.kernels._FASTMATH = set(os.environ["FLAGS"].split())
 from number import SIDE
 from helper import doubled
-from spackle._numba import kernel
+from spackle.runtime.kernels import kernel
 
 @kernel
 def area(x):
@@ -26,7 +26,7 @@ def inner(x):
 print(area(3), sum(area.stats.cache_hits.values()), sum(area.stats.cache_misses.values()))
 """
 HELPER = """
-from spackle._numba import kernel
+from spackle.runtime.kernels import kernel
 
 @kernel
 def doubled(x):
@@ -43,7 +43,9 @@ def run(folder: Path, side: int = 10, factor: int = 2, flags: str = "nsz afn") -
             path.write_text(text)
     mine = {"FLAGS": flags, "NUMBA_CACHE_DIR": str(folder / "kept"), "PYTHONDONTWRITEBYTECODE": "1"}
     command = [sys.executable, str(folder / "user.py")]
-    done = subprocess.run(command, env={**os.environ, **mine}, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        command, env={**os.environ, **mine}, capture_output=True, text=True, check=True
+    )
     return [int(word) for word in done.stdout.split()]
 
 

@@ -8,22 +8,24 @@ from itertools import product
 import numpy as np
 import pytest
 import torch
+from helpers.scenes import random_scene, same_bits, turned_camera
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import random_scene, same_bits, turned_camera
 
-from spackle.camera import Camera
-from spackle.color import linear_to_srgb, srgb_to_linear
-from spackle.errors import InputError
-from spackle.gaussians import Gaussians
+from spackle.core.camera import Camera
+from spackle.core.color import linear_to_srgb, srgb_to_linear
+from spackle.core.gaussians import Gaussians
 from spackle.render import TILE, CpuRenderer, get_renderer, touched_tiles
 from spackle.render.blend import decode_srgb, encode_srgb, exp2
 from spackle.render.project import BLOCK, natural_log
 from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_STOP, Rendering
 from spackle.render.reference import ReferenceRenderer, falloff, front_to_back
+from spackle.runtime.errors import InputError
 
 CPU, TWIN = CpuRenderer(), ReferenceRenderer()
-CAMERA = Camera.from_focal(100.0, 33, 33)  # an odd size: the axis meets the centre of pixel (16, 16)
+CAMERA = Camera.from_focal(
+    100.0, 33, 33
+)  # an odd size: the axis meets the centre of pixel (16, 16)
 FIELDS = ("rgb", "depth", "alpha")
 SEEDS = st.integers(0, 2**31)
 BOTH = pytest.mark.parametrize("renderer", [CPU, TWIN])
@@ -31,7 +33,11 @@ BOTH = pytest.mark.parametrize("renderer", [CPU, TWIN])
 
 def ball(x=0.0, y=0.0, z=2.0, sigma=0.04, opacity=0.5, color=(0.2, 0.4, 0.8)) -> Gaussians:
     """A round Gaussian; at z = 2 its sigma of 0.04 covers 2 of CAMERA's pixels."""
-    means, quats, scales = torch.tensor([[x, y, z]]), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), sigma)
+    means, quats, scales = (
+        torch.tensor([[x, y, z]]),
+        torch.tensor([[1.0, 0, 0, 0]]),
+        torch.full((1, 3), sigma),
+    )
     return Gaussians(means, quats, scales, torch.tensor([opacity]), torch.tensor([color]))
 
 
@@ -52,11 +58,17 @@ def sturdy_pixels(gaussians: Gaussians, camera: Camera, eps2d: float) -> torch.T
 
     alphas = torch.where(raw < ALPHA_MIN, 0, raw.clamp_max(ALPHA_MAX))
     passed = torch.cumprod(1 - alphas, dim=0)
-    return ~(near(raw, ALPHA_MIN, 1e-4) | near(raw, ALPHA_MAX, 1e-5) | near(passed, TRANSMITTANCE_STOP, 1e-3))
+    return ~(
+        near(raw, ALPHA_MIN, 1e-4)
+        | near(raw, ALPHA_MAX, 1e-5)
+        | near(passed, TRANSMITTANCE_STOP, 1e-3)
+    )
 
 
 def tile_mask(tiles: torch.Tensor, camera: Camera) -> torch.Tensor:
-    return tiles.repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)[: camera.height, : camera.width]
+    return tiles.repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)[
+        : camera.height, : camera.width
+    ]
 
 
 @BOTH
@@ -83,13 +95,20 @@ def test_faint_contributions_are_skipped(renderer, opacity):
 
 @BOTH
 def test_the_nearer_of_two_covers_the_farther_one(renderer):
-    near, far = ball(z=2.0, opacity=0.6, color=(1.0, 0.0, 0.0)), ball(z=4.0, opacity=0.5, color=(0.0, 1.0, 0.0))
+    near, far = (
+        ball(z=2.0, opacity=0.6, color=(1.0, 0.0, 0.0)),
+        ball(z=4.0, opacity=0.5, color=(0.0, 1.0, 0.0)),
+    )
     view = renderer.render([far, near], CAMERA)
     assert float(view.alpha[16, 16]) == pytest.approx(0.6 + 0.4 * 0.5)
     assert float(view.depth[16, 16]) == pytest.approx((0.6 * 2 + 0.2 * 4) / 0.8)
-    torch.testing.assert_close(view.rgb[16, 16], linear_to_srgb(torch.tensor([0.6, 0.2, 0.0])), atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        view.rgb[16, 16], linear_to_srgb(torch.tensor([0.6, 0.2, 0.0])), atol=1e-6, rtol=0
+    )
     red, green = ball(opacity=0.9, color=(1.0, 0.0, 0.0)), ball(opacity=0.9, color=(0.0, 1.0, 0.0))
-    middle = renderer.render([red, green], CAMERA).rgb[16, 16]  # Gaussians of equal depth keep their order
+    middle = renderer.render([red, green], CAMERA).rgb[
+        16, 16
+    ]  # Gaussians of equal depth keep their order
     assert middle[0] > middle[1]
 
 
@@ -128,7 +147,9 @@ def test_bad_values_are_skipped(field, bad):
     scene = random_scene(1, 300, camera)  # more than a block of the projection
     spoiled = [t.clone() for t in scene.tensors]
     spoiled[field][::2] = bad
-    assert same_bits(CPU.render(Gaussians(*spoiled), camera), CPU.render(scene.select(slice(1, None, 2)), camera))
+    assert same_bits(
+        CPU.render(Gaussians(*spoiled), camera), CPU.render(scene.select(slice(1, None, 2)), camera)
+    )
     leaf = with_grad(Gaussians(*spoiled))
     backward(CPU.render(leaf, camera))
     assert all(t.grad.isfinite().all() for t in leaf.tensors)
@@ -146,9 +167,16 @@ def test_bad_tiles_and_devices_are_refused():
 @st.composite
 def scenes(draw: st.DrawFn) -> tuple[Gaussians, Camera, float, float]:
     """Gaussians, a camera, eps2d, and the share of opaque Gaussians."""
-    camera = turned_camera(draw(st.integers(1, 50)), draw(st.integers(1, 50)), draw(st.floats(20, 90)))
+    camera = turned_camera(
+        draw(st.integers(1, 50)), draw(st.integers(1, 50)), draw(st.floats(20, 90))
+    )
     solidity, eps2d = draw(st.sampled_from([1.0, 10.0])), draw(st.sampled_from([0.0, 0.3]))
-    return random_scene(draw(SEEDS), draw(st.integers(1, 80)), camera, solidity), camera, eps2d, solidity
+    return (
+        random_scene(draw(SEEDS), draw(st.integers(1, 80)), camera, solidity),
+        camera,
+        eps2d,
+        solidity,
+    )
 
 
 def held_to_the_twin(gaussians: Gaussians, camera: Camera, eps2d: float) -> Rendering:
@@ -158,7 +186,9 @@ def held_to_the_twin(gaussians: Gaussians, camera: Camera, eps2d: float) -> Rend
     assert (~sturdy).sum() <= 2 + 0.02 * sturdy.numel()
     for name in FIELDS:
         found, expected = getattr(fast, name).double(), getattr(slow, name)
-        torch.testing.assert_close(found[sturdy], expected[sturdy], rtol=1e-5, atol=1e-5, msg=lambda m, n=name: n + m)
+        torch.testing.assert_close(
+            found[sturdy], expected[sturdy], rtol=1e-5, atol=1e-5, msg=lambda m, n=name: n + m
+        )
     return fast
 
 
@@ -182,7 +212,9 @@ def test_any_number_of_blocks_matches_the_reference(count):
 def test_needles_and_edge_on_discs_match_the_reference(stretch):
     camera = turned_camera(50, 40, 45.0)
     scene = random_scene(5, 60, camera)
-    thin = dataclasses.replace(scene, scales=scene.scales * torch.tensor(stretch), opacities=0.2 * scene.opacities)
+    thin = dataclasses.replace(
+        scene, scales=scene.scales * torch.tensor(stretch), opacities=0.2 * scene.opacities
+    )
     assert held_to_the_twin(thin, camera, 0.0).alpha.count_nonzero() > 100
 
 
@@ -192,18 +224,25 @@ def test_gradients_match_the_reference(scene):
     gaussians, camera, eps2d, _ = scene
     sturdy = sturdy_pixels(gaussians, camera, eps2d)
     # With one weighting, contributions of pixels may cancel; with several weightings, this is unlikely.
-    weights = torch.randn(4, *sturdy.shape, 5, generator=torch.Generator().manual_seed(len(gaussians)))
+    weights = torch.randn(
+        4, *sturdy.shape, 5, generator=torch.Generator().manual_seed(len(gaussians))
+    )
     weights *= sturdy[..., None]
     gradients = []
     for renderer, dtype in ((CPU, torch.float32), (TWIN, torch.float64)):
         leaf = with_grad(gaussians.to(dtype=dtype))
         view = renderer.render(leaf, camera, eps2d=eps2d)
         images = torch.cat([view.rgb, view.depth[..., None], view.alpha[..., None]], dim=-1)
-        rows = [torch.autograd.grad((images * w).sum(), leaf.tensors, retain_graph=True) for w in weights]
+        rows = [
+            torch.autograd.grad((images * w).sum(), leaf.tensors, retain_graph=True)
+            for w in weights
+        ]
         gradients.append([torch.stack(column).double() for column in zip(*rows, strict=True)])
     for name, found, expected in zip(vars(gaussians), *gradients, strict=True):
         scale = float(expected.abs().max())
-        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4 * scale, msg=lambda m, n=name: n + m)
+        torch.testing.assert_close(
+            found, expected, rtol=1e-4, atol=1e-4 * scale, msg=lambda m, n=name: n + m
+        )
 
 
 def test_gradients_survive_long_lists_of_faint_gaussians():
@@ -216,7 +255,9 @@ def test_gradients_survive_long_lists_of_faint_gaussians():
         for r, s in ((CPU, with_grad(scene)), (TWIN, with_grad(scene.to(dtype=torch.float64))))
     )
     for one, other in zip(found, expected, strict=True):
-        torch.testing.assert_close(one.double(), other, rtol=1e-4, atol=1e-4 * float(other.abs().max()))
+        torch.testing.assert_close(
+            one.double(), other, rtol=1e-4, atol=1e-4 * float(other.abs().max())
+        )
 
 
 def test_reference_gradients_match_finite_differences():
@@ -236,10 +277,14 @@ def test_approximated_functions_are_accurate():
     found = np.array([exp2(x) for x in powers])
     np.testing.assert_allclose(found, np.exp2(powers.astype(np.float64)), rtol=5e-7)
     near_one = 1 + np.random.default_rng(0).normal(size=200) * 1e-6
-    numbers = np.float32([*np.geomspace(1e-37, 1e30, 3001), *np.linspace(0.65, 1.5, 3001), 1, ALPHA_MIN, *near_one])
+    numbers = np.float32(
+        [*np.geomspace(1e-37, 1e30, 3001), *np.linspace(0.65, 1.5, 3001), 1, ALPHA_MIN, *near_one]
+    )
     found = np.array([natural_log(x) for x in numbers])
     np.testing.assert_allclose(found, np.log(numbers.astype(np.float64)), rtol=4e-16, atol=0)
-    values = torch.cat([torch.linspace(-0.1, 1.1, 4001), torch.tensor([0.0, 0.0031308, 0.0031309, 1.0])])
+    values = torch.cat(
+        [torch.linspace(-0.1, 1.1, 4001), torch.tensor([0.0, 0.0031308, 0.0031309, 1.0])]
+    )
     encoded = torch.tensor([encode_srgb(x) for x in values.numpy()])
     torch.testing.assert_close(encoded, linear_to_srgb(values), atol=1e-6, rtol=0)
     values = torch.cat([values, torch.tensor([0.04045, 0.040451])])
@@ -277,7 +322,10 @@ def test_untouched_tiles_do_not_change(scene, more_seed):
     tiles = touched_tiles(more, camera)
     mask = tile_mask(tiles, camera)
     alone = CPU.render(more, camera).alpha > 0
-    assert all(torch.equal(one[~mask], other[~mask]) for one, other in zip(after.tensors, before.tensors, strict=True))
+    assert all(
+        torch.equal(one[~mask], other[~mask])
+        for one, other in zip(after.tensors, before.tensors, strict=True)
+    )
     assert not (alone & ~mask).any()
     assert not touched_tiles(more.select(torch.zeros(len(more), dtype=torch.bool)), camera).any()
 

@@ -9,11 +9,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from spackle.camera import Camera
-from spackle.residual import Seeds, ViewFeatures
-from spackle.residual.base_values import SAME_DEPTH
+from spackle.core.camera import Camera
+from spackle.residual import InitialGaussians, ViewFeatures
+from spackle.residual.features import cell_centers
+from spackle.residual.initializer import SAME_DEPTH
 from spackle.residual.network import Rim, find_rim
-from spackle.residual.view_features import cell_centers
 
 HEIGHT, WIDTH = 12, 20  # cells
 CAMERA = Camera.from_focal(40.0, 2 * WIDTH, 2 * HEIGHT)
@@ -32,7 +32,7 @@ def moved(*eye: float, width: int = WIDTH, height: int = HEIGHT) -> Camera:
 def rim_of(mask: Tensor, inverse_depth: Tensor, rgb: Tensor, *eye: float) -> Rim:
     camera = moved(*eye, width=mask.shape[1], height=mask.shape[0])
     features = ViewFeatures(rgb, inverse_depth, (~mask).float(), mask)
-    seeds = Seeds(cell_centers(camera), inverse_depth, torch.zeros(*mask.shape, 2), rgb)
+    seeds = InitialGaussians(cell_centers(camera), inverse_depth, torch.zeros(*mask.shape, 2), rgb)
     return find_rim(features, seeds, camera, CAMERA)[0]
 
 
@@ -43,7 +43,10 @@ def row_of(first: int, last: int, depth: Tensor) -> tuple[list[int], list[int], 
     rim = rim_of(mask, depth.expand(HEIGHT, WIDTH).contiguous(), RAMP, *SIDEWAYS)
     assert torch.equal(rim.rgb[~mask], RAMP[~mask])
     assert not rim.distance[~mask].any()
-    rgb, mirrored = (torch.round(100 * colors[5, mask[5], 0]).int().tolist() for colors in (rim.rgb, rim.mirrored))
+    rgb, mirrored = (
+        torch.round(100 * colors[5, mask[5], 0]).int().tolist()
+        for colors in (rim.rgb, rim.mirrored)
+    )
     return rgb, mirrored, rim.distance[5, mask[5]].int().tolist()
 
 
@@ -52,8 +55,14 @@ def test_a_sideways_move_finds_the_farther_side_of_a_row() -> None:
     assert row_of(8, 11, torch.where(right, 0.5, 0.1)) == ([7] * 4, [6, 5, 4, 3], [1, 2, 3, 4])
     assert row_of(8, 11, torch.where(right, 0.5, 1.0)) == ([12] * 4, [16, 15, 14, 13], [4, 3, 2, 1])
     assert row_of(15, 19, ones) == ([14] * 5, [13, 12, 11, 10, 9], [1, 2, 3, 4, 5])  # one rim
-    assert row_of(0, 19, ones) == (list(range(20)), list(range(20)), [0] * 20)  # no rim: seeds are kept
-    _, mirrored, _ = row_of(8, 11, torch.where(torch.arange(WIDTH) < 6, 0.2 * SAME_DEPTH * 1.01, 0.2))
+    assert row_of(0, 19, ones) == (
+        list(range(20)),
+        list(range(20)),
+        [0] * 20,
+    )  # no rim: seeds are kept
+    _, mirrored, _ = row_of(
+        8, 11, torch.where(torch.arange(WIDTH) < 6, 0.2 * SAME_DEPTH * 1.01, 0.2)
+    )
     assert mirrored in ([6, 7, 7, 7], [16, 15, 14, 13])  # other surfaces are not mirrored
 
 
@@ -77,12 +86,16 @@ def plain_rim(mask: Tensor, depth: Tensor, rgb: Tensor, camera: Camera) -> tuple
                         best = float(depth[v, u])
                         color[y, x], distance[y, x] = rgb[v, u], k
                     break
-        if 1.4 * float(depth[y, x]) < best < math.inf:  # a nearer surface does not continue into the hole
+        if (
+            1.4 * float(depth[y, x]) < best < math.inf
+        ):  # a nearer surface does not continue into the hole
             color[y, x] = rgb[y, x]
     return color, distance
 
 
-@pytest.mark.parametrize("eye", [SIDEWAYS, (-0.2, 0.31, 0.0), (0.1, -0.05, 0.6), (0.013, 0.007, -0.5)])
+@pytest.mark.parametrize(
+    "eye", [SIDEWAYS, (-0.2, 0.31, 0.0), (0.1, -0.05, 0.6), (0.013, 0.007, -0.5)]
+)
 def test_any_move_matches_a_plain_walk(eye: tuple[float, float, float]) -> None:
     generator = torch.Generator().manual_seed(3)
     mask = torch.rand(HEIGHT, WIDTH, generator=generator) < 0.6

@@ -8,21 +8,27 @@ from pathlib import Path
 
 import pytest
 import torch
-from holes import CPU, box_view, features_of, random_network, random_view
+from helpers.holes import CPU, box_view, features_of, random_network, random_view
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.torch import save_file
 
-from spackle.camera import Camera
-from spackle.color import linear_to_srgb, srgb_to_linear
-from spackle.errors import InputError
-from spackle.network_file import channels_last, read_tensors
+from spackle.core.camera import Camera
+from spackle.core.color import linear_to_srgb, srgb_to_linear
+from spackle.paper.training.residual import first_network
 from spackle.render.protocol import Rendering
 from spackle.residual import ViewFeatures, hole_area_ratio, hole_mask
 from spackle.residual.architectures import NOTE, SharpDecoder, load_residual, open_residual
-from spackle.residual.base_values import seen_in_photo
-from spackle.residual.network import DELTA_CHANNELS, PHOTO, RIM_CHANNELS, network_input, predict_deltas
-from spackle.training.residual import first_network
+from spackle.residual.initializer import seen_in_photo
+from spackle.residual.network import (
+    DELTA_CHANNELS,
+    PHOTO,
+    RIM_CHANNELS,
+    network_input,
+    predict_deltas,
+)
+from spackle.runtime.errors import InputError
+from spackle.weights.checkpoints import channels_last, read_tensors
 
 ARCHITECTURES = ("unet", "sharp-decoder")
 
@@ -36,11 +42,17 @@ def test_hole_mask_and_ratio() -> None:
 def plain_cell(view: Rendering, row: int, column: int) -> tuple[list[float], float, float, bool]:
     """The features of a cell in plain Python; an odd last row or column counts twice."""
     height, width = view.alpha.shape
-    pixels = [(min(2 * row + dy, height - 1), min(2 * column + dx, width - 1)) for dy in (0, 1) for dx in (0, 1)]
+    pixels = [
+        (min(2 * row + dy, height - 1), min(2 * column + dx, width - 1))
+        for dy in (0, 1)
+        for dx in (0, 1)
+    ]
     alphas = [float(view.alpha[p]) for p in pixels]
     light = [sum(float(srgb_to_linear(view.rgb[p])[c]) for p in pixels) for c in range(3)]
     rgb = [float(linear_to_srgb(torch.tensor(x / max(sum(alphas), 1e-6)))) for x in light]
-    covered = [1 / float(view.depth[p]) for p, alpha in zip(pixels, alphas, strict=True) if alpha >= 0.95]
+    covered = [
+        1 / float(view.depth[p]) for p, alpha in zip(pixels, alphas, strict=True) if alpha >= 0.95
+    ]
     return rgb, min(covered, default=0.0), sum(alphas) / 4, len(covered) < 4
 
 
@@ -48,7 +60,9 @@ def plain_cell(view: Rendering, row: int, column: int) -> tuple[list[float], flo
 @given(st.integers(0, 2**32 - 1), st.tuples(st.integers(1, 7), st.integers(1, 7)))
 def test_features_match_a_plain_loop_and_are_detached(seed: int, size: tuple[int, int]) -> None:
     view = random_view(seed, *size)
-    cues = ViewFeatures.of(Rendering(*(t.clone().requires_grad_() for t in (view.rgb, view.depth, view.alpha))))
+    cues = ViewFeatures.of(
+        Rendering(*(t.clone().requires_grad_() for t in (view.rgb, view.depth, view.alpha)))
+    )
     assert not any(t.requires_grad for t in (cues.rgb, cues.inverse_depth, cues.alpha))
     rows, columns = math.ceil(size[0] / 2), math.ceil(size[1] / 2)
     assert cues.mask.shape == (rows, columns)
@@ -63,9 +77,13 @@ def test_features_match_a_plain_loop_and_are_detached(seed: int, size: tuple[int
 
 @pytest.mark.parametrize("name", ARCHITECTURES)
 @pytest.mark.parametrize("size", [(1, 1), (1, 40), (17, 31)])
-def test_the_network_takes_any_size_and_does_not_mix_a_batch(name: str, size: tuple[int, int]) -> None:
+def test_the_network_takes_any_size_and_does_not_mix_a_batch(
+    name: str, size: tuple[int, int]
+) -> None:
     network = random_network(name=name)
-    assert sum(parameter.numel() for parameter in network.parameters()) == pytest.approx(8.02e6, rel=2e-3)
+    assert sum(parameter.numel() for parameter in network.parameters()) == pytest.approx(
+        8.02e6, rel=2e-3
+    )
     features = torch.randn(2, PHOTO.stop, *size, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
         deltas, alone = network(features), torch.cat([network(f[None]) for f in features])
@@ -91,15 +109,25 @@ def test_the_networks_input_does_not_depend_on_the_unit() -> None:
 
 @pytest.mark.parametrize("name", ARCHITECTURES)
 def test_a_loaded_network_equals_the_saved_one(name: str, tmp_path: Path) -> None:
-    network, path = random_network(name=name).half().float().eval(), tmp_path / "weights.safetensors"
+    network, path = (
+        random_network(name=name).half().float().eval(),
+        tmp_path / "weights.safetensors",
+    )
     channels_last(network)  # the memory format of loaded networks, so that sums have one order
     tensors = {key: value.half().contiguous() for key, value in network.state_dict().items()}
     save_file(tensors, path, {NOTE: name})
     loaded = load_residual(path)
     assert loaded.name == name
     context, camera = box_view()
-    view = features_of(context.base, camera, context.photo_camera, CPU.render(context.base, context.photo_camera).rgb)
-    assert torch.equal(predict_deltas(loaded, *view, "fp32"), predict_deltas(network, *view, "fp32"))
+    view = features_of(
+        context.base,
+        camera,
+        context.photo_camera,
+        CPU.render(context.base, context.photo_camera).rgb,
+    )
+    assert torch.equal(
+        predict_deltas(loaded, *view, "fp32"), predict_deltas(network, *view, "fp32")
+    )
     for wrong, said in (
         (next(n for n in ARCHITECTURES if n != name), "another network's"),
         ("vit", "unknown architecture"),
@@ -113,7 +141,10 @@ def test_colours_of_the_photo_at_projected_points() -> None:
     camera = Camera.from_focal(40, 64, 48)
     pose = torch.eye(4)
     pose[0, 3] = -0.8  # at two metres, a shift of 16 pixels or 8 cells
-    photo, nowhere = torch.rand(48, 64, 3, generator=torch.Generator().manual_seed(0)), torch.zeros(24, 32, 3)
+    photo, nowhere = (
+        torch.rand(48, 64, 3, generator=torch.Generator().manual_seed(0)),
+        torch.zeros(24, 32, 3),
+    )
     cells = photo.unflatten(1, (32, 2)).unflatten(0, (24, 2)).mean((1, 3))
     view = dataclasses.replace(camera, world_to_camera=pose)
     seen = seen_in_photo(photo, nowhere, torch.full((24, 32), 0.5), view, camera)
@@ -125,7 +156,9 @@ def test_the_papers_network_starts_with_sharps_decoder(made: dict[str, Path]) ->
     network = first_network("sharp-decoder", made["sharp"])
     assert isinstance(network, SharpDecoder)
     theirs = read_tensors(made["sharp"], "give others")
-    weights = {f"feature_model.{key}": value for key, value in network.feature_model.state_dict().items()}
+    weights = {
+        f"feature_model.{key}": value for key, value in network.feature_model.state_dict().items()
+    }
     assert all(torch.equal(value, theirs[key]) for key, value in weights.items())
     assert not network(torch.randn(1, PHOTO.stop, 16, 16)).any()
     with pytest.raises(InputError, match=rf"{made['sharp'].name}: .*another network"):

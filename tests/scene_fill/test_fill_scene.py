@@ -7,17 +7,26 @@ from typing import Any
 
 import pytest
 import torch
-from holes import CPU, box_view, random_network
-from scenes import away, box_before_wall, motorcycle, motorcycle_base, psnr, same_bits, shifted, wall
+from helpers.holes import CPU, box_view, random_network
+from helpers.scenes import (
+    away,
+    box_before_wall,
+    motorcycle,
+    motorcycle_base,
+    psnr,
+    same_bits,
+    shifted,
+    wall,
+)
 
-from spackle.camera import Camera
-from spackle.camera_path import DepthRange, TrajectoryKind, extremes, trajectory
-from spackle.color import to_bytes
-from spackle.filters import greatest_around
-from spackle.gaussians import Gaussians
-from spackle.residual import ViewFeatures, hole_area_ratio, hole_mask, make_seeds
+from spackle.core.camera import Camera
+from spackle.core.color import to_bytes
+from spackle.core.gaussians import Gaussians
+from spackle.core.hole_filling import greatest_around
+from spackle.core.trajectories import DepthRange, TrajectoryKind, extremes, trajectory
+from spackle.residual import ViewFeatures, hole_area_ratio, hole_mask, initialize
 from spackle.residual.architectures import UNet
-from spackle.residual.base_values import inside_photo
+from spackle.residual.initializer import inside_photo
 from spackle.scene_fill import FillContext, fill, fill_scene, fill_view
 from spackle.scene_fill.fill import COARSE, REACH_CELLS, WIDEST, farthest_first, rim_underlay
 from spackle.scene_fill.texture import in_cells
@@ -30,7 +39,10 @@ def holes_of(camera: Camera, *gaussians: Gaussians) -> float:
 
 
 def path_of(
-    context: FillContext, kind: TrajectoryKind = "rotate-forward", disparity: float = 0.3, frames: int = FRAMES
+    context: FillContext,
+    kind: TrajectoryKind = "rotate-forward",
+    disparity: float = 0.3,
+    frames: int = FRAMES,
 ) -> list[Camera]:
     return trajectory(kind, context.photo_camera, disparity, DepthRange.of(context.base), frames)
 
@@ -48,9 +60,13 @@ def test_a_completed_view_equals_a_full_rendering(network: bool) -> None:
 
 @pytest.mark.parametrize(("size", "network"), [((64, 48), False), ((63, 47), True)])
 @pytest.mark.parametrize("empty", [False, True])
-def test_an_empty_view_is_filled_with_a_wall(size: tuple[int, int], network: bool, empty: bool) -> None:
+def test_an_empty_view_is_filled_with_a_wall(
+    size: tuple[int, int], network: bool, empty: bool
+) -> None:
     scene = wall(4.0, *size)
-    base, camera = (Gaussians.empty(), scene.camera) if empty else (scene.base(), away(scene.camera))
+    base, camera = (
+        (Gaussians.empty(), scene.camera) if empty else (scene.base(), away(scene.camera))
+    )
     aux = fill_view(FillContext(base, scene.camera, CPU, UNet() if network else None), camera).aux
     assert holes_of(camera, base) == 1
     assert all(bool(t.isfinite().all()) for t in aux.tensors)
@@ -86,7 +102,7 @@ def test_an_underlay_is_hidden_and_closes_holes_of_neighbours() -> None:
     features = ViewFeatures.of(before)
     mask, seen = features.mask, ~hole_mask(before.alpha)
     filling = fill_view(context, camera, [], before).aux
-    beneath = rim_underlay(mask, make_seeds(features, camera, context.photo_camera), camera)
+    beneath = rim_underlay(mask, initialize(features, camera, context.photo_camera), camera)
     assert len(beneath) > 100
     without, both = (CPU.render([context.base, filling, *more], camera) for more in ([], [beneath]))
     assert psnr(both.rgb[seen], before.rgb[seen]) >= 48
@@ -99,7 +115,8 @@ def test_an_underlay_is_hidden_and_closes_holes_of_neighbours() -> None:
     assert bool((row % COARSE == 0).all() and (column % COARSE == 0).all())
     beside = [path[index + step] for step in (-8, -4, 4, 8)]
     open_before, open_after = (
-        sum(holes_of(view, context.base, filling, *more) for view in beside) / 4 for more in ([], [beneath])
+        sum(holes_of(view, context.base, filling, *more) for view in beside) / 4
+        for more in ([], [beneath])
     )
     assert open_before > 1e-4
     assert open_after < 0.5 * open_before
@@ -140,7 +157,7 @@ def test_an_underlay_is_not_visible_beyond_the_border(monkeypatch: pytest.Monkey
     assert len(bare) < len(aux)
     for camera in sides:
         features = ViewFeatures.of(CPU.render(context.base, camera))
-        seeds = make_seeds(features, camera, context.photo_camera)
+        seeds = initialize(features, camera, context.photo_camera)
         beyond = features.mask & ~inside_photo(seeds.inverse_depth, camera, context.photo_camera)
         with_rims, without = (CPU.render([context.base, part], camera).rgb for part in (aux, bare))
         assert int(beyond.sum()) > 500
@@ -151,7 +168,10 @@ def test_an_underlay_is_not_visible_beyond_the_border(monkeypatch: pytest.Monkey
 def test_half_of_the_frames_are_visited_and_all_are_filled(kind: TrajectoryKind) -> None:
     calls, (context, _) = list[tuple[int, int]](), box_view(width=160, height=120)
     path = path_of(context, kind)
-    views = [*path, *extremes(context.photo_camera, 0.3, DepthRange.of(context.base))]  # as the command line adds them
+    views = [
+        *path,
+        *extremes(context.photo_camera, 0.3, DepthRange.of(context.base)),
+    ]  # as the command line adds them
     filled = fill_scene(context, views, progress=lambda done, total: calls.append((done, total)))
     visits = len(views) // 2
     assert calls == [(k, visits) for k in range(1, visits + 1)]
@@ -166,7 +186,9 @@ def test_half_of_the_frames_are_visited_and_all_are_filled(kind: TrajectoryKind)
         before = CPU.render(context.base, path[index])
         seen = ~hole_mask(before.alpha)
         assert psnr(after[index].rgb[seen], before.rgb[seen]) >= 45
-    fill_scene(context, path[::5], exact=True, progress=lambda done, total: calls.append((done, total)))
+    fill_scene(
+        context, path[::5], exact=True, progress=lambda done, total: calls.append((done, total))
+    )
     assert calls[-1] == (12, 12)  # no view of an exact path is skipped
 
 
@@ -174,12 +196,18 @@ def test_motorcycle_is_filled_and_visible_pixels_stay() -> None:
     pair, found = motorcycle(), motorcycle_base()
     context = FillContext(found.gaussians, found.camera, CPU)
     aux = fill_view(context, pair.right).aux
-    before, after = CPU.render(context.base, pair.right), CPU.render([context.base, aux], pair.right)
+    before, after = (
+        CPU.render(context.base, pair.right),
+        CPU.render([context.base, aux], pair.right),
+    )
     assert hole_area_ratio(before.alpha) > 0.08
     assert hole_area_ratio(after.alpha) <= 0.03 * hole_area_ratio(before.alpha)
     hole = hole_mask(before.alpha)
     assert psnr(after.rgb[hole], pair.right_rgb[hole]) >= 16.3
-    assert psnr(after.rgb[~hole], pair.right_rgb[~hole]) >= psnr(before.rgb[~hole], pair.right_rgb[~hole]) - 0.1
+    assert (
+        psnr(after.rgb[~hole], pair.right_rgb[~hole])
+        >= psnr(before.rgb[~hole], pair.right_rgb[~hole]) - 0.1
+    )
     photo = CPU.render(context.base, found.camera)
     whole = fill_scene(context, path_of(context, "swipe", frames=5)).aux
     for new in (aux, whole):

@@ -7,13 +7,14 @@ import math
 from collections.abc import Sequence
 
 import torch
+from helpers.scenes import away, shifted
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import away, shifted
 from torch import Tensor
 
-from spackle.camera import Camera
-from spackle.gaussians import Gaussians
+from spackle.core.camera import Camera
+from spackle.core.gaussians import Gaussians
+from spackle.core.surfels import BEHIND
 from spackle.scene_fill import OcclusionGuard
 from spackle.scene_fill.occlusion_guard import (
     MAX_REACH_PX,
@@ -21,17 +22,18 @@ from spackle.scene_fill.occlusion_guard import (
     REACH,
     STEPS,
     WINDOW_PX,
-    push_behind,
+    move_behind_surfaces,
     without_pits,
 )  # fmt: skip
-from spackle.surface import BEHIND
 
 PROPERTY = settings(deadline=None, max_examples=20)
 SEEDS = st.integers(0, 2**32 - 1)
 
 
-def plain_push(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) -> tuple[list[float], list[int]]:
-    """The factors and indices of the Gaussians that `push_behind` keeps, in plain Python."""
+def plain_push(
+    aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]
+) -> tuple[list[float], list[int]]:
+    """The factors and indices of the Gaussians that `move_behind_surfaces` keeps, in plain Python."""
 
     def blocked(point: Tensor, covariance: Tensor) -> bool:
         for guard in guards:
@@ -63,7 +65,9 @@ def plain_push(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) ->
     for index, mean in enumerate(aux.means.double()):
         for step in range(STEPS):
             factor = 1 / (1 - step / STEPS)
-            if not blocked(eye.double() + factor * (mean - eye.double()), factor**2 * covariances[index]):
+            if not blocked(
+                eye.double() + factor * (mean - eye.double()), factor**2 * covariances[index]
+            ):
                 factors.append(factor)
                 kept.append(index)
                 break
@@ -74,7 +78,10 @@ def random_aux(count: int, seed: int) -> Gaussians:
     """Random Gaussians around the origin."""
     generator = torch.Generator().manual_seed(seed)
     means = 6 * torch.randn(count, 3, generator=generator)
-    quats, drawn = torch.randn(count, 4, generator=generator), torch.rand(count, 7, generator=generator)
+    quats, drawn = (
+        torch.randn(count, 4, generator=generator),
+        torch.rand(count, 7, generator=generator),
+    )
     return Gaussians(means, quats, drawn[:, :3], drawn[:, 3], drawn[:, 4:])
 
 
@@ -88,9 +95,11 @@ def test_pushing_matches_a_plain_loop(seed: int) -> None:
     guards = [OcclusionGuard(c, d * (d > 3)) for c, d in zip(cameras, depths, strict=True)]
     eye = torch.randn(3, generator=generator)
     factors, kept = plain_push(aux, eye, guards)
-    found, factor = push_behind(aux, eye, guards), torch.tensor(factors)[:, None]
+    found, factor = move_behind_surfaces(aux, eye, guards), torch.tensor(factors)[:, None]
     assert len(found) == len(kept)
-    torch.testing.assert_close(found.means, eye + factor * (aux.means[kept] - eye), rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(
+        found.means, eye + factor * (aux.means[kept] - eye), rtol=1e-4, atol=1e-4
+    )
     torch.testing.assert_close(found.scales, aux.scales[kept] * factor, rtol=1e-4, atol=0)
     for name in ("quats", "opacities", "colors"):
         assert torch.equal(getattr(found, name), getattr(aux, name)[kept])
@@ -100,7 +109,10 @@ def test_pushing_matches_a_plain_loop(seed: int) -> None:
 @given(SEEDS, st.floats(0.2, 1))
 def test_closing_of_depths_matches_a_plain_loop(seed: int, share: float) -> None:
     generator = torch.Generator().manual_seed(seed)
-    depth, cells = 1 + torch.rand(9, 75, generator=generator), torch.rand(9, 75, generator=generator) < share
+    depth, cells = (
+        1 + torch.rand(9, 75, generator=generator),
+        torch.rand(9, 75, generator=generator) < share,
+    )
     cells[0, 0] = True
     found, places = without_pits(depth[cells], cells), cells.nonzero()
     near = (places[:, None] - places).abs().amax(-1) <= round(75 * PIT)

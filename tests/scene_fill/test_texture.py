@@ -8,24 +8,24 @@ import functools
 import numpy as np
 import pytest
 import torch
-from holes import CPU, box_view, features_of
-from plain_patches import Subject
+from helpers.holes import CPU, box_view, features_of
+from helpers.plain_patches import Subject
 from torch import Tensor
 
-from spackle.camera import Camera
-from spackle.camera_path import DepthRange, trajectory
-from spackle.filters import blurred, greatest_around
+from spackle.core.camera import Camera
+from spackle.core.hole_filling import blurred, greatest_around
+from spackle.core.patch_matching import Patches
+from spackle.core.surfels import PIXEL_SPREAD
+from spackle.core.trajectories import DepthRange, trajectory
 from spackle.inpaint import InpainterOptions
 from spackle.inpaint.plain import PlainInpainter
-from spackle.patches import Patches
-from spackle.residual import Seeds, hole_mask
-from spackle.residual.complete import compose
+from spackle.residual import InitialGaussians, hole_mask
+from spackle.residual.completion import compose
 from spackle.residual.network import find_rim
 from spackle.scene_fill import FillContext, exemplar_texture, fill_scene, fill_view, painted_texture
 from spackle.scene_fill import texture as room
 from spackle.scene_fill.fill import OPPOSITE
 from spackle.scene_fill.texture import HoleView
-from spackle.surface import PIXEL_SPREAD
 
 
 @pytest.mark.parametrize("period", [4.0, 6.0, 8.0])  # pixels
@@ -38,12 +38,16 @@ def test_sharpening_balances_overlap(period: float) -> None:
 
     def strength(colors: Tensor) -> float:
         grid = (uv, 1 / depths, torch.zeros_like(uv), 0.5 + colors)
-        blobs = compose(Seeds(*(field.flatten(0, 1) for field in grid)), None, camera, PIXEL_SPREAD)
+        blobs = compose(
+            InitialGaussians(*(field.flatten(0, 1) for field in grid)), None, camera, PIXEL_SPREAD
+        )
         shown, truth = (image[4:-4, 4:-4] for image in (CPU.render(blobs, camera).rgb, wanted))
         return float(((shown - shown.mean((0, 1))) * truth).sum() / truth.square().sum())
 
     assert strength(wanted) < 0.96
-    assert 1.05 < strength(room.sharpened(wanted)) < 1.6  # more than 1, to balance the blur of votes
+    assert (
+        1.05 < strength(room.sharpened(wanted)) < 1.6
+    )  # more than 1, to balance the blur of votes
 
 
 class Paint(PlainInpainter):
@@ -99,7 +103,10 @@ def hole_view() -> tuple[HoleView, FillContext, Camera]:
 def test_texture_has_no_low_frequencies() -> None:
     view, _, _ = hole_view()
     bad = dataclasses.replace(view.patches, mismatch=view.patches.mismatch + 100)
-    found, plain = (exemplar_texture(dataclasses.replace(view, patches=patches)) for patches in (view.patches, bad))
+    found, plain = (
+        exemplar_texture(dataclasses.replace(view, patches=patches))
+        for patches in (view.patches, bad)
+    )
     fine, mask = found - plain, view.features.mask
     assert float(room.in_cells(fine)[mask].abs().mean()) > 1e-3
     assert float(blurred(fine, 4 * room.TEXTURE_PX).abs().max()) < 0.1 * float(fine.abs().max())
@@ -117,7 +124,10 @@ def test_colours_at_the_border_are_extended() -> None:
     cells, known = beyond.nonzero(), (~features.mask).nonzero()
     apart, nearest = torch.cdist(cells.float(), known.float()).min(1)
     near, far = apart == 1, apart == apart.max()
-    shown, changed = features.rgb[tuple(known[nearest].T)] - found[beyond], (found - view.structure)[beyond].abs()
+    shown, changed = (
+        features.rgb[tuple(known[nearest].T)] - found[beyond],
+        (found - view.structure)[beyond].abs(),
+    )
     assert float(shown[near].abs().mean()) < 0.3 * float(changed[near].mean())
     assert float(changed[far].mean()) < 0.3 * float(changed[near].mean())
 

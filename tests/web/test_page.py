@@ -18,14 +18,21 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from photos import write_pair
+from helpers import ROOT
+from helpers.photos import write_pair
+from helpers.scenes import box_before_wall, psnr
+from helpers.web_client import eventually, served
 from PIL import Image
-from scenes import box_before_wall, psnr
 from torch import Tensor
-from web_client import eventually, served
 
-from spackle.camera import Camera
-from spackle.camera_path import OVERSCAN, SHARP_TRAJECTORIES, DepthRange, TrajectoryKind, trajectory
+from spackle.core.camera import Camera
+from spackle.core.trajectories import (
+    OVERSCAN,
+    SHARP_TRAJECTORIES,
+    DepthRange,
+    TrajectoryKind,
+    trajectory,
+)
 from spackle.formats.html import PageScene, page_file, page_scene, single_html
 from spackle.pipeline import complete
 from spackle.render import CpuRenderer
@@ -33,9 +40,14 @@ from spackle.scene import Scene
 from spackle.web.guard import MAX_BYTES
 from spackle.web.work import SceneWork
 
-WEB = Path(__file__).parents[2] / "web"
+WEB = ROOT / "web"
 CPU = CpuRenderer()
-FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
+FLAGS = (
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+)
 VIEW = ("swipe", 0.3, 1.0)  # far to the right, where there are holes
 
 
@@ -44,7 +56,9 @@ def box() -> Scene:
     """A small scene, completed by the seeds."""
     prediction = box_before_wall(width=64, height=48, focal=53).lift()
     depths = DepthRange.of(prediction.gaussians)
-    return complete(prediction, trajectory("swipe", prediction.camera.even(), 0.35, depths, 4), network=None)
+    return complete(
+        prediction, trajectory("swipe", prediction.camera.even(), 0.35, depths, 4), network=None
+    )
 
 
 @functools.cache
@@ -55,7 +69,10 @@ def page_of_box(name: str = "Box") -> PageScene:
 def test_the_built_page_belongs_to_its_sources() -> None:
     if not WEB.is_dir():
         pytest.skip("web/ is not here: this is no checkout")
-    sources = [*(WEB / name for name in ("build.mjs", "package-lock.json", "package.json")), *(WEB / "src").iterdir()]
+    sources = [
+        *(WEB / name for name in ("build.mjs", "package-lock.json", "package.json")),
+        *(WEB / "src").iterdir(),
+    ]
     digest = hashlib.sha256()
     for path in sorted(sources, key=lambda path: path.relative_to(WEB).as_posix()):
         digest.update(f"{path.relative_to(WEB).as_posix()}\0".encode() + path.read_bytes() + b"\0")
@@ -63,16 +80,24 @@ def test_the_built_page_belongs_to_its_sources() -> None:
     assert "http" not in (WEB / "package-lock.json").read_text(encoding="utf-8")
     wanted = json.loads((WEB / "package.json").read_text(encoding="utf-8"))["devDependencies"]
     assert all(re.fullmatch(r"\d+\.\d+\.\d+", version) for version in wanted.values())
-    for package, name in itertools.product(("three", "@sparkjsdev/spark", "fflate"), ("licenses.txt", "viewer.js")):
+    for package, name in itertools.product(
+        ("three", "@sparkjsdev/spark", "fflate"), ("licenses.txt", "viewer.js")
+    ):
         assert f"\n{package} " in page_file(name)[:8000].decode()
 
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    chromium = (
+        shutil.which("chromium")
+        or shutil.which("chromium-browser")
+        or shutil.which("google-chrome")
+    )
     if chromium is None:
         pytest.skip("there is no Chromium")
-    api = pytest.importorskip("playwright.sync_api", reason="playwright is missing: pip install '.[dev]'")
+    api = pytest.importorskip(
+        "playwright.sync_api", reason="playwright is missing: pip install '.[dev]'"
+    )
     with api.sync_playwright() as play:
         browser = play.chromium.launch(executable_path=chromium, args=[*FLAGS])
         yield browser
@@ -164,7 +189,10 @@ def test_the_single_file_opens_from_a_disk_and_asks_nobody(shown: Opened) -> Non
     assert shown.said == []
     assert [url.partition(":")[0] for url in shown.asked if not url.startswith("blob:")] == ["file"]
     assert shown.page.title() == "Box · Spackle"
-    assert shown.page.locator("#facts").inner_text() == f"{len(box().base) + len(box().aux):,} Gaussians"
+    assert (
+        shown.page.locator("#facts").inner_text()
+        == f"{len(box().base) + len(box().aux):,} Gaussians"
+    )
     assert all(shown.page.locator(name).is_hidden() for name in ("#open", "#notice"))
 
 
@@ -172,7 +200,9 @@ def test_the_single_file_opens_from_a_disk_and_asks_nobody(shown: Opened) -> Non
 def test_the_page_goes_where_the_trajectory_goes(page: Any, kind: TrajectoryKind) -> None:
     cameras = trajectory(kind, box().camera, 0.45, DepthRange.of(box().base), 121)
     places = [0, 17, 60, 61, 103, 120]
-    eyes = page.evaluate("([kind, places]) => places.map((k) => spackle.eye(kind, 0.45, k / 120))", [kind, places])
+    eyes = page.evaluate(
+        "([kind, places]) => places.map((k) => spackle.eye(kind, 0.45, k / 120))", [kind, places]
+    )
     for k, eye in zip(places, eyes, strict=True):
         np.testing.assert_allclose(eye, cameras[k].position.numpy(), atol=2e-6)
     page.evaluate("(kind) => spackle.setView(kind, 0.45, 17 / 120)", kind)
@@ -183,7 +213,9 @@ def test_the_page_goes_where_the_trajectory_goes(page: Any, kind: TrajectoryKind
 def test_the_slider_opens_the_hole_and_only_the_hole_is_filled(page: Any) -> None:
     page.evaluate("spackle.setView('swipe', 0.05, 1)")
     page.locator("#disparity").fill("0.3")
-    assert page.evaluate("spackle.pose().eye") == pytest.approx(page.evaluate("spackle.eye('swipe', 0.3, 1)"))
+    assert page.evaluate("spackle.pose().eye") == pytest.approx(
+        page.evaluate("spackle.eye('swipe', 0.3, 1)")
+    )
     filled = canvas(page)
     page.get_by_role("button", name="What the photo shows", exact=True).click(force=True)
     base = canvas(page)
@@ -191,7 +223,9 @@ def test_the_slider_opens_the_hole_and_only_the_hole_is_filled(page: Any) -> Non
     change = (filled - base).abs().amax(dim=-1)
     assert float(change[hole].quantile(0.05)) > 0.3
     assert float(change[rest].max()) < 0.04  # where the base lets 2 % through, no more
-    assert float(change[rest].mean()) < 0.004  # and that around the hole, beneath whose rim the fill goes on
+    assert (
+        float(change[rest].mean()) < 0.004
+    )  # and that around the hole, beneath whose rim the fill goes on
     assert float(base[hole].mean()) < 0.1
     # The heat map glows in the hole alone.
     page.evaluate("spackle.setLayers('both')")
@@ -246,9 +280,16 @@ def test_the_whole_photo_and_every_control_has_room(page: Any, size: tuple[int, 
         page.locator("#more").click(force=True)
     inside = " && ".join(f"frame.client{side} <= area.client{side}" for side in ("Width", "Height"))
     eventually(lambda: page.evaluate(inside))
-    for box in [each.bounding_box() for each in page.locator("button, select, #view").all() if each.is_visible()]:
+    for box in [
+        each.bounding_box()
+        for each in page.locator("button, select, #view").all()
+        if each.is_visible()
+    ]:
         assert (box["x"] >= 0, box["y"] >= 0) == (True, True)
-        assert (box["x"] + box["width"] <= size[0], box["y"] + box["height"] <= size[1]) == (True, True), box
+        assert (box["x"] + box["width"] <= size[0], box["y"] + box["height"] <= size[1]) == (
+            True,
+            True,
+        ), box
     photo = page.locator("#view").bounding_box()
     assert photo["width"] / photo["height"] == pytest.approx(64 / 48, rel=0.01)
     page.set_viewport_size(before)
@@ -280,9 +321,13 @@ def test_a_photo_is_sent_to_the_server_and_watched(browser: Any, tmp_path: Path)
         settled(page, "spackle.ready")
         assert page.title() == "my photo.png · Spackle"
         page.get_by_role("button", name="Open a photo").click(force=True)
-        page.locator("#file").set_input_files({"name": "rough.png", "mimeType": "image/png", "buffer": b"no photo"})
+        page.locator("#file").set_input_files(
+            {"name": "rough.png", "mimeType": "image/png", "buffer": b"no photo"}
+        )
         page.get_by_role("button", name="Start").click()
         page.get_by_text("rough.png: not an image").wait_for()
         assert [line for line in found.said if "415" not in line] == []
-        assert all(url.startswith((address, f"blob:http://127.0.0.1:{server.port}")) for url in found.asked)
+        assert all(
+            url.startswith((address, f"blob:http://127.0.0.1:{server.port}")) for url in found.asked
+        )
         page.context.close()

@@ -18,16 +18,27 @@ from pathlib import Path
 import numpy as np
 import pillow_heif
 import pytest
-from photos import metres
+from helpers import ROOT
+from helpers.photos import metres
+from helpers.web_client import (
+    MAX_BYTES,
+    PHOTO,
+    SCENES,
+    Served,
+    answer_of,
+    eventually,
+    form,
+    post,
+    request,
+    saved,
+    served,
+)
 from PIL import Image
-from web_client import MAX_BYTES, PHOTO, SCENES, Served, answer_of, eventually, form, post, request, saved, served
 
-from spackle.errors import InputError
-from spackle.task_process import DIED
+from spackle.runtime.errors import InputError
+from spackle.runtime.task_process import DIED
 from spackle.web.app import shown_name
-from spackle.web.jobs import Keep
-
-ROOT = Path(__file__).parents[2]
+from spackle.web.jobs import RetentionLimits
 
 
 @pytest.fixture(scope="module")
@@ -37,15 +48,26 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
 
 
 def test_a_photo_becomes_a_scene(server: Served) -> None:
-    reply = server.send(name="my photo.png", depth=("d.npy", b"depth"), options='{"base": "auto", "frames": 3}')
+    reply = server.send(
+        name="my photo.png", depth=("d.npy", b"depth"), options='{"base": "auto", "frames": 3}'
+    )
     id = reply.json["id"]
     expected = (202, f"/s3cret{SCENES}/{id}", "my photo.png")
     assert (reply.status, reply.headers["location"], reply.json["name"]) == expected
     told = server.events(id)
-    assert (told[-1]["state"], told[-1]["error"], told[-1]["line"]) == ("done", None, "focal length <50> px")
+    assert (told[-1]["state"], told[-1]["error"], told[-1]["line"]) == (
+        "done",
+        None,
+        "focal length <50> px",
+    )
     assert server.events(id) == told[-1:]  # for a page that asks later
     state = server.ask(f"{SCENES}/{id}").json
-    assert (state["state"], state["error"], state["share"], "source" in state) == ("done", None, None, False)
+    assert (state["state"], state["error"], state["share"], "source" in state) == (
+        "done",
+        None,
+        None,
+        False,
+    )
     assert state["files"] == ["photo.jpg"]  # without page.json
     page = server.ask(f"{SCENES}/{id}/files/page.json").json
     assert (page["depth"], page["options"]) == ("depth", {"base": "auto", "frames": 3})
@@ -65,7 +87,9 @@ def test_the_interface_is_described(server: Served) -> None:
     assert set(paths) == {f"{SCENES}{path}" for path in below}
     docs = server.ask("/docs").body.decode()
     assert all(word in docs for word in ("DELETE", "keep_frame", "scene.spz"))
-    assert "http" not in docs.lower().replace("http interface", "")  # nothing is fetched from elsewhere
+    assert "http" not in docs.lower().replace(
+        "http interface", ""
+    )  # nothing is fetched from elsewhere
     assert Served(server.port).ask("/healthz").json == {"status": "ok"}
 
 
@@ -86,9 +110,18 @@ def test_options_are_checked(server: Served, options: str, why: str) -> None:
 
 
 def test_every_answer_has_the_security_headers(server: Served) -> None:
-    wanted = {"x-content-type-options": "nosniff", "referrer-policy": "no-referrer", "cache-control": "no-store"}
+    wanted = {
+        "x-content-type-options": "nosniff",
+        "referrer-policy": "no-referrer",
+        "cache-control": "no-store",
+    }
     wanted |= {"cross-origin-resource-policy": "same-origin", "server": "spackle"}  # no versions
-    for reply in (server.ask(), server.ask("/no"), server.ask("/", "PUT"), server.ask(Host="evil.example")):
+    for reply in (
+        server.ask(),
+        server.ask("/no"),
+        server.ask("/", "PUT"),
+        server.ask(Host="evil.example"),
+    ):
         assert wanted.items() <= reply.headers.items()
         policy = reply.headers["content-security-policy"]
         assert all(part in policy for part in ("default-src 'none'", "frame-ancestors 'none'"))
@@ -104,7 +137,10 @@ UNKNOWN = [
     "/viewer.js%00",
     f"{SCENES}/0123456789abcdef/files/scene.ply",
     *(f"{SCENES}/{id}/files/scene.ply" for id in ("..", "%2e%2e", ".new-1")),
-    *(f"{SCENES}/0123456789abcdef/files/{name}" for name in ("..%2fetc%2fpasswd", "%252e%252e%252fpasswd", "job.json")),
+    *(
+        f"{SCENES}/0123456789abcdef/files/{name}"
+        for name in ("..%2fetc%2fpasswd", "%252e%252e%252fpasswd", "job.json")
+    ),
 ]
 HOSTS = ["evil.example", "localhost.evil.example", "10.0.0.7", "localhost:x", "[::1"]
 PAGES = [f"Origin: {page}" for page in ("http://evil.example", "null", "http://localhost:1", "")]
@@ -116,7 +152,10 @@ REFUSED = [
     *((post(len(SENT)).replace(b"localhost", host.encode()) + SENT, 403) for host in HOSTS),
     *((request("/s3cret/", header), 403) for header in PAGES + SITES),
     *((post(len(SENT), header) + SENT, 403) for header in PAGES + SITES),
-    *((request(f"/s3cret{path}", method=method), 405) for method, path in (("PUT", "/"), ("FOO", SCENES))),
+    *(
+        (request(f"/s3cret{path}", method=method), 405)
+        for method, path in (("PUT", "/"), ("FOO", SCENES))
+    ),
 ]
 MALFORMED = [
     b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03\r\n\r\n",  # TLS
@@ -130,7 +169,9 @@ MALFORMED = [
 
 
 @pytest.mark.parametrize(("data", "status"), REFUSED, ids=lambda value: repr(value)[:60])
-def test_foreign_requests_and_unknown_paths_are_refused(server: Served, data: bytes, status: int) -> None:
+def test_foreign_requests_and_unknown_paths_are_refused(
+    server: Served, data: bytes, status: int
+) -> None:
     answer, body = server.raw(data)
     assert (answer, set(json.loads(body))) == (status, {"error"})
 
@@ -145,22 +186,47 @@ def test_names_of_this_machine_are_accepted(server: Served, tmp_path: Path) -> N
     for host in ("127.0.0.1", "LOCALHOST:9", "[::1]:9000"):
         assert server.raw(request("/s3cret/", host=host))[0] == 200
     with served(tmp_path, host="0.0.0.0") as wide:  # open to the network
-        for host, status in {"10.0.0.7:80": 200, socket.gethostname(): 200, "evil.example": 403}.items():
+        for host, status in {
+            "10.0.0.7:80": 200,
+            socket.gethostname(): 200,
+            "evil.example": 403,
+        }.items():
             assert wide.raw(request("/s3cret/", host=host))[0] == status
 
 
 def test_a_token_is_asked_for_on_every_request(server: Served, tmp_path: Path) -> None:
     bare, id = Served(server.port), server.send().json["id"]
-    paths = ["/", "/viewer.js", "/page.json", "/docs", "/api/v1/openapi.json", SCENES, f"{SCENES}/{id}"]
+    paths = [
+        "/",
+        "/viewer.js",
+        "/page.json",
+        "/docs",
+        "/api/v1/openapi.json",
+        SCENES,
+        f"{SCENES}/{id}",
+    ]
     for path in paths:
         for prefix in ("", "/", "/x", "/S3CRET", "/x/s3cret"):
             assert bare.ask(prefix + path).status == 401, prefix + path
-        assert bare.ask(f"{path}?token=s3cret", Cookie="s3cret", Authorization="Bearer s3cre").status == 401
-    assert bare.ask(SCENES, "POST", form()).status == bare.ask(f"{SCENES}/{id}", "DELETE").status == 401
+        assert (
+            bare.ask(f"{path}?token=s3cret", Cookie="s3cret", Authorization="Bearer s3cre").status
+            == 401
+        )
+    assert (
+        bare.ask(SCENES, "POST", form()).status
+        == bare.ask(f"{SCENES}/{id}", "DELETE").status
+        == 401
+    )
     assert bare.ask(f"{SCENES}/{id}", Authorization="Bearer s3cret").status == 200
     assert bare.ask(SCENES, "POST", form(), Authorization="Bearer s3cret").status == 202
-    with served(tmp_path, token=None) as free:  # everybody on this machine may read, nobody may write
-        assert (free.ask().status, free.ask("/page.json").json, free.send().status) == (200, {"upload": None}, 401)
+    with served(
+        tmp_path, token=None
+    ) as free:  # everybody on this machine may read, nobody may write
+        assert (free.ask().status, free.ask("/page.json").json, free.send().status) == (
+            200,
+            {"upload": None},
+            401,
+        )
 
 
 def test_one_photo_of_a_known_kind_and_usable_size_is_accepted(server: Served) -> None:
@@ -169,7 +235,9 @@ def test_one_photo_of_a_known_kind_and_usable_size_is_accepted(server: Served) -
     tiny = io.BytesIO()
     Image.new("RGB", (1, 1)).save(tiny, "PNG")
     reply = server.send(tiny.getvalue())
-    assert (reply.status, "photo.png: 1×1 is too small" in reply.json["error"]) == (415, True), reply.body
+    assert (reply.status, "photo.png: 1×1 is too small" in reply.json["error"]) == (415, True), (
+        reply.body
+    )
     assert server.send(b"").status == server.send(depth=("d.npy", b"")).status == 400
     two = form().rsplit(b"--", 2)[0] + form(name="b.png")
     assert server.ask(SCENES, "POST", two).status == 422
@@ -178,7 +246,9 @@ def test_one_photo_of_a_known_kind_and_usable_size_is_accepted(server: Served) -
 def test_an_upload_is_bounded_while_it_comes(server: Served) -> None:
     waiting = set(server.jobs.folder.iterdir())
     assert server.send(bytes(MAX_BYTES + 1)).status == 413
-    with server.dial(post(0).replace(b"Content-Length: 0", b"Transfer-Encoding: chunked")) as endless:
+    with server.dial(
+        post(0).replace(b"Content-Length: 0", b"Transfer-Encoding: chunked")
+    ) as endless:
         with contextlib.suppress(OSError):
             endless.sendall(b"5a\r\n" + form()[:90] + b"\r\n")
             for _ in range(40):
@@ -188,7 +258,9 @@ def test_an_upload_is_bounded_while_it_comes(server: Served) -> None:
     assert set(server.jobs.folder.iterdir()) == waiting
 
 
-def test_a_slow_or_vanished_client_frees_its_place(server: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slow_or_vanished_client_frees_its_place(
+    server: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("spackle.web.app.UPLOAD_S", 0.5)
     before = set(server.jobs.folder.iterdir())
     for gone in (False, True):
@@ -202,7 +274,9 @@ def test_a_slow_or_vanished_client_frees_its_place(server: Served, monkeypatch: 
             eventually(lambda: set(server.jobs.folder.iterdir()) == before)
 
 
-def test_the_connection_of_a_silent_or_deaf_client_is_closed(server: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_connection_of_a_silent_or_deaf_client_is_closed(
+    server: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("spackle.web.app.SILENT_S", 0.3)
     monkeypatch.setattr("spackle.web.guard.SEND_S", 0.5)
     with server.dial(b"GET / HTTP/1.1\r\nHost: local") as silent:
@@ -225,7 +299,10 @@ def test_jobs_leave_no_thread_no_file_and_no_memory_behind(server: Served) -> No
             assert server.events(id)[-1]["ended"]
             assert server.ask(f"{SCENES}/{id}", "DELETE").status == 204
         eventually(lambda: len(os.listdir("/proc/self/fd")) <= files)
-        return [len(os.listdir("/proc/self/task")), int(Path("/proc/self/statm").read_text().split()[1]) >> 8]
+        return [
+            len(os.listdir("/proc/self/task")),
+            int(Path("/proc/self/statm").read_text().split()[1]) >> 8,
+        ]
 
     files = 1000
     threads, megabytes = done(6)
@@ -251,7 +328,9 @@ def png_claiming(width: int, height: int) -> bytes:
     ],
     ids=lambda value: repr(value)[:20],
 )
-def test_photos_are_recognised_by_decoding(server: Served, content: bytes | str, why: str | None) -> None:
+def test_photos_are_recognised_by_decoding(
+    server: Served, content: bytes | str, why: str | None
+) -> None:
     pillow_heif.register_heif_opener()
     if isinstance(content, str):
         assert server.send(saved(content), "a.heic").status == 202
@@ -269,7 +348,8 @@ def test_a_name_is_safe_to_show() -> None:
 
 
 @pytest.mark.parametrize(
-    ("how", "error"), [("bad", "bad.png: no depth at all"), ("bug", "internal error: KeyError: 'oh'"), ("die", DIED)]
+    ("how", "error"),
+    [("bad", "bad.png: no depth at all"), ("bug", "internal error: KeyError: 'oh'"), ("die", DIED)],
 )
 def test_an_error_is_one_line(server: Served, how: str, error: str) -> None:
     id = server.send(name=f"{how}.png").json["id"]
@@ -280,7 +360,7 @@ def test_an_error_is_one_line(server: Served, how: str, error: str) -> None:
 
 
 def test_photos_wait_and_go_on_after_a_restart(tmp_path: Path) -> None:
-    with served(tmp_path, keep=Keep(waiting=2)) as server:
+    with served(tmp_path, keep=RetentionLimits(waiting=2)) as server:
         slow = server.send(name="slow.png").json["id"]
         eventually(lambda: server.ask(f"{SCENES}/{slow}").json["stage"] == "base")
         waiting = [server.send(name=f"{k}.png").json["id"] for k in range(2)]
@@ -293,7 +373,7 @@ def test_photos_wait_and_go_on_after_a_restart(tmp_path: Path) -> None:
         eventually(lambda: server.ask(f"{SCENES}/{slow}").json["stage"] == "base")
         assert server.ask(f"{SCENES}/{slow}", "DELETE").status == 204
         assert [server.events(id)[-1]["state"] for id in waiting] == ["done", "done"]
-        server.jobs.keep = Keep(seconds=0)
+        server.jobs.keep = RetentionLimits(seconds=0)
         server.jobs.tidy()
         assert {path.name for path in tmp_path.iterdir()} == {".lock"}
 
@@ -318,7 +398,9 @@ def test_the_example_mounts_the_app(tmp_path: Path) -> None:
         with socket.socket() as probe:
             return probe.connect_ex(("127.0.0.1", port)) == 0
 
-    with subprocess.Popen([sys.executable, ROOT / "examples" / "11_server.py", tmp_path, str(port)]) as service:
+    with subprocess.Popen(
+        [sys.executable, ROOT / "examples" / "11_server.py", tmp_path, str(port)]
+    ) as service:
         try:
             mine = Served(port, "/spackle")
             eventually(listens, 60)
@@ -326,7 +408,8 @@ def test_the_example_mounts_the_app(tmp_path: Path) -> None:
             depth = io.BytesIO()
             np.save(depth, metres())
             sent = mine.send(
-                depth=("depth.npy", depth.getvalue()), options='{"frames": 2, "files": ["scene.spz"]}'
+                depth=("depth.npy", depth.getvalue()),
+                options='{"frames": 2, "files": ["scene.spz"]}',
             ).json
             assert mine.events(sent["id"])[-1]["state"] == "done"
             assert mine.ask(f"{SCENES}/{sent['id']}/files/scene.spz").body[:2] == b"\x1f\x8b"

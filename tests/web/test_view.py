@@ -15,11 +15,11 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
-from command import Run, refuses, report_of, run
-from photos import write_pair, write_photo
-from portraits import PORTRAIT
-from scenes import box_before_wall
-from web_client import SCENES, Served
+from helpers.command import Run, refuses, report_of, run
+from helpers.photos import write_pair, write_photo
+from helpers.portraits import PORTRAIT
+from helpers.scenes import box_before_wall
+from helpers.web_client import SCENES, Served
 
 import spackle
 from spackle.bases.settings import ROUGH
@@ -43,7 +43,9 @@ def visit(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Run]:
     """Run `spackle view` with a function as the browser; a signal ends the command when the function returns."""
     monkeypatch.setenv("BROWSER", "anything")
 
-    def run_view(browse: Callable[[Served, str], object], *arguments: object, end: int = signal.SIGINT) -> Run:
+    def run_view(
+        browse: Callable[[Served, str], object], *arguments: object, end: int = signal.SIGINT
+    ) -> Run:
         failed: list[BaseException] = []
 
         def browser(url: str) -> bool:
@@ -73,7 +75,9 @@ def test_a_scene_keeps_its_parts_and_its_camera(tmp_path: Path, visit: Callable[
 
     def browse(server: Served, id: str) -> None:
         seen.append(page_of(server, id))
-        assert server.ask(f"{SCENES}/{id}").json["files"] == ["scene.ply"]  # there is no photo to show meanwhile
+        assert server.ask(f"{SCENES}/{id}").json["files"] == [
+            "scene.ply"
+        ]  # there is no photo to show meanwhile
         assert server.ask(f"{SCENES}/{id}/files/scene.spz").body[:2] == b"\x1f\x8b"
         assert server.ask(f"{SCENES}/{id}/files/report.json").status == 404
 
@@ -84,7 +88,10 @@ def test_a_scene_keeps_its_parts_and_its_camera(tmp_path: Path, visit: Callable[
     assert seen[0]["camera"]["K"] == scene.camera.K.tolist()
     save_ply(scene.base(), path)  # a stranger's: all base
     result = visit(browse, path, "--fov", "90", "--host", "0.0.0.0", end=signal.SIGTERM)
-    assert (result.code, result.lines[0].startswith("warning: ")) == (130, True)  # open to the network
+    assert (result.code, result.lines[0].startswith("warning: ")) == (
+        130,
+        True,
+    )  # open to the network
     assert counts(seen[1]) == {"base": count, "aux": 0}
     assert seen[1]["camera"]["K"][0] == pytest.approx([640, 0, 640])
 
@@ -110,15 +117,22 @@ def test_a_photo_is_completed_as_predict_completes_it(
     result = visit(browse, photo, *given)
     assert result.code == 130, result.err
     assert photo.is_file()
-    assert counts(seen[0]) == {"base": report["base"]["gaussians"], "aux": report["aux"]["gaussians"]}
+    assert counts(seen[0]) == {
+        "base": report["base"]["gaussians"],
+        "aux": report["aux"]["gaussians"],
+    }
     assert [page["name"] for page in seen] == ["photo.png", "my other.jpg", "rough.png"]
     assert [page["note"] for page in seen] == ["", "", ROUGH]  # by lite, which stays near
     assert seen[2]["orbit"]["free"] <= 0.15
-    first, other = ([line for line in result.lines if line.startswith(f"{page['name']}: ")] for page in seen[:2])
+    first, other = (
+        [line for line in result.lines if line.startswith(f"{page['name']}: ")] for page in seen[:2]
+    )
     assert any("Gaussians from rgbd" in line for line in first)
     assert any("--fov" in line for line in first)
     assert other[0].startswith("my other.jpg: base rgbd (the depth in the photo)")
-    assert not any("--fov" in line or "source." in line for line in other)  # what was said of the first photo
+    assert not any(
+        "--fov" in line or "source." in line for line in other
+    )  # what was said of the first photo
     assert not list(tmp_path.glob("spackle-view-*"))
 
 
@@ -144,17 +158,37 @@ def test_bad_files_and_options(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     photo = write_photo(tmp_path / "photo.png")
     refuses(run("view", photo, "--host", "0.0.0.0", "--no-token"), "--no-token")
     with socket.create_server(("127.0.0.1", 0)) as taken:
-        bad = ["--base shrap", "--disparity 7", "--fov 200", "--depth none.npy", f"--port {taken.getsockname()[1]}"]
+        bad = [
+            "--base shrap",
+            "--disparity 7",
+            "--fov 200",
+            "--depth none.npy",
+            f"--port {taken.getsockname()[1]}",
+        ]
         for option in (*bad, "-c no.safetensors", "--port 70000", "--host no.such.host.invalid"):
             name, value = option.split()
-            refuses(done := run("view", photo, name, value), value if name in ("--depth", "-c") else name)
+            refuses(
+                done := run("view", photo, name, value),
+                value if name in ("--depth", "-c") else name,
+            )
             assert done.err.count("127.0.0.1") < 2
 
 
 def test_a_service_ends_at_once_whatever_it_is_at(tmp_path: Path) -> None:
     photo = write_photo(tmp_path / "photo.png", 1500, 1000)  # seconds of work
     environment = {**os.environ, "PYTHONPATH": str(Path(spackle.__file__).parents[1])}
-    command = [sys.executable, "-m", "spackle", "serve", "--port", "0", "-o", tmp_path / "scenes", "--base", "lite"]
+    command = [
+        sys.executable,
+        "-m",
+        "spackle",
+        "serve",
+        "--port",
+        "0",
+        "-o",
+        tmp_path / "scenes",
+        "--base",
+        "lite",
+    ]
     with subprocess.Popen(
         command, stderr=subprocess.PIPE, text=True, env=environment, start_new_session=True
     ) as process:
@@ -172,6 +206,8 @@ def test_a_service_ends_at_once_whatever_it_is_at(tmp_path: Path) -> None:
             assert process.wait(10) == 130
             assert time.monotonic() - start < 5  # a second, where nobody else wants the processor
             assert process.stderr.read().splitlines()[-1] == "interrupted"
-            assert '"state": "running"' in (tmp_path / "scenes" / id / "job.json").read_text()  # and goes on
+            assert (
+                '"state": "running"' in (tmp_path / "scenes" / id / "job.json").read_text()
+            )  # and goes on
         finally:
             process.kill()

@@ -14,14 +14,15 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from command import Run, run
-from sites import Site, serve
-from stand_in import SHARP_FILE, publish
+from helpers.command import Run, run
+from helpers.sites import Site, serve
+from helpers.stand_in import SHARP_FILE, publish
 
-from spackle.errors import InputError
+from spackle.runtime.errors import InputError
+from spackle.runtime.progress import Progress
 from spackle.weights import PUBLISHED, installed, weights_folder
 from spackle.weights import download as module
-from spackle.weights.download import Progress, download
+from spackle.weights.download import download
 
 CONTENT = random.Random(5).randbytes(1_000_003)
 SHA256 = hashlib.sha256(CONTENT).hexdigest()
@@ -70,7 +71,9 @@ def ranges(site: Site) -> list[str | None]:
     return [asked.get("Range") for asked in site.requests]
 
 
-def test_an_older_file_or_a_link_stays_until_the_new_one_is_whole(site: Site, tmp_path: Path) -> None:
+def test_an_older_file_or_a_link_stays_until_the_new_one_is_whole(
+    site: Site, tmp_path: Path
+) -> None:
     (tmp_path / "real").mkdir()
     link, real = tmp_path / "link.pt", tmp_path / "real" / "weights.pt"
     link.symlink_to(real)
@@ -95,7 +98,10 @@ def test_a_later_call_requests_only_the_rest(site: Site, target: Path, knows_ran
     assert ranges(site) == [None, f"bytes={BREAK}-"]
     assert site.requests[0]["Accept-Encoding"] == "identity"
     assert steps == sorted(set(steps))
-    assert (steps[0], steps[-1]) == ((BREAK * knows_ranges, len(CONTENT)), (len(CONTENT), len(CONTENT)))
+    assert (steps[0], steps[-1]) == (
+        (BREAK * knows_ranges, len(CONTENT)),
+        (len(CONTENT), len(CONTENT)),
+    )
 
 
 @pytest.mark.parametrize("size", [BREAK, len(CONTENT) + 1])
@@ -112,7 +118,10 @@ def test_a_part_of_another_file_is_discarded(site: Site, target: Path, size: int
         ({"content": CONTENT + b"more"}, ("the file has 1,000,007 bytes instead of 1,000,003",)),
         ({"content": CONTENT[::-1]}, ("SHA-256 is not", SHA256, "another address")),
         ({"drops": [len(CONTENT) - 10]}, ("10 bytes early", "try again")),
-        ({"headers": {"Content-Type": "text/html; charset=utf-8"}}, ("the server's answer is not a file",)),
+        (
+            {"headers": {"Content-Type": "text/html; charset=utf-8"}},
+            ("the server's answer is not a file",),
+        ),
         ({"status": 302, "headers": {"Location": "file:///etc/hostname"}}, ("HTTP 302",)),
     ],
 )
@@ -122,7 +131,9 @@ def test_answers_other_than_the_file_are_refused(
     for name, value in server.items():
         setattr(site, name, value)
     refused(site.url, target, site.url, *words)
-    assert bool(os.listdir(target.parent)) is ("10 bytes early" in words)  # the received bytes are kept
+    assert bool(os.listdir(target.parent)) is (
+        "10 bytes early" in words
+    )  # the received bytes are kept
 
 
 def test_a_full_disk_is_refused(site: Site, target: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -131,16 +142,22 @@ def test_a_full_disk_is_refused(site: Site, target: Path, monkeypatch: pytest.Mo
     assert os.listdir(target.parent) == []
 
 
-def test_servers_that_hang_are_refused(site: Site, target: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_servers_that_hang_are_refused(
+    site: Site, target: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(module, "TIMEOUT", 0.2)
     site.hang_after = 200_000
     refused(site.url, target, site.url, "no connection (timed out)")
     with socket.create_server(("127.0.0.1", 0)) as silent:
-        refused(f"http://127.0.0.1:{silent.getsockname()[1]}/", target.with_name("other"), "timed out")
+        refused(
+            f"http://127.0.0.1:{silent.getsockname()[1]}/", target.with_name("other"), "timed out"
+        )
     refused(site.url.replace("http:", "https:"), target, "SSL")
 
 
-@pytest.mark.parametrize("url", ["", "a.pt", "file:///a", "ftp://a/b", "http://", "https://[/", "http://a:b/"])
+@pytest.mark.parametrize(
+    "url", ["", "a.pt", "file:///a", "ftp://a/b", "http://", "https://[/", "http://a:b/"]
+)
 def test_other_addresses_and_passwords_are_refused(target: Path, url: str) -> None:
     refused(url, target, url)
     with pytest.raises(InputError, match="password") as caught:
@@ -155,7 +172,9 @@ def test_the_entries_of_published_weights(monkeypatch: pytest.MonkeyPatch) -> No
         assert all((entry.purpose, entry.licence, entry.notice, entry.option))
         assert entry.address == entry.url
     monkeypatch.setenv("HF_ENDPOINT", "https://mirror.example/hub/")
-    assert PUBLISHED["depth"].address.startswith("https://mirror.example/hub/Ruicheng/moge-2-vits-normal/resolve/")
+    assert PUBLISHED["depth"].address.startswith(
+        "https://mirror.example/hub/Ruicheng/moge-2-vits-normal/resolve/"
+    )
     assert PUBLISHED["sharp"].address == PUBLISHED["sharp"].url
 
 
@@ -164,7 +183,11 @@ def test_the_folder_of_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     for name in ("SPACKLE_WEIGHTS", "XDG_CACHE_HOME"):
         monkeypatch.delenv(name, raising=False)
     for variable, value, folder in (
-        ("XDG_CACHE_HOME", "relative", ".cache/spackle/weights"),  # ignored, as the XDG standard demands
+        (
+            "XDG_CACHE_HOME",
+            "relative",
+            ".cache/spackle/weights",
+        ),  # ignored, as the XDG standard demands
         ("XDG_CACHE_HOME", str(tmp_path / "cache"), "cache/spackle/weights"),
         ("SPACKLE_WEIGHTS", "~/mine", "mine"),
     ):
@@ -204,7 +227,13 @@ def test_get_shows_the_terms_once_and_does_nothing_twice(site: Site, weights: Pa
     file.write_bytes(CONTENT[::-1])
     assert f"{file}: damaged, or a file of yours" in get("sharp", "--url", site.url).err
     forced = gets("sharp", "--url", site.url, "--force", "--json")
-    told = {"name": "sharp", "file": str(file), "bytes": len(CONTENT), "sha256": SHA256, "downloaded": True}
+    told = {
+        "name": "sharp",
+        "file": str(file),
+        "bytes": len(CONTENT),
+        "sha256": SHA256,
+        "downloaded": True,
+    }
     assert json.loads(forced.out) == told
     assert file.read_bytes() == CONTENT
 
@@ -226,6 +255,9 @@ def test_list_tells_which_weights_are_on_this_machine(weights: Path) -> None:
     for content, said in ((None, "not here"), (CONTENT, "whole 1.0 MB"), (CONTENT[:-1], "damaged")):
         if content is not None:
             (weights / SHARP_FILE).write_bytes(content)
-        result, words = run("weights", "list"), ("research only", "photo to Gaussians", str(weights))
+        result, words = (
+            run("weights", "list"),
+            ("research only", "photo to Gaussians", str(weights)),
+        )
         assert (result.code, result.err) == (0, "")
         assert all(part in " ".join(result.out.split()) for part in (said, *words))

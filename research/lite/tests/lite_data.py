@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from helpers.photos import metres, picture, write_depth, write_photo
 from numpy.typing import NDArray
-from photos import metres, picture, write_depth, write_photo
 from PIL import Image
 from torch import Tensor
 

@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from ray_tracer import BOX, ELLIPSOID, NUDGE, SHEET, Solid
 
 Array = NDArray[Any]
-Hit = tuple[float, float, float, Array]  # t, the texture's u and v, the normal in the unit shape's axes
+Hit = tuple[
+    float, float, float, Array
+]  # t, the texture's u and v, the normal in the unit shape's axes
 
 
 def plain_trace(
@@ -20,7 +22,11 @@ def plain_trace(
     """Colours [N, 3] and distances [N], as from `trace`."""
     colors, distances = sky.astype(np.float64), np.full(len(rays), np.inf)
     for number, ray in enumerate(rays.astype(np.float64)):
-        seen = [(*hit, solid) for solid in solids if (hit := first_hit(solid, textures, np.zeros(3), ray, 0.05))]
+        seen = [
+            (*hit, solid)
+            for solid in solids
+            if (hit := first_hit(solid, textures, np.zeros(3), ray, 0.05))
+        ]
         if not seen:
             continue
         t, u, v, direction, solid = min(seen, key=lambda hit: hit[0])
@@ -28,9 +34,13 @@ def plain_trace(
         normal *= -np.sign(normal @ ray) / np.linalg.norm(normal)
         shine = max(0.0, float(normal @ light))
         start = (1 - NUDGE) * t * ray
-        if any(other.casts and first_hit(other, textures, start, light, NUDGE * t) for other in solids):
+        if any(
+            other.casts and first_hit(other, textures, start, light, NUDGE * t) for other in solids
+        ):
             shine = 0.0
-        colors[number] = (ambient + (1 - ambient) * shine) * between_pixels(textures[solid.texture], u, v)
+        colors[number] = (ambient + (1 - ambient) * shine) * between_pixels(
+            textures[solid.texture], u, v
+        )
         distances[number] = t
     return colors, distances
 
@@ -74,7 +84,12 @@ def unit_hits(kind: int, o: Array, d: Array) -> Iterator[Hit]:
         for t in np.roots([a, b, c]):
             place = o + t * d
             if abs(place[1]) <= 1:
-                yield t, math.atan2(place[2], place[0]) / (2 * math.pi) + 0.5, (place[1] + 1) / 2, across * place
+                yield (
+                    t,
+                    math.atan2(place[2], place[0]) / (2 * math.pi) + 0.5,
+                    (place[1] + 1) / 2,
+                    across * place,
+                )
 
 
 def between_pixels(texture: Array, u: float, v: float) -> Array:

@@ -18,8 +18,8 @@ from torch import nn
 from torch.nn.functional import avg_pool2d, interpolate
 
 from spackle.bases.lite import LiteBase
-from spackle.errors import InputError
-from spackle.training.recipe import RgbdFolder
+from spackle.paper.training.recipe import RgbdFolder
+from spackle.runtime.errors import InputError
 
 pytestmark = pytest.mark.slow  # not part of the package: `make test-slow` runs it
 
@@ -35,7 +35,9 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def frame(seed: int) -> tuple[str, Frame]:
     rng = torch.Generator().manual_seed(seed)
     depth = 0.5 + torch.rand(48, 64, generator=rng)
-    return str(seed), Frame(torch.rand(3, 48, 64, generator=rng), depth, torch.ones(48, 64, dtype=torch.bool))
+    return str(seed), Frame(
+        torch.rand(3, 48, 64, generator=rng), depth, torch.ones(48, 64, dtype=torch.bool)
+    )
 
 
 def blurred(rgb: torch.Tensor) -> torch.Tensor:
@@ -43,9 +45,15 @@ def blurred(rgb: torch.Tensor) -> torch.Tensor:
 
 
 def test_a_place_in_a_step_decides_what_stands_there_and_nothing_else() -> None:
-    mixture = Mixture([Kept([frame(n) for n in range(5)]), Kept([frame(9)])], [1.0, 0.5], (64, 96), 0)
+    mixture = Mixture(
+        [Kept([frame(n) for n in range(5)]), Kept([frame(9)])], [1.0, 0.5], (64, 96), 0
+    )
     batch = mixture.batch(7, [0, 1, 2])
-    assert batch.inverse_depth.shape == batch.valid.shape == (3, *(side // 2 for side in batch.rgb.shape[2:]))
+    assert (
+        batch.inverse_depth.shape
+        == batch.valid.shape
+        == (3, *(side // 2 for side in batch.rgb.shape[2:]))
+    )
     for place in range(3):
         alone = mixture.batch(7, [place])
         assert torch.equal(alone.rgb[0], batch.rgb[place])
@@ -57,11 +65,20 @@ def test_a_place_in_a_step_decides_what_stands_there_and_nothing_else() -> None:
     names = [mixture.name(step, 0) for step in range(300)]
     assert 70 < sum(name.startswith("9") for name in names) < 130
     assert 70 < sum(" and " in name for name in names) < 140
-    assert any(name.startswith("9 and") and name != "9 and 9" for name in names)  # merged from two sources
+    assert any(
+        name.startswith("9 and") and name != "9 and 9" for name in names
+    )  # merged from two sources
 
 
 def test_a_step_sees_its_pictures_large_or_small() -> None:
-    smooth = [Kept([(name, dataclasses.replace(one, rgb=blurred(one.rgb))) for name, one in map(frame, range(5))])]
+    smooth = [
+        Kept(
+            [
+                (name, dataclasses.replace(one, rgb=blurred(one.rgb)))
+                for name, one in map(frame, range(5))
+            ]
+        )
+    ]
     whole = Mixture(smooth, [1.0], (128, 192), 0)
     mixed = Mixture(smooth, [1.0], (128, 192), 0, (1.0, 0.5, 0.3))
     heights = []
@@ -69,8 +86,14 @@ def test_a_step_sees_its_pictures_large_or_small() -> None:
         large, small = whole.batch(step, [0, 1]), mixed.batch(step, [0, 1])
         heights.append(min(small.rgb.shape[2:]))
         assert all(side % 32 == 0 for side in small.rgb.shape[2:])
-        assert small.inverse_depth.shape == small.valid.shape == (2, *(side // 2 for side in small.rgb.shape[2:]))
-        assert (small.rgb - interpolate(large.rgb, size=small.rgb.shape[2:], mode="area")).abs().mean() < 0.02
+        assert (
+            small.inverse_depth.shape
+            == small.valid.shape
+            == (2, *(side // 2 for side in small.rgb.shape[2:]))
+        )
+        assert (
+            small.rgb - interpolate(large.rgb, size=small.rgb.shape[2:], mode="area")
+        ).abs().mean() < 0.02
         if heights[-1] == 128:
             assert torch.equal(small.rgb, large.rgb)
             assert torch.equal(small.inverse_depth, large.inverse_depth)
@@ -82,10 +105,16 @@ def test_of_two_frames_in_one_picture_the_nearer_one_shows() -> None:
     """The front frame's median becomes e^scale of the back frame's; where one is unknown, the back frame stays."""
     depth = torch.tensor([[1.0, 1.0, 4.0, 9.0, 1.0]])
     valid = torch.tensor([[True, True, True, False, True]])
-    back = Frame(torch.zeros(3, 1, 5), torch.full((1, 5), 2.0), torch.tensor([[True, True, True, True, False]]))
+    back = Frame(
+        torch.zeros(3, 1, 5),
+        torch.full((1, 5), 2.0),
+        torch.tensor([[True, True, True, True, False]]),
+    )
     front = Frame(torch.ones(3, 1, 5), depth, valid)
     shown = mingled(np.random.default_rng(0), back, front)
-    scale = 2 * math.exp(np.random.default_rng(0).uniform(*MINGLED_SCALE))  # medians where both are known
+    scale = 2 * math.exp(
+        np.random.default_rng(0).uniform(*MINGLED_SCALE)
+    )  # medians where both are known
     assert scale > 2
     expected = torch.tensor([[scale, scale, 4 * scale, 2.0, 2.0]])
     torch.testing.assert_close(shown.inverse_depth, expected)
@@ -120,7 +149,10 @@ def test_the_right_photo_has_the_depth_of_the_left_one() -> None:
     assert known.tolist() == [[True, True, True, True, False, False, True, False]]
     assert seen[known].tolist() == [8, 8, 2, 2, 8]
     # A slope that becomes wider has a crack one pixel wide, which is closed if it is empty or shows the background.
-    slope, shift = torch.tensor([[9.0, 2.0, 2.02, 2.04, 2.06]]), torch.tensor([[3.0, 0.0, 0.0, 1.0, 1.0]])
+    slope, shift = (
+        torch.tensor([[9.0, 2.0, 2.02, 2.04, 2.06]]),
+        torch.tensor([[3.0, 0.0, 0.0, 1.0, 1.0]]),
+    )
     for behind in (True, False):
         seen, known = warp_to_right(slope, torch.tensor([[behind, True, True, True, True]]), shift)
         assert known.tolist() == [[False, True, True, True, True]]
@@ -129,11 +161,16 @@ def test_the_right_photo_has_the_depth_of_the_left_one() -> None:
 
 def test_both_photos_of_a_pair_teach_and_the_left_one_judges(place: Path) -> None:
     files = LiteFiles.of(LiteData(stereo=place / "pairs", validation_stereo=place / "others"))
-    assert [(file.path.name, file.right) for file in files.stereo] == [("one", False), ("one", True)]
+    assert [(file.path.name, file.right) for file in files.stereo] == [
+        ("one", False),
+        ("one", True),
+    ]
     assert [file.right for group in files.groups for file in group.files] == [False]
     left, right = (file.read(480) for file in files.stereo)
     near, far = sorted(left.inverse_depth.unique().tolist(), reverse=True)
-    assert sorted(right.inverse_depth[right.valid].unique().tolist(), reverse=True) == pytest.approx([near, far])
+    assert sorted(
+        right.inverse_depth[right.valid].unique().tolist(), reverse=True
+    ) == pytest.approx([near, far])
     # 6 f b / z: the near part by 2 pixels, the far one by 1.
     columns = torch.arange(64.0)
     edges = [columns[(frame.inverse_depth > 0.9 * near).any(0)] for frame in (left, right)]
@@ -155,11 +192,15 @@ def test_guesses_are_kept_where_the_looks_agree_and_are_not_steep() -> None:
 
 
 def test_another_teacher_is_another_run_wherever_it_lies(place: Path, tmp_path: Path) -> None:
-    data = LiteData(photos=place / "photos", stereo=place / "pairs", validation_stereo=place / "others")
+    data = LiteData(
+        photos=place / "photos", stereo=place / "pairs", validation_stereo=place / "others"
+    )
     for name, content in (("one", b"1"), ("same", b"1"), ("two", b"2")):
         (tmp_path / name).write_bytes(content)
     teachers = [None, *(tmp_path / name for name in ("one", "same", "two"))]
-    none, one, same, two = (LiteFiles.of(data.model_copy(update={"teacher": teacher})) for teacher in teachers)
+    none, one, same, two = (
+        LiteFiles.of(data.model_copy(update={"teacher": teacher})) for teacher in teachers
+    )
     assert one.digest == same.digest
     assert len({files.digest for files in (none, one, two)}) == 3
     assert (len(none.guessed), len(one.guessed)) == (0, 3)
@@ -204,10 +245,17 @@ def test_a_network_that_knows_the_depth_has_a_perfect_score(place: Path) -> None
 
     class Knowing(nn.Module):
         def forward(self, rgb: torch.Tensor) -> torch.Tensor:
-            return frame.inverse_depth[1::2, 1::2].log()[None]  # between two pixels, the later one is sampled
+            return frame.inverse_depth[1::2, 1::2].log()[
+                None
+            ]  # between two pixels, the later one is sampled
 
     judge = DepthJudge(DepthLossWeights(), 64 * 64, torch.float32, torch.device("cpu"))
-    frame = Frame(*(torch.cat([part, part[..., :16, :]], -2) for part in (frame.rgb, frame.inverse_depth, frame.valid)))
+    frame = Frame(
+        *(
+            torch.cat([part, part[..., :16, :]], -2)
+            for part in (frame.rgb, frame.inverse_depth, frame.valid)
+        )
+    )
     found = judge.measure(Knowing(), frame)
     assert found["factor"] == found["steps"] == 0
     # The depth of pixels at outlines is between those of both sides.

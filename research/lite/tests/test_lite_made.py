@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 import synthetic_scenes
 import torch
+from helpers.photos import write_photo
 from lite_data import f32, photo
-from photos import write_photo
 from ray_tracer import SHEET, Solid
 from scene_kinds import Scene
 from standing import SMALLEST, labelled_scene, score_standing
 from synthetic_scenes import SyntheticScenes, synthetic_scene
 from textures import FIRST_SHAPE, PEAK, RING, SIDE, WHOLE, textures
 
-from spackle.errors import InputError
+from spackle.runtime.errors import InputError
 
 pytestmark = pytest.mark.slow  # not part of the package: `make test-slow` runs it
 
@@ -54,17 +54,27 @@ def test_a_made_scene_has_the_inverse_depth_of_its_planes(monkeypatch: pytest.Mo
 
 
 def test_the_same_numbers_make_the_same_scene_and_others_another() -> None:
-    one, same, other = (synthetic_scene(np.random.default_rng([seed, 1]), photo, 64, 64) for seed in (0, 0, 1))
+    one, same, other = (
+        synthetic_scene(np.random.default_rng([seed, 1]), photo, 64, 64) for seed in (0, 0, 1)
+    )
     assert all(map(torch.equal, one, same))
     assert not torch.equal(one[1], other[1])
     assert all(torch.isfinite(part).all() and (part >= 0).all() for part in (*one, *other))
 
 
-@pytest.mark.parametrize("kind", [kind for kind, _ in synthetic_scenes.KINDS], ids=lambda kind: kind.__name__)
-def test_every_kind_of_scene_has_things_before_others(kind: Kind, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "kind", [kind for kind, _ in synthetic_scenes.KINDS], ids=lambda kind: kind.__name__
+)
+def test_every_kind_of_scene_has_things_before_others(
+    kind: Kind, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(synthetic_scenes, "KINDS", ((kind, 1.0),))
-    found = [synthetic_scene(np.random.default_rng([seed, 2]), photo, 32, 48)[1] for seed in range(12)]
-    steps = [float((depth.diff(dim=1).abs() > 0.1 * depth[:, 1:]).float().mean()) for depth in found]
+    found = [
+        synthetic_scene(np.random.default_rng([seed, 2]), photo, 32, 48)[1] for seed in range(12)
+    ]
+    steps = [
+        float((depth.diff(dim=1).abs() > 0.1 * depth[:, 1:]).float().mean()) for depth in found
+    ]
     assert sum(steps) / len(steps) > 0.003
     assert all(torch.isfinite(depth).all() and float(depth.max()) < 1 / 0.049 for depth in found)
 
@@ -76,7 +86,8 @@ def test_each_pixel_of_a_street_knows_whose_it_is_and_the_score_asks_for_true_sh
     assert int((owner > 0).sum()) > 100
     perfect = score_standing(3 * true + 0.2, frame, owner)
     assert perfect.things == sum(
-        float(((owner == n) & (true > 0.01)).float().mean()) > SMALLEST for n in range(1, int(owner.max()) + 1)
+        float(((owner == n) & (true > 0.01)).float().mean()) > SMALLEST
+        for n in range(1, int(owner.max()) + 1)
     )
     assert perfect.within < 1e-6
     assert perfect.abs_rel < 1e-6
@@ -107,7 +118,9 @@ def test_shapes_let_through_what_they_do_not_cover() -> None:
 
 
 def scenes(folder: Path, count: int) -> SyntheticScenes:
-    return SyntheticScenes(folder / "made", sorted((folder / "photos").iterdir()), (32, 64), 0, count)
+    return SyntheticScenes(
+        folder / "made", sorted((folder / "photos").iterdir()), (32, 64), 0, count
+    )
 
 
 def filled(made: SyntheticScenes) -> list[str]:
@@ -127,14 +140,18 @@ def test_scenes_are_made_once_and_a_damaged_file_is_made_anew(tmp_path: Path) ->
     assert "broken.jpg" in said[0]
     frames = [made.frame(index) for index in range(6)]
     assert {tuple(frame.rgb.shape) for frame in frames} == {(3, 32, 64), (3, 64, 32)}
-    assert all(frame.inverse_depth.shape == frame.rgb.shape[1:] and frame.valid.all() for frame in frames)
+    assert all(
+        frame.inverse_depth.shape == frame.rgb.shape[1:] and frame.valid.all() for frame in frames
+    )
     (file,) = (tmp_path / "made").iterdir()
     before, whole = file.stat().st_mtime_ns, file.read_bytes()
     assert not filled(made)
     assert file.stat().st_mtime_ns == before
     for damage in (whole[:-100], b"nothing", whole.replace(b'"U8"', b'"I8"')[:50]):
         file.write_bytes(damage)
-        with pytest.raises(InputError, match=r"0000\.safetensors: no synthetic scenes, or damaged: delete it"):
+        with pytest.raises(
+            InputError, match=r"0000\.safetensors: no synthetic scenes, or damaged: delete it"
+        ):
             made.frame(5)
         assert f"{file}: damaged, made anew" in filled(made)
         assert file.read_bytes() == whole
@@ -150,5 +167,7 @@ def test_scenes_are_made_once_and_a_damaged_file_is_made_anew(tmp_path: Path) ->
 def test_photos_that_cannot_be_read_at_all_end_it(tmp_path: Path) -> None:
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "broken.jpg").write_bytes(b"\xff\xd8 no more")
-    with pytest.raises(InputError, match=r"photos in a row cannot be read: give others as data\.photos"):
+    with pytest.raises(
+        InputError, match=r"photos in a row cannot be read: give others as data\.photos"
+    ):
         filled(scenes(tmp_path, 1))

@@ -10,9 +10,9 @@ import pytest
 import torch
 from depth_loss import DepthLossWeights, depth_loss, score_depth, vertical_ramp
 from frames import Frame, Turning, relit, turned
+from helpers.photos import picture
 from lite_data import f32
 from numpy.typing import NDArray
-from photos import picture
 from plain_trace import plain_trace
 from ray_tracer import BOX, CYLINDER, ELLIPSOID, SHEET, Solid, trace
 from task import VIRIDIS, colored
@@ -21,7 +21,7 @@ from torch.nn.functional import batch_norm, conv2d, pad, relu6
 from weights import load_encoder
 
 from spackle.bases.lite import STAGES, TAPS, Encoder, Size
-from spackle.errors import InputError
+from spackle.runtime.errors import InputError
 
 pytestmark = pytest.mark.slow  # not part of the package: `make test-slow` runs it
 
@@ -39,7 +39,9 @@ def random_solids(rng: np.random.Generator, count: int) -> list[Solid]:
         center = rng.uniform((-1, -1, 0.5), (1, 1, 4.0))
         kind = (SHEET, BOX, ELLIPSOID, CYLINDER)[number % 4]
         repeats = (float(rng.uniform(1, 3)), float(rng.uniform(1, 3)))
-        solids.append(Solid(kind, f32(center), f32(axes), number % 3, repeats, casts=number % 5 > 0))
+        solids.append(
+            Solid(kind, f32(center), f32(axes), number % 3, repeats, casts=number % 5 > 0)
+        )
     return solids
 
 
@@ -100,7 +102,11 @@ def test_a_camera_that_is_not_turned_sees_a_part_of_the_photo() -> None:
     frame = plane(48, 64)
     for seed in range(4):
         seen = turned(np.random.default_rng(seed), frame, 48, 64, still)
-        rgb, valid = (seen.rgb, seen.valid) if not seen.valid[24, 1] else (seen.rgb.flip(-1), seen.valid.flip(-1))
+        rgb, valid = (
+            (seen.rgb, seen.valid)
+            if not seen.valid[24, 1]
+            else (seen.rgb.flip(-1), seen.valid.flip(-1))
+        )
         # As wide as the frame, but for the stretch across, at most a few pixels at the ends.
         assert float((rgb[:, :, 32] - frame.rgb[:, :, 32]).abs().mean()) < 0.02
         assert torch.equal(seen.inverse_depth[seen.valid].unique(), torch.tensor([1.0]))
@@ -109,11 +115,15 @@ def test_a_camera_that_is_not_turned_sees_a_part_of_the_photo() -> None:
 
 def test_a_camera_turned_aside_sees_a_frontal_plane_aslant() -> None:
     """Its inverse depth is n·ray, with the plane's normal n in the new camera, |n| = 1: affine in the pixel."""
-    seen = turned(np.random.default_rng(5), plane(48, 64), 48, 64, Turning((1.5, 1.5), (10.0, 10.0, 10.0)))
+    seen = turned(
+        np.random.default_rng(5), plane(48, 64), 48, 64, Turning((1.5, 1.5), (10.0, 10.0, 10.0))
+    )
     rows, columns = (place.double() for place in seen.valid.nonzero(as_tuple=True))
     A = torch.stack([columns, rows, torch.ones_like(rows)], 1)
     fitted = torch.linalg.lstsq(A, seen.inverse_depth[seen.valid].double()[:, None]).solution[:, 0]
-    torch.testing.assert_close(A @ fitted, seen.inverse_depth[seen.valid].double(), rtol=0, atol=1e-6)
+    torch.testing.assert_close(
+        A @ fitted, seen.inverse_depth[seen.valid].double(), rtol=0, atol=1e-6
+    )
     assert float(fitted[:2].norm()) > 1e-4
     assert float(seen.inverse_depth[seen.valid].max()) < 1.5
 
@@ -133,7 +143,10 @@ def test_other_light_changes_colours_and_keeps_them_colours() -> None:
 
 def terms(predicted: Tensor, truth: list[float], valid: list[bool]) -> dict[str, float]:
     loss, found = depth_loss(
-        predicted[None, None], torch.tensor([[truth]]), torch.tensor([[valid]]), DepthLossWeights(2.0, 3.0, 0.5, 0.25)
+        predicted[None, None],
+        torch.tensor([[truth]]),
+        torch.tensor([[valid]]),
+        DepthLossWeights(2.0, 3.0, 0.5, 0.25),
     )
     numbers = {name: float(value) for name, value in found.items()}
     offset = numbers.pop("offset")
@@ -156,7 +169,9 @@ def test_each_term_of_the_loss_is_what_it_says_it_is() -> None:
     scale = sum(a * (b - mean) for a, b in zip(p, t, strict=True)) / (sum(a * a for a in p) + 4e-3)
     line = sum(abs(scale * a + mean - b) / (b + 0.2) for a, b in zip(p, t, strict=True)) / 4
     assert found["line"] == pytest.approx(line, rel=1e-4)
-    assert terms(right, truth, known) == pytest.approx({"factor": 0, "line": 0, "steps": 0}, abs=1e-3)
+    assert terms(right, truth, known) == pytest.approx(
+        {"factor": 0, "line": 0, "steps": 0}, abs=1e-3
+    )
 
 
 def test_only_the_offset_knows_a_factor_and_pulls_it_back() -> None:
@@ -165,7 +180,9 @@ def test_only_the_offset_knows_a_factor_and_pulls_it_back() -> None:
     valid = torch.tensor([True, True, False])[:, None, None].expand(3, 1, 3)
     predicted = (truth.log() + torch.tensor([3.0, 0.0, 9.0])[:, None, None]).requires_grad_()
     loss, found = depth_loss(predicted, truth, valid, DepthLossWeights(offset=0.6))
-    assert float(found["offset"]) == pytest.approx((3 + 2 * math.log(2)) / 3)  # t is over its median, 2
+    assert float(found["offset"]) == pytest.approx(
+        (3 + 2 * math.log(2)) / 3
+    )  # t is over its median, 2
     assert loss.item() == pytest.approx(0.6 * float(found["offset"]), abs=2e-3)
     (gradient,) = torch.autograd.grad(loss, predicted)
     assert gradient.sum((1, 2)).tolist() == pytest.approx([0.2, 0.2, 0], abs=1e-3)
@@ -180,7 +197,9 @@ def test_what_is_not_known_does_not_count_and_gross_errors_count_as_less() -> No
     truth = [1.0, 2.0, 4.0, 8.0, 0.0, 1e9]
     known = [True, True, True, True, False, False]
     right = torch.tensor([1.0, 2.0, 4.0, 8.0, 0.01, 700.0]).log()
-    assert terms(right, truth, known) == pytest.approx({"factor": 0, "line": 0, "steps": 0}, abs=1e-3)
+    assert terms(right, truth, known) == pytest.approx(
+        {"factor": 0, "line": 0, "steps": 0}, abs=1e-3
+    )
     found = terms(right + torch.tensor([0.0, 0.0, 0.0, -5.0, 0.0, 0.0]), truth, known)
     assert found["factor"] == pytest.approx(2 / 4)
     assert found["steps"] == pytest.approx(1 / 4)  # strides 2 and 4 skip it
@@ -188,7 +207,10 @@ def test_what_is_not_known_does_not_count_and_gross_errors_count_as_less() -> No
 
 
 def test_the_sky_is_far_and_that_is_all_that_is_known_of_it() -> None:
-    found = [terms(torch.tensor([0.0, 0.0, 0.0, sky]), [1.0, 1.0, 1.0, 0.0], [True] * 4) for sky in (0.0, -3.9, -9.0)]
+    found = [
+        terms(torch.tensor([0.0, 0.0, 0.0, sky]), [1.0, 1.0, 1.0, 0.0], [True] * 4)
+        for sky in (0.0, -3.9, -9.0)
+    ]
     assert found[1]["factor"] == pytest.approx((math.log(50) - 3.9) / 4, abs=1e-6)
     assert found[0]["factor"] == pytest.approx(2 / 4) == found[2]["factor"]
 
@@ -217,12 +239,16 @@ def test_a_score_by_hand() -> None:
     score = score_depth(torch.full((2, 2), 0.3), depth, torch.ones(2, 2, dtype=torch.bool))
     assert score.abs_rel == pytest.approx(1 / 3)
     assert score.delta == 0
-    assert score_depth(vertical_ramp(2, 2), 3 - depth, depth > 0).abs_rel == pytest.approx(0, abs=1e-6)
+    assert score_depth(vertical_ramp(2, 2), 3 - depth, depth > 0).abs_rel == pytest.approx(
+        0, abs=1e-6
+    )
 
 
 def test_what_would_lie_behind_the_eye_is_put_far_away() -> None:
     depth = torch.tensor([[1.0, 1.0, 1.0, 10.0]])
-    score = score_depth(torch.tensor([[1.0, 0.9, 1.1, -9.0]]), depth, torch.ones(1, 4, dtype=torch.bool))
+    score = score_depth(
+        torch.tensor([[1.0, 0.9, 1.1, -9.0]]), depth, torch.ones(1, 4, dtype=torch.bool)
+    )
     assert score.abs_rel < 0.5
 
 
@@ -231,7 +257,9 @@ def test_near_is_light_and_unknown_is_grey() -> None:
     shown = colored(values, 0.0, 2.0, torch.tensor([[True, True, True, False]]))
     assert torch.equal(shown[0, :3], VIRIDIS[[0, 4, 8]])
     assert len(shown[0, 3].unique()) == 1
-    luminance = colored(torch.linspace(0, 1, 50)[None], 0.0, 1.0) @ torch.tensor([0.2126, 0.7152, 0.0722])
+    luminance = colored(torch.linspace(0, 1, 50)[None], 0.0, 1.0) @ torch.tensor(
+        [0.2126, 0.7152, 0.0722]
+    )
     assert (luminance.diff() > 0).all()
 
 
@@ -245,13 +273,23 @@ def published(rng: torch.Generator, size: Size) -> dict[str, Tensor]:
     def layer(convolution: str, norm: str, shape: torch.Size) -> None:
         fan = shape[1] * shape[2] * shape[3]
         tensors[f"{convolution}.weight"] = torch.randn(shape, generator=rng) * (2 / fan) ** 0.5
-        for name, low, high in (("weight", 0.5, 1.5), ("bias", -0.2, 0.5), ("running_mean", -0.2, 0.2)):
+        for name, low, high in (
+            ("weight", 0.5, 1.5),
+            ("bias", -0.2, 0.5),
+            ("running_mean", -0.2, 0.2),
+        ):
             tensors[f"{norm}.{name}"] = low + (high - low) * torch.rand(shape[0], generator=rng)
         tensors[f"{norm}.running_var"] = 0.5 + torch.rand(shape[0], generator=rng)
 
-    shapes = {name: tensor.shape for name, tensor in Encoder(size).state_dict().items() if name.endswith("weight")}
+    shapes = {
+        name: tensor.shape
+        for name, tensor in Encoder(size).state_dict().items()
+        if name.endswith("weight")
+    }
     layer("_conv_stem", "_bn0", shapes["stem.weight"])
-    places = [(stage, block) for stage, (count, *_) in enumerate(STAGES[size]) for block in range(count)]
+    places = [
+        (stage, block) for stage, (count, *_) in enumerate(STAGES[size]) for block in range(count)
+    ]
     for number, (stage, block) in enumerate(places):
         ours, theirs = f"stages.{stage}.{block}", f"_blocks.{number}"
         for part, norm in (("expand", "_bn0"), ("depthwise", "_bn1"), ("project", "_bn2")):
@@ -267,8 +305,12 @@ def plain_features(tensors: dict[str, Tensor], x: Tensor, size: Size) -> list[Te
         weight = tensors[f"{convolution}.weight"]
         kernel, side = weight.shape[-1], x.shape[-1]
         missing = max(0, (-(-side // stride) - 1) * stride + kernel - side)
-        x = conv2d(pad(x, (missing // 2, missing - missing // 2) * 2), weight, stride=stride, groups=groups)
-        mean, var, gain, bias = (tensors[f"{norm}.{n}"] for n in ("running_mean", "running_var", "weight", "bias"))
+        x = conv2d(
+            pad(x, (missing // 2, missing - missing // 2) * 2), weight, stride=stride, groups=groups
+        )
+        mean, var, gain, bias = (
+            tensors[f"{norm}.{n}"] for n in ("running_mean", "running_var", "weight", "bias")
+        )
         return batch_norm(x, mean, var, gain, bias, eps=1e-3)
 
     x = relu6(layer((x * 255 - 127) / 128, "_conv_stem", "_bn0", 2))
@@ -289,24 +331,32 @@ def plain_features(tensors: dict[str, Tensor], x: Tensor, size: Size) -> list[Te
 
 
 @pytest.mark.parametrize("size", ["lite0", "lite2"])
-def test_folded_weights_do_what_convolutions_and_normalisations_did(tmp_path: Path, size: Size) -> None:
+def test_folded_weights_do_what_convolutions_and_normalisations_did(
+    tmp_path: Path, size: Size
+) -> None:
     rng = torch.Generator().manual_seed(0)
     tensors = published(rng, size)
     torch.save(tensors, tmp_path / "published.pth")
     photos = torch.rand(1, 3, 64, 64, generator=rng)
     with torch.no_grad():
         for mine, plain in zip(
-            load_encoder(size, tmp_path / "published.pth")(photos), plain_features(tensors, photos, size), strict=True
+            load_encoder(size, tmp_path / "published.pth")(photos),
+            plain_features(tensors, photos, size),
+            strict=True,
         ):
             torch.testing.assert_close(mine, plain, rtol=1e-3, atol=1e-3 * float(plain.std()))
 
 
-@pytest.mark.parametrize("content", [b"", b"nothing", {"_conv_stem.weight": torch.zeros(1)}, [1, 2], torch.zeros(3)])
+@pytest.mark.parametrize(
+    "content", [b"", b"nothing", {"_conv_stem.weight": torch.zeros(1)}, [1, 2], torch.zeros(3)]
+)
 def test_a_file_that_is_no_efficientnet_is_refused(tmp_path: Path, content: object) -> None:
     path = tmp_path / "other.pth"
     if isinstance(content, bytes):
         path.write_bytes(content)
     else:
         torch.save(content, path)
-    with pytest.raises(InputError, match=r"other\.pth: no weights of EfficientNet-Lite2 for PyTorch: give encoder="):
+    with pytest.raises(
+        InputError, match=r"other\.pth: no weights of EfficientNet-Lite2 for PyTorch: give encoder="
+    ):
         load_encoder("lite2", path)

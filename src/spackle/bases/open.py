@@ -12,18 +12,19 @@ import logging
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 
-from spackle.bases import Base, BasePrediction, Progress
-from spackle.bases.depth_map import DepthMap, find_depth, load_depth
-from spackle.bases.hf import HfBase
-from spackle.bases.lift import RgbdBase
+from spackle.bases import Base, BasePrediction
+from spackle.bases.depth import RgbdBase
 from spackle.bases.lite import LiteBase
 from spackle.bases.moge.base import MogeBase
-from spackle.bases.photo_depth.layouts import load_photo_depth
 from spackle.bases.settings import AUTO, HF, NETWORKS, RGBD, ROUGH, BaseSettings, Depth
 from spackle.bases.sharp.base import SharpBase
-from spackle.device import MemoryShort
-from spackle.errors import InputError
-from spackle.image import Photo
+from spackle.bases.transformers import HfBase
+from spackle.core.photo import Photo
+from spackle.depth.depth_map import DepthMap, find_depth, load_depth
+from spackle.depth.in_photo.layouts import load_photo_depth
+from spackle.runtime.device import MemoryShort
+from spackle.runtime.errors import InputError
+from spackle.runtime.progress import Progress
 
 LOG = logging.getLogger("spackle")
 Log = Callable[[str], None]
@@ -45,8 +46,16 @@ class BaseError(InputError):
 def open_base(settings: BaseSettings) -> OpenedBase:
     """A base by its settings, whose network is loaded for the first photo; InputError for unsuitable settings."""
     settings.check()
-    why = f"--base {settings.named}" if settings.name != AUTO else "--depth" if settings.depth is not None else "-c"
-    return OpenedBase(ORDER if settings.named == AUTO else {settings.named: (why, "")}, settings, {})
+    why = (
+        f"--base {settings.named}"
+        if settings.name != AUTO
+        else "--depth"
+        if settings.depth is not None
+        else "-c"
+    )
+    return OpenedBase(
+        ORDER if settings.named == AUTO else {settings.named: (why, "")}, settings, {}
+    )
 
 
 def open_loaded(base: Base) -> OpenedBase:
@@ -83,9 +92,15 @@ def _lift(settings: BaseSettings, photo: Photo, depth: Depth) -> Base | None:
     if isinstance(source, DepthMap):
         found, read = source, None
     else:
-        ends = {name: end for name, end in (("near", settings.near), ("far", settings.far)) if end is not None}
+        ends = {
+            name: end
+            for name, end in (("near", settings.near), ("far", settings.far))
+            if end is not None
+        }
         file = find_depth(source, photo.path)
-        read = functools.partial(load_depth, file, calib=settings.calib, kind=settings.depth_kind, **ends)
+        read = functools.partial(
+            load_depth, file, calib=settings.calib, kind=settings.depth_kind, **ends
+        )
         found = read()
     if found.K is None or not photo.focal_source.startswith("--"):  # "--…": the user gave it
         return RgbdBase(found)
@@ -101,18 +116,25 @@ class ResolvedBase:
     why: str
     failures: tuple[str, ...] = ()  # name and error of each candidate that failed before
     note: str = ""  # for the user, if `auto` chose this base for the first time
-    lasting: bool = True  # False: memory was short for a better base, which may work in the next run
+    lasting: bool = (
+        True  # False: memory was short for a better base, which may work in the next run
+    )
 
 
 class OpenedBase:
     """Turns photos into Gaussians. A network is loaded when a photo first needs it, and kept for later photos."""
 
     def __init__(
-        self, candidates: Mapping[str, tuple[str, str]], settings: BaseSettings, loaded: dict[str, Base | None]
+        self,
+        candidates: Mapping[str, tuple[str, str]],
+        settings: BaseSettings,
+        loaded: dict[str, Base | None],
     ) -> None:
         """`candidates` are tried in their order (see `ORDER`); `loaded` maps names to networks already loaded."""
         self.candidates, self._settings, self._loaded = candidates, settings, loaded
-        self._times = {file: file.stat().st_mtime_ns for file in settings.files.values() if file.is_file()}
+        self._times = {
+            file: file.stat().st_mtime_ns for file in settings.files.values() if file.is_file()
+        }
         # Candidates that no photo can use: the reason, and whether memory was short.
         self._failed: dict[str, tuple[str, bool]] = {}
         self._notes: set[str] = set()  # given for earlier photos
@@ -148,7 +170,9 @@ class OpenedBase:
                 break
             except InputError as error:
                 shared = name != RGBD or name in self._loaded
-                for_good = shared and (base is None or isinstance(error, MemoryShort))  # another photo does not help
+                for_good = shared and (
+                    base is None or isinstance(error, MemoryShort)
+                )  # another photo does not help
                 if for_good and len(self.candidates) == 1:
                     raise BaseError(str(error)) from error
                 if name == list(self.candidates)[-1] or isinstance(error, BaseError):
@@ -173,7 +197,10 @@ class OpenedBase:
             return _lift(self._settings, photo, depth)
         if name not in self._loaded:
             self._loaded[name] = _load_network(name, self._settings)
-            if any(not file.is_file() or file.stat().st_mtime_ns != time for file, time in self._times.items()):
+            if any(
+                not file.is_file() or file.stat().st_mtime_ns != time
+                for file, time in self._times.items()
+            ):
                 raise BaseError("a file of weights changed while this was running: start again")
         return self._loaded[name]
 

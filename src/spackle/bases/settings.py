@@ -9,10 +9,10 @@ from pathlib import Path
 from rich.filesize import decimal
 
 from spackle.bases import lite
-from spackle.bases.depth_map import DEPTH_KINDS, RELATIVE, DepthKind, DepthMap
 from spackle.bases.sharp.base import check_windows
-from spackle.device import PRECISIONS, Precision
-from spackle.errors import InputError, check_name
+from spackle.depth.depth_map import DEPTH_KINDS, RELATIVE, DepthKind, DepthMap
+from spackle.runtime.device import PRECISIONS, Precision
+from spackle.runtime.errors import InputError, check_name
 from spackle.weights import PUBLISHED, installed
 
 AUTO, RGBD = "auto", "rgbd"
@@ -22,7 +22,10 @@ NETWORKS = (*AUTO_NETWORKS, "hf:NAME_OR_FOLDER")
 READING = ("--depth-kind", "--near", "--far")  # how to read a depth map
 NOT_SHARP = "lifted; not SHARP, so not the paper's base"
 KINDS = {  # each base's description below tables, and the options that only some bases take
-    RGBD: (f"the dataset's own depth, map or points, {NOT_SHARP}", ("--depth", "--calib", *READING)),
+    RGBD: (
+        f"the dataset's own depth, map or points, {NOT_SHARP}",
+        ("--depth", "--calib", *READING),
+    ),
     "sharp": ("SHARP's network, from the photo alone", ("-c", "--precision", "--sharp")),
     "moge": (f"MoGe-2, from the photo alone, {NOT_SHARP}", ("-c", "--precision")),
     "lite": (f"Spackle's own small depth networks, from the photo alone, {NOT_SHARP}", ("-c",)),
@@ -31,7 +34,9 @@ KINDS = {  # each base's description below tables, and the options that only som
 }
 HF_FILES: tuple[str, ...] = ("config.json", "preprocessor_config.json", "processor_config.json")
 HF_FILES += ("model.safetensors", "model-*.safetensors", "model.safetensors.index.json")
-Depth = Path | DepthMap | None  # a photo's depth; a path may be a folder of depth maps named like the photos
+Depth = (
+    Path | DepthMap | None
+)  # a photo's depth; a path may be a folder of depth maps named like the photos
 
 
 def _download(name: str) -> str:
@@ -60,11 +65,15 @@ class BaseSettings:
     depth: Depth = None
     calib: Path | None = None  # calibration of a disparity map
     depth_kind: DepthKind = "auto"  # what the numbers of a depth map are
-    near: float | None = None  # nearest depth of a relative map in metres; None: `load_depth`'s default
+    near: float | None = (
+        None  # nearest depth of a relative map in metres; None: `load_depth`'s default
+    )
     far: float | None = None  # farthest depth of a relative map in metres
     checkpoint: Path | None = None  # weights of SHARP, MoGe or lite
     precision: Precision = "auto"  # of the network
-    windows: int | None = None  # number of windows that SHARP computes at once; 1 takes the least memory
+    windows: int | None = (
+        None  # number of windows that SHARP computes at once; 1 takes the least memory
+    )
     device: str = "auto"
 
     @property
@@ -99,7 +108,12 @@ class BaseSettings:
     def files(self) -> dict[str, Path]:
         """The files that predictions depend on: weights by the base's name, or a folder's files by their own names."""
         if self.folder is not None:
-            return {file.name: file for p in HF_FILES for file in sorted(self.folder.glob(p)) if file.is_file()}
+            return {
+                file.name: file
+                for p in HF_FILES
+                for file in sorted(self.folder.glob(p))
+                if file.is_file()
+            }
         names = AUTO_NETWORKS if self.named == AUTO else (self.named,)
         found = {name: self.checkpoint or _weights_here(name) for name in names}
         return {name: file for name, file in found.items() if file is not None}
@@ -108,9 +122,13 @@ class BaseSettings:
         """InputError for an unknown base or an option that the base cannot use; if `one`, also for the base `auto`."""
         if one and self.name == AUTO:
             known = ", ".join((RGBD, *NETWORKS))
-            raise InputError(f"--base {AUTO} is not allowed here, because the results name their base: give {known}")
+            raise InputError(
+                f"--base {AUTO} is not allowed here, because the results name their base: give {known}"
+            )
         if self.name == HF:
-            raise InputError(f"--base {HF} names no model: give a Hugging Face model as owner/name, or a folder")
+            raise InputError(
+                f"--base {HF} names no model: give a Hugging Face model as owner/name, or a folder"
+            )
         if not self.name.startswith(HF):
             check_name("--base", self.name, (AUTO, RGBD, *NETWORKS))
         check_name("--precision", self.precision, PRECISIONS)
@@ -127,13 +145,23 @@ class BaseSettings:
         kind = self.named.partition(":")[0]
         for option, value in options.items():
             if value is not None and option not in KINDS[kind][1]:
-                raise InputError(f"{option} {value}: the {kind} base does not take this option: leave it out")
+                raise InputError(
+                    f"{option} {value}: the {kind} base does not take this option: leave it out"
+                )
         check_windows("--sharp windows", self.windows)
         check_name("--depth-kind", self.depth_kind, DEPTH_KINDS)
         for option in ("--calib", *READING):
             if (value := options[option]) is not None and self.depth is None:
-                raise InputError(f"{option} {value}: there is no depth map to read: give the map with --depth")
-            if value is not None and option in ("--near", "--far") and self.depth_kind not in RELATIVE:
-                raise InputError(f"{option} {value}: only for relative maps: add --depth-kind {' or '.join(RELATIVE)}")
+                raise InputError(
+                    f"{option} {value}: there is no depth map to read: give the map with --depth"
+                )
+            if (
+                value is not None
+                and option in ("--near", "--far")
+                and self.depth_kind not in RELATIVE
+            ):
+                raise InputError(
+                    f"{option} {value}: only for relative maps: add --depth-kind {' or '.join(RELATIVE)}"
+                )
         if self.named in MISSING and not self.files:
             raise InputError(f"--base {self.named}: {MISSING[self.named]}")

@@ -17,7 +17,7 @@ from typer.exceptions import TyperException
 
 from spackle.cli import commands, dataset, evaluate, train, weights
 from spackle.cli.options import INTERRUPTED
-from spackle.errors import InputError, one_line
+from spackle.runtime.errors import InputError, one_line
 
 app = typer.Typer(
     name="spackle",
@@ -45,13 +45,19 @@ app.command(short_help="Render a saved scene as a video")(commands.render)
 app.command(short_help="Write a scene for other viewers, or as one page to send")(commands.export)
 app.command(short_help="Describe a scene, photo, depth map or clip")(commands.info)
 app.command(short_help="Complete one photo and compare with its true second view")(commands.demo)
-app.add_typer(weights.weights, name="weights", short_help="Download or list weights that others publish")
+app.add_typer(
+    weights.weights, name="weights", short_help="Download or list weights that others publish"
+)
 app.command(short_help="Train the residual network or SHARP's decoder")(train.train)
 app.command(short_help="Evaluate on a dataset by the paper's protocols")(evaluate.evaluate)
 app.command(short_help="Merge several evaluations into the same tables")(evaluate.tables)
 app.command(short_help="Draw the paper's figures from several evaluations")(evaluate.figures)
 app.command(short_help="Measure what Spackle costs, in Gaussians and in time")(evaluate.bench)
-app.add_typer(dataset.dataset, name="dataset", short_help="Build training data: views with holes and completed targets")
+app.add_typer(
+    dataset.dataset,
+    name="dataset",
+    short_help="Build training data: views with holes and completed targets",
+)
 
 
 def _version(asked: bool) -> None:
@@ -77,7 +83,9 @@ def main() -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     # Otherwise the garbage collector scans the 200,000 objects of torch and numba too often.
     gc.set_threshold(50_000)
-    if threading.current_thread() is threading.main_thread():  # let SIGTERM run every `finally`, too
+    if (
+        threading.current_thread() is threading.main_thread()
+    ):  # let SIGTERM run every `finally`, too
         signal.signal(signal.SIGTERM, _end)
     try:
         code = app(standalone_mode=False)
@@ -88,11 +96,16 @@ def main() -> None:
         if type(error).__name__ == "NoArgsIsHelpError":  # no arguments: print the help
             print(error.format_message(), file=sys.stderr)
             sys.exit(2)
-        _fail(error.format_message().replace("Value error, ", ""))  # pydantic's words, which typer keeps
+        _fail(
+            error.format_message().replace("Value error, ", "")
+        )  # pydantic's words, which typer keeps
     except OSError as error:
         if error.filename is not None:
             raise
-        print(f"error: cannot write to the standard output: {error.strerror or error}", file=sys.stderr)
+        print(
+            f"error: cannot write to the standard output: {error.strerror or error}",
+            file=sys.stderr,
+        )
         sys.exit(2)
     if code == INTERRUPTED:
         print("interrupted", file=sys.stderr)

@@ -8,20 +8,20 @@ from pathlib import Path
 from statistics import fmean as mean
 
 from spackle.bases import BasePrediction
-from spackle.bases.depth_map import RELATIVE
 from spackle.bases.open import ResolvedBase
 from spackle.clips.complete import ClipCompleter, CompletedView
 from spackle.clips.files import ClipWriter, clip_frames, read_clip
-from spackle.errors import InputError
-from spackle.files import file_records, results_folder, whole_set, write_json
-from spackle.image import Photo, check_shape, focal_length, resize_photo
+from spackle.core.photo import Photo, check_shape, focal_length, resize_photo
+from spackle.depth.depth_map import RELATIVE
 from spackle.inpaint.plain import OpenCV
-from spackle.photo_results import PhotoOptions, shared_report
 from spackle.pipeline import Options, Pipeline, move_in_words
-from spackle.progress import Reporter
 from spackle.residual import hole_area_ratio
-from spackle.video_frames import VideoOptions
-from spackle.views import choose_move
+from spackle.results.photo_folder import PhotoOptions, shared_report
+from spackle.runtime.errors import InputError
+from spackle.runtime.files import atomic_files, file_records, results_folder, write_json
+from spackle.runtime.progress import Reporter
+from spackle.video.frames import VideoOptions
+from spackle.views import choose_disparity
 
 FILES = ("video.mp4", "report.json")
 # Names of frames, by their number: a folder may hold a depth map for each frame, 000000.npy for the first.
@@ -48,7 +48,9 @@ def clip_options(scene: Options, photo: PhotoOptions, workers: int) -> Options:
         if given:
             raise InputError(f"--{option}: not for a clip: leave the option out, see docs/clips.md")
     if depth is not None and not (isinstance(depth, Path) and depth.is_dir()):
-        raise InputError(f"--depth {depth}: a clip needs a folder of maps: {NAME.format(0)}.npy for the first frame")
+        raise InputError(
+            f"--depth {depth}: a clip needs a folder of maps: {NAME.format(0)}.npy for the first frame"
+        )
     OpenCV("a clip, whose motion has to be followed,")
     if fill.fill == "auto":  # opens no inpainter
         fill = dataclasses.replace(fill, fill="network")
@@ -56,7 +58,11 @@ def clip_options(scene: Options, photo: PhotoOptions, workers: int) -> Options:
 
 
 def predict_clip(
-    path: Path, folder: Path, pipeline: Pipeline, lens: Mapping[str, float | None], reporter: Reporter
+    path: Path,
+    folder: Path,
+    pipeline: Pipeline,
+    lens: Mapping[str, float | None],
+    reporter: Reporter,
 ) -> None:
     """Write video.mp4, with as many frames as the clip, and report.json to `folder`; `lens` as for `load_photo`.
 
@@ -64,7 +70,7 @@ def predict_clip(
         InputError: the clip, a frame, a depth map or the folder cannot be used.
     """
     reporter, options = reporter.restarted(), pipeline.options
-    with results_folder(folder, FILES, alone=True), whole_set(folder, FILES[-1]) as new:
+    with results_folder(folder, FILES, alone=True), atomic_files(folder, FILES[-1]) as new:
         with reporter.stage("read") as step:
             clip = read_clip(path, options.path.frames, step)
         completer = ClipCompleter(
@@ -73,7 +79,8 @@ def predict_clip(
             len(clip),
             pipeline.renderer,
             OpenCV("a clip").flow,
-            align=options.base.depth is None or options.base.depth_kind in RELATIVE,  # measured depth is not changed
+            align=options.base.depth is None
+            or options.base.depth_kind in RELATIVE,  # measured depth is not changed
             fill=options.fill.texture != "none",
             network=pipeline.network,
             precision=options.base.precision,
@@ -92,7 +99,7 @@ def predict_clip(
                 prediction, choice = base.predict(photo, log=reporter.log)
                 if first is None:  # its base, disparity and focal length hold for all frames
                     if completer.disparity is None:
-                        prediction = choose_move(prediction, pipeline.renderer, photo.path)
+                        prediction = choose_disparity(prediction, pipeline.renderer, photo.path)
                         completer.disparity = prediction.disparity
                         reporter.log(f"{path.name}: {move_in_words(prediction)}")
                     first, base = (photo, prediction, choice), base.only(choice)
@@ -118,7 +125,9 @@ def predict_clip(
                 )
                 step(index + 1, len(clip))
         if clip.audio and not writer.sound:
-            reporter.log(f"{path.name}: an mp4 cannot hold the sound ({clip.audio}), which is left out")
+            reporter.log(
+                f"{path.name}: an mp4 cannot hold the sound ({clip.audio}), which is left out"
+            )
         assert first is not None
         report = {
             **shared_report(*first, pipeline, reporter),
@@ -134,7 +143,9 @@ def predict_clip(
             },
             "aux": {"gaussians": round(mean(frame["aux"] for frame in frames))},  # of a frame
             "disparity": options.path.reach(first[1].disparity),
-            "hole_area_ratio": {end: mean(frame[end] for frame in frames) for end in ("before", "after")}
+            "hole_area_ratio": {
+                end: mean(frame[end] for frame in frames) for end in ("before", "after")
+            }
             | {"worst_after": max(frame["after"] for frame in frames)},
         }
         report["files"] = file_records(new, [new / FILES[0]])
@@ -152,7 +163,11 @@ def _complete(completer: ClipCompleter, photo: Photo, prediction: BasePrediction
     try:
         view = completer.add(resize_photo(photo).rgb, prediction)
     except ValueError as error:
-        raise InputError(f"{photo.path}: no camera path: {error}: check depth and focal length") from error
+        raise InputError(
+            f"{photo.path}: no camera path: {error}: check depth and focal length"
+        ) from error
     if not view.gaussians[1].finite:
-        raise InputError(f"{photo.path}: a view too extreme to complete: give a smaller --disparity")
+        raise InputError(
+            f"{photo.path}: a view too extreme to complete: give a smaller --disparity"
+        )
     return view

@@ -33,7 +33,10 @@ if TYPE_CHECKING:  # torch takes seconds to load
 @with_path_options
 def predict(
     *,
-    photos: Annotated[list[Path], typer.Argument(metavar="PHOTO...", help="Photos, folders of photos, or one clip.")],
+    photos: Annotated[
+        list[Path],
+        typer.Argument(metavar="PHOTO...", help="Photos, folders of photos, or one clip."),
+    ],
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="OUT", help="Results go to OUT/PHOTO_NAME/.")
     ] = Path("out"),
@@ -75,12 +78,18 @@ def predict(
         ),
     ] = None,
     calib: Annotated[
-        Path | None, typer.Option(hidden=True, metavar="FILE", help="calib.txt, if it is not in the map's folder.")
+        Path | None,
+        typer.Option(
+            hidden=True, metavar="FILE", help="calib.txt, if it is not in the map's folder."
+        ),
     ] = None,
     checkpoint: CheckpointOption = None,
     precision: Annotated[
         PrecisionName,
-        typer.Option(hidden=True, help="Precision of the base's network; auto: bf16 if the hardware supports it."),
+        typer.Option(
+            hidden=True,
+            help="Precision of the base's network; auto: bf16 if the hardware supports it.",
+        ),
     ] = "auto",
     sharp: SharpOption = None,
     residual: Annotated[
@@ -100,23 +109,39 @@ def predict(
     ] = "auto",
     render: Annotated[bool, typer.Option(help="Write a video.")] = True,
     keep_base: Annotated[
-        bool, typer.Option("--keep-base", hidden=True, help="Also write base.ply, the Gaussians of the base.")
+        bool,
+        typer.Option(
+            "--keep-base", hidden=True, help="Also write base.ply, the Gaussians of the base."
+        ),
     ] = False,
     depth_out: Annotated[
         str | None,
-        typer.Option(metavar="NAME", hidden=True, help="Also write the depth: depth.png (mm), .npy or .exr (m)."),
+        typer.Option(
+            metavar="NAME",
+            hidden=True,
+            help="Also write the depth: depth.png (mm), .npy or .exr (m).",
+        ),
     ] = None,
     path: PathOptions,
     mode: Annotated[
         Literal["scene", "view"],
-        typer.Option(hidden=True, help="scene: one set of aux Gaussians for all views; view: a set for each view."),
+        typer.Option(
+            hidden=True,
+            help="scene: one set of aux Gaussians for all views; view: a set for each view.",
+        ),
     ] = "scene",
     device: DeviceOption = "auto",
-    focal_px: Annotated[float | None, typer.Option(hidden=True, help="Focal length in pixels of the photo.")] = None,
-    focal_mm: Annotated[float | None, typer.Option(help="Focal length in mm, 35 mm equivalent.")] = None,
+    focal_px: Annotated[
+        float | None, typer.Option(hidden=True, help="Focal length in pixels of the photo.")
+    ] = None,
+    focal_mm: Annotated[
+        float | None, typer.Option(help="Focal length in mm, 35 mm equivalent.")
+    ] = None,
     fov: FovOption = None,
     keep_frame: KeepFrameOption = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Predict again even if results exist.")] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Predict again even if results exist.")
+    ] = False,
     workers: Annotated[
         int,
         typer.Option(
@@ -145,9 +170,9 @@ def predict(
     """
     from spackle.bases.settings import BaseSettings
     from spackle.cli.photos import PredictOptions, predict_all
-    from spackle.photo_results import PhotoOptions
     from spackle.pipeline import FillOptions, Options
-    from spackle.progress import Reporter
+    from spackle.results.photo_folder import PhotoOptions
+    from spackle.runtime.progress import Reporter
 
     reading, speed = (calib, depth_kind, near, far), sharp_speed(sharp)
     settings = BaseSettings(base, depth, *reading, checkpoint, precision, device=device, **speed)
@@ -163,13 +188,20 @@ def predict(
 def render(
     *,
     scene: Annotated[Path, typer.Argument(metavar="SCENE", help="A 3D Gaussian scene.")],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="A folder, or a video file.")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="OUT", help="A folder, or a video file.")
+    ],
     compare: Annotated[
         bool,
-        typer.Option("--compare", help="Show the base, with holes, on the left, and the completed scene on the right."),
+        typer.Option(
+            "--compare",
+            help="Show the base, with holes, on the left, and the completed scene on the right.",
+        ),
     ] = False,
     path: PathOptions,
-    focal_px: Annotated[float | None, typer.Option(help="Focal length in pixels of the video.")] = None,
+    focal_px: Annotated[
+        float | None, typer.Option(help="Focal length in pixels of the video.")
+    ] = None,
     fov: FovOption = None,
     device: DeviceOption = "auto",
     as_json: JsonOption = False,
@@ -177,10 +209,17 @@ def render(
 ) -> None:
     """Render a saved scene along a camera path."""
     from spackle.cli.saved_scene import render_scene
-    from spackle.progress import Reporter
+    from spackle.runtime.progress import Reporter
 
     path = dataclasses.replace(path, video=dataclasses.replace(path.video, compare=compare))
-    render_scene(scene, output, path, {"focal_px": focal_px, "fov": fov}, device, Reporter(verbose, as_json=as_json))
+    render_scene(
+        scene,
+        output,
+        path,
+        {"focal_px": focal_px, "fov": fov},
+        device,
+        Reporter(verbose, as_json=as_json),
+    )
 
 
 def export(
@@ -199,18 +238,20 @@ def export(
 ) -> None:
     """Write a scene in the formats that other viewers read."""
     from spackle.cli.saved_scene import export_scene
-    from spackle.progress import Reporter
+    from spackle.runtime.progress import Reporter
 
     export_scene(scene, output, Reporter(as_json=as_json))
 
 
 def info(
-    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Scenes, photos, depth maps or clips.")],
+    files: Annotated[
+        list[Path], typer.Argument(metavar="FILE...", help="Scenes, photos, depth maps or clips.")
+    ],
     as_json: JsonOption = False,
 ) -> None:
     """Describe files: size, depth range, Gaussians and camera, and commands that take the file."""
     from spackle.cli.info import show_info
-    from spackle.progress import Reporter
+    from spackle.runtime.progress import Reporter
 
     for file in files:
         show_info(file, Reporter(as_json=as_json))
@@ -219,9 +260,14 @@ def info(
 def view(
     target: Annotated[
         Path | None,
-        typer.Argument(metavar="SCENE_OR_PHOTO", help="A scene, or a photo to complete; by default the page is empty."),
+        typer.Argument(
+            metavar="SCENE_OR_PHOTO",
+            help="A scene, or a photo to complete; by default the page is empty.",
+        ),
     ] = None,
-    base: Annotated[str, typer.Option(metavar="NAME", help="Base, as for `spackle predict`.")] = "auto",
+    base: Annotated[
+        str, typer.Option(metavar="NAME", help="Base, as for `spackle predict`.")
+    ] = "auto",
     depth: Annotated[Path | None, typer.Option(metavar="FILE", help="Depth of the photo.")] = None,
     depth_kind: DepthKindOption = "auto",
     checkpoint: CheckpointOption = None,
@@ -238,7 +284,9 @@ def view(
     device: DeviceOption = "auto",
     host: HostOption = "127.0.0.1",
     port: PortOption = 0,
-    browser: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in a browser.")] = True,
+    browser: Annotated[
+        bool, typer.Option("--open/--no-open", help="Open the page in a browser.")
+    ] = True,
     token: Annotated[
         bool,
         typer.Option(
@@ -253,9 +301,11 @@ def view(
     """Open a page in the browser that shows a scene or completes photos. Ctrl-C ends the server."""
     from spackle.bases.settings import BaseSettings
     from spackle.cli import serve as app
-    from spackle.progress import Reporter
+    from spackle.runtime.progress import Reporter
 
-    settings = BaseSettings(base, depth, depth_kind=depth_kind, checkpoint=checkpoint, device=device)
+    settings = BaseSettings(
+        base, depth, depth_kind=depth_kind, checkpoint=checkpoint, device=device
+    )
     place = app.Place(host, port, secrets.token_urlsafe(16) if token else None, browser)
     reporter = Reporter(verbose, as_json=as_json)
     usual = {"disparity": disparity, "keep_frame": keep_frame, "depth_kind": depth_kind}
@@ -268,7 +318,11 @@ def serve(
     port: PortOption = 8080,
     token: Annotated[
         str | None,
-        typer.Option(help="The token that clients must send.", show_default="a new one", envvar="SPACKLE_TOKEN"),
+        typer.Option(
+            help="The token that clients must send.",
+            show_default="a new one",
+            envvar="SPACKLE_TOKEN",
+        ),
     ] = None,
     workers: Annotated[
         int,
@@ -278,17 +332,25 @@ def serve(
             help="Number of processes that share the photos, each with its own copy of the base's network.",
         ),
     ] = 1,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="Folder of photos and scenes.")] = Path(
-        "spackle-scenes"
-    ),
-    keep: Annotated[float, typer.Option(min=0, metavar="DAYS", help="Delete scenes after this number of days.")] = 7,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="OUT", help="Folder of photos and scenes.")
+    ] = Path("spackle-scenes"),
+    keep: Annotated[
+        float, typer.Option(min=0, metavar="DAYS", help="Delete scenes after this number of days.")
+    ] = 7,
     quota: Annotated[
-        float, typer.Option(min=0, metavar="GB", help="Delete the oldest scenes if all take more space.")
+        float,
+        typer.Option(min=0, metavar="GB", help="Delete the oldest scenes if all take more space."),
     ] = 20,
     waiting: Annotated[
-        int, typer.Option(min=1, metavar="N", help="Number of photos that may wait; more photos are refused.")
+        int,
+        typer.Option(
+            min=1, metavar="N", help="Number of photos that may wait; more photos are refused."
+        ),
     ] = 32,
-    base: Annotated[str, typer.Option(metavar="NAME", help="Base, as for `spackle predict`.")] = "auto",
+    base: Annotated[
+        str, typer.Option(metavar="NAME", help="Base, as for `spackle predict`.")
+    ] = "auto",
     checkpoint: CheckpointOption = None,
     device: DeviceOption = "auto",
     as_json: JsonOption = False,
@@ -297,27 +359,32 @@ def serve(
     """Serve an HTTP interface and a page that complete photos (see docs/http.md). Ctrl-C ends the server."""
     from spackle.bases.settings import BaseSettings
     from spackle.cli import serve as app
-    from spackle.progress import Reporter
-    from spackle.web.jobs import Keep
+    from spackle.runtime.progress import Reporter
+    from spackle.web.jobs import RetentionLimits
     from spackle.web.work import SceneWork
 
     work = SceneWork(BaseSettings(base, checkpoint=checkpoint, device=device), verbose=verbose)
     place = app.Place(host, port, token or secrets.token_urlsafe(16), False)
     app.serve(
-        output, work, workers, Keep(keep * 86400, quota * 1e9, waiting), place, Reporter(verbose, as_json=as_json)
+        output,
+        work,
+        workers,
+        RetentionLimits(keep * 86400, quota * 1e9, waiting),
+        place,
+        Reporter(verbose, as_json=as_json),
     )
     raise typer.Exit(INTERRUPTED)
 
 
 def demo(
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="Folder for the results.")] = Path(
-        "demo-output"
-    ),
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="OUT", help="Folder for the results.")
+    ] = Path("demo-output"),
     as_json: JsonOption = False,
     verbose: VerboseOption = False,
 ) -> None:
     """Complete Middlebury's Motorcycle photo and compare with the true second photo (needs scikit-image)."""
     from spackle.cli.demo import run_demo
-    from spackle.progress import Reporter
+    from spackle.runtime.progress import Reporter
 
     run_demo(output, Reporter(verbose, as_json=as_json))

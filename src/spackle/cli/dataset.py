@@ -7,75 +7,130 @@ from typing import Annotated
 
 import typer
 
-from spackle.cli.options import INTERRUPTED, DeviceOption, PrecisionOption, SharpTrajectoryName, VerboseOption
+from spackle.cli.options import (
+    INTERRUPTED,
+    DeviceOption,
+    PrecisionOption,
+    SharpTrajectoryName,
+    VerboseOption,
+)
 
-dataset = typer.Typer(help="Build and inspect training data: views with holes, and targets.", no_args_is_help=True)
+dataset = typer.Typer(
+    help="Build and inspect training data: views with holes, and targets.", no_args_is_help=True
+)
 
 
-DatasetArgument = Annotated[str, typer.Argument(metavar="DATASET", help="A folder, or an address (s3://…).")]
+DatasetArgument = Annotated[
+    str, typer.Argument(metavar="DATASET", help="A folder, or an address (s3://…).")
+]
 
 
 @dataset.command("build")
 def dataset_build(
     *,
     photos: Annotated[
-        Path, typer.Argument(metavar="FOLDER|COCO.json", help="Photos, with subfolders; or COCO annotations.")
+        Path,
+        typer.Argument(
+            metavar="FOLDER|COCO.json", help="Photos, with subfolders; or COCO annotations."
+        ),
     ],
     output: Annotated[
         Path,
-        typer.Option("-o", "--output", metavar="OUT", help="The dataset's folder; an unfinished build is resumed."),
+        typer.Option(
+            "-o",
+            "--output",
+            metavar="OUT",
+            help="The dataset's folder; an unfinished build is resumed.",
+        ),
     ],
     images: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Folder of a COCO JSON's photos; default: the JSON's folder.")
+        Path | None,
+        typer.Option(
+            metavar="FOLDER", help="Folder of a COCO JSON's photos; default: the JSON's folder."
+        ),
     ] = None,
     sample: Annotated[
-        int | None, typer.Option(min=1, max=1_000_000, help="Number of photos, chosen at random; default: all.")
+        int | None,
+        typer.Option(
+            min=1, max=1_000_000, help="Number of photos, chosen at random; default: all."
+        ),
     ] = None,
     seed: Annotated[
-        int, typer.Option(min=0, max=2**31 - 1, help="Seed of the random choice of photos and camera paths.")
+        int,
+        typer.Option(
+            min=0, max=2**31 - 1, help="Seed of the random choice of photos and camera paths."
+        ),
     ] = 0,
     base: Annotated[
-        str, typer.Option(help="What turns a photo into Gaussians: sharp, rgbd, depth, lite or hf:NAME.")
+        str,
+        typer.Option(
+            help="What turns a photo into Gaussians: sharp, rgbd, depth, lite or hf:NAME."
+        ),
     ] = "sharp",
     depth: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Depth maps with the photos' names, for --base rgbd.")
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Depth maps with the photos' names, for --base rgbd."),
     ] = None,
-    checkpoint: Annotated[Path | None, typer.Option("-c", "--checkpoint", help="Weights of the base.")] = None,
+    checkpoint: Annotated[
+        Path | None, typer.Option("-c", "--checkpoint", help="Weights of the base.")
+    ] = None,
     precision: PrecisionOption = "auto",
     views: Annotated[
-        int, typer.Option(min=2, max=100, help="Number of views of each photo, including the photo's camera.")
+        int,
+        typer.Option(
+            min=2, max=100, help="Number of views of each photo, including the photo's camera."
+        ),
     ] = 20,
     trajectory: Annotated[
-        SharpTrajectoryName | None, typer.Option(help="Camera path; default: a random path for each photo.")
+        SharpTrajectoryName | None,
+        typer.Option(help="Camera path; default: a random path for each photo."),
     ] = None,
     disparity: Annotated[
         tuple[float, float],
-        typer.Option(metavar="LO HI", help="Smallest and greatest disparity of the random camera paths."),
+        typer.Option(
+            metavar="LO HI", help="Smallest and greatest disparity of the random camera paths."
+        ),
     ] = (0.1, 0.6),
     inpainter: Annotated[
-        str, typer.Option(help="What completes the views: exemplar, lama, opencv, propainter; geometry; or none.")
+        str,
+        typer.Option(
+            help="What completes the views: exemplar, lama, opencv, propainter; geometry; or none."
+        ),
     ] = "exemplar",
     inpainter_weights: Annotated[
-        Path | None, typer.Option(metavar="PATH", help="Weights of the inpainter: propainter's folder, or lama's file.")
+        Path | None,
+        typer.Option(
+            metavar="PATH", help="Weights of the inpainter: propainter's folder, or lama's file."
+        ),
     ] = None,
     inpainter_side: Annotated[
         int | None,
-        typer.Option(help="Long side in pixels at which the inpainter works; default: propainter 640, lama 1024."),
+        typer.Option(
+            help="Long side in pixels at which the inpainter works; default: propainter 640, lama 1024."
+        ),
     ] = None,
     workers: Annotated[
-        int, typer.Option(min=1, max=1024, help="Number of processes, each with a copy of the base's network.")
+        int,
+        typer.Option(
+            min=1, max=1024, help="Number of processes, each with a copy of the base's network."
+        ),
     ] = 1,
     threads: Annotated[
-        int, typer.Option(min=1, max=1024, help="Threads of each process; the number changes SHARP's last bits.")
+        int,
+        typer.Option(
+            min=1, max=1024, help="Threads of each process; the number changes SHARP's last bits."
+        ),
     ] = 2,
-    shard_size: Annotated[int, typer.Option(min=1, max=1_000_000, help="Number of photos in a tar file.")] = 50,
+    shard_size: Annotated[
+        int, typer.Option(min=1, max=1_000_000, help="Number of photos in a tar file.")
+    ] = 50,
     device: DeviceOption = "auto",
     verbose: VerboseOption = False,
 ) -> None:
     """Build a pseudo-supervised dataset: manifest.json and shard-000000.tar, … (the paper's appendix)."""
     from spackle.bases.settings import BaseSettings
-    from spackle.dataset.build import DatasetOptions, build_dataset
-    from spackle.progress import Reporter
+    from spackle.paper.dataset.build import DatasetOptions, build_dataset
+    from spackle.runtime.progress import Reporter
 
     settings = BaseSettings(base, depth, checkpoint=checkpoint, precision=precision, device=device)
     options = DatasetOptions(
@@ -102,7 +157,7 @@ def dataset_info(location: DatasetArgument) -> None:
     """Print a dataset's counts, sizes, holes of each view, and configuration."""
     from rich.console import Console
 
-    from spackle.dataset.inspect import show_info
+    from spackle.paper.dataset.inspect import show_info
 
     show_info(location, Console(highlight=False))
 
@@ -110,8 +165,8 @@ def dataset_info(location: DatasetArgument) -> None:
 @dataset.command("verify")
 def dataset_verify(location: DatasetArgument) -> None:
     """Read every byte and name each damaged sample; exit code 1 if any is damaged."""
-    from spackle.dataset.inspect import verify_dataset
-    from spackle.progress import Reporter
+    from spackle.paper.dataset.inspect import verify_dataset
+    from spackle.runtime.progress import Reporter
 
     if verify_dataset(location, Reporter()):
         raise typer.Exit(1)
@@ -120,12 +175,15 @@ def dataset_verify(location: DatasetArgument) -> None:
 @dataset.command("preview")
 def dataset_preview(
     location: DatasetArgument,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="Folder for the sheet and the video.")],
+    output: Annotated[
+        Path,
+        typer.Option("-o", "--output", metavar="OUT", help="Folder for the sheet and the video."),
+    ],
     photos: Annotated[int, typer.Option(min=1, help="Number of photos.")] = 3,
     views: Annotated[int, typer.Option(min=1, help="Number of views of each photo.")] = 6,
 ) -> None:
     """Write sheet.png (base, mask, target) and trajectory.mp4 (base beside target)."""
-    from spackle.dataset.inspect import preview_dataset
-    from spackle.progress import Reporter
+    from spackle.paper.dataset.inspect import preview_dataset
+    from spackle.runtime.progress import Reporter
 
     preview_dataset(location, output, photos, views, Reporter())

@@ -11,20 +11,28 @@ from rich.table import Table
 
 from spackle.bases import BasePrediction
 from spackle.bases.settings import BaseSettings
-from spackle.evaluation.datasets.stereo import StereoPair, load_motorcycle
-from spackle.files import results_folder, write_json
+from spackle.core.photo import Photo
 from spackle.formats import save_ply, save_png
 from spackle.formats.png import sheet
-from spackle.image import Photo
-from spackle.photo_results import save_views
+from spackle.paper.evaluation.datasets.stereo import StereoPair, load_motorcycle
+from spackle.paper.training.losses import hole_psnr
 from spackle.pipeline import Options, Pipeline, complete
-from spackle.progress import Reporter
 from spackle.render import Renderer
 from spackle.residual import hole_area_ratio, hole_mask
-from spackle.training.losses import hole_psnr
+from spackle.results.photo_folder import save_views
+from spackle.runtime.files import results_folder, write_json
+from spackle.runtime.progress import Reporter
 from spackle.views import PathOptions
 
-FILES = ("base.ply", "scene.ply", "video.mp4", "comparison.png", "right_view.png", "right_photo.png", "report.json")
+FILES = (
+    "base.ply",
+    "scene.ply",
+    "video.mp4",
+    "comparison.png",
+    "right_view.png",
+    "right_photo.png",
+    "report.json",
+)
 DISPARITY = 0.3
 
 
@@ -34,7 +42,9 @@ def run_demo(output: Path, reporter: Reporter) -> None:
     InputError if scikit-image is missing, or `output` cannot be written to.
     """
     pair = load_motorcycle()
-    pipeline = Pipeline.open(Options(BaseSettings("rgbd", pair.depth), PathOptions(disparity=DISPARITY, overscan=0)))
+    pipeline = Pipeline.open(
+        Options(BaseSettings("rgbd", pair.depth), PathOptions(disparity=DISPARITY, overscan=0))
+    )
     renderer = pipeline.renderer
     with results_folder(output, FILES, alone=True):
         start = time.perf_counter()
@@ -42,16 +52,23 @@ def run_demo(output: Path, reporter: Reporter) -> None:
         done = pipeline.complete(photo, reporter)
         scene, views = done.scene, done.views
         with reporter.stage("write"):
-            save_ply(scene.base, output / "base.ply", camera=scene.camera, base_count=len(scene.base))
+            save_ply(
+                scene.base, output / "base.ply", camera=scene.camera, base_count=len(scene.base)
+            )
             scene.save(output / "scene.ply")
         with reporter.stage("video") as step:
             save_views(done, output / "video.mp4", renderer, step)
         with torch.no_grad():
             widest = [views.cameras[index] for index in views.measured.values()]
-            drawn = [[renderer.render(parts, view) for view in widest] for parts in ([scene.base], scene.of_view(0))]
+            drawn = [
+                [renderer.render(parts, view) for view in widest]
+                for parts in ([scene.base], scene.of_view(0))
+            ]
         pictures = [[view.rgb for view in row] for row in drawn]
         save_png(sheet(pictures, max(widest[0].width, widest[0].height)), output / "comparison.png")
-        before, after = (sum(hole_area_ratio(view.alpha) for view in row) / len(row) for row in drawn)
+        before, after = (
+            sum(hole_area_ratio(view.alpha) for view in row) / len(row) for row in drawn
+        )
         with reporter.stage("truth"):
             scores = _compare_truth(done.prediction, pair, renderer, output)
         seconds = round(time.perf_counter() - start, 3)
@@ -77,13 +94,17 @@ def run_demo(output: Path, reporter: Reporter) -> None:
 
 
 @torch.no_grad()
-def _compare_truth(prediction: BasePrediction, pair: StereoPair, renderer: Renderer, output: Path) -> dict[str, Any]:
+def _compare_truth(
+    prediction: BasePrediction, pair: StereoPair, renderer: Renderer, output: Path
+) -> dict[str, Any]:
     """PSNR against the true right photo: of the base, of 2D inpainting, and of the scene with and without a network."""
     from skimage.restoration import inpaint_biharmonic
 
     before = renderer.render(prediction.gaussians, pair.right_camera)
     hole = hole_mask(before.alpha)
-    flat = inpaint_biharmonic(before.rgb.numpy(), hole.numpy(), split_into_regions=True, channel_axis=-1)
+    flat = inpaint_biharmonic(
+        before.rgb.numpy(), hole.numpy(), split_into_regions=True, channel_axis=-1
+    )
     seeds, trained = (
         complete(prediction, [pair.right_camera], exact=True, network=network, renderer=renderer)
         for network in (None, "shipped")
@@ -101,14 +122,19 @@ def _compare_truth(prediction: BasePrediction, pair: StereoPair, renderer: Rende
         "har_before": hole_area_ratio(before.alpha),
         "har_after": hole_area_ratio(after.alpha),
         "psnr": {
-            name: {"in_hole": hole_psnr(image, pair.right, hole), "outside": hole_psnr(image, pair.right, ~hole)}
+            name: {
+                "in_hole": hole_psnr(image, pair.right, hole),
+                "outside": hole_psnr(image, pair.right, ~hole),
+            }
             for name, image in methods.items()
         },
     }
 
 
 def _table(scores: dict[str, Any]) -> Table:
-    table = Table(title=f"True right camera: {scores['har_before']:.1%} holes before, {scores['har_after']:.2%} after")
+    table = Table(
+        title=f"True right camera: {scores['har_before']:.1%} holes before, {scores['har_after']:.2%} after"
+    )
     for header in ("PSNR against the true photo", "in the hole", "outside"):
         table.add_column(header)
     for name, psnr in scores["psnr"].items():

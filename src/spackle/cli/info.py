@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from spackle.bases.depth_map import EXTREMES, SUFFIXES, load_depth
-from spackle.bases.photo_depth.layouts import load_photo_depth
-from spackle.camera import Camera
 from spackle.clips.files import is_clip, read_clip
-from spackle.files import check_file
+from spackle.core.camera import Camera
+from spackle.core.photo import load_photo
+from spackle.depth.depth_map import EXTREMES, SUFFIXES, load_depth
+from spackle.depth.in_photo.layouts import load_photo_depth
 from spackle.formats.scene_files import load_scene, scene_kind
-from spackle.image import load_photo
-from spackle.progress import Reporter
+from spackle.runtime.files import check_file
+from spackle.runtime.progress import Reporter
 
 Facts = dict[str, object]
 
@@ -26,7 +26,13 @@ def show_info(path: Path, reporter: Reporter) -> None:
     if scene_kind(path):
         facts = scene_facts(path)
     else:
-        facts = clip_facts(path) if is_clip(path) else depth_facts(path) if is_depth(path) else photo_facts(path)
+        facts = (
+            clip_facts(path)
+            if is_clip(path)
+            else depth_facts(path)
+            if is_depth(path)
+            else photo_facts(path)
+        )
     reporter.result({"file": path, **facts})
     if not reporter.as_json:
         for name, value in facts.items():
@@ -47,19 +53,29 @@ def is_depth(path: Path) -> bool:
 def scene_facts(path: Path) -> Facts:
     scene = load_scene(path)
     count, base = len(scene.gaussians), scene.base_count
-    parts = "number of base Gaussians unknown" if base is None else f"{base:,} base, {count - base:,} aux"
+    parts = (
+        "number of base Gaussians unknown"
+        if base is None
+        else f"{base:,} base, {count - base:,} aux"
+    )
     facts: Facts = {"kind": f"scene ({scene_kind(path)})", "Gaussians": f"{count:,} ({parts})"}
     depths = scene.gaussians.means[:, 2].double().numpy()
     near, middle, far = np.quantile(depths, [EXTREMES[0], 0.5, EXTREMES[1]])
-    facts["depth"] = f"{near:.3g} near, {middle:.3g} median, {far:.3g} far (metres if the base is metric)"
+    facts["depth"] = (
+        f"{near:.3g} near, {middle:.3g} median, {far:.3g} far (metres if the base is metric)"
+    )
     facts["camera"] = (
-        "not stored: give --fov, and --size to `spackle render`" if scene.camera is None else lens_of(scene.camera)
+        "not stored: give --fov, and --size to `spackle render`"
+        if scene.camera is None
+        else lens_of(scene.camera)
     )
     if scene.disparity is not None:
         facts["completed"] = f"for --disparity {scene.disparity:g}"
     if scene.harmonics:
         facts["harmonics"] = f"{scene.harmonics} of each Gaussian above degree 0, not read"
-    facts["next"] = f"spackle view {path}; `spackle render` makes a video, `spackle export` other formats"
+    facts["next"] = (
+        f"spackle view {path}; `spackle render` makes a video, `spackle export` other formats"
+    )
     return facts
 
 
@@ -73,7 +89,12 @@ def lens_of(camera: Camera) -> str:
 def clip_facts(path: Path) -> Facts:
     clip = read_clip(path)
     size, rate = f"{clip.width}×{clip.height}", f"{len(clip)}, {float(clip.rate):.4g} a second"
-    facts: Facts = {"kind": "clip", "size": size, "frames": rate, "seconds": f"{float(clip.seconds):.3g}"}
+    facts: Facts = {
+        "kind": "clip",
+        "size": size,
+        "frames": rate,
+        "seconds": f"{float(clip.seconds):.3g}",
+    }
     return facts | {"sound": clip.audio or "none", "next": f"spackle predict {path} -o out"}
 
 
@@ -81,7 +102,10 @@ def depth_facts(path: Path) -> Facts:
     found = load_depth(path)
     height, width = found.depth.shape
     facts: Facts = {"kind": "depth map", "size": f"{width}×{height}", "holds": found.quantity}
-    facts |= {"depth": found.range_in_words, "unknown": f"{float((~found.valid).float().mean()):.1%} of the pixels"}
+    facts |= {
+        "depth": found.range_in_words,
+        "unknown": f"{float((~found.valid).float().mean()):.1%} of the pixels",
+    }
     return facts | {"next": f"spackle predict PHOTO --depth {path}"}
 
 
@@ -92,5 +116,7 @@ def photo_facts(path: Path) -> Facts:
     if photo.frame is not None:
         facts["frame"] = "a uniform frame is cropped; --keep-frame keeps the frame"
     inside = load_photo_depth(path)
-    facts["depth"] = "none inside" if inside is None else f"inside: {inside.note}; {inside.range_in_words}"
+    facts["depth"] = (
+        "none inside" if inside is None else f"inside: {inside.note}; {inside.range_in_words}"
+    )
     return facts | {"next": f"spackle predict {path} -o out; spackle view {path}"}

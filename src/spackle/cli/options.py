@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from typer.core import TyperOption
 
-from spackle.errors import InputError, check_name
+from spackle.runtime.errors import InputError, check_name
 
 if TYPE_CHECKING:  # torch takes seconds to load
     from spackle.views import PathOptions
@@ -23,15 +23,25 @@ TrajectoryName = Literal[SharpTrajectoryName, "vertical", "orbit", "dolly-zoom"]
 PrecisionName = Literal["auto", "fp32", "bf16"]
 DepthKindName = Literal["auto", "metric", "disparity", "near-white", "near-black"]
 PrecisionOption = Annotated[PrecisionName, typer.Option(help="Precision of the base's network.")]
-DeviceOption = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Device of networks and renderer.")]
+DeviceOption = Annotated[
+    Literal["auto", "cpu", "cuda"], typer.Option(help="Device of networks and renderer.")
+]
 FovOption = Annotated[float | None, typer.Option(help="Horizontal field of view in degrees.")]
 HostOption = Annotated[
     str,
-    typer.Option(metavar="H", help="Address of the server; 0.0.0.0 admits everybody in the network who has the token."),
+    typer.Option(
+        metavar="H",
+        help="Address of the server; 0.0.0.0 admits everybody in the network who has the token.",
+    ),
 ]
-PortOption = Annotated[int, typer.Option(metavar="N", min=0, max=65535, help="Port of the server; 0: any free one.")]
+PortOption = Annotated[
+    int, typer.Option(metavar="N", min=0, max=65535, help="Port of the server; 0: any free one.")
+]
 KeepFrameOption = Annotated[
-    bool, typer.Option("--keep-frame", help="Keep a scan's margin or letterbox bars, which are cropped by default.")
+    bool,
+    typer.Option(
+        "--keep-frame", help="Keep a scan's margin or letterbox bars, which are cropped by default."
+    ),
 ]
 DepthKindOption = Annotated[
     DepthKindName,
@@ -42,10 +52,17 @@ DepthKindOption = Annotated[
         "near-black: relative depth, near is dark. auto: disparity if there is a calibration, else metric.",
     ),
 ]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print each result or error as a line of JSON.")]
-VerboseOption = Annotated[bool, typer.Option("-v", "--verbose", help="Print the duration of each stage.")]
+JsonOption = Annotated[
+    bool, typer.Option("--json", help="Print each result or error as a line of JSON.")
+]
+VerboseOption = Annotated[
+    bool, typer.Option("-v", "--verbose", help="Print the duration of each stage.")
+]
 CheckpointOption = Annotated[
-    Path | None, typer.Option("-c", "--checkpoint", metavar="FILE", help="Weights of sharp (or auto), moge or lite.")
+    Path | None,
+    typer.Option(
+        "-c", "--checkpoint", metavar="FILE", help="Weights of sharp (or auto), moge or lite."
+    ),
 ]
 SharpOption = Annotated[
     list[str] | None,
@@ -69,7 +86,10 @@ def _help_all(context: typer.Context, asked: bool) -> None:
 
 
 HelpAllOption = Annotated[
-    bool, typer.Option("--help-all", is_eager=True, callback=_help_all, help="Show this help with all options.")
+    bool,
+    typer.Option(
+        "--help-all", is_eager=True, callback=_help_all, help="Show this help with all options."
+    ),
 ]
 
 
@@ -88,7 +108,8 @@ def sharp_speed(words: Sequence[str] | None) -> dict[str, Any]:
 def path_options(
     *,
     trajectory: Annotated[
-        TrajectoryName | None, typer.Option(help="Camera path of the video.", show_default="rotate-forward")
+        TrajectoryName | None,
+        typer.Option(help="Camera path of the video.", show_default="rotate-forward"),
     ] = None,
     disparity: Annotated[
         float | None,
@@ -99,20 +120,35 @@ def path_options(
     ] = None,
     path: Annotated[
         Path | None,
-        typer.Option("--path", metavar="FILE.json", hidden=True, help="Keyframes of a path, see docs/video.md."),
+        typer.Option(
+            "--path",
+            metavar="FILE.json",
+            hidden=True,
+            help="Keyframes of a path, see docs/video.md.",
+        ),
     ] = None,
     cameras: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.json", hidden=True, help="Complete the views in a file instead of a path."),
+        typer.Option(
+            metavar="FILE.json", hidden=True, help="Complete the views in a file instead of a path."
+        ),
     ] = None,
-    frames: Annotated[int | None, typer.Option(hidden=True, help="Number of frames, instead of --seconds.")] = None,
+    frames: Annotated[
+        int | None, typer.Option(hidden=True, help="Number of frames, instead of --seconds.")
+    ] = None,
     seconds: Annotated[
-        float | None, typer.Option(help="Length of the video in seconds.", show_default="4, or the duration of --path")
+        float | None,
+        typer.Option(
+            help="Length of the video in seconds.", show_default="4, or the duration of --path"
+        ),
     ] = None,
     video_format: Annotated[
-        Literal["mp4", "webm", "gif", "webp"] | None, typer.Option("--format", help="Video format.", show_default="mp4")
+        Literal["mp4", "webm", "gif", "webp"] | None,
+        typer.Option("--format", help="Video format.", show_default="mp4"),
     ] = None,
-    fps: Annotated[float | None, typer.Option(help="Frames a second.", show_default="30", hidden=True)] = None,
+    fps: Annotated[
+        float | None, typer.Option(help="Frames a second.", show_default="30", hidden=True)
+    ] = None,
     loop: Annotated[
         int | None,
         typer.Option(
@@ -133,25 +169,38 @@ def path_options(
     ] = None,
     size: Annotated[
         str | None,
-        typer.Option(metavar="WxH", help="Size of the video (of one eye's view): 1280x720, or 16:9, 9:16 or 1:1."),
+        typer.Option(
+            metavar="WxH",
+            help="Size of the video (of one eye's view): 1280x720, or 16:9, 9:16 or 1:1.",
+        ),
     ] = None,
     fit: Annotated[
         Literal["pad", "blur", "crop"],
         typer.Option(
-            hidden=True, help="How to reach the aspect ratio of --size: black or blurred margins, or cropping."
+            hidden=True,
+            help="How to reach the aspect ratio of --size: black or blurred margins, or cropping.",
         ),
     ] = "pad",
     show: Annotated[
         Literal["color", "depth"],
-        typer.Option(hidden=True, help="Show the scene's colours, or its depth as colours (near is bright)."),
+        typer.Option(
+            hidden=True, help="Show the scene's colours, or its depth as colours (near is bright)."
+        ),
     ] = "color",
     stereo: Annotated[
         Literal["sbs", "sbs-half", "ou", "ou-half", "anaglyph"] | None,
-        typer.Option(hidden=True, help="Stereo video: side by side, over-under, or for red-cyan glasses."),
+        typer.Option(
+            hidden=True, help="Stereo video: side by side, over-under, or for red-cyan glasses."
+        ),
     ] = None,
     ipd: Annotated[
         float | None,
-        typer.Option(metavar="METRES", hidden=True, help="Distance of the eyes.", show_default="by the scene's depth"),
+        typer.Option(
+            metavar="METRES",
+            hidden=True,
+            help="Distance of the eyes.",
+            show_default="by the scene's depth",
+        ),
     ] = None,
     convergence: Annotated[
         float | None,
@@ -168,15 +217,21 @@ def path_options(
     Raises:
         InputError: an option would have no effect, because --path or --cameras sets the views.
     """
-    from spackle.camera_path import OVERSCAN
-    from spackle.video_frames import VideoOptions, parse_size
+    from spackle.core.trajectories import OVERSCAN
+    from spackle.video.frames import VideoOptions, parse_size
     from spackle.views import PathOptions
 
-    useless: dict[str, object] = {"--trajectory": trajectory, "--disparity": disparity, "--overscan": overscan}
+    useless: dict[str, object] = {
+        "--trajectory": trajectory,
+        "--disparity": disparity,
+        "--overscan": overscan,
+    }
     useless |= {} if cameras is None else {"--frames": frames, "--seconds": seconds}
     for option, value in useless.items():
         if value is not None and (path, cameras) != (None, None):
-            raise InputError(f"{option} {value}: has no effect, because --path or --cameras sets the views")
+            raise InputError(
+                f"{option} {value}: has no effect, because --path or --cameras sets the views"
+            )
     pixels = None if size is None else parse_size(size)
     video = VideoOptions(video_format, fps, loop, pixels, fit, show, stereo, ipd, convergence)
     kind, zoom = trajectory or "rotate-forward", OVERSCAN if overscan is None else overscan

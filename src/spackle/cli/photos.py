@@ -14,25 +14,32 @@ from pathlib import Path
 from typing import NamedTuple
 
 import spackle
-from spackle._numba import is_compiled
-from spackle.bases.depth_map import calibrations_beside, find_depth
 from spackle.bases.open import BaseError
 from spackle.cli.clip import FILES as CLIP_FILES
 from spackle.cli.clip import clip_options, predict_clip
 from spackle.clips.files import is_clip
-from spackle.device import thread_count
-from spackle.errors import InputError
-from spackle.files import as_recorded, check_file, digest_of, files_in, fingerprint, results_folder
-from spackle.formats.depth import check_depth_name
-from spackle.image import PHOTO_SUFFIXES
-from spackle.photo_results import REPORT, PhotoOptions, earlier_report, predict_photo
+from spackle.core.photo import PHOTO_SUFFIXES
+from spackle.depth.depth_map import calibrations_beside, find_depth
+from spackle.depth.writers import check_depth_name
 from spackle.pipeline import Options, Pipeline
-from spackle.progress import Notes, Reporter, asked_to_stop
 from spackle.render import device_of
 from spackle.render.blend import blend_tiles
-from spackle.video_frames import video_problem
+from spackle.results.photo_folder import REPORT, PhotoOptions, earlier_report, predict_photo
+from spackle.runtime.device import thread_count
+from spackle.runtime.errors import InputError
+from spackle.runtime.files import (
+    check_file,
+    digest_of,
+    files_in,
+    fingerprint,
+    matches_records,
+    results_folder,
+)
+from spackle.runtime.kernels import is_compiled
+from spackle.runtime.progress import BufferedReporter, Reporter, asked_to_stop
+from spackle.runtime.workers import parallel_map, threads_of_torch
+from spackle.video.frames import video_problem
 from spackle.weights import installed
-from spackle.workers import at_work, threads_of_torch
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,13 +57,23 @@ class PredictOptions:
         if (name := self.photo.depth_out) is not None:
             check_depth_name(name)
             if Path(name).name != name:
-                raise InputError(f"--depth-out {name}: give a name without a folder: the file lies beside scene.ply")
+                raise InputError(
+                    f"--depth-out {name}: give a name without a folder: the file lies beside scene.ply"
+                )
         pipeline, path = Pipeline.open(self.scene), self.scene.path
-        unused = [name for name in ("format", "fps", "loop") if getattr(path.video, name) is not None]
+        unused = [
+            name for name in ("format", "fps", "loop") if getattr(path.video, name) is not None
+        ]
         if unused and not self.photo.render:
             raise InputError(f"--{unused[0]}: --no-render writes no video: leave one of them out")
-        if self.photo.render and pipeline.given_views and (problem := video_problem(pipeline.given_views)):
-            raise InputError(f"{path.cameras}: {problem}, so no video can be made: add --no-render for pictures only")
+        if (
+            self.photo.render
+            and pipeline.given_views
+            and (problem := video_problem(pipeline.given_views))
+        ):
+            raise InputError(
+                f"{path.cameras}: {problem}, so no video can be made: add --no-render for pictures only"
+            )
         return pipeline
 
 
@@ -67,7 +84,9 @@ class NamedPhoto(NamedTuple):
     name: str
 
 
-def predict_all(given: Sequence[Path], output: Path, options: PredictOptions, reporter: Reporter) -> int:
+def predict_all(
+    given: Sequence[Path], output: Path, options: PredictOptions, reporter: Reporter
+) -> int:
     """Predict a clip, or photos and folders of photos; returns the number of photos that failed.
 
     Raises:
@@ -81,10 +100,14 @@ def predict_all(given: Sequence[Path], output: Path, options: PredictOptions, re
     if clips and not single:
         raise InputError(f"{clips[0]}: is a clip: give it alone, without other photos or clips")
     pipeline = (
-        options.open() if not clips else Pipeline.open(clip_options(options.scene, options.photo, options.workers))
+        options.open()
+        if not clips
+        else Pipeline.open(clip_options(options.scene, options.photo, options.workers))
     )
     if device_of(pipeline.renderer).type == "cpu" and not is_compiled(blend_tiles):
-        reporter.log("first use: kernels are compiled for this processor, which takes about half a minute, once")
+        reporter.log(
+            "first use: kernels are compiled for this processor, which takes about half a minute, once"
+        )
     if clips:
         check_file(clips[0], "clip")
         folder = output / named[0].name
@@ -104,13 +127,21 @@ def predict_all(given: Sequence[Path], output: Path, options: PredictOptions, re
         else:
             open_predictor = partial(Predictor.open, output, options, shared, reporter.verbose)
             gpu = options.scene.base.device != "cpu"
-            failed = _predict_by_workers(open_predictor, list(left), len(named), count, threads, gpu, reporter)
+            failed = _predict_by_workers(
+                open_predictor, list(left), len(named), count, threads, gpu, reporter
+            )
     if failed:
         reporter.log(f"{failed} of {len(named)} photos failed")
     else:
         folder = output / (named[0].name if single else "NAME")
-        video = f" at {folder / f'video{options.scene.path.video.suffix}'}, or" if options.photo.render else ""
-        reporter.log(f"Look{video} into the scene: spackle view {shlex.quote(str(folder / 'scene.ply'))}")
+        video = (
+            f" at {folder / f'video{options.scene.path.video.suffix}'}, or"
+            if options.photo.render
+            else ""
+        )
+        reporter.log(
+            f"Look{video} into the scene: spackle view {shlex.quote(str(folder / 'scene.ply'))}"
+        )
     return failed
 
 
@@ -124,15 +155,21 @@ def find_photos(given: Sequence[Path]) -> list[NamedPhoto]:
         matches = [] if os.path.lexists(path) else map(Path, sorted(glob.glob(str(path))))
         found = files_in(path, PHOTO_SUFFIXES) if os.path.isdir(path) else list(matches) or [path]
         if not found:
-            raise InputError(f"{path}: no photos in this folder (looked for {', '.join(PHOTO_SUFFIXES)})")
+            raise InputError(
+                f"{path}: no photos in this folder (looked for {', '.join(PHOTO_SUFFIXES)})"
+            )
         photos += found
     stems = Counter(photo.stem.casefold() for photo in photos)
     named: dict[str, NamedPhoto] = {}
     for photo in photos:
-        plain = stems[photo.stem.casefold()] == 1 and photo.stem.strip(".")  # "...png" has the stem ".."
+        plain = stems[photo.stem.casefold()] == 1 and photo.stem.strip(
+            "."
+        )  # "...png" has the stem ".."
         name = photo.stem if plain else photo.name
         if other := named.get(name.casefold()):
-            raise InputError(f"{photo}: {other.path} has the same name: predict them in two runs, each with its own -o")
+            raise InputError(
+                f"{photo}: {other.path} has the same name: predict them in two runs, each with its own -o"
+            )
         named[name.casefold()] = NamedPhoto(photo, name)
     return list(named.values())
 
@@ -157,7 +194,7 @@ def _predict_by_workers(
     with (
         asked_to_stop(alone=True) as stop,
         reporter.steps("photos", ready, total) as step,
-        at_work(open_predictor, left, stop, count=count, threads=threads, gpu=gpu) as results,
+        parallel_map(open_predictor, left, stop, count=count, threads=threads, gpu=gpu) as results,
     ):
         for done, result in enumerate(results, ready + 1):
             for what in result.said:
@@ -204,7 +241,7 @@ class Predictor:
             return (
                 bool(earlier)
                 and earlier.get("request") == self.request(photo)
-                and as_recorded(folder, REPORT, earlier.get("files"))
+                and matches_records(folder, REPORT, earlier.get("files"))
             )
         return False
 
@@ -214,11 +251,15 @@ class Predictor:
         if isinstance(depth, Path):
             depth = find_depth(depth, photo.path)
             files.append(fingerprint(depth, "depth map"))
-            files += [fingerprint(file, "calibration") for file in calibrations_beside(depth) if file.is_file()]
+            files += [
+                fingerprint(file, "calibration")
+                for file in calibrations_beside(depth)
+                if file.is_file()
+            ]
         return digest_of([self.shared, *files])
 
     def make(self, photo: NamedPhoto) -> Predicted:
-        notes = Notes(self.verbose)
+        notes = BufferedReporter(self.verbose)
         return Predicted(photo.path.name, not self.predict(photo, notes), notes.said)
 
     def left(self, photos: Iterable[NamedPhoto], reporter: Reporter) -> Iterator[NamedPhoto]:
@@ -248,12 +289,21 @@ class Predictor:
 def _shared_digest(options: PredictOptions) -> str:
     """A digest of version, options and files that all photos share; InputError for a missing file."""
     base, path, fill = options.scene.base, options.scene.path, options.scene.fill
-    files = {"calibration": base.calib, "camera file": path.cameras, "path file": path.path, "weights": fill.file}
+    files = {
+        "calibration": base.calib,
+        "camera file": path.cameras,
+        "path file": path.path,
+        "weights": fill.file,
+    }
     files |= {"LaMa": installed("lama") if fill.texture == "lama" else None, **base.files}
     prints = {kind: fingerprint(file, kind) for kind, file in files.items() if file is not None}
-    name = base.named if base.folder is None else "hf"  # digests identify the folder, wherever it lies
+    name = (
+        base.named if base.folder is None else "hf"
+    )  # digests identify the folder, wherever it lies
     # The number of windows changes only the last bits of results.
-    base = dataclasses.replace(base, name=name, depth=None, calib=None, checkpoint=None, windows=None)
+    base = dataclasses.replace(
+        base, name=name, depth=None, calib=None, checkpoint=None, windows=None
+    )
     path = dataclasses.replace(path, cameras=None, path=None)
     choices = [dataclasses.asdict(each) for each in (base, path, options.photo)]
     return digest_of([spackle.__version__, *choices, fill.weights, fill.texture, fill.mode, prints])

@@ -13,28 +13,35 @@ from pathlib import Path
 from rich.filesize import decimal
 from torch import Tensor
 
-from spackle.camera_path import PathError
-from spackle.errors import InputError, reading
-from spackle.files import results_folder, write_whole
-from spackle.formats import save_png, save_video
+from spackle.core.photo import DEFAULT_FOCAL_MM
+from spackle.core.trajectories import PathError
+from spackle.formats import save_png
 from spackle.formats.html import single_html
 from spackle.formats.scene_files import Encoder, SceneFile, encoder_of, load_scene
 from spackle.formats.spz import LARGEST, spz_grid
-from spackle.formats.video import FORMATS
-from spackle.image import DEFAULT_FOCAL_MM
-from spackle.progress import Reporter
 from spackle.render import get_renderer
 from spackle.residual import hole_area_ratio
+from spackle.runtime.errors import InputError, as_input_error
+from spackle.runtime.files import results_folder, write_atomic
+from spackle.runtime.progress import Reporter
 from spackle.scene import Scene
-from spackle.video_frames import FrameMaker, video_problem
+from spackle.video.encoding import FORMATS, save_video
+from spackle.video.frames import FrameMaker, video_problem
 from spackle.views import PathOptions
 
 TOLERATED = 0.01  # fraction of a frame that may be holes before the log mentions it
-PAGE: dict[str, Encoder] = {".html": lambda file: single_html(Scene.of_file(file).page(page_name(file.path)))}
+PAGE: dict[str, Encoder] = {
+    ".html": lambda file: single_html(Scene.of_file(file).page(page_name(file.path)))
+}
 
 
 def render_scene(
-    scene: Path, output: Path, path: PathOptions, lens: Mapping[str, float | None], device: str, reporter: Reporter
+    scene: Path,
+    output: Path,
+    path: PathOptions,
+    lens: Mapping[str, float | None],
+    device: str,
+    reporter: Reporter,
 ) -> None:
     """Render a scene along a path to the video `output`, or to STEM.mp4 in the folder `output`.
 
@@ -48,11 +55,15 @@ def render_scene(
     if single:
         path = dataclasses.replace(path, video=path.video.for_file(output))
     elif (mimetypes.guess_type(output.name)[0] or "").startswith(("video/", "image/")):
-        raise InputError(f"{output}: not a kind of video that can be written: end the name with {', '.join(FORMATS)}")
+        raise InputError(
+            f"{output}: not a kind of video that can be written: end the name with {', '.join(FORMATS)}"
+        )
     path.check()
     new_lens = any(value is not None for value in lens.values())
     if path.cameras is not None and new_lens:
-        raise InputError(f"--cameras {path.cameras}: its views have their own lenses: leave --fov and --focal-px out")
+        raise InputError(
+            f"--cameras {path.cameras}: its views have their own lenses: leave --fov and --focal-px out"
+        )
     renderer = get_renderer(device)
     with reporter.stage("load"):
         given, keyframes = path.load()
@@ -60,12 +71,17 @@ def render_scene(
         whole = Scene.of_file(loaded, path.video.size, **lens)
         base, aux, reach = whole.base, whole.aux, whole.disparity
         if path.video.compare and not len(aux):
-            raise InputError(f"{scene}: --compare needs a completed scene, such as the scene.ply of `spackle predict`")
+            raise InputError(
+                f"{scene}: --compare needs a completed scene, such as the scene.ply of `spackle predict`"
+            )
         parts = [[base]] * path.video.compare + [[base, aux]]
         if new_lens or reach is None:
             path = dataclasses.replace(path, overscan=0)
         impossible = "no camera path: {reason}: give views with --cameras"
-        with reading(scene, impossible, ValueError), reading(path.path, "{reason}", PathError):
+        with (
+            as_input_error(scene, impossible, ValueError),
+            as_input_error(path.path, "{reason}", PathError),
+        ):
             cameras = given or path.fly(base, whole.camera, keyframes, reach)
         if reach is not None and (path.disparity or 0) > reach:
             far = f"--disparity {path.disparity:g}"
@@ -74,7 +90,9 @@ def render_scene(
                 f"`spackle predict {far}` completes a photo that far"
             )
         if not given and loaded.camera is None and not new_lens:
-            reporter.log(f"{scene.name}: no camera stored: {DEFAULT_FOCAL_MM:g} mm assumed, --fov gives another lens")
+            reporter.log(
+                f"{scene.name}: no camera stored: {DEFAULT_FOCAL_MM:g} mm assumed, --fov gives another lens"
+            )
         maker = FrameMaker.of(path.video, base, cameras, scene)
     target = output if single else output / f"{scene.stem}{path.video.suffix}"
     names = [f"{index:04d}.png" for index in range(len(cameras))] if given and not single else []
@@ -102,7 +120,12 @@ def render_scene(
         else:
             save_video(frames(), target, path.video.rate, path.video.loop)
     seconds, total = reporter.seconds["video"], len(loaded.gaussians)
-    result = {"gaussians": total, "frames": len(cameras), "seconds": seconds, "open": round(max(holes), 5)}
+    result = {
+        "gaussians": total,
+        "frames": len(cameras),
+        "seconds": seconds,
+        "open": round(max(holes), 5),
+    }
     if max(holes) > TOLERATED:
         reporter.log(f"{scene.name}: holes take up to {max(holes):.1%} of a frame")
     if problem:
@@ -125,17 +148,21 @@ def export_scene(scene: Path, outputs: Sequence[Path], reporter: Reporter) -> No
         for output in outputs:
             folders.enter_context(results_folder(output.parent, [output.name]))
             if os.path.realpath(output) == os.path.realpath(scene):
-                raise InputError(f"{output}: this is the scene itself: give the output another name")
+                raise InputError(
+                    f"{output}: this is the scene itself: give the output another name"
+                )
         loaded = load_scene(scene)
         if rest := loaded.harmonics:
-            reporter.log(f"{scene}: {rest} spherical harmonics of each Gaussian, above degree 0, are left out")
+            reporter.log(
+                f"{scene}: {rest} spherical harmonics of each Gaussian, above degree 0, are left out"
+            )
         for output, encoder in zip(outputs, encoders, strict=True):
             start = time.perf_counter()
             try:
                 data = encoder(loaded)
             except InputError as error:  # the encoder does not know the file's name
                 raise InputError(f"{output}: {error}") from error
-            write_whole(output, data)
+            write_atomic(output, data)
             _report_file(loaded, output, time.perf_counter() - start, reporter)
 
 
@@ -151,10 +178,16 @@ def _report_file(scene: SceneFile, output: Path, seconds: float, reporter: Repor
             "the photo's view"
         )
     seconds = round(seconds, 3)
-    reporter.result({"file": output, "gaussians": count, "bytes": size, "seconds": seconds, "drawn_nearer": far})
+    reporter.result(
+        {"file": output, "gaussians": count, "bytes": size, "seconds": seconds, "drawn_nearer": far}
+    )
 
 
 def page_name(path: Path) -> str:
     """A scene's name on the page: the folder's name for a file called scene.ply or base.ply, else the file's name."""
     place = path.absolute()
-    return place.parent.name if place.name in ("scene.ply", "base.ply") and place.parent.name else place.stem
+    return (
+        place.parent.name
+        if place.name in ("scene.ply", "base.ply") and place.parent.name
+        else place.stem
+    )

@@ -18,16 +18,16 @@ from typing import NamedTuple
 from spackle.bases.open import open_base
 from spackle.bases.settings import AUTO, RGBD, BaseSettings
 from spackle.cli.saved_scene import page_name
-from spackle.errors import InputError, reading
-from spackle.files import check_file
+from spackle.core.photo import check_shape, load_photo
 from spackle.formats.scene_files import scene_kind
-from spackle.image import check_shape, load_photo
-from spackle.progress import Reporter, asked_to_stop
+from spackle.runtime.errors import InputError, as_input_error
+from spackle.runtime.files import check_file
+from spackle.runtime.progress import Reporter, asked_to_stop
 from spackle.scene import Scene
 from spackle.views import PathOptions
 from spackle.web.app import create_app, server_of
 from spackle.web.guard import Access
-from spackle.web.jobs import LOG, Jobs, Keep
+from spackle.web.jobs import LOG, Jobs, RetentionLimits
 from spackle.web.work import PREVIEW, SceneWork, check_photo
 
 LOOPBACK = "127.0.0.1"
@@ -68,7 +68,7 @@ def view(
     others.check()
     with tempfile.TemporaryDirectory(prefix="spackle-view-", ignore_cleanup_errors=True) as folder:
         work = SceneWork(others, usual, reporter.verbose)
-        with listening(Path(folder), work, 1, Keep(), place, reporter) as (jobs, urls):
+        with listening(Path(folder), work, 1, RetentionLimits(), place, reporter) as (jobs, urls):
             if target is not None:
                 with jobs.place() as new:
                     if scene_kind(target) is None:
@@ -80,14 +80,20 @@ def view(
             announce(name, urls, place, reporter)
 
 
-def _checked(target: Path, settings: BaseSettings, lens: Mapping[str, float | None], keep_frame: bool) -> str:
+def _checked(
+    target: Path, settings: BaseSettings, lens: Mapping[str, float | None], keep_frame: bool
+) -> str:
     """The name of a photo or scene on the page; InputError if the target, or its depth, cannot be read."""
     check_file(target, "photo or scene")
     settings.check()
     if scene_kind(target):
         if settings.depth is not None:
-            raise InputError(f"--depth {settings.depth}: {target.name} is a scene already: leave the option out")
-        with reading(target, "cannot be viewed: {reason}: give the lens with --fov", ValueError):
+            raise InputError(
+                f"--depth {settings.depth}: {target.name} is a scene already: leave the option out"
+            )
+        with as_input_error(
+            target, "cannot be viewed: {reason}: give the lens with --fov", ValueError
+        ):
             Scene.load(target, **lens).page(target.name)
         return page_name(target)
     photo = load_photo(target, keep_frame=keep_frame or settings.depth is not None, **lens)
@@ -99,7 +105,14 @@ def _checked(target: Path, settings: BaseSettings, lens: Mapping[str, float | No
     return target.name
 
 
-def serve(folder: Path, work: SceneWork, workers: int, keep: Keep, place: Place, reporter: Reporter) -> None:
+def serve(
+    folder: Path,
+    work: SceneWork,
+    workers: int,
+    keep: RetentionLimits,
+    place: Place,
+    reporter: Reporter,
+) -> None:
     """Complete photos for programs until the user stops the server; InputError for an option that cannot be used."""
     work.base.check()
     with listening(folder, work, workers, keep, place, reporter) as (_, urls):
@@ -111,14 +124,25 @@ def serve(folder: Path, work: SceneWork, workers: int, keep: Keep, place: Place,
 
 @contextlib.contextmanager
 def listening(
-    folder: Path, work: SceneWork, workers: int, keep: Keep, place: Place, reporter: Reporter
+    folder: Path,
+    work: SceneWork,
+    workers: int,
+    keep: RetentionLimits,
+    place: Place,
+    reporter: Reporter,
 ) -> Iterator[tuple[Jobs, list[str]]]:
     """Yield the app's jobs and the page's addresses; after the block, answer requests until Ctrl-C or SIGTERM."""
-    with asked_to_stop(alone=True) as stopped, listener_at(place.host, place.port) as listener, logged_to(reporter):
+    with (
+        asked_to_stop(alone=True) as stopped,
+        listener_at(place.host, place.port) as listener,
+        logged_to(reporter),
+    ):
         address, port = listener.getsockname()[:2]
         access = Access.at(place.host, address, place.token)
         if not access.local and place.token is None:
-            raise InputError(f"--host {place.host}: other machines can connect: leave --no-token out")
+            raise InputError(
+                f"--host {place.host}: other machines can connect: leave --no-token out"
+            )
         app = create_app(folder, work, workers=workers, keep=keep, access=access)
         here = {"0.0.0.0": LOOPBACK, "::": "::1"}.get(address, address)
         addresses = [here] if access.local else [here, address_in_network(place.host)]
@@ -145,13 +169,18 @@ def logged_to(reporter: Reporter) -> Iterator[None]:
 
 def listener_at(host: str, port: int) -> socket.socket:
     """A listening socket; InputError if the address cannot be used."""
-    with reading(
-        f"--host {host}, --port {port}", "cannot listen there: {reason}: give another one", OSError, UnicodeError
+    with as_input_error(
+        f"--host {host}, --port {port}",
+        "cannot listen there: {reason}: give another one",
+        OSError,
+        UnicodeError,
     ):
         family, *_ = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         both = family == socket.AF_INET6 and socket.has_dualstack_ipv6()
         try:
-            listener = socket.create_server((host, port), family=family, backlog=128, dualstack_ipv6=both)
+            listener = socket.create_server(
+                (host, port), family=family, backlog=128, dualstack_ipv6=both
+            )
         except OSError as error:  # whose text names the address, too
             raise OSError(error.errno, os.strerror(error.errno or 0)) from error
         # Finds the protocol, without which asyncio would not avoid delays of 40 ms (TCP_NODELAY).
@@ -171,10 +200,14 @@ def announce(name: str, urls: list[str], place: Place, reporter: Reporter) -> No
     # A text browser would take over the terminal.
     screen = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"))
     if place.browser and sys.platform.startswith("linux") and not screen:
-        reporter.log("this machine has no screen: open the page on another machine, through `ssh -L`")
+        reporter.log(
+            "this machine has no screen: open the page on another machine, through `ssh -L`"
+        )
     elif place.browser:
         # Some browsers return only when they are closed.
-        threading.Thread(target=webbrowser.open, args=(urls[0],), daemon=True, name="browser").start()
+        threading.Thread(
+            target=webbrowser.open, args=(urls[0],), daemon=True, name="browser"
+        ).start()
 
 
 def address_in_network(host: str) -> str:

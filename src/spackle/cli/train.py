@@ -22,33 +22,50 @@ def train(
     ],
     output: Annotated[
         Path,
-        typer.Option("-o", "--output", metavar="OUT", help="Folder for the results; an unfinished run in it resumes."),
+        typer.Option(
+            "-o",
+            "--output",
+            metavar="OUT",
+            help="Folder for the results; an unfinished run in it resumes.",
+        ),
     ],
     overrides: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[KEY=VALUE]...", help="Values that replace the recipe's, such as optim.steps=100."),
+        typer.Argument(
+            metavar="[KEY=VALUE]...",
+            help="Values that replace the recipe's, such as optim.steps=100.",
+        ),
     ] = None,
     method: Annotated[
         Literal["residual", "direct-ft"],
-        typer.Option(help="What to train: the residual network, or (direct-ft) SHARP's decoder, for comparison."),
+        typer.Option(
+            help="What to train: the residual network, or (direct-ft) SHARP's decoder, for comparison."
+        ),
     ] = "residual",
     checkpoint: Annotated[
-        Path | None, typer.Option("-c", "--checkpoint", metavar="FILE", help="Weights of SHARP, for direct-ft.")
+        Path | None,
+        typer.Option("-c", "--checkpoint", metavar="FILE", help="Weights of SHARP, for direct-ft."),
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Delete a run in OUT and start anew.")] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Delete a run in OUT and start anew.")
+    ] = False,
     verbose: VerboseOption = False,
 ) -> None:
     """Train the residual network or SHARP's decoder: best.safetensors, last.safetensors, run.json, pictures, logs."""
-    from spackle.errors import InputError
-    from spackle.progress import Reporter
-    from spackle.training.direct_ft import DirectFt
-    from spackle.training.recipe import Recipe, load_recipe
-    from spackle.training.residual import ResidualTask
-    from spackle.training.train import train
+    from spackle.paper.training.direct_ft import DirectFt
+    from spackle.paper.training.recipe import Recipe, load_recipe
+    from spackle.paper.training.residual import ResidualTask
+    from spackle.paper.training.train import train
+    from spackle.runtime.errors import InputError
+    from spackle.runtime.progress import Reporter
 
     if method == "residual" and checkpoint is not None:
-        raise InputError(f"-c {checkpoint}: --method residual learns without a base: leave the option out")
+        raise InputError(
+            f"-c {checkpoint}: --method residual learns without a base: leave the option out"
+        )
     task = ResidualTask if method == "residual" else partial(DirectFt, checkpoint=checkpoint)
-    ended = train(load_recipe(Recipe, recipe, overrides or ()), task, output, Reporter(verbose), overwrite)
+    ended = train(
+        load_recipe(Recipe, recipe, overrides or ()), task, output, Reporter(verbose), overwrite
+    )
     if ended == "stopped":
         raise typer.Exit(INTERRUPTED)

@@ -9,27 +9,36 @@ from typing import Annotated
 import typer
 
 from spackle.cli.options import JsonOption
-from spackle.errors import InputError
+from spackle.runtime.errors import InputError
 
 weights = typer.Typer(help="Download or list weights that others publish.", no_args_is_help=True)
 
 
 @weights.command("get")
 def weights_get(
-    name: Annotated[str, typer.Argument(help="Which weights: depth (MoGe-2), sharp, lama or features.")],
+    name: Annotated[
+        str, typer.Argument(help="Which weights: depth (MoGe-2), sharp, lama or features.")
+    ],
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", metavar="OUT", help="A folder, or a file name; default: the weights' folder."),
+        typer.Option(
+            "-o",
+            "--output",
+            metavar="OUT",
+            help="A folder, or a file name; default: the weights' folder.",
+        ),
     ] = None,
     url: Annotated[str | None, typer.Option(help="Download from this mirror.")] = None,
-    force: Annotated[bool, typer.Option("--force", help="Download even if the file exists.")] = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="Download even if the file exists.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Download weights and check their SHA-256; a broken download resumes where it stopped."""
     from rich.filesize import decimal
 
-    from spackle.files import results_folder
-    from spackle.progress import Reporter
+    from spackle.runtime.files import results_folder
+    from spackle.runtime.progress import Reporter
     from spackle.weights import published_weights, weights_digest, weights_folder
     from spackle.weights.download import download
 
@@ -48,9 +57,19 @@ def weights_get(
     else:
         with reporter.stage("check"):
             if weights_digest(path) != entry.sha256:
-                raise InputError(f"{path}: damaged, or a file of yours: SHA-256 is not {entry.sha256}: use --force")
+                raise InputError(
+                    f"{path}: damaged, or a file of yours: SHA-256 is not {entry.sha256}: use --force"
+                )
         reporter.log(f"{summary}, already downloaded and intact: {path}")
-    reporter.result({"name": name, "file": path, "bytes": entry.bytes, "sha256": entry.sha256, "downloaded": new})
+    reporter.result(
+        {
+            "name": name,
+            "file": path,
+            "bytes": entry.bytes,
+            "sha256": entry.sha256,
+            "downloaded": new,
+        }
+    )
 
 
 @weights.command("list")
@@ -58,7 +77,7 @@ def weights_list(as_json: JsonOption = False) -> None:
     """List the published weights, and say which are on this machine."""
     from rich.filesize import decimal
 
-    from spackle.progress import Reporter
+    from spackle.runtime.progress import Reporter
     from spackle.weights import PUBLISHED, weights_folder
 
     reporter, folder = Reporter(as_json=as_json), weights_folder()
@@ -66,10 +85,20 @@ def weights_list(as_json: JsonOption = False) -> None:
         file, state = folder / entry.file, "not here"
         if os.path.isfile(file):
             size = os.path.getsize(file)
-            state = "whole" if size == entry.bytes else f"damaged, or a file of yours: {size:,} bytes"
-        facts = {"name": entry.name, "state": state, "file": file, "bytes": entry.bytes, "licence": entry.licence}
+            state = (
+                "whole" if size == entry.bytes else f"damaged, or a file of yours: {size:,} bytes"
+            )
+        facts = {
+            "name": entry.name,
+            "state": state,
+            "file": file,
+            "bytes": entry.bytes,
+            "licence": entry.licence,
+        }
         reporter.result({**facts, "purpose": entry.purpose})
         if not as_json:
-            print(f"{entry.name:9} {state:9} {decimal(entry.bytes):>8}  {entry.licence:20} {entry.purpose}")
+            print(
+                f"{entry.name:9} {state:9} {decimal(entry.bytes):>8}  {entry.licence:20} {entry.purpose}"
+            )
     if not as_json:
         print(f"in {folder} (SPACKLE_WEIGHTS names another)")

@@ -8,17 +8,26 @@ import torch
 from torch import Tensor
 
 from spackle.bases import BasePrediction
-from spackle.camera import Camera
-from spackle.camera_path import DepthRange, TrajectoryKind, trajectory
-from spackle.clips.temporal import DepthAlignment, Flow, FrameMemory, align_depth, propagate_colors, track
-from spackle.device import Precision
-from spackle.gaussians import Gaussians
+from spackle.clips.temporal import (
+    DepthAlignment,
+    Flow,
+    FrameMemory,
+    align_depth,
+    propagate_colors,
+    track,
+)
+from spackle.core.camera import Camera
+from spackle.core.gaussians import Gaussians
+from spackle.core.trajectories import DepthRange, TrajectoryKind, trajectory
 from spackle.render import Renderer
 from spackle.render.protocol import Rendering
 from spackle.residual import ResidualNet, hole_mask
+from spackle.runtime.device import Precision
 from spackle.scene_fill import FillContext, OcclusionGuard, fill_view
 
-FOLLOW = 0.05  # in each frame, the path's depth range moves by this part towards the frame's depth range
+FOLLOW = (
+    0.05  # in each frame, the path's depth range moves by this part towards the frame's depth range
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,7 +84,9 @@ class ClipCompleter:
         base, guard, now, past = self._aligned(rgb, prediction)
         even = prediction.camera.even()
         disparity = prediction.disparity if self.disparity is None else self.disparity
-        (camera,) = trajectory(self.trajectory, even, disparity, now.depths, self.frames, only=self._count)
+        (camera,) = trajectory(
+            self.trajectory, even, disparity, now.depths, self.frames, only=self._count
+        )
         camera = camera.zoomed(1 + self.overscan)
         before, aux = self.renderer.render(base, camera), Gaussians.empty()
         alone = before
@@ -85,11 +96,16 @@ class ClipCompleter:
             context = FillContext(*parts, texture=None, precision=self.precision)
             filled = fill_view(context, camera, [guard], before)
             aux, alone = filled.aux, filled.rendering
-        drawn, memory = CompletedView(camera, (base, aux), alone, before, alone, cut=past is not self._past), None
+        drawn, memory = (
+            CompletedView(camera, (base, aux), alone, before, alone, cut=past is not self._past),
+            None,
+        )
         if self.fill:
             memory_before = None if past is None else past.memory
             views = (before, alone)
-            aux, memory = propagate_colors(base, aux, camera, self.renderer, views, memory_before, self.flow)
+            aux, memory = propagate_colors(
+                base, aux, camera, self.renderer, views, memory_before, self.flow
+            )
             drawn = dataclasses.replace(drawn, gaussians=(base, aux), view=memory.view)
         self._past = dataclasses.replace(now, memory=memory)
         self._count += 1
@@ -112,9 +128,13 @@ class ClipCompleter:
             if not found.same_shot():
                 past = None
             elif self.align:
-                alignment = past.alignment.after(align_depth(inverse_depth, past.inverse_depth, found)).leaked()
+                alignment = past.alignment.after(
+                    align_depth(inverse_depth, past.inverse_depth, found)
+                ).leaked()
         base = alignment.of_gaussians(prediction.gaussians)
-        guard = OcclusionGuard.of(dataclasses.replace(seen, depth=alignment.of_depth(seen.depth)), prediction.camera)
+        guard = OcclusionGuard.of(
+            dataclasses.replace(seen, depth=alignment.of_depth(seen.depth)), prediction.camera
+        )
         depths = DepthRange.of(base)
         if past is not None:
             depths = past.depths.towards(depths, FOLLOW)

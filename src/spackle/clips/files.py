@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
 
@@ -19,16 +19,38 @@ from av.video.reformatter import VideoReformatter
 from av.video.stream import VideoStream
 from torch import Tensor
 
-from spackle.errors import InputError, reading
-from spackle.files import check_file
-from spackle.formats.video import BT709, H264, StreamEncoder, VideoWriter
-from spackle.image import check_pixels
+from spackle.core.photo import check_pixels
+from spackle.runtime.errors import InputError, as_input_error
+from spackle.runtime.files import check_file
+from spackle.runtime.progress import Progress
+from spackle.video.encoding import BT709, H264, StreamEncoder, VideoWriter
 
-SUFFIXES = {".mp4", ".m4v", ".mov", ".webm", ".mkv", ".avi", ".gif", ".mpg", ".mpeg", ".ts", ".mts", ".m2ts", ".wmv"}
+SUFFIXES = {
+    ".mp4",
+    ".m4v",
+    ".mov",
+    ".webm",
+    ".mkv",
+    ".avi",
+    ".gif",
+    ".mpg",
+    ".mpeg",
+    ".ts",
+    ".mts",
+    ".m2ts",
+    ".wmv",
+}
 SUFFIXES |= {".flv", ".3gp", ".ogv"}
 UNSPECIFIED, BT601 = 2, 5  # FFmpeg's numbers of colour matrices
 HD_ROWS = 720  # from this height on, a video without declared colour matrix is read as BT.709, as players do
-LISTS = {"concat", "dash", "hls", "rtsp", "sdp", "webm_dash_manifest"}  # formats that make FFmpeg open other files
+LISTS = {
+    "concat",
+    "dash",
+    "hls",
+    "rtsp",
+    "sdp",
+    "webm_dash_manifest",
+}  # formats that make FFmpeg open other files
 DECODING = (av.FFmpegError, ValueError)  # errors of a damaged file
 HDR = {16: "PQ", 18: "HLG"}  # FFmpeg's numbers of transfers
 DEFAULT_RATE = Fraction(25)
@@ -74,7 +96,9 @@ def is_clip(path: Path) -> bool:
 
 
 def read_clip(
-    path: str | os.PathLike[str], first: int | None = None, progress: Callable[[int, int], None] | None = None
+    path: str | os.PathLike[str],
+    first: int | None = None,
+    progress: Progress | None = None,
 ) -> Clip:
     """Decode a clip from beginning to end, so that damage in any frame is reported at once.
 
@@ -95,7 +119,7 @@ def read_clip(
     raise InputError(message) from (cause and cause.with_traceback(None))
 
 
-def _read_clip(path: str | os.PathLike[str], first: int | None, progress: Callable[[int, int], None] | None) -> Clip:
+def _read_clip(path: str | os.PathLike[str], first: int | None, progress: Progress | None) -> Clip:
     ticks: list[Fraction | None] = []
     frame = None
     with _opened(path) as (container, stream):
@@ -104,7 +128,11 @@ def _read_clip(path: str | os.PathLike[str], first: int | None, progress: Callab
         sounds = container.streams.audio
         audio = sounds[0].codec_context.name if sounds and sounds[0].codec_context else None
         for frame in _decoded(path, container, stream, first):
-            ticks.append(None if frame.pts is None or frame.time_base is None else frame.pts * frame.time_base)
+            ticks.append(
+                None
+                if frame.pts is None or frame.time_base is None
+                else frame.pts * frame.time_base
+            )
             if progress:
                 progress(len(ticks), max(len(ticks), first or stream.frames))
     if frame is None:
@@ -115,7 +143,9 @@ def _read_clip(path: str | os.PathLike[str], first: int | None, progress: Callab
     check_pixels(width, height, os.path.getsize(path), path)
     times = _rising(ticks, Fraction(rate))
     hdr = HDR.get(int(frame.color_trc))
-    return Clip(Path(path), width, height, times, ticks[0] or Fraction(0), Fraction(rate), audio, hdr)
+    return Clip(
+        Path(path), width, height, times, ticks[0] or Fraction(0), Fraction(rate), audio, hdr
+    )
 
 
 def clip_frames(clip: Clip) -> Iterator[Tensor]:
@@ -129,18 +159,30 @@ def clip_frames(clip: Clip) -> Iterator[Tensor]:
 @contextlib.contextmanager
 def _opened(path: str | os.PathLike[str]) -> Iterator[tuple[InputContainer, VideoStream]]:
     """Open a file, and find the video stream."""
-    with reading(path, "not a video, or damaged at the beginning or end ({reason})", *DECODING):
-        container = av.open(str(path), metadata_errors="replace")  # in strict mode, the file stays open after an error
+    with as_input_error(
+        path, "not a video, or damaged at the beginning or end ({reason})", *DECODING
+    ):
+        container = av.open(
+            str(path), metadata_errors="replace"
+        )  # in strict mode, the file stays open after an error
     with container:
         if LISTS & set(container.format.name.split(",")):
-            raise InputError(f"{path}: is a list of other files, not a video: give one of these files")
-        pictures = [s for s in container.streams.video if not s.disposition & Disposition.attached_pic]
+            raise InputError(
+                f"{path}: is a list of other files, not a video: give one of these files"
+            )
+        pictures = [
+            s for s in container.streams.video if not s.disposition & Disposition.attached_pic
+        ]
         if not pictures:
             raise InputError(f"{path}: has no moving picture: give a video")
         stream = pictures[0]
         if stream.codec_context is None:
-            raise InputError(f"{path}: FFmpeg does not know the codec: convert the clip to H.264 first")
-        check_pixels(stream.codec_context.width, stream.codec_context.height, os.path.getsize(path), path)
+            raise InputError(
+                f"{path}: FFmpeg does not know the codec: convert the clip to H.264 first"
+            )
+        check_pixels(
+            stream.codec_context.width, stream.codec_context.height, os.path.getsize(path), path
+        )
         stream.thread_type = "AUTO"
         yield container, stream
 
@@ -150,7 +192,9 @@ def _decoded(
 ) -> Iterator[av.VideoFrame]:
     """Decode frames, which must all have the same size."""
     size, count, packets = None, 0, 0
-    with reading(path, "damaged or truncated ({reason}): give a whole clip, or fewer --frames", *DECODING):
+    with as_input_error(
+        path, "damaged or truncated ({reason}): give a whole clip, or fewer --frames", *DECODING
+    ):
         for packet in container.demux(stream):
             packets += packet.size > 0
             for frame in packet.decode():
@@ -248,7 +292,10 @@ class _ClipEncoder(StreamEncoder):
             assert packet.time_base is not None
             assert packet.pts is not None
             assert packet.dts is not None
-            times = [self._time(round(ticks * packet.time_base * self._even)) for ticks in (packet.pts, packet.dts)]
+            times = [
+                self._time(round(ticks * packet.time_base * self._even))
+                for ticks in (packet.pts, packet.dts)
+            ]
             packet.time_base = CLOCK
             packet.pts, packet.dts = (round(time / CLOCK) for time in times)
             packet.duration = 0
@@ -260,7 +307,11 @@ class _ClipEncoder(StreamEncoder):
         times = self._clip.times
         if 0 <= index < len(times):
             return times[index]
-        return times[0] + index / self._even if index < 0 else times[-1] + (index - len(times) + 1) / self._even
+        return (
+            times[0] + index / self._even
+            if index < 0
+            else times[-1] + (index - len(times) + 1) / self._even
+        )
 
     def _copy_sound(self, until: Fraction) -> None:
         """Copy the clip's sound up to a time; stop at the first damaged packet."""

@@ -14,18 +14,21 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample
 
-from spackle.camera import Camera
-from spackle.color import srgb_to_linear
-from spackle.filters import far_fill
-from spackle.gaussians import Gaussians
+from spackle.core.camera import Camera
+from spackle.core.color import srgb_to_linear
+from spackle.core.gaussians import Gaussians
+from spackle.core.hole_filling import far_fill
 from spackle.render import Renderer, touched_tiles
 from spackle.render.protocol import Rendering
-from spackle.residual.view_features import CELL, hole_mask
+from spackle.residual.features import CELL, hole_mask
 
 # Maps two sRGB images [H, W, 3] to the offset [H, W, 2] from each pixel of the first image to its place in the second.
 Flow = Callable[[Tensor, Tensor], Tensor]
 
-RETURN_PX, RETURN_SHARE = 1.0, 0.05  # forward and backward flow may differ by so many pixels, plus this part of a flow
+RETURN_PX, RETURN_SHARE = (
+    1.0,
+    0.05,
+)  # forward and backward flow may differ by so many pixels, plus this part of a flow
 ALIKE = 0.1  # largest mean sRGB difference between two pixels that show the same content
 SAME_SHOT = 0.3  # least fraction of a frame whose content the previous frame shows, unless a new shot begins
 THINNING = 4  # a fit of six numbers uses every fourth pixel along each axis
@@ -85,7 +88,9 @@ def inside(uv: Tensor, height: int, width: int) -> Tensor:
 def sample(image: Tensor, uv: Tensor) -> Tensor:
     """Sample an image [H, W, C] bilinearly at pixel positions [h, w, 2], with edge padding: [h, w, C]."""
     grid = 2 * uv / uv.new_tensor([image.shape[1], image.shape[0]]) - 1
-    found = grid_sample(image.permute(2, 0, 1)[None], grid[None], align_corners=False, padding_mode="border")
+    found = grid_sample(
+        image.permute(2, 0, 1)[None], grid[None], align_corners=False, padding_mode="border"
+    )
     return found[0].permute(1, 2, 0)
 
 
@@ -149,7 +154,9 @@ class FrameMemory:
     """The state of a completed view that the next frame needs."""
 
     view: Rendering  # completed
-    light: Tensor  # [H, W, 3] linear light of the view; in holes the light of the aux Gaussians alone
+    light: (
+        Tensor  # [H, W, 3] linear light of the view; in holes the light of the aux Gaussians alone
+    )
     inverse_depth: Tensor  # [H, W] of the same surfaces, positive
     trust: Tensor  # [H, W] in 0..1: 1 if the base shows the pixel, about KEEP^n if a base showed it n frames ago
 
@@ -194,7 +201,9 @@ def propagate_colors(
     blended = (fresh + weight[..., None] * (recalled - fresh)).clamp(0, 1)
     light = torch.where(hole[..., None], blended, made_up)
     # The colour of a faint cell is too noisy to measure a change.
-    changed = _recoloured(aux, camera, light - made_up, torch.where(hole & (share >= FAINT), share, 0.0))
+    changed = _recoloured(
+        aux, camera, light - made_up, torch.where(hole & (share >= FAINT), share, 0.0)
+    )
     view = renderer.render([base, changed], camera, tiles=touched_tiles(aux, camera), onto=own)
     return changed, FrameMemory(view, light, inverse_depth, _trust(hole, share, weight))
 
@@ -224,12 +233,18 @@ def _recall(past: FrameMemory, uv: Tensor, inverse_depth: Tensor) -> tuple[Tenso
     height, width = past.trust.shape
     corner = (uv - 0.5).floor()
     part = uv - 0.5 - corner
-    light, mass, trust = torch.zeros_like(past.light), torch.zeros_like(past.trust), torch.zeros_like(past.trust)
+    light, mass, trust = (
+        torch.zeros_like(past.light),
+        torch.zeros_like(past.trust),
+        torch.zeros_like(past.trust),
+    )
     for dy in (0, 1):
         for dx in (0, 1):
             column = (corner[..., 0].long() + dx).clamp(0, width - 1)
             row = (corner[..., 1].long() + dy).clamp(0, height - 1)
-            share = (part[..., 0] if dx else 1 - part[..., 0]) * (part[..., 1] if dy else 1 - part[..., 1])
+            share = (part[..., 0] if dx else 1 - part[..., 0]) * (
+                part[..., 1] if dy else 1 - part[..., 1]
+            )
             nearer = (past.inverse_depth[row, column] / inverse_depth - 1).clamp_min(0)
             share = share * torch.exp(-((nearer / NEARER) ** 2)) * (past.trust[row, column] > 0)
             light += share[..., None] * past.light[row, column]
@@ -293,7 +308,9 @@ class DepthAlignment:
             return gaussians
         z = gaussians.means[:, 2]
         factor = torch.where(z == 0, 1.0, self.of_depth(z) / z.where(z != 0, 1.0))[:, None]
-        return dataclasses.replace(gaussians, means=gaussians.means * factor, scales=gaussians.scales * factor)
+        return dataclasses.replace(
+            gaussians, means=gaussians.means * factor, scales=gaussians.scales * factor
+        )
 
 
 def align_depth(inverse_depth: Tensor, earlier: Tensor, found: Track) -> DepthAlignment:
@@ -308,8 +325,12 @@ def align_depth(inverse_depth: Tensor, earlier: Tensor, found: Track) -> DepthAl
     for _ in range(ROUNDS):
         weights = 1 / (1 + ((scale * now + shift - then) / (OFF * unit)) ** 2)
         mass, x, y = weights.sum(), (weights * now).sum(), (weights * then).sum()
-        normal = torch.stack([torch.stack([(weights * now * now).sum(), x]), torch.stack([x, mass * (1 + NO_SHIFT)])])
-        scale, shift = torch.linalg.solve(normal, torch.stack([(weights * now * then).sum(), y])).tolist()
+        normal = torch.stack(
+            [torch.stack([(weights * now * now).sum(), x]), torch.stack([x, mass * (1 + NO_SHIFT)])]
+        )
+        scale, shift = torch.linalg.solve(
+            normal, torch.stack([(weights * now * then).sum(), y])
+        ).tolist()
     if not (math.isfinite(scale) and math.isfinite(shift) and 1 / MAX_SCALE <= scale <= MAX_SCALE):
         return DepthAlignment()
     return DepthAlignment(scale, shift)

@@ -12,10 +12,10 @@ import torch
 from pydantic import BaseModel, Field, Strict, ValidationError
 from torch import Tensor
 
-from spackle.camera import Camera
-from spackle.camera_path import UP, Keyframe, KeyframePath, PathError, PathUnit
-from spackle.errors import InputError, reading
-from spackle.files import check_file
+from spackle.core.camera import Camera
+from spackle.core.trajectories import UP, Keyframe, KeyframePath, PathError, PathUnit
+from spackle.runtime.errors import InputError, as_input_error
+from spackle.runtime.files import check_file
 
 MAX_BYTES = 64 << 20
 MAX_FRAMES = 10_000  # cameras or keyframes
@@ -72,14 +72,19 @@ def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
     """
     content = _read(_CameraFile, path, "camera file")
     return [
-        _camera(frame, frame.width or content.width, frame.height or content.height, f"{path}: frame {index}")
+        _camera(
+            frame,
+            frame.width or content.width,
+            frame.height or content.height,
+            f"{path}: frame {index}",
+        )
         for index, frame in enumerate(content.frames)
     ]
 
 
 def camera_of(facts: Mapping[str, Any], where: str) -> Camera:
     """A camera from its entry in a JSON file; InputError, beginning with `where`, if the camera is impossible."""
-    with reading(where, "{reason}", ValidationError):
+    with as_input_error(where, "{reason}", ValidationError):
         frame = _Frame.model_validate(facts)
     return _camera(frame, frame.width, frame.height, where)
 
@@ -109,16 +114,29 @@ def checked_camera(
     """
     if not (1 <= width <= MAX_SIZE and 1 <= height <= MAX_SIZE):
         raise InputError(f"{where}: width and height must be whole numbers from 1 to {MAX_SIZE}")
-    if not all(bool((matrix.abs() <= LARGEST).all()) for matrix in (K, world_to_camera)):  # NaN fails, too
-        raise InputError(f"{where}: numbers in K and world_to_camera must be finite, at most {LARGEST:g}")
+    if not all(
+        bool((matrix.abs() <= LARGEST).all()) for matrix in (K, world_to_camera)
+    ):  # NaN fails, too
+        raise InputError(
+            f"{where}: numbers in K and world_to_camera must be finite, at most {LARGEST:g}"
+        )
     fx, fy = float(K[0, 0]), float(K[1, 1])
     if min(fx, fy) < 1 / LARGEST:
         raise InputError(f"{where}: K needs positive focal lengths at [0][0] and [1][1]")
-    if K[2].tolist() != [0, 0, 1] or max(abs(float(K[0, 1])), abs(float(K[1, 0]))) > ZERO_TOLERANCE * fx:
-        raise InputError(f"{where}: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]: skew is not supported")
+    if (
+        K[2].tolist() != [0, 0, 1]
+        or max(abs(float(K[0, 1])), abs(float(K[1, 0]))) > ZERO_TOLERANCE * fx
+    ):
+        raise InputError(
+            f"{where}: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]: skew is not supported"
+        )
     rotation, last = world_to_camera[:3, :3], world_to_camera.new_tensor([0, 0, 0, 1])
     error = (rotation @ rotation.T - torch.eye(3, dtype=rotation.dtype)).abs().max()
-    if error > tolerance or torch.linalg.det(rotation) < 0 or (world_to_camera[3] - last).abs().max() > ZERO_TOLERANCE:
+    if (
+        error > tolerance
+        or torch.linalg.det(rotation) < 0
+        or (world_to_camera[3] - last).abs().max() > ZERO_TOLERANCE
+    ):
         raise InputError(
             f"{where}: world_to_camera must be a rotation (no scale, no mirror) and a translation, above a row 0 0 0 1"
         )
@@ -139,14 +157,16 @@ def load_path(path: str | os.PathLike[str]) -> KeyframePath:
     content = _read(_PathFile, path, "path file")
     keys = []
     for index, key in enumerate(content.keyframes):
-        with reading(f"{path}: keyframe {index}", "{reason}", PathError):
+        with as_input_error(f"{path}: keyframe {index}", "{reason}", PathError):
             keys.append(Keyframe(**key.model_dump()))
-    with reading(path, "{reason}", PathError):
+    with as_input_error(path, "{reason}", PathError):
         return KeyframePath(tuple(keys), content.closed, content.unit)
 
 
 def _read(model: type[M], path: str | os.PathLike[str], kind: str) -> M:
     if check_file(path, kind) > MAX_BYTES:
-        raise InputError(f"{path}: too long for a {kind} (at most {MAX_BYTES >> 20} MiB): is it the right file?")
-    with reading(path, "{reason}", ValidationError):
+        raise InputError(
+            f"{path}: too long for a {kind} (at most {MAX_BYTES >> 20} MiB): is it the right file?"
+        )
+    with as_input_error(path, "{reason}", ValidationError):
         return model.model_validate_json(Path(path).read_bytes().removeprefix(codecs.BOM_UTF8))

@@ -23,7 +23,12 @@ LARGEST_LOG_SCALE = 20  # largest absolute value that readers expect
 GRID_BITS = 10  # bits of each coordinate in Morton order
 
 _CHUNK_NAMES = [
-    *(f"{end}_{prefix}{axis}" for prefix in ("", "scale_") for end in ("min", "max") for axis in "xyz"),
+    *(
+        f"{end}_{prefix}{axis}"
+        for prefix in ("", "scale_")
+        for end in ("min", "max")
+        for axis in "xyz"
+    ),
     *(f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"),
 ]
 PLACE_BITS, TURN_BITS, COLOR_BITS = (11, 10, 11), (10, 10, 10), (8, 8, 8, 8)
@@ -35,8 +40,14 @@ def encode_compressed_ply(scene: SceneFile) -> bytes:
     The base's Gaussians come first; within base and aux, neighbours in space become neighbours in the file. ValueError
     if a Gaussian is not finite.
     """
-    columns, count, border = Columns.of(scene.gaussians), len(scene.gaussians), scene.base_count or 0
-    order = np.concatenate([morton_order(columns.means[:border]), border + morton_order(columns.means[border:])])
+    columns, count, border = (
+        Columns.of(scene.gaussians),
+        len(scene.gaussians),
+        scene.base_count or 0,
+    )
+    order = np.concatenate(
+        [morton_order(columns.means[:border]), border + morton_order(columns.means[border:])]
+    )
     columns = columns.select(order)
     scales = np.clip(columns.log_scales, -LARGEST_LOG_SCALE, LARGEST_LOG_SCALE)
     starts = np.arange(0, count, CHUNK)
@@ -49,10 +60,19 @@ def encode_compressed_ply(scene: SceneFile) -> bytes:
         colors, chunks[:, 12:18] = _normalised(columns.srgb, starts)
         rows[:, 0] = _packed(places, PLACE_BITS)
         largest, others = smallest_three(columns.quats)
-        rows[:, 1] = largest.astype(np.uint32) << np.uint32(30) | _packed(as_shares(others), TURN_BITS)
+        rows[:, 1] = largest.astype(np.uint32) << np.uint32(30) | _packed(
+            as_shares(others), TURN_BITS
+        )
         rows[:, 2] = _packed(sizes, PLACE_BITS)
-        rows[:, 3] = _packed(np.concatenate([colors, columns.opacities[:, None]], axis=1), COLOR_BITS)
-    header = ply_header(*tables, camera=scene.untilted_camera, base_count=scene.base_count, disparity=scene.disparity)
+        rows[:, 3] = _packed(
+            np.concatenate([colors, columns.opacities[:, None]], axis=1), COLOR_BITS
+        )
+    header = ply_header(
+        *tables,
+        camera=scene.untilted_camera,
+        base_count=scene.base_count,
+        disparity=scene.disparity,
+    )
     return header + chunks.tobytes() + rows.tobytes()
 
 
@@ -89,7 +109,9 @@ def _packed(shares: Floats, widths: tuple[int, ...]) -> NDArray[np.uint32]:
     """Pack fractions 0..1 [N, k] into words [N]; each is rounded to its width, the first takes the highest bits."""
     word = np.zeros(len(shares), np.uint32)
     for column, width in zip(shares.T, widths, strict=True):
-        word = word << np.uint32(width) | np.round(column * np.float32(2**width - 1)).astype(np.uint32)
+        word = word << np.uint32(width) | np.round(column * np.float32(2**width - 1)).astype(
+            np.uint32
+        )
     return word
 
 
@@ -101,7 +123,11 @@ def decode_compressed_ply(chunks: NDArray[Any], rows: NDArray[Any]) -> Columns:
         raise ValueError(f"{len(chunks)} chunks for {len(rows)} vertices")
     places, turns, sizes, colors = (np.array(rows[name], np.uint32) for name in PACKED)
     rgba = _unpacked(colors, COLOR_BITS)
-    srgb = _between(rgba[:, :3], chunks, _CHUNK_NAMES[12:]) if "min_r" in (chunks.dtype.names or ()) else rgba[:, :3]
+    srgb = (
+        _between(rgba[:, :3], chunks, _CHUNK_NAMES[12:])
+        if "min_r" in (chunks.dtype.names or ())
+        else rgba[:, :3]
+    )
     return Columns(
         _between(_unpacked(places, PLACE_BITS), chunks, _CHUNK_NAMES[0:6]),
         from_smallest_three(turns >> np.uint32(30), from_shares(_unpacked(turns, TURN_BITS))),
@@ -124,5 +150,7 @@ def _between(shares: Floats, chunks: NDArray[Any], names: list[str]) -> Floats:
     """The inverse of `_normalised`; `names` are the properties with the chunks' bounds: three minima, three maxima."""
     bounds = np.stack([chunks[name] for name in names], axis=1).astype(np.float64)
     low, high = np.split(bounds[np.arange(len(shares)) // CHUNK], 2, axis=1)
-    with np.errstate(over="ignore", invalid="ignore"):  # `Columns.gaussians` refuses infinite values
+    with np.errstate(
+        over="ignore", invalid="ignore"
+    ):  # `Columns.gaussians` refuses infinite values
         return (low + shares * (high - low)).astype(np.float32)

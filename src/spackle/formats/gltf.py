@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from spackle.camera import Camera
-from spackle.color import srgb_to_linear
-from spackle.errors import InputError
+from spackle.core.camera import Camera
+from spackle.core.color import srgb_to_linear
 from spackle.formats.scene_files import Columns, SceneFile
+from spackle.runtime.errors import InputError
 
 EXTENSION = "KHR_gaussian_splatting"
 LARGEST_FILE = 2**32 - 1  # bytes that a .glb can announce
@@ -38,7 +38,9 @@ def encode_glb(scene: SceneFile) -> bytes:
     if count == 0:
         raise InputError("glTF cannot hold a scene without Gaussians: use another format")
     if count * ROW + (1 << 16) > LARGEST_FILE:
-        raise InputError(f"{count:,} Gaussians are too many for .glb (4 GiB at most): use another format")
+        raise InputError(
+            f"{count:,} Gaussians are too many for .glb (4 GiB at most): use another format"
+        )
     arrays = _attributes(Columns.of(scene.gaussians).flipped())
     parts = [array.tobytes() for array in arrays.values()]
     text = json.dumps(
@@ -47,7 +49,15 @@ def encode_glb(scene: SceneFile) -> bytes:
     text += b" " * (-len(text) % 4)
     size = sum(len(part) for part in parts)
     head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + size)
-    return b"".join([head, struct.pack("<I4s", len(text), b"JSON"), text, struct.pack("<I4s", size, b"BIN\0"), *parts])
+    return b"".join(
+        [
+            head,
+            struct.pack("<I4s", len(text), b"JSON"),
+            text,
+            struct.pack("<I4s", size, b"BIN\0"),
+            *parts,
+        ]
+    )
 
 
 def _attributes(columns: Columns) -> dict[str, NDArray[Any]]:
@@ -64,13 +74,22 @@ def _attributes(columns: Columns) -> dict[str, NDArray[Any]]:
     }
 
 
-def _description(arrays: dict[str, NDArray[Any]], camera: Camera | None, base_count: int | None) -> dict[str, Any]:
+def _description(
+    arrays: dict[str, NDArray[Any]], camera: Camera | None, base_count: int | None
+) -> dict[str, Any]:
     """The file's JSON part."""
     views, accessors, offset = [], [], 0
     for index, array in enumerate(arrays.values()):
-        views.append({"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": ARRAY_BUFFER})
+        views.append(
+            {"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": ARRAY_BUFFER}
+        )
         kind = "SCALAR" if array.ndim == 1 else f"VEC{array.shape[1]}"
-        accessor: dict[str, Any] = {"bufferView": index, "componentType": FLOAT, "count": len(array), "type": kind}
+        accessor: dict[str, Any] = {
+            "bufferView": index,
+            "componentType": FLOAT,
+            "count": len(array),
+            "type": kind,
+        }
         if array.dtype == np.uint16:
             accessor |= {"componentType": UNSIGNED_SHORT, "normalized": True}
         accessors.append(accessor)
@@ -95,11 +114,21 @@ def _description(arrays: dict[str, NDArray[Any]], camera: Camera | None, base_co
     }
     if camera is not None:
         flip = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
-        matrix = flip @ torch.linalg.inv(camera.world_to_camera.detach().to("cpu", torch.float64)) @ flip
+        matrix = (
+            flip @ torch.linalg.inv(camera.world_to_camera.detach().to("cpu", torch.float64)) @ flip
+        )
         pose = (matrix.T.flatten() + 0.0).tolist()  # camera to world, column by column, without -0
         nodes.append({"name": "photo", "camera": 0} | ({} if pose == UNMOVED else {"matrix": pose}))
         (fx, fy), width, height = camera.focal, camera.width, camera.height
-        lens = {"yfov": 2 * math.atan2(height, 2 * fy), "aspectRatio": width * fy / (height * fx), "znear": NEAR_PLANE}
-        extras = {"K": camera.K.tolist(), "width": width, "height": height}  # glTF has no principal point
+        lens = {
+            "yfov": 2 * math.atan2(height, 2 * fy),
+            "aspectRatio": width * fy / (height * fx),
+            "znear": NEAR_PLANE,
+        }
+        extras = {
+            "K": camera.K.tolist(),
+            "width": width,
+            "height": height,
+        }  # glTF has no principal point
         description["cameras"] = [{"type": "perspective", "perspective": lens, "extras": extras}]
     return description

@@ -15,18 +15,31 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from spackle.camera import Camera
-from spackle.camera_path import OVERSCAN, SHARP_TRAJECTORIES, DepthRange, TrajectoryKind, max_offset, trajectory
-from spackle.color import linear_to_srgb
-from spackle.errors import InputError
+from spackle.core.camera import Camera
+from spackle.core.color import linear_to_srgb
+from spackle.core.gaussians import Gaussians
+from spackle.core.trajectories import (
+    OVERSCAN,
+    SHARP_TRAJECTORIES,
+    DepthRange,
+    TrajectoryKind,
+    max_offset,
+    trajectory,
+)
 from spackle.formats.scene_files import smallest_three
-from spackle.gaussians import Gaussians
+from spackle.runtime.errors import InputError
 
 SAMPLES = 121  # positions along a path, between which the page interpolates linearly
-USUAL, FOREIGN = 0.3, 0.6  # disparity limit of a completed scene, and of another program's, if none is stored
+USUAL, FOREIGN = (
+    0.3,
+    0.6,
+)  # disparity limit of a completed scene, and of another program's, if none is stored
 LEAST, MOST = 0.01, 1.0  # bounds of the disparity limit
 BYTES = 20  # byte planes: 9 of centres, 3 of scales, 4 of rotations, 3 of colours, 1 of opacity
-SMALLEST_SCALE, LARGEST_SCALE = 1e-7, 1e5  # bounds of scales, because an outlier would cost the others precision
+SMALLEST_SCALE, LARGEST_SCALE = (
+    1e-7,
+    1e5,
+)  # bounds of scales, because an outlier would cost the others precision
 BLOCK = 1 << 16  # Gaussians that are packed at a time, which fit the cache
 
 STYLE = '<link rel="stylesheet" href="viewer.css">'
@@ -42,7 +55,12 @@ class PageScene:
 
 
 def page_scene(
-    name: str, base: Gaussians, aux: Gaussians, camera: Camera, disparity: float | None = None, note: str = ""
+    name: str,
+    base: Gaussians,
+    aux: Gaussians,
+    camera: Camera,
+    disparity: float | None = None,
+    note: str = "",
 ) -> PageScene:
     """Prepare a scene for the page.
 
@@ -61,14 +79,26 @@ def page_scene(
         InputError: no Gaussian lies in front of the camera.
     """
     if not bool((base.means[:, 2] > 0).any()):
-        raise InputError(f"{name}: no Gaussian lies in front of the photo's camera: nothing can be shown")
+        raise InputError(
+            f"{name}: no Gaussian lies in front of the photo's camera: nothing can be shown"
+        )
     depths = DepthRange.of(base)
-    free = min(max((USUAL if len(aux) else FOREIGN) if disparity is None else disparity, LEAST), MOST)
+    free = min(
+        max((USUAL if len(aux) else FOREIGN) if disparity is None else disparity, LEAST), MOST
+    )
     files, layers = {}, []
     for layer, gaussians in {"base": base, "aux": aux}.items():
         file = f"{layer}.splats"
         files[file], low, step = encode_layer(gaussians)
-        layers.append({"name": layer, "file": file, "count": len(gaussians), "scaleLow": low, "scaleStep": step})
+        layers.append(
+            {
+                "name": layer,
+                "file": file,
+                "count": len(gaussians),
+                "scaleLow": low,
+                "scaleStep": step,
+            }
+        )
     drawn = camera if disparity is None else camera.zoomed(1 + OVERSCAN)
     description: dict[str, object] = {
         "name": name,
@@ -86,11 +116,19 @@ def page_scene(
 def _path(kind: TrajectoryKind, camera: Camera, depths: DepthRange) -> dict[str, list[list[float]]]:
     """Camera positions at disparity 0 (`still`), and their change for a disparity of 1 (`moving`), to nine digits."""
     still, wide = (
-        torch.stack([each.position for each in trajectory(kind, camera.to("cpu", torch.float64), far, depths, SAMPLES)])
+        torch.stack(
+            [
+                each.position
+                for each in trajectory(kind, camera.to("cpu", torch.float64), far, depths, SAMPLES)
+            ]
+        )
         for far in (0.0, 1.0)
     )
     parts = {"still": still, "moving": wide - still}
-    return {name: [[float(f"{x:.9g}") + 0.0 for x in eye] for eye in eyes.tolist()] for name, eyes in parts.items()}
+    return {
+        name: [[float(f"{x:.9g}") + 0.0 for x in eye] for eye in eyes.tolist()]
+        for name, eyes in parts.items()
+    }
 
 
 @torch.no_grad()
@@ -105,16 +143,22 @@ def encode_layer(gaussians: Gaussians) -> tuple[bytes, float, float]:
     Returns:
         The bytes [BYTES, N]; the logarithm of the scale for byte 0; the increase of the logarithm per step.
     """
-    means, quats, scales, opacities, colors = (t.detach().to("cpu", torch.float32) for t in gaussians.tensors)
+    means, quats, scales, opacities, colors = (
+        t.detach().to("cpu", torch.float32) for t in gaussians.tensors
+    )
     low, step = _scale_range(scales)
     planes = np.empty((BYTES, len(gaussians)), np.uint8)
     for start in range(0, len(gaussians), BLOCK):
         part = slice(start, start + BLOCK)
-        bits = (means[part].T.contiguous().numpy().view(np.uint32) + np.uint32(0x80)).view(np.uint8)  # little-endian
+        bits = (means[part].T.contiguous().numpy().view(np.uint32) + np.uint32(0x80)).view(
+            np.uint8
+        )  # little-endian
         planes[0:9, part] = bits.reshape(3, -1, 4)[:, :, 1:].transpose(0, 2, 1).reshape(9, -1)
         logs = scales[part].clamp(SMALLEST_SCALE, LARGEST_SCALE).log()
         planes[9:12, part] = _bytes((logs - low) / step)
-        planes[12, part], others = smallest_three(torch.nn.functional.normalize(quats[part], dim=-1).numpy())
+        planes[12, part], others = smallest_three(
+            torch.nn.functional.normalize(quats[part], dim=-1).numpy()
+        )
         planes[13:16, part] = _bytes(torch.from_numpy(others) * (127 * math.sqrt(2)) + 128)
         planes[16:19, part] = _bytes(linear_to_srgb(colors[part]) * 255)
         planes[19, part] = _bytes(opacities[part, None] * 255)
@@ -124,7 +168,10 @@ def encode_layer(gaussians: Gaussians) -> tuple[bytes, float, float]:
 def _scale_range(scales: Tensor) -> tuple[float, float]:
     if not scales.numel():
         return 0.0, 1.0
-    low, high = (math.log(min(max(float(end), SMALLEST_SCALE), LARGEST_SCALE)) for end in torch.aminmax(scales))
+    low, high = (
+        math.log(min(max(float(end), SMALLEST_SCALE), LARGEST_SCALE))
+        for end in torch.aminmax(scales)
+    )
     return low, max(high - low, 1e-3) / 255
 
 
@@ -144,7 +191,10 @@ def as_json(value: object) -> bytes:
 def single_html(scene: PageScene) -> bytes:
     """The page with a scene embedded; it opens from a disk or an e-mail and fetches nothing."""
     page, css, js = (page_file(name).decode() for name in ("index.html", "viewer.css", "viewer.js"))
-    held = {name: base64.b64encode(gzip.compress(data, 6, mtime=0)).decode() for name, data in scene.files.items()}
+    held = {
+        name: base64.b64encode(gzip.compress(data, 6, mtime=0)).decode()
+        for name, data in scene.files.items()
+    }
     data = as_json({"description": scene.description, "files": held}).decode()
     style, script = f"<style>{css}</style>", f"<script>{js}</script>"
     embedded = f'<script type="application/json" id="spackle-scene">{data}</script>'

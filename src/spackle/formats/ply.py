@@ -14,19 +14,21 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from spackle.camera import Camera
-from spackle.color import srgb_to_linear
-from spackle.errors import InputError, reading
-from spackle.files import atomic_path, check_file
+from spackle.core.camera import Camera
+from spackle.core.color import srgb_to_linear
+from spackle.core.gaussians import Gaussians
 from spackle.formats.camera_files import checked_camera
 from spackle.formats.scene_files import SH_C0, Columns, SceneFile, function_named
-from spackle.gaussians import Gaussians
+from spackle.runtime.errors import InputError, as_input_error
+from spackle.runtime.files import atomic_path, check_file
 
 MAX_HEADER_BYTES = 1 << 16
 MAX_EXTRA_ROWS = 64  # larger tables than this hold no camera
 
 _TYPES = "char uchar short ushort int uint float double int8 uint8 int16 uint16 int32 uint32 float32 float64"
-_CODES = dict(zip(_TYPES.split(), ["i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"] * 2, strict=True))
+_CODES = dict(
+    zip(_TYPES.split(), ["i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"] * 2, strict=True)
+)
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 
 SMALLEST_OPACITY, LARGEST_OPACITY = 1e-12, 1 - 2.0**-24  # bounds that keep the logit finite
@@ -39,7 +41,13 @@ _READ = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "sca
 PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
 _READ += ["rot_0", "rot_1", "rot_2", "rot_3"]
 _WRITTEN = [*_READ[:3], "nx", "ny", "nz", *_READ[3:]]
-_SLICES = slice(0, 3), slice(3, 6), slice(6, 7), slice(7, 10), slice(10, 14)  # means, f_dc, opacity, scales, rot
+_SLICES = (
+    slice(0, 3),
+    slice(3, 6),
+    slice(6, 7),
+    slice(7, 10),
+    slice(10, 14),
+)  # means, f_dc, opacity, scales, rot
 
 StrPath = str | os.PathLike[str]
 
@@ -61,7 +69,7 @@ def save_ply(
     Args:
         camera: the photo's camera, at the world's origin.
         base_count: the number of base Gaussians, which come first.
-        disparity: the disparity for which the scene was completed, see `spackle.camera_path.max_offset`.
+        disparity: the disparity for which the scene was completed, see `spackle.core.trajectories.max_offset`.
 
     Raises:
         InputError: `path` cannot be written.
@@ -73,7 +81,9 @@ def save_ply(
 
 def encode_ply(scene: SceneFile) -> bytes:
     """Encode a scene as `save_ply` does; ValueError if a Gaussian is not finite."""
-    return b"".join(_written(scene.gaussians, scene.untilted_camera, scene.base_count, scene.disparity))
+    return b"".join(
+        _written(scene.gaussians, scene.untilted_camera, scene.base_count, scene.disparity)
+    )
 
 
 def _written(
@@ -89,7 +99,11 @@ def _written(
         block = gaussians.select(slice(start, start + BLOCK))
         columns = Columns.of(Gaussians.cat([block, surplus.select(slice(len(block), BLOCK))]))
         opacities = np.clip(columns.opacities, SMALLEST_OPACITY, LARGEST_OPACITY)
-        table[:, 0:3], table[:, 6:9], table[:, 13:17] = columns.means, columns.harmonics, columns.quats
+        table[:, 0:3], table[:, 6:9], table[:, 13:17] = (
+            columns.means,
+            columns.harmonics,
+            columns.quats,
+        )
         table[:, 9] = np.log(opacities / (1 - opacities))  # 1 - o is exact above one half
         table[:, 10:13] = columns.log_scales
         yield table[: len(block)].tobytes()
@@ -124,7 +138,9 @@ class Element:
 
     name: str
     count: int
-    fields: list[tuple[str, str]] = dataclasses.field(default_factory=list)  # (name, NumPy type or "list")
+    fields: list[tuple[str, str]] = dataclasses.field(
+        default_factory=list
+    )  # (name, NumPy type or "list")
     start: int = -1  # offset in the file, in bytes; -1 from the first table with lists on
 
 
@@ -141,11 +157,13 @@ class PlyFile:
         with open(path, "rb") as file:
             head = file.read(MAX_HEADER_BYTES)
         if head.split(b"\n", 1)[0].rstrip() != b"ply":
-            raise InputError(f"{path}: not a PLY file: its first line must be 'ply' (`spackle predict` makes one)")
+            raise InputError(
+                f"{path}: not a PLY file: its first line must be 'ply' (`spackle predict` makes one)"
+            )
         end = re.search(rb"\n[ \t]*end_header[ \t\r]*\n", head)
         if end is None:
             raise InputError(f"{path}: the header has no end: the file is damaged or cut off")
-        with reading(path, "broken PLY header: {reason}", ValueError, KeyError, IndexError):
+        with as_input_error(path, "broken PLY header: {reason}", ValueError, KeyError, IndexError):
             self._parse(head[: end.start()].decode("latin-1").split("\n")[1:])
             self._place_tables(end.end())
 
@@ -163,15 +181,21 @@ class PlyFile:
         vertex, extras = self._vertex(), self._extras()
         if chunks := [element for element in self.elements if element.name == "chunk"]:
             decode = function_named("spackle.formats.compressed_ply:decode_compressed_ply")
-            with reading(self.path, "the compressed tables cannot be read: {reason}: export the scene again"):
+            with as_input_error(
+                self.path, "the compressed tables cannot be read: {reason}: export the scene again"
+            ):
                 gaussians: Gaussians = decode(self._rows(chunks[0]), self._rows(vertex)).gaussians()
             return gaussians
-        linear = bool(extras["color_space"].any()) if "color_space" in extras else "intrinsic" in extras
+        linear = (
+            bool(extras["color_space"].any()) if "color_space" in extras else "intrinsic" in extras
+        )
         parts = [torch.empty(vertex.count, columns.stop - columns.start) for columns in _SLICES]
         table, broken, whole = np.zeros((len(_READ), BLOCK), np.float32), 0, self._rows(vertex)
         for start in range(0, vertex.count, BLOCK):
             rows = whole[start : start + BLOCK]
-            with np.errstate(over="ignore", invalid="ignore"):  # numbers beyond float32 become inf, and are counted
+            with np.errstate(
+                over="ignore", invalid="ignore"
+            ):  # numbers beyond float32 become inf, and are counted
                 for k, name in enumerate(_READ):
                     table[k, : len(rows)] = rows[name]
                 table[7:10] = np.exp(table[7:10])
@@ -182,7 +206,9 @@ class PlyFile:
             for part, columns in zip(parts, _SLICES, strict=True):
                 part[start : start + BLOCK] = torch.from_numpy(table[columns, : len(rows)].T)
         if broken:
-            raise InputError(f"{self.path}: {broken} of {vertex.count} Gaussians are not finite: export it again")
+            raise InputError(
+                f"{self.path}: {broken} of {vertex.count} Gaussians are not finite: export it again"
+            )
         means, colors, opacities, scales, quats = parts
         return Gaussians(means, quats, scales, opacities[:, 0], colors)
 
@@ -195,9 +221,13 @@ class PlyFile:
         if numbers := self._numbers("spackle_camera", 6, lowest=-math.inf):
             K[0, 0], K[1, 1], K[0, 2], K[1, 2], width, height = numbers
         elif "intrinsic" in (extras := self._extras()):
-            parts = [extras.get(name, np.empty(0)) for name in ("intrinsic", "extrinsic", "image_size")]
+            parts = [
+                extras.get(name, np.empty(0)) for name in ("intrinsic", "extrinsic", "image_size")
+            ]
             if [len(part) for part in parts] != [9, 16, 2]:
-                raise InputError(f"{self.path}: the stored camera is not as SHARP writes it: give the focal length")
+                raise InputError(
+                    f"{self.path}: the stored camera is not as SHARP writes it: give the focal length"
+                )
             K, matrix, (width, height) = parts[0].reshape(3, 3), parts[1].reshape(4, 4), parts[2]
         else:
             return None
@@ -223,7 +253,9 @@ class PlyFile:
 
     def scene(self) -> SceneFile:
         """Read camera, counts, disparity and Gaussians; InputError if one of them is invalid."""
-        rest = sum(name.startswith("f_rest_") for element in self.elements for name, _ in element.fields)
+        rest = sum(
+            name.startswith("f_rest_") for element in self.elements for name, _ in element.fields
+        )
         known = self.camera(), self.base_count(), self.disparity()
         return SceneFile(Path(self.path), self.gaussians(), *known, harmonics=rest)
 
@@ -256,19 +288,27 @@ class PlyFile:
             if "list" in dict(element.fields).values():
                 return
             element.start = start
-            start += element.count * np.dtype(element.fields).itemsize  # ValueError for a name given twice
+            start += (
+                element.count * np.dtype(element.fields).itemsize
+            )  # ValueError for a name given twice
             if start > self._size:
                 announced = f"{element.count} rows of {element.name!r} are announced"
-                raise InputError(f"{self.path}: cut off: {announced}, but the file ends after {self._size} bytes")
+                raise InputError(
+                    f"{self.path}: cut off: {announced}, but the file ends after {self._size} bytes"
+                )
 
-    def _numbers(self, comment: str, count: int, lowest: float = 0, highest: float = math.inf) -> list[float] | None:
+    def _numbers(
+        self, comment: str, count: int, lowest: float = 0, highest: float = math.inf
+    ) -> list[float] | None:
         """The finite numbers in one of Spackle's comments; None if the file does not have this comment."""
         if (words := self.comments.get(comment)) is None:
             return None
         what = comment.removeprefix("spackle_")
-        with reading(self.path, f"the stored {what} makes no sense: {{reason}}", ValueError):
+        with as_input_error(self.path, f"the stored {what} makes no sense: {{reason}}", ValueError):
             numbers = [float(word) for word in words]
-            if len(numbers) != count or not all(math.isfinite(n) and lowest <= n <= highest for n in numbers):
+            if len(numbers) != count or not all(
+                math.isfinite(n) and lowest <= n <= highest for n in numbers
+            ):
                 raise ValueError(" ".join(words))
         return numbers
 
@@ -276,11 +316,15 @@ class PlyFile:
         """The element with the vertices; InputError if they are not Gaussians, or have no fixed size."""
         named = [element for element in self.elements if element.name == "vertex"]
         if len(named) != 1:
-            raise InputError(f"{self.path}: holds {len(named)} elements called vertex: not a Gaussian scene")
+            raise InputError(
+                f"{self.path}: holds {len(named)} elements called vertex: not a Gaussian scene"
+            )
         read = PACKED if "packed_position" in dict(named[0].fields) else _READ
         missing = [name for name in read if name not in dict(named[0].fields)]
         if missing:
-            raise InputError(f"{self.path}: not a Gaussian scene: its vertices have no {', '.join(missing)}")
+            raise InputError(
+                f"{self.path}: not a Gaussian scene: its vertices have no {', '.join(missing)}"
+            )
         if named[0].count == 0 or named[0].start < 0:
             problem = "no Gaussians" if named[0].count == 0 else "lists in or before its vertices"
             raise InputError(f"{self.path}: holds {problem}: export it as a plain Gaussian scene")
@@ -291,9 +335,16 @@ class PlyFile:
         small = [
             element
             for element in self.elements
-            if element.name != "vertex" and element.start >= 0 and element.fields and element.count <= MAX_EXTRA_ROWS
+            if element.name != "vertex"
+            and element.start >= 0
+            and element.fields
+            and element.count <= MAX_EXTRA_ROWS
         ]
-        return {name: self._rows(each)[name].astype(np.float64) for each in small for name, _ in each.fields}
+        return {
+            name: self._rows(each)[name].astype(np.float64)
+            for each in small
+            for name, _ in each.fields
+        }
 
     def _rows(self, element: Element) -> NDArray[Any]:
         """The rows of a table, as a structured array."""

@@ -10,8 +10,8 @@ from PIL import Image
 from torch import Tensor
 from torch.nn.functional import interpolate, pad
 
-from spackle.color import to_bytes
-from spackle.files import atomic_path
+from spackle.core.color import to_bytes
+from spackle.runtime.files import atomic_path
 
 
 def thumbnail(picture: Tensor, side: int) -> Tensor:
@@ -45,4 +45,6 @@ def save_gray_png(gray: Tensor, path: str | os.PathLike[str]) -> None:
 
 def _save(image: Image.Image, path: str | os.PathLike[str]) -> None:
     with atomic_path(path) as temporary:
-        image.save(temporary, format="PNG", compress_level=4)  # level 6 takes twice the time for files 1 % smaller
+        image.save(
+            temporary, format="PNG", compress_level=4
+        )  # level 6 takes twice the time for files 1 % smaller

@@ -12,16 +12,19 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from spackle.camera import Camera
-from spackle.color import linear_to_srgb, srgb_to_linear
-from spackle.errors import InputError, reading
-from spackle.files import check_file
-from spackle.gaussians import Gaussians
+from spackle.core.camera import Camera
+from spackle.core.color import linear_to_srgb, srgb_to_linear
+from spackle.core.gaussians import Gaussians
+from spackle.runtime.errors import InputError, as_input_error
+from spackle.runtime.files import check_file
 
 Floats = NDArray[np.float32]
 
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 √π)
-SMALLEST_SCALE, LARGEST_SCALE = 1e-37, 1e37  # bounds that keep a scale and its logarithm finite in float32
+SMALLEST_SCALE, LARGEST_SCALE = (
+    1e-37,
+    1e37,
+)  # bounds that keep a scale and its logarithm finite in float32
 _FLIP = np.array([1, 1, -1, -1], np.float32)
 SMALLEST_QUAT = 1e-12  # a shorter quaternion has no direction
 
@@ -65,13 +68,23 @@ class Columns:
 
         ValueError if a Gaussian is not finite.
         """
-        means, quats, scales, opacities, colors = (t.detach().to("cpu", torch.float32) for t in gaussians.tensors)
-        for name, tensor in zip(vars(gaussians), (means, quats, scales.clamp(-1, 1), opacities, colors), strict=True):
+        means, quats, scales, opacities, colors = (
+            t.detach().to("cpu", torch.float32) for t in gaussians.tensors
+        )
+        for name, tensor in zip(
+            vars(gaussians), (means, quats, scales.clamp(-1, 1), opacities, colors), strict=True
+        ):
             if not torch.isfinite(tensor).all():  # infinite scales are clamped below
                 raise ValueError(f"{name} of these Gaussians are not all finite")
-        quats = quats / quats.abs().amax(-1, keepdim=True).clamp_min(1.0)  # their squares may overflow
+        quats = quats / quats.abs().amax(-1, keepdim=True).clamp_min(
+            1.0
+        )  # their squares may overflow
         norm = torch.linalg.vector_norm(quats, dim=-1, keepdim=True)
-        unit = torch.where(norm < SMALLEST_QUAT, torch.tensor([1.0, 0, 0, 0]), quats / norm.clamp_min(SMALLEST_QUAT))
+        unit = torch.where(
+            norm < SMALLEST_QUAT,
+            torch.tensor([1.0, 0, 0, 0]),
+            quats / norm.clamp_min(SMALLEST_QUAT),
+        )
         # NumPy's logarithm, because torch would start threads for every block of a PLY.
         log_scales = np.log(np.clip(scales.numpy(), SMALLEST_SCALE, LARGEST_SCALE))
         srgb = linear_to_srgb(colors).numpy()
@@ -82,10 +95,14 @@ class Columns:
         with np.errstate(over="ignore", invalid="ignore"):
             columns = self.means, self.quats, np.exp(self.log_scales), self.opacities, self.srgb
         count = len(self.means)
-        finite = np.all([np.isfinite(column.reshape(count, -1)).all(axis=1) for column in columns], axis=0)
+        finite = np.all(
+            [np.isfinite(column.reshape(count, -1)).all(axis=1) for column in columns], axis=0
+        )
         if broken := count - np.count_nonzero(finite):
             raise ValueError(f"{broken} of {count} Gaussians are not finite")
-        means, quats, scales, opacities, srgb = (torch.from_numpy(np.array(column, np.float32)) for column in columns)
+        means, quats, scales, opacities, srgb = (
+            torch.from_numpy(np.array(column, np.float32)) for column in columns
+        )
         return Gaussians(means, quats, scales, opacities, srgb_to_linear(srgb))
 
     @property
@@ -103,7 +120,9 @@ class Columns:
         return Columns(*(getattr(self, field.name)[rows] for field in dataclasses.fields(self)))
 
 
-OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # row k: a quaternion's components other than k
+OTHERS = np.array(
+    [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]
+)  # row k: a quaternion's components other than k
 
 
 def smallest_three(quats: Floats) -> tuple[NDArray[np.int64], Floats]:
@@ -113,7 +132,9 @@ def smallest_three(quats: Floats) -> tuple[NDArray[np.int64], Floats]:
     component then follows from the other three, which are at most √½.
     """
     largest = np.abs(quats).argmax(axis=1)
-    sign = np.where(np.take_along_axis(quats, largest[:, None], axis=1) < 0, np.float32(-1), np.float32(1))
+    sign = np.where(
+        np.take_along_axis(quats, largest[:, None], axis=1) < 0, np.float32(-1), np.float32(1)
+    )
     return largest, np.take_along_axis(quats * sign, OTHERS[largest], axis=1)
 
 
@@ -142,7 +163,9 @@ def fractions(codes: NDArray[Any], largest: int) -> Floats:
     return codes.astype(np.float32) / np.float32(largest)
 
 
-SPLAT_ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
+SPLAT_ROW = np.dtype(
+    [("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)]
+)
 
 
 def encode_splat(scene: SceneFile) -> bytes:
@@ -153,7 +176,9 @@ def encode_splat(scene: SceneFile) -> bytes:
     columns = Columns.of(scene.gaussians)
     rows = np.empty(len(scene.gaussians), SPLAT_ROW)
     rows["means"], rows["scales"] = columns.means, np.exp(columns.log_scales)
-    rows["rgba"] = np.round(np.concatenate([columns.srgb, columns.opacities[:, None]], axis=1) * 255)
+    rows["rgba"] = np.round(
+        np.concatenate([columns.srgb, columns.opacities[:, None]], axis=1) * 255
+    )
     rows["quats"] = np.clip(np.round(columns.quats * 128 + 128), 0, 255)
     return rows.tobytes()
 
@@ -164,7 +189,9 @@ def decode_splat(data: bytes) -> Columns:
     with np.errstate(divide="ignore", invalid="ignore"):
         log_scales = np.log(np.clip(rows["scales"], SMALLEST_SCALE, LARGEST_SCALE))
     rgba = fractions(rows["rgba"], 255)
-    return Columns(rows["means"], fractions(rows["quats"], 128) - 1, log_scales, rgba[:, 3], rgba[:, :3])
+    return Columns(
+        rows["means"], fractions(rows["quats"], 128) - 1, log_scales, rgba[:, 3], rgba[:, :3]
+    )
 
 
 Encoder = Callable[[SceneFile], bytes]
@@ -195,18 +222,24 @@ def scene_kind(path: Path) -> str | None:
     with open(path, "rb") as file:
         start = file.read(4)
     begun = next((suffix for magic, suffix in STARTS.items() if start.startswith(magic)), None)
-    return begun or next((end for end in (*SCENE_SUFFIXES, *WRITTEN_ONLY) if path.name.lower().endswith(end)), None)
+    return begun or next(
+        (end for end in (*SCENE_SUFFIXES, *WRITTEN_ONLY) if path.name.lower().endswith(end)), None
+    )
 
 
 def load_scene(path: Path) -> SceneFile:
     """Read a scene in any format of SCENE_SUFFIXES; InputError if the file has another format or is damaged."""
     kind = scene_kind(path)
     if kind in WRITTEN_ONLY:
-        raise InputError(f"{path}: {kind} files cannot be read: give the scene.ply from which the file was exported")
+        raise InputError(
+            f"{path}: {kind} files cannot be read: give the scene.ply from which the file was exported"
+        )
     if kind not in SCENE_DECODERS:
         ply: SceneFile = import_module("spackle.formats.ply").PlyFile(path).scene()
         return ply
-    with reading(path, f"cannot be read as {kind}: {{reason}}: the file is damaged, or from another program"):
+    with as_input_error(
+        path, f"cannot be read as {kind}: {{reason}}: the file is damaged, or from another program"
+    ):
         columns = function_named(SCENE_DECODERS[kind])(path.read_bytes())
         if not len(columns.means):
             raise ValueError("it holds no Gaussians")

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from spackle.errors import InputError
 from spackle.formats.scene_files import (
     SH_C0,
     Columns,
@@ -23,13 +22,19 @@ from spackle.formats.scene_files import (
     from_smallest_three,
     smallest_three,
 )
+from spackle.runtime.errors import InputError
 
 LARGEST_SIDE = 16_380  # of a WebP image, a multiple of four
 LARGEST_MEMBER = 1 << 28  # largest file in the archive, in bytes
 CODES = 256  # entries of a codebook
 BINS = 1 << 16  # bins into which values are sorted to build a codebook
 EVEN = 0.25  # fraction of the codes that are spaced evenly
-EFFORT = {"lossless": True, "exact": True, "quality": 25, "method": 1}  # exact: keeps colours if opacity is 0
+EFFORT = {
+    "lossless": True,
+    "exact": True,
+    "quality": 25,
+    "method": 1,
+}  # exact: keeps colours if opacity is 0
 EPOCH = (1980, 1, 1, 0, 0, 0)  # a constant, so that the same scene gives the same bytes
 
 
@@ -55,7 +60,9 @@ def encode_sog(scene: SceneFile) -> bytes:
     opacities = np.round(columns.opacities * 255).astype(np.uint8)[:, None]
     opaque = np.full_like(opacities, 255)
     largest, others = smallest_three(columns.quats)
-    quats = np.concatenate([np.round(as_shares(others) * 255), largest[:, None] + 252], axis=1).astype(np.uint8)
+    quats = np.concatenate(
+        [np.round(as_shares(others) * 255), largest[:, None] + 252], axis=1
+    ).astype(np.uint8)
     pictures = {
         "means_l.webp": [(means & 255).astype(np.uint8), opaque],
         "means_u.webp": [(means >> 8).astype(np.uint8), opaque],
@@ -67,7 +74,11 @@ def encode_sog(scene: SceneFile) -> bytes:
         "version": 2,
         "asset": {"generator": "Spackle"},
         "count": count,
-        "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
+        "means": {
+            "mins": low.tolist(),
+            "maxs": high.tolist(),
+            "files": ["means_l.webp", "means_u.webp"],
+        },
         "scales": {"codebook": scale_book.tolist(), "files": ["scales.webp"]},
         "quats": {"files": ["quats.webp"]},
         "sh0": {"codebook": color_book.tolist(), "files": ["sh0.webp"]},
@@ -75,7 +86,10 @@ def encode_sog(scene: SceneFile) -> bytes:
     files = {name: _webp(np.concatenate(parts, axis=1), width) for name, parts in pictures.items()}
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:  # WebP is compressed already
-        for name, content in {"meta.json": json.dumps(meta, allow_nan=False).encode(), **files}.items():
+        for name, content in {
+            "meta.json": json.dumps(meta, allow_nan=False).encode(),
+            **files,
+        }.items():
             archive.writestr(zipfile.ZipInfo(name, EPOCH), content)
     return buffer.getvalue()
 
@@ -140,11 +154,14 @@ def decode_sog(data: bytes) -> Columns:
             """Pixels [N, 4] of an image, without the padding at its end."""
             with Image.open(io.BytesIO(member(name)), formats=["WEBP"]) as image:
                 if max(image.size) > LARGEST_SIDE or not 0 < count <= image.width * image.height:
-                    raise ValueError(f"{name} has {image.width}×{image.height} pixels for {count:,} Gaussians")
+                    raise ValueError(
+                        f"{name} has {image.width}×{image.height} pixels for {count:,} Gaussians"
+                    )
                 return np.asarray(image.convert("RGBA")).reshape(-1, 4)[:count]
 
         (lower, upper), (scales,), (quats,), (sh0,) = (
-            [pixels(name) for name in meta[key]["files"]] for key in ("means", "scales", "quats", "sh0")
+            [pixels(name) for name in meta[key]["files"]]
+            for key in ("means", "scales", "quats", "sh0")
         )
     low, high = (np.array(meta["means"][end], np.float32).reshape(3) for end in ("mins", "maxs"))
     logs = low + (high - low) * fractions(upper[:, :3] * np.uint32(256) + lower[:, :3], 65535)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spackle.errors import InputError
+from spackle.core.gaussians import Gaussians
 from spackle.formats.scene_files import (
     SH_C0,
     Columns,
@@ -21,10 +21,12 @@ from spackle.formats.scene_files import (
     from_smallest_three,
     smallest_three,
 )
-from spackle.gaussians import Gaussians
+from spackle.runtime.errors import InputError
 
 MAGIC, VERSION = 0x5053474E, 3
-HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, degree of harmonics, fractional bits, flags, reserved
+HEADER = struct.Struct(
+    "<IIIBBBB"
+)  # magic, version, count, degree of harmonics, fractional bits, flags, reserved
 ROW = 20  # bytes for each Gaussian
 LARGEST = 2**23 - 1  # largest coordinate, which has 24 bits
 FEWEST_BITS, MOST_BITS = 1, 23  # fractional bits of a coordinate
@@ -40,8 +42,13 @@ MAX_COUNT = 10_000_000  # most Gaussians that the format's own library reads
 # PLY's size.
 LIMIT = 8.5  # bytes for each Gaussian; the PLY has 68
 SMALL = 1 << 14  # bytes; smaller files need no further rounding
-SAMPLE, SAMPLES = 1 << 13, 8  # consecutive Gaussians in a sample, and number of samples, with which levels are tried
-SAMPLED_LIMIT = 8.7  # bytes for each Gaussian of a sample; samples deflate a little worse than the file
+SAMPLE, SAMPLES = (
+    1 << 13,
+    8,
+)  # consecutive Gaussians in a sample, and number of samples, with which levels are tried
+SAMPLED_LIMIT = (
+    8.7  # bytes for each Gaussian of a sample; samples deflate a little worse than the file
+)
 
 
 class _Detail(NamedTuple):
@@ -51,7 +58,12 @@ class _Detail(NamedTuple):
     opacity_step: int  # step in 255ths
 
 
-_DETAILS = [_Detail(1 / 16, 9, 1, 1), _Detail(1 / 8, 7, 1, 1), _Detail(1 / 4, 6, 1, 2), _Detail(1 / 4, 5, 2, 2)]
+_DETAILS = [
+    _Detail(1 / 16, 9, 1, 1),
+    _Detail(1 / 8, 7, 1, 1),
+    _Detail(1 / 4, 6, 1, 2),
+    _Detail(1 / 4, 5, 2, 2),
+]
 _DETAILS += [_Detail(1 / 2, 5, 2, 4), _Detail(1 / 2, 4, 2, 4), _Detail(1 / 2, 4, 4, 8)]
 
 
@@ -67,7 +79,9 @@ def encode_spz(scene: SceneFile) -> bytes:
     """
     count = len(scene.gaussians)
     if count > MAX_COUNT:
-        raise InputError(f"{count:,} Gaussians are too many for SPZ (at most {MAX_COUNT:,}): use another format")
+        raise InputError(
+            f"{count:,} Gaussians are too many for SPZ (at most {MAX_COUNT:,}): use another format"
+        )
     columns = Columns.of(scene.gaussians).flipped()
     bits, _ = spz_grid(scene.gaussians)
     columns = _within(columns, bits)
@@ -86,7 +100,9 @@ def spz_grid(gaussians: Gaussians) -> tuple[int, int]:
     if not len(means):
         return 12, 0
     reach, distance = np.abs(means).max(axis=1), np.sqrt((means * means).sum(axis=1))
-    near = float(np.partition(distance, int(NEAR_SHARE * len(distance)))[int(NEAR_SHARE * len(distance))])
+    near = float(
+        np.partition(distance, int(NEAR_SHARE * len(distance)))[int(NEAR_SHARE * len(distance))]
+    )
     holds_all = np.floor(np.log2(LARGEST / max(float(reach.max()), 1e-30)))
     shows_near = np.ceil(np.log2(NEAR_STEPS / max(near, 1e-30)))
     bits = int(np.clip(max(holds_all, shows_near), FEWEST_BITS, MOST_BITS))
@@ -98,7 +114,9 @@ def _within(columns: Columns, bits: int) -> Columns:
     reach = np.abs(columns.means).max(axis=1, initial=0).astype(np.float64)
     factor = np.minimum(1, LARGEST / 2.0**bits / np.maximum(reach, 1e-30))[:, None]
     means, log_scales = columns.means * factor, columns.log_scales + np.log(factor)
-    return dataclasses.replace(columns, means=means.astype(np.float32), log_scales=log_scales.astype(np.float32))
+    return dataclasses.replace(
+        columns, means=means.astype(np.float32), log_scales=log_scales.astype(np.float32)
+    )
 
 
 def _finest(columns: Columns, bits: int) -> int:
@@ -109,22 +127,32 @@ def _finest(columns: Columns, bits: int) -> int:
     sample = columns.select(rows)
 
     def fits(detail: _Detail) -> bool:
-        return len(_deflated(b"".join(_sections(sample, bits, detail)))) <= max(SAMPLED_LIMIT * len(rows), SMALL)
+        return len(_deflated(b"".join(_sections(sample, bits, detail)))) <= max(
+            SAMPLED_LIMIT * len(rows), SMALL
+        )
 
     return bisect.bisect_left(_DETAILS[:-1], True, key=fits)
 
 
 def _sections(columns: Columns, bits: int, detail: _Detail) -> list[bytes]:
     """The bytes of positions, opacities, colours, scales and rotations, in the file's order."""
-    scales = np.round((columns.log_scales + 10) * np.float32(16 / detail.scale_step)) * detail.scale_step
+    scales = (
+        np.round((columns.log_scales + 10) * np.float32(16 / detail.scale_step)) * detail.scale_step
+    )
     scales = np.clip(scales, 0, 255).astype(np.uint8)
-    colors = (columns.srgb - np.float32(0.5)) * np.float32(COLOR_SCALE * 255 / SH_C0) + np.float32(127.5)
+    colors = (columns.srgb - np.float32(0.5)) * np.float32(COLOR_SCALE * 255 / SH_C0) + np.float32(
+        127.5
+    )
     step = detail.opacity_step
-    ball = (scales == scales[:, :1]).all(axis=1, keepdims=True)  # the rotation of a sphere is invisible
+    ball = (scales == scales[:, :1]).all(
+        axis=1, keepdims=True
+    )  # the rotation of a sphere is invisible
     quats = np.where(ball, np.array([1, 0, 0, 0], np.float32), columns.quats)
     return [
         _positions(columns, bits, detail.position).tobytes(),
-        np.minimum(255, np.round(columns.opacities * (255 / step)) * step).astype(np.uint8).tobytes(),
+        np.minimum(255, np.round(columns.opacities * (255 / step)) * step)
+        .astype(np.uint8)
+        .tobytes(),
         np.clip(np.round(colors), 0, 255).astype(np.uint8).tobytes(),
         scales.tobytes(),
         _rotations(quats, detail.quat_bits).tobytes(),
@@ -149,7 +177,9 @@ def _rotations(quats: Floats, bits: int) -> NDArray[np.uint32]:
     """
     largest, others = smallest_three(quats[:, [1, 2, 3, 0]])
     step = 2 ** (9 - bits)
-    sizes = np.minimum(511, np.round(np.abs(others) * np.float32(511 * 2**0.5 / step)) * step).astype("<u4")
+    sizes = np.minimum(
+        511, np.round(np.abs(others) * np.float32(511 * 2**0.5 / step)) * step
+    ).astype("<u4")
     words: NDArray[np.uint32] = largest.astype("<u4")
     for size, other in zip(sizes.T, others.T, strict=True):
         words = words << 10 | ((other < 0) & (size > 0)).astype("<u4") << 9 | size
@@ -170,7 +200,9 @@ def decode_spz(data: bytes) -> Columns:
     head = inflater.decompress(data, HEADER.size)
     magic, version, count, degree, bits, _, _ = HEADER.unpack(head)
     if magic != MAGIC or version not in (2, 3) or degree > MAX_DEGREE or count > MAX_COUNT:
-        raise ValueError(f"version {version} with {count:,} Gaussians and harmonics of degree {degree}")
+        raise ValueError(
+            f"version {version} with {count:,} Gaussians and harmonics of degree {degree}"
+        )
     widths = (9, 1, 3, 3, 4 if version == 3 else 3)  # bytes of `_sections`
     body = inflater.decompress(inflater.unconsumed_tail, max(1, count * sum(widths)))
     if len(body) != count * sum(widths):
@@ -178,7 +210,9 @@ def decode_spz(data: bytes) -> Columns:
     cut = np.split(np.frombuffer(body, np.uint8), np.cumsum(widths)[:-1] * count)
     places, alphas, colors, scales, turns = (part.reshape(count, -1) for part in cut)
     fixed = np.pad(places.reshape(-1, 3), ((0, 0), (1, 0))).view("<i4").reshape(count, 3) >> 8
-    srgb = (fractions(colors, 255) - np.float32(0.5)) * np.float32(SH_C0 / COLOR_SCALE) + np.float32(0.5)
+    srgb = (fractions(colors, 255) - np.float32(0.5)) * np.float32(
+        SH_C0 / COLOR_SCALE
+    ) + np.float32(0.5)
     if version == 3:
         words = turns.copy().view("<u4")
         fields = words >> np.array([20, 10, 0], np.uint32)
@@ -188,4 +222,6 @@ def decode_spz(data: bytes) -> Columns:
         xyzw = from_smallest_three(np.full(count, 3), fractions(turns, 255) * 2 - 1)
     means, log_scales = (fixed / 2.0**bits).astype(np.float32), fractions(scales, 16) - 10
     opacities = fractions(alphas[:, 0], 255)
-    return Columns(means, xyzw[:, [3, 0, 1, 2]], log_scales, opacities, np.clip(srgb, 0, 1)).flipped()
+    return Columns(
+        means, xyzw[:, [3, 0, 1, 2]], log_scales, opacities, np.clip(srgb, 0, 1)
+    ).flipped()

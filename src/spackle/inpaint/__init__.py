@@ -11,8 +11,8 @@ from typing import ClassVar, Protocol
 import torch
 from torch import Tensor
 
-from spackle.errors import InputError, check_name
-from spackle.image import MAX_SIDE
+from spackle.core.photo import MAX_SIDE
+from spackle.runtime.errors import InputError, check_name
 
 MIN_SIDE = 128  # pixels; the coarsest map of ProPainter's flow, 1/64, needs two cells each way
 INPAINTERS = {  # module and class, imported on use
@@ -28,13 +28,17 @@ class InpainterOptions:
     """Options of all inpainters."""
 
     weights: Path | None = None  # a file or a folder; None: the download of `spackle weights get`
-    side: int | None = None  # pixels of the long side of a network's input; None: the network's default
+    side: int | None = (
+        None  # pixels of the long side of a network's input; None: the network's default
+    )
     device: str | None = None  # "cpu" or "cuda"; None: CUDA if available
 
     def side_or(self, default: int) -> int:
         """The side, or `default`; InputError for a side that is too small or too large."""
         if self.side is not None and not MIN_SIDE <= self.side <= MAX_SIDE:
-            raise InputError(f"--inpainter-side must be between {MIN_SIDE} and {MAX_SIDE}, got {self.side}")
+            raise InputError(
+                f"--inpainter-side must be between {MIN_SIDE} and {MAX_SIDE}, got {self.side}"
+            )
         return default if self.side is None else self.side
 
 

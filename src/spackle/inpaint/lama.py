@@ -10,17 +10,19 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from spackle.crop import Crop
-from spackle.device import enough_memory, own_arithmetic, pick_device
-from spackle.errors import InputError
-from spackle.image import working_size
+from spackle.core.crop import Crop
+from spackle.core.photo import working_size
 from spackle.inpaint import InpainterOptions
-from spackle.network_file import Shapes, check_finite, check_tensors, read_tensors
+from spackle.runtime.device import enough_memory, own_arithmetic, pick_device
+from spackle.runtime.errors import InputError
 from spackle.weights import installed
+from spackle.weights.checkpoints import Shapes, check_finite, check_tensors, read_tensors
 
 SIDE = 1024  # default for the long side of the input in pixels
 MULTIPLE = 8  # both sides of the network's input are multiples of this
-SMALLEST = 2 * MULTIPLE  # least side in pixels: features have an eighth of the side and are padded by reflection
+SMALLEST = (
+    2 * MULTIPLE
+)  # least side in pixels: features have an eighth of the side and are padded by reflection
 MARGIN = 128  # pixels around a group of holes in the network's input
 BLOCK = 16  # pixels of the grid on which groups are found
 LOCAL = 4  # one of so many channels is local, all others are global
@@ -45,7 +47,9 @@ class LamaInpainter:
         self._device = pick_device(options.device)
         path = options.weights or installed("lama")
         if path is None:
-            raise InputError("inpainter lama: no weights: `spackle weights get lama` downloads 206 MB")
+            raise InputError(
+                "inpainter lama: no weights: `spackle weights get lama` downloads 206 MB"
+            )
         self.files: Mapping[str, Path] = {"lama": path}
         self._network = load_network(path).to(self._device)
         self.version = f"1, long side {self._side}"
@@ -76,7 +80,9 @@ class LamaInpainter:
         with shortage, own_arithmetic(self._device):
             drawn: Tensor = self._network(padded(colors), padded(mask))[..., : small[0], : small[1]]
         if not bool(drawn.isfinite().all()):
-            raise InputError(f"{self.files['lama']}: LaMa's colours are not finite: give other weights")
+            raise InputError(
+                f"{self.files['lama']}: LaMa's colours are not finite: give other weights"
+            )
         if small != (height, width):
             drawn = F.interpolate(drawn, (height, width), mode="bicubic").clamp_(0, 1)
         return drawn[0].permute(1, 2, 0)
@@ -92,7 +98,9 @@ def groups_of(hole: Tensor) -> list[tuple[Crop, Crop]]:
         return group.grown(MARGIN, MULTIPLE, *hole.shape)
 
     def belong(one: Crop, other: Crop) -> bool:
-        return one.touches(other) or seen(one.union(other)).area <= seen(one).area + seen(other).area
+        return (
+            one.touches(other) or seen(one.union(other)).area <= seen(one).area + seen(other).area
+        )
 
     blocks = F.max_pool2d(hole[None].float(), BLOCK, ceil_mode=True)[0].cpu().numpy() > 0
     groups: list[Crop] = []
@@ -109,7 +117,9 @@ def padded(x: Tensor) -> Tensor:
     """Pad [B, C, H, W] to sides that the network accepts, by reflection to the right and below."""
     for axis in (-2, -1):
         side = x.shape[axis]
-        steps = torch.arange(max(SMALLEST, -(-side // MULTIPLE) * MULTIPLE), device=x.device) % max(2 * side - 2, 1)
+        steps = torch.arange(max(SMALLEST, -(-side // MULTIPLE) * MULTIPLE), device=x.device) % max(
+            2 * side - 2, 1
+        )
         x = x.index_select(axis, torch.minimum(steps, 2 * side - 2 - steps))
     return x
 
@@ -122,7 +132,11 @@ def load_network(path: Path) -> LamaNetwork:
     """
     found = read_tensors(path, ADVICE)
     before = (name.removesuffix(FIRST) for name in found if name.endswith(FIRST))
-    prefix = min((start for start in before if not start or start.endswith("generator.")), key=len, default=None)
+    prefix = min(
+        (start for start in before if not start or start.endswith("generator.")),
+        key=len,
+        default=None,
+    )
     if prefix is None:
         raise InputError(f"{path}: holds no generator of LaMa: {ADVICE}")
     tensors = {
@@ -132,7 +146,9 @@ def load_network(path: Path) -> LamaNetwork:
     }
     blocks = sum(name.endswith(".conv1.bn_l.weight") for name in tensors)
     check_tensors(tensors, expected_shapes(sum(tensors[FIRST].shape[:1]), blocks), path, ADVICE)
-    network = LamaNetwork({name: tensor.to(torch.float32, copy=True) for name, tensor in tensors.items()})
+    network = LamaNetwork(
+        {name: tensor.to(torch.float32, copy=True) for name, tensor in tensors.items()}
+    )
     check_finite(network, path, ADVICE)
     return network
 
@@ -144,13 +160,20 @@ def expected_shapes(width: int = WIDTH, blocks: int = BLOCKS) -> Shapes:
     """Names and shapes of the published tensors, without `num_batches_tracked`."""
     shapes: Shapes = {}
 
-    def add(conv: str, norm: str | None, *shape: int, bias: bool = False, transposed: bool = False) -> None:
+    def add(
+        conv: str, norm: str | None, *shape: int, bias: bool = False, transposed: bool = False
+    ) -> None:
         """Add a convolution, and the batch norm `norm` of its outputs."""
         shapes[f"{conv}.weight"], outputs = shape, (shape[transposed],)
         if bias:
             shapes[f"{conv}.bias"] = outputs
         if norm:
-            shapes.update({f"{norm}.{key}": outputs for key in ("weight", "bias", "running_mean", "running_var")})
+            shapes.update(
+                {
+                    f"{norm}.{key}": outputs
+                    for key in ("weight", "bias", "running_mean", "running_var")
+                }
+            )
 
     deep = 8 * width
     near, far, half = deep // LOCAL, deep - deep // LOCAL, (deep - deep // LOCAL) // 2
@@ -168,7 +191,16 @@ def expected_shapes(width: int = WIDTH, blocks: int = BLOCKS) -> Shapes:
         add(f"{spectral}.fu.conv_layer", f"{spectral}.fu.bn", far, far, 1, 1)
         add(f"{spectral}.conv2", None, far, half, 1, 1)
     for stage, channels in zip(_up_stages(blocks), (deep, deep // 2, deep // 4), strict=True):
-        add(f"model.{stage}", f"model.{stage + 1}", channels, channels // 2, 3, 3, bias=True, transposed=True)
+        add(
+            f"model.{stage}",
+            f"model.{stage + 1}",
+            channels,
+            channels // 2,
+            3,
+            3,
+            bias=True,
+            transposed=True,
+        )
     add(f"model.{_last_stage(blocks)}", None, 3, width, 7, 7, bias=True)
     return shapes
 
@@ -196,13 +228,23 @@ class LamaNetwork(nn.Module):
         super().__init__()
         blocks = sum(name.endswith("conv1.bn_l.weight") for name in tensors)
         self.first = _conv(*_folded(tensors, "model.1.ffc.convl2l", "model.1.bn_l"))
-        deepest = [_folded(tensors, f"model.4.ffc.convl2{side}", f"model.4.bn_{side}") for side in "lg"]
-        stages = [_folded(tensors, f"model.{stage}.ffc.convl2l", f"model.{stage}.bn_l") for stage in (2, 3)]
-        stages.append((torch.cat([weight for weight, _ in deepest]), torch.cat([bias for _, bias in deepest])))
+        deepest = [
+            _folded(tensors, f"model.4.ffc.convl2{side}", f"model.4.bn_{side}") for side in "lg"
+        ]
+        stages = [
+            _folded(tensors, f"model.{stage}.ffc.convl2l", f"model.{stage}.bn_l")
+            for stage in (2, 3)
+        ]
+        stages.append(
+            (torch.cat([weight for weight, _ in deepest]), torch.cat([bias for _, bias in deepest]))
+        )
         self.down = nn.ModuleList(_conv(*stage, stride=2) for stage in stages)
         self.layers = nn.ModuleList(FourierLayer(tensors, name) for name in _layer_names(blocks))
         self.up = nn.ModuleList(
-            _conv(*_folded(tensors, f"model.{stage}", f"model.{stage + 1}", transposed=True), transposed=True)
+            _conv(
+                *_folded(tensors, f"model.{stage}", f"model.{stage + 1}", transposed=True),
+                transposed=True,
+            )
             for stage in _up_stages(blocks)
         )
         last = f"model.{_last_stage(blocks)}"
@@ -227,7 +269,9 @@ class LamaNetwork(nn.Module):
         height = x.shape[2]
         rows = self.rows(_reflected(x, 3))
         del x
-        return torch.stack([rows[:, 3 * row : 3 * row + 3, row : row + height] for row in range(7)]).sum(0)
+        return torch.stack(
+            [rows[:, 3 * row : 3 * row + 3, row : row + height] for row in range(7)]
+        ).sum(0)
 
 
 class FourierLayer(nn.Module):
@@ -237,7 +281,9 @@ class FourierLayer(nn.Module):
         super().__init__()
         spectral = f"{name}.ffc.convg2g"
         scale, shift = _affine(tensors, f"{name}.bn_l")
-        near = torch.cat([tensors[f"{name}.ffc.convl2l.weight"], tensors[f"{name}.ffc.convg2l.weight"]], 1)
+        near = torch.cat(
+            [tensors[f"{name}.ffc.convl2l.weight"], tensors[f"{name}.ffc.convg2l.weight"]], 1
+        )
         self.near = _conv(near * scale.view(-1, 1, 1, 1), shift)
         self.far = _conv(*_folded(tensors, f"{name}.ffc.convl2g", f"{name}.bn_g"))
         self.narrow = _linear(*_folded(tensors, f"{spectral}.conv1.0", f"{spectral}.conv1.1"))
@@ -262,23 +308,31 @@ class FourierLayer(nn.Module):
         x = self.narrow(x).relu_()
         parts = torch.view_as_real(torch.fft.rfft2(x, dim=(1, 2), norm="ortho").contiguous())
         parts = self.spectrum(parts.flatten(-2)).relu_().unflatten(-1, (-1, 2))
-        filtered = torch.fft.irfft2(torch.view_as_complex(parts), s=x.shape[1:3], dim=(1, 2), norm="ortho")
+        filtered = torch.fft.irfft2(
+            torch.view_as_complex(parts), s=x.shape[1:3], dim=(1, 2), norm="ortho"
+        )
         return self.wide(x.add_(filtered))  # type: ignore[no-any-return]
 
 
 def _affine(tensors: Tensors, norm: str) -> tuple[Tensor, Tensor]:
     """The scale and the offset of each channel in a batch norm."""
-    mean, var, weight, bias = (tensors[f"{norm}.{key}"] for key in ("running_mean", "running_var", "weight", "bias"))
+    mean, var, weight, bias = (
+        tensors[f"{norm}.{key}"] for key in ("running_mean", "running_var", "weight", "bias")
+    )
     scale = weight / torch.sqrt(var + EPSILON)
     return scale, bias - mean * scale
 
 
-def _folded(tensors: Tensors, conv: str, norm: str, *, transposed: bool = False) -> tuple[Tensor, Tensor]:
+def _folded(
+    tensors: Tensors, conv: str, norm: str, *, transposed: bool = False
+) -> tuple[Tensor, Tensor]:
     """Weight and bias of a convolution, with the batch norm folded in."""
     scale, shift = _affine(tensors, norm)
     shape = (1, -1, 1, 1) if transposed else (-1, 1, 1, 1)
     bias = tensors.get(f"{conv}.bias")
-    return tensors[f"{conv}.weight"] * scale.view(shape), shift if bias is None else shift + bias * scale
+    return tensors[f"{conv}.weight"] * scale.view(
+        shape
+    ), shift if bias is None else shift + bias * scale
 
 
 def _conv(weight: Tensor, bias: Tensor, *, stride: int = 1, transposed: bool = False) -> nn.Module:

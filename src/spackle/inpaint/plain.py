@@ -9,10 +9,10 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from spackle.errors import InputError
-from spackle.filters import far_fill
+from spackle.core.hole_filling import far_fill
+from spackle.core.patch_matching import match_patches
 from spackle.inpaint import InpainterOptions
-from spackle.patches import match_patches
+from spackle.runtime.errors import InputError
 
 RADIUS = 5.0  # pixels: how far colours are propagated into a hole
 
@@ -57,14 +57,18 @@ class OpenCV:
         try:
             import cv2
         except ImportError as error:
-            raise InputError(f"{wanted_by} needs a package: pip install 'spackle-nvs[opencv]'") from error
+            raise InputError(
+                f"{wanted_by} needs a package: pip install 'spackle-nvs[opencv]'"
+            ) from error
         self._cv2: Any = cv2
         self.version: str = cv2.__version__
         self._flow = self._cv2.DISOpticalFlow_create(self._cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
 
     def inpaint(self, rgb: Tensor, mask: Tensor, radius: float) -> Tensor:
         """Fill a mask [H, W] bool in sRGB [H, W, 3] by Telea's method; returns [H, W, 3] with 8 bits per channel."""
-        filled = self._cv2.inpaint(_bytes(rgb).numpy(), mask.to(torch.uint8).numpy(), radius, self._cv2.INPAINT_TELEA)
+        filled = self._cv2.inpaint(
+            _bytes(rgb).numpy(), mask.to(torch.uint8).numpy(), radius, self._cv2.INPAINT_TELEA
+        )
         return torch.from_numpy(filled).float() / 255
 
     def flow(self, picture: Tensor, other: Tensor) -> Tensor:
@@ -75,7 +79,10 @@ class OpenCV:
         height, width = picture.shape[:2]
         if min(height, width) < 16:  # the search uses patches of 8 pixels at several scales
             return torch.zeros(height, width, 2, device=picture.device)
-        grey = [self._cv2.cvtColor(_bytes(image).numpy(), self._cv2.COLOR_RGB2GRAY) for image in (picture, other)]
+        grey = [
+            self._cv2.cvtColor(_bytes(image).numpy(), self._cv2.COLOR_RGB2GRAY)
+            for image in (picture, other)
+        ]
         return torch.from_numpy(self._flow.calc(grey[0], grey[1], None)).to(picture.device)
 
 

@@ -15,17 +15,23 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.nn.functional import max_pool2d
 
-from spackle.device import enough_memory, pick_device
-from spackle.errors import InputError, reading
-from spackle.image import working_size
+from spackle.core.photo import working_size
 from spackle.inpaint import MIN_SIDE, InpainterOptions
-from spackle.network_file import load_strict, read_tensors
+from spackle.runtime.device import enough_memory, pick_device
+from spackle.runtime.errors import InputError, as_input_error
+from spackle.weights.checkpoints import load_strict, read_tensors
 
-NETWORKS = ("raft_things", "propainter_rfc", "propainter")  # flow, completion of flow, colours; prefixes of file names
+NETWORKS = (
+    "raft_things",
+    "propainter_rfc",
+    "propainter",
+)  # flow, completion of flow, colours; prefixes of file names
 SOURCE = "https://github.com/osmr/imgclsmob/releases/tag/v0.0.570"
 SIDE = 640  # default for the long side of the input in pixels; the training had 432×240
 MULTIPLE = 8  # both sides of the networks' input are multiples of this
-DILATION = 4  # steps by which holes are dilated, because rims have mixed colours; the authors' choice
+DILATION = (
+    4  # steps by which holes are dilated, because rims have mixed colours; the authors' choice
+)
 INSTALL = "pip install 'spackle-nvs[propainter]'"
 ITERATIONS = 20  # of the flow; the authors' choice
 
@@ -44,7 +50,9 @@ class PropainterInpainter:
     def __init__(self, options: InpainterOptions) -> None:
         """Load the networks; InputError for an invalid side, a missing package, or unsuitable weights."""
         self._side = options.side_or(SIDE)
-        with reading("inpainter propainter", f"cannot import its package ({{reason}}): {INSTALL}"):
+        with as_input_error(
+            "inpainter propainter", f"cannot import its package ({{reason}}): {INSTALL}"
+        ):
             import pytorchcv
             import pytorchcv.models.propainter_stream
         self.files: Mapping[str, Path] = weight_files(options.weights)
@@ -64,8 +72,12 @@ class PropainterInpainter:
         with enough_memory("lower --inpainter-side", what=f"for ProPainter at {self._side} pixels"):
             filled = self._fill(frames.clamp(0, 1), holes.float()).to(rgb)
         if not bool(filled.isfinite().all()):
-            raise InputError("ProPainter: the colours are not finite: give the published --inpainter-weights")
-        painted = F.interpolate(filled, (height, width), mode="bicubic").clamp(0, 1).permute(0, 2, 3, 1)
+            raise InputError(
+                "ProPainter: the colours are not finite: give the published --inpainter-weights"
+            )
+        painted = (
+            F.interpolate(filled, (height, width), mode="bicubic").clamp(0, 1).permute(0, 2, 3, 1)
+        )
         return torch.where(hole[..., None], painted, rgb)
 
     def _fill(self, frames: Tensor, holes: Tensor) -> Tensor:
@@ -75,7 +87,9 @@ class PropainterInpainter:
         count, _, height, width = frames.shape
         turns = [*range(count), *[0] * (count == 1)]  # a video needs two frames
         margin = (0, padded(width) - width, 0, padded(height) - height)
-        frames, holes = (F.pad(x[turns].to(self._device), margin, mode="replicate") for x in (frames, holes))
+        frames, holes = (
+            F.pad(x[turns].to(self._device), margin, mode="replicate") for x in (frames, holes)
+        )
         video = ProPainterIterator(
             TensorSequencer(2 * frames - 1),
             TensorSequencer(dilated(holes)),
@@ -95,7 +109,9 @@ def padded(side: int) -> int:
 def dilated(holes: Tensor) -> Tensor:
     """Holes [V, 1, h, w], dilated by DILATION steps to the four neighbours."""
     for _ in range(DILATION):
-        holes = torch.maximum(max_pool2d(holes, (3, 1), 1, (1, 0)), max_pool2d(holes, (1, 3), 1, (0, 1)))
+        holes = torch.maximum(
+            max_pool2d(holes, (3, 1), 1, (1, 0)), max_pool2d(holes, (1, 3), 1, (0, 1))
+        )
     return holes
 
 
@@ -111,12 +127,16 @@ def _network(name: str, file: Path) -> nn.Module:
         network = propainter_rfc() if name == "propainter_rfc" else propainter()
     advice = f"unpack the file of {name} from {SOURCE} again"
     ours, found = network.state_dict().keys(), read_tensors(file, advice)
-    return load_strict(network, {key: tensor for key, tensor in found.items() if key in ours}, file, advice)
+    return load_strict(
+        network, {key: tensor for key, tensor in found.items() if key in ours}, file, advice
+    )
 
 
 def weight_files(folder: Path | None) -> dict[str, Path]:
     """The file NAME.pth, NAME-….pth or .safetensors of each of `NETWORKS`; InputError for a missing or second file."""
-    advice = f"give a folder with one file for each of {', '.join(NETWORKS)}, unpacked from {SOURCE}"
+    advice = (
+        f"give a folder with one file for each of {', '.join(NETWORKS)}, unpacked from {SOURCE}"
+    )
     if folder is None:
         raise InputError(f"inpainter propainter: --inpainter-weights is missing: {advice}")
     files = {}

@@ -5,9 +5,9 @@ from importlib import import_module
 
 import torch
 
-from spackle.errors import InputError
 from spackle.render.cpu import CpuRenderer, touched_tiles
 from spackle.render.protocol import TILE, Renderer
+from spackle.runtime.errors import InputError
 
 __all__ = ["TILE", "CpuRenderer", "Renderer", "device_of", "get_renderer", "touched_tiles"]
 
@@ -23,7 +23,7 @@ def get_renderer(device: str = "auto") -> Renderer:
         raise InputError(f"--device {device}: unknown device; use auto, cpu or cuda")
     if device == "cuda" or (device == "auto" and torch.cuda.is_available()):
         try:
-            gpu: Renderer = import_module("spackle.render.cuda").GsplatRenderer()
+            gpu: Renderer = import_module("spackle.render.gsplat_backend").GsplatRenderer()
             return gpu
         except InputError as error:
             if device == "cuda":

@@ -11,14 +11,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.polynomial import Chebyshev, Polynomial
 
-from spackle._numba import MANTISSA, ONE, ZERO, Array, inlined_kernel, kernel
 from spackle.render.project import RECORD, Arrays, Numbers, in_tile
 from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_STOP
+from spackle.runtime.kernels import MANTISSA, ONE, ZERO, Array, inlined_kernel, kernel
 
 LIMIT = np.float32(ALPHA_MAX)
 FAINT = np.float32(ALPHA_MIN)
 LOWEST = np.float32(-60.0)
-ROUND = np.float32(1.5 * 2.0**23)  # this plus a small float has the rounded float as integer in its low bits
+ROUND = np.float32(
+    1.5 * 2.0**23
+)  # this plus a small float has the rounded float as integer in its low bits
 ROUND_BITS = np.int32(0x4B400000)
 KNEE = np.float32(0.0031308)  # linear value at which sRGB changes from a line to a power
 LINE = np.float32(12.92)
@@ -113,7 +115,9 @@ class TileLists(NamedTuple):
 
 
 @kernel
-def blend_patch(state: Array, offset: np.uint64, left: np.float32, top: np.float32, splat: Numbers) -> None:
+def blend_patch(
+    state: Array, offset: np.uint64, left: np.float32, top: np.float32, splat: Numbers
+) -> None:
     """Draw a Gaussian into the patch with the first pixel (left, top), relative to the tile."""
     x, y, slope, across, fall, peak, depth, red, green, blue = splat
     for lane in range(LANES):
@@ -152,7 +156,9 @@ def patches_of(center: np.float32, reach: np.float32) -> tuple[int, int]:
 @inlined_kernel
 def blend_splat(state: Array, record: Array, left: int, top: int) -> None:
     """Draw a Gaussian into the tile with the first pixel (left, top)."""
-    x, y, slope, across, fall, peak, half_width, half_height, depth, red, green, blue = in_tile(record, left, top)
+    x, y, slope, across, fall, peak, half_width, half_height, depth, red, green, blue = in_tile(
+        record, left, top
+    )
     splat = x, y, slope, across, fall, peak, depth, red, green, blue
     first_row, last_row = patches_of(y, half_height)
     first_column, last_column = patches_of(x, half_width)
@@ -200,7 +206,9 @@ def store_tile(state: Array, left: int, top: int, images: Arrays) -> None:
             i = pixel_index(row, column)
             opacity = state[i + 5 * PLANE]
             alpha[top + row, left + column] = opacity
-            depth[top + row, left + column] = state[i + 4 * PLANE] / opacity if opacity > ZERO else ZERO
+            depth[top + row, left + column] = (
+                state[i + 4 * PLANE] / opacity if opacity > ZERO else ZERO
+            )
 
 
 @kernel
@@ -209,11 +217,15 @@ def store_color(state: Array, left: int, top: int, rows: int, columns: int, imag
     for row in range(rows):
         for column in range(columns):
             for channel in range(3):
-                image[top + row, left + column, channel] = state[pixel_index(row, column) + (1 + channel) * PLANE]
+                image[top + row, left + column, channel] = state[
+                    pixel_index(row, column) + (1 + channel) * PLANE
+                ]
 
 
 @kernel
-def blend_tiles(first: int, last: int, tiles: Array, lists: TileLists, records: Array, images: Arrays) -> None:
+def blend_tiles(
+    first: int, last: int, tiles: Array, lists: TileLists, records: Array, images: Arrays
+) -> None:
     """Draw the tiles first..last of `tiles` [K] into the images rgb, depth, alpha and (unless empty) linear colour."""
     ids, starts = lists
     columns = (images[1].shape[1] + TILE - 1) // TILE

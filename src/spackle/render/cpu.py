@@ -10,13 +10,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spackle._numba import Array, inlined_kernel, kernel
-from spackle.camera import Camera
-from spackle.device import run_chunks
-from spackle.gaussians import Gaussians
+from spackle.core.camera import Camera
+from spackle.core.gaussians import Gaussians
 from spackle.render.blend import TileLists, blend_tiles
-from spackle.render.project import DEPTH, RECORD, Arrays, KernelCamera, Splats, count_before, project_chunk
+from spackle.render.project import (
+    DEPTH,
+    RECORD,
+    Arrays,
+    KernelCamera,
+    Splats,
+    count_before,
+    project_chunk,
+)
 from spackle.render.protocol import Rendering, check_tiles
+from spackle.runtime.device import run_chunks
+from spackle.runtime.kernels import Array, inlined_kernel, kernel
 
 PROJECT_GRAIN = 1 << 16  # Gaussians a thread projects at a time
 BLEND_GRAIN = 64  # tiles a thread blends at a time
@@ -44,7 +52,9 @@ class CpuRenderer:
         inputs = [t for part in sets for t in part.tensors] + list(onto.tensors if onto else ())
         if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
             # Without gradients this module, which needs time to compile, is not loaded.
-            drawn: Rendering = import_module("spackle.render.gradients").draw(sets, view, wanted, onto)
+            drawn: Rendering = import_module("spackle.render.gradients").draw(
+                sets, view, wanted, onto
+            )
             return drawn
         return draw(sets, view, wanted, onto).rendering()
 
@@ -65,7 +75,12 @@ class Drawing:
 
 
 def draw(
-    sets: Sequence[Gaussians], view: KernelCamera, wanted: Array, onto: Rendering | None, *, keep_linear: bool = False
+    sets: Sequence[Gaussians],
+    view: KernelCamera,
+    wanted: Array,
+    onto: Rendering | None,
+    *,
+    keep_linear: bool = False,
 ) -> Drawing:
     """Draw sets of Gaussians in the wanted tiles [rows, columns] bool, over a copy of `onto` (None: black).
 
@@ -97,7 +112,9 @@ def touched_tiles(gaussians: Gaussians | Sequence[Gaussians], camera: Camera) ->
     return torch.from_numpy(np.diff(lists.starts) > 0).reshape(view.tiles)
 
 
-def deal_out(sets: Sequence[Gaussians], view: KernelCamera, wanted: Array) -> tuple[Splats, TileLists]:
+def deal_out(
+    sets: Sequence[Gaussians], view: KernelCamera, wanted: Array
+) -> tuple[Splats, TileLists]:
     """Project Gaussians, and assign them to tiles."""
     splats = project(sets, view, wanted)
     return splats, list_tiles(splats.boxes, wanted)
@@ -142,7 +159,9 @@ def sort_tiles(first: int, last: int, tiles: Array, lists: TileLists, records: A
         longest = max(longest, starts[tiles[k] + 1] - starts[tiles[k]])
     keys, sorted_keys = np.empty(longest, np.uint32), np.empty(longest, np.uint32)
     items, sorted_items = np.empty(longest, np.int32), np.empty(longest, np.int32)
-    places = np.empty((DIGITS, BUCKETS), np.uint32)  # unsigned, so that no check for negative indices is compiled
+    places = np.empty(
+        (DIGITS, BUCKETS), np.uint32
+    )  # unsigned, so that no check for negative indices is compiled
     for k in range(first, last):
         own = ids[starts[tiles[k]] : starts[tiles[k] + 1]]
         places[:] = 0
@@ -206,7 +225,9 @@ def count_entries(first: int, last: int, boxes: Array, wanted: Array, counts: Ar
 
 
 @kernel
-def write_entries(first: int, last: int, boxes: Array, wanted: Array, positions: Array, ids: Array) -> None:
+def write_entries(
+    first: int, last: int, boxes: Array, wanted: Array, positions: Array, ids: Array
+) -> None:
     """Write the entries of each tile from the parts first..last of the Gaussians."""
     columns, flat = wanted.shape[1], wanted.reshape(-1)
     for part in range(first, last):

@@ -15,14 +15,33 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from spackle._numba import ONE, ZERO, Array, kernel, reordering_kernel
-from spackle.device import run_chunks, thread_count
-from spackle.gaussians import Gaussians
-from spackle.render.blend import CHECK_EVERY, LIMIT, PLANE, STOP, TileLists, alpha_of, is_full, span_of, srgb_slope
+from spackle.core.gaussians import Gaussians
+from spackle.render.blend import (
+    CHECK_EVERY,
+    LIMIT,
+    PLANE,
+    STOP,
+    TileLists,
+    alpha_of,
+    is_full,
+    span_of,
+    srgb_slope,
+)
 from spackle.render.cpu import BLEND_GRAIN, PROJECT_GRAIN, Drawing, as_array
 from spackle.render.cpu import draw as draw_plainly
-from spackle.render.project import Arrays, KernelCamera, Numbers, factor, in_tile, jacobian, rotation, spread
+from spackle.render.project import (
+    Arrays,
+    KernelCamera,
+    Numbers,
+    factor,
+    in_tile,
+    jacobian,
+    rotation,
+    spread,
+)
 from spackle.render.protocol import ALPHA_MIN, TILE, Rendering, tile_mask
+from spackle.runtime.device import run_chunks, thread_count
+from spackle.runtime.kernels import ONE, ZERO, Array, kernel, reordering_kernel
 
 FIELDS = 5  # tensors in a set of Gaussians
 
@@ -40,10 +59,14 @@ WORKSPACE = 7 * PLANE
 CHUNK = 128  # Gaussians
 NOTE = 2 * TILE  # floats for one row of one Gaussian
 NOTES = CHUNK * TILE * NOTE
-INVISIBLE = np.float32(math.log2(ALPHA_MIN) - 1e-3)  # log2 of alpha, below which a Gaussian draws nothing
+INVISIBLE = np.float32(
+    math.log2(ALPHA_MIN) - 1e-3
+)  # log2 of alpha, below which a Gaussian draws nothing
 
 
-def draw(sets: Sequence[Gaussians], view: KernelCamera, wanted: Array, onto: Rendering | None) -> Rendering:
+def draw(
+    sets: Sequence[Gaussians], view: KernelCamera, wanted: Array, onto: Rendering | None
+) -> Rendering:
     """Draw like `spackle.render.cpu.draw`, with gradients."""
     under = [None] * 3 if onto is None else [image.float() for image in onto.tensors]
     fields = [t.to(device="cpu", dtype=torch.float32) for part in sets for t in part.tensors]
@@ -54,12 +77,17 @@ class Draw(torch.autograd.Function):
     """Draws sets of Gaussians over three images; the sets are given as one flat sequence of tensors."""
 
     @staticmethod
-    def forward(ctx: Any, view: KernelCamera, wanted: Array, *tensors: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(
+        ctx: Any, view: KernelCamera, wanted: Array, *tensors: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Draw; `tensors` are rgb, depth and alpha of `onto` (or three None), then five float32 tensors per set."""
         under, fields = tensors[:3], [t for t in tensors[3:] if t is not None]
         sets = [Gaussians(*fields[k : k + FIELDS]) for k in range(0, len(fields), FIELDS)]
         onto = None if under[0] is None else Rendering(*under)  # type: ignore[arg-type]
-        ctx.drawing, ctx.sizes = draw_plainly(sets, view, wanted, onto, keep_linear=True), [len(part) for part in sets]
+        ctx.drawing, ctx.sizes = (
+            draw_plainly(sets, view, wanted, onto, keep_linear=True),
+            [len(part) for part in sets],
+        )
         rendering: Rendering = ctx.drawing.rendering()
         ctx.save_for_backward(*rendering.tensors, *fields)
         return rendering.tensors
@@ -68,22 +96,35 @@ class Draw(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         """Turn gradients of the three images into gradients of the tensors."""
-        fields = ctx.saved_tensors[3:]  # saved, because PyTorch raises an error if they were changed in place
+        fields = ctx.saved_tensors[
+            3:
+        ]  # saved, because PyTorch raises an error if they were changed in place
         needs = ctx.needs_input_grad[2:]
         drawn = tile_mask(torch.from_numpy(ctx.drawing.wanted), *gradients[1].shape)
         under = [  # no gradient for pixels over which tiles were drawn
             torch.where(mask, 0, gradient) if need else None
-            for mask, gradient, need in zip((drawn[..., None], drawn, drawn), gradients, needs, strict=False)
+            for mask, gradient, need in zip(
+                (drawn[..., None], drawn, drawn), gradients, needs, strict=False
+            )
         ]
         sets = [slice(k, k + FIELDS) for k in range(0, len(fields), FIELDS)]
         asking = np.array([any(needs[3:][part]) for part in sets], np.bool_)
         wanted = np.repeat(asking, ctx.sizes)
         rows = np.where(wanted, np.cumsum(wanted) - 1, -1).astype(np.int32)
-        table = pixel_sums(ctx.drawing, tuple(as_array(g) for g in gradients), rows, int(wanted.sum()))
+        table = pixel_sums(
+            ctx.drawing, tuple(as_array(g) for g in gradients), rows, int(wanted.sum())
+        )
         results: list[Tensor | None] = []
         for part, size, asks in zip(sets, ctx.sizes, asking, strict=True):
-            found = set_gradients(fields[part], ctx.drawing.view, table[:size]) if asks else [None] * FIELDS
-            results += [gradient if need else None for gradient, need in zip(found, needs[3:][part], strict=True)]
+            found = (
+                set_gradients(fields[part], ctx.drawing.view, table[:size])
+                if asks
+                else [None] * FIELDS
+            )
+            results += [
+                gradient if need else None
+                for gradient, need in zip(found, needs[3:][part], strict=True)
+            ]
             table = table[size if asks else 0 :]
         return None, None, *under, *results
 
@@ -111,15 +152,26 @@ def pixel_sums(drawing: Drawing, gradients: Arrays, rows: Array, count: int) -> 
     return table
 
 
-def set_gradients(fields: Sequence[Tensor], view: KernelCamera, table: Array) -> list[Tensor | None]:
+def set_gradients(
+    fields: Sequence[Tensor], view: KernelCamera, table: Array
+) -> list[Tensor | None]:
     """The gradients of a set's five tensors, from sums over pixels."""
-    scene, gradients = tuple(as_array(t) for t in fields), tuple(np.zeros(t.shape, np.float32) for t in fields)
-    run_chunks(lambda a, b: project_backward(a, b, scene, view, table, gradients), len(table), PROJECT_GRAIN)
+    scene, gradients = (
+        tuple(as_array(t) for t in fields),
+        tuple(np.zeros(t.shape, np.float32) for t in fields),
+    )
+    run_chunks(
+        lambda a, b: project_backward(a, b, scene, view, table, gradients),
+        len(table),
+        PROJECT_GRAIN,
+    )
     return [torch.from_numpy(g) for g in gradients]
 
 
 @kernel
-def replay_row(work: Array, offset: np.uint64, notes: Array, note: np.uint64, peak: np.float32, bell: Numbers) -> None:
+def replay_row(
+    work: Array, offset: np.uint64, notes: Array, note: np.uint64, peak: np.float32, bell: Numbers
+) -> None:
     """Draw a row of a Gaussian, and note each pixel's alpha (0 if nothing is drawn) and transmittance.
 
     `bell` has the rate and the centre of the Gaussian's fall-off in the row.
@@ -138,7 +190,9 @@ def replay_row(work: Array, offset: np.uint64, notes: Array, note: np.uint64, pe
 
 
 @kernel
-def replay(work: Array, notes: Array, records: Array, ids: Array, left: int, top: int, first_notes: Array) -> int:
+def replay(
+    work: Array, notes: Array, records: Array, ids: Array, left: int, top: int, first_notes: Array
+) -> int:
     """Draw a chunk of Gaussians again; `first_notes` [CHUNK] receives each Gaussian's first row in `notes`.
 
     Returns the number of Gaussians that were drawn until the tile was full.
@@ -146,7 +200,9 @@ def replay(work: Array, notes: Array, records: Array, ids: Array, left: int, top
     note = np.uint64(0)
     for k in range(len(ids)):
         first_notes[k] = note
-        x, y, slope, across, fall, height, _, half_height, _, _, _, _ = in_tile(records[ids[k]], left, top)
+        x, y, slope, across, fall, height, _, half_height, _, _, _, _ = in_tile(
+            records[ids[k]], left, top
+        )
         first, last = span_of(y, half_height)
         for row in range(first, last):
             dy = np.float32(row) - y
@@ -167,7 +223,11 @@ def pass_row(work: Array, offset: np.uint64, notes: Array, note: np.uint64, look
     for x in range(TILE):
         i, n = offset + np.uint64(x), note + np.uint64(x)
         g = i + np.uint64(GRADIENTS)
-        value = red * work[g] + green * work[g + np.uint64(PLANE)] + blue * work[g + np.uint64(2 * PLANE)]
+        value = (
+            red * work[g]
+            + green * work[g + np.uint64(PLANE)]
+            + blue * work[g + np.uint64(2 * PLANE)]
+        )
         value += depth * work[g + np.uint64(3 * PLANE)] + work[g + np.uint64(4 * PLANE)]
         work[i + np.uint64(BEHIND)] += notes[n] * notes[n + np.uint64(TILE)] * value
 
@@ -183,7 +243,11 @@ def gather_row(
     for x in range(TILE):
         i, n = offset + np.uint64(x), note + np.uint64(x)
         g = i + np.uint64(GRADIENTS)
-        by_red, by_green, by_blue = work[g], work[g + np.uint64(PLANE)], work[g + np.uint64(2 * PLANE)]
+        by_red, by_green, by_blue = (
+            work[g],
+            work[g + np.uint64(PLANE)],
+            work[g + np.uint64(2 * PLANE)],
+        )
         by_depth, by_alpha = work[g + np.uint64(3 * PLANE)], work[g + np.uint64(4 * PLANE)]
         value = red * by_red + green * by_green + blue * by_blue + depth * by_depth + by_alpha
         alpha, light, behind = notes[n], notes[n + np.uint64(TILE)], work[i + np.uint64(BEHIND)]
@@ -205,10 +269,19 @@ def gather_row(
 
 @kernel
 def walk_back(
-    work: Array, notes: Array, note: np.uint64, record: Array, left: int, top: int, wanted: bool, sums: Array
+    work: Array,
+    notes: Array,
+    note: np.uint64,
+    record: Array,
+    left: int,
+    top: int,
+    wanted: bool,
+    sums: Array,
 ) -> None:
     """Step back over a Gaussian, whose saved values begin at `note`; if `wanted`, add its sums to `sums` [SUMS]."""
-    x, y, slope, _, fall, height, _, half_height, depth, red, green, blue = in_tile(record, left, top)
+    x, y, slope, _, fall, height, _, half_height, depth, red, green, blue = in_tile(
+        record, left, top
+    )
     look, (first, last) = (red, green, blue, depth), span_of(y, half_height)
     for row in range(first, last):
         dy = np.float32(row) - y
@@ -254,7 +327,9 @@ def load_gradients(work: Array, left: int, top: int, images: Arrays, gradients: 
 
 
 @kernel
-def backward_tile(room: Arrays, records: Array, ids: Array, wanted: Array, left: int, top: int, sums: Array) -> None:
+def backward_tile(
+    room: Arrays, records: Array, ids: Array, wanted: Array, left: int, top: int, sums: Array
+) -> None:
     """Compute the gradients of a tile with the list `ids` [n], for the entries `wanted` [n] bool.
 
     Args:
@@ -269,7 +344,15 @@ def backward_tile(room: Arrays, records: Array, ids: Array, wanted: Array, left:
     for chunk in range(chunks):
         before[chunk] = work[:PLANE]
         if chunk < chunks - 1:
-            replay(work, notes, records, ids[chunk * CHUNK : (chunk + 1) * CHUNK], left, top, first_notes)
+            replay(
+                work,
+                notes,
+                records,
+                ids[chunk * CHUNK : (chunk + 1) * CHUNK],
+                left,
+                top,
+                first_notes,
+            )
     slot = len(sums)
     for chunk in range(chunks - 1, -1, -1):
         work[:PLANE] = before[chunk]
@@ -300,7 +383,10 @@ def backward_tiles(
         tile = tiles[k]
         left, top = (tile % columns) * TILE, (tile // columns) * TILE
         load_gradients(room[0], left, top, images, gradients)
-        part, own = slice(lists.starts[tile], lists.starts[tile + 1]), sums[slots[tile] : slots[tile + 1]]
+        part, own = (
+            slice(lists.starts[tile], lists.starts[tile + 1]),
+            sums[slots[tile] : slots[tile + 1]],
+        )
         backward_tile(room, records, lists.ids[part], wanted[part], left, top, own)
 
 
@@ -325,7 +411,12 @@ def project_backward(
     """
     (means, quats, scales, opacities, _), lens, pose = scene, camera.lens, camera.pose
     means_grad, quats_grad, scales_grad, opacities_grad, colors_grad = gradients
-    local, factor_grad, rotation_grad, jacobian_grad = np.empty(3), np.empty((2, 3)), np.empty((3, 3)), np.empty((2, 3))
+    local, factor_grad, rotation_grad, jacobian_grad = (
+        np.empty(3),
+        np.empty((2, 3)),
+        np.empty((3, 3)),
+        np.empty((2, 3)),
+    )
     for i in range(start, stop):
         row = table[i]
         if not row.any():
@@ -333,19 +424,35 @@ def project_backward(
         colors_grad[i, 0], colors_grad[i, 1], colors_grad[i, 2] = row[6], row[7], row[8]
         opacities_grad[i] = row[0] / opacities[i]
         for a in range(3):
-            local[a] = pose[a, 0] * means[i, 0] + pose[a, 1] * means[i, 1] + pose[a, 2] * means[i, 2] + pose[a, 3]
+            local[a] = (
+                pose[a, 0] * means[i, 0]
+                + pose[a, 1] * means[i, 1]
+                + pose[a, 2] * means[i, 2]
+                + pose[a, 3]
+            )
         nearness = 1.0 / local[2]
-        j, r = jacobian(local[0] * nearness, local[1] * nearness, nearness, lens), rotation(quats[i])
-        u_grad, v_grad = splat_backward(row, factor(j, pose, r, scales[i]), camera.eps2d, factor_grad)
-        factor_backward(j, pose, r, scales[i], factor_grad, (jacobian_grad, rotation_grad), scales_grad[i])
+        j, r = (
+            jacobian(local[0] * nearness, local[1] * nearness, nearness, lens),
+            rotation(quats[i]),
+        )
+        u_grad, v_grad = splat_backward(
+            row, factor(j, pose, r, scales[i]), camera.eps2d, factor_grad
+        )
+        factor_backward(
+            j, pose, r, scales[i], factor_grad, (jacobian_grad, rotation_grad), scales_grad[i]
+        )
         quat_backward(quats[i], rotation_grad, quats_grad[i])
         local_grad = point_backward(local, lens, jacobian_grad, u_grad, v_grad, row[9])
         for b in range(3):
-            means_grad[i, b] = pose[0, b] * local_grad[0] + pose[1, b] * local_grad[1] + pose[2, b] * local_grad[2]
+            means_grad[i, b] = (
+                pose[0, b] * local_grad[0] + pose[1, b] * local_grad[1] + pose[2, b] * local_grad[2]
+            )
 
 
 @kernel
-def splat_backward(row: Array, factors: Numbers, eps2d: float, factor_grad: Array) -> tuple[float, float]:
+def splat_backward(
+    row: Array, factors: Numbers, eps2d: float, factor_grad: Array
+) -> tuple[float, float]:
     """Turn sums over pixels into gradients of the factor M (written to `factor_grad`) and of the centre (returned).
 
     For a pixel at d from the centre, ∂ln(alpha)/∂centre = p and ∂ln(alpha)/∂Σ = ½ p pᵀ with p = Σ⁻¹ d
@@ -366,7 +473,13 @@ def splat_backward(row: Array, factors: Numbers, eps2d: float, factor_grad: Arra
 
 @kernel
 def factor_backward(
-    j: Numbers, pose: Array, r: Numbers, scale: Array, factor_grad: Array, grads: Arrays, scale_grad: Array
+    j: Numbers,
+    pose: Array,
+    r: Numbers,
+    scale: Array,
+    factor_grad: Array,
+    grads: Arrays,
+    scale_grad: Array,
 ) -> None:
     """Turn the gradient of the factor M = J W R S into gradients of the Jacobian J, the rotation R and the scales."""
     jacobian_grad, rotation_grad = grads
@@ -391,9 +504,15 @@ def quat_backward(quat: Array, r: Array, grad: Array) -> None:
     norm = 1.0 / max(math.sqrt(w * w + x * x + y * y + z * z), 1e-12)
     w, x, y, z = w * norm, x * norm, y * norm, z * norm
     gw = 2 * (x * (r[2, 1] - r[1, 2]) + y * (r[0, 2] - r[2, 0]) + z * (r[1, 0] - r[0, 1]))
-    gx = 2 * (w * (r[2, 1] - r[1, 2]) + y * (r[0, 1] + r[1, 0]) + z * (r[0, 2] + r[2, 0])) - 4 * x * (r[1, 1] + r[2, 2])
-    gy = 2 * (w * (r[0, 2] - r[2, 0]) + x * (r[0, 1] + r[1, 0]) + z * (r[1, 2] + r[2, 1])) - 4 * y * (r[0, 0] + r[2, 2])
-    gz = 2 * (w * (r[1, 0] - r[0, 1]) + x * (r[0, 2] + r[2, 0]) + y * (r[1, 2] + r[2, 1])) - 4 * z * (r[0, 0] + r[1, 1])
+    gx = 2 * (
+        w * (r[2, 1] - r[1, 2]) + y * (r[0, 1] + r[1, 0]) + z * (r[0, 2] + r[2, 0])
+    ) - 4 * x * (r[1, 1] + r[2, 2])
+    gy = 2 * (
+        w * (r[0, 2] - r[2, 0]) + x * (r[0, 1] + r[1, 0]) + z * (r[1, 2] + r[2, 1])
+    ) - 4 * y * (r[0, 0] + r[2, 2])
+    gz = 2 * (
+        w * (r[1, 0] - r[0, 1]) + x * (r[0, 2] + r[2, 0]) + y * (r[1, 2] + r[2, 1])
+    ) - 4 * z * (r[0, 0] + r[1, 1])
     along = gw * w + gx * x + gy * y + gz * z
     grad[0], grad[1] = (gw - along * w) * norm, (gx - along * x) * norm
     grad[2], grad[3] = (gy - along * y) * norm, (gz - along * z) * norm

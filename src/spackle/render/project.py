@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from spackle._numba import HALF, MANTISSA, ZERO, Array, inlined_kernel, kernel
-from spackle.camera import Camera
+from spackle.core.camera import Camera
 from spackle.render.protocol import ALPHA_MIN, NEAR_PLANE, TILE, tile_grid
+from spackle.runtime.kernels import HALF, MANTISSA, ZERO, Array, inlined_kernel, kernel
 
 Numbers = Array | tuple[Any, ...]
 Arrays = tuple[Array, ...]
@@ -56,7 +56,10 @@ class KernelCamera(NamedTuple):
         K = camera.K.detach().double().cpu().numpy()
         pose = np.ascontiguousarray(camera.world_to_camera.detach().double().cpu().numpy()[:3])
         fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-        slack_x, slack_y = BLUR_CLAMP * 0.5 * camera.width / fx, BLUR_CLAMP * 0.5 * camera.height / fy
+        slack_x, slack_y = (
+            BLUR_CLAMP * 0.5 * camera.width / fx,
+            BLUR_CLAMP * 0.5 * camera.height / fy,
+        )
         left, right = -cx / fx - slack_x, (camera.width - cx) / fx + slack_x
         top, bottom = -cy / fy - slack_y, (camera.height - cy) / fy + slack_y
         lens = np.array([fx, fy, cx, cy, left, right, top, bottom])
@@ -79,18 +82,35 @@ class Splats(NamedTuple):
 def in_tile(record: Array, left: int, top: int) -> Numbers:
     """A record's numbers, with (X, Y) relative to the centre of the tile's first pixel (left, top)."""
     x, y = record[X] - np.float32(left) - HALF, record[Y] - np.float32(top) - HALF
-    shape = x, y, record[SLOPE], record[ACROSS], record[FALL], record[PEAK], record[HALF_WIDTH], record[HALF_HEIGHT]
+    shape = (
+        x,
+        y,
+        record[SLOPE],
+        record[ACROSS],
+        record[FALL],
+        record[PEAK],
+        record[HALF_WIDTH],
+        record[HALF_HEIGHT],
+    )
     return *shape, record[DEPTH], record[RED], record[GREEN], record[BLUE]
 
 
 def count_before(wanted: Array) -> Array:
     """[rows + 1, columns + 1] int32: the number of wanted tiles above and to the left of each corner."""
-    return np.pad(wanted.astype(np.int32).cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0))).astype(np.int32)
+    return np.pad(wanted.astype(np.int32).cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0))).astype(
+        np.int32
+    )
 
 
 @kernel
 def project_chunk(
-    start: int, stop: int, first: int, scene: Arrays, camera: KernelCamera, wanted_before: Array, splats: Splats
+    start: int,
+    stop: int,
+    first: int,
+    scene: Arrays,
+    camera: KernelCamera,
+    wanted_before: Array,
+    splats: Splats,
 ) -> None:
     """Project the Gaussians start..stop of a set, whose first Gaussian has the index `first` among all sets.
 
@@ -101,7 +121,11 @@ def project_chunk(
     for begin in range(start, stop, BLOCK):
         end = min(begin + BLOCK, stop)
         # For flat arrays, the compiler knows the stride between a Gaussian's numbers.
-        shapes = means[begin:end].reshape(-1), quats[begin:end].reshape(-1), scales[begin:end].reshape(-1)
+        shapes = (
+            means[begin:end].reshape(-1),
+            quats[begin:end].reshape(-1),
+            scales[begin:end].reshape(-1),
+        )
         measure_block(block, *shapes, opacities[begin:end], camera)
         pack_block(block, colors[begin:end].reshape(-1), first + begin, wanted_before, splats)
 
@@ -117,7 +141,11 @@ def measure_block(
     lens, pose = camera.lens, camera.pose
     for k in range(len(opacities)):
         i, i3, i4 = np.uint64(k), np.uint64(3 * k), np.uint64(4 * k)
-        px, py, pz = np.float64(means[i3]), np.float64(means[i3 + ONCE]), np.float64(means[i3 + TWICE])
+        px, py, pz = (
+            np.float64(means[i3]),
+            np.float64(means[i3 + ONCE]),
+            np.float64(means[i3 + TWICE]),
+        )
         x = pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3]
         y = pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3]
         z = pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + pose[2, 3]
@@ -150,15 +178,22 @@ def measure_block(
         block[i + np.uint64(HALF_HEIGHT * BLOCK)] = half_height
         block[i + np.uint64(DEPTH * BLOCK)] = z
         block[i + np.uint64(LEFT * BLOCK)] = left // TILE
-        block[i + np.uint64(RIGHT * BLOCK)] = np.float32((right + TILE - 1) // TILE) if visible else ZERO
+        block[i + np.uint64(RIGHT * BLOCK)] = (
+            np.float32((right + TILE - 1) // TILE) if visible else ZERO
+        )
         block[i + np.uint64(TOP * BLOCK)] = top // TILE
         block[i + np.uint64(BOTTOM * BLOCK)] = (bottom + TILE - 1) // TILE
 
 
 @inlined_kernel
-def covariance(x: float, y: float, nearness: float, quat: Numbers, scale: Numbers, camera: KernelCamera) -> Numbers:
+def covariance(
+    x: float, y: float, nearness: float, quat: Numbers, scale: Numbers, camera: KernelCamera
+) -> Numbers:
     """The projected covariance (xx, xy, yy) and its determinant, for a Gaussian at (x, y, 1) / nearness."""
-    return spread(factor(jacobian(x, y, nearness, camera.lens), camera.pose, rotation(quat), scale), camera.eps2d)
+    return spread(
+        factor(jacobian(x, y, nearness, camera.lens), camera.pose, rotation(quat), scale),
+        camera.eps2d,
+    )
 
 
 @inlined_kernel
@@ -171,11 +206,30 @@ def jacobian(x: float, y: float, nearness: float, lens: Array) -> Numbers:
 @inlined_kernel
 def rotation(quat: Numbers) -> Numbers:
     """The rotation matrix R, row by row, of a quaternion (wxyz) of any length."""
-    qw, qx, qy, qz = np.float64(quat[0]), np.float64(quat[1]), np.float64(quat[2]), np.float64(quat[3])
-    two = 2.0 / max(qw * qw + qx * qx + qy * qy + qz * qz, 1e-24)  # 2/‖q‖² normalises the quaternion
-    r00, r01, r02 = 1 - two * (qy * qy + qz * qz), two * (qx * qy - qw * qz), two * (qx * qz + qw * qy)
-    r10, r11, r12 = two * (qx * qy + qw * qz), 1 - two * (qx * qx + qz * qz), two * (qy * qz - qw * qx)
-    r20, r21, r22 = two * (qx * qz - qw * qy), two * (qy * qz + qw * qx), 1 - two * (qx * qx + qy * qy)
+    qw, qx, qy, qz = (
+        np.float64(quat[0]),
+        np.float64(quat[1]),
+        np.float64(quat[2]),
+        np.float64(quat[3]),
+    )
+    two = 2.0 / max(
+        qw * qw + qx * qx + qy * qy + qz * qz, 1e-24
+    )  # 2/‖q‖² normalises the quaternion
+    r00, r01, r02 = (
+        1 - two * (qy * qy + qz * qz),
+        two * (qx * qy - qw * qz),
+        two * (qx * qz + qw * qy),
+    )
+    r10, r11, r12 = (
+        two * (qx * qy + qw * qz),
+        1 - two * (qx * qx + qz * qz),
+        two * (qy * qz - qw * qx),
+    )
+    r20, r21, r22 = (
+        two * (qx * qz - qw * qy),
+        two * (qy * qz + qw * qx),
+        1 - two * (qx * qx + qy * qy),
+    )
     return r00, r01, r02, r10, r11, r12, r20, r21, r22
 
 
@@ -183,8 +237,16 @@ def rotation(quat: Numbers) -> Numbers:
 def factor(j: Numbers, pose: Array, r: Numbers, scale: Numbers) -> Numbers:
     """The two rows of M = J W R S; the projected covariance is M Mᵀ."""
     a, b, c, d = j
-    h0, h1, h2 = a * pose[0, 0] + b * pose[2, 0], a * pose[0, 1] + b * pose[2, 1], a * pose[0, 2] + b * pose[2, 2]
-    v0, v1, v2 = c * pose[1, 0] + d * pose[2, 0], c * pose[1, 1] + d * pose[2, 1], c * pose[1, 2] + d * pose[2, 2]
+    h0, h1, h2 = (
+        a * pose[0, 0] + b * pose[2, 0],
+        a * pose[0, 1] + b * pose[2, 1],
+        a * pose[0, 2] + b * pose[2, 2],
+    )
+    v0, v1, v2 = (
+        c * pose[1, 0] + d * pose[2, 0],
+        c * pose[1, 1] + d * pose[2, 1],
+        c * pose[1, 2] + d * pose[2, 2],
+    )
     s0, s1, s2 = np.float64(scale[0]), np.float64(scale[1]), np.float64(scale[2])
     m0, n0 = s0 * (h0 * r[0] + h1 * r[3] + h2 * r[6]), s0 * (v0 * r[0] + v1 * r[3] + v2 * r[6])
     m1, n1 = s1 * (h0 * r[1] + h1 * r[4] + h2 * r[7]), s1 * (v0 * r[1] + v1 * r[4] + v2 * r[7])
@@ -220,7 +282,9 @@ def cover(center: float, extent: float, size: int) -> tuple[np.int32, np.int32]:
 
 
 @kernel
-def pack_block(block: Array, colors: Array, first: int, wanted_before: Array, splats: Splats) -> None:
+def pack_block(
+    block: Array, colors: Array, first: int, wanted_before: Array, splats: Splats
+) -> None:
     """Write boxes of the projected Gaussians `first`, `first` + 1, …, and records of those that touch wanted tiles."""
     records, boxes = splats
     for k in range(len(colors) // 3):
@@ -231,7 +295,10 @@ def pack_block(block: Array, colors: Array, first: int, wanted_before: Array, sp
         light = abs(red) + abs(green) + abs(blue)
         if right == 0 or not light < FINITE:
             continue
-        left, top = np.uint32(block[i + np.uint64(LEFT * BLOCK)]), np.uint32(block[i + np.uint64(TOP * BLOCK)])
+        left, top = (
+            np.uint32(block[i + np.uint64(LEFT * BLOCK)]),
+            np.uint32(block[i + np.uint64(TOP * BLOCK)]),
+        )
         bottom = np.uint32(block[i + np.uint64(BOTTOM * BLOCK)])
         boxes[out, 0], boxes[out, 1], boxes[out, 2], boxes[out, 3] = left, right, top, bottom
         if not touches(left, right, top, bottom, wanted_before):
@@ -243,7 +310,9 @@ def pack_block(block: Array, colors: Array, first: int, wanted_before: Array, sp
 
 
 @inlined_kernel
-def touches(left: np.uint32, right: np.uint32, top: np.uint32, bottom: np.uint32, wanted_before: Array) -> bool:
+def touches(
+    left: np.uint32, right: np.uint32, top: np.uint32, bottom: np.uint32, wanted_before: Array
+) -> bool:
     """Whether any tile of a box is wanted."""
     below = wanted_before[bottom, right] - wanted_before[bottom, left]
     return bool(below != wanted_before[top, right] - wanted_before[top, left])
@@ -254,8 +323,12 @@ def natural_log(x: np.float32) -> float:
     """The logarithm of a positive number, accurate to the last digits of float64."""
     bits = np.float32(x).view(np.int32)
     exponent = (bits - ROOT_HALF_BITS) >> MANTISSA
-    m = np.float64(np.int32(bits - (exponent << MANTISSA)).view(np.float32))  # from sqrt(1/2) to sqrt(2)
+    m = np.float64(
+        np.int32(bits - (exponent << MANTISSA)).view(np.float32)
+    )  # from sqrt(1/2) to sqrt(2)
     t = (m - 1.0) / (m + 1.0)
     s = t * t
-    series = L3 + s * (L5 + s * (L7 + s * (L9 + s * (L11 + s * (L13 + s * (L15 + s * (L17 + s * L19)))))))
+    series = L3 + s * (
+        L5 + s * (L7 + s * (L9 + s * (L11 + s * (L13 + s * (L15 + s * (L17 + s * L19))))))
+    )
     return np.float64(exponent) * LN_2 + (2.0 * t + t * s * series)

@@ -9,8 +9,8 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from spackle.camera import Camera
-from spackle.gaussians import Gaussians
+from spackle.core.camera import Camera
+from spackle.core.gaussians import Gaussians
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,7 +28,11 @@ class Rendering:
 
     def to(self, device: torch.device) -> Rendering:
         """The images on another device."""
-        return self if self.rgb.device == device else Rendering(*(image.to(device) for image in self.tensors))
+        return (
+            self
+            if self.rgb.device == device
+            else Rendering(*(image.to(device) for image in self.tensors))
+        )
 
     def detach(self) -> Rendering:
         """The same values, detached from autograd."""
@@ -73,7 +77,9 @@ def tile_grid(height: int, width: int) -> tuple[int, int]:
 def check_tiles(tiles: Tensor, height: int, width: int) -> None:
     """ValueError if the shape of `tiles` does not fit an image of this size."""
     if tuple(tiles.shape) != (grid := tile_grid(height, width)):
-        raise ValueError(f"tiles has shape {tuple(tiles.shape)}, expected {grid}: one for each {TILE}×{TILE} pixels")
+        raise ValueError(
+            f"tiles has shape {tuple(tiles.shape)}, expected {grid}: one for each {TILE}×{TILE} pixels"
+        )
 
 
 def tile_mask(tiles: Tensor, height: int, width: int) -> Tensor:
@@ -85,6 +91,12 @@ def tile_mask(tiles: Tensor, height: int, width: int) -> Tensor:
 def paste(rendering: Rendering, tiles: Tensor, onto: Rendering | None) -> Rendering:
     """Take the pixels of `tiles` ([rows, columns] bool) from a rendering, all others from `onto` (None: black)."""
     mask = tile_mask(tiles, *rendering.alpha.shape)
-    others = onto.tensors if onto is not None else tuple(torch.zeros_like(image) for image in rendering.tensors)
+    others = (
+        onto.tensors
+        if onto is not None
+        else tuple(torch.zeros_like(image) for image in rendering.tensors)
+    )
     masks = (mask[..., None], mask, mask)
-    return Rendering(*(torch.where(*images) for images in zip(masks, rendering.tensors, others, strict=True)))
+    return Rendering(
+        *(torch.where(*images) for images in zip(masks, rendering.tensors, others, strict=True))
+    )

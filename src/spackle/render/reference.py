@@ -7,10 +7,17 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from spackle.camera import Camera
-from spackle.color import linear_to_srgb
-from spackle.gaussians import Gaussians, quat_to_matrix
-from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, NEAR_PLANE, TRANSMITTANCE_STOP, Rendering, paste
+from spackle.core.camera import Camera
+from spackle.core.color import linear_to_srgb
+from spackle.core.gaussians import Gaussians, quat_to_matrix
+from spackle.render.protocol import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    NEAR_PLANE,
+    TRANSMITTANCE_STOP,
+    Rendering,
+    paste,
+)
 
 
 class ReferenceRenderer:
@@ -26,7 +33,11 @@ class ReferenceRenderer:
         onto: Rendering | None = None,
     ) -> Rendering:
         """See `Renderer.render`; the result has the dtype of the input."""
-        joined = gaussians if isinstance(gaussians, Gaussians) else Gaussians.cat([Gaussians.empty(), *gaussians])
+        joined = (
+            gaussians
+            if isinstance(gaussians, Gaussians)
+            else Gaussians.cat([Gaussians.empty(), *gaussians])
+        )
         visible = front_to_back(joined, camera)
         rendering = blend(visible, camera, eps2d)
         return rendering if tiles is None else paste(rendering, tiles, onto)
@@ -37,7 +48,9 @@ def front_to_back(gaussians: Gaussians, camera: Camera) -> Gaussians:
     finite = [t.detach().isfinite().unsqueeze(-1).flatten(1).all(dim=1) for t in gaussians.tensors]
     z = camera.to_camera(gaussians.means.detach())[:, 2]
     gaussians = gaussians.select(torch.stack(finite).all(dim=0) & (z >= NEAR_PLANE))
-    return gaussians.select(torch.argsort(camera.to_camera(gaussians.means.detach())[:, 2], stable=True))
+    return gaussians.select(
+        torch.argsort(camera.to_camera(gaussians.means.detach())[:, 2], stable=True)
+    )
 
 
 def blend(gaussians: Gaussians, camera: Camera, eps2d: float) -> Rendering:
@@ -67,7 +80,10 @@ def project_covariances(gaussians: Gaussians, camera: Camera, eps2d: float) -> T
     tx = (x / z).clamp(-K[0, 2] / fx - slack_x, (camera.width - K[0, 2]) / fx + slack_x)
     ty = (y / z).clamp(-K[1, 2] / fy - slack_y, (camera.height - K[1, 2]) / fy + slack_y)
     zero = torch.zeros_like(z)
-    rows = [torch.stack([fx / z, zero, -fx * tx / z], -1), torch.stack([zero, fy / z, -fy * ty / z], -1)]
+    rows = [
+        torch.stack([fx / z, zero, -fx * tx / z], -1),
+        torch.stack([zero, fy / z, -fy * ty / z], -1),
+    ]
     jacobian = torch.stack(rows, dim=-2)  # [N, 2, 3]
     axes = quat_to_matrix(gaussians.quats) * gaussians.scales[:, None, :]  # R S, [N, 3, 3]
     factor = jacobian @ camera.world_to_camera[:3, :3].to(x) @ axes
@@ -77,7 +93,9 @@ def project_covariances(gaussians: Gaussians, camera: Camera, eps2d: float) -> T
 def falloff(gaussians: Gaussians, camera: Camera, eps2d: float) -> Tensor:
     """Unclamped alpha of each Gaussian at each pixel, [N, H, W]."""
     uv, _ = camera.project(gaussians.means)  # [N, 2]
-    covariances = project_covariances(gaussians, camera, eps2d)[:, :, :, None, None]  # [N, 2, 2, 1, 1]
+    covariances = project_covariances(gaussians, camera, eps2d)[
+        :, :, :, None, None
+    ]  # [N, 2, 2, 1, 1]
     xx, xy, yy = covariances[:, 0, 0], covariances[:, 0, 1], covariances[:, 1, 1]
     det = xx * yy - xy * xy
     proper = det > 0  # a Gaussian without extent is invisible

@@ -16,9 +16,7 @@ from torch.nn.functional import interpolate, pad
 
 from spackle.bases.sharp.encoder import CONFIGS, FULL, ExactConv, SharpConfig
 from spackle.bases.sharp.network import FeatureNetwork
-from spackle.crop import Crop
-from spackle.errors import InputError, one_line
-from spackle.network_file import channels_last, load_strict, read_note, read_tensors
+from spackle.core.crop import Crop
 from spackle.residual.network import (
     COLOR,
     DELTA_CHANNELS,
@@ -34,6 +32,8 @@ from spackle.residual.network import (
     VIEW_DEPTH,
     ResidualNet,
 )
+from spackle.runtime.errors import InputError, one_line
+from spackle.weights.checkpoints import channels_last, load_strict, read_note, read_tensors
 
 SHIPPED = Path(__file__).parent.parent / "weights" / "residual.safetensors"
 NOTE = "spackle.residual"  # metadata key of the architecture's name; a file without this key holds a UNet
@@ -73,7 +73,9 @@ class UNet(ResidualNet):
         super().__init__()
         self.stem = nn.Conv2d(RIM_CHANNELS, WIDTHS[0], 3, padding=1)
         pairs = list(itertools.pairwise(WIDTHS))
-        self.down = nn.ModuleList(nn.Conv2d(fine, coarse, 3, stride=2, padding=1) for fine, coarse in pairs)
+        self.down = nn.ModuleList(
+            nn.Conv2d(fine, coarse, 3, stride=2, padding=1) for fine, coarse in pairs
+        )
         self.encode = nn.ModuleList(ResidualBlock(width) for width in WIDTHS[:-1])
         self.coarse = nn.Sequential(*(ResidualBlock(WIDTHS[-1]) for _ in range(COARSE_BLOCKS)))
         self.up = nn.ModuleList(nn.Conv2d(coarse, fine, 1) for fine, coarse in pairs)
@@ -98,11 +100,18 @@ class UNet(ResidualNet):
                 x = x[(..., *near.slices)].contiguous(memory_format=torch.channels_last)
             x = decode(x)
         heads = torch.cat([self.geometry(x), self.texture(x)], dim=1)
-        heads, features = heads[(..., *inner.moved(-near.top, -near.left).slices)], features[(..., *inner.slices)]
+        heads, features = (
+            heads[(..., *inner.moved(-near.top, -near.left).slices)],
+            features[(..., *inner.slices)],
+        )
         # The last outputs are weights of the known colours.
         deltas, shares = torch.split(heads, [DELTA_CHANNELS, len(KNOWN_COLORS)], dim=1)
-        copied = sum(shares[:, k : k + 1] * features[:, colors] for k, colors in enumerate(KNOWN_COLORS))
-        return torch.cat([deltas[:, : COLOR.start], deltas[:, COLOR] + copied, deltas[:, COLOR.stop :]], dim=1)
+        copied = sum(
+            shares[:, k : k + 1] * features[:, colors] for k, colors in enumerate(KNOWN_COLORS)
+        )
+        return torch.cat(
+            [deltas[:, : COLOR.start], deltas[:, COLOR] + copied, deltas[:, COLOR.stop :]], dim=1
+        )
 
 
 class SharpDecoder(ResidualNet):
@@ -112,20 +121,28 @@ class SharpDecoder(ResidualNet):
     receives the base values' colours and depth, and the view's depth.
     """
 
-    name, sees_photo, local = "sharp-decoder", True, False  # group norms make a cell depend on all others
+    name, sees_photo, local = (
+        "sharp-decoder",
+        True,
+        False,
+    )  # group norms make a cell depend on all others
 
     def __init__(self, config: SharpConfig = FULL) -> None:
         super().__init__()
         dims = (config.depth_width, *config.pyramid)
         self.stem = nn.Conv2d(VIEW_CHANNELS + 3, STEM_WIDTH, 3, padding=1)
-        self.down = nn.ModuleList(nn.Conv2d(STEM_WIDTH, STEM_WIDTH, 3, stride=2, padding=1) for _ in dims[1:])
+        self.down = nn.ModuleList(
+            nn.Conv2d(STEM_WIDTH, STEM_WIDTH, 3, stride=2, padding=1) for _ in dims[1:]
+        )
         self.maps = nn.ModuleList(nn.Conv2d(STEM_WIDTH, dim, 1) for dim in dims)
         self.feature_model = FeatureNetwork(config)
         self.geometry = ExactConv(config.feature_width, GEOMETRY_CHANNELS, 1)
         self.texture = ExactConv(config.feature_width, TEXTURE_CHANNELS, 1)
         for name, layer in self.feature_model.named_modules():
             if isinstance(layer, (nn.Conv2d, nn.ConvTranspose2d)):
-                _scale(0.0 if name.endswith(("residual.3", "residual.5")) else 1.0, layer)  # blocks: identity
+                _scale(
+                    0.0 if name.endswith(("residual.3", "residual.5")) else 1.0, layer
+                )  # blocks: identity
         _scale(STEM_GAIN, self.stem)
         _scale(math.sqrt(2), *self.down, *self.maps)
         _scale(0.0, self.geometry, self.texture)
@@ -143,7 +160,9 @@ class SharpDecoder(ResidualNet):
         picture = torch.cat([2 * features[:, SEED_RGB], depths], dim=1)
         pixels = interpolate(picture, scale_factor=2, mode="nearest")
         texture, geometry = self.feature_model(pixels, maps, x.new_zeros(()))
-        return torch.cat([self.geometry(geometry), self.texture(texture)], dim=1)[..., :height, :width]
+        return torch.cat([self.geometry(geometry), self.texture(texture)], dim=1)[
+            ..., :height, :width
+        ]
 
 
 def _head(width: int, channels: int) -> nn.Sequential:
@@ -162,7 +181,9 @@ def _initialise(network: UNet) -> None:
 def _scale(gain: float, *layers: Any) -> None:
     """Set random weights that scale the input's magnitude by about `gain`, and zero biases."""
     for layer in layers:
-        taps = layer.in_channels if isinstance(layer, nn.ConvTranspose2d) else layer.weight[0].numel()
+        taps = (
+            layer.in_channels if isinstance(layer, nn.ConvTranspose2d) else layer.weight[0].numel()
+        )
         nn.init.normal_(layer.weight, std=gain / math.sqrt(taps))
         if layer.bias is not None:
             nn.init.zeros_(layer.bias)
@@ -185,7 +206,9 @@ def load_residual(path: str | os.PathLike[str]) -> ResidualNet:
     tensors, name = read_tensors(path, advice), read_note(path, NOTE) or UNet.name
     if name not in (UNet.name, SharpDecoder.name):
         raise InputError(f"{path}: unknown architecture {one_line(name)[:60]}: {advice}")
-    return load_strict(open_residual(name, decoder_size(tensors)), tensors, path, advice, prepare=channels_last)
+    return load_strict(
+        open_residual(name, decoder_size(tensors)), tensors, path, advice, prepare=channels_last
+    )
 
 
 def decoder_size(tensors: Mapping[str, Tensor]) -> SharpConfig:

@@ -8,25 +8,42 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from spackle.camera import Camera
-from spackle.crop import Crop, crops_around
-from spackle.device import Precision, own_arithmetic, pick_dtype
-from spackle.filters import broadly_blurred
-from spackle.patches import TONE_CELLS, Patches, match_patches
-from spackle.residual.base_values import Seeds, inside_photo, seen_in_photo, walk
-from spackle.residual.view_features import ViewFeatures
+from spackle.core.camera import Camera
+from spackle.core.crop import Crop, crops_around
+from spackle.core.hole_filling import broadly_blurred
+from spackle.core.patch_matching import TONE_CELLS, Patches, match_patches
+from spackle.residual.features import ViewFeatures
+from spackle.residual.initializer import (
+    InitialGaussians,
+    inside_photo,
+    seen_in_photo,
+    trace_epipolar_lines,
+)
+from spackle.runtime.device import Precision, own_arithmetic, pick_dtype
 
 ALIKE = 1.4  # a far rim whose inverse depth exceeds the seed's by more than this factor is ignored
 
 # Channels of the features.
 VIEW_DEPTH, SEED_DEPTH, SEED_RGB = 3, 6, slice(7, 10)
 VIEW_CHANNELS = SEED_RGB.stop  # rendered colour 3, depth, opacity, mask, seed depth, seed colour 3
-FAR_RIM = slice(VIEW_CHANNELS, VIEW_CHANNELS + 3)  # logit of the far rim's colour minus logit of the seed's colour
-MIRRORED = slice(FAR_RIM.stop, FAR_RIM.stop + 3)  # the same difference for the colour mirrored at the rim
-EXEMPLAR = slice(MIRRORED.stop + 1, MIRRORED.stop + 4)  # and for patches; the channel before is the rim's distance
-RIM_CHANNELS = EXEMPLAR.stop + 1  # number of channels without the photo; the last is the patch distance
+FAR_RIM = slice(
+    VIEW_CHANNELS, VIEW_CHANNELS + 3
+)  # logit of the far rim's colour minus logit of the seed's colour
+MIRRORED = slice(
+    FAR_RIM.stop, FAR_RIM.stop + 3
+)  # the same difference for the colour mirrored at the rim
+EXEMPLAR = slice(
+    MIRRORED.stop + 1, MIRRORED.stop + 4
+)  # and for patches; the channel before is the rim's distance
+RIM_CHANNELS = (
+    EXEMPLAR.stop + 1
+)  # number of channels without the photo; the last is the patch distance
 PHOTO = slice(RIM_CHANNELS, RIM_CHANNELS + 3)  # optional: the photo's colour at the cell's point
-KNOWN_COLORS = (FAR_RIM, MIRRORED, EXEMPLAR)  # differences that a network may add to the seed's colour
+KNOWN_COLORS = (
+    FAR_RIM,
+    MIRRORED,
+    EXEMPLAR,
+)  # differences that a network may add to the seed's colour
 # Channels of the deltas, as in SHARP: geometry (pixel, inverse depth), texture (scales, quaternion, colour, opacity).
 DELTAS = [2, 1, 3, 4, 3, 1]
 GEOMETRY_CHANNELS, TEXTURE_CHANNELS, DELTA_CHANNELS = sum(DELTAS[:2]), sum(DELTAS[2:]), sum(DELTAS)
@@ -45,16 +62,24 @@ class Rim:
     rgb: Tensor  # [h, w, 3] sRGB at the far rim
     mirrored: Tensor  # [h, w, 3] sRGB at the cell's mirror image beyond the rim, if on the same surface; else `rgb`
     distance: Tensor  # [h, w] cells to the rim; 0 elsewhere
-    exemplar: Tensor  # [h, w, 3] sRGB of matching patches elsewhere in the view, with the seeds' tone
+    exemplar: (
+        Tensor  # [h, w, 3] sRGB of matching patches elsewhere in the view, with the seeds' tone
+    )
     mismatch: Tensor  # [h, w] patch distance: root mean squared difference of a match; 0 elsewhere
     beyond: Tensor  # [h, w] bool: masked cells whose points project outside of the photo
-    photo: Tensor | None = None  # [h, w, 3] sRGB of the photo, see `seen_in_photo`; outside of it the seed's colour
+    photo: Tensor | None = (
+        None  # [h, w, 3] sRGB of the photo, see `seen_in_photo`; outside of it the seed's colour
+    )
 
 
 def find_rim(
-    features: ViewFeatures, seeds: Seeds, camera: Camera, photo_camera: Camera, photo: Tensor | None = None
+    features: ViewFeatures,
+    seeds: InitialGaussians,
+    camera: Camera,
+    photo_camera: Camera,
+    photo: Tensor | None = None,
 ) -> tuple[Rim, Patches]:
-    """Values at the far rims of a view's holes (see `walk`), and patches of the view that match its masked cells.
+    """Values at the far rims of a view's holes (see `trace_epipolar_lines`), and patches of the view that match its masked cells.
 
     Between photo and view, image points move along epipolar lines. An epipolar line therefore leads from a hole to the
     surface that was uncovered. If the line meets no surface, or a surface much nearer than the seed, the seed is kept.
@@ -64,8 +89,12 @@ def find_rim(
     """
     rgb, depths = seeds.rgb.detach(), seeds.inverse_depth.detach()
     values = torch.cat([rgb, depths[..., None]], dim=-1)
-    far, near, steps = walk(seeds.uv.detach(), values, depths, features.mask, camera, photo_camera.position)
-    in_front = (features.mask & (far[..., 3] > ALIKE * depths))[..., None]  # a nearer surface does not continue here
+    far, near, steps = trace_epipolar_lines(
+        seeds.uv.detach(), values, depths, features.mask, camera, photo_camera.position
+    )
+    in_front = (features.mask & (far[..., 3] > ALIKE * depths))[
+        ..., None
+    ]  # a nearer surface does not continue here
     far, near = (torch.where(in_front, rgb, met[..., :3]) for met in (far, near))
     beyond = features.mask & ~inside_photo(seeds.inverse_depth, camera, photo_camera)
     tone = torch.where(features.mask[..., None], rgb, features.rgb)
@@ -76,12 +105,21 @@ def find_rim(
     return Rim(far, near, steps, toned_patches, patches.mismatch, beyond, seen), patches
 
 
-def network_input(view: ViewFeatures, seeds: Seeds, rim: Rim) -> Tensor:
+def network_input(view: ViewFeatures, seeds: InitialGaussians, rim: Rim) -> Tensor:
     """Features [1, 21, h, w], or [1, 24, h, w] with the photo; depths are log(inverse depth / median)."""
-    view_depth = torch.where(view.inverse_depth > 0, (view.inverse_depth / seeds.unit).clamp_min(1e-4).log(), 0.0)
+    view_depth = torch.where(
+        view.inverse_depth > 0, (view.inverse_depth / seeds.unit).clamp_min(1e-4).log(), 0.0
+    )
     seed_depth = (seeds.inverse_depth / seeds.unit).clamp_min(1e-4).log()
     maps = [view_depth, view.alpha, view.mask.to(view.alpha), seed_depth]
-    grids = (seeds.rgb, rim.rgb, rim.mirrored, rim.exemplar, rim.distance[..., None], rim.mismatch[..., None])
+    grids = (
+        seeds.rgb,
+        rim.rgb,
+        rim.mirrored,
+        rim.exemplar,
+        rim.distance[..., None],
+        rim.mismatch[..., None],
+    )
     *colors, distance, mismatch = (grid[view.mask] for grid in grids)
     seed, near, mirrored, patches = map(color_logit, colors)
     distance, mismatch = (distance / TYPICAL_DISTANCE).log1p(), mismatch / TYPICAL_MISMATCH
@@ -115,7 +153,7 @@ class ResidualNet(nn.Module):
 def predict_deltas(
     network: nn.Module,
     view: ViewFeatures,
-    seeds: Seeds,
+    seeds: InitialGaussians,
     rim: Rim,
     precision: Precision = "auto",
     *,
@@ -140,7 +178,11 @@ def predict_deltas(
     # One autocast block around all crops: the weights are converted once.
     with own_arithmetic(device), torch.autocast(device.type, dtype, enabled=dtype != torch.float32):
         for inner, outer in crops_around(chosen, STRIDE) if local else [whole]:
-            part = features[(..., *outer.slices)].contiguous(memory_format=torch.channels_last).to(device)
+            part = (
+                features[(..., *outer.slices)]
+                .contiguous(memory_format=torch.channels_last)
+                .to(device)
+            )
             deltas = network(part, inner.moved(-outer.top, -outer.left)) if local else network(part)
             deltas = deltas[0].permute(1, 2, 0).float().cpu()
             field[inner.slices] = torch.where(chosen[inner.slices][..., None], deltas, 0)

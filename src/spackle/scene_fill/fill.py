@@ -8,25 +8,37 @@ from __future__ import annotations
 import copy
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
 
-from spackle.camera import Camera
-from spackle.color import linear_to_srgb, srgb_to_linear, to_bytes
-from spackle.device import Precision
-from spackle.filters import far_fill, greatest_around
-from spackle.gaussians import Gaussians
+from spackle.core.camera import Camera
+from spackle.core.color import linear_to_srgb, srgb_to_linear, to_bytes
+from spackle.core.gaussians import Gaussians
+from spackle.core.hole_filling import far_fill, greatest_around
+from spackle.core.surfels import BEHIND, PIXEL_SPREAD, surface_slope
 from spackle.render import Renderer, device_of, touched_tiles
 from spackle.render.protocol import Rendering
-from spackle.residual.base_values import BLOB_CELLS, Seeds, make_seeds, placed_behind
-from spackle.residual.complete import compose
+from spackle.residual.completion import compose
+from spackle.residual.features import CELL, CPU, MASK_THRESHOLD, ViewFeatures, hole_area_ratio
+from spackle.residual.initializer import (
+    BLOB_CELLS,
+    InitialGaussians,
+    initialize,
+    placed_behind_surfaces,
+)
 from spackle.residual.network import ResidualNet, find_rim, predict_deltas
-from spackle.residual.view_features import CELL, MASK_THRESHOLD, PROCESSOR, ViewFeatures, hole_area_ratio
-from spackle.scene_fill.occlusion_guard import OcclusionGuard, free_factors, moved_away, push_behind, without_pits
+from spackle.runtime.device import Precision
+from spackle.runtime.progress import Progress
+from spackle.scene_fill.occlusion_guard import (
+    OcclusionGuard,
+    move_behind_surfaces,
+    moved_away,
+    unoccluding_scales,
+    without_pits,
+)
 from spackle.scene_fill.texture import HoleView, Texture, exemplar_texture, in_cells, sharpened
-from spackle.surface import BEHIND, PIXEL_SPREAD, surface_slope
 
 PASSES = 2  # the second pass fills cells in which the first pass left alpha below the threshold
 WIDEST = 8  # so many of the widest views protect their surfaces from the start
@@ -38,7 +50,9 @@ SEEDS_HAR = 0.01  # a path's view with a smaller HAR is filled without the netwo
 FEW_HOLES = 1e-3  # a smaller HAR is invisible in a frame of a path
 LEAST_VISITS = 24  # half of a path's frames are checked, and at least this many
 COARSE = 3  # an underlay is smooth: each of its Gaussians is COARSE times as large and covers COARSE × COARSE cells
-REACH_CELLS = COARSE * BLOB_CELLS  # an underlay extends this far beneath a rim: the reach of one underlay Gaussian
+REACH_CELLS = (
+    COARSE * BLOB_CELLS
+)  # an underlay extends this far beneath a rim: the reach of one underlay Gaussian
 EVERY = (slice(None, None, COARSE),) * 2  # the cells that have an underlay Gaussian
 
 
@@ -50,9 +64,13 @@ class FillContext:
     photo_camera: Camera
     renderer: Renderer
     network: ResidualNet | None = None  # None: all deltas are zero
-    texture: Texture | None = exemplar_texture  # None: Gaussians keep the colours of the network or the seeds
+    texture: Texture | None = (
+        exemplar_texture  # None: Gaussians keep the colours of the network or the seeds
+    )
     threshold: float = MASK_THRESHOLD
-    precision: Precision = "auto"  # of the network; auto is bfloat16 if the hardware multiplies it natively
+    precision: Precision = (
+        "auto"  # of the network; auto is bfloat16 if the hardware multiplies it natively
+    )
 
     @functools.cached_property
     def placed(self) -> FillContext:
@@ -93,7 +111,9 @@ class FilledScene:
     """One set of aux Gaussians for all views."""
 
     aux: Gaussians
-    pictures: Mapping[int, Tensor]  # [H, W, 3] uint8 sRGB: final renderings, by view index, of some views
+    pictures: Mapping[
+        int, Tensor
+    ]  # [H, W, 3] uint8 sRGB: final renderings, by view index, of some views
 
 
 @torch.no_grad()
@@ -123,7 +143,7 @@ def fill_scene(
     context: FillContext,
     cameras: Sequence[Camera],
     exact: bool = False,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> FilledScene:
     """Complete all views of a path with one set of aux Gaussians.
 
@@ -157,7 +177,10 @@ def fill_scene(
         return [guard for of, guard in guards.items() if of != index]
 
     def underlays() -> list[Gaussians]:
-        return [push_behind(rims, cameras[index].position, others(index)) for index, rims in waiting]
+        return [
+            move_behind_surfaces(rims, cameras[index].position, others(index))
+            for index, rims in waiting
+        ]
 
     for count, index in enumerate(visited):
         camera = cameras[index]
@@ -169,7 +192,9 @@ def fill_scene(
             means = placed.seeds_alone if holes < SEEDS_HAR and not exact else placed
             if filled >= OPPOSITE and means.texture is not None:
                 means = dataclasses.replace(means, texture=exemplar_texture)
-            new, rims, view = _fill(means, stage, view, camera, others(index), enough, beneath=len(cameras) > 1)
+            new, rims, view = _fill(
+                means, stage, view, camera, others(index), enough, beneath=len(cameras) > 1
+            )
             aux += new
             waiting += [(index, part) for part in rims]
             filled += 1
@@ -236,14 +261,25 @@ def _fill(
 
 
 def _propose(
-    context: FillContext, view: Rendering, features: ViewFeatures, camera: Camera, guards: Sequence[OcclusionGuard]
-) -> tuple[Gaussians, Seeds]:
+    context: FillContext,
+    view: Rendering,
+    features: ViewFeatures,
+    camera: Camera,
+    guards: Sequence[OcclusionGuard],
+) -> tuple[Gaussians, InitialGaussians]:
     """Gaussians of the masked cells, behind the guards' surfaces; and the seeds for `rim_underlay`.
 
     Each cell has one Gaussian. With a texture, a cell whose pixels differ has a Gaussian for each pixel too.
     """
-    mask, seeds = features.mask, make_seeds(features, camera, context.photo_camera)
-    chosen, eye, deltas, picture, beyond, parts = seeds.select(mask), camera.position, None, None, None, []
+    mask, seeds = features.mask, initialize(features, camera, context.photo_camera)
+    chosen, eye, deltas, picture, beyond, parts = (
+        seeds.select(mask),
+        camera.position,
+        None,
+        None,
+        None,
+        [],
+    )
     if context.network is not None or context.texture is not None:
         rim, patches = find_rim(features, seeds, camera, context.photo_camera, context.photo)
         beyond = rim.beyond[mask]
@@ -254,38 +290,48 @@ def _propose(
         structure = features.rgb.clone()
         structure[mask] = linear_to_srgb(cells.colors)
         picture = context.texture(HoleView(view, features, seeds, rim, patches, structure))
-    depths, factors = camera.to_camera(cells.means)[:, 2], free_factors(cells, eye, guards)
+    depths, factors = camera.to_camera(cells.means)[:, 2], unoccluding_scales(cells, eye, guards)
     factors = torch.where(factors > 0, without_pits(depths * factors, mask) / depths, 0)
     if picture is not None:
         wanted, blobs = (in_cells(image)[mask] for image in (picture, sharpened(picture)))
         rough = (wanted - wanted.mean((1, 2), keepdim=True)).abs().amax((1, 2, 3)) > FLAT
         index = rough.nonzero()[:, 0]
-        pixels = _pixels(chosen.select(index), None if deltas is None else deltas[index], camera, blobs[index])
+        pixels = _pixels(
+            chosen.select(index), None if deltas is None else deltas[index], camera, blobs[index]
+        )
         parts.append(moved_away(pixels, eye, factors[index].repeat_interleave(CELL**2)))
         # As in a lifted photo, a cell's own Gaussian lies behind the Gaussians of its pixels.
         cells = dataclasses.replace(cells, colors=srgb_to_linear(wanted.clamp(0, 1)).mean((1, 2)))
         factors = factors / (1 - BEHIND)
     parts.append(moved_away(cells, eye, factors))
     inverse_depth = seeds.inverse_depth.clone()
-    if beyond is not None:  # beyond the photo's border, the underlay must follow the cells that were moved away
+    if (
+        beyond is not None
+    ):  # beyond the photo's border, the underlay must follow the cells that were moved away
         moved = beyond & (factors > 0)
         inverse_depth[mask] = torch.where(moved, 1 / (depths * factors), inverse_depth[mask])
     return Gaussians.cat(parts), dataclasses.replace(seeds, inverse_depth=inverse_depth)
 
 
-def _pixels(seeds: Seeds, deltas: Tensor | None, camera: Camera, colors: Tensor) -> Gaussians:
+def _pixels(
+    seeds: InitialGaussians, deltas: Tensor | None, camera: Camera, colors: Tensor
+) -> Gaussians:
     """Gaussians [4n] for the pixels of n cells, from flat seeds [n], deltas [n, 14] or None, and sRGB [n, 2, 2, 3]."""
     offsets = torch.tensor([[-0.5, -0.5], [0.5, -0.5], [-0.5, 0.5], [0.5, 0.5]])
     fields = (seeds.inverse_depth, seeds.slope, seeds.rgb, *([] if deltas is None else [deltas]))
-    inverse_depth, slope, rgb, *repeated = (field.repeat_interleave(len(offsets), 0) for field in fields)
+    inverse_depth, slope, rgb, *repeated = (
+        field.repeat_interleave(len(offsets), 0) for field in fields
+    )
     rise = (seeds.slope[:, None] * offsets).sum(-1).flatten()
     inverse_depth = (inverse_depth + rise).clamp_min(0.5 * inverse_depth)
-    fine = Seeds((seeds.uv[:, None] + offsets).flatten(0, 1), inverse_depth, slope, rgb, seeds.unit)
+    fine = InitialGaussians(
+        (seeds.uv[:, None] + offsets).flatten(0, 1), inverse_depth, slope, rgb, seeds.unit
+    )
     pixels = compose(fine, repeated[0] if repeated else None, camera, PIXEL_SPREAD)
     return dataclasses.replace(pixels, colors=srgb_to_linear(colors.flatten(0, 2).clamp(0, 1)))
 
 
-def rim_underlay(mask: Tensor, seeds: Seeds, camera: Camera) -> Gaussians:
+def rim_underlay(mask: Tensor, seeds: InitialGaussians, camera: Camera) -> Gaussians:
     """Gaussians that continue the filling of holes (`mask` [h, w] bool) beneath the surfaces around the holes.
 
     From another view, a slit appears between the rim of a hole and the hole's filling. The underlay closes most slits
@@ -297,9 +343,15 @@ def rim_underlay(mask: Tensor, seeds: Seeds, camera: Camera) -> Gaussians:
     coarse, rgb = far_fill(seeds.inverse_depth[EVERY], seeds.rgb[EVERY].permute(2, 0, 1), ~rim)
     depth, chosen = seeds.inverse_depth.clone(), mask.new_zeros(mask.shape)
     depth[EVERY], chosen[EVERY] = coarse, rim
-    placed = placed_behind(depth, chosen, seeds.inverse_depth, COARSE * BLOB_CELLS)[EVERY]
+    placed = placed_behind_surfaces(depth, chosen, seeds.inverse_depth, COARSE * BLOB_CELLS)[EVERY]
     slope = surface_slope(placed) / (COARSE * CELL)
-    beneath = compose(Seeds(seeds.uv[EVERY], placed, slope, rgb.permute(1, 2, 0), seeds.unit).select(rim), None, camera)
+    beneath = compose(
+        InitialGaussians(seeds.uv[EVERY], placed, slope, rgb.permute(1, 2, 0), seeds.unit).select(
+            rim
+        ),
+        None,
+        camera,
+    )
     return dataclasses.replace(beneath, scales=COARSE * beneath.scales)
 
 
@@ -307,14 +359,18 @@ class _Stage:
     """The base, the added Gaussians, and the last rendering of both, on the renderer's device."""
 
     def __init__(self, context: FillContext) -> None:
-        self._renderer, self._device, self._sets = context.renderer, device_of(context.renderer), [context.base]
+        self._renderer, self._device, self._sets = (
+            context.renderer,
+            device_of(context.renderer),
+            [context.base],
+        )
 
     def look(self, camera: Camera, bare: Rendering | None = None) -> Rendering:
         """The rendering from a camera, copied to the CPU; `bare`, if given, is the rendering of the base alone."""
         self._camera = camera
         if bare is None:
             self._drawn = self._renderer.render(self._sets, camera)
-            return self._drawn.to(PROCESSOR)
+            return self._drawn.to(CPU)
         self._drawn = bare.to(self._device)
         return self._redraw(self._sets[1:])
 
@@ -330,5 +386,7 @@ class _Stage:
         """Render again from the last camera; only tiles that the Gaussians in `new` touch are redrawn."""
         tiles = touched_tiles(new, self._camera)
         if bool(tiles.any()):
-            self._drawn = self._renderer.render(self._sets, self._camera, tiles=tiles, onto=self._drawn)
-        return self._drawn.to(PROCESSOR)
+            self._drawn = self._renderer.render(
+                self._sets, self._camera, tiles=tiles, onto=self._drawn
+            )
+        return self._drawn.to(CPU)

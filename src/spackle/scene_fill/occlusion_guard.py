@@ -11,17 +11,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spackle._numba import kernel
-from spackle.camera import Camera, beside
-from spackle.device import run_chunks
-from spackle.filters import greatest_around
-from spackle.gaussians import Gaussians
+from spackle.core.camera import Camera, to_like
+from spackle.core.gaussians import Gaussians
+from spackle.core.hole_filling import greatest_around
+from spackle.core.surfels import BEHIND
 from spackle.render.protocol import ALPHA_MIN, Rendering
-from spackle.residual.view_features import MASK_THRESHOLD, PROCESSOR
-from spackle.surface import BEHIND
+from spackle.residual.features import CPU, MASK_THRESHOLD
+from spackle.runtime.device import run_chunks
+from spackle.runtime.kernels import kernel
 
 WINDOW_PX = 4  # radius of the guard's window: most aux Gaussians reach no farther
-REACH = math.sqrt(-2 * math.log(ALPHA_MIN))  # a Gaussian is visible up to so many standard deviations from its centre
+REACH = math.sqrt(
+    -2 * math.log(ALPHA_MIN)
+)  # a Gaussian is visible up to so many standard deviations from its centre
 MAX_REACH_PX = 40.0  # a Gaussian is checked only up to this distance from its centre
 PIT = 0.027  # of a view's width: a near spot less than twice as wide is removed
 STEPS = 48  # candidate positions along the line of sight, evenly spaced in inverse depth
@@ -35,26 +37,32 @@ class OcclusionGuard:
     depth: Tensor  # [H, W]; 0 in holes
 
     @staticmethod
-    def of(rendering: Rendering, camera: Camera, threshold: float = MASK_THRESHOLD) -> OcclusionGuard:
+    def of(
+        rendering: Rendering, camera: Camera, threshold: float = MASK_THRESHOLD
+    ) -> OcclusionGuard:
         """The guard of a rendered view."""
-        view = rendering.to(PROCESSOR).detach()
+        view = rendering.to(CPU).detach()
         seen = torch.where(view.alpha < threshold, 0, view.depth).float()
         return OcclusionGuard(camera, greatest_around(seen, WINDOW_PX))
 
 
-def push_behind(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) -> Gaussians:
-    """Move Gaussians away from an eye [3] until they hide no guarded surface, see `free_factors`."""
-    return moved_away(aux, eye, free_factors(aux, eye, guards))
+def move_behind_surfaces(
+    aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]
+) -> Gaussians:
+    """Move Gaussians away from an eye [3] until they hide no guarded surface, see `unoccluding_scales`."""
+    return moved_away(aux, eye, unoccluding_scales(aux, eye, guards))
 
 
 def moved_away(aux: Gaussians, eye: Tensor, factors: Tensor) -> Gaussians:
     """Scale Gaussians about the eye [3] by factors [N]; the eye sees no change. Factor 0 removes a Gaussian."""
-    eye, factor = beside(eye, aux.means), factors[:, None]
-    moved = dataclasses.replace(aux, means=eye + factor * (aux.means - eye), scales=aux.scales * factor)
+    eye, factor = to_like(eye, aux.means), factors[:, None]
+    moved = dataclasses.replace(
+        aux, means=eye + factor * (aux.means - eye), scales=aux.scales * factor
+    )
     return moved.select(factors > 0)
 
 
-def free_factors(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) -> Tensor:
+def unoccluding_scales(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) -> Tensor:
     """Factors [N] ≥ 1 by which Gaussians must move away from an eye to hide no guarded surface; 0 if impossible.
 
     Args:
@@ -64,8 +72,10 @@ def free_factors(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) 
     """
     if not len(aux) or not guards:
         return torch.ones_like(aux.opacities)
-    rays = (aux.means - beside(eye, aux.means)).detach().cpu().double().numpy()
-    covariances = aux.detach().to(dtype=torch.float64).covariances().cpu().flatten(1).numpy()  # [N, 9]
+    rays = (aux.means - to_like(eye, aux.means)).detach().cpu().double().numpy()
+    covariances = (
+        aux.detach().to(dtype=torch.float64).covariances().cpu().flatten(1).numpy()
+    )  # [N, 9]
     lenses = np.empty((len(guards), 16))  # fx, fy, cx, cy and the 3×4 extrinsics of each view
     for lens, camera in zip(lenses, [guard.camera for guard in guards], strict=True):
         lens[:4] = camera.K.detach().cpu().numpy()[[0, 1, 0, 1], [0, 1, 2, 2]]
@@ -73,9 +83,12 @@ def free_factors(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) 
     depths = np.concatenate([guard.depth.numpy().ravel() for guard in guards])
     sizes = np.array([guard.depth.shape for guard in guards])
     starts = np.concatenate([[0], np.cumsum(sizes.prod(axis=1))])
-    place, factors = beside(eye, aux.means).cpu().double().numpy(), np.empty(len(rays))
+    place, factors = to_like(eye, aux.means).cpu().double().numpy(), np.empty(len(rays))
     views = (lenses, depths, sizes, starts)
-    run_chunks(lambda first, last: _free_factors(first, last, place, rays, covariances, *views, factors), len(rays))
+    run_chunks(
+        lambda first, last: _free_factors(first, last, place, rays, covariances, *views, factors),
+        len(rays),
+    )
     return torch.from_numpy(factors).to(aux.means)
 
 
@@ -98,10 +111,25 @@ def _free_factors(
         factors[n] = 0
         for step in range(STEPS):
             factor = 1.0 / (1.0 - step / STEPS)
-            x, y, z = eye[0] + factor * rays[n, 0], eye[1] + factor * rays[n, 1], eye[2] + factor * rays[n, 2]
+            x, y, z = (
+                eye[0] + factor * rays[n, 0],
+                eye[1] + factor * rays[n, 1],
+                eye[2] + factor * rays[n, 2],
+            )
             blocked = False
             for s in range(len(lenses)):
-                if _blocks(lenses[s], depths, starts[s], sizes[s, 0], sizes[s, 1], x, y, z, covariances[n], factor):
+                if _blocks(
+                    lenses[s],
+                    depths,
+                    starts[s],
+                    sizes[s, 0],
+                    sizes[s, 1],
+                    x,
+                    y,
+                    z,
+                    covariances[n],
+                    factor,
+                ):
                     blocked = True
                     break
             if not blocked:
@@ -121,7 +149,12 @@ def _blocks(
     tan_u = (lens[4] * x + lens[5] * y + lens[6] * z + lens[7]) / depth
     tan_v = (lens[8] * x + lens[9] * y + lens[10] * z + lens[11]) / depth
     u, v = lens[0] * tan_u + lens[2], lens[1] * tan_v + lens[3]
-    if u < -MAX_REACH_PX or v < -MAX_REACH_PX or u > width + MAX_REACH_PX or v > height + MAX_REACH_PX:
+    if (
+        u < -MAX_REACH_PX
+        or v < -MAX_REACH_PX
+        or u > width + MAX_REACH_PX
+        or v > height + MAX_REACH_PX
+    ):
         return False
     reach_u = _reach(lens, 4, lens[0] * factor / depth, tan_u, covariance)
     reach_v = _reach(lens, 8, lens[1] * factor / depth, tan_v, covariance)

@@ -13,18 +13,32 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
-from spackle.filters import FAR_BIAS, blurred, broadly_blurred, distance_to, far_fill, nearest_known
+from spackle.core.hole_filling import (
+    FAR_BIAS,
+    blurred,
+    broadly_blurred,
+    distance_to,
+    far_fill,
+    nearest_known,
+)
+from spackle.core.patch_matching import FAINTEST_VOTE, LEAST_COST, TONE_CELLS, Patches
 from spackle.inpaint import Inpainter, known_inverse_depth
-from spackle.patches import FAINTEST_VOTE, LEAST_COST, TONE_CELLS, Patches
 from spackle.render.protocol import Rendering
-from spackle.residual.base_values import Seeds
+from spackle.residual.features import CELL, LEAST, ViewFeatures, hole_mask
+from spackle.residual.initializer import InitialGaussians
 from spackle.residual.network import Rim
-from spackle.residual.view_features import CELL, LEAST, ViewFeatures, hole_mask
 
-TEXTURE_PX = 2.0  # standard deviation of the blur that separates structure (low frequencies) from texture
+TEXTURE_PX = (
+    2.0  # standard deviation of the blur that separates structure (low frequencies) from texture
+)
 TEXTURE_FADING = 0.16  # mismatch at which the texture has faded to 1/e
-EXTENDED_CELLS, SAME_DEPTH = 4.0, 0.05  # reach of the rim's colours beyond the photo's border; relative depth
-OVERLAP_PX = 0.8  # standard deviation of the blur that overlapping Gaussians and votes of patches cause
+EXTENDED_CELLS, SAME_DEPTH = (
+    4.0,
+    0.05,
+)  # reach of the rim's colours beyond the photo's border; relative depth
+OVERLAP_PX = (
+    0.8  # standard deviation of the blur that overlapping Gaussians and votes of patches cause
+)
 STEPS = 2  # Jacobi steps of `sharpened`
 
 
@@ -34,13 +48,15 @@ class HoleView:
 
     rendering: Rendering
     features: ViewFeatures
-    seeds: Seeds  # of all cells
+    seeds: InitialGaussians  # of all cells
     rim: Rim
     patches: Patches  # matching patches for the masked cells
     structure: Tensor  # [h, w, 3] sRGB of all cells; masked cells have the residual's colours
 
 
-Texture = Callable[[HoleView], Tensor]  # gives colours [2h, 2w, 3] sRGB of pixels; only masked cells are used
+Texture = Callable[
+    [HoleView], Tensor
+]  # gives colours [2h, 2w, 3] sRGB of pixels; only masked cells are used
 
 
 def exemplar_texture(view: HoleView) -> Tensor:
@@ -52,13 +68,19 @@ def exemplar_texture(view: HoleView) -> Tensor:
     gain = (-patches.mismatch / TEXTURE_FADING).exp() * _in_proportion(fine, view)
     smooth = in_cells(_magnified(extended(view), features.mask))
     picture = from_cells(torch.where(features.mask[..., None, None, None], smooth, pixels))
-    return fine.mul_(from_cells(gain[..., None, None, None].expand(*gain.shape, CELL, CELL, 1))).add_(picture)
+    return fine.mul_(
+        from_cells(gain[..., None, None, None].expand(*gain.shape, CELL, CELL, 1))
+    ).add_(picture)
 
 
 def painted_texture(painter: Inpainter, view: HoleView) -> Tensor:
     """Colours [2h, 2w, 3] sRGB of the view with its holes painted by an inpainter, without the residual's structure."""
     hole = hole_mask(view.rendering.alpha)
-    views = (view.rendering.rgb[None], hole[None], known_inverse_depth(view.rendering.depth, hole)[None])
+    views = (
+        view.rendering.rgb[None],
+        hole[None],
+        known_inverse_depth(view.rendering.depth, hole)[None],
+    )
     return from_cells(in_cells(painter.paint(*views)[0]))
 
 
@@ -78,9 +100,13 @@ def patch_blocks(patches: Patches, blocks: Tensor) -> Tensor:
     for dy, dx in itertools.product((-1, 0, 1), repeat=2):
         v, u = (y + dy).clamp(0, height - 1), (x + dx).clamp(0, width - 1)
         source, row, column = patches.matches[v, u].long().unbind(-1)
-        votes = (v == y + dy) & (u == x + dx) & matched[v, u]  # a matched cell's patch lies within its source
+        votes = (
+            (v == y + dy) & (u == x + dx) & matched[v, u]
+        )  # a matched cell's patch lies within its source
         weight = votes * ((-costs[v, u] / limit).exp() + FAINTEST_VOTE)
-        block = sources[source.clamp_min(0), (row - dy).clamp(0, height - 1), (column - dx).clamp(0, width - 1)]
+        block = sources[
+            source.clamp_min(0), (row - dy).clamp(0, height - 1), (column - dx).clamp(0, width - 1)
+        ]
         total += weight[:, None, None, None] * block
         mass += weight
     filled = blocks.clone()
@@ -118,7 +144,9 @@ def extended(view: HoleView) -> Tensor:
     row, column = torch.from_numpy(near).long().clamp_min(0)
     apart = (view.seeds.inverse_depth / features.inverse_depth[row, column].clamp_min(1e-9)).log()
     fading = torch.exp((1 - distance_to(near)) / EXTENDED_CELLS - (apart / SAME_DEPTH).square())
-    return torch.lerp(view.structure, features.rgb[row, column], (fading * view.rim.beyond)[..., None])
+    return torch.lerp(
+        view.structure, features.rgb[row, column], (fading * view.rim.beyond)[..., None]
+    )
 
 
 def sharpened(wanted: Tensor) -> Tensor:

@@ -24,17 +24,27 @@ from starlette.staticfiles import StaticFiles
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 import spackle
-from spackle.bases.depth_map import SUFFIXES
 from spackle.bases.settings import AUTO, MISSING
-from spackle.errors import InputError, first_problem, one_line
+from spackle.core.photo import PHOTO_SUFFIXES
+from spackle.depth.depth_map import SUFFIXES
 from spackle.formats.html import page_file
-from spackle.image import PHOTO_SUFFIXES
-from spackle.task_process import Work
+from spackle.runtime.errors import InputError, first_problem, one_line
+from spackle.runtime.task_process import Work
 from spackle.web.guard import MAX_BYTES, Access, Guard
-from spackle.web.jobs import Job, Jobs, Keep, SceneState
-from spackle.web.work import PREVIEW, Download, FileName, SceneOptions, SceneWork, Video, check_photo
+from spackle.web.jobs import Job, Jobs, RetentionLimits, SceneState
+from spackle.web.work import (
+    PREVIEW,
+    Download,
+    FileName,
+    SceneOptions,
+    SceneWork,
+    Video,
+    check_photo,
+)
 
-PagePart = Literal["page.json", "base.splats", "aux.splats", "photo.jpg"]  # files that the page draws
+PagePart = Literal[
+    "page.json", "base.splats", "aux.splats", "photo.jpg"
+]  # files that the page draws
 SCENES = "/api/v1/scenes"
 FILES = sorted([PREVIEW, *get_args(Download), *get_args(Video)])  # files that a state lists
 POLL_S = 0.1  # seconds between two checks whether a state has changed
@@ -42,9 +52,11 @@ UPLOAD_S = 300.0  # seconds that an upload may take, because it holds a place in
 MAX_NAME = 80  # characters
 CONNECTIONS = 512  # open at a time; further ones are refused
 SILENT_S = 10.0  # seconds that a client may take to send the head of a request
-WORK, KEEP = SceneWork(), Keep()
+WORK, KEEP = SceneWork(), RetentionLimits()
 FILE = {"type": "string", "format": "binary"}
-UPLOAD: dict[str, Any] = {  # not declared as a form: FastAPI would read it before the queue has a place
+UPLOAD: dict[
+    str, Any
+] = {  # not declared as a form: FastAPI would read it before the queue has a place
     "schema": {
         "type": "object",
         "required": ["photo"],
@@ -63,7 +75,7 @@ def create_app(
     work: Work = WORK,
     *,
     workers: int = 1,
-    keep: Keep = KEEP,
+    keep: RetentionLimits = KEEP,
     access: Access | None = None,
     max_bytes: int = MAX_BYTES,
 ) -> FastAPI:
@@ -105,14 +117,20 @@ def create_app(
         return (job.folder if file == PREVIEW else job.results) / file
 
     def with_files(job: Job) -> SceneState:
-        return job.model_copy(update={"files": [file for file in FILES if path_of(job, file).is_file()]})
+        return job.model_copy(
+            update={"files": [file for file in FILES if path_of(job, file).is_file()]}
+        )
 
     def job_of(id: str) -> Job:
         if (job := jobs.by_id.get(id)) is None:
             raise HTTPException(404, "there is no such scene")
         return job
 
-    @app.post(SCENES, status_code=202, openapi_extra={"requestBody": {"content": {"multipart/form-data": UPLOAD}}})
+    @app.post(
+        SCENES,
+        status_code=202,
+        openapi_extra={"requestBody": {"content": {"multipart/form-data": UPLOAD}}},
+    )
     async def post_photo(request: Request, response: Response) -> SceneState:
         """Send a photo. The photo is queued; if the queue is full, the answer is 429."""
         with jobs.place() as new:
@@ -144,7 +162,9 @@ def create_app(
         seen: Job | None = None
         while seen is None or seen.ended is None:
             if (state := jobs.by_id.get(id)) is None:
-                yield SceneState(id=id, name="", state="failed", error="there is no such scene", ended=0)
+                yield SceneState(
+                    id=id, name="", state="failed", error="there is no such scene", ended=0
+                )
                 return
             if state is not seen:
                 seen = state
@@ -168,7 +188,11 @@ def create_app(
     @app.get("/page.json", include_in_schema=False)
     async def get_page_state() -> dict[str, object]:
         writes = access is None or access.token is not None
-        upload = {"suffixes": PHOTO_SUFFIXES, "max_bytes": max_bytes, "bases": bases()} if writes else None
+        upload = (
+            {"suffixes": PHOTO_SUFFIXES, "max_bytes": max_bytes, "bases": bases()}
+            if writes
+            else None
+        )
         return {"upload": upload}
 
     @app.get("/healthz", include_in_schema=False)
@@ -177,7 +201,9 @@ def create_app(
 
     @app.get("/docs", include_in_schema=False)
     async def get_docs() -> HTMLResponse:
-        return HTMLResponse(Template(page_file("docs.html").decode(), autoescape=True).render(api=app.openapi()))
+        return HTMLResponse(
+            Template(page_file("docs.html").decode(), autoescape=True).render(api=app.openapi())
+        )
 
     app.mount("/", StaticFiles(packages=[("spackle.web", "page")], html=True))
     return app
@@ -186,8 +212,14 @@ def create_app(
 def accept(form: FormData, folder: Path, jobs: Jobs, bases: list[str]) -> Job:
     """Decode a form's photo and add its job; HTTPException for a bad form or a file that is no photo."""
     photo, depth, text = form.get("photo"), form.get("depth"), form.get("options") or "{}"
-    if len(form.getlist("photo")) != 1 or not isinstance(photo, UploadFile) or not isinstance(text, str):
-        raise HTTPException(422, "send one photo as the file `photo`, and the options as the text `options`")
+    if (
+        len(form.getlist("photo")) != 1
+        or not isinstance(photo, UploadFile)
+        or not isinstance(text, str)
+    ):
+        raise HTTPException(
+            422, "send one photo as the file `photo`, and the options as the text `options`"
+        )
     name = shown_name(photo.filename or "")
     try:
         options = SceneOptions.model_validate_json(text)
@@ -206,11 +238,15 @@ def accept(form: FormData, folder: Path, jobs: Jobs, bases: list[str]) -> Job:
     return jobs.add(folder, name, source, of_depth, options.model_dump(exclude_unset=True))
 
 
-def _saved(upload: UploadFile, folder: Path, stem: str, name: str, suffixes: tuple[str, ...]) -> str:
+def _saved(
+    upload: UploadFile, folder: Path, stem: str, name: str, suffixes: tuple[str, ...]
+) -> str:
     """Store an upload under a safe name."""
     suffix = PurePosixPath(upload.filename or "").suffix.lower()
     if suffix not in suffixes:
-        raise HTTPException(415, f"{name}: this kind of file is not accepted: give {', '.join(suffixes)}")
+        raise HTTPException(
+            415, f"{name}: this kind of file is not accepted: give {', '.join(suffixes)}"
+        )
     if not upload.size:
         raise HTTPException(400, f"{name}: the file is empty")
     with (folder / f"{stem}{suffix}").open("xb") as file:

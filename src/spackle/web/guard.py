@@ -20,7 +20,7 @@ from starlette.requests import ClientDisconnect
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from spackle.errors import one_line
+from spackle.runtime.errors import one_line
 
 LOG = logging.getLogger("spackle.web")
 HOST = re.compile(r"(\[[0-9a-f:.%]+\]|[0-9a-z._-]+)(?::\d{1,5})?", re.IGNORECASE)
@@ -44,7 +44,9 @@ HEADERS = {
 class Access(NamedTuple):
     """Access rules of a stand-alone server."""
 
-    token: str | None  # a request has it as the first part of the path, or as Bearer; None: no photo is accepted
+    token: (
+        str | None
+    )  # a request has it as the first part of the path, or as Bearer; None: no photo is accepted
     names: frozenset[str] = frozenset({"localhost"})  # accepted host names
     local: bool = True  # only this machine can connect
 
@@ -55,7 +57,9 @@ class Access(NamedTuple):
             return Access(token)
         machine = socket.gethostname().lower()
         short = machine.partition(".")[0]
-        return Access(token, frozenset({"localhost", machine, short, f"{short}.local", host.lower()}), False)
+        return Access(
+            token, frozenset({"localhost", machine, short, f"{short}.local", host.lower()}), False
+        )
 
     def admitted(self, scope: Scope, headers: Headers) -> Scope:
         """Check a request, and strip the token from its path; HTTPException without a valid token."""
@@ -63,18 +67,27 @@ class Access(NamedTuple):
         match = HOST.fullmatch(hosts[0].strip()) if len(hosts) == 1 else None
         if match is None or not self._is_own(match[1].lower()):
             raise HTTPException(403, "this server does not have that Host name")
-        ours = {f"{scheme}://{hosts[0].strip().lower()}" for scheme in ("http", "https")}  # https: through a tunnel
+        ours = {
+            f"{scheme}://{hosts[0].strip().lower()}" for scheme in ("http", "https")
+        }  # https: through a tunnel
         sites = {site.strip().lower() for site in headers.getlist("sec-fetch-site")}
-        if not {origin.strip().lower() for origin in headers.getlist("origin")} <= ours or not sites <= OWN_SITES:
+        if (
+            not {origin.strip().lower() for origin in headers.getlist("origin")} <= ours
+            or not sites <= OWN_SITES
+        ):
             raise HTTPException(403, "the request comes from a page of another site")
         root, path = scope["root_path"], scope["path"]
         first = path.removeprefix(root).split("/")[1] if path.count("/") > 1 else ""
         if self._is_token(first):
             return {**scope, "root_path": f"{root}/{first}"}
         may_ask = scope["method"] in ("GET", "HEAD") if self.token is None else path == "/healthz"
-        if not may_ask and not self._is_token(headers.get("authorization", "").removeprefix("Bearer ")):
+        if not may_ask and not self._is_token(
+            headers.get("authorization", "").removeprefix("Bearer ")
+        ):
             closed = "this page takes no photos: it was opened without a token"
-            raise HTTPException(401, "this needs the token that the server printed" if self.token else closed)
+            raise HTTPException(
+                401, "this needs the token that the server printed" if self.token else closed
+            )
         return scope
 
     def _is_own(self, name: str) -> bool:
@@ -105,7 +118,9 @@ class Guard:
 
         def check(size: int) -> None:
             if size > self.max_bytes:
-                raise HTTPException(413, f"more than {self.max_bytes / 1e6:g} MB: send a smaller photo")
+                raise HTTPException(
+                    413, f"more than {self.max_bytes / 1e6:g} MB: send a smaller photo"
+                )
 
         async def bounded() -> Message:
             nonlocal count

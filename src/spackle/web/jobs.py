@@ -17,17 +17,20 @@ from typing import Any, Literal, NamedTuple
 from fastapi import HTTPException
 from pydantic import BaseModel, Field
 
-from spackle.errors import InputError, reason_in_a_line
-from spackle.files import results_folder, write_json
-from spackle.task_process import DIED, Event, TaskProcess, Work
+from spackle.runtime.errors import InputError, reason_in_a_line
+from spackle.runtime.files import results_folder, write_json
+from spackle.runtime.task_process import DIED, Event, TaskProcess, Work
 
 LOG = logging.getLogger("spackle.web")
-RECORD, NEW = "job.json", ".new-"  # the file of a job's state; prefix of the folders of incomplete uploads
+RECORD, NEW = (
+    "job.json",
+    ".new-",
+)  # the file of a job's state; prefix of the folders of incomplete uploads
 RETRY_S = 10  # seconds after which a client may try again if the queue was full
 TIDY_S = 60.0  # seconds between two searches for results that are too old
 
 
-class Keep(NamedTuple):
+class RetentionLimits(NamedTuple):
     """Limits of the folder; the oldest finished jobs are removed first."""
 
     seconds: float = 7 * 86400.0  # since a job ended
@@ -42,10 +45,14 @@ class SceneState(BaseModel):
     name: str
     state: Literal["queued", "running", "done", "failed"] = "queued"
     stage: str | None = Field(default=None, description="The stage in progress.")
-    share: float | None = Field(default=None, description="Fraction of the stage that is done, 0 to 1, if known.")
+    share: float | None = Field(
+        default=None, description="Fraction of the stage that is done, 0 to 1, if known."
+    )
     line: str | None = Field(default=None, description="The latest log message.")
     error: str | None = Field(default=None, description="Why it failed, in a line.")
-    files: list[str] = Field(default=[], description="Existing files; a finished scene can make more.")
+    files: list[str] = Field(
+        default=[], description="Existing files; a finished scene can make more."
+    )
     created: float = Field(default_factory=time.time, description="Seconds since 1970.")
     ended: float | None = None
 
@@ -73,7 +80,7 @@ class Jobs:
     photo; else it adds this file to a finished scene, in one more process.
     """
 
-    def __init__(self, folder: Path, work: Work, workers: int, keep: Keep) -> None:
+    def __init__(self, folder: Path, work: Work, workers: int, keep: RetentionLimits) -> None:
         self.folder, self.keep = folder, keep
         self._held = contextlib.ExitStack()
         self._held.enter_context(results_folder(folder, alone=True))
@@ -109,7 +116,9 @@ class Jobs:
         """Reserve a place in the queue, and yield a folder that receives the photo; 429 if the queue is full."""
         folder = self.folder / f"{NEW}{secrets.token_hex(8)}"
         with self._lock:
-            waiting = len([*self.folder.glob(f"{NEW}*")]) + sum(job.state == "queued" for job in self.by_id.values())
+            waiting = len([*self.folder.glob(f"{NEW}*")]) + sum(
+                job.state == "queued" for job in self.by_id.values()
+            )
             if waiting >= self.keep.waiting:
                 line = f"too many photos are waiting: try again in {RETRY_S} seconds"
                 raise HTTPException(429, line, {"Retry-After": str(RETRY_S)})
@@ -117,15 +126,21 @@ class Jobs:
         try:
             yield folder
         finally:
-            shutil.rmtree(folder, ignore_errors=True)  # `add` has renamed the folder of an accepted photo
+            shutil.rmtree(
+                folder, ignore_errors=True
+            )  # `add` has renamed the folder of an accepted photo
 
-    def add(self, folder: Path, name: str, source: str, depth: str | None, options: dict[str, Any]) -> Job:
+    def add(
+        self, folder: Path, name: str, source: str, depth: str | None, options: dict[str, Any]
+    ) -> Job:
         """Add a job for a photo in a folder that `place` yielded; `source` and `depth` may be absolute paths."""
         id = folder.name.removeprefix(NEW)
         job = Job(id=id, name=name, source=source, depth=depth, options=options, folder=folder)
         job.save()
         with self._lock:  # `place` counts folders and jobs
-            self.by_id[id] = job = job.model_copy(update={"folder": folder.rename(self.folder / id)})
+            self.by_id[id] = job = job.model_copy(
+                update={"folder": folder.rename(self.folder / id)}
+            )
         self._photos.submit(self._run, id)
         return job
 
@@ -178,7 +193,9 @@ class Jobs:
         except (OSError, InputError) as problem:
             error = f"{job.name}: cannot be stored here: {reason_in_a_line(problem)}"
         if error == DIED:
-            self._closed.wait(1)  # a signal to end the whole service may reach the worker process first
+            self._closed.wait(
+                1
+            )  # a signal to end the whole service may reach the worker process first
         self._running.pop(id, None)
         if not self._closed.is_set():
             self._end(id, error)
@@ -198,7 +215,9 @@ class Jobs:
                 return
             end = {"state": "failed" if error else "done", "error": error, "ended": time.time()}
             ended = job.model_copy(update={**end, "stage": None, "share": None})
-            with contextlib.suppress(InputError):  # the disk is full: the next server repeats the job
+            with contextlib.suppress(
+                InputError
+            ):  # the disk is full: the next server repeats the job
                 ended.save()
                 for file in (job.source, job.depth):
                     if file is not None and not os.path.isabs(file):

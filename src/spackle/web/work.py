@@ -14,22 +14,22 @@ from PIL import Image, ImageOps
 from pydantic import BaseModel, ConfigDict, Field
 from rich.console import Console
 
-from spackle.bases.depth_map import DepthKind
 from spackle.bases.lite import LiteBase
 from spackle.bases.settings import AUTO, ROUGH, BaseSettings
-from spackle.camera_path import MAX_DISPARITY, TRAJECTORIES, TrajectoryKind
-from spackle.errors import InputError
-from spackle.files import write_whole
+from spackle.core.photo import PHOTO_SUFFIXES, check_shape, read_image
+from spackle.core.trajectories import MAX_DISPARITY, TRAJECTORIES, TrajectoryKind
+from spackle.depth.depth_map import DepthKind
 from spackle.formats.html import as_json, single_html
 from spackle.formats.scene_files import scene_kind
-from spackle.image import PHOTO_SUFFIXES, check_shape, read_image
-from spackle.photo_results import REPORT, PhotoOptions, predict_photo
 from spackle.pipeline import Fill, FillOptions, Options, Pipeline
-from spackle.progress import Reporter, Step
 from spackle.render import get_renderer
+from spackle.results.photo_folder import REPORT, PhotoOptions, predict_photo
+from spackle.runtime.errors import InputError
+from spackle.runtime.files import write_atomic
+from spackle.runtime.progress import Progress, Reporter
+from spackle.runtime.task_process import Tell
 from spackle.scene import Scene
-from spackle.task_process import Tell
-from spackle.video_frames import DEFAULT_FPS
+from spackle.video.frames import DEFAULT_FPS
 from spackle.views import MAX_FRAMES, SECONDS, PathOptions
 from spackle.web.jobs import Job
 
@@ -39,7 +39,14 @@ Video = Literal[
     "dolly-zoom.mp4",
 ]  # fmt: skip
 FileName = Literal[Download, Video]  # one list, so that a refusal names all
-MADE: list[FileName] = ["scene.ply", "scene.spz", "scene.glb", "scene.html", "video.mp4", "report.json"]  # the default
+MADE: list[FileName] = [
+    "scene.ply",
+    "scene.spz",
+    "scene.glb",
+    "scene.html",
+    "video.mp4",
+    "report.json",
+]  # the default
 PAGE, PREVIEW, SIDE = "page.json", "photo.jpg", 1280  # pixels of the preview's long side
 # The formats that Pillow may decode: for EPS, for example, Pillow would start another program.
 FORMATS = frozenset({"JPEG", "MPO", "PNG", "WEBP", "HEIF", "TIFF"})
@@ -50,17 +57,26 @@ class SceneOptions(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    base: str | None = Field(None, max_length=80, description="One of the server's bases; null: its default.")
+    base: str | None = Field(
+        None, max_length=80, description="One of the server's bases; null: its default."
+    )
     depth_kind: DepthKind = Field("auto", description="What the numbers in the depth map mean.")
-    disparity: float | None = Field(None, ge=0, le=MAX_DISPARITY, description="How far the camera moves; 0.3 is large.")
+    disparity: float | None = Field(
+        None, ge=0, le=MAX_DISPARITY, description="How far the camera moves; 0.3 is large."
+    )
     trajectory: TrajectoryKind = Field("rotate-forward", description="Camera path of the video.")
     frames: int = Field(
-        round(SECONDS * DEFAULT_FPS), ge=1, le=MAX_FRAMES, description="Number of frames of the video, 30 per second."
+        round(SECONDS * DEFAULT_FPS),
+        ge=1,
+        le=MAX_FRAMES,
+        description="Number of frames of the video, 30 per second.",
     )
     fill: Fill = Field("auto", description="Source of the texture in the holes.")
     focal_px: float | None = Field(None, gt=0, description="Focal length in pixels of the photo.")
     focal_mm: float | None = Field(None, gt=0, description="Focal length in mm, 35 mm equivalent.")
-    fov: float | None = Field(None, gt=0, lt=180, description="Horizontal field of view in degrees.")
+    fov: float | None = Field(
+        None, gt=0, lt=180, description="Horizontal field of view in degrees."
+    )
     keep_frame: bool = Field(False, description="Keep a uniform frame around the picture.")
     files: list[FileName] = Field(MADE, description="Files to make before the job is done.")
 
@@ -81,7 +97,10 @@ class SceneWork:
     def __call__(self, task: tuple[Job, str | None], tell: Tell) -> None:
         """Do a task; InputError, without any path of this server, for an unusable photo, depth map or scene."""
         job, file = task
-        options, teller = SceneOptions.model_validate({**self.usual, **job.options}), Teller(job, tell, self.verbose)
+        options, teller = (
+            SceneOptions.model_validate({**self.usual, **job.options}),
+            Teller(job, tell, self.verbose),
+        )
         ply, source, note = job.results / "scene.ply", job.folder / job.source, ""
         try:
             if file is None:
@@ -93,7 +112,7 @@ class SceneWork:
                 with teller.stage("page"):
                     page = scene.page(job.name, note)
                     for name, data in {**page.files, PAGE: as_json(page.description)}.items():
-                        write_whole(job.results / name, data)
+                        write_atomic(job.results / name, data)
             else:
                 scene = Scene.load(ply)
             for name in options.files if file is None else [file]:
@@ -108,7 +127,9 @@ class SceneWork:
         settings = self.base
         if job.depth is not None:
             depth, kind = job.folder / job.depth, options.depth_kind
-            settings = dataclasses.replace(settings, name=AUTO, checkpoint=None, depth=depth, depth_kind=kind)
+            settings = dataclasses.replace(
+                settings, name=AUTO, checkpoint=None, depth=depth, depth_kind=kind
+            )
         elif options.base not in (None, settings.name):
             settings = dataclasses.replace(settings, name=options.base, checkpoint=None)
         path = PathOptions(options.trajectory, options.disparity, frames=options.frames)
@@ -118,7 +139,9 @@ class SceneWork:
             self.opened = Pipeline.open(chosen)
         pipeline = dataclasses.replace(self.opened, options=chosen)
         lens = options.model_dump(include={"focal_px", "focal_mm", "fov"})
-        wanted = PhotoOptions(lens, render="video.mp4" in options.files, keep_frame=options.keep_frame)
+        wanted = PhotoOptions(
+            lens, render="video.mp4" in options.files, keep_frame=options.keep_frame
+        )
         predict_photo(job.folder / job.source, job.results, pipeline, teller, wanted)
         report = json.loads((job.results / REPORT).read_text(encoding="utf-8"))
         return ROUGH if report["base"]["name"] == LiteBase.name else ""
@@ -128,10 +151,12 @@ class SceneWork:
             raise InputError(f"{job.name}: has no report, because it was opened as a scene")
         if target.suffix == ".mp4":
             kind = next((kind for kind in TRAJECTORIES if kind == target.stem), options.trajectory)
-            scene.save_video(target, kind, frames=options.frames, renderer=get_renderer(self.base.device))
+            scene.save_video(
+                target, kind, frames=options.frames, renderer=get_renderer(self.base.device)
+            )
         elif target.suffix == ".html":
             note = json.loads((job.results / PAGE).read_bytes())["note"]
-            write_whole(target, single_html(scene.page(job.name, note)))
+            write_atomic(target, single_html(scene.page(job.name, note)))
         else:
             scene.export(target)
 
@@ -152,7 +177,7 @@ class Teller(Reporter):
         self._tell({"line": self.cleaned(line)})
 
     @contextlib.contextmanager
-    def stage(self, name: str) -> Iterator[Step]:
+    def stage(self, name: str) -> Iterator[Progress]:
         """Like `Reporter.stage`; a total of 0 means unknown."""
         self._tell({"stage": name, "done": 0, "total": 0})
         with super().stage(name):

@@ -8,8 +8,8 @@ import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from spackle.errors import check_name
-from spackle.files import check_file, sha256_of
+from spackle.runtime.errors import check_name
+from spackle.runtime.files import check_file, sha256_of
 
 HUB = "https://huggingface.co"
 
@@ -49,7 +49,11 @@ def weights_folder() -> Path:
     if chosen := os.environ.get("SPACKLE_WEIGHTS"):
         return Path(os.path.expanduser(chosen))
     cache = os.environ.get("XDG_CACHE_HOME", "")
-    return Path(cache if os.path.isabs(cache) else os.path.expanduser("~/.cache")) / "spackle" / "weights"
+    return (
+        Path(cache if os.path.isabs(cache) else os.path.expanduser("~/.cache"))
+        / "spackle"
+        / "weights"
+    )
 
 
 def installed(name: str) -> Path | None:

@@ -11,18 +11,29 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from spackle.bases import BasePrediction, Progress, believed_lens
-from spackle.bases.depth_map import DepthMap
-from spackle.bases.lift import lift_guess
-from spackle.bases.moge.network import FINEST, MogeNetwork, MogeOutput, load_network, token_grid, view_plane
-from spackle.camera import Camera
-from spackle.device import Precision, enough_memory, own_arithmetic, pick_device, pick_dtype
-from spackle.errors import InputError
-from spackle.image import Photo, resize_photo
+from spackle.bases import BasePrediction, is_plausible_focal
+from spackle.bases.depth import lift_guess
+from spackle.bases.moge.network import (
+    FINEST,
+    MogeNetwork,
+    MogeOutput,
+    load_network,
+    token_grid,
+    view_plane,
+)
+from spackle.core.camera import Camera
+from spackle.core.photo import Photo, resize_photo
+from spackle.depth.depth_map import DepthMap
+from spackle.runtime.device import Precision, enough_memory, own_arithmetic, pick_device, pick_dtype
+from spackle.runtime.errors import InputError
+from spackle.runtime.progress import Progress
 
 TOKENS = 1800  # for a photo, limited to the checkpoint's range
 SAMPLES = 64  # points along each side of the map that determine focal length and shift
-STEPS, STEP = 200, 1e-9  # the search for the shift: most steps, and the smallest step relative to 1 + shift
+STEPS, STEP = (
+    200,
+    1e-9,
+)  # the search for the shift: most steps, and the smallest step relative to 1 + shift
 SKY = 10.0  # distance of the sky, as a multiple of the farthest surface's distance
 
 Floats = NDArray[np.float64]
@@ -49,13 +60,19 @@ class MogeBase:
 
     @classmethod
     def load(
-        cls, path: str | os.PathLike[str], *, precision: Precision = "auto", device: torch.device | str | None = None
+        cls,
+        path: str | os.PathLike[str],
+        *,
+        precision: Precision = "auto",
+        device: torch.device | str | None = None,
     ) -> MogeBase:
         """Read MoGe-2's model.pt; InputError for a missing device, a foreign or broken file, or too little memory."""
         target = pick_device(device)
         dtype = pick_dtype(precision, target)
         with enough_memory():
-            return cls(load_network(path, dtype).to(target), "bf16" if dtype == torch.bfloat16 else "fp32")
+            return cls(
+                load_network(path, dtype).to(target), "bf16" if dtype == torch.bfloat16 else "fp32"
+            )
 
     def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
         """Gaussians of the pixels of the photo at its working size, as `lift` makes them.
@@ -66,23 +83,36 @@ class MogeBase:
         photo = resize_photo(photo)
         tokens = min(max(TOKENS, self.network.least_tokens), self.network.most_tokens)
         rows, columns = token_grid(photo.height, photo.width, tokens)
-        size = min((FINEST * rows, FINEST * columns), (photo.height, photo.width))  # `lift` enlarges
+        size = min(
+            (FINEST * rows, FINEST * columns), (photo.height, photo.width)
+        )  # `lift` enlarges
         known = not photo.focal_source.startswith("default")
         with enough_memory():
             output = self.ask(photo.rgb, tokens, size)
         view = to_view(output, photo.width, photo.height, photo.focal_px if known else None)
         camera, lens_source = photo.camera, ""
-        if not known and believed_lens(view.focal_px, photo.width, photo.height):
-            camera, lens_source = Camera.from_focal(view.focal_px, photo.width, photo.height), "MoGe"
+        if not known and is_plausible_focal(view.focal_px, photo.width, photo.height):
+            camera, lens_source = (
+                Camera.from_focal(view.focal_px, photo.width, photo.height),
+                "MoGe",
+            )
         elif not known:
             view = to_view(output, photo.width, photo.height, photo.focal_px)
         valid = view.surface & (view.depth > 0) & view.depth.isfinite()
         if not valid.any():
-            raise InputError(f"{photo.path}: MoGe finds no surface: give another photo, or --base lite")
-        depth = torch.where(view.surface, view.depth.where(valid, 0.0), SKY * view.depth[valid].max())
+            raise InputError(
+                f"{photo.path}: MoGe finds no surface: give another photo, or --base lite"
+            )
+        depth = torch.where(
+            view.surface, view.depth.where(valid, 0.0), SKY * view.depth[valid].max()
+        )
         depth_map = DepthMap(depth, valid | ~view.surface, None, None, "depth", photo.path)
         prediction = lift_guess(photo, depth_map, camera)
-        notes = {**prediction.notes, "precision": self.precision, "depth_scale": "metric, by the model"}
+        notes = {
+            **prediction.notes,
+            "precision": self.precision,
+            "depth_scale": "metric, by the model",
+        }
         return dataclasses.replace(prediction, notes=notes, lens_source=lens_source)
 
     @torch.no_grad()
@@ -108,7 +138,9 @@ def to_view(output: MogeOutput, width: int, height: int, focal_px: float | None 
     return MogeView(depth, output.mask_logits > 0, focal * half_diagonal, shift)
 
 
-def focal_and_shift(points: Floats, places: Floats, focal: float | None = None) -> tuple[float, float]:
+def focal_and_shift(
+    points: Floats, places: Floats, focal: float | None = None
+) -> tuple[float, float]:
     """The focal length f and the shift s along z with which points [N, 3] project to `places` [N, 2].
 
     Gauss-Newton steps from s = 0 minimise |f (x, y) / (z + s) - place|²; a step is halved until the error falls. The
@@ -132,7 +164,10 @@ def focal_and_shift(points: Floats, places: Floats, focal: float | None = None) 
         if focal is None:
             change += float((moved * (places - 2 * best * seen)).sum() / (seen * seen).sum()) * seen
         step = -float((change * off).sum() / ((change * change).sum() or 1.0))
-        while abs(step) > STEP * (1 + abs(shift)) and not (at(shift + step)[2] ** 2).sum() < (off**2).sum():
+        while (
+            abs(step) > STEP * (1 + abs(shift))
+            and not (at(shift + step)[2] ** 2).sum() < (off**2).sum()
+        ):
             step /= 2
         shift += step
         if not abs(step) > STEP * (1 + abs(shift)):

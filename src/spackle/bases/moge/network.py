@@ -18,11 +18,15 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
 from spackle.bases.sharp.encoder import NORM_EPS, TransformerBlock
-from spackle.errors import reading, shown
-from spackle.network_file import channels_last, load_strict, read_checkpoint
+from spackle.runtime.errors import as_input_error, shortened
+from spackle.weights.checkpoints import channels_last, load_strict, read_checkpoint
 
 ADVICE = "give MoGe-2's model.pt as it was downloaded"
-BACKBONES = {"dinov2_vits14": (384, 12, 6), "dinov2_vitb14": (768, 12, 12), "dinov2_vitl14": (1024, 24, 16)}
+BACKBONES = {
+    "dinov2_vits14": (384, 12, 6),
+    "dinov2_vitb14": (768, 12, 12),
+    "dinov2_vitl14": (1024, 24, 16),
+}
 PATCH = 14  # side of a token in pixels
 GRID = 37  # tokens along a side for which the positions were learned
 LEVELS = 5  # of a pyramid; each level is twice as fine as the previous level
@@ -42,7 +46,9 @@ USUAL = {  # options of a pyramid that are the same in all published checkpoints
 class MogeOutput:
     """The network's output on a grid [h, w] over the photo; float32."""
 
-    points: Tensor  # [h, w, 3] x right, y down, z forward, up to the metric scale and a shift along z
+    points: (
+        Tensor  # [h, w, 3] x right, y down, z forward, up to the metric scale and a shift along z
+    )
     mask_logits: Tensor  # [h, w] above 0 for a surface, else sky
     metric_scale: Tensor  # [] metres for each unit of the points
 
@@ -87,14 +93,20 @@ class DinoEncoder(nn.Module):
         self.register_buffer("image_mean", torch.zeros(1, 3, 1, 1))
         self.register_buffer("image_std", torch.ones(1, 3, 1, 1))
         self.backbone = DinoBackbone(width, depth, heads)
-        self.output_projections = nn.ModuleList(nn.Conv2d(width, config["dim_out"], 1) for _ in self.layers)
+        self.output_projections = nn.ModuleList(
+            nn.Conv2d(width, config["dim_out"], 1) for _ in self.layers
+        )
 
     def forward(self, image: Tensor, rows: int, columns: int) -> tuple[Tensor, Tensor]:
         size = (PATCH * rows, PATCH * columns)
         seen = interpolate(image, size=size, mode="bilinear", align_corners=False, antialias=True)
-        tokens = self.backbone((seen - self.get_buffer("image_mean")) / self.get_buffer("image_std"), self.layers)
+        tokens = self.backbone(
+            (seen - self.get_buffer("image_mean")) / self.get_buffer("image_std"), self.layers
+        )
         maps = [each[:, 1:].transpose(1, 2).unflatten(2, (rows, columns)) for each in tokens]
-        features = [project(each) for project, each in zip(self.output_projections, maps, strict=True)]
+        features = [
+            project(each) for project, each in zip(self.output_projections, maps, strict=True)
+        ]
         return torch.stack(features).sum(0), tokens[-1][:, 0]
 
 
@@ -104,7 +116,9 @@ class ConvBlock(nn.Module):
     def __init__(self, width: int) -> None:
         super().__init__()
         first, second = conv3(width, width), conv3(width, width)
-        self.layers = nn.Sequential(nn.Identity(), nn.ReLU(), first, nn.Identity(), nn.ReLU(), second)
+        self.layers = nn.Sequential(
+            nn.Identity(), nn.ReLU(), first, nn.Identity(), nn.ReLU(), second
+        )
 
     def forward(self, x: Tensor) -> Tensor:
         out: Tensor = x + self.layers(x.to(next(self.parameters()).dtype))
@@ -114,10 +128,14 @@ class ConvBlock(nn.Module):
 def resampler(kind: str, inputs: int, outputs: int) -> nn.Sequential:
     """Layers that double the size of feature maps."""
     if kind == "conv_transpose":
-        return nn.Sequential(nn.ConvTranspose2d(inputs, outputs, 2, stride=2), conv3(outputs, outputs))
+        return nn.Sequential(
+            nn.ConvTranspose2d(inputs, outputs, 2, stride=2), conv3(outputs, outputs)
+        )
     if kind != "bilinear":
-        raise ValueError(f"a resampler is {shown(kind)}")
-    return nn.Sequential(nn.Upsample(scale_factor=2, mode="bilinear", align_corners=False), conv3(inputs, outputs))
+        raise ValueError(f"a resampler is {shortened(kind)}")
+    return nn.Sequential(
+        nn.Upsample(scale_factor=2, mode="bilinear", align_corners=False), conv3(inputs, outputs)
+    )
 
 
 class Pyramid(nn.Module):
@@ -128,19 +146,28 @@ class Pyramid(nn.Module):
         options = {"dim_times_res_block_hidden": 1, "activation": "relu", **config}
         for key, value in USUAL.items():
             if options.get(key) != value:
-                raise ValueError(f"{key} is {shown(options.get(key))}")
-        widths, counts, outs = config["dim_res_blocks"], config["num_res_blocks"], config["dim_out"] or [None] * LEVELS
+                raise ValueError(f"{key} is {shortened(options.get(key))}")
+        widths, counts, outs = (
+            config["dim_res_blocks"],
+            config["num_res_blocks"],
+            config["dim_out"] or [None] * LEVELS,
+        )
         if len(widths) != LEVELS or max(counts) > MOST_BLOCKS:
-            raise ValueError(f"num_res_blocks is {shown(counts)}")
-        self.input_blocks = nn.ModuleList(map(functools.partial(nn.Conv2d, kernel_size=1), config["dim_in"], widths))
+            raise ValueError(f"num_res_blocks is {shortened(counts)}")
+        self.input_blocks = nn.ModuleList(
+            map(functools.partial(nn.Conv2d, kernel_size=1), config["dim_in"], widths)
+        )
         self.res_blocks = nn.ModuleList(
             nn.Sequential(*(ConvBlock(width) for _ in range(count)))
             for width, count in zip(widths, counts, strict=True)
         )
         self.output_blocks = nn.ModuleList(
-            nn.Identity() if out is None else nn.Conv2d(width, out, 1) for width, out in zip(widths, outs, strict=True)
+            nn.Identity() if out is None else nn.Conv2d(width, out, 1)
+            for width, out in zip(widths, outs, strict=True)
         )
-        self.resamplers = nn.ModuleList(map(resampler, config["resamplers"], widths[:-1], widths[1:]))
+        self.resamplers = nn.ModuleList(
+            map(resampler, config["resamplers"], widths[:-1], widths[1:])
+        )
 
     def forward(self, inputs: Sequence[Tensor]) -> list[Tensor]:
         """The outputs of all levels [1, C, 2^l·h, 2^l·w]; each level's input has the same height and width."""
@@ -148,7 +175,9 @@ class Pyramid(nn.Module):
         carried: Tensor | None = None
         for level, x in enumerate(inputs):
             x = self.input_blocks[level](x)
-            carried = self.res_blocks[level](x if carried is None else x + self.resamplers[level - 1](carried))
+            carried = self.res_blocks[level](
+                x if carried is None else x + self.resamplers[level - 1](carried)
+            )
             outputs.append(self.output_blocks[level](carried))
         return outputs
 
@@ -163,7 +192,10 @@ class MogeNetwork(nn.Module):
         self.plain_exp = {"exp": True, "sinh_exp": False}[config["remap_output"]]
         self.encoder = DinoEncoder(config["encoder"])
         self.neck = Pyramid(config["neck"])
-        self.points_head, self.mask_head = Pyramid(config["points_head"]), Pyramid(config["mask_head"])
+        self.points_head, self.mask_head = (
+            Pyramid(config["points_head"]),
+            Pyramid(config["mask_head"]),
+        )
         dims = config["scale_head"]["dims"]
         first, second, third = map(nn.Linear, dims[:-1], dims[1:])
         self.scale_head = nn.Sequential(first, nn.ReLU(), second, nn.ReLU(), third)
@@ -182,19 +214,26 @@ class MogeNetwork(nn.Module):
         height, width = image.shape[2:]
         rows, columns = token_grid(height, width, tokens)
         features, class_token = self.encoder(image, rows, columns)
-        planes = [view_plane(rows << level, columns << level, width / height).to(image) for level in range(LEVELS)]
+        planes = [
+            view_plane(rows << level, columns << level, width / height).to(image)
+            for level in range(LEVELS)
+        ]
         inputs = [torch.cat([features, planes[0]], dim=1), *planes[1:]]
         return self.neck(inputs), self.scale_head(class_token)[0, 0].exp()
 
     @staticmethod
     def decode(head: Pyramid, levels: Sequence[Tensor], size: tuple[int, int]) -> Tensor:
         """A head's finest output, resized to `size` (h, w): [h, w, C]."""
-        return interpolate(head(levels)[-1], size=size, mode="bilinear", align_corners=False)[0].permute(1, 2, 0)
+        return interpolate(head(levels)[-1], size=size, mode="bilinear", align_corners=False)[
+            0
+        ].permute(1, 2, 0)
 
 
 def token_grid(height: int, width: int, tokens: int) -> tuple[int, int]:
     """(rows, columns) of a grid of about the given number of tokens over a photo."""
-    return max(1, round(math.sqrt(tokens / (width / height)))), max(1, round(math.sqrt(tokens * (width / height))))
+    return max(1, round(math.sqrt(tokens / (width / height)))), max(
+        1, round(math.sqrt(tokens * (width / height)))
+    )
 
 
 def view_plane(rows: int, columns: int, aspect: float) -> Tensor:
@@ -212,14 +251,19 @@ def load_network(path: str | os.PathLike[str], dtype: torch.dtype) -> MogeNetwor
     would turn slanted surfaces into stairs. Nothing in the file is executed.
     """
     config, tensors = read_checkpoint(path, "model_config", ADVICE)
-    with reading(path, f"not a published kind of MoGe-2 ({{reason}}): {ADVICE}"), torch.device("meta"):
+    with (
+        as_input_error(path, f"not a published kind of MoGe-2 ({{reason}}): {ADVICE}"),
+        torch.device("meta"),
+    ):
         network = MogeNetwork(config)  # type: ignore[arg-type]
     weights = {  # without the head for normals, which Spackle does not use
         name.removeprefix("model."): tensor
         for name, tensor in tensors.items()
         if name.startswith("model.") and not name.startswith("model.normal_head.")
     }
-    return load_strict(network, weights, path, ADVICE, prepare=functools.partial(set_precision, dtype=dtype))
+    return load_strict(
+        network, weights, path, ADVICE, prepare=functools.partial(set_precision, dtype=dtype)
+    )
 
 
 def set_precision(network: nn.Module, dtype: torch.dtype) -> None:

@@ -15,17 +15,18 @@ from safetensors.torch import save
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
-from spackle.bases import BasePrediction, Progress
+from spackle.bases import BasePrediction
 from spackle.bases.sharp.encoder import CONFIGS, WINDOWS, SharpConfig, set_precision
 from spackle.bases.sharp.network import SharpNetwork, SharpOutput, compose
-from spackle.bases.sharp.unproject import stretch_gaussians
-from spackle.camera import Camera
-from spackle.device import Precision, enough_memory, own_arithmetic, pick_device, pick_dtype
-from spackle.errors import InputError, one_line, reading
-from spackle.files import sha256_of
-from spackle.gaussians import Gaussians
-from spackle.image import Photo, working_size
-from spackle.network_file import Shapes, load_strict, read_note, read_tensors
+from spackle.bases.sharp.stretch import stretch_gaussians
+from spackle.core.camera import Camera
+from spackle.core.gaussians import Gaussians
+from spackle.core.photo import Photo, working_size
+from spackle.runtime.device import Precision, enough_memory, own_arithmetic, pick_device, pick_dtype
+from spackle.runtime.errors import InputError, as_input_error, one_line
+from spackle.runtime.files import sha256_of
+from spackle.runtime.progress import Progress
+from spackle.weights.checkpoints import Shapes, load_strict, read_note, read_tensors
 
 WINDOWS_AT_ONCE = 5  # enough to keep two cores or a small GPU busy
 ADVICE = "give SHARP's checkpoint as it was downloaded"
@@ -42,7 +43,9 @@ class SharpBase:
 
     name = "sharp"
 
-    def __init__(self, network: SharpNetwork, *, windows: int | None = None, weights: str = "") -> None:
+    def __init__(
+        self, network: SharpNetwork, *, windows: int | None = None, weights: str = ""
+    ) -> None:
         """Use a loaded network on its device; `weights` is the name of the weights in the report."""
         check_windows("windows", windows)
         self.network = network
@@ -79,7 +82,11 @@ class SharpBase:
     @property
     def precision(self) -> str:
         """The number type of the heavy arithmetic: fp32 or bf16."""
-        return "bf16" if self.network.feature_model.fusion.out_conv.weight.dtype == torch.bfloat16 else "fp32"
+        return (
+            "bf16"
+            if self.network.feature_model.fusion.out_conv.weight.dtype == torch.bfloat16
+            else "fp32"
+        )
 
     def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
         """Two layers of Gaussians in metres, the nearer layer first, row by row; InputError if memory is short."""
@@ -87,7 +94,9 @@ class SharpBase:
             gaussians = to_metric(self.infer(photo, progress), photo)
         camera = Camera.from_focal(photo.focal_px, photo.width, photo.height)
         notes: dict[str, float | int | str] = {"precision": self.precision, "weights": self.weights}
-        return BasePrediction(gaussians, camera.resized(*working_size(photo.width, photo.height)), notes)
+        return BasePrediction(
+            gaussians, camera.resized(*working_size(photo.width, photo.height)), notes
+        )
 
     @torch.no_grad()
     def infer(self, photo: Photo, progress: Progress | None = None) -> SharpOutput:
@@ -126,7 +135,9 @@ def to_square(rgb: Tensor, side: int) -> Tensor:
 # The checkpoint -----------------------------------------------------------------------------------
 
 
-def load_network(path: str | os.PathLike[str], dtype: torch.dtype, device: torch.device | str = "cpu") -> SharpNetwork:
+def load_network(
+    path: str | os.PathLike[str], dtype: torch.dtype, device: torch.device | str = "cpu"
+) -> SharpNetwork:
     """A frozen network from Apple's .pt file, or a safetensors file with the same names, on a device.
 
     The size, published or tiny, follows from the shapes. If a file holds only a trained Gaussian decoder, the other
@@ -151,7 +162,9 @@ def load_network(path: str | os.PathLike[str], dtype: torch.dtype, device: torch
 def expected_shapes(config: SharpConfig) -> Shapes:
     """The names and shapes of all tensors that `load_network` reads from a checkpoint of this size."""
     with torch.device("meta"):
-        return {name: tuple(tensor.shape) for name, tensor in SharpNetwork(config).state_dict().items()}
+        return {
+            name: tuple(tensor.shape) for name, tensor in SharpNetwork(config).state_dict().items()
+        }
 
 
 # A trained decoder --------------------------------------------------------------------------------
@@ -172,14 +185,21 @@ class Owner:
 
 def decoder_bytes(decoder: nn.Module, owner: Owner) -> bytes:
     """A `GaussianDecoder` as a safetensors file in float32, which restores unchanged weights bit for bit."""
-    tensors = {name: tensor.detach().float().cpu().contiguous() for name, tensor in decoder.state_dict().items()}
-    return save(tensors, {NOTE: json.dumps({"checkpoint": owner.path.name, "sha256": owner.sha256})})
+    tensors = {
+        name: tensor.detach().float().cpu().contiguous()
+        for name, tensor in decoder.state_dict().items()
+    }
+    return save(
+        tensors, {NOTE: json.dumps({"checkpoint": owner.path.name, "sha256": owner.sha256})}
+    )
 
 
 def link_owner(owner: Owner, folder: Path) -> None:
     """Put a link to a checkpoint into the folder of its decoders, under a name that no other file has."""
     link = folder / owner.places[0]
-    with contextlib.suppress(OSError):  # the link exists, or the file system has none: then the user copies the file
+    with contextlib.suppress(
+        OSError
+    ):  # the link exists, or the file system has none: then the user copies the file
         if link.is_symlink() and not link.exists():  # the checkpoint has moved
             link.unlink()
         link.symlink_to(owner.path.absolute())
@@ -190,12 +210,14 @@ def owner_of(path: str | os.PathLike[str]) -> Owner | None:
     note = read_note(path, NOTE)
     if note is None:
         return None
-    with reading(path, "does not say which checkpoint it was trained on: train it again"):
+    with as_input_error(path, "does not say which checkpoint it was trained on: train it again"):
         facts = json.loads(note)
         return Owner(Path(Path(str(facts["checkpoint"])).name), str(facts["sha256"]))
 
 
-def _with_owner(decoder: Mapping[str, Tensor], path: str | os.PathLike[str], owner: Owner) -> dict[str, Tensor]:
+def _with_owner(
+    decoder: Mapping[str, Tensor], path: str | os.PathLike[str], owner: Owner
+) -> dict[str, Tensor]:
     """The tensors of the checkpoint in a decoder's folder, with the decoder's tensors in place of the checkpoint's.
 
     InputError if the checkpoint is missing, unreadable or changed, or if the decoder belongs to another network.
@@ -204,8 +226,10 @@ def _with_owner(decoder: Mapping[str, Tensor], path: str | os.PathLike[str], own
     home = next((beside / name for name in owner.places if os.path.isfile(beside / name)), None)
     name = one_line(owner.path.name)
     if home is None:
-        raise InputError(f"{path}: trained on {name}, which is not in this folder: put the checkpoint or a link there")
-    with reading(home, "cannot be read: {reason}", OSError), open(home, "rb") as file:
+        raise InputError(
+            f"{path}: trained on {name}, which is not in this folder: put the checkpoint or a link there"
+        )
+    with as_input_error(home, "cannot be read: {reason}", OSError), open(home, "rb") as file:
         found = sha256_of(file)
     if found != owner.sha256:
         raise InputError(
@@ -215,5 +239,7 @@ def _with_owner(decoder: Mapping[str, Tensor], path: str | os.PathLike[str], own
     whole = read_tensors(home, ADVICE)
     trained = {name for name in whole if name.startswith(("feature_model.", "prediction_head."))}
     if wrong := sorted(trained ^ decoder.keys()):
-        raise InputError(f"{path}: not a decoder of {home}: {len(wrong)} names differ, e.g. {one_line(wrong[0])[:120]}")
+        raise InputError(
+            f"{path}: not a decoder of {home}: {len(wrong)} names differ, e.g. {one_line(wrong[0])[:120]}"
+        )
     return {**whole, **decoder}

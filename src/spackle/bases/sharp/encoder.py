@@ -11,8 +11,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import gelu, interpolate, scaled_dot_product_attention
 
-from spackle.bases import Progress
-from spackle.network_file import channels_last
+from spackle.runtime.progress import Progress
+from spackle.weights.checkpoints import channels_last
 
 LAYERS = 2  # of Gaussians: the visible surface, and what may be behind it
 STRIDE = 2  # pixels of the network's picture for each cell of Gaussians
@@ -26,7 +26,12 @@ class SharpConfig:
     depth: int = 24  # their blocks
     heads: int = 16
     taps: tuple[int, int] = (5, 11)  # blocks whose tokens become the two finest feature maps
-    pyramid: tuple[int, int, int, int] = (256, 512, 1024, 1024)  # channels of the coarser feature maps, fine to coarse
+    pyramid: tuple[int, int, int, int] = (
+        256,
+        512,
+        1024,
+        1024,
+    )  # channels of the coarser feature maps, fine to coarse
     depth_width: int = 256  # channels of the depth decoder, and of the finest feature map
     gaussian_width: int = 128  # channels of the Gaussian decoder
     feature_width: int = 32  # channels that the Gaussians are predicted from
@@ -43,7 +48,9 @@ class SharpConfig:
 
 
 FULL = SharpConfig()
-TINY = SharpConfig(48, 4, 3, (0, 1), (16, 24, 32, 32), depth_width=16, gaussian_width=16, feature_width=16)
+TINY = SharpConfig(
+    48, 4, 3, (0, 1), (16, 24, 32, 32), depth_width=16, gaussian_width=16, feature_width=16
+)
 MICRO = dataclasses.replace(TINY, window=128)  # a ninth of the pixels
 CONFIGS = {"full": FULL, "tiny": TINY, "micro": MICRO}
 
@@ -84,14 +91,20 @@ class VisionTransformer(nn.Module):
         self.grid = config.grid
         self.cls_token = nn.Parameter(torch.zeros(1, 1, config.embed))
         self.pos_embed = nn.Parameter(torch.zeros(1, 1 + config.grid**2, config.embed))
-        self.patch_embed = nn.ModuleDict({"proj": ExactConv(3, config.embed, config.patch, stride=config.patch)})
-        self.blocks = nn.ModuleList(TransformerBlock(config.embed, config.heads) for _ in range(config.depth))
+        self.patch_embed = nn.ModuleDict(
+            {"proj": ExactConv(3, config.embed, config.patch, stride=config.patch)}
+        )
+        self.blocks = nn.ModuleList(
+            TransformerBlock(config.embed, config.heads) for _ in range(config.depth)
+        )
         self.norm = nn.LayerNorm(config.embed, eps=NORM_EPS)
 
     def forward(self, windows: Tensor, taps: tuple[int, ...] = ()) -> tuple[Tensor, list[Tensor]]:
         """Normalised features [B, C, G, G] of windows [B, 3, S, S] in -1..1, and raw features after blocks `taps`."""
         tokens = self.patch_embed["proj"](windows).flatten(2).transpose(1, 2)
-        tokens = torch.cat([self.cls_token.expand(len(tokens), -1, -1), tokens], dim=1) + self.pos_embed
+        tokens = (
+            torch.cat([self.cls_token.expand(len(tokens), -1, -1), tokens], dim=1) + self.pos_embed
+        )
         tapped = []
         for index, block in enumerate(self.blocks):
             tokens = block(tokens)
@@ -111,7 +124,9 @@ class TransformerBlock(nn.Module):
         super().__init__()
         self.heads = heads
         self.norm1, self.norm2 = (nn.LayerNorm(width, eps=NORM_EPS) for _ in range(2))
-        self.attn = nn.ModuleDict({"qkv": nn.Linear(width, 3 * width), "proj": nn.Linear(width, width)})
+        self.attn = nn.ModuleDict(
+            {"qkv": nn.Linear(width, 3 * width), "proj": nn.Linear(width, width)}
+        )
         self.mlp = nn.ModuleDict(
             {"fc1": nn.Linear(width, MLP_RATIO * width), "fc2": nn.Linear(MLP_RATIO * width, width)}
         )
@@ -126,7 +141,9 @@ class TransformerBlock(nn.Module):
     def _attended(self, tokens: Tensor) -> Tensor:
         batch, count, width = tokens.shape
         qkv = self.attn["qkv"](lower(tokens, self.attn["qkv"]))
-        query, key, value = qkv.view(batch, count, 3, self.heads, width // self.heads).permute(2, 0, 3, 1, 4)
+        query, key, value = qkv.view(batch, count, 3, self.heads, width // self.heads).permute(
+            2, 0, 3, 1, 4
+        )
         attended = scaled_dot_product_attention(query, key, value)
         projected: Tensor = self.attn["proj"](attended.transpose(1, 2).flatten(2))
         return projected
@@ -145,7 +162,10 @@ class SlidingPyramid(nn.Module):
         super().__init__()
         self.taps = config.taps
         self.window = config.window
-        self.full_trim, self.half_trim = config.grid // 8, config.grid // 4  # tokens: half an overlap
+        self.full_trim, self.half_trim = (
+            config.grid // 8,
+            config.grid // 4,
+        )  # tokens: half an overlap
         self.patch_encoder = VisionTransformer(config)
         self.image_encoder = VisionTransformer(config)
         fine, embed, dims = config.depth_width, config.embed, config.pyramid
@@ -160,7 +180,9 @@ class SlidingPyramid(nn.Module):
     def forward(self, image: Tensor, batch: int, progress: Progress | None = None) -> list[Tensor]:
         """Feature maps, fine to coarse, of a picture [1, 3, side, side] in -1..1, `batch` windows at a time."""
         half, quarter = (interpolate(image, scale_factor=f, mode="bilinear") for f in (0.5, 0.25))
-        windows = torch.cat([cut(image, self.window, FULL_WINDOWS), cut(half, self.window, HALF_WINDOWS), quarter])
+        windows = torch.cat(
+            [cut(image, self.window, FULL_WINDOWS), cut(half, self.window, HALF_WINDOWS), quarter]
+        )
         maps, latents = self._encode(windows, batch, progress)
         full, middle, whole = torch.split(maps, [FULL_WINDOWS**2, HALF_WINDOWS**2, 1])
         whole = self.upsample2(whole)
@@ -173,7 +195,9 @@ class SlidingPyramid(nn.Module):
             self.fuse_lowres(torch.cat([whole, lowres], dim=1)),
         ]
 
-    def _encode(self, windows: Tensor, batch: int, progress: Progress | None) -> tuple[Tensor, list[Tensor]]:
+    def _encode(
+        self, windows: Tensor, batch: int, progress: Progress | None
+    ) -> tuple[Tensor, list[Tensor]]:
         found: list[list[Tensor]] = [[] for _ in range(1 + len(self.taps))]
         for start in range(0, len(windows), batch):
             features, tapped = self.patch_encoder(windows[start : start + batch], self.taps)
@@ -189,7 +213,9 @@ class SlidingPyramid(nn.Module):
 def cut(image: Tensor, window: int, count: int) -> Tensor:
     """count² evenly overlapping windows [count², C, window, window] of [1, C, S, S], in row-major order."""
     stride = (image.shape[-1] - window) // (count - 1)
-    rows = image.unfold(2, window, stride).unfold(3, window, stride)  # [1, C, count, count, window, window]
+    rows = image.unfold(2, window, stride).unfold(
+        3, window, stride
+    )  # [1, C, count, count, window, window]
     return rows[0].permute(1, 2, 0, 3, 4).flatten(0, 1)
 
 
@@ -205,8 +231,12 @@ def merge(maps: Tensor, trim: int) -> Tensor:
     return torch.cat(rows, dim=1)[None]
 
 
-def _project_and_double(dim_in: int, dim_middle: int, dim_out: int, doublings: int) -> nn.Sequential:
+def _project_and_double(
+    dim_in: int, dim_middle: int, dim_out: int, doublings: int
+) -> nn.Sequential:
     layers: list[nn.Module] = [nn.Conv2d(dim_in, dim_middle, 1, bias=False)]
     for index in range(doublings):
-        layers.append(nn.ConvTranspose2d(dim_out if index else dim_middle, dim_out, 2, stride=2, bias=False))
+        layers.append(
+            nn.ConvTranspose2d(dim_out if index else dim_middle, dim_out, 2, stride=2, bias=False)
+        )
     return nn.Sequential(*layers)

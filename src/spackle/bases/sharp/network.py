@@ -13,10 +13,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, max_pool2d, softplus
 
-from spackle.bases import Progress
 from spackle.bases.sharp.encoder import LAYERS, STRIDE, ExactConv, SharpConfig, SlidingPyramid
-from spackle.color import srgb_to_linear
-from spackle.gaussians import Gaussians
+from spackle.core.color import srgb_to_linear
+from spackle.core.gaussians import Gaussians
+from spackle.runtime.progress import Progress
 
 GROUPS = 8  # channel groups of the group norms
 
@@ -74,7 +74,9 @@ class Fusion(nn.Module):
         super().__init__()
         self.resnet1 = plain_residual(dim)
         self.resnet2 = plain_residual(dim)
-        self.deconv = nn.ConvTranspose2d(dim, dim, 2, stride=2, bias=False) if doubles else nn.Identity()
+        self.deconv = (
+            nn.ConvTranspose2d(dim, dim, 2, stride=2, bias=False) if doubles else nn.Identity()
+        )
         self.out_conv = nn.Conv2d(dim, dim, 1)
 
     def forward(self, coarse: Tensor, fine: Tensor | None = None) -> Tensor:
@@ -120,7 +122,9 @@ class DecoderInput:
 
     start: InitialGaussians
     picture: Tensor  # [1, 5, side, side] float32 in -1..1: sRGB, and the disparity of both layers
-    maps: list[Tensor]  # the encoder's, fine to coarse: [1, C, side/2, side/2] to [1, C, side/32, side/32]
+    maps: list[
+        Tensor
+    ]  # the encoder's, fine to coarse: [1, C, side/2, side/2] to [1, C, side/32, side/32]
 
 
 class SharpNetwork(nn.Module):
@@ -135,7 +139,11 @@ class SharpNetwork(nn.Module):
         self.prediction_head = PredictionHead(config.feature_width)
 
     def forward(
-        self, image: Tensor, disparity_factor: float | Tensor, batch: int, progress: Progress | None = None
+        self,
+        image: Tensor,
+        disparity_factor: float | Tensor,
+        batch: int,
+        progress: Progress | None = None,
     ) -> SharpOutput:
         """Predict from the photo, stretched to [1, 3, side, side] sRGB in 0..1, float32.
 
@@ -147,7 +155,11 @@ class SharpNetwork(nn.Module):
         return SharpOutput(encoded.start, deltas)
 
     def encode(
-        self, image: Tensor, disparity_factor: float | Tensor, batch: int, progress: Progress | None = None
+        self,
+        image: Tensor,
+        disparity_factor: float | Tensor,
+        batch: int,
+        progress: Progress | None = None,
     ) -> DecoderInput:
         """Everything before the Gaussian decoder; the arguments are `forward`'s."""
         depth_network: DepthNetwork = self.monodepth_model.monodepth_predictor  # type: ignore[assignment]
@@ -199,7 +211,9 @@ class FeatureNetwork(nn.Module):
         self.texture_head = _head(width, config.feature_width)
         self.geometry_head = _head(width, config.feature_width)
 
-    def forward(self, picture: Tensor, maps: list[Tensor], coarser: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def forward(
+        self, picture: Tensor, maps: list[Tensor], coarser: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Texture and geometry features [1, F, side/2, side/2] of [1, 5, side, side] in -1..1; see `Decoder`."""
         features = self.decoder(maps, coarser)
         features = self.fusion(features, self.image_encoder.conv(picture).to(features))  # type: ignore[operator]
@@ -231,7 +245,9 @@ class GaussianDecoder(nn.Module):
         """Enable gradients, except for unused weights: 295,168 in the published checkpoint."""
         self.requires_grad_()
         coarsest: Fusion = self.feature_model.decoder.fusions[-1]  # type: ignore[assignment]
-        coarsest.resnet1.requires_grad_(False)  # for finer features, which the coarsest level does not get
+        coarsest.resnet1.requires_grad_(
+            False
+        )  # for finer features, which the coarsest level does not get
         return self
 
     def forward(self, picture: Tensor, maps: list[Tensor]) -> Tensor:
@@ -260,7 +276,9 @@ COLOR_GAIN = 0.1
 class InitialGaussians:
     """Gaussians on the predicted surfaces, one for each 2×2 pixels and layer, before any delta."""
 
-    disparity_map: Tensor  # [1, 2, side, side] of the scaled depths, an input of the feature network
+    disparity_map: (
+        Tensor  # [1, 2, side, side] of the scaled depths, an input of the feature network
+    )
     disparity: Tensor  # [2, side/2, side/2] of the nearest pixel in each cell
     color: Tensor  # [3, side/2, side/2] sRGB, the cell's mean
     unscale: Tensor  # [] float64: multiplies means and scales to undo the scaling of the depths
@@ -270,7 +288,9 @@ def make_start(image: Tensor, depth: Tensor) -> InitialGaussians:
     """The initial Gaussians of a picture [1, 3, side, side] with depth layers [1, 2, side, side]."""
     factor = NEAREST / (depth.min().double() + SMALLEST_INVERSE)
     disparity = 1.0 / (depth * factor).clamp_max(FARTHEST)
-    return InitialGaussians(disparity, max_pool2d(disparity, STRIDE)[0], avg_pool2d(image, STRIDE)[0], 1.0 / factor)
+    return InitialGaussians(
+        disparity, max_pool2d(disparity, STRIDE)[0], avg_pool2d(image, STRIDE)[0], 1.0 / factor
+    )
 
 
 def compose(start: InitialGaussians, deltas: Tensor) -> Gaussians:
@@ -279,7 +299,9 @@ def compose(start: InitialGaussians, deltas: Tensor) -> Gaussians:
     Means are (x·z, y·z, z), where x and y run from -1 to 1 over the picture.
     """
     height, width = deltas.shape[-2:]
-    x, y = ((2 * torch.arange(n, device=deltas.device) + 1) / n - 1 for n in (width, height))  # of the cells' centres
+    x, y = (
+        (2 * torch.arange(n, device=deltas.device) + 1) / n - 1 for n in (width, height)
+    )  # of the cells' centres
     inverse = softplus(_inverse_softplus(start.disparity) + Z_GAIN * deltas[2])
     z = 1.0 / (inverse + FARTHEST_INVERSE)
     means = torch.stack([z * (x + XY_GAIN * deltas[0]), z * (y[:, None] + XY_GAIN * deltas[1]), z])
@@ -291,7 +313,11 @@ def compose(start: InitialGaussians, deltas: Tensor) -> Gaussians:
     colors = srgb_to_linear(torch.sigmoid(torch.logit(color)[:, None] + COLOR_GAIN * deltas[10:13]))
     opacities = torch.sigmoid(deltas[13])
     return Gaussians(
-        _rows(means * start.unscale), _rows(quats), _rows(scales * start.unscale), opacities.flatten(), _rows(colors)
+        _rows(means * start.unscale),
+        _rows(quats),
+        _rows(scales * start.unscale),
+        opacities.flatten(),
+        _rows(colors),
     )
 
 

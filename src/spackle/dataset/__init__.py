@@ -1,6 +1,0 @@
-"""The pseudo-supervised dataset (paper, appendix): photos' views with holes, and completed targets, in shards."""
-
-from spackle.dataset.sample import DatasetView, PhotoGroup
-from spackle.dataset.shards import DatasetFiles
-
-__all__ = ["DatasetFiles", "DatasetView", "PhotoGroup"]

@@ -1,0 +1,207 @@
+"""Write and read a dataset's shards and manifest, in a folder or at a URL (optional: pip install fsspec)."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import IO, Annotated, Any
+
+from pydantic import BaseModel, Field, model_validator
+from torch.utils.data import Dataset
+
+from spackle.paper.dataset.sample import END, PhotoGroup
+from spackle.runtime.errors import InputError, as_input_error
+from spackle.runtime.files import atomic_path, digest_of
+
+NAME = "manifest.json"
+FORMAT = 1  # version of shards and manifest; other versions are refused
+Bytes = Annotated[int, Field(ge=0, le=1 << 40)]
+Share = Annotated[float, Field(ge=0, le=1)]
+
+
+class SampleEntry(BaseModel, frozen=True, extra="forbid", strict=True):
+    """A photo in a shard."""
+
+    key: str = Field(pattern="^[0-9A-Za-z]+$")
+    photo: str  # the photo's name, relative to the folder of photos
+    offset: Bytes  # position of the sample's first byte in the shard
+    size: Bytes
+    sha256: str  # of the sample's bytes
+    holes: tuple[Share, ...]  # HAR of each view
+
+
+class ShardEntry(BaseModel, frozen=True, extra="forbid", strict=True):
+    """A shard: one tar file."""
+
+    file: str = Field(pattern=r"^shard-[0-9]{6}\.tar$")
+    size: Bytes
+    sha256: str
+    samples: tuple[SampleEntry, ...]
+    passed_over: tuple[str, ...] = ()  # messages about photos without a sample
+
+
+class Manifest(BaseModel, frozen=True, extra="ignore", strict=True):
+    """A dataset, finished or not."""
+
+    config: dict[str, Any]  # everything that determines the contents
+    shards: tuple[ShardEntry, ...]
+    complete: bool
+
+    @model_validator(mode="after")
+    def _even(self) -> Manifest:
+        if len({len(sample.holes) for _, sample in self.samples}) > 1:
+            raise ValueError("photos with different numbers of views")
+        return self
+
+    @property
+    def samples(self) -> list[tuple[ShardEntry, SampleEntry]]:
+        """All samples in order, each with its shard."""
+        return [(shard, sample) for shard in self.shards for sample in shard.samples]
+
+    @property
+    def views(self) -> int:
+        return sum(len(sample.holes) for _, sample in self.samples)
+
+    @property
+    def size(self) -> int:
+        return sum(shard.size for shard in self.shards)
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the manifest, which identifies the dataset."""
+        return digest_of(self._content())
+
+    def save(self, folder: Path) -> None:
+        content = self._content()
+        text = json.dumps(
+            content | {"sha256": digest_of(content)}, indent=1, sort_keys=True, allow_nan=False
+        )
+        with atomic_path(folder / NAME) as temporary:
+            temporary.write_text(text + "\n", encoding="utf-8")
+
+    def _content(self) -> dict[str, Any]:
+        counts = {"photos": len(self.samples), "views": self.views, "bytes": self.size}
+        return self.model_dump(mode="json") | {"format": FORMAT, "counts": counts}
+
+
+def open_in(location: str | os.PathLike[str], name: str) -> IO[bytes]:
+    """Open a seekable file in a folder or at an fsspec address (s3://bucket/dataset); InputError if opening fails."""
+    place = f"{str(location).rstrip('/')}/{name}"
+    package = "an address needs fsspec (pip install fsspec), and perhaps a package for its protocol"
+    with (
+        as_input_error(place, f"cannot be opened ({{reason}}): {package}", ImportError, ValueError),
+        as_input_error(place, "cannot be read: {reason}", OSError),
+        as_input_error(
+            place,
+            f"no such file: is {location} a dataset of `spackle dataset build`?",
+            FileNotFoundError,
+        ),
+    ):
+        if "://" not in place:
+            return open(os.path.join(location, name), "rb")
+        import fsspec
+
+        file: IO[bytes] = fsspec.open(place, "rb").open()
+        return file
+
+
+def load_manifest(location: str | os.PathLike[str]) -> Manifest:
+    """Read the manifest of a dataset; InputError for a missing or damaged file, or another format."""
+    where = f"{str(location).rstrip('/')}/{NAME}"
+    with (
+        open_in(location, NAME) as file,
+        as_input_error(where, "damaged, or no manifest of a dataset: {reason}"),
+    ):
+        text = file.read()
+        content = json.loads(text)
+        if content["format"] != FORMAT:
+            raise InputError(
+                f"{where}: format {content['format']!r} is unknown: this Spackle reads format {FORMAT}"
+            )
+        recorded = content.pop("sha256")
+        manifest = Manifest.model_validate_json(text)
+        if not digest_of(content) == manifest.digest == recorded:
+            raise ValueError("the digest is wrong")
+        return manifest
+
+
+def write_shard(
+    parts: Sequence[tuple[str, Path]], target: Path, passed_over: Sequence[str] = ()
+) -> ShardEntry:
+    """Write samples, given as (key, file), to a tar file, atomically.
+
+    InputError if a part is damaged or the disk is full.
+    """
+    samples: list[SampleEntry] = []
+    whole, offset = hashlib.sha256(), 0
+    with atomic_path(target) as temporary, open(temporary, "wb") as file:
+        for key, path in parts:
+            data = path.read_bytes()
+            try:
+                group = PhotoGroup.of(key, data, str(path))
+            except InputError as error:
+                raise InputError(
+                    f"{error}: delete this file, and the same command makes it again"
+                ) from error
+            entry = {
+                "key": key,
+                "photo": group.facts["photo"]["name"],
+                "offset": offset,
+                "size": len(data),
+            }
+            samples.append(
+                SampleEntry(**entry, sha256=hashlib.sha256(data).hexdigest(), holes=group.holes)
+            )
+            file.write(data)
+            whole.update(data)
+            offset += len(data)
+        file.write(END)
+        whole.update(END)
+    size, sha256 = offset + len(END), whole.hexdigest()
+    return ShardEntry(
+        file=target.name,
+        size=size,
+        sha256=sha256,
+        samples=tuple(samples),
+        passed_over=tuple(passed_over),
+    )
+
+
+class DatasetFiles(Dataset[PhotoGroup]):
+    """The encoded photos of a dataset as a torch `Dataset` with random access.
+
+    A DataLoader with `batch_size=None` can shuffle and prefetch photos; a DistributedSampler can divide photos between
+    ranks.
+    """
+
+    def __init__(self, location: str | os.PathLike[str]) -> None:
+        """Open a dataset in a folder or at a URL for fsspec; InputError for an unfinished dataset."""
+        self.location = location
+        self.manifest = load_manifest(location)
+        if not self.manifest.complete:
+            raise InputError(
+                f"{location}: not finished: run the same `spackle dataset build` again"
+            )
+        self.samples = self.manifest.samples
+
+    def __len__(self) -> int:
+        return len(self.samples)
+
+    def __getitem__(self, index: int) -> PhotoGroup:
+        """The files of a photo, checked by their digest; InputError for damaged files."""
+        shard, sample = self.samples[index]
+        where = f"{self.location}/{shard.file}"
+        with (
+            open_in(self.location, shard.file) as file,
+            as_input_error(where, "cannot be read: {reason}", OSError),
+        ):
+            file.seek(sample.offset)
+            data = file.read(sample.size)
+        if hashlib.sha256(data).hexdigest() != sample.sha256:
+            raise InputError(
+                f"{where}: sample {sample.key} ({sample.photo}) is damaged: see `spackle dataset verify`"
+            )
+        return PhotoGroup.of(sample.key, data, f"{where}: sample {sample.key}")

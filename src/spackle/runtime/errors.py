@@ -1,0 +1,119 @@
+"""`InputError`, the one exception for bad input, and helpers for its messages."""
+
+from __future__ import annotations
+
+import contextlib
+import difflib
+import functools
+import reprlib
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, ParamSpec, TypeVar
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+_SHORT = reprlib.Repr()
+_SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother = 2, 60, 60
+
+
+class InputError(ValueError):
+    """Bad input from a user: one line that names the file or value, what is wrong and what to do."""
+
+
+def reason_in_a_line(error: object) -> str:
+    """The text of a library's exception, at most 200 characters, for the middle of a message."""
+    if callable(getattr(error, "errors", None)):  # of pydantic
+        return first_problem(error)
+    text = (
+        getattr(error, "strerror", None) or error
+    )  # the system's text, without error number and file name
+    return one_line(" ".join(str(text).split()))[:200] or type(error).__name__
+
+
+def first_problem(error: Any) -> str:
+    """The key of the first value that pydantic refuses, and what the value must be."""
+    first = error.errors()[0]
+    if first["type"] == "extra_forbidden":
+        problem = "there is no such key"
+    else:
+        message = first["msg"].removeprefix("Value error, ")
+        quoted = first["type"] not in ("missing", "json_invalid", "too_long", "too_short")
+        problem = (
+            f"{message[0].lower()}{message[1:]}" + f", not {shortened(first['input'])}" * quoted
+        )
+    return ": ".join(filter(None, (".".join(str(name)[:60] for name in first["loc"]), problem)))
+
+
+@contextlib.contextmanager
+def as_input_error(what: object, problem: str, *errors: type[Exception]) -> Iterator[None]:
+    """Turn an exception that a library raises in the block into the InputError "{what}: {problem}".
+
+    Args:
+        what: subject of the message, usually the file that the block reads.
+        problem: what is wrong and what to do; "{reason}" stands for the library's message.
+        errors: exceptions that mean bad input; by default all, because untrusted bytes can raise any exception.
+    """
+    caught = errors or (Exception,)
+    try:
+        yield
+    except InputError:
+        raise
+    except caught as error:
+        raise InputError(
+            f"{what}: {problem.replace('{reason}', reason_in_a_line(error))}"
+        ) from error
+
+
+@contextlib.contextmanager
+def short_messages() -> Iterator[None]:
+    """Shorten an InputError's message to 300 characters, because it may quote a program's values."""
+    try:
+        yield
+    except InputError as error:
+        message = str(error)
+        if len(message) <= 300:
+            raise
+        raise InputError(f"{message[:148]} … {message[-148:]}") from error
+
+
+def renamed(**names: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Decorator: accept arguments by their names in the previous release, with a DeprecationWarning."""
+
+    def decorate(function: Callable[P, R]) -> Callable[P, R]:
+        @functools.wraps(function)
+        def called(*arguments: P.args, **named: P.kwargs) -> R:
+            for old, new in names.items():
+                if old in named:
+                    warnings.warn(
+                        f"{function.__name__}({old}=) is called {new}= now",
+                        DeprecationWarning,
+                        stacklevel=2,
+                    )
+                    named[new] = named.pop(old)
+            return function(*arguments, **named)
+
+        return called
+
+    return decorate
+
+
+def one_line(text: str) -> str:
+    """The text with control characters escaped, because file names can contain a terminal's escape codes."""
+    line = " ".join(text.splitlines())
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
+
+
+def shortened(value: object) -> str:
+    """A value from a file, shortened to 60 characters, for the middle of a message."""
+    return _SHORT.repr(value)[:60]
+
+
+def check_name(option: str, name: str, known: Iterable[str]) -> None:
+    """Raise an InputError for an unknown name; the message suggests the most similar known name."""
+    names = list(known)
+    if name in names:
+        return
+    near = difflib.get_close_matches(name.lower(), names, n=1, cutoff=0.5)
+    advice = f"did you mean {near[0]}? There" if near else "there"
+    raise InputError(f"{option} {name} is unknown: {advice} are {', '.join(names)}")

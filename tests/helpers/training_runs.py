@@ -1,0 +1,78 @@
+"""Training runs in separate processes, and their checkpoints."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import pytest
+import torch
+
+from helpers.command import Run
+from spackle.paper.training.checkpoint import Checkpoint, load_checkpoint
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread() -> Iterator[None]:
+    """One thread fixes the order of sums, so that results are equal bit for bit."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def state(folder: Path) -> Checkpoint:
+    checkpoint = load_checkpoint(folder)
+    assert checkpoint is not None
+    return checkpoint
+
+
+def losses_of(done: Run) -> list[float]:
+    return [
+        float(line.split("loss ")[1].split(",")[0])
+        for line in done.lines
+        if line.startswith("train: ")
+    ]
+
+
+def assert_same_weights(one: Path, other: Path, tolerance: float = 0.0) -> None:
+    a, b = state(one), state(other)
+    assert a.progress.step == b.progress.step
+    for mine, yours in ((a.network, b.network), (a.average, b.average)):
+        assert max(float((mine[name] - yours[name]).abs().max()) for name in yours) <= tolerance
+
+
+def started(arguments: Sequence[str], code: str, **environment: str) -> subprocess.Popen[str]:
+    """Start a command in a new process that first runs `code`."""
+    code = f"import sys\nsys.argv = {['spackle', *arguments]!r}\n{code}\nfrom spackle.cli import main\nmain()"
+    return subprocess.Popen(
+        [sys.executable, "-c", code],
+        env={**os.environ, "OMP_NUM_THREADS": "1", **environment},
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def killed_at(number: int) -> str:
+    """Code for `started` that kills a run in this step, counted from 0, before its weights change."""
+    return f"""
+import os
+from spackle.paper.training import train
+rate = train.learning_rate
+train.learning_rate = lambda step, optim: os.kill(os.getpid(), 9) if step == {number} else rate(step, optim)
+"""
+
+
+def run_two(arguments: Sequence[str], code: str = "") -> None:
+    """Run a command in two distributed processes."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    shared = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}
+    processes = [started(arguments, code, RANK=str(rank), **shared) for rank in range(2)]
+    said = [process.communicate()[1] for process in processes]
+    assert [process.returncode for process in processes] == [0, 0], said

@@ -1,0 +1,34 @@
+"""A worker function that takes no time; the photo's name chooses success, an error or a crash."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from typing import Any
+
+from spackle.runtime.errors import InputError
+
+
+def work(task: Any, tell: Any) -> None:
+    """Write a scene with one layer, the photo's bytes; other files contain their name."""
+    job, file = task
+    if file is not None:
+        (job.results / file).write_text(file)
+        return
+    tell({"stage": "base", "done": 1, "total": 2})
+    how = job.name.partition(".")[0]
+    if how == "slow":
+        time.sleep(600)
+    if how == "bad":
+        raise InputError(f"{job.name}: no depth\nat all")
+    if how == "bug":
+        raise KeyError("oh")
+    if how == "die":
+        os._exit(9)
+    tell({"line": "focal length <50> px"})
+    depth = "" if job.depth is None else (job.folder / job.depth).read_text()
+    layer = {"name": "base", "file": "base.splats", "count": 1}
+    page = {"name": job.name, "layers": [layer], "depth": depth, "options": job.options}
+    (job.results / "base.splats").write_bytes((job.folder / job.source).read_bytes())
+    (job.results / "page.json").write_text(json.dumps(page))

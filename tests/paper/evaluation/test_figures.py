@@ -1,0 +1,90 @@
+"""`spackle figures` from an evaluation's pictures, and the LaTeX of tables and figures."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.command import names_in, refuses, run
+from helpers.evaluation_data import write_boxes
+from helpers.sharp_weights import MICRO, write_tiny
+from PIL import Image
+
+
+def check_latex(*files: Path) -> None:
+    """Braces and environments are closed, labels are unique, and all rows of a table have the same columns."""
+    text = "\n".join(file.read_text(encoding="utf-8") for file in files)
+    bare = re.sub(r"\\[\\{}%]", "", text)
+    depths = np.cumsum([(sign == "{") - (sign == "}") for sign in bare])
+    assert depths.min() >= 0
+    assert depths[-1] == 0
+    begun, ended = (sorted(re.findall(rf"\\{word}\{{(.*?)\}}", text)) for word in ("begin", "end"))
+    assert begun == ended
+    labels = re.findall(r"\\label\{(.*?)\}", text)
+    assert len(labels) == len(set(labels)) > 0
+    assert max(map(len, re.findall(r"\\caption\{(.*)\}", text))) < 500
+    for rows in re.findall(r"\\begin\{tabular\}\{(\w+)\}(.*?)\\end\{tabular\}", text, re.DOTALL):
+        lines = [
+            line
+            for line in rows[1].splitlines()
+            if line.endswith(r"\\") and "multicolumn" not in line
+        ]
+        assert {len(re.findall(r"(?<!\\)&", line)) for line in lines} == {len(rows[0]) - 1}
+
+
+def test_both_figures_and_all_tables_are_latex(tmp_path: Path) -> None:
+    data, large, near, bench = (tmp_path / name for name in ("data", "large", "near", "bench"))
+    write_boxes(data / "Ball_1", 0)
+    tiny, words = (
+        write_tiny(tmp_path / "sharp.safetensors", MICRO),
+        (data, "--dataset", "middlebury"),
+    )
+    sharp = ("--base", "sharp", "-c", tiny, "--precision", "fp32", "--metrics", "none")
+    choices = ("--methods", "base,paper,direct-ft", "--direct-ft", tiny, "--disparity", "0.6")
+    done = run("evaluate", *words, *sharp, *choices, "-o", large)
+    assert done.code == 0, done.err
+    assert (
+        run(
+            "evaluate",
+            *words,
+            "--base",
+            "rgbd",
+            "--protocol",
+            "near-view",
+            "--metrics",
+            "psnr",
+            "-o",
+            near,
+        ).code
+        == 0
+    )
+    assert (
+        run("bench", *words, "--base", "rgbd", "--runs", 1, "--disparity", "0.6", "-o", bench).code
+        == 0
+    )
+    done = run("figures", large, near, "-o", tmp_path / "figures")
+    assert done.code == 0, done.err
+    kinds = {f"{name}.{end}" for name in ("comparison", "direct_ft") for end in ("pdf", "png")}
+    assert names_in(tmp_path / "figures") == {*kinds, "figures.tex"}
+    assert (tmp_path / "figures" / "comparison.pdf").read_bytes().startswith(b"%PDF")
+    sizes = []
+    for name in ("comparison", "direct_ft"):
+        with Image.open(tmp_path / "figures" / f"{name}.png") as picture:
+            sizes.append(picture.size)
+    assert sizes[0][0] == pytest.approx(
+        sizes[1][0], rel=0.03
+    )  # three columns and five of one width
+    assert sizes[0][1] > sizes[1][1]
+    done = run("tables", large, near, bench, "-o", tmp_path / "tables")
+    assert done.code == 0, done.err
+    folders = large, near, tmp_path / "tables"
+    files = [
+        bench / "bench.tex",
+        *(folder / "tables.tex" for folder in folders),
+        tmp_path / "figures" / "figures.tex",
+    ]
+    check_latex(*files)  # one document can include all files
+    refuses(run("figures", near, "-o", tmp_path / "none"), "nothing to draw", "--disparity 0.6")
+    assert not (tmp_path / "none").exists()

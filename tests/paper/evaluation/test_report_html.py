@@ -1,0 +1,150 @@
+"""The report is a well-formed page without addresses, escapes names, contains all cells, and has reproducible bytes."""
+
+from __future__ import annotations
+
+import base64
+import importlib.util
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+from helpers import evaluation_data
+from helpers.command import refuses, run
+from PIL import Image
+
+from spackle.paper.evaluation.folder import image_file
+from spackle.paper.evaluation.report import make_report
+from spackle.paper.evaluation.rows import Run as Results
+from spackle.paper.evaluation.tables import make_tables
+
+pytest.importorskip("matplotlib")
+EVIL = "<script>alert('1')</script>&\"$x_{$"
+METHODS = ("base", "inpaint2d", "seeds", "spackle")
+
+
+class Page(HTMLParser):
+    """Parses a page; AssertionError unless end tags match start tags."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.words: list[tuple[tuple[str, ...], str]] = []  # the tags around a text, the text
+        self.feed(text)
+        self.close()
+        assert not self.open
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        self.open += [] if tag in ("br", "hr", "img", "input", "meta") else [tag]
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.words.append((tuple(self.open), data))
+
+    def named(self, name: str) -> list[dict[str, str | None]]:
+        return [attributes for tag, attributes in self.tags if tag == name]
+
+    def text(self, around: str) -> str:
+        return "".join(data for tags, data in self.words if around in tags)
+
+
+def results(near: bool) -> Results:
+    def numbers(method: str, scene: int) -> dict[str, float | None]:
+        before, rank = 0.05 + 0.01 * scene, METHODS.index(method)
+        found: dict[str, float | None] = {
+            "har_before": before,
+            "har": before if method == "base" else 0.0,
+        }
+        if near:
+            found |= {
+                "psnr": 20.0 + rank,
+                "psnr_hole": 8.0 + rank + 0.2 * scene,
+                "ssim_outside": None,
+            }
+            found |= {"ssim_hole": 0.3 + 0.1 * rank, "distance": 4.0 - rank}
+        return found
+
+    name = f"{EVIL}{{}}".replace("{$", "{{$")
+    return evaluation_data.results(
+        EVIL, near, lambda k: {m: numbers(m, k) for m in METHODS}, 11, name
+    )
+
+
+def test_a_page_is_well_formed_and_contains_everything(tmp_path: Path) -> None:
+    runs = results(near=True), results(near=False)
+    for index in range(len(runs[0].measured)):
+        for method in (*METHODS, "truth"):
+            file = image_file(tmp_path, index, runs[0].images[index], f".{method}.webp")
+            file.parent.mkdir(exist_ok=True)
+            Image.new("RGB", (48, 32)).save(file)
+    sources = [(one, tmp_path) for one in runs]
+    text = make_report(sources)
+    assert text == make_report(sources)
+    page, tables = Page(text), make_tables(runs)
+    plots = (str(image["src"]) for image in page.named("img") if image.get("class") == "plot")
+    drawings = [ElementTree.fromstring(base64.b64decode(plot.partition(",")[2])) for plot in plots]
+    assert len(drawings) == 3  # near views: PSNR, distance; large views: holes
+    sections = [part["id"] for part in page.named("section")]
+    assert sections == ["summary", "plots", "pictures", "tables", "setup"]
+    assert not re.search(r"://|@import|url\(|\*\*", text)
+    assert text.count("<script") == 1
+    assert "<b>damaged" not in text
+    assert f"{EVIL}9 worst" in page.text("h4")
+    (policy,) = (meta["content"] for meta in page.named("meta") if "http-equiv" in meta)
+    assert str(policy).startswith("default-src 'none'")
+    assert all(
+        str(attributes.get("src", "data:image/")).startswith("data:image/")
+        for _, attributes in page.tags
+    )
+    assert all(image["alt"] for image in page.named("img"))
+    written = [word for around, word in page.words if {"td", "th"} & set(around)]
+    rows = [(table, cells) for table in tables for body in table.bodies for cells in body]
+    cells = [cell.strip("*") for table, line in rows for cell in line[table.words - 1 :]]
+    assert all(written.count(cell) >= cells.count(cell) for cell in set(cells) - {""})
+    for table in tables:
+        assert table.caption in page.text("figcaption")
+        assert all(note in page.text("li") for note in table.notes)
+    assert page.text("strong")  # the best of a column
+
+
+def test_evaluate_and_tables_write_the_report(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, words = (
+        tmp_path / "out",
+        ("--dataset", "middlebury", "--base", "rgbd", "--protocol", "near-view"),
+    )
+    choices = (
+        "evaluate",
+        scenes,
+        *words,
+        "-o",
+        out,
+        "--methods",
+        "base,seeds",
+        "--metrics",
+        "psnr",
+        "--limit",
+        2,
+    )
+    assert run(*choices, "--html").code == 0
+    text = (out / "report.html").read_text(encoding="utf-8")
+    assert sum(image.get("class") != "plot" for image in Page(text).named("img")) == 2 * 3
+    assert str(tmp_path) not in text
+    assert run("tables", out, "-o", tmp_path / "again", "--html").code == 0
+    whole = (tmp_path / "again" / "report.html").read_text(encoding="utf-8")
+    assert whole.partition('id="tables"')[0] == text.partition('id="tables"')[0]
+    assert "Efficiency and Gaussian overhead" in Page(whole).text(
+        "figcaption"
+    )  # a table of the paper without our rows
+    find = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name: None if name == "matplotlib" else find(name)
+    )
+    for command in (choices, ("tables", out, "-o", tmp_path / "none")):
+        refuses(run(*command, "--html"), "spackle-nvs[eval]")
