@@ -15,9 +15,9 @@ from typing import NamedTuple
 
 import spackle
 from spackle.bases.open import BaseError
-from spackle.cli.clip import FILES as CLIP_FILES
-from spackle.cli.clip import clip_options, predict_clip
 from spackle.clips.files import is_clip
+from spackle.clips.predict import RESULT_FILES as CLIP_FILES
+from spackle.clips.predict import clip_options, predict_clip
 from spackle.core.photo import PHOTO_SUFFIXES
 from spackle.depth.depth_map import calibrations_beside, find_depth
 from spackle.depth.writers import check_depth_name

@@ -23,9 +23,9 @@ from spackle.runtime.progress import Reporter
 from spackle.video.frames import VideoOptions
 from spackle.views import choose_disparity
 
-FILES = ("video.mp4", "report.json")
+RESULT_FILES = ("video.mp4", "report.json")
 # Names of frames, by their number: a folder may hold a depth map for each frame, 000000.npy for the first.
-NAME = "{:06d}"
+FRAME_NAME = "{:06d}"
 
 
 def clip_options(scene: Options, photo: PhotoOptions, workers: int) -> Options:
@@ -49,7 +49,7 @@ def clip_options(scene: Options, photo: PhotoOptions, workers: int) -> Options:
             raise InputError(f"--{option}: not for a clip: leave the option out, see docs/clips.md")
     if depth is not None and not (isinstance(depth, Path) and depth.is_dir()):
         raise InputError(
-            f"--depth {depth}: a clip needs a folder of maps: {NAME.format(0)}.npy for the first frame"
+            f"--depth {depth}: a clip needs a folder of maps: {FRAME_NAME.format(0)}.npy for the first frame"
         )
     OpenCV("a clip, whose motion has to be followed,")
     if fill.fill == "auto":  # opens no inpainter
@@ -70,7 +70,10 @@ def predict_clip(
         InputError: the clip, a frame, a depth map or the folder cannot be used.
     """
     reporter, options = reporter.restarted(), pipeline.options
-    with results_folder(folder, FILES, alone=True), atomic_files(folder, FILES[-1]) as new:
+    with (
+        results_folder(folder, RESULT_FILES, alone=True),
+        atomic_files(folder, RESULT_FILES[-1]) as new,
+    ):
         with reporter.stage("read") as step:
             clip = read_clip(path, options.path.frames, step)
         completer = ClipCompleter(
@@ -91,10 +94,10 @@ def predict_clip(
             reporter.log(f"{path.name}: the {clip.hdr} colours are not converted and may look pale")
         base, frames = pipeline.base, list[dict[str, float]]()
         first: tuple[Photo, BasePrediction, ResolvedBase] | None = None
-        with reporter.stage("frames") as step, ClipWriter(new / FILES[0], clip) as writer:
+        with reporter.stage("frames") as step, ClipWriter(new / RESULT_FILES[0], clip) as writer:
             pictures = clip_frames(clip)
             for index in range(len(clip)):
-                photo = Photo(next(pictures), *focal, path / NAME.format(index))
+                photo = Photo(next(pictures), *focal, path / FRAME_NAME.format(index))
                 check_shape(photo.width, photo.height, photo.path)
                 prediction, choice = base.predict(photo, log=reporter.log)
                 if first is None:  # its base, disparity and focal length hold for all frames
@@ -148,8 +151,8 @@ def predict_clip(
             }
             | {"worst_after": max(frame["after"] for frame in frames)},
         }
-        report["files"] = file_records(new, [new / FILES[0]])
-        write_json(report, new / FILES[-1])
+        report["files"] = file_records(new, [new / RESULT_FILES[0]])
+        write_json(report, new / RESULT_FILES[-1])
     holes = report["hole_area_ratio"]
     reporter.log(
         f"{path.name}: {len(clip)} frames, holes {holes['before']:.2%} -> {holes['after']:.3%}, "
