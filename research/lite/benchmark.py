@@ -31,7 +31,7 @@ from torch.nn.functional import interpolate
 from spackle.bases.lite import LiteBase
 from spackle.core.photo import PHOTO_SUFFIXES, load_photo
 from spackle.formats import save_png
-from spackle.formats.png import sheet
+from spackle.formats.png import contact_sheet
 from spackle.paper.evaluation.datasets.stereo import pair_of_2014
 from spackle.paper.training.recipe import RgbdFolder
 from spackle.paper.training.sources import find_files
@@ -152,7 +152,7 @@ def main() -> None:
         print(f"\n{standing(base, arguments.standing)}", flush=True)
     print(f"\n640×480: {seconds(base):.3f} s on {torch.get_num_threads()} threads")
     if arguments.pictures:
-        save_png(sheet(rows, 320), arguments.pictures)
+        save_png(contact_sheet(rows, 320), arguments.pictures)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from weights import first_network, freeze, save_networks
 
 from spackle.bases.lite import LiteBase, LiteNet
-from spackle.formats.png import sheet
+from spackle.formats.png import contact_sheet
 from spackle.paper.training.residual import CACHE, PICTURED
 from spackle.paper.training.train import Task, rank, wait_for_ranks
 from spackle.runtime.device import pick_dtype
@@ -172,7 +172,7 @@ class LiteTask(Task):
                     colored(true, *ends(true[frame.valid]), frame.valid),
                 ]
             )
-        return sheet(rows, PICTURE_SIDE)
+        return contact_sheet(rows, PICTURE_SIDE)
 
     def export(self, network: nn.Module, path: Path) -> None:
         """Write the weights in eight bits, for `spackle predict --base lite`."""

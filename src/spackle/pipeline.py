@@ -27,7 +27,7 @@ from spackle.scene import Scene
 from spackle.scene_fill.fill import FillContext, fill_scene, fill_view
 from spackle.scene_fill.texture import Texture, exemplar_texture, painted_texture
 from spackle.views import PathOptions, PlannedViews, choose_disparity, plan_views
-from spackle.weights import installed
+from spackle.weights import installed_weights
 
 Fill = Literal["auto", "network", "exemplar", "lama", "none"]  # source of the texture in holes
 Mode = Literal["scene", "view"]  # one set of aux Gaussians for all views, or one set for each view
@@ -144,7 +144,7 @@ class Pipeline:
                     context, [views.cameras[k] for k in chosen], self.given_views is not None, step
                 )
                 aux = filled.aux
-                if views.maker.plain:
+                if views.maker.is_plain:
                     pictures = {chosen[k]: picture for k, picture in filled.pictures.items()}
             else:
                 by_view = tuple(_fill_each(context, views.cameras, step))
@@ -255,7 +255,7 @@ def resolved(fill: Fill) -> Fill:
     """Replace "auto" by "lama" if LaMa's weights have been downloaded, else by "exemplar"."""
     if fill != "auto":
         return fill
-    return "lama" if installed("lama") else "exemplar"
+    return "lama" if installed_weights("lama") else "exemplar"
 
 
 def open_texture(fill: Fill) -> Texture | None:

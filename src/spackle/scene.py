@@ -19,7 +19,7 @@ from spackle.core.gaussians import Gaussians
 from spackle.core.photo import focal_length
 from spackle.core.trajectories import OVERSCAN, DepthRange, KeyframePath, TrajectoryKind
 from spackle.formats.html import PageScene, page_scene, single_html
-from spackle.formats.scene_files import Encoder, SceneFile, at_origin, encoder_of, load_scene
+from spackle.formats.scene_files import Encoder, SceneFile, encoder_for, is_at_origin, load_scene
 from spackle.render import Renderer, get_renderer
 from spackle.render.protocol import Rendering
 from spackle.residual.features import hole_mask
@@ -73,7 +73,7 @@ class Scene:
             given = Camera.from_focal(focal, width, height)
             pose = given.world_to_camera if camera is None else camera.world_to_camera
             camera = dataclasses.replace(given, world_to_camera=pose)
-        if not at_origin(camera):
+        if not is_at_origin(camera):
             gaussians = gaussians.transform(camera.world_to_camera)
             camera = dataclasses.replace(camera, world_to_camera=torch.eye(4))
         count = len(gaussians) if file.base_count is None else file.base_count
@@ -172,7 +172,7 @@ class Scene:
     def _encoded(self, name: Path) -> bytes:
         page: Encoder = lambda file: single_html(self.page(file.path.stem))  # noqa: E731
         file = SceneFile(name, self.gaussians, self.camera, len(self.base), self.disparity)
-        return encoder_of(name, {".html": page})(file)
+        return encoder_for(name, {".html": page})(file)
 
     def show(self, height: int = 480) -> InlinePage:
         """A viewer with the scene, `height` pixels high, which a notebook displays as the value of a cell."""
@@ -228,7 +228,15 @@ class Scene:
             shown = file if named else Path(file.name)
             check_video(shown, fps, loop)
             video = VideoOptions(
-                None, fps, loop, pixels, fit, show, stereo, ipd, convergence, compare
+                fps=fps,
+                loop=loop,
+                size=pixels,
+                fit=fit,
+                show=show,
+                stereo=stereo,
+                ipd=ipd,
+                convergence=convergence,
+                compare=compare,
             ).for_file(file)
             path = PathOptions(trajectory, disparity, None, None, frames, seconds, video, overscan)
             path.check()

@@ -65,7 +65,7 @@ class PathOptions:
                 raise InputError(
                     f"--seconds {self.seconds:g}: --frames {self.frames} sets the length: leave one out"
                 )
-            if not 1 <= self.seconds * self.video.rate <= MAX_FRAMES:
+            if not 1 <= self.seconds * self.video.frames_per_second <= MAX_FRAMES:
                 raise InputError(
                     f"--seconds must give 1 to {MAX_FRAMES} frames, got {self.seconds:g}"
                 )
@@ -111,16 +111,16 @@ class PathOptions:
             PathError: the keyframes give no usable path.
             ValueError: the scene allows no such path.
         """
-        given = self.frames or (self.seconds and round(self.seconds * self.video.rate))
+        given = self.frames or (self.seconds and round(self.seconds * self.video.frames_per_second))
         if keyframes is None:
-            count = given or max(1, round(SECONDS * self.video.rate))
+            count = given or max(1, round(SECONDS * self.video.frames_per_second))
             reach, depths = (
                 self.reach(USUAL_DISPARITY if disparity is None else disparity),
                 DepthRange.of(gaussians),
             )
             path = trajectory(self.trajectory, camera.even(), reach, depths, count, looped=True)
             return [view.zoomed(1 + self.overscan) for view in path]
-        count = given or keyframes.frame_count(self.video.rate)
+        count = given or keyframes.frame_count(self.video.frames_per_second)
         if count > MAX_FRAMES:
             raise PathError(
                 f"{keyframes.seconds:g} s take {count} frames (at most {MAX_FRAMES}): give --frames"

@@ -19,7 +19,7 @@ from torch import Tensor
 import spackle
 from spackle.core.camera import Camera
 from spackle.render import CpuRenderer
-from spackle.video.frames import GAP, Fit, Stereo, cover
+from spackle.video.frames import COMPARE_GAP_PX, Fit, Stereo, crop_camera_to_size
 
 CPU = CpuRenderer()
 
@@ -116,10 +116,10 @@ def test_compare_puts_the_base_beside_the_scene(tmp_path: Path, scene: Path) -> 
     )
     assert len(both) == len(whole) == 2
     for pair, right in zip(both, whole, strict=True):
-        assert pair.size == (2 * WIDTH + GAP, HEIGHT)
+        assert pair.size == (2 * WIDTH + COMPARE_GAP_PX, HEIGHT)
         sides = [
             pair.crop(box).convert("RGB")
-            for box in ((0, 0, WIDTH, HEIGHT), (WIDTH + GAP, 0, *pair.size))
+            for box in ((0, 0, WIDTH, HEIGHT), (WIDTH + COMPARE_GAP_PX, 0, *pair.size))
         ]
         open_, filled, expected = (
             np.asarray(image.convert("RGB"), float) for image in (*sides, right)
@@ -241,7 +241,7 @@ def test_predict_completes_what_both_eyes_see(tmp_path: Path, pair: tuple[Path, 
             float((CPU.render(part, eye).alpha < 0.95).float().mean()) for part in (base, merged)
         )
         assert rest < 0.01 < 0.1 < holes
-        assert psnr(CPU.render(merged, cover(eye, 32, 24)).rgb, picture) > 25
+        assert psnr(CPU.render(merged, crop_camera_to_size(eye, 32, 24)).rgb, picture) > 25
 
 
 def test_predict_follows_a_path_and_measures_its_keyframes(

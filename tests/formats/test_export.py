@@ -24,8 +24,8 @@ from spackle.core.color import linear_to_srgb
 from spackle.core.gaussians import Gaussians, quat_to_matrix
 from spackle.formats import load_ply, save_ply
 from spackle.formats.compressed_ply import morton_order
-from spackle.formats.scene_files import SCENE_ENCODERS, SceneFile, encoder_of, load_scene
-from spackle.formats.spz import LIMIT
+from spackle.formats.scene_files import SCENE_ENCODERS, SceneFile, encoder_for, load_scene
+from spackle.formats.spz import MAX_BYTES_PER_GAUSSIAN
 from spackle.render import CpuRenderer
 from spackle.runtime.errors import InputError
 from spackle.runtime.progress import Reporter
@@ -48,7 +48,7 @@ def encode(
     kind: str, gaussians: Gaussians, camera: Camera | None = None, base_count: int | None = None
 ) -> bytes:
     path = Path(f"a.{kind}")
-    return encoder_of(path)(SceneFile(path, gaussians, camera, base_count, 0.2))
+    return encoder_for(path)(SceneFile(path, gaussians, camera, base_count, 0.2))
 
 
 def read(kind: str, data: bytes) -> Gaussians:
@@ -252,7 +252,7 @@ def test_spz_shows_what_is_near_and_a_far_sky(far: float) -> None:
 
 def test_spz_is_an_eighth_of_the_ply() -> None:
     base = slanted_plane(1.5, 6, 0).base()
-    assert len(encode("spz", base)) <= LIMIT * len(base) == 68 * len(base) / 8
+    assert len(encode("spz", base)) <= MAX_BYTES_PER_GAUSSIAN * len(base) == 68 * len(base) / 8
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from helpers.scenes import box_before_wall
 from spackle.core.color import linear_to_srgb
 from spackle.core.gaussians import Gaussians
 from spackle.core.gaussians import quat_to_matrix as matrices
-from spackle.formats.html import BYTES, encode_layer, page_scene, single_html
+from spackle.formats.html import BYTES_PER_GAUSSIAN, encode_layer, page_scene, single_html
 
 EVIL = "</script><b>&\"'\ud800"
 BOX = box_before_wall(width=64, height=48, focal=53)
@@ -26,8 +26,8 @@ BOX = box_before_wall(width=64, height=48, focal=53)
 
 def decoded(data: bytes, low: float, step: float) -> Gaussians:
     """Decode a layer in plain Python, by the docstring of `encode_layer`."""
-    count = len(data) // BYTES
-    planes = np.frombuffer(data, np.uint8).reshape(BYTES, count).astype(np.int64)
+    count = len(data) // BYTES_PER_GAUSSIAN
+    planes = np.frombuffer(data, np.uint8).reshape(BYTES_PER_GAUSSIAN, count).astype(np.int64)
     rows = []
     for i in range(count):
         b = [int(value) for value in planes[:, i]]

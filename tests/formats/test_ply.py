@@ -19,7 +19,7 @@ from spackle.core.camera import Camera
 from spackle.core.color import linear_to_srgb
 from spackle.core.gaussians import Gaussians
 from spackle.formats import PlyFile, load_ply, save_ply
-from spackle.formats.ply import BLOCK
+from spackle.formats.ply import ROWS_PER_BLOCK
 from spackle.runtime.errors import InputError
 
 PROPERTIES = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
@@ -87,9 +87,9 @@ def test_extremes_stay_finite(tmp_path: Path) -> None:
     assert torch.isfinite(found.scales).all()
 
 
-@pytest.mark.parametrize("count", [1, BLOCK, BLOCK + 777])
+@pytest.mark.parametrize("count", [1, ROWS_PER_BLOCK, ROWS_PER_BLOCK + 777])
 def test_first_rows_depend_on_the_first_gaussians_alone(tmp_path: Path, count: int) -> None:
-    base, more = random_gaussians(count), random_gaussians(3 * BLOCK + 1, seed=1)
+    base, more = random_gaussians(count), random_gaussians(3 * ROWS_PER_BLOCK + 1, seed=1)
     save_ply(base, tmp_path / "base.ply")
     threads = torch.get_num_threads()
     try:
@@ -191,7 +191,7 @@ def test_a_bad_file_is_refused_with_the_reason(tmp_path: Path, content: bytes, s
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
-    path, broken = tmp_path / "a.ply", random_gaussians(2 * BLOCK)
+    path, broken = tmp_path / "a.ply", random_gaussians(2 * ROWS_PER_BLOCK)
     broken.means[-1, 0] = math.nan
     save_ply(random_gaussians(3), path)
     before = path.read_bytes()

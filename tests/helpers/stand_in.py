@@ -19,9 +19,9 @@ from spackle.bases.lite import LiteNet
 from spackle.core.photo import Photo, resize_photo
 from spackle.depth.depth_map import DepthMap
 from spackle.runtime.progress import Progress
-from spackle.weights import PUBLISHED, PublishedWeights
+from spackle.weights import PUBLISHED_WEIGHTS, PublishedWeights
 
-SHARP_FILE = PUBLISHED["sharp"].file
+SHARP_FILE = PUBLISHED_WEIGHTS["sharp"].file
 QUICK = ("--no-render", "--residual", "none")
 
 
@@ -51,8 +51,8 @@ def publish(
 ) -> PublishedWeights:
     """Replace the published weights of that name by other bytes until the test ends."""
     facts = {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest(), **changes}
-    patch.setitem(PUBLISHED, name, dataclasses.replace(PUBLISHED[name], **facts))  # type: ignore[arg-type]
-    return PUBLISHED[name]
+    patch.setitem(PUBLISHED_WEIGHTS, name, dataclasses.replace(PUBLISHED_WEIGHTS[name], **facts))  # type: ignore[arg-type]
+    return PUBLISHED_WEIGHTS[name]
 
 
 def write_model(folder: Path) -> Path:

@@ -7,10 +7,12 @@ import torch
 from helpers.scenes import psnr
 
 from spackle.inpaint import INPAINTERS, InpainterOptions, get_inpainter, inpainter_class
+from spackle.inpaint.plain import ExemplarInpainter
+from spackle.runtime.errors import InputError
 
 
 @pytest.mark.parametrize(
-    "name", sorted(name for name in INPAINTERS if not inpainter_class(name).network)
+    "name", sorted(name for name in INPAINTERS if not inpainter_class(name).uses_network)
 )
 def test_only_holes_change_and_results_repeat(name: str) -> None:
     rgb = torch.rand(2, 24, 33, 3, generator=torch.Generator().manual_seed(0)) / 2 + 0.25
@@ -45,3 +47,23 @@ def test_exemplar_extends_a_pattern_also_without_depth() -> None:
     assert torch.equal(painted[0][~hole], truth[~hole])
     assert torch.equal(painted[1:], rgb[1:])
     assert torch.equal(painter.paint(rgb[:1], holes[:1], 0 * depths[:1]), painted[:1])
+
+
+def test_an_inpainter_of_another_package_is_named_by_its_module() -> None:
+    plugin = get_inpainter("spackle.inpaint.plain:ExemplarInpainter", InpainterOptions())
+    assert isinstance(plugin, ExemplarInpainter)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("exemplary", "did you mean exemplar"),
+        ("no_such_package:Painter", "cannot import no_such_package"),
+        ("spackle.inpaint.plain:Painter", "spackle.inpaint.plain has no Painter"),
+        (":Painter", "package.module:Name"),
+        ("spackle.inpaint.plain:", "package.module:Name"),
+    ],
+)
+def test_an_unknown_inpainter_is_refused(name: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        get_inpainter(name, InpainterOptions())

@@ -24,7 +24,7 @@ from spackle.inpaint.lama import (
     padded,
 )
 from spackle.runtime.errors import InputError
-from spackle.weights import PUBLISHED
+from spackle.weights import PUBLISHED_WEIGHTS
 
 Weights = dict[str, Tensor]
 GOLDEN = dict(np.load(DATA / "lama_golden.npz"))  # of the original code
@@ -142,7 +142,7 @@ def views(
 
 
 def test_only_holes_change_and_the_network_gets_crops(file: Path) -> None:
-    inpainter = LamaInpainter(InpainterOptions(file, device="cpu"))
+    inpainter = LamaInpainter(InpainterOptions(weights=file, device="cpu"))
     seen: list[tuple[int, ...]] = []
     inpainter._network.register_forward_pre_hook(
         lambda network, inputs: seen.append(tuple(inputs[1].shape[2:]))
@@ -162,7 +162,7 @@ def test_only_holes_change_and_the_network_gets_crops(file: Path) -> None:
 
 
 def test_large_crops_are_reduced_and_no_hole_is_lost(file: Path) -> None:
-    inpainter = LamaInpainter(InpainterOptions(file, 128, "cpu"))
+    inpainter = LamaInpainter(InpainterOptions(weights=file, side=128, device="cpu"))
     given: list[Tensor] = []
     inpainter._network.register_forward_pre_hook(lambda network, inputs: given.extend(inputs))
     rgb, hole, depth = views(200, 300, (70, 100, 71, 200))
@@ -190,13 +190,13 @@ def test_errors_are_one_line(file: Path, tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setenv("SPACKLE_WEIGHTS", str(tmp_path))
     with pytest.raises(InputError, match="spackle weights get lama"):
         get_inpainter("lama", InpainterOptions())
-    (tmp_path / PUBLISHED["lama"].file).write_bytes(file.read_bytes())
+    (tmp_path / PUBLISHED_WEIGHTS["lama"].file).write_bytes(file.read_bytes())
     inpainter = get_inpainter("lama", InpainterOptions(device="cpu"))
-    assert list(inpainter.files.values()) == [tmp_path / "big-lama.pt"]
-    with pytest.raises(InputError, match="--inpainter-side must be between 128 and 1536, got 8"):
-        get_inpainter("lama", InpainterOptions(file, 8))
+    assert list(inpainter.weight_files.values()) == [tmp_path / "big-lama.pt"]
+    with pytest.raises(InputError, match="`inpainter_side` must be between 128 and 1536, got 8"):
+        get_inpainter("lama", InpainterOptions(weights=file, side=8))
     with pytest.raises(InputError, match="not a plain file"):
-        get_inpainter("lama", InpainterOptions(tmp_path))
+        get_inpainter("lama", InpainterOptions(weights=tmp_path))
     picture = views(40, 40, (0, 0, 9, 9))
 
     def short(self: LamaNetwork, rgb: Tensor, hole: Tensor) -> Tensor:

@@ -77,7 +77,7 @@ def weights(package: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def inpainter(weights: Path) -> PropainterInpainter:
-    return PropainterInpainter(InpainterOptions(weights, device="cpu"))
+    return PropainterInpainter(InpainterOptions(weights=weights, device="cpu"))
 
 
 def views_of(count: int, height: int, width: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -116,7 +116,7 @@ def test_the_networks_paint_only_holes(inpainter: PropainterInpainter) -> None:
     assert 0 <= float(painted[hole].min()) <= float(painted[hole].max()) <= 1
     assert float((painted - rgb)[hole].abs().mean()) > 0.05
     assert re.fullmatch(r"1, pytorchcv [\d.]+, long side 640", inpainter.version)
-    assert inpainter.files.keys() == set(NETWORKS)
+    assert inpainter.weight_files.keys() == set(NETWORKS)
     assert "S-Lab" in inpainter.notice
 
 

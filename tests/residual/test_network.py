@@ -28,7 +28,7 @@ from spackle.residual.network import (
     predict_deltas,
 )
 from spackle.runtime.errors import InputError
-from spackle.weights.checkpoints import channels_last, read_tensors
+from spackle.weights.checkpoints import read_tensors, to_channels_last
 
 ARCHITECTURES = ("unet", "sharp-decoder")
 
@@ -113,7 +113,7 @@ def test_a_loaded_network_equals_the_saved_one(name: str, tmp_path: Path) -> Non
         random_network(name=name).half().float().eval(),
         tmp_path / "weights.safetensors",
     )
-    channels_last(network)  # the memory format of loaded networks, so that sums have one order
+    to_channels_last(network)  # the memory format of loaded networks, so that sums have one order
     tensors = {key: value.half().contiguous() for key, value in network.state_dict().items()}
     save_file(tensors, path, {NOTE: name})
     loaded = load_residual(path)

@@ -33,7 +33,7 @@ from spackle.core.trajectories import (
     TrajectoryKind,
     trajectory,
 )
-from spackle.formats.html import PageScene, page_file, page_scene, single_html
+from spackle.formats.html import PageScene, page_scene, read_page_file, single_html
 from spackle.pipeline import complete
 from spackle.render import CpuRenderer
 from spackle.scene import Scene
@@ -76,14 +76,14 @@ def test_the_built_page_belongs_to_its_sources() -> None:
     digest = hashlib.sha256()
     for path in sorted(sources, key=lambda path: path.relative_to(WEB).as_posix()):
         digest.update(f"{path.relative_to(WEB).as_posix()}\0".encode() + path.read_bytes() + b"\0")
-    assert digest.hexdigest() in page_file("viewer.js")[:200].decode(), "run `make viewer`"
+    assert digest.hexdigest() in read_page_file("viewer.js")[:200].decode(), "run `make viewer`"
     assert "http" not in (WEB / "package-lock.json").read_text(encoding="utf-8")
     wanted = json.loads((WEB / "package.json").read_text(encoding="utf-8"))["devDependencies"]
     assert all(re.fullmatch(r"\d+\.\d+\.\d+", version) for version in wanted.values())
     for package, name in itertools.product(
         ("three", "@sparkjsdev/spark", "fflate"), ("licenses.txt", "viewer.js")
     ):
-        assert f"\n{package} " in page_file(name)[:8000].decode()
+        assert f"\n{package} " in read_page_file(name)[:8000].decode()
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ from helpers.stand_in import SHARP_FILE, publish
 
 from spackle.runtime.errors import InputError
 from spackle.runtime.progress import Progress
-from spackle.weights import PUBLISHED, installed, weights_folder
+from spackle.weights import PUBLISHED_WEIGHTS, installed_weights, weights_folder
 from spackle.weights import download as module
 from spackle.weights.download import download
 
@@ -166,16 +166,16 @@ def test_other_addresses_and_passwords_are_refused(target: Path, url: str) -> No
 
 
 def test_the_entries_of_published_weights(monkeypatch: pytest.MonkeyPatch) -> None:
-    for entry in PUBLISHED.values():
+    for entry in PUBLISHED_WEIGHTS.values():
         assert re.fullmatch("[0-9a-f]{64}", entry.sha256)
         assert re.fullmatch(f"https://.*{re.escape(Path(entry.file).name)}", entry.url)
         assert all((entry.purpose, entry.licence, entry.notice, entry.option))
         assert entry.address == entry.url
     monkeypatch.setenv("HF_ENDPOINT", "https://mirror.example/hub/")
-    assert PUBLISHED["depth"].address.startswith(
+    assert PUBLISHED_WEIGHTS["depth"].address.startswith(
         "https://mirror.example/hub/Ruicheng/moge-2-vits-normal/resolve/"
     )
-    assert PUBLISHED["sharp"].address == PUBLISHED["sharp"].url
+    assert PUBLISHED_WEIGHTS["sharp"].address == PUBLISHED_WEIGHTS["sharp"].url
 
 
 def test_the_folder_of_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -215,9 +215,9 @@ def gets(*arguments: object) -> Run:
 
 def test_get_shows_the_terms_once_and_does_nothing_twice(site: Site, weights: Path) -> None:
     file = weights / SHARP_FILE
-    assert installed("sharp") is None
+    assert installed_weights("sharp") is None
     first = gets("sharp", "--url", site.url)
-    assert installed("sharp") == file
+    assert installed_weights("sharp") == file
     assert os.listdir(weights) == [SHARP_FILE]
     assert first.err.count("research only") == first.err.count("LICENSE_MODEL") == 1
     assert all(part in first.lines[-1] for part in ("1.0 MB", SHA256, str(file)))

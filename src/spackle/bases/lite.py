@@ -23,7 +23,7 @@ from spackle.depth.depth_map import NEAREST_M, DepthMap, nearest
 from spackle.runtime.device import own_arithmetic, pick_device
 from spackle.runtime.errors import InputError
 from spackle.runtime.progress import Progress
-from spackle.weights.checkpoints import channels_last, load_strict, read_tensors
+from spackle.weights.checkpoints import load_strict, read_tensors, to_channels_last
 
 STRIDE = 32  # both sides of a network's input are multiples of this number
 Size = Literal["lite0", "lite2"]
@@ -205,7 +205,7 @@ def load_networks(path: str | os.PathLike[str]) -> list[LiteNet]:
 def _network(tensors: dict[str, Tensor], path: str | os.PathLike[str]) -> LiteNet:
     for size, widths in WIDTHS.items():
         if LAST in tensors and tensors[LAST].shape == (widths[-1],):
-            return load_strict(LiteNet(size), tensors, path, ADVICE, prepare=channels_last)
+            return load_strict(LiteNet(size), tensors, path, ADVICE, prepare=to_channels_last)
     raise InputError(
         f"{path}: another network's weights: {LAST} is missing or of another length: {ADVICE}"
     )

@@ -13,7 +13,7 @@ from spackle.bases.sharp.base import check_windows
 from spackle.depth.depth_map import DEPTH_KINDS, RELATIVE, DepthKind, DepthMap
 from spackle.runtime.device import PRECISIONS, Precision
 from spackle.runtime.errors import InputError, check_name
-from spackle.weights import PUBLISHED, installed
+from spackle.weights import PUBLISHED_WEIGHTS, installed_weights
 
 AUTO, RGBD = "auto", "rgbd"
 HF = "hf:"  # before a folder, or a Hugging Face model's owner/name
@@ -40,7 +40,7 @@ Depth = (
 
 
 def _download(name: str) -> str:
-    return f"`spackle weights get {name}` ({decimal(PUBLISHED[name].bytes)}, {PUBLISHED[name].licence})"
+    return f"`spackle weights get {name}` ({decimal(PUBLISHED_WEIGHTS[name].bytes)}, {PUBLISHED_WEIGHTS[name].licence})"
 
 
 ROUGH = f"rough geometry; give --depth FILE for better geometry, or run {_download('depth')}, or {_download('sharp')}"
@@ -54,7 +54,7 @@ def _weights_here(name: str) -> Path | None:
     """The file with a base's weights on this machine; None if it is missing."""
     if name == "lite":
         return lite.SHIPPED if lite.SHIPPED.is_file() else None
-    return installed({"sharp": "sharp", "moge": "depth"}[name]) if name in MISSING else None
+    return installed_weights({"sharp": "sharp", "moge": "depth"}[name]) if name in MISSING else None
 
 
 @dataclasses.dataclass(frozen=True)

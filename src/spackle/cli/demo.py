@@ -13,7 +13,7 @@ from spackle.bases import BasePrediction
 from spackle.bases.settings import BaseSettings
 from spackle.core.photo import Photo
 from spackle.formats import save_ply, save_png
-from spackle.formats.png import sheet
+from spackle.formats.png import contact_sheet
 from spackle.paper.evaluation.datasets.stereo import StereoPair, load_motorcycle
 from spackle.paper.training.losses import hole_psnr
 from spackle.pipeline import Options, Pipeline, complete
@@ -65,7 +65,10 @@ def run_demo(output: Path, reporter: Reporter) -> None:
                 for parts in ([scene.base], scene.of_view(0))
             ]
         pictures = [[view.rgb for view in row] for row in drawn]
-        save_png(sheet(pictures, max(widest[0].width, widest[0].height)), output / "comparison.png")
+        save_png(
+            contact_sheet(pictures, max(widest[0].width, widest[0].height)),
+            output / "comparison.png",
+        )
         before, after = (
             sum(hole_area_ratio(view.alpha) for view in row) / len(row) for row in drawn
         )

@@ -13,7 +13,7 @@ from spackle.core.camera import Camera
 from spackle.core.photo import load_photo
 from spackle.depth.depth_map import EXTREMES, SUFFIXES, load_depth
 from spackle.depth.in_photo.layouts import load_photo_depth
-from spackle.formats.scene_files import load_scene, scene_kind
+from spackle.formats.scene_files import load_scene, scene_suffix
 from spackle.runtime.files import check_file
 from spackle.runtime.progress import Reporter
 
@@ -23,7 +23,7 @@ Facts = dict[str, object]
 def show_info(path: Path, reporter: Reporter) -> None:
     """Describe a scene, photo, depth map or clip; InputError for other files."""
     check_file(path, "scene, photo, depth map or clip")
-    if scene_kind(path):
+    if scene_suffix(path):
         facts = scene_facts(path)
     else:
         facts = (
@@ -58,7 +58,7 @@ def scene_facts(path: Path) -> Facts:
         if base is None
         else f"{base:,} base, {count - base:,} aux"
     )
-    facts: Facts = {"kind": f"scene ({scene_kind(path)})", "Gaussians": f"{count:,} ({parts})"}
+    facts: Facts = {"kind": f"scene ({scene_suffix(path)})", "Gaussians": f"{count:,} ({parts})"}
     depths = scene.gaussians.means[:, 2].double().numpy()
     near, middle, far = np.quantile(depths, [EXTREMES[0], 0.5, EXTREMES[1]])
     facts["depth"] = (

@@ -233,7 +233,17 @@ def path_options(
                 f"{option} {value}: has no effect, because --path or --cameras sets the views"
             )
     pixels = None if size is None else parse_size(size)
-    video = VideoOptions(video_format, fps, loop, pixels, fit, show, stereo, ipd, convergence)
+    video = VideoOptions(
+        format=video_format,
+        fps=fps,
+        loop=loop,
+        size=pixels,
+        fit=fit,
+        show=show,
+        stereo=stereo,
+        ipd=ipd,
+        convergence=convergence,
+    )
     kind, zoom = trajectory or "rotate-forward", OVERSCAN if overscan is None else overscan
     return PathOptions(kind, disparity, cameras, path, frames, seconds, video, zoom)
 

@@ -39,7 +39,7 @@ from spackle.runtime.kernels import is_compiled
 from spackle.runtime.progress import BufferedReporter, Reporter, asked_to_stop
 from spackle.runtime.workers import parallel_map, threads_of_torch
 from spackle.video.frames import video_problem
-from spackle.weights import installed
+from spackle.weights import installed_weights
 
 
 @dataclasses.dataclass(frozen=True)
@@ -295,7 +295,7 @@ def _shared_digest(options: PredictOptions) -> str:
         "path file": path.path,
         "weights": fill.file,
     }
-    files |= {"LaMa": installed("lama") if fill.texture == "lama" else None, **base.files}
+    files |= {"LaMa": installed_weights("lama") if fill.texture == "lama" else None, **base.files}
     prints = {kind: fingerprint(file, kind) for kind, file in files.items() if file is not None}
     name = (
         base.named if base.folder is None else "hf"

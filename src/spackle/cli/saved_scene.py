@@ -17,15 +17,15 @@ from spackle.core.photo import DEFAULT_FOCAL_MM
 from spackle.core.trajectories import PathError
 from spackle.formats import save_png
 from spackle.formats.html import single_html
-from spackle.formats.scene_files import Encoder, SceneFile, encoder_of, load_scene
-from spackle.formats.spz import LARGEST, spz_grid
+from spackle.formats.scene_files import Encoder, SceneFile, encoder_for, load_scene
+from spackle.formats.spz import MAX_GRID_COORDINATE, spz_grid
 from spackle.render import get_renderer
 from spackle.residual import hole_area_ratio
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import results_folder, write_atomic
 from spackle.runtime.progress import Reporter
 from spackle.scene import Scene
-from spackle.video.encoding import FORMATS, save_video
+from spackle.video.encoding import VIDEO_FORMATS, save_video
 from spackle.video.frames import FrameMaker, video_problem
 from spackle.views import PathOptions
 
@@ -51,12 +51,12 @@ def render_scene(
     Raises:
         InputError: a file or option cannot be used.
     """
-    single = output.suffix.lower() in FORMATS
+    single = output.suffix.lower() in VIDEO_FORMATS
     if single:
         path = dataclasses.replace(path, video=path.video.for_file(output))
     elif (mimetypes.guess_type(output.name)[0] or "").startswith(("video/", "image/")):
         raise InputError(
-            f"{output}: not a kind of video that can be written: end the name with {', '.join(FORMATS)}"
+            f"{output}: not a kind of video that can be written: end the name with {', '.join(VIDEO_FORMATS)}"
         )
     path.check()
     new_lens = any(value is not None for value in lens.values())
@@ -96,7 +96,7 @@ def render_scene(
         maker = FrameMaker.of(path.video, base, cameras, scene)
     target = output if single else output / f"{scene.stem}{path.video.suffix}"
     names = [f"{index:04d}.png" for index in range(len(cameras))] if given and not single else []
-    problem = video_problem([maker.sized(camera) for camera in cameras])
+    problem = video_problem([maker.resized_camera(camera) for camera in cameras])
     if problem and not names:
         hint = "give a folder with -o for pictures only" if given else "give --size"
         raise InputError(f"{path.cameras or scene}: {problem}, so no video can be made: {hint}")
@@ -118,7 +118,7 @@ def render_scene(
             for _ in frames():
                 pass
         else:
-            save_video(frames(), target, path.video.rate, path.video.loop)
+            save_video(frames(), target, path.video.frames_per_second, path.video.loop)
     seconds, total = reporter.seconds["video"], len(loaded.gaussians)
     result = {
         "gaussians": total,
@@ -143,7 +143,7 @@ def export_scene(scene: Path, outputs: Sequence[Path], reporter: Reporter) -> No
     Raises:
         InputError: a scene or name cannot be used, or the scene is too large for a format.
     """
-    encoders = [encoder_of(output, PAGE) for output in outputs]
+    encoders = [encoder_for(output, PAGE) for output in outputs]
     with contextlib.ExitStack() as folders:
         for output in outputs:
             folders.enter_context(results_folder(output.parent, [output.name]))
@@ -174,7 +174,7 @@ def _report_file(scene: SceneFile, output: Path, seconds: float, reporter: Repor
     bits, far = spz_grid(scene.gaussians) if output.name.lower().endswith(".spz") else (0, 0)
     if far:
         reporter.log(
-            f"{output}: {far:,} Gaussians beyond {LARGEST / 2**bits:,.0f} m were moved nearer, which does not change "
+            f"{output}: {far:,} Gaussians beyond {MAX_GRID_COORDINATE / 2**bits:,.0f} m were moved nearer, which does not change "
             "the photo's view"
         )
     seconds = round(seconds, 3)

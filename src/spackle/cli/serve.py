@@ -19,7 +19,7 @@ from spackle.bases.open import open_base
 from spackle.bases.settings import AUTO, RGBD, BaseSettings
 from spackle.cli.saved_scene import page_name
 from spackle.core.photo import check_shape, load_photo
-from spackle.formats.scene_files import scene_kind
+from spackle.formats.scene_files import scene_suffix
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import check_file
 from spackle.runtime.progress import Reporter, asked_to_stop
@@ -71,7 +71,7 @@ def view(
         with listening(Path(folder), work, 1, RetentionLimits(), place, reporter) as (jobs, urls):
             if target is not None:
                 with jobs.place() as new:
-                    if scene_kind(target) is None:
+                    if scene_suffix(target) is None:
                         check_photo(target, name, new / PREVIEW)
                     depth = None if settings.depth is None else os.path.abspath(str(settings.depth))
                     options: dict[str, object] = {"base": settings.name, **lens, "files": []}
@@ -86,7 +86,7 @@ def _checked(
     """The name of a photo or scene on the page; InputError if the target, or its depth, cannot be read."""
     check_file(target, "photo or scene")
     settings.check()
-    if scene_kind(target):
+    if scene_suffix(target):
         if settings.depth is not None:
             raise InputError(
                 f"--depth {settings.depth}: {target.name} is a scene already: leave the option out"

@@ -78,10 +78,10 @@ def weights_list(as_json: JsonOption = False) -> None:
     from rich.filesize import decimal
 
     from spackle.runtime.progress import Reporter
-    from spackle.weights import PUBLISHED, weights_folder
+    from spackle.weights import PUBLISHED_WEIGHTS, weights_folder
 
     reporter, folder = Reporter(as_json=as_json), weights_folder()
-    for entry in PUBLISHED.values():
+    for entry in PUBLISHED_WEIGHTS.values():
         file, state = folder / entry.file, "not here"
         if os.path.isfile(file):
             size = os.path.getsize(file)

@@ -20,7 +20,7 @@ from spackle.runtime.files import check_file
 MAX_BYTES = 64 << 20
 MAX_FRAMES = 10_000  # cameras or keyframes
 MAX_SIZE = 16_384
-LARGEST = 1e9  # largest number in a camera: float32 can represent its square
+MAX_CAMERA_NUMBER = 1e9  # largest number in a camera: float32 can represent its square
 MAX_NUMBER = 1e6  # largest number in a path: a thousand kilometres, or eleven days
 RIGID_TOLERANCE = 1e-3
 ZERO_TOLERANCE = 1e-6
@@ -82,7 +82,7 @@ def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
     ]
 
 
-def camera_of(facts: Mapping[str, Any], where: str) -> Camera:
+def camera_from_json(facts: Mapping[str, Any], where: str) -> Camera:
     """A camera from its entry in a JSON file; InputError, beginning with `where`, if the camera is impossible."""
     with as_input_error(where, "{reason}", ValidationError):
         frame = _Frame.model_validate(facts)
@@ -115,13 +115,13 @@ def checked_camera(
     if not (1 <= width <= MAX_SIZE and 1 <= height <= MAX_SIZE):
         raise InputError(f"{where}: width and height must be whole numbers from 1 to {MAX_SIZE}")
     if not all(
-        bool((matrix.abs() <= LARGEST).all()) for matrix in (K, world_to_camera)
+        bool((matrix.abs() <= MAX_CAMERA_NUMBER).all()) for matrix in (K, world_to_camera)
     ):  # NaN fails, too
         raise InputError(
-            f"{where}: numbers in K and world_to_camera must be finite, at most {LARGEST:g}"
+            f"{where}: numbers in K and world_to_camera must be finite, at most {MAX_CAMERA_NUMBER:g}"
         )
     fx, fy = float(K[0, 0]), float(K[1, 1])
-    if min(fx, fy) < 1 / LARGEST:
+    if min(fx, fy) < 1 / MAX_CAMERA_NUMBER:
         raise InputError(f"{where}: K needs positive focal lengths at [0][0] and [1][1]")
     if (
         K[2].tolist() != [0, 0, 1]

@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from spackle.formats.ply import PACKED, ply_header
 from spackle.formats.scene_files import (
-    Columns,
     Floats,
+    GaussianColumns,
     SceneFile,
-    as_shares,
-    from_shares,
-    from_smallest_three,
-    smallest_three,
+    components_to_fractions,
+    decode_smallest_three,
+    encode_smallest_three,
+    fractions_to_components,
 )
 
 CHUNK = 256  # Gaussians that share bounds
@@ -41,7 +41,7 @@ def encode_compressed_ply(scene: SceneFile) -> bytes:
     if a Gaussian is not finite.
     """
     columns, count, border = (
-        Columns.of(scene.gaussians),
+        GaussianColumns.of(scene.gaussians),
         len(scene.gaussians),
         scene.base_count or 0,
     )
@@ -59,9 +59,9 @@ def encode_compressed_ply(scene: SceneFile) -> bytes:
         sizes, chunks[:, 6:12] = _normalised(scales, starts)
         colors, chunks[:, 12:18] = _normalised(columns.srgb, starts)
         rows[:, 0] = _packed(places, PLACE_BITS)
-        largest, others = smallest_three(columns.quats)
+        largest, others = encode_smallest_three(columns.quats)
         rows[:, 1] = largest.astype(np.uint32) << np.uint32(30) | _packed(
-            as_shares(others), TURN_BITS
+            components_to_fractions(others), TURN_BITS
         )
         rows[:, 2] = _packed(sizes, PLACE_BITS)
         rows[:, 3] = _packed(
@@ -115,7 +115,7 @@ def _packed(shares: Floats, widths: tuple[int, ...]) -> NDArray[np.uint32]:
     return word
 
 
-def decode_compressed_ply(chunks: NDArray[Any], rows: NDArray[Any]) -> Columns:
+def decode_compressed_ply(chunks: NDArray[Any], rows: NDArray[Any]) -> GaussianColumns:
     """Decode Gaussians from a file's two tables; ValueError if the tables do not fit together."""
     if missing := set(_CHUNK_NAMES[:12]) - set(chunks.dtype.names or ()):
         raise ValueError(f"its chunks have no {min(missing)}")
@@ -128,9 +128,11 @@ def decode_compressed_ply(chunks: NDArray[Any], rows: NDArray[Any]) -> Columns:
         if "min_r" in (chunks.dtype.names or ())
         else rgba[:, :3]
     )
-    return Columns(
+    return GaussianColumns(
         _between(_unpacked(places, PLACE_BITS), chunks, _CHUNK_NAMES[0:6]),
-        from_smallest_three(turns >> np.uint32(30), from_shares(_unpacked(turns, TURN_BITS))),
+        decode_smallest_three(
+            turns >> np.uint32(30), fractions_to_components(_unpacked(turns, TURN_BITS))
+        ),
         _between(_unpacked(sizes, PLACE_BITS), chunks, _CHUNK_NAMES[6:12]),
         rgba[:, 3],
         np.clip(srgb, 0, 1),
@@ -152,5 +154,5 @@ def _between(shares: Floats, chunks: NDArray[Any], names: list[str]) -> Floats:
     low, high = np.split(bounds[np.arange(len(shares)) // CHUNK], 2, axis=1)
     with np.errstate(
         over="ignore", invalid="ignore"
-    ):  # `Columns.gaussians` refuses infinite values
+    ):  # `GaussianColumns.gaussians` refuses infinite values
         return (low + shares * (high - low)).astype(np.float32)

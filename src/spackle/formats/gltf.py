@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from spackle.core.camera import Camera
 from spackle.core.color import srgb_to_linear
-from spackle.formats.scene_files import Columns, SceneFile
+from spackle.formats.scene_files import GaussianColumns, SceneFile
 from spackle.runtime.errors import InputError
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -41,7 +41,7 @@ def encode_glb(scene: SceneFile) -> bytes:
         raise InputError(
             f"{count:,} Gaussians are too many for .glb (4 GiB at most): use another format"
         )
-    arrays = _attributes(Columns.of(scene.gaussians).flipped())
+    arrays = _attributes(GaussianColumns.of(scene.gaussians).flipped())
     parts = [array.tobytes() for array in arrays.values()]
     text = json.dumps(
         _description(arrays, scene.camera, scene.base_count), separators=(",", ":"), allow_nan=False
@@ -60,7 +60,7 @@ def encode_glb(scene: SceneFile) -> bytes:
     )
 
 
-def _attributes(columns: Columns) -> dict[str, NDArray[Any]]:
+def _attributes(columns: GaussianColumns) -> dict[str, NDArray[Any]]:
     """The Gaussians' attributes; each has a multiple of four bytes."""
     linear = srgb_to_linear(torch.from_numpy(columns.srgb)).numpy()
     rgba = np.concatenate([linear, columns.opacities[:, None]], axis=1)

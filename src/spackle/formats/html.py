@@ -26,7 +26,7 @@ from spackle.core.trajectories import (
     max_offset,
     trajectory,
 )
-from spackle.formats.scene_files import smallest_three
+from spackle.formats.scene_files import encode_smallest_three
 from spackle.runtime.errors import InputError
 
 SAMPLES = 121  # positions along a path, between which the page interpolates linearly
@@ -35,7 +35,9 @@ USUAL, FOREIGN = (
     0.6,
 )  # disparity limit of a completed scene, and of another program's, if none is stored
 LEAST, MOST = 0.01, 1.0  # bounds of the disparity limit
-BYTES = 20  # byte planes: 9 of centres, 3 of scales, 4 of rotations, 3 of colours, 1 of opacity
+BYTES_PER_GAUSSIAN = (
+    20  # byte planes: 9 of centres, 3 of scales, 4 of rotations, 3 of colours, 1 of opacity
+)
 SMALLEST_SCALE, LARGEST_SCALE = (
     1e-7,
     1e5,
@@ -147,7 +149,7 @@ def encode_layer(gaussians: Gaussians) -> tuple[bytes, float, float]:
         t.detach().to("cpu", torch.float32) for t in gaussians.tensors
     )
     low, step = _scale_range(scales)
-    planes = np.empty((BYTES, len(gaussians)), np.uint8)
+    planes = np.empty((BYTES_PER_GAUSSIAN, len(gaussians)), np.uint8)
     for start in range(0, len(gaussians), BLOCK):
         part = slice(start, start + BLOCK)
         bits = (means[part].T.contiguous().numpy().view(np.uint32) + np.uint32(0x80)).view(
@@ -156,7 +158,7 @@ def encode_layer(gaussians: Gaussians) -> tuple[bytes, float, float]:
         planes[0:9, part] = bits.reshape(3, -1, 4)[:, :, 1:].transpose(0, 2, 1).reshape(9, -1)
         logs = scales[part].clamp(SMALLEST_SCALE, LARGEST_SCALE).log()
         planes[9:12, part] = _bytes((logs - low) / step)
-        planes[12, part], others = smallest_three(
+        planes[12, part], others = encode_smallest_three(
             torch.nn.functional.normalize(quats[part], dim=-1).numpy()
         )
         planes[13:16, part] = _bytes(torch.from_numpy(others) * (127 * math.sqrt(2)) + 128)
@@ -180,7 +182,7 @@ def _bytes(values: Tensor) -> NDArray[np.uint8]:
     return values.round().clamp(0, 255).to(torch.uint8).T.numpy()
 
 
-def as_json(value: object) -> bytes:
+def html_safe_json(value: object) -> bytes:
     """JSON in ASCII that is safe inside HTML."""
     text = json.dumps(value, allow_nan=False)
     for character in "<>&":
@@ -190,12 +192,14 @@ def as_json(value: object) -> bytes:
 
 def single_html(scene: PageScene) -> bytes:
     """The page with a scene embedded; it opens from a disk or an e-mail and fetches nothing."""
-    page, css, js = (page_file(name).decode() for name in ("index.html", "viewer.css", "viewer.js"))
+    page, css, js = (
+        read_page_file(name).decode() for name in ("index.html", "viewer.css", "viewer.js")
+    )
     held = {
         name: base64.b64encode(gzip.compress(data, 6, mtime=0)).decode()
         for name, data in scene.files.items()
     }
-    data = as_json({"description": scene.description, "files": held}).decode()
+    data = html_safe_json({"description": scene.description, "files": held}).decode()
     style, script = f"<style>{css}</style>", f"<script>{js}</script>"
     embedded = f'<script type="application/json" id="spackle-scene">{data}</script>'
     policy = (  # allows only these scripts and styles
@@ -211,7 +215,7 @@ def _digest(text: str) -> str:
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 
-def page_file(name: str) -> bytes:
+def read_page_file(name: str) -> bytes:
     return (
         resources.files("spackle").joinpath("web", "page", name).read_bytes()
     )  # importing FastAPI would take a second

@@ -18,7 +18,7 @@ from spackle.core.camera import Camera
 from spackle.core.color import srgb_to_linear
 from spackle.core.gaussians import Gaussians
 from spackle.formats.camera_files import checked_camera
-from spackle.formats.scene_files import SH_C0, Columns, SceneFile, function_named
+from spackle.formats.scene_files import SH_C0, GaussianColumns, SceneFile, function_named
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import atomic_path, check_file
 
@@ -35,7 +35,7 @@ SMALLEST_OPACITY, LARGEST_OPACITY = 1e-12, 1 - 2.0**-24  # bounds that keep the 
 
 # Gaussians that are converted at a time. Blocks are padded to full size, so that a row's bits depend neither on the
 # rows after it nor on the number of threads.
-BLOCK = 8192
+ROWS_PER_BLOCK = 8192
 
 _READ = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2"]
 PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
@@ -93,11 +93,13 @@ def _written(
     vertex = ("vertex", len(gaussians), "float", _WRITTEN)
     yield ply_header(vertex, camera=camera, base_count=base_count, disparity=disparity)
     gaussians = gaussians.detach().to("cpu", torch.float32)
-    surplus = Gaussians(*(torch.zeros(BLOCK, *t.shape[1:]) for t in gaussians.tensors))
-    table = np.zeros((BLOCK, len(_WRITTEN)), "<f4")
-    for start in range(0, len(gaussians), BLOCK):
-        block = gaussians.select(slice(start, start + BLOCK))
-        columns = Columns.of(Gaussians.cat([block, surplus.select(slice(len(block), BLOCK))]))
+    surplus = Gaussians(*(torch.zeros(ROWS_PER_BLOCK, *t.shape[1:]) for t in gaussians.tensors))
+    table = np.zeros((ROWS_PER_BLOCK, len(_WRITTEN)), "<f4")
+    for start in range(0, len(gaussians), ROWS_PER_BLOCK):
+        block = gaussians.select(slice(start, start + ROWS_PER_BLOCK))
+        columns = GaussianColumns.of(
+            Gaussians.cat([block, surplus.select(slice(len(block), ROWS_PER_BLOCK))])
+        )
         opacities = np.clip(columns.opacities, SMALLEST_OPACITY, LARGEST_OPACITY)
         table[:, 0:3], table[:, 6:9], table[:, 13:17] = (
             columns.means,
@@ -190,9 +192,13 @@ class PlyFile:
             bool(extras["color_space"].any()) if "color_space" in extras else "intrinsic" in extras
         )
         parts = [torch.empty(vertex.count, columns.stop - columns.start) for columns in _SLICES]
-        table, broken, whole = np.zeros((len(_READ), BLOCK), np.float32), 0, self._rows(vertex)
-        for start in range(0, vertex.count, BLOCK):
-            rows = whole[start : start + BLOCK]
+        table, broken, whole = (
+            np.zeros((len(_READ), ROWS_PER_BLOCK), np.float32),
+            0,
+            self._rows(vertex),
+        )
+        for start in range(0, vertex.count, ROWS_PER_BLOCK):
+            rows = whole[start : start + ROWS_PER_BLOCK]
             with np.errstate(
                 over="ignore", invalid="ignore"
             ):  # numbers beyond float32 become inf, and are counted
@@ -204,7 +210,9 @@ class PlyFile:
             broken += int(np.count_nonzero(~np.isfinite(table[:, : len(rows)]).all(axis=0)))
             table[3:6] = rgb.clamp_min(0) if linear else srgb_to_linear(rgb)
             for part, columns in zip(parts, _SLICES, strict=True):
-                part[start : start + BLOCK] = torch.from_numpy(table[columns, : len(rows)].T)
+                part[start : start + ROWS_PER_BLOCK] = torch.from_numpy(
+                    table[columns, : len(rows)].T
+                )
         if broken:
             raise InputError(
                 f"{self.path}: {broken} of {vertex.count} Gaussians are not finite: export it again"

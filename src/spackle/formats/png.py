@@ -22,7 +22,7 @@ def thumbnail(picture: Tensor, side: int) -> Tensor:
     return interpolate(picture.movedim(-1, 0)[None], size=size, mode="area")[0].movedim(0, -1)
 
 
-def sheet(rows: Sequence[Sequence[Tensor]], side: int, fill: float = 0.0) -> Tensor:
+def contact_sheet(rows: Sequence[Sequence[Tensor]], side: int, fill: float = 0.0) -> Tensor:
     """Arrange rows of images [h, w, 3], shrunk to `side` pixels at most, in one image [H, W, 3] padded with `fill`."""
     shown = [torch.cat([thumbnail(picture.cpu(), side) for picture in row], dim=1) for row in rows]
     widest = max(row.shape[1] for row in shown)

@@ -42,17 +42,17 @@ class SceneFile:
 
     @property
     def untilted_camera(self) -> Camera | None:
-        """The camera if it is `at_origin`, else None, because a PLY's comment stores no pose."""
-        return self.camera if self.camera is not None and at_origin(self.camera) else None
+        """The camera if it is `is_at_origin`, else None, because a PLY's comment stores no pose."""
+        return self.camera if self.camera is not None and is_at_origin(self.camera) else None
 
 
-def at_origin(camera: Camera) -> bool:
+def is_at_origin(camera: Camera) -> bool:
     """Whether a camera is at the world's origin and looks along z."""
     return torch.equal(camera.world_to_camera, torch.eye(4).to(camera.world_to_camera))
 
 
 @dataclasses.dataclass(frozen=True)
-class Columns:
+class GaussianColumns:
     """N Gaussians as float32 NumPy columns, in the units that file formats share."""
 
     means: Floats  # [N, 3]
@@ -63,7 +63,7 @@ class Columns:
 
     @staticmethod
     @torch.no_grad()
-    def of(gaussians: Gaussians) -> Columns:
+    def of(gaussians: Gaussians) -> GaussianColumns:
         """Convert a scene; colours are clamped to 0..1, and quaternions of length 0 become (1, 0, 0, 0).
 
         ValueError if a Gaussian is not finite.
@@ -88,7 +88,9 @@ class Columns:
         # NumPy's logarithm, because torch would start threads for every block of a PLY.
         log_scales = np.log(np.clip(scales.numpy(), SMALLEST_SCALE, LARGEST_SCALE))
         srgb = linear_to_srgb(colors).numpy()
-        return Columns(means.numpy(), unit.numpy(), log_scales, opacities.clamp(0, 1).numpy(), srgb)
+        return GaussianColumns(
+            means.numpy(), unit.numpy(), log_scales, opacities.clamp(0, 1).numpy(), srgb
+        )
 
     def gaussians(self) -> Gaussians:
         """Convert to Gaussians; ValueError if a Gaussian is not finite."""
@@ -110,14 +112,16 @@ class Columns:
         """[N, 3] coefficients of the constant spherical harmonic that give the sRGB colours."""
         return (self.srgb - np.float32(0.5)) / np.float32(SH_C0)
 
-    def flipped(self) -> Columns:
+    def flipped(self) -> GaussianColumns:
         """Rotate the scene by 180° about x, so that y points up and z backward, as in OpenGL and glTF."""
         means, quats = self.means * _FLIP[1:], self.quats * _FLIP
         return dataclasses.replace(self, means=means, quats=quats)
 
-    def select(self, rows: NDArray[np.int64] | slice) -> Columns:
+    def select(self, rows: NDArray[np.int64] | slice) -> GaussianColumns:
         """The Gaussians that an index array or a slice selects."""
-        return Columns(*(getattr(self, field.name)[rows] for field in dataclasses.fields(self)))
+        return GaussianColumns(
+            *(getattr(self, field.name)[rows] for field in dataclasses.fields(self))
+        )
 
 
 OTHERS = np.array(
@@ -125,7 +129,7 @@ OTHERS = np.array(
 )  # row k: a quaternion's components other than k
 
 
-def smallest_three(quats: Floats) -> tuple[NDArray[np.int64], Floats]:
+def encode_smallest_three(quats: Floats) -> tuple[NDArray[np.int64], Floats]:
     """The index [N] of the largest component of unit quaternions [N, 4], and the other components [N, 3], in order.
 
     Quaternions are negated if their largest component is negative, which does not change the rotation. The largest
@@ -138,8 +142,8 @@ def smallest_three(quats: Floats) -> tuple[NDArray[np.int64], Floats]:
     return largest, np.take_along_axis(quats * sign, OTHERS[largest], axis=1)
 
 
-def from_smallest_three(largest: NDArray[Any], others: Floats) -> Floats:
-    """The inverse of `smallest_three`: unit quaternions [N, 4]."""
+def decode_smallest_three(largest: NDArray[Any], others: Floats) -> Floats:
+    """The inverse of `encode_smallest_three`: unit quaternions [N, 4]."""
     quats = np.empty((len(others), 4), np.float32)
     np.put_along_axis(quats, OTHERS[largest], others, axis=1)
     rest = np.sqrt(np.maximum(0, 1 - np.square(others).sum(axis=1)))
@@ -147,18 +151,18 @@ def from_smallest_three(largest: NDArray[Any], others: Floats) -> Floats:
     return quats
 
 
-def as_shares(components: Floats) -> Floats:
-    """Components of `smallest_three` as fractions 0..1 of their range."""
+def components_to_fractions(components: Floats) -> Floats:
+    """Components of `encode_smallest_three` as fractions 0..1 of their range."""
     shares: Floats = np.clip(components * np.float32(0.5**0.5) + np.float32(0.5), 0, 1)
     return shares
 
 
-def from_shares(shares: Floats) -> Floats:
-    """The inverse of `as_shares`."""
+def fractions_to_components(shares: Floats) -> Floats:
+    """The inverse of `components_to_fractions`."""
     return (shares - np.float32(0.5)) * np.float32(2**0.5)
 
 
-def fractions(codes: NDArray[Any], largest: int) -> Floats:
+def codes_to_fractions(codes: NDArray[Any], largest: int) -> Floats:
     """Integers from 0 to `largest` as floats in 0..1."""
     return codes.astype(np.float32) / np.float32(largest)
 
@@ -173,7 +177,7 @@ def encode_splat(scene: SceneFile) -> bytes:
 
     Colours, opacities and rotations are rounded to bytes. ValueError if a Gaussian is not finite.
     """
-    columns = Columns.of(scene.gaussians)
+    columns = GaussianColumns.of(scene.gaussians)
     rows = np.empty(len(scene.gaussians), SPLAT_ROW)
     rows["means"], rows["scales"] = columns.means, np.exp(columns.log_scales)
     rows["rgba"] = np.round(
@@ -183,14 +187,18 @@ def encode_splat(scene: SceneFile) -> bytes:
     return rows.tobytes()
 
 
-def decode_splat(data: bytes) -> Columns:
+def decode_splat(data: bytes) -> GaussianColumns:
     """Decode a .splat file; ValueError if it ends within a Gaussian."""
     rows = np.frombuffer(data, SPLAT_ROW)
     with np.errstate(divide="ignore", invalid="ignore"):
         log_scales = np.log(np.clip(rows["scales"], SMALLEST_SCALE, LARGEST_SCALE))
-    rgba = fractions(rows["rgba"], 255)
-    return Columns(
-        rows["means"], fractions(rows["quats"], 128) - 1, log_scales, rgba[:, 3], rgba[:, :3]
+    rgba = codes_to_fractions(rows["rgba"], 255)
+    return GaussianColumns(
+        rows["means"],
+        codes_to_fractions(rows["quats"], 128) - 1,
+        log_scales,
+        rgba[:, 3],
+        rgba[:, :3],
     )
 
 
@@ -216,7 +224,7 @@ STARTS = {b"ply": ".ply", b"\x1f\x8b": ".spz", b"PK": ".sog"}  # a .splat has no
 WRITTEN_ONLY = (".glb", ".html")  # formats that Spackle writes and does not read
 
 
-def scene_kind(path: Path) -> str | None:
+def scene_suffix(path: Path) -> str | None:
     """The suffix of a scene's format, by the file's first bytes, else by its name; None if the file is no scene."""
     check_file(path, "scene")
     with open(path, "rb") as file:
@@ -229,7 +237,7 @@ def scene_kind(path: Path) -> str | None:
 
 def load_scene(path: Path) -> SceneFile:
     """Read a scene in any format of SCENE_SUFFIXES; InputError if the file has another format or is damaged."""
-    kind = scene_kind(path)
+    kind = scene_suffix(path)
     if kind in WRITTEN_ONLY:
         raise InputError(
             f"{path}: {kind} files cannot be read: give the scene.ply from which the file was exported"
@@ -252,7 +260,7 @@ def function_named(name: str) -> Any:
     return getattr(import_module(module), function)
 
 
-def encoder_of(path: Path, more: Mapping[str, Encoder] | None = None) -> Encoder:
+def encoder_for(path: Path, more: Mapping[str, Encoder] | None = None) -> Encoder:
     """The encoder for a file name's suffix, from SCENE_ENCODERS and `more`; InputError for an unknown suffix."""
     encoders: dict[str, str | Encoder] = {**SCENE_ENCODERS, **(more or {})}
     for suffix, encoder in encoders.items():

@@ -13,14 +13,14 @@ from PIL import Image
 
 from spackle.formats.scene_files import (
     SH_C0,
-    Columns,
     Floats,
+    GaussianColumns,
     SceneFile,
-    as_shares,
-    fractions,
-    from_shares,
-    from_smallest_three,
-    smallest_three,
+    codes_to_fractions,
+    components_to_fractions,
+    decode_smallest_three,
+    encode_smallest_three,
+    fractions_to_components,
 )
 from spackle.runtime.errors import InputError
 
@@ -53,15 +53,15 @@ def encode_sog(scene: SceneFile) -> bytes:
     width = math.ceil(math.sqrt(count) / 4) * 4
     if width > LARGEST_SIDE:
         raise InputError(f"{count:,} Gaussians are too many for SOG: use another format")
-    columns = Columns.of(scene.gaussians)
+    columns = GaussianColumns.of(scene.gaussians)
     means, low, high = _means(columns.means)
     scale_book, scales = codebook(columns.log_scales)
     color_book, colors = codebook(columns.harmonics)
     opacities = np.round(columns.opacities * 255).astype(np.uint8)[:, None]
     opaque = np.full_like(opacities, 255)
-    largest, others = smallest_three(columns.quats)
+    largest, others = encode_smallest_three(columns.quats)
     quats = np.concatenate(
-        [np.round(as_shares(others) * 255), largest[:, None] + 252], axis=1
+        [np.round(components_to_fractions(others) * 255), largest[:, None] + 252], axis=1
     ).astype(np.uint8)
     pictures = {
         "means_l.webp": [(means & 255).astype(np.uint8), opaque],
@@ -136,7 +136,7 @@ def _webp(rgba: NDArray[np.uint8], width: int) -> bytes:
     return buffer.getvalue()
 
 
-def decode_sog(data: bytes) -> Columns:
+def decode_sog(data: bytes) -> GaussianColumns:
     """Decode a bundled SOG file of version 2; any exception if the file is damaged or of another version."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
 
@@ -164,7 +164,9 @@ def decode_sog(data: bytes) -> Columns:
             for key in ("means", "scales", "quats", "sh0")
         )
     low, high = (np.array(meta["means"][end], np.float32).reshape(3) for end in ("mins", "maxs"))
-    logs = low + (high - low) * fractions(upper[:, :3] * np.uint32(256) + lower[:, :3], 65535)
+    logs = low + (high - low) * codes_to_fractions(
+        upper[:, :3] * np.uint32(256) + lower[:, :3], 65535
+    )
     largest = quats[:, 3].astype(np.int64) - 252
     if largest.min() < 0:
         raise ValueError("a rotation has no largest component")
@@ -172,8 +174,10 @@ def decode_sog(data: bytes) -> Columns:
         np.array(meta[key]["codebook"], np.float32).reshape(CODES)[codes[:, :3]]
         for key, codes in (("scales", scales), ("sh0", sh0))
     )
-    with np.errstate(over="ignore"):  # `Columns.gaussians` refuses infinite values
+    with np.errstate(over="ignore"):  # `GaussianColumns.gaussians` refuses infinite values
         means = np.copysign(np.expm1(np.abs(logs)), logs)
-    turns = from_smallest_three(largest, from_shares(fractions(quats[:, :3], 255)))
+    turns = decode_smallest_three(
+        largest, fractions_to_components(codes_to_fractions(quats[:, :3], 255))
+    )
     srgb = np.clip(harmonics * np.float32(SH_C0) + np.float32(0.5), 0, 1)
-    return Columns(means, turns, log_scales, fractions(sh0[:, 3], 255), srgb)
+    return GaussianColumns(means, turns, log_scales, codes_to_fractions(sh0[:, 3], 255), srgb)

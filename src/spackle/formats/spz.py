@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from spackle.core.gaussians import Gaussians
 from spackle.formats.scene_files import (
     SH_C0,
-    Columns,
     Floats,
+    GaussianColumns,
     SceneFile,
-    fractions,
-    from_smallest_three,
-    smallest_three,
+    codes_to_fractions,
+    decode_smallest_three,
+    encode_smallest_three,
 )
 from spackle.runtime.errors import InputError
 
@@ -28,7 +28,7 @@ HEADER = struct.Struct(
     "<IIIBBBB"
 )  # magic, version, count, degree of harmonics, fractional bits, flags, reserved
 ROW = 20  # bytes for each Gaussian
-LARGEST = 2**23 - 1  # largest coordinate, which has 24 bits
+MAX_GRID_COORDINATE = 2**23 - 1  # largest coordinate, which has 24 bits
 FEWEST_BITS, MOST_BITS = 1, 23  # fractional bits of a coordinate
 NEAR_STEPS = 2048  # least number of grid steps in the near distance
 NEAR_SHARE = 0.01  # quantile of the Gaussians' distances that is the near distance
@@ -40,7 +40,7 @@ MAX_COUNT = 10_000_000  # most Gaussians that the format's own library reads
 
 # Rounded values deflate better. A file uses the finest of the levels in _DETAILS that keeps its size within 1/8 of the
 # PLY's size.
-LIMIT = 8.5  # bytes for each Gaussian; the PLY has 68
+MAX_BYTES_PER_GAUSSIAN = 8.5  # bytes for each Gaussian; the PLY has 68
 SMALL = 1 << 14  # bytes; smaller files need no further rounding
 SAMPLE, SAMPLES = (
     1 << 13,
@@ -82,14 +82,14 @@ def encode_spz(scene: SceneFile) -> bytes:
         raise InputError(
             f"{count:,} Gaussians are too many for SPZ (at most {MAX_COUNT:,}): use another format"
         )
-    columns = Columns.of(scene.gaussians).flipped()
+    columns = GaussianColumns.of(scene.gaussians).flipped()
     bits, _ = spz_grid(scene.gaussians)
     columns = _within(columns, bits)
     header = HEADER.pack(MAGIC, VERSION, count, 0, bits, 0, 0)
     data = b""
     for detail in _DETAILS[_finest(columns, bits) :]:
         data = _deflated(header + b"".join(_sections(columns, bits, detail)))
-        if len(data) <= max(LIMIT * count, SMALL):
+        if len(data) <= max(MAX_BYTES_PER_GAUSSIAN * count, SMALL):
             break
     return data
 
@@ -103,23 +103,23 @@ def spz_grid(gaussians: Gaussians) -> tuple[int, int]:
     near = float(
         np.partition(distance, int(NEAR_SHARE * len(distance)))[int(NEAR_SHARE * len(distance))]
     )
-    holds_all = np.floor(np.log2(LARGEST / max(float(reach.max()), 1e-30)))
+    holds_all = np.floor(np.log2(MAX_GRID_COORDINATE / max(float(reach.max()), 1e-30)))
     shows_near = np.ceil(np.log2(NEAR_STEPS / max(near, 1e-30)))
     bits = int(np.clip(max(holds_all, shows_near), FEWEST_BITS, MOST_BITS))
-    return bits, int((reach * 2.0**bits > LARGEST).sum())
+    return bits, int((reach * 2.0**bits > MAX_GRID_COORDINATE).sum())
 
 
-def _within(columns: Columns, bits: int) -> Columns:
+def _within(columns: GaussianColumns, bits: int) -> GaussianColumns:
     """Shrink positions and sizes of Gaussians outside the grid's range towards the origin, until they fit."""
     reach = np.abs(columns.means).max(axis=1, initial=0).astype(np.float64)
-    factor = np.minimum(1, LARGEST / 2.0**bits / np.maximum(reach, 1e-30))[:, None]
+    factor = np.minimum(1, MAX_GRID_COORDINATE / 2.0**bits / np.maximum(reach, 1e-30))[:, None]
     means, log_scales = columns.means * factor, columns.log_scales + np.log(factor)
     return dataclasses.replace(
         columns, means=means.astype(np.float32), log_scales=log_scales.astype(np.float32)
     )
 
 
-def _finest(columns: Columns, bits: int) -> int:
+def _finest(columns: GaussianColumns, bits: int) -> int:
     """Index of the finest rounding that keeps deflated samples within SAMPLED_LIMIT; the coarsest if none does."""
     count = len(columns.means)
     starts = np.unique(np.linspace(0, max(0, count - SAMPLE), SAMPLES).astype(np.int64))
@@ -134,7 +134,7 @@ def _finest(columns: Columns, bits: int) -> int:
     return bisect.bisect_left(_DETAILS[:-1], True, key=fits)
 
 
-def _sections(columns: Columns, bits: int, detail: _Detail) -> list[bytes]:
+def _sections(columns: GaussianColumns, bits: int, detail: _Detail) -> list[bytes]:
     """The bytes of positions, opacities, colours, scales and rotations, in the file's order."""
     scales = (
         np.round((columns.log_scales + 10) * np.float32(16 / detail.scale_step)) * detail.scale_step
@@ -159,14 +159,14 @@ def _sections(columns: Columns, bits: int, detail: _Detail) -> list[bytes]:
     ]
 
 
-def _positions(columns: Columns, bits: int, share: float) -> NDArray[np.uint8]:
+def _positions(columns: GaussianColumns, bits: int, share: float) -> NDArray[np.uint8]:
     """Positions as bytes [N, 9]: 24-bit fixed point, in steps of up to `share` times the Gaussian's middle axis."""
     a, b, c = columns.log_scales.T
     middle = np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c))
     exponent = np.floor(middle / np.float32(np.log(2)) + np.float32(np.log2(share) + bits))
     step = np.exp2(np.clip(exponent, 0, 20))[:, None]
     fixed = np.round(columns.means * np.float64(2.0**bits) / step) * step
-    whole = np.clip(fixed, -LARGEST, LARGEST).astype("<i4")
+    whole = np.clip(fixed, -MAX_GRID_COORDINATE, MAX_GRID_COORDINATE).astype("<i4")
     return np.ascontiguousarray(whole.view(np.uint8).reshape(-1, 3, 4)[:, :, :3])
 
 
@@ -175,7 +175,7 @@ def _rotations(quats: Floats, bits: int) -> NDArray[np.uint32]:
 
     A word has the index of the largest of xyzw, then a sign and 9 bits, rounded to `bits`, for each other component.
     """
-    largest, others = smallest_three(quats[:, [1, 2, 3, 0]])
+    largest, others = encode_smallest_three(quats[:, [1, 2, 3, 0]])
     step = 2 ** (9 - bits)
     sizes = np.minimum(
         511, np.round(np.abs(others) * np.float32(511 * 2**0.5 / step)) * step
@@ -191,7 +191,7 @@ def _deflated(data: bytes) -> bytes:
     return deflater.compress(data) + deflater.flush()
 
 
-def decode_spz(data: bytes) -> Columns:
+def decode_spz(data: bytes) -> GaussianColumns:
     """Decode the Gaussians of an SPZ file, with y down and z forward, and colours of degree 0.
 
     ValueError or zlib.error for another version or a damaged file. Never inflates more than the header announces.
@@ -210,18 +210,18 @@ def decode_spz(data: bytes) -> Columns:
     cut = np.split(np.frombuffer(body, np.uint8), np.cumsum(widths)[:-1] * count)
     places, alphas, colors, scales, turns = (part.reshape(count, -1) for part in cut)
     fixed = np.pad(places.reshape(-1, 3), ((0, 0), (1, 0))).view("<i4").reshape(count, 3) >> 8
-    srgb = (fractions(colors, 255) - np.float32(0.5)) * np.float32(
+    srgb = (codes_to_fractions(colors, 255) - np.float32(0.5)) * np.float32(
         SH_C0 / COLOR_SCALE
     ) + np.float32(0.5)
     if version == 3:
         words = turns.copy().view("<u4")
         fields = words >> np.array([20, 10, 0], np.uint32)
         sizes = (fields & 511).astype(np.float32) / np.float32(511 * 2**0.5)
-        xyzw = from_smallest_three(words[:, 0] >> 30, np.where(fields & 512, -sizes, sizes))
+        xyzw = decode_smallest_three(words[:, 0] >> 30, np.where(fields & 512, -sizes, sizes))
     else:  # version 2 omits w
-        xyzw = from_smallest_three(np.full(count, 3), fractions(turns, 255) * 2 - 1)
-    means, log_scales = (fixed / 2.0**bits).astype(np.float32), fractions(scales, 16) - 10
-    opacities = fractions(alphas[:, 0], 255)
-    return Columns(
+        xyzw = decode_smallest_three(np.full(count, 3), codes_to_fractions(turns, 255) * 2 - 1)
+    means, log_scales = (fixed / 2.0**bits).astype(np.float32), codes_to_fractions(scales, 16) - 10
+    opacities = codes_to_fractions(alphas[:, 0], 255)
+    return GaussianColumns(
         means, xyzw[:, [3, 0, 1, 2]], log_scales, opacities, np.clip(srgb, 0, 1)
     ).flipped()

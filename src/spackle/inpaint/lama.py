@@ -12,11 +12,11 @@ from torch import Tensor, nn
 
 from spackle.core.crop import Crop
 from spackle.core.photo import working_size
-from spackle.inpaint import InpainterOptions
+from spackle.inpaint.protocol import InpainterOptions
 from spackle.runtime.device import enough_memory, own_arithmetic, pick_device
 from spackle.runtime.errors import InputError
-from spackle.weights import installed
-from spackle.weights.checkpoints import Shapes, check_finite, check_tensors, read_tensors
+from spackle.weights import installed_weights
+from spackle.weights.checkpoints import TensorShapes, check_finite, check_tensors, read_tensors
 
 SIDE = 1024  # default for the long side of the input in pixels
 MULTIPLE = 8  # both sides of the network's input are multiples of this
@@ -37,20 +37,20 @@ class LamaInpainter:
     """Paints each view by itself."""
 
     name = "lama"
-    network: ClassVar[bool] = True
-    video: ClassVar[bool] = False
+    uses_network: ClassVar[bool] = True
+    paints_views_together: ClassVar[bool] = False
     notice: ClassVar[str] = ""
 
     def __init__(self, options: InpainterOptions) -> None:
         """Load the network; InputError for an invalid side or device, or unsuitable weights."""
         self._side = options.side_or(SIDE)
         self._device = pick_device(options.device)
-        path = options.weights or installed("lama")
+        path = options.weights or installed_weights("lama")
         if path is None:
             raise InputError(
                 "inpainter lama: no weights: `spackle weights get lama` downloads 206 MB"
             )
-        self.files: Mapping[str, Path] = {"lama": path}
+        self.weight_files: Mapping[str, Path] = {"lama": path}
         self._network = load_network(path).to(self._device)
         self.version = f"1, long side {self._side}"
 
@@ -81,7 +81,7 @@ class LamaInpainter:
             drawn: Tensor = self._network(padded(colors), padded(mask))[..., : small[0], : small[1]]
         if not bool(drawn.isfinite().all()):
             raise InputError(
-                f"{self.files['lama']}: LaMa's colours are not finite: give other weights"
+                f"{self.weight_files['lama']}: LaMa's colours are not finite: give other weights"
             )
         if small != (height, width):
             drawn = F.interpolate(drawn, (height, width), mode="bicubic").clamp_(0, 1)
@@ -156,9 +156,9 @@ def load_network(path: Path) -> LamaNetwork:
 # The network --------------------------------------------------------------------------------------
 
 
-def expected_shapes(width: int = WIDTH, blocks: int = BLOCKS) -> Shapes:
+def expected_shapes(width: int = WIDTH, blocks: int = BLOCKS) -> TensorShapes:
     """Names and shapes of the published tensors, without `num_batches_tracked`."""
-    shapes: Shapes = {}
+    shapes: TensorShapes = {}
 
     def add(
         conv: str, norm: str | None, *shape: int, bias: bool = False, transposed: bool = False

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from spackle.core.hole_filling import far_fill
 from spackle.core.patch_matching import match_patches
-from spackle.inpaint import InpainterOptions
+from spackle.inpaint.protocol import InpainterOptions
 from spackle.runtime.errors import InputError
 
 RADIUS = 5.0  # pixels: how far colours are propagated into a hole
@@ -20,10 +20,10 @@ RADIUS = 5.0  # pixels: how far colours are propagated into a hole
 class PlainInpainter:
     """Base class of inpainters without a network."""
 
-    network: ClassVar[bool] = False
-    video: ClassVar[bool] = False
+    uses_network: ClassVar[bool] = False
+    paints_views_together: ClassVar[bool] = False
     notice: ClassVar[str] = ""
-    files: Mapping[str, Path] = {}
+    weight_files: Mapping[str, Path] = {}
 
 
 class ExemplarInpainter(PlainInpainter):

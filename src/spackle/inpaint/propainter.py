@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.nn.functional import max_pool2d
 
 from spackle.core.photo import working_size
-from spackle.inpaint import MIN_SIDE, InpainterOptions
+from spackle.inpaint.protocol import MIN_INPUT_SIDE_PX, InpainterOptions
 from spackle.runtime.device import enough_memory, pick_device
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.weights.checkpoints import load_strict, read_tensors
@@ -40,8 +40,8 @@ class PropainterInpainter:
     """Paints all views at once, as the frames of one video."""
 
     name = "propainter"
-    network: ClassVar[bool] = True
-    video: ClassVar[bool] = True
+    uses_network: ClassVar[bool] = True
+    paints_views_together: ClassVar[bool] = True
     notice: ClassVar[str] = (
         "ProPainter and its weights are S-Lab's, for non-commercial use only: "
         "https://github.com/sczhou/ProPainter/blob/main/LICENSE"
@@ -55,8 +55,8 @@ class PropainterInpainter:
         ):
             import pytorchcv
             import pytorchcv.models.propainter_stream
-        self.files: Mapping[str, Path] = weight_files(options.weights)
-        self._networks = [_network(name, file) for name, file in self.files.items()]
+        self.weight_files: Mapping[str, Path] = weight_files(options.weights)
+        self._networks = [_network(name, file) for name, file in self.weight_files.items()]
         self._device = pick_device(options.device)
         self.version = f"1, pytorchcv {pytorchcv.__version__}, long side {self._side}"
 
@@ -103,7 +103,7 @@ class PropainterInpainter:
 
 def padded(side: int) -> int:
     """Round a side in pixels up to one that the networks accept."""
-    return max(MIN_SIDE, -(-side // MULTIPLE) * MULTIPLE)
+    return max(MIN_INPUT_SIDE_PX, -(-side // MULTIPLE) * MULTIPLE)
 
 
 def dilated(holes: Tensor) -> Tensor:

@@ -33,7 +33,7 @@ from spackle.residual.network import (
     ResidualNet,
 )
 from spackle.runtime.errors import InputError, one_line
-from spackle.weights.checkpoints import channels_last, load_strict, read_note, read_tensors
+from spackle.weights.checkpoints import load_strict, read_metadata, read_tensors, to_channels_last
 
 SHIPPED = Path(__file__).parent.parent / "weights" / "residual.safetensors"
 NOTE = "spackle.residual"  # metadata key of the architecture's name; a file without this key holds a UNet
@@ -203,11 +203,11 @@ def shipped_network() -> ResidualNet | None:
 def load_residual(path: str | os.PathLike[str]) -> ResidualNet:
     """Read a network; InputError if the file is missing or broken, or holds another network."""
     advice = "give the residual's weights, 'seeds' or 'none'"
-    tensors, name = read_tensors(path, advice), read_note(path, NOTE) or UNet.name
+    tensors, name = read_tensors(path, advice), read_metadata(path, NOTE) or UNet.name
     if name not in (UNet.name, SharpDecoder.name):
         raise InputError(f"{path}: unknown architecture {one_line(name)[:60]}: {advice}")
     return load_strict(
-        open_residual(name, decoder_size(tensors)), tensors, path, advice, prepare=channels_last
+        open_residual(name, decoder_size(tensors)), tensors, path, advice, prepare=to_channels_last
     )
 
 

@@ -92,7 +92,7 @@ def predict_photo(
                 save_depth(scene.depth_map(pipeline.renderer), new / wanted.depth_out)
         video = None
         if wanted.render:
-            video = views.maker.note(
+            video = views.maker.report_entry(
                 video_file, views.cameras[views.frames[0][0]], len(views.frames)
             )
             with reporter.stage("video") as step:
@@ -148,13 +148,15 @@ def save_views(done: CompletedPhoto, path: Path, renderer: Renderer, step: Progr
             else:
                 with torch.no_grad():
                     eyes = [
-                        renderer.render(done.scene.of_view(k), views.maker.sized(views.cameras[k]))
+                        renderer.render(
+                            done.scene.of_view(k), views.maker.resized_camera(views.cameras[k])
+                        )
                         for k in frame
                     ]
                     yield views.maker.frame(eyes)
             step(index + 1, len(views.frames))
 
-    save_video(frames(), path, video.rate, video.loop)
+    save_video(frames(), path, video.frames_per_second, video.loop)
 
 
 @torch.no_grad()

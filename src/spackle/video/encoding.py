@@ -70,7 +70,7 @@ VP9 = VideoFormat("libvpx-vp9", "webm", _VPX, _CUES_FIRST, "yuv420p", False, (0.
 GIF = VideoFormat("gif", "gif", {}, {}, "pal8", True, (0.01, 50), 65_535)
 # libwebp converts to YUV better than FFmpeg. The encoder libwebp_anim would keep old blocks where little changes.
 WEBP = VideoFormat("libwebp", "webp", {"quality": "85"}, {}, "bgra", True, (0.01, 90), 16_383)
-FORMATS = {".mp4": H264, ".m4v": H264, ".mov": H264, ".webm": VP9, ".gif": GIF, ".webp": WEBP}
+VIDEO_FORMATS = {".mp4": H264, ".m4v": H264, ".mov": H264, ".webm": VP9, ".gif": GIF, ".webp": WEBP}
 
 
 def check_video(path: str | os.PathLike[str], fps: float, loop: int | None = None) -> VideoFormat:
@@ -79,9 +79,9 @@ def check_video(path: str | os.PathLike[str], fps: float, loop: int | None = Non
     Raises:
         InputError: the suffix is unknown, or the format does not allow the rate or loop count.
     """
-    kind = FORMATS.get(Path(path).suffix.lower())
+    kind = VIDEO_FORMATS.get(Path(path).suffix.lower())
     if kind is None:
-        raise InputError(f"{path}: not a name for a video: end it with {', '.join(FORMATS)}")
+        raise InputError(f"{path}: not a name for a video: end it with {', '.join(VIDEO_FORMATS)}")
     least, most = kind.fps
     if not (math.isfinite(fps) and least <= fps <= most):
         raise InputError(

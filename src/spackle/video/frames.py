@@ -19,9 +19,9 @@ from spackle.core.gaussians import Gaussians
 from spackle.core.trajectories import DepthRange
 from spackle.render.protocol import Renderer, Rendering
 from spackle.runtime.errors import InputError, check_name
-from spackle.video.encoding import FORMATS, check_video
+from spackle.video.encoding import VIDEO_FORMATS, check_video
 
-VideoFormat = Literal["mp4", "webm", "gif", "webp"]
+VideoFormatName = Literal["mp4", "webm", "gif", "webp"]
 Show = Literal["color", "depth"]
 StereoLayout = Literal["sbs", "sbs-half", "ou", "ou-half", "anaglyph"]
 PARALLAX = (
@@ -38,7 +38,7 @@ BLURRED_PX, BLURRED_LIGHT = (
     12,
     0.6,
 )  # long side of the reduced image that makes blurred margins; margins' brightness
-GAP = 6  # pixels between the two images of --compare
+COMPARE_GAP_PX = 6  # pixels between the two images of --compare
 MAX_VIDEO_SIDE = 8192
 MAX_IPD = 1e6
 DEFAULT_FPS = 30
@@ -115,11 +115,11 @@ def _halved(picture: Tensor, side: bool) -> Tensor:
     return linear_to_srgb(adaptive_avg_pool2d(light, size))[0].permute(1, 2, 0)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class VideoOptions:
     """Options that all videos share."""
 
-    format: VideoFormat | None = None  # None: mp4
+    format: VideoFormatName | None = None  # None: mp4
     fps: float | None = None  # None: 30; must be None for a clip, whose frame rate is kept
     loop: int | None = None  # None: gif and webp repeat for ever, mp4 and webm play once
     size: tuple[int, int] | None = None  # width and height of one eye's image; None: the photo's
@@ -140,14 +140,14 @@ class VideoOptions:
         return f".{self.format or 'mp4'}"
 
     @property
-    def rate(self) -> float:
+    def frames_per_second(self) -> float:
         """Frames a second."""
         return DEFAULT_FPS if self.fps is None else self.fps
 
     @property
     def plays(self) -> int:
         """How often the video is shown; 0: for ever."""
-        return FORMATS[self.suffix].loop if self.loop is None else self.loop
+        return VIDEO_FORMATS[self.suffix].loop if self.loop is None else self.loop
 
     def check(self) -> None:
         """Raise an InputError for unknown names, and for options that contradict each other."""
@@ -155,9 +155,12 @@ class VideoOptions:
         check_name("--show", self.show, get_args(Show))
         if self.stereo is not None:
             check_name("--stereo", self.stereo, get_args(StereoLayout))
-        for option, loop in ((f"--fps {self.rate:g}", None), (f"--loop {self.loop}", self.loop)):
+        for option, loop in (
+            (f"--fps {self.frames_per_second:g}", None),
+            (f"--loop {self.loop}", self.loop),
+        ):
             try:
-                check_video(name := f"video{self.suffix}", self.rate, loop)
+                check_video(name := f"video{self.suffix}", self.frames_per_second, loop)
             except InputError as error:
                 raise InputError(f"{option}: {str(error).removeprefix(f'{name}: ')}") from error
         for option, value in {"--ipd": self.ipd, "--convergence": self.convergence}.items():
@@ -181,7 +184,7 @@ class VideoOptions:
     def for_file(self, file: Path) -> VideoOptions:
         """Set the format by a file's suffix; InputError if --format contradicts the suffix."""
         suffix = file.suffix.lower()
-        meant = "mp4" if suffix in (".m4v", ".mov") else cast(VideoFormat, suffix[1:])
+        meant = "mp4" if suffix in (".m4v", ".mov") else cast(VideoFormatName, suffix[1:])
         if self.format not in (None, meant):
             raise InputError(
                 f"--format {self.format}: the name {file} means {meant}: leave one of them out"
@@ -208,7 +211,7 @@ class FrameMaker:
         except ValueError as error:
             raise InputError(f"{source}: this video is impossible: {error}") from error
         maker = FrameMaker(options, stereo, depth)
-        width, height = maker.frame_size(maker.sized(cameras[0]))
+        width, height = maker.frame_size(maker.resized_camera(cameras[0]))
         if max(width, height) > MAX_VIDEO_SIDE:
             hint = (
                 "give a smaller --size"
@@ -221,7 +224,7 @@ class FrameMaker:
         return maker
 
     @property
-    def plain(self) -> bool:
+    def is_plain(self) -> bool:
         """Whether a frame is one colour view at the size of its camera."""
         return self.stereo is None and self.depth is None and self.options.size is None
 
@@ -240,7 +243,7 @@ class FrameMaker:
     ) -> tuple[Tensor, list[Rendering]]:
         """A frame, and renderings of each of `parts` (base and scene with `compare`, else the scene) by each eye."""
         with torch.no_grad():
-            eyes = [self.sized(eye) for eye in self.eyes(camera)]
+            eyes = [self.resized_camera(eye) for eye in self.eyes(camera)]
             views = [renderer.render(part, eye) for part in parts for eye in eyes]
             return self.frame(views), views
 
@@ -256,17 +259,17 @@ class FrameMaker:
             ]
         if self.options.compare:
             left, right = pictures
-            return torch.cat([left, left.new_ones(len(left), GAP, 3), right], dim=1)
+            return torch.cat([left, left.new_ones(len(left), COMPARE_GAP_PX, 3), right], dim=1)
         return pictures[0] if self.stereo is None else self.stereo.pack(*pictures)
 
-    def sized(self, camera: Camera) -> Camera:
+    def resized_camera(self, camera: Camera) -> Camera:
         """The camera at the size of one eye's image without margins."""
         if self.canvas is None:
             return camera
         width, height = self.canvas
         across, down = width / camera.width, height / camera.height
         if self.options.fit == "crop" or abs(across / down - 1) < ALIKE:
-            return cover(camera, width, height)
+            return crop_camera_to_size(camera, width, height)
         scale = min(across, down)
         return camera.resized(
             *(max(1, round(scale * side)) for side in (camera.width, camera.height))
@@ -276,19 +279,19 @@ class FrameMaker:
         """Width and height of a frame for a view of the camera's size."""
         width, height = self.canvas or (camera.width, camera.height)
         if self.options.compare:
-            return 2 * width + GAP, height
+            return 2 * width + COMPARE_GAP_PX, height
         return (width, height) if self.stereo is None else self.stereo.frame_size(width, height)
 
-    def note(self, name: str, camera: Camera, frames: int) -> dict[str, object]:
+    def report_entry(self, name: str, camera: Camera, frames: int) -> dict[str, object]:
         """The report's entry for the video."""
-        width, height = self.frame_size(self.sized(camera))
+        width, height = self.frame_size(self.resized_camera(camera))
         stereo = None if self.stereo is None else dataclasses.asdict(self.stereo)
         if stereo is not None and math.isinf(stereo["convergence"]):
             stereo["convergence"] = None  # JSON has no infinity
         return {
             "file": name,
             "frames": frames,
-            "fps": self.options.rate,
+            "fps": self.options.frames_per_second,
             "plays": self.options.plays,
             "width": width,
             "height": height,
@@ -312,7 +315,7 @@ def _stereo(options: VideoOptions, gaussians: Gaussians, camera: Camera) -> Ster
     return Stereo(options.stereo, ipd, convergence)
 
 
-def cover(camera: Camera, width: int, height: int) -> Camera:
+def crop_camera_to_size(camera: Camera, width: int, height: int) -> Camera:
     """The view at another size, scaled without distortion; two sides are cropped if the aspect ratio differs."""
     scale = max(width / camera.width, height / camera.height)
     K = camera.zoomed(scale).K

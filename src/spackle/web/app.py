@@ -27,7 +27,7 @@ import spackle
 from spackle.bases.settings import AUTO, MISSING
 from spackle.core.photo import PHOTO_SUFFIXES
 from spackle.depth.depth_map import SUFFIXES
-from spackle.formats.html import page_file
+from spackle.formats.html import read_page_file
 from spackle.runtime.errors import InputError, first_problem, one_line
 from spackle.runtime.task_process import Work
 from spackle.web.guard import MAX_BYTES, Access, Guard
@@ -202,7 +202,9 @@ def create_app(
     @app.get("/docs", include_in_schema=False)
     async def get_docs() -> HTMLResponse:
         return HTMLResponse(
-            Template(page_file("docs.html").decode(), autoescape=True).render(api=app.openapi())
+            Template(read_page_file("docs.html").decode(), autoescape=True).render(
+                api=app.openapi()
+            )
         )
 
     app.mount("/", StaticFiles(packages=[("spackle.web", "page")], html=True))

@@ -19,8 +19,8 @@ from spackle.bases.settings import AUTO, ROUGH, BaseSettings
 from spackle.core.photo import PHOTO_SUFFIXES, check_shape, read_image
 from spackle.core.trajectories import MAX_DISPARITY, TRAJECTORIES, TrajectoryKind
 from spackle.depth.depth_map import DepthKind
-from spackle.formats.html import as_json, single_html
-from spackle.formats.scene_files import scene_kind
+from spackle.formats.html import html_safe_json, single_html
+from spackle.formats.scene_files import scene_suffix
 from spackle.pipeline import Fill, FillOptions, Options, Pipeline
 from spackle.render import get_renderer
 from spackle.results.photo_folder import REPORT, PhotoOptions, predict_photo
@@ -104,14 +104,17 @@ class SceneWork:
         ply, source, note = job.results / "scene.ply", job.folder / job.source, ""
         try:
             if file is None:
-                if scene_kind(source):
+                if scene_suffix(source):
                     Scene.load(source, focal_px=options.focal_px, fov=options.fov).save(ply)
                 else:
                     note = self._complete(job, options, teller)
                 scene = Scene.load(ply)
                 with teller.stage("page"):
                     page = scene.page(job.name, note)
-                    for name, data in {**page.files, PAGE: as_json(page.description)}.items():
+                    for name, data in {
+                        **page.files,
+                        PAGE: html_safe_json(page.description),
+                    }.items():
                         write_atomic(job.results / name, data)
             else:
                 scene = Scene.load(ply)

@@ -35,13 +35,13 @@ class PublishedWeights:
 
 
 _FACTS = json.loads(Path(__file__).with_name("published.json").read_text(encoding="utf-8"))
-PUBLISHED = {name: PublishedWeights(name, **facts) for name, facts in _FACTS.items()}
+PUBLISHED_WEIGHTS = {name: PublishedWeights(name, **facts) for name, facts in _FACTS.items()}
 
 
 def published_weights(name: str) -> PublishedWeights:
     """The entry of this name; InputError for an unknown name."""
-    check_name("weights", name, PUBLISHED)
-    return PUBLISHED[name]
+    check_name("weights", name, PUBLISHED_WEIGHTS)
+    return PUBLISHED_WEIGHTS[name]
 
 
 def weights_folder() -> Path:
@@ -56,7 +56,7 @@ def weights_folder() -> Path:
     )
 
 
-def installed(name: str) -> Path | None:
+def installed_weights(name: str) -> Path | None:
     """The file of published weights in `weights_folder`; None if it is missing."""
     path = weights_folder() / published_weights(name).file
     return path if os.path.isfile(path) else None

@@ -25,7 +25,7 @@ from spackle.runtime.errors import InputError, as_input_error, one_line
 from spackle.runtime.files import check_file
 
 Network = TypeVar("Network", bound=nn.Module)
-Shapes = dict[str, tuple[int, ...]]  # tensors' shapes by name
+TensorShapes = dict[str, tuple[int, ...]]  # tensors' shapes by name
 
 NAMED = 3  # number of names that a message lists
 MAX_PICKLE = 4_000_000  # bytes; a pickle for a thousand tensors has a tenth
@@ -79,14 +79,14 @@ def load_strict(
     return network
 
 
-def channels_last(network: nn.Module) -> None:
+def to_channels_last(network: nn.Module) -> None:
     """Convert kernels to channels-last, which is faster on a CPU."""
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs lack it
 
 
 def check_tensors(
     found: Mapping[str, Tensor],
-    expected: Shapes,
+    expected: TensorShapes,
     path: str | os.PathLike[str],
     advice: str,
     ignored: Collection[str] = (),
@@ -163,7 +163,7 @@ def read_checkpoint(
         return root[name], _tensors(root)
 
 
-def read_note(path: str | os.PathLike[str], name: str) -> str | None:
+def read_metadata(path: str | os.PathLike[str], name: str) -> str | None:
     """The value `name` in a safetensors file's metadata; None if missing, or in another format."""
     with open(path, "rb") as file:
         if file.read(9)[8:] != b"{":

@@ -19,7 +19,7 @@ from torch.nn.functional import interpolate
 
 from spackle.bases.sharp.encoder import NORM_EPS, TransformerBlock
 from spackle.runtime.errors import as_input_error, shortened
-from spackle.weights.checkpoints import channels_last, load_strict, read_checkpoint
+from spackle.weights.checkpoints import load_strict, read_checkpoint, to_channels_last
 
 ADVICE = "give MoGe-2's model.pt as it was downloaded"
 BACKBONES = {
@@ -273,4 +273,4 @@ def set_precision(network: nn.Module, dtype: torch.dtype) -> None:
             for layer in block.modules():
                 if isinstance(layer, (nn.Linear, nn.Conv2d)):
                     layer.to(dtype)
-    channels_last(network)
+    to_channels_last(network)

@@ -26,7 +26,7 @@ from spackle.runtime.device import Precision, enough_memory, own_arithmetic, pic
 from spackle.runtime.errors import InputError, as_input_error, one_line
 from spackle.runtime.files import sha256_of
 from spackle.runtime.progress import Progress
-from spackle.weights.checkpoints import Shapes, load_strict, read_note, read_tensors
+from spackle.weights.checkpoints import TensorShapes, load_strict, read_metadata, read_tensors
 
 WINDOWS_AT_ONCE = 5  # enough to keep two cores or a small GPU busy
 ADVICE = "give SHARP's checkpoint as it was downloaded"
@@ -159,7 +159,7 @@ def load_network(
         return network.to(device)
 
 
-def expected_shapes(config: SharpConfig) -> Shapes:
+def expected_shapes(config: SharpConfig) -> TensorShapes:
     """The names and shapes of all tensors that `load_network` reads from a checkpoint of this size."""
     with torch.device("meta"):
         return {
@@ -207,7 +207,7 @@ def link_owner(owner: Owner, folder: Path) -> None:
 
 def owner_of(path: str | os.PathLike[str]) -> Owner | None:
     """The checkpoint that a decoder's file names; None for another file, InputError if the name is missing."""
-    note = read_note(path, NOTE)
+    note = read_metadata(path, NOTE)
     if note is None:
         return None
     with as_input_error(path, "does not say which checkpoint it was trained on: train it again"):

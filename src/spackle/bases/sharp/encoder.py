@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn.functional import gelu, interpolate, scaled_dot_product_attention
 
 from spackle.runtime.progress import Progress
-from spackle.weights.checkpoints import channels_last
+from spackle.weights.checkpoints import to_channels_last
 
 LAYERS = 2  # of Gaussians: the visible surface, and what may be behind it
 STRIDE = 2  # pixels of the network's picture for each cell of Gaussians
@@ -76,7 +76,7 @@ def set_precision(network: nn.Module, dtype: torch.dtype) -> None:
     for module in network.modules():
         if isinstance(module, _HEAVY) and not isinstance(module, ExactConv):
             module.to(dtype)
-    channels_last(network)
+    to_channels_last(network)
 
 
 NORM_EPS = 1e-6

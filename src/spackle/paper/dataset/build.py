@@ -19,7 +19,13 @@ from spackle.bases.settings import NETWORKS, BaseSettings
 from spackle.core.photo import load_photo, resize_photo
 from spackle.core.trajectories import MAX_DISPARITY, DepthRange, SharpTrajectory
 from spackle.depth.depth_map import find_depth
-from spackle.inpaint import INPAINTERS, Inpainter, InpainterOptions, get_inpainter, inpainter_class
+from spackle.inpaint import (
+    Inpainter,
+    InpainterOptions,
+    get_inpainter,
+    inpainter_class,
+    is_inpainter,
+)
 from spackle.paper.dataset.photos import PhotoFile, choose, find_photos
 from spackle.paper.dataset.sample import pack_sample
 from spackle.paper.dataset.shards import NAME, Manifest, load_manifest, write_shard
@@ -74,11 +80,14 @@ class DatasetOptions:
 
     def open_inpainter(self) -> Inpainter | None:
         """Open the inpainter; None for "geometry" and "none". InputError if a package or weights are missing."""
-        if self.inpainter not in INPAINTERS:
+        if not is_inpainter(self.inpainter):
             return None
         device = None if self.base.device == "auto" else self.base.device
         return get_inpainter(
-            self.inpainter, InpainterOptions(self.inpainter_weights, self.inpainter_side, device)
+            self.inpainter,
+            InpainterOptions(
+                weights=self.inpainter_weights, side=self.inpainter_side, device=device
+            ),
         )
 
     def check(self) -> None:
@@ -93,8 +102,9 @@ class DatasetOptions:
             raise InputError(
                 f"--depth {depth}: no such folder: give a folder with a depth map for each photo"
             )
-        check_name("--inpainter", self.inpainter, COMPLETIONS)
-        takes = self.inpainter in INPAINTERS and inpainter_class(self.inpainter).network
+        if not is_inpainter(self.inpainter):
+            check_name("--inpainter", self.inpainter, COMPLETIONS)
+        takes = is_inpainter(self.inpainter) and inpainter_class(self.inpainter).uses_network
         if not takes and (self.inpainter_weights or self.inpainter_side) is not None:
             raise InputError(
                 f"--inpainter {self.inpainter} takes neither --inpainter-weights nor --inpainter-side"
@@ -131,9 +141,9 @@ def configuration(
     base = options.base
     inputs = digest_of([options.inputs_of(photo) for photo in photos])
     completion: dict[str, Any] = _completion(options, inpainter)
-    if inpainter is not None and inpainter.files:
+    if inpainter is not None and inpainter.weight_files:
         completion["weights"] = {
-            name: weights_digest(file) for name, file in inpainter.files.items()
+            name: weights_digest(file) for name, file in inpainter.weight_files.items()
         }
     return {
         "spackle": spackle.__version__,

@@ -15,7 +15,7 @@ from rich.filesize import decimal
 from torch import Tensor
 
 from spackle.formats import save_png
-from spackle.formats.png import sheet
+from spackle.formats.png import contact_sheet
 from spackle.paper.dataset.sample import END
 from spackle.paper.dataset.shards import DatasetFiles, Manifest, ShardEntry, load_manifest, open_in
 from spackle.runtime.errors import InputError, as_input_error, one_line
@@ -116,7 +116,7 @@ def preview_dataset(
                 masks,
                 [view.target for view in chosen],
             ]
-        save_png(sheet(rows, THUMBNAIL, fill=1.0), output / SHEET)
+        save_png(contact_sheet(rows, THUMBNAIL, fill=1.0), output / SHEET)
         # View 0 is the photo's view, which is not on the path.
         path = (groups[0].view(index) for index in range(1, groups[0].views))
         save_video(

@@ -27,7 +27,7 @@ from spackle.core.camera import Camera
 from spackle.core.color import to_bytes
 from spackle.core.gaussians import Gaussians
 from spackle.core.photo import check_pixels
-from spackle.formats.camera_files import camera_of
+from spackle.formats.camera_files import camera_from_json
 from spackle.paper.dataset.views import ViewStack
 from spackle.render.protocol import Rendering
 from spackle.runtime.errors import as_input_error
@@ -138,8 +138,8 @@ class PhotoGroup:
                 key=self.key,
                 index=index,
                 photo=decode_rgb(self.files[f"{self.key}.photo.png"]),
-                photo_camera=camera_of(self.facts["photo_camera"], self.where),
-                camera=camera_of(facts, self.where),
+                photo_camera=camera_from_json(self.facts["photo_camera"], self.where),
+                camera=camera_from_json(facts, self.where),
                 rendering=Rendering(rgb, depth, decode_alpha(self._file(index, "alpha"))),
                 mask=torch.from_numpy(_pixels(self._file(index, "mask"), 2)) > 127,
                 target=target,

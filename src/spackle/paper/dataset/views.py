@@ -112,7 +112,7 @@ def complete_views(
         return torch.where(views.mask[..., None], render_completed(views, renderer)[0], views.rgb)
     return (
         paint_video(inpainter, views)
-        if inpainter.video
+        if inpainter.paints_views_together
         else paint_in_turn(inpainter, views, renderer)
     )
 

@@ -286,7 +286,7 @@ def _configuration(
         "direct_ft": None if options.direct_ft is None else weights_digest(options.direct_ft),
     }
     if inpainter is not None:
-        weights = {name: weights_digest(file) for name, file in inpainter.files.items()}
+        weights = {name: weights_digest(file) for name, file in inpainter.weight_files.items()}
         config["inpainter"] = {
             "name": inpainter.name,
             "version": inpainter.version,

@@ -40,7 +40,7 @@ from spackle.runtime.device import enough_memory, own_arithmetic
 from spackle.runtime.errors import InputError
 from spackle.runtime.files import write_atomic
 from spackle.runtime.progress import Reporter
-from spackle.weights import installed, weights_digest
+from spackle.weights import installed_weights, weights_digest
 from spackle.weights.checkpoints import read_tensors
 
 VIEWS_AT_ONCE = 4  # views of a photo in a step; they share one pass through the encoder, the most expensive part
@@ -146,7 +146,7 @@ class DirectFt(ViewTask):
                 "--method direct-ft learns only from data.pseudo, a dataset of `spackle dataset build --base sharp`: "
                 "leave out init and other data"
             )
-        path = checkpoint or installed("sharp")
+        path = checkpoint or installed_weights("sharp")
         if path is None:
             raise InputError(f"--method direct-ft: {MISSING['sharp']}")
         read_tensors(path, "give SHARP's checkpoint")  # without the numbers; refuses other files

@@ -14,7 +14,7 @@ from spackle.core.trajectories import MAX_DISPARITY
 from spackle.runtime.device import Precision
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import check_file
-from spackle.weights import installed
+from spackle.weights import installed_weights
 
 PACKAGED = Path(__file__).parent / "recipes"
 FREE = "free"  # marks keys that may change when a run resumes; samples are compared by digest, not by these keys
@@ -116,7 +116,7 @@ class LossRecipe(RecipePart):
     def features_file(self) -> Path | None:
         """Weights of the feature network: `features_path`, else the file of `spackle weights get features`."""
         return self.features_path or (
-            installed("features") if self.features == "resnet50" else None
+            installed_weights("features") if self.features == "resnet50" else None
         )
 
 

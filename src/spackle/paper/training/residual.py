@@ -13,7 +13,7 @@ import torch
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from spackle.formats.png import sheet
+from spackle.formats.png import contact_sheet
 from spackle.paper.training.losses import hole_psnr, load_features, total_loss
 from spackle.paper.training.recipe import Recipe
 from spackle.paper.training.samples import Sample, digest_of_samples, load_sample, make_samples
@@ -119,7 +119,7 @@ class ViewTask(Task):
             :PICTURED
         ]
         views = [self.complete(network, self.batch(None, [item])) for item in items]
-        return sheet(
+        return contact_sheet(
             [(view.base_rgb[-1], view.rgb[-1], view.target[-1]) for view in views], PICTURE_SIDE
         )
 

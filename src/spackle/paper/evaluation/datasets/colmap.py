@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from spackle.core.camera import Camera
 from spackle.core.gaussians import quat_to_matrix
-from spackle.formats.camera_files import LARGEST, checked_camera
+from spackle.formats.camera_files import MAX_CAMERA_NUMBER, checked_camera
 from spackle.paper.evaluation.case import Points
 from spackle.runtime.errors import InputError, as_input_error
 
@@ -90,7 +90,11 @@ def read_model(folder: Path) -> Model:
         table = np.array(
             [point for point in records if point[4] <= MAX_ERROR_PX], np.float64
         ).reshape(-1, 5)
-    table = table[(np.abs(table[:, :4]) <= [2**53, LARGEST, LARGEST, LARGEST]).all(axis=1)]
+    table = table[
+        (
+            np.abs(table[:, :4]) <= [2**53, MAX_CAMERA_NUMBER, MAX_CAMERA_NUMBER, MAX_CAMERA_NUMBER]
+        ).all(axis=1)
+    ]
     ids, first = np.unique(table[:, 0], return_index=True)
     with as_input_error(cameras, damaged):
         lenses = {
@@ -140,7 +144,7 @@ def _view(path: Path, lens: Camera, name: str, pose: list[float], observed: Arra
         torch.tensor(pose[4:], dtype=torch.float64),
     )
     where = f"{path}: the pose of {name}"
-    if len(shift) != 3 or not 1e-6 < float(quaternion.norm()) < LARGEST:
+    if len(shift) != 3 or not 1e-6 < float(quaternion.norm()) < MAX_CAMERA_NUMBER:
         raise InputError(f"{where} is not a rotation: the file is damaged")
     matrix = torch.eye(4, dtype=torch.float64)
     matrix[:3, :3], matrix[:3, 3] = quat_to_matrix(quaternion), shift
