@@ -21,7 +21,7 @@ from PIL import Image
 import spackle
 from spackle.bases.depth import RgbdBase
 from spackle.bases.settings import BaseSettings
-from spackle.pipeline import Options, Pipeline
+from spackle.pipeline import Pipeline, PipelineOptions
 from spackle.runtime.progress import LogReporter
 
 
@@ -71,7 +71,9 @@ def test_paths_and_loaded_values_give_the_same_scene(
     loaded = spackle.load_photo(photo), spackle.load_depth(depth)
     assert same_bits(spackle.predict(*loaded).gaussians, scene.gaussians)
     assert same_bits(spackle.predict(str(photo), str(depth)).gaussians, scene.gaussians)
-    whole = Pipeline.open(Options(BaseSettings(depth=depth))).complete(loaded[0], LogReporter())
+    whole = Pipeline.open(PipelineOptions(base=BaseSettings(depth=depth))).complete(
+        loaded[0], LogReporter()
+    )
     assert same_bits(whole.scene.gaussians, scene.gaussians)
     alone = RgbdBase(loaded[1]).predict(loaded[0])
     assert same_bits(scene.base, alone.gaussians)

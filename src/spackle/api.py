@@ -21,7 +21,7 @@ from spackle.bases.settings import AUTO, BaseSettings
 from spackle.core.photo import Photo, load_photo, photo_of_picture
 from spackle.core.trajectories import TrajectoryKind
 from spackle.depth.depth_map import DepthKind, DepthMap, depth_of_array, load_depth
-from spackle.pipeline import Fill, FillOptions, Options, Pipeline
+from spackle.pipeline import FillOptions, FillTexture, Pipeline, PipelineOptions
 from spackle.render import Renderer, get_renderer
 from spackle.residual.network import ResidualNet
 from spackle.runtime.errors import InputError, renamed, short_messages, shortened
@@ -44,7 +44,7 @@ class Spackle:
         base: str | Base = AUTO,
         *,
         residual: Residual = None,
-        fill: Fill = "auto",
+        fill: FillTexture = "auto",
         device: str = "auto",
         renderer: Renderer | None = None,
     ) -> None:
@@ -65,8 +65,12 @@ class Spackle:
         """
         name = base if isinstance(base, str) else AUTO
         network = residual if isinstance(residual, ResidualNet) else None
-        chosen = FillOptions(None if residual is None or network else os.fspath(residual), fill)  # type: ignore[arg-type]
-        options = Options(BaseSettings(name, device=device), fill=chosen)
+        if residual is None or isinstance(residual, ResidualNet):
+            weights = None
+        else:
+            weights = os.fspath(residual)
+        chosen = FillOptions(residual=weights, fill=fill)
+        options = PipelineOptions(base=BaseSettings(name=name, device=device), fill=chosen)
         options.base.check()
         opened = open_base(options.base) if isinstance(base, str) else open_loaded(base)
         self._given = not isinstance(base, str) or base not in (AUTO, "rgbd")
@@ -100,7 +104,9 @@ class Spackle:
                 "a loaded photo has a focal length already: give focal_px, focal_mm or fov to load_photo"
             )
         pipeline, options = self._pipeline, self._pipeline.options
-        options = dataclasses.replace(options, path=PathOptions(trajectory, disparity))
+        options = dataclasses.replace(
+            options, path=PathOptions(trajectory=trajectory, disparity=disparity)
+        )
         options.path.check()
         with contextlib.ExitStack() as stack:
             if depth is not None:
@@ -129,7 +135,7 @@ def predict(
     disparity: float | None = None,
     depth_kind: DepthKind = "auto",
     residual: Residual = None,
-    fill: Fill = "auto",
+    fill: FillTexture = "auto",
     device: str = "auto",
     renderer: Renderer | None = None,
     keep_frame: bool = False,

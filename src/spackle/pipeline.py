@@ -29,22 +29,24 @@ from spackle.scene_fill.texture import Texture, exemplar_texture, painted_textur
 from spackle.views import PathOptions, PlannedViews, choose_disparity, plan_views
 from spackle.weights import installed_weights
 
-Fill = Literal["auto", "network", "exemplar", "lama", "none"]  # source of the texture in holes
-Mode = Literal["scene", "view"]  # one set of aux Gaussians for all views, or one set for each view
+# Where the texture in the holes comes from.
+FillTexture = Literal["auto", "network", "exemplar", "lama", "none"]
+# One set of aux Gaussians for all views, or one set for each view.
+FillMode = Literal["scene", "view"]
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class FillOptions:
     """Options of the fill."""
 
     residual: str | None = (
         None  # a file of weights, "seeds", "none", or None for the shipped weights if there are any
     )
-    fill: Fill = "auto"
-    mode: Mode = "scene"
+    fill: FillTexture = "auto"
+    mode: FillMode = "scene"
 
     @property
-    def texture(self) -> Fill:
+    def texture(self) -> FillTexture:
         """The fill, with "auto" resolved; "none" if `residual` is "none".
 
         In view mode "auto" means "exemplar", because inpainting would take seconds for each view.
@@ -74,8 +76,8 @@ class FillOptions:
         return None if self.file is None else load_residual(self.file)
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PipelineOptions:
     """All options for a photo: base, camera path and fill."""
 
     base: BaseSettings = dataclasses.field(default_factory=BaseSettings)
@@ -107,7 +109,7 @@ class CompletedPhoto:
 class Pipeline:
     """A base, a residual network and a renderer, opened once for many photos."""
 
-    options: Options
+    options: PipelineOptions
     base: OpenedBase
     network: ResidualNet | None
     renderer: Renderer
@@ -115,7 +117,7 @@ class Pipeline:
     keyframes: KeyframePath | None = None  # from --path
 
     @staticmethod
-    def open(options: Options) -> Pipeline:
+    def open(options: PipelineOptions) -> Pipeline:
         """Check the options, and load the files that they name; InputError for an option that no photo can use."""
         options.base.check()
         options.path.check()
@@ -139,12 +141,12 @@ class Pipeline:
         saved_view, by_view, pictures = None, None, dict[int, Tensor]()
         with reporter.stage("complete") as step:
             if fill.mode == "scene" or fill.texture == "none":
-                chosen = [] if fill.texture == "none" else views.looked_at
+                chosen = [] if fill.texture == "none" else views.views_to_fill
                 filled = fill_scene(
                     context, [views.cameras[k] for k in chosen], self.given_views is not None, step
                 )
                 aux = filled.aux
-                if views.maker.is_plain:
+                if views.frame_maker.is_plain:
                     pictures = {chosen[k]: picture for k, picture in filled.pictures.items()}
             else:
                 by_view = tuple(_fill_each(context, views.cameras, step))
@@ -195,7 +197,7 @@ class Pipeline:
     def _disparity(self, prediction: BasePrediction) -> float | None:
         """The path's disparity; None if views or keyframes are given."""
         given = self.given_views is not None or self.keyframes is not None
-        return None if given else self.options.path.reach(prediction.disparity)
+        return None if given else self.options.path.disparity_or(prediction.disparity)
 
 
 def move_in_words(prediction: BasePrediction) -> str:
@@ -228,7 +230,7 @@ def complete(
     *,
     exact: bool = False,
     network: ResidualNet | Literal["shipped"] | None = "shipped",
-    fill: Fill = "auto",
+    fill: FillTexture = "auto",
     renderer: Renderer | None = None,
     progress: Progress | None = None,
 ) -> Scene:
@@ -251,14 +253,14 @@ def complete(
     )
 
 
-def resolved(fill: Fill) -> Fill:
+def resolved(fill: FillTexture) -> FillTexture:
     """Replace "auto" by "lama" if LaMa's weights have been downloaded, else by "exemplar"."""
     if fill != "auto":
         return fill
     return "lama" if installed_weights("lama") else "exemplar"
 
 
-def open_texture(fill: Fill) -> Texture | None:
+def open_texture(fill: FillTexture) -> Texture | None:
     """The texture function of a fill: "lama" inpaints the widest views, "exemplar" takes patches of each view.
 
     "auto" is one of the two, see `resolved`; "network" and "none" give None. InputError for "lama" without its weights.

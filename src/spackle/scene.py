@@ -238,9 +238,16 @@ class Scene:
                 convergence=convergence,
                 compare=compare,
             ).for_file(file)
-            path = PathOptions(trajectory, disparity, None, None, frames, seconds, video, overscan)
+            path = PathOptions(
+                trajectory=trajectory,
+                disparity=disparity,
+                frames=frames,
+                seconds=seconds,
+                video=video,
+                overscan=overscan,
+            )
             path.check()
-            cameras = path.fly(self.base, self.camera, None, self.disparity)
+            cameras = path.video_cameras(self.base, self.camera, None, self.disparity)
             maker = FrameMaker.of(video, self.base, cameras, shown)
             parts = [[self.base]] * compare + [[self.base, self.aux]]
             used = renderer or get_renderer()

@@ -36,7 +36,7 @@ MAX_OVERSCAN = 0.5
 MEASURED_KEYFRAMES = 16  # largest number of keyframes whose holes are reported
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class PathOptions:
     """Options of the camera path, and of the video along it."""
 
@@ -88,11 +88,11 @@ class PathOptions:
         views = None if self.cameras is None else load_cameras(self.cameras)
         return views, None if self.path is None else load_path(self.path)
 
-    def reach(self, default: float) -> float:
+    def disparity_or(self, default: float) -> float:
         """The path's disparity: that of the options, or the default."""
         return default if self.disparity is None else self.disparity
 
-    def fly(
+    def video_cameras(
         self,
         gaussians: Gaussians,
         camera: Camera,
@@ -115,7 +115,7 @@ class PathOptions:
         if keyframes is None:
             count = given or max(1, round(SECONDS * self.video.frames_per_second))
             reach, depths = (
-                self.reach(USUAL_DISPARITY if disparity is None else disparity),
+                self.disparity_or(USUAL_DISPARITY if disparity is None else disparity),
                 DepthRange.of(gaussians),
             )
             path = trajectory(self.trajectory, camera.even(), reach, depths, count, looped=True)
@@ -138,8 +138,8 @@ class PlannedViews:
         tuple[int, ...]
     ]  # for each frame of the video the index of its view, or of its two eyes' views
     stills: int  # the number of views at the beginning that are also saved as pictures
-    maker: FrameMaker
-    looked_at: list[
+    frame_maker: FrameMaker
+    views_to_fill: list[
         int
     ]  # views for which a scene is completed; more frames of the same path uncover nothing more
 
@@ -216,8 +216,8 @@ def plan_views(
             as_input_error(source, NO_PATH, ValueError),
             as_input_error(path.path, "{reason}", PathError),
         ):
-            path_cameras = path.fly(gaussians, camera, keyframes, prediction.disparity)
-            reach, depths = path.reach(prediction.disparity), DepthRange.of(gaussians)
+            path_cameras = path.video_cameras(gaussians, camera, keyframes, prediction.disparity)
+            reach, depths = path.disparity_or(prediction.disparity), DepthRange.of(gaussians)
             if keyframes is None:
                 others = dict(
                     zip((f"{-reach:g}", f"+{reach:g}"), extremes(even, reach, depths), strict=True)
@@ -240,9 +240,9 @@ def plan_views(
     measured = {name: last + k for k, name in enumerate(others)} or {
         str(k): k for k in range(len(eyes))
     }
-    looked_at = [
+    views_to_fill = [
         *range(first),
         *itertools.chain(*frames[::every]),
         *range(first + each * len(eyes), len(cameras)),
     ]
-    return PlannedViews(cameras, measured, frames, len(given or []), maker, looked_at)
+    return PlannedViews(cameras, measured, frames, len(given or []), maker, views_to_fill)

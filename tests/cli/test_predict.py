@@ -211,8 +211,8 @@ def test_lama_is_used_if_its_weights_are_downloaded(
     choices = (
         FillOptions(),
         FillOptions(mode="view"),
-        FillOptions(None, "lama", "view"),
-        FillOptions("none"),
+        FillOptions(fill="lama", mode="view"),
+        FillOptions(residual="none"),
     )
     assert [choice.texture for choice in choices] == ["lama", "exemplar", "lama", "none"]
     refuses(run(*command), published_weights("lama").file)

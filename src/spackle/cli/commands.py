@@ -170,16 +170,32 @@ def predict(
     """
     from spackle.bases.settings import BaseSettings
     from spackle.cli.photos import PredictOptions, predict_all
-    from spackle.pipeline import FillOptions, Options
+    from spackle.pipeline import FillOptions, PipelineOptions
     from spackle.results.photo_folder import PhotoOptions
     from spackle.runtime.progress import Reporter
 
-    reading, speed = (calib, depth_kind, near, far), sharp_speed(sharp)
-    settings = BaseSettings(base, depth, *reading, checkpoint, precision, device=device, **speed)
-    scene = Options(settings, path, FillOptions(residual, fill, mode))
+    settings = BaseSettings(
+        name=base,
+        depth=depth,
+        calib=calib,
+        depth_kind=depth_kind,
+        near=near,
+        far=far,
+        checkpoint=checkpoint,
+        precision=precision,
+        device=device,
+        **sharp_speed(sharp),
+    )
+    scene = PipelineOptions(
+        base=settings, path=path, fill=FillOptions(residual=residual, fill=fill, mode=mode)
+    )
     lens = {"focal_px": focal_px, "focal_mm": focal_mm, "fov": fov}
-    photo = PhotoOptions(lens, render, keep_base, depth_out, keep_frame)
-    options = PredictOptions(scene, photo, overwrite, workers, threads)
+    photo = PhotoOptions(
+        lens=lens, render=render, keep_base=keep_base, depth_out=depth_out, keep_frame=keep_frame
+    )
+    options = PredictOptions(
+        scene=scene, photo=photo, overwrite=overwrite, workers=workers, threads=threads
+    )
     if predict_all(photos, output, options, Reporter(verbose, as_json=as_json)):
         raise typer.Exit(1)
 
@@ -304,7 +320,7 @@ def view(
     from spackle.runtime.progress import Reporter
 
     settings = BaseSettings(
-        base, depth, depth_kind=depth_kind, checkpoint=checkpoint, device=device
+        name=base, depth=depth, depth_kind=depth_kind, checkpoint=checkpoint, device=device
     )
     place = app.Place(host, port, secrets.token_urlsafe(16) if token else None, browser)
     reporter = Reporter(verbose, as_json=as_json)
@@ -363,7 +379,7 @@ def serve(
     from spackle.web.jobs import RetentionLimits
     from spackle.web.work import SceneWork
 
-    work = SceneWork(BaseSettings(base, checkpoint=checkpoint, device=device), verbose=verbose)
+    work = SceneWork(BaseSettings(name=base, checkpoint=checkpoint, device=device), verbose=verbose)
     place = app.Place(host, port, token or secrets.token_urlsafe(16), False)
     app.serve(
         output,

@@ -132,7 +132,9 @@ def dataset_build(
     from spackle.paper.dataset.build import DatasetOptions, build_dataset
     from spackle.runtime.progress import Reporter
 
-    settings = BaseSettings(base, depth, checkpoint=checkpoint, precision=precision, device=device)
+    settings = BaseSettings(
+        name=base, depth=depth, checkpoint=checkpoint, precision=precision, device=device
+    )
     options = DatasetOptions(
         settings,
         images=images,

@@ -16,7 +16,7 @@ from spackle.formats import save_ply, save_png
 from spackle.formats.png import contact_sheet
 from spackle.paper.evaluation.datasets.stereo import StereoPair, load_motorcycle
 from spackle.paper.training.losses import hole_psnr
-from spackle.pipeline import Options, Pipeline, complete
+from spackle.pipeline import Pipeline, PipelineOptions, complete
 from spackle.render import Renderer
 from spackle.residual import hole_area_ratio, hole_mask
 from spackle.results.photo_folder import save_views
@@ -43,7 +43,10 @@ def run_demo(output: Path, reporter: Reporter) -> None:
     """
     pair = load_motorcycle()
     pipeline = Pipeline.open(
-        Options(BaseSettings("rgbd", pair.depth), PathOptions(disparity=DISPARITY, overscan=0))
+        PipelineOptions(
+            base=BaseSettings(name="rgbd", depth=pair.depth),
+            path=PathOptions(disparity=DISPARITY, overscan=0),
+        )
     )
     renderer = pipeline.renderer
     with results_folder(output, FILES, alone=True):

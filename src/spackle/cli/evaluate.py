@@ -147,7 +147,11 @@ def evaluate(
         second_views=second_views,
         metrics=None if metrics is None else () if metrics == "none" else split_words(metrics),
         base=BaseSettings(
-            base, checkpoint=checkpoint, precision=precision, device=device, **sharp_speed(sharp)
+            name=base,
+            checkpoint=checkpoint,
+            precision=precision,
+            device=device,
+            **sharp_speed(sharp),
         ),
         residual=residual,
         direct_ft=direct_ft,
@@ -246,7 +250,11 @@ def bench(
         side=side,
         metrics=(),
         base=BaseSettings(
-            base, checkpoint=checkpoint, precision=precision, device=device, **sharp_speed(sharp)
+            name=base,
+            checkpoint=checkpoint,
+            precision=precision,
+            device=device,
+            **sharp_speed(sharp),
         ),
         residual=residual,
         limit=limit,

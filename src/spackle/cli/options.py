@@ -245,7 +245,16 @@ def path_options(
         convergence=convergence,
     )
     kind, zoom = trajectory or "rotate-forward", OVERSCAN if overscan is None else overscan
-    return PathOptions(kind, disparity, cameras, path, frames, seconds, video, zoom)
+    return PathOptions(
+        trajectory=kind,
+        disparity=disparity,
+        cameras=cameras,
+        path=path,
+        frames=frames,
+        seconds=seconds,
+        video=video,
+        overscan=zoom,
+    )
 
 
 def with_path_options(command: Callable[..., None]) -> Callable[..., None]:

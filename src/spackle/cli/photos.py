@@ -21,7 +21,7 @@ from spackle.clips.predict import clip_options, predict_clip
 from spackle.core.photo import PHOTO_SUFFIXES
 from spackle.depth.depth_map import calibrations_beside, find_depth
 from spackle.depth.writers import check_depth_name
-from spackle.pipeline import Options, Pipeline
+from spackle.pipeline import Pipeline, PipelineOptions
 from spackle.render import device_of
 from spackle.render.blend import blend_tiles
 from spackle.results.photo_folder import REPORT, PhotoOptions, earlier_report, predict_photo
@@ -42,11 +42,11 @@ from spackle.video.frames import video_problem
 from spackle.weights import installed_weights
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class PredictOptions:
     """Options of `spackle predict`."""
 
-    scene: Options
+    scene: PipelineOptions
     photo: PhotoOptions
     overwrite: bool = False  # redo photos whose results exist
     workers: int = 1  # processes that share the photos

@@ -82,7 +82,7 @@ def render_scene(
             as_input_error(scene, impossible, ValueError),
             as_input_error(path.path, "{reason}", PathError),
         ):
-            cameras = given or path.fly(base, whole.camera, keyframes, reach)
+            cameras = given or path.video_cameras(base, whole.camera, keyframes, reach)
         if reach is not None and (path.disparity or 0) > reach:
             far = f"--disparity {path.disparity:g}"
             reporter.log(

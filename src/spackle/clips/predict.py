@@ -14,7 +14,7 @@ from spackle.clips.files import ClipWriter, clip_frames, read_clip
 from spackle.core.photo import Photo, check_shape, focal_length, resize_photo
 from spackle.depth.depth_map import RELATIVE
 from spackle.inpaint.plain import OpenCV
-from spackle.pipeline import Options, Pipeline, move_in_words
+from spackle.pipeline import Pipeline, PipelineOptions, move_in_words
 from spackle.residual import hole_area_ratio
 from spackle.results.photo_folder import PhotoOptions, shared_report
 from spackle.runtime.errors import InputError
@@ -28,7 +28,7 @@ RESULT_FILES = ("video.mp4", "report.json")
 FRAME_NAME = "{:06d}"
 
 
-def clip_options(scene: Options, photo: PhotoOptions, workers: int) -> Options:
+def clip_options(scene: PipelineOptions, photo: PhotoOptions, workers: int) -> PipelineOptions:
     """The pipeline's options for a clip; InputError for an option that does not apply to a clip."""
     depth, path, fill = scene.base.depth, scene.path, scene.fill
     plain = vars(VideoOptions())
@@ -145,7 +145,7 @@ def predict_clip(
                 "sound": {"codec": clip.audio, "copied": writer.sound} if clip.audio else None,
             },
             "aux": {"gaussians": round(mean(frame["aux"] for frame in frames))},  # of a frame
-            "disparity": options.path.reach(first[1].disparity),
+            "disparity": options.path.disparity_or(first[1].disparity),
             "hole_area_ratio": {
                 end: mean(frame[end] for frame in frames) for end in ("before", "after")
             }

@@ -29,7 +29,7 @@ from spackle.video.encoding import save_video
 REPORT = "report.json"
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class PhotoOptions:
     """Options of reading a photo, and the files to write; other options belong to the pipeline."""
 
@@ -92,7 +92,7 @@ def predict_photo(
                 save_depth(scene.depth_map(pipeline.renderer), new / wanted.depth_out)
         video = None
         if wanted.render:
-            video = views.maker.report_entry(
+            video = views.frame_maker.report_entry(
                 video_file, views.cameras[views.frames[0][0]], len(views.frames)
             )
             with reporter.stage("video") as step:
@@ -139,7 +139,7 @@ def predict_photo(
 
 def save_views(done: CompletedPhoto, path: Path, renderer: Renderer, step: Progress) -> None:
     """Write the planned views, which have one size, as a video; InputError if the file cannot be written."""
-    views, video = done.views, done.views.maker.options
+    views, video = done.views, done.views.frame_maker.options
 
     def frames() -> Iterator[Tensor]:
         for index, frame in enumerate(views.frames):
@@ -149,11 +149,12 @@ def save_views(done: CompletedPhoto, path: Path, renderer: Renderer, step: Progr
                 with torch.no_grad():
                     eyes = [
                         renderer.render(
-                            done.scene.of_view(k), views.maker.resized_camera(views.cameras[k])
+                            done.scene.of_view(k),
+                            views.frame_maker.resized_camera(views.cameras[k]),
                         )
                         for k in frame
                     ]
-                    yield views.maker.frame(eyes)
+                    yield views.frame_maker.frame(eyes)
             step(index + 1, len(views.frames))
 
     save_video(frames(), path, video.frames_per_second, video.loop)

@@ -21,7 +21,7 @@ from spackle.core.trajectories import MAX_DISPARITY, TRAJECTORIES, TrajectoryKin
 from spackle.depth.depth_map import DepthKind
 from spackle.formats.html import html_safe_json, single_html
 from spackle.formats.scene_files import scene_suffix
-from spackle.pipeline import Fill, FillOptions, Options, Pipeline
+from spackle.pipeline import FillOptions, FillTexture, Pipeline, PipelineOptions
 from spackle.render import get_renderer
 from spackle.results.photo_folder import REPORT, PhotoOptions, predict_photo
 from spackle.runtime.errors import InputError
@@ -71,7 +71,7 @@ class SceneOptions(BaseModel):
         le=MAX_FRAMES,
         description="Number of frames of the video, 30 per second.",
     )
-    fill: Fill = Field("auto", description="Source of the texture in the holes.")
+    fill: FillTexture = Field("auto", description="Source of the texture in the holes.")
     focal_px: float | None = Field(None, gt=0, description="Focal length in pixels of the photo.")
     focal_mm: float | None = Field(None, gt=0, description="Focal length in mm, 35 mm equivalent.")
     fov: float | None = Field(
@@ -135,15 +135,17 @@ class SceneWork:
             )
         elif options.base not in (None, settings.name):
             settings = dataclasses.replace(settings, name=options.base, checkpoint=None)
-        path = PathOptions(options.trajectory, options.disparity, frames=options.frames)
-        chosen = Options(settings, path, FillOptions(fill=options.fill))
+        path = PathOptions(
+            trajectory=options.trajectory, disparity=options.disparity, frames=options.frames
+        )
+        chosen = PipelineOptions(base=settings, path=path, fill=FillOptions(fill=options.fill))
         if self.opened is None or self.opened.options.base != settings:
             self.opened = None  # frees the network before another one is loaded
             self.opened = Pipeline.open(chosen)
         pipeline = dataclasses.replace(self.opened, options=chosen)
         lens = options.model_dump(include={"focal_px", "focal_mm", "fov"})
         wanted = PhotoOptions(
-            lens, render="video.mp4" in options.files, keep_frame=options.keep_frame
+            lens=lens, render="video.mp4" in options.files, keep_frame=options.keep_frame
         )
         predict_photo(job.folder / job.source, job.results, pipeline, teller, wanted)
         report = json.loads((job.results / REPORT).read_text(encoding="utf-8"))

@@ -193,7 +193,12 @@ def open_evaluation(options: EvaluateOptions, more_metrics: Sequence[str] = ()) 
     """
     options.check()
     base, cases = options.base, _cases_of(options)
-    network, direct, features, inpainter = FillOptions(options.residual).load(), None, None, None
+    network, direct, features, inpainter = (
+        FillOptions(residual=options.residual).load(),
+        None,
+        None,
+        None,
+    )
     if "inpaint2d" in options.methods:
         inpainter = get_inpainter(options.inpainter, InpainterOptions(device=options.device.type))
     if options.direct_ft is not None:
@@ -248,7 +253,11 @@ def _configuration(
     options: EvaluateOptions, cases: Sequence[Case], inpainter: Inpainter | None, renderer: Renderer
 ) -> dict[str, Any]:
     """Everything that determines the renders, ready for JSON, without paths."""
-    base, dataset, fill = options.base, DATASETS[options.dataset], FillOptions(options.residual)
+    base, dataset, fill = (
+        options.base,
+        DATASETS[options.dataset],
+        FillOptions(residual=options.residual),
+    )
     precision = str(pick_dtype(base.precision, device_of(renderer))).removeprefix("torch.")
     config: dict[str, Any] = {
         "kind": "evaluate",
