@@ -63,7 +63,7 @@ from spackle.depth.depth_map import DepthMap
 from spackle.lifting.edges import Edges
 from spackle.lifting.silhouettes import Layers
 from spackle.paper.evaluation.metrics import GREY, sharpness
-from spackle.paper.training.losses import FeatureNet, covered, hole_psnr, load_features
+from spackle.paper.training.losses import FeatureNet, covered_fraction, hole_psnr, load_features
 from spackle.paper.training.sources import load_pair
 
 Row = dict[str, float]  # the figures of a scene, by name
@@ -193,7 +193,7 @@ class Perception:
         distances, textures = [], []
         for both in (self.maps[layer] for layer in LAYERS):  # [2, C, h, w]
             unit = (both / both.norm(dim=1, keepdim=True).clamp_min(1e-10)).flatten(2)
-            weight = covered(hole[None], both)[0, 0].flatten()
+            weight = covered_fraction(hole[None], both)[0, 0].flatten()
             weight /= weight.sum()
             distances.append(float(((unit[0] - unit[1]).square().sum(0) * weight).sum()))
             ours, theirs = (vectors * weight @ vectors.T for vectors in unit)

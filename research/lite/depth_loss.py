@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
 from spackle.bases.lite import network_size
-from spackle.paper.training.recipe import RecipePart, Share
+from spackle.paper.training.recipe import NonNegative, RecipePart
 
 FARTHEST = 0.02  # part of the median inverse depth: farther surfaces, mostly sky, get this value
 NEAREST = 20.0
@@ -26,10 +26,10 @@ SCALES = (1, 2, 4, 8)  # strides between neighbours in the loss term steps
 class DepthLossWeights(RecipePart):
     """The weights of the loss's terms."""
 
-    factor: Share = 1.0
-    line: Share = 1.0
-    steps: Share = 0.5
-    offset: Share = 0.1  # without it features grow until they overflow half precision
+    factor: NonNegative = 1.0
+    line: NonNegative = 1.0
+    steps: NonNegative = 0.5
+    offset: NonNegative = 0.1  # without it features grow until they overflow half precision
 
 
 def depth_loss(

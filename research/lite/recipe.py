@@ -15,15 +15,15 @@ from pydantic import Field
 from spackle.bases.lite import STAGES, STRIDE, Size
 from spackle.core.photo import PHOTO_SUFFIXES
 from spackle.paper.training.recipe import (
-    FREE,
+    MAY_CHANGE_ON_RESUME,
     AnyRecipe,
     Count,
+    NonNegative,
     OptimRecipe,
-    Place,
+    OptionalPath,
     RecipePart,
     RgbdFolder,
     Seed,
-    Share,
 )
 from spackle.paper.training.samples import short_digest
 from spackle.paper.training.sources import find_files
@@ -37,20 +37,22 @@ Scale = Annotated[float, Field(ge=0.1, le=2)]
 class LiteShares(RecipePart):
     """Relative shares of the pictures from each source; a source without data gets no share."""
 
-    made: Share = 0.4
-    stereo: Share = 0.28
-    rgbd: Share = 0.14
-    guessed: Share = 0.18  # only with a teacher
+    made: NonNegative = 0.4
+    stereo: NonNegative = 0.28
+    rgbd: NonNegative = 0.14
+    guessed: NonNegative = 0.18  # only with a teacher
 
 
 class LiteData(RecipePart):
     """The sources of photos with depth."""
 
-    photos: Place = (
+    photos: OptionalPath = (
         None  # a folder, with its subfolders; textures of synthetic scenes are cut from them
     )
-    rgbd: Annotated[tuple[RgbdFolder, ...], FREE] = ()  # their focal lengths are not used
-    stereo: Place = None  # a folder of scenes, each with a scene.json
+    rgbd: Annotated[
+        tuple[RgbdFolder, ...], MAY_CHANGE_ON_RESUME
+    ] = ()  # their focal lengths are not used
+    stereo: OptionalPath = None  # a folder of scenes, each with a scene.json
     made: Count = 4900  # number of synthetic scenes
     teacher: Path | None = (
         None  # weights of an earlier run; its predictions for `photos` become training data
@@ -63,11 +65,11 @@ class LiteData(RecipePart):
     )  # height and width of pictures; swapped in a fifth of the steps
     # Factors on `size`; each step draws one, because the base uses several sizes.
     scales: Annotated[tuple[Scale, ...], Field(min_length=1)] = (1.0,)
-    cache: Place = None  # a folder for synthetic scenes and guesses; None: inside the output
+    cache: OptionalPath = None  # a folder for synthetic scenes and guesses; None: inside the output
     seed: Seed = 0  # for synthetic scenes alone: runs that differ only in run.seed share them
     # Share of each folder of `rgbd` for validation: the last frames by name, because neighbouring frames are alike.
     validation: Annotated[float, Field(ge=0, le=0.9)] = 0.2
-    validation_stereo: Place = (
+    validation_stereo: OptionalPath = (
         None  # scenes for validation; all scenes of `stereo` are for training
     )
 

@@ -17,7 +17,7 @@ from synthetic_scenes import SAMPLES, drawn
 from textures import LATTICE, LEAVES, RING, WHOLE
 from torch import Tensor
 
-from spackle.paper.training.sources import Photos
+from spackle.paper.training.sources import DrawPhoto
 
 Things = list[list[Solid]]
 MOST = 64  # more than a scene's number of objects
@@ -220,7 +220,7 @@ THINGS: tuple[tuple[Callable[[Rng, Array], list[Solid]], float], ...] = (
 )
 
 
-def labelled_scene(rng: Rng, photos: Photos, height: int, width: int) -> tuple[Frame, Tensor]:
+def labelled_scene(rng: Rng, photos: DrawPhoto, height: int, width: int) -> tuple[Frame, Tensor]:
     """A street, and labels [H, W] int64: 0 for background, else the number of the object that a pixel shows."""
     owners: list[int] = []
 

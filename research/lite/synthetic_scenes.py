@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from spackle.core.photo import load_photo
-from spackle.paper.training.sources import Photos
+from spackle.paper.training.sources import DrawPhoto
 from spackle.runtime.errors import InputError
 from spackle.runtime.files import atomic_path
 
@@ -36,7 +36,7 @@ KINDS: tuple[tuple[Callable[[Rng], Scene], float], ...] = (  # with their relati
 )
 
 
-def synthetic_scene(rng: Rng, photos: Photos, height: int, width: int) -> tuple[Tensor, Tensor]:
+def synthetic_scene(rng: Rng, photos: DrawPhoto, height: int, width: int) -> tuple[Tensor, Tensor]:
     """Render a random scene: [H, W, 3] sRGB, and exact inverse depth [H, W] in 1/m (0 in the sky).
 
     Args:
@@ -66,7 +66,7 @@ class Picture:
 
 
 def drawn(
-    rng: Rng, photos: Photos, height: int, width: int, build: Callable[[Rng], Scene]
+    rng: Rng, photos: DrawPhoto, height: int, width: int, build: Callable[[Rng], Scene]
 ) -> Picture:
     """Render a scene made by `build`; see `synthetic_scene`."""
     skins = textures(rng, photos)

@@ -54,14 +54,14 @@ class LiteTask(Task):
     """Trains the lite base; items are indices in a batch, validation items are groups of frames."""
 
     name: ClassVar[str] = "lite"
-    aim: ClassVar[str] = "abs_rel"
+    selection_measure: ClassVar[str] = "abs_rel"
 
     def __init__(self, recipe: LiteRecipe, device: torch.device) -> None:
         """Find a recipe's files, without making scenes or reading frames; InputError if they cannot be used."""
         self.recipe, self.device, self.files = recipe, device, LiteFiles.of(recipe.data)
         self.network: nn.Module = freeze(first_network(recipe), recipe.optim.frozen)
         self.digest = self.files.digest
-        self.items = self.items_a_step = recipe.optim.batch
+        self.items = self.items_per_step = recipe.optim.batch
 
     def prepare(self, output: Path, reporter: Reporter) -> dict[str, Any]:
         """Make missing scenes and guesses, and read the frames."""
@@ -121,7 +121,7 @@ class LiteTask(Task):
         )
         return {"samples": {"train": counts, "validation": judged, "digest": self.digest}}
 
-    def groups(self) -> list[dict[str, Any]]:
+    def parameter_groups(self) -> list[dict[str, Any]]:
         """One group of weights for each rate: the pretrained encoder has its own."""
         found: dict[float, list[Tensor]] = {}
         for name, weight in self.network.named_parameters():
@@ -130,7 +130,7 @@ class LiteTask(Task):
                 found.setdefault(scale, []).append(weight)
         return [{"params": weights, "lr_scale": scale} for scale, weights in found.items()]
 
-    def batch(
+    def load_batch(
         self, step: int | None, items: Sequence[int]
     ) -> DepthBatch | list[tuple[str, list[Frame]]]:
         """A step's pictures, or groups of validation frames by name; InputError if a file cannot be read."""
@@ -156,7 +156,7 @@ class LiteTask(Task):
         return found
 
     @torch.no_grad()
-    def picture(self, network: nn.Module) -> Tensor:
+    def draw_picture(self, network: nn.Module) -> Tensor:
         """[H, W, 3] sRGB: for a few validation frames the photo, and predicted and true inverse depth."""
         each, rows = max(1, PICTURED // self.validation_items), []
         chosen = [

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from spackle.paper.training.sources import Photos, outline, random_crop
+from spackle.paper.training.sources import DrawPhoto, random_crop, random_outline
 
 Floats = NDArray[np.float32]
 Rng = np.random.Generator
@@ -25,12 +25,12 @@ LATTICE, LEAVES, RING, PEAK = (
 )  # one texture of each of these shapes
 
 
-def textures(rng: Rng, photos: Photos) -> Floats:
+def textures(rng: Rng, photos: DrawPhoto) -> Floats:
     """[T, S, S, 4] the textures of a scene: colours 0..1 and coverage 0 or 1."""
     return np.stack([_skin(rng, photos, number) for number in range(PEAK + 1)])
 
 
-def sky(rng: Rng, photos: Photos, height: int, width: int) -> Floats:
+def sky(rng: Rng, photos: DrawPhoto, height: int, width: int) -> Floats:
     """[H, W, 3] a sky: a gradient with a faint photo in it, or plain white."""
     if rng.random() < 0.2:
         return np.full((height, width, 3), rng.uniform(0.92, 1.0), np.float32)
@@ -48,14 +48,14 @@ def sky(rng: Rng, photos: Photos, height: int, width: int) -> Floats:
     return result.contiguous().numpy()
 
 
-def _skin(rng: Rng, photos: Photos, number: int) -> Floats:
+def _skin(rng: Rng, photos: DrawPhoto, number: int) -> Floats:
     """[S, S, 4]: part of a photo, unchanged or as a faint pattern on a colour; `number` determines the outline."""
     picture = random_crop(rng, photos(rng), SIDE, SIDE)
     coverage = np.ones((SIDE, SIDE), np.float32)
     if number >= FIRST_SHAPE:
         coverage = _shape(rng, number)
     elif number >= WHOLE:
-        shape = outline(rng, picture)
+        shape = random_outline(rng, picture)
         coverage = shape.numpy() if float(shape.mean()) > 0.05 else coverage
     if number >= FIRST_SHAPE or (number < WHOLE and rng.random() < 0.5):
         picture = _painted(rng, picture)

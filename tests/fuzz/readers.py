@@ -24,7 +24,7 @@ from spackle.depth.in_photo.layouts import load_photo_depth
 from spackle.formats import PlyFile, load_cameras, load_path
 from spackle.formats.scene_files import load_scene
 from spackle.paper.dataset import DatasetFiles
-from spackle.paper.dataset.inspect import problems
+from spackle.paper.dataset.inspect import find_problems
 from spackle.paper.dataset.photos import find_photos
 from spackle.paper.dataset.shards import load_manifest
 from spackle.paper.evaluation.case import load_case
@@ -109,7 +109,7 @@ def _read_tree(name: str, folder: Path) -> None:
 
 
 def _read_dataset(folder: Path) -> None:
-    list(problems(folder, load_manifest(folder), lambda done, total: None))
+    list(find_problems(folder, load_manifest(folder), lambda done, total: None))
     files = DatasetFiles(folder)
     for place in range(len(files)):
         group = files[place]

@@ -18,7 +18,7 @@ from PIL import Image
 
 from helpers import web_work
 from helpers.photos import picture
-from spackle.web.app import create_app, server_of
+from spackle.web.app import create_app, make_server
 from spackle.web.guard import Access
 from spackle.web.jobs import Jobs, RetentionLimits
 
@@ -118,9 +118,13 @@ def served(
         listener.listen()
         address, port = listener.getsockname()
         app = create_app(
-            folder, work, keep=keep, access=Access.at(host, address, token), max_bytes=max_bytes
+            folder,
+            work,
+            keep=keep,
+            access=Access.for_listener(host, address, token),
+            max_bytes=max_bytes,
         )
-        server = server_of(app)
+        server = make_server(app)
         thread = threading.Thread(target=server.run, args=([listener],))
         thread.start()
         try:

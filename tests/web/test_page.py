@@ -37,7 +37,7 @@ from spackle.formats.html import PageScene, page_scene, read_page_file, single_h
 from spackle.pipeline import complete
 from spackle.render import CpuRenderer
 from spackle.scene import Scene
-from spackle.web.guard import MAX_BYTES
+from spackle.web.guard import MAX_UPLOAD_BYTES
 from spackle.web.work import SceneWork
 
 WEB = ROOT / "web"
@@ -298,7 +298,7 @@ def test_the_whole_photo_and_every_control_has_room(page: Any, size: tuple[int, 
 def test_a_photo_is_sent_to_the_server_and_watched(browser: Any, tmp_path: Path) -> None:
     photo, depth = write_pair(tmp_path / "first")
     photo = photo.rename(tmp_path / "my photo.png")
-    with served(tmp_path / "scenes", work=SceneWork(), max_bytes=MAX_BYTES) as server:
+    with served(tmp_path / "scenes", work=SceneWork(), max_bytes=MAX_UPLOAD_BYTES) as server:
         address = f"http://127.0.0.1:{server.port}{server.root}/"
         page = (found := opened(browser, address)).page
         page.get_by_role("button", name="Choose a photo…").click()

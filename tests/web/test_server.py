@@ -37,7 +37,7 @@ from PIL import Image
 
 from spackle.runtime.errors import InputError
 from spackle.runtime.task_process import DIED
-from spackle.web.app import shown_name
+from spackle.web.app import safe_display_name
 from spackle.web.jobs import RetentionLimits
 
 
@@ -261,7 +261,7 @@ def test_an_upload_is_bounded_while_it_comes(server: Served) -> None:
 def test_a_slow_or_vanished_client_frees_its_place(
     server: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("spackle.web.app.UPLOAD_S", 0.5)
+    monkeypatch.setattr("spackle.web.app.MAX_UPLOAD_S", 0.5)
     before = set(server.jobs.folder.iterdir())
     for gone in (False, True):
         with server.dial(post(90_000) + form()[:90]) as connection:
@@ -277,8 +277,8 @@ def test_a_slow_or_vanished_client_frees_its_place(
 def test_the_connection_of_a_silent_or_deaf_client_is_closed(
     server: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("spackle.web.app.SILENT_S", 0.3)
-    monkeypatch.setattr("spackle.web.guard.SEND_S", 0.5)
+    monkeypatch.setattr("spackle.web.app.MAX_HEAD_S", 0.3)
+    monkeypatch.setattr("spackle.web.guard.MAX_SEND_S", 0.5)
     with server.dial(b"GET / HTTP/1.1\r\nHost: local") as silent:
         assert answer_of(silent) == b""
     content = bytes(30_000_000)  # more than the socket's buffers hold
@@ -342,9 +342,9 @@ def test_photos_are_recognised_by_decoding(
 
 
 def test_a_name_is_safe_to_show() -> None:
-    assert shown_name("../../etc/passwd.png") == "passwd.png"
-    assert shown_name("\x1b[31m\r\na\u202e.png") == "[31ma.png"
-    assert len(shown_name(f"{200 * 'a'}.png")) == 80
+    assert safe_display_name("../../etc/passwd.png") == "passwd.png"
+    assert safe_display_name("\x1b[31m\r\na\u202e.png") == "[31ma.png"
+    assert len(safe_display_name(f"{200 * 'a'}.png")) == 80
 
 
 @pytest.mark.parametrize(
@@ -373,8 +373,8 @@ def test_photos_wait_and_go_on_after_a_restart(tmp_path: Path) -> None:
         eventually(lambda: server.ask(f"{SCENES}/{slow}").json["stage"] == "base")
         assert server.ask(f"{SCENES}/{slow}", "DELETE").status == 204
         assert [server.events(id)[-1]["state"] for id in waiting] == ["done", "done"]
-        server.jobs.keep = RetentionLimits(seconds=0)
-        server.jobs.tidy()
+        server.jobs.limits = RetentionLimits(seconds=0)
+        server.jobs.remove_expired()
         assert {path.name for path in tmp_path.iterdir()} == {".lock"}
 
 

@@ -25,7 +25,7 @@ from spackle.runtime.files import check_file
 from spackle.runtime.progress import Reporter, asked_to_stop
 from spackle.scene import Scene
 from spackle.views import PathOptions
-from spackle.web.app import create_app, server_of
+from spackle.web.app import create_app, make_server
 from spackle.web.guard import Access
 from spackle.web.jobs import LOG, Jobs, RetentionLimits
 from spackle.web.work import PREVIEW, SceneWork, check_photo
@@ -70,7 +70,7 @@ def view(
         work = SceneWork(others, usual, reporter.verbose)
         with listening(Path(folder), work, 1, RetentionLimits(), place, reporter) as (jobs, urls):
             if target is not None:
-                with jobs.place() as new:
+                with jobs.reserve_place() as new:
                     if scene_suffix(target) is None:
                         check_photo(target, name, new / PREVIEW)
                     depth = None if settings.depth is None else os.path.abspath(str(settings.depth))
@@ -138,7 +138,7 @@ def listening(
         logged_to(reporter),
     ):
         address, port = listener.getsockname()[:2]
-        access = Access.at(place.host, address, place.token)
+        access = Access.for_listener(place.host, address, place.token)
         if not access.local and place.token is None:
             raise InputError(
                 f"--host {place.host}: other machines can connect: leave --no-token out"
@@ -150,7 +150,7 @@ def listening(
         with contextlib.closing(app.state.jobs) as jobs:
             yield jobs, [f"http://{f'[{a}]' if ':' in a else a}:{port}/{token}" for a in addresses]
             if not stopped():
-                server_of(app).run(sockets=[listener])
+                make_server(app).run(sockets=[listener])
 
 
 @contextlib.contextmanager

@@ -30,7 +30,7 @@ from spackle.depth.depth_map import SUFFIXES
 from spackle.formats.html import read_page_file
 from spackle.runtime.errors import InputError, first_problem, one_line
 from spackle.runtime.task_process import Work
-from spackle.web.guard import MAX_BYTES, Access, Guard
+from spackle.web.guard import MAX_UPLOAD_BYTES, Access, Guard
 from spackle.web.jobs import Job, Jobs, RetentionLimits, SceneState
 from spackle.web.work import (
     PREVIEW,
@@ -45,24 +45,28 @@ from spackle.web.work import (
 PagePart = Literal[
     "page.json", "base.splats", "aux.splats", "photo.jpg"
 ]  # files that the page draws
-SCENES = "/api/v1/scenes"
-FILES = sorted([PREVIEW, *get_args(Download), *get_args(Video)])  # files that a state lists
+SCENES_PATH = "/api/v1/scenes"
+LISTED_FILES = sorted([PREVIEW, *get_args(Download), *get_args(Video)])  # files that a state lists
 POLL_S = 0.1  # seconds between two checks whether a state has changed
-UPLOAD_S = 300.0  # seconds that an upload may take, because it holds a place in the queue
-MAX_NAME = 80  # characters
-CONNECTIONS = 512  # open at a time; further ones are refused
-SILENT_S = 10.0  # seconds that a client may take to send the head of a request
-WORK, KEEP = SceneWork(), RetentionLimits()
-FILE = {"type": "string", "format": "binary"}
-UPLOAD: dict[
+MAX_UPLOAD_S = 300.0  # seconds that an upload may take, because it holds a place in the queue
+MAX_NAME_CHARACTERS = 80  # characters
+MAX_CONNECTIONS = 512  # open at a time; further ones are refused
+MAX_HEAD_S = 10.0  # seconds that a client may take to send the head of a request
+DEFAULT_WORK = SceneWork()
+DEFAULT_LIMITS = RetentionLimits()
+BINARY_FILE = {"type": "string", "format": "binary"}
+UPLOAD_FORM: dict[
     str, Any
 ] = {  # not declared as a form: FastAPI would read it before the queue has a place
     "schema": {
         "type": "object",
         "required": ["photo"],
         "properties": {
-            "photo": {**FILE, "description": f"One of {', '.join(PHOTO_SUFFIXES)}."},
-            "depth": {**FILE, "description": f"Its depth map, one of {', '.join(SUFFIXES)}."},
+            "photo": {**BINARY_FILE, "description": f"One of {', '.join(PHOTO_SUFFIXES)}."},
+            "depth": {
+                **BINARY_FILE,
+                "description": f"Its depth map, one of {', '.join(SUFFIXES)}.",
+            },
             "options": SceneOptions.model_json_schema(),
         },
     },
@@ -72,12 +76,12 @@ UPLOAD: dict[
 
 def create_app(
     folder: Path,
-    work: Work = WORK,
+    work: Work = DEFAULT_WORK,
     *,
     workers: int = 1,
-    keep: RetentionLimits = KEEP,
+    keep: RetentionLimits = DEFAULT_LIMITS,
     access: Access | None = None,
-    max_bytes: int = MAX_BYTES,
+    max_bytes: int = MAX_UPLOAD_BYTES,
 ) -> FastAPI:
     """An app to serve alone, or to mount in another app, which must then control access.
 
@@ -107,7 +111,7 @@ def create_app(
         docs_url=None,
         redoc_url=None,
         lifespan=until_the_end,
-        exception_handlers=dict.fromkeys((HTTPException, RequestValidationError), answered),
+        exception_handlers=dict.fromkeys((HTTPException, RequestValidationError), error_answer),
     )
     app.state.jobs = jobs
     app.add_middleware(Guard, access=access, max_bytes=max_bytes)
@@ -118,7 +122,7 @@ def create_app(
 
     def with_files(job: Job) -> SceneState:
         return job.model_copy(
-            update={"files": [file for file in FILES if path_of(job, file).is_file()]}
+            update={"files": [file for file in LISTED_FILES if path_of(job, file).is_file()]}
         )
 
     def job_of(id: str) -> Job:
@@ -127,36 +131,36 @@ def create_app(
         return job
 
     @app.post(
-        SCENES,
+        SCENES_PATH,
         status_code=202,
-        openapi_extra={"requestBody": {"content": {"multipart/form-data": UPLOAD}}},
+        openapi_extra={"requestBody": {"content": {"multipart/form-data": UPLOAD_FORM}}},
     )
     async def post_photo(request: Request, response: Response) -> SceneState:
         """Send a photo. The photo is queued; if the queue is full, the answer is 429."""
-        with jobs.place() as new:
+        with jobs.reserve_place() as new:
             try:
-                form = await asyncio.wait_for(request.form(max_files=2, max_fields=1), UPLOAD_S)
+                form = await asyncio.wait_for(request.form(max_files=2, max_fields=1), MAX_UPLOAD_S)
             except asyncio.TimeoutError:
                 raise HTTPException(408, "the photo arrived too slowly") from None
             try:
                 async with decoding:
-                    job = await run_in_threadpool(accept, form, new, jobs, bases())
+                    job = await run_in_threadpool(accept_photo, form, new, jobs, bases())
             finally:
                 await form.close()
-        response.headers["Location"] = f"{request.scope['root_path']}{SCENES}/{job.id}"
+        response.headers["Location"] = f"{request.scope['root_path']}{SCENES_PATH}/{job.id}"
         return job
 
-    @app.get(SCENES + "/{id}")
+    @app.get(SCENES_PATH + "/{id}")
     async def get_state(id: str) -> SceneState:
         """The state of a photo and its files."""
         return with_files(job_of(id))
 
-    @app.delete(SCENES + "/{id}", status_code=204)
+    @app.delete(SCENES_PATH + "/{id}", status_code=204)
     async def delete(id: str) -> None:
         """Delete a photo and its scene, and end work on it."""
         await run_in_threadpool(jobs.remove, job_of(id).id)
 
-    @app.get(SCENES + "/{id}/events", response_class=EventSourceResponse)
+    @app.get(SCENES_PATH + "/{id}/events", response_class=EventSourceResponse)
     async def get_events(id: str) -> AsyncIterator[SceneState]:
         """Server-sent events: the state, now and whenever it changes, until the photo is done or failed."""
         seen: Job | None = None
@@ -171,7 +175,7 @@ def create_app(
                 yield with_files(state)
             await asyncio.sleep(POLL_S)
 
-    @app.get(SCENES + "/{id}/files/{file}", response_class=FileResponse)
+    @app.get(SCENES_PATH + "/{id}/files/{file}", response_class=FileResponse)
     async def get_file(id: str, file: FileName | PagePart) -> FileResponse:
         """A file of a finished scene; a file that does not exist yet is made on demand."""
         job = job_of(id)
@@ -181,7 +185,7 @@ def create_app(
                 raise HTTPException(409, job.error or "this scene is not done yet")
             if file in get_args(PagePart):
                 raise HTTPException(404, "this file exists only for photos, and a scene was opened")
-            if error := await asyncio.shield(asyncio.wrap_future(jobs.make(job, file))):
+            if error := await asyncio.shield(asyncio.wrap_future(jobs.make_file(job, file))):
                 raise HTTPException(404, error)
         return FileResponse(path, filename=PurePosixPath(job.name).stem + path.suffix)
 
@@ -211,7 +215,7 @@ def create_app(
     return app
 
 
-def accept(form: FormData, folder: Path, jobs: Jobs, bases: list[str]) -> Job:
+def accept_photo(form: FormData, folder: Path, jobs: Jobs, bases: list[str]) -> Job:
     """Decode a form's photo and add its job; HTTPException for a bad form or a file that is no photo."""
     photo, depth, text = form.get("photo"), form.get("depth"), form.get("options") or "{}"
     if (
@@ -222,7 +226,7 @@ def accept(form: FormData, folder: Path, jobs: Jobs, bases: list[str]) -> Job:
         raise HTTPException(
             422, "send one photo as the file `photo`, and the options as the text `options`"
         )
-    name = shown_name(photo.filename or "")
+    name = safe_display_name(photo.filename or "")
     try:
         options = SceneOptions.model_validate_json(text)
     except ValidationError as error:
@@ -230,9 +234,9 @@ def accept(form: FormData, folder: Path, jobs: Jobs, bases: list[str]) -> Job:
     if options.base not in (None, *bases):
         why = MISSING.get(options.base or "", f"unknown: there are {', '.join(bases)}")
         raise HTTPException(422, one_line(f"base {options.base} on this server: {why}"))
-    source, of_depth = _saved(photo, folder, "source", name, PHOTO_SUFFIXES), None
+    source, of_depth = store_upload(photo, folder, "source", name, PHOTO_SUFFIXES), None
     if isinstance(depth, UploadFile) and depth.filename:
-        of_depth = _saved(depth, folder, "depth", "depth map", SUFFIXES)
+        of_depth = store_upload(depth, folder, "depth", "depth map", SUFFIXES)
     try:
         check_photo(folder / source, name, folder / PREVIEW)
     except InputError as error:
@@ -240,7 +244,7 @@ def accept(form: FormData, folder: Path, jobs: Jobs, bases: list[str]) -> Job:
     return jobs.add(folder, name, source, of_depth, options.model_dump(exclude_unset=True))
 
 
-def _saved(
+def store_upload(
     upload: UploadFile, folder: Path, stem: str, name: str, suffixes: tuple[str, ...]
 ) -> str:
     """Store an upload under a safe name."""
@@ -256,20 +260,22 @@ def _saved(
     return f"{stem}{suffix}"
 
 
-def shown_name(given: str) -> str:
+def safe_display_name(given: str) -> str:
     """The last part of a file's name, without characters that are unsafe in terminals, pages and logs."""
     last = re.split(r"[/\\]", given)[-1]
-    return "".join(character for character in last if character.isprintable()).strip()[-MAX_NAME:]
+    return "".join(character for character in last if character.isprintable()).strip()[
+        -MAX_NAME_CHARACTERS:
+    ]
 
 
-async def answered(request: Request, error: Any) -> JSONResponse:
+async def error_answer(request: Request, error: Any) -> JSONResponse:
     """The answer to a refused request, with the reason in one line."""
     if isinstance(error, HTTPException):
         return JSONResponse({"error": error.detail}, error.status_code, error.headers)
     return JSONResponse({"error": "there is nothing with that name"}, 404)
 
 
-def server_of(app: FastAPI) -> uvicorn.Server:
+def make_server(app: FastAPI) -> uvicorn.Server:
     """A server whose `run(sockets=[listener])` serves until Ctrl-C or SIGTERM; then the app's processes end."""
     return uvicorn.Server(
         uvicorn.Config(
@@ -280,7 +286,7 @@ def server_of(app: FastAPI) -> uvicorn.Server:
             log_level="critical",
             server_header=False,
             proxy_headers=False,
-            limit_concurrency=CONNECTIONS,
+            limit_concurrency=MAX_CONNECTIONS,
             timeout_graceful_shutdown=1,  # seconds for clients that still watch a photo
         )
     )
@@ -298,4 +304,4 @@ class PatientProtocol(H11Protocol):
         if self.transport.is_closing() or (waiting and self.cycle is before):
             self.transport.abort()  # `close` would first send data that nobody reads
         else:
-            self.loop.call_later(SILENT_S, self._check, self.cycle if waiting else self)
+            self.loop.call_later(MAX_HEAD_S, self._check, self.cycle if waiting else self)

@@ -23,12 +23,12 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from spackle.runtime.errors import one_line
 
 LOG = logging.getLogger("spackle.web")
-HOST = re.compile(r"(\[[0-9a-f:.%]+\]|[0-9a-z._-]+)(?::\d{1,5})?", re.IGNORECASE)
+HOST_PATTERN = re.compile(r"(\[[0-9a-f:.%]+\]|[0-9a-z._-]+)(?::\d{1,5})?", re.IGNORECASE)
 OWN_SITES = {"same-origin", "none"}  # none: an address that a person typed, or a bookmark
-SEND_S = 20.0  # seconds that a client may take to read a part of an answer
-MAX_BYTES = 200_000_000  # of an upload: photo and depth map
+MAX_SEND_S = 20.0  # seconds that a client may take to read a part of an answer
+MAX_UPLOAD_BYTES = 200_000_000  # of an upload: photo and depth map
 # The page loads scripts and styles from this server only and sends nothing elsewhere; no other page can frame it.
-HEADERS = {
+SECURITY_HEADERS = {
     "Cache-Control": "no-store",  # a photo is private
     "Content-Security-Policy": "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; style-src 'self'; "
     "connect-src 'self'; img-src 'self' data: blob:; media-src blob:; worker-src 'self' blob:; "
@@ -51,7 +51,7 @@ class Access(NamedTuple):
     local: bool = True  # only this machine can connect
 
     @staticmethod
-    def at(host: str, address: str, token: str | None) -> Access:
+    def for_listener(host: str, address: str, token: str | None) -> Access:
         """The rules for a server that listens at `host`, whose numeric address is `address`."""
         if is_loopback(address):
             return Access(token)
@@ -61,10 +61,10 @@ class Access(NamedTuple):
             token, frozenset({"localhost", machine, short, f"{short}.local", host.lower()}), False
         )
 
-    def admitted(self, scope: Scope, headers: Headers) -> Scope:
+    def authorize(self, scope: Scope, headers: Headers) -> Scope:
         """Check a request, and strip the token from its path; HTTPException without a valid token."""
         hosts = headers.getlist("host")
-        match = HOST.fullmatch(hosts[0].strip()) if len(hosts) == 1 else None
+        match = HOST_PATTERN.fullmatch(hosts[0].strip()) if len(hosts) == 1 else None
         if match is None or not self._is_own(match[1].lower()):
             raise HTTPException(403, "this server does not have that Host name")
         ours = {
@@ -130,13 +130,13 @@ class Guard:
 
         async def answer(message: Message) -> None:
             if message["type"] == "http.response.start":
-                MutableHeaders(scope=message).update(HEADERS)
+                MutableHeaders(scope=message).update(SECURITY_HEADERS)
                 path = scope["path"].replace((self.access and self.access.token) or "/", "…", 1)
                 LOG.debug(one_line(f"{scope['method']} {path} {message['status']}"))
-            await asyncio.wait_for(send(message), SEND_S)
+            await asyncio.wait_for(send(message), MAX_SEND_S)
 
         try:
-            admitted = scope if self.access is None else self.access.admitted(scope, headers)
+            admitted = scope if self.access is None else self.access.authorize(scope, headers)
             check(int(headers.get("content-length", 0)))
             await self.app(admitted, bounded, answer)
         except HTTPException as error:

@@ -22,12 +22,10 @@ from spackle.runtime.files import results_folder, write_json
 from spackle.runtime.task_process import DIED, Event, TaskProcess, Work
 
 LOG = logging.getLogger("spackle.web")
-RECORD, NEW = (
-    "job.json",
-    ".new-",
-)  # the file of a job's state; prefix of the folders of incomplete uploads
-RETRY_S = 10  # seconds after which a client may try again if the queue was full
-TIDY_S = 60.0  # seconds between two searches for results that are too old
+RECORD_FILE = "job.json"  # stores the state of a job, in the folder of the job
+UPLOAD_PREFIX = ".new-"  # begins the names of folders of incomplete uploads
+RETRY_AFTER_S = 10  # seconds after which a client may try again if the queue was full
+TIDY_INTERVAL_S = 60.0  # seconds between two searches for results that are too old
 
 
 class RetentionLimits(NamedTuple):
@@ -70,7 +68,7 @@ class Job(SceneState):
         return self.folder / "results"
 
     def save(self) -> None:
-        write_json(self.model_dump(mode="json"), self.folder / RECORD)
+        write_json(self.model_dump(mode="json"), self.folder / RECORD_FILE)
 
 
 class Jobs:
@@ -81,7 +79,7 @@ class Jobs:
     """
 
     def __init__(self, folder: Path, work: Work, workers: int, keep: RetentionLimits) -> None:
-        self.folder, self.keep = folder, keep
+        self.folder, self.limits = folder, keep
         self._held = contextlib.ExitStack()
         self._held.enter_context(results_folder(folder, alone=True))
         self._lock, self._closed = threading.RLock(), threading.Event()
@@ -96,10 +94,10 @@ class Jobs:
     def _take_up(self) -> None:
         """Queue the unfinished jobs of an earlier server again, and delete incomplete uploads."""
         for folder in self.folder.iterdir():
-            if folder.name.startswith(NEW):
+            if folder.name.startswith(UPLOAD_PREFIX):
                 shutil.rmtree(folder, ignore_errors=True)
             with contextlib.suppress(OSError, ValueError):
-                job = Job.model_validate_json((folder / RECORD).read_bytes())
+                job = Job.model_validate_json((folder / RECORD_FILE).read_bytes())
                 self.by_id[job.id] = job.model_copy(update={"folder": folder})
         for job in sorted(self.by_id.values(), key=lambda job: job.created):
             if job.ended is None:
@@ -112,16 +110,16 @@ class Jobs:
                 self.by_id[id] = self.by_id[id].model_copy(update=values)
 
     @contextlib.contextmanager
-    def place(self) -> Iterator[Path]:
+    def reserve_place(self) -> Iterator[Path]:
         """Reserve a place in the queue, and yield a folder that receives the photo; 429 if the queue is full."""
-        folder = self.folder / f"{NEW}{secrets.token_hex(8)}"
+        folder = self.folder / f"{UPLOAD_PREFIX}{secrets.token_hex(8)}"
         with self._lock:
-            waiting = len([*self.folder.glob(f"{NEW}*")]) + sum(
+            waiting = len([*self.folder.glob(f"{UPLOAD_PREFIX}*")]) + sum(
                 job.state == "queued" for job in self.by_id.values()
             )
-            if waiting >= self.keep.waiting:
-                line = f"too many photos are waiting: try again in {RETRY_S} seconds"
-                raise HTTPException(429, line, {"Retry-After": str(RETRY_S)})
+            if waiting >= self.limits.waiting:
+                line = f"too many photos are waiting: try again in {RETRY_AFTER_S} seconds"
+                raise HTTPException(429, line, {"Retry-After": str(RETRY_AFTER_S)})
             folder.mkdir()
         try:
             yield folder
@@ -134,7 +132,7 @@ class Jobs:
         self, folder: Path, name: str, source: str, depth: str | None, options: dict[str, Any]
     ) -> Job:
         """Add a job for a photo in a folder that `place` yielded; `source` and `depth` may be absolute paths."""
-        id = folder.name.removeprefix(NEW)
+        id = folder.name.removeprefix(UPLOAD_PREFIX)
         job = Job(id=id, name=name, source=source, depth=depth, options=options, folder=folder)
         job.save()
         with self._lock:  # `place` counts folders and jobs
@@ -144,7 +142,7 @@ class Jobs:
         self._photos.submit(self._run, id)
         return job
 
-    def make(self, job: Job, file: str) -> Future[str | None]:
+    def make_file(self, job: Job, file: str) -> Future[str | None]:
         """Add a file to a finished scene; the future's result is None, or the reason for failure."""
         return self._files.submit(lambda: self._process().do((job, file), lambda event: None))
 
@@ -227,11 +225,11 @@ class Jobs:
             LOG.error("error: %s", error)
 
     def _tidy_until_closed(self) -> None:
-        while not self._closed.wait(TIDY_S):
+        while not self._closed.wait(TIDY_INTERVAL_S):
             with contextlib.suppress(OSError):  # a worker may rename a file meanwhile
-                self.tidy()
+                self.remove_expired()
 
-    def tidy(self) -> None:
+    def remove_expired(self) -> None:
         """Remove jobs that are too old, and the oldest jobs while the folder is too large."""
         ended = [
             (job.ended, sum(file.stat().st_size for file in job.folder.rglob("*")), job.id)
@@ -240,6 +238,6 @@ class Jobs:
         ]
         total = sum(size for _, size, _ in ended)
         for when, size, id in sorted(ended):
-            if when + self.keep.seconds < time.time() or total > self.keep.size:
+            if when + self.limits.seconds < time.time() or total > self.limits.size:
                 total -= size
                 self.remove(id)

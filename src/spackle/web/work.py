@@ -39,7 +39,7 @@ Video = Literal[
     "dolly-zoom.mp4",
 ]  # fmt: skip
 FileName = Literal[Download, Video]  # one list, so that a refusal names all
-MADE: list[FileName] = [
+DEFAULT_FILES: list[FileName] = [
     "scene.ply",
     "scene.spz",
     "scene.glb",
@@ -47,9 +47,11 @@ MADE: list[FileName] = [
     "video.mp4",
     "report.json",
 ]  # the default
-PAGE, PREVIEW, SIDE = "page.json", "photo.jpg", 1280  # pixels of the preview's long side
+PAGE = "page.json"
+PREVIEW = "photo.jpg"
+PREVIEW_SIDE_PX = 1280  # pixels of the preview's long side
 # The formats that Pillow may decode: for EPS, for example, Pillow would start another program.
-FORMATS = frozenset({"JPEG", "MPO", "PNG", "WEBP", "HEIF", "TIFF"})
+PILLOW_FORMATS = frozenset({"JPEG", "MPO", "PNG", "WEBP", "HEIF", "TIFF"})
 
 
 class SceneOptions(BaseModel):
@@ -78,7 +80,9 @@ class SceneOptions(BaseModel):
         None, gt=0, lt=180, description="Horizontal field of view in degrees."
     )
     keep_frame: bool = Field(False, description="Keep a uniform frame around the picture.")
-    files: list[FileName] = Field(MADE, description="Files to make before the job is done.")
+    files: list[FileName] = Field(
+        DEFAULT_FILES, description="Files to make before the job is done."
+    )
 
 
 @dataclasses.dataclass
@@ -99,7 +103,7 @@ class SceneWork:
         job, file = task
         options, teller = (
             SceneOptions.model_validate({**self.usual, **job.options}),
-            Teller(job, tell, self.verbose),
+            JobReporter(job, tell, self.verbose),
         )
         ply, source, note = job.results / "scene.ply", job.folder / job.source, ""
         try:
@@ -125,7 +129,7 @@ class SceneWork:
         except InputError as error:
             raise InputError(teller.cleaned(str(error))) from error
 
-    def _complete(self, job: Job, options: SceneOptions, teller: Teller) -> str:
+    def _complete(self, job: Job, options: SceneOptions, teller: JobReporter) -> str:
         """Complete a photo: make the files of `predict_photo`; returns a note for the user."""
         settings = self.base
         if job.depth is not None:
@@ -166,7 +170,7 @@ class SceneWork:
             scene.export(target)
 
 
-class Teller(Reporter):
+class JobReporter(Reporter):
     """Reports log lines and progress to the server, with the photo's name in place of paths."""
 
     def __init__(self, job: Job, tell: Tell, verbose: bool) -> None:
@@ -196,12 +200,12 @@ def check_photo(path: Path, name: str, preview: Path) -> None:
     """
 
     def decode(image: Image.Image) -> None:
-        if image.format not in FORMATS:
+        if image.format not in PILLOW_FORMATS:
             raise InputError(f"{path}: a {image.format} picture: give {', '.join(PHOTO_SUFFIXES)}")
         check_shape(image.width, image.height, path)
         image.load()
         upright = ImageOps.exif_transpose(image)
-        upright.thumbnail((SIDE, SIDE))
+        upright.thumbnail((PREVIEW_SIDE_PX, PREVIEW_SIDE_PX))
         upright.convert("RGB").save(preview, quality=85)
 
     try:

@@ -20,8 +20,8 @@ from helpers.photos import picture
 from PIL import Image
 
 from spackle.paper.dataset import DatasetFiles
-from spackle.paper.dataset.build import Made, Maker
-from spackle.paper.dataset.photos import PhotoFile, choose, find_photos
+from spackle.paper.dataset.build import PhotoResult, SampleMaker
+from spackle.paper.dataset.photos import PhotoFile, choose_photos, find_photos
 from spackle.paper.dataset.shards import load_manifest
 from spackle.paper.training.recipe import DataRecipe
 from spackle.paper.training.samples import Source, digest_of_samples
@@ -55,7 +55,7 @@ def test_one_worker_and_two_write_the_same_shards(whole: Path, place: Path, tmp_
 @pytest.mark.parametrize(
     ("patched", "at", "left"),
     [
-        ("build.Maker.make", 4, {"manifest.json", "parts", "shard-000000.tar", ".lock"}),
+        ("build.SampleMaker.make", 4, {"manifest.json", "parts", "shard-000000.tar", ".lock"}),
         # The second shard is written, and the manifest does not list it yet.
         (
             "build.Manifest.save",
@@ -87,7 +87,7 @@ def test_workers_end_with_a_killed_build(
 def dying(*arguments):
     print(*(child.pid for child in multiprocessing.active_children()), flush=True)
     die()
-build._Build._keep = dying"""
+build.DatasetBuild._store = dying"""
     process = dying_build(tmp_path / "script.py", patch, place, tmp_path / "out", "--workers", 2)
     assert process.wait() == -signal.SIGKILL
     workers = [int(pid) for pid in capfd.readouterr().out.split()]
@@ -101,14 +101,14 @@ build._Build._keep = dying"""
 def test_ctrl_c_ends_after_the_current_photo(
     whole: Path, place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    make = Maker.make
+    make = SampleMaker.make
 
-    def interrupted(self: Maker, photo: PhotoFile) -> Made:
+    def interrupted(self: SampleMaker, photo: PhotoFile) -> PhotoResult:
         signal.raise_signal(signal.SIGINT)
         return make(self, photo)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Maker, "make", interrupted)
+        patch.setattr(SampleMaker, "make", interrupted)
         assert build(place, tmp_path / "out").code == 130
     assert build(place, tmp_path / "out").code == 0
     assert content(tmp_path / "out") == content(whole)
@@ -174,7 +174,9 @@ def test_a_subset_depends_on_the_seed_alone(place: Path) -> None:
         root, names = find_photos(place / "photos", None, print)
         return [
             photo.name
-            for photo in choose(root, names[::order], count, seed, print, lambda done, total: None)
+            for photo in choose_photos(
+                root, names[::order], count, seed, print, lambda done, total: None
+            )
         ]
 
     assert subset(3, 0) == sorted(subset(3, 0)) == subset(3, 0, -1)

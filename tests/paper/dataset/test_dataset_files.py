@@ -20,7 +20,13 @@ from PIL import Image
 from torch.utils.data import DataLoader
 
 from spackle.paper.dataset import DatasetFiles
-from spackle.paper.dataset.sample import END, decode_alpha, decode_depth, encode_alpha, encode_depth
+from spackle.paper.dataset.sample import (
+    END_OF_ARCHIVE,
+    decode_alpha,
+    decode_depth,
+    encode_alpha,
+    encode_depth,
+)
 from spackle.paper.dataset.shards import load_manifest
 from spackle.render import get_renderer
 from spackle.residual import hole_mask
@@ -87,7 +93,12 @@ def test_verify_names_the_sample_of_any_flipped_byte(copy: Path) -> None:
     for shard in manifest.shards:
         path = copy / shard.file
         original = path.read_bytes()
-        places = [0, len(original) - 1, len(original) - len(END), int(rng.integers(len(original)))]
+        places = [
+            0,
+            len(original) - 1,
+            len(original) - len(END_OF_ARCHIVE),
+            int(rng.integers(len(original))),
+        ]
         for place in places:
             path.write_bytes(
                 original[:place] + bytes([original[place] ^ 1]) + original[place + 1 :]
@@ -166,11 +177,11 @@ def test_odd_members_are_refused_though_all_digests_fit(copy: Path, data: bytes)
         shard["samples"] = [
             shard["samples"][0] | {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()}
         ]
-        shard["size"] = len(data + END)
+        shard["size"] = len(data + END_OF_ARCHIVE)
         sizes = [shard["size"] for shard in content["shards"]]
         content["counts"] = {"photos": 4, "views": 4 * VIEWS, "bytes": sum(sizes)}
 
-    (copy / "shard-000000.tar").write_bytes(data + END)
+    (copy / "shard-000000.tar").write_bytes(data + END_OF_ARCHIVE)
     resealed(copy, change)
     with pytest.raises(InputError, match="sample 000000: not a photo of a dataset"):
         DatasetFiles(copy)[0]

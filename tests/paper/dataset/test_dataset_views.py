@@ -13,11 +13,11 @@ from spackle.core.camera import Camera
 from spackle.core.trajectories import SHARP_TRAJECTORIES, DepthRange, SharpTrajectory
 from spackle.inpaint import INPAINTERS, InpainterOptions, get_inpainter, known_inverse_depth
 from spackle.paper.dataset.views import (
-    APART,
+    SAME_VIEW_DISTANCE,
     ViewStack,
+    cameras_along_path,
     complete_views,
     paint_video,
-    path_cameras,
     render_views,
 )
 from spackle.render import get_renderer
@@ -29,13 +29,13 @@ def test_no_two_views_are_alike_and_the_first_is_the_photos(
     kind: SharpTrajectory, views: int
 ) -> None:
     camera = Camera.from_focal(80.0, 96, 72)
-    cameras = path_cameras(kind, 0.4, camera, DepthRange(2.0, 3.0), views)
+    cameras = cameras_along_path(kind, 0.4, camera, DepthRange(2.0, 3.0), views)
     assert len(cameras) == views
     assert cameras[0] is camera
     eyes = torch.stack([view.position.double() for view in cameras])
-    assert float(torch.nn.functional.pdist(eyes).min()) > APART
+    assert float(torch.nn.functional.pdist(eyes).min()) > SAME_VIEW_DISTANCE
     with pytest.raises(ValueError, match="different views"):
-        path_cameras(kind, 0.0, camera, DepthRange(2.0, 3.0), views)
+        cameras_along_path(kind, 0.0, camera, DepthRange(2.0, 3.0), views)
 
 
 def stack_of(*rights: float) -> ViewStack:

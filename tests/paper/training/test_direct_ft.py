@@ -22,11 +22,11 @@ from spackle.bases.sharp.encoder import MICRO
 from spackle.paper.dataset import DatasetFiles
 from spackle.paper.dataset.shards import load_manifest
 from spackle.paper.training.direct_ft import (
-    VIEWS_AT_ONCE,
+    VIEWS_PER_PHOTO,
     DirectFt,
     TunableSharp,
-    drawn_views,
-    render_photo,
+    draw_view_numbers,
+    render_views_of_photo,
 )
 from spackle.paper.training.recipe import Recipe, load_recipe
 from spackle.render import get_renderer
@@ -109,7 +109,7 @@ def test_untrained_views_equal_the_datasets_views(place: Path) -> None:
     holes = [float(view.mask.float().mean()) for view in views]
     assert holes[0] < 0.02 < min(holes[1:])
     with torch.no_grad():
-        batch = render_photo(base.network.gaussian_decoder(), base, views, get_renderer())
+        batch = render_views_of_photo(base.network.gaussian_decoder(), base, views, get_renderer())
     assert batch.rgb.shape == (VIEWS, HEIGHT, WIDTH, 3)
     assert float((batch.rgb - batch.base_rgb).abs().max()) < 1.01 / 510  # 8 bits
     assert torch.equal(batch.alpha < 0.95, batch.hole)
@@ -178,13 +178,13 @@ def test_two_processes_compute_the_gradient_of_one(place: Path, tmp_path: Path) 
 
 
 def test_views_of_a_step_and_division_of_photos(place: Path) -> None:
-    drawn = [drawn_views([0, step], VIEWS) for step in range(20)]
-    assert all(views[0] == 0 and len(set(views)) == VIEWS_AT_ONCE for views in drawn)
+    drawn = [draw_view_numbers([0, step], VIEWS) for step in range(20)]
+    assert all(views[0] == 0 and len(set(views)) == VIEWS_PER_PHOTO for views in drawn)
     assert {view for views in drawn for view in views} == set(range(VIEWS))
-    assert drawn_views([0, 0], 2) == [0, 1]
+    assert draw_view_numbers([0, 0], 2) == [0, 1]
     recipe = load_recipe(Recipe, place / "recipe.yaml", ["data.validation_views=1"])
     task = DirectFt(recipe, CPU, place / "sharp.safetensors")
-    assert sorted([*task.learned, *task.validation]) == [0, 1, 2]
+    assert sorted([*task.training_photos, *task.validation_photos]) == [0, 1, 2]
 
 
 @pytest.mark.parametrize(

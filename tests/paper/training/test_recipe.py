@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from spackle.paper.training.recipe import OptimRecipe, Recipe, RgbdFolder, differences, load_recipe
+from spackle.paper.training.recipe import OptimRecipe, Recipe, RgbdFolder, changed_keys, load_recipe
 from spackle.paper.training.train import ema_decay, learning_rate, samples_of_step
 from spackle.runtime.errors import InputError
 from spackle.weights import published_weights
@@ -128,10 +128,10 @@ def test_differences_ignore_the_length_of_a_run(tmp_path: Path) -> None:
         "data.cache=elsewhere",
         "data.photos=moved",
     ]
-    assert differences(one, load_recipe(Recipe, path, same)) == []
+    assert changed_keys(one, load_recipe(Recipe, path, same)) == []
     other = load_recipe(Recipe, path, ["optim.lr=1e-3", "data.shares.pairs=0", "run.seed=1"])
-    assert differences(one, other) == ["data.shares.pairs", "optim.lr", "run.seed"]
-    assert differences({**one, "once": 1, "init": "w"}, load_recipe(Recipe, path)) == [
+    assert changed_keys(one, other) == ["data.shares.pairs", "optim.lr", "run.seed"]
+    assert changed_keys({**one, "once": 1, "init": "w"}, load_recipe(Recipe, path)) == [
         "init",
         "once",
     ]

@@ -238,7 +238,7 @@ def test_a_cut_out_is_nearer_than_its_background(
         """A composite of photos with one colour each; more objects do not change earlier objects."""
         monkeypatch.setattr(sources, "OBJECTS", (objects, objects))
         colors = iter(PALETTE)
-        return sources.composite(
+        return sources.compose_cutouts(
             np.random.default_rng(seed), lambda rng: next(colors).expand(150, 200, 3), 120, 160
         )
 
@@ -248,7 +248,10 @@ def test_a_cut_out_is_nearer_than_its_background(
         assert 0.5 / 8.0 * 0.99 < next_inverse.min() < next_inverse.max() < 1.2 / 0.7
         moved, painted = next_inverse != inverse, (next_rgb - rgb).abs().amax(-1) > 1e-4
         assert (next_inverse > 1.03 * inverse)[moved].all()
-        assert not moved.any() or sources.AREA[0] < float(moved.float().mean()) < sources.AREA[1]
+        assert (
+            not moved.any()
+            or sources.CUTOUT_AREA[0] < float(moved.float().mean()) < sources.CUTOUT_AREA[1]
+        )
         assert not (moved & ~painted).any()
         assert (painted & ~grow(moved)).float().mean() < 2e-3
     assert any((b[1] != a[1]).any() for a, b in itertools.pairwise(steps))
@@ -349,7 +352,7 @@ def test_frames_of_a_depth_camera(tmp_path: Path, unit_m: float) -> None:
     color, depth = tmp_path / "frame-0.color.jpg", tmp_path / "frame-0.depth.png"
     Image.fromarray(stored).save(depth)
     Image.fromarray(picture(96, 72)).save(color, quality=95)
-    rgb, known, camera = sources.frame_photo(np.random.default_rng(1), [color], 80.0, unit_m)
+    rgb, known, camera = sources.draw_rgbd_frame(np.random.default_rng(1), [color], 80.0, unit_m)
     assert torch.equal(rgb, pixels(color))
     assert camera.focal == (80.0, 80.0)
     assert int((~known.valid).sum()) == 2 * 9
@@ -376,7 +379,7 @@ def test_targets_of_a_stereo_pair(tmp_path: Path) -> None:
     folder = write_stereo(tmp_path, disparity="maps/left.npz")  # in another folder
     (folder / "maps").mkdir()
     (folder / "disparity.npz").rename(folder / "maps" / "left.npz")
-    sample = sources.right_view(np.random.default_rng(0), [folder], CPU)
+    sample = sources.random_right_view(np.random.default_rng(0), [folder], CPU)
     right = pixels(folder / "right.png")
     assert torch.equal(sample.target, right)
     covered = ~grow(sample.hole)
@@ -392,7 +395,7 @@ def test_targets_of_a_stereo_pair(tmp_path: Path) -> None:
     assert not (sample.hole & ~grow(expected)).any()
     assert not (~sample.hole & ~grow(~expected)).any()
     assert sample.hole[26:46, 57:61].all()
-    left = partial(sources.left_photo, folders=[folder])
+    left = partial(sources.draw_left_photo, folders=[folder])
     sample = sources.random_reverse_view(np.random.default_rng(0), left, (0.3, 0.6), CPU)
     assert torch.equal(sample.target, pixels(folder / "left.png"))
     assert torch.equal(sample.camera.world_to_camera, torch.eye(4))

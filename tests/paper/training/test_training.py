@@ -242,7 +242,7 @@ def test_unusable_input_is_refused(
 
 def test_batches_of_several_threads_keep_their_order() -> None:
     assert list(
-        training.made_ahead(lambda n: (time.sleep(0.01 * (3 - n % 4)), n)[1], range(12), 4)
+        training.prefetch(lambda n: (time.sleep(0.01 * (3 - n % 4)), n)[1], range(12), 4)
     ) == [*range(12)]
 
 

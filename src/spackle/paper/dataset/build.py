@@ -26,14 +26,14 @@ from spackle.inpaint import (
     inpainter_class,
     is_inpainter,
 )
-from spackle.paper.dataset.photos import PhotoFile, choose, find_photos
+from spackle.paper.dataset.photos import PhotoFile, choose_photos, find_photos
 from spackle.paper.dataset.sample import pack_sample
-from spackle.paper.dataset.shards import NAME, Manifest, load_manifest, write_shard
+from spackle.paper.dataset.shards import MANIFEST_NAME, Manifest, load_manifest, write_shard
 from spackle.paper.dataset.views import (
     COMPLETIONS,
+    cameras_along_path,
     complete_views,
-    draw_path,
-    path_cameras,
+    draw_random_path,
     render_views,
 )
 from spackle.render import get_renderer
@@ -52,7 +52,7 @@ from spackle.runtime.progress import Reporter, asked_to_stop, counted
 from spackle.runtime.workers import parallel_map
 from spackle.weights import weights_digest, weights_digests
 
-PARTS = "parts"  # folder in the output for samples that are not in a shard yet
+PARTS_FOLDER = "parts"  # folder in the output for samples that are not in a shard yet
 
 
 @dataclasses.dataclass(frozen=True)
@@ -131,7 +131,7 @@ class DatasetOptions:
         return inputs
 
 
-def configuration(
+def dataset_configuration(
     options: DatasetOptions, photos: Sequence[PhotoFile], inpainter: Inpainter | None
 ) -> dict[str, Any]:
     """Everything that determines the shards' bytes, ready for JSON, without paths of this machine.
@@ -181,19 +181,19 @@ def build_dataset(source: Path, output: Path, options: DatasetOptions, reporter:
         InputError: options, photos or folders cannot be used, or `output` holds another dataset.
     """
     options.check()
-    maker = Maker(options)  # raises errors before any long work
+    maker = SampleMaker(options)  # raises errors before any long work
     if maker.inpainter is not None and maker.inpainter.notice:
         reporter.log(maker.inpainter.notice)
     root, names = find_photos(source, options.images, reporter.log)
     with reporter.stage("photos") as step:
-        photos = choose(root, names, options.sample, options.seed, reporter.log, step)
-    config = configuration(options, photos, maker.inpainter)
-    with results_folder(output, (NAME,), alone=True):
-        return _Build(photos, output, options, reporter, config).run()
+        photos = choose_photos(root, names, options.sample, options.seed, reporter.log, step)
+    config = dataset_configuration(options, photos, maker.inpainter)
+    with results_folder(output, (MANIFEST_NAME,), alone=True):
+        return DatasetBuild(photos, output, options, reporter, config).run()
 
 
 @dataclasses.dataclass(frozen=True)
-class Made:
+class PhotoResult:
     """The sample of a photo, or the reason why the photo has no sample."""
 
     index: int
@@ -201,7 +201,7 @@ class Made:
     problem: str | None = None
 
 
-class Maker:
+class SampleMaker:
     """Makes photos' samples: base, views and targets."""
 
     def __init__(self, options: DatasetOptions) -> None:
@@ -209,24 +209,24 @@ class Maker:
         self.options, self.base = options, open_base(options.base)
         self.renderer, self.inpainter = get_renderer(options.base.device), options.open_inpainter()
 
-    def make(self, photo: PhotoFile) -> Made:
+    def make(self, photo: PhotoFile) -> PhotoResult:
         """Make a photo's sample; BaseError if the base would fail for every photo."""
         try:
-            return Made(photo.index, sample=self._sample(photo))
+            return PhotoResult(photo.index, sample=self._sample(photo))
         except BaseError:
             raise
         except InputError as error:
-            return Made(photo.index, problem=str(error))
+            return PhotoResult(photo.index, problem=str(error))
 
     def _sample(self, file: PhotoFile) -> bytes:
         options, photo = self.options, load_photo(file.path)
         prediction, _ = self.base.predict(photo, options.depth_of(file))
-        kind, disparity = draw_path(
+        kind, disparity = draw_random_path(
             options.trajectory, options.disparity, options.seed, file.sha256
         )
         with as_input_error(file.path, "no camera path: {reason}", ValueError):
             depth_range = DepthRange.of(prediction.gaussians)
-            cameras = path_cameras(
+            cameras = cameras_along_path(
                 kind, disparity, prediction.camera.even(), depth_range, options.views
             )
         stack = render_views(prediction, cameras, self.renderer)
@@ -247,7 +247,7 @@ class Maker:
         return pack_sample(file.key, resize_photo(photo).rgb, stack, targets, facts)
 
 
-class _Build:
+class DatasetBuild:
     """A dataset's photos, and the state of each."""
 
     def __init__(
@@ -261,15 +261,15 @@ class _Build:
         """Start or resume a build in a folder; InputError if the folder holds another dataset."""
         self.photos, self.output, self.options, self.reporter = photos, output, options, reporter
         self.config, self.size = config, options.shard_size
-        if not (output / NAME).exists():
+        if not (output / MANIFEST_NAME).exists():
             Manifest(config=config, shards=(), complete=False).save(output)
         manifest = load_manifest(output)
         if lines := differences(manifest.config, config):
             raise InputError(
                 f"{output}: holds a dataset with other options ({'; '.join(lines)}): choose another -o"
             )
-        make_folder(output / PARTS)
-        remove_half_written(output, output / PARTS)
+        make_folder(output / PARTS_FOLDER)
+        remove_half_written(output, output / PARTS_FOLDER)
         sizes = {path.name: path.stat().st_size for path in output.iterdir() if path.is_file()}
         self.shards = {int(s.file[6:-4]): s for s in manifest.shards if sizes.get(s.file) == s.size}
         self.missing = {  # indices of photos
@@ -291,7 +291,7 @@ class _Build:
             for number in range(-(-len(self.photos) // self.size)):
                 self._write_shard(number)
             make, options, gpu = (
-                partial(Maker, self.options),
+                partial(SampleMaker, self.options),
                 self.options,
                 self.options.base.device != "cpu",
             )
@@ -299,7 +299,7 @@ class _Build:
                 make, jobs, stop, count=options.workers, threads=options.threads, gpu=gpu
             ) as results:
                 for done, result in enumerate(results, ready + 1):
-                    self._keep(result)
+                    self._store(result)
                     self._write_shard(result.index // self.size)
                     step(done, len(self.photos))
                     if stop():
@@ -312,9 +312,9 @@ class _Build:
 
     def _part(self, index: int) -> Path:
         """The file that holds a photo's sample until its shard is written."""
-        return self.output / PARTS / f"{self.photos[index].key}.tar"
+        return self.output / PARTS_FOLDER / f"{self.photos[index].key}.tar"
 
-    def _keep(self, result: Made) -> None:
+    def _store(self, result: PhotoResult) -> None:
         """Write a photo's sample to its `_part`, or log why the photo has no sample."""
         if result.sample is not None:
             write_atomic(self._part(result.index), result.sample)
@@ -349,9 +349,9 @@ class _Build:
         samples = sum(len(shard.samples) for shard in shards)
         if samples:
             self._save(complete=True)
-        shutil.rmtree(self.output / PARTS)
+        shutil.rmtree(self.output / PARTS_FOLDER)
         if not samples:
-            for name in (NAME, *(shard.file for shard in shards)):
+            for name in (MANIFEST_NAME, *(shard.file for shard in shards)):
                 (self.output / name).unlink(missing_ok=True)
             why = min(line for shard in shards for line in shard.passed_over)
             raise InputError(

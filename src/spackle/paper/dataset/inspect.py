@@ -16,16 +16,23 @@ from torch import Tensor
 
 from spackle.formats import save_png
 from spackle.formats.png import contact_sheet
-from spackle.paper.dataset.sample import END
-from spackle.paper.dataset.shards import DatasetFiles, Manifest, ShardEntry, load_manifest, open_in
+from spackle.paper.dataset.sample import END_OF_ARCHIVE
+from spackle.paper.dataset.shards import (
+    DatasetFiles,
+    Manifest,
+    ShardEntry,
+    load_manifest,
+    open_dataset_file,
+)
 from spackle.runtime.errors import InputError, as_input_error, one_line
 from spackle.runtime.files import results_folder
 from spackle.runtime.progress import Progress, Reporter, counted
 from spackle.video.encoding import save_video
 
-SHEET, VIDEO = "sheet.png", "trajectory.mp4"
-THUMBNAIL = 192  # pixels of a thumbnail's longer side
-FPS = 8
+SHEET_FILE = "sheet.png"
+VIDEO_FILE = "trajectory.mp4"
+THUMBNAIL_SIDE_PX = 192  # pixels of a thumbnail's longer side
+PREVIEW_FPS = 8
 
 
 def show_info(location: str, console: Console) -> None:
@@ -52,7 +59,7 @@ def verify_dataset(location: str, reporter: Reporter) -> int:
     manifest = load_manifest(location)
     count = 0
     with reporter.stage("verify") as step:
-        for line in problems(location, manifest, step):
+        for line in find_problems(location, manifest, step):
             reporter.log(f"{location}: {line}")
             count += 1
     if not count:
@@ -62,7 +69,7 @@ def verify_dataset(location: str, reporter: Reporter) -> int:
     return count
 
 
-def problems(
+def find_problems(
     location: str | os.PathLike[str], manifest: Manifest, progress: Progress
 ) -> Iterator[str]:
     """Read every byte of a dataset and yield a line for each problem. `progress` counts bytes."""
@@ -71,17 +78,17 @@ def problems(
         yield "the dataset is not finished: run the same `spackle dataset build` again"
     for shard in manifest.shards:
         try:
-            yield from (f"{shard.file}: {line}" for line in _shard_problems(location, shard))
+            yield from (f"{shard.file}: {line}" for line in find_shard_problems(location, shard))
         except InputError as error:
             yield str(error)
         done += shard.size
         progress(done, manifest.size)
 
 
-def _shard_problems(location: str | os.PathLike[str], shard: ShardEntry) -> Iterator[str]:
+def find_shard_problems(location: str | os.PathLike[str], shard: ShardEntry) -> Iterator[str]:
     """Check a shard's size, the digest of each sample, and the end of the archive; InputError if reading fails."""
     with (
-        open_in(location, shard.file) as file,
+        open_dataset_file(location, shard.file) as file,
         as_input_error(shard.file, "cannot be read: {reason}", OSError),
     ):
         size = file.seek(0, os.SEEK_END)
@@ -93,7 +100,7 @@ def _shard_problems(location: str | os.PathLike[str], shard: ShardEntry) -> Iter
             if hashlib.sha256(file.read(sample.size)).hexdigest() != sample.sha256:
                 damaged = True
                 yield f"sample {sample.key} ({sample.photo}) is damaged"
-        if not damaged and file.read(len(END)) != END:
+        if not damaged and file.read(len(END_OF_ARCHIVE)) != END_OF_ARCHIVE:
             yield "damaged after its last sample"
 
 
@@ -105,27 +112,27 @@ def preview_dataset(
     InputError if the dataset is unfinished or damaged, or the folder cannot be written to.
     """
     files = DatasetFiles(location)
-    with results_folder(output, (SHEET, VIDEO), alone=True):
-        groups = [files[index] for index in _spread(len(files), photos)]
+    with results_folder(output, (SHEET_FILE, VIDEO_FILE), alone=True):
+        groups = [files[index] for index in spread_indices(len(files), photos)]
         rows: list[list[Tensor]] = []
         for group in groups:
-            chosen = [group.view(index) for index in _spread(group.views, views)]
+            chosen = [group.view(index) for index in spread_indices(group.views, views)]
             masks = [view.mask[..., None].expand(-1, -1, 3).float() for view in chosen]
             rows += [
                 [view.rendering.rgb for view in chosen],
                 masks,
                 [view.target for view in chosen],
             ]
-        save_png(contact_sheet(rows, THUMBNAIL, fill=1.0), output / SHEET)
+        save_png(contact_sheet(rows, THUMBNAIL_SIDE_PX, fill=1.0), output / SHEET_FILE)
         # View 0 is the photo's view, which is not on the path.
         path = (groups[0].view(index) for index in range(1, groups[0].views))
         save_video(
             (torch.cat([view.rendering.rgb, view.target], dim=1) for view in path),
-            output / VIDEO,
-            fps=FPS,
+            output / VIDEO_FILE,
+            fps=PREVIEW_FPS,
         )
-    reporter.log(f"{SHEET} and {VIDEO} -> {output}")
+    reporter.log(f"{SHEET_FILE} and {VIDEO_FILE} -> {output}")
 
 
-def _spread(total: int, count: int) -> list[int]:
+def spread_indices(total: int, count: int) -> list[int]:
     return sorted({round(place) for place in np.linspace(0, total - 1, min(count, total))})

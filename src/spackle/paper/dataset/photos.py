@@ -15,8 +15,8 @@ from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import files_in, sha256_of
 from spackle.runtime.progress import Progress
 
-SUFFIXES = (*PHOTO_SUFFIXES, ".gif", ".bmp")
-MIN_SIDE = 32  # pixels: no depth can be recognised in smaller images
+DATASET_PHOTO_SUFFIXES = (*PHOTO_SUFFIXES, ".gif", ".bmp")
+MIN_SIDE_PX = 32  # pixels: no depth can be recognised in smaller images
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,9 +49,14 @@ def find_photos(
     """
     if not os.path.isdir(source):
         return _named_by_coco(source, folder, log)
-    names = [file.relative_to(source).as_posix() for file in files_in(source, SUFFIXES, below=True)]
+    names = [
+        file.relative_to(source).as_posix()
+        for file in files_in(source, DATASET_PHOTO_SUFFIXES, below=True)
+    ]
     if not names:
-        raise InputError(f"{source}: no photos in this folder (looked for {', '.join(SUFFIXES)})")
+        raise InputError(
+            f"{source}: no photos in this folder (looked for {', '.join(DATASET_PHOTO_SUFFIXES)})"
+        )
     return source, sorted(names)
 
 
@@ -86,7 +91,7 @@ def _named_by_coco(
     return root, present
 
 
-def choose(
+def choose_photos(
     root: Path,
     names: Sequence[str],
     count: int | None,
@@ -112,10 +117,10 @@ def choose(
         path = root / name
         try:
             photo = load_photo(path)  # decodes all pixels, to find damage
-            if min(photo.width, photo.height) < MIN_SIDE:
+            if min(photo.width, photo.height) < MIN_SIDE_PX:
                 size = f"{photo.width}×{photo.height}"
                 raise InputError(
-                    f"{path}: {size} pixels are too few (at least {MIN_SIDE} each way)"
+                    f"{path}: {size} pixels are too few (at least {MIN_SIDE_PX} each way)"
                 )
             with open(path, "rb") as file:
                 sha256 = sha256_of(file)

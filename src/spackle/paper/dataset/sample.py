@@ -32,10 +32,12 @@ from spackle.paper.dataset.views import ViewStack
 from spackle.render.protocol import Rendering
 from spackle.runtime.errors import as_input_error
 
-COMPRESSION = 1  # zlib's level: level 6 takes three times as long and saves a tenth of the bytes
-DEEPEST = 65535
-SMALLEST_SCALE = 1e-30
-END = bytes(2 * tarfile.BLOCKSIZE)  # the end-of-archive mark
+PNG_COMPRESSION_LEVEL = (
+    1  # zlib's level: level 6 takes three times as long and saves a tenth of the bytes
+)
+MAX_CODE = 65535
+MIN_SCALE = 1e-30
+END_OF_ARCHIVE = bytes(2 * tarfile.BLOCKSIZE)  # the end-of-archive mark
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,7 +108,7 @@ class PhotoGroup:
     where: str  # the source, for messages
 
     @staticmethod
-    def of(key: str, data: bytes, where: str) -> PhotoGroup:
+    def from_tar(key: str, data: bytes, where: str) -> PhotoGroup:
         """Split a photo's part of a shard into files; InputError for damaged bytes."""
         files: dict[str, bytes] = {}
         with as_input_error(where, "not a photo of a dataset, or damaged: {reason}"):
@@ -184,15 +186,15 @@ def decode_rgb(data: bytes) -> Tensor:
 
 def encode_alpha(alpha: Tensor, mask: Tensor, threshold: float) -> bytes:
     """Encode opacity [H, W] in 0..1 as 16-bit PNG, so that exactly the pixels of `mask` stay below `threshold`."""
-    codes = (alpha.detach().cpu().double() * DEEPEST).round().clamp(0, DEEPEST)
-    last = math.ceil(threshold * DEEPEST) - 1  # the greatest code below the threshold
+    codes = (alpha.detach().cpu().double() * MAX_CODE).round().clamp(0, MAX_CODE)
+    last = math.ceil(threshold * MAX_CODE) - 1  # the greatest code below the threshold
     codes = torch.where(mask.cpu(), codes.clamp_max(last), codes.clamp_min(last + 1))
     return _png(codes.numpy().astype(np.uint16))
 
 
 def decode_alpha(data: bytes) -> Tensor:
     """Decode opacity [H, W] in 0..1."""
-    return torch.from_numpy(_pixels(data, 2).astype(np.float64) / DEEPEST).float()
+    return torch.from_numpy(_pixels(data, 2).astype(np.float64) / MAX_CODE).float()
 
 
 def encode_depth(depth: Tensor, alpha: Tensor) -> tuple[bytes, tuple[float, float]]:
@@ -202,31 +204,31 @@ def encode_depth(depth: Tensor, alpha: Tensor) -> tuple[bytes, tuple[float, floa
     near, far = (float(z[known].min()), float(z[known].max())) if known.any() else (1.0, 1.0)
     codes = np.zeros(z.shape, np.uint16)
     span = max(math.log(far / near), 1e-12)
-    codes[known] = 1 + np.round((DEEPEST - 1) * np.log(z[known] / near) / span)
+    codes[known] = 1 + np.round((MAX_CODE - 1) * np.log(z[known] / near) / span)
     return _png(codes), (near, far)
 
 
 def decode_depth(data: bytes, near: float, far: float) -> Tensor:
     """Decode expected z [H, W]; 0 means unknown."""
     codes = _pixels(data, 2).astype(np.float64)
-    z = near * np.exp((codes - 1) / (DEEPEST - 1) * math.log(far / near))
+    z = near * np.exp((codes - 1) / (MAX_CODE - 1) * math.log(far / near))
     return torch.from_numpy(np.where(codes > 0, z, 0.0)).float()
 
 
 def encode_gaussians(gaussians: Gaussians) -> bytes:
     """Encode Gaussians as safetensors, 34 bytes each."""
     means, quats, scales, opacities, colors = (t.detach().cpu().float() for t in gaussians.tensors)
-    logs = scales.double().clamp_min(SMALLEST_SCALE).log()
+    logs = scales.double().clamp_min(MIN_SCALE).log()
     low, high = (float(logs.min()), float(logs.max())) if len(means) else (0.0, 0.0)
-    steps = ((logs - low) / max(high - low, 1e-12) * DEEPEST).round()
+    steps = ((logs - low) / max(high - low, 1e-12) * MAX_CODE).round()
     arrays: dict[str, NDArray[Any]] = {
         "means": means.numpy(),
         "quats": normalize(quats, dim=-1).half().numpy(),
         "scales": steps.numpy().astype(np.uint16),
         "scale_logs": np.array([low, high]),
-        "opacities": (opacities.double() * DEEPEST)
+        "opacities": (opacities.double() * MAX_CODE)
         .round()
-        .clamp(0, DEEPEST)
+        .clamp(0, MAX_CODE)
         .numpy()
         .astype(np.uint16),
         "colors": colors.half().numpy(),
@@ -238,8 +240,8 @@ def decode_gaussians(data: bytes) -> Gaussians:
     """Decode bytes of `encode_gaussians` to float32; other bytes may raise any exception."""
     arrays = load(data)
     low, high = arrays["scale_logs"].tolist()
-    scales = np.exp(low + arrays["scales"].astype(np.float64) / DEEPEST * max(high - low, 1e-12))
-    opacities = arrays["opacities"].astype(np.float64) / DEEPEST
+    scales = np.exp(low + arrays["scales"].astype(np.float64) / MAX_CODE * max(high - low, 1e-12))
+    opacities = arrays["opacities"].astype(np.float64) / MAX_CODE
     columns = (arrays["means"], arrays["quats"], scales, opacities, arrays["colors"])
     gaussians = Gaussians(
         *(torch.from_numpy(np.ascontiguousarray(column)).float() for column in columns)
@@ -251,7 +253,7 @@ def decode_gaussians(data: bytes) -> Gaussians:
 
 def _png(pixels: NDArray[Any]) -> bytes:
     file = io.BytesIO()
-    Image.fromarray(pixels).save(file, format="PNG", compress_level=COMPRESSION)
+    Image.fromarray(pixels).save(file, format="PNG", compress_level=PNG_COMPRESSION_LEVEL)
     return file.getvalue()
 
 

@@ -12,14 +12,14 @@ from typing import IO, Annotated, Any
 from pydantic import BaseModel, Field, model_validator
 from torch.utils.data import Dataset
 
-from spackle.paper.dataset.sample import END, PhotoGroup
+from spackle.paper.dataset.sample import END_OF_ARCHIVE, PhotoGroup
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import atomic_path, digest_of
 
-NAME = "manifest.json"
-FORMAT = 1  # version of shards and manifest; other versions are refused
-Bytes = Annotated[int, Field(ge=0, le=1 << 40)]
-Share = Annotated[float, Field(ge=0, le=1)]
+MANIFEST_NAME = "manifest.json"
+FORMAT_VERSION = 1  # version of shards and manifest; other versions are refused
+ByteCount = Annotated[int, Field(ge=0, le=1 << 40)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
 class SampleEntry(BaseModel, frozen=True, extra="forbid", strict=True):
@@ -27,17 +27,17 @@ class SampleEntry(BaseModel, frozen=True, extra="forbid", strict=True):
 
     key: str = Field(pattern="^[0-9A-Za-z]+$")
     photo: str  # the photo's name, relative to the folder of photos
-    offset: Bytes  # position of the sample's first byte in the shard
-    size: Bytes
+    offset: ByteCount  # position of the sample's first byte in the shard
+    size: ByteCount
     sha256: str  # of the sample's bytes
-    holes: tuple[Share, ...]  # HAR of each view
+    holes: tuple[Fraction, ...]  # HAR of each view
 
 
 class ShardEntry(BaseModel, frozen=True, extra="forbid", strict=True):
     """A shard: one tar file."""
 
     file: str = Field(pattern=r"^shard-[0-9]{6}\.tar$")
-    size: Bytes
+    size: ByteCount
     sha256: str
     samples: tuple[SampleEntry, ...]
     passed_over: tuple[str, ...] = ()  # messages about photos without a sample
@@ -79,15 +79,15 @@ class Manifest(BaseModel, frozen=True, extra="ignore", strict=True):
         text = json.dumps(
             content | {"sha256": digest_of(content)}, indent=1, sort_keys=True, allow_nan=False
         )
-        with atomic_path(folder / NAME) as temporary:
+        with atomic_path(folder / MANIFEST_NAME) as temporary:
             temporary.write_text(text + "\n", encoding="utf-8")
 
     def _content(self) -> dict[str, Any]:
         counts = {"photos": len(self.samples), "views": self.views, "bytes": self.size}
-        return self.model_dump(mode="json") | {"format": FORMAT, "counts": counts}
+        return self.model_dump(mode="json") | {"format": FORMAT_VERSION, "counts": counts}
 
 
-def open_in(location: str | os.PathLike[str], name: str) -> IO[bytes]:
+def open_dataset_file(location: str | os.PathLike[str], name: str) -> IO[bytes]:
     """Open a seekable file in a folder or at an fsspec address (s3://bucket/dataset); InputError if opening fails."""
     place = f"{str(location).rstrip('/')}/{name}"
     package = "an address needs fsspec (pip install fsspec), and perhaps a package for its protocol"
@@ -110,16 +110,16 @@ def open_in(location: str | os.PathLike[str], name: str) -> IO[bytes]:
 
 def load_manifest(location: str | os.PathLike[str]) -> Manifest:
     """Read the manifest of a dataset; InputError for a missing or damaged file, or another format."""
-    where = f"{str(location).rstrip('/')}/{NAME}"
+    where = f"{str(location).rstrip('/')}/{MANIFEST_NAME}"
     with (
-        open_in(location, NAME) as file,
+        open_dataset_file(location, MANIFEST_NAME) as file,
         as_input_error(where, "damaged, or no manifest of a dataset: {reason}"),
     ):
         text = file.read()
         content = json.loads(text)
-        if content["format"] != FORMAT:
+        if content["format"] != FORMAT_VERSION:
             raise InputError(
-                f"{where}: format {content['format']!r} is unknown: this Spackle reads format {FORMAT}"
+                f"{where}: format {content['format']!r} is unknown: this Spackle reads format {FORMAT_VERSION}"
             )
         recorded = content.pop("sha256")
         manifest = Manifest.model_validate_json(text)
@@ -141,7 +141,7 @@ def write_shard(
         for key, path in parts:
             data = path.read_bytes()
             try:
-                group = PhotoGroup.of(key, data, str(path))
+                group = PhotoGroup.from_tar(key, data, str(path))
             except InputError as error:
                 raise InputError(
                     f"{error}: delete this file, and the same command makes it again"
@@ -158,9 +158,9 @@ def write_shard(
             file.write(data)
             whole.update(data)
             offset += len(data)
-        file.write(END)
-        whole.update(END)
-    size, sha256 = offset + len(END), whole.hexdigest()
+        file.write(END_OF_ARCHIVE)
+        whole.update(END_OF_ARCHIVE)
+    size, sha256 = offset + len(END_OF_ARCHIVE), whole.hexdigest()
     return ShardEntry(
         file=target.name,
         size=size,
@@ -195,7 +195,7 @@ class DatasetFiles(Dataset[PhotoGroup]):
         shard, sample = self.samples[index]
         where = f"{self.location}/{shard.file}"
         with (
-            open_in(self.location, shard.file) as file,
+            open_dataset_file(self.location, shard.file) as file,
             as_input_error(where, "cannot be read: {reason}", OSError),
         ):
             file.seek(sample.offset)
@@ -204,4 +204,4 @@ class DatasetFiles(Dataset[PhotoGroup]):
             raise InputError(
                 f"{where}: sample {sample.key} ({sample.photo}) is damaged: see `spackle dataset verify`"
             )
-        return PhotoGroup.of(sample.key, data, f"{where}: sample {sample.key}")
+        return PhotoGroup.from_tar(sample.key, data, f"{where}: sample {sample.key}")

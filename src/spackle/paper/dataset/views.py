@@ -30,16 +30,16 @@ from spackle.render import Renderer
 from spackle.residual import hole_mask
 from spackle.scene_fill.fill import farthest_first
 
-APART = (
+SAME_VIEW_DISTANCE = (
     1e-3  # two views are the same if their cameras are closer than this times the maximum offset
 )
-SPARE = 6  # the most extra frames of a path, tried because frames may coincide
-SAME_SURFACE = 0.03  # relative difference below which two depths belong to one surface
-LEAST = 1e-6  # the smallest inverse depth to divide by
+MAX_EXTRA_FRAMES = 6  # the most extra frames of a path, tried because frames may coincide
+SAME_SURFACE_TOLERANCE = 0.03  # relative difference below which two depths belong to one surface
+MIN_INVERSE_DEPTH = 1e-6  # the smallest inverse depth to divide by
 COMPLETIONS = (*INPAINTERS, "geometry", "none")  # values of --inpainter
 
 
-def draw_path(
+def draw_random_path(
     kind: SharpTrajectory | None, disparity: tuple[float, float], seed: int, photo_sha256: str
 ) -> tuple[SharpTrajectory, float]:
     """Draw a photo's path and disparity at random, by seed and file content; `kind` fixes the kind of path."""
@@ -48,7 +48,7 @@ def draw_path(
     return kind or drawn, float(rng.uniform(*disparity))
 
 
-def path_cameras(
+def cameras_along_path(
     kind: SharpTrajectory, disparity: float, camera: Camera, depth_range: DepthRange, views: int
 ) -> list[Camera]:
     """Choose `views` different cameras: first the photo's `camera` (of the views' size), then cameras along the path.
@@ -62,8 +62,8 @@ def path_cameras(
         return float((one.position.double() - other.position.double()).norm())
 
     cameras = [camera]
-    least = APART * max_offset(camera, disparity, depth_range)
-    for frames in range(views - 1, views + SPARE) if least > 0 else ():
+    least = SAME_VIEW_DISTANCE * max_offset(camera, disparity, depth_range)
+    for frames in range(views - 1, views + MAX_EXTRA_FRAMES) if least > 0 else ():
         cameras = [camera]
         for view in trajectory(kind, camera, disparity, depth_range, frames):
             if all(distance(view, other) > least for other in cameras):
@@ -113,7 +113,7 @@ def complete_views(
     return (
         paint_video(inpainter, views)
         if inpainter.paints_views_together
-        else paint_in_turn(inpainter, views, renderer)
+        else paint_view_by_view(inpainter, views, renderer)
     )
 
 
@@ -142,7 +142,7 @@ def render_completed(views: ViewStack, renderer: Renderer) -> tuple[Tensor, Tens
 
 
 @torch.no_grad()
-def paint_in_turn(inpainter: Inpainter, views: ViewStack, renderer: Renderer) -> Tensor:
+def paint_view_by_view(inpainter: Inpainter, views: ViewStack, renderer: Renderer) -> Tensor:
     """Paint the views' holes one view after the other, the farthest from the photo first, so that all views agree.
 
     Painted views are reprojected into the next view's holes, and the inpainter paints the rest. The depth in the holes
@@ -156,9 +156,9 @@ def paint_in_turn(inpainter: Inpainter, views: ViewStack, renderer: Renderer) ->
             row, column = hole.nonzero(as_tuple=True)
             pixels = camera.pixel_centers().to(target)[row, column]
             points = camera.unproject(
-                pixels, 1 / inverse_depths[index][row, column].clamp_min(LEAST)
+                pixels, 1 / inverse_depths[index][row, column].clamp_min(MIN_INVERSE_DEPTH)
             )
-            colors, seen = _looked_up(
+            colors, seen = look_up_points(
                 points, views.cameras[other], targets[other], inverse_depths[other]
             )
             target[row[seen], column[seen]] = colors[seen]
@@ -171,7 +171,7 @@ def paint_in_turn(inpainter: Inpainter, views: ViewStack, renderer: Renderer) ->
     return targets
 
 
-def _looked_up(
+def look_up_points(
     points: Tensor, camera: Camera, rgb: Tensor, inverse_depth: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Colours [n, 3] of points [n, 3] in a view [H, W, 3] with inverse depth [H, W], and whether each is seen [n]."""
@@ -181,7 +181,7 @@ def _looked_up(
     values = grid_sample(
         images[None], place[None, None], align_corners=False, padding_mode="border"
     )[0, :, 0].T
-    same = (values[:, 3] * z - 1).abs() < SAME_SURFACE
+    same = (values[:, 3] * z - 1).abs() < SAME_SURFACE_TOLERANCE
     return values[:, :3], same & (z > 0) & (place.abs() <= 1).all(-1)
 
 

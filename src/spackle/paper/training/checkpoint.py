@@ -15,19 +15,22 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from spackle.paper.training.recipe import AnyRecipe, differences
+from spackle.paper.training.recipe import AnyRecipe, changed_keys
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import atomic_path
 
-CHECKPOINT = "checkpoint.pt"
-BEST, LAST, RUN = "best.safetensors", "last.safetensors", "run.json"
-RESULTS = (CHECKPOINT, BEST, LAST, RUN)
-PICTURES, LOGS = "pictures", "logs"
+CHECKPOINT_FILE = "checkpoint.pt"
+BEST_WEIGHTS = "best.safetensors"
+LAST_WEIGHTS = "last.safetensors"
+RUN_REPORT = "run.json"
+RUN_FILES = (CHECKPOINT_FILE, BEST_WEIGHTS, LAST_WEIGHTS, RUN_REPORT)
+PICTURES_FOLDER = "pictures"
+LOGS_FOLDER = "logs"
 Log = Callable[[str], None]
 
 
 @dataclasses.dataclass
-class Progress:
+class TrainingProgress:
     """The progress of a run."""
 
     step: int = 0  # steps done
@@ -41,7 +44,7 @@ class Progress:
         default_factory=list
     )  # the measures of each validation
 
-    def validated(self, measures: dict[str, float], aim: str, min_delta: float) -> bool:
+    def record_validation(self, measures: dict[str, float], aim: str, min_delta: float) -> bool:
         """Record a validation; returns whether the measure `aim` is lower than the best by more than `min_delta`."""
         self.history.append({"step": self.step, **measures})
         best, value = math.inf if self.best is None else self.best, measures.get(aim, math.inf)
@@ -56,7 +59,7 @@ class Progress:
 class Checkpoint:
     """All state on which the next step depends; the number of a step determines the step's samples."""
 
-    progress: Progress
+    progress: TrainingProgress
     network: dict[str, Tensor]
     average: dict[str, Tensor]
     optimizer: dict[str, Any]
@@ -69,18 +72,18 @@ def save_checkpoint(checkpoint: Checkpoint, folder: Path) -> None:
     """Write checkpoint.pt; if the disk is full, raise InputError and keep the previous checkpoint."""
     buffer = io.BytesIO()  # torch.save to a file hides that the disk is full
     torch.save({**vars(checkpoint), "progress": dataclasses.asdict(checkpoint.progress)}, buffer)
-    with atomic_path(folder / CHECKPOINT) as temporary:
+    with atomic_path(folder / CHECKPOINT_FILE) as temporary:
         temporary.write_bytes(buffer.getbuffer())
 
 
 def load_checkpoint(folder: Path) -> Checkpoint | None:
     """The checkpoint in a folder; None if there is none, InputError if it cannot be read."""
-    path = folder / CHECKPOINT
+    path = folder / CHECKPOINT_FILE
     if not path.exists():
         return None
     with as_input_error(path, "cannot be read ({reason}): --overwrite starts a new run"):
         state = torch.load(path, map_location="cpu", weights_only=True)
-        return Checkpoint(**{**state, "progress": Progress(**state["progress"])})
+        return Checkpoint(**{**state, "progress": TrainingProgress(**state["progress"])})
 
 
 def find_checkpoint(
@@ -91,7 +94,7 @@ def find_checkpoint(
     if checkpoint is None:
         return None
     changed = [] if checkpoint.method == method else ["--method"]
-    changed += differences(checkpoint.recipe, recipe)
+    changed += changed_keys(checkpoint.recipe, recipe)
     changed += [] if checkpoint.digest == digest else ["the data's files"]
     if changed:
         raise InputError(
@@ -104,7 +107,7 @@ def find_checkpoint(
 
 def remove_run(output: Path) -> None:
     """Delete a run's files, except for its samples."""
-    for path in (output / name for name in (*RESULTS, PICTURES, LOGS)):
+    for path in (output / name for name in (*RUN_FILES, PICTURES_FOLDER, LOGS_FOLDER)):
         shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
 
 
@@ -116,4 +119,4 @@ def open_logs(folder: Path, first: int, log: Log) -> AbstractContextManager[Any]
     except ImportError:
         log("no TensorBoard logs: pip install 'spackle-nvs[train]'")
         return contextlib.nullcontext()
-    return SummaryWriter(str(folder / LOGS), purge_step=first)
+    return SummaryWriter(str(folder / LOGS_FOLDER), purge_step=first)

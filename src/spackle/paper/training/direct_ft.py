@@ -34,7 +34,7 @@ from spackle.paper.dataset.sample import DatasetView
 from spackle.paper.training.recipe import Recipe
 from spackle.paper.training.residual import ViewBatch, ViewTask
 from spackle.paper.training.samples import short_digest
-from spackle.paper.training.sources import divided_photos, open_pseudo
+from spackle.paper.training.sources import open_pseudo_dataset, split_photos
 from spackle.render import Renderer, device_of
 from spackle.runtime.device import enough_memory, own_arithmetic
 from spackle.runtime.errors import InputError
@@ -43,7 +43,7 @@ from spackle.runtime.progress import Reporter
 from spackle.weights import installed_weights, weights_digest
 from spackle.weights.checkpoints import read_tensors
 
-VIEWS_AT_ONCE = 4  # views of a photo in a step; they share one pass through the encoder, the most expensive part
+VIEWS_PER_PHOTO = 4  # views of a photo in a step; they share one pass through the encoder, the most expensive part
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,7 +101,7 @@ def normalised_camera(camera: Camera, photo_camera: Camera) -> Camera:
     return dataclasses.replace(camera, world_to_camera=matrix * stretch)
 
 
-def render_photo(
+def render_views_of_photo(
     decoder: nn.Module, base: TunableSharp, views: Sequence[DatasetView], renderer: Renderer
 ) -> ViewBatch:
     """Predict a photo's Gaussians and render them in the given views; only `decoder` gets gradients.
@@ -126,7 +126,7 @@ class DirectFt(ViewTask):
     """Trains SHARP's decoder; its items are photos, run one at a time, because one gradient takes gigabytes."""
 
     name: ClassVar[str] = "direct-ft"
-    at_once = 1
+    micro_batch = 1
 
     def __init__(
         self, recipe: Recipe, device: torch.device, checkpoint: Path | None = None
@@ -137,9 +137,9 @@ class DirectFt(ViewTask):
         """
         super().__init__(recipe, device)
         data = recipe.data
-        if recipe.optim.batch % VIEWS_AT_ONCE:
+        if recipe.optim.batch % VIEWS_PER_PHOTO:
             raise InputError(
-                f"optim.batch={recipe.optim.batch}: give a multiple of {VIEWS_AT_ONCE} views"
+                f"optim.batch={recipe.optim.batch}: give a multiple of {VIEWS_PER_PHOTO} views"
             )
         if data.pseudo is None or recipe.init or data.photos or data.rgbd or data.stereo:
             raise InputError(
@@ -155,17 +155,19 @@ class DirectFt(ViewTask):
                 f"-c {path}: holds an already trained decoder: give the original checkpoint of SHARP"
             )
         self.owner = Owner(path, weights_digest(path))
-        self.files = open_pseudo(data.pseudo)
+        self.files = open_pseudo_dataset(data.pseudo)
         base = self.files.manifest.config.get("base", {})
         if (base.get("name"), base.get("weights")) != ("sharp", self.owner.sha256):
             raise InputError(
                 f"{data.pseudo}: built with the base {base.get('name')}, weights {base.get('weights')}: build a "
                 f"dataset with --base sharp and the weights {path}"
             )
-        self.learned, self.validation = divided_photos(self.files, data)
-        self.digest = short_digest((self.files.manifest.digest, self.learned, self.validation))
-        self.items, self.validation_items = len(self.learned), len(self.validation)
-        self.items_a_step = recipe.optim.batch // VIEWS_AT_ONCE
+        self.training_photos, self.validation_photos = split_photos(self.files, data)
+        self.digest = short_digest(
+            (self.files.manifest.digest, self.training_photos, self.validation_photos)
+        )
+        self.items, self.validation_items = len(self.training_photos), len(self.validation_photos)
+        self.items_per_step = recipe.optim.batch // VIEWS_PER_PHOTO
 
     def prepare(self, output: Path, reporter: Reporter) -> dict[str, Any]:
         """Load SHARP."""
@@ -174,19 +176,19 @@ class DirectFt(ViewTask):
         reporter.log(f"{self.items} training photos, {self.validation_items} validation photos")
         return {"checkpoint": {"file": self.owner.path.name, "sha256": self.owner.sha256}}
 
-    def batch(self, step: int | None, items: Sequence[int]) -> list[DatasetView]:
-        """Views of a photo, see `drawn_views`; for validation (step None) all views."""
+    def load_batch(self, step: int | None, items: Sequence[int]) -> list[DatasetView]:
+        """Views of a photo, see `draw_view_numbers`; for validation (step None) all views."""
         (item,) = items
-        group = self.files[(self.validation if step is None else self.learned)[item]]
+        group = self.files[(self.validation_photos if step is None else self.training_photos)[item]]
         drawn = (
             range(group.views)
             if step is None
-            else drawn_views([self.recipe.run.seed, step, item], group.views)
+            else draw_view_numbers([self.recipe.run.seed, step, item], group.views)
         )
         return [group.view(index) for index in drawn]
 
     def complete(self, network: nn.Module, batch: Sequence[DatasetView]) -> ViewBatch:
-        return render_photo(network, self.base, batch, self.renderer)
+        return render_views_of_photo(network, self.base, batch, self.renderer)
 
     def export(self, network: nn.Module, path: Path) -> None:
         """Write the decoder in float32, for `spackle predict --base sharp -c`, and a link to SHARP's checkpoint."""
@@ -194,7 +196,7 @@ class DirectFt(ViewTask):
         link_owner(self.owner, path.parent)
 
 
-def drawn_views(seed: Sequence[int], views: int) -> list[int]:
-    """Numbers of up to `VIEWS_AT_ONCE` views of a photo: 0 for the photo's own view, then random other views."""
-    others = 1 + np.random.default_rng(seed).permutation(views - 1)[: VIEWS_AT_ONCE - 1]
+def draw_view_numbers(seed: Sequence[int], views: int) -> list[int]:
+    """Numbers of up to `VIEWS_PER_PHOTO` views of a photo: 0 for the photo's own view, then random other views."""
+    others = 1 + np.random.default_rng(seed).permutation(views - 1)[: VIEWS_PER_PHOTO - 1]
     return [0, *sorted(others.tolist())]

@@ -236,7 +236,9 @@ def perceptual_loss(
     ours = features(_resized(torch.where(near[..., None], rgb, target), size))
     with torch.no_grad():
         theirs = features(_resized(target, size))
-    terms = [_layer_terms(f, t, covered(near, f)) for f, t in zip(ours, theirs, strict=True)]
+    terms = [
+        _layer_terms(f, t, covered_fraction(near, f)) for f, t in zip(ours, theirs, strict=True)
+    ]
     return torch.stack([layer + gram * texture for layer, texture in terms]).sum()
 
 
@@ -281,7 +283,7 @@ def hole_distance(features: FeatureNet, rgb: Tensor, target: Tensor, hole: Tenso
     total = 0.0
     for both in features(torch.stack([shown, target]).movedim(-1, 1)):  # [2, C, h, w]
         ours, theirs = both / both.norm(dim=1, keepdim=True).clamp_min(NO_LENGTH)
-        weight = covered(hole[None], both)[0, 0]
+        weight = covered_fraction(hole[None], both)[0, 0]
         total += float(((ours - theirs).square().sum(0) * weight).sum() / weight.sum())
     return total
 
@@ -297,7 +299,7 @@ def hole_psnr(rgb: Tensor, target: Tensor, hole: Tensor) -> float:
     return math.inf if error == 0 else -10 * math.log10(error)
 
 
-def covered(mask: Tensor, features: Tensor) -> Tensor:
+def covered_fraction(mask: Tensor, features: Tensor) -> Tensor:
     """[B, 1, h, w]: the fraction of each cell of a feature map [B, C, h, w] that a mask [B, H, W] covers."""
     height, width = features.shape[-2:]
     return F.adaptive_avg_pool2d(mask[:, None].to(features.dtype), (height, width))

@@ -17,10 +17,10 @@ from spackle.runtime.files import check_file
 from spackle.weights import installed_weights
 
 PACKAGED = Path(__file__).parent / "recipes"
-FREE = "free"  # marks keys that may change when a run resumes; samples are compared by digest, not by these keys
+MAY_CHANGE_ON_RESUME = "free"  # marks keys that may change when a run resumes; samples are compared by digest, not by these keys
 
 
-def _rule(text: str, holds: Callable[[Any], bool]) -> AfterValidator:
+def must_hold(text: str, holds: Callable[[Any], bool]) -> AfterValidator:
     """A validator that refuses a value for which `holds` is false; the message is `text`."""
 
     def check(value: Any) -> Any:
@@ -36,17 +36,17 @@ Section = Annotated[
     T, BeforeValidator(lambda value: {} if value is None else value)
 ]  # an empty section has defaults
 # YAML reads 1e3 as text.
-Whole = Annotated[
+Int = Annotated[
     int,
     BeforeValidator(lambda v: float(v) if re.fullmatch(r"\d+(\.\d*)?[eE]\+?\d+", str(v)) else v),
 ]
-Share = Annotated[float, Field(ge=0, le=1e6)]
-Count = Annotated[Whole, Field(ge=1, le=1_000_000)]  # file names of samples have six digits
+NonNegative = Annotated[float, Field(ge=0, le=1e6)]
+Count = Annotated[Int, Field(ge=1, le=1_000_000)]  # file names of samples have six digits
 Beta = Annotated[float, Field(ge=0, lt=1)]
 Disparity = Annotated[float, Field(ge=0, le=MAX_DISPARITY)]
-Interval = Annotated[Whole, Field(ge=1), FREE]  # steps
-Place = Annotated[Path | None, FREE]
-Seed = Annotated[Whole, Field(ge=0, le=2**31 - 2)]
+Interval = Annotated[Int, Field(ge=1), MAY_CHANGE_ON_RESUME]  # steps
+OptionalPath = Annotated[Path | None, MAY_CHANGE_ON_RESUME]
+Seed = Annotated[Int, Field(ge=0, le=2**31 - 2)]
 
 
 class RecipePart(BaseModel):
@@ -66,51 +66,51 @@ class RgbdFolder(RecipePart):
 class Shares(RecipePart):
     """Relative shares of the views from each source; a source without data gets no share."""
 
-    composites: Share = 0.66
-    rgbd: Share = 0.12
-    stereo: Share = 0.10  # `reverse_view` of the left photo
-    pairs: Share = 0.12  # the right photo is the target
-    pseudo: Annotated[Share, FREE] = 1.0  # views of a dataset
+    composites: NonNegative = 0.66
+    rgbd: NonNegative = 0.12
+    stereo: NonNegative = 0.10  # `reverse_view` of the left photo
+    pairs: NonNegative = 0.12  # the right photo is the target
+    pseudo: Annotated[NonNegative, MAY_CHANGE_ON_RESUME] = 1.0  # views of a dataset
 
 
 class DataRecipe(RecipePart):
     """Sources and numbers of the training views."""
 
-    photos: Place = None  # a folder, with its subfolders
-    rgbd: Annotated[tuple[RgbdFolder, ...], FREE] = ()
-    stereo: Place = None  # a folder of scenes, each with a scene.json
-    pseudo: Place = None  # a dataset that `spackle dataset build` made
+    photos: OptionalPath = None  # a folder, with its subfolders
+    rgbd: Annotated[tuple[RgbdFolder, ...], MAY_CHANGE_ON_RESUME] = ()
+    stereo: OptionalPath = None  # a folder of scenes, each with a scene.json
+    pseudo: OptionalPath = None  # a dataset that `spackle dataset build` made
     shares: Section[Shares] = Shares()
     # Least and greatest disparity of the virtual camera.
     disparity: Annotated[
-        tuple[Disparity, Disparity], _rule("must ascend", lambda of: of[0] <= of[1])
+        tuple[Disparity, Disparity], must_hold("must ascend", lambda of: of[0] <= of[1])
     ] = (0.1, 0.6)
     views: Count = 20_000  # the paper: 20 views of 1,000 photos
-    crops: Annotated[Whole, Field(ge=1, le=100)] = 3  # most crops of a view
-    cells: Annotated[Whole, Field(ge=16, le=768)] = 96  # cells of 2×2 pixels along a crop's side
+    crops: Annotated[Int, Field(ge=1, le=100)] = 3  # most crops of a view
+    cells: Annotated[Int, Field(ge=16, le=768)] = 96  # cells of 2×2 pixels along a crop's side
     validation_views: Count = 100
-    cache: Place = None  # a folder for the samples; None: inside the output
+    cache: OptionalPath = None  # a folder for the samples; None: inside the output
     seed: Seed = 0  # for the samples alone: runs that differ only in run.seed share samples
 
 
 class LossRecipe(RecipePart):
     """Weights of the terms of eq. 12, and settings of the terms (paper, "Training Details and Loss Weights")."""
 
-    color: Share = 10.0
-    alpha: Share = 0.5
-    perceptual: Share = 1.0
-    preserve: Share = 5.0
+    color: NonNegative = 10.0
+    alpha: NonNegative = 0.5
+    perceptual: NonNegative = 1.0
+    preserve: NonNegative = 5.0
     features: Literal["resnet50", "squeezenet", "none"] = "resnet50"
-    features_path: Place = None
+    features_path: OptionalPath = None
     # Longer side in pixels to which crops are resized for the feature network; None: not resized.
-    feature_size: Annotated[Whole, Field(ge=64, le=4096)] | None = 512
+    feature_size: Annotated[Int, Field(ge=64, le=4096)] | None = 512
     dilation: Annotated[
-        Whole, Field(ge=1, le=1001), _rule("must be odd", lambda side: side % 2 == 1)
+        Int, Field(ge=1, le=1001), must_hold("must be odd", lambda side: side % 2 == 1)
     ] = 21  # pixels
     color_blur: Annotated[float, Field(ge=0, le=64)] = (
         0.0  # standard deviation in pixels, see `color_loss`
     )
-    gram: Share = 1.0  # weight of Gram matrices within the perceptual term
+    gram: NonNegative = 1.0  # weight of Gram matrices within the perceptual term
 
     @property
     def features_file(self) -> Path | None:
@@ -125,9 +125,9 @@ class OptimRecipe(RecipePart):
 
     lr: Annotated[float, Field(gt=0, le=1)] = 1.6e-4
     min_lr: Annotated[float, Field(ge=0, le=1)] = 1.6e-5
-    warmup: Annotated[Whole, Field(ge=0)] = 10_000  # steps
+    warmup: Annotated[Int, Field(ge=0)] = 10_000  # steps
     steps: Interval = 100_000
-    batch: Annotated[Whole, Field(ge=1, le=100_000)] = 16  # crops per step, over all processes
+    batch: Annotated[Int, Field(ge=1, le=100_000)] = 16  # crops per step, over all processes
     betas: tuple[Beta, Beta] = (0.9, 0.999)
     weight_decay: Annotated[float, Field(ge=0, le=10)] = 1e-4
     clip: Annotated[float, Field(gt=0)] = 1.0  # largest norm of the gradient
@@ -145,8 +145,10 @@ class RunRecipe(RecipePart):
     save_every: Interval = 1000
     log_every: Interval = 50
     patience: Interval = 10  # validations without improvement before the run ends
-    min_delta: Annotated[float, Field(ge=0), FREE] = 1e-4  # smaller improvements do not count
-    device: Annotated[Literal["auto", "cpu", "cuda"], FREE] = (
+    min_delta: Annotated[float, Field(ge=0), MAY_CHANGE_ON_RESUME] = (
+        1e-4  # smaller improvements do not count
+    )
+    device: Annotated[Literal["auto", "cpu", "cuda"], MAY_CHANGE_ON_RESUME] = (
         "auto"  # of the networks, not of the renderer
     )
 
@@ -155,7 +157,7 @@ class AnyRecipe(RecipePart):
     """The sections that all recipes have."""
 
     optim: Annotated[
-        Section[OptimRecipe], _rule("min_lr must be <= lr", lambda o: o.min_lr <= o.lr)
+        Section[OptimRecipe], must_hold("min_lr must be <= lr", lambda o: o.min_lr <= o.lr)
     ] = OptimRecipe()
     run: Section[RunRecipe] = RunRecipe()
 
@@ -165,7 +167,7 @@ class Recipe(AnyRecipe):
 
     data: Section[DataRecipe] = DataRecipe()
     loss: Section[LossRecipe] = LossRecipe()
-    network: Annotated[Literal["unet", "sharp-decoder"], FREE] = (
+    network: Annotated[Literal["unet", "sharp-decoder"], MAY_CHANGE_ON_RESUME] = (
         "unet"  # architecture of the residual
     )
     init: Path | None = None  # initial weights; sharp-decoder also takes SHARP's checkpoint
@@ -174,8 +176,8 @@ class Recipe(AnyRecipe):
 R = TypeVar("R", bound=AnyRecipe)
 
 
-def differences(stored: Mapping[str, Any], recipe: RecipePart, above: str = "") -> list[str]:
-    """Keys in which a recipe differs from a `stored` model_dump, prefixed by `above`; `FREE` keys are ignored."""
+def changed_keys(stored: Mapping[str, Any], recipe: RecipePart, above: str = "") -> list[str]:
+    """Keys in which a recipe differs from a `stored` model_dump, prefixed by `above`; `MAY_CHANGE_ON_RESUME` keys are ignored."""
     fields, now = type(recipe).model_fields, recipe.model_dump(mode="json")
     keys = [
         above + name for name, value in stored.items() if name not in fields and value is not None
@@ -183,8 +185,8 @@ def differences(stored: Mapping[str, Any], recipe: RecipePart, above: str = "") 
     for name, field in fields.items():
         part = getattr(recipe, name)
         if isinstance(part, RecipePart):
-            keys += differences(stored.get(name) or {}, part, f"{above}{name}.")
-        elif FREE not in field.metadata and stored.get(name) != now[name]:
+            keys += changed_keys(stored.get(name) or {}, part, f"{above}{name}.")
+        elif MAY_CHANGE_ON_RESUME not in field.metadata and stored.get(name) != now[name]:
             keys.append(above + name)
     return sorted(keys)
 
@@ -211,7 +213,7 @@ def load_recipe(kind: type[R], path: str | os.PathLike[str], overrides: Sequence
     check_file(path, "recipe")
     with as_input_error(path, "not a recipe: {reason}", OSError, UnicodeDecodeError):
         text = Path(path).read_text(encoding="utf-8")
-    content = _parse(text, path) or {}
+    content = parse_yaml(text, path) or {}
     for override in overrides:
         key, equals, value = override.partition("=")
         if not equals or not key:
@@ -219,12 +221,12 @@ def load_recipe(kind: type[R], path: str | os.PathLike[str], overrides: Sequence
                 f"{override!r}: neither an option nor key=value, such as optim.steps=100"
             )
         with as_input_error(override, f"{path} has no such key ({{reason}})"):
-            _set(content, key.split("."), _parse(value, override))
+            set_nested(content, key.split("."), parse_yaml(value, override))
     with as_input_error(path, "{reason}", ValidationError):
         return kind.model_validate(content)
 
 
-def _parse(text: str, where: object) -> Any:
+def parse_yaml(text: str, where: object) -> Any:
     try:
         import yaml
     except ImportError as error:
@@ -235,7 +237,7 @@ def _parse(text: str, where: object) -> Any:
         return yaml.safe_load(text)
 
 
-def _set(content: Any, keys: Sequence[str], value: object) -> None:
+def set_nested(content: Any, keys: Sequence[str], value: object) -> None:
     """Set a value in nested dictionaries and lists; missing dictionaries are created."""
     for key, following in zip(keys, [*keys[1:], None], strict=True):
         index = int(key) if isinstance(content, list) else key

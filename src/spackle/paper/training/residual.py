@@ -113,12 +113,12 @@ class ViewTask(Task):
         }
 
     @torch.no_grad()
-    def picture(self, network: nn.Module) -> Tensor:
+    def draw_picture(self, network: nn.Module) -> Tensor:
         """[H, W, 3] sRGB, one row per validation item: base, completed view, target."""
         items = range(0, self.validation_items, max(1, self.validation_items // PICTURED))[
             :PICTURED
         ]
-        views = [self.complete(network, self.batch(None, [item])) for item in items]
+        views = [self.complete(network, self.load_batch(None, [item])) for item in items]
         return contact_sheet(
             [(view.base_rgb[-1], view.rgb[-1], view.target[-1]) for view in views], PICTURE_SIDE
         )
@@ -211,7 +211,7 @@ class ResidualTask(ViewTask):
         self.sources = [
             find_sources(recipe.data, self.renderer, validation=which) for which in (False, True)
         ]
-        self.digest, self.items_a_step = (
+        self.digest, self.items_per_step = (
             digest_of_samples(recipe.data, self.sources[0]),
             recipe.optim.batch,
         )
@@ -231,11 +231,11 @@ class ResidualTask(ViewTask):
         )
         reporter.log(f"samples of {data.views + data.validation_views} views in {folder}")
         with reporter.stage("samples") as step:
-            self.validation, self.learned = (
+            self.validation_files, self.training_files = (
                 make_samples(data, of, folder / self.digest / name, seed, views, step, skip)
                 for name, of, seed, views in parts
             )
-        self.items, self.validation_items = len(self.learned), len(self.validation)
+        self.items, self.validation_items = len(self.training_files), len(self.validation_files)
         reporter.log(f"{self.items} training samples, {self.validation_items} validation samples")
         samples = {"train": self.items, "validation": self.validation_items, "digest": self.digest}
         return {
@@ -253,7 +253,7 @@ class ResidualTask(ViewTask):
             network = open_residual(self.recipe.network).to(device_of(self.renderer))
         decibels: dict[str, list[float]] = {"untrained": [], "colours of the targets": []}
         for item in range(self.validation_items):
-            (sample,) = self.batch(None, [item])
+            (sample,) = self.load_batch(None, [item])
             height, width = sample.features.mask.shape
             colors = sample.target.view(height, CELL, width, CELL, 3).mean((1, 3))
             best = dataclasses.replace(sample, seeds=dataclasses.replace(sample.seeds, rgb=colors))
@@ -262,9 +262,9 @@ class ResidualTask(ViewTask):
                 values.append(hole_psnr(views.rgb[0], views.target[0], views.hole[0]))
         return {name: sum(values) / len(values) for name, values in decibels.items()}
 
-    def batch(self, step: int | None, items: Sequence[int]) -> list[Sample]:
+    def load_batch(self, step: int | None, items: Sequence[int]) -> list[Sample]:
         """Read samples; InputError if one cannot be read."""
-        files = self.validation if step is None else self.learned
+        files = self.validation_files if step is None else self.training_files
         samples = [load_sample(files[item]) for item in items]
         for sample in samples:
             _ = (

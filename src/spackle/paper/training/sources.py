@@ -29,15 +29,17 @@ from spackle.render import Renderer
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import files_in
 
-TOLERANCE = 0.02  # a Gaussian up to this far behind the visible surface, relative to the depth, counts as visible
-CORNER = 0.25  # pixels: a centre closer than this to a pixel's corner counts as being at the corner
-FRAMES = 24  # frames of a path, one of which becomes the virtual camera
-NO_TARGETS = (
+VISIBLE_DEPTH_TOLERANCE = 0.02  # a Gaussian up to this far behind the visible surface, relative to the depth, counts as visible
+MAX_CORNER_DISTANCE_PX = (
+    0.25  # pixels: a centre closer than this to a pixel's corner counts as being at the corner
+)
+PATH_FRAMES = 24  # frames of a path, one of which becomes the virtual camera
+INPAINTERS_WITHOUT_TARGETS = (
     "none",
     "geometry",
 )  # inpainters that leave holes empty, or paint what the untrained residual renders
 
-Draw = Callable[
+DrawPhotoWithDepth = Callable[
     [np.random.Generator], tuple[Tensor, DepthMap, Camera]
 ]  # draws a photo [H, W, 3] sRGB with depth
 
@@ -50,7 +52,11 @@ def find_sources(data: DataRecipe, renderer: Renderer, *, validation: bool) -> l
     shares, sources = data.shares, list[Source]()
 
     def add(
-        name: str, share: float, folder: Path, files: Sequence[Path], draw: Draw | None = None
+        name: str,
+        share: float,
+        folder: Path,
+        files: Sequence[Path],
+        draw: DrawPhotoWithDepth | None = None,
     ) -> None:
         """Add a source: reverse views of photos that `draw` makes, or the right views of stereo pairs if it is None."""
 
@@ -58,7 +64,7 @@ def find_sources(data: DataRecipe, renderer: Renderer, *, validation: bool) -> l
             return (
                 random_reverse_view(rng, draw, data.disparity, renderer)
                 if draw
-                else right_view(rng, files, renderer)
+                else random_right_view(rng, files, renderer)
             )
 
         if share > 0:
@@ -75,7 +81,7 @@ def find_sources(data: DataRecipe, renderer: Renderer, *, validation: bool) -> l
             shares.composites,
             data.photos,
             photos,
-            partial(composite_photo, photos=photos),
+            partial(draw_composite, photos=photos),
         )
     frames = [
         find_files(camera.folder, "data.rgbd", (".color.jpg",), "NAME.color.jpg")
@@ -83,18 +89,20 @@ def find_sources(data: DataRecipe, renderer: Renderer, *, validation: bool) -> l
     ]
     for camera, files in zip(data.rgbd, frames, strict=True):
         share = shares.rgbd * len(files) / sum(map(len, frames))  # all frames are equally likely
-        draw = partial(frame_photo, frames=files, focal_px=camera.focal_px, unit_m=camera.unit_m)
+        draw = partial(
+            draw_rgbd_frame, frames=files, focal_px=camera.focal_px, unit_m=camera.unit_m
+        )
         add("rgbd", share, camera.folder, files, draw)
     if data.stereo is not None:
         scenes = [
             file.parent
             for file in find_files(data.stereo, "data.stereo", ("scene.json",), "scene.json")
         ]
-        add("stereo", shares.stereo, data.stereo, scenes, partial(left_photo, folders=scenes))
+        add("stereo", shares.stereo, data.stereo, scenes, partial(draw_left_photo, folders=scenes))
         add("pairs", shares.pairs, data.stereo, scenes)
     if data.pseudo is not None and shares.pseudo > 0:
-        dataset = open_pseudo(data.pseudo)
-        split = divided_photos(dataset, data)
+        dataset = open_pseudo_dataset(data.pseudo)
+        split = split_photos(dataset, data)
         places = [
             (photo, view)
             for photo in split[validation]
@@ -147,12 +155,12 @@ def reverse_view(
     camera, gaussians = prediction.camera, prediction.gaussians
     view = renderer.render(gaussians, viewer)
     kept = gaussians.select(
-        with_backing(seen_from(gaussians, viewer, view.depth), gaussians, camera)
+        add_visible_backing(visible_from(gaussians, viewer, view.depth), gaussians, camera)
     )
     return Sample.of(kept, renderer.render(kept, camera), camera, viewer, view.rgb, photo)
 
 
-def seen_from(gaussians: Gaussians, viewer: Camera, depth: Tensor) -> Tensor:
+def visible_from(gaussians: Gaussians, viewer: Camera, depth: Tensor) -> Tensor:
     """[N] bool: the Gaussians no farther than the greatest rendered `depth` [H, W] of the 3×3 pixels around them.
 
     One pixel's depth is not enough: at an outline, the pixel of a farther Gaussian may show the nearer surface.
@@ -162,10 +170,10 @@ def seen_from(gaussians: Gaussians, viewer: Camera, depth: Tensor) -> Tensor:
     column, row = uv.floor().long().unbind(-1)
     inside = (column >= 0) & (column < viewer.width) & (row >= 0) & (row < viewer.height) & (z > 0)
     at = row.clamp(0, viewer.height - 1), column.clamp(0, viewer.width - 1)
-    return inside & ((depth[at] == 0) | (z <= around[at] * (1 + TOLERANCE)))
+    return inside & ((depth[at] == 0) | (z <= around[at] * (1 + VISIBLE_DEPTH_TOLERANCE)))
 
 
-def with_backing(seen: Tensor, gaussians: Gaussians, camera: Camera) -> Tensor:
+def add_visible_backing(seen: Tensor, gaussians: Gaussians, camera: Camera) -> Tensor:
     """Extend `seen` [N] to backing Gaussians, which lie behind their surface by design (`spackle.lifting.lift`).
 
     A backing Gaussian counts as seen if the farthest of the four pixels around the Gaussian is seen. A lifted photo's
@@ -180,13 +188,16 @@ def with_backing(seen: Tensor, gaussians: Gaussians, camera: Camera) -> Tensor:
     )
     around = y.clamp(0, height - 1) * width + x.clamp(0, width - 1)
     backed = around.gather(1, z[around].argmax(-1, keepdim=True))[:, 0]
-    backing = (uv - corner).abs().amax(-1) < CORNER
+    backing = (uv - corner).abs().amax(-1) < MAX_CORNER_DISTANCE_PX
     backing[: width * height] = False
     return torch.where(backing, seen[backed], seen)
 
 
 def random_reverse_view(
-    rng: np.random.Generator, draw: Draw, disparity: tuple[float, float], renderer: Renderer
+    rng: np.random.Generator,
+    draw: DrawPhotoWithDepth,
+    disparity: tuple[float, float],
+    renderer: Renderer,
 ) -> Sample:
     """`reverse_view` of a random photo, with a random frame of a random path as the virtual camera."""
     rgb, depth, camera = draw(rng)
@@ -195,22 +206,26 @@ def random_reverse_view(
     )  # no tiles: a tile would be seen or hidden as a whole
     kind = SHARP_TRAJECTORIES[rng.integers(len(SHARP_TRAJECTORIES))]
     reach = DepthRange.of(prediction.gaussians)
-    viewer = trajectory(kind, camera, rng.uniform(*disparity), reach, FRAMES)[rng.integers(FRAMES)]
+    viewer = trajectory(kind, camera, rng.uniform(*disparity), reach, PATH_FRAMES)[
+        rng.integers(PATH_FRAMES)
+    ]
     return reverse_view(prediction, rgb, viewer, renderer)
 
 
-def right_view(rng: np.random.Generator, folders: Sequence[Path], renderer: Renderer) -> Sample:
+def random_right_view(
+    rng: np.random.Generator, folders: Sequence[Path], renderer: Renderer
+) -> Sample:
     """The lifted left photo of a random stereo pair, rendered at the right camera; the right photo is the target."""
-    left, right, depth, camera, beside = load_pair(_chosen(rng, folders))
+    left, right, depth, camera, beside = load_pair(pick_random(rng, folders))
     base = lift(left, depth, camera).gaussians
     return Sample.of(base, renderer.render(base, beside), beside, camera, left, right)
 
 
-def open_pseudo(location: str | os.PathLike[str]) -> DatasetFiles:
+def open_pseudo_dataset(location: str | os.PathLike[str]) -> DatasetFiles:
     """Open a pseudo-supervised dataset (appendix, "Dataset"); InputError if no target is useful."""
     files = DatasetFiles(location)
     name = files.manifest.config.get("inpainter", {}).get("name")
-    if name in NO_TARGETS:
+    if name in INPAINTERS_WITHOUT_TARGETS:
         raise InputError(
             f"{location}: built with --inpainter {name}, whose targets teach nothing: build another dataset with "
             "--inpainter propainter, exemplar or lama"
@@ -222,7 +237,7 @@ def open_pseudo(location: str | os.PathLike[str]) -> DatasetFiles:
     return files
 
 
-def divided_photos(files: DatasetFiles, data: DataRecipe) -> tuple[list[int], list[int]]:
+def split_photos(files: DatasetFiles, data: DataRecipe) -> tuple[list[int], list[int]]:
     """Indices of a dataset's photos for training, and of other photos for validation, shuffled by `data.seed`.
 
     InputError if the dataset has a single photo.
@@ -244,21 +259,21 @@ def views_with_holes(files: DatasetFiles, photo: int) -> list[int]:
 # Photos with depth --------------------------------------------------------------------------------
 
 
-def frame_photo(
+def draw_rgbd_frame(
     rng: np.random.Generator, frames: Sequence[Path], focal_px: float, unit_m: float
 ) -> tuple[Tensor, DepthMap, Camera]:
-    rgb, depth = load_frame(_chosen(rng, frames), unit_m)
+    rgb, depth = load_frame(pick_random(rng, frames), unit_m)
     return rgb, depth, Camera.from_focal(focal_px, rgb.shape[1], rgb.shape[0])
 
 
-def left_photo(
+def draw_left_photo(
     rng: np.random.Generator, folders: Sequence[Path]
 ) -> tuple[Tensor, DepthMap, Camera]:
-    left, _, depth, camera, _ = load_pair(_chosen(rng, folders))
+    left, _, depth, camera, _ = load_pair(pick_random(rng, folders))
     return left, depth, camera
 
 
-def _chosen(rng: np.random.Generator, files: Sequence[Path]) -> Path:
+def pick_random(rng: np.random.Generator, files: Sequence[Path]) -> Path:
     return files[int(rng.integers(len(files)))]
 
 
@@ -301,27 +316,27 @@ def load_pair(folder: Path) -> tuple[Tensor, Tensor, DepthMap, Camera, Camera]:
 
 # Photos without depth -----------------------------------------------------------------------------
 
-COMPOSITE_SIZE = (336, 448)  # height, width; swapped in half of the composites
+COMPOSITE_SIZE_PX = (336, 448)  # height, width; swapped in half of the composites
 FOCAL_MM = (20.0, 50.0)  # range of focal lengths, 35 mm equivalent
-BACKGROUND_M = (3.0, 8.0)  # depth of the farthest plane
-NEARER = (
+BACKGROUND_DEPTH_M = (3.0, 8.0)  # depth of the farthest plane
+CUTOUT_NEARNESS = (
     1.15,
     4.0,
 )  # ratio of a cut-out's inverse depth to the largest inverse depth behind the cut-out
-NEAREST_M = 0.7
-OBJECTS = (1, 4)  # number of cut-outs
-AREA = (0.01, 0.35)  # share of the image that a cut-out may cover
+MIN_DEPTH_M = 0.7
+CUTOUT_COUNT = (1, 4)  # number of cut-outs
+CUTOUT_AREA = (0.01, 0.35)  # share of the image that a cut-out may cover
 
-Photos = Callable[[np.random.Generator], Tensor]  # gives a random photo [H, W, 3] sRGB
+DrawPhoto = Callable[[np.random.Generator], Tensor]  # gives a random photo [H, W, 3] sRGB
 
 
-def composite_photo(
+def draw_composite(
     rng: np.random.Generator, photos: Sequence[Path]
 ) -> tuple[Tensor, DepthMap, Camera]:
     """A random composite, its depth, and a camera with a random focal length."""
-    height, width = COMPOSITE_SIZE if rng.random() < 0.5 else COMPOSITE_SIZE[::-1]
-    rgb, inverse_depth = composite(
-        rng, lambda rng: load_photo(_chosen(rng, photos)).rgb, height, width
+    height, width = COMPOSITE_SIZE_PX if rng.random() < 0.5 else COMPOSITE_SIZE_PX[::-1]
+    rgb, inverse_depth = compose_cutouts(
+        rng, lambda rng: load_photo(pick_random(rng, photos)).rgb, height, width
     )
     focal = film_to_pixels(rng.uniform(*FOCAL_MM), width, height)
     every = torch.ones_like(inverse_depth, dtype=torch.bool)
@@ -329,23 +344,23 @@ def composite_photo(
     return rgb, depth, Camera.from_focal(focal, width, height)
 
 
-def composite(
-    rng: np.random.Generator, photos: Photos, height: int, width: int
+def compose_cutouts(
+    rng: np.random.Generator, photos: DrawPhoto, height: int, width: int
 ) -> tuple[Tensor, Tensor]:
     """An image [H, W, 3] sRGB of cut-outs of photos in front of another photo, and its inverse depth [H, W] in 1/m."""
     rgb = random_crop(rng, photos(rng), height, width)
-    inverse_depth = _background(rng, height, width)
-    for _ in range(rng.integers(OBJECTS[0], OBJECTS[1] + 1)):
+    inverse_depth = random_background(rng, height, width)
+    for _ in range(rng.integers(CUTOUT_COUNT[0], CUTOUT_COUNT[1] + 1)):
         picture = random_crop(rng, photos(rng), height, width)
-        shape = outline(rng, picture)
+        shape = random_outline(rng, picture)
         share = float((shape > 0.5).float().mean())
-        if not AREA[0] < share < AREA[1]:
+        if not CUTOUT_AREA[0] < share < CUTOUT_AREA[1]:
             continue
         inside = shape > 0.5
-        depth = float(inverse_depth[inside].max()) * rng.uniform(*NEARER)
-        if depth > 1 / NEAREST_M:
+        depth = float(inverse_depth[inside].max()) * rng.uniform(*CUTOUT_NEARNESS)
+        if depth > 1 / MIN_DEPTH_M:
             continue
-        plane = depth * (1 + _tilt(rng, height, width, 0.1))
+        plane = depth * (1 + random_ramp(rng, height, width, 0.1))
         rgb = torch.lerp(rgb, picture, shape[..., None])
         inverse_depth = torch.where(inside, plane, inverse_depth)
     return rgb, inverse_depth
@@ -368,20 +383,20 @@ def random_crop(rng: np.random.Generator, photo: Tensor, height: int, width: int
     return part.flip(1).contiguous() if rng.random() < 0.5 else part.contiguous()
 
 
-def _background(rng: np.random.Generator, height: int, width: int) -> Tensor:
+def random_background(rng: np.random.Generator, height: int, width: int) -> Tensor:
     """Inverse depth [H, W] of a wall, in some cases with the ground or a second wall."""
-    far = 1.0 / rng.uniform(*BACKGROUND_M)
-    plane = far * (1 + _tilt(rng, height, width, 0.3))
+    far = 1.0 / rng.uniform(*BACKGROUND_DEPTH_M)
+    plane = far * (1 + random_ramp(rng, height, width, 0.3))
     if rng.random() < 0.5:  # the ground: inverse depth grows linearly below the horizon
         rows = (torch.arange(height) + 0.5) / height
         ground = far * rng.uniform(1.5, 4.0) * (rows - rng.uniform(0.2, 0.6))[:, None].clamp_min(0)
         plane = torch.maximum(plane, ground.expand(height, width))
     if rng.random() < 0.3:
-        plane = torch.maximum(plane, far * (1 + _tilt(rng, height, width, 1.0)))
-    return plane.clamp(0.5 * far, 1 / NEAREST_M)
+        plane = torch.maximum(plane, far * (1 + random_ramp(rng, height, width, 1.0)))
+    return plane.clamp(0.5 * far, 1 / MIN_DEPTH_M)
 
 
-def _tilt(rng: np.random.Generator, height: int, width: int, most: float) -> Tensor:
+def random_ramp(rng: np.random.Generator, height: int, width: int, most: float) -> Tensor:
     """A linear ramp [H, W] of random direction, within ±`most`."""
     y, x = torch.meshgrid(
         torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij"
@@ -390,10 +405,10 @@ def _tilt(rng: np.random.Generator, height: int, width: int, most: float) -> Ten
     return a * x + b * y
 
 
-def outline(rng: np.random.Generator, picture: Tensor) -> Tensor:
+def random_outline(rng: np.random.Generator, picture: Tensor) -> Tensor:
     """A mask [H, W] in 0..1 of random shape, with an edge about one pixel wide."""
     height, width = picture.shape[:2]
-    cloud = _noise(rng, height, width, rng.uniform(0.1, 0.35))
+    cloud = smooth_noise(rng, height, width, rng.uniform(0.1, 0.35))
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     cy, cx = rng.uniform(0.1, 1.0) * height, rng.uniform(0.0, 1.0) * width
     kind = rng.random()
@@ -416,7 +431,7 @@ def outline(rng: np.random.Generator, picture: Tensor) -> Tensor:
     return avg_pool2d(soft, 3, stride=1, padding=1, count_include_pad=False)[0, 0]
 
 
-def _noise(rng: np.random.Generator, height: int, width: int, size: float) -> Tensor:
+def smooth_noise(rng: np.random.Generator, height: int, width: int, size: float) -> Tensor:
     """Smooth noise [H, W] of about ±1, with features of `size` times the width."""
     rows, columns = max(2, round(height / (size * width))), max(2, round(1 / size))
     coarse = torch.from_numpy(rng.standard_normal((1, 1, rows, columns)).astype(np.float32))

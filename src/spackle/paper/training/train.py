@@ -31,13 +31,13 @@ from torch.optim import AdamW
 
 from spackle.formats import save_png
 from spackle.paper.training.checkpoint import (
-    BEST,
-    LAST,
-    PICTURES,
-    RESULTS,
-    RUN,
+    BEST_WEIGHTS,
+    LAST_WEIGHTS,
+    PICTURES_FOLDER,
+    RUN_FILES,
+    RUN_REPORT,
     Checkpoint,
-    Progress,
+    TrainingProgress,
     find_checkpoint,
     open_logs,
     remove_run,
@@ -49,13 +49,13 @@ from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import results_folder, write_json
 from spackle.runtime.progress import Reporter, asked_to_stop
 
-EMA_START = (
+EMA_WARMUP_STEPS = (
     10  # the early decay is (step + 1) / (step + 10): the average soon forgets the initial weights
 )
-PATIENCE = timedelta(
+MAX_WAIT_FOR_RANKS = timedelta(
     hours=24
 )  # a process waits so long for other processes, which may still make samples
-END = {
+END_MESSAGES = {
     "steps": "all steps are done",
     "patience": "the validation no longer improves",
     "stopped": "stopped; the same command resumes the run",
@@ -72,12 +72,14 @@ class Task(Protocol):
     """
 
     name: ClassVar[str]  # in `--method` and in checkpoints
-    aim: ClassVar[str] = "loss"  # the measure by which the best weights are chosen; lower is better
-    at_once: ClassVar[int | None] = (
+    selection_measure: ClassVar[str] = (
+        "loss"  # the measure by which the best weights are chosen; lower is better
+    )
+    micro_batch: ClassVar[int | None] = (
         None  # items in one pass through the network; None: all items of a step
     )
     digest: str  # identifies the training data by content, not by paths
-    items_a_step: int  # over all processes
+    items_per_step: int  # over all processes
     network: nn.Module  # weights with requires_grad are trained in place
     measures: Sequence[str]  # names of the values that `measure` returns
     items: int  # number of training items; an epoch has each item once
@@ -86,13 +88,13 @@ class Task(Protocol):
     def prepare(self, output: Path, reporter: Reporter) -> dict[str, Any]:
         """Do all long preparations; returns facts for run.json. Every process calls this."""
 
-    def groups(self) -> list[dict[str, Any]]:
+    def parameter_groups(self) -> list[dict[str, Any]]:
         """The optimiser's groups of weights; a group's "lr_scale" is a factor on the learning rate."""
         return [
             {"params": [weight for weight in self.network.parameters() if weight.requires_grad]}
         ]
 
-    def batch(self, step: int | None, items: Sequence[int]) -> Any:
+    def load_batch(self, step: int | None, items: Sequence[int]) -> Any:
         """Load items of a training step, or validation items if `step` is None; InputError if an item cannot be read.
 
         The result depends on the arguments alone; any thread may call this.
@@ -104,7 +106,7 @@ class Task(Protocol):
     def measure(self, network: nn.Module, batch: Any) -> dict[str, list[float]]:
         """Measure a network on a batch of validation items; returns the values of each measure by name."""
 
-    def picture(self, network: nn.Module) -> Tensor:
+    def draw_picture(self, network: nn.Module) -> Tensor:
         """[H, W, 3] sRGB: results of the network for a few validation items."""
 
     def export(self, network: nn.Module, path: Path) -> None:
@@ -136,11 +138,11 @@ def train(
     kind = pick_device(None if recipe.run.device == "auto" else recipe.run.device).type
     with joined_ranks(kind) as device, contextlib.ExitStack() as stack:
         if rank() == 0:  # the only process that writes
-            stack.enter_context(results_folder(output, RESULTS, alone=True))
+            stack.enter_context(results_folder(output, RUN_FILES, alone=True))
         else:
             reporter = Reporter(console=Console(quiet=True))
         task = open_task(recipe, device)
-        if task.items_a_step % rank_count():
+        if task.items_per_step % rank_count():
             raise InputError(
                 f"optim.batch={recipe.optim.batch} cannot be divided between {rank_count()} processes"
             )
@@ -160,9 +162,9 @@ def train(
         average = copy.deepcopy(network).requires_grad_(False)
         wrapped = DistributedDataParallel(network) if rank_count() > 1 else network
         optimizer = AdamW(
-            task.groups(), optim.lr, betas=optim.betas, weight_decay=optim.weight_decay
+            task.parameter_groups(), optim.lr, betas=optim.betas, weight_decay=optim.weight_decay
         )
-        progress, stopped = Progress(), False
+        progress, stopped = TrainingProgress(), False
         if checkpoint:
             with as_input_error(
                 output,
@@ -172,7 +174,11 @@ def train(
                 average.load_state_dict(checkpoint.average)
                 optimizer.load_state_dict(checkpoint.optimizer)
             progress = checkpoint.progress
-        facts |= {"method": task.name, "aim": task.aim, "recipe": recipe.model_dump(mode="json")}
+        facts |= {
+            "method": task.name,
+            "aim": task.selection_measure,
+            "recipe": recipe.model_dump(mode="json"),
+        }
         facts |= {"processes": rank_count(), "versions": versions(), "hardware": hardware(device)}
 
         def ended() -> str:
@@ -183,14 +189,16 @@ def train(
 
         def report(ended: str | None = None) -> None:
             if rank() == 0:
-                write_json({**facts, "ended": ended, **dataclasses.asdict(progress)}, output / RUN)
+                write_json(
+                    {**facts, "ended": ended, **dataclasses.asdict(progress)}, output / RUN_REPORT
+                )
 
         def parts(step: int) -> list[list[int]]:
             """The items of this process at a step, divided into passes through the network."""
             items = samples_of_step(
-                step, task.items, task.items_a_step, run.seed, rank(), rank_count()
+                step, task.items, task.items_per_step, run.seed, rank(), rank_count()
             )
-            size = task.at_once or len(items)
+            size = task.micro_batch or len(items)
             return [items[start : start + size] for start in range(0, len(items), size)]
 
         def curves(group: str, values: Mapping[str, float]) -> None:
@@ -204,7 +212,9 @@ def train(
             open_logs(output, progress.step, reporter.log)
             if rank() == 0
             else contextlib.nullcontext() as logs,
-            contextlib.closing(made_ahead(lambda key: task.batch(*key), todo, readers)) as batches,
+            contextlib.closing(
+                prefetch(lambda key: task.load_batch(*key), todo, readers)
+            ) as batches,
             reporter.steps("train", progress.step, optim.steps) as tell,
             asked_to_stop(alone=rank_count() == 1) as asked,
         ):
@@ -216,7 +226,7 @@ def train(
                 optimizer.zero_grad(set_to_none=True)
                 sums: dict[str, Tensor] = {}
                 for number, part in enumerate(split := parts(step), 1):
-                    share = len(part) * rank_count() / task.items_a_step
+                    share = len(part) * rank_count() / task.items_per_step
                     alone = rank_count() > 1 and number < len(split)
                     with wrapped.no_sync() if alone else contextlib.nullcontext():  # type: ignore[operator]
                         loss, terms = task.loss(wrapped, next(batches))
@@ -259,13 +269,15 @@ def train(
                 # Validate the averaged weights, and export them if they are the best so far
                 if progress.step % run.validate_every == 0 or last:
                     measures = validate(task, average, device)
-                    best = progress.validated(measures, task.aim, run.min_delta)
+                    best = progress.record_validation(
+                        measures, task.selection_measure, run.min_delta
+                    )
                     if rank() == 0:
-                        sheet = task.picture(average)
-                        (output / PICTURES).mkdir(exist_ok=True)
-                        save_png(sheet, output / PICTURES / f"{progress.step:07d}.png")
+                        sheet = task.draw_picture(average)
+                        (output / PICTURES_FOLDER).mkdir(exist_ok=True)
+                        save_png(sheet, output / PICTURES_FOLDER / f"{progress.step:07d}.png")
                         if best:
-                            task.export(average, output / BEST)
+                            task.export(average, output / BEST_WEIGHTS)
                         curves("validation", measures)
                         if logs is not None:
                             logs.add_image(
@@ -281,7 +293,7 @@ def train(
 
                 # Save
                 if rank() == 0 and (progress.step % run.save_every == 0 or ended()):
-                    task.export(average, output / LAST)
+                    task.export(average, output / LAST_WEIGHTS)
                     states = network.state_dict(), average.state_dict(), optimizer.state_dict()
                     save_checkpoint(
                         Checkpoint(progress, *states, facts["recipe"], task.digest, task.name),
@@ -289,7 +301,7 @@ def train(
                     )
                     report()
         report(ended())
-        reporter.log(f"{END[ended()]}, step {progress.step} -> {output}")
+        reporter.log(f"{END_MESSAGES[ended()]}, step {progress.step} -> {output}")
         return ended()
 
 
@@ -302,11 +314,11 @@ def validate(task: Task, network: nn.Module, device: torch.device) -> dict[str, 
     totals, counts = dict.fromkeys(task.measures, 0.0), dict.fromkeys(task.measures, 0.0)
     mine, size = (
         range(rank(), task.validation_items, rank_count()),
-        task.at_once or task.items_a_step // rank_count(),
+        task.micro_batch or task.items_per_step // rank_count(),
     )
     for start in range(0, len(mine), size):
         for name, values in task.measure(
-            network, task.batch(None, mine[start : start + size])
+            network, task.load_batch(None, mine[start : start + size])
         ).items():
             finite = [value for value in values if math.isfinite(value)]
             totals[name] += sum(finite)
@@ -315,7 +327,7 @@ def validate(task: Task, network: nn.Module, device: torch.device) -> dict[str, 
     return {name: total / counts[name] for name, total in totals.items() if counts[name]}
 
 
-def made_ahead(make: Callable[[K], V], keys: Iterable[K], threads: int) -> Generator[V, None, None]:
+def prefetch(make: Callable[[K], V], keys: Iterable[K], threads: int) -> Generator[V, None, None]:
     """Yield `make(key)` for each key, in order; each thread computes one value in advance."""
     with ThreadPoolExecutor(threads, thread_name_prefix="batches") as workers:
         begun = deque[Future[V]]()
@@ -336,7 +348,7 @@ def learning_rate(step: int, optim: OptimRecipe) -> float:
 
 def ema_decay(step: int, decay: float) -> float:
     """The share of the old average at a step; the new weights get the rest."""
-    return min(decay, (step + 1) / (step + EMA_START))
+    return min(decay, (step + 1) / (step + EMA_WARMUP_STEPS))
 
 
 def samples_of_step(
@@ -350,13 +362,13 @@ def samples_of_step(
     share = batch // ranks
     first = step * batch + rank * share
     return [
-        int(_epoch(seed, place // count, count)[place % count])
+        int(order_of_epoch(seed, place // count, count)[place % count])
         for place in range(first, first + share)
     ]
 
 
 @functools.lru_cache(maxsize=2)
-def _epoch(seed: int, epoch: int, count: int) -> NDArray[np.int64]:
+def order_of_epoch(seed: int, epoch: int, count: int) -> NDArray[np.int64]:
     return np.random.default_rng([seed, epoch]).permutation(count)
 
 
@@ -375,7 +387,9 @@ def joined_ranks(kind: str) -> Iterator[torch.device]:
             "RANK and WORLD_SIZE are set", "but the processes cannot join: {reason}"
         ):
             local = int(os.environ.get("LOCAL_RANK", "0"))
-            dist.init_process_group("nccl" if kind == "cuda" else "gloo", timeout=PATIENCE)
+            dist.init_process_group(
+                "nccl" if kind == "cuda" else "gloo", timeout=MAX_WAIT_FOR_RANKS
+            )
     if kind == "cuda":
         torch.cuda.set_device(
             local
