@@ -31,7 +31,7 @@ from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
 from spackle.core.photo import Photo
 from spackle.core.trajectories import DepthRange, extremes
-from spackle.paper.evaluation.bench import TOTAL, Task, measure
+from spackle.paper.evaluation.bench import TOTAL_STAGE, TimedTask, time_tasks
 from spackle.paper.training.losses import total_loss
 from spackle.paper.training.recipe import LossRecipe
 from spackle.paper.training.residual import complete_samples
@@ -102,11 +102,11 @@ def views() -> tuple[Gaussians, list[Camera]]:
     return scene, [camera, extremes(camera, 0.3, DepthRange.of(scene))[1]]
 
 
-def rows(tasks: dict[str, Task], runs: int = RUNS) -> Iterator[str]:
+def rows(tasks: dict[str, TimedTask], runs: int = RUNS) -> Iterator[str]:
     """Yield a table of the tasks' median milliseconds; the tasks take turns."""
     yield from ("", "| what | median |", "|---|---|")
-    for (name, stage), times in measure(runs, tasks, CUDA).items():
-        if stage == TOTAL:
+    for (name, stage), times in time_tasks(runs, tasks, CUDA).items():
+        if stage == TOTAL_STAGE:
             low, median, high = (
                 torch.from_numpy(times).quantile(torch.tensor([0.25, 0.5, 0.75]).double()).tolist()
             )
@@ -204,7 +204,7 @@ def waits(options: argparse.Namespace) -> Iterator[str]:
 
 def precisions(options: argparse.Namespace) -> Iterator[str]:
     """bf16 is several times as fast as fp32 and gives nearly the same results"""
-    tasks: dict[str, Task] = {}
+    tasks: dict[str, TimedTask] = {}
     found: dict[str, torch.Tensor] = {}
     names: list[Precision] = ["fp32", "bf16"]
     for name in names:

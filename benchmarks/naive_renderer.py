@@ -13,7 +13,7 @@ from torch import Tensor
 
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
-from spackle.paper.evaluation.bench import Lap
+from spackle.paper.evaluation.bench import EndStage
 from spackle.render.cpu import BLEND_GRAIN, PROJECT_GRAIN
 from spackle.render.project import KernelCamera, covariance
 from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, NEAR_PLANE, TILE, TRANSMITTANCE_STOP
@@ -23,7 +23,7 @@ Array = npt.NDArray[Any]
 Arrays = tuple[Array, ...]  # a scene's five tensors
 
 
-def naive_render(scene: Gaussians, camera: Camera, lap: Lap = lambda name: None) -> Tensor:
+def naive_render(scene: Gaussians, camera: Camera, lap: EndStage = lambda name: None) -> Tensor:
     """Render Gaussians to [H, W, 3] sRGB, with `eps2d` 0; depth and alpha are computed too, as in ours."""
     tensors, view = tuple(t.numpy() for t in scene.tensors), KernelCamera.of(camera, 0.0)
     splats, boxes = np.empty((len(scene), 6), np.float32), np.zeros((len(scene), 4), np.int32)

@@ -108,13 +108,13 @@ def middlebury(scene: Path) -> None:
     np.save(scene / "disparity.npy", disparity[::2, ::2] / 2)
     facts = {"left": "left.png", "right": "right.png", "disparity": "disparity.npy"}
     pixels = {
-        "focal_px": stereo.MOTORCYCLE_FOCAL,
-        "cx": stereo.MOTORCYCLE_CX,
-        "cy": stereo.MOTORCYCLE_CY,
+        "focal_px": stereo.MOTORCYCLE_FOCAL_PX,
+        "cx": stereo.MOTORCYCLE_CX_PX,
+        "cy": stereo.MOTORCYCLE_CY_PX,
     }
-    pixels["doffs_px"] = stereo.MOTORCYCLE_DOFFS
+    pixels["doffs_px"] = stereo.MOTORCYCLE_DOFFS_PX
     facts |= {name: value / 2 for name, value in pixels.items()} | {
-        "baseline_m": stereo.MOTORCYCLE_BASELINE
+        "baseline_m": stereo.MOTORCYCLE_BASELINE_M
     }
     (scene / "scene.json").write_text(json.dumps(facts))
 

@@ -62,7 +62,7 @@ from spackle.core.trajectories import DepthRange, extremes
 from spackle.depth.depth_map import DepthMap
 from spackle.lifting.edges import Edges
 from spackle.lifting.silhouettes import Layers
-from spackle.paper.evaluation.metrics import GREY, sharpness
+from spackle.paper.evaluation.metrics import GREY_WEIGHTS, sharpness
 from spackle.paper.training.losses import FeatureNet, covered_fraction, hole_psnr, load_features
 from spackle.paper.training.sources import load_pair
 
@@ -286,7 +286,9 @@ def seam(rgb: Tensor, crossings: Sequence[Tensor]) -> float:
     sums = torch.zeros(
         2, 2, dtype=torch.float64
     )  # rows near and beside, columns sum of differences and their number
-    for picture, crossing in zip((rgb @ GREY, (rgb @ GREY).T), crossings, strict=True):
+    for picture, crossing in zip(
+        (rgb @ GREY_WEIGHTS, (rgb @ GREY_WEIGHTS).T), crossings, strict=True
+    ):
         steps = (picture[:, 1:] - picture[:, :-1]).abs()
         reach = [F.max_pool1d(crossing.float(), 2 * r - 1, 1, r - 1) > 0 for r in (NEAR, BESIDE)]
         for row, where in zip(sums, (reach[0], reach[1] & ~reach[0]), strict=True):

@@ -40,16 +40,16 @@ from spackle.core.trajectories import DepthRange, trajectory
 from spackle.formats import save_ply
 from spackle.paper.evaluation.bench import (
     CPU,
-    MS,
-    TOTAL,
-    Lap,
-    Task,
-    Values,
-    complete_in_laps,
-    measure,
+    MS_PER_S,
+    TOTAL_STAGE,
+    EndStage,
+    RunValues,
+    TimedTask,
+    complete_view_in_stages,
+    time_tasks,
 )
 from spackle.paper.evaluation.datasets.stereo import load_motorcycle
-from spackle.paper.evaluation.rows import EXTRA
+from spackle.paper.evaluation.measurements import COMPLETION_STAGES
 from spackle.render import CpuRenderer, Renderer, get_renderer
 from spackle.render.blend import blend_tiles
 from spackle.render.cpu import BLEND_GRAIN, list_tiles, project, sort_tiles, wanted_tiles
@@ -89,7 +89,7 @@ class Timed(NamedTuple):
     """One measured figure."""
 
     name: str
-    values: Values
+    values: RunValues
     unit: str = "ms"
     limit_ms: float | None = None  # the least possible time, at the measured limit that applies
 
@@ -105,9 +105,9 @@ def limits_section(runs: int, device: torch.device = CPU, share: float = 1.0) ->
     side = round(share * MATRIX_SIDE)
     figures: list[Timed] = []
 
-    def add(name: str, unit: str, amount: float, task: Task) -> None:
-        times = measure(max(runs, LIMIT_RUNS), {name: task}, device)[name, TOTAL]
-        figures.append(Timed(name, amount / (times / MS) / 1e9, unit))
+    def add(name: str, unit: str, amount: float, task: TimedTask) -> None:
+        times = time_tasks(max(runs, LIMIT_RUNS), {name: task}, device)[name, TOTAL_STAGE]
+        figures.append(Timed(name, amount / (times / MS_PER_S) / 1e9, unit))
 
     for name, dtype in {"fp32": torch.float32, "bf16": torch.bfloat16}.items():
         a, b = (
@@ -125,13 +125,13 @@ def limits_section(runs: int, device: torch.device = CPU, share: float = 1.0) ->
 def renderer_section(runs: int, side: int, peaks: Peaks) -> Section:
     """Time the CPU renderer on a scene of SHARP's size: its stages, a whole call, and the naive renderer."""
     scene, camera = photo_scene(side)
-    tasks: dict[str, Task] = {
+    tasks: dict[str, TimedTask] = {
         "ours": lambda lap: render_in_laps(scene, camera, lap),
         "call": lambda _: CpuRenderer().render(scene, camera),
         "naive": lambda lap: naive_render(scene, camera, lap),
     }
-    times = measure(runs, tasks)
-    call, naive = times["call", TOTAL], times["naive", TOTAL]
+    times = time_tasks(runs, tasks)
+    call, naive = times["call", TOTAL_STAGE], times["naive", TOTAL_STAGE]
     least = (
         len(scene) * GAUSSIAN_BYTES + side * side * PIXEL_BYTES
     )  # bytes that must be read or written once
@@ -142,7 +142,7 @@ def renderer_section(runs: int, side: int, peaks: Peaks) -> Section:
     return figures, {"gaussians": len(scene), "width": side, "height": side}
 
 
-def render_in_laps(scene: Gaussians, camera: Camera, lap: Lap) -> None:
+def render_in_laps(scene: Gaussians, camera: Camera, lap: EndStage) -> None:
     """Do what `spackle.render.cpu.draw` does, with a lap after each step."""
     view = KernelCamera.of(camera, 0.0)
     wanted = wanted_tiles(view, None)
@@ -174,8 +174,10 @@ def completion_section(
     """Time the completion of a view with 5 % holes, and the base's rendering; if `network` is None, by seeds."""
     disparity, camera = find_view(base, photo_camera, renderer)
     context = FillContext(base, photo_camera, renderer, network)
-    times = measure(runs, {"": lambda lap: complete_in_laps(context, camera, lap)}, device)
-    render, guard, added = (times["", stage] for stage in ("view", *EXTRA))
+    times = time_tasks(
+        runs, {"": lambda lap: complete_view_in_stages(context, camera, lap)}, device
+    )
+    render, guard, added = (times["", stage] for stage in ("view", *COMPLETION_STAGES))
     figures = [
         Timed("base render of the view", render),
         Timed("photo's occlusion guard, once a photo", guard),
@@ -211,7 +213,7 @@ def video_section(
     path = trajectory("rotate-forward", prediction.camera.even(), DISPARITY, depths, frames)
     context = FillContext(prediction.gaussians, prediction.camera, renderer, network)
 
-    def scene(lap: Lap) -> None:
+    def scene(lap: EndStage) -> None:
         nonlocal aux
         base = lift()
         lap(LIFT)
@@ -225,15 +227,19 @@ def video_section(
             save_video((picture / 255 for picture in pictures), Path(folder) / "video.mp4")
         lap(ENCODE)
 
-    def scratch(lap: Lap) -> None:
+    def scratch(lap: EndStage) -> None:
         for camera in path:
             guard = context.photo_guard()
             lap(GUARDS)
             fill_view(context, camera, [guard])
             lap(EACH)
 
-    times = measure(min(runs, VIDEO_RUNS), {"scene": scene, "scratch": scratch}, device)
-    whole, each, guards = times["scene", TOTAL], times["scratch", EACH], times["scratch", GUARDS]
+    times = time_tasks(min(runs, VIDEO_RUNS), {"scene": scene, "scratch": scratch}, device)
+    whole, each, guards = (
+        times["scene", TOTAL_STAGE],
+        times["scratch", EACH],
+        times["scratch", GUARDS],
+    )
     anew = times["scene", LIFT] + each + guards + times["scene", ENCODE]
     kept = anew - guards * (frames - 1) / frames
     figures = [Timed(name, times["scene", name]) for name in (LIFT, COMPLETE, DRAW, ENCODE)]
@@ -256,7 +262,7 @@ def sharp_section(
     """Time a photo to a scene on disk by SHARP, by stage; the time does not depend on the photo's content."""
     count = 0
 
-    def whole(lap: Lap) -> None:
+    def whole(lap: EndStage) -> None:
         nonlocal count
         output = base.infer(photo)
         lap(FORWARD)
@@ -267,13 +273,13 @@ def sharp_section(
             save_ply(gaussians, Path(folder) / "scene.ply", camera=photo.camera)
         lap(SAVE)
 
-    # Counting operations also warms up. A compiled network hides its operations, and is warmed up by `measure`.
+    # Counting operations also warms up. A compiled network hides its operations, and is warmed up by `time_tasks`.
     flops = 0.0 if base.compiled else count_flops(lambda: whole(lambda name: None))
-    times = measure(runs, {"": whole}, device, warm=flops > 0)
+    times = time_tasks(runs, {"": whole}, device, warm=flops > 0)
     least = flops / peaks[PRODUCT.format(base.precision)] if flops else None
     figures = [Timed(FORWARD, times["", FORWARD], limit_ms=least)]
     figures += [Timed(name, times["", name]) for name in (UNPROJECT, SAVE)]
-    figures.append(Timed("photo to scene", times["", TOTAL]))
+    figures.append(Timed("photo to scene", times["", TOTAL_STAGE]))
     facts = {"weights": base.weights, "precision": base.precision, "side": base.network.config.side}
     facts |= {"windows": base.windows, "compiled": base.compiled}
     return figures, {**facts, "gaussians": count}

@@ -12,9 +12,9 @@ import spackle
 from spackle.bases.depth import lift
 from spackle.paper.evaluation.case import Viewpoint
 from spackle.paper.evaluation.datasets.stereo import load_motorcycle
+from spackle.paper.evaluation.measurements import Measurement
 from spackle.paper.evaluation.methods import Fill, MethodView, make_method
-from spackle.paper.evaluation.protocols import Gauges, measure_views
-from spackle.paper.evaluation.rows import Row
+from spackle.paper.evaluation.protocols import MetricSuite, measure_views
 
 
 def mean_color(camera: spackle.Camera, before: spackle.Rendering) -> MethodView:
@@ -25,7 +25,7 @@ def mean_color(camera: spackle.Camera, before: spackle.Rendering) -> MethodView:
     )
 
 
-def main() -> list[Row]:
+def main() -> list[Measurement]:
     pair = load_motorcycle()
     base = lift(pair.left, pair.depth, pair.left_camera).gaussians
     context = spackle.FillContext(base, pair.left_camera, spackle.get_renderer())
@@ -36,8 +36,8 @@ def main() -> list[Row]:
     methods |= {
         name: partial(make_method, name, context=context) for name in ("base", "seeds", "spackle")
     }
-    image = Row("Middlebury", "Motorcycle", "", "", "", "", None)
-    rows, _ = measure_views(image, context, views, methods, Gauges(["psnr", "ssim"], {}, None))
+    image = Measurement("Middlebury", "Motorcycle", "", "", "", "", None)
+    rows, _ = measure_views(image, context, views, methods, MetricSuite(["psnr", "ssim"], {}, None))
     return rows
 
 

@@ -13,7 +13,7 @@ from PIL import Image
 
 from spackle.paper.evaluation.datasets import DATASETS
 from spackle.paper.evaluation.folder import load_run
-from spackle.paper.evaluation.rows import Run
+from spackle.paper.evaluation.measurements import Run
 from spackle.residual.architectures import load_residual
 
 ROOT = Path(__file__).parents[1]

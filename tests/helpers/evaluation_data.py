@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from helpers import DATA
-from spackle.paper.evaluation.rows import Row, Run
+from spackle.paper.evaluation.measurements import Measurement, Run
 
 WIDTH, HEIGHT = 72, 48
 
@@ -52,18 +52,18 @@ def results(
     }
     rows = []
     for image in range(count):
-        known = Row(title, name.format(image), "", "", "", "base_gaussians", 50000)
+        known = Measurement(title, name.format(image), "", "", "", "base_gaussians", 50000)
         rows.append(known)
         for setting in Run(config, ()).settings:
             for method, measured in figures(image).items():
                 for view in ("left", "right"):
                     rows += [
-                        Row(title, known.image, setting, view, method, *one)
+                        Measurement(title, known.image, setting, view, method, *one)
                         for one in measured.items()
                     ]
     return Run(
         config,
-        [*rows, Row(title, "gone", "", "", "", "problem", "gone.png: <b>damaged</b>")],
+        [*rows, Measurement(title, "gone", "", "", "", "problem", "gone.png: <b>damaged</b>")],
         {"metrics": states},
     )
 

@@ -17,9 +17,15 @@ from spackle.paper.evaluation import bench
 from spackle.paper.evaluation.case import Points
 from spackle.paper.evaluation.evaluate import EvaluateOptions, open_evaluation
 from spackle.paper.evaluation.folder import load_run
+from spackle.paper.evaluation.measurements import (
+    BASE_STAGES,
+    COMPLETION_STAGES,
+    PAPER,
+    Measurement,
+    pivot,
+)
+from spackle.paper.evaluation.measurements import Run as Results
 from spackle.paper.evaluation.protocols import large_views
-from spackle.paper.evaluation.rows import BASE_PATH, EXTRA, PAPER, Row, pivot
-from spackle.paper.evaluation.rows import Run as Results
 from spackle.paper.evaluation.tables import make_tables
 from spackle.render import get_renderer
 from spackle.residual.architectures import UNet, open_residual
@@ -56,7 +62,7 @@ def results(title: str = "Middlebury", factor: float = 1.0) -> Results:
     config["versions"] = {"spackle": "0", "torch": "2"}
     rows = []
     for k in range(3):
-        image = Row(title, f"image {k}", "", "", "", "", None)
+        image = Measurement(title, f"image {k}", "", "", "", "", None)
         rows.append(image._replace(metric="note.precision", value="bf16"))
         for disparity in config["disparities"]:
             view = image._replace(setting=f"{disparity:g}", view="right")
@@ -70,7 +76,7 @@ def results(title: str = "Middlebury", factor: float = 1.0) -> Results:
                     view._replace(method=method, metric=name, value=value)
                     for name, value in numbers
                 ]
-    rows.append(Row(title, "broken", "", "", "", "problem", "no such file"))
+    rows.append(Measurement(title, "broken", "", "", "", "problem", "no such file"))
     return Results(config, rows, {"parameters": bench.count_parameters(UNet())})
 
 
@@ -129,10 +135,11 @@ def test_a_view_costs_what_a_completion_adds() -> None:
     context, laps = FillContext(prediction.gaussians, prediction.camera, renderer), list[str]()
     camera = large_views(prediction, (0.3,), 1280)[0].camera
     paper, spackle = (
-        len(bench.complete_in_laps(context, camera, laps.append, name)) for name in bench.TIMED
+        len(bench.complete_view_in_stages(context, camera, laps.append, name))
+        for name in bench.TIMED
     )
     assert spackle == len(fill_view(context, camera).aux) > paper > 64
-    assert laps == [*BASE_PATH[1:], *EXTRA] * 2
+    assert laps == [*BASE_STAGES[1:], *COMPLETION_STAGES] * 2
 
 
 def test_points_suffice_and_without_depth_a_case_is_refused(scenes: Path) -> None:

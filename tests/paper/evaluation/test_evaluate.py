@@ -23,11 +23,11 @@ from torch import Tensor
 
 from spackle.core.trajectories import DepthRange, max_offset
 from spackle.paper.evaluation.folder import load_run
+from spackle.paper.evaluation.measurements import Measurement, mean
+from spackle.paper.evaluation.measurements import Run as Results
 from spackle.paper.evaluation.methods import make_method
 from spackle.paper.evaluation.metrics import DEFINITIONS, open_metrics, psnr, ssim_average, ssim_map
-from spackle.paper.evaluation.protocols import Gauges, large_views, measure_views
-from spackle.paper.evaluation.rows import Row, mean
-from spackle.paper.evaluation.rows import Run as Results
+from spackle.paper.evaluation.protocols import MetricSuite, large_views, measure_views
 from spackle.paper.evaluation.table import Table, latex, mark_best, markdown
 from spackle.paper.evaluation.tables import make_tables
 from spackle.render import get_renderer
@@ -280,8 +280,8 @@ def test_large_views_end_a_swipe_and_a_failed_metric_is_a_remark() -> None:
         raise RuntimeError("svd did not converge")
 
     gauges, image = (
-        Gauges(("niqe",), {"niqe": broken}, None),
-        Row("Boxes", "box", "", "", "", "", None),
+        MetricSuite(("niqe",), {"niqe": broken}, None),
+        Measurement("Boxes", "box", "", "", "", "", None),
     )
     context = FillContext(prediction.gaussians, prediction.camera, get_renderer())
     rows, pictures = measure_views(

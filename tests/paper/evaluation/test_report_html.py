@@ -15,8 +15,8 @@ from helpers.command import refuses, run
 from PIL import Image
 
 from spackle.paper.evaluation.folder import image_file
+from spackle.paper.evaluation.measurements import Run as Results
 from spackle.paper.evaluation.report import make_report
-from spackle.paper.evaluation.rows import Run as Results
 from spackle.paper.evaluation.tables import make_tables
 
 pytest.importorskip("matplotlib")

@@ -21,9 +21,9 @@ from spackle.core.gaussians import Gaussians
 from spackle.paper.evaluation.case import Case, load_case
 from spackle.paper.evaluation.evaluate import EvaluateOptions, Evaluation, open_evaluation
 from spackle.paper.evaluation.folder import ROWS, measure_images, write_rows
+from spackle.paper.evaluation.measurements import BASE_STAGES, COMPLETION_STAGES, NOTE, Measurement
 from spackle.paper.evaluation.methods import make_method
 from spackle.paper.evaluation.protocols import large_views
-from spackle.paper.evaluation.rows import BASE_PATH, EXTRA, NOTE, Row
 from spackle.paper.evaluation.tables import make_tables, write_tables
 from spackle.render import device_of
 from spackle.residual import ResidualNet
@@ -45,15 +45,15 @@ SHARED = (
     "residual",
     "device",
 )
-TOTAL = "total"
-MS = 1000.0
+TOTAL_STAGE = "total"
+MS_PER_S = 1000.0
 CPU = torch.device("cpu")
 TIMED = ("paper", "spackle")  # the methods that are timed
 
-Lap = Callable[[str], None]
-Task = Callable[[Lap], Any]
-Values = npt.NDArray[np.float64]  # one value per run
-Times = dict[tuple[str, str], Values]  # (task, stage) → milliseconds
+EndStage = Callable[[str], None]
+TimedTask = Callable[[EndStage], Any]
+RunValues = npt.NDArray[np.float64]  # one value per run
+Times = dict[tuple[str, str], RunValues]  # (task, stage) → milliseconds
 
 
 def bench(
@@ -78,7 +78,7 @@ def bench(
     about = {"parameters": count_parameters(evaluation.network)}
     with results_folder(output, (ROWS, *FILES), alone=True):
 
-        def measure_one(index: int, case: Case) -> tuple[list[Row], list[Path]]:
+        def measure_one(index: int, case: Case) -> tuple[list[Measurement], list[Path]]:
             return time_case(case, evaluation, config), []
 
         run = measure_images(
@@ -94,7 +94,7 @@ def bench(
     return "complete"
 
 
-def time_case(case: Case, evaluation: Evaluation, config: Mapping[str, Any]) -> list[Row]:
+def time_case(case: Case, evaluation: Evaluation, config: Mapping[str, Any]) -> list[Measurement]:
     """Time all settings of an image.
 
     Raises:
@@ -109,25 +109,29 @@ def time_case(case: Case, evaluation: Evaluation, config: Mapping[str, Any]) -> 
     warm = options.base.named == "sharp" and config["base"]["device"] == "cpu"
     latest: dict[str, BasePrediction] = {}
     predict = {"": lambda _: latest.update(base=opened.predict(loaded.full)[0])}
-    seconds = measure(config["base_runs"], predict, device, warm=warm)["", TOTAL] / MS
+    seconds = (
+        time_tasks(config["base_runs"], predict, device, warm=warm)["", TOTAL_STAGE] / MS_PER_S
+    )
     prediction = latest["base"]
     context = evaluation.context(prediction)
     facts: dict[str, Any] = {"width": loaded.photo.width, "height": loaded.photo.height}
     facts |= {"base_gaussians": len(prediction.gaussians)}
     facts |= {f"{NOTE}{name}": value for name, value in prediction.notes.items()}
-    image = Row(config["title"], case.name, "", "", "", "", None)
+    image = Measurement(config["title"], case.name, "", "", "", "", None)
     rows = [image._replace(metric=metric, value=value) for metric, value in facts.items()]
     added: dict[str, int] = {}
 
-    def complete(camera: Camera, method: str, lap: Lap) -> None:
-        added[method] = len(complete_in_laps(context, camera, lap, method))
+    def complete(camera: Camera, method: str, lap: EndStage) -> None:
+        added[method] = len(complete_view_in_stages(context, camera, lap, method))
 
     for view in large_views(prediction, options.disparities, options.max_side):
         tasks = {method: partial(complete, view.camera, method) for method in TIMED}
-        times = measure(config["runs"], tasks, device)
+        times = time_tasks(config["runs"], tasks, device)
         for method, count in added.items():
             stages = {
-                stage: values / MS for (name, stage), values in times.items() if name == method
+                stage: values / MS_PER_S
+                for (name, stage), values in times.items()
+                if name == method
             }
             row = image._replace(setting=view.setting, view=view.name, method=method)
             numbers = view_numbers(len(context.base), count, stages | {"base": seconds})
@@ -135,14 +139,14 @@ def time_case(case: Case, evaluation: Evaluation, config: Mapping[str, Any]) -> 
     return rows
 
 
-def view_numbers(base: int, added: int, seconds: Mapping[str, Values]) -> dict[str, float]:
+def view_numbers(base: int, added: int, seconds: Mapping[str, RunValues]) -> dict[str, float]:
     """A view's numbers for tables, from counts of Gaussians and the seconds of each stage in each run.
 
     Returns counts, milliseconds (medians over runs), shares (not percent) and views per second.
     """
     before, extra = (
-        sum(MS * float(np.median(seconds[stage])) for stage in stages)
-        for stages in (BASE_PATH, EXTRA)
+        sum(MS_PER_S * float(np.median(seconds[stage])) for stage in stages)
+        for stages in (BASE_STAGES, COMPLETION_STAGES)
     )
     return {
         "aux": added,
@@ -151,8 +155,8 @@ def view_numbers(base: int, added: int, seconds: Mapping[str, Values]) -> dict[s
         "base_ms": before,
         "spackle_ms": before + extra,
         "overhead": extra / before,
-        "base_fps": MS / before,
-        "spackle_fps": MS / (before + extra),
+        "base_fps": MS_PER_S / before,
+        "spackle_fps": MS_PER_S / (before + extra),
     }
 
 
@@ -170,8 +174,8 @@ def count_parameters(residual: ResidualNet | None) -> dict[str, float]:
 # --- the clock
 
 
-def measure(
-    runs: int, tasks: Mapping[str, Task], device: torch.device = CPU, *, warm: bool = False
+def time_tasks(
+    runs: int, tasks: Mapping[str, TimedTask], device: torch.device = CPU, *, warm: bool = False
 ) -> Times:
     """Time each task (stage "total") and each stage of a task in milliseconds, in each run.
 
@@ -183,7 +187,7 @@ def measure(
     def now() -> float:
         if device.type == "cuda":
             torch.cuda.synchronize(device)
-        return MS * time.perf_counter()
+        return MS_PER_S * time.perf_counter()
 
     times: dict[tuple[str, str], list[float]] = {}
     for run in range(1 if warm else 0, runs + 1):
@@ -198,15 +202,15 @@ def measure(
                 last = end
 
             task(lap)
-            laps[TOTAL] = now() - start
+            laps[TOTAL_STAGE] = now() - start
             for stage, milliseconds in laps.items() if run else ():
                 times.setdefault((name, stage), []).append(milliseconds)
     return {key: np.array(values) for key, values in times.items()}
 
 
 @torch.no_grad()
-def complete_in_laps(
-    context: FillContext, camera: Camera, lap: Lap, method: str = "spackle"
+def complete_view_in_stages(
+    context: FillContext, camera: Camera, lap: EndStage, method: str = "spackle"
 ) -> Gaussians:
     """A view's aux Gaussians; calls `lap` after the stages "view", "photo" and "completion"."""
     context = context.placed

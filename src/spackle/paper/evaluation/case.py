@@ -13,7 +13,7 @@ from torch import Tensor
 from spackle.core.camera import Camera
 from spackle.core.photo import MAX_SIDE, Photo, load_photo, resize_photo, working_size
 from spackle.depth.depth_map import DepthMap
-from spackle.paper.evaluation.rows import NEAR
+from spackle.paper.evaluation.measurements import NEAR
 from spackle.runtime.errors import InputError
 
 SHAPE_TOLERANCE = (

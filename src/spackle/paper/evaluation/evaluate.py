@@ -31,7 +31,9 @@ from spackle.paper.evaluation.folder import (
     measure_images,
     write_rows,
 )
-from spackle.paper.evaluation.methods import METHODS, make_method
+from spackle.paper.evaluation.measurements import DISPARITIES, NOTE, REMARK, Measurement
+from spackle.paper.evaluation.method_descriptions import METHODS
+from spackle.paper.evaluation.methods import make_method
 from spackle.paper.evaluation.metrics import (
     DEFAULT_METRICS,
     DEFINITIONS,
@@ -43,14 +45,13 @@ from spackle.paper.evaluation.metrics import (
 from spackle.paper.evaluation.pictures import BEST, WORST, save_picture, write_sheets
 from spackle.paper.evaluation.protocols import (
     INPUT,
-    Gauges,
+    MetricSuite,
     align,
     large_views,
     measure_views,
     to_base,
 )
 from spackle.paper.evaluation.report import REPORT, check_matplotlib, make_report, means_table
-from spackle.paper.evaluation.rows import DISPARITIES, NOTE, REMARK, Row
 from spackle.paper.evaluation.table import NOT_RUN, plain
 from spackle.paper.evaluation.tables import FILES, make_tables, write_tables
 from spackle.paper.training.losses import load_features
@@ -166,7 +167,7 @@ class Evaluation:
     network: ResidualNet | None
     inpainter: Inpainter | None  # for the method inpaint2d
     renderer: Renderer
-    gauges: Gauges
+    gauges: MetricSuite
     config: dict[str, Any]  # everything that determines the renders, ready for JSON, without paths
     metrics: dict[
         str, str
@@ -219,7 +220,7 @@ def open_evaluation(options: EvaluateOptions, more_metrics: Sequence[str] = ()) 
             states["distance"] = f"{OWN}, weights {weights_digest(options.features)[:16]}"
     renderer = get_renderer(base.device)
     config = _configuration(options, cases, inpainter, renderer)
-    gauges = Gauges(wanted, metrics, features)
+    gauges = MetricSuite(wanted, metrics, features)
     return Evaluation(
         options,
         cases,
@@ -333,7 +334,7 @@ def evaluate(options: EvaluateOptions, output: Path, reporter: Reporter, html: b
         output, (ROWS, WORST, BEST, *FILES, *([REPORT] if html else [])), alone=True
     ):
 
-        def measure(index: int, case: Case) -> tuple[list[Row], list[Path]]:
+        def measure(index: int, case: Case) -> tuple[list[Measurement], list[Path]]:
             rows, pictures = measure_case(case, evaluation)
             for remark in dict.fromkeys(row.value for row in rows if row.metric == REMARK):
                 reporter.log(f"{case.name}: {remark}")
@@ -361,7 +362,7 @@ def evaluate(options: EvaluateOptions, output: Path, reporter: Reporter, html: b
     return "complete"
 
 
-def measure_case(case: Case, evaluation: Evaluation) -> tuple[list[Row], dict[str, Tensor]]:
+def measure_case(case: Case, evaluation: Evaluation) -> tuple[list[Measurement], dict[str, Tensor]]:
     """Measure an image. Returns its rows, and pictures [H, W, 3]: the photo and the views of `measure_views`.
 
     InputError if a file is missing or cannot be used; BaseError if the base would fail for every image.
@@ -390,7 +391,7 @@ def measure_case(case: Case, evaluation: Evaluation) -> tuple[list[Row], dict[st
         make_method, context=context, inpainter=evaluation.inpainter, direct_ft=direct_ft
     )
     methods = {name: partial(method, name) for name in options.methods}
-    image = Row(str(evaluation.config["title"]), case.name, "", "", "", "", None)
+    image = Measurement(str(evaluation.config["title"]), case.name, "", "", "", "", None)
     rows, pictures = measure_views(image, context, views, methods, evaluation.gauges)
     facts = {
         "width": loaded.photo.width,

@@ -17,7 +17,7 @@ from typing import Any
 
 from spackle.bases.open import BaseError
 from spackle.paper.evaluation.case import Case
-from spackle.paper.evaluation.rows import PROBLEM, Row, Run
+from spackle.paper.evaluation.measurements import PROBLEM, Measurement, Run
 from spackle.paper.evaluation.table import NOT_RUN
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import (
@@ -37,10 +37,10 @@ CONFIG, ROWS, IMAGES = "config.json", "rows.jsonl", "images"
 FORMAT = 3
 DAMAGED = "not written by `spackle evaluate` or `spackle bench` ({reason}): run the command again"
 # From index and case to the case's rows and written files.
-Measure = Callable[[int, Case], tuple[list[Row], list[Path]]]
+Measure = Callable[[int, Case], tuple[list[Measurement], list[Path]]]
 
 
-def write_rows(rows: Iterable[Row], path: Path) -> None:
+def write_rows(rows: Iterable[Measurement], path: Path) -> None:
     """Write rows atomically, one JSON object per line."""
     lines = (json.dumps(row._asdict(), allow_nan=False) + "\n" for row in rows)
     write_atomic(path, "".join(lines).encode())
@@ -54,7 +54,10 @@ def load_run(folder: Path) -> Run:
         )
         raise InputError(f"{folder}: {state}: {ROWS} is missing")
     with as_input_error(folder / ROWS, DAMAGED):
-        rows = [Row(**json.loads(line)) for line in (folder / ROWS).read_text("utf-8").splitlines()]
+        rows = [
+            Measurement(**json.loads(line))
+            for line in (folder / ROWS).read_text("utf-8").splitlines()
+        ]
     with as_input_error(folder / CONFIG, DAMAGED):
         config = json.loads((folder / CONFIG).read_text("utf-8"))
         if config.pop("format") != FORMAT:
@@ -94,7 +97,7 @@ def measure_images(
         InputError: no image could be measured, or the folder holds results of another configuration.
     """
     _open_folder(output, config, about)
-    rows: list[Row] = []
+    rows: list[Measurement] = []
     begun, failed, digest = (
         False,
         0,
@@ -125,7 +128,9 @@ def measure_images(
                     if not problem.startswith(case.name):  # several cases may share a photo
                         problem = f"{case.name}: {problem}"
                     reporter.log(f"passed over: {problem}")
-                    rows.append(Row(str(config["title"]), case.name, "", "", "", PROBLEM, problem))
+                    rows.append(
+                        Measurement(str(config["title"]), case.name, "", "", "", PROBLEM, problem)
+                    )
                     failed += 1
                 else:
                     content = {
@@ -165,11 +170,11 @@ def _open_folder(output: Path, config: Mapping[str, Any], about: Mapping[str, An
     write_json({"format": FORMAT, **config, "about": about}, path)
 
 
-def _load_part(path: Path, inputs: str) -> list[Row] | None:
+def _load_part(path: Path, inputs: str) -> list[Measurement] | None:
     """An image's rows from an earlier run; None if files are missing, or the inputs have changed."""
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
         content = json.loads(path.read_text("utf-8"))
         whole = not content["files"] or matches_records(path.parent, path.name, content["files"])
         if whole and content["inputs"] == inputs:
-            return [Row(*row) for row in content["rows"]]
+            return [Measurement(*row) for row in content["rows"]]
     return None

@@ -1,4 +1,4 @@
-"""The compared methods (methods.json): each renders new viewpoints of a photo from the same base prediction."""
+"""The compared methods: each renders new viewpoints of a photo from the same base prediction."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from torch import Tensor
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
 from spackle.inpaint import Inpainter, known_inverse_depth
-from spackle.paper.evaluation.rows import load_data
 from spackle.render import Renderer
 from spackle.render.protocol import Rendering
 from spackle.residual import complete_view, hole_mask
@@ -38,16 +37,7 @@ Fill = Callable[
 ]  # from a view's camera and the base's rendering of the view
 
 
-class MethodFacts(NamedTuple):
-    title: str  # in tables
-    says: str  # in notes
-    color: str  # in plots; the palette of Okabe and Ito, for colour-blind readers
-    form: str  # the shape of markers in plots
-
-
-METHODS = {name: MethodFacts(**facts) for name, facts in load_data("methods.json").items()}
 LEAST_AUX = 64  # the least number of aux Gaussians per view in the paper (training details)
-RESIDUAL = ("paper", "spackle", "spackle-scene", "dense")  # methods that run the residual network
 
 
 def make_method(

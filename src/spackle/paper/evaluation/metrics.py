@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from spackle.core.hole_filling import blurred, greatest_around
-from spackle.paper.evaluation.rows import load_data
+from spackle.paper.evaluation.measurements import load_data
 from spackle.paper.evaluation.table import NOT_RUN
 from spackle.paper.training.losses import hole_psnr
 from spackle.runtime.errors import reason_in_a_line
@@ -30,7 +30,7 @@ NOTICE = (
 NOT_INSTALLED = "pyiqa is not installed: pip install 'spackle-nvs[eval]'"
 WINDOW, SIGMA = 11, 1.5  # SSIM's window, in pixels (Wang et al. 2004)
 C1, C2 = 0.01**2, 0.03**2  # SSIM's constants K1 = 0.01, K2 = 0.03, for values in 0..1
-GREY = torch.tensor([0.299, 0.587, 0.114])
+GREY_WEIGHTS = torch.tensor([0.299, 0.587, 0.114])
 INNER = 7  # side in pixels of the square around a pixel that must lie in the mask, for sharpness
 
 Metric = Callable[
@@ -85,7 +85,8 @@ def sharpness(image: Tensor, truth: Tensor, mask: Tensor) -> float:
     """
     inner = ~greatest_around(~mask, INNER // 2)
     ours, theirs = (
-        torch.hypot(*torch.gradient(picture @ GREY))[inner].mean() for picture in (image, truth)
+        torch.hypot(*torch.gradient(picture @ GREY_WEIGHTS))[inner].mean()
+        for picture in (image, truth)
     )
     return float(ours / theirs)
 

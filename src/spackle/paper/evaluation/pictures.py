@@ -16,10 +16,10 @@ from torch.nn.functional import avg_pool2d
 from spackle.core.color import to_bytes
 from spackle.formats.png import thumbnail
 from spackle.paper.evaluation.folder import image_file, load_run
-from spackle.paper.evaluation.methods import METHODS
+from spackle.paper.evaluation.measurements import Run, load_data
+from spackle.paper.evaluation.method_descriptions import METHODS
 from spackle.paper.evaluation.metrics import METRICS
 from spackle.paper.evaluation.protocols import HOLE, INPUT, TRUTH
-from spackle.paper.evaluation.rows import Run, load_data
 from spackle.paper.evaluation.table import tex
 from spackle.runtime.errors import InputError
 from spackle.runtime.files import atomic_path, results_folder, write_atomic

@@ -15,9 +15,9 @@ from spackle.core.photo import working_size
 from spackle.core.trajectories import DepthRange, extremes
 from spackle.depth.depth_map import DepthMap
 from spackle.paper.evaluation.case import Case, Points, Viewpoint
+from spackle.paper.evaluation.measurements import REMARK, Measurement
 from spackle.paper.evaluation.methods import Fill
 from spackle.paper.evaluation.metrics import METRICS, Metric, psnr, ssim_average, ssim_map
-from spackle.paper.evaluation.rows import REMARK, Row
 from spackle.paper.training.losses import FeatureNet, hole_distance
 from spackle.residual import CELL, hole_area_ratio, hole_mask
 from spackle.runtime.errors import InputError, reason_in_a_line
@@ -32,7 +32,7 @@ TRUTH, INPUT, HOLE = "truth", "input", "hole"  # names of pictures beside the me
 
 
 @dataclasses.dataclass(frozen=True)
-class Gauges:
+class MetricSuite:
     """The metrics to measure, besides holes and counts."""
 
     metrics: Sequence[str]  # names in `METRICS`
@@ -189,19 +189,19 @@ def _point_ratios(case: Case, points: Points, z_base: Tensor, seen: Tensor) -> T
 
 @torch.no_grad()
 def measure_views(
-    image: Row,
+    image: Measurement,
     context: FillContext,
     viewpoints: Sequence[Viewpoint],
     methods: Mapping[str, Callable[[Sequence[Camera]], Fill]],
-    gauges: Gauges,
-) -> tuple[list[Row], dict[str, Tensor]]:
+    gauges: MetricSuite,
+) -> tuple[list[Measurement], dict[str, Tensor]]:
     """Measure every method on every view of a base; a method gets all cameras of a setting at once.
 
     Returns:
         Rows, whose dataset and image are copied from the row `image`. Also pictures [H, W, 3] of the view with the
         largest hole: the hole in white, the view by each method, and the truth if known.
     """
-    rows: list[Row] = []
+    rows: list[Measurement] = []
     pictures: dict[str, Tensor] = {}
     largest, base = -1.0, len(context.base)
     for setting in dict.fromkeys(view.setting for view in viewpoints):

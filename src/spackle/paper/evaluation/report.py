@@ -20,20 +20,20 @@ from jinja2 import Environment
 from markupsafe import Markup, escape
 from PIL import Image
 
-from spackle.paper.evaluation.methods import METHODS
-from spackle.paper.evaluation.metrics import METRICS
-from spackle.paper.evaluation.pictures import column_title, evenly, kept_pictures, rank, ranked
-from spackle.paper.evaluation.protocols import TRUTH
-from spackle.paper.evaluation.rows import (
+from spackle.paper.evaluation.measurements import (
     IMAGES,
     REMARK,
-    Row,
+    Measurement,
     Run,
     mean,
     paper_rows,
     pivot,
     setting_title,
 )
+from spackle.paper.evaluation.method_descriptions import METHODS
+from spackle.paper.evaluation.metrics import METRICS
+from spackle.paper.evaluation.pictures import column_title, evenly, kept_pictures, rank, ranked
+from spackle.paper.evaluation.protocols import TRUTH
 from spackle.paper.evaluation.table import EMPTY, TEXTS, Cells, Table, groups
 from spackle.paper.evaluation.tables import grouped, make_tables, method_name
 from spackle.runtime.errors import InputError
@@ -142,7 +142,7 @@ def _part(run: Run, folder: Path, count: int) -> dict[str, Any]:
     }
 
 
-def means_table(run: Run, rows: Iterable[Row]) -> Table:
+def means_table(run: Run, rows: Iterable[Measurement]) -> Table:
     """Means of metrics over a run's images: a row for each method, grouped by setting if there are several settings."""
     values = pivot((row for row in rows if row.metric in COLUMNS), "setting", "method", "metric")
     settings = list(dict.fromkeys(setting for setting, *_ in values))
@@ -244,7 +244,7 @@ def _draw(
         figure = Figure(figsize=(WIDTH, height), layout="constrained")
         axes = figure.subplots()
         for one in series:
-            _, _, color, form = METHODS[one.method]
+            color, form = METHODS[one.method].color, METHODS[one.method].marker
             places = ([p[0] for p in one.points], [p[1] for p in one.points])
             face = "white" if one.hollow else color
             axes.plot(*places, form, color=color, ls=one.line, mfc=face, alpha=0.8, label=one.title)
@@ -260,7 +260,7 @@ def _draw(
 def holes_plot(run: Run) -> Plot | None:
     """HAR against disparity, before and after completion, with the paper's values; None if nothing was measured."""
 
-    def means(rows: Iterable[Row], metric: str, method: str) -> list[tuple[float, float]]:
+    def means(rows: Iterable[Measurement], metric: str, method: str) -> list[tuple[float, float]]:
         chosen = (
             row
             for row in rows

@@ -10,16 +10,14 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from spackle.paper.evaluation.methods import METHODS, RESIDUAL
-from spackle.paper.evaluation.metrics import METRICS, metric_name
-from spackle.paper.evaluation.rows import (
+from spackle.paper.evaluation.measurements import (
     IMAGES,
     NEAR,
     NOTE,
     PAPER,
     SETTINGS,
     Mean,
-    Row,
+    Measurement,
     Run,
     Value,
     load_data,
@@ -28,6 +26,8 @@ from spackle.paper.evaluation.rows import (
     pivot,
     setting_title,
 )
+from spackle.paper.evaluation.method_descriptions import METHODS
+from spackle.paper.evaluation.metrics import METRICS, metric_name
 from spackle.paper.evaluation.table import (
     EMPTY,
     NOT_RUN,
@@ -138,7 +138,7 @@ def method_name(run: Run, method: str, title: str = "") -> str:
         return f"{run.base} alone"
     mark = (
         NOTES["recipe"][0]
-        if method in RESIDUAL and run.config["residual"]["weights"] != "given"
+        if METHODS[method].uses_residual and run.config["residual"]["weights"] != "given"
         else ""
     )
     return f"{title or METHODS[method].title}{mark} ({run.base})"
@@ -156,7 +156,7 @@ def _notes(spec: Mapping[str, Any], runs: Sequence[Run]) -> list[str]:
     ]
     notes += [f"Base {run.base}: {run.config['base']['says']}." for run in runs]
     said = [
-        f"{title or METHODS[method].title}: {METHODS[method].says}"
+        f"{title or METHODS[method].title}: {METHODS[method].summary}"
         for method, title in rows.items()
     ]
     notes += [f"Rows: {'; '.join(said)}."] if said else []
@@ -250,7 +250,7 @@ def _text(found: Mean | None, column: Column, method: str) -> str:
 
 
 def _cells(
-    rows: Iterable[Row], columns: Sequence[Column], methods: Sequence[str]
+    rows: Iterable[Measurement], columns: Sequence[Column], methods: Sequence[str]
 ) -> list[list[str]]:
     """A row of texts for each method; the best of a column is marked."""
     values, texts = pivot(rows, "method", "setting", "metric"), []
@@ -371,12 +371,12 @@ def _overhead_table(
         grouped(dataset, [(name, *cells) for name, _, cells in rows])
         for dataset, rows in of.items()
     ]
-    pools: dict[str, list[Row]] = {}  # for each row's name, the numbers of all datasets
+    pools: dict[str, list[Measurement]] = {}  # for each row's name, the numbers of all datasets
     for run in runs:
         values, names = pivot(run.rows, "method", "setting", "metric"), _row_names(spec, run)
         for method, setting, metric in values:
             if method in names and (found := _find(values, method, setting, metric)):
-                row = Row("", run.title, setting, "", names[method], metric, found.value)
+                row = Measurement("", run.title, setting, "", names[method], metric, found.value)
                 pools.setdefault(names[method], []).append(row)
     for row in paper_rows(label):
         pools.setdefault(row.method, []).append(row)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from spackle.paper.evaluation.case import Case
 from spackle.paper.evaluation.datasets import posed_photos, stereo
-from spackle.paper.evaluation.rows import load_data
+from spackle.paper.evaluation.measurements import load_data
 from spackle.runtime.errors import InputError
 
 __all__ = ["DATASETS", "EvalDataset", "read_cases"]

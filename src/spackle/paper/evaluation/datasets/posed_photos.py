@@ -21,7 +21,7 @@ from spackle.paper.evaluation.case import Case
 from spackle.paper.evaluation.datasets.colmap import model_folder, read_model
 from spackle.paper.evaluation.datasets.multiview import Posed, make_cases, posed_by, spread
 from spackle.paper.evaluation.datasets.stereo import HALF_PIXEL
-from spackle.paper.evaluation.rows import IMAGES
+from spackle.paper.evaluation.measurements import IMAGES
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import files_in
 

@@ -32,8 +32,11 @@ from spackle.runtime.files import files_in
 HALF_PIXEL = 0.5  # Middlebury's and Booster's (0, 0) is the middle of the first pixel; here (0, 0) is its corner
 TRUTHS = ("disp0GT.pfm", "disp0.pfm")  # the names in MiddEval3, and in the 2014 dataset
 # Middlebury's calibration of the Motorcycle at a quarter of its size, as in scikit-image.
-MOTORCYCLE_FOCAL, MOTORCYCLE_CX, MOTORCYCLE_CY = 994.978, 311.193, 254.877
-MOTORCYCLE_DOFFS, MOTORCYCLE_BASELINE = 31.086, 0.193001
+MOTORCYCLE_FOCAL_PX = 994.978
+MOTORCYCLE_CX_PX = 311.193
+MOTORCYCLE_CY_PX = 254.877
+MOTORCYCLE_DOFFS_PX = 31.086
+MOTORCYCLE_BASELINE_M = 0.193001
 
 
 def _pair(
@@ -184,8 +187,8 @@ def load_motorcycle() -> StereoPair:
             "the demo's photo is inside scikit-image: pip install 'spackle-nvs[demo]'"
         ) from error
     left, right, disparity = stereo_motorcycle()  # type: ignore[no-untyped-call]
-    cx, cy = MOTORCYCLE_CX, MOTORCYCLE_CY
-    lens = Calibration(MOTORCYCLE_FOCAL, cx, cy, MOTORCYCLE_DOFFS, MOTORCYCLE_BASELINE)
+    cx, cy = MOTORCYCLE_CX_PX, MOTORCYCLE_CY_PX
+    lens = Calibration(MOTORCYCLE_FOCAL_PX, cx, cy, MOTORCYCLE_DOFFS_PX, MOTORCYCLE_BASELINE_M)
     first, second = (torch.from_numpy(photo.astype(np.float32) / 255) for photo in (left, right))
     return StereoPair(
         first,

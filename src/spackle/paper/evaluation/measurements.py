@@ -16,11 +16,11 @@ PROBLEM, REMARK, NOTE = (
     "remark",
     "note.",
 )  # metrics with text as values; "note." precedes a note's name
-BASE_PATH = (
+BASE_STAGES = (
     "base",
     "view",
 )  # stages of a view without Spackle: photo to base Gaussians, render of the view
-EXTRA = (
+COMPLETION_STAGES = (
     "photo",
     "completion",
 )  # stages that Spackle adds: render at the photo's camera; mask to rendered view
@@ -43,7 +43,7 @@ SETTINGS: list[str] = PAPER["settings"]  # S1, S2, S3
 DISPARITIES = tuple(map(float, SETTINGS))
 
 
-class Row(NamedTuple):
+class Measurement(NamedTuple):
     """One number. A number of a whole image has an empty setting, view and method."""
 
     dataset: str  # the dataset's name in the paper's tables
@@ -68,7 +68,7 @@ def mean(values: Sequence[Value], of: Callable[[list[float]], float] = statistic
     return Mean(of(known) if known else None, len(values) - len(known))
 
 
-def pivot(rows: Iterable[Row], *columns: str) -> dict[tuple[str, ...], list[Value]]:
+def pivot(rows: Iterable[Measurement], *columns: str) -> dict[tuple[str, ...], list[Value]]:
     """Group the values of rows by the rows' entries in `columns`."""
     groups: dict[tuple[str, ...], list[Value]] = {}
     for row in rows:
@@ -81,7 +81,7 @@ class Run:
     """The results of an evaluation or a benchmark of one dataset."""
 
     config: Mapping[str, Any]
-    rows: Sequence[Row]
+    rows: Sequence[Measurement]
     about: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # versions, machine, metrics
 
     @property
@@ -141,7 +141,7 @@ class Run:
 
 
 @functools.cache
-def paper_rows(label: str) -> tuple[Row, ...]:
+def paper_rows(label: str) -> tuple[Measurement, ...]:
     """The numbers of a table of the paper, with shares instead of percent."""
     rows = []
     for table in (table for table in PAPER["tables"] if table["label"] == label):
@@ -152,7 +152,7 @@ def paper_rows(label: str) -> tuple[Row, ...]:
             for (setting, metric), value in zip(keys, values, strict=True):
                 name = metric.removesuffix("_percent")
                 rows.append(
-                    Row(
+                    Measurement(
                         dataset,
                         "",
                         setting,

@@ -1,0 +1,72 @@
+"""The names, texts and plot styles of the compared methods; `methods.py` has the methods themselves."""
+
+from __future__ import annotations
+
+import dataclasses
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class MethodDescription:
+    """How tables and plots present a method, that is, one way to render new views of a photo."""
+
+    title: str  # its name in tables
+    summary: str  # half a sentence for the notes below a table
+    color: str  # in plots; from the palette of Okabe and Ito, which colour-blind readers can tell
+    marker: str  # its shape in plots, in matplotlib's notation
+    uses_residual: bool = False  # whether the residual network runs
+
+
+METHODS = {
+    "base": MethodDescription(
+        title="base alone",
+        summary="the base's render, holes black",
+        color="#5b6066",
+        marker="o",
+    ),
+    "paper": MethodDescription(
+        title="Spackle, eqs. 2 to 9",
+        summary="the paper's method: one pass for each view, an aux Gaussian for each masked cell",
+        color="#7a4fb5",
+        marker="<",
+        uses_residual=True,
+    ),
+    "spackle": MethodDescription(
+        title="Spackle",
+        summary="ours: each view by itself in two passes, behind what the photo shows, with texture",
+        color="#0072b2",
+        marker="D",
+        uses_residual=True,
+    ),
+    "spackle-scene": MethodDescription(
+        title="Spackle, one scene",
+        summary="one set of aux Gaussians for all views of a setting",
+        color="#3a9fd8",
+        marker="P",
+        uses_residual=True,
+    ),
+    "seeds": MethodDescription(
+        title="seeds",
+        summary="as Spackle, without a network: deltas of zero",
+        color="#008a66",
+        marker="^",
+    ),
+    "dense": MethodDescription(
+        title="dense grid",
+        summary="an aux Gaussian for every cell, in one pass",
+        color="#b5568c",
+        marker="s",
+        uses_residual=True,
+    ),
+    "inpaint2d": MethodDescription(
+        title="2D inpainting",
+        summary="the base's render, its hole inpainted as a flat picture",
+        color="#c87f00",
+        marker="v",
+    ),
+    "direct-ft": MethodDescription(
+        title="direct FT",
+        summary="the base fine-tuned on completed views, no aux Gaussians",
+        color="#d55e00",
+        marker="X",
+    ),
+}
