@@ -27,7 +27,7 @@ from spackle.clips.temporal import inside, pixel_grid, sample
 from spackle.core.camera import Camera
 from spackle.core.color import srgb_to_linear
 from spackle.core.gaussians import Gaussians
-from spackle.core.surfels import surface_gaussians
+from spackle.core.surfels import make_surfels
 from spackle.depth.depth_map import DepthMap
 from spackle.inpaint.plain import OpenCV
 from spackle.paper.evaluation.datasets.stereo import load_motorcycle
@@ -103,7 +103,7 @@ def board(camera: Camera) -> Gaussians:
     ]
     flat = torch.full((len(uv),), 1 / BOARD_M)
     colors = srgb_to_linear(torch.stack(paint, -1))
-    return surface_gaussians(
+    return make_surfels(
         camera, uv, flat, torch.zeros(len(uv), 2), 0.7, colors, torch.full((len(uv),), 0.99)
     )
 

@@ -30,7 +30,7 @@ from spackle.bases.sharp.base import to_metric
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
 from spackle.core.photo import Photo
-from spackle.core.trajectories import DepthRange, extremes
+from spackle.core.trajectories import DepthRange, leftmost_and_rightmost
 from spackle.paper.evaluation.bench import TOTAL_STAGE, TimedTask, time_tasks
 from spackle.paper.training.losses import total_loss
 from spackle.paper.training.recipe import LossRecipe
@@ -43,7 +43,7 @@ from spackle.render.project import KernelCamera
 from spackle.render.protocol import NEAR_PLANE, TILE, Rendering
 from spackle.residual import hole_area_ratio
 from spackle.residual.architectures import UNet, shipped_network
-from spackle.runtime.device import Precision, hardware, versions
+from spackle.runtime.device import Precision, hardware_facts, package_versions
 from spackle.runtime.errors import InputError
 from spackle.runtime.files import write_atomic
 from spackle.scene_fill import FillContext, fill_view
@@ -99,7 +99,7 @@ def sharp(options: argparse.Namespace, precision: Precision = "fp32") -> tuple[S
 def views() -> tuple[Gaussians, list[Camera]]:
     """A scene of SHARP's size, the photo's camera, and a camera to its side."""
     scene, camera = photo_scene()
-    return scene, [camera, extremes(camera, 0.3, DepthRange.of(scene))[1]]
+    return scene, [camera, leftmost_and_rightmost(camera, 0.3, DepthRange.of(scene))[1]]
 
 
 def rows(tasks: dict[str, TimedTask], runs: int = RUNS) -> Iterator[str]:
@@ -370,7 +370,10 @@ def main(arguments: Sequence[str]) -> int:
     chosen = options.only.split(",")
     if unknown := set(chosen) - set(steps):
         parser.error(f"--only {', '.join(sorted(unknown))}: the steps are {', '.join(steps)}")
-    facts = {**hardware(CUDA if torch.cuda.is_available() else torch.device("cpu")), **versions()}
+    facts = {
+        **hardware_facts(CUDA if torch.cuda.is_available() else torch.device("cpu")),
+        **package_versions(),
+    }
     lines = [
         "## A GPU",
         "",

@@ -17,7 +17,7 @@ from spackle.paper.evaluation.bench import EndStage
 from spackle.render.cpu import BLEND_GRAIN, PROJECT_GRAIN
 from spackle.render.project import KernelCamera, covariance
 from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, NEAR_PLANE, TILE, TRANSMITTANCE_STOP
-from spackle.runtime.device import run_chunks
+from spackle.runtime.device import parallel_for_chunks
 
 Array = npt.NDArray[Any]
 Arrays = tuple[Array, ...]  # a scene's five tensors
@@ -27,7 +27,7 @@ def naive_render(scene: Gaussians, camera: Camera, lap: EndStage = lambda name: 
     """Render Gaussians to [H, W, 3] sRGB, with `eps2d` 0; depth and alpha are computed too, as in ours."""
     tensors, view = tuple(t.numpy() for t in scene.tensors), KernelCamera.of(camera, 0.0)
     splats, boxes = np.empty((len(scene), 6), np.float32), np.zeros((len(scene), 4), np.int32)
-    run_chunks(
+    parallel_for_chunks(
         lambda a, b: naive_project(a, b, tensors, view, splats, boxes), len(scene), PROJECT_GRAIN
     )
     lap("project")
@@ -36,7 +36,7 @@ def naive_render(scene: Gaussians, camera: Camera, lap: EndStage = lambda name: 
     starts, ids = naive_bin(order, boxes, *view.tiles)
     lap("bin")
     images = np.zeros((view.height, view.width, 5), np.float32)
-    run_chunks(
+    parallel_for_chunks(
         lambda a, b: naive_blend(a, b, tensors, splats, boxes, starts, ids, images),
         len(starts) - 1,
         BLEND_GRAIN,

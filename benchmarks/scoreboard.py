@@ -56,9 +56,10 @@ import spackle
 from spackle import Camera, get_renderer, hole_area_ratio, hole_mask
 from spackle.bases.depth import lift
 from spackle.bases.lite import FARTHEST, NEAREST_M, nearest
-from spackle.core.hole_filling import FAR_BIAS, far_fill, greatest_around
+from spackle.core.filters import maximum_filter
+from spackle.core.hole_filling import FAR_SIDE_BIAS, fill_from_far_side
 from spackle.core.photo import load_photo, resize_photo
-from spackle.core.trajectories import DepthRange, extremes
+from spackle.core.trajectories import DepthRange, leftmost_and_rightmost
 from spackle.depth.depth_map import DepthMap
 from spackle.lifting.edges import Edges
 from spackle.lifting.silhouettes import Layers
@@ -92,14 +93,14 @@ def first(own: Any) -> Any:
 
 
 def unbiased(own: Any) -> Any:
-    """`far_fill` without preference for the farther side of a rim."""
+    """`fill_from_far_side` without preference for the farther side of a rim."""
     return lambda *given, far_bias=None, **named: own(*given, far_bias=0.0, **named)
 
 
 def filled_from_around(own: Any) -> Any:
     """`fill_around` that treats holes beyond the photo's border like other holes."""
-    return lambda cues, across, uv, known, inside, *cameras: far_fill(
-        cues.inverse_depth, cues.rgb.permute(2, 0, 1), known, far_bias=FAR_BIAS * inside
+    return lambda cues, across, uv, known, inside, *cameras: fill_from_far_side(
+        cues.inverse_depth, cues.rgb.permute(2, 0, 1), known, far_bias=FAR_SIDE_BIAS * inside
     )
 
 
@@ -130,7 +131,7 @@ LIFT: dict[str, dict[str, Replace]] = {
     "blended opacities": {"blended_opacities": first},
 }
 FILL: dict[str, dict[str, Replace]] = {
-    "far bias": {"far_fill": unbiased},
+    "far bias": {"fill_from_far_side": unbiased},
     "network": {"shipped_network": lambda own: lambda: None},
     "texture": {"open_texture": lambda own: lambda fill: None},
     "half texture": {"_in_proportion": lambda own: lambda *given: 0.5 * own(*given)},
@@ -210,7 +211,7 @@ class Pair:
         self.depth = smaller(depth, small) if small > 1 else depth
         prediction = lift(self.left, self.depth, self.camera)
         self.hole = hole_mask(RENDERER.render(prediction.gaussians, self.beside).alpha)
-        self.near = greatest_around(self.hole, BAND_PX)
+        self.near = maximum_filter(self.hole, BAND_PX)
         seeds = spackle.complete(
             prediction, [self.beside], exact=True, network=None, fill="network"
         )
@@ -395,7 +396,9 @@ def sheet(folder: Path, runs: Sequence[str]) -> Image.Image:
                 if run == DEFAULT
                 else ([scene.base, scene.aux],)
             )
-            ends = extremes(scene.camera.even(), scene.disparity or 0.0, DepthRange.of(scene.base))
+            ends = leftmost_and_rightmost(
+                scene.camera.even(), scene.disparity or 0.0, DepthRange.of(scene.base)
+            )
             pictures.append([[RENDERER.render(part, end).rgb for part in sets] for end in ends])
         ordered = [
             picture for end in zip(*pictures, strict=True) for group in end for picture in group

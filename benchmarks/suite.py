@@ -36,7 +36,7 @@ from spackle.bases.sharp.base import to_metric
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
 from spackle.core.photo import Photo
-from spackle.core.trajectories import DepthRange, trajectory
+from spackle.core.trajectories import DepthRange, trajectory_cameras
 from spackle.formats import save_ply
 from spackle.paper.evaluation.bench import (
     CPU,
@@ -56,7 +56,7 @@ from spackle.render.cpu import BLEND_GRAIN, list_tiles, project, sort_tiles, wan
 from spackle.render.project import KernelCamera
 from spackle.residual import ResidualNet, hole_area_ratio
 from spackle.residual.architectures import load_residual
-from spackle.runtime.device import hardware, run_chunks, versions
+from spackle.runtime.device import hardware_facts, package_versions, parallel_for_chunks
 from spackle.runtime.errors import InputError, check_name
 from spackle.runtime.files import make_folder, write_atomic, write_json
 from spackle.scene_fill import FillContext, fill_scene, fill_view
@@ -151,11 +151,13 @@ def render_in_laps(scene: Gaussians, camera: Camera, lap: EndStage) -> None:
     lists = list_tiles(splats.boxes, wanted)
     lap("bin")
     tiles = np.flatnonzero(wanted)
-    run_chunks(lambda a, b: sort_tiles(a, b, tiles, lists, splats.records), len(tiles), BLEND_GRAIN)
+    parallel_for_chunks(
+        lambda a, b: sort_tiles(a, b, tiles, lists, splats.records), len(tiles), BLEND_GRAIN
+    )
     lap("sort")
     size = camera.height, camera.width
     images = tuple(np.zeros(shape, np.float32) for shape in ((*size, 3), size, size, (0, 0, 3)))
-    run_chunks(
+    parallel_for_chunks(
         lambda a, b: blend_tiles(a, b, tiles, lists, splats.records, images),
         len(tiles),
         BLEND_GRAIN,
@@ -210,7 +212,7 @@ def video_section(
     """
     prediction, aux = lift(), Gaussians.empty()
     depths = DepthRange.of(prediction.gaussians)
-    path = trajectory("rotate-forward", prediction.camera.even(), DISPARITY, depths, frames)
+    path = trajectory_cameras("rotate-forward", prediction.camera.even(), DISPARITY, depths, frames)
     context = FillContext(prediction.gaussians, prediction.camera, renderer, network)
 
     def scene(lap: EndStage) -> None:
@@ -375,7 +377,7 @@ def main(arguments: list[str]) -> None:
         make_folder(options.output)
     except InputError as error:
         parser.error(str(error))
-    about = {**hardware(torch.device(options.device)), **versions()}
+    about = {**hardware_facts(torch.device(options.device)), **package_versions()}
     record: dict[str, Any] = {
         "commit": commit(),
         "about": about,

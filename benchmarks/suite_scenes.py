@@ -11,7 +11,7 @@ from torch import Tensor
 import spackle
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
-from spackle.core.trajectories import MAX_DISPARITY, DepthRange, extremes
+from spackle.core.trajectories import MAX_DISPARITY, DepthRange, leftmost_and_rightmost
 from spackle.render import Renderer
 from spackle.residual import hole_area_ratio
 from spackle.runtime.errors import InputError
@@ -106,7 +106,7 @@ def find_view(
     low, high = 0.0, MAX_DISPARITY
     for _ in range(HALVINGS):
         middle = (low + high) / 2
-        view = extremes(even, middle, depths)[1]
+        view = leftmost_and_rightmost(even, middle, depths)[1]
         found = hole_area_ratio(renderer.render(base, view).alpha)
         low, high = (middle, high) if found < share else (low, middle)
         if abs(found / share - 1) < CLOSE:

@@ -7,7 +7,7 @@
 from PIL import Image
 
 import spackle
-from spackle.core.color import to_bytes
+from spackle.core.color import to_uint8
 
 scene = spackle.predict("photo.jpg")
 print(scene)
@@ -17,7 +17,7 @@ scene.show(height=480)
 
 # %% One view, as a picture
 view = scene.render(scene.path("swipe", frames=3)[0])
-Image.fromarray(to_bytes(view.rgb).numpy())
+Image.fromarray(to_uint8(view.rgb).numpy())
 
 # %% A file to send
 scene.export("photo.html")

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 import spackle
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
-from spackle.core.trajectories import TRAJECTORIES, DepthRange, trajectory
+from spackle.core.trajectories import TRAJECTORIES, DepthRange, trajectory_cameras
 from spackle.residual import CELL, ViewFeatures, hole_area_ratio, hole_mask
 from spackle.residual.features import cell_centers
 from spackle.scene_fill import FillContext, fill_scene, fill_view
@@ -46,7 +46,9 @@ def context_of(name: str, network: bool = False) -> FillContext:
 def path_of(
     subject: FillContext, kind: str, disparity: float = 0.3, frames: int = 4
 ) -> list[Camera]:
-    return trajectory(kind, subject.photo_camera, disparity, DepthRange.of(subject.base), frames)  # type: ignore[arg-type]
+    return trajectory_cameras(
+        kind, subject.photo_camera, disparity, DepthRange.of(subject.base), frames
+    )  # type: ignore[arg-type]
 
 
 @EACH

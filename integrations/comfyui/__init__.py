@@ -23,7 +23,7 @@ from spackle.bases.settings import AUTO, AUTO_NETWORKS, BaseSettings
 from spackle.core.camera import Camera
 from spackle.core.color import linear_to_srgb, srgb_to_linear
 from spackle.core.gaussians import Gaussians
-from spackle.core.photo import focal_length
+from spackle.core.photo import resolve_focal_length
 from spackle.core.trajectories import MAX_DISPARITY, TRAJECTORIES, TrajectoryKind
 from spackle.depth.depth_map import FAR_M, NEAREST_M, RELATIVE, relative_depth
 from spackle.formats.scene_files import SH_C0
@@ -87,7 +87,7 @@ class PredictScene:
         """InputError if the base cannot use the image."""
         rgb = image[0, ..., :3].detach().float().cpu().clamp(0, 1)
         height, width = rgb.shape[:2]
-        lens = focal_length(
+        lens = resolve_focal_length(
             "image", width, height, {}, focal_px=None, focal_mm=None, fov=fov or None
         )
         photo = Photo(rgb, *lens, Path("image"))
@@ -217,7 +217,7 @@ class FromSplat:
             part[0, :count].detach().float().cpu() for part in parts
         )
         colors = srgb_to_linear((0.5 + SH_C0 * harmonics[:, 0]).clamp(0, 1))
-        lens, _ = focal_length(
+        lens, _ = resolve_focal_length(
             "splat", width, height, {}, focal_px=None, focal_mm=None, fov=fov or None
         )
         base = Gaussians(means, quats, scales, opacities[:, 0], colors)

@@ -18,13 +18,13 @@ from torch import Tensor
 from spackle.bases import Base
 from spackle.bases.open import open_base, open_loaded
 from spackle.bases.settings import AUTO, BaseSettings
-from spackle.core.photo import Photo, load_photo, photo_of_picture
+from spackle.core.photo import Photo, load_photo, photo_from_picture
 from spackle.core.trajectories import TrajectoryKind
 from spackle.depth.depth_map import DepthKind, DepthMap, depth_of_array, load_depth
 from spackle.pipeline import FillOptions, FillTexture, Pipeline, PipelineOptions
 from spackle.render import Renderer, get_renderer
 from spackle.residual.network import ResidualNet
-from spackle.runtime.errors import InputError, renamed, short_messages, shortened
+from spackle.runtime.errors import InputError, renamed, short_repr, shorten_input_errors
 from spackle.runtime.progress import LogReporter
 from spackle.scene import Scene
 from spackle.views import PathOptions
@@ -38,7 +38,7 @@ Residual = str | os.PathLike[str] | ResidualNet | None
 class Spackle:
     """Completes many photos; a network is loaded once, at the first photo that needs it."""
 
-    @short_messages()
+    @shorten_input_errors()
     def __init__(
         self,
         base: str | Base = AUTO,
@@ -78,7 +78,7 @@ class Spackle:
             options, opened, network or chosen.load(), renderer or get_renderer(device)
         )
 
-    @short_messages()
+    @shorten_input_errors()
     def predict(
         self,
         photo: PhotoSource,
@@ -153,7 +153,7 @@ def predict(
             in metres (0, NaN or inf: unknown), or a loaded depth map.
         base, residual, fill, device, renderer: see `Spackle`.
         trajectory: the path for which the scene is completed, in addition to the leftmost and rightmost views.
-        disparity: size of the camera's movement, see `spackle.core.trajectories.max_offset`; None lets `choose_disparity` decide,
+        disparity: size of the camera's movement, see `spackle.core.trajectories.disparity_to_offset`; None lets `choose_disparity` decide,
             with a limit of 0.15 for lite and 0.3 for other bases.
         depth_kind: the meaning of a depth map's numbers, see `spackle.load_depth`.
         keep_frame: keep a uniform frame around a picture. Otherwise the frame is cropped, unless depth or a focal
@@ -185,7 +185,7 @@ def _photo(source: PhotoSource, **options: Any) -> Iterator[Photo]:
     if isinstance(source, Photo):
         yield source
     elif isinstance(source, Image.Image | np.ndarray | Tensor):
-        yield photo_of_picture(source, **options)
+        yield photo_from_picture(source, **options)
     else:
         with _as_file(source, "photo") as path:
             yield load_photo(path, **options)
@@ -213,7 +213,7 @@ def _as_file(source: str | os.PathLike[str] | bytes | BinaryIO, kind: str) -> It
     if not isinstance(content, bytes):
         accepted = "a path, bytes, a file opened in binary mode, or an array"
         raise InputError(
-            f"{kind}: {type(source).__name__} {shortened(source)} is not accepted: give {accepted}"
+            f"{kind}: {type(source).__name__} {short_repr(source)} is not accepted: give {accepted}"
         )
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / kind

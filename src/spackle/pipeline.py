@@ -15,7 +15,7 @@ from spackle.bases.open import OpenedBase, ResolvedBase, open_base
 from spackle.bases.settings import BaseSettings
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
-from spackle.core.photo import Photo, check_shape
+from spackle.core.photo import Photo, check_photo_size
 from spackle.core.trajectories import KeyframePath
 from spackle.inpaint import InpainterOptions, get_inpainter
 from spackle.render import Renderer, get_renderer
@@ -167,7 +167,7 @@ class Pipeline:
 
     def predict(self, photo: Photo, reporter: Reporter) -> tuple[BasePrediction, ResolvedBase]:
         """Predict the photo's Gaussians, and choose the size of the camera's movement; also return the chosen base."""
-        check_shape(photo.width, photo.height, photo.path)
+        check_photo_size(photo.width, photo.height, photo.path)
         name = photo.path.name
         if photo.frame is not None:
             reporter.log(f"{name}: {photo.frame.note}; --keep-frame keeps it")

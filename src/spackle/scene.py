@@ -16,15 +16,15 @@ from spackle.bases import USUAL_DISPARITY
 from spackle.core import trajectories as camera_path
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
-from spackle.core.photo import focal_length
-from spackle.core.trajectories import OVERSCAN, DepthRange, KeyframePath, TrajectoryKind
+from spackle.core.photo import resolve_focal_length
+from spackle.core.trajectories import DEFAULT_OVERSCAN, DepthRange, KeyframePath, TrajectoryKind
 from spackle.formats.html import PageScene, page_scene, single_html
 from spackle.formats.scene_files import Encoder, SceneFile, encoder_for, is_at_origin, load_scene
 from spackle.render import Renderer, get_renderer
 from spackle.render.protocol import Rendering
 from spackle.residual.features import hole_mask
 from spackle.runtime.errors import renamed
-from spackle.runtime.files import Target, write_atomic
+from spackle.runtime.files import PathOrFile, write_atomic
 from spackle.video.encoding import check_video, save_video
 from spackle.video.frames import Fit, FrameMaker, Show, StereoLayout, VideoOptions, parse_size
 from spackle.views import PATH_FRAMES, PathOptions
@@ -69,7 +69,7 @@ class Scene:
         gaussians, camera = file.gaussians, file.camera
         if camera is None or any(value is not None for value in lens.values()):
             width, height = size or ((camera.width, camera.height) if camera else DEFAULT_SIZE)
-            focal, _ = focal_length(file.path, width, height, {}, **lens)
+            focal, _ = resolve_focal_length(file.path, width, height, {}, **lens)
             given = Camera.from_focal(focal, width, height)
             pose = given.world_to_camera if camera is None else camera.world_to_camera
             camera = dataclasses.replace(given, world_to_camera=pose)
@@ -100,14 +100,16 @@ class Scene:
         """Cameras of a path around the photo's camera position, of even width and height.
 
         Args:
-            trajectory: see `spackle.core.trajectories.trajectory`.
+            trajectory: see `spackle.core.trajectories.trajectory_cameras`.
             disparity: by default `Scene.disparity`.
             frames: number of cameras.
             looped: make a path that repeats without a jump.
         """
         usual = USUAL_DISPARITY if self.disparity is None else self.disparity
         reach, depths = usual if disparity is None else disparity, DepthRange.of(self.base)
-        return camera_path.trajectory(trajectory, self.camera.even(), reach, depths, frames, looped)
+        return camera_path.trajectory_cameras(
+            trajectory, self.camera.even(), reach, depths, frames, looped
+        )
 
     def along(self, keyframes: KeyframePath, frames: int | None = None) -> list[Camera]:
         """Cameras through keyframes (see `spackle.formats.load_path`), by default 30 for each second.
@@ -137,7 +139,7 @@ class Scene:
             view = (renderer or get_renderer()).render(self.base, self.camera)
         return torch.where(hole_mask(view.alpha), 0, view.depth)
 
-    def save(self, target: Target, disparity: float | None = None) -> None:
+    def save(self, target: PathOrFile, disparity: float | None = None) -> None:
         """Write a plain PLY that every common viewer opens.
 
         Args:
@@ -151,7 +153,7 @@ class Scene:
         """The scene in the form that `spackle view` shows; see `page_scene`."""
         return page_scene(name, self.base, self.aux, self.camera, self.disparity, note)
 
-    def export(self, target: Target, format: str | None = None) -> None:
+    def export(self, target: PathOrFile, format: str | None = None) -> None:
         """Write a file for other viewers.
 
         Args:
@@ -181,13 +183,13 @@ class Scene:
     @renamed(kind="trajectory")
     def save_video(
         self,
-        target: Target,
+        target: PathOrFile,
         trajectory: TrajectoryKind = "rotate-forward",
         disparity: float | None = None,
         frames: int | None = None,
         fps: float = 30,
         loop: int | None = None,
-        overscan: float = OVERSCAN,
+        overscan: float = DEFAULT_OVERSCAN,
         format: str | None = None,
         renderer: Renderer | None = None,
         *,

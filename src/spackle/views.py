@@ -14,15 +14,15 @@ from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
 from spackle.core.photo import working_size
 from spackle.core.trajectories import (
+    DEFAULT_OVERSCAN,
     MAX_DISPARITY,
-    OVERSCAN,
     TRAJECTORIES,
     DepthRange,
     KeyframePath,
     PathError,
     TrajectoryKind,
-    extremes,
-    trajectory,
+    leftmost_and_rightmost,
+    trajectory_cameras,
 )
 from spackle.formats.camera_files import load_cameras, load_path
 from spackle.render.protocol import Renderer
@@ -47,7 +47,7 @@ class PathOptions:
     frames: int | None = None  # None: seconds times the frame rate
     seconds: float | None = None  # duration of the video; None: 4, or the keyframes'
     video: VideoOptions = dataclasses.field(default_factory=VideoOptions)
-    overscan: float = OVERSCAN  # relative gain in focal length along a trajectory
+    overscan: float = DEFAULT_OVERSCAN  # relative gain in focal length along a trajectory
 
     def check(self) -> None:
         """Raise an InputError for an impossible path or video, or for options that contradict each other."""
@@ -118,7 +118,9 @@ class PathOptions:
                 self.disparity_or(USUAL_DISPARITY if disparity is None else disparity),
                 DepthRange.of(gaussians),
             )
-            path = trajectory(self.trajectory, camera.even(), reach, depths, count, looped=True)
+            path = trajectory_cameras(
+                self.trajectory, camera.even(), reach, depths, count, looped=True
+            )
             return [view.zoomed(1 + self.overscan) for view in path]
         count = given or keyframes.frame_count(self.video.frames_per_second)
         if count > MAX_FRAMES:
@@ -173,7 +175,7 @@ def choose_disparity(
     )
 
     def uncovered(disparity: float) -> float:
-        ends = extremes(camera, disparity, depths)
+        ends = leftmost_and_rightmost(camera, disparity, depths)
         return sum(hole_area_ratio(renderer.render(gaussians, end).alpha) for end in ends) / len(
             ends
         )
@@ -220,7 +222,11 @@ def plan_views(
             reach, depths = path.disparity_or(prediction.disparity), DepthRange.of(gaussians)
             if keyframes is None:
                 others = dict(
-                    zip((f"{-reach:g}", f"+{reach:g}"), extremes(even, reach, depths), strict=True)
+                    zip(
+                        (f"{-reach:g}", f"+{reach:g}"),
+                        leftmost_and_rightmost(even, reach, depths),
+                        strict=True,
+                    )
                 )
             else:
                 keys = keyframes.at([key.time for key in keyframes.keys], even, depths)
@@ -228,7 +234,7 @@ def plan_views(
                 others = {f"keyframe {k}": keys[k] for k in range(0, len(keys), step)}
             # Other programs render without overscan, so views with the photo's focal length are filled too.
             if keyframes is None and path.trajectory in ("shake", "rotate", "vertical"):
-                unseen = trajectory("rotate", even, reach, depths, frames=5)[:4:2]
+                unseen = trajectory_cameras("rotate", even, reach, depths, frames=5)[:4:2]
         every = 1 if keyframes else max(1, len(path_cameras) // PATH_FRAMES)
     maker = FrameMaker.of(path.video, gaussians, path_cameras, source)
     middles = given if given and maker.stereo else []  # pictures are taken midway between the eyes

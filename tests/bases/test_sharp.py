@@ -35,11 +35,11 @@ from spackle.bases.sharp.stretch import stretch_gaussians
 from spackle.core.photo import Photo
 from spackle.render import CpuRenderer
 from spackle.runtime.device import (
-    enough_memory,
-    multiplies_bf16,
-    own_arithmetic,
+    has_native_bf16,
     pick_device,
     pick_dtype,
+    report_memory_shortage,
+    without_autocast_or_tf32,
 )
 from spackle.runtime.errors import InputError
 
@@ -165,13 +165,13 @@ def test_auto_is_bf16_if_the_hardware_multiplies_it(
     monkeypatch: pytest.MonkeyPatch, flag: str, native: bool
 ) -> None:
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {flag: True})
-    assert multiplies_bf16(CPU) is native
+    assert has_native_bf16(CPU) is native
     assert pick_dtype("auto", CPU) == (torch.bfloat16 if native else torch.float32)
     assert (pick_dtype("fp32", CPU), pick_dtype("bf16", CPU)) == (torch.float32, torch.bfloat16)
     with pytest.raises(InputError, match="--precision fp16 is unknown"):
         pick_dtype("fp16", CPU)  # type: ignore[arg-type]
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: (8 if native else 7, 0))
-    assert multiplies_bf16(torch.device("cuda")) is native  # from Ampere on
+    assert has_native_bf16(torch.device("cuda")) is native  # from Ampere on
 
 
 def test_unknown_devices_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -200,9 +200,9 @@ def test_unknown_devices_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyP
 )
 def test_too_little_memory_is_one_line(error: Exception) -> None:
     words = r"^not enough memory .*: try this, or close other programs$"
-    with pytest.raises(spackle.InputError, match=words), enough_memory("try this"):
+    with pytest.raises(spackle.InputError, match=words), report_memory_shortage("try this"):
         raise error
-    with pytest.raises(RuntimeError, match="shapes"), enough_memory():
+    with pytest.raises(RuntimeError, match="shapes"), report_memory_shortage():
         raise RuntimeError("shapes do not fit")
 
 
@@ -226,9 +226,9 @@ def test_tf32_is_off_during_own_arithmetic_on_a_gpu() -> None:
     before = [switch.fp32_precision for switch in switches]
     try:
         switches[0].fp32_precision = "tf32"
-        with own_arithmetic(CPU):
+        with without_autocast_or_tf32(CPU):
             assert switches[0].fp32_precision == "tf32"
-        with own_arithmetic(torch.device("cuda")):
+        with without_autocast_or_tf32(torch.device("cuda")):
             assert [switch.fp32_precision for switch in switches] == ["ieee", "ieee"]
         assert switches[0].fp32_precision == "tf32"
     finally:

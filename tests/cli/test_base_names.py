@@ -20,7 +20,7 @@ from spackle.bases.transformers import HfBase
 from spackle.core.photo import Photo
 from spackle.formats import PlyFile
 from spackle.paper.dataset.shards import load_manifest
-from spackle.runtime.device import MemoryShort
+from spackle.runtime.device import NotEnoughMemory
 from spackle.runtime.errors import InputError
 from spackle.runtime.progress import Progress
 
@@ -49,7 +49,7 @@ def test_a_dataset_skips_bad_photos_and_stops_without_memory(
 
     def picky(self: StandIn, photo: Photo, progress: Progress | None = None) -> BasePrediction:
         if short:
-            raise MemoryShort("not enough memory")
+            raise NotEnoughMemory("not enough memory")
         if photo.path.name == "b.png":
             raise InputError(f"{photo.path}: the model predicts 0 for every pixel")
         return work(self, photo, progress)
@@ -167,7 +167,7 @@ def test_a_photo_is_done_again_if_memory_was_short_for_a_better_base(
     tmp_path: Path, made: dict[str, Path], photos: Path, monkeypatch: pytest.MonkeyPatch, when: str
 ) -> None:
     def hungry(*args: object, **options: object) -> None:
-        raise MemoryShort("not enough memory for SHARP")
+        raise NotEnoughMemory("not enough memory for SHARP")
 
     install(made, tmp_path)
     with monkeypatch.context() as patch:

@@ -25,7 +25,7 @@ from PIL import Image
 from safetensors.torch import save_file
 
 import spackle
-from spackle.core.photo import film_to_pixels
+from spackle.core.photo import focal_mm_to_px
 from spackle.pipeline import FillOptions
 from spackle.residual.architectures import UNet
 from spackle.runtime.files import results_folder
@@ -77,7 +77,7 @@ def test_predict_writes_a_scene_a_video_and_a_report(plain: tuple[Path, Run]) ->
         "scene",
         0.07,
     )
-    assert report["focal_px"] == pytest.approx(film_to_pixels(30, WIDTH, HEIGHT), abs=1e-3)
+    assert report["focal_px"] == pytest.approx(focal_mm_to_px(30, WIDTH, HEIGHT), abs=1e-3)
     assert report["photo"] == {"file": "photo.png", "width": WIDTH, "height": HEIGHT}
     assert (report["views"], report["disparity_source"]) == ("rotate-forward", "photo")
     assert [view["view"] for view in report["hole_area_ratio"]] == ["-0.07", "+0.07"]
@@ -313,13 +313,13 @@ def test_what_is_changed_or_damaged_in_a_folder_is_redone(tmp_path: Path) -> Non
 
 def test_two_runs_never_share_a_folder(tmp_path: Path, pair: tuple[Path, Path]) -> None:
     out = tmp_path / "out"
-    with results_folder(out / "photo", alone=True):
+    with results_folder(out / "photo", locked=True):
         refuses(
             run("predict", pair[0], "--depth", pair[1], "-o", out, *SHORT),
             out / "photo",
             "another run",
         )
-    with results_folder(out, alone=True):
+    with results_folder(out, locked=True):
         refuses(
             run("predict", pair[0].parent, "--depth", pair[1], "-o", out, *SHORT),
             out,

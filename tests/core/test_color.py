@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from spackle.core.color import linear_to_srgb, srgb_to_linear, to_bytes
+from spackle.core.color import linear_to_srgb, srgb_to_linear, to_uint8
 
 
 def test_transfers_follow_the_standard_and_every_byte_survives() -> None:
@@ -16,8 +16,8 @@ def test_transfers_follow_the_standard_and_every_byte_survives() -> None:
     assert srgb_to_linear(srgb).tolist() == pytest.approx(linear, abs=1e-7)
     assert linear_to_srgb(torch.tensor(linear)).tolist() == pytest.approx(srgb.tolist(), abs=1e-6)
     levels = torch.arange(256)
-    assert torch.equal(to_bytes(linear_to_srgb(srgb_to_linear(levels / 255))).long(), levels)
-    assert to_bytes(torch.tensor([math.nan, -math.inf, -1, 0.7 / 255, 2, math.inf])).tolist() == [
+    assert torch.equal(to_uint8(linear_to_srgb(srgb_to_linear(levels / 255))).long(), levels)
+    assert to_uint8(torch.tensor([math.nan, -math.inf, -1, 0.7 / 255, 2, math.inf])).tolist() == [
         0,
         0,
         0,

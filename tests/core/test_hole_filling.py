@@ -11,14 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from spackle.core import hole_filling as filters
-from spackle.core.hole_filling import (
-    blurred,
-    broadly_blurred,
-    far_fill,
-    greatest_around,
-    nearest_known,
+from spackle.core import hole_filling
+from spackle.core.filters import (
+    approximate_gaussian_blur,
+    gaussian_blur,
+    maximum_filter,
+    nearest_known_pixels,
 )
+from spackle.core.hole_filling import fill_from_far_side
 
 
 @pytest.mark.parametrize(
@@ -36,16 +36,16 @@ def test_blur_against_a_plain_loop(size: tuple[int, int], sigma: float) -> None:
                 weight = float(np.exp(-((v - y) ** 2 + (u - x) ** 2) / (2 * sigma**2)))
                 total, mass = total + weight * pictures[..., v, u, :], mass + weight
         expected[..., y, x, :] = total / mass
-    torch.testing.assert_close(blurred(pictures, sigma), expected, rtol=1e-6, atol=0)
-    torch.testing.assert_close(blurred(pictures[1, 0].float(), sigma), expected[1, 0].float())
+    torch.testing.assert_close(gaussian_blur(pictures, sigma), expected, rtol=1e-6, atol=0)
+    torch.testing.assert_close(gaussian_blur(pictures[1, 0].float(), sigma), expected[1, 0].float())
 
 
 @pytest.mark.parametrize(
     ("size", "sigma"), [((60, 81), 5.0), ((60, 81), 0.8), ((120, 101), 20.0), ((3, 4), 9.0)]
 )
 def test_broad_blur_approximates_the_exact_blur(size: tuple[int, int], sigma: float) -> None:
-    picture = blurred(torch.rand(*size, 3, generator=torch.Generator().manual_seed(0)), 1.0)
-    exact, found = blurred(picture, sigma), broadly_blurred(picture, sigma)
+    picture = gaussian_blur(torch.rand(*size, 3, generator=torch.Generator().manual_seed(0)), 1.0)
+    exact, found = gaussian_blur(picture, sigma), approximate_gaussian_blur(picture, sigma)
     assert float((found - exact).abs().mean()) <= 0.1 * float((picture - exact).abs().mean())
 
 
@@ -56,8 +56,8 @@ def test_maximum_against_a_plain_loop(reach: int) -> None:
     expected = torch.stack(
         [pictures[:, near[y], near[x]].amax((1, 2)) for y, x in np.ndindex(7, 11)], 1
     ).view(2, 7, 11)
-    assert torch.equal(greatest_around(pictures, reach), expected)
-    assert torch.equal(greatest_around(pictures > 0.4, reach), expected > 0.4)
+    assert torch.equal(maximum_filter(pictures, reach), expected)
+    assert torch.equal(maximum_filter(pictures > 0.4, reach), expected > 0.4)
 
 
 @pytest.mark.parametrize(
@@ -66,7 +66,7 @@ def test_maximum_against_a_plain_loop(reach: int) -> None:
 def test_nearest_known_against_brute_force(size: tuple[int, int], share: float) -> None:
     hole = np.random.default_rng(1).random(size) < share
     hole[0, 0] = False
-    near, here = nearest_known(hole), np.indices(size)
+    near, here = nearest_known_pixels(hole), np.indices(size)
     found, best = (
         np.hypot(*(near - here)),
         np.hypot(*(here[..., None] - np.argwhere(~hole).T[:, None, None])).min(-1),
@@ -95,7 +95,7 @@ def test_known_pixels_stay_and_filled_ones_are_within_their_range(
     seed: int, size: tuple[int, int], bias: float, share: float
 ) -> None:
     inverse, values, known = random_scene(seed, *size, share)
-    filled, propagated = far_fill(inverse, values, known, far_bias=bias)
+    filled, propagated = fill_from_far_side(inverse, values, known, far_bias=bias)
     images, sources = (
         torch.cat([image[None], more]) for image, more in ((filled, propagated), (inverse, values))
     )
@@ -105,7 +105,7 @@ def test_known_pixels_stay_and_filled_ones_are_within_their_range(
         assert float(image.max()) <= float(source.max()) * (1 + 1e-4) + 1e-6
     for rubbish in (math.nan, 1e30):  # unknown values are ignored
         spoiled = torch.where(known, sources, rubbish)
-        again = far_fill(spoiled[0], spoiled[1:], known, far_bias=bias)
+        again = fill_from_far_side(spoiled[0], spoiled[1:], known, far_bias=bias)
         assert torch.equal(torch.cat([again[0][None], again[1]]), images)
 
 
@@ -113,10 +113,10 @@ def test_known_pixels_stay_and_filled_ones_are_within_their_range(
 def test_a_relaxed_fill_is_a_membrane_over_the_rim(
     bias: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(filters, "SWEEPS", 4000)
+    monkeypatch.setattr(hole_filling, "RELAXATION_SWEEPS", 4000)
     inverse, values, known = random_scene(7, 11, 13, 0.7)
     biases = bias * torch.rand(11, 13, generator=torch.Generator().manual_seed(1))
-    filled, propagated = far_fill(inverse, values, known, far_bias=biases)
+    filled, propagated = fill_from_far_side(inverse, values, known, far_bias=biases)
     images = torch.cat([filled[None], propagated]).double()
     for y, x in (~known).nonzero().tolist():
         mass, total = 0.0, torch.zeros(3, dtype=torch.float64)
@@ -140,8 +140,8 @@ def test_a_hole_between_near_and_far_is_filled_from_the_far_side(
     near, known = (x >= 32) if flipped else (x < 32), (x < 16) | (x >= 48)
     near, known = (near.T, known.T) if turned else (near, known)
     inverse, red = torch.where(near, 1.0, 0.2), near.float()[None]
-    filled, propagated = far_fill(inverse, red, known)
-    alike, _ = far_fill(inverse, red, known, far_bias=0.0)
+    filled, propagated = fill_from_far_side(inverse, red, known)
+    alike, _ = fill_from_far_side(inverse, red, known, far_bias=0.0)
     assert float(filled[~known].median()) < 0.3
     assert float(alike[~known].mean()) == pytest.approx(0.6, abs=0.05)
     assert float(propagated[0][~known].mean()) < 0.3

@@ -9,8 +9,8 @@ from helpers.plain_patches import Subject
 from helpers.scenes import psnr
 from torch import Tensor
 
-from spackle.core import patch_matching as room
-from spackle.core.patch_matching import JUMPS, match_patches
+from spackle.core import patch_matching
+from spackle.core.patch_matching import NEIGHBOR_STEPS, match_patches
 
 Y, X = np.indices((100, 117))
 WALL = torch.ones(Y.shape)
@@ -27,11 +27,16 @@ def test_costs_match_the_formula_and_searches_approach_the_minimum(size: tuple[i
     assert set(places[:, 0]) == {0, 1}
     np.testing.assert_allclose(costs, subject.expected(), rtol=1e-4)
     ask = (*subject.target[:2], subject.level.traits, *subject.target[3:], *cells[7], *places[7])
-    assert [room._cost(*ask, costs[7] * np.float32(k)) for k in (1.01, 0.99)] == [costs[7], np.inf]
+    assert [patch_matching._cost(*ask, costs[7] * np.float32(k)) for k in (1.01, 0.99)] == [
+        costs[7],
+        np.inf,
+    ]
     for turn in range(24):
-        jump, before = JUMPS[turn % len(JUMPS)], (places.copy(), costs.copy())
+        jump, before = NEIGHBOR_STEPS[turn % len(NEIGHBOR_STEPS)], (places.copy(), costs.copy())
         state = (*before, subject.valid, subject.pool, jump, np.uint32(turn * 7919))
-        room._search(0, len(costs), cells, subject.numbers, *state, *subject.target, places, costs)
+        patch_matching._search(
+            0, len(costs), cells, subject.numbers, *state, *subject.target, places, costs
+        )
         assert (costs <= before[1]).all()
     np.testing.assert_allclose(costs, subject.expected(), rtol=1e-4)
     assert costs.mean() < 1.06 * np.mean([subject.formula(*cell).min() for cell in cells])

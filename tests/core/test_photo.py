@@ -15,10 +15,10 @@ import torch
 from PIL import Image, ImageCms, ImageOps, TiffImagePlugin
 
 from spackle.core.photo import (
-    film_to_pixels,
     focal_from_exif,
+    focal_mm_to_px,
     load_photo,
-    pad_edge,
+    replace_border,
     resize_photo,
     working_size,
 )
@@ -68,7 +68,7 @@ def test_common_formats_are_read_upright(tmp_path: Path, suffix: str, orientatio
     if suffix not in ("tiff", "bmp"):  # Pillow writes no EXIF directory into these formats
         assert (photo.focal_source, photo.focal_px) == (
             "EXIF",
-            pytest.approx(film_to_pixels(26, 64, 32)),
+            pytest.approx(focal_mm_to_px(26, 64, 32)),
         )
 
 
@@ -117,13 +117,13 @@ def test_colour_profile(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("tags", "expected"),
     [
-        ({"film": 26, "focal": 4.2}, film_to_pixels(26, 480, 320)),
-        ({"film": 0, "focal": 50.0}, film_to_pixels(50, 480, 320)),
-        ({"focal": 4.0}, film_to_pixels(4.0 * 8.4, 480, 320)),
+        ({"film": 26, "focal": 4.2}, focal_mm_to_px(26, 480, 320)),
+        ({"film": 0, "focal": 50.0}, focal_mm_to_px(50, 480, 320)),
+        ({"focal": 4.0}, focal_mm_to_px(4.0 * 8.4, 480, 320)),
         ({"focal": 35.0, "plane_x": 2000.0, "plane_unit": 3, "pixel_x": 4800}, 35 * 200 / 10),
         (
             {"focal": 50.0, "plane_x": 1e9},
-            film_to_pixels(50, 480, 320),
+            focal_mm_to_px(50, 480, 320),
         ),  # an absurd pixel pitch is ignored
         ({"film": 65535}, None),
         ({"focal": TiffImagePlugin.IFDRational(1, 0)}, None),
@@ -134,7 +134,7 @@ def test_focal_from_exif(tmp_path: Path, tags: dict[str, Any], expected: float |
     picture(480, 320).save(tmp_path / "a.jpg", exif=exif(**tags))
     photo = load_photo(tmp_path / "a.jpg")
     assert photo.focal_source == ("EXIF" if expected else "default 30 mm")
-    assert photo.focal_px == pytest.approx(expected or film_to_pixels(30, 480, 320), rel=1e-4)
+    assert photo.focal_px == pytest.approx(expected or focal_mm_to_px(30, 480, 320), rel=1e-4)
 
 
 @pytest.mark.parametrize("value", ["4.2 mm", None, -1, math.nan, 10**400])
@@ -183,10 +183,10 @@ def test_resize(tmp_path: Path) -> None:
 def test_pad_edge_replaces_the_outermost_pixels() -> None:
     photo = torch.full((100, 400, 3), 0.5)
     photo[:, -2:], photo[0] = 1.0, 0.0
-    assert (pad_edge(photo) == 0.5).all()
+    assert (replace_border(photo) == 0.5).all()
     photo[2:-2, 2:-2] = torch.rand(96, 396, 3)
-    assert (pad_edge(photo)[2:-2, 2:-2] == photo[2:-2, 2:-2]).all()
-    assert pad_edge(photo[:3, :1]).shape == (3, 1, 3)
+    assert (replace_border(photo)[2:-2, 2:-2] == photo[2:-2, 2:-2]).all()
+    assert replace_border(photo[:3, :1]).shape == (3, 1, 3)
 
 
 def png_claiming(width: int, height: int) -> bytes:

@@ -10,7 +10,13 @@ from torch import Tensor
 
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians, quat_to_matrix
-from spackle.core.surfels import CREASE, EDGE, THICKNESS, surface_gaussians, surface_slope
+from spackle.core.surfels import (
+    CREASE_RATIO,
+    DEPTH_EDGE_RATIO,
+    SURFEL_THICKNESS_RATIO,
+    inverse_depth_slope,
+    make_surfels,
+)
 
 PROPERTY = settings(deadline=None, max_examples=40)
 SLOPES = st.floats(-0.01, 0.01)
@@ -36,9 +42,7 @@ def one_sample(
     camera: Camera, uv: Tensor, inverse: float, slope: tuple[float, float], spread: float
 ) -> Gaussians:
     grey = torch.full((1, 3), 0.5, dtype=torch.float64)
-    return surface_gaussians(
-        camera, uv[None], double(inverse), double(slope), spread, grey, double(1.0)
-    )
+    return make_surfels(camera, uv[None], double(inverse), double(slope), spread, grey, double(1.0))
 
 
 def random_image(seed: int, height: int, width: int, roughness: float) -> Tensor:
@@ -68,7 +72,7 @@ def test_in_space_a_sample_is_the_image_of_its_pixel_disc(
     down = (surface(0, step) - surface(0, -step)) / (2 * step)
     normal = torch.linalg.cross(across, down)
     normal = normal / normal.norm()
-    thickness = THICKNESS * found.scales[0, :2].min()
+    thickness = SURFEL_THICKNESS_RATIO * found.scales[0, :2].min()
     expected = spread**2 * (torch.outer(across, across) + torch.outer(down, down))
     expected += thickness**2 * torch.outer(normal, normal)
     scale = float(expected.diagonal().sum())
@@ -86,9 +90,9 @@ def plain_slope(row: list[float]) -> list[float]:
             continue
         backward = here - row[k - 1] if k > 0 else row[1] - row[0]
         forward = row[k + 1] - here if k < last else row[last] - row[last - 1]
-        slope, steepest = (backward + forward) / 2, EDGE
-        if abs(forward - backward) > CREASE * here:
-            slope, steepest = backward if abs(backward) < abs(forward) else forward, CREASE
+        slope, steepest = (backward + forward) / 2, DEPTH_EDGE_RATIO
+        if abs(forward - backward) > CREASE_RATIO * here:
+            slope, steepest = backward if abs(backward) < abs(forward) else forward, CREASE_RATIO
         slopes.append(slope if abs(slope) <= steepest * here else 0.0)
     return slopes
 
@@ -102,5 +106,5 @@ def test_slopes_match_a_plain_loop(image: tuple[int, int, int, float]) -> None:
         [plain_slope(column.tolist()) for column in inverse.T], dtype=torch.float64
     ).T
     torch.testing.assert_close(
-        surface_slope(inverse), torch.stack([across, down], dim=-1), rtol=0, atol=1e-12
+        inverse_depth_slope(inverse), torch.stack([across, down], dim=-1), rtol=0, atol=1e-12
     )

@@ -21,10 +21,10 @@ from spackle.core.trajectories import (
     KeyframePath,
     PathError,
     TrajectoryKind,
-    extremes,
-    interpolate,
-    max_offset,
-    trajectory,
+    disparity_to_offset,
+    interpolate_monotone,
+    leftmost_and_rightmost,
+    trajectory_cameras,
 )
 from spackle.render import CpuRenderer
 from spackle.residual import hole_area_ratio
@@ -52,11 +52,13 @@ def test_interpolation_passes_through_keys_and_stays_between_them(closed: bool) 
             rng.uniform(-100, 100, (count, 2)),
         )
         period = times[-1] - times[0] + 1.7 if closed else None
-        assert np.array_equal(interpolate(times, values, times, period), values)
+        assert np.array_equal(interpolate_monotone(times, values, times, period), values)
         ends = [*times, times[0] + period] if period else times
         around = np.concatenate([values, values[:1]]) if closed else values
         for k in range(len(ends) - 1):
-            between = interpolate(times, values, np.linspace(ends[k], ends[k + 1], 9), period)
+            between = interpolate_monotone(
+                times, values, np.linspace(ends[k], ends[k + 1], 9), period
+            )
             low, high = np.minimum(around[k], around[k + 1]), np.maximum(around[k], around[k + 1])
             assert ((between >= low - 1e-9) & (between <= high + 1e-9)).all()
             assert (np.diff(between, axis=0) * (around[k + 1] - around[k]) >= -1e-5).all()
@@ -68,7 +70,7 @@ def test_the_interpolation_is_scipys_monotone_cubic() -> None:
     times, values = np.cumsum(rng.uniform(0.1, 2, 9)), rng.normal(size=(9, 3))
     wanted = np.linspace(times[1], times[-2], 200)  # SciPy computes other slopes at the two ends
     expected = scipy.PchipInterpolator(times, values)(wanted)
-    np.testing.assert_allclose(interpolate(times, values, wanted), expected, atol=1e-12)
+    np.testing.assert_allclose(interpolate_monotone(times, values, wanted), expected, atol=1e-12)
 
 
 def test_frames_reach_the_keyframes_and_the_focal_length_changes() -> None:
@@ -97,7 +99,9 @@ def test_a_closed_path_does_not_repeat_its_first_view() -> None:
     assert float(jumps[0]) < 2 * float(jumps.median())
     assert len({tuple(eye.tolist()) for eye in eyes}) == 30
     in_disparity = dataclasses.replace(path, unit="disparity").cameras(CAMERA, 30, DEPTHS)
-    torch.testing.assert_close(in_disparity[7].position, max_offset(CAMERA, 1.0, DEPTHS) * eyes[7])
+    torch.testing.assert_close(
+        in_disparity[7].position, disparity_to_offset(CAMERA, 1.0, DEPTHS) * eyes[7]
+    )
     torch.testing.assert_close(
         path.at([3.0], CAMERA, DEPTHS)[0].position, eyes[0], atol=1e-6, rtol=0
     )
@@ -162,7 +166,7 @@ AWAY, NEARER = 4 * 0.2 / math.sqrt(1.04), 4 - 4 / math.sqrt(1.04)
     ],
 )
 def test_trajectories_by_hand(kind: str, frames: int, places: list[list[float]]) -> None:
-    path = trajectory(kind, PHOTO, 0.4, RANGE, frames)  # type: ignore[arg-type]
+    path = trajectory_cameras(kind, PHOTO, 0.4, RANGE, frames)  # type: ignore[arg-type]
     assert len(path) == frames
     for camera, *place in zip(path, *places, strict=True):
         assert camera.position.tolist() == pytest.approx(place, abs=1e-6)
@@ -174,7 +178,7 @@ def test_trajectories_by_hand(kind: str, frames: int, places: list[list[float]])
             assert aside == pytest.approx([200 + 500 / 4, 150], abs=1e-3)
         else:
             assert torch.equal(camera.K, PHOTO.K)
-    (alone,) = trajectory(kind, PHOTO, 0.4, RANGE, frames, only=frames // 2)  # type: ignore[arg-type]
+    (alone,) = trajectory_cameras(kind, PHOTO, 0.4, RANGE, frames, only=frames // 2)  # type: ignore[arg-type]
     assert torch.equal(alone.world_to_camera, path[frames // 2].world_to_camera)
     assert torch.equal(alone.K, path[frames // 2].K)
 
@@ -182,12 +186,12 @@ def test_trajectories_by_hand(kind: str, frames: int, places: list[list[float]])
 @pytest.mark.parametrize("kind", TRAJECTORIES)
 def test_a_looped_path_continues_at_its_beginning(kind: TrajectoryKind) -> None:
     eyes = torch.stack(
-        [view.position for view in trajectory(kind, PHOTO, 0.4, RANGE, 40, looped=True)]
+        [view.position for view in trajectory_cameras(kind, PHOTO, 0.4, RANGE, 40, looped=True)]
     )
     steps = (eyes - eyes.roll(1, 0)).norm(dim=1)
     assert float(steps[0]) <= float(steps.max())
     assert len(eyes) == 40
-    plain = torch.stack([view.position for view in trajectory(kind, PHOTO, 0.4, RANGE, 41)])
+    plain = torch.stack([view.position for view in trajectory_cameras(kind, PHOTO, 0.4, RANGE, 41)])
     assert torch.equal(eyes, plain[:40]) == (kind != "swipe")  # swipe returns
     assert float(eyes[:, 0].min()) == pytest.approx(float(plain[:, 0].min()), abs=1e-3)
 
@@ -202,7 +206,7 @@ def test_a_looped_path_continues_at_its_beginning(kind: TrajectoryKind) -> None:
 )
 def test_impossible_paths_are_refused(kind: str, disparity: float, frames: int, says: str) -> None:
     with pytest.raises(ValueError, match=says):
-        trajectory(kind, PHOTO, disparity, RANGE, frames)  # type: ignore[arg-type]
+        trajectory_cameras(kind, PHOTO, disparity, RANGE, frames)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -216,7 +220,7 @@ def test_choose_move_finds_the_largest_disparity_within_the_limit(
     gaussians, renderer = prediction.gaussians, CpuRenderer()
 
     def uncovered(disparity: float) -> float:
-        ends = extremes(scene.camera, disparity, DepthRange.of(gaussians))
+        ends = leftmost_and_rightmost(scene.camera, disparity, DepthRange.of(gaussians))
         return sum(hole_area_ratio(renderer.render(gaussians, end).alpha) for end in ends) / 2
 
     chosen = choose_disparity(prediction, renderer, photo)

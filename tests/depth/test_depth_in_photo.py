@@ -228,7 +228,7 @@ def test_huge_announced_sizes_are_refused(tmp_path: Path, monkeypatch: pytest.Mo
         if width * height > 700:
             raise InputError(f"{path}: {width}×{height} is too large")
 
-    monkeypatch.setattr(layouts, "check_pixels", small)
+    monkeypatch.setattr(layouts, "check_pixel_count", small)
     kinds = (
         "GDepth, extended: inverse, metres",
         "Dynamic Depth: inverse, metres",

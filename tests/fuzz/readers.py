@@ -31,8 +31,8 @@ from spackle.paper.evaluation.case import load_case
 from spackle.paper.evaluation.datasets import read_cases
 from spackle.paper.training.checkpoint import load_checkpoint
 from spackle.paper.training.recipe import Recipe, load_recipe
-from spackle.runtime.errors import one_line
-from spackle.runtime.files import digest_of
+from spackle.runtime.errors import printable_line
+from spackle.runtime.files import json_digest
 from spackle.weights.checkpoints import read_tensors
 
 Files = dict[str, bytes]  # name in the case's folder → content
@@ -63,7 +63,7 @@ def sealed(files: Files) -> Files:
                 sample["sha256"] = hashlib.sha256(
                     data[sample["offset"] :][: sample["size"]]
                 ).hexdigest()
-            done["manifest.json"] = json.dumps(content | {"sha256": digest_of(content)}).encode()
+            done["manifest.json"] = json.dumps(content | {"sha256": json_digest(content)}).encode()
         except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
             pass
     return done
@@ -92,7 +92,7 @@ def _only(folder: Path) -> Path:
 
 
 def _say(line: str) -> None:
-    one_line(line).encode()  # a report encodes its lines
+    printable_line(line).encode()  # a report encodes its lines
 
 
 def _read_ply(folder: Path) -> None:

@@ -11,7 +11,7 @@ from helpers.scenes import box_before_wall
 from spackle.core.camera import Camera
 from spackle.core.color import linear_to_srgb
 from spackle.core.gaussians import Gaussians
-from spackle.core.trajectories import DepthRange, extremes
+from spackle.core.trajectories import DepthRange, leftmost_and_rightmost
 from spackle.render import CpuRenderer
 from spackle.render.protocol import Rendering
 from spackle.residual import InitialGaussians, ResidualNet, ViewFeatures, initialize
@@ -39,7 +39,9 @@ def box_view(
     """A box before a wall, and a camera from which the wall behind the box is a hole."""
     scene = box_before_wall(width=width, height=height, focal=width * 80 // 96)
     context = FillContext(scene.base(), scene.camera, CPU)
-    return context, extremes(scene.camera, disparity, DepthRange.of(context.base))[side]
+    return context, leftmost_and_rightmost(scene.camera, disparity, DepthRange.of(context.base))[
+        side
+    ]
 
 
 def features_of(

@@ -6,11 +6,11 @@ import numpy as np
 import torch
 from numpy.lib.stride_tricks import sliding_window_view as windows
 
-from spackle.core import patch_matching as room
-from spackle.core.hole_filling import blurred
-from spackle.core.patch_matching import RADIUS, SIDE
+from spackle.core import patch_matching
+from spackle.core.filters import gaussian_blur
+from spackle.core.patch_matching import PATCH_RADIUS, PATCH_SIDE
 
-INNER = slice(RADIUS, -RADIUS)
+INNER = slice(PATCH_RADIUS, -PATCH_RADIUS)
 
 
 class Subject:
@@ -21,17 +21,19 @@ class Subject:
         hole = torch.zeros(height, width, dtype=torch.bool)
         hole[height // 3 : height // 2, width // 3 : width // 2] = hole[-height // 5 :, -3:] = True
         z = torch.linspace(-1.5, 0, width) + 0.1 * rgb[..., 0]
-        self.level = room._pyramid(rgb, hole, z.exp())[0]
+        self.level = patch_matching._pyramid(rgb, hole, z.exp())[0]
         self.hole, self.cells = hole.numpy(), hole.nonzero().numpy().astype(np.int32)
         self.numbers = np.where(hole, hole.flatten().cumsum(0).view_as(hole) - 1, -1).astype(
             np.int32
         )
-        usable = np.pad(~windows(self.hole, (SIDE, SIDE)).any(axis=(2, 3)), RADIUS)
+        usable = np.pad(
+            ~windows(self.hole, (PATCH_SIDE, PATCH_SIDE)).any(axis=(2, 3)), PATCH_RADIUS
+        )
         self.pool = np.argwhere(usable).astype(np.int32)
         grids = (self.level.rgb, self.level.traits, usable)
         self.sources, traits, self.valid = (np.stack([grid, grid[:, ::-1]]) for grid in grids)
         self.padded, step = (
-            np.pad(self.level.rgb, [(RADIUS, RADIUS)] * 2 + [(0, 0)]),
+            np.pad(self.level.rgb, [(PATCH_RADIUS, PATCH_RADIUS)] * 2 + [(0, 0)]),
             0.05 / max(height, width) ** 2,
         )
         self.target = (
@@ -42,7 +44,7 @@ class Subject:
             traits,
             np.float32(step),
         )
-        tones = 2**0.5 * blurred(rgb, 4.0).permute(2, 0, 1).numpy()
+        tones = 2**0.5 * gaussian_blur(rgb, 4.0).permute(2, 0, 1).numpy()
         marks = [
             0.15 * z[None] / z[~hole].std(correction=0),
             tones,
@@ -52,19 +54,19 @@ class Subject:
         every = np.argwhere(self.valid).astype(np.int32)
         self.places = every[:: len(every) // len(self.cells)][: len(self.cells)]
         self.costs = np.empty(len(self.cells), np.float32)
-        room._score(0, len(self.cells), self.cells, self.places, *self.target, self.costs)
+        patch_matching._score(0, len(self.cells), self.cells, self.places, *self.target, self.costs)
 
     def formula(self, y: int, x: int) -> np.ndarray:
         """Costs [2, height, width] of all patches and mirrored patches; infinite for patches that touch the hole."""
-        cells = np.argwhere(np.ones((SIDE, SIDE))) + np.array([y, x]) - RADIUS
+        cells = np.argwhere(np.ones((PATCH_SIDE, PATCH_SIDE))) + np.array([y, x]) - PATCH_RADIUS
         deep = np.hypot(*(cells[:, None] - np.argwhere(~self.hole)).T).min(0)
         weights = np.where(((cells >= 0) & (cells < self.hole.shape)).all(1), 0.8**deep, 0).reshape(
-            SIDE, SIDE
+            PATCH_SIDE, PATCH_SIDE
         )
-        patch = self.padded[y : y + SIDE, x : x + SIDE].transpose(2, 0, 1)
-        fit = (weights * (windows(self.sources, (SIDE, SIDE), axis=(1, 2)) - patch) ** 2).sum(
-            (-3, -2, -1)
-        )
+        patch = self.padded[y : y + PATCH_SIDE, x : x + PATCH_SIDE].transpose(2, 0, 1)
+        fit = (
+            weights * (windows(self.sources, (PATCH_SIDE, PATCH_SIDE), axis=(1, 2)) - patch) ** 2
+        ).sum((-3, -2, -1))
         total = ((self.marks - self.marks[0, :, y, x][:, None, None]) ** 2).sum(1)
         total[:, INNER, INNER] += fit / weights.sum()
         return np.where(self.valid, total, np.inf)

@@ -16,7 +16,8 @@ from torch.nn.functional import avg_pool2d, interpolate
 
 from spackle.bases.depth import lift
 from spackle.core.camera import Camera
-from spackle.core.hole_filling import blurred, far_fill
+from spackle.core.filters import gaussian_blur
+from spackle.core.hole_filling import fill_from_far_side
 from spackle.depth.depth_map import DepthMap
 from spackle.lifting import edges
 from spackle.lifting import lift as lifting
@@ -59,9 +60,9 @@ def random_map(seed: int, height: int = 13, width: int = 17) -> tuple[np.ndarray
     for _ in range(3):
         a, b, c, rise = (2 * torch.rand(4, generator=generator) - 1).tolist()
         inverse = inverse + torch.where(a * (x - 0.5) + b * (y - 0.5) > 0.2 * c, abs(rise), 0.0)
-    inverse = blurred(inverse[..., None], 0.4 + 0.5 * float(torch.rand(1, generator=generator)))[
-        ..., 0
-    ]
+    inverse = gaussian_blur(
+        inverse[..., None], 0.4 + 0.5 * float(torch.rand(1, generator=generator))
+    )[..., 0]
     inverse = inverse + 0.003 * torch.rand(height, width, generator=generator)
     known = torch.rand(height, width, generator=generator) > 0.06
     return torch.where(known, inverse, 0.0).numpy(), known.numpy()
@@ -162,9 +163,9 @@ def test_cheapest_paths_are_those_of_dijkstra(seed: int) -> None:
     )
     found, expected = settle(sampled, rgb), sampled.inverse_depth.copy()
     for state in (OPEN, HOLE):
-        far = far_fill(*map(torch.from_numpy, (expected, expected[None], sampled.state != HOLE)))[
-            0
-        ].numpy()
+        far = fill_from_far_side(
+            *map(torch.from_numpy, (expected, expected[None], sampled.state != HOLE))
+        )[0].numpy()
 
         def step(p: Pixel, q: Pixel, state: int = state, far: np.ndarray = far) -> float:
             cost = edges.CHANGE_COST * float(np.abs(rgb[p] - rgb[q]).sum())
@@ -188,7 +189,9 @@ def test_cheapest_paths_are_those_of_dijkstra(seed: int) -> None:
 )
 def test_a_smeared_outline_snaps_to_the_photos(sigma: float, factor: int) -> None:
     scene = box_before_wall(width=192, height=144, focal=200)
-    smeared = avg_pool2d(blurred(1 / scene.depth[..., None], sigma)[None, ..., 0], factor)[None]
+    smeared = avg_pool2d(gaussian_blur(1 / scene.depth[..., None], sigma)[None, ..., 0], factor)[
+        None
+    ]
     found = front(scene, map_of(smeared[0, 0]))
     ways = [
         3 * values - 0.5

@@ -26,7 +26,7 @@ from spackle.core.camera import Camera
 from spackle.core.color import srgb_to_linear
 from spackle.core.photo import Photo
 from spackle.core.photo_frame import PhotoFrame
-from spackle.core.trajectories import DepthRange, extremes, trajectory
+from spackle.core.trajectories import DepthRange, leftmost_and_rightmost, trajectory_cameras
 from spackle.depth.depth_map import DepthMap
 from spackle.lifting.quadtree import LEVELS
 from spackle.render import CpuRenderer
@@ -147,7 +147,9 @@ def test_the_holes_are_the_regions_that_a_box_uncovers(disparity: float, side: i
     near, far = 2.0, 6.0
     scene = box_before_wall(near, far)
     base = scene.lift(LEVELS).gaussians
-    camera = extremes(scene.camera, disparity, DepthRange.of(scene.lift(levels=0).gaussians))[side]
+    camera = leftmost_and_rightmost(
+        scene.camera, disparity, DepthRange.of(scene.lift(levels=0).gaussians)
+    )[side]
     box = box_mask(96, 72)
 
     def looked_up(points: Tensor) -> Tensor:
@@ -173,7 +175,7 @@ def test_the_holes_are_the_regions_that_a_box_uncovers(disparity: float, side: i
 def test_slanted_ground_has_no_pinholes(axis: int, kind: str) -> None:
     scene = slanted_plane(1.5, 6, axis)
     base = scene.lift(LEVELS).gaussians
-    for camera in trajectory(kind, scene.camera, 0.5, DepthRange.of(base), frames=9):  # type: ignore[arg-type]
+    for camera in trajectory_cameras(kind, scene.camera, 0.5, DepthRange.of(base), frames=9):  # type: ignore[arg-type]
         interior = shows_plane(scene, camera)
         assert int(interior.sum()) > 1000
         assert int(hole_mask(CPU.render(base, camera).alpha)[interior].sum()) == 0
@@ -193,7 +195,7 @@ def test_rounded_disparities_leave_no_stairs() -> None:
         (stored - 1 / scene.depth).square().mean(),
     )
     assert float(error) < 0.25 * float(before)
-    for camera in extremes(scene.camera, 0.3, DepthRange.of(base)):
+    for camera in leftmost_and_rightmost(scene.camera, 0.3, DepthRange.of(base)):
         holes = hole_mask(CPU.render(base, camera).alpha)[shows_plane(scene, camera)]
         assert float(holes.float().mean()) < 0.002
 

@@ -13,8 +13,8 @@ from torch.nn.functional import avg_pool2d, interpolate, max_pool2d
 
 from spackle.core.camera import Camera
 from spackle.core.color import srgb_to_linear
-from spackle.core.surfels import EDGE
-from spackle.core.trajectories import DepthRange, extremes
+from spackle.core.surfels import DEPTH_EDGE_RATIO
+from spackle.core.trajectories import DepthRange, leftmost_and_rightmost
 from spackle.lifting.quadtree import BEND, LEVELS, Quadtree
 from spackle.lifting.splats import layered_gaussians
 from spackle.render import CpuRenderer
@@ -47,7 +47,7 @@ def losses(picture: Tensor, height: int, width: int) -> Tensor:
 @pytest.mark.parametrize("level", [1, 2, 3])
 def test_a_blocks_loss_is_its_difference_from_interpolated_means(level: int) -> None:
     picture, inverse, slope, free = ground()
-    lost = Quadtree(picture, inverse, slope, free, LEVELS, EDGE).lost[level - 1]
+    lost = Quadtree(picture, inverse, slope, free, LEVELS, DEPTH_EDGE_RATIO).lost[level - 1]
     side, (rows, columns) = 2**level, lost.shape[:2]
     assert (rows, columns) == (27 // side, 38 // side)
     whole = picture[: rows * side, : columns * side]
@@ -73,7 +73,7 @@ def test_a_blocks_loss_is_its_difference_from_interpolated_means(level: int) -> 
 @pytest.mark.parametrize("worth", [1e-6, 1e-3, 0.02, 10.0])
 def test_a_cut_covers_every_pixel_once_and_no_other_costs_less(worth: float) -> None:
     picture, inverse, slope, free = ground()
-    tree = Quadtree(picture, inverse, slope, free, LEVELS, EDGE)
+    tree = Quadtree(picture, inverse, slope, free, LEVELS, DEPTH_EDGE_RATIO)
     single, tiles = tree.cut(worth)
     covered = single.long()
     for part in tiles:
@@ -132,7 +132,7 @@ def test_no_grid_is_visible_between_tiles_of_several_sizes(slant: float, rise: f
     away = max_pool2d(speck[None, None].float(), 7, 1, 3)[0, 0] == 0
     assert float((own.rgb - photo).abs().amax(-1)[away].max()) < (1.0 if rise == 0 else 1.5) / 255
     if rise == 0:
-        for view in extremes(camera, 0.3, DepthRange.of(base)):
+        for view in leftmost_and_rightmost(camera, 0.3, DepthRange.of(base)):
             seen = CPU.render(base, view)
             inner = max_pool2d((seen.alpha < 0.9)[None, None].float(), 9, 1, 4)[0, 0] == 0
             off = (seen.rgb - 0.3).abs().amax(-1)[inner]

@@ -15,8 +15,8 @@ from torch.nn.functional import avg_pool2d, max_pool2d
 
 from spackle.core.camera import Camera
 from spackle.core.color import linear_to_srgb, srgb_to_linear
-from spackle.core.surfels import OPACITY, surface_gaussians
-from spackle.core.trajectories import DepthRange, extremes
+from spackle.core.surfels import SURFEL_OPACITY, make_surfels
+from spackle.core.trajectories import DepthRange, leftmost_and_rightmost
 from spackle.lifting import silhouettes, splats
 from spackle.lifting.quadtree import LEVELS
 from spackle.lifting.silhouettes import find_layers
@@ -80,7 +80,10 @@ def wall_beside(scene: Scene) -> list[Tensor]:
     """[N, 3] colours of the wall in views from both sides."""
     base = scene.lift(LEVELS).gaussians
     assert psnr(CPU.render(base, scene.camera).rgb, scene.rgb) > 32
-    views = [CPU.render(base, view) for view in extremes(scene.camera, 0.3, DepthRange.of(base))]
+    views = [
+        CPU.render(base, view)
+        for view in leftmost_and_rightmost(scene.camera, 0.3, DepthRange.of(base))
+    ]
     return [seen.rgb[(seen.depth > 5) & (seen.alpha > 0.95)] for seen in views]
 
 
@@ -114,7 +117,7 @@ def test_a_mixture_is_the_renderers_picture() -> None:
     depth = (0.2 + torch.rand(n)).sort(descending=True).values
     opacity, colors = 0.2 + 0.79 * torch.rand(n), torch.rand(n, 3)
     mixed = mixture(torch.cat([uv, spread, opacity[:, None]], 1).numpy(), colors, 300, 40)
-    gaussians = surface_gaussians(camera, uv, depth, torch.zeros(n, 2), spread, colors, opacity)
+    gaussians = make_surfels(camera, uv, depth, torch.zeros(n, 2), spread, colors, opacity)
     assert psnr(linear_to_srgb(mixed), CPU.render(gaussians, camera).rgb) > 50
 
 
@@ -152,5 +155,5 @@ def test_opacities_blend_to_the_shares(seed: int) -> None:
                 min(max(x + dx, 0), inverse.shape[1] - 1),
             )
             if k != 4 and layers.ring[v, u]:
-                passes *= 1 - OPACITY * WEIGHTS[k] * opacity[v, u]
+                passes *= 1 - SURFEL_OPACITY * WEIGHTS[k] * opacity[v, u]
         assert 1 - passes * (1 - opacity[y, x]) == pytest.approx(layers.alpha[y, x], abs=0.03)

@@ -18,7 +18,7 @@ from spackle.render import CpuRenderer, get_renderer
 from spackle.render import gsplat_backend as cuda
 from spackle.render.gsplat_backend import GsplatRenderer, SetStore, load_gsplat, upper_covariances
 from spackle.render.protocol import ALPHA_MAX, Rendering
-from spackle.runtime.device import MemoryShort
+from spackle.runtime.device import NotEnoughMemory
 from spackle.runtime.errors import InputError
 
 CPU = CpuRenderer()
@@ -141,7 +141,7 @@ def test_a_shortage_of_memory_is_reported(
     gpu: GsplatRenderer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(cuda, "MOST_ENTRIES", 10)
-    with pytest.raises(MemoryShort, match=f"{len(BASE):,} Gaussians at 45×35"):
+    with pytest.raises(NotEnoughMemory, match=f"{len(BASE):,} Gaussians at 45×35"):
         gpu.render(BASE, SIDE)
 
 

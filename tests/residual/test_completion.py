@@ -14,8 +14,8 @@ from torch import Tensor
 from spackle.core.camera import Camera
 from spackle.core.color import linear_to_srgb, srgb_to_linear
 from spackle.core.gaussians import Gaussians
-from spackle.core.surfels import surface_gaussians
-from spackle.core.trajectories import DepthRange, extremes
+from spackle.core.surfels import make_surfels
+from spackle.core.trajectories import DepthRange, leftmost_and_rightmost
 from spackle.render.protocol import Rendering
 from spackle.render.reference import ReferenceRenderer
 from spackle.residual import InitialGaussians, ResidualNet, ViewFeatures, complete_view, initialize
@@ -49,7 +49,7 @@ def augmented(
         for c, d in zip(seeds.rgb[row, column], delta[10:13], strict=True)
     ]
     opacity = sigmoid(logit(0.99) + delta[13])
-    surfel = surface_gaussians(
+    surfel = make_surfels(
         camera, torch.tensor([[u, v]]), torch.tensor([inverse]), seeds.slope[row, column][None], 1.3,
         srgb_to_linear(torch.tensor([rgb])), torch.tensor([opacity]),
     )  # fmt: skip
@@ -93,7 +93,7 @@ def paper(
 def test_a_completed_view_matches_the_equations(size: tuple[int, int]) -> None:
     scene = box_before_wall(width=size[0], height=size[1], focal=40)
     base, network = scene.base(), random_network()
-    camera = extremes(scene.camera, 0.3, DepthRange.of(base))[1]
+    camera = leftmost_and_rightmost(scene.camera, 0.3, DepthRange.of(base))[1]
     aux = complete_view(base, camera, scene.camera, CPU, network, precision="fp32")
     with torch.no_grad():
         expected, final = paper(base, camera, scene.camera, network)

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from spackle.core.camera import Camera
-from spackle.core.surfels import BEHIND
+from spackle.core.surfels import BEHIND_SURFACE_RATIO
 from spackle.residual import CELL, ViewFeatures, initialize
 from spackle.residual.features import cell_centers
 from spackle.residual.initializer import BLOB_CELLS, inside_photo
@@ -38,7 +38,9 @@ def test_seeds_lie_behind_visible_surfaces(seed: int, size: tuple[int, int]) -> 
     assert 0 <= float(seeds.rgb.min()) <= float(seeds.rgb.max()) <= 1
     seen = torch.where(features.inverse_depth > 0, features.inverse_depth, torch.inf)
     farthest = -max_pool2d(-seen[None], 2 * BLOB_CELLS + 1, 1, BLOB_CELLS)[0]
-    assert bool((seeds.inverse_depth <= farthest * (1 - BEHIND / 2))[features.mask].all())
+    assert bool(
+        (seeds.inverse_depth <= farthest * (1 - BEHIND_SURFACE_RATIO / 2))[features.mask].all()
+    )
     chosen = seeds.select(features.mask)
     for name in ("uv", "inverse_depth", "slope", "rgb"):
         assert torch.equal(getattr(chosen, name), getattr(seeds, name)[features.mask])

@@ -20,10 +20,15 @@ from helpers.scenes import (
 )
 
 from spackle.core.camera import Camera
-from spackle.core.color import to_bytes
+from spackle.core.color import to_uint8
+from spackle.core.filters import maximum_filter
 from spackle.core.gaussians import Gaussians
-from spackle.core.hole_filling import greatest_around
-from spackle.core.trajectories import DepthRange, TrajectoryKind, extremes, trajectory
+from spackle.core.trajectories import (
+    DepthRange,
+    TrajectoryKind,
+    leftmost_and_rightmost,
+    trajectory_cameras,
+)
 from spackle.residual import ViewFeatures, hole_area_ratio, hole_mask, initialize
 from spackle.residual.architectures import UNet
 from spackle.residual.initializer import inside_photo
@@ -44,7 +49,9 @@ def path_of(
     disparity: float = 0.3,
     frames: int = FRAMES,
 ) -> list[Camera]:
-    return trajectory(kind, context.photo_camera, disparity, DepthRange.of(context.base), frames)
+    return trajectory_cameras(
+        kind, context.photo_camera, disparity, DepthRange.of(context.base), frames
+    )
 
 
 @pytest.mark.parametrize("network", [False, True])
@@ -111,7 +118,7 @@ def test_an_underlay_is_hidden_and_closes_holes_of_neighbours() -> None:
     uv, z = camera.project(beneath.means)
     column, row = (uv / 2).floor().long().unbind(-1)
     assert bool((z > 0).all())
-    assert bool((greatest_around(mask, REACH_CELLS) & ~mask)[row, column].all())
+    assert bool((maximum_filter(mask, REACH_CELLS) & ~mask)[row, column].all())
     assert bool((row % COARSE == 0).all() and (column % COARSE == 0).all())
     beside = [path[index + step] for step in (-8, -4, 4, 8)]
     open_before, open_after = (
@@ -138,7 +145,7 @@ def test_an_underlay_is_not_visible_in_the_opposite_view(monkeypatch: pytest.Mon
     pole[:, 44:54] = True
     scene = dataclasses.replace(scene, depth=torch.where(pole, 2.0, 6.0))
     context = FillContext(scene.base(), scene.camera, CPU)
-    sides = extremes(scene.camera, 0.3, DepthRange.of(context.base))
+    sides = leftmost_and_rightmost(scene.camera, 0.3, DepthRange.of(context.base))
     aux = fill_scene(context, sides, exact=True).aux
     assert int((aux.colors == green).all(-1).sum()) > 20
     shown = [CPU.render([context.base, aux], camera).rgb for camera in sides]
@@ -150,7 +157,7 @@ def test_an_underlay_is_not_visible_in_the_opposite_view(monkeypatch: pytest.Mon
 
 def test_an_underlay_is_not_visible_beyond_the_border(monkeypatch: pytest.MonkeyPatch) -> None:
     context, _ = box_view()
-    sides = extremes(context.photo_camera, 0.6, DepthRange.of(context.base))
+    sides = leftmost_and_rightmost(context.photo_camera, 0.6, DepthRange.of(context.base))
     aux = fill_scene(context, sides, exact=True).aux
     monkeypatch.setattr(fill, "rim_underlay", lambda *given: Gaussians.empty())
     bare = fill_scene(context, sides, exact=True).aux
@@ -170,7 +177,7 @@ def test_half_of_the_frames_are_visited_and_all_are_filled(kind: TrajectoryKind)
     path = path_of(context, kind)
     views = [
         *path,
-        *extremes(context.photo_camera, 0.3, DepthRange.of(context.base)),
+        *leftmost_and_rightmost(context.photo_camera, 0.3, DepthRange.of(context.base)),
     ]  # as the command line adds them
     filled = fill_scene(context, views, progress=lambda done, total: calls.append((done, total)))
     visits = len(views) // 2
@@ -178,7 +185,7 @@ def test_half_of_the_frames_are_visited_and_all_are_filled(kind: TrajectoryKind)
     after = [CPU.render([context.base, filled.aux], camera) for camera in views]
     assert len(filled.pictures) > 3
     for index, picture in filled.pictures.items():  # equal to the final scene, bit for bit
-        assert torch.equal(picture, to_bytes(after[index].rgb))
+        assert torch.equal(picture, to_uint8(after[index].rgb))
     left = [hole_area_ratio(view.alpha) for view in after]
     assert max(left) <= 2e-3
     assert sum(left) / len(left) <= 5e-4
@@ -212,6 +219,6 @@ def test_motorcycle_is_filled_and_visible_pixels_stay() -> None:
     whole = fill_scene(context, path_of(context, "swipe", frames=5)).aux
     for new in (aux, whole):
         assert psnr(CPU.render([context.base, new], found.camera).rgb, photo.rgb) >= 45
-    for camera in extremes(found.camera, 0.3, DepthRange.of(context.base)):
+    for camera in leftmost_and_rightmost(found.camera, 0.3, DepthRange.of(context.base)):
         assert holes_of(camera, context.base) > 0.2
         assert holes_of(camera, context.base, whole) <= 0.03 * holes_of(camera, context.base)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
-from spackle.core.surfels import BEHIND
+from spackle.core.surfels import BEHIND_SURFACE_RATIO
 from spackle.scene_fill import OcclusionGuard
 from spackle.scene_fill.occlusion_guard import (
     MAX_REACH_PX,
@@ -56,7 +56,7 @@ def plain_push(
             for j, i in itertools.product(range(-down, down + 1), range(-across, across + 1)):
                 row_, column = math.floor(v + 2 * WINDOW_PX * j), math.floor(u + 2 * WINDOW_PX * i)
                 seen = guard.depth[min(max(row_, 0), height - 1), min(max(column, 0), width - 1)]
-                if float(z) < float(seen) * (1 + BEHIND):
+                if float(z) < float(seen) * (1 + BEHIND_SURFACE_RATIO):
                     return True
         return False
 

@@ -13,10 +13,10 @@ from helpers.plain_patches import Subject
 from torch import Tensor
 
 from spackle.core.camera import Camera
-from spackle.core.hole_filling import blurred, greatest_around
+from spackle.core.filters import gaussian_blur, maximum_filter
 from spackle.core.patch_matching import Patches
-from spackle.core.surfels import PIXEL_SPREAD
-from spackle.core.trajectories import DepthRange, trajectory
+from spackle.core.surfels import PIXEL_SIGMA_PX
+from spackle.core.trajectories import DepthRange, trajectory_cameras
 from spackle.inpaint import InpainterOptions
 from spackle.inpaint.plain import PlainInpainter
 from spackle.residual import InitialGaussians, hole_mask
@@ -39,7 +39,7 @@ def test_sharpening_balances_overlap(period: float) -> None:
     def strength(colors: Tensor) -> float:
         grid = (uv, 1 / depths, torch.zeros_like(uv), 0.5 + colors)
         blobs = compose(
-            InitialGaussians(*(field.flatten(0, 1) for field in grid)), None, camera, PIXEL_SPREAD
+            InitialGaussians(*(field.flatten(0, 1) for field in grid)), None, camera, PIXEL_SIGMA_PX
         )
         shown, truth = (image[4:-4, 4:-4] for image in (CPU.render(blobs, camera).rgb, wanted))
         return float(((shown - shown.mean((0, 1))) * truth).sum() / truth.square().sum())
@@ -80,12 +80,14 @@ def test_painted_textures_are_visible(size: tuple[int, int], threshold: float) -
     assert torch.equal(rgb[0], view.rgb)
     assert torch.equal(asked[0], hole)
     torch.testing.assert_close(inverse_depth[0], torch.where(hole, 0, 1 / view.depth))
-    inner = ~greatest_around(~hole, 2)
+    inner = ~maximum_filter(~hole, 2)
     assert int(inner.sum()) > 2000
     assert float((filled.rendering.rgb - ramp(*hole.shape))[inner].abs().mean()) < 0.01
     assert bool((filled.aux.colors.sum(-1) > 0).all())  # no black cells
     painter.asked.clear()
-    path = trajectory("rotate-forward", context.photo_camera, 0.4, DepthRange.of(context.base), 9)
+    path = trajectory_cameras(
+        "rotate-forward", context.photo_camera, 0.4, DepthRange.of(context.base), 9
+    )
     assert len(fill_scene(context, path, exact=True).aux)
     assert len(painter.asked) == OPPOSITE  # only the widest views
 
@@ -109,7 +111,9 @@ def test_texture_has_no_low_frequencies() -> None:
     )
     fine, mask = found - plain, view.features.mask
     assert float(room.in_cells(fine)[mask].abs().mean()) > 1e-3
-    assert float(blurred(fine, 4 * room.TEXTURE_PX).abs().max()) < 0.1 * float(fine.abs().max())
+    assert float(gaussian_blur(fine, 4 * room.TEXTURE_PX).abs().max()) < 0.1 * float(
+        fine.abs().max()
+    )
     assert torch.equal(room.in_cells(plain)[~mask], room.in_cells(view.rendering.rgb)[~mask])
 
 

@@ -12,8 +12,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from spackle.core.camera import Camera
-from spackle.core.color import INFERNO, UNKNOWN_GREY, DepthColors, linear_to_srgb, srgb_to_linear
-from spackle.core.trajectories import DepthRange, trajectory
+from spackle.core.color import (
+    INFERNO_COLORS,
+    UNKNOWN_DEPTH_GREY,
+    DepthColorScale,
+    linear_to_srgb,
+    srgb_to_linear,
+)
+from spackle.core.trajectories import DepthRange, trajectory_cameras
 from spackle.render import CpuRenderer
 from spackle.video.frames import FrameMaker, Stereo, VideoOptions, anaglyph, default_ipd
 
@@ -77,24 +83,24 @@ def test_an_anaglyph_of_grey_is_grey_and_each_eye_has_its_filter() -> None:
 
 
 def test_depth_colours_are_linear_in_inverse_depth() -> None:
-    colors = DepthColors(near=1.0, far=5.0)
+    colors = DepthColorScale(near=1.0, far=5.0)
     shown = colors(1 / torch.linspace(1 / 5, 1, 17)[None], torch.ones(1, 17, dtype=torch.bool))[0]
-    torch.testing.assert_close(shown, torch.tensor(INFERNO), atol=1e-4, rtol=0)
+    torch.testing.assert_close(shown, torch.tensor(INFERNO_COLORS), atol=1e-4, rtol=0)
     assert bool(((shown @ torch.tensor([0.2126, 0.7152, 0.0722])).diff() > 0).all())
     odd = colors(torch.tensor([[0.0, 0.5, 50.0]]), torch.tensor([[False, True, True]]))[0]
-    assert odd[0].tolist() == [UNKNOWN_GREY] * 3
-    torch.testing.assert_close(odd[1:], torch.tensor([INFERNO[-1], INFERNO[0]]))
+    assert odd[0].tolist() == [UNKNOWN_DEPTH_GREY] * 3
+    torch.testing.assert_close(odd[1:], torch.tensor([INFERNO_COLORS[-1], INFERNO_COLORS[0]]))
 
 
 def test_depth_colours_of_a_video_share_one_scale() -> None:
     scene = box_before_wall(near=2.0, far=6.0)
     base = scene.base()
-    path = trajectory("rotate-forward", scene.camera, 0.3, DepthRange.of(base), 5)
-    scale = DepthColors.over(base, path)
+    path = trajectory_cameras("rotate-forward", scene.camera, 0.3, DepthRange.of(base), 5)
+    scale = DepthColorScale.over(base, path)
     assert (scale.near, scale.far) == pytest.approx((2.0, 6.0), rel=0.25)
     film = FrameMaker.of(VideoOptions(show="depth"), base, path, Path("x"))
     for camera in path:
         frame = film.frame([CpuRenderer().render(base, camera)])
         assert float(frame[36, 48].sum()) > float(frame[2, 48].sum()) + 1  # the box, and a corner
     with pytest.raises(ValueError, match="in view"):
-        DepthColors.over(base, [CAMERA.looking(torch.zeros(3), torch.tensor([0.0, 0.0, -1.0]))])
+        DepthColorScale.over(base, [CAMERA.looking(torch.zeros(3), torch.tensor([0.0, 0.0, -1.0]))])

@@ -27,11 +27,11 @@ from torch import Tensor
 
 from spackle.core.camera import Camera
 from spackle.core.trajectories import (
-    OVERSCAN,
+    DEFAULT_OVERSCAN,
     SHARP_TRAJECTORIES,
     DepthRange,
     TrajectoryKind,
-    trajectory,
+    trajectory_cameras,
 )
 from spackle.formats.html import PageScene, page_scene, read_page_file, single_html
 from spackle.pipeline import complete
@@ -57,7 +57,9 @@ def box() -> Scene:
     prediction = box_before_wall(width=64, height=48, focal=53).lift()
     depths = DepthRange.of(prediction.gaussians)
     return complete(
-        prediction, trajectory("swipe", prediction.camera.even(), 0.35, depths, 4), network=None
+        prediction,
+        trajectory_cameras("swipe", prediction.camera.even(), 0.35, depths, 4),
+        network=None,
     )
 
 
@@ -170,7 +172,7 @@ def camera_of(page: Any, width: int, height: int) -> Camera:
     """A camera of Spackle at the position of the page's camera."""
     eye = torch.tensor(page.evaluate("spackle.pose().eye"))
     focus = torch.tensor([0.0, 0.0, DepthRange.of(box().base).focus])
-    return box().camera.resized(width, height).zoomed(1 + OVERSCAN).looking(eye, focus)
+    return box().camera.resized(width, height).zoomed(1 + DEFAULT_OVERSCAN).looking(eye, focus)
 
 
 def hole_and_rest(page: Any, height: int, width: int) -> tuple[Tensor, Tensor]:
@@ -198,7 +200,7 @@ def test_the_single_file_opens_from_a_disk_and_asks_nobody(shown: Opened) -> Non
 
 @pytest.mark.parametrize("kind", SHARP_TRAJECTORIES)
 def test_the_page_goes_where_the_trajectory_goes(page: Any, kind: TrajectoryKind) -> None:
-    cameras = trajectory(kind, box().camera, 0.45, DepthRange.of(box().base), 121)
+    cameras = trajectory_cameras(kind, box().camera, 0.45, DepthRange.of(box().base), 121)
     places = [0, 17, 60, 61, 103, 120]
     eyes = page.evaluate(
         "([kind, places]) => places.map((k) => spackle.eye(kind, 0.45, k / 120))", [kind, places]

@@ -36,7 +36,7 @@ from helpers.web_client import (
 from PIL import Image
 
 from spackle.runtime.errors import InputError
-from spackle.runtime.task_process import DIED
+from spackle.runtime.task_process import WORKER_DIED
 from spackle.web.app import safe_display_name
 from spackle.web.jobs import RetentionLimits
 
@@ -349,7 +349,11 @@ def test_a_name_is_safe_to_show() -> None:
 
 @pytest.mark.parametrize(
     ("how", "error"),
-    [("bad", "bad.png: no depth at all"), ("bug", "internal error: KeyError: 'oh'"), ("die", DIED)],
+    [
+        ("bad", "bad.png: no depth at all"),
+        ("bug", "internal error: KeyError: 'oh'"),
+        ("die", WORKER_DIED),
+    ],
 )
 def test_an_error_is_one_line(server: Served, how: str, error: str) -> None:
     id = server.send(name=f"{how}.png").json["id"]

@@ -7,7 +7,7 @@ from typing import Protocol
 
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
-from spackle.core.photo import Photo, film_to_pixels
+from spackle.core.photo import Photo, focal_mm_to_px
 from spackle.runtime.progress import Progress
 
 USUAL_DISPARITY = (
@@ -57,5 +57,5 @@ SEEN_LENSES_MM = (
 
 def is_plausible_focal(focal_px: float, width: int, height: int) -> bool:
     """Whether a focal length that a network estimates is plausible for a photo of this size."""
-    shortest, longest = (film_to_pixels(mm, width, height) for mm in SEEN_LENSES_MM)
+    shortest, longest = (focal_mm_to_px(mm, width, height) for mm in SEEN_LENSES_MM)
     return shortest <= focal_px <= longest

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from spackle.bases import BasePrediction
 from spackle.core.camera import Camera
-from spackle.core.photo import Photo, pad_edge, resize_photo
+from spackle.core.photo import Photo, replace_border, resize_photo
 from spackle.depth.depth_map import DepthMap
 from spackle.lifting.lift import lift_depth_map
 from spackle.lifting.quadtree import LEVELS
@@ -53,7 +53,7 @@ class RgbdBase:
 
 def lift_guess(photo: Photo, depth: DepthMap, camera: Camera) -> BasePrediction:
     """Lift a photo with the depth that a network predicts; the photo's outermost lines are replaced first."""
-    return lift(pad_edge(photo.rgb), depth, camera)
+    return lift(replace_border(photo.rgb), depth, camera)
 
 
 def lift(rgb: Tensor, depth: DepthMap, camera: Camera, levels: int = LEVELS) -> BasePrediction:

@@ -20,7 +20,7 @@ from spackle.bases import BasePrediction
 from spackle.bases.depth import lift_guess
 from spackle.core.photo import Photo, resize_photo
 from spackle.depth.depth_map import NEAREST_M, DepthMap, nearest
-from spackle.runtime.device import own_arithmetic, pick_device
+from spackle.runtime.device import pick_device, without_autocast_or_tf32
 from spackle.runtime.errors import InputError
 from spackle.runtime.progress import Progress
 from spackle.weights.checkpoints import load_strict, read_tensors, to_channels_last
@@ -316,7 +316,7 @@ class LiteBase:
         size = network_size(picture.shape[2], picture.shape[3], scale.pixels)
         seen = interpolate(picture, size=size, mode="bicubic", antialias=True).clamp(0, 1)
         ways = torch.cat([seen, seen.flip(-1)]) if scale.mirrored else seen
-        with own_arithmetic(self.device):
+        with without_autocast_or_tf32(self.device):
             outputs = self.networks[scale.network](
                 ways.contiguous(memory_format=torch.channels_last)
             ).float()

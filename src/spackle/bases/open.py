@@ -22,7 +22,7 @@ from spackle.bases.transformers import HfBase
 from spackle.core.photo import Photo
 from spackle.depth.depth_map import DepthMap, find_depth, load_depth
 from spackle.depth.in_photo.layouts import load_photo_depth
-from spackle.runtime.device import MemoryShort
+from spackle.runtime.device import NotEnoughMemory
 from spackle.runtime.errors import InputError
 from spackle.runtime.progress import Progress
 
@@ -171,13 +171,13 @@ class OpenedBase:
             except InputError as error:
                 shared = name != RGBD or name in self._loaded
                 for_good = shared and (
-                    base is None or isinstance(error, MemoryShort)
+                    base is None or isinstance(error, NotEnoughMemory)
                 )  # another photo does not help
                 if for_good and len(self.candidates) == 1:
                     raise BaseError(str(error)) from error
                 if name == list(self.candidates)[-1] or isinstance(error, BaseError):
                     raise
-                reasons.append((f"{title} cannot be used", isinstance(error, MemoryShort)))
+                reasons.append((f"{title} cannot be used", isinstance(error, NotEnoughMemory)))
                 failures.append(f"{title}: {error}")
                 log(f"{photo.path.name}: going on without {title}: {error}")
                 if for_good:

@@ -23,7 +23,13 @@ from spackle.bases.depth import lift_guess
 from spackle.core.camera import Camera
 from spackle.core.photo import Photo, resize_photo
 from spackle.depth.depth_map import NEAREST_M, DepthMap, is_depth, nearest
-from spackle.runtime.device import Precision, enough_memory, own_arithmetic, pick_device, pick_dtype
+from spackle.runtime.device import (
+    Precision,
+    pick_device,
+    pick_dtype,
+    report_memory_shortage,
+    without_autocast_or_tf32,
+)
 from spackle.runtime.errors import InputError, as_input_error, reason_in_a_line
 from spackle.runtime.progress import Progress
 
@@ -82,7 +88,7 @@ class HfBase:
         )
         transformers = _transformers()
         problem = "cannot be loaded ({reason}): check name and network, or give a folder with all the model's files"
-        with as_input_error(name, problem), enough_memory("give a smaller model"):
+        with as_input_error(name, problem), report_memory_shortage("give a smaller model"):
             try:
                 network, prepare, meaning = _read(transformers, source, name, from_hub=False)
             except OSError:  # the hub's cache lacks a file
@@ -106,7 +112,7 @@ class HfBase:
         """
         photo = resize_photo(photo)
         problem = f"{self.name} fails ({{reason}}): give another photo or model"
-        with as_input_error(photo.path, problem), enough_memory("give a smaller model"):
+        with as_input_error(photo.path, problem), report_memory_shortage("give a smaller model"):
             raw, fov = self._ask(photo.rgb)
         camera, lens_source = photo.camera, ""
         if fov is not None and 0 < fov < 180 and photo.focal_source.startswith("default"):
@@ -134,7 +140,7 @@ class HfBase:
         """The network's output [h, w] float32 on the CPU, and the horizontal field of view if it predicts one."""
         pixels, window = self.prepare(rgb)
         device = next(self.network.parameters()).device
-        with own_arithmetic(device):
+        with without_autocast_or_tf32(device):
             output = self.network(pixel_values=pixels.to(device))
         raw, fov = output.predicted_depth.float().cpu(), getattr(output, "field_of_view", None)
         sides = (raw.shape[1], raw.shape[1], raw.shape[2], raw.shape[2])

@@ -17,7 +17,7 @@ from typer.exceptions import TyperException
 
 from spackle.cli import commands, dataset, evaluate, train, weights
 from spackle.cli.options import INTERRUPTED
-from spackle.runtime.errors import InputError, one_line
+from spackle.runtime.errors import InputError, printable_line
 
 app = typer.Typer(
     name="spackle",
@@ -131,7 +131,7 @@ def _end(number: int, frame: object) -> NoReturn:
 
 
 def _fail(message: str) -> NoReturn:
-    line = one_line(message)
+    line = printable_line(message)
     print(f"error: {line}", file=sys.stderr)
     if "--json" in sys.argv:
         print(json.dumps({"error": line}))

@@ -49,7 +49,7 @@ def run_demo(output: Path, reporter: Reporter) -> None:
         )
     )
     renderer = pipeline.renderer
-    with results_folder(output, FILES, alone=True):
+    with results_folder(output, FILES, locked=True):
         start = time.perf_counter()
         photo = Photo(pair.left, pair.left_camera.focal[0], "calibration", Path("Motorcycle"))
         done = pipeline.complete(photo, reporter)

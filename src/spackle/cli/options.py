@@ -217,7 +217,7 @@ def path_options(
     Raises:
         InputError: an option would have no effect, because --path or --cameras sets the views.
     """
-    from spackle.core.trajectories import OVERSCAN
+    from spackle.core.trajectories import DEFAULT_OVERSCAN
     from spackle.video.frames import VideoOptions, parse_size
     from spackle.views import PathOptions
 
@@ -244,7 +244,7 @@ def path_options(
         ipd=ipd,
         convergence=convergence,
     )
-    kind, zoom = trajectory or "rotate-forward", OVERSCAN if overscan is None else overscan
+    kind, zoom = trajectory or "rotate-forward", DEFAULT_OVERSCAN if overscan is None else overscan
     return PathOptions(
         trajectory=kind,
         disparity=disparity,

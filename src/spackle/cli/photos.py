@@ -29,15 +29,15 @@ from spackle.runtime.device import thread_count
 from spackle.runtime.errors import InputError
 from spackle.runtime.files import (
     check_file,
-    digest_of,
-    files_in,
-    fingerprint,
+    file_fingerprint,
+    json_digest,
+    list_files,
     matches_records,
     results_folder,
 )
 from spackle.runtime.kernels import is_compiled
-from spackle.runtime.progress import BufferedReporter, Reporter, asked_to_stop
-from spackle.runtime.workers import parallel_map, threads_of_torch
+from spackle.runtime.progress import BufferedReporter, Reporter, catch_stop_signals
+from spackle.runtime.workers import parallel_map, torch_threads
 from spackle.video.frames import video_problem
 from spackle.weights import installed_weights
 
@@ -118,11 +118,11 @@ def predict_all(
     if single:
         check_file(named[0].path, "photo")
     shared = _shared_digest(options)
-    with results_folder(output, alone=not single):
+    with results_folder(output, locked=not single):
         predictor = Predictor(output, options, shared, single, pipeline, reporter.verbose)
         left = predictor.left(named, reporter)
         if count == 1:
-            with threads_of_torch(threads):
+            with torch_threads(threads):
                 failed = sum(not predictor.predict(photo, reporter) for photo in left)
         else:
             open_predictor = partial(Predictor.open, output, options, shared, reporter.verbose)
@@ -153,7 +153,7 @@ def find_photos(given: Sequence[Path]) -> list[NamedPhoto]:
     photos: list[Path] = []
     for path in given:
         matches = [] if os.path.lexists(path) else map(Path, sorted(glob.glob(str(path))))
-        found = files_in(path, PHOTO_SUFFIXES) if os.path.isdir(path) else list(matches) or [path]
+        found = list_files(path, PHOTO_SUFFIXES) if os.path.isdir(path) else list(matches) or [path]
         if not found:
             raise InputError(
                 f"{path}: no photos in this folder (looked for {', '.join(PHOTO_SUFFIXES)})"
@@ -192,7 +192,7 @@ def _predict_by_workers(
     failed = 0
     done = ready = total - len(left)
     with (
-        asked_to_stop(alone=True) as stop,
+        catch_stop_signals(single_process=True) as stop,
         reporter.steps("photos", ready, total) as step,
         parallel_map(open_predictor, left, stop, count=count, threads=threads, gpu=gpu) as results,
     ):
@@ -247,16 +247,16 @@ class Predictor:
 
     def request(self, photo: NamedPhoto) -> str:
         """A digest of all that a photo's results depend on; InputError if the photo or depth map is missing."""
-        files, depth = [fingerprint(photo.path, "photo")], self.options.scene.base.depth
+        files, depth = [file_fingerprint(photo.path, "photo")], self.options.scene.base.depth
         if isinstance(depth, Path):
             depth = find_depth(depth, photo.path)
-            files.append(fingerprint(depth, "depth map"))
+            files.append(file_fingerprint(depth, "depth map"))
             files += [
-                fingerprint(file, "calibration")
+                file_fingerprint(file, "calibration")
                 for file in calibrations_beside(depth)
                 if file.is_file()
             ]
-        return digest_of([self.shared, *files])
+        return json_digest([self.shared, *files])
 
     def make(self, photo: NamedPhoto) -> Predicted:
         notes = BufferedReporter(self.verbose)
@@ -296,7 +296,9 @@ def _shared_digest(options: PredictOptions) -> str:
         "weights": fill.file,
     }
     files |= {"LaMa": installed_weights("lama") if fill.texture == "lama" else None, **base.files}
-    prints = {kind: fingerprint(file, kind) for kind, file in files.items() if file is not None}
+    prints = {
+        kind: file_fingerprint(file, kind) for kind, file in files.items() if file is not None
+    }
     name = (
         base.named if base.folder is None else "hf"
     )  # digests identify the folder, wherever it lies
@@ -306,4 +308,6 @@ def _shared_digest(options: PredictOptions) -> str:
     )
     path = dataclasses.replace(path, cameras=None, path=None)
     choices = [dataclasses.asdict(each) for each in (base, path, options.photo)]
-    return digest_of([spackle.__version__, *choices, fill.weights, fill.texture, fill.mode, prints])
+    return json_digest(
+        [spackle.__version__, *choices, fill.weights, fill.texture, fill.mode, prints]
+    )

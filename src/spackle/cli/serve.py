@@ -18,11 +18,11 @@ from typing import NamedTuple
 from spackle.bases.open import open_base
 from spackle.bases.settings import AUTO, RGBD, BaseSettings
 from spackle.cli.saved_scene import page_name
-from spackle.core.photo import check_shape, load_photo
+from spackle.core.photo import check_photo_size, load_photo
 from spackle.formats.scene_files import scene_suffix
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import check_file
-from spackle.runtime.progress import Reporter, asked_to_stop
+from spackle.runtime.progress import Reporter, catch_stop_signals
 from spackle.scene import Scene
 from spackle.views import PathOptions
 from spackle.web.app import create_app, make_server
@@ -97,7 +97,7 @@ def _checked(
             Scene.load(target, **lens).page(target.name)
         return page_name(target)
     photo = load_photo(target, keep_frame=keep_frame or settings.depth is not None, **lens)
-    check_shape(photo.width, photo.height, photo.path)
+    check_photo_size(photo.width, photo.height, photo.path)
     if settings.checkpoint is not None:
         check_file(settings.checkpoint, "file of weights")
     if settings.depth is not None:
@@ -133,7 +133,7 @@ def listening(
 ) -> Iterator[tuple[Jobs, list[str]]]:
     """Yield the app's jobs and the page's addresses; after the block, answer requests until Ctrl-C or SIGTERM."""
     with (
-        asked_to_stop(alone=True) as stopped,
+        catch_stop_signals(single_process=True) as stopped,
         listener_at(place.host, place.port) as listener,
         logged_to(reporter),
     ):

@@ -49,7 +49,7 @@ def weights_get(
     summary = f"{name}: {decimal(entry.bytes)}, SHA-256 {entry.sha256}"
     new = force or not os.path.isfile(path)
     if new:
-        with results_folder(path.parent, [path.name], alone=True), reporter.transfer(name) as step:
+        with results_folder(path.parent, [path.name], locked=True), reporter.transfer(name) as step:
             download(url or entry.address, path, entry.bytes, entry.sha256, step)
         for line in entry.notice:  # without a download no licence applies
             reporter.log(line)

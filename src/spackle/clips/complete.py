@@ -18,7 +18,7 @@ from spackle.clips.temporal import (
 )
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
-from spackle.core.trajectories import DepthRange, TrajectoryKind, trajectory
+from spackle.core.trajectories import DepthRange, TrajectoryKind, trajectory_cameras
 from spackle.render import Renderer
 from spackle.render.protocol import Rendering
 from spackle.residual import ResidualNet, hole_mask
@@ -84,7 +84,7 @@ class ClipCompleter:
         base, guard, now, past = self._aligned(rgb, prediction)
         even = prediction.camera.even()
         disparity = prediction.disparity if self.disparity is None else self.disparity
-        (camera,) = trajectory(
+        (camera,) = trajectory_cameras(
             self.trajectory, even, disparity, now.depths, self.frames, only=self._count
         )
         camera = camera.zoomed(1 + self.overscan)

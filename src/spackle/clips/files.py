@@ -19,7 +19,7 @@ from av.video.reformatter import VideoReformatter
 from av.video.stream import VideoStream
 from torch import Tensor
 
-from spackle.core.photo import check_pixels
+from spackle.core.photo import check_pixel_count
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import check_file
 from spackle.runtime.progress import Progress
@@ -140,7 +140,7 @@ def _read_clip(path: str | os.PathLike[str], first: int | None, progress: Progre
     width, height = _square_size(frame, aspect)
     if _quarters(frame) % 2:
         width, height = height, width
-    check_pixels(width, height, os.path.getsize(path), path)
+    check_pixel_count(width, height, os.path.getsize(path), path)
     times = _rising(ticks, Fraction(rate))
     hdr = HDR.get(int(frame.color_trc))
     return Clip(
@@ -180,7 +180,7 @@ def _opened(path: str | os.PathLike[str]) -> Iterator[tuple[InputContainer, Vide
             raise InputError(
                 f"{path}: FFmpeg does not know the codec: convert the clip to H.264 first"
             )
-        check_pixels(
+        check_pixel_count(
             stream.codec_context.width, stream.codec_context.height, os.path.getsize(path), path
         )
         stream.thread_type = "AUTO"

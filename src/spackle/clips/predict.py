@@ -11,7 +11,7 @@ from spackle.bases import BasePrediction
 from spackle.bases.open import ResolvedBase
 from spackle.clips.complete import ClipCompleter, CompletedView
 from spackle.clips.files import ClipWriter, clip_frames, read_clip
-from spackle.core.photo import Photo, check_shape, focal_length, resize_photo
+from spackle.core.photo import Photo, check_photo_size, resize_photo, resolve_focal_length
 from spackle.depth.depth_map import RELATIVE
 from spackle.inpaint.plain import OpenCV
 from spackle.pipeline import Pipeline, PipelineOptions, move_in_words
@@ -71,7 +71,7 @@ def predict_clip(
     """
     reporter, options = reporter.restarted(), pipeline.options
     with (
-        results_folder(folder, RESULT_FILES, alone=True),
+        results_folder(folder, RESULT_FILES, locked=True),
         atomic_files(folder, RESULT_FILES[-1]) as new,
     ):
         with reporter.stage("read") as step:
@@ -89,7 +89,7 @@ def predict_clip(
             precision=options.base.precision,
             overscan=options.path.overscan,
         )
-        focal = focal_length(path, clip.width, clip.height, {}, **lens)
+        focal = resolve_focal_length(path, clip.width, clip.height, {}, **lens)
         if clip.hdr:
             reporter.log(f"{path.name}: the {clip.hdr} colours are not converted and may look pale")
         base, frames = pipeline.base, list[dict[str, float]]()
@@ -98,7 +98,7 @@ def predict_clip(
             pictures = clip_frames(clip)
             for index in range(len(clip)):
                 photo = Photo(next(pictures), *focal, path / FRAME_NAME.format(index))
-                check_shape(photo.width, photo.height, photo.path)
+                check_photo_size(photo.width, photo.height, photo.path)
                 prediction, choice = base.predict(photo, log=reporter.log)
                 if first is None:  # its base, disparity and focal length hold for all frames
                     if completer.disparity is None:

@@ -17,7 +17,7 @@ from torch.nn.functional import avg_pool2d, grid_sample
 from spackle.core.camera import Camera
 from spackle.core.color import srgb_to_linear
 from spackle.core.gaussians import Gaussians
-from spackle.core.hole_filling import far_fill
+from spackle.core.hole_filling import fill_from_far_side
 from spackle.render import Renderer, touched_tiles
 from spackle.render.protocol import Rendering
 from spackle.residual.features import CELL, hole_mask
@@ -109,7 +109,7 @@ def extend_flow(found: Track, inverse_depth: Tensor, known: Tensor, camera: Came
     basis = _motions(inverse_depth, camera)
     rigid = basis @ _fit(basis, found.flow, trusted)
     rest = (found.flow - rigid).permute(2, 0, 1)
-    _, filled = far_fill(inverse_depth, rest, trusted)
+    _, filled = fill_from_far_side(inverse_depth, rest, trusted)
     return rigid + filled.permute(1, 2, 0)
 
 
@@ -261,7 +261,7 @@ def _beside(change: Tensor, hole: Tensor, weight: Tensor, inverse_depth: Tensor)
     values = torch.where(carried[..., None], change, 0.0).permute(2, 0, 1)
     if not bool(carried.any()) or bool(known.all()):
         return torch.zeros_like(change)
-    _, spread = far_fill(inverse_depth, values, known, far_bias=0.0)
+    _, spread = fill_from_far_side(inverse_depth, values, known, far_bias=0.0)
     return torch.where(known[..., None], 0.0, spread.permute(1, 2, 0))
 
 

@@ -31,9 +31,9 @@ def linear_to_srgb(linear: Tensor) -> Tensor:
 
 MEASURED, LOOKS = 50_000, 60  # numbers of Gaussians and views that are sampled for the scale
 FARTHEST, NEAREST = 0.002, 0.998  # quantiles of inverse depth at the ends of the scale
-UNKNOWN_GREY = 0.5  # sRGB of unknown depth; the colour map contains no grey
+UNKNOWN_DEPTH_GREY = 0.5  # sRGB of unknown depth; the colour map contains no grey
 # Seventeen evenly spaced colours of matplotlib's inferno (CC0).
-INFERNO = (
+INFERNO_COLORS = (
     *((0.001, 0.000, 0.014), (0.042, 0.028, 0.141), (0.129, 0.047, 0.291), (0.238, 0.037, 0.396)),
     *((0.342, 0.062, 0.429), (0.441, 0.099, 0.432), (0.541, 0.135, 0.415), (0.640, 0.171, 0.381)),
     *((0.736, 0.216, 0.330), (0.817, 0.271, 0.270), (0.890, 0.348, 0.198), (0.944, 0.443, 0.120)),
@@ -43,14 +43,14 @@ INFERNO = (
 
 
 @dataclasses.dataclass(frozen=True)
-class DepthColors:
+class DepthColorScale:
     """A scale of colours between two depths; a depth outside of the scale gets the colour of the closest end."""
 
     near: float  # depth of the brightest colour
     far: float  # depth of the darkest colour
 
     @staticmethod
-    def over(gaussians: Gaussians, cameras: Sequence[Camera]) -> DepthColors:
+    def over(gaussians: Gaussians, cameras: Sequence[Camera]) -> DepthColorScale:
         """The scale for the depths in a set of views, without the nearest and the farthest 0.2 %.
 
         Raises:
@@ -65,19 +65,19 @@ class DepthColors:
         low, high = torch.quantile(
             inverse, torch.tensor([FARTHEST, NEAREST], dtype=torch.float64)
         ).tolist()
-        return DepthColors(1 / high, 1 / low)
+        return DepthColorScale(1 / high, 1 / low)
 
     def __call__(self, depth: Tensor, known: Tensor) -> Tensor:
         """Depth [H, W] as sRGB [H, W, 3], linear in inverse depth; grey where `known` [H, W] is false."""
         span = max(1 / self.near - 1 / self.far, 1e-12)
         share = ((1 / depth.clamp_min(1e-6) - 1 / self.far) / span).clamp(0, 1)
-        table = depth.new_tensor(INFERNO)
-        place = share * (len(INFERNO) - 1)
-        below = place.floor().clamp_max(len(INFERNO) - 2)
+        table = depth.new_tensor(INFERNO_COLORS)
+        place = share * (len(INFERNO_COLORS) - 1)
+        below = place.floor().clamp_max(len(INFERNO_COLORS) - 2)
         colors = torch.lerp(
             table[below.long()], table[below.long() + 1], (place - below)[..., None]
         )
-        return colors.where(known[..., None], colors.new_tensor(UNKNOWN_GREY))
+        return colors.where(known[..., None], colors.new_tensor(UNKNOWN_DEPTH_GREY))
 
 
 def _inverse_in_frame(means: Tensor, camera: Camera) -> Tensor:
@@ -90,7 +90,7 @@ def _inverse_in_frame(means: Tensor, camera: Camera) -> Tensor:
     return 1 / z[inside]
 
 
-def to_bytes(image: Tensor) -> Tensor:
+def to_uint8(image: Tensor) -> Tensor:
     """Round values in 0..1 to uint8 on the CPU; values outside are clamped, NaN becomes 0, and uint8 is kept."""
     if image.dtype == torch.uint8:
         return image.detach().cpu()

@@ -1,4 +1,4 @@
-"""Rectangles of a grid; `crops_around` covers all masked cells with a few small rectangles."""
+"""Rectangles of a grid; `crops_around_mask` covers all masked cells with a few small rectangles."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from spackle.core.hole_filling import greatest_around
+from spackle.core.filters import maximum_filter
 
 Mask = NDArray[np.bool_]
 
@@ -61,7 +61,7 @@ class Crop:
         return Crop(top, left, max(self.bottom, other.bottom), max(self.right, other.right))
 
 
-def crops_around(mask: Tensor, step: int, margin: int = MARGIN) -> list[tuple[Crop, Crop]]:
+def crops_around_mask(mask: Tensor, step: int, margin: int = MARGIN) -> list[tuple[Crop, Crop]]:
     """Cover all masked cells with a few small rectangles.
 
     Args:
@@ -120,7 +120,7 @@ def _least(blocks: Mask, crop: Crop, reach: int) -> int:
     """Lower bound for the number of blocks that the network must process, however the rectangle is cut."""
     near = np.zeros_like(blocks)
     near[crop.slices] = blocks[crop.slices]
-    return int(greatest_around(torch.from_numpy(near), reach).sum())
+    return int(maximum_filter(torch.from_numpy(near), reach).sum())
 
 
 def _row_halves(inside: Mask) -> NDArray[np.int64]:

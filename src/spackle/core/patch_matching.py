@@ -18,22 +18,27 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from spackle.core.hole_filling import blurred, distance_to, greatest_around, nearest_known
-from spackle.runtime.device import run_chunks
+from spackle.core.filters import (
+    distance_to_nearest,
+    gaussian_blur,
+    maximum_filter,
+    nearest_known_pixels,
+)
+from spackle.runtime.device import parallel_for_chunks
 from spackle.runtime.kernels import kernel, reordering_kernel
 
-RADIUS = 3  # patches have 7×7 cells
-SIDE = 2 * RADIUS + 1
+PATCH_RADIUS = 3  # patches have 7×7 cells
+PATCH_SIDE = 2 * PATCH_RADIUS + 1
 COARSEST = 48  # least short side of a level, in cells
 ROUNDS = 6  # number of searches and votes at each level
-JUMPS = (4, 1)  # distances, in cells, to the neighbours whose matches a search tries
-TONE_CELLS = 4.0  # standard deviation, in cells, of the blur that makes the tone L
+NEIGHBOR_STEPS = (4, 1)  # distances, in cells, to the neighbours whose matches a search tries
+TONE_BLUR_CELLS = 4.0  # standard deviation, in cells, of the blur that makes the tone L
 FADING = 0.8  # a cell's weight in a patch is 0.8^d at a depth of d cells in the hole
 FAINTEST_CELL = np.float32(1e-30)  # least weight of a cell
 DEPTH_WEIGHT, TONE_WEIGHT, OFFSET_WEIGHT = 0.15, math.sqrt(2), 0.05
 LEAST_SPREAD = 0.05  # least σz; the depth of a wall that faces the camera hardly varies
 SAME_SURFACE = 0.25  # greatest difference in z / σz between a cell and its mirror image
-FAINTEST_VOTE, LEAST_COST = 1e-6, 1e-8
+MIN_VOTE_WEIGHT, MIN_MEAN_COST = 1e-6, 1e-8
 
 Floats = NDArray[np.float32]
 Bools = NDArray[np.bool_]
@@ -88,15 +93,15 @@ def _pyramid(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> list[_Level]
         float(depth[~hole].std(correction=0)) if bool((~hole).any()) else 0.0, LEAST_SPREAD
     )
     rgb, tone, levels = guess.clone(memory_format=torch.contiguous_format), guess, list[_Level]()
-    _mirror(rgb.numpy(), hole.numpy(), depth[..., 0].numpy(), nearest_known(hole.numpy()))
+    _mirror(rgb.numpy(), hole.numpy(), depth[..., 0].numpy(), nearest_known_pixels(hole.numpy()))
     while True:
         traits = [
-            TONE_WEIGHT * blurred(tone, max(TONE_CELLS / 2 ** len(levels), 0.5)),
+            TONE_WEIGHT * gaussian_blur(tone, max(TONE_BLUR_CELLS / 2 ** len(levels), 0.5)),
             DEPTH_WEIGHT * depth,
         ]
-        weights = np.zeros([size + 2 * RADIUS for size in hole.shape], np.float32)
-        inside = distance_to(nearest_known(hole.numpy())).numpy()
-        weights[RADIUS:-RADIUS, RADIUS:-RADIUS] = np.maximum(
+        weights = np.zeros([size + 2 * PATCH_RADIUS for size in hole.shape], np.float32)
+        inside = distance_to_nearest(nearest_known_pixels(hole.numpy())).numpy()
+        weights[PATCH_RADIUS:-PATCH_RADIUS, PATCH_RADIUS:-PATCH_RADIUS] = np.maximum(
             np.float32(FADING) ** inside, FAINTEST_CELL
         )
         picture, marks = (image.contiguous().numpy() for image in (rgb, torch.cat(traits, dim=-1)))
@@ -125,9 +130,9 @@ def _mirror(rgb: Any, hole: Any, depth: Any, near: Any) -> None:
 
 def _match(level: _Level, coarse: Matches | None, number: int) -> Matches | None:
     """Alternate search and vote at a level; None without a hole, or without any patch."""
-    usable = ~greatest_around(torch.from_numpy(level.hole), RADIUS).numpy()
-    usable[:RADIUS] = usable[-RADIUS:] = False
-    usable[:, :RADIUS] = usable[:, -RADIUS:] = False
+    usable = ~maximum_filter(torch.from_numpy(level.hole), PATCH_RADIUS).numpy()
+    usable[:PATCH_RADIUS] = usable[-PATCH_RADIUS:] = False
+    usable[:, :PATCH_RADIUS] = usable[:, -PATCH_RADIUS:] = False
     if not usable.any() or not level.hole.any():
         return None
     height, width = level.hole.shape
@@ -141,7 +146,7 @@ def _match(level: _Level, coarse: Matches | None, number: int) -> Matches | None
     places, costs = np.empty((len(cells), 3), np.int32), np.zeros(len(cells), np.float32)
     parents = coarse or (numbers, places, costs)
     _begin(cells, coarse is not None, *parents[:2], valid, pool, places)
-    padded = np.pad(level.rgb, ((RADIUS, RADIUS), (RADIUS, RADIUS), (0, 0)))
+    padded = np.pad(level.rgb, ((PATCH_RADIUS, PATCH_RADIUS), (PATCH_RADIUS, PATCH_RADIUS), (0, 0)))
     target = (
         padded,
         level.weights,
@@ -152,18 +157,18 @@ def _match(level: _Level, coarse: Matches | None, number: int) -> Matches | None
     )
 
     def run(function: Callable[..., None], *given: Any) -> None:
-        run_chunks(lambda start, stop: function(start, stop, cells, *given), len(cells))
+        parallel_for_chunks(lambda start, stop: function(start, stop, cells, *given), len(cells))
 
     def vote(mean: float) -> None:
-        run(_vote, numbers, places, costs, np.float32(max(mean, LEAST_COST)), sources, level.rgb)
-        padded[RADIUS:-RADIUS, RADIUS:-RADIUS] = level.rgb
+        run(_vote, numbers, places, costs, np.float32(max(mean, MIN_MEAN_COST)), sources, level.rgb)
+        padded[PATCH_RADIUS:-PATCH_RADIUS, PATCH_RADIUS:-PATCH_RADIUS] = level.rgb
 
     if coarse is not None:
         vote(1.0)  # all costs are still zero
     for turn in range(ROUNDS):
         run(_score, places, *target, costs)
-        for jump in JUMPS:
-            seed = np.uint32(((number * ROUNDS + turn) * len(JUMPS) + jump) * 7919)
+        for jump in NEIGHBOR_STEPS:
+            seed = np.uint32(((number * ROUNDS + turn) * len(NEIGHBOR_STEPS) + jump) * 7919)
             run(
                 _search,
                 numbers,
@@ -218,15 +223,15 @@ def _patch_cost(
 ) -> Any:
     """Weighted mean of the squared differences of two patches; infinite if the mean exceeds the bound."""
     total, mass = np.float32(0), np.float32(0)
-    for j in range(SIDE):
-        for i in range(SIDE):
+    for j in range(PATCH_SIDE):
+        for i in range(PATCH_SIDE):
             mass += weights[y + j, x + i]
     limit = bound * mass
-    for j in range(SIDE):
-        for i in range(SIDE):
-            red = padded[y + j, x + i, 0] - source[v + j - RADIUS, u + i - RADIUS, 0]
-            green = padded[y + j, x + i, 1] - source[v + j - RADIUS, u + i - RADIUS, 1]
-            blue = padded[y + j, x + i, 2] - source[v + j - RADIUS, u + i - RADIUS, 2]
+    for j in range(PATCH_SIDE):
+        for i in range(PATCH_SIDE):
+            red = padded[y + j, x + i, 0] - source[v + j - PATCH_RADIUS, u + i - PATCH_RADIUS, 0]
+            green = padded[y + j, x + i, 1] - source[v + j - PATCH_RADIUS, u + i - PATCH_RADIUS, 1]
+            blue = padded[y + j, x + i, 2] - source[v + j - PATCH_RADIUS, u + i - PATCH_RADIUS, 2]
             total += weights[y + j, x + i] * (red * red + green * green + blue * blue)
         if total > limit:
             return np.float32(np.inf)
@@ -335,15 +340,15 @@ def _vote(
     for n in range(start, stop):
         y, x = cells[n]
         red, green, blue, mass = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
-        for dy in range(-RADIUS, RADIUS + 1):
-            for dx in range(-RADIUS, RADIUS + 1):
+        for dy in range(-PATCH_RADIUS, PATCH_RADIUS + 1):
+            for dx in range(-PATCH_RADIUS, PATCH_RADIUS + 1):
                 if not (0 <= y + dy < height and 0 <= x + dx < width):
                     continue
                 k = numbers[y + dy, x + dx]
                 if k < 0:
                     continue
                 m, v, u = places[k, 0], places[k, 1] - dy, places[k, 2] - dx
-                weight = np.float32(np.exp(-costs[k] / mean)) + np.float32(FAINTEST_VOTE)
+                weight = np.float32(np.exp(-costs[k] / mean)) + np.float32(MIN_VOTE_WEIGHT)
                 red += weight * sources[m, v, u, 0]
                 green += weight * sources[m, v, u, 1]
                 blue += weight * sources[m, v, u, 2]

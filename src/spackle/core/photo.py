@@ -21,8 +21,8 @@ from torch import Tensor
 
 from spackle.core.camera import Camera
 from spackle.core.photo_frame import PhotoFrame, find_frame
-from spackle.runtime.device import run_chunks
-from spackle.runtime.errors import InputError, as_input_error, shortened
+from spackle.runtime.device import parallel_for_chunks
+from spackle.runtime.errors import InputError, as_input_error, short_repr
 from spackle.runtime.files import check_file
 
 T = TypeVar("T")
@@ -35,8 +35,8 @@ SMALL_PIXELS, PIXELS_A_BYTE = (
     32,
 )  # a strongly compressed photo has 20 pixels for each byte
 LEAST_SIDE, MOST_ASPECT = 32, 8  # pixels of the short side; largest ratio of long to short side
-MAX_SIDE = 1536  # long side of the working size
-EDGE = 0.005  # width of the border that `pad_edge` replaces, as a share of the long side
+MAX_WORKING_SIDE_PX = 1536  # long side of the working size
+EDGE = 0.005  # width of the border that `replace_border` replaces, as a share of the long side
 DEFAULT_FOCAL_MM = 30.0  # 35 mm equivalent for a photo of unknown focal length; SHARP's choice
 FILM_DIAGONAL_MM = math.hypot(36, 24)
 PHONE_FOCAL_MM, PHONE_FACTOR = (
@@ -121,13 +121,13 @@ def load_photo(
     return _photo(rgb, exif, Path(path), keep_frame, focal_px=focal_px, focal_mm=focal_mm, fov=fov)
 
 
-def photo_of_picture(
+def photo_from_picture(
     picture: Image.Image | NDArray[Any] | Tensor, *, keep_frame: bool = True, **lens: float | None
 ) -> Photo:
     """A photo from a PIL image, or sRGB [H, W, 3] or [3, H, W] (uint8, floats in 0..1); for `lens` see `load_photo`."""
     path, exif = Path("photo"), dict[int, object]()
     if isinstance(picture, Image.Image):
-        check_pixels(picture.width, picture.height, MAX_PIXELS, path)
+        check_pixel_count(picture.width, picture.height, MAX_PIXELS, path)
         exif = _exif(picture)
         with as_input_error(path, "the picture cannot be used: {reason}"):
             rgb = _to_rgb(_upright(picture), path)
@@ -139,10 +139,10 @@ def photo_of_picture(
         )
         if values.ndim != 3 or 3 not in (values.shape[0], values.shape[2]) or not values.numel():
             raise InputError(
-                f"{path}: a picture of shape {shortened(tuple(values.shape))}: give [H, W, 3] or [3, H, W]"
+                f"{path}: a picture of shape {short_repr(tuple(values.shape))}: give [H, W, 3] or [3, H, W]"
             )
         values = values if values.shape[2] == 3 else values.movedim(0, 2)
-        check_pixels(values.shape[1], values.shape[0], MAX_PIXELS, path)
+        check_pixel_count(values.shape[1], values.shape[0], MAX_PIXELS, path)
         if values.dtype != torch.uint8 and not values.is_floating_point():
             raise InputError(
                 f"{path}: colours as {values.dtype}: give uint8, or floats from 0 to 1"
@@ -159,12 +159,12 @@ def _photo(
     rgb: Tensor, exif: dict[int, object], path: Path, keep_frame: bool, **lens: float | None
 ) -> Photo:
     height, width = rgb.shape[:2]
-    focal, source = focal_length(path, width, height, exif, **lens)
+    focal, source = resolve_focal_length(path, width, height, exif, **lens)
     frame = None if keep_frame or source.startswith("--") else find_frame(rgb)
     return Photo(frame.inside(rgb, width, height) if frame else rgb, focal, source, path, frame)
 
 
-def focal_length(
+def resolve_focal_length(
     path: str | os.PathLike[str],
     width: int,
     height: int,
@@ -191,12 +191,12 @@ def focal_length(
     if focal_px is not None:
         focal, source = focal_px, "--focal-px"
     elif focal_mm is not None:
-        focal, source = film_to_pixels(focal_mm, width, height), "--focal-mm"
+        focal, source = focal_mm_to_px(focal_mm, width, height), "--focal-mm"
     elif fov is not None:
         focal, source = width / 2 / math.tan(math.radians(fov) / 2), "--fov"
     else:
         found = focal_from_exif(exif, width, height)
-        focal = found or film_to_pixels(DEFAULT_FOCAL_MM, width, height)
+        focal = found or focal_mm_to_px(DEFAULT_FOCAL_MM, width, height)
         source = "EXIF" if found else "default 30 mm"
     shortest, longest = (lens * max(width, height) for lens in LENSES)
     if not shortest <= focal <= longest:
@@ -207,7 +207,7 @@ def focal_length(
     return float(focal), source
 
 
-def resize_photo(photo: Photo, max_side: int = MAX_SIDE) -> Photo:
+def resize_photo(photo: Photo, max_side: int = MAX_WORKING_SIDE_PX) -> Photo:
     """Resize a photo and its focal length to its `working_size`, by Lanczos."""
     width, height = working_size(photo.width, photo.height, max_side)
     if (width, height) == (photo.width, photo.height):
@@ -219,14 +219,14 @@ def resize_photo(photo: Photo, max_side: int = MAX_SIDE) -> Photo:
         resized = np.array(full.resize((width, height), Image.Resampling.LANCZOS))
         rgb[..., channel] = torch.from_numpy(resized).clamp_(0, 1)
 
-    run_chunks(resize, 3, 1)
+    parallel_for_chunks(resize, 3, 1)
     frame = photo.frame and photo.frame.scaled(width / photo.width, height / photo.height)
     return dataclasses.replace(
         photo, rgb=rgb, focal_px=photo.focal_px * width / photo.width, frame=frame
     )
 
 
-def pad_edge(rgb: Tensor) -> Tensor:
+def replace_border(rgb: Tensor) -> Tensor:
     """Replace the outermost pixels of a photo [H, W, 3] by the pixels just inside.
 
     The outermost pixels often show a scan's edge, or colours mixed by resizing; the fill would extend them as streaks.
@@ -237,13 +237,13 @@ def pad_edge(rgb: Tensor) -> Tensor:
     return rgb[rows][:, columns]
 
 
-def working_size(width: int, height: int, max_side: int = MAX_SIDE) -> tuple[int, int]:
+def working_size(width: int, height: int, max_side: int = MAX_WORKING_SIDE_PX) -> tuple[int, int]:
     """Width and height scaled down so that the long side is at most `max_side`."""
     scale = min(1.0, max_side / max(width, height))
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
-def film_to_pixels(focal_mm: float, width: int, height: int) -> float:
+def focal_mm_to_px(focal_mm: float, width: int, height: int) -> float:
     """Convert a 35 mm equivalent focal length to pixels, by the diagonals of film and photo."""
     return focal_mm * math.hypot(width, height) / FILM_DIAGONAL_MM
 
@@ -259,7 +259,7 @@ def focal_from_exif(tags: dict[int, object], width: int, height: int) -> float |
 
     film = _number(tags.get(_FOCAL_35MM)) or 0.0  # 0 means "unknown" in EXIF
     if plausible(film):
-        return film_to_pixels(film, width, height)
+        return focal_mm_to_px(film, width, height)
     lens = _number(tags.get(_FOCAL_LENGTH))
     if lens is None or lens <= 0:
         return None
@@ -268,10 +268,10 @@ def focal_from_exif(tags: dict[int, object], width: int, height: int) -> float |
         recorded = max(_number(tags.get(_PIXEL_X)) or 0, _number(tags.get(_PIXEL_Y)) or 0)
         shrunk = max(width, height) / recorded if recorded > 0 else 1.0  # if the photo was resized
         pixels = lens * density / _UNIT_MM.get(int(unit or 2), 25.4) * shrunk
-        if plausible(pixels / film_to_pixels(1.0, width, height)):
+        if plausible(pixels / focal_mm_to_px(1.0, width, height)):
             return pixels
     film = lens * PHONE_FACTOR if lens < PHONE_FOCAL_MM else lens
-    return film_to_pixels(film, width, height) if plausible(film) else None
+    return focal_mm_to_px(film, width, height) if plausible(film) else None
 
 
 class _BoundedFile(io.BufferedReader):
@@ -295,7 +295,7 @@ def read_image(path: str | os.PathLike[str], read: Callable[[Image.Image], T]) -
         warnings.simplefilter("ignore")  # about broken EXIF
         try:
             with _BoundedFile(open(path, "rb", buffering=0)) as file, Image.open(file) as image:
-                check_pixels(image.width, image.height, file.size, path)
+                check_pixel_count(image.width, image.height, file.size, path)
                 return read(image)
         except Image.DecompressionBombError:
             raise InputError(f"{path}: more than 100 megapixels: shrink the image first") from None
@@ -305,7 +305,7 @@ def read_image(path: str | os.PathLike[str], read: Callable[[Image.Image], T]) -
             ) from None
 
 
-def check_shape(width: int, height: int, path: str | os.PathLike[str]) -> None:
+def check_photo_size(width: int, height: int, path: str | os.PathLike[str]) -> None:
     """Raise an InputError for a photo that is too small or too narrow to show a scene."""
     short, long = sorted((width, height))
     if short < LEAST_SIDE or long > MOST_ASPECT * short:
@@ -317,7 +317,7 @@ def check_shape(width: int, height: int, path: str | os.PathLike[str]) -> None:
         )
 
 
-def check_pixels(width: int, height: int, size: int, path: str | os.PathLike[str]) -> None:
+def check_pixel_count(width: int, height: int, size: int, path: str | os.PathLike[str]) -> None:
     """Raise an InputError if an image in a file of `size` bytes would take too much memory."""
     most = min(MAX_PIXELS, max(SMALL_PIXELS, PIXELS_A_BYTE * size))
     if width * height > most:

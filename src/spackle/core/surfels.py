@@ -11,24 +11,24 @@ from torch.nn.functional import pad
 
 from spackle.core.camera import Camera, to_like
 from spackle.core.gaussians import Gaussians, quat_from_matrix
-from spackle.runtime.device import run_chunks
+from spackle.runtime.device import parallel_for_chunks
 from spackle.runtime.kernels import kernel
 
-EDGE = 0.03  # a larger relative difference of inverse depth between neighbouring pixels is a depth edge
-CREASE = (
+DEPTH_EDGE_RATIO = 0.03  # a larger relative difference of inverse depth between neighbouring pixels is a depth edge
+CREASE_RATIO = (
     0.01  # a larger relative difference between the slopes on both sides of a pixel is a crease
 )
-THICKNESS = 0.05  # third axis, in units of the smaller of the other two
+SURFEL_THICKNESS_RATIO = 0.05  # third axis, in units of the smaller of the other two
 # Opacity of a solid Gaussian. The renderer skips a Gaussian that would bring the transmittance below 1e-4, so a
 # Gaussian of opacity 0.999 behind another of alpha 0.9 would be skipped and leave a hole.
-OPACITY = np.float32(0.99)
-PIXEL_SPREAD = (
+SURFEL_OPACITY = np.float32(0.99)
+PIXEL_SIGMA_PX = (
     0.5  # standard deviation, in pixels, of a Gaussian for one pixel in front of a wider Gaussian
 )
-BEHIND = 0.005  # relative distance behind a surface at which a Gaussian does not show through the surface
+BEHIND_SURFACE_RATIO = 0.005  # relative distance behind a surface at which a Gaussian does not show through the surface
 
 
-def surface_gaussians(
+def make_surfels(
     camera: Camera,
     uv: Tensor,
     inverse_depth: Tensor,
@@ -61,7 +61,7 @@ def surface_gaussians(
         else uv.new_full((1, 1), spread)
     )
     rotation, scales = _principal_axes(across * widths[:, :1], down * widths[:, -1:])
-    scales = torch.cat([scales, THICKNESS * scales.amin(dim=-1, keepdim=True)], dim=-1)
+    scales = torch.cat([scales, SURFEL_THICKNESS_RATIO * scales.amin(dim=-1, keepdim=True)], dim=-1)
     local_to_world = to_like(camera.world_to_camera, uv)[:3, :3].T
     means = camera.unproject(uv, z)
     return Gaussians(means, quat_from_matrix(local_to_world @ rotation), scales, opacities, colors)
@@ -77,7 +77,7 @@ def _principal_axes(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
     return torch.stack([p, q, torch.linalg.cross(p, q)], dim=-1), lengths
 
 
-def surface_slope(inverse_depth: Tensor) -> Tensor:
+def inverse_depth_slope(inverse_depth: Tensor) -> Tensor:
     """Derivative of the inverse depth by pixel x and y, [H, W, 2], that never crosses a depth edge.
 
     The inverse depth of a plane changes linearly across the image, so the differences to both neighbours agree. If
@@ -88,8 +88,10 @@ def surface_slope(inverse_depth: Tensor) -> Tensor:
     """
     image = inverse_depth.detach().cpu().contiguous().numpy()
     slopes = np.empty((*image.shape, 2), image.dtype)
-    bounds = tuple(image.dtype.type(bound) for bound in (CREASE, EDGE))
-    run_chunks(lambda start, stop: _slopes(start, stop, image, *bounds, slopes), len(image))
+    bounds = tuple(image.dtype.type(bound) for bound in (CREASE_RATIO, DEPTH_EDGE_RATIO))
+    parallel_for_chunks(
+        lambda start, stop: _slopes(start, stop, image, *bounds, slopes), len(image)
+    )
     return torch.from_numpy(slopes).to(inverse_depth.device)
 
 

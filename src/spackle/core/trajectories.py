@@ -26,13 +26,13 @@ NEAR_QUANTILE = 0.001  # quantile of depth that defines z_near
 FOCUS_QUANTILE = 0.1  # quantile of depth that defines the focus depth
 MIN_FOCUS_M = 2.0  # metres; a nearer focus would turn the camera too much
 MAX_DISPARITY = 2.0  # beyond, the photo is out of view
-OVERSCAN = (
+DEFAULT_OVERSCAN = (
     0.05  # relative gain in focal length, which hides most of the fill beyond the photo's border
 )
 MAX_ZOOM = 0.15  # forward motion of rotate-forward, in units of z_near
 
 MIN_FOV, MAX_FOV = 1.0, 170.0  # degrees
-UP = (0.0, -1.0, 0.0)
+WORLD_UP = (0.0, -1.0, 0.0)
 LEAST_STEP = 1e-6  # least time between two keyframes, in seconds
 Array = NDArray[np.float64]
 
@@ -64,13 +64,13 @@ class DepthRange:
         return DepthRange(near, focus)
 
 
-def max_offset(camera: Camera, disparity: float, depth_range: DepthRange) -> float:
+def disparity_to_offset(camera: Camera, disparity: float, depth_range: DepthRange) -> float:
     """Sideways offset of the camera for a disparity m: m · ‖(W/f, H/f)‖ · z_near."""
     fx, fy = camera.focal
     return disparity * math.hypot(camera.width / fx, camera.height / fy) * depth_range.near
 
 
-def trajectory(
+def trajectory_cameras(
     kind: TrajectoryKind,
     camera: Camera,
     disparity: float,
@@ -87,7 +87,7 @@ def trajectory(
             distance from the focus point), or dolly-zoom (backward, while zooming in so that objects at the focus
             point keep their size).
         camera: the photo's camera at the world's origin.
-        disparity: the widest offset, see `max_offset`.
+        disparity: the widest offset, see `disparity_to_offset`.
         depth_range: depths of the base's Gaussians.
         frames: number of cameras.
         looped: make a path that repeats without a jump. Swipe then also returns. The other paths already end where they
@@ -105,7 +105,7 @@ def trajectory(
     if frames < 1:
         raise ValueError(f"a trajectory needs at least one frame, got {frames}")
     side, forward, focus = (
-        max_offset(camera, disparity, depth_range),
+        disparity_to_offset(camera, disparity, depth_range),
         MAX_ZOOM * depth_range.near,
         depth_range.focus,
     )
@@ -152,9 +152,11 @@ def trajectory(
     return views
 
 
-def extremes(camera: Camera, disparity: float, depth_range: DepthRange) -> tuple[Camera, Camera]:
+def leftmost_and_rightmost(
+    camera: Camera, disparity: float, depth_range: DepthRange
+) -> tuple[Camera, Camera]:
     """The leftmost and the rightmost view at a disparity, which have the widest holes."""
-    left, right = trajectory("swipe", camera, disparity, depth_range, frames=2)
+    left, right = trajectory_cameras("swipe", camera, disparity, depth_range, frames=2)
     return left, right
 
 
@@ -169,7 +171,7 @@ class Keyframe:
     time: float  # seconds
     eye: tuple[float, float, float]  # position of the camera
     target: tuple[float, float, float]  # a point on the optical axis
-    up: tuple[float, float, float] = UP  # direction that is roughly upwards in the image
+    up: tuple[float, float, float] = WORLD_UP  # direction that is roughly upwards in the image
     fov: float | None = None  # horizontal field of view in degrees; None: the photo's
 
     def __post_init__(self) -> None:
@@ -243,7 +245,7 @@ class KeyframePath:
 
     def at(self, times: list[float], camera: Camera, depth_range: DepthRange) -> list[Camera]:
         """Views at these times in seconds; see `cameras`."""
-        length = max_offset(camera, 1.0, depth_range) if self.unit == "disparity" else 1.0
+        length = disparity_to_offset(camera, 1.0, depth_range) if self.unit == "disparity" else 1.0
         fx = camera.focal[0]
         focals = [
             fx if key.fov is None else camera.width / 2 / math.tan(math.radians(key.fov) / 2)
@@ -254,7 +256,7 @@ class KeyframePath:
             for key, focal in zip(self.keys, focals, strict=True)
         ]
         period = self.seconds if self.closed else None
-        values = interpolate(
+        values = interpolate_monotone(
             np.array([key.time for key in self.keys]), np.array(rows), np.array(times), period
         )
         views = []
@@ -277,7 +279,9 @@ def _look_at(*vectors: Sequence[float] | Array) -> Tensor:
         raise PathError(str(error)) from None
 
 
-def interpolate(times: Array, values: Array, wanted: Array, period: float | None = None) -> Array:
+def interpolate_monotone(
+    times: Array, values: Array, wanted: Array, period: float | None = None
+) -> Array:
     """Interpolate `values` [K, C], given at increasing `times` [K], at the times `wanted` [M] by monotone cubics.
 
     Returns [M, C]. With a period, the curves are closed: they return to the first value at times[0] + period.

@@ -21,8 +21,8 @@ from PIL import Image
 from torch import Tensor
 
 from spackle.core.camera import Camera
-from spackle.core.photo import check_pixels, read_image
-from spackle.runtime.errors import InputError, as_input_error, shortened
+from spackle.core.photo import check_pixel_count, read_image
+from spackle.runtime.errors import InputError, as_input_error, short_repr
 from spackle.runtime.files import check_file
 
 Array = NDArray[Any]
@@ -172,7 +172,7 @@ def depth_of_array(stored: Array, path: Path, kind: DepthKind = "auto") -> Depth
     """A depth map from an array [H, W] of metres (0, NaN, inf: unknown) or relative values; messages name `path`."""
     if stored.ndim != 2 or not stored.size or stored.dtype.kind not in "fiu":
         raise InputError(
-            f"{path}: an array of {stored.dtype} {shortened(stored.shape)}: give [height, width] in metres"
+            f"{path}: an array of {stored.dtype} {short_repr(stored.shape)}: give [height, width] in metres"
         )
     return (
         relative_depth(stored, kind, path)
@@ -450,7 +450,7 @@ def _check_size(shape: tuple[int, ...], path: StrPath) -> None:
         raise InputError(
             f"{path}: an array of shape {shape} is not a depth map: give [height, width]"
         )
-    check_pixels(shape[1], shape[0], os.path.getsize(path), path)
+    check_pixel_count(shape[1], shape[0], os.path.getsize(path), path)
 
 
 def _png_values(image: Image.Image, path: StrPath, grey: bool) -> Array:

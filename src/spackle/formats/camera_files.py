@@ -13,7 +13,7 @@ from pydantic import BaseModel, Field, Strict, ValidationError
 from torch import Tensor
 
 from spackle.core.camera import Camera
-from spackle.core.trajectories import UP, Keyframe, KeyframePath, PathError, PathUnit
+from spackle.core.trajectories import WORLD_UP, Keyframe, KeyframePath, PathError, PathUnit
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import check_file
 
@@ -51,7 +51,7 @@ class _Key(BaseModel, extra="forbid"):
     time: Bounded
     eye: Vector
     target: Vector
-    up: Vector = UP
+    up: Vector = WORLD_UP
     fov: Bounded | None = None
 
 

@@ -19,12 +19,12 @@ from spackle.core.camera import Camera
 from spackle.core.color import linear_to_srgb
 from spackle.core.gaussians import Gaussians
 from spackle.core.trajectories import (
-    OVERSCAN,
+    DEFAULT_OVERSCAN,
     SHARP_TRAJECTORIES,
     DepthRange,
     TrajectoryKind,
-    max_offset,
-    trajectory,
+    disparity_to_offset,
+    trajectory_cameras,
 )
 from spackle.formats.scene_files import encode_smallest_three
 from spackle.runtime.errors import InputError
@@ -101,14 +101,14 @@ def page_scene(
                 "scaleStep": step,
             }
         )
-    drawn = camera if disparity is None else camera.zoomed(1 + OVERSCAN)
+    drawn = camera if disparity is None else camera.zoomed(1 + DEFAULT_OVERSCAN)
     description: dict[str, object] = {
         "name": name,
         "note": note,
         "camera": {"K": drawn.K.tolist(), "width": camera.width, "height": camera.height},
         "focus": depths.focus,
         "zNear": depths.near,
-        "orbit": {"unit": max_offset(camera, 1.0, depths), "free": free, "limit": free},
+        "orbit": {"unit": disparity_to_offset(camera, 1.0, depths), "free": free, "limit": free},
         "paths": {kind: _path(kind, camera, depths) for kind in SHARP_TRAJECTORIES},
         "layers": layers,
     }
@@ -121,7 +121,9 @@ def _path(kind: TrajectoryKind, camera: Camera, depths: DepthRange) -> dict[str,
         torch.stack(
             [
                 each.position
-                for each in trajectory(kind, camera.to("cpu", torch.float64), far, depths, SAMPLES)
+                for each in trajectory_cameras(
+                    kind, camera.to("cpu", torch.float64), far, depths, SAMPLES
+                )
             ]
         )
         for far in (0.0, 1.0)

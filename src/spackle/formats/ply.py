@@ -69,7 +69,7 @@ def save_ply(
     Args:
         camera: the photo's camera, at the world's origin.
         base_count: the number of base Gaussians, which come first.
-        disparity: the disparity for which the scene was completed, see `spackle.core.trajectories.max_offset`.
+        disparity: the disparity for which the scene was completed, see `spackle.core.trajectories.disparity_to_offset`.
 
     Raises:
         InputError: `path` cannot be written.

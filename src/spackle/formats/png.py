@@ -10,7 +10,7 @@ from PIL import Image
 from torch import Tensor
 from torch.nn.functional import interpolate, pad
 
-from spackle.core.color import to_bytes
+from spackle.core.color import to_uint8
 from spackle.runtime.files import atomic_path
 
 
@@ -33,14 +33,14 @@ def save_png(rgb: Tensor, path: str | os.PathLike[str]) -> None:
     """Write sRGB [H, W, 3] in 0..1, or uint8, with 8 bits a channel; InputError if the file cannot be written."""
     if rgb.ndim != 3 or rgb.shape[2] != 3:
         raise ValueError(f"a colour picture is [H, W, 3], got {tuple(rgb.shape)}")
-    _save(Image.fromarray(to_bytes(rgb).numpy()), path)
+    _save(Image.fromarray(to_uint8(rgb).numpy()), path)
 
 
 def save_gray_png(gray: Tensor, path: str | os.PathLike[str]) -> None:
     """Write [H, W] in 0..1, a mask for example, with 8 bits; InputError if the file cannot be written."""
     if gray.ndim != 2:
         raise ValueError(f"a grey picture is [H, W], got {tuple(gray.shape)}")
-    _save(Image.fromarray(to_bytes(gray).numpy()), path)
+    _save(Image.fromarray(to_uint8(gray).numpy()), path)
 
 
 def _save(image: Image.Image, path: str | os.PathLike[str]) -> None:

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from spackle.core.crop import Crop
 from spackle.core.photo import working_size
 from spackle.inpaint.protocol import InpainterOptions
-from spackle.runtime.device import enough_memory, own_arithmetic, pick_device
+from spackle.runtime.device import pick_device, report_memory_shortage, without_autocast_or_tf32
 from spackle.runtime.errors import InputError
 from spackle.weights import installed_weights
 from spackle.weights.checkpoints import TensorShapes, check_finite, check_tensors, read_tensors
@@ -76,8 +76,10 @@ class LamaInpainter:
             known = F.adaptive_avg_pool2d((~mask).to(colors), small)
             mask = known < 0.999  # a reduced pixel is masked if any part lies in a hole
             colors = F.adaptive_avg_pool2d(colors, small)
-        shortage = enough_memory("lower --inpainter-side", what=f"for LaMa at {max(small)} pixels")
-        with shortage, own_arithmetic(self._device):
+        shortage = report_memory_shortage(
+            "lower --inpainter-side", what=f"for LaMa at {max(small)} pixels"
+        )
+        with shortage, without_autocast_or_tf32(self._device):
             drawn: Tensor = self._network(padded(colors), padded(mask))[..., : small[0], : small[1]]
         if not bool(drawn.isfinite().all()):
             raise InputError(

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from spackle.core.hole_filling import far_fill
+from spackle.core.hole_filling import fill_from_far_side
 from spackle.core.patch_matching import match_patches
 from spackle.inpaint.protocol import InpainterOptions
 from spackle.runtime.errors import InputError
@@ -44,7 +44,9 @@ def _painted(rgb: Tensor, hole: Tensor, inverse_depth: Tensor) -> Tensor:
         return rgb
     if not bool(((inverse_depth > 0) & ~hole).any()):
         inverse_depth = torch.ones_like(inverse_depth)
-    depth, colors = far_fill(inverse_depth, rgb.permute(2, 0, 1), (inverse_depth > 0) & ~hole)
+    depth, colors = fill_from_far_side(
+        inverse_depth, rgb.permute(2, 0, 1), (inverse_depth > 0) & ~hole
+    )
     guess = torch.where(hole[..., None], colors.permute(1, 2, 0), rgb)
     return torch.where(hole[..., None], match_patches(guess, hole, depth).rgb.clamp(0, 1), rgb)
 

@@ -17,7 +17,7 @@ from torch.nn.functional import max_pool2d
 
 from spackle.core.photo import working_size
 from spackle.inpaint.protocol import MIN_INPUT_SIDE_PX, InpainterOptions
-from spackle.runtime.device import enough_memory, pick_device
+from spackle.runtime.device import pick_device, report_memory_shortage
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.weights.checkpoints import load_strict, read_tensors
 
@@ -69,7 +69,9 @@ class PropainterInpainter:
         small = working_size(width, height, self._side)[::-1]
         frames = F.interpolate(rgb.permute(0, 3, 1, 2), small, mode="bicubic", antialias=True)
         holes = F.interpolate(hole[:, None].float(), small, mode="area") > 0  # thin holes are kept
-        with enough_memory("lower --inpainter-side", what=f"for ProPainter at {self._side} pixels"):
+        with report_memory_shortage(
+            "lower --inpainter-side", what=f"for ProPainter at {self._side} pixels"
+        ):
             filled = self._fill(frames.clamp(0, 1), holes.float()).to(rgb)
         if not bool(filled.isfinite().all()):
             raise InputError(

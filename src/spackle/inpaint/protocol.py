@@ -10,7 +10,7 @@ from typing import ClassVar, Protocol
 import torch
 from torch import Tensor
 
-from spackle.core.photo import MAX_SIDE
+from spackle.core.photo import MAX_WORKING_SIDE_PX
 from spackle.runtime.errors import InputError
 
 # ProPainter's optical flow works at 1/64 of the input's size, and needs two of these pixels.
@@ -39,8 +39,8 @@ class InpainterOptions:
         """
         if self.side is None:
             return default_side
-        if not MIN_INPUT_SIDE_PX <= self.side <= MAX_SIDE:
-            limits = f"between {MIN_INPUT_SIDE_PX} and {MAX_SIDE}"
+        if not MIN_INPUT_SIDE_PX <= self.side <= MAX_WORKING_SIDE_PX:
+            limits = f"between {MIN_INPUT_SIDE_PX} and {MAX_WORKING_SIDE_PX}"
             raise InputError(f"`inpainter_side` must be {limits}, got {self.side}")
         return self.side
 

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from spackle.core.hole_filling import far_fill
-from spackle.core.surfels import EDGE
+from spackle.core.hole_filling import fill_from_far_side
+from spackle.core.surfels import DEPTH_EDGE_RATIO
 from spackle.runtime.kernels import inlined_kernel, kernel
 
 STEEPEST = (
@@ -36,7 +36,7 @@ def find_edges(inverse_depth: Floats, known: Bools, focal: tuple[float, float]) 
 
     The slope of the inverse depth rises to a peak and falls again only at an edge. A peak is an edge if it is steeper
     than a surface of slope `STEEPEST`; `focal` (horizontal, vertical) is in pixels of the map. The inverse depth must
-    also change by more than the share `EDGE`, in addition to the change that the slopes on both sides explain. The
+    also change by more than the share `DEPTH_EDGE_RATIO`, in addition to the change that the slopes on both sides explain. The
     pixels between the two feet of the peak belong to the smeared edge. No edge is found beside unknown pixels (`known`
     [h, w] false).
     """
@@ -74,7 +74,7 @@ def _rows(inverse_depth: Any, known: Any, steepest: float) -> Any:
             start, end = row[first - 1], row[last]
             outer = 0.5 * (left + right) if min(left, right) >= 0 else slope
             rise = abs(end - start) - outer * (last - first + 1)
-            if rise <= EDGE * max(start, end):
+            if rise <= DEPTH_EDGE_RATIO * max(start, end):
                 continue
             for k in range(first, last + 1):
                 across[y, k - 1] = True
@@ -282,7 +282,9 @@ def settle(sampled: Sampled, rgb: Floats) -> Floats:
         cost = np.where(sampled.state > state, np.float32(0), np.float32(np.inf))
         source, far, step = np.arange(cost.size), depth, sampled.step
         if state == HOLE:
-            far = far_fill(*(torch.from_numpy(a) for a in (depth, depth[None], ~hole)))[0].numpy()
+            far = fill_from_far_side(*(torch.from_numpy(a) for a in (depth, depth[None], ~hole)))[
+                0
+            ].numpy()
             step = np.full_like(step, np.inf)
         _spread(cost, source, depth, step, far, rgb, pixels)
         source, width = source[pixels], cost.shape[1]

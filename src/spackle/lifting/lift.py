@@ -12,7 +12,7 @@ from torch import Tensor
 from spackle.core.camera import Camera
 from spackle.core.color import srgb_to_linear
 from spackle.core.gaussians import Gaussians
-from spackle.core.surfels import EDGE
+from spackle.core.surfels import DEPTH_EDGE_RATIO
 from spackle.depth.depth_map import DepthMap
 from spackle.lifting.edges import HOLE, SETTLED, Bools, Floats, find_edges, sample, settle
 from spackle.lifting.quadtree import LEVELS
@@ -93,7 +93,7 @@ def smoothed(inverse_depth: Floats, known: Bools, step: Floats | np.float32) -> 
     limit belongs to another surface. Noise as large as depth edges is kept as content, such as leaves or meshes.
     """
     noise = noise_level(inverse_depth, known)
-    reach = np.maximum(step / 2, DEVIATIONS * noise * (noise <= EDGE) * inverse_depth)
+    reach = np.maximum(step / 2, DEVIATIONS * noise * (noise <= DEPTH_EDGE_RATIO) * inverse_depth)
     reach = np.where(reach >= LEAST_NOISE * inverse_depth, reach, 0).astype(np.float32)
     if not reach.any():
         return inverse_depth

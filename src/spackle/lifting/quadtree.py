@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from spackle.runtime.device import run_chunks
+from spackle.runtime.device import parallel_for_chunks
 from spackle.runtime.kernels import kernel
 
 LEVELS = 3  # the largest tiles have 8×8 pixels
@@ -144,7 +144,9 @@ def _sizes(side: int) -> tuple[tuple[int, int], ...]:
 def _measure_all(
     side: int, steepest: np.float32, lost: NDArray[np.float32], arrays: list[NDArray[Any]]
 ) -> None:
-    run_chunks(lambda start, stop: _measure(start, stop, side, steepest, lost, *arrays), len(lost))
+    parallel_for_chunks(
+        lambda start, stop: _measure(start, stop, side, steepest, lost, *arrays), len(lost)
+    )
 
 
 @kernel

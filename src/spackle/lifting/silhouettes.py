@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spackle.core.surfels import CREASE, EDGE
+from spackle.core.surfels import CREASE_RATIO, DEPTH_EDGE_RATIO
 from spackle.lifting.edges import Floats
-from spackle.runtime.device import run_chunks
+from spackle.runtime.device import parallel_for_chunks
 from spackle.runtime.kernels import inlined_kernel, kernel
 
 REACH = 3  # pixels on each side of a step that may be mixtures
@@ -65,9 +65,11 @@ def find_layers(inverse_depth: Floats, slope: Floats, colors: Floats) -> Layers:
     depth, slopes, color = (np.stack([image, image]) for image in (inverse_depth, slope, colors))
     alpha, inside, texture = (np.zeros((n, height, width), np.float32) for n in (1, 1, 2))
     found = (inside[0], depth, slopes, color, texture)
-    run_chunks(lambda a, b: _survey(a, b, inverse_depth, colors, ring, levels, *found), height)
+    parallel_for_chunks(
+        lambda a, b: _survey(a, b, inverse_depth, colors, ring, levels, *found), height
+    )
     looks = (colors, ring, inside[0], color, texture)
-    run_chunks(lambda a, b: _match(a, b, *looks, alpha[0]), height)
+    parallel_for_chunks(lambda a, b: _match(a, b, *looks, alpha[0]), height)
     _unmix(colors, ring, inside[0], alpha[0], color, texture)
     return Layers(ring, alpha[0], depth, slopes, color)
 
@@ -85,7 +87,7 @@ def _rings(image: Any) -> Any:
                 if v >= height or u >= width:
                     continue
                 high, low = max(image[y, x], image[v, u]), min(image[y, x], image[v, u])
-                if high - low <= EDGE * low:
+                if high - low <= DEPTH_EDGE_RATIO * low:
                     continue
                 # On a steep plane, such as ground near the horizon, the change continues on both sides.
                 jump = image[v, u] - image[y, x]
@@ -156,7 +158,7 @@ def _survey(
                         continue
                     w = np.exp(-np.float32(dx * dx + dy * dy) / np.float32(REACH * REACH))
                     r = ring[v, u]
-                    if abs(d - level[side]) < np.float32(EDGE) * 2 * d:
+                    if abs(d - level[side]) < np.float32(DEPTH_EDGE_RATIO) * 2 * d:
                         wd = w * STEADY[r]
                         m[side, 0] += wd
                         m[side, 1] += wd * dx
@@ -303,7 +305,7 @@ def _plane(m: Any, level: Any) -> Any:
     cxd, cyd = m[7] / m[0] - mx * md, m[8] / m[0] - my * md
     determinant = cxx * cyy - cxy * cxy
     across, down = (cxd * cyy - cyd * cxy) / determinant, (cyd * cxx - cxd * cxy) / determinant
-    limit = np.float32(CREASE) * md
+    limit = np.float32(CREASE_RATIO) * md
     across, down = min(max(across, -limit), limit), min(max(down, -limit), limit)
     return (
         np.float32(max(md - across * mx - down * my, 0.5 * md)),

@@ -17,18 +17,18 @@ from spackle.core.camera import Camera
 from spackle.core.color import linear_to_srgb
 from spackle.core.gaussians import Gaussians
 from spackle.core.surfels import (
-    BEHIND,
-    CREASE,
-    EDGE,
-    OPACITY,
-    PIXEL_SPREAD,
-    surface_gaussians,
-    surface_slope,
+    BEHIND_SURFACE_RATIO,
+    CREASE_RATIO,
+    DEPTH_EDGE_RATIO,
+    PIXEL_SIGMA_PX,
+    SURFEL_OPACITY,
+    inverse_depth_slope,
+    make_surfels,
 )
 from spackle.lifting.edges import Floats
 from spackle.lifting.quadtree import LEVELS, Quadtree, Tiles
 from spackle.lifting.silhouettes import Layers, find_layers
-from spackle.runtime.device import run_chunks
+from spackle.runtime.device import parallel_for_chunks
 from spackle.runtime.kernels import ONE, ZERO, inlined_kernel, kernel
 
 # Gaussians of half a pixel reproduce the photo sharply, but light passes between them; wide ones would blur the photo.
@@ -60,13 +60,17 @@ def layered_gaussians(
     sizes. The Gaussians come in this order: single pixels, row by row, on the surface that covers most of the pixel;
     tiles of up to 8×8 pixels; the other surface of mixed pixels; the backing.
     """
-    slope = surface_slope(inverse_depth)
+    slope = inverse_depth_slope(inverse_depth)
     layers = find_layers(*(image.contiguous().numpy() for image in (inverse_depth, slope, colors)))
     ring = torch.from_numpy(layers.ring)
-    tree = Quadtree(linear_to_srgb(colors), inverse_depth, slope, _inner(ring == 0), levels, EDGE)
+    tree = Quadtree(
+        linear_to_srgb(colors), inverse_depth, slope, _inner(ring == 0), levels, DEPTH_EDGE_RATIO
+    )
     worth = min(max(WORTH * tree.detail(), LEAST_WORTH), MOST_WORTH)
     single, tiles = tree.cut(worth)
-    surface = _Surface(inverse_depth, slope, colors, torch.full_like(inverse_depth, float(OPACITY)))
+    surface = _Surface(
+        inverse_depth, slope, colors, torch.full_like(inverse_depth, float(SURFEL_OPACITY))
+    )
     front = [surface.samples(part, TILE_SPREAD) for part in tiles]
     pixels = _split(layers, colors)
     rest = pixels.rest.pixels(pixels.mixed, camera)
@@ -75,11 +79,11 @@ def layered_gaussians(
     corrected = _inner(ring != 1)[
         single
     ]  # corrected colours beside a step or at the border would be visible ghosts
-    return surface_gaussians(camera, *_fitted(samples, colors, single, corrected, tiles))
+    return make_surfels(camera, *_fitted(samples, colors, single, corrected, tiles))
 
 
 class _Samples(NamedTuple):
-    """N Gaussians, in the order of `surface_gaussians`."""
+    """N Gaussians, in the order of `make_surfels`."""
 
     uv: Tensor  # [N, 2] pixels
     depth: Tensor  # [N] inverse
@@ -124,7 +128,7 @@ class _Surface(NamedTuple):
         """A Gaussian for each of the pixels `where` [H, W] bool, in row-major order."""
         uv = camera.pixel_centers()[where]
         depth, slope, color, opacity = (image[where] for image in self)
-        return _Samples(uv, depth, slope, torch.full_like(uv, PIXEL_SPREAD), color, opacity)
+        return _Samples(uv, depth, slope, torch.full_like(uv, PIXEL_SIGMA_PX), color, opacity)
 
     def samples(self, tiles: Tiles, spread: float, pixels: int = 1) -> _Samples:
         """An opaque Gaussian for each tile; its standard deviations are `spread` times the tile's sides.
@@ -132,7 +136,7 @@ class _Surface(NamedTuple):
         The unit of tiles is a cell of the surface, which is `pixels` pixels wide.
         """
         depth, slope, color = (tiles.means(image) for image in (self.depth, self.slope, self.color))
-        opacity = torch.full_like(depth, float(OPACITY))
+        opacity = torch.full_like(depth, float(SURFEL_OPACITY))
         sides = torch.tensor([tiles.width, tiles.height]) * (spread * pixels)
         return _Samples(
             tiles.centers() * pixels, depth, slope, sides.expand(len(depth), 2), color, opacity
@@ -152,12 +156,12 @@ def _split(layers: Layers, colors: Tensor) -> _Pixels:
     ring, alpha = torch.from_numpy(layers.ring), torch.from_numpy(layers.alpha)
     near = alpha >= 0.5
     mixed = torch.minimum(alpha, 1 - alpha) >= LEAST_MIXED
-    opacity = float(OPACITY) * blended_opacities(
+    opacity = float(SURFEL_OPACITY) * blended_opacities(
         torch.where(mixed, alpha, near.float()).numpy(), layers.ring
     )
     surfaces = []
     for side, opaque in enumerate(
-        (torch.from_numpy(opacity), torch.full_like(alpha, float(OPACITY)))
+        (torch.from_numpy(opacity), torch.full_like(alpha, float(SURFEL_OPACITY)))
     ):
         depth, slope, own = (
             torch.from_numpy(a[side]) for a in (layers.depth, layers.slope, layers.color)
@@ -190,9 +194,9 @@ def _backing(pixels: _Pixels, worth: float, levels: int) -> list[_Samples]:
     has_near, has_far = (_cells(pixels.edge & side).any(-1) for side in (pixels.near, ~pixels.near))
     wanted = torch.where(has_far, ~has_near, ~_cells(behind).any(-1))
     flat = _inner(wanted & ~_cells(pixels.edge).any(-1))
-    tree = Quadtree(linear_to_srgb(color), at_center, 2 * slope, flat, levels, CREASE)
+    tree = Quadtree(linear_to_srgb(color), at_center, 2 * slope, flat, levels, CREASE_RATIO)
     single, tiles = tree.cut(worth / BACKING_SHARE)
-    surface = _Surface(at_center, slope, color, torch.full_like(far, float(OPACITY)))
+    surface = _Surface(at_center, slope, color, torch.full_like(far, float(SURFEL_OPACITY)))
     parts = [(part, LARGE_BACKING_SPREAD) for part in tiles]
     for where, spread in ((~has_near, TILE_SPREAD), (has_near, RIM_BACKING_SPREAD)):
         parts.append((Tiles(1, 1, *(single & wanted & where).nonzero(as_tuple=True)), spread))
@@ -202,7 +206,7 @@ def _backing(pixels: _Pixels, worth: float, levels: int) -> list[_Samples]:
 def _receded(samples: _Samples, tiles: Tiles) -> _Samples:
     """Move the backing behind the front Gaussians; the unit of `tiles` is a cell of 2×2 pixels."""
     reach = 2 * BACKING_SIDES * torch.tensor([tiles.width, tiles.height])
-    recede = 1 - BEHIND - (reach * samples.slope.abs()).sum(-1) / samples.depth
+    recede = 1 - BEHIND_SURFACE_RATIO - (reach * samples.slope.abs()).sum(-1) / samples.depth
     return samples._replace(depth=samples.depth * recede, slope=samples.slope * recede[:, None])
 
 
@@ -220,7 +224,7 @@ def _cells(image: Tensor) -> Tensor:
     return grid.transpose(1, 2).flatten(2, 3)
 
 
-WEIGHTS = np.exp(-0.5 / PIXEL_SPREAD**2 * np.array([2, 1, 2, 1, 0, 1, 2, 1, 2])).astype(
+WEIGHTS = np.exp(-0.5 / PIXEL_SIGMA_PX**2 * np.array([2, 1, 2, 1, 0, 1, 2, 1, 2])).astype(
     np.float32
 )  # 3×3 neighbours
 FAINT, STOP = (
@@ -254,7 +258,7 @@ def _thin(alpha: Any, ring: Any, result: Any) -> None:
                     min(max(x + k % 3 - 1, 0), width - 1),
                 )
                 if k != 4 and ring[v, u] > 0:
-                    passes *= 1 - OPACITY * WEIGHTS[k] * result[v, u]
+                    passes *= 1 - SURFEL_OPACITY * WEIGHTS[k] * result[v, u]
             result[y, x] = min(max(1 - (1 - alpha[y, x]) / passes, np.float32(0)), np.float32(1))
 
 
@@ -265,7 +269,7 @@ def mixture(spots: Floats, colors: Tensor, height: int, width: int) -> Tensor:
     [N, 3] are linear RGB.
     """
     image = np.empty((height, width, 3), np.float32)
-    run_chunks(lambda a, b: _mix(a, b, spots, colors.numpy(), image), height, grain=128)
+    parallel_for_chunks(lambda a, b: _mix(a, b, spots, colors.numpy(), image), height, grain=128)
     return torch.from_numpy(image)
 
 

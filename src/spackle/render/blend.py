@@ -13,7 +13,7 @@ from numpy.polynomial import Chebyshev, Polynomial
 
 from spackle.render.project import RECORD, Arrays, Numbers, in_tile
 from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_STOP
-from spackle.runtime.kernels import MANTISSA, ONE, ZERO, Array, inlined_kernel, kernel
+from spackle.runtime.kernels import MANTISSA_BITS, ONE, ZERO, Array, inlined_kernel, kernel
 
 LIMIT = np.float32(ALPHA_MAX)
 FAINT = np.float32(ALPHA_MIN)
@@ -52,7 +52,7 @@ def exp2(x: np.float32) -> np.float32:
     shifted = x + ROUND
     f = x - (shifted - ROUND)
     series = E0 + f * (E1 + f * (E2 + f * (E3 + f * (E4 + f * E5))))
-    exponent = (np.float32(shifted).view(np.int32) - ROUND_BITS) << MANTISSA
+    exponent = (np.float32(shifted).view(np.int32) - ROUND_BITS) << MANTISSA_BITS
     return np.int32(np.float32(series).view(np.int32) + exponent).view(np.float32)
 
 

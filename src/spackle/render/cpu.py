@@ -23,7 +23,7 @@ from spackle.render.project import (
     project_chunk,
 )
 from spackle.render.protocol import Rendering, check_tiles
-from spackle.runtime.device import run_chunks
+from spackle.runtime.device import parallel_for_chunks
 from spackle.runtime.kernels import Array, inlined_kernel, kernel
 
 PROJECT_GRAIN = 1 << 16  # Gaussians a thread projects at a time
@@ -100,7 +100,7 @@ def draw(
         sort_tiles(start, stop, tiles, lists, splats.records)
         blend_tiles(start, stop, tiles, lists, splats.records, images)
 
-    run_chunks(chunk, len(tiles), BLEND_GRAIN)
+    parallel_for_chunks(chunk, len(tiles), BLEND_GRAIN)
     return Drawing(view, wanted, splats, lists, images)
 
 
@@ -143,7 +143,7 @@ def project(sets: Sequence[Gaussians], view: KernelCamera, wanted: Array) -> Spl
         def chunk(start: int, stop: int, first: int = first, scene: Arrays = scene) -> None:
             project_chunk(start, stop, first, scene, view, before, splats)
 
-        run_chunks(chunk, len(part), PROJECT_GRAIN)
+        parallel_for_chunks(chunk, len(part), PROJECT_GRAIN)
         first += len(part)
     return splats
 
@@ -201,11 +201,11 @@ def list_tiles(boxes: Array, wanted: Array) -> TileLists:
     """
     parts = -(-len(boxes) // PROJECT_GRAIN)
     counts = np.zeros((parts, wanted.size), np.int64)
-    run_chunks(lambda a, b: count_entries(a, b, boxes, wanted, counts), parts, 1)
+    parallel_for_chunks(lambda a, b: count_entries(a, b, boxes, wanted, counts), parts, 1)
     starts = np.concatenate([[0], np.cumsum(counts.sum(axis=0))])
     positions = starts[:-1] + np.cumsum(counts, axis=0) - counts  # of each part's first entry
     ids = np.empty(starts[-1], np.int32)
-    run_chunks(lambda a, b: write_entries(a, b, boxes, wanted, positions, ids), parts, 1)
+    parallel_for_chunks(lambda a, b: write_entries(a, b, boxes, wanted, positions, ids), parts, 1)
     return TileLists(ids, starts)
 
 

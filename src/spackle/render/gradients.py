@@ -40,7 +40,7 @@ from spackle.render.project import (
     spread,
 )
 from spackle.render.protocol import ALPHA_MIN, TILE, Rendering, tile_mask
-from spackle.runtime.device import run_chunks, thread_count
+from spackle.runtime.device import parallel_for_chunks, thread_count
 from spackle.runtime.kernels import ONE, ZERO, Array, kernel, reordering_kernel
 
 FIELDS = 5  # tensors in a set of Gaussians
@@ -145,10 +145,10 @@ def pixel_sums(drawing: Drawing, gradients: Arrays, rows: Array, count: int) -> 
     def chunk(start: int, stop: int) -> None:
         backward_tiles(start, stop, tiles, lists, wanted, records, images, gradients, slots, sums)
 
-    run_chunks(chunk, len(tiles), BLEND_GRAIN)
+    parallel_for_chunks(chunk, len(tiles), BLEND_GRAIN)
     shares, slot_rows = thread_count(), entry_rows[wanted]
     share = -(-count // shares)
-    run_chunks(lambda a, b: collect_sums(a, b, share, slot_rows, sums, table), shares, 1)
+    parallel_for_chunks(lambda a, b: collect_sums(a, b, share, slot_rows, sums, table), shares, 1)
     return table
 
 
@@ -160,7 +160,7 @@ def set_gradients(
         tuple(as_array(t) for t in fields),
         tuple(np.zeros(t.shape, np.float32) for t in fields),
     )
-    run_chunks(
+    parallel_for_chunks(
         lambda a, b: project_backward(a, b, scene, view, table, gradients),
         len(table),
         PROJECT_GRAIN,

@@ -16,7 +16,7 @@ from spackle.core.color import linear_to_srgb
 from spackle.core.gaussians import Gaussians, quat_to_matrix
 from spackle.render.project import FINITE
 from spackle.render.protocol import NEAR_PLANE, TILE, Rendering, check_tiles, paste, tile_grid
-from spackle.runtime.device import enough_memory
+from spackle.runtime.device import report_memory_shortage
 from spackle.runtime.errors import InputError, as_input_error
 
 INSTALL = "pip install 'spackle-nvs[cuda]'"
@@ -100,7 +100,7 @@ class GsplatRenderer:
         tiles: Tensor | None = None,
         onto: Rendering | None = None,
     ) -> Rendering:
-        """See `Renderer.render`; the result is float32. MemoryShort if the GPU's memory is too small."""
+        """See `Renderer.render`; the result is float32. NotEnoughMemory if the GPU's memory is too small."""
         sets = [gaussians] if isinstance(gaussians, Gaussians) else gaussians
         return self.render_batch([sets], [camera], eps2d=eps2d, tiles=[tiles], onto=[onto])[0]
 
@@ -115,7 +115,7 @@ class GsplatRenderer:
     ) -> list[Rendering]:
         """Render several views of one size in one batch, with the same bits as `render`.
 
-        ValueError if the views differ in size, or `tiles` do not fit. MemoryShort if the GPU's memory is too small.
+        ValueError if the views differ in size, or `tiles` do not fit. NotEnoughMemory if the GPU's memory is too small.
         """
         width, height = cameras[0].width, cameras[0].height
         if any((camera.width, camera.height) != (width, height) for camera in cameras):
@@ -127,7 +127,7 @@ class GsplatRenderer:
                 wanted[index] = each.to(self.device, torch.bool, non_blocking=True)
         count = sum(len(part) for parts in scenes for part in parts)
         what = f"to draw {count:,} Gaussians at {width}×{height} on the GPU"
-        with enough_memory("make the picture smaller", "use --device cpu", what=what):
+        with report_memory_shortage("make the picture smaller", "use --device cpu", what=what):
             drawn = self._draw(scenes, cameras, eps2d, wanted)
             results = []
             for view, parts, here, under in zip(

@@ -12,7 +12,7 @@ import numpy as np
 
 from spackle.core.camera import Camera
 from spackle.render.protocol import ALPHA_MIN, NEAR_PLANE, TILE, tile_grid
-from spackle.runtime.kernels import HALF, MANTISSA, ZERO, Array, inlined_kernel, kernel
+from spackle.runtime.kernels import HALF, MANTISSA_BITS, ZERO, Array, inlined_kernel, kernel
 
 Numbers = Array | tuple[Any, ...]
 Arrays = tuple[Array, ...]
@@ -322,9 +322,9 @@ def touches(
 def natural_log(x: np.float32) -> float:
     """The logarithm of a positive number, accurate to the last digits of float64."""
     bits = np.float32(x).view(np.int32)
-    exponent = (bits - ROOT_HALF_BITS) >> MANTISSA
+    exponent = (bits - ROOT_HALF_BITS) >> MANTISSA_BITS
     m = np.float64(
-        np.int32(bits - (exponent << MANTISSA)).view(np.float32)
+        np.int32(bits - (exponent << MANTISSA_BITS)).view(np.float32)
     )  # from sqrt(1/2) to sqrt(2)
     t = (m - 1.0) / (m + 1.0)
     s = t * t

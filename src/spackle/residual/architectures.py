@@ -32,7 +32,7 @@ from spackle.residual.network import (
     VIEW_DEPTH,
     ResidualNet,
 )
-from spackle.runtime.errors import InputError, one_line
+from spackle.runtime.errors import InputError, printable_line
 from spackle.weights.checkpoints import load_strict, read_metadata, read_tensors, to_channels_last
 
 SHIPPED = Path(__file__).parent.parent / "weights" / "residual.safetensors"
@@ -205,7 +205,7 @@ def load_residual(path: str | os.PathLike[str]) -> ResidualNet:
     advice = "give the residual's weights, 'seeds' or 'none'"
     tensors, name = read_tensors(path, advice), read_metadata(path, NOTE) or UNet.name
     if name not in (UNet.name, SharpDecoder.name):
-        raise InputError(f"{path}: unknown architecture {one_line(name)[:60]}: {advice}")
+        raise InputError(f"{path}: unknown architecture {printable_line(name)[:60]}: {advice}")
     return load_strict(
         open_residual(name, decoder_size(tensors)), tensors, path, advice, prepare=to_channels_last
     )

@@ -12,7 +12,7 @@ from torch.nn.functional import softplus
 from spackle.core.camera import Camera
 from spackle.core.color import srgb_to_linear
 from spackle.core.gaussians import Gaussians
-from spackle.core.surfels import OPACITY, surface_gaussians
+from spackle.core.surfels import SURFEL_OPACITY, make_surfels
 from spackle.render import Renderer
 from spackle.render.protocol import Rendering
 from spackle.residual.features import CELL, MASK_THRESHOLD, ViewFeatures, hole_mask
@@ -89,17 +89,15 @@ def compose(
         spread_px: standard deviation of a Gaussian in pixels.
     """
     uv, inverse_depth, rgb = seeds.uv, seeds.inverse_depth, seeds.rgb
-    opacities = torch.full_like(inverse_depth, float(OPACITY))
+    opacities = torch.full_like(inverse_depth, float(SURFEL_OPACITY))
     if deltas is None:
         colors = srgb_to_linear(rgb)
-        return surface_gaussians(
-            camera, uv, inverse_depth, seeds.slope, spread_px, colors, opacities
-        )
+        return make_surfels(camera, uv, inverse_depth, seeds.slope, spread_px, colors, opacities)
     shift, nearer, scale, turn, color, opacity = torch.split(deltas, DELTAS, dim=1)
     inverse_depth = _shift_positive(inverse_depth, GAIN * nearer.squeeze(1), seeds.unit)
     colors = srgb_to_linear(torch.sigmoid(color_logit(rgb) + color))
     opacities = torch.sigmoid(color_logit(opacities) + opacity.squeeze(1))
-    surfels = surface_gaussians(
+    surfels = make_surfels(
         camera, uv + shift, inverse_depth, seeds.slope, spread_px, colors, opacities
     )
     scales, quats = surfels.scales * _scale_factor(scale), surfels.quats + GAIN * turn

@@ -12,7 +12,7 @@ from torch import Tensor
 from spackle.core.camera import Camera
 from spackle.render.blend import decode_srgb, encode_srgb
 from spackle.render.protocol import Rendering
-from spackle.runtime.device import run_chunks
+from spackle.runtime.device import parallel_for_chunks
 from spackle.runtime.kernels import kernel
 
 MASK_THRESHOLD = 0.95  # τ_α: a pixel with lower opacity is a hole (eq. 4)
@@ -59,7 +59,7 @@ class ViewFeatures:
         )
         inverse_depth, alpha = (np.empty((rows, columns), np.float32) for _ in range(2))
         cells, low = (rgb, inverse_depth, alpha, mask), np.float32(threshold)
-        run_chunks(lambda start, stop: _gather(start, stop, *view, low, *cells), rows)
+        parallel_for_chunks(lambda start, stop: _gather(start, stop, *view, low, *cells), rows)
         colors = rgb.reshape(rows, columns, CHANNELS)
         return ViewFeatures(
             *(torch.from_numpy(image) for image in (colors, inverse_depth, alpha, mask))

@@ -15,10 +15,11 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample
 
 from spackle.core.camera import Camera, to_like
-from spackle.core.hole_filling import FAR_BIAS, far_fill, greatest_around
-from spackle.core.surfels import BEHIND, surface_slope
+from spackle.core.filters import maximum_filter
+from spackle.core.hole_filling import FAR_SIDE_BIAS, fill_from_far_side
+from spackle.core.surfels import BEHIND_SURFACE_RATIO, inverse_depth_slope
 from spackle.residual.features import CELL, LEAST, ViewFeatures, cell_centers
-from spackle.runtime.device import run_chunks
+from spackle.runtime.device import parallel_for_chunks
 from spackle.runtime.kernels import kernel
 
 AT_BORDER = 0.03  # of the photo's width: a surface that ends farther inside is not extended beyond the border
@@ -63,7 +64,7 @@ def initialize(features: ViewFeatures, camera: Camera, photo_camera: Camera) -> 
         return InitialGaussians(
             uv, torch.full_like(features.alpha, 0.1), torch.zeros_like(uv), grey, 0.1
         )
-    across, _ = far_fill(
+    across, _ = fill_from_far_side(
         features.inverse_depth, features.rgb.permute(2, 0, 1)[:0], known, far_bias=0.0
     )
     inside = inside_photo(across, camera, photo_camera)
@@ -71,7 +72,7 @@ def initialize(features: ViewFeatures, camera: Camera, photo_camera: Camera) -> 
     inverse_depth = placed_behind_surfaces(
         filled, features.mask, features.inverse_depth, BLOB_CELLS
     )
-    slope = surface_slope(inverse_depth) / CELL
+    slope = inverse_depth_slope(inverse_depth) / CELL
     return InitialGaussians(
         uv, inverse_depth, slope, rgb.permute(1, 2, 0), float(inverse_depth.median())
     )
@@ -126,8 +127,8 @@ def placed_behind_surfaces(filled: Tensor, chosen: Tensor, seen: Tensor, radius:
 
     `seen` [h, w] is the inverse depth of visible surfaces; 0: none.
     """
-    farthest = -greatest_around(-torch.where(seen > 0, seen, torch.inf), radius)
-    return torch.where(chosen, torch.minimum(filled, farthest) * (1 - BEHIND), filled)
+    farthest = -maximum_filter(-torch.where(seen > 0, seen, torch.inf), radius)
+    return torch.where(chosen, torch.minimum(filled, farthest) * (1 - BEHIND_SURFACE_RATIO), filled)
 
 
 def fill_around(
@@ -145,10 +146,10 @@ def fill_around(
     Values are propagated from the cells `known` ([h, w] bool). Cells `inside` ([h, w] bool) project into the photo;
     their holes are filled from the far surface.
     """
-    mask, bias, colors = features.mask, FAR_BIAS * inside, features.rgb.movedim(-1, 0)
+    mask, bias, colors = features.mask, FAR_SIDE_BIAS * inside, features.rgb.movedim(-1, 0)
     beyond = mask & ~inside
     if not bool(beyond.any()):
-        return far_fill(features.inverse_depth, colors, known, far_bias=bias)
+        return fill_from_far_side(features.inverse_depth, colors, known, far_bias=bias)
     rays, motion = _rays_in_photo(uv, camera, photo_camera)
     points, lens = rays + motion[:3, 3] * across[..., None], to_like(photo_camera.K, uv)
     depth = points[..., 2:].clamp_min(LEAST)
@@ -164,12 +165,12 @@ def fill_around(
     nearest = torch.where(known, features.inverse_depth, 0).amax()
     extended = torch.minimum((rays[..., 2] / away.clamp_min(LEAST)).clamp_min(LEAST), nearest)
 
-    bias = torch.where(hidden, FAR_BIAS, bias)
-    filled, mixed = far_fill(features.inverse_depth, colors, known, far_bias=bias)
+    bias = torch.where(hidden, FAR_SIDE_BIAS, bias)
+    filled, mixed = fill_from_far_side(features.inverse_depth, colors, known, far_bias=bias)
     filled = torch.where(traced, extended, filled)
     others = beyond & ~traced
     if bool(others.any()):
-        refilled, _ = far_fill(filled, colors[:0], traced | known, far_bias=bias)
+        refilled, _ = fill_from_far_side(filled, colors[:0], traced | known, far_bias=bias)
         filled = torch.where(others, refilled, filled)
     return filled, mixed
 
@@ -200,7 +201,7 @@ def trace_epipolar_lines(
     epipole = (camera.K.to(eye) @ camera.to_camera(eye)).detach().cpu().numpy()
     view = [image.contiguous().numpy() for image in (uv, values, inverse_depth, mask)]
     grids = (view[1].copy(), view[1].copy(), np.zeros(mask.shape, np.float32))
-    run_chunks(
+    parallel_for_chunks(
         lambda start, stop: _walk(start, stop, *view, epipole, SAME_DEPTH, *grids), len(mask)
     )
     far, mirrored, distance = map(torch.from_numpy, grids)

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor, nn
 
 from spackle.core.camera import Camera
-from spackle.core.crop import Crop, crops_around
-from spackle.core.hole_filling import broadly_blurred
-from spackle.core.patch_matching import TONE_CELLS, Patches, match_patches
+from spackle.core.crop import Crop, crops_around_mask
+from spackle.core.filters import approximate_gaussian_blur
+from spackle.core.patch_matching import TONE_BLUR_CELLS, Patches, match_patches
 from spackle.residual.features import ViewFeatures
 from spackle.residual.initializer import (
     InitialGaussians,
@@ -19,7 +19,7 @@ from spackle.residual.initializer import (
     seen_in_photo,
     trace_epipolar_lines,
 )
-from spackle.runtime.device import Precision, own_arithmetic, pick_dtype
+from spackle.runtime.device import Precision, pick_dtype, without_autocast_or_tf32
 
 ALIKE = 1.4  # a far rim whose inverse depth exceeds the seed's by more than this factor is ignored
 
@@ -99,7 +99,9 @@ def find_rim(
     beyond = features.mask & ~inside_photo(seeds.inverse_depth, camera, photo_camera)
     tone = torch.where(features.mask[..., None], rgb, features.rgb)
     patches = match_patches(torch.where(beyond[..., None], near, tone), features.mask, depths)
-    toned = (patches.rgb - broadly_blurred(patches.rgb - tone, TONE_CELLS)).clamp(0, 1)
+    toned = (patches.rgb - approximate_gaussian_blur(patches.rgb - tone, TONE_BLUR_CELLS)).clamp(
+        0, 1
+    )
     toned_patches = torch.where(beyond[..., None], toned, patches.rgb)
     seen = None if photo is None else seen_in_photo(photo, rgb, depths, camera, photo_camera)
     return Rim(far, near, steps, toned_patches, patches.mismatch, beyond, seen), patches
@@ -161,7 +163,7 @@ def predict_deltas(
 ) -> Tensor:
     """Deltas [h, w, 14] float32 on the CPU; 0 in unmasked cells.
 
-    A `local` network runs only on crops around the masked cells, see `crops_around`.
+    A `local` network runs only on crops around the masked cells, see `crops_around_mask`.
 
     Args:
         network: a `ResidualNet`.
@@ -176,8 +178,11 @@ def predict_deltas(
     field = view.alpha.new_zeros(*view.mask.shape, DELTA_CHANNELS)
     features, local = network_input(view, seeds, rim), getattr(network, "local", True)
     # One autocast block around all crops: the weights are converted once.
-    with own_arithmetic(device), torch.autocast(device.type, dtype, enabled=dtype != torch.float32):
-        for inner, outer in crops_around(chosen, STRIDE) if local else [whole]:
+    with (
+        without_autocast_or_tf32(device),
+        torch.autocast(device.type, dtype, enabled=dtype != torch.float32),
+    ):
+        for inner, outer in crops_around_mask(chosen, STRIDE) if local else [whole]:
             part = (
                 features[(..., *outer.slices)]
                 .contiguous(memory_format=torch.channels_last)

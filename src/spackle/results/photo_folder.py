@@ -66,7 +66,7 @@ def predict_photo(
             ["base.ply"] * wanted.keep_base + ["scene.ply", REPORT] + [video_file] * wanted.render
         )
         files += [wanted.depth_out] if wanted.depth_out else []
-        folders.enter_context(results_folder(folder, files, alone=True))
+        folders.enter_context(results_folder(folder, files, locked=True))
         stills = range(len(pipeline.given_views or []))
         if stills:
             pictures = [

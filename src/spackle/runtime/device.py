@@ -28,7 +28,7 @@ _SHORTAGES = (
 )
 
 
-class MemoryShort(InputError):
+class NotEnoughMemory(InputError):
     """Too little memory was free; a later attempt may succeed."""
 
 
@@ -56,8 +56,8 @@ def pick_device(device: torch.device | str | None) -> torch.device:
 
 
 @contextmanager
-def enough_memory(*advice: str, what: str = "for the network") -> Iterator[None]:
-    """Turn a shortage of memory into a `MemoryShort` with advice."""
+def report_memory_shortage(*advice: str, what: str = "for the network") -> Iterator[None]:
+    """Turn a shortage of memory into a `NotEnoughMemory` with advice."""
     try:
         yield
     except (MemoryError, RuntimeError) as error:
@@ -65,11 +65,11 @@ def enough_memory(*advice: str, what: str = "for the network") -> Iterator[None]
         if not (named or any(words in str(error) for words in _SHORTAGES)):
             raise
         remedies = ", or ".join([*advice, "close other programs"])
-        raise MemoryShort(f"not enough memory {what}: {remedies}") from error
+        raise NotEnoughMemory(f"not enough memory {what}: {remedies}") from error
 
 
 @contextmanager
-def own_arithmetic(device: torch.device) -> Iterator[None]:
+def without_autocast_or_tf32(device: torch.device) -> Iterator[None]:
     """Switch off autocast and TF32 during the block, so that networks compute in the dtypes of their tensors.
 
     TF32's switches hold for the whole process, so the block affects other threads too.
@@ -97,11 +97,11 @@ def pick_dtype(precision: Precision, device: torch.device) -> torch.dtype:
     """The dtype for a precision on a device; "auto" is bfloat16 on hardware that multiplies bfloat16."""
     check_name("--precision", precision, PRECISIONS)
     if precision == "auto":
-        return torch.bfloat16 if multiplies_bf16(device) else torch.float32
+        return torch.bfloat16 if has_native_bf16(device) else torch.float32
     return torch.float32 if precision == "fp32" else torch.bfloat16
 
 
-def multiplies_bf16(device: torch.device) -> bool:
+def has_native_bf16(device: torch.device) -> bool:
     """Whether the hardware multiplies bfloat16 natively: CPUs with AMX or AVX512-BF16, GPUs from Ampere on."""
     if device.type == "cuda":
         return torch.cuda.get_device_capability(device) >= (8, 0)
@@ -117,7 +117,7 @@ def thread_count() -> int:
 CHUNKS = 6  # chunks of a task for each thread; several chunks balance uneven work
 
 
-def run_chunks(
+def parallel_for_chunks(
     function: Callable[[int, int], object], total: int, grain: int | None = None
 ) -> None:
     """Call `function(start, stop)` for chunks of 0..total, each at most `grain` long, in any order, on several threads.
@@ -151,7 +151,7 @@ def _threads(process: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix=f"spackle-{process}")
 
 
-def versions() -> dict[str, str]:
+def package_versions() -> dict[str, str]:
     """Versions of Spackle, Python and the numerical packages."""
     ours = {
         "spackle": spackle.__version__,
@@ -161,7 +161,7 @@ def versions() -> dict[str, str]:
     return ours | {name: version(name) for name in ("numba", "numpy")}
 
 
-def hardware(device: torch.device) -> dict[str, Any]:
+def hardware_facts(device: torch.device) -> dict[str, Any]:
     """Names of the CPU and, for a CUDA device, of the GPU; numbers of cores and threads."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text(encoding="utf-8").splitlines() if info.exists() else []

@@ -24,14 +24,14 @@ class InputError(ValueError):
 def reason_in_a_line(error: object) -> str:
     """The text of a library's exception, at most 200 characters, for the middle of a message."""
     if callable(getattr(error, "errors", None)):  # of pydantic
-        return first_problem(error)
+        return first_validation_problem(error)
     text = (
         getattr(error, "strerror", None) or error
     )  # the system's text, without error number and file name
-    return one_line(" ".join(str(text).split()))[:200] or type(error).__name__
+    return printable_line(" ".join(str(text).split()))[:200] or type(error).__name__
 
 
-def first_problem(error: Any) -> str:
+def first_validation_problem(error: Any) -> str:
     """The key of the first value that pydantic refuses, and what the value must be."""
     first = error.errors()[0]
     if first["type"] == "extra_forbidden":
@@ -40,7 +40,7 @@ def first_problem(error: Any) -> str:
         message = first["msg"].removeprefix("Value error, ")
         quoted = first["type"] not in ("missing", "json_invalid", "too_long", "too_short")
         problem = (
-            f"{message[0].lower()}{message[1:]}" + f", not {shortened(first['input'])}" * quoted
+            f"{message[0].lower()}{message[1:]}" + f", not {short_repr(first['input'])}" * quoted
         )
     return ": ".join(filter(None, (".".join(str(name)[:60] for name in first["loc"]), problem)))
 
@@ -66,7 +66,7 @@ def as_input_error(what: object, problem: str, *errors: type[Exception]) -> Iter
 
 
 @contextlib.contextmanager
-def short_messages() -> Iterator[None]:
+def shorten_input_errors() -> Iterator[None]:
     """Shorten an InputError's message to 300 characters, because it may quote a program's values."""
     try:
         yield
@@ -98,13 +98,13 @@ def renamed(**names: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
     return decorate
 
 
-def one_line(text: str) -> str:
+def printable_line(text: str) -> str:
     """The text with control characters escaped, because file names can contain a terminal's escape codes."""
     line = " ".join(text.splitlines())
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
 
 
-def shortened(value: object) -> str:
+def short_repr(value: object) -> str:
     """A value from a file, shortened to 60 characters, for the middle of a message."""
     return _SHORT.repr(value)[:60]
 

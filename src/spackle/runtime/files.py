@@ -24,8 +24,10 @@ else:
 LEFTOVER = re.compile(
     r"\.(.+)\.[0-9a-f]{12}(\.\w+)"
 )  # pattern of the temporary names that `atomic_path` gives
-MAX_HASHED = 200_000_000  # bytes; a larger file is recognised by its size and modification time
-LOCK, NEW = ".lock", ".new"  # names of a lock file and of a folder for a new set of files
+MAX_HASHED_BYTES = (
+    200_000_000  # bytes; a larger file is recognised by its size and modification time
+)
+LOCK_NAME, NEW = ".lock", ".new"  # names of a lock file and of a folder for a new set of files
 BLOCK = 1 << 20  # bytes that are hashed at once
 
 
@@ -75,10 +77,10 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
 
 
-Target = str | os.PathLike[str] | BinaryIO  # a path, or a file that is open for writing bytes
+PathOrFile = str | os.PathLike[str] | BinaryIO  # a path, or a file that is open for writing bytes
 
 
-def write_atomic(target: Target, content: bytes) -> None:
+def write_atomic(target: PathOrFile, content: bytes) -> None:
     """Write to a path, whole or not at all (see `atomic_path`), or to an open file."""
     if not isinstance(target, str | os.PathLike):
         target.write(content)
@@ -112,7 +114,7 @@ def write_json(content: Mapping[str, Any], path: Path) -> None:
     write_atomic(path, (json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
 
 
-def files_in(folder: Path, endings: tuple[str, ...], *, below: bool = False) -> list[Path]:
+def list_files(folder: Path, endings: tuple[str, ...], *, below: bool = False) -> list[Path]:
     """A sorted list of a folder's visible files whose names end in one of `endings`; `below` includes subfolders."""
     with as_input_error(folder, "cannot read the folder: {reason}", OSError):
         os.scandir(folder).close()
@@ -135,10 +137,10 @@ def sha256_of(file: BinaryIO) -> str:
     return sha256.hexdigest()
 
 
-def fingerprint(file: Path, kind: str) -> str:
+def file_fingerprint(file: Path, kind: str) -> str:
     """A text that changes with the file; an InputError that names `kind` if the file is missing."""
     size = check_file(file, kind)
-    if size > MAX_HASHED:
+    if size > MAX_HASHED_BYTES:
         return f"{size} bytes of {file.stat().st_mtime_ns}"
     return hashlib.sha256(file.read_bytes()).hexdigest()
 
@@ -177,10 +179,12 @@ def file_lock(path: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def results_folder(path: Path, files: Sequence[str] = (), *, alone: bool = False) -> Iterator[None]:
+def results_folder(
+    path: Path, files: Sequence[str] = (), *, locked: bool = False
+) -> Iterator[None]:
     """Create a folder for results; remove the folder if the block writes no file into it.
 
-    Temporary files of killed runs are deleted. `alone` locks the folder during the block.
+    Temporary files of killed runs are deleted. `locked` locks the folder during the block.
 
     Raises:
         InputError: `files` cannot be written, or the folder cannot be locked.
@@ -189,8 +193,8 @@ def results_folder(path: Path, files: Sequence[str] = (), *, alone: bool = False
     try:
         with contextlib.ExitStack() as stack:
             make_folder(path)
-            if alone:
-                stack.enter_context(file_lock(path / LOCK))
+            if locked:
+                stack.enter_context(file_lock(path / LOCK_NAME))
             for name in files:
                 check_writable(path / name)
             with contextlib.suppress(OSError):
@@ -258,9 +262,9 @@ def matches_records(folder: Path, report: str, records: object) -> bool:
 
 
 def photo_digest(path: Path) -> str:
-    """The photo's `fingerprint`, or "none" for a missing photo."""
+    """The photo's `file_fingerprint`, or "none" for a missing photo."""
     with contextlib.suppress(InputError):
-        return fingerprint(path, "photo")
+        return file_fingerprint(path, "photo")
     return "none"
 
 
@@ -288,12 +292,14 @@ def make_folder(path: Path) -> None:
         raise InputError(f"{path}: this output folder is not writable; choose another with -o")
 
 
-def digest_of(value: object) -> str:
+def json_digest(value: object) -> str:
     """SHA-256 of a value as JSON."""
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
 
 
-def differences(old: Mapping[str, Any], new: Mapping[str, Any], where: str = "") -> list[str]:
+def config_differences(
+    old: Mapping[str, Any], new: Mapping[str, Any], where: str = ""
+) -> list[str]:
     """List the differences of two configurations as "key: old -> new"."""
 
     def short(value: object) -> str:
@@ -304,7 +310,7 @@ def differences(old: Mapping[str, Any], new: Mapping[str, Any], where: str = "")
     for key in sorted({*old, *new}):
         a, b = old.get(key), new.get(key)
         if isinstance(a, Mapping) and isinstance(b, Mapping):
-            found += differences(a, b, f"{where}{key}.")
+            found += config_differences(a, b, f"{where}{key}.")
         elif a != b:
             found.append(f"{where}{key}: {short(a)} -> {short(b)}")
     return found

@@ -16,7 +16,7 @@ Array = NDArray[Any]  # what kernels take
 
 # Constants of float32 kernels: a Python float would widen a whole expression to float64.
 ZERO, HALF, ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
-MANTISSA = np.int32(23)  # bits of a float32's mantissa
+MANTISSA_BITS = np.int32(23)  # bits of a float32's mantissa
 
 # Reordered sums are not allowed, because results must be the same bit for bit; "nnan" and "ninf" are not, because
 # kernels test for NaN and infinity.

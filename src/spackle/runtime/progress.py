@@ -28,12 +28,12 @@ from rich.progress import (
     Progress as Bars,
 )
 
-from spackle.runtime.errors import one_line
+from spackle.runtime.errors import printable_line
 
 Progress = Callable[[int, int], None]  # reports (steps done, steps in all)
 
 
-def counted(count: int, thing: str) -> str:
+def pluralized(count: int, thing: str) -> str:
     """`1 shard`, `2 shards`."""
     return f"{count:,} {thing}{'' if count == 1 else 's'}"
 
@@ -65,7 +65,7 @@ class Reporter:
 
     def log(self, line: str) -> None:
         """Print a line."""
-        self.console.print(escape(one_line(line)), soft_wrap=True)
+        self.console.print(escape(printable_line(line)), soft_wrap=True)
 
     def warn(self, line: str) -> None:
         """Print a line about something that could not be done as asked."""
@@ -167,10 +167,10 @@ class BufferedReporter(Reporter):
 
 
 @contextlib.contextmanager
-def asked_to_stop(alone: bool) -> Iterator[Callable[[], bool]]:
+def catch_stop_signals(single_process: bool) -> Iterator[Callable[[], bool]]:
     """Yield a function that tells whether Ctrl-C or SIGTERM came, so that a run can end between two steps.
 
-    If `alone`, a second Ctrl-C ends the run at once; torchrun, which sends each Ctrl-C twice, needs `alone=False`.
+    If `single_process`, a second Ctrl-C ends the run at once; torchrun, which sends each Ctrl-C twice, needs `single_process=False`.
     """
     asked: list[
         int
@@ -183,7 +183,7 @@ def asked_to_stop(alone: bool) -> Iterator[Callable[[], bool]]:
 
     def note(number: int, frame: object) -> None:
         asked.append(number)
-        if alone:
+        if single_process:
             signal.signal(signal.SIGINT, signal.default_int_handler)
 
     before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}

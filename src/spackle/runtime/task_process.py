@@ -13,18 +13,18 @@ from typing import Any
 
 from spackle.runtime.errors import InputError, reason_in_a_line
 
-DIED = "the worker process died, probably because memory ran out"
-Event = Mapping[str, Any]
-Tell = Callable[[Event], None]
-Work = Callable[
-    [Any, Tell], None
+WORKER_DIED = "the worker process died, probably because memory ran out"
+TaskEvent = Mapping[str, Any]
+SendEvent = Callable[[TaskEvent], None]
+TaskFunction = Callable[
+    [Any, SendEvent], None
 ]  # pickled, like tasks; raises InputError if a task cannot be done
 
 
 class TaskProcess:
     """A worker process and its connection."""
 
-    def __init__(self, work: Work) -> None:
+    def __init__(self, work: TaskFunction) -> None:
         spawn = multiprocessing.get_context("spawn")  # torch's threads do not survive a fork
         self._pipe, theirs = spawn.Pipe()
         self._process = spawn.Process(target=_serve, args=(theirs, work), daemon=True)
@@ -39,7 +39,7 @@ class TaskProcess:
         self._process.kill()
         self._process.join()
 
-    def do(self, task: object, tell: Tell) -> str | None:
+    def do(self, task: object, tell: SendEvent) -> str | None:
         """Do a task; returns None, or a line with the reason for a failure."""
         try:
             self._pipe.send(task)
@@ -47,12 +47,12 @@ class TaskProcess:
                 tell(event)
         except (EOFError, OSError):
             self.kill()
-            return DIED
+            return WORKER_DIED
         error: str | None = event
         return error
 
 
-def _serve(pipe: connection.Connection, work: Work) -> None:
+def _serve(pipe: connection.Connection, work: TaskFunction) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent
     threading.Thread(target=end_with_parent, daemon=True).start()
     while True:

@@ -24,7 +24,7 @@ QUEUED = (
 
 
 @contextlib.contextmanager
-def threads_of_torch(count: int) -> Iterator[None]:
+def torch_threads(count: int) -> Iterator[None]:
     """Let torch use this number of threads inside the `with` block."""
     before = torch.get_num_threads()
     torch.set_num_threads(count)
@@ -58,7 +58,7 @@ def parallel_map(
     """
     count = min(count, len(jobs))
     if count < 2:
-        with threads_of_torch(threads):
+        with torch_threads(threads):
             yield map(open_worker().make, jobs)
         return
     spawn = multiprocessing.get_context("spawn")  # torch's threads do not survive a fork

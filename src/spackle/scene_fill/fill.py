@@ -14,10 +14,11 @@ import torch
 from torch import Tensor
 
 from spackle.core.camera import Camera
-from spackle.core.color import linear_to_srgb, srgb_to_linear, to_bytes
+from spackle.core.color import linear_to_srgb, srgb_to_linear, to_uint8
+from spackle.core.filters import maximum_filter
 from spackle.core.gaussians import Gaussians
-from spackle.core.hole_filling import far_fill, greatest_around
-from spackle.core.surfels import BEHIND, PIXEL_SPREAD, surface_slope
+from spackle.core.hole_filling import fill_from_far_side
+from spackle.core.surfels import BEHIND_SURFACE_RATIO, PIXEL_SIGMA_PX, inverse_depth_slope
 from spackle.render import Renderer, device_of, touched_tiles
 from spackle.render.protocol import Rendering
 from spackle.residual.completion import compose
@@ -187,7 +188,7 @@ def fill_scene(
         view = stage.look(camera, bare.pop(index, None))
         holes = hole_area_ratio(view.alpha, threshold)
         if holes <= enough:
-            pictures[index] = to_bytes(view.rgb)
+            pictures[index] = to_uint8(view.rgb)
         else:
             means = placed.seeds_alone if holes < SEEDS_HAR and not exact else placed
             if filled >= OPPOSITE and means.texture is not None:
@@ -302,7 +303,7 @@ def _propose(
         parts.append(moved_away(pixels, eye, factors[index].repeat_interleave(CELL**2)))
         # As in a lifted photo, a cell's own Gaussian lies behind the Gaussians of its pixels.
         cells = dataclasses.replace(cells, colors=srgb_to_linear(wanted.clamp(0, 1)).mean((1, 2)))
-        factors = factors / (1 - BEHIND)
+        factors = factors / (1 - BEHIND_SURFACE_RATIO)
     parts.append(moved_away(cells, eye, factors))
     inverse_depth = seeds.inverse_depth.clone()
     if (
@@ -327,7 +328,7 @@ def _pixels(
     fine = InitialGaussians(
         (seeds.uv[:, None] + offsets).flatten(0, 1), inverse_depth, slope, rgb, seeds.unit
     )
-    pixels = compose(fine, repeated[0] if repeated else None, camera, PIXEL_SPREAD)
+    pixels = compose(fine, repeated[0] if repeated else None, camera, PIXEL_SIGMA_PX)
     return dataclasses.replace(pixels, colors=srgb_to_linear(colors.flatten(0, 2).clamp(0, 1)))
 
 
@@ -337,14 +338,16 @@ def rim_underlay(mask: Tensor, seeds: InitialGaussians, camera: Camera) -> Gauss
     From another view, a slit appears between the rim of a hole and the hole's filling. The underlay closes most slits
     in advance. `seeds` are those of all cells of the view.
     """
-    rim = (greatest_around(mask, REACH_CELLS) & ~mask)[EVERY]
+    rim = (maximum_filter(mask, REACH_CELLS) & ~mask)[EVERY]
     if not bool(rim.any()) or bool(rim.all()):
         return Gaussians.empty()
-    coarse, rgb = far_fill(seeds.inverse_depth[EVERY], seeds.rgb[EVERY].permute(2, 0, 1), ~rim)
+    coarse, rgb = fill_from_far_side(
+        seeds.inverse_depth[EVERY], seeds.rgb[EVERY].permute(2, 0, 1), ~rim
+    )
     depth, chosen = seeds.inverse_depth.clone(), mask.new_zeros(mask.shape)
     depth[EVERY], chosen[EVERY] = coarse, rim
     placed = placed_behind_surfaces(depth, chosen, seeds.inverse_depth, COARSE * BLOB_CELLS)[EVERY]
-    slope = surface_slope(placed) / (COARSE * CELL)
+    slope = inverse_depth_slope(placed) / (COARSE * CELL)
     beneath = compose(
         InitialGaussians(seeds.uv[EVERY], placed, slope, rgb.permute(1, 2, 0), seeds.unit).select(
             rim

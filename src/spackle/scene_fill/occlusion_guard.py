@@ -12,12 +12,12 @@ import torch
 from torch import Tensor
 
 from spackle.core.camera import Camera, to_like
+from spackle.core.filters import maximum_filter
 from spackle.core.gaussians import Gaussians
-from spackle.core.hole_filling import greatest_around
-from spackle.core.surfels import BEHIND
+from spackle.core.surfels import BEHIND_SURFACE_RATIO
 from spackle.render.protocol import ALPHA_MIN, Rendering
 from spackle.residual.features import CPU, MASK_THRESHOLD
-from spackle.runtime.device import run_chunks
+from spackle.runtime.device import parallel_for_chunks
 from spackle.runtime.kernels import kernel
 
 WINDOW_PX = 4  # radius of the guard's window: most aux Gaussians reach no farther
@@ -43,7 +43,7 @@ class OcclusionGuard:
         """The guard of a rendered view."""
         view = rendering.to(CPU).detach()
         seen = torch.where(view.alpha < threshold, 0, view.depth).float()
-        return OcclusionGuard(camera, greatest_around(seen, WINDOW_PX))
+        return OcclusionGuard(camera, maximum_filter(seen, WINDOW_PX))
 
 
 def move_behind_surfaces(
@@ -85,7 +85,7 @@ def unoccluding_scales(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGu
     starts = np.concatenate([[0], np.cumsum(sizes.prod(axis=1))])
     place, factors = to_like(eye, aux.means).cpu().double().numpy(), np.empty(len(rays))
     views = (lenses, depths, sizes, starts)
-    run_chunks(
+    parallel_for_chunks(
         lambda first, last: _free_factors(first, last, place, rays, covariances, *views, factors),
         len(rays),
     )
@@ -97,8 +97,8 @@ def without_pits(depths: Tensor, cells: Tensor) -> Tensor:
     reach = max(1, round(PIT * cells.shape[1]))
     grid = depths.new_zeros(cells.shape)
     grid[cells] = depths
-    farthest = greatest_around(grid, reach)
-    return -greatest_around(torch.where(cells, -farthest, -torch.inf), reach)[cells]
+    farthest = maximum_filter(grid, reach)
+    return -maximum_filter(torch.where(cells, -farthest, -torch.inf), reach)[cells]
 
 
 @kernel
@@ -167,7 +167,7 @@ def _blocks(
         row = min(max(int(np.floor(v + 2 * WINDOW_PX * j)), 0), height - 1)
         for i in range(-steps_u, steps_u + 1):
             column = min(max(int(np.floor(u + 2 * WINDOW_PX * i)), 0), width - 1)
-            if depth < guards[start + row * width + column] * (1 + BEHIND):
+            if depth < guards[start + row * width + column] * (1 + BEHIND_SURFACE_RATIO):
                 return True
     return False
 

@@ -13,15 +13,14 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
-from spackle.core.hole_filling import (
-    FAR_BIAS,
-    blurred,
-    broadly_blurred,
-    distance_to,
-    far_fill,
-    nearest_known,
+from spackle.core.filters import (
+    approximate_gaussian_blur,
+    distance_to_nearest,
+    gaussian_blur,
+    nearest_known_pixels,
 )
-from spackle.core.patch_matching import FAINTEST_VOTE, LEAST_COST, TONE_CELLS, Patches
+from spackle.core.hole_filling import FAR_SIDE_BIAS, fill_from_far_side
+from spackle.core.patch_matching import MIN_MEAN_COST, MIN_VOTE_WEIGHT, TONE_BLUR_CELLS, Patches
 from spackle.inpaint import Inpainter, known_inverse_depth
 from spackle.render.protocol import Rendering
 from spackle.residual.features import CELL, LEAST, ViewFeatures, hole_mask
@@ -64,7 +63,7 @@ def exemplar_texture(view: HoleView) -> Tensor:
     features, patches = view.features, view.patches
     pixels = in_cells(view.rendering.rgb)
     painted = from_cells(patch_blocks(patches, pixels))
-    fine = painted - blurred(painted, TEXTURE_PX)
+    fine = painted - gaussian_blur(painted, TEXTURE_PX)
     gain = (-patches.mismatch / TEXTURE_FADING).exp() * _in_proportion(fine, view)
     smooth = in_cells(_magnified(extended(view), features.mask))
     picture = from_cells(torch.where(features.mask[..., None, None, None], smooth, pixels))
@@ -95,7 +94,7 @@ def patch_blocks(patches: Patches, blocks: Tensor) -> Tensor:
     matched = patches.matches[..., 0] >= 0
     y, x = matched.nonzero(as_tuple=True)
     costs = patches.mismatch.square()
-    limit = costs[matched].mean().clamp_min(LEAST_COST)
+    limit = costs[matched].mean().clamp_min(MIN_MEAN_COST)
     total, mass = torch.zeros_like(blocks[y, x]), torch.zeros_like(costs[y, x])
     for dy, dx in itertools.product((-1, 0, 1), repeat=2):
         v, u = (y + dy).clamp(0, height - 1), (x + dx).clamp(0, width - 1)
@@ -103,7 +102,7 @@ def patch_blocks(patches: Patches, blocks: Tensor) -> Tensor:
         votes = (
             (v == y + dy) & (u == x + dx) & matched[v, u]
         )  # a matched cell's patch lies within its source
-        weight = votes * ((-costs[v, u] / limit).exp() + FAINTEST_VOTE)
+        weight = votes * ((-costs[v, u] / limit).exp() + MIN_VOTE_WEIGHT)
         block = sources[
             source.clamp_min(0), (row - dy).clamp(0, height - 1), (column - dx).clamp(0, width - 1)
         ]
@@ -118,11 +117,15 @@ def _in_proportion(fine: Tensor, view: HoleView) -> Tensor:
     """Factors [h, w] ≤ 1 that make the texture `fine` [2h, 2w, 3] no stronger than the texture around a hole."""
     energy, hole = avg_pool2d(fine.square().sum(-1)[None], CELL)[0], view.features.mask.float()
     parts = torch.stack([energy * hole, hole, energy * (1 - hole), 1 - hole], dim=-1)
-    own, masked, others, seen = broadly_blurred(parts, TONE_CELLS).clamp_min(LEAST).unbind(-1)
+    own, masked, others, seen = (
+        approximate_gaussian_blur(parts, TONE_BLUR_CELLS).clamp_min(LEAST).unbind(-1)
+    )
     around, known = (others / seen).log(), ~view.features.mask
     if bool(known.any()):
-        bias = FAR_BIAS * ~view.rim.beyond
-        around = far_fill(view.seeds.inverse_depth, around[None], known, far_bias=bias)[1][0]
+        bias = FAR_SIDE_BIAS * ~view.rim.beyond
+        around = fill_from_far_side(view.seeds.inverse_depth, around[None], known, far_bias=bias)[
+            1
+        ][0]
     return (around.exp() / (own / masked)).sqrt().clamp_max(1)
 
 
@@ -140,10 +143,12 @@ def extended(view: HoleView) -> Tensor:
     object keep `structure`, because their nearest visible cell may belong to the object.
     """
     features = view.features
-    near = nearest_known(features.mask.numpy())
+    near = nearest_known_pixels(features.mask.numpy())
     row, column = torch.from_numpy(near).long().clamp_min(0)
     apart = (view.seeds.inverse_depth / features.inverse_depth[row, column].clamp_min(1e-9)).log()
-    fading = torch.exp((1 - distance_to(near)) / EXTENDED_CELLS - (apart / SAME_DEPTH).square())
+    fading = torch.exp(
+        (1 - distance_to_nearest(near)) / EXTENDED_CELLS - (apart / SAME_DEPTH).square()
+    )
     return torch.lerp(
         view.structure, features.rgb[row, column], (fading * view.rim.beyond)[..., None]
     )
@@ -153,7 +158,7 @@ def sharpened(wanted: Tensor) -> Tensor:
     """Colours [H, W, c] that Gaussians need to show the `wanted` colours although they overlap; by Jacobi steps."""
     colors = wanted
     for _ in range(STEPS):
-        colors = colors + wanted - blurred(colors, OVERLAP_PX)
+        colors = colors + wanted - gaussian_blur(colors, OVERLAP_PX)
     return colors
 
 

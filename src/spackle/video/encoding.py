@@ -22,7 +22,7 @@ from av.video.stream import VideoStream
 from numpy.typing import NDArray
 from torch import Tensor
 
-from spackle.core.color import to_bytes
+from spackle.core.color import to_uint8
 from spackle.runtime.errors import InputError
 from spackle.runtime.files import atomic_path, check_writable
 
@@ -160,7 +160,7 @@ class VideoWriter:
             raise InputError(f"{self.path}: {most}: write an mp4, or fewer or smaller frames")
         self._wait(QUEUE - 1)
         pixels = np.array(
-            to_bytes(frame).numpy()
+            to_uint8(frame).numpy()
         )  # a copy, because the caller may reuse a frame of bytes
         self._encoding.append(self._aside.submit(self._encoder.add, pixels))
         self.frames += 1

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, interpolate
 
 from spackle.core.camera import Camera
-from spackle.core.color import DepthColors, linear_to_srgb, srgb_to_linear
+from spackle.core.color import DepthColorScale, linear_to_srgb, srgb_to_linear
 from spackle.core.gaussians import Gaussians
 from spackle.core.trajectories import DepthRange
 from spackle.render.protocol import Renderer, Rendering
@@ -198,7 +198,7 @@ class FrameMaker:
 
     options: VideoOptions
     stereo: Stereo | None = None
-    depth: DepthColors | None = None
+    depth: DepthColorScale | None = None
 
     @staticmethod
     def of(
@@ -207,7 +207,7 @@ class FrameMaker:
         """Derive missing options from the scene and the cameras; InputError, naming `source`, for impossible videos."""
         try:
             stereo = _stereo(options, gaussians, cameras[0])
-            depth = DepthColors.over(gaussians, cameras) if options.show == "depth" else None
+            depth = DepthColorScale.over(gaussians, cameras) if options.show == "depth" else None
         except ValueError as error:
             raise InputError(f"{source}: this video is impossible: {error}") from error
         maker = FrameMaker(options, stereo, depth)

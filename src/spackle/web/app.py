@@ -28,8 +28,8 @@ from spackle.bases.settings import AUTO, MISSING
 from spackle.core.photo import PHOTO_SUFFIXES
 from spackle.depth.depth_map import SUFFIXES
 from spackle.formats.html import read_page_file
-from spackle.runtime.errors import InputError, first_problem, one_line
-from spackle.runtime.task_process import Work
+from spackle.runtime.errors import InputError, first_validation_problem, printable_line
+from spackle.runtime.task_process import TaskFunction
 from spackle.web.guard import MAX_UPLOAD_BYTES, Access, Guard
 from spackle.web.jobs import Job, Jobs, RetentionLimits, SceneState
 from spackle.web.work import (
@@ -76,7 +76,7 @@ UPLOAD_FORM: dict[
 
 def create_app(
     folder: Path,
-    work: Work = DEFAULT_WORK,
+    work: TaskFunction = DEFAULT_WORK,
     *,
     workers: int = 1,
     keep: RetentionLimits = DEFAULT_LIMITS,
@@ -230,10 +230,12 @@ def accept_photo(form: FormData, folder: Path, jobs: Jobs, bases: list[str]) -> 
     try:
         options = SceneOptions.model_validate_json(text)
     except ValidationError as error:
-        raise HTTPException(422, one_line(f"options: {first_problem(error)}")) from error
+        raise HTTPException(
+            422, printable_line(f"options: {first_validation_problem(error)}")
+        ) from error
     if options.base not in (None, *bases):
         why = MISSING.get(options.base or "", f"unknown: there are {', '.join(bases)}")
-        raise HTTPException(422, one_line(f"base {options.base} on this server: {why}"))
+        raise HTTPException(422, printable_line(f"base {options.base} on this server: {why}"))
     source, of_depth = store_upload(photo, folder, "source", name, PHOTO_SUFFIXES), None
     if isinstance(depth, UploadFile) and depth.filename:
         of_depth = store_upload(depth, folder, "depth", "depth map", SUFFIXES)

@@ -20,7 +20,7 @@ from starlette.requests import ClientDisconnect
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from spackle.runtime.errors import one_line
+from spackle.runtime.errors import printable_line
 
 LOG = logging.getLogger("spackle.web")
 HOST_PATTERN = re.compile(r"(\[[0-9a-f:.%]+\]|[0-9a-z._-]+)(?::\d{1,5})?", re.IGNORECASE)
@@ -132,7 +132,7 @@ class Guard:
             if message["type"] == "http.response.start":
                 MutableHeaders(scope=message).update(SECURITY_HEADERS)
                 path = scope["path"].replace((self.access and self.access.token) or "/", "…", 1)
-                LOG.debug(one_line(f"{scope['method']} {path} {message['status']}"))
+                LOG.debug(printable_line(f"{scope['method']} {path} {message['status']}"))
             await asyncio.wait_for(send(message), MAX_SEND_S)
 
         try:

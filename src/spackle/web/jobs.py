@@ -19,7 +19,7 @@ from pydantic import BaseModel, Field
 
 from spackle.runtime.errors import InputError, reason_in_a_line
 from spackle.runtime.files import results_folder, write_json
-from spackle.runtime.task_process import DIED, Event, TaskProcess, Work
+from spackle.runtime.task_process import WORKER_DIED, TaskEvent, TaskFunction, TaskProcess
 
 LOG = logging.getLogger("spackle.web")
 RECORD_FILE = "job.json"  # stores the state of a job, in the folder of the job
@@ -78,10 +78,12 @@ class Jobs:
     photo; else it adds this file to a finished scene, in one more process.
     """
 
-    def __init__(self, folder: Path, work: Work, workers: int, keep: RetentionLimits) -> None:
+    def __init__(
+        self, folder: Path, work: TaskFunction, workers: int, keep: RetentionLimits
+    ) -> None:
         self.folder, self.limits = folder, keep
         self._held = contextlib.ExitStack()
-        self._held.enter_context(results_folder(folder, alone=True))
+        self._held.enter_context(results_folder(folder, locked=True))
         self._lock, self._closed = threading.RLock(), threading.Event()
         self.by_id: dict[str, Job] = {}  # a change replaces a job by a new one
         self._work, self._processes, self._of_thread = work, list[TaskProcess](), threading.local()
@@ -190,7 +192,7 @@ class Jobs:
             error = process.do((job, None), lambda event: self._tell(id, event))
         except (OSError, InputError) as problem:
             error = f"{job.name}: cannot be stored here: {reason_in_a_line(problem)}"
-        if error == DIED:
+        if error == WORKER_DIED:
             self._closed.wait(
                 1
             )  # a signal to end the whole service may reach the worker process first
@@ -198,7 +200,7 @@ class Jobs:
         if not self._closed.is_set():
             self._end(id, error)
 
-    def _tell(self, id: str, event: Event) -> None:
+    def _tell(self, id: str, event: TaskEvent) -> None:
         if "line" in event:
             LOG.info(event["line"])
             self._change(id, line=event["line"])

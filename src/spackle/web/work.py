@@ -16,7 +16,7 @@ from rich.console import Console
 
 from spackle.bases.lite import LiteBase
 from spackle.bases.settings import AUTO, ROUGH, BaseSettings
-from spackle.core.photo import PHOTO_SUFFIXES, check_shape, read_image
+from spackle.core.photo import PHOTO_SUFFIXES, check_photo_size, read_image
 from spackle.core.trajectories import MAX_DISPARITY, TRAJECTORIES, TrajectoryKind
 from spackle.depth.depth_map import DepthKind
 from spackle.formats.html import html_safe_json, single_html
@@ -27,7 +27,7 @@ from spackle.results.photo_folder import REPORT, PhotoOptions, predict_photo
 from spackle.runtime.errors import InputError
 from spackle.runtime.files import write_atomic
 from spackle.runtime.progress import Progress, Reporter
-from spackle.runtime.task_process import Tell
+from spackle.runtime.task_process import SendEvent
 from spackle.scene import Scene
 from spackle.video.frames import DEFAULT_FPS
 from spackle.views import MAX_FRAMES, SECONDS, PathOptions
@@ -98,7 +98,7 @@ class SceneWork:
         """The bases that a client may choose: the server's base, "auto", and those with weights on this machine."""
         return list(dict.fromkeys([self.base.name, AUTO, *BaseSettings().files]))
 
-    def __call__(self, task: tuple[Job, str | None], tell: Tell) -> None:
+    def __call__(self, task: tuple[Job, str | None], tell: SendEvent) -> None:
         """Do a task; InputError, without any path of this server, for an unusable photo, depth map or scene."""
         job, file = task
         options, teller = (
@@ -173,7 +173,7 @@ class SceneWork:
 class JobReporter(Reporter):
     """Reports log lines and progress to the server, with the photo's name in place of paths."""
 
-    def __init__(self, job: Job, tell: Tell, verbose: bool) -> None:
+    def __init__(self, job: Job, tell: SendEvent, verbose: bool) -> None:
         super().__init__(verbose, Console(quiet=True, force_terminal=False))
         self._job, self._tell = job, tell
 
@@ -202,7 +202,7 @@ def check_photo(path: Path, name: str, preview: Path) -> None:
     def decode(image: Image.Image) -> None:
         if image.format not in PILLOW_FORMATS:
             raise InputError(f"{path}: a {image.format} picture: give {', '.join(PHOTO_SUFFIXES)}")
-        check_shape(image.width, image.height, path)
+        check_photo_size(image.width, image.height, path)
         image.load()
         upright = ImageOps.exif_transpose(image)
         upright.thumbnail((PREVIEW_SIDE_PX, PREVIEW_SIDE_PX))

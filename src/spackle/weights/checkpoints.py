@@ -20,8 +20,8 @@ import torch
 from safetensors import safe_open
 from torch import Tensor, nn
 
-from spackle.runtime.device import enough_memory
-from spackle.runtime.errors import InputError, as_input_error, one_line
+from spackle.runtime.device import report_memory_shortage
+from spackle.runtime.errors import InputError, as_input_error, printable_line
 from spackle.runtime.files import check_file
 
 Network = TypeVar("Network", bound=nn.Module)
@@ -130,7 +130,7 @@ def check_finite(network: nn.Module, path: str | os.PathLike[str], advice: str) 
 
 def _some(names: list[str]) -> str:
     more = len(names) - NAMED
-    shown = ", ".join(one_line(name[:120])[:200] for name in names[:NAMED])
+    shown = ", ".join(printable_line(name[:120])[:200] for name in names[:NAMED])
     return shown + (f", and {more} more" if more > 0 else "")
 
 
@@ -177,7 +177,7 @@ def _reading_weights(path: str | os.PathLike[str], advice: str) -> Iterator[None
     check_file(path, "weight file")
     with (
         as_input_error(path, f"not a file of weights, or damaged ({{reason}}): {advice}"),
-        enough_memory(),
+        report_memory_shortage(),
     ):
         yield
 

@@ -31,7 +31,7 @@ from spackle.paper.dataset.shards import load_manifest
 from spackle.render import get_renderer
 from spackle.residual import hole_mask
 from spackle.runtime.errors import InputError
-from spackle.runtime.files import digest_of
+from spackle.runtime.files import json_digest
 
 
 @pytest.mark.filterwarnings(
@@ -143,7 +143,7 @@ def resealed(folder: Path, change: Callable[[dict[str, Any]], None]) -> None:
     content = json.loads(path.read_text())
     del content["sha256"]
     change(content)
-    path.write_text(json.dumps(content | {"sha256": digest_of(content)}))
+    path.write_text(json.dumps(content | {"sha256": json_digest(content)}))
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ from helpers.evaluation_data import Figures, fake_pyiqa, results
 from helpers.scenes import box_before_wall, shifted
 from torch import Tensor
 
-from spackle.core.trajectories import DepthRange, max_offset
+from spackle.core.trajectories import DepthRange, disparity_to_offset
 from spackle.paper.evaluation.folder import load_run
 from spackle.paper.evaluation.measurements import Measurement, mean
 from spackle.paper.evaluation.measurements import Run as Results
@@ -273,7 +273,7 @@ def test_large_views_end_a_swipe_and_a_failed_metric_is_a_remark() -> None:
     ]
     reach = DepthRange.of(prediction.gaussians)
     for view, sign in zip(views, (-1, 1, -1, 1), strict=True):
-        x = sign * max_offset(views[0].camera, float(view.setting), reach)
+        x = sign * disparity_to_offset(views[0].camera, float(view.setting), reach)
         assert view.camera.position.tolist() == pytest.approx([x, 0, 0], rel=1e-5, abs=1e-6)
 
     def broken(picture: Tensor, truth: Tensor | None) -> float:

@@ -29,7 +29,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from spackle.core.camera import Camera
-from spackle.core.hole_filling import greatest_around
+from spackle.core.filters import maximum_filter
 from spackle.paper.training import samples, sources
 from spackle.paper.training.recipe import DataRecipe
 from spackle.paper.training.residual import MIN_AUX, training_cells
@@ -55,7 +55,7 @@ RIM_PX = 2  # tolerance for the size of Gaussians at outlines
 
 
 def grow(mask: Tensor, pixels: int = 1) -> Tensor:
-    return greatest_around(mask, pixels)
+    return maximum_filter(mask, pixels)
 
 
 def outline(scene: Scene) -> Tensor:

@@ -24,7 +24,13 @@ from spackle.bases.moge.network import (
 from spackle.core.camera import Camera
 from spackle.core.photo import Photo, resize_photo
 from spackle.depth.depth_map import DepthMap
-from spackle.runtime.device import Precision, enough_memory, own_arithmetic, pick_device, pick_dtype
+from spackle.runtime.device import (
+    Precision,
+    pick_device,
+    pick_dtype,
+    report_memory_shortage,
+    without_autocast_or_tf32,
+)
 from spackle.runtime.errors import InputError
 from spackle.runtime.progress import Progress
 
@@ -69,7 +75,7 @@ class MogeBase:
         """Read MoGe-2's model.pt; InputError for a missing device, a foreign or broken file, or too little memory."""
         target = pick_device(device)
         dtype = pick_dtype(precision, target)
-        with enough_memory():
+        with report_memory_shortage():
             return cls(
                 load_network(path, dtype).to(target), "bf16" if dtype == torch.bfloat16 else "fp32"
             )
@@ -87,7 +93,7 @@ class MogeBase:
             (FINEST * rows, FINEST * columns), (photo.height, photo.width)
         )  # `lift` enlarges
         known = not photo.focal_source.startswith("default")
-        with enough_memory():
+        with report_memory_shortage():
             output = self.ask(photo.rgb, tokens, size)
         view = to_view(output, photo.width, photo.height, photo.focal_px if known else None)
         camera, lens_source = photo.camera, ""
@@ -119,7 +125,7 @@ class MogeBase:
     def ask(self, rgb: Tensor, tokens: int, size: tuple[int, int]) -> MogeOutput:
         """The network's output, on the CPU, for a photo [H, W, 3], sRGB in 0..1, with maps of `size` (h, w)."""
         device = next(self.network.parameters()).device
-        with own_arithmetic(device):
+        with without_autocast_or_tf32(device):
             output = self.network(rgb.float().permute(2, 0, 1)[None].to(device), tokens, size)
         return MogeOutput(output.points.cpu(), output.mask_logits.cpu(), output.metric_scale.cpu())
 

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
 from spackle.bases.sharp.encoder import NORM_EPS, TransformerBlock
-from spackle.runtime.errors import as_input_error, shortened
+from spackle.runtime.errors import as_input_error, short_repr
 from spackle.weights.checkpoints import load_strict, read_checkpoint, to_channels_last
 
 ADVICE = "give MoGe-2's model.pt as it was downloaded"
@@ -132,7 +132,7 @@ def resampler(kind: str, inputs: int, outputs: int) -> nn.Sequential:
             nn.ConvTranspose2d(inputs, outputs, 2, stride=2), conv3(outputs, outputs)
         )
     if kind != "bilinear":
-        raise ValueError(f"a resampler is {shortened(kind)}")
+        raise ValueError(f"a resampler is {short_repr(kind)}")
     return nn.Sequential(
         nn.Upsample(scale_factor=2, mode="bilinear", align_corners=False), conv3(inputs, outputs)
     )
@@ -146,14 +146,14 @@ class Pyramid(nn.Module):
         options = {"dim_times_res_block_hidden": 1, "activation": "relu", **config}
         for key, value in USUAL.items():
             if options.get(key) != value:
-                raise ValueError(f"{key} is {shortened(options.get(key))}")
+                raise ValueError(f"{key} is {short_repr(options.get(key))}")
         widths, counts, outs = (
             config["dim_res_blocks"],
             config["num_res_blocks"],
             config["dim_out"] or [None] * LEVELS,
         )
         if len(widths) != LEVELS or max(counts) > MOST_BLOCKS:
-            raise ValueError(f"num_res_blocks is {shortened(counts)}")
+            raise ValueError(f"num_res_blocks is {short_repr(counts)}")
         self.input_blocks = nn.ModuleList(
             map(functools.partial(nn.Conv2d, kernel_size=1), config["dim_in"], widths)
         )

@@ -22,8 +22,14 @@ from spackle.bases.sharp.stretch import stretch_gaussians
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
 from spackle.core.photo import Photo, working_size
-from spackle.runtime.device import Precision, enough_memory, own_arithmetic, pick_device, pick_dtype
-from spackle.runtime.errors import InputError, as_input_error, one_line
+from spackle.runtime.device import (
+    Precision,
+    pick_device,
+    pick_dtype,
+    report_memory_shortage,
+    without_autocast_or_tf32,
+)
+from spackle.runtime.errors import InputError, as_input_error, printable_line
 from spackle.runtime.files import sha256_of
 from spackle.runtime.progress import Progress
 from spackle.weights.checkpoints import TensorShapes, load_strict, read_metadata, read_tensors
@@ -90,7 +96,7 @@ class SharpBase:
 
     def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
         """Two layers of Gaussians in metres, the nearer layer first, row by row; InputError if memory is short."""
-        with enough_memory(LESS_MEMORY):
+        with report_memory_shortage(LESS_MEMORY):
             gaussians = to_metric(self.infer(photo, progress), photo)
         camera = Camera.from_focal(photo.focal_px, photo.width, photo.height)
         notes: dict[str, float | int | str] = {"precision": self.precision, "weights": self.weights}
@@ -102,7 +108,7 @@ class SharpBase:
     def infer(self, photo: Photo, progress: Progress | None = None) -> SharpOutput:
         """The network's output for a photo; `to_metric` turns it into Gaussians."""
         image = to_square(photo.rgb.to(self.device, non_blocking=True), self.network.config.side)
-        with own_arithmetic(self.device):
+        with without_autocast_or_tf32(self.device):
             factor = photo.focal_px / photo.width
             output: SharpOutput = self.network(image, factor, self.windows, progress)
         return output
@@ -122,7 +128,7 @@ def check_windows(option: str, windows: int | None) -> None:
 def to_metric(output: SharpOutput, photo: Photo) -> Gaussians:
     """Convert Gaussians from normalised space, where x / z and y / z run from -1 to 1, to metres, on the CPU."""
     stretch = (photo.width / (2 * photo.focal_px), photo.height / (2 * photo.focal_px), 1.0)
-    with own_arithmetic(output.deltas.device):
+    with without_autocast_or_tf32(output.deltas.device):
         return stretch_gaussians(compose(output.start, output.deltas).to("cpu"), stretch)
 
 
@@ -153,7 +159,7 @@ def load_network(
     sizes = {(1, 1 + config.grid**2, config.embed): config for config in CONFIGS.values()}
     with torch.device("meta"):
         network = SharpNetwork(sizes.get(positions, CONFIGS["full"]))
-    with enough_memory(LESS_MEMORY):
+    with report_memory_shortage(LESS_MEMORY):
         convert = functools.partial(set_precision, dtype=dtype)
         load_strict(network, tensors, path, ADVICE, prepare=convert)
         return network.to(device)
@@ -180,7 +186,7 @@ class Owner:
     @property
     def places(self) -> tuple[str, str]:
         """Possible names of the checkpoint in a decoder's folder: `link_owner`'s link, and the file's own name."""
-        return f"trained-on-{one_line(Path(self.sha256).name)[:12]}.link", self.path.name
+        return f"trained-on-{printable_line(Path(self.sha256).name)[:12]}.link", self.path.name
 
 
 def decoder_bytes(decoder: nn.Module, owner: Owner) -> bytes:
@@ -224,7 +230,7 @@ def _with_owner(
     """
     beside = Path(path).absolute().parent
     home = next((beside / name for name in owner.places if os.path.isfile(beside / name)), None)
-    name = one_line(owner.path.name)
+    name = printable_line(owner.path.name)
     if home is None:
         raise InputError(
             f"{path}: trained on {name}, which is not in this folder: put the checkpoint or a link there"
@@ -233,13 +239,13 @@ def _with_owner(
         found = sha256_of(file)
     if found != owner.sha256:
         raise InputError(
-            f"{path}: trained on a checkpoint with the SHA-256 {one_line(owner.sha256)[:64]}, but {home} has another: "
+            f"{path}: trained on a checkpoint with the SHA-256 {printable_line(owner.sha256)[:64]}, but {home} has another: "
             f"put the right {name} into the folder"
         )
     whole = read_tensors(home, ADVICE)
     trained = {name for name in whole if name.startswith(("feature_model.", "prediction_head."))}
     if wrong := sorted(trained ^ decoder.keys()):
         raise InputError(
-            f"{path}: not a decoder of {home}: {len(wrong)} names differ, e.g. {one_line(wrong[0])[:120]}"
+            f"{path}: not a decoder of {home}: {len(wrong)} names differ, e.g. {printable_line(wrong[0])[:120]}"
         )
     return {**whole, **decoder}

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from spackle.core.gaussians import Gaussians
-from spackle.runtime.device import run_chunks
+from spackle.runtime.device import parallel_for_chunks
 from spackle.runtime.kernels import kernel
 
 SWEEPS = 4  # the cosine between two columns is at worst 3e-3 after three sweeps, 1e-15 after four
@@ -33,7 +33,7 @@ def stretch_gaussians(gaussians: Gaussians, stretch: tuple[float, float, float])
     source = quats.contiguous().numpy(), scales.contiguous().numpy()
     result = np.empty((len(quats), 4), np.float32), np.empty((len(quats), 3), np.float32)
     factors = float(stretch[0]), float(stretch[1]), float(stretch[2])
-    run_chunks(
+    parallel_for_chunks(
         lambda start, stop: stretch_chunk(start, stop, *source, factors, *result), len(quats), GRAIN
     )
     turned, scaled = torch.from_numpy(result[0]), torch.from_numpy(result[1])

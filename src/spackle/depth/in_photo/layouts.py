@@ -18,7 +18,7 @@ import torch
 from PIL import Image
 from PIL.JpegImagePlugin import JpegImageFile
 
-from spackle.core.photo import check_pixels
+from spackle.core.photo import check_pixel_count
 from spackle.depth.depth_map import Array, DepthMap, Quantity, StrPath, grid_step, is_depth
 from spackle.depth.in_photo.containers import (
     BY_ORIENTATION,
@@ -130,7 +130,7 @@ def _depth_map(coded: CodedDepth, path: Path) -> DepthMap:
 def _read_codes(picture: bytes) -> tuple[Array, int]:
     """[H, W] values of a JPEG or PNG, and the highest value that its format has."""
     with Image.open(io.BytesIO(picture), formats=("JPEG", "PNG")) as image:
-        check_pixels(*image.size, len(picture), "the map")
+        check_pixel_count(*image.size, len(picture), "the map")
         if image.mode.startswith("I"):
             return np.asarray(image).astype(np.uint16), 65535
         return np.asarray(image.convert("L")), 255
@@ -289,7 +289,7 @@ def _find_in_heif(data: bytes) -> CodedDepth | None:
         return None
     image = pillow_heif.open_heif(io.BytesIO(data), hdr_to_16bit=False).info["depth_images"][0]
     width, height = image.size
-    check_pixels(width, height, len(data), "the map")
+    check_pixel_count(width, height, len(data), "the map")
     codes, full = np.array(image), FULL_CODES[image.mode]
     of_apple = next(
         filter(None, map(apple_scale, xmp_packets(data))), None

@@ -40,15 +40,15 @@ from spackle.render import get_renderer
 from spackle.residual import MASK_THRESHOLD
 from spackle.runtime.errors import InputError, as_input_error, check_name
 from spackle.runtime.files import (
-    differences,
-    digest_of,
-    fingerprint,
+    config_differences,
+    file_fingerprint,
+    json_digest,
     make_folder,
     remove_half_written,
     results_folder,
     write_atomic,
 )
-from spackle.runtime.progress import Reporter, asked_to_stop, counted
+from spackle.runtime.progress import Reporter, catch_stop_signals, pluralized
 from spackle.runtime.workers import parallel_map
 from spackle.weights import weights_digest, weights_digests
 
@@ -68,7 +68,7 @@ class DatasetOptions:
     disparity: tuple[float, float] = (
         0.1,
         0.6,
-    )  # range of the random disparity, see `spackle.core.trajectories.max_offset`
+    )  # range of the random disparity, see `spackle.core.trajectories.disparity_to_offset`
     inpainter: str = "exemplar"  # one of `COMPLETIONS`
     inpainter_weights: Path | None = None  # a file or folder, if the inpainter has a network
     inpainter_side: int | None = (
@@ -127,7 +127,9 @@ class DatasetOptions:
         """Name and digest of a photo, and the digest of its depth map."""
         inputs = [photo.name, photo.sha256]
         with contextlib.suppress(InputError):  # the build reports a missing depth map later
-            inputs += [fingerprint(depth, "depth map")] if (depth := self.depth_of(photo)) else []
+            inputs += (
+                [file_fingerprint(depth, "depth map")] if (depth := self.depth_of(photo)) else []
+            )
         return inputs
 
 
@@ -139,7 +141,7 @@ def dataset_configuration(
     The number of threads is included, because SHARP's last bits depend on it; the number of workers is not.
     """
     base = options.base
-    inputs = digest_of([options.inputs_of(photo) for photo in photos])
+    inputs = json_digest([options.inputs_of(photo) for photo in photos])
     completion: dict[str, Any] = _completion(options, inpainter)
     if inpainter is not None and inpainter.weight_files:
         completion["weights"] = {
@@ -188,7 +190,7 @@ def build_dataset(source: Path, output: Path, options: DatasetOptions, reporter:
     with reporter.stage("photos") as step:
         photos = choose_photos(root, names, options.sample, options.seed, reporter.log, step)
     config = dataset_configuration(options, photos, maker.inpainter)
-    with results_folder(output, (MANIFEST_NAME,), alone=True):
+    with results_folder(output, (MANIFEST_NAME,), locked=True):
         return DatasetBuild(photos, output, options, reporter, config).run()
 
 
@@ -264,7 +266,7 @@ class DatasetBuild:
         if not (output / MANIFEST_NAME).exists():
             Manifest(config=config, shards=(), complete=False).save(output)
         manifest = load_manifest(output)
-        if lines := differences(manifest.config, config):
+        if lines := config_differences(manifest.config, config):
             raise InputError(
                 f"{output}: holds a dataset with other options ({'; '.join(lines)}): choose another -o"
             )
@@ -287,7 +289,7 @@ class DatasetBuild:
                 f"{self.output}: going on, {ready} of {len(self.photos)} photos are done"
             )
         start = time.perf_counter()
-        with self.reporter.stage("photos") as step, asked_to_stop(alone=True) as stop:
+        with self.reporter.stage("photos") as step, catch_stop_signals(single_process=True) as stop:
             for number in range(-(-len(self.photos) // self.size)):
                 self._write_shard(number)
             make, options, gpu = (
@@ -361,7 +363,7 @@ class DatasetBuild:
             self.reporter.log(f"{3600 * made / seconds:,.0f} photos an hour")
         total = decimal(sum(shard.size for shard in shards))
         self.reporter.log(
-            f"{counted(samples, 'photo')} in {counted(len(shards), 'shard')}, {total} -> {self.output}"
+            f"{pluralized(samples, 'photo')} in {pluralized(len(shards), 'shard')}, {total} -> {self.output}"
         )
 
     def _portable(self, photo: PhotoFile, problem: str) -> str:

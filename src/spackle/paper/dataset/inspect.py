@@ -24,9 +24,9 @@ from spackle.paper.dataset.shards import (
     load_manifest,
     open_dataset_file,
 )
-from spackle.runtime.errors import InputError, as_input_error, one_line
+from spackle.runtime.errors import InputError, as_input_error, printable_line
 from spackle.runtime.files import results_folder
-from spackle.runtime.progress import Progress, Reporter, counted
+from spackle.runtime.progress import Progress, Reporter, pluralized
 from spackle.video.encoding import save_video
 
 SHEET_FILE = "sheet.png"
@@ -40,8 +40,8 @@ def show_info(location: str, console: Console) -> None:
     manifest = load_manifest(location)
     samples = manifest.samples
     lines = [
-        one_line(f"{location}: {'complete' if manifest.complete else 'not finished'}"),
-        f"{counted(len(samples), 'photo')}, {manifest.views} views, {counted(len(manifest.shards), 'shard')}",
+        printable_line(f"{location}: {'complete' if manifest.complete else 'not finished'}"),
+        f"{pluralized(len(samples), 'photo')}, {manifest.views} views, {pluralized(len(manifest.shards), 'shard')}",
         f"{decimal(manifest.size)}, {decimal(manifest.size // max(1, len(samples)))} a photo",
     ]
     if skipped := sum(len(shard.passed_over) for shard in manifest.shards):
@@ -112,7 +112,7 @@ def preview_dataset(
     InputError if the dataset is unfinished or damaged, or the folder cannot be written to.
     """
     files = DatasetFiles(location)
-    with results_folder(output, (SHEET_FILE, VIDEO_FILE), alone=True):
+    with results_folder(output, (SHEET_FILE, VIDEO_FILE), locked=True):
         groups = [files[index] for index in spread_indices(len(files), photos)]
         rows: list[list[Tensor]] = []
         for group in groups:

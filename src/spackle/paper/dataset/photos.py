@@ -12,7 +12,7 @@ from typing import Any
 
 from spackle.core.photo import PHOTO_SUFFIXES, load_photo
 from spackle.runtime.errors import InputError, as_input_error
-from spackle.runtime.files import files_in, sha256_of
+from spackle.runtime.files import list_files, sha256_of
 from spackle.runtime.progress import Progress
 
 DATASET_PHOTO_SUFFIXES = (*PHOTO_SUFFIXES, ".gif", ".bmp")
@@ -51,7 +51,7 @@ def find_photos(
         return _named_by_coco(source, folder, log)
     names = [
         file.relative_to(source).as_posix()
-        for file in files_in(source, DATASET_PHOTO_SUFFIXES, below=True)
+        for file in list_files(source, DATASET_PHOTO_SUFFIXES, below=True)
     ]
     if not names:
         raise InputError(

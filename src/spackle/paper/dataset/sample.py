@@ -24,9 +24,9 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from spackle.core.camera import Camera
-from spackle.core.color import to_bytes
+from spackle.core.color import to_uint8
 from spackle.core.gaussians import Gaussians
-from spackle.core.photo import check_pixels
+from spackle.core.photo import check_pixel_count
 from spackle.formats.camera_files import camera_from_json
 from spackle.paper.dataset.views import ViewStack
 from spackle.render.protocol import Rendering
@@ -176,7 +176,7 @@ def _camera_facts(camera: Camera) -> dict[str, Any]:
 
 def encode_rgb(rgb: Tensor) -> bytes:
     """Encode sRGB [H, W, 3] in 0..1 as PNG."""
-    return _png(to_bytes(rgb).numpy())
+    return _png(to_uint8(rgb).numpy())
 
 
 def decode_rgb(data: bytes) -> Tensor:
@@ -259,7 +259,7 @@ def _png(pixels: NDArray[Any]) -> bytes:
 
 def _pixels(data: bytes, axes: int) -> NDArray[Any]:
     with Image.open(io.BytesIO(data), formats=["PNG"]) as image:
-        check_pixels(*image.size, len(data), "a picture")
+        check_pixel_count(*image.size, len(data), "a picture")
         pixels = np.array(image)
     if pixels.ndim != axes:
         raise ValueError(f"a picture with {pixels.ndim} axes instead of {axes}")

@@ -14,7 +14,7 @@ from torch.utils.data import Dataset
 
 from spackle.paper.dataset.sample import END_OF_ARCHIVE, PhotoGroup
 from spackle.runtime.errors import InputError, as_input_error
-from spackle.runtime.files import atomic_path, digest_of
+from spackle.runtime.files import atomic_path, json_digest
 
 MANIFEST_NAME = "manifest.json"
 FORMAT_VERSION = 1  # version of shards and manifest; other versions are refused
@@ -72,12 +72,12 @@ class Manifest(BaseModel, frozen=True, extra="ignore", strict=True):
     @property
     def digest(self) -> str:
         """SHA-256 of the manifest, which identifies the dataset."""
-        return digest_of(self._content())
+        return json_digest(self._content())
 
     def save(self, folder: Path) -> None:
         content = self._content()
         text = json.dumps(
-            content | {"sha256": digest_of(content)}, indent=1, sort_keys=True, allow_nan=False
+            content | {"sha256": json_digest(content)}, indent=1, sort_keys=True, allow_nan=False
         )
         with atomic_path(folder / MANIFEST_NAME) as temporary:
             temporary.write_text(text + "\n", encoding="utf-8")
@@ -123,7 +123,7 @@ def load_manifest(location: str | os.PathLike[str]) -> Manifest:
             )
         recorded = content.pop("sha256")
         manifest = Manifest.model_validate_json(text)
-        if not digest_of(content) == manifest.digest == recorded:
+        if not json_digest(content) == manifest.digest == recorded:
             raise ValueError("the digest is wrong")
         return manifest
 

@@ -16,13 +16,13 @@ from torch.nn.functional import grid_sample
 
 from spackle.bases import BasePrediction
 from spackle.core.camera import Camera
-from spackle.core.hole_filling import far_fill
+from spackle.core.hole_filling import fill_from_far_side
 from spackle.core.trajectories import (
     SHARP_TRAJECTORIES,
     DepthRange,
     SharpTrajectory,
-    max_offset,
-    trajectory,
+    disparity_to_offset,
+    trajectory_cameras,
 )
 from spackle.inpaint import INPAINTERS, Inpainter, known_inverse_depth
 from spackle.pipeline import complete
@@ -62,10 +62,10 @@ def cameras_along_path(
         return float((one.position.double() - other.position.double()).norm())
 
     cameras = [camera]
-    least = SAME_VIEW_DISTANCE * max_offset(camera, disparity, depth_range)
+    least = SAME_VIEW_DISTANCE * disparity_to_offset(camera, disparity, depth_range)
     for frames in range(views - 1, views + MAX_EXTRA_FRAMES) if least > 0 else ():
         cameras = [camera]
-        for view in trajectory(kind, camera, disparity, depth_range, frames):
+        for view in trajectory_cameras(kind, camera, disparity, depth_range, frames):
             if all(distance(view, other) > least for other in cameras):
                 cameras.append(view)
         if len(cameras) >= views:
@@ -133,7 +133,7 @@ def render_completed(views: ViewStack, renderer: Renderer) -> tuple[Tensor, Tens
             drawn = renderer.render([prediction.gaussians, aux], camera)
             rgb, inverse_depth = drawn.rgb, known_inverse_depth(drawn.depth, hole_mask(drawn.alpha))
             if 0 < int(inverse_depth.count_nonzero()) < inverse_depth.numel():
-                inverse_depth, mixed = far_fill(
+                inverse_depth, mixed = fill_from_far_side(
                     inverse_depth, rgb.permute(2, 0, 1), inverse_depth > 0
                 )
                 rgb = mixed.permute(1, 2, 0)

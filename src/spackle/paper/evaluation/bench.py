@@ -27,7 +27,7 @@ from spackle.paper.evaluation.protocols import large_views
 from spackle.paper.evaluation.tables import make_tables, write_tables
 from spackle.render import device_of
 from spackle.residual import ResidualNet
-from spackle.runtime.device import hardware, versions
+from spackle.runtime.device import hardware_facts, package_versions
 from spackle.runtime.files import results_folder
 from spackle.runtime.progress import Reporter
 from spackle.scene_fill import FillContext
@@ -74,9 +74,9 @@ def bench(
     config |= {name: evaluation.config[name] for name in SHARED}
     config |= {"runs": runs, "base_runs": base_runs or (1 if slow else runs)}
     config["base"] |= {"device": options.device.type if options.base.network else "cpu"}
-    config |= {"hardware": hardware(options.device), "versions": versions()}
+    config |= {"hardware": hardware_facts(options.device), "versions": package_versions()}
     about = {"parameters": count_parameters(evaluation.network)}
-    with results_folder(output, (ROWS, *FILES), alone=True):
+    with results_folder(output, (ROWS, *FILES), locked=True):
 
         def measure_one(index: int, case: Case) -> tuple[list[Measurement], list[Path]]:
             return time_case(case, evaluation, config), []

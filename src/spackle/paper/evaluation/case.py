@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from spackle.core.camera import Camera
-from spackle.core.photo import MAX_SIDE, Photo, load_photo, resize_photo, working_size
+from spackle.core.photo import MAX_WORKING_SIDE_PX, Photo, load_photo, resize_photo, working_size
 from spackle.depth.depth_map import DepthMap
 from spackle.paper.evaluation.measurements import NEAR
 from spackle.runtime.errors import InputError
@@ -82,7 +82,7 @@ class LoadedCase:
     seconds: tuple[Viewpoint, ...]  # with cameras in the input photo's frame and the dataset's unit
 
 
-def load_case(case: Case, max_side: int = MAX_SIDE) -> LoadedCase:
+def load_case(case: Case, max_side: int = MAX_WORKING_SIDE_PX) -> LoadedCase:
     """Read the photos of a case; resize photos and cameras to `working_size`.
 
     Views have even sides, so a second photo with an odd side loses its last row or column.

@@ -17,7 +17,7 @@ from spackle.bases.depth import RgbdBase
 from spackle.bases.open import OpenedBase, open_base, open_loaded
 from spackle.bases.settings import BaseSettings
 from spackle.core.gaussians import Gaussians
-from spackle.core.photo import MAX_SIDE
+from spackle.core.photo import MAX_WORKING_SIDE_PX
 from spackle.core.trajectories import MAX_DISPARITY
 from spackle.inpaint import Inpainter, InpainterOptions, get_inpainter
 from spackle.paper.evaluation.case import Case, LoadedCase, known_depth, load_case
@@ -58,10 +58,10 @@ from spackle.paper.training.losses import load_features
 from spackle.pipeline import FillOptions
 from spackle.render import Renderer, device_of, get_renderer
 from spackle.residual import ResidualNet, hole_mask
-from spackle.runtime.device import hardware, pick_device, pick_dtype, versions
+from spackle.runtime.device import hardware_facts, package_versions, pick_device, pick_dtype
 from spackle.runtime.errors import InputError, check_name
-from spackle.runtime.files import digest_of, results_folder, write_atomic
-from spackle.runtime.progress import Reporter, counted
+from spackle.runtime.files import json_digest, results_folder, write_atomic
+from spackle.runtime.progress import Reporter, pluralized
 from spackle.scene_fill import FillContext
 from spackle.weights import weights_digest, weights_digests
 
@@ -98,7 +98,7 @@ class EvaluateOptions:
     @property
     def max_side(self) -> int:
         """The long side of the views, in pixels."""
-        return self.side or (MAX_SIDE if self.near else LARGE_SIDE)
+        return self.side or (MAX_WORKING_SIDE_PX if self.near else LARGE_SIDE)
 
     @property
     def device(self) -> torch.device:
@@ -269,7 +269,7 @@ def _configuration(
         "images": {
             "count": len(cases),
             "limit": options.limit,
-            "names": digest_of([case.name for case in cases]),
+            "names": json_digest([case.name for case in cases]),
         },
         "protocol": options.protocol,
         "side": options.max_side,
@@ -326,12 +326,12 @@ def evaluate(options: EvaluateOptions, output: Path, reporter: Reporter, html: b
     if evaluation.gauges.published:
         reporter.log(NOTICE)
     about = {
-        "versions": versions(),
-        "machine": hardware(options.device),
+        "versions": package_versions(),
+        "machine": hardware_facts(options.device),
         "metrics": evaluation.metrics,
     }
     with results_folder(
-        output, (ROWS, WORST, BEST, *FILES, *([REPORT] if html else [])), alone=True
+        output, (ROWS, WORST, BEST, *FILES, *([REPORT] if html else [])), locked=True
     ):
 
         def measure(index: int, case: Case) -> tuple[list[Measurement], list[Path]]:
@@ -357,7 +357,7 @@ def evaluate(options: EvaluateOptions, output: Path, reporter: Reporter, html: b
     more = f", {problems} passed over" if problems else ""
     for line in plain(means_table(run, run.rows)):
         reporter.log(line)
-    reporter.log(f"{run.title}: {counted(count, 'image')}{more} -> {output}")
+    reporter.log(f"{run.title}: {pluralized(count, 'image')}{more} -> {output}")
     reporter.result({"folder": output, "images": count + problems, "measured": count})
     return "complete"
 
@@ -428,7 +428,7 @@ def merge_tables(
         runs, whole=True
     )  # raises for results that cannot share tables, before files are written
     files = (*FILES, *([REPORT] if html else []))
-    with results_folder(output, files, alone=True):
+    with results_folder(output, files, locked=True):
         write_tables(tables, output)
         if html:
             write_atomic(

@@ -21,9 +21,9 @@ from spackle.paper.evaluation.measurements import PROBLEM, Measurement, Run
 from spackle.paper.evaluation.table import NOT_RUN
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import (
-    differences,
-    digest_of,
+    config_differences,
     file_records,
+    json_digest,
     make_folder,
     matches_records,
     photo_digest,
@@ -31,7 +31,7 @@ from spackle.runtime.files import (
     write_atomic,
     write_json,
 )
-from spackle.runtime.progress import Reporter, asked_to_stop
+from spackle.runtime.progress import Reporter, catch_stop_signals
 
 CONFIG, ROWS, IMAGES = "config.json", "rows.jsonl", "images"
 FORMAT = 3
@@ -103,7 +103,7 @@ def measure_images(
         0,
         functools.cache(photo_digest),
     )  # many cases may share a second photo
-    with reporter.stage("images") as step, asked_to_stop(alone=True) as stop:
+    with reporter.stage("images") as step, catch_stop_signals(single_process=True) as stop:
         for index, case in enumerate(cases):
             if stop():
                 reporter.log("stopped; the same command resumes from here")
@@ -112,7 +112,7 @@ def measure_images(
             photos = [
                 digest(photo) for photo in (case.photo, *(second.photo for second in case.seconds))
             ]
-            inputs = digest_of([photos, about.get("metrics")])
+            inputs = json_digest([photos, about.get("metrics")])
             done = _load_part(part, inputs)
             if done is None:
                 if index and not begun:
@@ -163,7 +163,7 @@ def _open_folder(output: Path, config: Mapping[str, Any], about: Mapping[str, An
         ):
             raise InputError(f"{path}: not written by `spackle {kind}`: choose another -o")
         old.pop("about", None)
-        if lines := differences(old, json.loads(json.dumps(config))):
+        if lines := config_differences(old, json.loads(json.dumps(config))):
             raise InputError(
                 f"{output}: holds results with other options ({'; '.join(lines)}): choose another -o"
             )

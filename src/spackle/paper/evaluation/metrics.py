@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spackle.core.hole_filling import blurred, greatest_around
+from spackle.core.filters import gaussian_blur, maximum_filter
 from spackle.paper.evaluation.measurements import load_data
 from spackle.paper.evaluation.table import NOT_RUN
 from spackle.paper.training.losses import hole_psnr
@@ -83,7 +83,7 @@ def sharpness(image: Tensor, truth: Tensor, mask: Tensor) -> float:
     Counts pixels inside `mask` [H, W], at least 3 pixels from the mask's border; NaN if no pixel counts. `image` and
     `truth` are [H, W, 3] sRGB 0..1.
     """
-    inner = ~greatest_around(~mask, INNER // 2)
+    inner = ~maximum_filter(~mask, INNER // 2)
     ours, theirs = (
         torch.hypot(*torch.gradient(picture @ GREY_WEIGHTS))[inner].mean()
         for picture in (image, truth)
@@ -126,7 +126,7 @@ def ssim_map(image: Tensor, truth: Tensor) -> Tensor:
 def _blur(image: Tensor) -> Tensor:
     reach = WINDOW // 2
     wide = np.pad(image.numpy(), ((reach, reach), (reach, reach), (0, 0)), "symmetric")
-    return blurred(torch.from_numpy(wide), SIGMA)[reach:-reach, reach:-reach]
+    return gaussian_blur(torch.from_numpy(wide), SIGMA)[reach:-reach, reach:-reach]
 
 
 def open_metrics(

@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from spackle.core.color import to_bytes
+from spackle.core.color import to_uint8
 from spackle.formats.png import thumbnail
 from spackle.paper.evaluation.folder import image_file, load_run
 from spackle.paper.evaluation.measurements import Run, load_data
@@ -128,7 +128,7 @@ def _as_wide(picture: Image.Image, width: int) -> Image.Image:
 
 def save_picture(picture: Tensor, path: Path) -> None:
     """Write [H, W, 3] sRGB 0..1 as WebP, with a longer side of at most `LARGE_SIDE` pixels."""
-    image = Image.fromarray(to_bytes(thumbnail(picture, LARGE_SIDE)).numpy())
+    image = Image.fromarray(to_uint8(thumbnail(picture, LARGE_SIDE)).numpy())
     with atomic_path(path) as temporary:
         image.save(temporary, format="WEBP", quality=QUALITY, method=4)
 
@@ -241,7 +241,7 @@ def make_figures(folders: Sequence[Path], rows: int, output: Path, reporter: Rep
     for name in [figure.name for figure in FIGURES if figure.name not in made]:
         reporter.log(f"no figure {name}: no large-view run has the pictures of its methods")
     files = [f"{name}.{end}" for name in made for end in ("pdf", "png")]
-    with results_folder(output, (*files, CAPTIONS), alone=True):
+    with results_folder(output, (*files, CAPTIONS), locked=True):
         for name, (image, _) in made.items():
             for form, more in (
                 ("pdf", {"resolution": DPI, "quality": 95}),

@@ -12,7 +12,7 @@ from torch import Tensor
 from spackle.bases import BasePrediction
 from spackle.core.camera import Camera
 from spackle.core.photo import working_size
-from spackle.core.trajectories import DepthRange, extremes
+from spackle.core.trajectories import DepthRange, leftmost_and_rightmost
 from spackle.depth.depth_map import DepthMap
 from spackle.paper.evaluation.case import Case, Points, Viewpoint
 from spackle.paper.evaluation.measurements import REMARK, Measurement
@@ -87,7 +87,7 @@ def large_views(
             Viewpoint(f"{disparity:g}", name, camera)
             for disparity in disparities
             for name, camera in zip(
-                ("left", "right"), extremes(even, disparity, reach), strict=True
+                ("left", "right"), leftmost_and_rightmost(even, disparity, reach), strict=True
             )
         ]
     except ValueError as error:

@@ -36,7 +36,7 @@ from spackle.paper.training.residual import ViewBatch, ViewTask
 from spackle.paper.training.samples import short_digest
 from spackle.paper.training.sources import open_pseudo_dataset, split_photos
 from spackle.render import Renderer, device_of
-from spackle.runtime.device import enough_memory, own_arithmetic
+from spackle.runtime.device import report_memory_shortage, without_autocast_or_tf32
 from spackle.runtime.errors import InputError
 from spackle.runtime.files import write_atomic
 from spackle.runtime.progress import Reporter
@@ -67,7 +67,7 @@ class TunableSharp:
         """Run the frozen encoder on a photo [H, W, 3], sRGB in 0..1, with a camera of the same size."""
         device = next(self.network.parameters()).device
         image = to_square(rgb.to(device), self.network.config.side)
-        with own_arithmetic(device):
+        with without_autocast_or_tf32(device):
             return self.network.encode(
                 image, photo_camera.focal[0] / photo_camera.width, usual_windows(device)
             )
@@ -80,7 +80,7 @@ class TunableSharp:
         autocast = torch.autocast(
             device.type, self.precision, enabled=self.precision != torch.float32
         )
-        with own_arithmetic(device):
+        with without_autocast_or_tf32(device):
             with autocast:
                 deltas = decoder(encoded.picture, encoded.maps)
             return compose(encoded.start, deltas).to(place)
@@ -109,7 +109,7 @@ def render_views_of_photo(
     InputError if memory runs out.
     """
     photo_camera = views[0].photo_camera
-    with enough_memory("try optim.precision=bf16"):
+    with report_memory_shortage("try optim.precision=bf16"):
         gaussians = base.gaussians(
             decoder, base.encode(views[0].photo, photo_camera), device_of(renderer)
         )

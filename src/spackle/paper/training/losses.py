@@ -16,7 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from spackle.core.hole_filling import blurred, greatest_around
+from spackle.core.filters import gaussian_blur, maximum_filter
 from spackle.paper.training.recipe import LossRecipe
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import check_file
@@ -188,8 +188,8 @@ def color_loss(rgb: Tensor, target: Tensor, hole: Tensor, blur: float = 0.0) -> 
     """
     apart = torch.where(hole[..., None], rgb - target, 0)
     if blur > 0:
-        mass = blurred(hole[..., None].to(rgb), blur).clamp_min(TINY)
-        apart = torch.where(hole[..., None], blurred(apart, blur) / mass, 0)
+        mass = gaussian_blur(hole[..., None].to(rgb), blur).clamp_min(TINY)
+        apart = torch.where(hole[..., None], gaussian_blur(apart, blur) / mass, 0)
     return _mean_of_images(apart.abs().mean(-1), hole)
 
 
@@ -228,7 +228,7 @@ def perceptual_loss(
         size: longer side in pixels to which images are resized for the network; None: not resized.
         gram: weight of the Gram matrices.
     """
-    near = greatest_around(hole, dilation // 2)
+    near = maximum_filter(hole, dilation // 2)
     if (
         near.device.type == "cpu" and not near.any()
     ):  # reading a mask on a GPU would wait for the GPU

@@ -19,9 +19,9 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from spackle.core.camera import Camera
-from spackle.core.color import linear_to_srgb, srgb_to_linear, to_bytes
+from spackle.core.color import linear_to_srgb, srgb_to_linear, to_uint8
+from spackle.core.filters import maximum_filter
 from spackle.core.gaussians import Gaussians
-from spackle.core.hole_filling import greatest_around
 from spackle.paper.training.recipe import DataRecipe
 from spackle.paper.training.train import rank, rank_count, wait_for_ranks
 from spackle.render import CpuRenderer
@@ -95,7 +95,7 @@ class Sample:
     @functools.cached_property
     def tiles(self) -> Tensor:
         """[ceil(H/16), ceil(W/16)] bool: tiles of the renderer that aux Gaussians can touch."""
-        near = greatest_around(self.hole, REACH_PX)
+        near = maximum_filter(self.hole, REACH_PX)
         return max_pool2d(near[None, None].float(), TILE, ceil_mode=True)[0, 0] > 0
 
     def to(self, device: torch.device) -> Sample:
@@ -172,7 +172,7 @@ def save_sample(sample: Sample, path: Path) -> None:
     tensors["seeds.unit"] = torch.tensor(sample.seeds.unit, dtype=torch.float64)
     del tensors["seeds.uv"]  # computed from the camera
     tensors["base.colors"] = linear_to_srgb(sample.base.colors)
-    tensors |= {name: to_bytes(tensors[name]) for name in EIGHT_BITS}
+    tensors |= {name: to_uint8(tensors[name]) for name in EIGHT_BITS}
     quats = sample.base.quats  # not normalised: the largest component becomes 127
     tensors["base.quats"] = (
         (127 * quats / quats.abs().amax(-1, keepdim=True)).round().to(torch.int8)

@@ -19,15 +19,15 @@ from spackle.bases import BasePrediction
 from spackle.bases.depth import lift
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
-from spackle.core.photo import PHOTO_SUFFIXES, film_to_pixels, load_photo
-from spackle.core.trajectories import SHARP_TRAJECTORIES, DepthRange, trajectory
+from spackle.core.photo import PHOTO_SUFFIXES, focal_mm_to_px, load_photo
+from spackle.core.trajectories import SHARP_TRAJECTORIES, DepthRange, trajectory_cameras
 from spackle.depth.depth_map import DepthMap, load_depth, read_calibration
 from spackle.paper.dataset.shards import DatasetFiles
 from spackle.paper.training.recipe import DataRecipe
 from spackle.paper.training.samples import Sample, Source
 from spackle.render import Renderer
 from spackle.runtime.errors import InputError, as_input_error
-from spackle.runtime.files import files_in
+from spackle.runtime.files import list_files
 
 VISIBLE_DEPTH_TOLERANCE = 0.02  # a Gaussian up to this far behind the visible surface, relative to the depth, counts as visible
 MAX_CORNER_DISTANCE_PX = (
@@ -130,7 +130,7 @@ def find_files(folder: Path, key: str, endings: tuple[str, ...], what: str) -> l
     """All files below a folder with one of these endings, sorted; InputError if there are none."""
     if not os.path.isdir(folder):
         raise InputError(f"{folder}: no such folder, but {key} names it: give {key}=FOLDER")
-    files = files_in(folder, endings, below=True)
+    files = list_files(folder, endings, below=True)
     if not files:
         raise InputError(f"{folder}: contains no {what}: set {key} to another folder")
     return files
@@ -206,7 +206,7 @@ def random_reverse_view(
     )  # no tiles: a tile would be seen or hidden as a whole
     kind = SHARP_TRAJECTORIES[rng.integers(len(SHARP_TRAJECTORIES))]
     reach = DepthRange.of(prediction.gaussians)
-    viewer = trajectory(kind, camera, rng.uniform(*disparity), reach, PATH_FRAMES)[
+    viewer = trajectory_cameras(kind, camera, rng.uniform(*disparity), reach, PATH_FRAMES)[
         rng.integers(PATH_FRAMES)
     ]
     return reverse_view(prediction, rgb, viewer, renderer)
@@ -338,7 +338,7 @@ def draw_composite(
     rgb, inverse_depth = compose_cutouts(
         rng, lambda rng: load_photo(pick_random(rng, photos)).rgb, height, width
     )
-    focal = film_to_pixels(rng.uniform(*FOCAL_MM), width, height)
+    focal = focal_mm_to_px(rng.uniform(*FOCAL_MM), width, height)
     every = torch.ones_like(inverse_depth, dtype=torch.bool)
     depth = DepthMap(1.0 / inverse_depth, every, None, None, "depth", Path("composite"))
     return rgb, depth, Camera.from_focal(focal, width, height)

@@ -44,10 +44,10 @@ from spackle.paper.training.checkpoint import (
     save_checkpoint,
 )
 from spackle.paper.training.recipe import AnyRecipe, OptimRecipe
-from spackle.runtime.device import hardware, pick_device, versions
+from spackle.runtime.device import hardware_facts, package_versions, pick_device
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import results_folder, write_json
-from spackle.runtime.progress import Reporter, asked_to_stop
+from spackle.runtime.progress import Reporter, catch_stop_signals
 
 EMA_WARMUP_STEPS = (
     10  # the early decay is (step + 1) / (step + 10): the average soon forgets the initial weights
@@ -138,7 +138,7 @@ def train(
     kind = pick_device(None if recipe.run.device == "auto" else recipe.run.device).type
     with joined_ranks(kind) as device, contextlib.ExitStack() as stack:
         if rank() == 0:  # the only process that writes
-            stack.enter_context(results_folder(output, RUN_FILES, alone=True))
+            stack.enter_context(results_folder(output, RUN_FILES, locked=True))
         else:
             reporter = Reporter(console=Console(quiet=True))
         task = open_task(recipe, device)
@@ -179,7 +179,11 @@ def train(
             "aim": task.selection_measure,
             "recipe": recipe.model_dump(mode="json"),
         }
-        facts |= {"processes": rank_count(), "versions": versions(), "hardware": hardware(device)}
+        facts |= {
+            "processes": rank_count(),
+            "versions": package_versions(),
+            "hardware": hardware_facts(device),
+        }
 
         def ended() -> str:
             """Why the run ends now; empty if the run continues."""
@@ -216,7 +220,7 @@ def train(
                 prefetch(lambda key: task.load_batch(*key), todo, readers)
             ) as batches,
             reporter.steps("train", progress.step, optim.steps) as tell,
-            asked_to_stop(alone=rank_count() == 1) as asked,
+            catch_stop_signals(single_process=rank_count() == 1) as asked,
         ):
             begun, before, recent = time.perf_counter(), progress.seconds, list[dict[str, float]]()
             while not ended():

@@ -23,7 +23,7 @@ from spackle.paper.evaluation.datasets.multiview import Posed, make_cases, posed
 from spackle.paper.evaluation.datasets.stereo import HALF_PIXEL
 from spackle.paper.evaluation.measurements import IMAGES
 from spackle.runtime.errors import InputError, as_input_error
-from spackle.runtime.files import files_in
+from spackle.runtime.files import list_files
 
 LLFF_PHOTOS = ("images_4", "images", "images_8")  # the first of these folders with photos is used
 MAX_POSES_BYTES = 1 << 24
@@ -112,7 +112,9 @@ def llff_cases(scenes: Mapping[str, Path]) -> list[Case]:
 
 def _llff_views(scene: Path) -> list[Posed]:
     folders = (scene / name for name in LLFF_PHOTOS if (scene / name).is_dir())
-    photos = next((files for folder in folders if (files := files_in(folder, PHOTO_SUFFIXES))), [])
+    photos = next(
+        (files for folder in folders if (files := list_files(folder, PHOTO_SUFFIXES))), []
+    )
     path = scene / "poses_bounds.npy"
     rows = _read_bounds(path, len(photos)) if path.is_file() else ()
     bounds = {

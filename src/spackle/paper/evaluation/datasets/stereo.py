@@ -27,7 +27,7 @@ from spackle.depth.depth_map import (
 )
 from spackle.paper.evaluation.case import Case, SecondView
 from spackle.runtime.errors import InputError, as_input_error
-from spackle.runtime.files import files_in
+from spackle.runtime.files import list_files
 
 HALF_PIXEL = 0.5  # Middlebury's and Booster's (0, 0) is the middle of the first pixel; here (0, 0) is its corner
 TRUTHS = ("disp0GT.pfm", "disp0.pfm")  # the names in MiddEval3, and in the 2014 dataset
@@ -137,7 +137,7 @@ def booster_cases(scenes: Mapping[str, Path]) -> list[Case]:
 
 
 def _lights_of(scene: Path) -> list[Case]:
-    photos, rights = files_in(scene / "camera_00", PHOTO_SUFFIXES), scene / "camera_02"
+    photos, rights = list_files(scene / "camera_00", PHOTO_SUFFIXES), scene / "camera_02"
     lens, truth = _read_opencv(scene / "calib_00-02.xml"), scene / "disp_00.npy"
     if not truth.is_file():
         raise InputError(
