@@ -154,7 +154,7 @@ def test_scenes_are_written_to_open_files(scene: spackle.Scene, tmp_path: Path) 
             (160, 40)
         ] * 3
     for bad in ({"stereo": "both"}, {"fit": "fill"}, {"show": "light"}, {"format": "avi"}):
-        with pytest.raises(spackle.InputError, match=r"^(--\w+ \w+ is unknown|video\.avi: not)"):
+        with pytest.raises(spackle.InputError, match=r"^(`\w+` \w+ is unknown|video\.avi: not)"):
             scene.save_video(io.BytesIO(), **bad)  # type: ignore[arg-type]
     off = (scene.depth_map() / torch.from_numpy(metres()) - 1).abs()
     assert float((off < 0.05).float().mean()) > 0.9  # except at outlines

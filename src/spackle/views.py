@@ -51,7 +51,7 @@ class PathOptions:
 
     def check(self) -> None:
         """Raise an InputError for an impossible path or video, or for options that contradict each other."""
-        check_name("--trajectory", self.trajectory.replace("_", "-"), TRAJECTORIES)
+        check_name("trajectory", self.trajectory.replace("_", "-"), TRAJECTORIES)
         if self.disparity is not None and not (
             math.isfinite(self.disparity) and 0 <= self.disparity <= MAX_DISPARITY
         ):

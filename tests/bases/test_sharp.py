@@ -168,7 +168,7 @@ def test_auto_is_bf16_if_the_hardware_multiplies_it(
     assert has_native_bf16(CPU) is native
     assert pick_dtype("auto", CPU) == (torch.bfloat16 if native else torch.float32)
     assert (pick_dtype("fp32", CPU), pick_dtype("bf16", CPU)) == (torch.float32, torch.bfloat16)
-    with pytest.raises(InputError, match="--precision fp16 is unknown"):
+    with pytest.raises(InputError, match="`precision` fp16 is unknown"):
         pick_dtype("fp16", CPU)  # type: ignore[arg-type]
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: (8 if native else 7, 0))
     assert has_native_bf16(torch.device("cuda")) is native  # from Ampere on

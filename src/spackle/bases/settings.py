@@ -130,8 +130,8 @@ class BaseSettings:
                 f"--base {HF} names no model: give a Hugging Face model as owner/name, or a folder"
             )
         if not self.name.startswith(HF):
-            check_name("--base", self.name, (AUTO, RGBD, *NETWORKS))
-        check_name("--precision", self.precision, PRECISIONS)
+            check_name("base", self.name, (AUTO, RGBD, *NETWORKS))
+        check_name("precision", self.precision, PRECISIONS)
         options = {
             "--depth": self.depth.path if isinstance(self.depth, DepthMap) else self.depth,
             "--calib": self.calib,
@@ -149,7 +149,7 @@ class BaseSettings:
                     f"{option} {value}: the {kind} base does not take this option: leave it out"
                 )
         check_windows("--sharp windows", self.windows)
-        check_name("--depth-kind", self.depth_kind, DEPTH_KINDS)
+        check_name("depth_kind", self.depth_kind, DEPTH_KINDS)
         for option in ("--calib", *READING):
             if (value := options[option]) is not None and self.depth is None:
                 raise InputError(

@@ -16,6 +16,7 @@ import typer
 from typer.exceptions import TyperException
 
 from spackle.cli import commands, dataset, evaluate, train, weights
+from spackle.cli.messages import applications, with_flags
 from spackle.cli.options import INTERRUPTED
 from spackle.runtime.errors import InputError, printable_line
 
@@ -58,6 +59,7 @@ app.add_typer(
     name="dataset",
     short_help="Build training data: views with holes and completed targets",
 )
+applications.append(app)
 
 
 def _version(asked: bool) -> None:
@@ -131,7 +133,7 @@ def _end(number: int, frame: object) -> NoReturn:
 
 
 def _fail(message: str) -> NoReturn:
-    line = printable_line(message)
+    line = with_flags(printable_line(message))
     print(f"error: {line}", file=sys.stderr)
     if "--json" in sys.argv:
         print(json.dumps({"error": line}))

@@ -169,10 +169,10 @@ def predict(
     A depth map, or weights from `spackle weights get depth` or `sharp`, improve the geometry.
     """
     from spackle.bases.settings import BaseSettings
+    from spackle.cli.messages import CommandReporter
     from spackle.cli.photos import PredictOptions, predict_all
     from spackle.pipeline import FillOptions, PipelineOptions
     from spackle.results.photo_folder import PhotoOptions
-    from spackle.runtime.progress import Reporter
 
     settings = BaseSettings(
         name=base,
@@ -196,7 +196,7 @@ def predict(
     options = PredictOptions(
         scene=scene, photo=photo, overwrite=overwrite, workers=workers, threads=threads
     )
-    if predict_all(photos, output, options, Reporter(verbose, as_json=as_json)):
+    if predict_all(photos, output, options, CommandReporter(verbose, as_json=as_json)):
         raise typer.Exit(1)
 
 
@@ -224,8 +224,8 @@ def render(
     verbose: VerboseOption = False,
 ) -> None:
     """Render a saved scene along a camera path."""
+    from spackle.cli.messages import CommandReporter
     from spackle.cli.saved_scene import render_scene
-    from spackle.runtime.progress import Reporter
 
     path = dataclasses.replace(path, video=dataclasses.replace(path.video, compare=compare))
     render_scene(
@@ -234,7 +234,7 @@ def render(
         path,
         {"focal_px": focal_px, "fov": fov},
         device,
-        Reporter(verbose, as_json=as_json),
+        CommandReporter(verbose, as_json=as_json),
     )
 
 
@@ -253,10 +253,10 @@ def export(
     as_json: JsonOption = False,
 ) -> None:
     """Write a scene in the formats that other viewers read."""
+    from spackle.cli.messages import CommandReporter
     from spackle.cli.saved_scene import export_scene
-    from spackle.runtime.progress import Reporter
 
-    export_scene(scene, output, Reporter(as_json=as_json))
+    export_scene(scene, output, CommandReporter(as_json=as_json))
 
 
 def info(
@@ -267,10 +267,10 @@ def info(
 ) -> None:
     """Describe files: size, depth range, Gaussians and camera, and commands that take the file."""
     from spackle.cli.info import show_info
-    from spackle.runtime.progress import Reporter
+    from spackle.cli.messages import CommandReporter
 
     for file in files:
-        show_info(file, Reporter(as_json=as_json))
+        show_info(file, CommandReporter(as_json=as_json))
 
 
 def view(
@@ -317,13 +317,13 @@ def view(
     """Open a page in the browser that shows a scene or completes photos. Ctrl-C ends the server."""
     from spackle.bases.settings import BaseSettings
     from spackle.cli import serve as app
-    from spackle.runtime.progress import Reporter
+    from spackle.cli.messages import CommandReporter
 
     settings = BaseSettings(
         name=base, depth=depth, depth_kind=depth_kind, checkpoint=checkpoint, device=device
     )
     place = app.Place(host, port, secrets.token_urlsafe(16) if token else None, browser)
-    reporter = Reporter(verbose, as_json=as_json)
+    reporter = CommandReporter(verbose, as_json=as_json)
     usual = {"disparity": disparity, "keep_frame": keep_frame, "depth_kind": depth_kind}
     app.view(target, settings, usual, {"focal_px": focal_px, "fov": fov}, place, reporter)
     raise typer.Exit(INTERRUPTED)
@@ -375,7 +375,7 @@ def serve(
     """Serve an HTTP interface and a page that complete photos (see docs/http.md). Ctrl-C ends the server."""
     from spackle.bases.settings import BaseSettings
     from spackle.cli import serve as app
-    from spackle.runtime.progress import Reporter
+    from spackle.cli.messages import CommandReporter
     from spackle.web.jobs import RetentionLimits
     from spackle.web.work import SceneWork
 
@@ -387,7 +387,7 @@ def serve(
         workers,
         RetentionLimits(keep * 86400, quota * 1e9, waiting),
         place,
-        Reporter(verbose, as_json=as_json),
+        CommandReporter(verbose, as_json=as_json),
     )
     raise typer.Exit(INTERRUPTED)
 
@@ -401,6 +401,6 @@ def demo(
 ) -> None:
     """Complete Middlebury's Motorcycle photo and compare with the true second photo (needs scikit-image)."""
     from spackle.cli.demo import run_demo
-    from spackle.runtime.progress import Reporter
+    from spackle.cli.messages import CommandReporter
 
-    run_demo(output, Reporter(verbose, as_json=as_json))
+    run_demo(output, CommandReporter(verbose, as_json=as_json))

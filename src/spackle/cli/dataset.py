@@ -129,8 +129,8 @@ def dataset_build(
 ) -> None:
     """Build a pseudo-supervised dataset: manifest.json and shard-000000.tar, … (the paper's appendix)."""
     from spackle.bases.settings import BaseSettings
+    from spackle.cli.messages import CommandReporter
     from spackle.paper.dataset.build import DatasetOptions, build_dataset
-    from spackle.runtime.progress import Reporter
 
     settings = BaseSettings(
         name=base, depth=depth, checkpoint=checkpoint, precision=precision, device=device
@@ -150,7 +150,7 @@ def dataset_build(
         threads=threads,
         shard_size=shard_size,
     )
-    if build_dataset(photos, output, options, Reporter(verbose)) == "stopped":
+    if build_dataset(photos, output, options, CommandReporter(verbose)) == "stopped":
         raise typer.Exit(INTERRUPTED)
 
 
@@ -167,10 +167,10 @@ def dataset_info(location: DatasetArgument) -> None:
 @dataset.command("verify")
 def dataset_verify(location: DatasetArgument) -> None:
     """Read every byte and name each damaged sample; exit code 1 if any is damaged."""
+    from spackle.cli.messages import CommandReporter
     from spackle.paper.dataset.inspect import verify_dataset
-    from spackle.runtime.progress import Reporter
 
-    if verify_dataset(location, Reporter()):
+    if verify_dataset(location, CommandReporter()):
         raise typer.Exit(1)
 
 
@@ -185,7 +185,7 @@ def dataset_preview(
     views: Annotated[int, typer.Option(min=1, help="Number of views of each photo.")] = 6,
 ) -> None:
     """Write sheet.png (base, mask, target) and trajectory.mp4 (base beside target)."""
+    from spackle.cli.messages import CommandReporter
     from spackle.paper.dataset.inspect import preview_dataset
-    from spackle.runtime.progress import Reporter
 
-    preview_dataset(location, output, photos, views, Reporter())
+    preview_dataset(location, output, photos, views, CommandReporter())

@@ -133,9 +133,9 @@ def evaluate(
 ) -> None:
     """Evaluate on a dataset by the paper's protocols: rows.jsonl, tables.md, tables.tex, worst.png, best.png."""
     from spackle.bases.settings import BaseSettings
+    from spackle.cli.messages import CommandReporter
     from spackle.paper.evaluation.evaluate import EvaluateOptions, parse_disparities, split_words
     from spackle.paper.evaluation.evaluate import evaluate as run
-    from spackle.runtime.progress import Reporter
 
     options = EvaluateOptions(
         dataset=dataset,
@@ -161,7 +161,7 @@ def evaluate(
         download=download_metrics,
     )
     results = output or Path(f"evaluation-{dataset}-{protocol}")
-    if run(options, results, Reporter(verbose, as_json=as_json), html) == "stopped":
+    if run(options, results, CommandReporter(verbose, as_json=as_json), html) == "stopped":
         raise typer.Exit(INTERRUPTED)
 
 
@@ -178,10 +178,10 @@ def tables(
     html: Html = False,
 ) -> None:
     """Put several evaluations and benchmarks into the same tables: tables.md and tables.tex."""
+    from spackle.cli.messages import CommandReporter
     from spackle.paper.evaluation.evaluate import merge_tables
-    from spackle.runtime.progress import Reporter
 
-    merge_tables(results, output, Reporter(), html)
+    merge_tables(results, output, CommandReporter(), html)
 
 
 def figures(
@@ -202,10 +202,10 @@ def figures(
     ] = 6,
 ) -> None:
     """Draw the paper's figures of views: PDF, PNG, and captions in figures.tex."""
+    from spackle.cli.messages import CommandReporter
     from spackle.paper.evaluation.pictures import make_figures
-    from spackle.runtime.progress import Reporter
 
-    make_figures(results, rows, output, Reporter())
+    make_figures(results, rows, output, CommandReporter())
 
 
 def bench(
@@ -237,10 +237,10 @@ def bench(
 ) -> None:
     """Count the Gaussians and measure the time that Spackle adds to a base: rows.jsonl, bench.md, bench.tex."""
     from spackle.bases.settings import BaseSettings
+    from spackle.cli.messages import CommandReporter
     from spackle.paper.evaluation.bench import TIMED
     from spackle.paper.evaluation.bench import bench as run
     from spackle.paper.evaluation.evaluate import EvaluateOptions, parse_disparities
-    from spackle.runtime.progress import Reporter
 
     options = EvaluateOptions(
         dataset=dataset,
@@ -260,5 +260,8 @@ def bench(
         limit=limit,
     )
     results = output or Path(f"bench-{dataset}-{UNFIT.sub('-', base)}")
-    if run(options, runs, base_runs, results, Reporter(verbose, as_json=as_json)) == "stopped":
+    if (
+        run(options, runs, base_runs, results, CommandReporter(verbose, as_json=as_json))
+        == "stopped"
+    ):
         raise typer.Exit(INTERRUPTED)

@@ -98,7 +98,7 @@ def sharp_speed(words: Sequence[str] | None) -> dict[str, Any]:
     speed: dict[str, Any] = {}
     for word in words or ():
         key, _, value = word.partition("=")
-        check_name("--sharp", key, ("windows",))
+        check_name("sharp", key, ("windows",))
         if not value.isdecimal():
             raise InputError(f"--sharp {word}: give windows=N")
         speed["windows"] = int(value)

@@ -52,12 +52,12 @@ def train(
     verbose: VerboseOption = False,
 ) -> None:
     """Train the residual network or SHARP's decoder: best.safetensors, last.safetensors, run.json, pictures, logs."""
+    from spackle.cli.messages import CommandReporter
     from spackle.paper.training.direct_ft import DirectFt
     from spackle.paper.training.recipe import Recipe, load_recipe
     from spackle.paper.training.residual import ResidualTask
     from spackle.paper.training.train import train
     from spackle.runtime.errors import InputError
-    from spackle.runtime.progress import Reporter
 
     if method == "residual" and checkpoint is not None:
         raise InputError(
@@ -65,7 +65,11 @@ def train(
         )
     task = ResidualTask if method == "residual" else partial(DirectFt, checkpoint=checkpoint)
     ended = train(
-        load_recipe(Recipe, recipe, overrides or ()), task, output, Reporter(verbose), overwrite
+        load_recipe(Recipe, recipe, overrides or ()),
+        task,
+        output,
+        CommandReporter(verbose),
+        overwrite,
     )
     if ended == "stopped":
         raise typer.Exit(INTERRUPTED)

@@ -37,12 +37,12 @@ def weights_get(
     """Download weights and check their SHA-256; a broken download resumes where it stopped."""
     from rich.filesize import decimal
 
+    from spackle.cli.messages import CommandReporter
     from spackle.runtime.files import results_folder
-    from spackle.runtime.progress import Reporter
     from spackle.weights import published_weights, weights_digest, weights_folder
     from spackle.weights.download import download
 
-    reporter, entry = Reporter(as_json=as_json), published_weights(name)
+    reporter, entry = CommandReporter(as_json=as_json), published_weights(name)
     path = (output or weights_folder()) / entry.file
     if output is not None and output.suffix.lower() == path.suffix and not os.path.isdir(output):
         path = output
@@ -77,10 +77,10 @@ def weights_list(as_json: JsonOption = False) -> None:
     """List the published weights, and say which are on this machine."""
     from rich.filesize import decimal
 
-    from spackle.runtime.progress import Reporter
+    from spackle.cli.messages import CommandReporter
     from spackle.weights import PUBLISHED_WEIGHTS, weights_folder
 
-    reporter, folder = Reporter(as_json=as_json), weights_folder()
+    reporter, folder = CommandReporter(as_json=as_json), weights_folder()
     for entry in PUBLISHED_WEIGHTS.values():
         file, state = folder / entry.file, "not here"
         if os.path.isfile(file):

@@ -95,7 +95,7 @@ PRECISIONS: tuple[Precision, ...] = get_args(Precision)
 
 def pick_dtype(precision: Precision, device: torch.device) -> torch.dtype:
     """The dtype for a precision on a device; "auto" is bfloat16 on hardware that multiplies bfloat16."""
-    check_name("--precision", precision, PRECISIONS)
+    check_name("precision", precision, PRECISIONS)
     if precision == "auto":
         return torch.bfloat16 if has_native_bf16(device) else torch.float32
     return torch.float32 if precision == "fp32" else torch.bfloat16

@@ -110,10 +110,13 @@ def short_repr(value: object) -> str:
 
 
 def check_name(option: str, name: str, known: Iterable[str]) -> None:
-    """Raise an InputError for an unknown name; the message suggests the most similar known name."""
+    """Raise an InputError for an unknown name; the message suggests the most similar known name.
+
+    `option` is the Python name of the option whose value is `name`, such as "depth_kind".
+    """
     names = list(known)
     if name in names:
         return
     near = difflib.get_close_matches(name.lower(), names, n=1, cutoff=0.5)
     advice = f"did you mean {near[0]}? There" if near else "there"
-    raise InputError(f"{option} {name} is unknown: {advice} are {', '.join(names)}")
+    raise InputError(f"`{option}` {name} is unknown: {advice} are {', '.join(names)}")

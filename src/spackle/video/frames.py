@@ -151,10 +151,10 @@ class VideoOptions:
 
     def check(self) -> None:
         """Raise an InputError for unknown names, and for options that contradict each other."""
-        check_name("--fit", self.fit, get_args(Fit))
-        check_name("--show", self.show, get_args(Show))
+        check_name("fit", self.fit, get_args(Fit))
+        check_name("show", self.show, get_args(Show))
         if self.stereo is not None:
-            check_name("--stereo", self.stereo, get_args(StereoLayout))
+            check_name("stereo", self.stereo, get_args(StereoLayout))
         for option, loop in (
             (f"--fps {self.frames_per_second:g}", None),
             (f"--loop {self.loop}", self.loop),

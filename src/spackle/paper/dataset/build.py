@@ -103,7 +103,7 @@ class DatasetOptions:
                 f"--depth {depth}: no such folder: give a folder with a depth map for each photo"
             )
         if not is_inpainter(self.inpainter):
-            check_name("--inpainter", self.inpainter, COMPLETIONS)
+            check_name("inpainter", self.inpainter, COMPLETIONS)
         takes = is_inpainter(self.inpainter) and inpainter_class(self.inpainter).uses_network
         if not takes and (self.inpainter_weights or self.inpainter_side) is not None:
             raise InputError(

@@ -113,11 +113,11 @@ class EvaluateOptions:
 
     def check(self) -> None:
         """InputError if an option cannot be used; the images are not looked at."""
-        check_name("--dataset", self.dataset, DATASETS)
+        check_name("dataset", self.dataset, DATASETS)
         for method in self.methods:
-            check_name("--methods", method, METHODS)
+            check_name("methods", method, METHODS)
         for metric in self.metrics or ():
-            check_name("--metrics", metric, METRICS)
+            check_name("metrics", metric, METRICS)
             if METRICS[metric].truth and not self.near:
                 raise InputError(
                     f"--metrics {metric}: needs a true second view: add --protocol near-view"

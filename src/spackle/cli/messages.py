@@ -1,0 +1,62 @@
+"""Messages as the command line shows them: options are named as flags.
+
+The library names an option in backticks by its Python name, such as `depth_kind`. Whoever calls the
+library from Python knows it by this name; whoever types a command knows it as `--depth-kind`.
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+from collections.abc import Mapping
+
+import typer
+from typer.core import TyperGroup
+from typer.main import get_command
+
+from spackle.runtime.progress import Reporter
+
+# The application whose commands' options are known; `spackle.cli` adds it once all commands exist.
+applications: list[typer.Typer] = []
+
+
+def with_flags(message: str) -> str:
+    """The message, with every option in backticks replaced by its flag: `fov` becomes --fov.
+
+    A name in backticks that no command has as an option stays as it is.
+    """
+
+    def flag_of(match: re.Match[str]) -> str:
+        flag = "--" + match[1].replace("_", "-")
+        return flag if flag in _known_flags() else match[0]
+
+    return re.sub(r"`([a-z][a-z0-9_]*)`", flag_of, message)
+
+
+@functools.cache
+def _known_flags() -> set[str]:
+    """All long flags, such as --fov, of all commands and of their subcommands."""
+    flags: set[str] = set()
+    commands = [get_command(application) for application in applications]
+    while commands:
+        command = commands.pop()
+        for parameter in command.params:
+            flags.update(option for option in parameter.opts if option.startswith("--"))
+        if isinstance(command, TyperGroup):
+            commands.extend(command.commands.values())
+    return flags
+
+
+class CommandReporter(Reporter):
+    """Reports progress, messages and results of a command; options in messages are named as flags."""
+
+    def log(self, line: str) -> None:
+        """Print a line."""
+        super().log(with_flags(line))
+
+    def result(self, values: Mapping[str, object]) -> None:
+        """Print a result as a line of JSON if the user asked for JSON; an error in it names flags."""
+        error = values.get("error")
+        if isinstance(error, str):
+            values = {**values, "error": with_flags(error)}
+        super().result(values)
