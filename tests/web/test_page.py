@@ -297,7 +297,20 @@ def test_the_whole_photo_and_every_control_has_room(page: Any, size: tuple[int, 
     page.set_viewport_size(before)
 
 
-def test_a_photo_is_sent_to_the_server_and_watched(browser: Any, tmp_path: Path) -> None:
+def drag_moves_the_eye(page: Any) -> None:
+    """Drag from the middle of the picture to the left, as a hand does; the eye must go to the right."""
+    settled(page, "spackle.settled()")
+    frame = page.locator("#frame").bounding_box()
+    x, y = frame["x"] + frame["width"] / 2, frame["y"] + frame["height"] / 2
+    start = page.evaluate("spackle.pose().eye[0]")
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x - 0.1 * frame["width"], y)
+    page.mouse.up()
+    assert page.evaluate("spackle.pose().eye[0]") > start
+
+
+def test_a_photo_is_sent_to_the_server_watched_and_dragged(browser: Any, tmp_path: Path) -> None:
     photo, depth = write_pair(tmp_path / "first")
     photo = photo.rename(tmp_path / "my photo.png")
     with served(tmp_path / "scenes", work=SceneWork(), max_bytes=MAX_UPLOAD_BYTES) as server:
@@ -312,6 +325,7 @@ def test_a_photo_is_sent_to_the_server_and_watched(browser: Any, tmp_path: Path)
         page.locator("#frame.waiting #photo").wait_for()  # the picture stands where the scene will
         page.get_by_role("heading", name="my photo.png").wait_for()
         page.locator("#notice").wait_for(state="hidden")
+        drag_moves_the_eye(page)
         for start, name in (
             (lambda: page.locator("#record").click(), "my-photo.mp4"),
             (lambda: page.locator("#download").select_option(".glb"), "my-photo.glb"),

@@ -1,4 +1,4 @@
-// Layers as src/spackle/web/layers.py writes them, as Spark's Gaussians.
+// Layers as src/spackle/formats/html.py writes them, as Spark's Gaussians.
 import { ExtSplats } from "@sparkjsdev/spark";
 
 const BYTES = 20;

@@ -1,4 +1,4 @@
-// Where the eye stands and how it looks: the conventions of src/spackle/trajectory.py and camera.py.
+// Where the eye stands and how it looks: the conventions of src/spackle/core/trajectories.py and src/spackle/core/camera.py.
 
 /** Eye [x, y, z] in metres on a path, at t in 0..1; the path's samples come from Python. */
 export function eyeOnPath(description, kind, disparity, t) {

@@ -1,4 +1,4 @@
-/* built from web/ by "make viewer", sources 55606bc9453b818f7decad0b5294c91dba455917546d91cbf3461fddb9287555
+/* built from web/ by "make viewer", sources 3b4761ccb0116cbfd8059fd682481e3cfad61283414813022434931d50201e65
 
 viewer.js holds the page of Spackle (Apache-2.0, see LICENSE of the project) and these packages:
 
