@@ -2,10 +2,10 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
-# The pinned versions need Python 3.11; with 3.10 pip chooses.
-PINNED := $(shell $(PYTHON) -c "import sys; print('--constraint constraints.txt' * (sys.version_info >= (3, 11)))")
+# The versions of all packages, for every Python and system: CONTRIBUTING.md says how they are renewed.
+PINNED := --constraint constraints.txt
 PIP := $(BIN)/pip install --disable-pip-version-check --quiet $(PINNED)
-.PHONY: demo test fuzz test-wheel test-slow wheel dist test-install docs lint types check release-check bench reproduce viewer clean clean-cache
+.PHONY: demo test test-fast hooks pins fuzz test-wheel test-slow wheel dist test-install docs lint types check release-check bench reproduce viewer clean clean-cache
 
 $(VENV)/.demo: pyproject.toml constraints.txt
 	@echo "Installing Spackle and what it needs into $(VENV), once: some minutes, and about 400 MB of downloads."
@@ -25,6 +25,21 @@ demo: $(VENV)/.demo
 
 test: $(VENV)/.installed
 	$(BIN)/python -m pytest -n 2 --dist loadfile
+
+# What a minute can tell: all tests of values, kernels and files, without commands, browsers and training.
+test-fast: $(VENV)/.installed
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'not slow and not journey'
+
+# Checks before each commit (.pre-commit-config.yaml).
+hooks: $(VENV)/.installed
+	$(BIN)/pre-commit install
+
+# Newer versions of all packages into constraints.txt.
+pins: $(VENV)/.installed
+	test -x build/uv/bin/uv || { $(PYTHON) -m venv build/uv && build/uv/bin/pip install --quiet uv; }
+	build/uv/bin/uv pip compile pyproject.toml --universal --python-version 3.10 --upgrade --quiet \
+		$(foreach extra,demo dev eval hf opencv train,--extra $(extra)) \
+		--no-emit-index-url --no-annotate --no-header --output-file constraints.txt
 
 # In an environment that is empty but for the wheel: pip fetches what it asks for.
 test-wheel: $(VENV)/.installed
