@@ -28,6 +28,7 @@ from suite_scenes import SIDE, commit, find_view, holed_scene, photo_scene
 from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.base import to_metric
 from spackle.core.camera import Camera
+from spackle.core.focal_length import FocalSource
 from spackle.core.gaussians import Gaussians
 from spackle.core.photo import Photo
 from spackle.core.trajectories import DepthRange, leftmost_and_rightmost
@@ -89,7 +90,7 @@ def sharp(options: argparse.Namespace, precision: Precision = "fp32") -> tuple[S
     photo = Photo(
         torch.rand(SIDE, SIDE, 3, generator=torch.Generator().manual_seed(0)),
         1843.2,
-        "",
+        FocalSource.DATASET,
         Path("photo.png"),
     )
     base = SharpBase.load(options.checkpoint, precision=precision, device=CUDA)

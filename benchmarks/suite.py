@@ -34,6 +34,7 @@ from spackle.bases.settings import BaseSettings
 from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.base import to_metric
 from spackle.core.camera import Camera
+from spackle.core.focal_length import FocalSource
 from spackle.core.gaussians import Gaussians
 from spackle.core.photo import Photo
 from spackle.core.trajectories import DepthRange, trajectory_cameras
@@ -309,7 +310,7 @@ def section(name: str, options: argparse.Namespace, peaks: Peaks) -> Section:
     if name == "sharp":
         if options.checkpoint is None:
             raise InputError("no weights: name them by -c FILE")
-        photo = Photo(torch.rand(SIDE, SIDE, 3), 1.2 * SIDE, "", Path("photo.png"))
+        photo = Photo(torch.rand(SIDE, SIDE, 3), 1.2 * SIDE, FocalSource.DATASET, Path("photo.png"))
         speed = {
             "windows": options.windows,
             "compiled": options.compile,

@@ -129,7 +129,7 @@ def test_a_photo_and_its_depth_in_every_form(pair: tuple[Path, Path], tmp_path: 
             "leave one of them out",
         ),
         (np.zeros((48, 64, 3)), {"base": "sharpest"}, "sharp"),
-        (np.zeros((48, 64, 3)), {"fov": "60"}, "--fov must be a positive number, got '60'"),
+        (np.zeros((48, 64, 3)), {"fov": "60"}, "`fov` must be a positive number, got '60'"),
         (np.zeros((48, 64, 3)), {"residual": "no" * 9000}, "no such weight file"),
     ],
     ids=lambda value: value if isinstance(value, str) and len(value) < 30 else type(value).__name__,

@@ -22,8 +22,8 @@ from spackle.bases.open import OpenedBase, open_base
 from spackle.bases.settings import AUTO, AUTO_NETWORKS, BaseSettings
 from spackle.core.camera import Camera
 from spackle.core.color import linear_to_srgb, srgb_to_linear
+from spackle.core.focal_length import resolve_focal_length
 from spackle.core.gaussians import Gaussians
-from spackle.core.photo import resolve_focal_length
 from spackle.core.trajectories import MAX_DISPARITY, TRAJECTORIES, TrajectoryKind
 from spackle.depth.depth_map import FAR_M, NEAREST_M, RELATIVE, relative_depth
 from spackle.formats.scene_files import SH_C0

@@ -180,7 +180,7 @@ class Pipeline:
                 prediction = choose_disparity(prediction, self.renderer, photo.path)
         reporter.log(
             f"{name}: {len(prediction.gaussians):,} Gaussians from {choice.base}, "
-            f"focal length {prediction.camera.focal[0]:.0f} px ({prediction.lens_source or photo.focal_source})"
+            f"focal length {prediction.camera.focal[0]:.0f} px ({prediction.lens_source or photo.focal_source.value})"
         )
         if chosen:
             reporter.log(f"{name}: {move_in_words(prediction)}")

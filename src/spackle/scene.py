@@ -15,8 +15,8 @@ from torch import Tensor
 from spackle.bases import USUAL_DISPARITY
 from spackle.core import trajectories as camera_path
 from spackle.core.camera import Camera
+from spackle.core.focal_length import resolve_focal_length
 from spackle.core.gaussians import Gaussians
-from spackle.core.photo import resolve_focal_length
 from spackle.core.trajectories import DEFAULT_OVERSCAN, DepthRange, KeyframePath, TrajectoryKind
 from spackle.formats.html import PageScene, page_scene, single_html
 from spackle.formats.scene_files import Encoder, SceneFile, encoder_for, is_at_origin, load_scene

@@ -15,6 +15,7 @@ from weights import save_networks
 
 import spackle
 from spackle.bases.lite import FARTHEST, SCALE, SHIPPED, LiteBase, LiteNet, load_networks
+from spackle.core.focal_length import FocalSource
 from spackle.core.photo import Photo
 from spackle.depth.depth_map import NEAREST_M
 from spackle.runtime.errors import InputError
@@ -50,7 +51,7 @@ def test_depth_of_a_real_photo_beats_a_ramp_and_a_plane() -> None:
 
 def test_the_same_photo_gives_the_same_scene_and_its_colours() -> None:
     rgb = motorcycle()[0][:96, :128]
-    photo = Photo(rgb, 140.8, "default 30 mm", Path("photo.png"))
+    photo = Photo(rgb, 140.8, FocalSource.ASSUMED, Path("photo.png"))
     one, other = (shipped().predict(photo) for _ in range(2))
     assert same_bits(one.gaussians, other.gaussians)
     view = spackle.get_renderer("cpu").render(one.gaussians, one.camera)

@@ -26,6 +26,7 @@ from spackle.bases.moge.base import SKY, MogeBase, MogeView, to_view
 from spackle.bases.moge.network import MogeOutput, load_network
 from spackle.bases.open import open_base
 from spackle.bases.settings import BaseSettings
+from spackle.core.focal_length import FocalSource
 from spackle.core.photo import Photo
 from spackle.runtime.errors import InputError
 
@@ -120,7 +121,7 @@ def test_focal_length_and_shift_alone() -> None:
 
 
 def photo_of(rgb: Tensor) -> Photo:
-    return Photo(rgb, 120.0, "default 30 mm", Path("photo.png"))
+    return Photo(rgb, 120.0, FocalSource.ASSUMED, Path("photo.png"))
 
 
 def test_whose_focal_length_is_used_and_the_distance_of_the_sky(
@@ -128,7 +129,7 @@ def test_whose_focal_length_is_used_and_the_distance_of_the_sky(
 ) -> None:
     photo, output = photo_of(torch.from_numpy(picture(160, 90)) / 255), scene(0.5, scale=2.0)
     monkeypatch.setattr(base, "ask", lambda *given: output)
-    for source in ("--focal-px", "EXIF"):
+    for source in (FocalSource.FOCAL_PX, FocalSource.EXIF):
         kept = base.predict(dataclasses.replace(photo, focal_source=source))
         assert (kept.camera.focal[0], kept.lens_source) == (120, "")
     seen = base.predict(photo)

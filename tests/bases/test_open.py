@@ -24,6 +24,7 @@ from spackle.bases.settings import BaseSettings
 from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.encoder import MICRO
 from spackle.bases.transformers import HfBase
+from spackle.core.focal_length import FocalSource
 from spackle.core.photo import Photo, load_photo
 from spackle.depth.depth_map import DepthMap, load_depth
 from spackle.runtime.errors import InputError
@@ -163,7 +164,7 @@ def test_the_focal_length_comes_from_the_user_then_the_map_then_the_photo(
         scene = spackle.predict(ours_px, depth=depth, residual="none")
         assert scene.camera.focal[0] == 60
         assert same_bits(scene.base, ours.gaussians)
-    of_the_file = dataclasses.replace(ours_px, focal_source="EXIF")
+    of_the_file = dataclasses.replace(ours_px, focal_source=FocalSource.EXIF)
     assert open_base(BaseSettings(depth=loaded)).predict(of_the_file)[0].camera.focal[0] == 80
 
 

@@ -32,6 +32,7 @@ from spackle.bases.sharp.encoder import (
 )
 from spackle.bases.sharp.network import GroupNorm, SharpNetwork, compose, make_start
 from spackle.bases.sharp.stretch import stretch_gaussians
+from spackle.core.focal_length import FocalSource
 from spackle.core.photo import Photo
 from spackle.render import CpuRenderer
 from spackle.runtime.device import (
@@ -137,7 +138,8 @@ def test_depth_goes_with_focal_length_over_width() -> None:
     base = SharpBase(micro_network())
     rgb = torch.rand(20, 30, 3)
     near, far = (
-        base.predict(Photo(rgb, f, "EXIF", Path("a.jpg"))).gaussians.means for f in (30.0, 60.0)
+        base.predict(Photo(rgb, f, FocalSource.EXIF, Path("a.jpg"))).gaussians.means
+        for f in (30.0, 60.0)
     )
     torch.testing.assert_close(far[:, 2], 2 * near[:, 2], rtol=1e-3, atol=1e-4)
     torch.testing.assert_close(far[:, :2], near[:, :2], rtol=1e-2, atol=1e-3)
@@ -209,7 +211,7 @@ def test_too_little_memory_is_one_line(error: Exception) -> None:
 def test_the_callers_autocast_has_no_effect() -> None:
     base, photo = (
         SharpBase(micro_network()),
-        Photo(torch.rand(20, 30, 3), 40.0, "EXIF", Path("a.jpg")),
+        Photo(torch.rand(20, 30, 3), 40.0, FocalSource.EXIF, Path("a.jpg")),
     )
     expected = to_metric(base.infer(photo), photo)
     with torch.autocast("cpu", dtype=torch.bfloat16):
@@ -237,7 +239,10 @@ def test_tf32_is_off_during_own_arithmetic_on_a_gpu() -> None:
 
 
 PHOTO = Photo(
-    torch.rand(20, 30, 3, generator=torch.Generator().manual_seed(0)), 40.0, "EXIF", Path("a.jpg")
+    torch.rand(20, 30, 3, generator=torch.Generator().manual_seed(0)),
+    40.0,
+    FocalSource.EXIF,
+    Path("a.jpg"),
 )
 
 

@@ -20,6 +20,7 @@ from torch import Tensor
 from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.base import NOTE, Owner, decoder_bytes, expected_shapes, link_owner
 from spackle.core.camera import Camera
+from spackle.core.focal_length import FocalSource
 from spackle.core.gaussians import Gaussians
 from spackle.core.photo import Photo
 from spackle.paper.training.direct_ft import TunableSharp, normalised_camera
@@ -47,7 +48,10 @@ def base(owner: Owner) -> TunableSharp:
 
 def photo() -> Photo:
     return Photo(
-        torch.from_numpy(picture(WIDTH, HEIGHT)).float() / 255, FOCAL, "--focal-px", Path("a.png")
+        torch.from_numpy(picture(WIDTH, HEIGHT)).float() / 255,
+        FOCAL,
+        FocalSource.FOCAL_PX,
+        Path("a.png"),
     )
 
 

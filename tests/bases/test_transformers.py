@@ -26,7 +26,8 @@ from torch.nn.functional import interpolate
 from spackle.bases import transformers as hf
 from spackle.bases.depth import lift
 from spackle.bases.transformers import FARTHEST_M, HfBase, meaning_of
-from spackle.core.photo import DEFAULT_FOCAL_MM, Photo
+from spackle.core.focal_length import FocalSource
+from spackle.core.photo import Photo
 from spackle.depth.depth_map import NEAREST_M, DepthMap
 from spackle.runtime.errors import InputError
 
@@ -65,7 +66,12 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> Folders:
     return {name: root / name for name in MODELS}
 
 
-def photo_of(width: int = 96, height: int = 64, focal: float = 80.0, source: str = "EXIF") -> Photo:
+def photo_of(
+    width: int = 96,
+    height: int = 64,
+    focal: float = 80.0,
+    source: FocalSource = FocalSource.EXIF,
+) -> Photo:
     return Photo(box_before_wall(width=width, height=height).rgb, focal, source, Path("photo.png"))
 
 
@@ -131,7 +137,7 @@ def test_depth_pro_gives_an_unknown_focal_length_and_scales_its_depth_to_a_known
 ) -> None:
     base, unknown = (
         load(folders["depth_pro"]),
-        photo_of(focal=90.0, source=f"default {DEFAULT_FOCAL_MM:g} mm"),
+        photo_of(focal=90.0, source=FocalSource.ASSUMED),
     )
     settings = MODELS["depth_pro"][2]
     network = transformers.DepthProForDepthEstimation.from_pretrained(folders["depth_pro"]).eval()
@@ -146,7 +152,7 @@ def test_depth_pro_gives_an_unknown_focal_length_and_scales_its_depth_to_a_known
     seen = 0.5 * unknown.width / math.tan(math.radians(fov) / 2)
     known = [
         photo_of(focal=focal, source=source)
-        for focal, source in ((48.0, "EXIF"), (192.0, "--focal-px"))
+        for focal, source in ((48.0, FocalSource.EXIF), (192.0, FocalSource.FOCAL_PX))
     ]
     for photo, focal, source in zip(
         [unknown, *known], (seen, 48.0, 192.0), ("Depth Pro", "", ""), strict=True

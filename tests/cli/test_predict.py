@@ -25,7 +25,7 @@ from PIL import Image
 from safetensors.torch import save_file
 
 import spackle
-from spackle.core.photo import focal_mm_to_px
+from spackle.core.focal_length import focal_mm_to_px
 from spackle.pipeline import FillOptions
 from spackle.residual.architectures import UNet
 from spackle.runtime.files import results_folder
@@ -103,7 +103,7 @@ def test_a_second_run_replaces_the_first(tmp_path: Path, pair: tuple[Path, Path]
     error = pixels(folder / "depth.png") / 1000 / metres() - 1  # but where the box begins
     assert np.quantile(np.abs(error), 0.9) < 0.01
     report, bare = report_of(folder), read_ply(folder / "scene.ply")
-    assert (report["focal_source"], report["focal_px"]) == ("--fov", WIDTH / 2)
+    assert (report["focal_source"], report["focal_px"]) == ("fov", WIDTH / 2)
     row = bare.row(0)
     assert row["x"] / row["z"] * WIDTH / 2 == pytest.approx(0.5 - WIDTH / 2, abs=1e-3)
     assert (report["aux"], report["residual"]) == (

@@ -14,14 +14,8 @@ import pytest
 import torch
 from PIL import Image, ImageCms, ImageOps, TiffImagePlugin
 
-from spackle.core.photo import (
-    focal_from_exif,
-    focal_mm_to_px,
-    load_photo,
-    replace_border,
-    resize_photo,
-    working_size,
-)
+from spackle.core.focal_length import FocalSource, focal_from_exif, focal_mm_to_px
+from spackle.core.photo import load_photo, replace_border, resize_photo, working_size
 from spackle.runtime.errors import InputError
 
 
@@ -67,7 +61,7 @@ def test_common_formats_are_read_upright(tmp_path: Path, suffix: str, orientatio
     assert (photo.rgb - expected).abs().max() < (0.06 if suffix in ("jpg", "heic") else 1e-6)
     if suffix not in ("tiff", "bmp"):  # Pillow writes no EXIF directory into these formats
         assert (photo.focal_source, photo.focal_px) == (
-            "EXIF",
+            FocalSource.EXIF,
             pytest.approx(focal_mm_to_px(26, 64, 32)),
         )
 
@@ -133,7 +127,7 @@ def test_colour_profile(tmp_path: Path) -> None:
 def test_focal_from_exif(tmp_path: Path, tags: dict[str, Any], expected: float | None) -> None:
     picture(480, 320).save(tmp_path / "a.jpg", exif=exif(**tags))
     photo = load_photo(tmp_path / "a.jpg")
-    assert photo.focal_source == ("EXIF" if expected else "default 30 mm")
+    assert photo.focal_source == (FocalSource.EXIF if expected else FocalSource.ASSUMED)
     assert photo.focal_px == pytest.approx(expected or focal_mm_to_px(30, 480, 320), rel=1e-4)
 
 
@@ -157,14 +151,14 @@ def test_given_focal_lengths(tmp_path: Path, option: str, value: float, focal: f
     picture(480, 320).save(path := tmp_path / "a.png")
     photo = load_photo(path, **{option: value})  # type: ignore[arg-type]
     assert (photo.focal_source, photo.focal_px) == (
-        f"--{option.replace('_', '-')}",
+        FocalSource(option),
         pytest.approx(focal),
     )
     assert photo.camera.focal == pytest.approx((focal, focal))
     assert photo.camera.K[:2, 2].tolist() == [240, 160]
     nonsense: list[dict[str, float]] = [{option: wrong} for wrong in (0, -1, math.nan, math.inf)]
     for given in (*nonsense, {"fov": 180.0}, {"fov": 60.0, "focal_mm": 30.0}):
-        with pytest.raises(InputError, match="--f"):
+        with pytest.raises(InputError, match="`f"):
             load_photo(path, **given)  # type: ignore[arg-type]
 
 

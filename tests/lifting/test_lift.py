@@ -24,6 +24,7 @@ from torch.nn.functional import max_pool2d
 from spackle.bases.depth import RgbdBase, lift
 from spackle.core.camera import Camera
 from spackle.core.color import srgb_to_linear
+from spackle.core.focal_length import FocalSource
 from spackle.core.photo import Photo
 from spackle.core.photo_frame import PhotoFrame
 from spackle.core.trajectories import DepthRange, leftmost_and_rightmost, trajectory_cameras
@@ -113,7 +114,7 @@ def test_missing_depth_is_filled_from_behind_and_reported() -> None:
 
 def test_the_intrinsics_come_from_the_calibration_else_from_the_photo() -> None:
     scene = wall()
-    photo = Photo(scene.rgb, scene.camera.focal[0], "--focal-px", Path("photo.png"))
+    photo = Photo(scene.rgb, scene.camera.focal[0], FocalSource.FOCAL_PX, Path("photo.png"))
     assert torch.equal(RgbdBase(scene.depth_map).predict(photo).camera.K, photo.camera.K)
     K = torch.tensor([[70.0, 0.0, 15.0], [0.0, 70.0, 12.5], [0.0, 0.0, 1.0]])
     half = DepthMap(

@@ -6,8 +6,9 @@ import dataclasses
 from typing import Protocol
 
 from spackle.core.camera import Camera
+from spackle.core.focal_length import focal_mm_to_px
 from spackle.core.gaussians import Gaussians
-from spackle.core.photo import Photo, focal_mm_to_px
+from spackle.core.photo import Photo
 from spackle.runtime.progress import Progress
 
 USUAL_DISPARITY = (

@@ -102,7 +102,7 @@ def _lift(settings: BaseSettings, photo: Photo, depth: Depth) -> Base | None:
             load_depth, file, calib=settings.calib, kind=settings.depth_kind, **ends
         )
         found = read()
-    if found.K is None or not photo.focal_source.startswith("--"):  # "--…": the user gave it
+    if found.K is None or not photo.focal_source.is_from_user:
         return RgbdBase(found)
     focal = photo.focal_px * (found.depth.shape[1] / photo.framed_size[0])
     return RgbdBase(read(focal_px=focal) if read else found.with_focal(focal), "")

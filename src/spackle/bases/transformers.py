@@ -115,7 +115,7 @@ class HfBase:
         with as_input_error(photo.path, problem), report_memory_shortage("give a smaller model"):
             raw, fov = self._ask(photo.rgb)
         camera, lens_source = photo.camera, ""
-        if fov is not None and 0 < fov < 180 and photo.focal_source.startswith("default"):
+        if fov is not None and 0 < fov < 180 and photo.focal_source.is_assumed:
             focal = 0.5 * photo.width / math.tan(math.radians(fov) / 2)
             if is_plausible_focal(focal, photo.width, photo.height):
                 camera, lens_source = (

@@ -11,6 +11,7 @@ from rich.table import Table
 
 from spackle.bases import BasePrediction
 from spackle.bases.settings import BaseSettings
+from spackle.core.focal_length import FocalSource
 from spackle.core.photo import Photo
 from spackle.formats import save_ply, save_png
 from spackle.formats.png import contact_sheet
@@ -51,7 +52,9 @@ def run_demo(output: Path, reporter: Reporter) -> None:
     renderer = pipeline.renderer
     with results_folder(output, FILES, locked=True):
         start = time.perf_counter()
-        photo = Photo(pair.left, pair.left_camera.focal[0], "calibration", Path("Motorcycle"))
+        photo = Photo(
+            pair.left, pair.left_camera.focal[0], FocalSource.CALIBRATION, Path("Motorcycle")
+        )
         done = pipeline.complete(photo, reporter)
         scene, views = done.scene, done.views
         with reporter.stage("write"):

@@ -112,7 +112,7 @@ def depth_facts(path: Path) -> Facts:
 def photo_facts(path: Path) -> Facts:
     photo = load_photo(path, keep_frame=False)
     facts: Facts = {"kind": "photo", "size": f"{photo.width}×{photo.height}"}
-    facts["camera"] = f"{lens_of(photo.camera)} ({photo.focal_source})"
+    facts["camera"] = f"{lens_of(photo.camera)} ({photo.focal_source.value})"
     if photo.frame is not None:
         facts["frame"] = "a uniform frame is cropped; --keep-frame keeps the frame"
     inside = load_photo_depth(path)

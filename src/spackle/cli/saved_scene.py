@@ -13,7 +13,7 @@ from pathlib import Path
 from rich.filesize import decimal
 from torch import Tensor
 
-from spackle.core.photo import DEFAULT_FOCAL_MM
+from spackle.core.focal_length import ASSUMED_FOCAL_MM
 from spackle.core.trajectories import PathError
 from spackle.formats import save_png
 from spackle.formats.html import single_html
@@ -91,7 +91,7 @@ def render_scene(
             )
         if not given and loaded.camera is None and not new_lens:
             reporter.log(
-                f"{scene.name}: no camera stored: {DEFAULT_FOCAL_MM:g} mm assumed, --fov gives another lens"
+                f"{scene.name}: no camera stored: {ASSUMED_FOCAL_MM:g} mm assumed, --fov gives another lens"
             )
         maker = FrameMaker.of(path.video, base, cameras, scene)
     target = output if single else output / f"{scene.stem}{path.video.suffix}"

@@ -11,7 +11,8 @@ from spackle.bases import BasePrediction
 from spackle.bases.open import ResolvedBase
 from spackle.clips.complete import ClipCompleter, CompletedView
 from spackle.clips.files import ClipWriter, clip_frames, read_clip
-from spackle.core.photo import Photo, check_photo_size, resize_photo, resolve_focal_length
+from spackle.core.focal_length import FocalSource, resolve_focal_length
+from spackle.core.photo import Photo, check_photo_size, resize_photo
 from spackle.depth.depth_map import RELATIVE
 from spackle.inpaint.plain import OpenCV
 from spackle.pipeline import Pipeline, PipelineOptions, move_in_words
@@ -108,13 +109,13 @@ def predict_clip(
                     first, base = (photo, prediction, choice), base.only(choice)
                     if prediction.lens_source:
                         seen = prediction.camera.focal[0] * clip.width / prediction.camera.width
-                        focal = seen, prediction.lens_source
+                        focal = seen, FocalSource.FIRST_FRAME
                     if choice.note:
                         reporter.log(f"{path.name}: {choice.note}")
                     reporter.log(
                         f"{path.name}: {len(clip)} frames, {len(prediction.gaussians):,} Gaussians from {choice.base} "
                         f"for each, focal length {prediction.camera.focal[0]:.0f} px "
-                        f"({prediction.lens_source or photo.focal_source})"
+                        f"({prediction.lens_source or photo.focal_source.value})"
                     )
                 view = _complete(completer, photo, prediction)
                 writer.add(view.view.rgb)

@@ -21,7 +21,7 @@ from PIL import Image
 from torch import Tensor
 
 from spackle.core.camera import Camera
-from spackle.core.photo import check_pixel_count, read_image
+from spackle.core.image_files import check_pixel_count, read_image
 from spackle.runtime.errors import InputError, as_input_error, short_repr
 from spackle.runtime.files import check_file
 

@@ -203,7 +203,7 @@ def shared_report(
     report: dict[str, Any] = {
         "spackle": spackle.__version__,
         "focal_px": round(prediction.camera.focal[0], 3),
-        "focal_source": prediction.lens_source or photo.focal_source,
+        "focal_source": prediction.lens_source or photo.focal_source.value,
         "base": {"name": choice.base, "chosen": choice.why, "gaussians": len(prediction.gaussians)},
         "residual": {"weights": weights},
         "views": given.name if given else path.trajectory,

@@ -16,7 +16,8 @@ from rich.console import Console
 
 from spackle.bases.lite import LiteBase
 from spackle.bases.settings import AUTO, ROUGH, BaseSettings
-from spackle.core.photo import PHOTO_SUFFIXES, check_photo_size, read_image
+from spackle.core.image_files import read_image
+from spackle.core.photo import PHOTO_SUFFIXES, check_photo_size
 from spackle.core.trajectories import MAX_DISPARITY, TRAJECTORIES, TrajectoryKind
 from spackle.depth.depth_map import DepthKind
 from spackle.formats.html import html_safe_json, single_html

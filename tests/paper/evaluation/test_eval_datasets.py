@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from spackle.bases.settings import BaseSettings
 from spackle.core.camera import Camera
+from spackle.core.focal_length import FocalSource
 from spackle.core.photo import working_size
 from spackle.depth.depth_map import DepthMap
 from spackle.paper.evaluation.case import Case, Points, known_depth, load_case
@@ -344,7 +345,7 @@ def test_files_that_are_no_photos_of_the_case(tmp_path: Path) -> None:
     lonely = load_case(Case("lonely", write_photo(tmp_path / "lonely.png", WIDTH, HEIGHT)))
     assert (lonely.camera.width, lonely.photo.focal_source, lonely.seconds) == (
         WIDTH,
-        "default 30 mm",
+        FocalSource.ASSUMED,
         (),
     )
 

@@ -92,7 +92,7 @@ class MogeBase:
         size = min(
             (FINEST * rows, FINEST * columns), (photo.height, photo.width)
         )  # `lift` enlarges
-        known = not photo.focal_source.startswith("default")
+        known = not photo.focal_source.is_assumed
         with report_memory_shortage():
             output = self.ask(photo.rgb, tokens, size)
         view = to_view(output, photo.width, photo.height, photo.focal_px if known else None)

@@ -18,7 +18,7 @@ import torch
 from PIL import Image
 from PIL.JpegImagePlugin import JpegImageFile
 
-from spackle.core.photo import check_pixel_count
+from spackle.core.image_files import check_pixel_count
 from spackle.depth.depth_map import Array, DepthMap, Quantity, StrPath, grid_step, is_depth
 from spackle.depth.in_photo.containers import (
     BY_ORIENTATION,

@@ -239,7 +239,7 @@ class SampleMaker:
                 "sha256": file.sha256,
                 "width": photo.width,
                 "height": photo.height,
-                "focal_source": prediction.lens_source or photo.focal_source,
+                "focal_source": prediction.lens_source or photo.focal_source.value,
             },
             "base": {"gaussians": len(prediction.gaussians), **prediction.notes},
             "inpainter": _completion(options, self.inpainter),

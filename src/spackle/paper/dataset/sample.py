@@ -26,7 +26,7 @@ from torch.nn.functional import normalize
 from spackle.core.camera import Camera
 from spackle.core.color import to_uint8
 from spackle.core.gaussians import Gaussians
-from spackle.core.photo import check_pixel_count
+from spackle.core.image_files import check_pixel_count
 from spackle.formats.camera_files import camera_from_json
 from spackle.paper.dataset.views import ViewStack
 from spackle.render.protocol import Rendering

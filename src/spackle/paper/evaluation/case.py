@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from spackle.core.camera import Camera
+from spackle.core.focal_length import FocalSource
 from spackle.core.photo import MAX_WORKING_SIDE_PX, Photo, load_photo, resize_photo, working_size
 from spackle.depth.depth_map import DepthMap
 from spackle.paper.evaluation.measurements import NEAR
@@ -94,7 +95,7 @@ def load_case(case: Case, max_side: int = MAX_WORKING_SIDE_PX) -> LoadedCase:
     if case.camera is not None:
         _check_shape(case.photo, full, case.camera)
         focal = case.camera.resized(full.width, full.height).focal[0]
-        full = dataclasses.replace(full, focal_px=focal, focal_source="dataset")
+        full = dataclasses.replace(full, focal_px=focal, focal_source=FocalSource.DATASET)
     photo = resize_photo(full, max_side)
     camera = photo.camera if case.camera is None else case.camera.resized(photo.width, photo.height)
     camera = dataclasses.replace(camera, world_to_camera=torch.eye(4))

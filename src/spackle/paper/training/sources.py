@@ -18,8 +18,9 @@ from torch.nn.functional import avg_pool2d, interpolate, max_pool2d
 from spackle.bases import BasePrediction
 from spackle.bases.depth import lift
 from spackle.core.camera import Camera
+from spackle.core.focal_length import focal_mm_to_px
 from spackle.core.gaussians import Gaussians
-from spackle.core.photo import PHOTO_SUFFIXES, focal_mm_to_px, load_photo
+from spackle.core.photo import PHOTO_SUFFIXES, load_photo
 from spackle.core.trajectories import SHARP_TRAJECTORIES, DepthRange, trajectory_cameras
 from spackle.depth.depth_map import DepthMap, load_depth, read_calibration
 from spackle.paper.dataset.shards import DatasetFiles

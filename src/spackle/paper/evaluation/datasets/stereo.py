@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from spackle.core.camera import Camera
-from spackle.core.photo import PHOTO_SUFFIXES, read_image
+from spackle.core.image_files import read_image
+from spackle.core.photo import PHOTO_SUFFIXES
 from spackle.depth.depth_map import (
     Calibration,
     DepthMap,
