@@ -81,13 +81,6 @@ def test_paths_and_loaded_values_give_the_same_scene(
     assert same_bits(scene.gaussians.select(torch.arange(len(scene.base))), scene.base)
 
 
-def test_an_argument_works_by_its_earlier_name(scene: spackle.Scene) -> None:
-    with pytest.warns(DeprecationWarning, match="trajectory= now"):
-        assert len(scene.path(kind="swipe", frames=3)) == 3
-    with pytest.warns(DeprecationWarning, match="trajectory= now"):
-        scene.save_video(io.BytesIO(), kind="swipe", frames=1)
-
-
 def test_a_photo_and_its_depth_in_every_form(pair: tuple[Path, Path], tmp_path: Path) -> None:
     photo, depth = pair
     pixels, metres_of = np.asarray(Image.open(photo).convert("RGB")), spackle.load_depth(depth)

@@ -24,7 +24,7 @@ from spackle.depth.depth_map import DepthKind, DepthMap, depth_of_array, load_de
 from spackle.pipeline import FillOptions, FillTexture, Pipeline, PipelineOptions
 from spackle.render import Renderer, get_renderer
 from spackle.residual.network import ResidualNet
-from spackle.runtime.errors import InputError, renamed, short_repr, shorten_input_errors
+from spackle.runtime.errors import InputError, short_repr, shorten_input_errors
 from spackle.runtime.progress import LogReporter
 from spackle.scene import Scene
 from spackle.views import PathOptions
@@ -125,7 +125,6 @@ class Spackle:
             )
 
 
-@renamed(kind="trajectory")
 def predict(
     photo: PhotoSource,
     depth: DepthSource | None = None,

@@ -23,7 +23,6 @@ from spackle.formats.scene_files import Encoder, SceneFile, encoder_for, is_at_o
 from spackle.render import Renderer, get_renderer
 from spackle.render.protocol import Rendering
 from spackle.residual.features import hole_mask
-from spackle.runtime.errors import renamed
 from spackle.runtime.files import PathOrFile, write_atomic
 from spackle.video.encoding import check_video, save_video
 from spackle.video.frames import Fit, FrameMaker, Show, StereoLayout, VideoOptions, parse_size
@@ -89,7 +88,6 @@ class Scene:
         """The sets of Gaussians from which a completed view is rendered."""
         return [self.base, self.aux if self.by_view is None else self.by_view[index]]
 
-    @renamed(kind="trajectory")
     def path(
         self,
         trajectory: TrajectoryKind = "rotate-forward",
@@ -180,7 +178,6 @@ class Scene:
         """A viewer with the scene, `height` pixels high, which a notebook displays as the value of a cell."""
         return InlinePage(single_html(self.page("scene")).decode(), height)
 
-    @renamed(kind="trajectory")
     def save_video(
         self,
         target: PathOrFile,

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import difflib
-import functools
 import reprlib
-import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any, ParamSpec, TypeVar
 
 P = ParamSpec("P")
@@ -75,27 +73,6 @@ def shorten_input_errors() -> Iterator[None]:
         if len(message) <= 300:
             raise
         raise InputError(f"{message[:148]} … {message[-148:]}") from error
-
-
-def renamed(**names: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorator: accept arguments by their names in the previous release, with a DeprecationWarning."""
-
-    def decorate(function: Callable[P, R]) -> Callable[P, R]:
-        @functools.wraps(function)
-        def called(*arguments: P.args, **named: P.kwargs) -> R:
-            for old, new in names.items():
-                if old in named:
-                    warnings.warn(
-                        f"{function.__name__}({old}=) is called {new}= now",
-                        DeprecationWarning,
-                        stacklevel=2,
-                    )
-                    named[new] = named.pop(old)
-            return function(*arguments, **named)
-
-        return called
-
-    return decorate
 
 
 def printable_line(text: str) -> str:
