@@ -21,7 +21,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from spackle.bases.depth import lift
+from spackle.bases.depth import lift_rgbd
 from spackle.clips.complete import ClipCompleter, CompletedView
 from spackle.clips.temporal import inside, pixel_grid, sample
 from spackle.core.camera import Camera
@@ -76,7 +76,7 @@ def load_world(side: int) -> World:
     rgb = torch.from_numpy(resize(left, (height, side), anti_aliasing=True)).float()
     rows, columns = (((torch.arange(n) + 0.5) * step).long() for n in (height, side))
     camera = Camera.from_focal(float(pair.left_camera.focal[0]) / step, side, height)
-    still = lift(rgb, depth_map(pair.depth.depth[rows][:, columns]), camera).gaussians
+    still = lift_rgbd(rgb, depth_map(pair.depth.depth[rows][:, columns]), camera).gaussians
     around = [
         moved(camera, (x, y, z)) for x in (-0.8, 0.8, 0.0) for y in (-0.8, 0.4) for z in (-0.4, 0.4)
     ]
@@ -144,7 +144,7 @@ def play(
         taken = renderer.render(scene, camera)
         depth = said_depth(taken.depth, dice) if noisy else taken.depth
         own = dataclasses.replace(camera, world_to_camera=torch.eye(4))
-        drawn = completer.add(taken.rgb, lift(taken.rgb, depth_map(depth), own))
+        drawn = completer.add(taken.rgb, lift_rgbd(taken.rgb, depth_map(depth), own))
         pose = drawn.camera.world_to_camera @ camera.world_to_camera
         truth = dataclasses.replace(drawn.camera, world_to_camera=pose)
         yield drawn, (truth, renderer.render(scene, truth))

@@ -19,7 +19,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from spackle.bases.sharp.base import expected_shapes as sharp_shapes
-from spackle.bases.sharp.encoder import CONFIGS
+from spackle.bases.sharp.encoder import SIZES
 from spackle.inpaint.lama import expected_shapes as lama_shapes
 
 
@@ -63,7 +63,7 @@ def main() -> None:
     parser.add_argument("--size", choices=("full", "tiny", "micro", "lama"), default="full")
     words = parser.parse_args()
     lama = words.size == "lama"
-    tensors = lama_weights() if lama else deterministic_weights(sharp_shapes(CONFIGS[words.size]))
+    tensors = lama_weights() if lama else deterministic_weights(sharp_shapes(SIZES[words.size]))
     (torch.save if words.file.suffix == ".pt" else save_file)(tensors, words.file)
 
 

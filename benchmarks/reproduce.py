@@ -30,8 +30,8 @@ from safetensors.torch import load_file, save_file
 from skimage import data as pictures
 from torch.nn.functional import grid_sample, interpolate, unfold
 
-from spackle.bases.sharp.base import expected_shapes, load_network, to_square
-from spackle.bases.sharp.encoder import MICRO, WINDOWS
+from spackle.bases.sharp.base import expected_shapes, load_network, resize_to_square
+from spackle.bases.sharp.encoder import MICRO_SIZE, WINDOW_COUNT
 from spackle.paper.evaluation.datasets import stereo
 
 WIDTH, HEIGHT = 192, 144
@@ -210,9 +210,13 @@ def fit_sharp(random: Path, fitted: Path) -> None:
     The tokens of the whole image get low-frequency position embeddings. All of the decoder is zeroed but the path from
     these tokens to the disparities, which is thus linear and nearly the same for all photos.
     """
-    weights, grid, depths = load_file(random), MICRO.grid, "monodepth_model.monodepth_predictor."
+    weights, grid, depths = (
+        load_file(random),
+        MICRO_SIZE.grid,
+        "monodepth_model.monodepth_predictor.",
+    )
     across = (np.arange(grid) + 0.5) * math.pi / grid
-    waves = sorted(((m, n) for m in range(grid) for n in range(grid)), key=sum)[: MICRO.embed]
+    waves = sorted(((m, n) for m in range(grid) for n in range(grid)), key=sum)[: MICRO_SIZE.embed]
     places = np.stack(
         [np.outer(np.cos(m * across), np.cos(n * across)).ravel() for m, n in waves], -1
     )
@@ -222,7 +226,7 @@ def fit_sharp(random: Path, fitted: Path) -> None:
     for name in [name for name in weights if name.startswith(closed)]:
         weights[name].zero_()
         if name.endswith((".out_conv.weight", ".deconv.weight")):
-            weights[name] += torch.eye(MICRO.depth_width)[..., None, None]
+            weights[name] += torch.eye(MICRO_SIZE.depth_width)[..., None, None]
     for layer, tap in (
         ("0", 1),
         ("1", slice(None)),
@@ -238,11 +242,13 @@ def fit_sharp(random: Path, fitted: Path) -> None:
     encoder: Any = load_network(fitted, torch.float32).monodepth_model.monodepth_predictor.encoder
     seen, wanted = [], []
     for photo, depth in (scene.seen() for scene in (*SCENES.values(), *LEARNED)):
-        coarsest = encoder(2 * to_square(torch.from_numpy(photo) / 255, MICRO.side) - 1, WINDOWS)[
-            -1
-        ]
+        coarsest = encoder(
+            2 * resize_to_square(torch.from_numpy(photo) / 255, MICRO_SIZE.side) - 1, WINDOW_COUNT
+        )[-1]
         seen.append(unfold(coarsest, 3, padding=1)[0].T)
-        disparity = to_square(FOCAL / WIDTH / torch.from_numpy(depth)[..., None], MICRO.side)
+        disparity = resize_to_square(
+            FOCAL / WIDTH / torch.from_numpy(depth)[..., None], MICRO_SIZE.side
+        )
         wanted.append(interpolate(disparity, coarsest.shape[-2:], mode="area").flatten())
     known, truth = torch.cat(seen).double(), torch.cat(wanted).double()
     ridge = 1e-5 * len(truth) * torch.eye(known.shape[1]).double()
@@ -320,7 +326,7 @@ def main() -> None:
     if out.exists():
         parser.error(f"{out}: is there already: give another folder with -o")
     make_data(out / "data", out / "photos")
-    save_file(deterministic_weights(expected_shapes(MICRO)), out / "random.safetensors")
+    save_file(deterministic_weights(expected_shapes(MICRO_SIZE)), out / "random.safetensors")
     fit_sharp(out / "random.safetensors", out / "sharp.safetensors")
     for line in commands():
         run(out, line)

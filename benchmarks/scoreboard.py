@@ -54,13 +54,14 @@ from torch import Tensor
 
 import spackle
 from spackle import Camera, get_renderer, hole_area_ratio, hole_mask
-from spackle.bases.depth import lift
-from spackle.bases.lite import FARTHEST, NEAREST_M, nearest
+from spackle.bases.depth import lift_rgbd
+from spackle.bases.lite import MAX_DEPTH_RATIO
 from spackle.core.filters import maximum_filter
 from spackle.core.hole_filling import FAR_SIDE_BIAS, fill_from_far_side
 from spackle.core.photo import load_photo, resize_photo
 from spackle.core.trajectories import DepthRange, leftmost_and_rightmost
 from spackle.depth.depth_map import DepthMap
+from spackle.depth.units import RELATIVE_NEAR_M, near_inverse_depth
 from spackle.lifting.edges import Edges
 from spackle.lifting.silhouettes import Layers
 from spackle.paper.evaluation.metrics import GREY_WEIGHTS, sharpness
@@ -209,7 +210,7 @@ class Pair:
         pair = load_pair(place) if place.is_dir() else load_cut(place)
         self.left, self.right, depth, self.camera, self.beside = pair
         self.depth = smaller(depth, small) if small > 1 else depth
-        prediction = lift(self.left, self.depth, self.camera)
+        prediction = lift_rgbd(self.left, self.depth, self.camera)
         self.hole = hole_mask(RENDERER.render(prediction.gaussians, self.beside).alpha)
         self.near = maximum_filter(self.hole, BAND_PX)
         seeds = spackle.complete(
@@ -221,7 +222,7 @@ class Pair:
         """The figures of a run."""
         began = time.process_time()
         with switched_off(run, LIFT):
-            prediction = lift(self.left, self.depth, self.camera)
+            prediction = lift_rgbd(self.left, self.depth, self.camera)
         lifted = time.process_time()
         with switched_off(run, FILL):
             scene = spackle.complete(prediction, [self.beside], exact=True, fill="exemplar")
@@ -248,7 +249,9 @@ def load_cut(file: Path) -> tuple[Tensor, Tensor, DepthMap, Camera, Camera]:
     inverse, side = spackle.LiteBase.load().inverse_depth(photo.rgb), photo.width // 5
     inverse = F.interpolate(inverse[None, None], (photo.height, photo.width), mode="bilinear")[0, 0]
     middle = slice(side, photo.width - side)
-    depth = NEAREST_M / (inverse[:, middle] / nearest(inverse.flatten())).clamp(1 / FARTHEST, 1)
+    depth = RELATIVE_NEAR_M / (inverse[:, middle] / near_inverse_depth(inverse.flatten())).clamp(
+        1 / MAX_DEPTH_RATIO, 1
+    )
     cut = photo.camera.cropped(side, 0, depth.shape[1], photo.height)
     known = DepthMap(depth, depth > 0, None, None, "disparity", file)
     return photo.rgb[:, middle].contiguous(), photo.rgb, known, cut, photo.camera

@@ -28,7 +28,7 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
 from spackle.bases import BasePrediction
-from spackle.bases.depth import lift
+from spackle.bases.depth import lift_rgbd
 from spackle.bases.open import open_base
 from spackle.bases.settings import BaseSettings
 from spackle.bases.sharp import SharpBase
@@ -284,7 +284,7 @@ def sharp_section(
     figures += [Timed(name, times["", name]) for name in (UNPROJECT, SAVE)]
     figures.append(Timed("photo to scene", times["", TOTAL_STAGE]))
     facts = {"weights": base.weights, "precision": base.precision, "side": base.network.config.side}
-    facts |= {"windows": base.windows, "compiled": base.compiled}
+    facts |= {"windows": base.windows_per_batch, "compiled": base.compiled}
     return figures, {**facts, "gaussians": count}
 
 
@@ -312,11 +312,13 @@ def section(name: str, options: argparse.Namespace, peaks: Peaks) -> Section:
             raise InputError("no weights: name them by -c FILE")
         photo = Photo(torch.rand(SIDE, SIDE, 3), 1.2 * SIDE, FocalSource.DATASET, Path("photo.png"))
         speed = {
-            "windows": options.windows,
+            "windows_per_batch": options.windows,
             "compiled": options.compile,
             "precision": options.precision,
         }
-        settings = BaseSettings("sharp", checkpoint=options.checkpoint, device=device.type, **speed)
+        settings = BaseSettings(
+            name="sharp", checkpoint=options.checkpoint, device=device.type, **speed
+        )
         base = open_base(settings).load(photo)
         assert isinstance(base, SharpBase)
         return sharp_section(options.base_runs, base, photo, peaks, device)
@@ -325,7 +327,7 @@ def section(name: str, options: argparse.Namespace, peaks: Peaks) -> Section:
     if name == "completion":
         return completion_section(runs, *holed_scene(side), renderer, residual, device)
     pair = load_motorcycle()
-    lifting = functools.partial(lift, pair.left, pair.depth, pair.left_camera)
+    lifting = functools.partial(lift_rgbd, pair.left, pair.depth, pair.left_camera)
     if name == "video":
         return video_section(
             runs, lifting, renderer, residual, FRAMES if side >= SIDE else 4, device

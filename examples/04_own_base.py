@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 
 import spackle
-from spackle.bases.depth import lift
+from spackle.bases.depth import lift_rgbd
 
 
 class Street:
@@ -24,7 +24,7 @@ class Street:
         """Turn the photo into Gaussians."""
         metres = torch.linspace(20, 2, photo.height)[:, None].repeat(1, photo.width)
         depth = spackle.DepthMap(metres, metres > 0, None, None, "depth", photo.path)
-        return lift(photo.rgb, depth, photo.camera)
+        return lift_rgbd(photo.rgb, depth, photo.camera)
 
 
 def main(photo: Path, out: Path) -> None:

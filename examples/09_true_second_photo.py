@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import spackle
-from spackle.bases.depth import lift
+from spackle.bases.depth import lift_rgbd
 from spackle.formats import save_png
 from spackle.paper.evaluation.datasets.stereo import load_motorcycle
 from spackle.paper.evaluation.metrics import psnr
@@ -18,7 +18,7 @@ from spackle.paper.evaluation.metrics import psnr
 def main(out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
     pair = load_motorcycle()
-    prediction = lift(pair.left, pair.depth, pair.left_camera)
+    prediction = lift_rgbd(pair.left, pair.depth, pair.left_camera)
     scene = spackle.complete(prediction, [pair.right_camera], exact=True)
 
     before = spackle.get_renderer().render(scene.base, pair.right_camera)

@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 
 import spackle
-from spackle.bases.depth import lift
+from spackle.bases.depth import lift_rgbd
 from spackle.formats import save_png
 from spackle.paper.evaluation.datasets.stereo import load_motorcycle
 
@@ -20,7 +20,7 @@ from spackle.paper.evaluation.datasets.stereo import load_motorcycle
 def main(out: Path, steps: int = 25) -> None:
     pair = load_motorcycle()
     camera, renderer = pair.right_camera, spackle.get_renderer()
-    base = lift(pair.left, pair.depth, pair.left_camera).gaussians
+    base = lift_rgbd(pair.left, pair.depth, pair.left_camera).gaussians
     aux = spackle.fill_view(spackle.FillContext(base, pair.left_camera, renderer), camera).aux
     hole = spackle.hole_mask(renderer.render(base, camera).alpha)
 

@@ -9,7 +9,7 @@ from functools import partial
 import torch
 
 import spackle
-from spackle.bases.depth import lift
+from spackle.bases.depth import lift_rgbd
 from spackle.paper.evaluation.case import Viewpoint
 from spackle.paper.evaluation.datasets.stereo import load_motorcycle
 from spackle.paper.evaluation.measurements import Measurement
@@ -27,7 +27,7 @@ def mean_color(camera: spackle.Camera, before: spackle.Rendering) -> MethodView:
 
 def main() -> list[Measurement]:
     pair = load_motorcycle()
-    base = lift(pair.left, pair.depth, pair.left_camera).gaussians
+    base = lift_rgbd(pair.left, pair.depth, pair.left_camera).gaussians
     context = spackle.FillContext(base, pair.left_camera, spackle.get_renderer())
     views = [Viewpoint("near", "right", pair.right_camera, lambda: pair.right)]
     methods: dict[str, Callable[[Sequence[spackle.Camera]], Fill]] = {

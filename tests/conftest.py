@@ -45,5 +45,5 @@ def shipped(tmp_path: Path, made: dict[str, Path], monkeypatch: pytest.MonkeyPat
     """Random weights of lite in place of the shipped ones; SHARP is not installed."""
     monkeypatch.setenv("SPACKLE_WEIGHTS", str(tmp_path / "weights"))
     lite = Path(shutil.copy(made["lite"], tmp_path / "lite.safetensors"))
-    monkeypatch.setattr("spackle.bases.lite.SHIPPED", lite)
+    monkeypatch.setattr("spackle.bases.lite.SHIPPED_WEIGHTS", lite)
     return lite

@@ -12,7 +12,7 @@ import pytest
 from helpers.photos import write_photo
 from safetensors.torch import load_file
 
-from spackle.bases.lite import SHIPPED as LITE
+from spackle.bases.lite import SHIPPED_WEIGHTS as LITE
 from spackle.bases.lite import load_networks
 from spackle.residual.architectures import SHIPPED, load_residual
 

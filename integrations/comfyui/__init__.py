@@ -25,7 +25,7 @@ from spackle.core.color import linear_to_srgb, srgb_to_linear
 from spackle.core.focal_length import resolve_focal_length
 from spackle.core.gaussians import Gaussians
 from spackle.core.trajectories import MAX_DISPARITY, TRAJECTORIES, TrajectoryKind
-from spackle.depth.depth_map import FAR_M, NEAREST_M, RELATIVE, relative_depth
+from spackle.depth.units import RELATIVE_FAR_M, RELATIVE_KINDS, RELATIVE_NEAR_M, relative_depth
 from spackle.formats.scene_files import SH_C0
 from spackle.views import PATH_FRAMES
 
@@ -52,7 +52,9 @@ class LoadBase:
 
     def load(self, name: str, checkpoint: str = "") -> tuple[OpenedBase]:
         """InputError if the base is not installed, or the checkpoint does not hold the base's weights."""
-        return (open_base(BaseSettings(name, checkpoint=Path(checkpoint) if checkpoint else None)),)
+        return (
+            open_base(BaseSettings(name=name, checkpoint=Path(checkpoint) if checkpoint else None)),
+        )
 
 
 class PredictScene:
@@ -67,9 +69,9 @@ class PredictScene:
         metres = {"min": 0.01, "max": 1000.0, "step": 0.1}
         optional = {
             "depth": ("IMAGE",),
-            "depth_kind": (list(RELATIVE),),
-            "near": ("FLOAT", {"default": NEAREST_M, **metres}),
-            "far": ("FLOAT", {"default": FAR_M, **metres}),
+            "depth_kind": (list(RELATIVE_KINDS),),
+            "near": ("FLOAT", {"default": RELATIVE_NEAR_M, **metres}),
+            "far": ("FLOAT", {"default": RELATIVE_FAR_M, **metres}),
             "fov": ("FLOAT", {"default": 0.0, "min": 0.0, "max": 170.0}),
         }
         return {"required": {"image": ("IMAGE",), "base": ("SPACKLE_BASE",)}, "optional": optional}
@@ -79,9 +81,9 @@ class PredictScene:
         image: Tensor,
         base: OpenedBase,
         depth: Tensor | None = None,
-        depth_kind: Any = RELATIVE[0],
-        near: float = NEAREST_M,
-        far: float = FAR_M,
+        depth_kind: Any = RELATIVE_KINDS[0],
+        near: float = RELATIVE_NEAR_M,
+        far: float = RELATIVE_FAR_M,
         fov: float = 0.0,
     ) -> tuple[Scene]:
         """InputError if the base cannot use the image."""

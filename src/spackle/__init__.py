@@ -24,7 +24,7 @@ if TYPE_CHECKING:  # for editors and type checkers
     from spackle.core.photo import Photo as Photo
     from spackle.core.photo import load_photo as load_photo
     from spackle.depth.depth_map import DepthMap as DepthMap
-    from spackle.depth.depth_map import load_depth as load_depth
+    from spackle.depth.readers import load_depth as load_depth
     from spackle.formats import load_cameras as load_cameras
     from spackle.formats import load_ply as load_ply
     from spackle.formats import save_ply as save_ply
@@ -46,7 +46,8 @@ __version__ = "0.1.0"  # pyproject.toml reads this line
 # A name is imported at its first use, so that `spackle --help` does not wait for torch.
 _NAMES = {
     "spackle.bases": ("Base", "BasePrediction"),
-    "spackle.depth.depth_map": ("DepthMap", "load_depth"),
+    "spackle.depth.depth_map": ("DepthMap",),
+    "spackle.depth.readers": ("load_depth",),
     "spackle.bases.transformers": ("HfBase",),
     "spackle.bases.lite": ("LiteBase",),
     "spackle.bases.moge.base": ("MogeBase",),

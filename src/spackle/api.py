@@ -16,11 +16,13 @@ from PIL import Image
 from torch import Tensor
 
 from spackle.bases import Base
-from spackle.bases.open import open_base, open_loaded
+from spackle.bases.open import open_base, wrap_loaded_base
 from spackle.bases.settings import AUTO, BaseSettings
 from spackle.core.photo import Photo, load_photo, photo_from_picture
 from spackle.core.trajectories import TrajectoryKind
-from spackle.depth.depth_map import DepthKind, DepthMap, depth_of_array, load_depth
+from spackle.depth.depth_map import DepthMap
+from spackle.depth.readers import load_depth
+from spackle.depth.units import DepthKind, depth_from_array
 from spackle.pipeline import FillOptions, FillTexture, Pipeline, PipelineOptions
 from spackle.render import Renderer, get_renderer
 from spackle.residual.network import ResidualNet
@@ -72,7 +74,7 @@ class Spackle:
         chosen = FillOptions(residual=weights, fill=fill)
         options = PipelineOptions(base=BaseSettings(name=name, device=device), fill=chosen)
         options.base.check()
-        opened = open_base(options.base) if isinstance(base, str) else open_loaded(base)
+        opened = open_base(options.base) if isinstance(base, str) else wrap_loaded_base(base)
         self._given = not isinstance(base, str) or base not in (AUTO, "rgbd")
         self._pipeline = Pipeline(
             options, opened, network or chosen.load(), renderer or get_renderer(device)
@@ -194,7 +196,7 @@ def _photo(source: PhotoSource, **options: Any) -> Iterator[Photo]:
 def _depth(source: DepthSource, kind: DepthKind) -> Iterator[Path | DepthMap]:
     if isinstance(source, np.ndarray | Tensor):
         array = source.detach().cpu().numpy() if isinstance(source, Tensor) else source
-        yield depth_of_array(array, Path("depth"), kind)
+        yield depth_from_array(array, Path("depth"), kind)
     elif isinstance(source, DepthMap | str | os.PathLike):
         yield source if isinstance(source, DepthMap) else Path(source)
     else:

@@ -197,13 +197,13 @@ class Pipeline:
     def _disparity(self, prediction: BasePrediction) -> float | None:
         """The path's disparity; None if views or keyframes are given."""
         given = self.given_views is not None or self.keyframes is not None
-        return None if given else self.options.path.disparity_or(prediction.disparity)
+        return None if given else self.options.path.disparity_or(prediction.max_disparity)
 
 
 def move_in_words(prediction: BasePrediction) -> str:
     """A line for the log about the disparity that `choose_disparity` has chosen."""
     reach, usual, invented = (
-        prediction.disparity,
+        prediction.max_disparity,
         prediction.notes["usual_disparity"],
         prediction.notes["uncovered"],
     )

@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from spackle.bases import USUAL_DISPARITY
+from spackle.bases import DEFAULT_MAX_DISPARITY
 from spackle.core import trajectories as camera_path
 from spackle.core.camera import Camera
 from spackle.core.focal_length import resolve_focal_length
@@ -103,7 +103,7 @@ class Scene:
             frames: number of cameras.
             looped: make a path that repeats without a jump.
         """
-        usual = USUAL_DISPARITY if self.disparity is None else self.disparity
+        usual = DEFAULT_MAX_DISPARITY if self.disparity is None else self.disparity
         reach, depths = usual if disparity is None else disparity, DepthRange.of(self.base)
         return camera_path.trajectory_cameras(
             trajectory, self.camera.even(), reach, depths, frames, looped

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from spackle.bases import USUAL_DISPARITY, BasePrediction
+from spackle.bases import DEFAULT_MAX_DISPARITY, BasePrediction
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
 from spackle.core.photo import working_size
@@ -115,7 +115,7 @@ class PathOptions:
         if keyframes is None:
             count = given or max(1, round(SECONDS * self.video.frames_per_second))
             reach, depths = (
-                self.disparity_or(USUAL_DISPARITY if disparity is None else disparity),
+                self.disparity_or(DEFAULT_MAX_DISPARITY if disparity is None else disparity),
                 DepthRange.of(gaussians),
             )
             path = trajectory_cameras(
@@ -159,7 +159,7 @@ NO_PATH = "no camera path: {reason}: check the depth map and the focal length"
 def choose_disparity(
     prediction: BasePrediction, renderer: Renderer, source: Path
 ) -> BasePrediction:
-    """Replace the prediction's disparity by the largest one with a hole-area ratio of at most `prediction.uncovered`.
+    """Replace the prediction's disparity by the largest one with a hole-area ratio of at most `prediction.max_hole_ratio`.
 
     The usual disparity is the upper limit. Coarse renderings measure the mean hole-area ratio (eq. 11) of the
     leftmost and the rightmost view. The ratio and the usual disparity are added to the notes.
@@ -167,7 +167,11 @@ def choose_disparity(
     Raises:
         InputError: the depths and the focal length of the photo `source` allow no camera path.
     """
-    gaussians, usual, allowed = prediction.gaussians, prediction.disparity, prediction.uncovered
+    gaussians, usual, allowed = (
+        prediction.gaussians,
+        prediction.max_disparity,
+        prediction.max_hole_ratio,
+    )
     with as_input_error(source, NO_PATH, ValueError):
         depths = DepthRange.of(gaussians)
     camera = prediction.camera.resized(
@@ -196,7 +200,7 @@ def choose_disparity(
     if near[0] < LEAST_MOVE:
         near = (least := min(LEAST_MOVE, usual), uncovered(least))
     notes = prediction.notes | {"usual_disparity": usual, "uncovered": round(near[1], 4)}
-    return dataclasses.replace(prediction, disparity=near[0], notes=notes)
+    return dataclasses.replace(prediction, max_disparity=near[0], notes=notes)
 
 
 def plan_views(
@@ -218,8 +222,10 @@ def plan_views(
             as_input_error(source, NO_PATH, ValueError),
             as_input_error(path.path, "{reason}", PathError),
         ):
-            path_cameras = path.video_cameras(gaussians, camera, keyframes, prediction.disparity)
-            reach, depths = path.disparity_or(prediction.disparity), DepthRange.of(gaussians)
+            path_cameras = path.video_cameras(
+                gaussians, camera, keyframes, prediction.max_disparity
+            )
+            reach, depths = path.disparity_or(prediction.max_disparity), DepthRange.of(gaussians)
             if keyframes is None:
                 others = dict(
                     zip(

@@ -14,10 +14,17 @@ from torch.nn.functional import interpolate
 from weights import save_networks
 
 import spackle
-from spackle.bases.lite import FARTHEST, SCALE, SHIPPED, LiteBase, LiteNet, load_networks
+from spackle.bases.lite import (
+    MAX_DEPTH_RATIO,
+    SCALE_SUFFIX,
+    SHIPPED_WEIGHTS,
+    LiteBase,
+    LiteNet,
+    load_networks,
+)
 from spackle.core.focal_length import FocalSource
 from spackle.core.photo import Photo
-from spackle.depth.depth_map import NEAREST_M
+from spackle.depth.units import RELATIVE_NEAR_M
 from spackle.runtime.errors import InputError
 
 
@@ -58,9 +65,9 @@ def test_the_same_photo_gives_the_same_scene_and_its_colours() -> None:
     assert float((view.rgb - rgb).abs().mean()) < 0.05
     assert float(view.alpha.min()) > 0.95
     z = one.gaussians.means[:, 2]
-    assert one.notes["depth_scale"] == f"relative, the nearest at {NEAREST_M:g} m"
-    assert NEAREST_M * 0.9 < float(z.min()) < NEAREST_M * 1.5
-    assert float(z.max()) < NEAREST_M * FARTHEST * 10
+    assert one.notes["depth_scale"] == f"relative, the nearest at {RELATIVE_NEAR_M:g} m"
+    assert RELATIVE_NEAR_M * 0.9 < float(z.min()) < RELATIVE_NEAR_M * 1.5
+    assert float(z.max()) < RELATIVE_NEAR_M * MAX_DEPTH_RATIO * 10
 
 
 @pytest.mark.parametrize("shape", [(40, 3000), (17, 17), (1, 1)])
@@ -70,8 +77,11 @@ def test_a_photo_of_any_shape_has_finite_depth(shape: tuple[int, int]) -> None:
 
 
 def test_stored_weights_are_small_and_only_rounded(tmp_path: Path) -> None:
-    assert SHIPPED.stat().st_size <= 12_000_000
-    assert [network.encoder.size for network in load_networks(SHIPPED)] == ["lite0", "lite2"]
+    assert SHIPPED_WEIGHTS.stat().st_size <= 12_000_000
+    assert [network.encoder.size for network in load_networks(SHIPPED_WEIGHTS)] == [
+        "lite0",
+        "lite2",
+    ]
     networks = [LiteNet("lite2"), LiteNet("lite0")]
     save_networks(networks, tmp_path / "two.safetensors")
     read = load_networks(tmp_path / "two.safetensors")
@@ -85,7 +95,8 @@ def test_stored_weights_are_small_and_only_rounded(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "missing", ["0.context.weight", f"0.context.weight{SCALE}", "0.encoder.stages.6.0.project.bias"]
+    "missing",
+    ["0.context.weight", f"0.context.weight{SCALE_SUFFIX}", "0.encoder.stages.6.0.project.bias"],
 )
 def test_weights_with_a_missing_tensor_are_refused_in_one_line(
     tmp_path: Path, missing: str

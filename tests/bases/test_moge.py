@@ -21,8 +21,8 @@ from helpers.photos import CLIPS, picture, write_photo
 from helpers.scenes import same_bits
 from torch import Tensor
 
-from spackle.bases.depth import lift
-from spackle.bases.moge.base import SKY, MogeBase, MogeView, to_view
+from spackle.bases.depth import lift_rgbd
+from spackle.bases.moge.base import SKY_DISTANCE_FACTOR, MogeBase, MogeView, to_view
 from spackle.bases.moge.network import MogeOutput, load_network
 from spackle.bases.open import open_base
 from spackle.bases.settings import BaseSettings
@@ -134,7 +134,9 @@ def test_whose_focal_length_is_used_and_the_distance_of_the_sky(
         assert (kept.camera.focal[0], kept.lens_source) == (120, "")
     seen = base.predict(photo)
     assert (seen.camera.focal[0], seen.lens_source) == (pytest.approx(1.3 * HALF, rel=1e-6), "MoGe")
-    assert float(seen.gaussians.means[:, 2].max()) == pytest.approx(SKY * 8, rel=0.02)
+    assert float(seen.gaussians.means[:, 2].max()) == pytest.approx(
+        SKY_DISTANCE_FACTOR * 8, rel=0.02
+    )
     points = output.points
     for factor in (-1, 30, 0.03):  # mirrored, 174° and 2°
         output = dataclasses.replace(output, points=points * torch.tensor([factor, factor, 1]))
@@ -153,7 +155,7 @@ def test_the_same_photo_gives_the_same_scene_and_bf16_nearly_so(checkpoint: Path
             "device": "cpu",
         }
         found.append(
-            open_base(BaseSettings("moge", **settings)).predict(photo_of(waves(70, 98)))[0]
+            open_base(BaseSettings(name="moge", **settings)).predict(photo_of(waves(70, 98)))[0]
         )
     assert same_bits(found[0].gaussians, found[1].gaussians)
     assert found[2].notes["precision"] == "bf16"
@@ -178,7 +180,8 @@ def test_predict_takes_a_checkpoint_and_a_clip_keeps_one_lens(
 
     monkeypatch.setattr(MogeBase, "ask", ask)
     monkeypatch.setattr(
-        "spackle.bases.depth.lift", lambda *given: (seen.append(given[2].focal[0]), lift(*given))[1]
+        "spackle.bases.depth.lift_rgbd",
+        lambda *given: (seen.append(given[2].focal[0]), lift_rgbd(*given))[1],
     )
     done = run("predict", CLIPS / "large.mp4", *words, "--residual", "none")
     assert (done.code, report_of(tmp_path / "large")["focal_source"]) == (0, "MoGe"), done.err

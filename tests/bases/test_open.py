@@ -22,11 +22,12 @@ from spackle.bases.lite import INPUT_SCALES, LiteBase
 from spackle.bases.open import BaseError, ResolvedBase, open_base
 from spackle.bases.settings import BaseSettings
 from spackle.bases.sharp import SharpBase
-from spackle.bases.sharp.encoder import MICRO
+from spackle.bases.sharp.encoder import MICRO_SIZE
 from spackle.bases.transformers import HfBase
 from spackle.core.focal_length import FocalSource
 from spackle.core.photo import Photo, load_photo
-from spackle.depth.depth_map import DepthMap, load_depth
+from spackle.depth.depth_map import DepthMap
+from spackle.depth.readers import load_depth
 from spackle.runtime.errors import InputError
 from spackle.runtime.progress import Progress
 
@@ -84,7 +85,7 @@ def test_auto_uses_the_photos_depth_then_sharp_then_lite(
     assert (choice.base, choice.why, len(prediction.gaussians)) == (
         "sharp",
         NO_DEPTH,
-        gaussians_of(MICRO),
+        gaussians_of(MICRO_SIZE),
     )
     assert prediction.notes["weights"] == SHARP_FILE
     sharp.unlink()
@@ -108,7 +109,7 @@ def test_weights_and_options_reach_sharp(
     given = write_tiny(tmp_path / "mine.pt")
     choice = pick(photo, checkpoint=given)[1]
     assert (choice.base, choice.why, quick.pop()["path"]) == ("sharp", "-c", given)
-    words: dict[str, Any] = {"precision": "fp32", "windows": 9}
+    words: dict[str, Any] = {"precision": "fp32", "windows_per_batch": 9}
     assert pick(photo, **words)[1].base == "sharp"
     assert quick == [{"path": sharp, "device": None, **words}]
     assert pick(portrait, **words)[1].base == "rgbd"
@@ -130,7 +131,7 @@ def test_a_base_is_loaded_once_and_only_if_a_photo_needs_it(
     assert not quick
     news = [base.predict(load_photo(photo))[1].note for _ in range(2)]
     assert ([bool(line) for line in news], len(quick)) == ([True, False], 1)
-    model = open_base(BaseSettings("hf:me/small", precision="fp32", device="cpu"))
+    model = open_base(BaseSettings(name="hf:me/small", precision="fp32", device="cpu"))
     assert [model.predict(load_photo(photo))[1].base for _ in range(2)] == ["hf:me/small"] * 2
     assert quick[1:] == [{"path": "me/small", "precision": "fp32", "device": "cpu"}]
 
@@ -138,7 +139,7 @@ def test_a_base_is_loaded_once_and_only_if_a_photo_needs_it(
 def test_the_chosen_base_predicts_all_frames_of_a_clip(photo: Path, portrait: Path) -> None:
     base = open_base(BaseSettings())
     prediction, choice = base.predict(load_photo(photo))
-    kept, again = base.only(choice).predict(load_photo(portrait))
+    kept, again = base.only_chosen(choice).predict(load_photo(portrait))
     assert (choice.base, again.base) == ("lite", "lite")
     assert kept.notes == prediction.notes
 
@@ -245,7 +246,7 @@ def test_given_depth_has_no_fallback(tmp_path: Path, photo: Path, portrait: Path
         pick(photo, name="rgbd")
     assert not isinstance(caught.value, BaseError)
     ours = load_depth(write_depth(tmp_path / "depths" / "photo.npy"))
-    by_call, _ = open_base(BaseSettings("rgbd")).predict(load_photo(photo), depth=ours)
+    by_call, _ = open_base(BaseSettings(name="rgbd")).predict(load_photo(photo), depth=ours)
     assert same_bits(by_call.gaussians, pick(photo, depth=tmp_path / "depths")[0].gaussians)
 
 
@@ -254,7 +255,7 @@ def test_given_depth_has_no_fallback(tmp_path: Path, photo: Path, portrait: Path
     [
         ({"name": "lite", "depth": Path("d.npy")}, "--depth d.npy: the lite base"),
         ({"name": "hf:a/b", "checkpoint": Path("x.pt")}, "-c x.pt: the hf base"),
-        ({"name": "hf:a/b", "windows": 1}, "--sharp windows=1: the hf base"),
+        ({"name": "hf:a/b", "windows_per_batch": 1}, "--sharp windows=1: the hf base"),
         ({"name": "hf:"}, "names no model"),
         ({"name": "shrap"}, r"did you mean sharp\?"),
         ({"name": "sharp"}, "spackle weights get sharp.*-c FILE"),
@@ -265,9 +266,9 @@ def test_given_depth_has_no_fallback(tmp_path: Path, photo: Path, portrait: Path
             {"depth": Path("d.npy"), "far": 9.0},
             "--far 9.0: only for relative maps: add --depth-kind near-white",
         ),
-        ({"depth": Path("d.npy"), "windows": 1}, "--sharp windows=1: the rgbd base"),
+        ({"depth": Path("d.npy"), "windows_per_batch": 1}, "--sharp windows=1: the rgbd base"),
         ({"precision": "fp8"}, "fp8"),
-        ({"windows": 36}, "--sharp windows must be between 1 and 35, got 36"),
+        ({"windows_per_batch": 36}, "--sharp windows must be between 1 and 35, got 36"),
     ],
     ids=str,
 )
@@ -280,9 +281,9 @@ def test_options_that_a_base_does_not_take_are_refused(
 
 def test_the_files_and_the_public_name_of_a_models_folder(tmp_path: Path) -> None:
     folder = write_model(tmp_path / "one" / "small")
-    settings = BaseSettings(f"hf:{folder}")
-    assert set(settings.files) == {"config.json", "model.safetensors"}
-    assert (settings.public_name, BaseSettings("hf:me/small").public_name) == (
+    settings = BaseSettings(name=f"hf:{folder}")
+    assert set(settings.model_files) == {"config.json", "model.safetensors"}
+    assert (settings.public_name, BaseSettings(name="hf:me/small").public_name) == (
         "hf:small",
         "hf:me/small",
     )

@@ -11,7 +11,7 @@ import torch
 from helpers import DATA
 from helpers.scenes import psnr
 from helpers.sharp_weights import (
-    MICRO,
+    MICRO_SIZE,
     gaussians_of,
     micro_network,
     tiny_weights,
@@ -22,15 +22,26 @@ from torch import Tensor, nn
 
 import spackle
 from spackle.bases.sharp import SharpBase
-from spackle.bases.sharp.base import PARAMETERS, UNUSED, expected_shapes, load_network, to_metric
+from spackle.bases.sharp.base import (
+    PARAMETER_COUNT,
+    UNUSED_PREFIXES,
+    expected_shapes,
+    load_network,
+    to_metric,
+)
 from spackle.bases.sharp.encoder import (
-    FULL,
-    TINY,
-    WINDOWS,
+    FULL_SIZE,
+    TINY_SIZE,
+    WINDOW_COUNT,
     SharpConfig,
     set_precision,
 )
-from spackle.bases.sharp.network import GroupNorm, SharpNetwork, compose, make_start
+from spackle.bases.sharp.network import (
+    GroupNorm,
+    SharpNetwork,
+    apply_deltas,
+    make_initial_gaussians,
+)
 from spackle.bases.sharp.stretch import stretch_gaussians
 from spackle.core.focal_length import FocalSource
 from spackle.core.photo import Photo
@@ -61,7 +72,7 @@ def run_small(config: SharpConfig, dtype: torch.dtype) -> tuple[Tensor, spackle.
     )
     with torch.inference_mode():
         output = network(waves(config.side), 0.8, batch=5)
-        return heard[0], compose(output.start, output.deltas)
+        return heard[0], apply_deltas(output.initial, output.deltas)
 
 
 def off(found: Tensor, golden: np.ndarray) -> float:
@@ -76,16 +87,16 @@ def test_the_network_has_the_tensors_of_the_published_checkpoint_that_are_used()
     }
     assert (len(published), sum(int(np.prod(shape)) for shape in published.values())) == (
         1038,
-        PARAMETERS,
+        PARAMETER_COUNT,
     )
-    assert expected_shapes(FULL) == {
-        name: shape for name, shape in published.items() if not name.startswith(UNUSED)
+    assert expected_shapes(FULL_SIZE) == {
+        name: shape for name, shape in published.items() if not name.startswith(UNUSED_PREFIXES)
     }
-    assert gaussians_of(FULL) == 1_179_648
+    assert gaussians_of(FULL_SIZE) == 1_179_648
 
 
 def test_the_tiny_network_gives_the_originals_depth_and_gaussians() -> None:
-    disparity, gaussians = run_small(TINY, torch.float32)
+    disparity, gaussians = run_small(TINY_SIZE, torch.float32)
     assert off(disparity[:, ::48, ::48], GOLDEN["disparity"]) < 1e-5
     index = torch.from_numpy(GOLDEN["index"].astype(np.int64))
     columns = [
@@ -106,7 +117,7 @@ def test_the_tiny_network_gives_the_originals_depth_and_gaussians() -> None:
 
 def test_bf16_renders_the_same_picture_to_45_db() -> None:
     camera = spackle.Camera.from_focal(300, 400, 300)
-    sets = [run_small(MICRO, dtype)[1] for dtype in (torch.float32, torch.bfloat16)]
+    sets = [run_small(MICRO_SIZE, dtype)[1] for dtype in (torch.float32, torch.bfloat16)]
     views = [
         CpuRenderer().render(stretch_gaussians(gaussians, STRETCH), camera).rgb
         for gaussians in sets
@@ -129,8 +140,9 @@ def test_group_norm_is_exact_over_half_a_million_pixels(channels_last: bool) -> 
 
 def test_extreme_depths_make_finite_gaussians() -> None:
     for extreme in (1e-8, 1e9):
-        assert compose(
-            make_start(waves(8), torch.full((1, 2, 8, 8), extreme)), torch.zeros(14, 2, 4, 4)
+        assert apply_deltas(
+            make_initial_gaussians(waves(8), torch.full((1, 2, 8, 8), extreme)),
+            torch.zeros(14, 2, 4, 4),
         ).finite
 
 
@@ -247,7 +259,8 @@ PHOTO = Photo(
 
 
 @pytest.mark.parametrize(
-    ("options", "calls"), [({}, 7), ({"windows": 9}, 4), ({"windows": 1}, WINDOWS)]
+    ("options", "calls"),
+    [({}, 7), ({"windows_per_batch": 9}, 4), ({"windows_per_batch": 1}, WINDOW_COUNT)],
 )
 def test_the_number_of_windows_at_once_changes_nothing(options: dict[str, Any], calls: int) -> None:
     seen: list[int] = []
@@ -255,9 +268,9 @@ def test_the_number_of_windows_at_once_changes_nothing(options: dict[str, Any], 
         PHOTO, lambda done, total: seen.append(done)
     )
     assert len(seen) == calls
-    assert seen[-1] == WINDOWS
-    expected = SharpBase(micro_network(), windows=35).infer(PHOTO)
+    assert seen[-1] == WINDOW_COUNT
+    expected = SharpBase(micro_network(), windows_per_batch=35).infer(PHOTO)
     torch.testing.assert_close(
-        found.start.disparity_map, expected.start.disparity_map, rtol=1e-5, atol=1e-6
+        found.initial.disparity_map, expected.initial.disparity_map, rtol=1e-5, atol=1e-6
     )
     torch.testing.assert_close(found.deltas, expected.deltas, rtol=1e-4, atol=1e-4)

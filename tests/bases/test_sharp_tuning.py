@@ -12,13 +12,19 @@ import pytest
 import torch
 from helpers.photos import picture
 from helpers.scenes import shifted
-from helpers.sharp_weights import MICRO
+from helpers.sharp_weights import MICRO_SIZE
 from random_weights import deterministic_weights
 from safetensors.torch import save_file
 from torch import Tensor
 
 from spackle.bases.sharp import SharpBase
-from spackle.bases.sharp.base import NOTE, Owner, decoder_bytes, expected_shapes, link_owner
+from spackle.bases.sharp.base import (
+    SOURCE_KEY,
+    SourceCheckpoint,
+    encode_decoder,
+    expected_shapes,
+    link_source_checkpoint,
+)
 from spackle.core.camera import Camera
 from spackle.core.focal_length import FocalSource
 from spackle.core.gaussians import Gaussians
@@ -34,15 +40,15 @@ NUDGE = 3e-4  # step of the finite differences
 
 
 @pytest.fixture(scope="module")
-def owner(tmp_path_factory: pytest.TempPathFactory) -> Owner:
+def owner(tmp_path_factory: pytest.TempPathFactory) -> SourceCheckpoint:
     """A checkpoint of SHARP with an input of 512² pixels."""
     path = tmp_path_factory.mktemp("tuning") / "sharp.safetensors"
-    save_file(deterministic_weights(expected_shapes(MICRO)), path)
-    return Owner(path, hashlib.sha256(path.read_bytes()).hexdigest())
+    save_file(deterministic_weights(expected_shapes(MICRO_SIZE)), path)
+    return SourceCheckpoint(path, hashlib.sha256(path.read_bytes()).hexdigest())
 
 
 @pytest.fixture(scope="module")
-def base(owner: Owner) -> TunableSharp:
+def base(owner: SourceCheckpoint) -> TunableSharp:
     return TunableSharp.load(owner.path, torch.float32, CPU)
 
 
@@ -80,7 +86,7 @@ def test_normalised_gaussians_render_like_gaussians_in_metres(base: TunableSharp
 def test_gradients_to_weights_are_those_of_finite_differences(
     base: TunableSharp, name: str
 ) -> None:
-    decoder = copy.deepcopy(base.network.gaussian_decoder()).let_learn()
+    decoder = copy.deepcopy(base.network.gaussian_decoder()).enable_training()
     encoded = base.encode(photo().rgb, CAMERA)
 
     def loss() -> Tensor:
@@ -106,10 +112,10 @@ def test_gradients_to_weights_are_those_of_finite_differences(
 
 
 def test_a_decoders_file_finds_its_checkpoint(
-    owner: Owner, base: TunableSharp, tmp_path: Path
+    owner: SourceCheckpoint, base: TunableSharp, tmp_path: Path
 ) -> None:
     best, beside = tmp_path / "best.safetensors", tmp_path / "sharp.safetensors"
-    best.write_bytes(decoder_bytes(base.network.gaussian_decoder(), owner))
+    best.write_bytes(encode_decoder(base.network.gaussian_decoder(), owner))
     assert str(owner.path.parent).encode() not in best.read_bytes()[:9999]
     expected = gaussians_from(owner.path).tensors
     beside.symlink_to(owner.path)  # a file of the checkpoint's name
@@ -121,7 +127,7 @@ def test_a_decoders_file_finds_its_checkpoint(
         owner.path,
         owner.path,
     ):  # a dead link is renewed, and counts more than the name
-        link_owner(Owner(where, owner.sha256), tmp_path)
+        link_source_checkpoint(SourceCheckpoint(where, owner.sha256), tmp_path)
     assert all(map(torch.equal, gaussians_from(best).tensors, expected))
 
 
@@ -140,7 +146,7 @@ def test_a_decoders_file_finds_its_checkpoint(
     ],
 )
 def test_a_decoder_without_its_checkpoint_or_a_tensor_is_refused(
-    owner: Owner,
+    owner: SourceCheckpoint,
     base: TunableSharp,
     tmp_path: Path,
     beside: Any,
@@ -150,7 +156,7 @@ def test_a_decoder_without_its_checkpoint_or_a_tensor_is_refused(
 ) -> None:
     decoder = base.network.gaussian_decoder().state_dict()
     facts = {"checkpoint": "/elsewhere/sharp.safetensors", "sha256": owner.sha256}
-    note = {NOTE: json.dumps(facts) if noted else "{}"}
+    note = {SOURCE_KEY: json.dumps(facts) if noted else "{}"}
     tensors = {name: tensor.contiguous() for name, tensor in decoder.items() if name != missing}
     save_file(tensors, tmp_path / "best.safetensors", note)
     if beside is not None:

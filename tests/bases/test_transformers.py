@@ -24,11 +24,12 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
 from spackle.bases import transformers as hf
-from spackle.bases.depth import lift
+from spackle.bases.depth import lift_rgbd
 from spackle.bases.transformers import FARTHEST_M, HfBase, meaning_of
 from spackle.core.focal_length import FocalSource
 from spackle.core.photo import Photo
-from spackle.depth.depth_map import NEAREST_M, DepthMap
+from spackle.depth.depth_map import DepthMap
+from spackle.depth.units import RELATIVE_NEAR_M
 from spackle.runtime.errors import InputError
 
 transformers = pytest.importorskip(
@@ -88,8 +89,8 @@ def image_of(photo: Photo) -> Image.Image:
 def maps(monkeypatch: pytest.MonkeyPatch) -> list[DepthMap]:
     seen: list[DepthMap] = []
     monkeypatch.setattr(
-        "spackle.bases.depth.lift",
-        lambda rgb, depth, camera: (seen.append(depth), lift(rgb, depth, camera))[1],
+        "spackle.bases.depth.lift_rgbd",
+        lambda rgb, depth, camera: (seen.append(depth), lift_rgbd(rgb, depth, camera))[1],
     )
     return seen
 
@@ -113,7 +114,7 @@ def test_the_map_is_the_models_output_as_transformers_gives_it(
     assert bool(found.valid.all())
     assert (found.K, found.quantum, found.path) == (None, None, photo.path)
     if name in RELATIVE:
-        share = (1 / found.depth - 1 / FARTHEST_M) / (1 / NEAREST_M - 1 / FARTHEST_M)
+        share = (1 / found.depth - 1 / FARTHEST_M) / (1 / RELATIVE_NEAR_M - 1 / FARTHEST_M)
         near = float(expected.flatten().kthvalue(1 + round(0.999 * (expected.numel() - 1))).values)
         torch.testing.assert_close(share, (expected / near).clamp(0, 1), rtol=1e-4, atol=1e-5)
     else:
@@ -187,7 +188,11 @@ def test_models_whose_output_has_no_known_meaning_are_refused() -> None:
 def predicting(depth: Tensor, meaning: Any = "metres", fov: float | None = None) -> HfBase:
     network = Stub(lambda _: depth, fov)
     return HfBase(
-        "hf:a/b", network, lambda rgb: (rgb.permute(2, 0, 1)[None], hf.WHOLE), meaning, "fp32"
+        "hf:a/b",
+        network,
+        lambda rgb: (rgb.permute(2, 0, 1)[None], hf.WHOLE_PICTURE),
+        meaning,
+        "fp32",
     )
 
 

@@ -12,20 +12,20 @@ from helpers.sharp_weights import gaussians_of, tiny_weights, write_tiny
 from helpers.stand_in import QUICK
 
 from spackle.bases.sharp import SharpBase
-from spackle.bases.sharp.encoder import MICRO
+from spackle.bases.sharp.encoder import MICRO_SIZE
 from spackle.runtime.device import pick_dtype
 
 
 @pytest.fixture
 def weights(tmp_path: Path) -> Path:
-    return write_tiny(tmp_path / "micro.safetensors", MICRO)
+    return write_tiny(tmp_path / "micro.safetensors", MICRO_SIZE)
 
 
 def test_a_photo_becomes_a_scene_and_is_done_again_for_other_weights_but_not_for_other_speed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_photo(tmp_path / "photos" / "a.png")
-    weights, folder = write_tiny(tmp_path / "w.pt", MICRO), tmp_path / "out" / "a"
+    weights, folder = write_tiny(tmp_path / "w.pt", MICRO_SIZE), tmp_path / "out" / "a"
     arguments = (
         "predict",
         tmp_path / "photos",
@@ -40,7 +40,7 @@ def test_a_photo_becomes_a_scene_and_is_done_again_for_other_weights_but_not_for
     assert (run(*arguments).code, names_in(folder)) == (0, FILES)
     report = report_of(folder)
     native = pick_dtype("auto", torch.device("cpu")) == torch.bfloat16
-    expected = {"name": "sharp", "chosen": "--base sharp", "gaussians": gaussians_of(MICRO)}
+    expected = {"name": "sharp", "chosen": "--base sharp", "gaussians": gaussians_of(MICRO_SIZE)}
     expected |= {
         "precision": "bf16" if native else "fp32",
         "weights": weights.name,
@@ -51,7 +51,7 @@ def test_a_photo_becomes_a_scene_and_is_done_again_for_other_weights_but_not_for
     with monkeypatch.context() as patch:
         patch.setattr(SharpBase, "load", lambda *args, **options: pytest.fail("loaded"))
         assert run(*arguments, "--sharp", "windows=9").err.count("done already") == 1
-    changed = tiny_weights(MICRO)
+    changed = tiny_weights(MICRO_SIZE)
     changed["prediction_head.texture_prediction_head.bias"] += 0.1
     torch.save(changed, weights)
     result = run(*arguments, "--precision", "fp32", "--sharp", "windows=1")

@@ -11,7 +11,7 @@ from helpers.scenes import box_before_wall, cast
 from torch import Tensor
 
 from spackle.bases import BasePrediction
-from spackle.bases.depth import lift
+from spackle.bases.depth import lift_rgbd
 from spackle.clips.complete import ClipCompleter, CompletedView
 from spackle.clips.temporal import (
     DepthAlignment,
@@ -86,7 +86,7 @@ def paint(points: Tensor) -> Tensor:
 
 def lifted(rgb: Tensor, depth: Tensor) -> BasePrediction:
     camera = Camera.from_focal(80, 96, 72)
-    return lift(rgb, DepthMap(depth, depth > 0, None, None, "depth", Path("frame")), camera)
+    return lift_rgbd(rgb, DepthMap(depth, depth > 0, None, None, "depth", Path("frame")), camera)
 
 
 def frame_of(right: float) -> tuple[Camera, Tensor, BasePrediction]:
@@ -139,7 +139,9 @@ def test_a_cut_resets_the_state_and_holes_can_be_kept(fill: bool) -> None:
     assert [one.cut for one in drawn] == [False, True]
     assert torch.equal(drawn[1].view.rgb, drawn[1].alone.rgb)
     assert drawn[0].gaussians[0] is prediction.gaussians
-    given = ClipCompleter("rotate", prediction.disparity, 20, CPU, OpenCV("this").flow, fill=False)
+    given = ClipCompleter(
+        "rotate", prediction.max_disparity, 20, CPU, OpenCV("this").flow, fill=False
+    )
     assert torch.equal(
         given.add(rgb, prediction).camera.world_to_camera, drawn[0].camera.world_to_camera
     )

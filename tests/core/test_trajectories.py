@@ -216,7 +216,7 @@ def test_choose_move_finds_the_largest_disparity_within_the_limit(
     usual: float, allowed: float
 ) -> None:
     scene, photo = box_before_wall(width=288, height=216, focal=240), Path("photo.png")
-    prediction = dataclasses.replace(scene.lift(), disparity=usual, uncovered=allowed)
+    prediction = dataclasses.replace(scene.lift(), max_disparity=usual, max_hole_ratio=allowed)
     gaussians, renderer = prediction.gaussians, CpuRenderer()
 
     def uncovered(disparity: float) -> float:
@@ -226,8 +226,8 @@ def test_choose_move_finds_the_largest_disparity_within_the_limit(
     chosen = choose_disparity(prediction, renderer, photo)
     steps = [usual, *(k / 100 for k in range(4, round(100 * usual)))]
     within = [step for step in steps if uncovered(step) <= allowed]
-    assert chosen.disparity == pytest.approx(max(within, default=min(usual, 0.04)), abs=0.0101)
-    assert chosen.notes["uncovered"] == pytest.approx(uncovered(chosen.disparity), abs=0.01)
+    assert chosen.max_disparity == pytest.approx(max(within, default=min(usual, 0.04)), abs=0.0101)
+    assert chosen.notes["uncovered"] == pytest.approx(uncovered(chosen.max_disparity), abs=0.01)
     assert chosen.notes["usual_disparity"] == usual
     with pytest.raises(InputError, match=r"^photo\.png: no camera path: no Gaussian is in front"):
         choose_disparity(

@@ -171,7 +171,7 @@ def test_the_map_is_upright_as_the_photo_is(tmp_path: Path, kind: str, orientati
     np.testing.assert_allclose(photo.rgb.numpy() * 255, upright(picture(), orientation), atol=60)
     as_stored = found(tmp_path, f"{kind}, turned 1").depth.numpy()
     np.testing.assert_array_equal(depth.depth.numpy(), upright(as_stored, orientation))
-    depth.check_shape(photo.height, photo.width, depth.path)
+    depth.check_aspect_ratio(photo.height, photo.width, depth.path)
 
 
 def test_photos_without_depth(tmp_path: Path) -> None:

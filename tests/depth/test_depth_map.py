@@ -17,12 +17,15 @@ from helpers.portraits import png
 from numpy.typing import NDArray
 from PIL import Image
 
-from spackle.depth.depth_map import RELATIVE, DepthKind, DepthMap, load_depth
+from spackle.depth.depth_map import DepthMap
+from spackle.depth.readers import load_depth
+from spackle.depth.units import RELATIVE_KINDS, DepthKind
 from spackle.runtime.errors import InputError
 
 CALIB = "cam0=[1000.5 0 30.25; 0 1000.5 20.5; 0 0 1]\ncam1=[1000.5 0 40.25; 0 1000.5 20.5; 0 0 1]\n doffs= 10.0\n"
 CALIB += "baseline=200.0\nwidth=8\nheight=6\nisint=0\n"
-EXR, BAD_EXR = DATA / "exr", ("lossy", "integers", "tiled")
+EXR = DATA / "exr"
+BAD_EXR = ("lossy", "integers")
 
 
 def ramp(height: int = 6, width: int = 8) -> NDArray[np.float32]:
@@ -198,7 +201,7 @@ SLOPE = np.tile(np.linspace(0, 1, 100), (60, 1))
         (pfm(np.float32(0.01 * SLOPE + 5)), None),
     ],
 )
-@pytest.mark.parametrize("kind", RELATIVE)
+@pytest.mark.parametrize("kind", RELATIVE_KINDS)
 def test_relative_maps(tmp_path: Path, content: bytes, step: float | None, kind: DepthKind) -> None:
     (tmp_path / "map").write_bytes(content)
     for ends in ({}, {"near": 0.5, "far": 4.0}):
@@ -254,7 +257,7 @@ KINDS: list[tuple[bytes, dict[str, Any], str]] = [  # content, options, message
     (zipped(npy_claiming("(100000, 100000)")), {}, "too large"),
     (b"PF\n2 2\n-1\n" + b"\0" * 48, {}, "three channels"),
     (png(NOISE)[:2000], {}, "damaged"),
-    ((EXR / "good" / "zips, depth.exr").read_bytes()[:-1], {}, "the last rows are missing"),
+    ((EXR / "good" / "zips, depth.exr").read_bytes()[:-1], {}, "rows are missing"),
     *(
         ((EXR / "bad" / f"{name}.exr").read_bytes(), {}, f"an? .*{name}.*: (give|save)")
         for name in BAD_EXR
@@ -277,7 +280,7 @@ def test_maps_that_are_damaged_or_of_another_kind_are_refused(
 def test_shape_against_the_photo(tmp_path: Path) -> None:
     np.save(tmp_path / "d.npy", np.ones((480, 640), np.float32))
     found = load_depth(tmp_path / "d.npy")
-    found.check_shape(959, 1281, "a.jpg")
+    found.check_aspect_ratio(959, 1281, "a.jpg")
     for height, width in [(640, 480), (480, 660), (100, 100)]:
         with pytest.raises(InputError, match=r"is 640×480 but photo a\.jpg is"):
-            found.check_shape(height, width, "a.jpg")
+            found.check_aspect_ratio(height, width, "a.jpg")

@@ -19,8 +19,8 @@ from helpers import DATA
 
 from spackle.clips.files import clip_frames, is_clip, read_clip
 from spackle.core.photo import load_photo, resize_photo
-from spackle.depth.depth_map import load_depth
 from spackle.depth.in_photo.layouts import load_photo_depth
+from spackle.depth.readers import load_depth
 from spackle.formats import PlyFile, load_cameras, load_path
 from spackle.formats.scene_files import load_scene
 from spackle.paper.dataset import DatasetFiles

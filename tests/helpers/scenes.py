@@ -14,7 +14,7 @@ from torch import Tensor
 
 from helpers.photos import box
 from spackle.bases import BasePrediction
-from spackle.bases.depth import lift
+from spackle.bases.depth import lift_rgbd
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
 from spackle.depth.depth_map import DepthMap
@@ -34,7 +34,7 @@ class Scene:
         return DepthMap(self.depth, self.depth > 0, None, None, "depth", Path("synthetic.npy"))
 
     def lift(self, levels: int = 0) -> BasePrediction:
-        return lift(self.rgb, self.depth_map, self.camera, levels)
+        return lift_rgbd(self.rgb, self.depth_map, self.camera, levels)
 
     def base(self) -> Gaussians:
         return self.lift().gaussians

@@ -11,15 +11,15 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from spackle.bases.sharp.base import expected_shapes
-from spackle.bases.sharp.encoder import LAYERS, MICRO, STRIDE, SharpConfig
+from spackle.bases.sharp.encoder import CELL_STRIDE, LAYER_COUNT, MICRO_SIZE, SharpConfig
 from spackle.bases.sharp.network import SharpNetwork
 
 
-def tiny_weights(config: SharpConfig = MICRO) -> dict[str, Tensor]:
+def tiny_weights(config: SharpConfig = MICRO_SIZE) -> dict[str, Tensor]:
     return deterministic_weights(expected_shapes(config))
 
 
-def write_tiny(path: Path, config: SharpConfig = MICRO) -> Path:
+def write_tiny(path: Path, config: SharpConfig = MICRO_SIZE) -> Path:
     """A checkpoint of a small network, .pt or .safetensors by the name."""
     if path.suffix == ".safetensors":
         save_file(tiny_weights(config), path)
@@ -30,7 +30,7 @@ def write_tiny(path: Path, config: SharpConfig = MICRO) -> Path:
 
 def micro_network() -> SharpNetwork:
     """A network that predicts 131,072 Gaussians from 512² pixels, in float32."""
-    network = SharpNetwork(MICRO).eval().requires_grad_(False)
+    network = SharpNetwork(MICRO_SIZE).eval().requires_grad_(False)
     weights = tiny_weights()
     network.load_state_dict({name: weights[name] for name in network.state_dict()})
     return network
@@ -38,7 +38,7 @@ def micro_network() -> SharpNetwork:
 
 def gaussians_of(config: SharpConfig) -> int:
     """The number of Gaussians that the network predicts."""
-    return LAYERS * (config.side // STRIDE) ** 2
+    return LAYER_COUNT * (config.side // CELL_STRIDE) ** 2
 
 
 def waves(height: int = 1536, width: int | None = None) -> Tensor:

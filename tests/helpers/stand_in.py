@@ -14,7 +14,7 @@ from safetensors.torch import save_file
 from helpers.command import Run, run
 from helpers.photos import box
 from spackle.bases import BasePrediction
-from spackle.bases.depth import lift
+from spackle.bases.depth import lift_rgbd
 from spackle.bases.lite import LiteNet
 from spackle.core.photo import Photo, resize_photo
 from spackle.depth.depth_map import DepthMap
@@ -37,7 +37,7 @@ class StandIn:
             np.where(box(photo.width, photo.height), 2.0, 6.0).astype(np.float32)
         )
         map_ = DepthMap(depth, depth > 0, None, None, "depth", photo.path)
-        return lift(photo.rgb, map_, photo.camera)
+        return lift_rgbd(photo.rgb, map_, photo.camera)
 
 
 def write_lite(path: Path) -> Path:

@@ -14,7 +14,7 @@ from helpers.scenes import Scene, box_before_wall, box_mask, slanted_plane, text
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
-from spackle.bases.depth import lift
+from spackle.bases.depth import lift_rgbd
 from spackle.core.camera import Camera
 from spackle.core.filters import gaussian_blur
 from spackle.core.hole_filling import fill_from_far_side
@@ -37,7 +37,7 @@ def map_of(inverse: Tensor, known: Tensor | None = None) -> DepthMap:
 
 def front(scene: Scene, depth: DepthMap) -> Tensor:
     """[H, W] inverse depth of the pixels' Gaussians after lifting."""
-    means = lift(scene.rgb, depth, scene.camera, levels=0).gaussians.means
+    means = lift_rgbd(scene.rgb, depth, scene.camera, levels=0).gaussians.means
     return 1 / means[: scene.depth.numel(), 2].reshape(scene.depth.shape)
 
 
@@ -242,10 +242,10 @@ def test_invalid_depths_are_filled() -> None:
     depth = scene.depth.clone()
     depth[10, 10:26:4] = torch.tensor([math.nan, math.inf, 0.0, -1.0])
     every = torch.ones(36, 48, dtype=torch.bool)
-    found = lift(
+    found = lift_rgbd(
         scene.rgb, DepthMap(depth, every, None, None, "depth", Path("d")), scene.camera, levels=0
     )
     assert found.gaussians.finite
     assert found.notes["depth_filled"] == round(4 / (36 * 48), 4)
     with pytest.raises(InputError, match=r"network: no depth is left at 48×36"):
-        lift(scene.rgb, map_of(torch.zeros(36, 48)), scene.camera)
+        lift_rgbd(scene.rgb, map_of(torch.zeros(36, 48)), scene.camera)

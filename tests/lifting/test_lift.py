@@ -21,7 +21,7 @@ from helpers.scenes import (
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from spackle.bases.depth import RgbdBase, lift
+from spackle.bases.depth import RgbdBase, lift_rgbd
 from spackle.core.camera import Camera
 from spackle.core.color import srgb_to_linear
 from spackle.core.focal_length import FocalSource
@@ -188,7 +188,7 @@ def test_rounded_disparities_leave_no_stairs() -> None:
     stored = (1 / scene.depth / quantum).round() * quantum
     depth = DepthMap(1 / stored, stored > 0, None, quantum, "disparity", Path("disp.png"))
     pixels, base = (
-        lift(scene.rgb, depth, scene.camera, levels).gaussians for levels in (0, LEVELS)
+        lift_rgbd(scene.rgb, depth, scene.camera, levels).gaussians for levels in (0, LEVELS)
     )
     z = pixels.means[: scene.depth.numel(), 2].reshape(scene.depth.shape)
     error, before = (

@@ -16,7 +16,7 @@ from helpers.scenes import psnr
 from PIL import Image
 from torch import Tensor
 
-from spackle.depth.depth_map import load_depth
+from spackle.depth.readers import load_depth
 from spackle.depth.writers import save_depth
 from spackle.formats import save_gray_png, save_png
 from spackle.runtime.errors import InputError

@@ -22,7 +22,7 @@ from helpers.scenes import box_before_wall
 from helpers.web_client import SCENES, Served
 
 import spackle
-from spackle.bases.settings import ROUGH
+from spackle.bases.settings import ROUGH_GEOMETRY_ADVICE
 from spackle.formats import save_ply
 
 
@@ -122,7 +122,11 @@ def test_a_photo_is_completed_as_predict_completes_it(
         "aux": report["aux"]["gaussians"],
     }
     assert [page["name"] for page in seen] == ["photo.png", "my other.jpg", "rough.png"]
-    assert [page["note"] for page in seen] == ["", "", ROUGH]  # by lite, which stays near
+    assert [page["note"] for page in seen] == [
+        "",
+        "",
+        ROUGH_GEOMETRY_ADVICE,
+    ]  # by lite, which stays near
     assert seen[2]["orbit"]["free"] <= 0.15
     first, other = (
         [line for line in result.lines if line.startswith(f"{page['name']}: ")] for page in seen[:2]

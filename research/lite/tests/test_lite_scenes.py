@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.nn.functional import batch_norm, conv2d, pad, relu6
 from weights import load_encoder
 
-from spackle.bases.lite import STAGES, TAPS, Encoder, Size
+from spackle.bases.lite import FEATURE_STAGES, STAGES, EfficientNetEncoder, EncoderSize
 from spackle.runtime.errors import InputError
 
 pytestmark = pytest.mark.slow  # not part of the package: `make test-slow` runs it
@@ -266,7 +266,7 @@ def test_near_is_light_and_unknown_is_grey() -> None:
 # The encoder's first weights ----------------------------------------------------------------------
 
 
-def published(rng: torch.Generator, size: Size) -> dict[str, Tensor]:
+def published(rng: torch.Generator, size: EncoderSize) -> dict[str, Tensor]:
     """Random tensors with the names in EfficientNet-Lite's conversions to PyTorch."""
     tensors: dict[str, Tensor] = {}
 
@@ -283,7 +283,7 @@ def published(rng: torch.Generator, size: Size) -> dict[str, Tensor]:
 
     shapes = {
         name: tensor.shape
-        for name, tensor in Encoder(size).state_dict().items()
+        for name, tensor in EfficientNetEncoder(size).state_dict().items()
         if name.endswith("weight")
     }
     layer("_conv_stem", "_bn0", shapes["stem.weight"])
@@ -298,7 +298,7 @@ def published(rng: torch.Generator, size: Size) -> dict[str, Tensor]:
     return tensors | {"_fc.weight": torch.zeros(10, 1280)}
 
 
-def plain_features(tensors: dict[str, Tensor], x: Tensor, size: Size) -> list[Tensor]:
+def plain_features(tensors: dict[str, Tensor], x: Tensor, size: EncoderSize) -> list[Tensor]:
     """EfficientNet-Lite layer by layer, with separate convolution and normalisation, and TensorFlow's padding."""
 
     def layer(x: Tensor, convolution: str, norm: str, stride: int = 1, groups: int = 1) -> Tensor:
@@ -325,14 +325,14 @@ def plain_features(tensors: dict[str, Tensor], x: Tensor, size: Size) -> list[Te
             y = layer(y, f"{name}._project_conv", f"{name}._bn2")
             x = x + y if x.shape == y.shape else y
             number += 1
-        if stage in TAPS:
+        if stage in FEATURE_STAGES:
             features.append(x)
     return features
 
 
 @pytest.mark.parametrize("size", ["lite0", "lite2"])
 def test_folded_weights_do_what_convolutions_and_normalisations_did(
-    tmp_path: Path, size: Size
+    tmp_path: Path, size: EncoderSize
 ) -> None:
     rng = torch.Generator().manual_seed(0)
     tensors = published(rng, size)

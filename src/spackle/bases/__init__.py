@@ -11,10 +11,10 @@ from spackle.core.gaussians import Gaussians
 from spackle.core.photo import Photo
 from spackle.runtime.progress import Progress
 
-USUAL_DISPARITY = (
+DEFAULT_MAX_DISPARITY = (
     0.3  # the camera's disparity if neither the user nor the base limits it; the paper's S1
 )
-UNCOVERED = 0.125  # share of the widest views that may be holes if the user sets no disparity; more is conspicuous
+DEFAULT_MAX_HOLE_RATIO = 0.125  # share of the widest views that may be holes if the user sets no disparity; more is conspicuous
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,12 +27,10 @@ class BasePrediction:
     lens_source: str = (
         ""  # source of the focal length, if it is neither the photo's file nor the user
     )
-    disparity: float = (
-        USUAL_DISPARITY  # largest disparity with correct geometry, used if the user sets none
+    max_disparity: float = (
+        DEFAULT_MAX_DISPARITY  # largest disparity with correct geometry, used if the user sets none
     )
-    uncovered: float = (
-        UNCOVERED  # share of the widest views that may be holes, if the user sets no disparity
-    )
+    max_hole_ratio: float = DEFAULT_MAX_HOLE_RATIO  # share of the widest views that may be holes, if the user sets no disparity
 
 
 class Base(Protocol):
@@ -50,7 +48,7 @@ class Base(Protocol):
         ...
 
 
-SEEN_LENSES_MM = (
+PLAUSIBLE_FOCALS_MM = (
     10.0,
     600.0,
 )  # a network's estimate is plausible between these 35 mm equivalents (130° to 4°)
@@ -58,5 +56,5 @@ SEEN_LENSES_MM = (
 
 def is_plausible_focal(focal_px: float, width: int, height: int) -> bool:
     """Whether a focal length that a network estimates is plausible for a photo of this size."""
-    shortest, longest = (focal_mm_to_px(mm, width, height) for mm in SEEN_LENSES_MM)
+    shortest, longest = (focal_mm_to_px(mm, width, height) for mm in PLAUSIBLE_FOCALS_MM)
     return shortest <= focal_px <= longest

@@ -28,7 +28,7 @@ class RgbdBase:
     def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
         """Gaussians of the photo's pixels at its working size; InputError for a map of another aspect ratio."""
         depth, (width, height) = self.depth, photo.framed_size
-        depth.check_shape(height, width, photo.path)
+        depth.check_aspect_ratio(height, width, photo.path)
         own = None if depth.K is None else Camera(depth.K, torch.eye(4), *depth.depth.shape[::-1])
         if photo.frame is not None:
             frame = photo.frame
@@ -41,7 +41,7 @@ class RgbdBase:
             )
         photo = resize_photo(photo)
         camera = photo.camera if own is None else own.resized(photo.width, photo.height)
-        prediction = lift(photo.rgb, depth, camera)
+        prediction = lift_rgbd(photo.rgb, depth, camera)
         notes = (
             prediction.notes
             | {"depth_range": self.depth.range_in_words}
@@ -51,12 +51,12 @@ class RgbdBase:
         return dataclasses.replace(prediction, notes=notes, lens_source=lens_source)
 
 
-def lift_guess(photo: Photo, depth: DepthMap, camera: Camera) -> BasePrediction:
+def lift_predicted_depth(photo: Photo, depth: DepthMap, camera: Camera) -> BasePrediction:
     """Lift a photo with the depth that a network predicts; the photo's outermost lines are replaced first."""
-    return lift(replace_border(photo.rgb), depth, camera)
+    return lift_rgbd(replace_border(photo.rgb), depth, camera)
 
 
-def lift(rgb: Tensor, depth: DepthMap, camera: Camera, levels: int = LEVELS) -> BasePrediction:
+def lift_rgbd(rgb: Tensor, depth: DepthMap, camera: Camera, levels: int = LEVELS) -> BasePrediction:
     """Lift a photo [H, W, 3] and its depth map to Gaussians; see `lift_depth_map` for the arguments."""
     lifted = lift_depth_map(rgb, depth, camera, levels)
     return BasePrediction(lifted.gaussians, lifted.camera, lifted.notes)

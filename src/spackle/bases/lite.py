@@ -17,16 +17,17 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate, pad, relu, relu6
 
 from spackle.bases import BasePrediction
-from spackle.bases.depth import lift_guess
+from spackle.bases.depth import lift_predicted_depth
 from spackle.core.photo import Photo, resize_photo
-from spackle.depth.depth_map import NEAREST_M, DepthMap, nearest
+from spackle.depth.depth_map import DepthMap
+from spackle.depth.units import RELATIVE_NEAR_M, near_inverse_depth
 from spackle.runtime.device import pick_device, without_autocast_or_tf32
 from spackle.runtime.errors import InputError
 from spackle.runtime.progress import Progress
 from spackle.weights.checkpoints import load_strict, read_tensors, to_channels_last
 
-STRIDE = 32  # both sides of a network's input are multiples of this number
-Size = Literal["lite0", "lite2"]
+SIDE_MULTIPLE = 32  # both sides of a network's input are multiples of this number
+EncoderSize = Literal["lite0", "lite2"]
 # Stages of EfficientNet (Tan and Le 2019; Google's Lite variants have no squeeze-and-excitation).
 BLOCKS = (
     (3, 1, 1),
@@ -37,11 +38,11 @@ BLOCKS = (
     (5, 2, 6),
     (3, 1, 6),
 )  # kernel, stride, expansion
-DEPTHS: dict[Size, tuple[int, ...]] = {
+DEPTHS: dict[EncoderSize, tuple[int, ...]] = {
     "lite0": (1, 2, 2, 3, 3, 4, 1),
     "lite2": (1, 3, 3, 4, 4, 5, 1),
 }  # blocks
-WIDTHS: dict[Size, tuple[int, ...]] = {
+WIDTHS: dict[EncoderSize, tuple[int, ...]] = {
     "lite0": (16, 24, 40, 80, 112, 192, 320),
     "lite2": (16, 24, 48, 88, 120, 208, 352),
 }
@@ -49,16 +50,19 @@ STAGES = {  # each stage: number of blocks, kernel, stride, expansion, channels
     size: tuple((n, *block, c) for n, block, c in zip(depths, BLOCKS, WIDTHS[size], strict=True))
     for size, depths in DEPTHS.items()
 }
-STEM = 32
-TAPS = (
+STEM_CHANNELS = 32
+FEATURE_STAGES = (
     0,
     1,
     2,
     4,
     6,
 )  # the decoder gets the features of these stages: 1/2, 1/4, 1/8, 1/16 and 1/32 of the input
-DECODER = (24, 40, 64, 96, 160)  # the decoder's channels at these scales
-MEAN, STD = 127.0 / 255, 128.0 / 255  # the pretrained encoder's normalisation of its input
+DECODER_CHANNELS = (24, 40, 64, 96, 160)  # the decoder's channels at these scales
+INPUT_MEAN, INPUT_STD = (
+    127.0 / 255,
+    128.0 / 255,
+)  # the pretrained encoder's normalisation of its input
 
 
 class SameConv(nn.Conv2d):
@@ -92,13 +96,13 @@ class MBConv(nn.Module):
         return x + y if self.skips else y
 
 
-class Encoder(nn.Module):
-    def __init__(self, size: Size) -> None:
+class EfficientNetEncoder(nn.Module):
+    def __init__(self, size: EncoderSize) -> None:
         super().__init__()
         self.size = size
-        self.stem = SameConv(3, STEM, 3, 2)
+        self.stem = SameConv(3, STEM_CHANNELS, 3, 2)
         self.stages = nn.ModuleList()
-        inputs = STEM
+        inputs = STEM_CHANNELS
         for count, kernel, stride, expansion, outputs in STAGES[size]:
             blocks = []
             for n in range(count):
@@ -107,17 +111,17 @@ class Encoder(nn.Module):
             self.stages.append(nn.Sequential(*blocks))
 
     def forward(self, x: Tensor) -> list[Tensor]:
-        """[B, 3, H, W] sRGB in 0..1 to the features of `TAPS`, finest first."""
-        x = relu6(self.stem((x - MEAN) / STD))
+        """[B, 3, H, W] sRGB in 0..1 to the features of `FEATURE_STAGES`, finest first."""
+        x = relu6(self.stem((x - INPUT_MEAN) / INPUT_STD))
         features = []
         for index, stage in enumerate(self.stages):
             x = stage(x)
-            if index in TAPS:
+            if index in FEATURE_STAGES:
                 features.append(x)
         return features
 
 
-class Fuse(nn.Module):
+class UpsampleAndAdd(nn.Module):
     """Upsamples the features of the coarser scale, and adds the features of this scale."""
 
     def __init__(self, coarse: int, skip: int, outputs: int) -> None:
@@ -139,11 +143,11 @@ class Fuse(nn.Module):
 class LiteNet(nn.Module):
     """Predicts a photo's inverse depth, up to a factor."""
 
-    def __init__(self, size: Size = "lite2") -> None:
+    def __init__(self, size: EncoderSize = "lite2") -> None:
         super().__init__()
-        self.encoder = Encoder(size)
-        channels = [STAGES[size][stage][-1] for stage in TAPS]
-        top = DECODER[-1]
+        self.encoder = EfficientNetEncoder(size)
+        channels = [STAGES[size][stage][-1] for stage in FEATURE_STAGES]
+        top = DECODER_CHANNELS[-1]
         self.top = nn.Conv2d(channels[-1] + 2, top, 1)
         self.context = nn.Conv2d(channels[-1], top, 1)
         self.spread = nn.Sequential(
@@ -152,10 +156,11 @@ class LiteNet(nn.Module):
             nn.Conv2d(top, top, 1),
         )
         self.fuse = nn.ModuleList(
-            Fuse(DECODER[n + 1], channels[n], DECODER[n]) for n in reversed(range(len(TAPS) - 1))
+            UpsampleAndAdd(DECODER_CHANNELS[n + 1], channels[n], DECODER_CHANNELS[n])
+            for n in reversed(range(len(FEATURE_STAGES) - 1))
         )
         self.head = nn.Sequential(
-            nn.Conv2d(DECODER[0], 16, 3, padding=1), nn.ReLU(), nn.Conv2d(16, 1, 1)
+            nn.Conv2d(DECODER_CHANNELS[0], 16, 3, padding=1), nn.ReLU(), nn.Conv2d(16, 1, 1)
         )
 
     def forward(self, rgb: Tensor) -> Tensor:
@@ -181,7 +186,7 @@ def _places(x: Tensor) -> Tensor:
 
 
 ADVICE = "give lite's weights"  # if a file holds other weights
-SCALE = "/scale"  # suffix of the tensor with the quantisation steps of 8-bit weights, one for each output channel
+SCALE_SUFFIX = "/scale"  # suffix of the tensor with the quantisation steps of 8-bit weights, one for each output channel
 LAST = f"encoder.stages.{len(STAGES['lite2']) - 1}.0.project.bias"  # the length of this tensor tells a network's size
 
 
@@ -215,20 +220,20 @@ def _unpacked(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     """All tensors as floats; an 8-bit tensor without a fitting scale is left out, so that it counts as missing."""
     values: dict[str, Tensor] = {}
     for name, tensor in tensors.items():
-        scale = tensors.get(name + SCALE)
-        if tensor.is_floating_point() and not name.endswith(SCALE):
+        scale = tensors.get(name + SCALE_SUFFIX)
+        if tensor.is_floating_point() and not name.endswith(SCALE_SUFFIX):
             values[name] = tensor
         elif scale is not None and tensor.dim() == 4 and scale.shape == tensor.shape[:1]:
             values[name] = tensor.float() * scale[:, None, None, None]
     return values
 
 
-SHIPPED = Path(__file__).parents[1] / "weights" / "lite.safetensors"
-DISPARITY = 0.15  # at a larger disparity upright objects lean and poles bend: docs/lab/lite.md
-UNCOVERED = (
+SHIPPED_WEIGHTS = Path(__file__).parents[1] / "weights" / "lite.safetensors"
+MAX_DISPARITY = 0.15  # at a larger disparity upright objects lean and poles bend: docs/lab/lite.md
+MAX_HOLE_RATIO = (
     0.075  # share of the widest views that may be holes: more invented parts would be conspicuous
 )
-FARTHEST = 60.0  # depths are limited to this multiple of the nearest depth
+MAX_DEPTH_RATIO = 60.0  # depths are limited to this multiple of the nearest depth
 
 
 @dataclasses.dataclass(frozen=True)
@@ -251,7 +256,7 @@ INPUT_SCALES = (
     InputScale(256 * 320),
     InputScale(448 * 608, mirrored=False, tilt=False),
 )
-COARSE = (
+COARSE_CELLS = (
     3,
     4,
 )  # an output's low frequencies are its means in 3×4 cells, with 4 cells along the longer side
@@ -272,25 +277,25 @@ class LiteBase:
 
         `device` is cpu or a CUDA device; None: CUDA if available. InputError for a file or device that cannot be used.
         """
-        return cls(load_networks(path or SHIPPED), pick_device(device))
+        return cls(load_networks(path or SHIPPED_WEIGHTS), pick_device(device))
 
     def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
-        """Gaussians of the pixels of the photo at its working size, as `lift` makes them."""
+        """Gaussians of the pixels of the photo at its working size, as `lift_rgbd` makes them."""
         photo = resize_photo(photo)
         inverse_depth = self.inverse_depth(photo.rgb)
-        depth = NEAREST_M / (inverse_depth / nearest(inverse_depth.flatten())).clamp(
-            1 / FARTHEST, 1
-        )
+        depth = RELATIVE_NEAR_M / (
+            inverse_depth / near_inverse_depth(inverse_depth.flatten())
+        ).clamp(1 / MAX_DEPTH_RATIO, 1)
         known = torch.ones_like(depth, dtype=torch.bool)
         depth_map = DepthMap(depth, known, None, None, "disparity", photo.path)
-        prediction = lift_guess(photo, depth_map, photo.camera)
+        prediction = lift_predicted_depth(photo, depth_map, photo.camera)
         notes = {
             **prediction.notes,
             "precision": "fp32",
-            "depth_scale": f"relative, the nearest at {NEAREST_M:g} m",
+            "depth_scale": f"relative, the nearest at {RELATIVE_NEAR_M:g} m",
         }
         return dataclasses.replace(
-            prediction, notes=notes, disparity=DISPARITY, uncovered=UNCOVERED
+            prediction, notes=notes, max_disparity=MAX_DISPARITY, max_hole_ratio=MAX_HOLE_RATIO
         )
 
     def inverse_depth(self, rgb: Tensor) -> Tensor:
@@ -299,7 +304,7 @@ class LiteBase:
         Returns [h, w] float32 up to a factor, on the CPU: about 224×304, in the photo's aspect ratio.
         """
         scales = [scale for scale in INPUT_SCALES if scale.network < len(self.networks)]
-        return merged(self.at_scales(rgb, scales), [scale.tilt for scale in scales]).exp()
+        return merge_outputs(self.at_scales(rgb, scales), [scale.tilt for scale in scales]).exp()
 
     @torch.no_grad()
     def at_scales(self, rgb: Tensor, scales: Sequence[InputScale]) -> Tensor:
@@ -325,9 +330,9 @@ class LiteBase:
         )
 
 
-def merged(outputs: Tensor, tilt: Sequence[bool]) -> Tensor:
+def merge_outputs(outputs: Tensor, tilt: Sequence[bool]) -> Tensor:
     """Mean [h, w] of outputs [n, h, w]; its low frequencies come only from the outputs for which `tilt` is true."""
-    cells = COARSE if outputs.shape[1] <= outputs.shape[2] else COARSE[::-1]
+    cells = COARSE_CELLS if outputs.shape[1] <= outputs.shape[2] else COARSE_CELLS[::-1]
     coarse = interpolate(
         interpolate(outputs[None], size=cells, mode="area"), size=outputs.shape[1:], mode="bicubic"
     )[0]
@@ -341,5 +346,8 @@ def network_size(height: int, width: int, pixels: int) -> tuple[int, int]:
 
 def scaled_size(height: int, width: int, scale: float) -> tuple[int, int]:
     """The size closest to `scale` times (height, width) that a network accepts."""
-    tall, wide = (max(STRIDE, round(side * scale / STRIDE) * STRIDE) for side in (height, width))
+    tall, wide = (
+        max(SIDE_MULTIPLE, round(side * scale / SIDE_MULTIPLE) * SIDE_MULTIPLE)
+        for side in (height, width)
+    )
     return tall, wide

@@ -16,12 +16,21 @@ from spackle.bases import Base, BasePrediction
 from spackle.bases.depth import RgbdBase
 from spackle.bases.lite import LiteBase
 from spackle.bases.moge.base import MogeBase
-from spackle.bases.settings import AUTO, HF, NETWORKS, RGBD, ROUGH, BaseSettings, Depth
+from spackle.bases.settings import (
+    AUTO,
+    HF_PREFIX,
+    NETWORK_BASES,
+    RGBD,
+    ROUGH_GEOMETRY_ADVICE,
+    BaseSettings,
+    Depth,
+)
 from spackle.bases.sharp.base import SharpBase
 from spackle.bases.transformers import HfBase
 from spackle.core.photo import Photo
-from spackle.depth.depth_map import DepthMap, find_depth, load_depth
+from spackle.depth.depth_map import DepthMap
 from spackle.depth.in_photo.layouts import load_photo_depth
+from spackle.depth.readers import find_depth_file, load_depth
 from spackle.runtime.device import NotEnoughMemory
 from spackle.runtime.errors import InputError
 from spackle.runtime.progress import Progress
@@ -30,13 +39,13 @@ LOG = logging.getLogger("spackle")
 Log = Callable[[str], None]
 Stage = Callable[[str], AbstractContextManager[Progress]]
 UNTIMED: Stage = lambda name: contextlib.nullcontext(lambda done, total: None)  # noqa: E731
-ORDER = {  # candidates of `auto`: the name in reports and the log, and the reason that is given if it is missing
+AUTO_CANDIDATES = {  # candidates of `auto`: the name in reports and the log, and the reason that is given if it is missing
     RGBD: ("the depth in the photo", "no depth in the photo"),
     "sharp": ("SHARP", "no SHARP weights here"),
     "moge": ("MoGe", "no MoGe weights here"),
     "lite": ("lite", ""),
 }
-NO_DEPTH = "--base rgbd needs depth, and the photo has none inside: give --depth FILE, or FOLDER for many photos"
+NO_DEPTH_ADVICE = "--base rgbd needs depth, and the photo has none inside: give --depth FILE, or FOLDER for many photos"
 
 
 class BaseError(InputError):
@@ -47,18 +56,20 @@ def open_base(settings: BaseSettings) -> OpenedBase:
     """A base by its settings, whose network is loaded for the first photo; InputError for unsuitable settings."""
     settings.check()
     why = (
-        f"--base {settings.named}"
+        f"--base {settings.resolved_name}"
         if settings.name != AUTO
         else "--depth"
         if settings.depth is not None
         else "-c"
     )
     return OpenedBase(
-        ORDER if settings.named == AUTO else {settings.named: (why, "")}, settings, {}
+        AUTO_CANDIDATES if settings.resolved_name == AUTO else {settings.resolved_name: (why, "")},
+        settings,
+        {},
     )
 
 
-def open_loaded(base: Base) -> OpenedBase:
+def wrap_loaded_base(base: Base) -> OpenedBase:
     """Wrap a base that the calling program has loaded."""
     return OpenedBase({base.name: ("loaded", "")}, BaseSettings(), {base.name: base})
 
@@ -66,15 +77,17 @@ def open_loaded(base: Base) -> OpenedBase:
 def _load_network(name: str, settings: BaseSettings) -> Base | None:
     """Load the network of a base; None if its weights are not on this machine."""
     device, precision = None if settings.device == "auto" else settings.device, settings.precision
-    if name.startswith(HF):
-        return HfBase.load(name.removeprefix(HF), device=device, precision=precision)
+    if name.startswith(HF_PREFIX):
+        return HfBase.load(name.removeprefix(HF_PREFIX), device=device, precision=precision)
     if name == "lite":
         return LiteBase.load(settings.checkpoint, device=device)
-    if (file := settings.files.get(name)) is None:
+    if (file := settings.model_files.get(name)) is None:
         return None
     if name == "moge":
         return MogeBase.load(file, device=device, precision=precision)
-    return SharpBase.load(file, precision=precision, windows=settings.windows, device=device)
+    return SharpBase.load(
+        file, precision=precision, windows_per_batch=settings.windows_per_batch, device=device
+    )
 
 
 def _lift(settings: BaseSettings, photo: Photo, depth: Depth) -> Base | None:
@@ -86,8 +99,10 @@ def _lift(settings: BaseSettings, photo: Photo, depth: Depth) -> Base | None:
     if source is None and photo.path.is_file():  # a photo that a program made has no file
         source = load_photo_depth(photo.path)
     if source is None:
-        if settings.named == RGBD:
-            raise InputError(f"{photo.path}: {NO_DEPTH}; {', '.join(NETWORKS)} need no depth")
+        if settings.resolved_name == RGBD:
+            raise InputError(
+                f"{photo.path}: {NO_DEPTH_ADVICE}; {', '.join(NETWORK_BASES)} need no depth"
+            )
         return None
     if isinstance(source, DepthMap):
         found, read = source, None
@@ -97,7 +112,7 @@ def _lift(settings: BaseSettings, photo: Photo, depth: Depth) -> Base | None:
             for name, end in (("near", settings.near), ("far", settings.far))
             if end is not None
         }
-        file = find_depth(source, photo.path)
+        file = find_depth_file(source, photo.path)
         read = functools.partial(
             load_depth, file, calib=settings.calib, kind=settings.depth_kind, **ends
         )
@@ -130,10 +145,12 @@ class OpenedBase:
         settings: BaseSettings,
         loaded: dict[str, Base | None],
     ) -> None:
-        """`candidates` are tried in their order (see `ORDER`); `loaded` maps names to networks already loaded."""
+        """`candidates` are tried in their order (see `AUTO_CANDIDATES`); `loaded` maps names to networks already loaded."""
         self.candidates, self._settings, self._loaded = candidates, settings, loaded
         self._times = {
-            file: file.stat().st_mtime_ns for file in settings.files.values() if file.is_file()
+            file: file.stat().st_mtime_ns
+            for file in settings.model_files.values()
+            if file.is_file()
         }
         # Candidates that no photo can use: the reason, and whether memory was short.
         self._failed: dict[str, tuple[str, bool]] = {}
@@ -185,7 +202,7 @@ class OpenedBase:
                     self._loaded.pop(name, None)  # frees its memory
         why = ", ".join(reason for reason, _ in reasons) or title
         lasting = not any(short for _, short in reasons)
-        note = f"base {name} ({why})" + (f": {ROUGH}" if name == "lite" else "")
+        note = f"base {name} ({why})" + (f": {ROUGH_GEOMETRY_ADVICE}" if name == "lite" else "")
         new = len(self.candidates) > 1 and note not in self._notes
         self._notes.add(note)
         return prediction, ResolvedBase(name, why, tuple(failures), note if new else "", lasting)
@@ -204,6 +221,6 @@ class OpenedBase:
                 raise BaseError("a file of weights changed while this was running: start again")
         return self._loaded[name]
 
-    def only(self, choice: ResolvedBase) -> OpenedBase:
+    def only_chosen(self, choice: ResolvedBase) -> OpenedBase:
         """The chosen base for all further photos, such as the frames of a clip, without a fallback."""
         return OpenedBase({choice.base: self.candidates[choice.base]}, self._settings, self._loaded)

@@ -19,10 +19,11 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
 from spackle.bases import BasePrediction, is_plausible_focal
-from spackle.bases.depth import lift_guess
+from spackle.bases.depth import lift_predicted_depth
 from spackle.core.camera import Camera
 from spackle.core.photo import Photo, resize_photo
-from spackle.depth.depth_map import NEAREST_M, DepthMap, is_depth, nearest
+from spackle.depth.depth_map import DepthMap, is_valid_depth
+from spackle.depth.units import RELATIVE_NEAR_M, near_inverse_depth
 from spackle.runtime.device import (
     Precision,
     pick_device,
@@ -46,8 +47,8 @@ Window = tuple[
 Prepare = Callable[
     [Tensor], tuple[Tensor, Window]
 ]  # [H, W, 3] sRGB in 0..1 to pixel values [1, 3, h, w]
-WHOLE: Window = (0.0, 1.0, 0.0, 1.0)
-MEANINGS: dict[
+WHOLE_PICTURE: Window = (0.0, 1.0, 0.0, 1.0)
+OUTPUT_MEANINGS: dict[
     str, Meaning
 ] = {  # by `model_type` of config.json; depth_anything may also be metric: see `meaning_of`
     "depth_anything": "relative disparity",
@@ -60,7 +61,7 @@ MEANINGS: dict[
 # NEAREST_M: the ratio of 20 gives a clear parallax, and noise far away makes no depth edges. The smallest disparity is
 # not stretched to FARTHEST_M, because a wall seen from the front would become a valley.
 FARTHEST_M = 30.0
-FLAT = 1e-5  # relative spread below which all pixels count as equal
+MIN_RELATIVE_SPREAD = 1e-5  # relative spread below which all pixels count as equal
 
 
 class HfBase:
@@ -105,7 +106,7 @@ class HfBase:
         return HfBase(name, network, prepare, meaning, "bf16" if dtype.itemsize == 2 else "fp32")
 
     def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
-        """Gaussians of the pixels of the photo at its working size, as `lift` makes them.
+        """Gaussians of the pixels of the photo at its working size, as `lift_rgbd` makes them.
 
         If the focal length is unknown, the model's estimate is used. InputError if the model fails on this photo, its
         output is no depth, or memory is short.
@@ -125,10 +126,10 @@ class HfBase:
         depth = to_depth_map(
             raw, self.meaning, camera.focal[0] / photo.width, self.name, photo.path
         )
-        prediction = lift_guess(photo, depth, camera)
+        prediction = lift_predicted_depth(photo, depth, camera)
         relative = self.meaning == "relative disparity"
         scale = (
-            f"relative, scaled to {NEAREST_M:g}–{FARTHEST_M:g} m"
+            f"relative, scaled to {RELATIVE_NEAR_M:g}–{FARTHEST_M:g} m"
             if relative
             else "metric, by the model"
         )
@@ -160,12 +161,12 @@ def meaning_of(settings: Mapping[str, Any], name: str) -> Meaning:
     dinov2 = (
         kind == "dpt" and isinstance(backbone, dict) and backbone.get("model_type") == "dinov2"
     )  # no MiDaS
-    if kind not in MEANINGS or dinov2 or stated not in ("relative", "metric"):
-        known = ", ".join(MEANINGS)
+    if kind not in OUTPUT_MEANINGS or dinov2 or stated not in ("relative", "metric"):
+        known = ", ".join(OUTPUT_MEANINGS)
         raise InputError(
             f"{name}: the output of {kind[:40]!a} has no known meaning: give a model of type {known}"
         )
-    return "metres" if kind == "depth_anything" and stated == "metric" else MEANINGS[kind]
+    return "metres" if kind == "depth_anything" and stated == "metric" else OUTPUT_MEANINGS[kind]
 
 
 def to_depth_map(raw: Tensor, meaning: Meaning, focal: float, name: str, photo: Path) -> DepthMap:
@@ -180,7 +181,7 @@ def to_depth_map(raw: Tensor, meaning: Meaning, focal: float, name: str, photo: 
         if known.any()
         else (math.nan, math.nan)
     )
-    if not high > max(0, low + FLAT * max(abs(low), abs(high))):
+    if not high > max(0, low + MIN_RELATIVE_SPREAD * max(abs(low), abs(high))):
         why = "its weights are broken or need --precision fp32, or the photo is empty"
         raise InputError(
             f"{photo}: {name} predicts {low:g} to {high:g}, which cannot be depth: {why}"
@@ -188,12 +189,12 @@ def to_depth_map(raw: Tensor, meaning: Meaning, focal: float, name: str, photo: 
     if meaning == "metres":
         depth = raw
     elif meaning == "relative disparity":
-        near = float(nearest(raw[known]))
+        near = float(near_inverse_depth(raw[known]))
         share = (raw / (near if near > 0 else high)).clamp(0, 1)
-        depth = 1 / ((1 - share) / FARTHEST_M + share / NEAREST_M)
+        depth = 1 / ((1 - share) / FARTHEST_M + share / RELATIVE_NEAR_M)
     else:
         depth = 1 / (raw / focal).clamp(1e-4, 1e4)  # in 1/m: Depth Pro's own limits
-    valid = known & is_depth(depth)
+    valid = known & is_valid_depth(depth)
     return DepthMap(
         depth.where(valid, 0.0),
         valid,
@@ -267,7 +268,7 @@ def _processed(processor: Any, kind: str) -> Prepare:
     def prepare(rgb: Tensor) -> tuple[Tensor, Window]:
         image = Image.fromarray((rgb * 255).round().to(torch.uint8).numpy())
         pixels = torch.as_tensor(processor(images=image, return_tensors="pt")["pixel_values"])
-        window = WHOLE
+        window = WHOLE_PICTURE
         if (
             kind == "zoedepth" and processor.do_pad
         ):  # reflects the photo beyond its borders, then resizes both together
@@ -292,6 +293,6 @@ def _stretched(settings: Mapping[str, Any]) -> Prepare:
     def prepare(rgb: Tensor) -> tuple[Tensor, Window]:
         return interpolate(
             ((rgb - mean) / std).permute(2, 0, 1)[None], size=size, mode="bilinear"
-        ), WHOLE
+        ), WHOLE_PICTURE
 
     return prepare

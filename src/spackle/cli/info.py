@@ -11,8 +11,9 @@ from PIL import Image
 from spackle.clips.files import is_clip, read_clip
 from spackle.core.camera import Camera
 from spackle.core.photo import load_photo
-from spackle.depth.depth_map import EXTREMES, SUFFIXES, load_depth
+from spackle.depth.depth_map import NEAR_AND_FAR_QUANTILES
 from spackle.depth.in_photo.layouts import load_photo_depth
+from spackle.depth.readers import DEPTH_SUFFIXES, load_depth
 from spackle.formats.scene_files import load_scene, scene_suffix
 from spackle.runtime.files import check_file
 from spackle.runtime.progress import Reporter
@@ -42,7 +43,7 @@ def show_info(path: Path, reporter: Reporter) -> None:
 def is_depth(path: Path) -> bool:
     """Whether a file is a depth map, by its suffix or, for a PNG, by 16 bits in one channel."""
     if path.suffix.lower() != ".png":
-        return path.suffix.lower() in SUFFIXES
+        return path.suffix.lower() in DEPTH_SUFFIXES
     try:
         with Image.open(path) as image:
             return image.mode.startswith("I")
@@ -60,7 +61,9 @@ def scene_facts(path: Path) -> Facts:
     )
     facts: Facts = {"kind": f"scene ({scene_suffix(path)})", "Gaussians": f"{count:,} ({parts})"}
     depths = scene.gaussians.means[:, 2].double().numpy()
-    near, middle, far = np.quantile(depths, [EXTREMES[0], 0.5, EXTREMES[1]])
+    near, middle, far = np.quantile(
+        depths, [NEAR_AND_FAR_QUANTILES[0], 0.5, NEAR_AND_FAR_QUANTILES[1]]
+    )
     facts["depth"] = (
         f"{near:.3g} near, {middle:.3g} median, {far:.3g} far (metres if the base is metric)"
     )

@@ -94,14 +94,14 @@ HelpAllOption = Annotated[
 
 
 def sharp_speed(words: Sequence[str] | None) -> dict[str, Any]:
-    """`windows` of `BaseSettings` from the values of --sharp; InputError for other values."""
+    """`windows_per_batch` of `BaseSettings` from the values of --sharp; InputError for other values."""
     speed: dict[str, Any] = {}
     for word in words or ():
         key, _, value = word.partition("=")
         check_name("sharp", key, ("windows",))
         if not value.isdecimal():
             raise InputError(f"--sharp {word}: give windows=N")
-        speed["windows"] = int(value)
+        speed["windows_per_batch"] = int(value)
     return speed
 
 

@@ -19,7 +19,8 @@ from spackle.clips.files import is_clip
 from spackle.clips.predict import RESULT_FILES as CLIP_FILES
 from spackle.clips.predict import clip_options, predict_clip
 from spackle.core.photo import PHOTO_SUFFIXES
-from spackle.depth.depth_map import calibrations_beside, find_depth
+from spackle.depth.calibration import calibration_candidates
+from spackle.depth.readers import find_depth_file
 from spackle.depth.writers import check_depth_name
 from spackle.pipeline import Pipeline, PipelineOptions
 from spackle.render import device_of
@@ -249,11 +250,11 @@ class Predictor:
         """A digest of all that a photo's results depend on; InputError if the photo or depth map is missing."""
         files, depth = [file_fingerprint(photo.path, "photo")], self.options.scene.base.depth
         if isinstance(depth, Path):
-            depth = find_depth(depth, photo.path)
+            depth = find_depth_file(depth, photo.path)
             files.append(file_fingerprint(depth, "depth map"))
             files += [
                 file_fingerprint(file, "calibration")
-                for file in calibrations_beside(depth)
+                for file in calibration_candidates(depth)
                 if file.is_file()
             ]
         return json_digest([self.shared, *files])
@@ -295,16 +296,19 @@ def _shared_digest(options: PredictOptions) -> str:
         "path file": path.path,
         "weights": fill.file,
     }
-    files |= {"LaMa": installed_weights("lama") if fill.texture == "lama" else None, **base.files}
+    files |= {
+        "LaMa": installed_weights("lama") if fill.texture == "lama" else None,
+        **base.model_files,
+    }
     prints = {
         kind: file_fingerprint(file, kind) for kind, file in files.items() if file is not None
     }
     name = (
-        base.named if base.folder is None else "hf"
+        base.resolved_name if base.model_folder is None else "hf"
     )  # digests identify the folder, wherever it lies
     # The number of windows changes only the last bits of results.
     base = dataclasses.replace(
-        base, name=name, depth=None, calib=None, checkpoint=None, windows=None
+        base, name=name, depth=None, calib=None, checkpoint=None, windows_per_batch=None
     )
     path = dataclasses.replace(path, cameras=None, path=None)
     choices = [dataclasses.asdict(each) for each in (base, path, options.photo)]

@@ -83,7 +83,7 @@ class ClipCompleter:
         """
         base, guard, now, past = self._aligned(rgb, prediction)
         even = prediction.camera.even()
-        disparity = prediction.disparity if self.disparity is None else self.disparity
+        disparity = prediction.max_disparity if self.disparity is None else self.disparity
         (camera,) = trajectory_cameras(
             self.trajectory, even, disparity, now.depths, self.frames, only=self._count
         )

@@ -13,7 +13,7 @@ from spackle.clips.complete import ClipCompleter, CompletedView
 from spackle.clips.files import ClipWriter, clip_frames, read_clip
 from spackle.core.focal_length import FocalSource, resolve_focal_length
 from spackle.core.photo import Photo, check_photo_size, resize_photo
-from spackle.depth.depth_map import RELATIVE
+from spackle.depth.units import RELATIVE_KINDS
 from spackle.inpaint.plain import OpenCV
 from spackle.pipeline import Pipeline, PipelineOptions, move_in_words
 from spackle.residual import hole_area_ratio
@@ -84,7 +84,7 @@ def predict_clip(
             pipeline.renderer,
             OpenCV("a clip").flow,
             align=options.base.depth is None
-            or options.base.depth_kind in RELATIVE,  # measured depth is not changed
+            or options.base.depth_kind in RELATIVE_KINDS,  # measured depth is not changed
             fill=options.fill.texture != "none",
             network=pipeline.network,
             precision=options.base.precision,
@@ -104,9 +104,9 @@ def predict_clip(
                 if first is None:  # its base, disparity and focal length hold for all frames
                     if completer.disparity is None:
                         prediction = choose_disparity(prediction, pipeline.renderer, photo.path)
-                        completer.disparity = prediction.disparity
+                        completer.disparity = prediction.max_disparity
                         reporter.log(f"{path.name}: {move_in_words(prediction)}")
-                    first, base = (photo, prediction, choice), base.only(choice)
+                    first, base = (photo, prediction, choice), base.only_chosen(choice)
                     if prediction.lens_source:
                         seen = prediction.camera.focal[0] * clip.width / prediction.camera.width
                         focal = seen, FocalSource.FIRST_FRAME
@@ -146,7 +146,7 @@ def predict_clip(
                 "sound": {"codec": clip.audio, "copied": writer.sound} if clip.audio else None,
             },
             "aux": {"gaussians": round(mean(frame["aux"] for frame in frames))},  # of a frame
-            "disparity": options.path.disparity_or(first[1].disparity),
+            "disparity": options.path.disparity_or(first[1].max_disparity),
             "hole_area_ratio": {
                 end: mean(frame[end] for frame in frames) for end in ("before", "after")
             }

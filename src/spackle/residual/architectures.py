@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, pad
 
-from spackle.bases.sharp.encoder import CONFIGS, FULL, ExactConv, SharpConfig
+from spackle.bases.sharp.encoder import FULL_SIZE, SIZES, Float32Conv, SharpConfig
 from spackle.bases.sharp.network import FeatureNetwork
 from spackle.core.crop import Crop
 from spackle.residual.network import (
@@ -127,7 +127,7 @@ class SharpDecoder(ResidualNet):
         False,
     )  # group norms make a cell depend on all others
 
-    def __init__(self, config: SharpConfig = FULL) -> None:
+    def __init__(self, config: SharpConfig = FULL_SIZE) -> None:
         super().__init__()
         dims = (config.depth_width, *config.pyramid)
         self.stem = nn.Conv2d(VIEW_CHANNELS + 3, STEM_WIDTH, 3, padding=1)
@@ -136,8 +136,8 @@ class SharpDecoder(ResidualNet):
         )
         self.maps = nn.ModuleList(nn.Conv2d(STEM_WIDTH, dim, 1) for dim in dims)
         self.feature_model = FeatureNetwork(config)
-        self.geometry = ExactConv(config.feature_width, GEOMETRY_CHANNELS, 1)
-        self.texture = ExactConv(config.feature_width, TEXTURE_CHANNELS, 1)
+        self.geometry = Float32Conv(config.feature_width, GEOMETRY_CHANNELS, 1)
+        self.texture = Float32Conv(config.feature_width, TEXTURE_CHANNELS, 1)
         for name, layer in self.feature_model.named_modules():
             if isinstance(layer, (nn.Conv2d, nn.ConvTranspose2d)):
                 _scale(
@@ -189,7 +189,7 @@ def _scale(gain: float, *layers: Any) -> None:
             nn.init.zeros_(layer.bias)
 
 
-def open_residual(name: str, config: SharpConfig = FULL) -> ResidualNet:
+def open_residual(name: str, config: SharpConfig = FULL_SIZE) -> ResidualNet:
     """An untrained network of the named architecture; `config` is the size of a `SharpDecoder`."""
     return UNet() if name == UNet.name else SharpDecoder(config)
 
@@ -214,5 +214,5 @@ def load_residual(path: str | os.PathLike[str]) -> ResidualNet:
 def decoder_size(tensors: Mapping[str, Tensor]) -> SharpConfig:
     """The size of the SHARP decoder in a file, from its tensors; the published size if there is no decoder."""
     last = tensors.get("feature_model.fusion.out_conv.bias")
-    width = FULL.gaussian_width if last is None else last.numel()
-    return next((config for config in CONFIGS.values() if config.gaussian_width == width), FULL)
+    width = FULL_SIZE.gaussian_width if last is None else last.numel()
+    return next((config for config in SIZES.values() if config.gaussian_width == width), FULL_SIZE)

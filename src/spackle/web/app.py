@@ -24,9 +24,9 @@ from starlette.staticfiles import StaticFiles
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 import spackle
-from spackle.bases.settings import AUTO, MISSING
+from spackle.bases.settings import AUTO, MISSING_WEIGHTS_ADVICE
 from spackle.core.photo import PHOTO_SUFFIXES
-from spackle.depth.depth_map import SUFFIXES
+from spackle.depth.readers import DEPTH_SUFFIXES
 from spackle.formats.html import read_page_file
 from spackle.runtime.errors import InputError, first_validation_problem, printable_line
 from spackle.runtime.task_process import TaskFunction
@@ -65,7 +65,7 @@ UPLOAD_FORM: dict[
             "photo": {**BINARY_FILE, "description": f"One of {', '.join(PHOTO_SUFFIXES)}."},
             "depth": {
                 **BINARY_FILE,
-                "description": f"Its depth map, one of {', '.join(SUFFIXES)}.",
+                "description": f"Its depth map, one of {', '.join(DEPTH_SUFFIXES)}.",
             },
             "options": SceneOptions.model_json_schema(),
         },
@@ -234,11 +234,13 @@ def accept_photo(form: FormData, folder: Path, jobs: Jobs, bases: list[str]) -> 
             422, printable_line(f"options: {first_validation_problem(error)}")
         ) from error
     if options.base not in (None, *bases):
-        why = MISSING.get(options.base or "", f"unknown: there are {', '.join(bases)}")
+        why = MISSING_WEIGHTS_ADVICE.get(
+            options.base or "", f"unknown: there are {', '.join(bases)}"
+        )
         raise HTTPException(422, printable_line(f"base {options.base} on this server: {why}"))
     source, of_depth = store_upload(photo, folder, "source", name, PHOTO_SUFFIXES), None
     if isinstance(depth, UploadFile) and depth.filename:
-        of_depth = store_upload(depth, folder, "depth", "depth map", SUFFIXES)
+        of_depth = store_upload(depth, folder, "depth", "depth map", DEPTH_SUFFIXES)
     try:
         check_photo(folder / source, name, folder / PREVIEW)
     except InputError as error:

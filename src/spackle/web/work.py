@@ -15,11 +15,11 @@ from pydantic import BaseModel, ConfigDict, Field
 from rich.console import Console
 
 from spackle.bases.lite import LiteBase
-from spackle.bases.settings import AUTO, ROUGH, BaseSettings
+from spackle.bases.settings import AUTO, ROUGH_GEOMETRY_ADVICE, BaseSettings
 from spackle.core.image_files import read_image
 from spackle.core.photo import PHOTO_SUFFIXES, check_photo_size
 from spackle.core.trajectories import MAX_DISPARITY, TRAJECTORIES, TrajectoryKind
-from spackle.depth.depth_map import DepthKind
+from spackle.depth.units import DepthKind
 from spackle.formats.html import html_safe_json, single_html
 from spackle.formats.scene_files import scene_suffix
 from spackle.pipeline import FillOptions, FillTexture, Pipeline, PipelineOptions
@@ -97,7 +97,7 @@ class SceneWork:
 
     def bases(self) -> list[str]:
         """The bases that a client may choose: the server's base, "auto", and those with weights on this machine."""
-        return list(dict.fromkeys([self.base.name, AUTO, *BaseSettings().files]))
+        return list(dict.fromkeys([self.base.name, AUTO, *BaseSettings().model_files]))
 
     def __call__(self, task: tuple[Job, str | None], tell: SendEvent) -> None:
         """Do a task; InputError, without any path of this server, for an unusable photo, depth map or scene."""
@@ -154,7 +154,7 @@ class SceneWork:
         )
         predict_photo(job.folder / job.source, job.results, pipeline, teller, wanted)
         report = json.loads((job.results / REPORT).read_text(encoding="utf-8"))
-        return ROUGH if report["base"]["name"] == LiteBase.name else ""
+        return ROUGH_GEOMETRY_ADVICE if report["base"]["name"] == LiteBase.name else ""
 
     def _make(self, target: Path, scene: Scene, job: Job, options: SceneOptions) -> None:
         if target.name == REPORT:

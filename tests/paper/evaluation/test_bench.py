@@ -150,7 +150,7 @@ def test_points_suffice_and_without_depth_a_case_is_refused(scenes: Path) -> Non
         "residual": "seeds",
     }
     tools = open_evaluation(
-        EvaluateOptions("middlebury", scenes, base=BaseSettings("rgbd"), **settings)
+        EvaluateOptions("middlebury", scenes, base=BaseSettings(name="rgbd"), **settings)
     )
     case, config = (
         tools.cases[0],

@@ -257,7 +257,11 @@ def test_second_views_are_the_nearest_but_not_the_same(tmp_path: Path) -> None:
     ]
     assert len(first.seconds) == 7  # all other photos, the nearest first
     assert [view.name for view in first.seconds][::6] == ["fern/image001", "fern/image006"]
-    settings: dict[str, Any] = {"base": BaseSettings("lite"), "metrics": (), "residual": "seeds"}
+    settings: dict[str, Any] = {
+        "base": BaseSettings(name="lite"),
+        "metrics": (),
+        "residual": "seeds",
+    }
     for choice, count in (("all", 7), ("nearest", 3)):
         evaluation = open_evaluation(
             EvaluateOptions("llff", tmp_path, "near-view", second_views=choice, **settings)

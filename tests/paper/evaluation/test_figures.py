@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers.command import names_in, refuses, run
 from helpers.evaluation_data import write_boxes
-from helpers.sharp_weights import MICRO, write_tiny
+from helpers.sharp_weights import MICRO_SIZE, write_tiny
 from PIL import Image
 
 
@@ -38,7 +38,7 @@ def test_both_figures_and_all_tables_are_latex(tmp_path: Path) -> None:
     data, large, near, bench = (tmp_path / name for name in ("data", "large", "near", "bench"))
     write_boxes(data / "Ball_1", 0)
     tiny, words = (
-        write_tiny(tmp_path / "sharp.safetensors", MICRO),
+        write_tiny(tmp_path / "sharp.safetensors", MICRO_SIZE),
         (data, "--dataset", "middlebury"),
     )
     sharp = ("--base", "sharp", "-c", tiny, "--precision", "fp32", "--metrics", "none")

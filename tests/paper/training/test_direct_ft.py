@@ -18,7 +18,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from spackle.bases.sharp.base import expected_shapes
-from spackle.bases.sharp.encoder import MICRO
+from spackle.bases.sharp.encoder import MICRO_SIZE
 from spackle.paper.dataset import DatasetFiles
 from spackle.paper.dataset.shards import load_manifest
 from spackle.paper.training.direct_ft import (
@@ -48,7 +48,7 @@ run: {validate_every: 4, save_every: 2, log_every: 1}
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Weights of SHARP, a dataset built with these weights, and a recipe."""
     place = tmp_path_factory.mktemp("direct")
-    weights = deterministic_weights(expected_shapes(MICRO))
+    weights = deterministic_weights(expected_shapes(MICRO_SIZE))
     weights["prediction_head.texture_prediction_head.bias"][-2:] = (
         6.0  # opaque: the photo's own view has no holes
     )
@@ -217,7 +217,7 @@ def test_unusable_input_is_refused(
                 place / name
             )
     if "{place}/other.safetensors" in options:
-        save_file(deterministic_weights(expected_shapes(MICRO)), place / "other.safetensors")
+        save_file(deterministic_weights(expected_shapes(MICRO_SIZE)), place / "other.safetensors")
     done = train(place, tmp_path / "out", *(option.format(place=place) for option in options))
     assert (done.code, said in done.lines[-1]) == (2, True), done.err
     assert not (tmp_path / "out").exists()

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from spackle.bases import BasePrediction, is_plausible_focal
-from spackle.bases.depth import lift_guess
+from spackle.bases.depth import lift_predicted_depth
 from spackle.bases.moge.network import (
-    FINEST,
+    PIXELS_PER_TOKEN,
     MogeNetwork,
     MogeOutput,
     load_network,
@@ -34,13 +34,13 @@ from spackle.runtime.device import (
 from spackle.runtime.errors import InputError
 from spackle.runtime.progress import Progress
 
-TOKENS = 1800  # for a photo, limited to the checkpoint's range
+USUAL_TOKENS = 1800  # for a photo, limited to the checkpoint's range
 SAMPLES = 64  # points along each side of the map that determine focal length and shift
-STEPS, STEP = (
+MAX_STEPS, MIN_STEP = (
     200,
     1e-9,
 )  # the search for the shift: most steps, and the smallest step relative to 1 + shift
-SKY = 10.0  # distance of the sky, as a multiple of the farthest surface's distance
+SKY_DISTANCE_FACTOR = 10.0  # distance of the sky, as a multiple of the farthest surface's distance
 
 Floats = NDArray[np.float64]
 
@@ -81,17 +81,17 @@ class MogeBase:
             )
 
     def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
-        """Gaussians of the pixels of the photo at its working size, as `lift` makes them.
+        """Gaussians of the pixels of the photo at its working size, as `lift_rgbd` makes them.
 
         The user's or the file's focal length is kept. Without one, MoGe's focal length is used if it is plausible, else
         the default. The sky lies behind all surfaces. InputError if the network finds no surface, or memory is short.
         """
         photo = resize_photo(photo)
-        tokens = min(max(TOKENS, self.network.least_tokens), self.network.most_tokens)
+        tokens = min(max(USUAL_TOKENS, self.network.least_tokens), self.network.most_tokens)
         rows, columns = token_grid(photo.height, photo.width, tokens)
         size = min(
-            (FINEST * rows, FINEST * columns), (photo.height, photo.width)
-        )  # `lift` enlarges
+            (PIXELS_PER_TOKEN * rows, PIXELS_PER_TOKEN * columns), (photo.height, photo.width)
+        )  # `lift_rgbd` enlarges
         known = not photo.focal_source.is_assumed
         with report_memory_shortage():
             output = self.ask(photo.rgb, tokens, size)
@@ -110,10 +110,12 @@ class MogeBase:
                 f"{photo.path}: MoGe finds no surface: give another photo, or --base lite"
             )
         depth = torch.where(
-            view.surface, view.depth.where(valid, 0.0), SKY * view.depth[valid].max()
+            view.surface,
+            view.depth.where(valid, 0.0),
+            SKY_DISTANCE_FACTOR * view.depth[valid].max(),
         )
         depth_map = DepthMap(depth, valid | ~view.surface, None, None, "depth", photo.path)
-        prediction = lift_guess(photo, depth_map, camera)
+        prediction = lift_predicted_depth(photo, depth_map, camera)
         notes = {
             **prediction.notes,
             "precision": self.precision,
@@ -163,7 +165,7 @@ def focal_and_shift(
             return best, seen, best * seen - places
 
     shift = 0.0
-    for _ in range(STEPS):
+    for _ in range(MAX_STEPS):
         best, seen, off = at(shift)
         moved = -seen / (points[:, 2:] + shift)  # the derivative of `seen` by the shift
         change = best * moved  # the derivative of `off` by the shift
@@ -171,11 +173,11 @@ def focal_and_shift(
             change += float((moved * (places - 2 * best * seen)).sum() / (seen * seen).sum()) * seen
         step = -float((change * off).sum() / ((change * change).sum() or 1.0))
         while (
-            abs(step) > STEP * (1 + abs(shift))
+            abs(step) > MIN_STEP * (1 + abs(shift))
             and not (at(shift + step)[2] ** 2).sum() < (off**2).sum()
         ):
             step /= 2
         shift += step
-        if not abs(step) > STEP * (1 + abs(shift)):
+        if not abs(step) > MIN_STEP * (1 + abs(shift)):
             break
     return at(shift)[0], shift

@@ -27,10 +27,10 @@ BACKBONES = {
     "dinov2_vitb14": (768, 12, 12),
     "dinov2_vitl14": (1024, 24, 16),
 }
-PATCH = 14  # side of a token in pixels
-GRID = 37  # tokens along a side for which the positions were learned
-LEVELS = 5  # of a pyramid; each level is twice as fine as the previous level
-FINEST = 2 ** (LEVELS - 1)  # output pixels along a token's side
+PATCH_PX = 14  # side of a token in pixels
+TRAINED_GRID = 37  # tokens along a side for which the positions were learned
+LEVEL_COUNT = 5  # of a pyramid; each level is twice as fine as the previous level
+PIXELS_PER_TOKEN = 2 ** (LEVEL_COUNT - 1)  # output pixels along a token's side
 conv3 = functools.partial(nn.Conv2d, kernel_size=3, padding=1, padding_mode="replicate")
 
 MOST_BLOCKS = 64  # of a pyramid's level
@@ -59,9 +59,9 @@ class DinoBackbone(nn.Module):
     def __init__(self, width: int, depth: int, heads: int) -> None:
         super().__init__()
         self.cls_token = nn.Parameter(torch.zeros(1, 1, width))
-        self.pos_embed = nn.Parameter(torch.zeros(1, 1 + GRID**2, width))
+        self.pos_embed = nn.Parameter(torch.zeros(1, 1 + TRAINED_GRID**2, width))
         self.mask_token = nn.Parameter(torch.zeros(1, width))  # for training only
-        self.patch_embed = nn.ModuleDict({"proj": nn.Conv2d(3, width, PATCH, stride=PATCH)})
+        self.patch_embed = nn.ModuleDict({"proj": nn.Conv2d(3, width, PATCH_PX, stride=PATCH_PX)})
         self.blocks = nn.ModuleList(TransformerBlock(width, heads) for _ in range(depth))
         self.norm = nn.LayerNorm(width, eps=NORM_EPS)
 
@@ -69,10 +69,10 @@ class DinoBackbone(nn.Module):
         """Normalised tokens [1, 1 + T, C] (class token first) after the blocks `layers`; image [1, 3, 14·h, 14·w]."""
         patches, positions = self.patch_embed["proj"](image), self.pos_embed
         rows, columns = patches.shape[2:]
-        if (rows, columns) != (GRID, GRID):
+        if (rows, columns) != (TRAINED_GRID, TRAINED_GRID):
             # DINOv2 resizes by a factor of (n + 0.1) / 37, which puts positions a little off the grid.
-            factors = ((rows + 0.1) / GRID, (columns + 0.1) / GRID)
-            grid = positions[:, 1:].reshape(1, GRID, GRID, -1).permute(0, 3, 1, 2)
+            factors = ((rows + 0.1) / TRAINED_GRID, (columns + 0.1) / TRAINED_GRID)
+            grid = positions[:, 1:].reshape(1, TRAINED_GRID, TRAINED_GRID, -1).permute(0, 3, 1, 2)
             grid = interpolate(grid, scale_factor=factors, mode="bicubic", align_corners=False)
             positions = torch.cat([positions[:, :1], grid.flatten(2).transpose(1, 2)], dim=1)  # type: ignore[assignment]
         tokens = torch.cat([self.cls_token, patches.flatten(2).transpose(1, 2)], dim=1) + positions
@@ -98,7 +98,7 @@ class DinoEncoder(nn.Module):
         )
 
     def forward(self, image: Tensor, rows: int, columns: int) -> tuple[Tensor, Tensor]:
-        size = (PATCH * rows, PATCH * columns)
+        size = (PATCH_PX * rows, PATCH_PX * columns)
         seen = interpolate(image, size=size, mode="bilinear", align_corners=False, antialias=True)
         tokens = self.backbone(
             (seen - self.get_buffer("image_mean")) / self.get_buffer("image_std"), self.layers
@@ -125,7 +125,7 @@ class ConvBlock(nn.Module):
         return out
 
 
-def resampler(kind: str, inputs: int, outputs: int) -> nn.Sequential:
+def make_resampler(kind: str, inputs: int, outputs: int) -> nn.Sequential:
     """Layers that double the size of feature maps."""
     if kind == "conv_transpose":
         return nn.Sequential(
@@ -150,9 +150,9 @@ class Pyramid(nn.Module):
         widths, counts, outs = (
             config["dim_res_blocks"],
             config["num_res_blocks"],
-            config["dim_out"] or [None] * LEVELS,
+            config["dim_out"] or [None] * LEVEL_COUNT,
         )
-        if len(widths) != LEVELS or max(counts) > MOST_BLOCKS:
+        if len(widths) != LEVEL_COUNT or max(counts) > MOST_BLOCKS:
             raise ValueError(f"num_res_blocks is {short_repr(counts)}")
         self.input_blocks = nn.ModuleList(
             map(functools.partial(nn.Conv2d, kernel_size=1), config["dim_in"], widths)
@@ -166,7 +166,7 @@ class Pyramid(nn.Module):
             for width, out in zip(widths, outs, strict=True)
         )
         self.resamplers = nn.ModuleList(
-            map(resampler, config["resamplers"], widths[:-1], widths[1:])
+            map(make_resampler, config["resamplers"], widths[:-1], widths[1:])
         )
 
     def forward(self, inputs: Sequence[Tensor]) -> list[Tensor]:
@@ -216,7 +216,7 @@ class MogeNetwork(nn.Module):
         features, class_token = self.encoder(image, rows, columns)
         planes = [
             view_plane(rows << level, columns << level, width / height).to(image)
-            for level in range(LEVELS)
+            for level in range(LEVEL_COUNT)
         ]
         inputs = [torch.cat([features, planes[0]], dim=1), *planes[1:]]
         return self.neck(inputs), self.scale_head(class_token)[0, 0].exp()

@@ -16,8 +16,8 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
 from spackle.bases import BasePrediction
-from spackle.bases.sharp.encoder import CONFIGS, WINDOWS, SharpConfig, set_precision
-from spackle.bases.sharp.network import SharpNetwork, SharpOutput, compose
+from spackle.bases.sharp.encoder import SIZES, WINDOW_COUNT, SharpConfig, set_precision
+from spackle.bases.sharp.network import SharpNetwork, SharpOutput, apply_deltas
 from spackle.bases.sharp.stretch import stretch_gaussians
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
@@ -34,14 +34,18 @@ from spackle.runtime.files import sha256_of
 from spackle.runtime.progress import Progress
 from spackle.weights.checkpoints import TensorShapes, load_strict, read_metadata, read_tensors
 
-WINDOWS_AT_ONCE = 5  # enough to keep two cores or a small GPU busy
+CPU_WINDOW_BATCH = 5  # enough to keep two cores or a small GPU busy
 ADVICE = "give SHARP's checkpoint as it was downloaded"
 LESS_MEMORY = "try --sharp windows=1 and --precision bf16"
-NOTE = "spackle.gaussian_decoder"  # a decoder file's only metadata key, as JSON: safetensors shuffles several keys
+SOURCE_KEY = "spackle.gaussian_decoder"  # a decoder file's only metadata key, as JSON: safetensors shuffles several keys
 _ENCODER = "monodepth_model.monodepth_predictor.encoder."
 # Prefixes of tensors that are never read: the transformers' classifiers, and a U-Net that only training uses.
-UNUSED = (f"{_ENCODER}patch_encoder.head.", f"{_ENCODER}image_encoder.head.", "depth_alignment.")
-PARAMETERS = 702_305_169  # in Apple's checkpoint, with the unused ones
+UNUSED_PREFIXES = (
+    f"{_ENCODER}patch_encoder.head.",
+    f"{_ENCODER}image_encoder.head.",
+    "depth_alignment.",
+)
+PARAMETER_COUNT = 702_305_169  # in Apple's checkpoint, with the unused ones
 
 
 class SharpBase:
@@ -50,12 +54,12 @@ class SharpBase:
     name = "sharp"
 
     def __init__(
-        self, network: SharpNetwork, *, windows: int | None = None, weights: str = ""
+        self, network: SharpNetwork, *, windows_per_batch: int | None = None, weights: str = ""
     ) -> None:
         """Use a loaded network on its device; `weights` is the name of the weights in the report."""
-        check_windows("windows", windows)
+        check_window_batch("windows", windows_per_batch)
         self.network = network
-        self.windows = windows or usual_windows(self.device)
+        self.windows_per_batch = windows_per_batch or default_window_batch(self.device)
         self.weights = weights
 
     @staticmethod
@@ -63,7 +67,7 @@ class SharpBase:
         path: str | os.PathLike[str],
         *,
         precision: Precision = "auto",
-        windows: int | None = None,
+        windows_per_batch: int | None = None,
         device: torch.device | str | None = None,
     ) -> SharpBase:
         """Read a checkpoint; InputError for an unusable file, device or number of windows, or too little memory.
@@ -78,7 +82,7 @@ class SharpBase:
         """
         target = pick_device(device)
         network = load_network(path, pick_dtype(precision, target), target)
-        return SharpBase(network, windows=windows, weights=Path(path).name)
+        return SharpBase(network, windows_per_batch=windows_per_batch, weights=Path(path).name)
 
     @property
     def device(self) -> torch.device:
@@ -107,32 +111,34 @@ class SharpBase:
     @torch.no_grad()
     def infer(self, photo: Photo, progress: Progress | None = None) -> SharpOutput:
         """The network's output for a photo; `to_metric` turns it into Gaussians."""
-        image = to_square(photo.rgb.to(self.device, non_blocking=True), self.network.config.side)
+        image = resize_to_square(
+            photo.rgb.to(self.device, non_blocking=True), self.network.config.side
+        )
         with without_autocast_or_tf32(self.device):
             factor = photo.focal_px / photo.width
-            output: SharpOutput = self.network(image, factor, self.windows, progress)
+            output: SharpOutput = self.network(image, factor, self.windows_per_batch, progress)
         return output
 
 
-def usual_windows(device: torch.device) -> int:
+def default_window_batch(device: torch.device) -> int:
     """The default for the number of windows that go through the transformer at once."""
-    return WINDOWS_AT_ONCE if device.type == "cpu" else WINDOWS
+    return CPU_WINDOW_BATCH if device.type == "cpu" else WINDOW_COUNT
 
 
-def check_windows(option: str, windows: int | None) -> None:
+def check_window_batch(option: str, windows: int | None) -> None:
     """InputError if the number of windows is out of range; `option` is its name in the message."""
-    if windows is not None and not 1 <= windows <= WINDOWS:
-        raise InputError(f"{option} must be between 1 and {WINDOWS}, got {windows}")
+    if windows is not None and not 1 <= windows <= WINDOW_COUNT:
+        raise InputError(f"{option} must be between 1 and {WINDOW_COUNT}, got {windows}")
 
 
 def to_metric(output: SharpOutput, photo: Photo) -> Gaussians:
     """Convert Gaussians from normalised space, where x / z and y / z run from -1 to 1, to metres, on the CPU."""
     stretch = (photo.width / (2 * photo.focal_px), photo.height / (2 * photo.focal_px), 1.0)
     with without_autocast_or_tf32(output.deltas.device):
-        return stretch_gaussians(compose(output.start, output.deltas).to("cpu"), stretch)
+        return stretch_gaussians(apply_deltas(output.initial, output.deltas).to("cpu"), stretch)
 
 
-def to_square(rgb: Tensor, side: int) -> Tensor:
+def resize_to_square(rgb: Tensor, side: int) -> Tensor:
     """Resize [H, W, 3] sRGB to [1, 3, side, side], bilinearly with aligned corner pixels, as SHARP was trained."""
     image = rgb.permute(2, 0, 1)[None].contiguous()
     return interpolate(image, size=(side, side), mode="bilinear", align_corners=True)
@@ -151,14 +157,16 @@ def load_network(
     for a missing, broken or foreign file, or too little memory. Nothing in the file is executed.
     """
     tensors: Mapping[str, Tensor] = read_tensors(path, ADVICE)
-    if (owner := owner_of(path)) is not None:
+    if (owner := source_checkpoint_of(path)) is not None:
         tensors = _with_owner(tensors, path, owner)
-    tensors = {name: tensor for name, tensor in tensors.items() if not name.startswith(UNUSED)}
+    tensors = {
+        name: tensor for name, tensor in tensors.items() if not name.startswith(UNUSED_PREFIXES)
+    }
     positions = tensors.get(f"{_ENCODER}patch_encoder.pos_embed", torch.empty(0)).shape
     sizes: dict[tuple[int, ...], SharpConfig]
-    sizes = {(1, 1 + config.grid**2, config.embed): config for config in CONFIGS.values()}
+    sizes = {(1, 1 + config.grid**2, config.embed): config for config in SIZES.values()}
     with torch.device("meta"):
-        network = SharpNetwork(sizes.get(positions, CONFIGS["full"]))
+        network = SharpNetwork(sizes.get(positions, SIZES["full"]))
     with report_memory_shortage(LESS_MEMORY):
         convert = functools.partial(set_precision, dtype=dtype)
         load_strict(network, tensors, path, ADVICE, prepare=convert)
@@ -177,7 +185,7 @@ def expected_shapes(config: SharpConfig) -> TensorShapes:
 
 
 @dataclasses.dataclass(frozen=True)
-class Owner:
+class SourceCheckpoint:
     """The checkpoint that a decoder was trained on, which holds the weights that were not trained."""
 
     path: Path  # only the file's name if it was read from a decoder's file
@@ -185,22 +193,22 @@ class Owner:
 
     @property
     def places(self) -> tuple[str, str]:
-        """Possible names of the checkpoint in a decoder's folder: `link_owner`'s link, and the file's own name."""
+        """Possible names of the checkpoint in a decoder's folder: `link_source_checkpoint`'s link, and the file's own name."""
         return f"trained-on-{printable_line(Path(self.sha256).name)[:12]}.link", self.path.name
 
 
-def decoder_bytes(decoder: nn.Module, owner: Owner) -> bytes:
+def encode_decoder(decoder: nn.Module, owner: SourceCheckpoint) -> bytes:
     """A `GaussianDecoder` as a safetensors file in float32, which restores unchanged weights bit for bit."""
     tensors = {
         name: tensor.detach().float().cpu().contiguous()
         for name, tensor in decoder.state_dict().items()
     }
     return save(
-        tensors, {NOTE: json.dumps({"checkpoint": owner.path.name, "sha256": owner.sha256})}
+        tensors, {SOURCE_KEY: json.dumps({"checkpoint": owner.path.name, "sha256": owner.sha256})}
     )
 
 
-def link_owner(owner: Owner, folder: Path) -> None:
+def link_source_checkpoint(owner: SourceCheckpoint, folder: Path) -> None:
     """Put a link to a checkpoint into the folder of its decoders, under a name that no other file has."""
     link = folder / owner.places[0]
     with contextlib.suppress(
@@ -211,18 +219,18 @@ def link_owner(owner: Owner, folder: Path) -> None:
         link.symlink_to(owner.path.absolute())
 
 
-def owner_of(path: str | os.PathLike[str]) -> Owner | None:
+def source_checkpoint_of(path: str | os.PathLike[str]) -> SourceCheckpoint | None:
     """The checkpoint that a decoder's file names; None for another file, InputError if the name is missing."""
-    note = read_metadata(path, NOTE)
+    note = read_metadata(path, SOURCE_KEY)
     if note is None:
         return None
     with as_input_error(path, "does not say which checkpoint it was trained on: train it again"):
         facts = json.loads(note)
-        return Owner(Path(Path(str(facts["checkpoint"])).name), str(facts["sha256"]))
+        return SourceCheckpoint(Path(Path(str(facts["checkpoint"])).name), str(facts["sha256"]))
 
 
 def _with_owner(
-    decoder: Mapping[str, Tensor], path: str | os.PathLike[str], owner: Owner
+    decoder: Mapping[str, Tensor], path: str | os.PathLike[str], owner: SourceCheckpoint
 ) -> dict[str, Tensor]:
     """The tensors of the checkpoint in a decoder's folder, with the decoder's tensors in place of the checkpoint's.
 

@@ -14,8 +14,8 @@ from torch.nn.functional import gelu, interpolate, scaled_dot_product_attention
 from spackle.runtime.progress import Progress
 from spackle.weights.checkpoints import to_channels_last
 
-LAYERS = 2  # of Gaussians: the visible surface, and what may be behind it
-STRIDE = 2  # pixels of the network's picture for each cell of Gaussians
+LAYER_COUNT = 2  # of Gaussians: the visible surface, and what may be behind it
+CELL_STRIDE = 2  # pixels of the network's picture for each cell of Gaussians
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,17 +47,17 @@ class SharpConfig:
         return self.window // self.patch
 
 
-FULL = SharpConfig()
-TINY = SharpConfig(
+FULL_SIZE = SharpConfig()
+TINY_SIZE = SharpConfig(
     48, 4, 3, (0, 1), (16, 24, 32, 32), depth_width=16, gaussian_width=16, feature_width=16
 )
-MICRO = dataclasses.replace(TINY, window=128)  # a ninth of the pixels
-CONFIGS = {"full": FULL, "tiny": TINY, "micro": MICRO}
+MICRO_SIZE = dataclasses.replace(TINY_SIZE, window=128)  # a ninth of the pixels
+SIZES = {"full": FULL_SIZE, "tiny": TINY_SIZE, "micro": MICRO_SIZE}
 
 _HEAVY = (nn.Linear, nn.Conv2d, nn.ConvTranspose2d, nn.GroupNorm)
 
 
-class ExactConv(nn.Conv2d):
+class Float32Conv(nn.Conv2d):
     """A convolution that stays in float32: it is cheap, and reads the pixels or writes the Gaussians' values."""
 
     def forward(self, x: Tensor) -> Tensor:
@@ -65,7 +65,7 @@ class ExactConv(nn.Conv2d):
             return super().forward(x.float())
 
 
-def lower(x: Tensor, module: nn.Module) -> Tensor:
+def to_precision_of(x: Tensor, module: nn.Module) -> Tensor:
     """`x` in the module's precision."""
     weight: Tensor = module.weight  # type: ignore[assignment]
     return x.to(weight.dtype)
@@ -74,7 +74,7 @@ def lower(x: Tensor, module: nn.Module) -> Tensor:
 def set_precision(network: nn.Module, dtype: torch.dtype) -> None:
     """Convert the expensive layers to `dtype`, in place, and kernels to channels-last, which is fast on a CPU."""
     for module in network.modules():
-        if isinstance(module, _HEAVY) and not isinstance(module, ExactConv):
+        if isinstance(module, _HEAVY) and not isinstance(module, Float32Conv):
             module.to(dtype)
     to_channels_last(network)
 
@@ -92,7 +92,7 @@ class VisionTransformer(nn.Module):
         self.cls_token = nn.Parameter(torch.zeros(1, 1, config.embed))
         self.pos_embed = nn.Parameter(torch.zeros(1, 1 + config.grid**2, config.embed))
         self.patch_embed = nn.ModuleDict(
-            {"proj": ExactConv(3, config.embed, config.patch, stride=config.patch)}
+            {"proj": Float32Conv(3, config.embed, config.patch, stride=config.patch)}
         )
         self.blocks = nn.ModuleList(
             TransformerBlock(config.embed, config.heads) for _ in range(config.depth)
@@ -134,13 +134,13 @@ class TransformerBlock(nn.Module):
 
     def forward(self, tokens: Tensor) -> Tensor:
         tokens = tokens + self._attended(self.norm1(tokens)) * self.ls1["gamma"]
-        hidden = gelu(self.mlp["fc1"](lower(self.norm2(tokens), self.mlp["fc1"])))
+        hidden = gelu(self.mlp["fc1"](to_precision_of(self.norm2(tokens), self.mlp["fc1"])))
         out: Tensor = tokens + self.mlp["fc2"](hidden) * self.ls2["gamma"]
         return out
 
     def _attended(self, tokens: Tensor) -> Tensor:
         batch, count, width = tokens.shape
-        qkv = self.attn["qkv"](lower(tokens, self.attn["qkv"]))
+        qkv = self.attn["qkv"](to_precision_of(tokens, self.attn["qkv"]))
         query, key, value = qkv.view(batch, count, 3, self.heads, width // self.heads).permute(
             2, 0, 3, 1, 4
         )
@@ -152,7 +152,7 @@ class TransformerBlock(nn.Module):
 # Number of windows along a side of the picture: at full size they overlap by a quarter, at half size by a half.
 # At a quarter of its size, the picture is one window.
 FULL_WINDOWS, HALF_WINDOWS = 5, 3
-WINDOWS = FULL_WINDOWS**2 + HALF_WINDOWS**2 + 1
+WINDOW_COUNT = FULL_WINDOWS**2 + HALF_WINDOWS**2 + 1
 
 
 class SlidingPyramid(nn.Module):
@@ -181,17 +181,23 @@ class SlidingPyramid(nn.Module):
         """Feature maps, fine to coarse, of a picture [1, 3, side, side] in -1..1, `batch` windows at a time."""
         half, quarter = (interpolate(image, scale_factor=f, mode="bilinear") for f in (0.5, 0.25))
         windows = torch.cat(
-            [cut(image, self.window, FULL_WINDOWS), cut(half, self.window, HALF_WINDOWS), quarter]
+            [
+                cut_windows(image, self.window, FULL_WINDOWS),
+                cut_windows(half, self.window, HALF_WINDOWS),
+                quarter,
+            ]
         )
         maps, latents = self._encode(windows, batch, progress)
         full, middle, whole = torch.split(maps, [FULL_WINDOWS**2, HALF_WINDOWS**2, 1])
         whole = self.upsample2(whole)
-        lowres = self.upsample_lowres(lower(self.image_encoder(quarter)[0], self.upsample_lowres))
+        lowres = self.upsample_lowres(
+            to_precision_of(self.image_encoder(quarter)[0], self.upsample_lowres)
+        )
         return [
-            self.upsample_latent0(merge(latents[0], self.full_trim)),
-            self.upsample_latent1(merge(latents[1], self.full_trim)),
-            self.upsample0(merge(full, self.full_trim)),
-            self.upsample1(merge(middle, self.half_trim)),
+            self.upsample_latent0(merge_windows(latents[0], self.full_trim)),
+            self.upsample_latent1(merge_windows(latents[1], self.full_trim)),
+            self.upsample0(merge_windows(full, self.full_trim)),
+            self.upsample1(merge_windows(middle, self.half_trim)),
             self.fuse_lowres(torch.cat([whole, lowres], dim=1)),
         ]
 
@@ -203,14 +209,14 @@ class SlidingPyramid(nn.Module):
             features, tapped = self.patch_encoder(windows[start : start + batch], self.taps)
             kept = max(0, FULL_WINDOWS**2 - start)  # only full-size windows need taps
             for into, part in zip(found, [features, *(tap[:kept] for tap in tapped)], strict=True):
-                into.append(lower(part, self.fuse_lowres))
+                into.append(to_precision_of(part, self.fuse_lowres))
             if progress:
                 progress(min(start + batch, len(windows)), len(windows))
         features, *latents = (torch.cat(parts) for parts in found)
         return features, latents
 
 
-def cut(image: Tensor, window: int, count: int) -> Tensor:
+def cut_windows(image: Tensor, window: int, count: int) -> Tensor:
     """count² evenly overlapping windows [count², C, window, window] of [1, C, S, S], in row-major order."""
     stride = (image.shape[-1] - window) // (count - 1)
     rows = image.unfold(2, window, stride).unfold(
@@ -219,8 +225,8 @@ def cut(image: Tensor, window: int, count: int) -> Tensor:
     return rows[0].permute(1, 2, 0, 3, 4).flatten(0, 1)
 
 
-def merge(maps: Tensor, trim: int) -> Tensor:
-    """The inverse of `cut` for feature maps [n², C, G, G]; beside a neighbour, `trim` cells of a map are cut off."""
+def merge_windows(maps: Tensor, trim: int) -> Tensor:
+    """The inverse of `cut_windows` for feature maps [n², C, G, G]; beside a neighbour, `trim` cells of a map are cut off."""
     count = int(len(maps) ** 0.5)
     size = maps.shape[-1]
     spans = [slice(trim if i else 0, size - trim if i < count - 1 else size) for i in range(count)]

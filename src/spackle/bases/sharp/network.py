@@ -13,12 +13,18 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, max_pool2d, softplus
 
-from spackle.bases.sharp.encoder import LAYERS, STRIDE, ExactConv, SharpConfig, SlidingPyramid
+from spackle.bases.sharp.encoder import (
+    CELL_STRIDE,
+    LAYER_COUNT,
+    Float32Conv,
+    SharpConfig,
+    SlidingPyramid,
+)
 from spackle.core.color import srgb_to_linear
 from spackle.core.gaussians import Gaussians
 from spackle.runtime.progress import Progress
 
-GROUPS = 8  # channel groups of the group norms
+NORM_GROUPS = 8  # channel groups of the group norms
 
 
 class Residual(nn.Module):
@@ -63,7 +69,7 @@ def plain_residual(dim: int) -> Residual:
 def normed_residual(dim: int, out: int) -> Residual:
     """A residual block of two 3×3 convolutions with group norms; the first has half as many output channels."""
     first, second = nn.Conv2d(dim, out // 2, 3, padding=1), nn.Conv2d(out // 2, out, 3, padding=1)
-    norms = GroupNorm(GROUPS, dim), GroupNorm(GROUPS, out // 2)
+    norms = GroupNorm(NORM_GROUPS, dim), GroupNorm(NORM_GROUPS, out // 2)
     return Residual(norms[0], nn.ReLU(inplace=True), first, norms[1], nn.ReLU(inplace=True), second)
 
 
@@ -107,12 +113,12 @@ class Decoder(nn.Module):
 
 
 DISPARITY_RANGE = (1e-4, 1e4)  # the depth head's output is clamped to it
-HIDDEN = 32  # channels before the last layer of the depth head
+HEAD_CHANNELS = 32  # channels before the last layer of the depth head
 
 
 @dataclasses.dataclass(frozen=True)
 class SharpOutput:
-    start: InitialGaussians  # Gaussians on the two surfaces
+    initial: InitialGaussians  # Gaussians on the two surfaces
     deltas: Tensor  # [14, 2, side/2, side/2] float32 changes of these Gaussians
 
 
@@ -120,9 +126,11 @@ class SharpOutput:
 class DecoderInput:
     """Outputs of the encoder and the depth network for one picture: the input of the Gaussian decoder."""
 
-    start: InitialGaussians
-    picture: Tensor  # [1, 5, side, side] float32 in -1..1: sRGB, and the disparity of both layers
-    maps: list[
+    initial: InitialGaussians
+    image_and_disparity: (
+        Tensor  # [1, 5, side, side] float32 in -1..1: sRGB, and the disparity of both layers
+    )
+    encoder_maps: list[
         Tensor
     ]  # the encoder's, fine to coarse: [1, C, side/2, side/2] to [1, C, side/32, side/32]
 
@@ -151,8 +159,8 @@ class SharpNetwork(nn.Module):
         transformer at once; `progress` gets the number of windows done and the number of all windows.
         """
         encoded = self.encode(image, disparity_factor, batch, progress)
-        deltas: Tensor = self.gaussian_decoder()(encoded.picture, encoded.maps)
-        return SharpOutput(encoded.start, deltas)
+        deltas: Tensor = self.gaussian_decoder()(encoded.image_and_disparity, encoded.encoder_maps)
+        return SharpOutput(encoded.initial, deltas)
 
     def encode(
         self,
@@ -165,7 +173,9 @@ class SharpNetwork(nn.Module):
         depth_network: DepthNetwork = self.monodepth_model.monodepth_predictor  # type: ignore[assignment]
         maps = depth_network.encoder(image * 2 - 1, batch, progress)
         disparity = depth_network.disparity(maps)
-        start = make_start(image, disparity.clamp(*DISPARITY_RANGE).reciprocal() * disparity_factor)
+        start = make_initial_gaussians(
+            image, disparity.clamp(*DISPARITY_RANGE).reciprocal() * disparity_factor
+        )
         return DecoderInput(start, torch.cat([image, start.disparity_map], dim=1) * 2 - 1, maps)
 
     def gaussian_decoder(self) -> GaussianDecoder:
@@ -184,9 +194,9 @@ class DepthNetwork(nn.Module):
         self.head = nn.Sequential(
             nn.Conv2d(width, width // 2, 3, padding=1),
             nn.ConvTranspose2d(width // 2, width // 2, 2, stride=2),
-            nn.Conv2d(width // 2, HIDDEN, 3, padding=1),
+            nn.Conv2d(width // 2, HEAD_CHANNELS, 3, padding=1),
             nn.ReLU(inplace=True),
-            ExactConv(HIDDEN, LAYERS, 1),
+            Float32Conv(HEAD_CHANNELS, LAYER_COUNT, 1),
             nn.ReLU(inplace=True),
         )
 
@@ -195,7 +205,10 @@ class DepthNetwork(nn.Module):
         return out
 
 
-GEOMETRY, TEXTURE = 3, 11  # delta channels: offset; scale 3, quaternion 4, colour 3, opacity 1
+GEOMETRY_CHANNELS, TEXTURE_CHANNELS = (
+    3,
+    11,
+)  # delta channels: offset; scale 3, quaternion 4, colour 3, opacity 1
 
 
 class FeatureNetwork(nn.Module):
@@ -206,7 +219,9 @@ class FeatureNetwork(nn.Module):
         width = config.gaussian_width
         self.decoder = Decoder((config.depth_width, *config.pyramid), width)
         self.image_encoder = nn.Module()
-        self.image_encoder.conv = ExactConv(3 + LAYERS, width, STRIDE, stride=STRIDE)
+        self.image_encoder.conv = Float32Conv(
+            3 + LAYER_COUNT, width, CELL_STRIDE, stride=CELL_STRIDE
+        )
         self.fusion = Fusion(width, doubles=False)
         self.texture_head = _head(width, config.feature_width)
         self.geometry_head = _head(width, config.feature_width)
@@ -223,13 +238,17 @@ class FeatureNetwork(nn.Module):
 class PredictionHead(nn.Module):
     def __init__(self, width: int) -> None:
         super().__init__()
-        self.geometry_prediction_head = ExactConv(width, GEOMETRY * LAYERS, 1)
-        self.texture_prediction_head = ExactConv(width, TEXTURE * LAYERS, 1)
+        self.geometry_prediction_head = Float32Conv(width, GEOMETRY_CHANNELS * LAYER_COUNT, 1)
+        self.texture_prediction_head = Float32Conv(width, TEXTURE_CHANNELS * LAYER_COUNT, 1)
 
     def forward(self, texture: Tensor, geometry: Tensor) -> Tensor:
         """Deltas [14, 2, H, W] float32 from texture and geometry features [1, F, H, W]."""
-        geometry = self.geometry_prediction_head(geometry)[0].unflatten(0, (GEOMETRY, LAYERS))
-        texture = self.texture_prediction_head(texture)[0].unflatten(0, (TEXTURE, LAYERS))
+        geometry = self.geometry_prediction_head(geometry)[0].unflatten(
+            0, (GEOMETRY_CHANNELS, LAYER_COUNT)
+        )
+        texture = self.texture_prediction_head(texture)[0].unflatten(
+            0, (TEXTURE_CHANNELS, LAYER_COUNT)
+        )
         return torch.cat([geometry, texture])
 
 
@@ -241,7 +260,7 @@ class GaussianDecoder(nn.Module):
         self.feature_model = feature_model
         self.prediction_head = prediction_head
 
-    def let_learn(self) -> GaussianDecoder:
+    def enable_training(self) -> GaussianDecoder:
         """Enable gradients, except for unused weights: 295,168 in the published checkpoint."""
         self.requires_grad_()
         coarsest: Fusion = self.feature_model.decoder.fusions[-1]  # type: ignore[assignment]
@@ -261,7 +280,10 @@ def _head(width: int, out: int) -> nn.Sequential:
     return nn.Sequential(*blocks, nn.ReLU(inplace=True), last, nn.ReLU(inplace=True))
 
 
-NEAREST, FARTHEST = 1.0, 100.0  # depths are scaled so that the nearest is 1, and cut off at 100
+NEAREST_DEPTH, FARTHEST_DEPTH = (
+    1.0,
+    100.0,
+)  # depths are scaled so that the nearest is 1, and cut off at 100
 FARTHEST_INVERSE = 1e-3  # added to inverse depth, which keeps depth finite
 SMALLEST_INVERSE = 1e-6
 COLOR_MARGIN = 0.01  # keeps the inverse sigmoid of a colour finite
@@ -284,16 +306,19 @@ class InitialGaussians:
     unscale: Tensor  # [] float64: multiplies means and scales to undo the scaling of the depths
 
 
-def make_start(image: Tensor, depth: Tensor) -> InitialGaussians:
+def make_initial_gaussians(image: Tensor, depth: Tensor) -> InitialGaussians:
     """The initial Gaussians of a picture [1, 3, side, side] with depth layers [1, 2, side, side]."""
-    factor = NEAREST / (depth.min().double() + SMALLEST_INVERSE)
-    disparity = 1.0 / (depth * factor).clamp_max(FARTHEST)
+    factor = NEAREST_DEPTH / (depth.min().double() + SMALLEST_INVERSE)
+    disparity = 1.0 / (depth * factor).clamp_max(FARTHEST_DEPTH)
     return InitialGaussians(
-        disparity, max_pool2d(disparity, STRIDE)[0], avg_pool2d(image, STRIDE)[0], 1.0 / factor
+        disparity,
+        max_pool2d(disparity, CELL_STRIDE)[0],
+        avg_pool2d(image, CELL_STRIDE)[0],
+        1.0 / factor,
     )
 
 
-def compose(start: InitialGaussians, deltas: Tensor) -> Gaussians:
+def apply_deltas(start: InitialGaussians, deltas: Tensor) -> Gaussians:
     """Apply deltas [14, 2, H, W]; the Gaussians come layer by layer, each in row-major order.
 
     Means are (x·z, y·z, z), where x and y run from -1 to 1 over the picture.

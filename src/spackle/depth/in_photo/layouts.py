@@ -19,7 +19,14 @@ from PIL import Image
 from PIL.JpegImagePlugin import JpegImageFile
 
 from spackle.core.image_files import check_pixel_count
-from spackle.depth.depth_map import Array, DepthMap, Quantity, StrPath, grid_step, is_depth
+from spackle.depth.depth_map import (
+    Array,
+    DepthMap,
+    Quantity,
+    StrPath,
+    is_valid_depth,
+    quantisation_step,
+)
 from spackle.depth.in_photo.containers import (
     BY_ORIENTATION,
     extended_xmp_of,
@@ -73,7 +80,7 @@ class CodedDepth:
         if int(self.codes.min()) == int(self.codes.max()):
             raise ValueError("it has the same value everywhere")
         slope = (last - first) / self.full
-        step = abs(slope) * (grid_step(self.codes) or 1)
+        step = abs(slope) * (quantisation_step(self.codes) or 1)
         with np.errstate(all="ignore"):  # the caller marks infinite results as unknown
             values = first + slope * self.codes.astype(np.float64)
             if self.scale.quantity == "depth":
@@ -112,14 +119,14 @@ def _depth_map(coded: CodedDepth, path: Path) -> DepthMap:
     for step in coded.turn:
         depth = depth.T if step == "t" else depth.flip(1 if step == "x" else 0)
     note = f"portrait depth of the photo ({coded.scale.source}"
-    known = depth[is_depth(depth)]
+    known = depth[is_valid_depth(depth)]
     middle = float(known.median()) if len(known) and not coded.scale.unit_known else USUAL_M
     if not PLAUSIBLE_M[0] <= middle <= PLAUSIBLE_M[1]:
         factor = USUAL_M / middle
         depth, note = depth * factor, f"{note}, scaled to a median of {USUAL_M:g} m"
         quantum *= factor if coded.scale.quantity == "depth" else 1 / factor
     metres = depth.float().contiguous()
-    valid = is_depth(metres)
+    valid = is_valid_depth(metres)
     if not valid.any():
         raise ValueError("no pixel has a depth")
     return DepthMap(

@@ -15,10 +15,10 @@ from rich.filesize import decimal
 
 import spackle
 from spackle.bases.open import BaseError, open_base
-from spackle.bases.settings import NETWORKS, BaseSettings
+from spackle.bases.settings import NETWORK_BASES, BaseSettings
 from spackle.core.photo import load_photo, resize_photo
 from spackle.core.trajectories import MAX_DISPARITY, DepthRange, SharpTrajectory
-from spackle.depth.depth_map import find_depth
+from spackle.depth.readers import find_depth_file
 from spackle.inpaint import (
     Inpainter,
     InpainterOptions,
@@ -94,9 +94,9 @@ class DatasetOptions:
         """InputError if options contradict each other; inpainters check their options themselves."""
         self.base.check(one=True)
         depth = self.base.depth
-        if depth is None and not self.base.network:
+        if depth is None and not self.base.uses_network:
             raise InputError(
-                f"--base {self.base.name} needs depth: give --depth FOLDER; {', '.join(NETWORKS)} need no depth"
+                f"--base {self.base.name} needs depth: give --depth FOLDER; {', '.join(NETWORK_BASES)} need no depth"
             )
         if isinstance(depth, Path) and not depth.is_dir():  # a single map would fit one photo only
             raise InputError(
@@ -121,7 +121,7 @@ class DatasetOptions:
         if not isinstance(folder, Path):
             return None
         beside = folder / Path(photo.name).parent
-        return find_depth(beside if beside.is_dir() else folder, photo.path)
+        return find_depth_file(beside if beside.is_dir() else folder, photo.path)
 
     def inputs_of(self, photo: PhotoFile) -> list[str]:
         """Name and digest of a photo, and the digest of its depth map."""
@@ -152,7 +152,7 @@ def dataset_configuration(
         "photos": {"count": len(photos), "sample": options.sample, "sha256": inputs},
         "base": {
             "name": base.public_name,
-            "weights": weights_digests(base.files),
+            "weights": weights_digests(base.model_files),
             "precision": base.precision,
             "device": base.device,
         },

@@ -13,8 +13,8 @@ import numpy.typing as npt
 import torch
 
 from spackle.bases import BasePrediction
-from spackle.bases.sharp.base import PARAMETERS
-from spackle.bases.sharp.encoder import FULL
+from spackle.bases.sharp.base import PARAMETER_COUNT
+from spackle.bases.sharp.encoder import FULL_SIZE
 from spackle.bases.sharp.network import SharpNetwork
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
@@ -69,11 +69,11 @@ def bench(
         InputError: options, dataset or folder cannot be used, `output` holds another benchmark, or memory is too small
             for the base.
     """
-    evaluation, slow = open_evaluation(options), options.base.named == "sharp"
+    evaluation, slow = open_evaluation(options), options.base.resolved_name == "sharp"
     config: dict[str, Any] = {"kind": "bench", "protocol": "bench", "methods": list(TIMED)}
     config |= {name: evaluation.config[name] for name in SHARED}
     config |= {"runs": runs, "base_runs": base_runs or (1 if slow else runs)}
-    config["base"] |= {"device": options.device.type if options.base.network else "cpu"}
+    config["base"] |= {"device": options.device.type if options.base.uses_network else "cpu"}
     config |= {"hardware": hardware_facts(options.device), "versions": package_versions()}
     about = {"parameters": count_parameters(evaluation.network)}
     with results_folder(output, (ROWS, *FILES), locked=True):
@@ -106,7 +106,7 @@ def time_case(case: Case, evaluation: Evaluation, config: Mapping[str, Any]) -> 
     opened = evaluation.open(loaded)
     opened.load(loaded.full)  # not timed
     # SHARP on a CPU takes a minute, of which compiling kernels is a small part: the first prediction is timed.
-    warm = options.base.named == "sharp" and config["base"]["device"] == "cpu"
+    warm = options.base.resolved_name == "sharp" and config["base"]["device"] == "cpu"
     latest: dict[str, BasePrediction] = {}
     predict = {"": lambda _: latest.update(base=opened.predict(loaded.full)[0])}
     seconds = (
@@ -166,9 +166,14 @@ def count_parameters(residual: ResidualNet | None) -> dict[str, float]:
     Inference uses neither SHARP's classifiers nor the part that aligns depths.
     """
     with torch.device("meta"):
-        used = sum(p.numel() for p in SharpNetwork(FULL).parameters())
+        used = sum(p.numel() for p in SharpNetwork(FULL_SIZE).parameters())
     extra = 0 if residual is None else sum(p.numel() for p in residual.parameters())
-    return {"base": PARAMETERS, "base_used": used, "residual": extra, "share": extra / PARAMETERS}
+    return {
+        "base": PARAMETER_COUNT,
+        "base_used": used,
+        "residual": extra,
+        "share": extra / PARAMETER_COUNT,
+    }
 
 
 # --- the clock

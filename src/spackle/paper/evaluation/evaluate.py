@@ -14,7 +14,7 @@ from torch import Tensor
 import spackle
 from spackle.bases import BasePrediction
 from spackle.bases.depth import RgbdBase
-from spackle.bases.open import OpenedBase, open_base, open_loaded
+from spackle.bases.open import OpenedBase, open_base, wrap_loaded_base
 from spackle.bases.settings import BaseSettings
 from spackle.core.gaussians import Gaussians
 from spackle.core.photo import MAX_WORKING_SIDE_PX
@@ -65,7 +65,7 @@ from spackle.runtime.progress import Reporter, pluralized
 from spackle.scene_fill import FillContext
 from spackle.weights import weights_digest, weights_digests
 
-BASE = BaseSettings("sharp")
+BASE = BaseSettings(name="sharp")
 LARGE_SIDE = 1280  # long side of the paper's large views: the paper adds (1280 / 1536)² of HAR × grid at 1536
 
 
@@ -108,7 +108,7 @@ class EvaluateOptions:
     @property
     def opened(self) -> BaseSettings:
         """The base's settings. If a base has no precision option, only the residual uses the precision."""
-        without = self.base.named in ("rgbd", "lite")
+        without = self.base.resolved_name in ("rgbd", "lite")
         return dataclasses.replace(self.base, precision="auto") if without else self.base
 
     def check(self) -> None:
@@ -175,8 +175,8 @@ class Evaluation:
 
     def open(self, loaded: LoadedCase) -> OpenedBase:
         """The base of a case: a network, or else the case's depth or points; InputError if there is none."""
-        network = self.options.base.network
-        return self.base if network else open_loaded(RgbdBase(known_depth(loaded.case)))
+        network = self.options.base.uses_network
+        return self.base if network else wrap_loaded_base(RgbdBase(known_depth(loaded.case)))
 
     def context(self, prediction: BasePrediction) -> FillContext:
         """The context in which the holes of a photo's views are filled."""
@@ -277,9 +277,9 @@ def _configuration(
         "second_views": options.second_views if options.near else None,
         "base": {
             "name": base.public_name,
-            "title": "SHARP" if base.named == "sharp" else base.public_name,
+            "title": "SHARP" if base.resolved_name == "sharp" else base.public_name,
             "says": base.description,
-            "weights": weights_digests(base.files),
+            "weights": weights_digests(base.model_files),
             "precision": base.precision,
         },
         "device": device_of(renderer).type,  # of the renderer, the residual and the base's network
@@ -408,7 +408,7 @@ def measure_case(case: Case, evaluation: Evaluation) -> tuple[list[Measurement],
 @torch.no_grad()
 def _align(loaded: LoadedCase, prediction: BasePrediction, evaluation: Evaluation) -> float:
     """The scale between base and dataset, from the base's depth at the photo's camera."""
-    if not evaluation.options.base.network:  # the base is the dataset's depth
+    if not evaluation.options.base.uses_network:  # the base is the dataset's depth
         return 1.0
     view = evaluation.renderer.render(prediction.gaussians, prediction.camera)
     return align(loaded.case, view.depth, ~hole_mask(view.alpha))

@@ -16,18 +16,18 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from spackle.bases.settings import MISSING
+from spackle.bases.settings import MISSING_WEIGHTS_ADVICE
 from spackle.bases.sharp.base import (
-    Owner,
-    decoder_bytes,
-    link_owner,
+    SourceCheckpoint,
+    default_window_batch,
+    encode_decoder,
+    link_source_checkpoint,
     load_network,
-    owner_of,
-    to_square,
-    usual_windows,
+    resize_to_square,
+    source_checkpoint_of,
 )
 from spackle.bases.sharp.encoder import set_precision
-from spackle.bases.sharp.network import DecoderInput, SharpNetwork, compose
+from spackle.bases.sharp.network import DecoderInput, SharpNetwork, apply_deltas
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
 from spackle.paper.dataset.sample import DatasetView
@@ -66,24 +66,24 @@ class TunableSharp:
     def encode(self, rgb: Tensor, photo_camera: Camera) -> DecoderInput:
         """Run the frozen encoder on a photo [H, W, 3], sRGB in 0..1, with a camera of the same size."""
         device = next(self.network.parameters()).device
-        image = to_square(rgb.to(device), self.network.config.side)
+        image = resize_to_square(rgb.to(device), self.network.config.side)
         with without_autocast_or_tf32(device):
             return self.network.encode(
-                image, photo_camera.focal[0] / photo_camera.width, usual_windows(device)
+                image, photo_camera.focal[0] / photo_camera.width, default_window_batch(device)
             )
 
     def gaussians(
         self, decoder: nn.Module, encoded: DecoderInput, place: torch.device | str = "cpu"
     ) -> Gaussians:
         """Gaussians in SHARP's normalised space, on the device `place`; gradients reach `decoder`."""
-        device = encoded.picture.device
+        device = encoded.image_and_disparity.device
         autocast = torch.autocast(
             device.type, self.precision, enabled=self.precision != torch.float32
         )
         with without_autocast_or_tf32(device):
             with autocast:
-                deltas = decoder(encoded.picture, encoded.maps)
-            return compose(encoded.start, deltas).to(place)
+                deltas = decoder(encoded.image_and_disparity, encoded.encoder_maps)
+            return apply_deltas(encoded.initial, deltas).to(place)
 
 
 def normalised_camera(camera: Camera, photo_camera: Camera) -> Camera:
@@ -148,13 +148,13 @@ class DirectFt(ViewTask):
             )
         path = checkpoint or installed_weights("sharp")
         if path is None:
-            raise InputError(f"--method direct-ft: {MISSING['sharp']}")
+            raise InputError(f"--method direct-ft: {MISSING_WEIGHTS_ADVICE['sharp']}")
         read_tensors(path, "give SHARP's checkpoint")  # without the numbers; refuses other files
-        if owner_of(path) is not None:
+        if source_checkpoint_of(path) is not None:
             raise InputError(
                 f"-c {path}: holds an already trained decoder: give the original checkpoint of SHARP"
             )
-        self.owner = Owner(path, weights_digest(path))
+        self.owner = SourceCheckpoint(path, weights_digest(path))
         self.files = open_pseudo_dataset(data.pseudo)
         base = self.files.manifest.config.get("base", {})
         if (base.get("name"), base.get("weights")) != ("sharp", self.owner.sha256):
@@ -172,7 +172,7 @@ class DirectFt(ViewTask):
     def prepare(self, output: Path, reporter: Reporter) -> dict[str, Any]:
         """Load SHARP."""
         self.base = TunableSharp.load(self.owner.path, self.precision, self.device)
-        self.network = self.base.network.gaussian_decoder().let_learn()
+        self.network = self.base.network.gaussian_decoder().enable_training()
         reporter.log(f"{self.items} training photos, {self.validation_items} validation photos")
         return {"checkpoint": {"file": self.owner.path.name, "sha256": self.owner.sha256}}
 
@@ -192,8 +192,8 @@ class DirectFt(ViewTask):
 
     def export(self, network: nn.Module, path: Path) -> None:
         """Write the decoder in float32, for `spackle predict --base sharp -c`, and a link to SHARP's checkpoint."""
-        write_atomic(path, decoder_bytes(network, self.owner))
-        link_owner(self.owner, path.parent)
+        write_atomic(path, encode_decoder(network, self.owner))
+        link_source_checkpoint(self.owner, path.parent)
 
 
 def draw_view_numbers(seed: Sequence[int], views: int) -> list[int]:

@@ -16,13 +16,15 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, max_pool2d
 
 from spackle.bases import BasePrediction
-from spackle.bases.depth import lift
+from spackle.bases.depth import lift_rgbd
 from spackle.core.camera import Camera
 from spackle.core.focal_length import focal_mm_to_px
 from spackle.core.gaussians import Gaussians
 from spackle.core.photo import PHOTO_SUFFIXES, load_photo
 from spackle.core.trajectories import SHARP_TRAJECTORIES, DepthRange, trajectory_cameras
-from spackle.depth.depth_map import DepthMap, load_depth, read_calibration
+from spackle.depth.calibration import read_calibration
+from spackle.depth.depth_map import DepthMap
+from spackle.depth.readers import load_depth
 from spackle.paper.dataset.shards import DatasetFiles
 from spackle.paper.training.recipe import DataRecipe
 from spackle.paper.training.samples import Sample, Source
@@ -148,7 +150,7 @@ def reverse_view(
     Parts of the photo that the virtual camera cannot see become holes, and the photo is the target.
 
     Args:
-        prediction: from `lift` with levels=0.
+        prediction: from `lift_rgbd` with levels=0.
         photo: [H, W, 3] sRGB at the camera's size.
         viewer: the virtual camera, which is the input camera of the sample.
         renderer: renders the views.
@@ -202,7 +204,7 @@ def random_reverse_view(
 ) -> Sample:
     """`reverse_view` of a random photo, with a random frame of a random path as the virtual camera."""
     rgb, depth, camera = draw(rng)
-    prediction = lift(
+    prediction = lift_rgbd(
         rgb, depth, camera, levels=0
     )  # no tiles: a tile would be seen or hidden as a whole
     kind = SHARP_TRAJECTORIES[rng.integers(len(SHARP_TRAJECTORIES))]
@@ -218,7 +220,7 @@ def random_right_view(
 ) -> Sample:
     """The lifted left photo of a random stereo pair, rendered at the right camera; the right photo is the target."""
     left, right, depth, camera, beside = load_pair(pick_random(rng, folders))
-    base = lift(left, depth, camera).gaussians
+    base = lift_rgbd(left, depth, camera).gaussians
     return Sample.of(base, renderer.render(base, beside), beside, camera, left, right)
 
 
@@ -288,7 +290,7 @@ def load_frame(color: Path, unit_m: float) -> tuple[Tensor, DepthMap]:
     stored = load_depth(
         color.with_name(color.name.replace(".color.", ".depth.")).with_suffix(".png")
     )
-    stored.check_shape(rgb.shape[0], rgb.shape[1], color)
+    stored.check_aspect_ratio(rgb.shape[0], rgb.shape[1], color)
     return rgb, dataclasses.replace(
         stored, depth=stored.depth * (unit_m / 0.001)
     )  # `load_depth` assumes mm
@@ -310,7 +312,7 @@ def load_pair(folder: Path) -> tuple[Tensor, Tensor, DepthMap, Camera, Camera]:
     if left.shape != right.shape:
         raise InputError(f"{folder}: the two photos differ in size")
     depth = load_depth(names[2], calib=scene)
-    depth.check_shape(left.shape[0], left.shape[1], names[0])
+    depth.check_aspect_ratio(left.shape[0], left.shape[1], names[0])
     height, width = left.shape[:2]
     return left, right, depth, *lens.cameras(width, height)
 

@@ -15,7 +15,8 @@ from torch import Tensor
 
 from spackle.core.camera import Camera
 from spackle.core.photo import PHOTO_SUFFIXES
-from spackle.depth.depth_map import load_depth, read_text
+from spackle.depth.calibration import read_short_text
+from spackle.depth.readers import load_depth
 from spackle.formats.camera_files import checked_camera
 from spackle.paper.evaluation.case import Case
 from spackle.paper.evaluation.datasets.colmap import model_folder, read_model
@@ -225,7 +226,7 @@ def _wildrgbd_views(name: str, scene: Path) -> list[Posed]:
     with as_input_error(
         metadata, "not the metadata of a scene ({reason}): needs w, h and K of nine numbers"
     ):
-        facts = json.loads(read_text(metadata, "description of the camera"))
+        facts = json.loads(read_short_text(metadata, "description of the camera"))
         width, height = int(facts["w"]), int(facts["h"])
         K = torch.tensor(facts["K"], dtype=torch.float64).reshape(3, 3).T.clone()
         K[:2, 2] += HALF_PIXEL
@@ -233,7 +234,8 @@ def _wildrgbd_views(name: str, scene: Path) -> list[Posed]:
         poses, "not a list of poses ({reason}): needs a frame and 16 numbers a line"
     ):
         lines = [
-            line.split() for line in read_text(poses, "list of poses", MAX_POSES_BYTES).splitlines()
+            line.split()
+            for line in read_short_text(poses, "list of poses", MAX_POSES_BYTES).splitlines()
         ]
         frames = [
             (int(line[0]), np.array(line[1:], np.float64).reshape(4, 4)) for line in lines if line

@@ -18,14 +18,9 @@ from torch import Tensor
 from spackle.core.camera import Camera
 from spackle.core.image_files import read_image
 from spackle.core.photo import PHOTO_SUFFIXES
-from spackle.depth.depth_map import (
-    Calibration,
-    DepthMap,
-    load_depth,
-    read_array,
-    read_calibration,
-    read_text,
-)
+from spackle.depth.calibration import Calibration, read_calibration, read_short_text
+from spackle.depth.depth_map import DepthMap
+from spackle.depth.readers import load_depth, read_array
 from spackle.paper.evaluation.case import Case, SecondView
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import list_files
@@ -116,7 +111,7 @@ def _middlebury_case(folder: Path) -> Case:
         return pair_of_2014(folder)
     lens = read_calibration(path)
     with as_input_error(path, "not a scene description: needs the photos and the disparity map"):
-        facts = json.loads(read_text(path))
+        facts = json.loads(read_short_text(path))
         left, right, truth = (folder / str(facts[key]) for key in ("left", "right", "disparity"))
     return _pair(
         folder.name, left, right, lens, _size_of(left), partial(load_depth, truth, calib=path)
@@ -144,7 +139,7 @@ def _lights_of(scene: Path) -> list[Case]:
         raise InputError(
             f"{truth}: no such disparity map: give train/balanced; Booster's test scenes have none"
         )
-    size, read = _size_of(*photos), lambda: lens.depth(read_array(truth)[0], truth)
+    size, read = _size_of(*photos), lambda: lens.depth_from_positive(read_array(truth)[0], truth)
     return [_pair(f"{scene.name}/{p.stem}", p, rights / p.name, lens, size, read) for p in photos]
 
 
@@ -156,13 +151,13 @@ def _read_opencv(path: Path) -> Calibration:
     with as_input_error(
         path, "not a Booster calibration ({reason}): needs proj_matL, proj_matR and baselineLR"
     ):
-        entries = {entry.tag: entry for entry in ElementTree.fromstring(read_text(path))}
+        entries = {entry.tag: entry for entry in ElementTree.fromstring(read_short_text(path))}
         left, right = (matrix(entries[name]) for name in ("proj_matL", "proj_matR"))
         cx, baseline = float(left[0, 2]), float(entries["baselineLR"].text or "") / 1000
         lens = Calibration(
             float(left[0, 0]), cx, float(left[1, 2]), float(right[0, 2]) - cx, baseline
         )
-    return _from_corner(lens.check(path))
+    return _from_corner(lens.checked(path))
 
 
 # --- the Motorcycle
@@ -194,6 +189,6 @@ def load_motorcycle() -> StereoPair:
     return StereoPair(
         first,
         second,
-        lens.depth(disparity, Path("Motorcycle")),
+        lens.depth_from_positive(disparity, Path("Motorcycle")),
         *lens.cameras(*disparity.shape[::-1]),
     )
