@@ -26,7 +26,7 @@ from spackle.core.focal_length import resolve_focal_length
 from spackle.core.gaussians import Gaussians
 from spackle.core.trajectories import MAX_DISPARITY, TRAJECTORIES, TrajectoryKind
 from spackle.depth.units import RELATIVE_FAR_M, RELATIVE_KINDS, RELATIVE_NEAR_M, relative_depth
-from spackle.formats.scene_files import SH_C0
+from spackle.formats.gaussian_columns import SH_C0
 from spackle.views import PATH_FRAMES
 
 FILLS = ("auto", "network", "exemplar", "lama", "none")

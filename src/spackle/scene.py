@@ -19,7 +19,8 @@ from spackle.core.focal_length import resolve_focal_length
 from spackle.core.gaussians import Gaussians
 from spackle.core.trajectories import DEFAULT_OVERSCAN, DepthRange, KeyframePath, TrajectoryKind
 from spackle.formats.html import PageScene, page_scene, single_html
-from spackle.formats.scene_files import Encoder, SceneFile, encoder_for, is_at_origin, load_scene
+from spackle.formats.scene_content import SceneFile, is_at_origin
+from spackle.formats.scene_files import Encoder, encoder_for, load_scene
 from spackle.render import Renderer, get_renderer
 from spackle.render.protocol import Rendering
 from spackle.residual.features import hole_mask

@@ -24,7 +24,8 @@ from spackle.core.color import linear_to_srgb
 from spackle.core.gaussians import Gaussians, quat_to_matrix
 from spackle.formats import load_ply, save_ply
 from spackle.formats.compressed_ply import morton_order
-from spackle.formats.scene_files import SCENE_ENCODERS, SceneFile, encoder_for, load_scene
+from spackle.formats.scene_content import SceneFile
+from spackle.formats.scene_files import SCENE_ENCODERS, encoder_for, load_scene
 from spackle.formats.spz import MAX_BYTES_PER_GAUSSIAN
 from spackle.render import CpuRenderer
 from spackle.runtime.errors import InputError
@@ -333,7 +334,7 @@ def test_bad_requests_leave_nothing(
 LIMITS = [
     ("spz", "spz.MAX_COUNT", 3000),
     ("sog", "sog.LARGEST_SIDE", 40),
-    ("glb", "gltf.LARGEST_FILE", 1 << 17),
+    ("glb", "gltf.MAX_GLB_BYTES", 1 << 17),
 ]
 
 

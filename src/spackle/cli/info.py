@@ -74,8 +74,8 @@ def scene_facts(path: Path) -> Facts:
     )
     if scene.disparity is not None:
         facts["completed"] = f"for --disparity {scene.disparity:g}"
-    if scene.harmonics:
-        facts["harmonics"] = f"{scene.harmonics} of each Gaussian above degree 0, not read"
+    if scene.unread_harmonics:
+        facts["harmonics"] = f"{scene.unread_harmonics} of each Gaussian above degree 0, not read"
     facts["next"] = (
         f"spackle view {path}; `spackle render` makes a video, `spackle export` other formats"
     )

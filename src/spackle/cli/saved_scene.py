@@ -17,7 +17,8 @@ from spackle.core.focal_length import ASSUMED_FOCAL_MM
 from spackle.core.trajectories import PathError
 from spackle.formats import save_png
 from spackle.formats.html import single_html
-from spackle.formats.scene_files import Encoder, SceneFile, encoder_for, load_scene
+from spackle.formats.scene_content import SceneFile
+from spackle.formats.scene_files import Encoder, encoder_for, load_scene
 from spackle.formats.spz import MAX_GRID_COORDINATE, spz_grid
 from spackle.render import get_renderer
 from spackle.residual import hole_area_ratio
@@ -152,7 +153,7 @@ def export_scene(scene: Path, outputs: Sequence[Path], reporter: Reporter) -> No
                     f"{output}: this is the scene itself: give the output another name"
                 )
         loaded = load_scene(scene)
-        if rest := loaded.harmonics:
+        if rest := loaded.unread_harmonics:
             reporter.log(
                 f"{scene}: {rest} spherical harmonics of each Gaussian, above degree 0, are left out"
             )

@@ -1,4 +1,7 @@
-"""JSON files of cameras: views to render, or keyframes of a path."""
+"""JSON files of cameras: views to render, or keyframes of a path.
+
+`load_cameras` and `load_path` read files; `checked_camera` turns matrices of any file into a camera.
+"""
 
 from __future__ import annotations
 
@@ -17,81 +20,108 @@ from spackle.core.trajectories import WORLD_UP, Keyframe, KeyframePath, PathErro
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import check_file
 
-MAX_BYTES = 64 << 20
-MAX_FRAMES = 10_000  # cameras or keyframes
-MAX_SIZE = 16_384
-MAX_CAMERA_NUMBER = 1e9  # largest number in a camera: float32 can represent its square
-MAX_NUMBER = 1e6  # largest number in a path: a thousand kilometres, or eleven days
-RIGID_TOLERANCE = 1e-3
+MAX_FILE_BYTES = 64 << 20
+MAX_FRAMES = 10_000  # cameras or keyframes of a file
+MAX_SIDE_PX = 16_384
+
+# The largest absolute value in a camera's matrices: float32 can represent its square.
+MAX_CAMERA_NUMBER = 1e9
+# The largest absolute value in a path: a thousand kilometres, or eleven days.
+MAX_PATH_NUMBER = 1e6
+
+# How far a rotation times its transpose may be from the identity, in a file with few digits.
+ROTATION_TOLERANCE = 1e-3
+# How large a number that has to be 0 may be.
 ZERO_TOLERANCE = 1e-6
 
-Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]  # not a bool or a text
-Bounded = Annotated[Number, Field(ge=-MAX_NUMBER, le=MAX_NUMBER)]
-Vector = tuple[Bounded, Bounded, Bounded]
+# A number of JSON; a text or a bool is refused.
+Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
+PathNumber = Annotated[Number, Field(ge=-MAX_PATH_NUMBER, le=MAX_PATH_NUMBER)]
+PathVector = tuple[PathNumber, PathNumber, PathNumber]
 Row3 = tuple[Number, Number, Number]
 Row4 = tuple[Number, Number, Number, Number]
-Side = Annotated[int, Strict(), Field(ge=1, le=MAX_SIZE)]
-M = TypeVar("M", bound=BaseModel)
+SidePx = Annotated[int, Strict(), Field(ge=1, le=MAX_SIDE_PX)]
+Model = TypeVar("Model", bound=BaseModel)
 
 
-class _Frame(BaseModel):
+class _CameraEntry(BaseModel):
+    """One camera in a file."""
+
     K: tuple[Row3, Row3, Row3]
     world_to_camera: tuple[Row4, Row4, Row4, Row4]
-    width: Side | None = None
-    height: Side | None = None
+    width: SidePx | None = None
+    height: SidePx | None = None
 
 
 class _CameraFile(BaseModel):
-    frames: Annotated[list[_Frame], Field(min_length=1, max_length=MAX_FRAMES)]
-    width: Side | None = None
-    height: Side | None = None
+    """A file of cameras; its width and height hold for cameras that have none."""
+
+    frames: Annotated[list[_CameraEntry], Field(min_length=1, max_length=MAX_FRAMES)]
+    width: SidePx | None = None
+    height: SidePx | None = None
 
 
-class _Key(BaseModel, extra="forbid"):
-    time: Bounded
-    eye: Vector
-    target: Vector
-    up: Vector = WORLD_UP
-    fov: Bounded | None = None
+class _KeyframeEntry(BaseModel, extra="forbid"):
+    """One keyframe in a file; the names are those of `Keyframe`."""
+
+    time: PathNumber
+    eye: PathVector
+    target: PathVector
+    up: PathVector = UP
+    fov: PathNumber | None = None
 
 
 class _PathFile(BaseModel, extra="forbid"):
-    keyframes: Annotated[list[_Key], Field(max_length=MAX_FRAMES)]
+    """A file of keyframes; the names are those of `KeyframePath`."""
+
+    keyframes: Annotated[list[_KeyframeEntry], Field(max_length=MAX_FRAMES)]
     closed: Annotated[bool, Strict()] = False
     unit: PathUnit = "metres"
 
 
 def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
-    """Read `{"width": W, "height": H, "frames": [{"K": 3×3, "world_to_camera": 4×4}, …]}`.
+    """Read a file of cameras.
 
-    Matrices are lists of rows. The world is the photo's camera (OpenCV: x right, y down, z forward);
-    K is in pixels. A frame may have its own width and height.
+    The file holds {"width": W, "height": H, "frames": [{"K": 3×3, "world_to_camera": 4×4}, …]}.
+    Matrices are lists of rows. The world is that of the photo's camera (OpenCV: x right, y
+    down, z forward); K is in pixels. A frame may have its own width and height.
 
     Raises:
-        InputError: other content, no frame, more than 10,000 frames, or an impossible camera (see `checked_camera`).
+        InputError: the file has other content, no frame or more than 10,000, or a camera that
+            `checked_camera` refuses.
     """
-    content = _read(_CameraFile, path, "camera file")
-    return [
-        _camera(
-            frame,
-            frame.width or content.width,
-            frame.height or content.height,
-            f"{path}: frame {index}",
-        )
-        for index, frame in enumerate(content.frames)
-    ]
+    content = _read_json(_CameraFile, path, "camera file")
+    cameras = []
+    for index, entry in enumerate(content.frames):
+        width = entry.width or content.width
+        height = entry.height or content.height
+        cameras.append(_camera_from_entry(entry, width, height, f"{path}: frame {index}"))
+    return cameras
 
 
 def camera_from_json(facts: Mapping[str, Any], where: str) -> Camera:
-    """A camera from its entry in a JSON file; InputError, beginning with `where`, if the camera is impossible."""
+    """Return a camera from its entry in a JSON file: K, world_to_camera, width and height.
+
+    Args:
+        facts: the parsed entry.
+        where: names the entry at the beginning of messages.
+
+    Raises:
+        InputError: the entry is incomplete, or the camera is impossible.
+    """
     with as_input_error(where, "{reason}", ValidationError):
-        frame = _Frame.model_validate(facts)
-    return _camera(frame, frame.width, frame.height, where)
+        entry = _CameraEntry.model_validate(facts)
+    return _camera_from_entry(entry, entry.width, entry.height, where)
 
 
-def _camera(frame: _Frame, width: int | None, height: int | None, where: str) -> Camera:
-    K, pose = (torch.tensor(rows, dtype=torch.float64) for rows in (frame.K, frame.world_to_camera))
-    return checked_camera(K, pose, width or 0, height or 0, where)
+def _camera_from_entry(
+    entry: _CameraEntry, width: int | None, height: int | None, where: str
+) -> Camera:
+    """Return a camera from a file's entry; InputError if it is impossible or has no size."""
+    K = torch.tensor(entry.K, dtype=torch.float64)
+    world_to_camera = torch.tensor(entry.world_to_camera, dtype=torch.float64)
+    # `checked_camera` refuses a size of 0.
+    return checked_camera(K, world_to_camera, width or 0, height or 0, where)
 
 
 def checked_camera(
@@ -102,71 +132,101 @@ def checked_camera(
     where: str,
     *,
     dtype: torch.dtype = torch.float32,
-    tolerance: float = RIGID_TOLERANCE,
+    tolerance: float = ROTATION_TOLERANCE,
 ) -> Camera:
-    """Check float64 matrices [3, 3] and [4, 4], and return a camera of them, in `dtype`.
+    """Return a camera, after checking that its numbers make sense.
 
-    The rotation times its transpose must equal the identity within `tolerance`.
+    Args:
+        K: [3, 3] float64 intrinsics in pixels.
+        world_to_camera: [4, 4] float64 pose.
+        width, height: size of the image in pixels.
+        where: names the camera at the beginning of messages.
+        dtype: the type of the camera's matrices.
+        tolerance: how far the rotation times its transpose may be from the identity.
 
     Raises:
-        InputError: beginning with `where`, if a size is outside 1..16384, a matrix is not finite, K has skew or no
-            positive focal lengths, or world_to_camera is not a rotation and a translation.
+        InputError: a side is outside of 1..16384 pixels, a matrix is not finite, K has skew or
+            no positive focal lengths, or the pose is not a rotation and a translation.
     """
-    if not (1 <= width <= MAX_SIZE and 1 <= height <= MAX_SIZE):
-        raise InputError(f"{where}: width and height must be whole numbers from 1 to {MAX_SIZE}")
-    if not all(
-        bool((matrix.abs() <= MAX_CAMERA_NUMBER).all()) for matrix in (K, world_to_camera)
-    ):  # NaN fails, too
-        raise InputError(
-            f"{where}: numbers in K and world_to_camera must be finite, at most {MAX_CAMERA_NUMBER:g}"
-        )
-    fx, fy = float(K[0, 0]), float(K[1, 1])
-    if min(fx, fy) < 1 / MAX_CAMERA_NUMBER:
-        raise InputError(f"{where}: K needs positive focal lengths at [0][0] and [1][1]")
-    if (
-        K[2].tolist() != [0, 0, 1]
-        or max(abs(float(K[0, 1])), abs(float(K[1, 0]))) > ZERO_TOLERANCE * fx
-    ):
-        raise InputError(
-            f"{where}: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]: skew is not supported"
-        )
-    rotation, last = world_to_camera[:3, :3], world_to_camera.new_tensor([0, 0, 0, 1])
-    error = (rotation @ rotation.T - torch.eye(3, dtype=rotation.dtype)).abs().max()
-    if (
-        error > tolerance
-        or torch.linalg.det(rotation) < 0
-        or (world_to_camera[3] - last).abs().max() > ZERO_TOLERANCE
-    ):
-        raise InputError(
-            f"{where}: world_to_camera must be a rotation (no scale, no mirror) and a translation, above a row 0 0 0 1"
-        )
+    if not (1 <= width <= MAX_SIDE_PX and 1 <= height <= MAX_SIDE_PX):
+        raise InputError(f"{where}: width and height must be whole numbers from 1 to {MAX_SIDE_PX}")
+    for matrix in (K, world_to_camera):
+        # Also false for NaN.
+        if not bool((matrix.abs() <= MAX_CAMERA_NUMBER).all()):
+            limits = f"finite, at most {MAX_CAMERA_NUMBER:g}"
+            raise InputError(f"{where}: numbers in K and world_to_camera must be {limits}")
+    _check_intrinsics(K, where)
+    _check_pose(world_to_camera, tolerance, where)
     return Camera(K.to(dtype), world_to_camera.to(dtype), width, height)
 
 
-def load_path(path: str | os.PathLike[str]) -> KeyframePath:
-    """Read `{"keyframes": [{"time": s, "eye": [x, y, z], "target": [x, y, z]}, …]}`.
+def _check_intrinsics(K: Tensor, where: str) -> None:
+    """Raise an InputError unless K [3, 3] has positive focal lengths and no skew."""
+    fx = float(K[0, 0])
+    fy = float(K[1, 1])
+    if min(fx, fy) < 1 / MAX_CAMERA_NUMBER:
+        raise InputError(f"{where}: K needs positive focal lengths at [0][0] and [1][1]")
+    largest_skew = max(abs(float(K[0, 1])), abs(float(K[1, 0])))
+    if K[2].tolist() != [0, 0, 1] or largest_skew > ZERO_TOLERANCE * fx:
+        form = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
+        raise InputError(f"{where}: K must be {form}: skew is not supported")
 
-    A keyframe may also have "up" [x, y, z] and "fov" in degrees; the file may have "closed" and "unit", as in
-    `KeyframePath`. The world is the photo's camera (OpenCV: x right, y down, z forward).
+
+def _check_pose(world_to_camera: Tensor, tolerance: float, where: str) -> None:
+    """Raise an InputError unless a matrix [4, 4] is a rotation and a translation.
+
+    The rotation times its transpose must equal the identity within `tolerance`.
+    """
+    rotation = world_to_camera[:3, :3]
+    identity = torch.eye(3, dtype=rotation.dtype)
+    rotation_error = (rotation @ rotation.T - identity).abs().max()
+    is_mirrored = torch.linalg.det(rotation) < 0
+
+    expected_last_row = world_to_camera.new_tensor([0, 0, 0, 1])
+    last_row_error = (world_to_camera[3] - expected_last_row).abs().max()
+    if rotation_error > tolerance or is_mirrored or last_row_error > ZERO_TOLERANCE:
+        form = "a rotation (no scale, no mirror) and a translation, above a row 0 0 0 1"
+        raise InputError(f"{where}: world_to_camera must be {form}")
+
+
+def load_path(path: str | os.PathLike[str]) -> KeyframePath:
+    """Read a file of keyframes.
+
+    The file holds {"keyframes": [{"time": s, "eye": [x, y, z], "target": [x, y, z]}, …]}. A
+    keyframe may also have "up" [x, y, z] and "fov" in degrees; the file may have "closed" and
+    "unit", as in `KeyframePath`. The world is that of the photo's camera (OpenCV: x right, y
+    down, z forward).
 
     Raises:
-        InputError: other content, an unknown name, fewer than two keyframes or more than 10,000, times that do not
-            increase, a number that is not finite or beyond a million, an eye at its target, an up along the view, or a
-            fov outside 1..170 degrees.
+        InputError: the file has other content, an unknown name, fewer than two keyframes or
+            more than 10,000, times that do not increase, a number that is not finite or beyond
+            a million, an eye at its target, an up along the view, or a fov outside of 1..170
+            degrees.
     """
-    content = _read(_PathFile, path, "path file")
-    keys = []
-    for index, key in enumerate(content.keyframes):
+    content = _read_json(_PathFile, path, "path file")
+    keyframes = []
+    for index, entry in enumerate(content.keyframes):
         with as_input_error(f"{path}: keyframe {index}", "{reason}", PathError):
-            keys.append(Keyframe(**key.model_dump()))
+            keyframes.append(Keyframe(**entry.model_dump()))
     with as_input_error(path, "{reason}", PathError):
-        return KeyframePath(tuple(keys), content.closed, content.unit)
+        return KeyframePath(tuple(keyframes), content.closed, content.unit)
 
 
-def _read(model: type[M], path: str | os.PathLike[str], kind: str) -> M:
-    if check_file(path, kind) > MAX_BYTES:
-        raise InputError(
-            f"{path}: too long for a {kind} (at most {MAX_BYTES >> 20} MiB): is it the right file?"
-        )
+def _read_json(model: type[Model], path: str | os.PathLike[str], kind: str) -> Model:
+    """Read a JSON file, and check it against a pydantic model.
+
+    Args:
+        model: what the file must hold.
+        path: the file.
+        kind: what the file is called in messages, such as "camera file".
+
+    Raises:
+        InputError: the file cannot be read, is too long, or holds something else.
+    """
+    if check_file(path, kind) > MAX_FILE_BYTES:
+        limit = f"at most {MAX_FILE_BYTES >> 20} MiB"
+        raise InputError(f"{path}: too long for a {kind} ({limit}): is it the right file?")
+    # Some editors of Windows begin a file with a byte order mark, which JSON does not allow.
+    text = Path(path).read_bytes().removeprefix(codecs.BOM_UTF8)
     with as_input_error(path, "{reason}", ValidationError):
-        return model.model_validate_json(Path(path).read_bytes().removeprefix(codecs.BOM_UTF8))
+        return model.model_validate_json(text)

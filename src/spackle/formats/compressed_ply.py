@@ -1,4 +1,8 @@
-"""Compressed PLY, PlayCanvas's format: 16 bytes for each Gaussian, quantised within bounds that 256 Gaussians share."""
+"""Compressed PLY, PlayCanvas's format: 16 bytes for each Gaussian.
+
+256 consecutive Gaussians, a chunk, share bounds of their positions, scales and colours; the
+values of a Gaussian are small integers between these bounds.
+"""
 
 from __future__ import annotations
 
@@ -7,152 +11,244 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spackle.formats.ply import PACKED, ply_header
-from spackle.formats.scene_files import (
-    Floats,
-    GaussianColumns,
-    SceneFile,
+from spackle.formats.gaussian_columns import Floats, GaussianColumns
+from spackle.formats.ply_tables import NewTable, ply_header
+from spackle.formats.quantization import (
     components_to_fractions,
     decode_smallest_three,
     encode_smallest_three,
     fractions_to_components,
 )
+from spackle.formats.scene_content import SceneFile
 
-CHUNK = 256  # Gaussians that share bounds
-LARGEST_LOG_SCALE = 20  # largest absolute value that readers expect
-GRID_BITS = 10  # bits of each coordinate in Morton order
+GAUSSIANS_PER_CHUNK = 256
 
-_CHUNK_NAMES = [
-    *(
-        f"{end}_{prefix}{axis}"
-        for prefix in ("", "scale_")
-        for end in ("min", "max")
-        for axis in "xyz"
-    ),
-    *(f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"),
-]
-PLACE_BITS, TURN_BITS, COLOR_BITS = (11, 10, 11), (10, 10, 10), (8, 8, 8, 8)
+# The largest absolute value of a scale's logarithm that readers expect.
+MAX_LOG_SCALE = 20
+
+# Bits of each coordinate along Morton's curve; three coordinates fit a word of 32 bits.
+MORTON_BITS = 10
+
+# A range of equal values counts as this wide, so that no fraction divides by zero.
+MIN_SPAN = 1e-30
+
+# The properties of a vertex: four words of 32 bits.
+PACKED_PROPERTIES = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
+
+# Bits of each value in a word, the first value in the highest bits. The index of a quaternion's
+# largest component takes the two bits above those of the rotation.
+POSITION_BITS = (11, 10, 11)
+ROTATION_BITS = (10, 10, 10)
+SCALE_BITS = (11, 10, 11)
+COLOR_BITS = (8, 8, 8, 8)  # red, green, blue, opacity
+
+# The properties of a chunk: three minima and three maxima of each kind.
+POSITION_BOUNDS = ["min_x", "min_y", "min_z", "max_x", "max_y", "max_z"]
+SCALE_BOUNDS = ["min_scale_x", "min_scale_y", "min_scale_z"]
+SCALE_BOUNDS += ["max_scale_x", "max_scale_y", "max_scale_z"]
+COLOR_BOUNDS = ["min_r", "min_g", "min_b", "max_r", "max_g", "max_b"]
+CHUNK_PROPERTIES = [*POSITION_BOUNDS, *SCALE_BOUNDS, *COLOR_BOUNDS]
 
 
 def encode_compressed_ply(scene: SceneFile) -> bytes:
-    """Encode a scene as a compressed PLY; the axes stay the same, and the comments are those of `save_ply`.
+    """Encode a scene as a compressed PLY; the axes and the header's comments are `save_ply`'s.
 
-    The base's Gaussians come first; within base and aux, neighbours in space become neighbours in the file. ValueError
-    if a Gaussian is not finite.
+    Gaussians that come from the photo stay before those that fill holes. Within both groups,
+    neighbours in space become neighbours in the file, so that chunks are small.
+
+    Raises:
+        ValueError: a Gaussian is not finite.
     """
-    columns, count, border = (
-        GaussianColumns.of(scene.gaussians),
-        len(scene.gaussians),
-        scene.base_count or 0,
-    )
-    order = np.concatenate(
-        [morton_order(columns.means[:border]), border + morton_order(columns.means[border:])]
-    )
-    columns = columns.select(order)
-    scales = np.clip(columns.log_scales, -LARGEST_LOG_SCALE, LARGEST_LOG_SCALE)
-    starts = np.arange(0, count, CHUNK)
-    tables = ("chunk", len(starts), "float", _CHUNK_NAMES), ("vertex", count, "uint", PACKED)
-    chunks = np.zeros((len(starts), len(_CHUNK_NAMES)), "<f4")
-    rows = np.zeros((count, len(PACKED)), "<u4")
-    if count:
-        places, chunks[:, 0:6] = _normalised(columns.means, starts)
-        sizes, chunks[:, 6:12] = _normalised(scales, starts)
-        colors, chunks[:, 12:18] = _normalised(columns.srgb, starts)
-        rows[:, 0] = _packed(places, PLACE_BITS)
-        largest, others = encode_smallest_three(columns.quats)
-        rows[:, 1] = largest.astype(np.uint32) << np.uint32(30) | _packed(
-            components_to_fractions(others), TURN_BITS
-        )
-        rows[:, 2] = _packed(sizes, PLACE_BITS)
-        rows[:, 3] = _packed(
-            np.concatenate([colors, columns.opacities[:, None]], axis=1), COLOR_BITS
-        )
+    columns = GaussianColumns.from_gaussians(scene.gaussians)
+    base_count = 0 if scene.base_count is None else scene.base_count
+    base_order = morton_order(columns.means[:base_count])
+    fill_order = base_count + morton_order(columns.means[base_count:])
+    columns = columns.select(np.concatenate([base_order, fill_order]))
+
+    chunks, vertices = _encode_tables(columns)
     header = ply_header(
-        *tables,
-        camera=scene.untilted_camera,
+        NewTable(name="chunk", row_count=len(chunks), type="float", properties=CHUNK_PROPERTIES),
+        NewTable(name="vertex", row_count=len(vertices), type="uint", properties=PACKED_PROPERTIES),
+        camera=scene.camera_at_origin,
         base_count=scene.base_count,
         disparity=scene.disparity,
     )
-    return header + chunks.tobytes() + rows.tobytes()
+    return header + chunks.tobytes() + vertices.tobytes()
+
+
+def _encode_tables(columns: GaussianColumns) -> tuple[Floats, NDArray[np.uint32]]:
+    """Encode N Gaussians as the two tables of the file.
+
+    Returns:
+        The chunks [ceil(N / 256), 18], in the order of CHUNK_PROPERTIES, and the vertices
+        [N, 4], in the order of PACKED_PROPERTIES.
+    """
+    count = len(columns.means)
+    chunk_starts = np.arange(0, count, GAUSSIANS_PER_CHUNK)
+    chunks = np.zeros((len(chunk_starts), len(CHUNK_PROPERTIES)), "<f4")
+    vertices = np.zeros((count, len(PACKED_PROPERTIES)), "<u4")
+    if count == 0:
+        return chunks, vertices
+
+    positions, chunks[:, 0:6] = _to_fractions(columns.means, chunk_starts)
+    log_scales = np.clip(columns.log_scales, -MAX_LOG_SCALE, MAX_LOG_SCALE)
+    scales, chunks[:, 6:12] = _to_fractions(log_scales, chunk_starts)
+    colors, chunks[:, 12:18] = _to_fractions(columns.srgb, chunk_starts)
+    rgba = np.concatenate([colors, columns.opacities[:, None]], axis=1)  # [N, 4]
+
+    largest, others = encode_smallest_three(columns.quats)
+    rotation_words = _pack_fractions(components_to_fractions(others), ROTATION_BITS)
+    # The index of the largest component takes the two bits above the three others.
+    largest_bits = largest.astype(np.uint32) << np.uint32(30)
+
+    vertices[:, 0] = _pack_fractions(positions, POSITION_BITS)
+    vertices[:, 1] = largest_bits | rotation_words
+    vertices[:, 2] = _pack_fractions(scales, SCALE_BITS)
+    vertices[:, 3] = _pack_fractions(rgba, COLOR_BITS)
+    return chunks, vertices
 
 
 def morton_order(means: Floats) -> NDArray[np.int64]:
-    """Indices [N] that sort points [N, 3] along Morton's curve, so that neighbours stay together."""
-    if not len(means):
+    """Return the indices [N] that sort points [N, 3] along Morton's curve.
+
+    The curve visits the cells of a grid so that neighbours in space mostly stay neighbours. A
+    cell's place on it has the bits of its three coordinates in turn.
+    """
+    if len(means) == 0:
         return np.zeros(0, np.int64)
-    # Logarithms, because a single distant point would otherwise put all near points into one cell.
-    places = np.sign(means) * np.log1p(np.abs(means.astype(np.float64)))
-    low = places.min(axis=0)
-    span = np.maximum(places.max(axis=0) - low, 1e-30)
-    cells = ((places - low) / span * (2**GRID_BITS - 1)).astype(np.uint32)
-    return np.argsort(sum(_spread(cells[:, axis]) << axis for axis in range(3)), kind="stable")
+    # Logarithms, because a single distant point would otherwise put all near points in one cell.
+    log_positions = np.sign(means) * np.log1p(np.abs(means.astype(np.float64)))
+    low = log_positions.min(axis=0)  # [3]
+    span = np.maximum(log_positions.max(axis=0) - low, MIN_SPAN)
+    last_cell = 2**MORTON_BITS - 1
+    cells = ((log_positions - low) / span * last_cell).astype(np.uint32)  # [N, 3]
+
+    place_on_curve = _spread_bits(cells[:, 0])
+    place_on_curve |= _spread_bits(cells[:, 1]) << np.uint32(1)
+    place_on_curve |= _spread_bits(cells[:, 2]) << np.uint32(2)
+    return np.argsort(place_on_curve, kind="stable")
 
 
-def _spread(bits: NDArray[np.uint32]) -> NDArray[np.uint32]:
-    """Spread the ten lowest bits, with two zeros between neighbouring ones."""
+def _spread_bits(numbers: NDArray[np.uint32]) -> NDArray[np.uint32]:
+    """Put two zero bits between neighbouring bits of numbers [N] below 1024 (ten bits)."""
+    # Each step moves the upper half of every group of bits up, and halves the groups. The mask
+    # clears the copies that the shift left behind.
     for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
-        bits = (bits | bits << np.uint32(shift)) & np.uint32(mask)
-    return bits
+        numbers = (numbers | numbers << np.uint32(shift)) & np.uint32(mask)
+    return numbers
 
 
-def _normalised(values: Floats, starts: NDArray[np.int64]) -> tuple[Floats, Floats]:
-    """Values [N, 3] as fractions 0..1 between their chunk's bounds, and the bounds [chunks, 6]: minima, maxima."""
-    low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
-    rows = np.arange(len(values)) // CHUNK
-    wide = low.astype(np.float64)  # the bounds' difference may overflow float32
-    span = np.maximum(high - wide, 1e-30)
-    shares = (values - wide[rows]) / span[rows]
-    return shares.astype(np.float32), np.concatenate([low, high], axis=1)
+def _to_fractions(values: Floats, chunk_starts: NDArray[np.int64]) -> tuple[Floats, Floats]:
+    """Express values [N, 3] as fractions between the smallest and largest value of their chunk.
+
+    Args:
+        values: one row for each Gaussian.
+        chunk_starts: [C] the first row of each chunk.
+
+    Returns:
+        The fractions [N, 3] in 0..1, and the bounds [C, 6]: three minima, three maxima.
+    """
+    low = np.minimum.reduceat(values, chunk_starts)  # [C, 3]
+    high = np.maximum.reduceat(values, chunk_starts)
+    # The difference of the bounds may overflow float32.
+    low_64 = low.astype(np.float64)
+    span = np.maximum(high - low_64, MIN_SPAN)
+    chunk_of_row = np.arange(len(values)) // GAUSSIANS_PER_CHUNK  # [N]
+    fractions = (values - low_64[chunk_of_row]) / span[chunk_of_row]
+    return fractions.astype(np.float32), np.concatenate([low, high], axis=1)
 
 
-def _packed(shares: Floats, widths: tuple[int, ...]) -> NDArray[np.uint32]:
-    """Pack fractions 0..1 [N, k] into words [N]; each is rounded to its width, the first takes the highest bits."""
-    word = np.zeros(len(shares), np.uint32)
-    for column, width in zip(shares.T, widths, strict=True):
-        word = word << np.uint32(width) | np.round(column * np.float32(2**width - 1)).astype(
-            np.uint32
-        )
-    return word
+def _pack_fractions(fractions: Floats, bit_counts: tuple[int, ...]) -> NDArray[np.uint32]:
+    """Pack k fractions a row into one word a row.
+
+    Args:
+        fractions: [N, k] in 0..1.
+        bit_counts: to how many bits each of the k columns is rounded.
+
+    Returns:
+        [N] words; the first column takes the highest bits.
+    """
+    words = np.zeros(len(fractions), np.uint32)
+    for column, bit_count in zip(fractions.T, bit_counts, strict=True):
+        largest_code = np.float32(2**bit_count - 1)
+        codes = np.round(column * largest_code).astype(np.uint32)
+        words = words << np.uint32(bit_count) | codes
+    return words
 
 
-def decode_compressed_ply(chunks: NDArray[Any], rows: NDArray[Any]) -> GaussianColumns:
-    """Decode Gaussians from a file's two tables; ValueError if the tables do not fit together."""
-    if missing := set(_CHUNK_NAMES[:12]) - set(chunks.dtype.names or ()):
+def decode_compressed_ply(chunks: NDArray[Any], vertices: NDArray[Any]) -> GaussianColumns:
+    """Decode the two tables of a compressed PLY.
+
+    Args:
+        chunks: [C] rows with the fields CHUNK_PROPERTIES; older files have no COLOR_BOUNDS.
+        vertices: [N] rows with the fields PACKED_PROPERTIES.
+
+    Raises:
+        ValueError: bounds are missing, or there are too few chunks for the vertices.
+    """
+    chunk_fields = chunks.dtype.names or ()
+    missing = {*POSITION_BOUNDS, *SCALE_BOUNDS}.difference(chunk_fields)
+    if missing:
         raise ValueError(f"its chunks have no {min(missing)}")
-    if len(chunks) * CHUNK < len(rows):
-        raise ValueError(f"{len(chunks)} chunks for {len(rows)} vertices")
-    places, turns, sizes, colors = (np.array(rows[name], np.uint32) for name in PACKED)
-    rgba = _unpacked(colors, COLOR_BITS)
-    srgb = (
-        _between(rgba[:, :3], chunks, _CHUNK_NAMES[12:])
-        if "min_r" in (chunks.dtype.names or ())
-        else rgba[:, :3]
+    if len(chunks) * GAUSSIANS_PER_CHUNK < len(vertices):
+        raise ValueError(f"{len(chunks)} chunks for {len(vertices)} vertices")
+
+    positions, rotations, scales, colors = (
+        np.array(vertices[name], np.uint32) for name in PACKED_PROPERTIES
     )
+    rgba = _unpack_fractions(colors, COLOR_BITS)  # [N, 4]
+    srgb = rgba[:, :3]
+    if "min_r" in chunk_fields:
+        srgb = _from_fractions(srgb, chunks, COLOR_BOUNDS)
+
+    # The two highest bits hold the index of the largest component.
+    largest = rotations >> np.uint32(30)
+    others = fractions_to_components(_unpack_fractions(rotations, ROTATION_BITS))
+
+    position_fractions = _unpack_fractions(positions, POSITION_BITS)
+    scale_fractions = _unpack_fractions(scales, SCALE_BITS)
     return GaussianColumns(
-        _between(_unpacked(places, PLACE_BITS), chunks, _CHUNK_NAMES[0:6]),
-        decode_smallest_three(
-            turns >> np.uint32(30), fractions_to_components(_unpacked(turns, TURN_BITS))
-        ),
-        _between(_unpacked(sizes, PLACE_BITS), chunks, _CHUNK_NAMES[6:12]),
-        rgba[:, 3],
-        np.clip(srgb, 0, 1),
+        means=_from_fractions(position_fractions, chunks, POSITION_BOUNDS),
+        quats=decode_smallest_three(largest, others),
+        log_scales=_from_fractions(scale_fractions, chunks, SCALE_BOUNDS),
+        opacities=rgba[:, 3],
+        srgb=np.clip(srgb, 0, 1),
     )
 
 
-def _unpacked(words: NDArray[np.uint32], widths: tuple[int, ...]) -> Floats:
-    """The inverse of `_packed`: unpack words [N] into fractions 0..1 [N, k]; higher bits are ignored."""
-    shifts = np.array([sum(widths[k + 1 :]) for k in range(len(widths))], np.uint32)
-    masks = np.array([2**width - 1 for width in widths])
-    codes = words[:, None] >> shifts & masks.astype(np.uint32)
-    shares: Floats = np.divide(codes, masks, dtype=np.float32)
-    return shares
+def _unpack_fractions(words: NDArray[np.uint32], bit_counts: tuple[int, ...]) -> Floats:
+    """Unpack words into fractions; the inverse of `_pack_fractions`.
+
+    Args:
+        words: [N]; bits above those of the first column are ignored.
+        bit_counts: how many bits each of the k columns has.
+
+    Returns:
+        [N, k] fractions in 0..1.
+    """
+    # Column k lies above the bits of all later columns.
+    shifts = np.array([sum(bit_counts[k + 1 :]) for k in range(len(bit_counts))], np.uint32)
+    largest_codes = np.array([2**bit_count - 1 for bit_count in bit_counts])
+    codes = words[:, None] >> shifts & largest_codes.astype(np.uint32)
+    fractions: Floats = np.divide(codes, largest_codes, dtype=np.float32)
+    return fractions
 
 
-def _between(shares: Floats, chunks: NDArray[Any], names: list[str]) -> Floats:
-    """The inverse of `_normalised`; `names` are the properties with the chunks' bounds: three minima, three maxima."""
-    bounds = np.stack([chunks[name] for name in names], axis=1).astype(np.float64)
-    low, high = np.split(bounds[np.arange(len(shares)) // CHUNK], 2, axis=1)
-    with np.errstate(
-        over="ignore", invalid="ignore"
-    ):  # `GaussianColumns.gaussians` refuses infinite values
-        return (low + shares * (high - low)).astype(np.float32)
+def _from_fractions(fractions: Floats, chunks: NDArray[Any], bound_names: list[str]) -> Floats:
+    """Return the values of fractions between their chunk's bounds; inverts `_to_fractions`.
+
+    Args:
+        fractions: [N, 3] in 0..1, one row for each Gaussian.
+        chunks: [C] rows with the fields `bound_names`.
+        bound_names: three minima, then three maxima.
+
+    Returns:
+        [N, 3] low + fraction · (high - low).
+    """
+    bounds = np.stack([chunks[name] for name in bound_names], axis=1).astype(np.float64)  # [C, 6]
+    bounds_of_row = bounds[np.arange(len(fractions)) // GAUSSIANS_PER_CHUNK]  # [N, 6]
+    low = bounds_of_row[:, 0:3]
+    high = bounds_of_row[:, 3:6]
+    # Broken bounds may give infinite values, which `GaussianColumns.to_gaussians` refuses.
+    with np.errstate(over="ignore", invalid="ignore"):
+        return (low + fractions * (high - low)).astype(np.float32)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import struct
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -13,22 +14,33 @@ from numpy.typing import NDArray
 
 from spackle.core.camera import Camera
 from spackle.core.color import srgb_to_linear
-from spackle.formats.scene_files import GaussianColumns, SceneFile
+from spackle.formats.gaussian_columns import GaussianColumns
+from spackle.formats.scene_content import SceneFile
 from spackle.runtime.errors import InputError
 
 EXTENSION = "KHR_gaussian_splatting"
-LARGEST_FILE = 2**32 - 1  # bytes that a .glb can announce
-ROW = 64  # bytes for each Gaussian
-FLOAT, UNSIGNED_SHORT, ARRAY_BUFFER, POINTS = 5126, 5123, 34962, 0
-UNMOVED = np.eye(4).ravel().tolist()
-NEAR_PLANE = 0.01  # glTF requires a near plane
+
+MAX_GLB_BYTES = 2**32 - 1  # a .glb states its size in 32 bits
+ATTRIBUTE_BYTES_PER_GAUSSIAN = 64
+MAX_DESCRIPTION_BYTES = 1 << 16  # more than the JSON part takes
+
+# glTF's numbers for types, buffers and kinds of primitives.
+GLTF_FLOAT = 5126
+GLTF_UNSIGNED_SHORT = 5123
+GLTF_ARRAY_BUFFER = 34_962
+GLTF_POINTS = 0
+
+IDENTITY_POSE = np.eye(4).ravel().tolist()
+NEAR_PLANE = 0.01  # glTF requires a near plane; viewers may choose their own
 
 
 def encode_glb(scene: SceneFile) -> bytes:
-    """Encode a scene as binary glTF: order as in the scene, y up, z backward, linear scales, sRGB colours as harmonics.
+    """Encode a scene as binary glTF, in the scene's order, with y up and z backward.
 
-    Viewers without the extension show points, with the linear colours of COLOR_0. The photo's camera becomes a glTF
-    camera. `extras` hold the base's count and the camera's parameters that glTF cannot express.
+    Scales are linear, colours are coefficients of the constant spherical harmonic. Viewers
+    without the extension show points with the linear colours of COLOR_0. The photo's camera
+    becomes a glTF camera. `extras` hold what glTF cannot express: how many Gaussians come from
+    the photo, and the camera's principal point and size.
 
     Raises:
         InputError: there are no Gaussians, or more than 4 GiB of Gaussians.
@@ -37,98 +49,146 @@ def encode_glb(scene: SceneFile) -> bytes:
     count = len(scene.gaussians)
     if count == 0:
         raise InputError("glTF cannot hold a scene without Gaussians: use another format")
-    if count * ROW + (1 << 16) > LARGEST_FILE:
-        raise InputError(
-            f"{count:,} Gaussians are too many for .glb (4 GiB at most): use another format"
-        )
-    arrays = _attributes(GaussianColumns.of(scene.gaussians).flipped())
-    parts = [array.tobytes() for array in arrays.values()]
-    text = json.dumps(
-        _description(arrays, scene.camera, scene.base_count), separators=(",", ":"), allow_nan=False
-    ).encode()
-    text += b" " * (-len(text) % 4)
-    size = sum(len(part) for part in parts)
-    head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + size)
+    if count * ATTRIBUTE_BYTES_PER_GAUSSIAN + MAX_DESCRIPTION_BYTES > MAX_GLB_BYTES:
+        problem = f"{count:,} Gaussians are too many for .glb (4 GiB at most)"
+        raise InputError(f"{problem}: use another format")
+
+    columns = GaussianColumns.from_gaussians(scene.gaussians).flip_y_and_z()
+    attributes = _attribute_arrays(columns)
+    description = _describe_scene(attributes, scene.camera, scene.base_count)
+    json_part = json.dumps(description, separators=(",", ":"), allow_nan=False).encode()
+    # The length of each part must be a multiple of four; JSON is filled up with spaces.
+    json_part = json_part.ljust(math.ceil(len(json_part) / 4) * 4)
+    binary_part = b"".join(array.tobytes() for array in attributes.values())
+
+    # 12 bytes of the file's header, and 8 of each part's.
+    file_bytes = 12 + 8 + len(json_part) + 8 + len(binary_part)
     return b"".join(
         [
-            head,
-            struct.pack("<I4s", len(text), b"JSON"),
-            text,
-            struct.pack("<I4s", size, b"BIN\0"),
-            *parts,
+            struct.pack("<4sII", b"glTF", 2, file_bytes),
+            struct.pack("<I4s", len(json_part), b"JSON"),
+            json_part,
+            struct.pack("<I4s", len(binary_part), b"BIN\0"),
+            binary_part,
         ]
     )
 
 
-def _attributes(columns: GaussianColumns) -> dict[str, NDArray[Any]]:
-    """The Gaussians' attributes; each has a multiple of four bytes."""
-    linear = srgb_to_linear(torch.from_numpy(columns.srgb)).numpy()
-    rgba = np.concatenate([linear, columns.opacities[:, None]], axis=1)
+def _attribute_arrays(columns: GaussianColumns) -> dict[str, NDArray[Any]]:
+    """Return the arrays of N Gaussians by their names in glTF, in the file's order.
+
+    Each array has a multiple of four bytes, as glTF requires.
+    """
+    linear_rgb = srgb_to_linear(torch.from_numpy(columns.srgb)).numpy()
+    rgba = np.concatenate([linear_rgb, columns.opacities[:, None]], axis=1)  # [N, 4]
+    xyzw = columns.quats[:, [1, 2, 3, 0]]
     return {
         "POSITION": columns.means.astype("<f4"),
-        f"{EXTENSION}:ROTATION": columns.quats[:, [1, 2, 3, 0]].astype("<f4"),
+        f"{EXTENSION}:ROTATION": xyzw.astype("<f4"),
         f"{EXTENSION}:SCALE": np.exp(columns.log_scales).astype("<f4"),
         f"{EXTENSION}:OPACITY": columns.opacities.astype("<f4"),
         f"{EXTENSION}:SH_DEGREE_0_COEF_0": columns.harmonics.astype("<f4"),
-        "COLOR_0": np.round(rgba * 65535).astype("<u2"),
+        "COLOR_0": np.round(rgba * 65_535).astype("<u2"),
     }
 
 
-def _description(
-    arrays: dict[str, NDArray[Any]], camera: Camera | None, base_count: int | None
+def _describe_scene(
+    attributes: Mapping[str, NDArray[Any]], camera: Camera | None, base_count: int | None
 ) -> dict[str, Any]:
-    """The file's JSON part."""
-    views, accessors, offset = [], [], 0
-    for index, array in enumerate(arrays.values()):
-        views.append(
-            {"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": ARRAY_BUFFER}
-        )
-        kind = "SCALAR" if array.ndim == 1 else f"VEC{array.shape[1]}"
-        accessor: dict[str, Any] = {
-            "bufferView": index,
-            "componentType": FLOAT,
-            "count": len(array),
-            "type": kind,
-        }
-        if array.dtype == np.uint16:
-            accessor |= {"componentType": UNSIGNED_SHORT, "normalized": True}
-        accessors.append(accessor)
-        offset += array.nbytes
-    means = arrays["POSITION"]  # glTF requires the bounds of this attribute
-    accessors[0] |= {"min": means.min(axis=0).tolist(), "max": means.max(axis=0).tolist()}
-    kernel = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
-    primitive = {"mode": POINTS, "attributes": {name: index for index, name in enumerate(arrays)}}
-    nodes: list[dict[str, Any]] = [{"name": "scene", "mesh": 0}]
+    """Return the JSON part of a .glb file.
+
+    Args:
+        attributes: the arrays of the binary part, in their order, by their names in glTF.
+        camera: the photo's camera, if it is known.
+        base_count: how many Gaussians come from the photo, if it is known.
+    """
+    buffer_views, accessors = _describe_arrays(attributes)
+    splat_settings = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    primitive = {
+        "mode": GLTF_POINTS,
+        "attributes": {name: index for index, name in enumerate(attributes)},
+        "extensions": {EXTENSION: splat_settings},
+    }
+    scene_node: dict[str, Any] = {"name": "scene", "mesh": 0}
     if base_count is not None:
-        nodes[0]["extras"] = {"spackle_base": base_count}
+        scene_node["extras"] = {"spackle_base": base_count}
+
+    nodes = [scene_node]
+    if camera is not None:
+        nodes.append(_describe_photo_node(camera))
     description: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "Spackle"},
         "extensionsUsed": [EXTENSION],
         "scene": 0,
-        "scenes": [{"nodes": [0] if camera is None else [0, 1]}],
+        "scenes": [{"nodes": list(range(len(nodes)))}],
         "nodes": nodes,
-        "meshes": [{"primitives": [primitive | {"extensions": {EXTENSION: kernel}}]}],
+        "meshes": [{"primitives": [primitive]}],
         "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": offset}],
+        "bufferViews": buffer_views,
+        "buffers": [{"byteLength": sum(array.nbytes for array in attributes.values())}],
     }
     if camera is not None:
-        flip = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
-        matrix = (
-            flip @ torch.linalg.inv(camera.world_to_camera.detach().to("cpu", torch.float64)) @ flip
-        )
-        pose = (matrix.T.flatten() + 0.0).tolist()  # camera to world, column by column, without -0
-        nodes.append({"name": "photo", "camera": 0} | ({} if pose == UNMOVED else {"matrix": pose}))
-        (fx, fy), width, height = camera.focal, camera.width, camera.height
-        lens = {
-            "yfov": 2 * math.atan2(height, 2 * fy),
-            "aspectRatio": width * fy / (height * fx),
-            "znear": NEAR_PLANE,
-        }
-        extras = {
-            "K": camera.K.tolist(),
-            "width": width,
-            "height": height,
-        }  # glTF has no principal point
-        description["cameras"] = [{"type": "perspective", "perspective": lens, "extras": extras}]
+        description["cameras"] = [_describe_lens(camera)]
     return description
+
+
+def _describe_arrays(
+    attributes: Mapping[str, NDArray[Any]],
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Return glTF's buffer views and accessors, which say where and what each array is."""
+    buffer_views: list[dict[str, Any]] = []
+    accessors: list[dict[str, Any]] = []
+    byte_offset = 0
+    for name, array in attributes.items():
+        buffer_views.append(
+            {
+                "buffer": 0,
+                "byteOffset": byte_offset,
+                "byteLength": array.nbytes,
+                "target": GLTF_ARRAY_BUFFER,
+            }
+        )
+        byte_offset += array.nbytes
+
+        accessor: dict[str, Any] = {
+            "bufferView": len(accessors),
+            "componentType": GLTF_FLOAT,
+            "count": len(array),
+            "type": "SCALAR" if array.ndim == 1 else f"VEC{array.shape[1]}",
+        }
+        if array.dtype == np.uint16:
+            accessor["componentType"] = GLTF_UNSIGNED_SHORT
+            accessor["normalized"] = True  # 65535 means 1
+        # glTF requires the bounds of the positions, and of no other attribute.
+        if name == "POSITION":
+            accessor["min"] = array.min(axis=0).tolist()
+            accessor["max"] = array.max(axis=0).tolist()
+        accessors.append(accessor)
+    return buffer_views, accessors
+
+
+def _describe_photo_node(camera: Camera) -> dict[str, Any]:
+    """Return the node of the photo's camera, with its pose unless it is at the origin."""
+    # Both world and camera turn from y down, z forward to y up, z backward.
+    flip = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+    world_to_camera = camera.world_to_camera.detach().to("cpu", torch.float64)
+    camera_to_world = flip @ torch.linalg.inv(world_to_camera) @ flip
+    # glTF stores matrices column by column. Adding zero turns -0 into 0.
+    pose = (camera_to_world.T.flatten() + 0.0).tolist()
+
+    node: dict[str, Any] = {"name": "photo", "camera": 0}
+    if pose != IDENTITY_POSE:
+        node["matrix"] = pose
+    return node
+
+
+def _describe_lens(camera: Camera) -> dict[str, Any]:
+    """Return glTF's perspective camera; `extras` keep the principal point, which glTF lacks."""
+    fx, fy = camera.focal
+    lens = {
+        "yfov": 2 * math.atan2(camera.height, 2 * fy),
+        "aspectRatio": camera.width * fy / (camera.height * fx),
+        "znear": NEAR_PLANE,
+    }
+    extras = {"K": camera.K.tolist(), "width": camera.width, "height": camera.height}
+    return {"type": "perspective", "perspective": lens, "extras": extras}

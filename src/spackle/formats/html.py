@@ -1,4 +1,7 @@
-"""A scene for the page: a description, Gaussians of 20 bytes each, and the page as one file."""
+"""A scene for the page: a description as JSON, and layers of 20 bytes for each Gaussian.
+
+`page_scene` prepares a scene; `single_html` puts it and the page into one file.
+"""
 
 from __future__ import annotations
 
@@ -26,26 +29,35 @@ from spackle.core.trajectories import (
     disparity_to_offset,
     trajectory_cameras,
 )
-from spackle.formats.scene_files import encode_smallest_three
+from spackle.formats.quantization import encode_smallest_three
 from spackle.runtime.errors import InputError
 
-SAMPLES = 121  # positions along a path, between which the page interpolates linearly
-USUAL, FOREIGN = (
-    0.3,
-    0.6,
-)  # disparity limit of a completed scene, and of another program's, if none is stored
-LEAST, MOST = 0.01, 1.0  # bounds of the disparity limit
-BYTES_PER_GAUSSIAN = (
-    20  # byte planes: 9 of centres, 3 of scales, 4 of rotations, 3 of colours, 1 of opacity
-)
-SMALLEST_SCALE, LARGEST_SCALE = (
-    1e-7,
-    1e5,
-)  # bounds of scales, because an outlier would cost the others precision
-BLOCK = 1 << 16  # Gaussians that are packed at a time, which fit the cache
+# The page interpolates linearly between this many positions along a path.
+PATH_POSITIONS = 121
 
-STYLE = '<link rel="stylesheet" href="viewer.css">'
-SCRIPT = '<script src="viewer.js" defer></script>'
+# How far the page's camera may go (a disparity), where the file of a scene does not say so: in a
+# scene whose holes are filled, and in one of another program.
+DEFAULT_LIMIT_OF_FILLED_SCENE = 0.3
+DEFAULT_LIMIT_OF_OTHER_SCENE = 0.6
+MIN_LIMIT = 0.01
+MAX_LIMIT = 1.0
+
+# Bytes of a Gaussian: 9 of the centre, 3 of the scales, 4 of the rotation, 3 of the colour, and
+# 1 of the opacity.
+BYTES_PER_GAUSSIAN = 20
+
+# Scales beyond these bounds are clamped, because an outlier would cost the others precision.
+MIN_SCALE = 1e-7
+MAX_SCALE = 1e5
+# The least range of the scales' logarithms, so that no step is 0.
+MIN_LOG_SCALE_RANGE = 1e-3
+
+# So many Gaussians are packed at a time that their values fit the processor's cache.
+GAUSSIANS_PER_BLOCK = 1 << 16
+
+# The places in the page where the style and the script are put.
+STYLE_TAG = '<link rel="stylesheet" href="viewer.css">'
+SCRIPT_TAG = '<script src="viewer.js" defer></script>'
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,158 +78,214 @@ def page_scene(
 ) -> PageScene:
     """Prepare a scene for the page.
 
-    The description's `paths` have two lists of positions [SAMPLES, 3] in metres for each trajectory. The camera is at
-    still + disparity · moving, because sideways motion grows with the disparity and forward motion does not.
+    The description's `paths` have two lists of positions [PATH_POSITIONS, 3] in metres for each
+    kind of path. The page's camera is at still + disparity · moving, because sideways motion
+    grows with the disparity and forward motion does not.
 
     Args:
         name: the scene's name on the page.
-        base: the base's Gaussians.
-        aux: the Gaussians that completion added; may be empty.
+        base: the Gaussians that come from the photo.
+        aux: the Gaussians that fill holes; may be empty.
         camera: the photo's camera, at the world's origin.
-        disparity: the disparity for which the scene was completed; it limits the page's camera.
+        disparity: the relative camera movement for which the scene was completed; the page's
+            camera goes no farther.
         note: a note for the user; the page always shows the part before the semicolon.
 
     Raises:
         InputError: no Gaussian lies in front of the camera.
     """
     if not bool((base.means[:, 2] > 0).any()):
-        raise InputError(
-            f"{name}: no Gaussian lies in front of the photo's camera: nothing can be shown"
-        )
+        problem = "no Gaussian lies in front of the photo's camera"
+        raise InputError(f"{name}: {problem}: nothing can be shown")
+
     depths = DepthRange.of(base)
-    free = min(
-        max((USUAL if len(aux) else FOREIGN) if disparity is None else disparity, LEAST), MOST
-    )
-    files, layers = {}, []
-    for layer, gaussians in {"base": base, "aux": aux}.items():
-        file = f"{layer}.splats"
-        files[file], low, step = encode_layer(gaussians)
+    limit = _movement_limit(disparity, is_filled=len(aux) > 0)
+    # A scene that Spackle completed is shown enlarged a little, as its videos are, which hides
+    # most of what was filled in beyond the photo's border.
+    shown_camera = camera if disparity is None else camera.zoomed(1 + OVERSCAN)
+
+    files: dict[str, bytes] = {}
+    layers: list[dict[str, object]] = []
+    for layer_name, gaussians in (("base", base), ("aux", aux)):
+        file_name = f"{layer_name}.splats"
+        files[file_name], scale_low, scale_step = encode_layer(gaussians)
         layers.append(
             {
-                "name": layer,
-                "file": file,
+                "name": layer_name,
+                "file": file_name,
                 "count": len(gaussians),
-                "scaleLow": low,
-                "scaleStep": step,
+                "scaleLow": scale_low,
+                "scaleStep": scale_step,
             }
         )
-    drawn = camera if disparity is None else camera.zoomed(1 + DEFAULT_OVERSCAN)
     description: dict[str, object] = {
         "name": name,
         "note": note,
-        "camera": {"K": drawn.K.tolist(), "width": camera.width, "height": camera.height},
+        "camera": {
+            "K": shown_camera.K.tolist(),
+            "width": camera.width,
+            "height": camera.height,
+        },
         "focus": depths.focus,
         "zNear": depths.near,
-        "orbit": {"unit": disparity_to_offset(camera, 1.0, depths), "free": free, "limit": free},
-        "paths": {kind: _path(kind, camera, depths) for kind in SHARP_TRAJECTORIES},
+        "orbit": {"unit": max_offset(camera, 1.0, depths), "free": limit, "limit": limit},
+        "paths": {kind: _path_positions(kind, camera, depths) for kind in SHARP_TRAJECTORIES},
         "layers": layers,
     }
     return PageScene(description, files)
 
 
-def _path(kind: TrajectoryKind, camera: Camera, depths: DepthRange) -> dict[str, list[list[float]]]:
-    """Camera positions at disparity 0 (`still`), and their change for a disparity of 1 (`moving`), to nine digits."""
-    still, wide = (
-        torch.stack(
-            [
-                each.position
-                for each in trajectory_cameras(
-                    kind, camera.to("cpu", torch.float64), far, depths, SAMPLES
-                )
-            ]
-        )
-        for far in (0.0, 1.0)
-    )
-    parts = {"still": still, "moving": wide - still}
-    return {
-        name: [[float(f"{x:.9g}") + 0.0 for x in eye] for eye in eyes.tolist()]
-        for name, eyes in parts.items()
-    }
+def _movement_limit(disparity: float | None, is_filled: bool) -> float:
+    """Return how far the page's camera may go, as a disparity.
+
+    Args:
+        disparity: the disparity for which the scene was completed, if it is known.
+        is_filled: whether holes of the scene are filled.
+    """
+    if disparity is None and is_filled:
+        disparity = DEFAULT_LIMIT_OF_FILLED_SCENE
+    elif disparity is None:
+        disparity = DEFAULT_LIMIT_OF_OTHER_SCENE
+    return min(max(disparity, MIN_LIMIT), MAX_LIMIT)
+
+
+def _path_positions(
+    kind: TrajectoryKind, camera: Camera, depths: DepthRange
+) -> dict[str, list[list[float]]]:
+    """Return the camera positions along a path as the page needs them, to nine digits.
+
+    Returns:
+        "still": positions [PATH_POSITIONS][3] in metres for a disparity of 0; and "moving":
+        their change for a disparity of 1.
+    """
+    exact_camera = camera.to("cpu", torch.float64)
+
+    def positions(disparity: float) -> Tensor:
+        views = trajectory(kind, exact_camera, disparity, depths, PATH_POSITIONS)
+        return torch.stack([view.position for view in views])  # [PATH_POSITIONS, 3]
+
+    still = positions(0.0)
+    moving = positions(1.0) - still
+    return {"still": _rounded_rows(still), "moving": _rounded_rows(moving)}
+
+
+def _rounded_rows(positions: Tensor) -> list[list[float]]:
+    """Return positions [N, 3] as lists of numbers with nine digits, without -0."""
+    return [[float(f"{x:.9g}") + 0.0 for x in row] for row in positions.tolist()]
 
 
 @torch.no_grad()
 def encode_layer(gaussians: Gaussians) -> tuple[bytes, float, float]:
     """Pack N Gaussians for the page as byte planes, which compress well.
 
-    A plane has N bytes. Nine planes hold x, y and z: the upper 24 bits of a float32, lowest byte first. The others hold
-    the logarithms of the three scales; the index of the quaternion's largest component (wxyz), which is made positive;
-    the other three components, ±127 for ±1/√2; red, green, blue in sRGB; opacity. Rounding to 24 bits moves a centre by
-    at most 2⁻¹⁶ of its distance to the photo's camera, which is a hundredth of a pixel.
+    A plane has one byte of each Gaussian. In their order, the 20 planes hold:
+
+    * 9 planes: x, y and z, each as the upper 24 bits of a float32, lowest byte first. Rounding
+      to 24 bits moves a centre by at most 2⁻¹⁶ of its distance to the photo's camera, which is
+      a hundredth of a pixel.
+    * 3 planes: the logarithms of the three scales.
+    * 4 planes: the index of the largest component of the quaternion (w, x, y, z), which is made
+      positive; and the other three components, with 128 for 0 and ±127 for ±1/√2.
+    * 4 planes: red, green and blue in sRGB, and the opacity.
 
     Returns:
-        The bytes [BYTES, N]; the logarithm of the scale for byte 0; the increase of the logarithm per step.
+        The bytes of the planes [20, N]; the logarithm of the scale for byte 0; and the increase
+        of the logarithm per step.
     """
-    means, quats, scales, opacities, colors = (
-        t.detach().to("cpu", torch.float32) for t in gaussians.tensors
-    )
-    low, step = _scale_range(scales)
+    gaussians = gaussians.detach().to("cpu", torch.float32)
+    low, step = _log_scale_steps(gaussians.scales)
     planes = np.empty((BYTES_PER_GAUSSIAN, len(gaussians)), np.uint8)
-    for start in range(0, len(gaussians), BLOCK):
-        part = slice(start, start + BLOCK)
-        bits = (means[part].T.contiguous().numpy().view(np.uint32) + np.uint32(0x80)).view(
-            np.uint8
-        )  # little-endian
-        planes[0:9, part] = bits.reshape(3, -1, 4)[:, :, 1:].transpose(0, 2, 1).reshape(9, -1)
-        logs = scales[part].clamp(SMALLEST_SCALE, LARGEST_SCALE).log()
-        planes[9:12, part] = _bytes((logs - low) / step)
-        planes[12, part], others = encode_smallest_three(
-            torch.nn.functional.normalize(quats[part], dim=-1).numpy()
-        )
-        planes[13:16, part] = _bytes(torch.from_numpy(others) * (127 * math.sqrt(2)) + 128)
-        planes[16:19, part] = _bytes(linear_to_srgb(colors[part]) * 255)
-        planes[19, part] = _bytes(opacities[part, None] * 255)
+    for start in range(0, len(gaussians), GAUSSIANS_PER_BLOCK):
+        block = slice(start, start + GAUSSIANS_PER_BLOCK)
+        part = gaussians.select(block)
+        log_scales = part.scales.clamp(MIN_SCALE, MAX_SCALE).log()
+        quats = torch.nn.functional.normalize(part.quats, dim=-1)
+        largest, others = encode_smallest_three(quats.numpy())
+
+        planes[0:9, block] = _center_planes(part.means)
+        planes[9:12, block] = _byte_planes((log_scales - low) / step)
+        planes[12, block] = largest
+        planes[13:16, block] = _byte_planes(torch.from_numpy(others) * (127 * math.sqrt(2)) + 128)
+        planes[16:19, block] = _byte_planes(linear_to_srgb(part.colors) * 255)
+        planes[19, block] = _byte_planes(part.opacities[:, None] * 255)
     return planes.tobytes(), low, step
 
 
-def _scale_range(scales: Tensor) -> tuple[float, float]:
-    if not scales.numel():
+def _log_scale_steps(scales: Tensor) -> tuple[float, float]:
+    """Return the logarithm of the scale for byte 0, and its increase per step of a byte.
+
+    Args:
+        scales: [N, 3] standard deviations.
+    """
+    if scales.numel() == 0:
         return 0.0, 1.0
-    low, high = (
-        math.log(min(max(float(end), SMALLEST_SCALE), LARGEST_SCALE))
-        for end in torch.aminmax(scales)
-    )
-    return low, max(high - low, 1e-3) / 255
+    smallest, largest = torch.aminmax(scales)
+    low = math.log(min(max(float(smallest), MIN_SCALE), MAX_SCALE))
+    high = math.log(min(max(float(largest), MIN_SCALE), MAX_SCALE))
+    return low, max(high - low, MIN_LOG_SCALE_RANGE) / 255
 
 
-def _bytes(values: Tensor) -> NDArray[np.uint8]:
-    """Values [rows, C], rounded, clamped to 0..255 and transposed to [C, rows]."""
+def _center_planes(means: Tensor) -> NDArray[np.uint8]:
+    """Return the planes [9, N] of centres [N, 3]: the upper 24 bits of each float32."""
+    coordinates = means.T.contiguous().numpy()  # [3, N]
+    # Half of the lowest byte's range is added, so that dropping this byte rounds.
+    words = coordinates.view(np.uint32) + np.uint32(0x80)
+    four_bytes = words.view(np.uint8).reshape(3, -1, 4)  # the lowest byte first
+    return four_bytes[:, :, 1:].transpose(0, 2, 1).reshape(9, -1)
+
+
+def _byte_planes(values: Tensor) -> NDArray[np.uint8]:
+    """Round values [N, C], clamp them to 0..255, and return them as planes [C, N]."""
     return values.round().clamp(0, 255).to(torch.uint8).T.numpy()
 
 
 def html_safe_json(value: object) -> bytes:
-    """JSON in ASCII that is safe inside HTML."""
+    """Return a value as JSON in ASCII that can stand inside HTML."""
     text = json.dumps(value, allow_nan=False)
+    # These characters would begin or end a tag; JSON can write them as \u003c.
     for character in "<>&":
         text = text.replace(character, f"\\u{ord(character):04x}")
     return text.encode("ascii")
 
 
 def single_html(scene: PageScene) -> bytes:
-    """The page with a scene embedded; it opens from a disk or an e-mail and fetches nothing."""
-    page, css, js = (
-        read_page_file(name).decode() for name in ("index.html", "viewer.css", "viewer.js")
-    )
-    held = {
-        name: base64.b64encode(gzip.compress(data, 6, mtime=0)).decode()
-        for name, data in scene.files.items()
-    }
-    data = html_safe_json({"description": scene.description, "files": held}).decode()
-    style, script = f"<style>{css}</style>", f"<script>{js}</script>"
-    embedded = f'<script type="application/json" id="spackle-scene">{data}</script>'
-    policy = (  # allows only these scripts and styles
-        f"default-src 'none'; script-src {_digest(js)} 'wasm-unsafe-eval'; style-src {_digest(css)}; worker-src blob:; "
+    """Return the page with a scene embedded; it opens from a disk or an e-mail.
+
+    The page fetches nothing, and its policy lets browsers run its own script alone.
+    """
+    page = read_page_file("index.html").decode()
+    css = read_page_file("viewer.css").decode()
+    js = read_page_file("viewer.js").decode()
+
+    embedded_files = {}
+    for name, data in scene.files.items():
+        # A constant time, so that the same scene gives the same bytes.
+        compressed = gzip.compress(data, 6, mtime=0)
+        embedded_files[name] = base64.b64encode(compressed).decode()
+    content = {"description": scene.description, "files": embedded_files}
+    scene_json = html_safe_json(content).decode()
+
+    policy = (
+        f"default-src 'none'; script-src {_policy_digest(js)} 'wasm-unsafe-eval'; "
+        f"style-src {_policy_digest(css)}; worker-src blob:; "
         "img-src data: blob:; media-src blob:; form-action 'none'; base-uri 'none'"
     )
     meta = f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
-    page = page.replace(STYLE, f"{meta}\n{style}").replace(SCRIPT, f"{embedded}\n{script}")
+    style = f"<style>{css}</style>"
+    embedded_scene = f'<script type="application/json" id="spackle-scene">{scene_json}</script>'
+    script = f"<script>{js}</script>"
+    page = page.replace(STYLE_TAG, f"{meta}\n{style}")
+    page = page.replace(SCRIPT_TAG, f"{embedded_scene}\n{script}")
     return page.encode()
 
 
-def _digest(text: str) -> str:
-    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+def _policy_digest(text: str) -> str:
+    """Return the digest with which a Content-Security-Policy names a script or a style."""
+    digest = hashlib.sha256(text.encode()).digest()
+    return f"'sha256-{base64.b64encode(digest).decode()}'"
 
 
 def read_page_file(name: str) -> bytes:
-    return (
-        resources.files("spackle").joinpath("web", "page", name).read_bytes()
-    )  # importing FastAPI would take a second
+    """Read a file of the page, such as "index.html", from the installed package."""
+    # By the path, because importing `spackle.web` imports FastAPI, which takes a second.
+    return resources.files("spackle").joinpath("web", "page", name).read_bytes()

@@ -1,12 +1,13 @@
-"""Write Gaussians in INRIA's PLY layout, and read the layouts of INRIA, SHARP and PlayCanvas."""
+"""Write Gaussians in INRIA's PLY layout, and read the layouts of INRIA, SHARP and PlayCanvas.
+
+`save_ply` writes, `PlyFile` reads. `ply_tables.py` knows the container.
+"""
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import os
-import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,36 +19,35 @@ from spackle.core.camera import Camera
 from spackle.core.color import srgb_to_linear
 from spackle.core.gaussians import Gaussians
 from spackle.formats.camera_files import checked_camera
-from spackle.formats.scene_files import SH_C0, GaussianColumns, SceneFile, function_named
+from spackle.formats.compressed_ply import PACKED_PROPERTIES, decode_compressed_ply
+from spackle.formats.gaussian_columns import Floats, GaussianColumns, harmonics_to_srgb
+from spackle.formats.ply_tables import NewTable, PlyElement, PlyTables, ply_header
+from spackle.formats.scene_content import SceneFile
 from spackle.runtime.errors import InputError, as_input_error
-from spackle.runtime.files import atomic_path, check_file
+from spackle.runtime.files import atomic_path
 
-MAX_HEADER_BYTES = 1 << 16
-MAX_EXTRA_ROWS = 64  # larger tables than this hold no camera
+# Tables of more rows than SHARP's camera needs, such as the faces of a mesh, are not read.
+MAX_CAMERA_TABLE_ROWS = 64
 
-_TYPES = "char uchar short ushort int uint float double int8 uint8 int16 uint16 int32 uint32 float32 float64"
-_CODES = dict(
-    zip(_TYPES.split(), ["i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"] * 2, strict=True)
-)
-_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
+# Between these bounds, the logit of an opacity is finite in float32.
+MIN_OPACITY = 1e-12
+MAX_OPACITY = 1 - 2.0**-24
 
-SMALLEST_OPACITY, LARGEST_OPACITY = 1e-12, 1 - 2.0**-24  # bounds that keep the logit finite
-
-# Gaussians that are converted at a time. Blocks are padded to full size, so that a row's bits depend neither on the
-# rows after it nor on the number of threads.
+# Gaussians are converted in blocks of this many. The last block is padded to full size, so that
+# a row's bits depend neither on the rows after it nor on the number of threads.
 ROWS_PER_BLOCK = 8192
 
-_READ = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2"]
-PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
-_READ += ["rot_0", "rot_1", "rot_2", "rot_3"]
-_WRITTEN = [*_READ[:3], "nx", "ny", "nz", *_READ[3:]]
-_SLICES = (
-    slice(0, 3),
-    slice(3, 6),
-    slice(6, 7),
-    slice(7, 10),
-    slice(10, 14),
-)  # means, f_dc, opacity, scales, rot
+# The properties of a Gaussian that are read, and where each group stands among them.
+READ_PROPERTIES = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
+READ_PROPERTIES += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+MEANS = slice(0, 3)
+COLORS = slice(3, 6)
+OPACITIES = slice(6, 7)
+SCALES = slice(7, 10)
+QUATS = slice(10, 14)
+
+# The properties that are written: also a normal, which some viewers expect.
+WRITTEN_PROPERTIES = [*READ_PROPERTIES[MEANS], "nx", "ny", "nz", *READ_PROPERTIES[3:]]
 
 StrPath = str | os.PathLike[str]
 
@@ -62,298 +62,324 @@ def save_ply(
 ) -> None:
     """Write a binary PLY that viewers of 3D Gaussian splatting read.
 
-    The one element, `vertex`, is float32: x y z, normals of zero, f_dc from the sRGB colour, opacity as logit, scales
-    as logarithms, rot as unit quaternion wxyz. Each row depends only on its Gaussian. Comments in the header keep
-    `camera`, `base_count` and `disparity`.
+    The one table, `vertex`, has float32 columns: the position x y z, a normal of zero, the
+    sRGB colour as the coefficient f_dc of the constant spherical harmonic, the opacity as its
+    logit, the scales as natural logarithms, and the rotation as a unit quaternion (w, x, y, z).
+    Each row depends only on its Gaussian. Comments in the header keep `camera`, `base_count`
+    and `disparity`.
 
     Args:
+        gaussians: the scene.
+        path: the file to write, whole or not at all.
         camera: the photo's camera, at the world's origin.
-        base_count: the number of base Gaussians, which come first.
-        disparity: the disparity for which the scene was completed, see `spackle.core.trajectories.disparity_to_offset`.
+        base_count: how many Gaussians come from the photo; those that fill holes come after.
+        disparity: the relative camera movement for which the scene was completed.
 
     Raises:
         InputError: `path` cannot be written.
         ValueError: a Gaussian is not finite.
     """
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        file.writelines(_written(gaussians, camera, base_count, disparity))
+        file.writelines(_encoded_parts(gaussians, camera, base_count, disparity))
 
 
 def encode_ply(scene: SceneFile) -> bytes:
-    """Encode a scene as `save_ply` does; ValueError if a Gaussian is not finite."""
-    return b"".join(
-        _written(scene.gaussians, scene.untilted_camera, scene.base_count, scene.disparity)
+    """Encode a scene as `save_ply` does.
+
+    Raises:
+        ValueError: a Gaussian is not finite.
+    """
+    parts = _encoded_parts(
+        scene.gaussians, scene.camera_at_origin, scene.base_count, scene.disparity
     )
+    return b"".join(parts)
 
 
-def _written(
+def _encoded_parts(
     gaussians: Gaussians, camera: Camera | None, base_count: int | None, disparity: float | None
 ) -> Iterator[bytes]:
-    """The header, then the rows, BLOCK at a time."""
-    vertex = ("vertex", len(gaussians), "float", _WRITTEN)
+    """Yield the header of a PLY file, and then its rows, ROWS_PER_BLOCK at a time.
+
+    The arguments are those of `save_ply`.
+    """
+    vertex = NewTable(
+        name="vertex", row_count=len(gaussians), type="float", properties=WRITTEN_PROPERTIES
+    )
     yield ply_header(vertex, camera=camera, base_count=base_count, disparity=disparity)
+
     gaussians = gaussians.detach().to("cpu", torch.float32)
-    surplus = Gaussians(*(torch.zeros(ROWS_PER_BLOCK, *t.shape[1:]) for t in gaussians.tensors))
-    table = np.zeros((ROWS_PER_BLOCK, len(_WRITTEN)), "<f4")
+    padding = Gaussians(
+        *(torch.zeros(ROWS_PER_BLOCK, *tensor.shape[1:]) for tensor in gaussians.tensors)
+    )
+    # One array serves all blocks; its columns of normals stay zero.
+    table = np.zeros((ROWS_PER_BLOCK, len(WRITTEN_PROPERTIES)), "<f4")
     for start in range(0, len(gaussians), ROWS_PER_BLOCK):
         block = gaussians.select(slice(start, start + ROWS_PER_BLOCK))
-        columns = GaussianColumns.of(
-            Gaussians.cat([block, surplus.select(slice(len(block), ROWS_PER_BLOCK))])
-        )
-        opacities = np.clip(columns.opacities, SMALLEST_OPACITY, LARGEST_OPACITY)
-        table[:, 0:3], table[:, 6:9], table[:, 13:17] = (
-            columns.means,
-            columns.harmonics,
-            columns.quats,
-        )
-        table[:, 9] = np.log(opacities / (1 - opacities))  # 1 - o is exact above one half
-        table[:, 10:13] = columns.log_scales
+        missing_rows = slice(len(block), ROWS_PER_BLOCK)
+        full_block = Gaussians.cat([block, padding.select(missing_rows)])
+        _fill_table(table, GaussianColumns.from_gaussians(full_block))
         yield table[: len(block)].tobytes()
 
 
-def ply_header(
-    *tables: tuple[str, int, str, Sequence[str]],
-    camera: Camera | None = None,
-    base_count: int | None = None,
-    disparity: float | None = None,
-) -> bytes:
-    """The header of a binary file; each table is (name, number of rows, type, properties)."""
-    lines = ["ply", "format binary_little_endian 1.0"]
-    if camera is not None:
-        numbers = [*camera.focal, *camera.K[:2, 2].tolist(), camera.width, camera.height]
-        lines.append(f"comment spackle_camera {' '.join(map(repr, numbers))}")
-    for comment, number in (("spackle_base", base_count), ("spackle_disparity", disparity)):
-        lines += [] if number is None else [f"comment {comment} {number!r}"]
-    for name, count, kind, properties in tables:
-        lines += [f"element {name} {count}", *(f"property {kind} {each}" for each in properties)]
-    return "\n".join([*lines, "end_header", ""]).encode()
+def _fill_table(table: Floats, columns: GaussianColumns) -> None:
+    """Write N Gaussians into the rows of `table` [N, 17], in the order of WRITTEN_PROPERTIES.
+
+    The columns 3 to 5, the normals, are left as they are.
+    """
+    opacities = np.clip(columns.opacities, MIN_OPACITY, MAX_OPACITY)
+    table[:, 0:3] = columns.means
+    table[:, 6:9] = columns.harmonics
+    # The logit. Above one half, 1 - opacity is exact in floating point.
+    table[:, 9] = np.log(opacities / (1 - opacities))
+    table[:, 10:13] = columns.log_scales
+    table[:, 13:17] = columns.quats
 
 
 def load_ply(path: StrPath) -> Gaussians:
-    """Read Gaussians from a binary PLY file of INRIA's, SHARP's or PlayCanvas's layout; see `PlyFile.gaussians`."""
+    """Read Gaussians from a binary PLY file in the layout of INRIA, SHARP or PlayCanvas.
+
+    Raises:
+        InputError: the file cannot be read, holds no Gaussians, or some are not finite.
+    """
     return PlyFile(path).gaussians()
 
 
-@dataclasses.dataclass
-class Element:
-    """One table of a PLY file."""
-
-    name: str
-    count: int
-    fields: list[tuple[str, str]] = dataclasses.field(
-        default_factory=list
-    )  # (name, NumPy type or "list")
-    start: int = -1  # offset in the file, in bytes; -1 from the first table with lists on
-
-
 class PlyFile:
-    """A binary PLY file's header, and its tables up to the first one with lists.
-
-    InputError if the file is no PLY file, has an endless or broken header, or is too short for its tables.
-    """
+    """A binary PLY file with Gaussians, and what Spackle or SHARP noted of the scene."""
 
     def __init__(self, path: StrPath) -> None:
-        self.path, self._size = path, check_file(path, "PLY file")
-        self.elements: list[Element] = []
-        self.comments: dict[str, list[str]] = {}  # first word → the other words
-        with open(path, "rb") as file:
-            head = file.read(MAX_HEADER_BYTES)
-        if head.split(b"\n", 1)[0].rstrip() != b"ply":
-            raise InputError(
-                f"{path}: not a PLY file: its first line must be 'ply' (`spackle predict` makes one)"
-            )
-        end = re.search(rb"\n[ \t]*end_header[ \t\r]*\n", head)
-        if end is None:
-            raise InputError(f"{path}: the header has no end: the file is damaged or cut off")
-        with as_input_error(path, "broken PLY header: {reason}", ValueError, KeyError, IndexError):
-            self._parse(head[: end.start()].decode("latin-1").split("\n")[1:])
-            self._place_tables(end.end())
-
-    def gaussians(self) -> Gaussians:
-        """Read the scene; colours become linear RGB.
-
-        Properties may have any order and type; spherical harmonics above degree 0 (f_rest) are ignored. SHARP's
-        `color_space` states whether colours are sRGB (0) or linear (1). Without `color_space`, colours count as linear
-        if the file has SHARP's camera (SHARP reads them so), else as sRGB.
+        """Read the header of a file; the Gaussians are read by `gaussians`.
 
         Raises:
-            InputError: there are no Gaussians, or some contain NaN or inf. An infinite opacity logit is allowed: SHARP
-                writes one for an opacity of 1.
+            InputError: the file is no PLY file, its header is broken, or the file is too short.
         """
-        vertex, extras = self._vertex(), self._extras()
-        if chunks := [element for element in self.elements if element.name == "chunk"]:
-            decode = function_named("spackle.formats.compressed_ply:decode_compressed_ply")
-            with as_input_error(
-                self.path, "the compressed tables cannot be read: {reason}: export the scene again"
-            ):
-                gaussians: Gaussians = decode(self._rows(chunks[0]), self._rows(vertex)).gaussians()
-            return gaussians
-        linear = (
-            bool(extras["color_space"].any()) if "color_space" in extras else "intrinsic" in extras
+        self.path = path
+        self._tables = PlyTables(path)
+
+    def scene(self) -> SceneFile:
+        """Read the Gaussians and all that is noted of the scene.
+
+        Raises:
+            InputError: a part of it is invalid.
+        """
+        # f_rest are the coefficients of spherical harmonics above degree 0.
+        unread_harmonics = 0
+        for element in self._tables.elements:
+            for name in element.property_names:
+                if name.startswith("f_rest_"):
+                    unread_harmonics += 1
+
+        # A wrong camera is reported before the Gaussians, which take long, are read.
+        camera = self.camera()
+        base_count = self.base_count()
+        disparity = self.disparity()
+        return SceneFile(
+            path=Path(self.path),
+            gaussians=self.gaussians(),
+            camera=camera,
+            base_count=base_count,
+            disparity=disparity,
+            unread_harmonics=unread_harmonics,
         )
-        parts = [torch.empty(vertex.count, columns.stop - columns.start) for columns in _SLICES]
-        table, broken, whole = (
-            np.zeros((len(_READ), ROWS_PER_BLOCK), np.float32),
-            0,
-            self._rows(vertex),
-        )
-        for start in range(0, vertex.count, ROWS_PER_BLOCK):
-            rows = whole[start : start + ROWS_PER_BLOCK]
-            with np.errstate(
-                over="ignore", invalid="ignore"
-            ):  # numbers beyond float32 become inf, and are counted
-                for k, name in enumerate(_READ):
-                    table[k, : len(rows)] = rows[name]
-                table[7:10] = np.exp(table[7:10])
-                rgb = torch.from_numpy(table[3:6] * np.float32(SH_C0) + np.float32(0.5))
-            table[6:7] = torch.from_numpy(table[6:7]).sigmoid()
-            broken += int(np.count_nonzero(~np.isfinite(table[:, : len(rows)]).all(axis=0)))
-            table[3:6] = rgb.clamp_min(0) if linear else srgb_to_linear(rgb)
-            for part, columns in zip(parts, _SLICES, strict=True):
-                part[start : start + ROWS_PER_BLOCK] = torch.from_numpy(
-                    table[columns, : len(rows)].T
-                )
-        if broken:
-            raise InputError(
-                f"{self.path}: {broken} of {vertex.count} Gaussians are not finite: export it again"
-            )
-        means, colors, opacities, scales, quats = parts
+
+    def gaussians(self) -> Gaussians:
+        """Read the Gaussians, with linear RGB colours.
+
+        The properties may have any order and type. Spherical harmonics above degree 0 (f_rest)
+        are ignored.
+
+        Raises:
+            InputError: there are no Gaussians, or some contain NaN or inf. An infinite logit
+                of an opacity is allowed: SHARP writes one for an opacity of 1.
+        """
+        vertex = self._vertex_element()
+        chunk_elements = self._tables.elements_named("chunk")
+        if chunk_elements:
+            return self._compressed_gaussians(chunk_elements[0], vertex)
+
+        count = vertex.row_count
+        rows = self._tables.rows(vertex)
+        are_linear = self._are_colors_linear()
+        means = torch.empty(count, 3)
+        colors = torch.empty(count, 3)
+        opacities = torch.empty(count, 1)
+        scales = torch.empty(count, 3)
+        quats = torch.empty(count, 4)
+        groups = ((means, MEANS), (colors, COLORS), (opacities, OPACITIES))
+        groups += ((scales, SCALES), (quats, QUATS))
+
+        # One array serves all blocks; a row holds one property.
+        block = np.zeros((len(READ_PROPERTIES), ROWS_PER_BLOCK), np.float32)
+        broken_count = 0
+        for start in range(0, count, ROWS_PER_BLOCK):
+            block_rows = rows[start : start + ROWS_PER_BLOCK]
+            stop = start + len(block_rows)
+            broken_count += _convert_block(block, block_rows, are_linear)
+            for tensor, group in groups:
+                tensor[start:stop] = torch.from_numpy(block[group, : len(block_rows)].T)
+
+        if broken_count > 0:
+            problem = f"{broken_count} of {count} Gaussians are not finite"
+            raise InputError(f"{self.path}: {problem}: export it again")
         return Gaussians(means, quats, scales, opacities[:, 0], colors)
 
     def camera(self) -> Camera | None:
-        """The photo's camera, which SHARP stores after the Gaussians and `save_ply` in a comment.
+        """Read the photo's camera: `save_ply` stores it in a comment, SHARP in tables.
 
-        None if the file has no camera; InputError if the camera is invalid.
+        Returns:
+            The camera; None if the file has none.
+
+        Raises:
+            InputError: the stored camera is impossible.
         """
-        K, matrix = np.eye(3), np.eye(4)
-        if numbers := self._numbers("spackle_camera", 6, lowest=-math.inf):
-            K[0, 0], K[1, 1], K[0, 2], K[1, 2], width, height = numbers
-        elif "intrinsic" in (extras := self._extras()):
-            parts = [
-                extras.get(name, np.empty(0)) for name in ("intrinsic", "extrinsic", "image_size")
-            ]
-            if [len(part) for part in parts] != [9, 16, 2]:
-                raise InputError(
-                    f"{self.path}: the stored camera is not as SHARP writes it: give the focal length"
-                )
-            K, matrix, (width, height) = parts[0].reshape(3, 3), parts[1].reshape(4, 4), parts[2]
-        else:
+        numbers = self._tables.numbers_in_comment("spackle_camera", 6, lowest=-math.inf)
+        if numbers is not None:
+            fx, fy, cx, cy, width, height = numbers
+            K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+            return self._checked_camera(K, np.eye(4), width, height)
+
+        extras = self._small_columns()
+        if "intrinsic" not in extras:
             return None
-        width, height = (int(side) if float(side).is_integer() else 0 for side in (width, height))
-        where = f"{self.path}: the stored camera"
-        return checked_camera(torch.from_numpy(K), torch.from_numpy(matrix), width, height, where)
+        missing = np.empty(0)
+        intrinsic = extras["intrinsic"]
+        extrinsic = extras.get("extrinsic", missing)
+        image_size = extras.get("image_size", missing)
+        if (len(intrinsic), len(extrinsic), len(image_size)) != (9, 16, 2):
+            problem = "the stored camera is not as SHARP writes it"
+            raise InputError(f"{self.path}: {problem}: give the focal length")
+        width, height = image_size
+        return self._checked_camera(intrinsic.reshape(3, 3), extrinsic.reshape(4, 4), width, height)
 
     def base_count(self) -> int | None:
-        """The number of base Gaussians, which come first; None for files of other programs.
+        """Read how many Gaussians come from the photo; those that fill holes come after them.
 
-        InputError if the file states more base Gaussians than it contains Gaussians.
+        Returns:
+            The number; None for files of other programs.
+
+        Raises:
+            InputError: the stored number is negative, or larger than that of all Gaussians.
         """
-        numbers = self._numbers("spackle_base", 1, highest=self._vertex().count)
-        return int(numbers[0]) if numbers else None
+        count = self._vertex_element().row_count
+        numbers = self._tables.numbers_in_comment("spackle_base", 1, highest=count)
+        return None if numbers is None else int(numbers[0])
 
     def disparity(self) -> float | None:
-        """The disparity for which the scene was completed; None if the file states none.
+        """Read the relative camera movement for which the scene was completed.
 
-        InputError if the stored value is not a valid number.
+        Returns:
+            The disparity; None for files of other programs.
+
+        Raises:
+            InputError: the stored value is not a number, or negative.
         """
-        numbers = self._numbers("spackle_disparity", 1)
-        return numbers[0] if numbers else None
+        numbers = self._tables.numbers_in_comment("spackle_disparity", 1)
+        return None if numbers is None else numbers[0]
 
-    def scene(self) -> SceneFile:
-        """Read camera, counts, disparity and Gaussians; InputError if one of them is invalid."""
-        rest = sum(
-            name.startswith("f_rest_") for element in self.elements for name, _ in element.fields
-        )
-        known = self.camera(), self.base_count(), self.disparity()
-        return SceneFile(Path(self.path), self.gaussians(), *known, harmonics=rest)
+    def _vertex_element(self) -> PlyElement:
+        """Return the table of the vertices, which are the Gaussians.
 
-    def _parse(self, lines: list[str]) -> None:
-        order = ""
-        for words in map(str.split, lines):
-            match words:
-                case ["comment", name, *others]:
-                    self.comments[name] = others
-                case [] | ["comment" | "obj_info", *_]:
-                    pass
-                case ["format", "ascii", _]:
-                    raise ValueError("the file is text: export a binary PLY")
-                case ["format", name, _]:
-                    order = _ORDERS[name]
-                case ["element", name, count] if int(count) >= 0:
-                    self.elements.append(Element(name, int(count)))
-                case ["property", "list", _, _, name]:
-                    self.elements[-1].fields.append((name, "list"))
-                case ["property", kind, name] if order:
-                    self.elements[-1].fields.append((name, order + _CODES[kind]))
-                case _:
-                    raise ValueError(f"cannot understand the line {' '.join(words)[:80]!r}")
-        if not order:
-            raise ValueError("there is no format line")
+        Raises:
+            InputError: there is not exactly one such table, its vertices are not Gaussians, or
+                there are none, or they have no fixed size.
+        """
+        elements = self._tables.elements_named("vertex")
+        if len(elements) != 1:
+            problem = f"holds {len(elements)} elements called vertex"
+            raise InputError(f"{self.path}: {problem}: not a Gaussian scene")
+        vertex = elements[0]
 
-    def _place_tables(self, start: int) -> None:
-        """Set where each table starts; InputError if the file is too short."""
-        for element in self.elements:
-            if "list" in dict(element.fields).values():
-                return
-            element.start = start
-            start += (
-                element.count * np.dtype(element.fields).itemsize
-            )  # ValueError for a name given twice
-            if start > self._size:
-                announced = f"{element.count} rows of {element.name!r} are announced"
-                raise InputError(
-                    f"{self.path}: cut off: {announced}, but the file ends after {self._size} bytes"
-                )
-
-    def _numbers(
-        self, comment: str, count: int, lowest: float = 0, highest: float = math.inf
-    ) -> list[float] | None:
-        """The finite numbers in one of Spackle's comments; None if the file does not have this comment."""
-        if (words := self.comments.get(comment)) is None:
-            return None
-        what = comment.removeprefix("spackle_")
-        with as_input_error(self.path, f"the stored {what} makes no sense: {{reason}}", ValueError):
-            numbers = [float(word) for word in words]
-            if len(numbers) != count or not all(
-                math.isfinite(n) and lowest <= n <= highest for n in numbers
-            ):
-                raise ValueError(" ".join(words))
-        return numbers
-
-    def _vertex(self) -> Element:
-        """The element with the vertices; InputError if they are not Gaussians, or have no fixed size."""
-        named = [element for element in self.elements if element.name == "vertex"]
-        if len(named) != 1:
-            raise InputError(
-                f"{self.path}: holds {len(named)} elements called vertex: not a Gaussian scene"
-            )
-        read = PACKED if "packed_position" in dict(named[0].fields) else _READ
-        missing = [name for name in read if name not in dict(named[0].fields)]
+        present = vertex.property_names
+        is_compressed = "packed_position" in present
+        needed = PACKED_PROPERTIES if is_compressed else READ_PROPERTIES
+        missing = [name for name in needed if name not in present]
         if missing:
-            raise InputError(
-                f"{self.path}: not a Gaussian scene: its vertices have no {', '.join(missing)}"
-            )
-        if named[0].count == 0 or named[0].start < 0:
-            problem = "no Gaussians" if named[0].count == 0 else "lists in or before its vertices"
-            raise InputError(f"{self.path}: holds {problem}: export it as a plain Gaussian scene")
-        return named[0]
+            problem = f"its vertices have no {', '.join(missing)}"
+            raise InputError(f"{self.path}: not a Gaussian scene: {problem}")
 
-    def _extras(self) -> dict[str, NDArray[np.float64]]:
-        """The numbers in small tables, such as SHARP's camera, by their properties' names."""
-        small = [
-            element
-            for element in self.elements
-            if element.name != "vertex"
-            and element.start >= 0
-            and element.fields
-            and element.count <= MAX_EXTRA_ROWS
-        ]
-        return {
-            name: self._rows(each)[name].astype(np.float64)
-            for each in small
-            for name, _ in each.fields
-        }
+        advice = "export it as a plain Gaussian scene"
+        if vertex.row_count == 0:
+            raise InputError(f"{self.path}: holds no Gaussians: {advice}")
+        if vertex.start_byte < 0:
+            raise InputError(f"{self.path}: holds lists in or before its vertices: {advice}")
+        return vertex
 
-    def _rows(self, element: Element) -> NDArray[Any]:
-        """The rows of a table, as a structured array."""
-        return np.fromfile(self.path, element.fields, element.count, offset=element.start)
+    def _compressed_gaussians(self, chunk: PlyElement, vertex: PlyElement) -> Gaussians:
+        """Decode PlayCanvas's compressed layout.
+
+        Args:
+            chunk: the table of the bounds within which the vertices are stored.
+            vertex: the table of the Gaussians.
+        """
+        problem = "the compressed tables cannot be read: {reason}: export the scene again"
+        with as_input_error(self.path, problem):
+            chunk_rows = self._tables.rows(chunk)
+            columns = decode_compressed_ply(chunk_rows, self._tables.rows(vertex))
+            return columns.to_gaussians()
+
+    def _are_colors_linear(self) -> bool:
+        """Return whether the stored colours are linear RGB; else they are sRGB.
+
+        SHARP's `color_space` says so: 0 for sRGB, 1 for linear. An older file of SHARP has no
+        `color_space`, but a camera; SHARP reads its colours as linear. All other programs store
+        sRGB.
+        """
+        extras = self._small_columns()
+        if "color_space" in extras:
+            return bool(extras["color_space"].any())
+        return "intrinsic" in extras
+
+    def _small_columns(self) -> dict[str, NDArray[np.float64]]:
+        """Read the small tables after the Gaussians, in which SHARP stores its camera."""
+        return self._tables.small_columns(MAX_CAMERA_TABLE_ROWS)
+
+    def _checked_camera(
+        self, K: NDArray[Any], world_to_camera: NDArray[Any], width: float, height: float
+    ) -> Camera:
+        """Return a camera from the numbers in the file.
+
+        Args:
+            K: [3, 3] float64 intrinsics in pixels.
+            world_to_camera: [4, 4] float64 pose.
+            width, height: size in pixels.
+
+        Raises:
+            InputError: the camera is impossible.
+        """
+        # A size that is no whole number becomes 0, which `checked_camera` refuses.
+        whole_width = int(width) if float(width).is_integer() else 0
+        whole_height = int(height) if float(height).is_integer() else 0
+        return checked_camera(
+            torch.from_numpy(K),
+            torch.from_numpy(world_to_camera),
+            whole_width,
+            whole_height,
+            f"{self.path}: the stored camera",
+        )
+
+
+def _convert_block(block: Floats, rows: NDArray[Any], are_linear: bool) -> int:
+    """Convert rows of a PLY file to means, linear colours, opacities, scales and quaternions.
+
+    Args:
+        block: [14, ROWS_PER_BLOCK] overwritten in its first len(rows) columns; a row holds one
+            of READ_PROPERTIES. All columns are computed, so that the bits of a Gaussian do not
+            depend on how many others are in its block.
+        rows: at most ROWS_PER_BLOCK rows of the table, with a field for each property.
+        are_linear: whether the colours are linear RGB; else they are sRGB.
+
+    Returns:
+        How many of the Gaussians are not finite.
+    """
+    # Numbers beyond float32 become infinite, and are counted below.
+    with np.errstate(over="ignore", invalid="ignore"):
+        for index, name in enumerate(READ_PROPERTIES):
+            block[index, : len(rows)] = rows[name]
+        block[SCALES] = np.exp(block[SCALES])
+        rgb = torch.from_numpy(harmonics_to_srgb(block[COLORS]))
+    block[OPACITIES] = torch.from_numpy(block[OPACITIES]).sigmoid()
+
+    # The colours are counted as they are stored, because the conversion clamps infinite ones.
+    is_finite = np.isfinite(block[:, : len(rows)]).all(axis=0)  # [len(rows)]
+    block[COLORS] = rgb.clamp_min(0) if are_linear else srgb_to_linear(rgb)
+    return int(np.count_nonzero(~is_finite))

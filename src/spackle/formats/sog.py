@@ -1,4 +1,7 @@
-"""SOG 2, PlayCanvas's format: Gaussians as lossless WebP images, zipped into one file."""
+"""SOG 2, PlayCanvas's format: Gaussians as lossless WebP images, zipped into one file.
+
+A pixel is a Gaussian. Scales and colours are indices into codebooks of 256 values.
+"""
 
 from __future__ import annotations
 
@@ -6,42 +9,53 @@ import io
 import json
 import math
 import zipfile
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from spackle.formats.scene_files import (
-    SH_C0,
-    Floats,
-    GaussianColumns,
-    SceneFile,
+from spackle.formats.gaussian_columns import Floats, GaussianColumns, harmonics_to_srgb
+from spackle.formats.quantization import (
     codes_to_fractions,
     components_to_fractions,
     decode_smallest_three,
     encode_smallest_three,
     fractions_to_components,
 )
+from spackle.formats.scene_content import SceneFile
 from spackle.runtime.errors import InputError
 
-LARGEST_SIDE = 16_380  # of a WebP image, a multiple of four
-LARGEST_MEMBER = 1 << 28  # largest file in the archive, in bytes
-CODES = 256  # entries of a codebook
-BINS = 1 << 16  # bins into which values are sorted to build a codebook
-EVEN = 0.25  # fraction of the codes that are spaced evenly
-EFFORT = {
-    "lossless": True,
-    "exact": True,
-    "quality": 25,
-    "method": 1,
-}  # exact: keeps colours if opacity is 0
-EPOCH = (1980, 1, 1, 0, 0, 0)  # a constant, so that the same scene gives the same bytes
+LARGEST_SIDE = 16_380  # pixels; the largest multiple of four that a WebP image can have
+MAX_MEMBER_BYTES = 1 << 28  # of a file in an archive that is read
+
+CODEBOOK_SIZE = 256
+# Values are counted in this many bins to find a codebook for them.
+BIN_COUNT = 1 << 16
+# The part of the codes that is spaced evenly; the others follow the values' density.
+EVEN_CODES_SHARE = 0.25
+
+MAX_POSITION_CODE = 65_535  # a coordinate has 16 bits
+
+# A range of equal values counts as this wide, so that no fraction divides by zero.
+MIN_SPAN = 1e-30
+
+# A pixel's alpha holds the index 0..3 of a quaternion's largest component, plus this number.
+FIRST_LARGEST_COMPONENT_CODE = 252
+
+# `exact` keeps the colours of pixels whose alpha is 0. A slower method saves little.
+WEBP_OPTIONS: dict[str, Any] = {"lossless": True, "exact": True, "quality": 25, "method": 1}
+
+# A constant time for files in the archive, so that the same scene gives the same bytes.
+ARCHIVE_TIME = (1980, 1, 1, 0, 0, 0)
 
 
 def encode_sog(scene: SceneFile) -> bytes:
     """Encode a scene as a bundled SOG file; the order of the Gaussians and the axes stay the same.
 
-    Positions have 16 bits for each axis, spaced logarithmically from 0; scales and colours are looked up in codebooks.
+    Positions have 16 bits for each axis, spaced logarithmically from 0; scales and colours are
+    looked up in codebooks.
 
     Raises:
         InputError: there are no Gaussians, or more than the images can hold.
@@ -50,26 +64,15 @@ def encode_sog(scene: SceneFile) -> bytes:
     count = len(scene.gaussians)
     if count == 0:
         raise InputError("SOG cannot hold a scene without Gaussians: use another format")
+    # About square images, whose sides are multiples of four.
     width = math.ceil(math.sqrt(count) / 4) * 4
     if width > LARGEST_SIDE:
         raise InputError(f"{count:,} Gaussians are too many for SOG: use another format")
-    columns = GaussianColumns.of(scene.gaussians)
-    means, low, high = _means(columns.means)
-    scale_book, scales = codebook(columns.log_scales)
-    color_book, colors = codebook(columns.harmonics)
-    opacities = np.round(columns.opacities * 255).astype(np.uint8)[:, None]
-    opaque = np.full_like(opacities, 255)
-    largest, others = encode_smallest_three(columns.quats)
-    quats = np.concatenate(
-        [np.round(components_to_fractions(others) * 255), largest[:, None] + 252], axis=1
-    ).astype(np.uint8)
-    pictures = {
-        "means_l.webp": [(means & 255).astype(np.uint8), opaque],
-        "means_u.webp": [(means >> 8).astype(np.uint8), opaque],
-        "scales.webp": [scales, opaque],
-        "quats.webp": [quats],
-        "sh0.webp": [colors, opacities],
-    }
+
+    columns = GaussianColumns.from_gaussians(scene.gaussians)
+    positions, low, high = _quantize_positions(columns.means)
+    scale_book, scale_codes = codebook(columns.log_scales)
+    color_book, color_codes = codebook(columns.harmonics)
     meta = {
         "version": 2,
         "asset": {"generator": "Spackle"},
@@ -83,101 +86,204 @@ def encode_sog(scene: SceneFile) -> bytes:
         "quats": {"files": ["quats.webp"]},
         "sh0": {"codebook": color_book.tolist(), "files": ["sh0.webp"]},
     }
-    files = {name: _webp(np.concatenate(parts, axis=1), width) for name, parts in pictures.items()}
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:  # WebP is compressed already
-        for name, content in {
-            "meta.json": json.dumps(meta, allow_nan=False).encode(),
-            **files,
-        }.items():
-            archive.writestr(zipfile.ZipInfo(name, EPOCH), content)
-    return buffer.getvalue()
+
+    opacities = np.round(columns.opacities * 255).astype(np.uint8)[:, None]  # [N, 1]
+    opaque = np.full_like(opacities, 255)
+    low_bytes = (positions & 255).astype(np.uint8)
+    high_bytes = (positions >> 8).astype(np.uint8)
+    # The pixels [N, 4] of each image.
+    pixels = {
+        "means_l.webp": np.concatenate([low_bytes, opaque], axis=1),
+        "means_u.webp": np.concatenate([high_bytes, opaque], axis=1),
+        "scales.webp": np.concatenate([scale_codes, opaque], axis=1),
+        "quats.webp": _encode_rotations(columns.quats),
+        "sh0.webp": np.concatenate([color_codes, opacities], axis=1),
+    }
+    members = {"meta.json": json.dumps(meta, allow_nan=False).encode()}
+    for name, rgba in pixels.items():
+        members[name] = _encode_webp(rgba, width)
+    return _zip_members(members)
 
 
 def codebook(values: Floats) -> tuple[Floats, NDArray[np.uint8]]:
-    """A codebook [256] for values [N, 3] with small squared error, and each value's code.
+    """Find 256 values with which given values can be stored with a small squared error.
 
-    The density of codes follows the cube root of the values' density, which is optimal for many codes. A quarter of the
-    codes is evenly spaced, for rare values. Up to 256 different values get a code each.
+    The density of the codes follows the cube root of the values' density, which is optimal for
+    many codes. A quarter of the codes is evenly spaced, for rare values. Up to 256 different
+    values get a code each.
+
+    Args:
+        values: [N, 3].
+
+    Returns:
+        The codebook [256], in which codes that no value uses hold the largest value, and the
+        code of each value [N, 3].
     """
-    low, high = float(values.min()), float(values.max())
-    bins = np.minimum((values - low) * (BINS / max(high - low, 1e-30)), BINS - 1).astype(np.int32)
-    flat = bins.ravel()
-    counts = np.bincount(flat, minlength=BINS)
-    different = np.count_nonzero(counts)
-    if different <= CODES:
-        code_of_bin = np.maximum(np.cumsum(counts > 0) - 1, 0).astype(np.uint8)
+    low = float(values.min())
+    high = float(values.max())
+    bin_per_value = BIN_COUNT / max(high - low, MIN_SPAN)
+    bins = np.minimum((values - low) * bin_per_value, BIN_COUNT - 1).astype(np.int32)
+    bin_counts = np.bincount(bins.ravel(), minlength=BIN_COUNT)  # [BIN_COUNT]
+
+    used_bin_count = np.count_nonzero(bin_counts)
+    if used_bin_count <= CODEBOOK_SIZE:
+        # The n-th bin in use gets code n; empty bins before the first one get 0, too.
+        code_of_bin = np.maximum(np.cumsum(bin_counts > 0) - 1, 0).astype(np.uint8)
     else:
-        roots = np.cbrt(counts)
-        share = (1 - EVEN) * roots / roots.sum() + EVEN / BINS
-        code_of_bin = ((np.cumsum(share) - share) * CODES).astype(np.uint8)
-    sums = np.bincount(code_of_bin, np.bincount(flat, values.ravel(), BINS), CODES)
-    totals = np.bincount(code_of_bin, counts, CODES)
-    book = np.where(totals > 0, sums / np.maximum(totals, 1), high).astype(np.float32)
+        # Each bin takes a share of the codes; a code's bins are those where its part begins.
+        roots = np.cbrt(bin_counts)
+        share = (1 - EVEN_CODES_SHARE) * roots / roots.sum() + EVEN_CODES_SHARE / BIN_COUNT
+        share_before = np.cumsum(share) - share
+        code_of_bin = (share_before * CODEBOOK_SIZE).astype(np.uint8)
+
+    # A code stands for the mean of the values that have it.
+    sum_of_bin = np.bincount(bins.ravel(), values.ravel(), BIN_COUNT)
+    sum_of_code = np.bincount(code_of_bin, sum_of_bin, CODEBOOK_SIZE)
+    count_of_code = np.bincount(code_of_bin, bin_counts, CODEBOOK_SIZE)
+    mean_of_code = sum_of_code / np.maximum(count_of_code, 1)
+    book = np.where(count_of_code > 0, mean_of_code, high).astype(np.float32)
     return book, code_of_bin[bins]
 
 
-def _means(means: Floats) -> tuple[NDArray[np.uint16], Floats, Floats]:
-    """Quantise the logarithms of positions [N, 3] to 0..65535; also returns their lower and upper bounds, [3] each."""
-    logs = np.copysign(np.log1p(np.abs(means)), means)
-    low, high = logs.min(axis=0), logs.max(axis=0)
-    span = np.maximum(high - low, np.float32(1e-30))
-    return np.round((logs - low) / span * np.float32(65535)).astype(np.uint16), low, high
+def _quantize_positions(means: Floats) -> tuple[NDArray[np.uint16], Floats, Floats]:
+    """Quantise positions [N, 3] on a logarithmic scale, which is fine near the origin.
+
+    Returns:
+        The codes [N, 3] in 0..65535 of sign(x) · ln(1 + |x|), and the lower and upper bound [3]
+        of these logarithms, to which the codes 0 and 65535 belong.
+    """
+    log_positions = np.copysign(np.log1p(np.abs(means)), means)
+    low = log_positions.min(axis=0)
+    high = log_positions.max(axis=0)
+    span = np.maximum(high - low, np.float32(MIN_SPAN))
+    fractions = (log_positions - low) / span
+    codes = np.round(fractions * np.float32(MAX_POSITION_CODE)).astype(np.uint16)
+    return codes, low, high
 
 
-def _webp(rgba: NDArray[np.uint8], width: int) -> bytes:
+def _encode_rotations(quats: Floats) -> NDArray[np.uint8]:
+    """Encode unit quaternions [N, 4] (w, x, y, z) as pixels [N, 4].
+
+    Red, green and blue hold the three smaller components, alpha the index of the largest one.
+    """
+    largest, others = encode_smallest_three(quats)
+    other_codes = np.round(components_to_fractions(others) * 255)  # [N, 3]
+    largest_codes = largest[:, None] + FIRST_LARGEST_COMPONENT_CODE  # [N, 1]
+    return np.concatenate([other_codes, largest_codes], axis=1).astype(np.uint8)
+
+
+def _encode_webp(rgba: NDArray[np.uint8], width: int) -> bytes:
     """Encode pixels [N, 4], row by row, as an image; unused pixels at the end are black."""
-    height = math.ceil(len(rgba) / width / 4) * 4
+    height = math.ceil(len(rgba) / width / 4) * 4  # a multiple of four, as the width is
     pixels = np.zeros((height * width, 4), np.uint8)
-    pixels[:, 3] = 255
+    pixels[:, 3] = 255  # opaque
     pixels[: len(rgba)] = rgba
     buffer = io.BytesIO()
-    Image.fromarray(pixels.reshape(height, width, 4)).save(buffer, "WEBP", **EFFORT)
+    Image.fromarray(pixels.reshape(height, width, 4)).save(buffer, "WEBP", **WEBP_OPTIONS)
+    return buffer.getvalue()
+
+
+def _zip_members(members: Mapping[str, bytes]) -> bytes:
+    """Return a zip archive of files by name, not compressed, because WebP already is."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
+        for name, content in members.items():
+            archive.writestr(zipfile.ZipInfo(name, ARCHIVE_TIME), content)
     return buffer.getvalue()
 
 
 def decode_sog(data: bytes) -> GaussianColumns:
-    """Decode a bundled SOG file of version 2; any exception if the file is damaged or of another version."""
+    """Decode a bundled SOG file of version 2.
+
+    Raises:
+        Exception: any exception, if the file is damaged or of another version.
+    """
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
-
-        def member(name: str) -> bytes:
-            if archive.getinfo(name).file_size > LARGEST_MEMBER:
-                raise ValueError(f"{name} is too large")
-            return archive.read(name)
-
-        meta = json.loads(member("meta.json"))
+        meta = json.loads(_read_member(archive, "meta.json"))
         if meta["version"] != 2:
             raise ValueError(f"version {meta['version']}, not 2")
         count = int(meta["count"])
+        # Pixels [N, 4] of each image.
+        means_images = _read_images(archive, meta["means"]["files"], count)
+        scales_images = _read_images(archive, meta["scales"]["files"], count)
+        quats_images = _read_images(archive, meta["quats"]["files"], count)
+        colors_images = _read_images(archive, meta["sh0"]["files"], count)
+    low_bytes, high_bytes = means_images
+    (scale_codes,) = scales_images
+    (rotation_codes,) = quats_images
+    (color_codes,) = colors_images
 
-        def pixels(name: str) -> NDArray[np.uint8]:
-            """Pixels [N, 4] of an image, without the padding at its end."""
-            with Image.open(io.BytesIO(member(name)), formats=["WEBP"]) as image:
-                if max(image.size) > LARGEST_SIDE or not 0 < count <= image.width * image.height:
-                    raise ValueError(
-                        f"{name} has {image.width}×{image.height} pixels for {count:,} Gaussians"
-                    )
-                return np.asarray(image.convert("RGBA")).reshape(-1, 4)[:count]
-
-        (lower, upper), (scales,), (quats,), (sh0,) = (
-            [pixels(name) for name in meta[key]["files"]]
-            for key in ("means", "scales", "quats", "sh0")
-        )
-    low, high = (np.array(meta["means"][end], np.float32).reshape(3) for end in ("mins", "maxs"))
-    logs = low + (high - low) * codes_to_fractions(
-        upper[:, :3] * np.uint32(256) + lower[:, :3], 65535
+    position_codes = high_bytes[:, :3] * np.uint32(256) + low_bytes[:, :3]
+    means = _dequantize_positions(position_codes, meta["means"]["mins"], meta["means"]["maxs"])
+    log_scales = _look_up_codes(scale_codes[:, :3], meta["scales"]["codebook"])
+    harmonics = _look_up_codes(color_codes[:, :3], meta["sh0"]["codebook"])
+    return GaussianColumns(
+        means=means,
+        quats=_decode_rotations(rotation_codes),
+        log_scales=log_scales,
+        opacities=codes_to_fractions(color_codes[:, 3], 255),
+        srgb=np.clip(harmonics_to_srgb(harmonics), 0, 1),
     )
-    largest = quats[:, 3].astype(np.int64) - 252
+
+
+def _read_member(archive: zipfile.ZipFile, name: str) -> bytes:
+    """Read a file of an archive; ValueError if it is too large, before it is decompressed."""
+    if archive.getinfo(name).file_size > MAX_MEMBER_BYTES:
+        raise ValueError(f"{name} is too large")
+    return archive.read(name)
+
+
+def _read_images(archive: zipfile.ZipFile, names: list[str], count: int) -> list[NDArray[np.uint8]]:
+    """Read images as pixels [count, 4], without the padding at their ends.
+
+    Raises:
+        ValueError: an image is too large, or has fewer than `count` pixels.
+    """
+    images = []
+    for name in names:
+        content = io.BytesIO(_read_member(archive, name))
+        # Only WebP, so that a stranger's file cannot reach the decoders of rare formats.
+        with Image.open(content, formats=["WEBP"]) as image:
+            pixel_count = image.width * image.height
+            if max(image.size) > LARGEST_SIDE or not 0 < count <= pixel_count:
+                size = f"{image.width}×{image.height}"
+                raise ValueError(f"{name} has {size} pixels for {count:,} Gaussians")
+            rgba = np.asarray(image.convert("RGBA"))
+        images.append(rgba.reshape(-1, 4)[:count])
+    return images
+
+
+def _dequantize_positions(codes: NDArray[np.uint32], low: object, high: object) -> Floats:
+    """Return positions [N, 3] from codes; the inverse of `_quantize_positions`.
+
+    Args:
+        codes: [N, 3] in 0..65535.
+        low, high: lists of the three logarithms to which the codes 0 and 65535 belong.
+    """
+    low_logs = np.array(low, np.float32).reshape(3)
+    high_logs = np.array(high, np.float32).reshape(3)
+    fractions = codes_to_fractions(codes, MAX_POSITION_CODE)
+    log_positions = low_logs + (high_logs - low_logs) * fractions
+    # Broken bounds may give infinite positions, which `GaussianColumns.to_gaussians` refuses.
+    with np.errstate(over="ignore"):
+        positions: Floats = np.copysign(np.expm1(np.abs(log_positions)), log_positions)
+    return positions
+
+
+def _look_up_codes(codes: NDArray[np.uint8], book: object) -> Floats:
+    """Return the values [N, 3] of codes [N, 3] in a codebook, a list of 256 numbers."""
+    values: Floats = np.array(book, np.float32).reshape(CODEBOOK_SIZE)
+    return values[codes]
+
+
+def _decode_rotations(rgba: NDArray[np.uint8]) -> Floats:
+    """Return unit quaternions [N, 4] (w, x, y, z); the inverse of `_encode_rotations`.
+
+    Raises:
+        ValueError: an alpha does not name a component.
+    """
+    largest = rgba[:, 3].astype(np.int64) - FIRST_LARGEST_COMPONENT_CODE
     if largest.min() < 0:
         raise ValueError("a rotation has no largest component")
-    log_scales, harmonics = (
-        np.array(meta[key]["codebook"], np.float32).reshape(CODES)[codes[:, :3]]
-        for key, codes in (("scales", scales), ("sh0", sh0))
-    )
-    with np.errstate(over="ignore"):  # `GaussianColumns.gaussians` refuses infinite values
-        means = np.copysign(np.expm1(np.abs(logs)), logs)
-    turns = decode_smallest_three(
-        largest, fractions_to_components(codes_to_fractions(quats[:, :3], 255))
-    )
-    srgb = np.clip(harmonics * np.float32(SH_C0) + np.float32(0.5), 0, 1)
-    return GaussianColumns(means, turns, log_scales, codes_to_fractions(sh0[:, 3], 255), srgb)
+    others = fractions_to_components(codes_to_fractions(rgba[:, :3], 255))
+    return decode_smallest_three(largest, others)

@@ -1,4 +1,7 @@
-"""SPZ, Niantic's compressed format: writes version 3 (20 bytes for each Gaussian, then deflated), reads 2 and 3."""
+"""SPZ, Niantic's compressed format: 20 bytes for each Gaussian, deflated as gzip does.
+
+`encode_spz` writes version 3; `decode_spz` reads the versions 2 and 3.
+"""
 
 from __future__ import annotations
 
@@ -12,66 +15,101 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spackle.core.gaussians import Gaussians
-from spackle.formats.scene_files import (
-    SH_C0,
-    Floats,
-    GaussianColumns,
-    SceneFile,
+from spackle.formats.gaussian_columns import SH_C0, Floats, GaussianColumns
+from spackle.formats.quantization import (
     codes_to_fractions,
     decode_smallest_three,
     encode_smallest_three,
 )
+from spackle.formats.scene_content import SceneFile
 from spackle.runtime.errors import InputError
 
-MAGIC, VERSION = 0x5053474E, 3
-HEADER = struct.Struct(
-    "<IIIBBBB"
-)  # magic, version, count, degree of harmonics, fractional bits, flags, reserved
-ROW = 20  # bytes for each Gaussian
-MAX_GRID_COORDINATE = 2**23 - 1  # largest coordinate, which has 24 bits
-FEWEST_BITS, MOST_BITS = 1, 23  # fractional bits of a coordinate
-NEAR_STEPS = 2048  # least number of grid steps in the near distance
-NEAR_SHARE = 0.01  # quantile of the Gaussians' distances that is the near distance
-COLOR_SCALE = 0.15  # colours are stored with room below 0 and above 1
-MAX_DEGREE = 3  # of spherical harmonics
-GZIP, WINDOW = 16, 15
-EFFORT = 5  # level 6 takes twice the time for files 1 % smaller
+MAGIC = 0x5053474E  # "NGSP", lowest byte first
+WRITTEN_VERSION = 3
+
+# Magic, version, number of Gaussians, degree of the spherical harmonics, fractional bits of a
+# coordinate, flags, a reserved byte.
+HEADER = struct.Struct("<IIIBBBB")
+
 MAX_COUNT = 10_000_000  # most Gaussians that the format's own library reads
+MAX_HARMONICS_DEGREE = 3
 
-# Rounded values deflate better. A file uses the finest of the levels in _DETAILS that keeps its size within 1/8 of the
-# PLY's size.
-MAX_BYTES_PER_GAUSSIAN = 8.5  # bytes for each Gaussian; the PLY has 68
-SMALL = 1 << 14  # bytes; smaller files need no further rounding
-SAMPLE, SAMPLES = (
-    1 << 13,
-    8,
-)  # consecutive Gaussians in a sample, and number of samples, with which levels are tried
-SAMPLED_LIMIT = (
-    8.7  # bytes for each Gaussian of a sample; samples deflate a little worse than the file
-)
+# A coordinate is a fixed-point number of 24 bits with a sign, of which some are fractional.
+MAX_GRID_COORDINATE = 2**23 - 1
+MIN_FRACTION_BITS = 1
+MAX_FRACTION_BITS = 23
+FRACTION_BITS_OF_EMPTY_SCENE = 12
+
+# The grid has at least this many steps in the distance of the nearest 1 % of the Gaussians.
+MIN_NEAR_STEPS = 2048
+NEAR_QUANTILE = 0.01
+
+# A length of 0 counts as this, so that no ratio divides by zero.
+MIN_LENGTH = 1e-30
+
+# A byte of a colour stands for 0.5 + 0.15 · f_dc, where f_dc is the coefficient of the constant
+# spherical harmonic. This leaves room for colours below 0 and above 1.
+COLOR_SCALE = 0.15
+
+# A byte of a scale stands for the logarithm -10 + byte / 16.
+MIN_LOG_SCALE = -10
+SCALE_STEPS = 16
+
+# The three smaller components of a quaternion, times √2, have a sign and 9 bits each.
+MAX_COMPONENT_CODE = 511
+COMPONENT_SIGN_BIT = 512
+
+# Arguments of zlib: the container of gzip, the largest window, the most memory.
+GZIP_WINDOW = 16 + 15
+DEFLATE_MEMORY = 9
+DEFLATE_LEVEL = 5  # level 6 takes twice the time for files 1 % smaller
+
+# A file may take an eighth of the PLY's 68 bytes for each Gaussian. Rounded values deflate
+# better, so values are rounded more and more coarsely until the file is small enough.
+MAX_BYTES_PER_GAUSSIAN = 8.5
+SMALL_FILE_BYTES = 1 << 14  # smaller files need no further rounding
+
+# Roundings are first tried on samples of consecutive Gaussians, which deflate a little worse
+# than the whole file does.
+SAMPLE_GAUSSIANS = 1 << 13
+SAMPLE_COUNT = 8
+MAX_BYTES_PER_SAMPLED_GAUSSIAN = 8.7
 
 
-class _Detail(NamedTuple):
-    position: float  # step in standard deviations of the Gaussian's middle axis
-    quat_bits: int  # bits, of 9, that are kept of each of the three smaller components
-    scale_step: int  # step of a scale's logarithm, in sixteenths
-    opacity_step: int  # step in 255ths
+class Rounding(NamedTuple):
+    """How coarsely the values of a file are rounded."""
+
+    position_step: float  # in standard deviations along the Gaussian's middle axis
+    component_bits: int  # how many of the 9 bits of a quaternion's component are kept
+    scale_step: int  # in sixteenths of a scale's logarithm
+    opacity_step: int  # in 255ths
 
 
-_DETAILS = [
-    _Detail(1 / 16, 9, 1, 1),
-    _Detail(1 / 8, 7, 1, 1),
-    _Detail(1 / 4, 6, 1, 2),
-    _Detail(1 / 4, 5, 2, 2),
+# From the finest to the coarsest; found by trials, so that each next one looks as good as it can.
+ROUNDINGS = [
+    Rounding(1 / 16, 9, 1, 1),
+    Rounding(1 / 8, 7, 1, 1),
+    Rounding(1 / 4, 6, 1, 2),
+    Rounding(1 / 4, 5, 2, 2),
+    Rounding(1 / 2, 5, 2, 4),
+    Rounding(1 / 2, 4, 2, 4),
+    Rounding(1 / 2, 4, 4, 8),
 ]
-_DETAILS += [_Detail(1 / 2, 5, 2, 4), _Detail(1 / 2, 4, 2, 4), _Detail(1 / 2, 4, 4, 8)]
+
+
+class SpzGrid(NamedTuple):
+    """The grid to which positions are rounded."""
+
+    fraction_bits: int  # the grid's step is 2 to the power of -fraction_bits
+    outside_count: int  # how many Gaussians lie beyond the largest coordinate
 
 
 def encode_spz(scene: SceneFile) -> bytes:
-    """Encode a scene as an SPZ file of version 3, in the scene's order; y up and z backward as the format requires.
+    """Encode a scene as an SPZ file of version 3, in the scene's order.
 
-    Positions are rounded to a grid (see `spz_grid`). Gaussians outside the grid's range are moved towards the origin
-    and shrunk, which does not change the view from the origin.
+    The axes become y up and z backward, as the format requires. Positions are rounded to the
+    grid of `spz_grid`. A Gaussian outside of the grid is moved towards the origin and shrunk
+    in proportion, which does not change the view from the origin.
 
     Raises:
         InputError: there are more Gaussians than readers accept.
@@ -79,149 +117,243 @@ def encode_spz(scene: SceneFile) -> bytes:
     """
     count = len(scene.gaussians)
     if count > MAX_COUNT:
-        raise InputError(
-            f"{count:,} Gaussians are too many for SPZ (at most {MAX_COUNT:,}): use another format"
-        )
-    columns = GaussianColumns.of(scene.gaussians).flipped()
-    bits, _ = spz_grid(scene.gaussians)
-    columns = _within(columns, bits)
-    header = HEADER.pack(MAGIC, VERSION, count, 0, bits, 0, 0)
+        problem = f"{count:,} Gaussians are too many for SPZ (at most {MAX_COUNT:,})"
+        raise InputError(f"{problem}: use another format")
+
+    columns = GaussianColumns.from_gaussians(scene.gaussians).flip_y_and_z()
+    fraction_bits = spz_grid(scene.gaussians).fraction_bits
+    columns = _shrink_into_grid(columns, fraction_bits)
+    header = HEADER.pack(MAGIC, WRITTEN_VERSION, count, 0, fraction_bits, 0, 0)
+
     data = b""
-    for detail in _DETAILS[_finest(columns, bits) :]:
-        data = _deflated(header + b"".join(_sections(columns, bits, detail)))
-        if len(data) <= max(MAX_BYTES_PER_GAUSSIAN * count, SMALL):
+    max_bytes = max(MAX_BYTES_PER_GAUSSIAN * count, SMALL_FILE_BYTES)
+    finest = _finest_rounding_of_samples(columns, fraction_bits)
+    for rounding in ROUNDINGS[finest:]:
+        data = _deflate(header + b"".join(_encode_sections(columns, fraction_bits, rounding)))
+        if len(data) <= max_bytes:
             break
     return data
 
 
-def spz_grid(gaussians: Gaussians) -> tuple[int, int]:
-    """The number of fractional bits of positions, and the number of Gaussians outside the grid's range."""
-    means = gaussians.means.detach().to("cpu").double().numpy()
-    if not len(means):
-        return 12, 0
-    reach, distance = np.abs(means).max(axis=1), np.sqrt((means * means).sum(axis=1))
-    near = float(
-        np.partition(distance, int(NEAR_SHARE * len(distance)))[int(NEAR_SHARE * len(distance))]
+def spz_grid(gaussians: Gaussians) -> SpzGrid:
+    """Choose the grid for the positions of a scene.
+
+    The grid is as fine as the farthest Gaussian allows; but if it would be too coarse for the
+    nearest ones, it is finer, and distant Gaussians lie outside.
+    """
+    means = gaussians.means.detach().to("cpu").double().numpy()  # [N, 3]
+    if len(means) == 0:
+        return SpzGrid(FRACTION_BITS_OF_EMPTY_SCENE, 0)
+    largest_coordinate = np.abs(means).max(axis=1)  # [N]
+    distance = np.sqrt((means * means).sum(axis=1))  # [N]
+
+    near_index = int(NEAR_QUANTILE * len(distance))
+    near_distance = float(np.partition(distance, near_index)[near_index])
+    farthest_coordinate = float(largest_coordinate.max())
+    bits_for_all = np.floor(np.log2(MAX_GRID_COORDINATE / max(farthest_coordinate, MIN_LENGTH)))
+    bits_for_near = np.ceil(np.log2(MIN_NEAR_STEPS / max(near_distance, MIN_LENGTH)))
+    fraction_bits = int(
+        np.clip(max(bits_for_all, bits_for_near), MIN_FRACTION_BITS, MAX_FRACTION_BITS)
     )
-    holds_all = np.floor(np.log2(MAX_GRID_COORDINATE / max(float(reach.max()), 1e-30)))
-    shows_near = np.ceil(np.log2(NEAR_STEPS / max(near, 1e-30)))
-    bits = int(np.clip(max(holds_all, shows_near), FEWEST_BITS, MOST_BITS))
-    return bits, int((reach * 2.0**bits > MAX_GRID_COORDINATE).sum())
+
+    is_outside = largest_coordinate * 2.0**fraction_bits > MAX_GRID_COORDINATE
+    return SpzGrid(fraction_bits, int(is_outside.sum()))
 
 
-def _within(columns: GaussianColumns, bits: int) -> GaussianColumns:
-    """Shrink positions and sizes of Gaussians outside the grid's range towards the origin, until they fit."""
-    reach = np.abs(columns.means).max(axis=1, initial=0).astype(np.float64)
-    factor = np.minimum(1, MAX_GRID_COORDINATE / 2.0**bits / np.maximum(reach, 1e-30))[:, None]
-    means, log_scales = columns.means * factor, columns.log_scales + np.log(factor)
+def _shrink_into_grid(columns: GaussianColumns, fraction_bits: int) -> GaussianColumns:
+    """Scale each Gaussian outside of the grid, about the origin, until it fits.
+
+    Position and size shrink by the same factor, so the view from the origin stays the same.
+    """
+    largest_coordinate = np.abs(columns.means).max(axis=1, initial=0).astype(np.float64)  # [N]
+    grid_end = MAX_GRID_COORDINATE / 2.0**fraction_bits
+    factor = np.minimum(1, grid_end / np.maximum(largest_coordinate, MIN_LENGTH))[:, None]
+    means = columns.means * factor
+    log_scales = columns.log_scales + np.log(factor)
     return dataclasses.replace(
         columns, means=means.astype(np.float32), log_scales=log_scales.astype(np.float32)
     )
 
 
-def _finest(columns: GaussianColumns, bits: int) -> int:
-    """Index of the finest rounding that keeps deflated samples within SAMPLED_LIMIT; the coarsest if none does."""
-    count = len(columns.means)
-    starts = np.unique(np.linspace(0, max(0, count - SAMPLE), SAMPLES).astype(np.int64))
-    rows = np.concatenate([np.arange(start, min(start + SAMPLE, count)) for start in starts])
-    sample = columns.select(rows)
+def _finest_rounding_of_samples(columns: GaussianColumns, fraction_bits: int) -> int:
+    """Return the index in ROUNDINGS of the finest one with which samples get small enough.
 
-    def fits(detail: _Detail) -> bool:
-        return len(_deflated(b"".join(_sections(sample, bits, detail)))) <= max(
-            SAMPLED_LIMIT * len(rows), SMALL
-        )
-
-    return bisect.bisect_left(_DETAILS[:-1], True, key=fits)
-
-
-def _sections(columns: GaussianColumns, bits: int, detail: _Detail) -> list[bytes]:
-    """The bytes of positions, opacities, colours, scales and rotations, in the file's order."""
-    scales = (
-        np.round((columns.log_scales + 10) * np.float32(16 / detail.scale_step)) * detail.scale_step
-    )
-    scales = np.clip(scales, 0, 255).astype(np.uint8)
-    colors = (columns.srgb - np.float32(0.5)) * np.float32(COLOR_SCALE * 255 / SH_C0) + np.float32(
-        127.5
-    )
-    step = detail.opacity_step
-    ball = (scales == scales[:, :1]).all(
-        axis=1, keepdims=True
-    )  # the rotation of a sphere is invisible
-    quats = np.where(ball, np.array([1, 0, 0, 0], np.float32), columns.quats)
-    return [
-        _positions(columns, bits, detail.position).tobytes(),
-        np.minimum(255, np.round(columns.opacities * (255 / step)) * step)
-        .astype(np.uint8)
-        .tobytes(),
-        np.clip(np.round(colors), 0, 255).astype(np.uint8).tobytes(),
-        scales.tobytes(),
-        _rotations(quats, detail.quat_bits).tobytes(),
-    ]
-
-
-def _positions(columns: GaussianColumns, bits: int, share: float) -> NDArray[np.uint8]:
-    """Positions as bytes [N, 9]: 24-bit fixed point, in steps of up to `share` times the Gaussian's middle axis."""
-    a, b, c = columns.log_scales.T
-    middle = np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c))
-    exponent = np.floor(middle / np.float32(np.log(2)) + np.float32(np.log2(share) + bits))
-    step = np.exp2(np.clip(exponent, 0, 20))[:, None]
-    fixed = np.round(columns.means * np.float64(2.0**bits) / step) * step
-    whole = np.clip(fixed, -MAX_GRID_COORDINATE, MAX_GRID_COORDINATE).astype("<i4")
-    return np.ascontiguousarray(whole.view(np.uint8).reshape(-1, 3, 4)[:, :, :3])
-
-
-def _rotations(quats: Floats, bits: int) -> NDArray[np.uint32]:
-    """Pack unit quaternions wxyz into words [N].
-
-    A word has the index of the largest of xyzw, then a sign and 9 bits, rounded to `bits`, for each other component.
+    The index of the coarsest one if none does.
     """
-    largest, others = encode_smallest_three(quats[:, [1, 2, 3, 0]])
-    step = 2 ** (9 - bits)
-    sizes = np.minimum(
-        511, np.round(np.abs(others) * np.float32(511 * 2**0.5 / step)) * step
-    ).astype("<u4")
+    count = len(columns.means)
+    last_start = max(0, count - SAMPLE_GAUSSIANS)
+    starts = np.unique(np.linspace(0, last_start, SAMPLE_COUNT).astype(np.int64))
+    samples = [np.arange(start, min(start + SAMPLE_GAUSSIANS, count)) for start in starts]
+    rows = np.concatenate(samples)
+    sampled_columns = columns.select(rows)
+    max_bytes = max(MAX_BYTES_PER_SAMPLED_GAUSSIAN * len(rows), SMALL_FILE_BYTES)
+
+    def is_small_enough(rounding: Rounding) -> bool:
+        sections = _encode_sections(sampled_columns, fraction_bits, rounding)
+        return len(_deflate(b"".join(sections))) <= max_bytes
+
+    # Coarser roundings give smaller files, so bisection finds the first one that is enough.
+    return bisect.bisect_left(ROUNDINGS[:-1], True, key=is_small_enough)
+
+
+def _encode_sections(
+    columns: GaussianColumns, fraction_bits: int, rounding: Rounding
+) -> list[bytes]:
+    """Return the bytes of positions, opacities, colours, scales and rotations, as a file has them.
+
+    Args:
+        columns: N Gaussians with y up and z backward.
+        fraction_bits: the positions' grid has steps of 2 to the power of -fraction_bits.
+        rounding: how coarsely values are rounded.
+    """
+    positions = _encode_positions(columns, fraction_bits, rounding.position_step)
+
+    opacity_steps = np.round(columns.opacities * (255 / rounding.opacity_step))
+    opacities = np.minimum(255, opacity_steps * rounding.opacity_step).astype(np.uint8)
+
+    # srgb = 0.5 + SH_C0 · f_dc, and a byte stands for 0.5 + COLOR_SCALE · f_dc.
+    byte_per_srgb = np.float32(COLOR_SCALE * 255 / SH_C0)
+    color_bytes = (columns.srgb - np.float32(0.5)) * byte_per_srgb + np.float32(127.5)
+    colors = np.clip(np.round(color_bytes), 0, 255).astype(np.uint8)
+
+    step_per_log = np.float32(SCALE_STEPS / rounding.scale_step)
+    scale_steps = np.round((columns.log_scales - MIN_LOG_SCALE) * step_per_log)
+    scales = np.clip(scale_steps * rounding.scale_step, 0, 255).astype(np.uint8)
+
+    # The rotation of a sphere is invisible, and equal rotations deflate best.
+    is_sphere = (scales == scales[:, :1]).all(axis=1, keepdims=True)  # [N, 1]
+    quats = np.where(is_sphere, np.array([1, 0, 0, 0], np.float32), columns.quats)
+    rotations = _encode_rotations(quats, rounding.component_bits)
+    return [part.tobytes() for part in (positions, opacities, colors, scales, rotations)]
+
+
+def _encode_positions(
+    columns: GaussianColumns, fraction_bits: int, relative_step: float
+) -> NDArray[np.uint8]:
+    """Return positions as bytes [N, 9]: three fixed-point numbers of 24 bits, lowest byte first.
+
+    Args:
+        columns: N Gaussians.
+        fraction_bits: how many of a number's bits are fractional.
+        relative_step: positions are rounded to a power of two of at most this many standard
+            deviations along the Gaussian's middle axis, because finer detail is invisible.
+    """
+    a, b, c = columns.log_scales.T  # [N] each
+    middle_log_scale = np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c))
+    # The base-2 logarithm of the rounding step, in steps of the grid.
+    log2_scale = middle_log_scale / np.float32(np.log(2))
+    exponent = np.floor(log2_scale + np.float32(np.log2(relative_step) + fraction_bits))
+    step = np.exp2(np.clip(exponent, 0, 20))[:, None]  # [N, 1]; 2^20 leaves 3 of the 23 bits
+
+    grid_positions = columns.means * np.float64(2.0**fraction_bits)
+    rounded = np.round(grid_positions / step) * step
+    numbers = np.clip(rounded, -MAX_GRID_COORDINATE, MAX_GRID_COORDINATE).astype("<i4")
+    all_bytes = numbers.view(np.uint8).reshape(-1, 3, 4)
+    return np.ascontiguousarray(all_bytes[:, :, :3])  # without the highest byte, which is the sign
+
+
+def _encode_rotations(quats: Floats, component_bits: int) -> NDArray[np.uint32]:
+    """Pack unit quaternions [N, 4] (w, x, y, z) into words of 32 bits [N].
+
+    From the highest bit on, a word has two bits for the index of the largest component of
+    (x, y, z, w), and for each other component its sign and nine bits of its size. Only the
+    `component_bits` upper ones of the nine are used.
+    """
+    xyzw = quats[:, [1, 2, 3, 0]]
+    largest, others = encode_smallest_three(xyzw)  # [N], [N, 3]
+    step = 2 ** (9 - component_bits)
+    code_per_component = np.float32(MAX_COMPONENT_CODE * 2**0.5 / step)
+    rounded = np.round(np.abs(others) * code_per_component) * step
+    sizes = np.minimum(MAX_COMPONENT_CODE, rounded).astype("<u4")
+    is_negative = (others < 0) & (sizes > 0)  # zero has no sign, so that equal values stay equal
+    codes = sizes | is_negative.astype("<u4") << 9  # [N, 3]
+
     words: NDArray[np.uint32] = largest.astype("<u4")
-    for size, other in zip(sizes.T, others.T, strict=True):
-        words = words << 10 | ((other < 0) & (size > 0)).astype("<u4") << 9 | size
+    for component in range(3):
+        words = words << 10 | codes[:, component]
     return words
 
 
-def _deflated(data: bytes) -> bytes:
-    deflater = zlib.compressobj(EFFORT, zlib.DEFLATED, GZIP + WINDOW, 9)
-    return deflater.compress(data) + deflater.flush()
+def _deflate(data: bytes) -> bytes:
+    """Compress bytes as gzip does, without a time, so that equal data gives equal files."""
+    compressor = zlib.compressobj(DEFLATE_LEVEL, zlib.DEFLATED, GZIP_WINDOW, DEFLATE_MEMORY)
+    return compressor.compress(data) + compressor.flush()
 
 
 def decode_spz(data: bytes) -> GaussianColumns:
-    """Decode the Gaussians of an SPZ file, with y down and z forward, and colours of degree 0.
+    """Decode an SPZ file, with y down and z forward, and colours of degree 0.
 
-    ValueError or zlib.error for another version or a damaged file. Never inflates more than the header announces.
+    A file is never inflated beyond the size that its header announces.
+
+    Raises:
+        ValueError: the file has another version, or is too short.
+        zlib.error: the file is damaged.
     """
-    inflater = zlib.decompressobj(GZIP + WINDOW)
+    inflater = zlib.decompressobj(GZIP_WINDOW)
     head = inflater.decompress(data, HEADER.size)
-    magic, version, count, degree, bits, _, _ = HEADER.unpack(head)
-    if magic != MAGIC or version not in (2, 3) or degree > MAX_DEGREE or count > MAX_COUNT:
-        raise ValueError(
-            f"version {version} with {count:,} Gaussians and harmonics of degree {degree}"
-        )
-    widths = (9, 1, 3, 3, 4 if version == 3 else 3)  # bytes of `_sections`
-    body = inflater.decompress(inflater.unconsumed_tail, max(1, count * sum(widths)))
-    if len(body) != count * sum(widths):
+    magic, version, count, degree, fraction_bits, _, _ = HEADER.unpack(head)
+    is_known = magic == MAGIC and version in (2, 3)
+    if not is_known or degree > MAX_HARMONICS_DEGREE or count > MAX_COUNT:
+        harmonics = f"harmonics of degree {degree}"
+        raise ValueError(f"version {version} with {count:,} Gaussians and {harmonics}")
+
+    # Bytes of a Gaussian's position, opacity, colour, scales and rotation. Harmonics of higher
+    # degrees come after all of these, and are not inflated.
+    widths = (9, 1, 3, 3, 4 if version == 3 else 3)
+    body_bytes = count * sum(widths)
+    # The limit 0 would mean no limit.
+    body = inflater.decompress(inflater.unconsumed_tail, max(1, body_bytes))
+    if len(body) != body_bytes:
         raise ValueError(f"it ends after {len(body):,} bytes of {count:,} Gaussians")
-    cut = np.split(np.frombuffer(body, np.uint8), np.cumsum(widths)[:-1] * count)
-    places, alphas, colors, scales, turns = (part.reshape(count, -1) for part in cut)
-    fixed = np.pad(places.reshape(-1, 3), ((0, 0), (1, 0))).view("<i4").reshape(count, 3) >> 8
-    srgb = (codes_to_fractions(colors, 255) - np.float32(0.5)) * np.float32(
-        SH_C0 / COLOR_SCALE
-    ) + np.float32(0.5)
+
+    section_ends = np.cumsum(widths)[:-1] * count
+    sections = np.split(np.frombuffer(body, np.uint8), section_ends)
+    positions, opacities, colors, scales, rotations = (
+        section.reshape(count, -1) for section in sections
+    )
+    # A byte stands for 0.5 + COLOR_SCALE · f_dc, and srgb = 0.5 + SH_C0 · f_dc.
+    srgb_per_color = np.float32(SH_C0 / COLOR_SCALE)
+    centered_colors = codes_to_fractions(colors, 255) - np.float32(0.5)
+    srgb = centered_colors * srgb_per_color + np.float32(0.5)
     if version == 3:
-        words = turns.copy().view("<u4")
-        fields = words >> np.array([20, 10, 0], np.uint32)
-        sizes = (fields & 511).astype(np.float32) / np.float32(511 * 2**0.5)
-        xyzw = decode_smallest_three(words[:, 0] >> 30, np.where(fields & 512, -sizes, sizes))
-    else:  # version 2 omits w
-        xyzw = decode_smallest_three(np.full(count, 3), codes_to_fractions(turns, 255) * 2 - 1)
-    means, log_scales = (fixed / 2.0**bits).astype(np.float32), codes_to_fractions(scales, 16) - 10
-    opacities = codes_to_fractions(alphas[:, 0], 255)
-    return GaussianColumns(
-        means, xyzw[:, [3, 0, 1, 2]], log_scales, opacities, np.clip(srgb, 0, 1)
-    ).flipped()
+        quats = _decode_rotations(rotations)
+    else:
+        quats = _decode_rotations_of_version_2(rotations)
+    columns = GaussianColumns(
+        means=_decode_positions(positions, fraction_bits),
+        quats=quats,
+        log_scales=codes_to_fractions(scales, SCALE_STEPS) + MIN_LOG_SCALE,
+        opacities=codes_to_fractions(opacities[:, 0], 255),
+        srgb=np.clip(srgb, 0, 1),
+    )
+    return columns.flip_y_and_z()
+
+
+def _decode_positions(positions: NDArray[np.uint8], fraction_bits: int) -> Floats:
+    """Return positions [N, 3] from bytes [N, 9]: three numbers of 24 bits, lowest byte first."""
+    three_bytes = positions.reshape(-1, 3)
+    # With an empty lowest byte, the sign stands in the highest bit of an int32; the shift by 8
+    # bits then extends the sign.
+    four_bytes = np.pad(three_bytes, ((0, 0), (1, 0)))
+    numbers = four_bytes.view("<i4").reshape(len(positions), 3) >> 8
+    return (numbers / 2.0**fraction_bits).astype(np.float32)
+
+
+def _decode_rotations(rotations: NDArray[np.uint8]) -> Floats:
+    """Return unit quaternions [N, 4] (w, x, y, z) from words of version 3, as bytes [N, 4]."""
+    words = rotations.copy().view("<u4")  # [N, 1]
+    codes = words >> np.array([20, 10, 0], np.uint32)  # [N, 3]; the lowest ten bits count
+    sizes = (codes & MAX_COMPONENT_CODE).astype(np.float32)
+    sizes = sizes / np.float32(MAX_COMPONENT_CODE * 2**0.5)
+    others = np.where(codes & COMPONENT_SIGN_BIT, -sizes, sizes)
+    xyzw = decode_smallest_three(words[:, 0] >> 30, others)
+    return xyzw[:, [3, 0, 1, 2]]
+
+
+def _decode_rotations_of_version_2(rotations: NDArray[np.uint8]) -> Floats:
+    """Return unit quaternions [N, 4] (w, x, y, z) from bytes [N, 3] for x, y, z in -1..1."""
+    xyz = codes_to_fractions(rotations, 255) * 2 - 1
+    # The file omits w (index 3 of x, y, z, w), whichever component is the largest.
+    omitted = np.full(len(rotations), 3)
+    xyzw = decode_smallest_three(omitted, xyz)
+    return xyzw[:, [3, 0, 1, 2]]

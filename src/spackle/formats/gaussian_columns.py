@@ -1,0 +1,130 @@
+"""Gaussians as NumPy columns, in the units that the file formats share."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from spackle.core.color import linear_to_srgb, srgb_to_linear
+from spackle.core.gaussians import Gaussians
+
+Floats = NDArray[np.float32]
+
+# The value of the spherical harmonic of degree 0, which is constant: 1 / (2 √π).
+SH_C0 = 0.28209479177387814
+
+# Between these bounds, a scale and its logarithm are finite in float32.
+MIN_SCALE = 1e-37
+MAX_SCALE = 1e37
+
+# A shorter quaternion has no direction.
+MIN_QUAT_LENGTH = 1e-12
+
+
+@dataclasses.dataclass(frozen=True)
+class GaussianColumns:
+    """N Gaussians as float32 NumPy columns."""
+
+    means: Floats  # [N, 3] centres
+    quats: Floats  # [N, 4] rotations as unit quaternions (w, x, y, z)
+    log_scales: Floats  # [N, 3] natural logarithms of the standard deviations
+    opacities: Floats  # [N] in 0..1
+    srgb: Floats  # [N, 3] colours in 0..1
+
+    @staticmethod
+    @torch.no_grad()
+    def from_gaussians(gaussians: Gaussians) -> GaussianColumns:
+        """Convert Gaussians to columns with values that every format can store.
+
+        Colours are clamped to 0..1 and scales to MIN_SCALE..MAX_SCALE. A quaternion of length 0
+        becomes (1, 0, 0, 0), the rotation by 0°.
+
+        Raises:
+            ValueError: a value is not finite; only scales may be infinite.
+        """
+        gaussians = gaussians.detach().to("cpu", torch.float32)
+        for name, tensor in vars(gaussians).items():
+            # An infinite scale is allowed, because it is clamped below; NaN is not.
+            checked = tensor.clamp(-1, 1) if name == "scales" else tensor
+            if not torch.isfinite(checked).all():
+                raise ValueError(f"{name} of these Gaussians are not all finite")
+
+        # NumPy's logarithm, because torch would start threads for every block of a PLY.
+        scales = np.clip(gaussians.scales.numpy(), MIN_SCALE, MAX_SCALE)
+        return GaussianColumns(
+            means=gaussians.means.numpy(),
+            quats=_unit_quats(gaussians.quats).numpy(),
+            log_scales=np.log(scales),
+            opacities=gaussians.opacities.clamp(0, 1).numpy(),
+            srgb=linear_to_srgb(gaussians.colors).numpy(),
+        )
+
+    def to_gaussians(self) -> Gaussians:
+        """Convert the columns to Gaussians on the CPU.
+
+        Raises:
+            ValueError: a value is not finite.
+        """
+        # A large logarithm gives an infinite scale, which is refused below.
+        with np.errstate(over="ignore", invalid="ignore"):
+            scales = np.exp(self.log_scales)
+        columns = (self.means, self.quats, scales, self.opacities, self.srgb)
+
+        count = len(self.means)
+        is_finite = np.ones(count, bool)
+        for column in columns:
+            is_finite &= np.isfinite(column.reshape(count, -1)).all(axis=1)
+        broken_count = count - np.count_nonzero(is_finite)
+        if broken_count > 0:
+            raise ValueError(f"{broken_count} of {count} Gaussians are not finite")
+
+        means, quats, scale_tensor, opacities, srgb = (
+            torch.from_numpy(np.array(column, np.float32)) for column in columns
+        )
+        return Gaussians(means, quats, scale_tensor, opacities, srgb_to_linear(srgb))
+
+    @property
+    def harmonics(self) -> Floats:
+        """[N, 3] coefficients of the constant spherical harmonic that give the sRGB colours."""
+        return (self.srgb - np.float32(0.5)) / np.float32(SH_C0)
+
+    def flip_y_and_z(self) -> GaussianColumns:
+        """Rotate the scene by 180° about the x axis.
+
+        This turns OpenCV's axes (y down, z forward) into those of OpenGL and glTF (y up, z
+        backward), and back.
+        """
+        flipped_means = self.means * np.array([1, -1, -1], np.float32)
+        # Conjugation with the rotation by 180° about x negates y and z of (w, x, y, z).
+        flipped_quats = self.quats * np.array([1, 1, -1, -1], np.float32)
+        return dataclasses.replace(self, means=flipped_means, quats=flipped_quats)
+
+    def select(self, rows: NDArray[np.int64] | slice) -> GaussianColumns:
+        """Return the Gaussians that an index array [M] or a slice selects."""
+        names = [field.name for field in dataclasses.fields(self)]
+        return GaussianColumns(*(getattr(self, name)[rows] for name in names))
+
+
+def harmonics_to_srgb(harmonics: Floats) -> Floats:
+    """Return the colours of coefficients of the constant spherical harmonic, not clamped.
+
+    The inverse of `GaussianColumns.harmonics`: srgb = harmonics / (2 √π) + 0.5.
+    """
+    return harmonics * np.float32(SH_C0) + np.float32(0.5)
+
+
+def _unit_quats(quats: Tensor) -> Tensor:
+    """Normalise quaternions [N, 4] (w, x, y, z); one of length 0 becomes (1, 0, 0, 0)."""
+    # The squares of large components would overflow, so these are scaled to at most 1 first.
+    largest_component = quats.abs().amax(-1, keepdim=True)  # [N, 1]
+    quats = quats / largest_component.clamp_min(1.0)
+    length = torch.linalg.vector_norm(quats, dim=-1, keepdim=True)  # [N, 1]
+    return torch.where(
+        length < MIN_QUAT_LENGTH,
+        torch.tensor([1.0, 0, 0, 0]),
+        quats / length.clamp_min(MIN_QUAT_LENGTH),
+    )

@@ -1,0 +1,250 @@
+"""The container of a PLY file: a text header, then binary tables. Knows nothing of Gaussians.
+
+`PlyTables` reads a file; `ply_header` writes the header of one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spackle.core.camera import Camera
+from spackle.runtime.errors import InputError, as_input_error
+from spackle.runtime.files import check_file
+
+MAX_HEADER_BYTES = 1 << 16
+
+# NumPy's codes of PLY's types, by their old and their new names; the byte order is put before.
+NUMPY_TYPES = {
+    "char": "i1",
+    "uchar": "u1",
+    "short": "i2",
+    "ushort": "u2",
+    "int": "i4",
+    "uint": "u4",
+    "float": "f4",
+    "double": "f8",
+    "int8": "i1",
+    "uint8": "u1",
+    "int16": "i2",
+    "uint16": "u2",
+    "int32": "i4",
+    "uint32": "u4",
+    "float32": "f4",
+    "float64": "f8",
+}
+NUMPY_BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
+
+# The type, in `PlyElement.fields`, of a property that is a list, and so has no fixed size.
+LIST_TYPE = "list"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class NewTable:
+    """A table for the header of a new file."""
+
+    name: str
+    row_count: int
+    type: str  # PLY's name of the type that all properties have, such as "float"
+    properties: Sequence[str]
+
+
+def ply_header(
+    *tables: NewTable,
+    camera: Camera | None = None,
+    base_count: int | None = None,
+    disparity: float | None = None,
+) -> bytes:
+    """Return the header of a binary PLY file, with what Spackle knows of the scene as comments.
+
+    Args:
+        tables: the file's tables, in their order.
+        camera: the photo's camera, at the world's origin.
+        base_count: how many Gaussians come from the photo; those that fill holes come after.
+        disparity: the relative camera movement for which the scene was completed.
+    """
+    lines = ["ply", "format binary_little_endian 1.0"]
+    if camera is not None:
+        principal_point = camera.K[:2, 2].tolist()
+        numbers = [*camera.focal, *principal_point, camera.width, camera.height]
+        lines.append("comment spackle_camera " + " ".join(repr(number) for number in numbers))
+    if base_count is not None:
+        lines.append(f"comment spackle_base {base_count!r}")
+    if disparity is not None:
+        lines.append(f"comment spackle_disparity {disparity!r}")
+
+    for table in tables:
+        lines.append(f"element {table.name} {table.row_count}")
+        for property_name in table.properties:
+            lines.append(f"property {table.type} {property_name}")
+    lines.append("end_header")
+    return "".join(f"{line}\n" for line in lines).encode()
+
+
+@dataclasses.dataclass
+class PlyElement:
+    """One table of a PLY file, which PLY calls an element."""
+
+    name: str
+    row_count: int
+    # (name of a property, NumPy's type or LIST_TYPE), in the file's order.
+    fields: list[tuple[str, str]] = dataclasses.field(default_factory=list)
+    # The offset of the first row in the file, in bytes; -1 from the first table with lists on,
+    # because the size of such a table is known only after reading it.
+    start_byte: int = -1
+
+    @property
+    def property_names(self) -> list[str]:
+        """The names of the properties, in the file's order."""
+        return [name for name, _ in self.fields]
+
+    @property
+    def has_lists(self) -> bool:
+        """Whether a property is a list."""
+        return any(field_type == LIST_TYPE for _, field_type in self.fields)
+
+
+class PlyTables:
+    """The header of a binary PLY file, and its tables up to the first one with lists."""
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        """Read the header of a file.
+
+        Raises:
+            InputError: the file is no PLY file, its header is broken or has no end, or the file
+                is too short for the tables that the header announces.
+        """
+        self.path = path
+        self.file_bytes = check_file(path, "PLY file")
+        self.elements: list[PlyElement] = []
+        # The first word of each comment, and its other words.
+        self.comments: dict[str, list[str]] = {}
+        self._byte_order = ""  # "<" or ">", once the format line has been read
+
+        with open(path, "rb") as file:
+            head = file.read(MAX_HEADER_BYTES)
+        first_line = head.split(b"\n", 1)[0].rstrip()
+        if first_line != b"ply":
+            problem = "not a PLY file: its first line must be 'ply'"
+            raise InputError(f"{path}: {problem} (`spackle predict` makes one)")
+        end_line = re.search(rb"\n[ \t]*end_header[ \t\r]*\n", head)
+        if end_line is None:
+            raise InputError(f"{path}: the header has no end: the file is damaged or cut off")
+
+        # The parser unpacks whatever a line holds; a broken one raises one of these errors.
+        with as_input_error(path, "broken PLY header: {reason}", ValueError, KeyError, IndexError):
+            lines = head[: end_line.start()].decode("latin-1").split("\n")
+            for line in lines[1:]:  # the first line is "ply"
+                self._parse_line(line.split())
+            if not self._byte_order:
+                raise ValueError("there is no format line")
+            self._set_start_bytes(end_line.end())
+
+    def elements_named(self, name: str) -> list[PlyElement]:
+        """Return the tables with this name; a sound file has at most one."""
+        return [element for element in self.elements if element.name == name]
+
+    def rows(self, element: PlyElement) -> NDArray[Any]:
+        """Read the rows of a table, as a structured array [row_count]."""
+        return np.fromfile(self.path, element.fields, element.row_count, offset=element.start_byte)
+
+    def small_columns(self, max_rows: int) -> dict[str, NDArray[np.float64]]:
+        """Read all tables of at most `max_rows` rows, except that of the vertices.
+
+        Programs store a camera, for example, in such tables.
+
+        Returns:
+            The numbers of each property [row_count] by the property's name.
+        """
+        columns = {}
+        for element in self.elements:
+            has_known_place = element.start_byte >= 0 and element.fields
+            if element.name == "vertex" or not has_known_place or element.row_count > max_rows:
+                continue
+            for name in element.property_names:
+                columns[name] = self.rows(element)[name].astype(np.float64)
+        return columns
+
+    def numbers_in_comment(
+        self, comment: str, count: int, lowest: float = 0, highest: float = math.inf
+    ) -> list[float] | None:
+        """Return the numbers after the first word `comment` of one of Spackle's comments.
+
+        Args:
+            comment: the comment's first word, such as "spackle_camera".
+            count: how many numbers the comment must have.
+            lowest, highest: bounds of the numbers.
+
+        Returns:
+            The numbers; None if the file does not have this comment.
+
+        Raises:
+            InputError: there are more or fewer numbers, or one is out of bounds or not finite.
+        """
+        words = self.comments.get(comment)
+        if words is None:
+            return None
+        subject = comment.removeprefix("spackle_")
+        problem = f"the stored {subject} makes no sense: {{reason}}"
+        with as_input_error(self.path, problem, ValueError):
+            numbers = [float(word) for word in words]
+            are_in_bounds = all(
+                math.isfinite(number) and lowest <= number <= highest for number in numbers
+            )
+            if len(numbers) != count or not are_in_bounds:
+                raise ValueError(" ".join(words))
+        return numbers
+
+    def _parse_line(self, words: list[str]) -> None:
+        """Take one line of the header, split into words, into `elements` and `comments`.
+
+        Raises:
+            ValueError, KeyError, IndexError: the line has no meaning, or stands in a wrong place.
+        """
+        match words:
+            case ["comment", name, *others]:
+                self.comments[name] = others
+            case [] | ["comment" | "obj_info", *_]:
+                pass
+            case ["format", "ascii", _]:
+                raise ValueError("the file is text: export a binary PLY")
+            case ["format", format_name, _]:
+                self._byte_order = NUMPY_BYTE_ORDERS[format_name]
+            case ["element", name, row_count] if int(row_count) >= 0:
+                self.elements.append(PlyElement(name, int(row_count)))
+            case ["property", "list", _, _, name]:
+                self.elements[-1].fields.append((name, LIST_TYPE))
+            case ["property", type_name, name] if self._byte_order:
+                numpy_type = self._byte_order + NUMPY_TYPES[type_name]
+                self.elements[-1].fields.append((name, numpy_type))
+            case _:
+                raise ValueError(f"cannot understand the line {' '.join(words)[:80]!r}")
+
+    def _set_start_bytes(self, first_byte: int) -> None:
+        """Set where each table starts, up to the first one with lists.
+
+        Args:
+            first_byte: the offset of the first table in the file.
+
+        Raises:
+            InputError: the file is too short.
+            ValueError: two properties of a table have the same name.
+        """
+        start_byte = first_byte
+        for element in self.elements:
+            if element.has_lists:
+                return
+            element.start_byte = start_byte
+            row_bytes = np.dtype(element.fields).itemsize
+            start_byte += element.row_count * row_bytes
+            if start_byte > self.file_bytes:
+                announced = f"{element.row_count} rows of {element.name!r} are announced"
+                ending = f"but the file ends after {self.file_bytes} bytes"
+                raise InputError(f"{self.path}: cut off: {announced}, {ending}")
