@@ -67,7 +67,7 @@ class _KeyframeEntry(BaseModel, extra="forbid"):
     time: PathNumber
     eye: PathVector
     target: PathVector
-    up: PathVector = UP
+    up: PathVector = WORLD_UP
     fov: PathNumber | None = None
 
 

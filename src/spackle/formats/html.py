@@ -102,7 +102,7 @@ def page_scene(
     limit = _movement_limit(disparity, is_filled=len(aux) > 0)
     # A scene that Spackle completed is shown enlarged a little, as its videos are, which hides
     # most of what was filled in beyond the photo's border.
-    shown_camera = camera if disparity is None else camera.zoomed(1 + OVERSCAN)
+    shown_camera = camera if disparity is None else camera.zoomed(1 + DEFAULT_OVERSCAN)
 
     files: dict[str, bytes] = {}
     layers: list[dict[str, object]] = []
@@ -128,7 +128,7 @@ def page_scene(
         },
         "focus": depths.focus,
         "zNear": depths.near,
-        "orbit": {"unit": max_offset(camera, 1.0, depths), "free": limit, "limit": limit},
+        "orbit": {"unit": disparity_to_offset(camera, 1.0, depths), "free": limit, "limit": limit},
         "paths": {kind: _path_positions(kind, camera, depths) for kind in SHARP_TRAJECTORIES},
         "layers": layers,
     }
@@ -161,7 +161,7 @@ def _path_positions(
     exact_camera = camera.to("cpu", torch.float64)
 
     def positions(disparity: float) -> Tensor:
-        views = trajectory(kind, exact_camera, disparity, depths, PATH_POSITIONS)
+        views = trajectory_cameras(kind, exact_camera, disparity, depths, PATH_POSITIONS)
         return torch.stack([view.position for view in views])  # [PATH_POSITIONS, 3]
 
     still = positions(0.0)

@@ -64,7 +64,7 @@ def save_png(rgb: Tensor, path: str | os.PathLike[str]) -> None:
     """
     if rgb.ndim != 3 or rgb.shape[2] != 3:
         raise ValueError(f"a colour picture is [H, W, 3], got {tuple(rgb.shape)}")
-    _write_png(Image.fromarray(to_bytes(rgb).numpy()), path)
+    _write_png(Image.fromarray(to_uint8(rgb).numpy()), path)
 
 
 def save_gray_png(gray: Tensor, path: str | os.PathLike[str]) -> None:
@@ -80,7 +80,7 @@ def save_gray_png(gray: Tensor, path: str | os.PathLike[str]) -> None:
     """
     if gray.ndim != 2:
         raise ValueError(f"a grey picture is [H, W], got {tuple(gray.shape)}")
-    _write_png(Image.fromarray(to_bytes(gray).numpy()), path)
+    _write_png(Image.fromarray(to_uint8(gray).numpy()), path)
 
 
 def _write_png(image: Image.Image, path: str | os.PathLike[str]) -> None:
