@@ -65,7 +65,8 @@ from spackle.depth.units import RELATIVE_NEAR_M, near_inverse_depth
 from spackle.lifting.edges import Edges
 from spackle.lifting.silhouettes import Layers
 from spackle.paper.evaluation.metrics import GREY_WEIGHTS, sharpness
-from spackle.paper.training.losses import FeatureNet, covered_fraction, hole_psnr, load_features
+from spackle.paper.training.feature_networks import FeatureNet, load_features
+from spackle.paper.training.losses import covered_fraction, hole_psnr
 from spackle.paper.training.sources import load_pair
 
 Row = dict[str, float]  # the figures of a scene, by name

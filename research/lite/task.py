@@ -18,8 +18,9 @@ from weights import first_network, freeze, save_networks
 
 from spackle.bases.lite import LiteBase, LiteNet
 from spackle.formats.png import contact_sheet
+from spackle.paper.training.ranks import rank, wait_for_ranks
 from spackle.paper.training.residual import CACHE, PICTURED
-from spackle.paper.training.train import Task, rank, wait_for_ranks
+from spackle.paper.training.task import Task
 from spackle.runtime.device import pick_dtype
 from spackle.runtime.files import make_folder
 from spackle.runtime.progress import Progress, Reporter

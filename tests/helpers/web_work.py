@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-import time
+import threading
 from typing import Any
 
 from spackle.runtime.errors import InputError
@@ -19,7 +19,7 @@ def work(task: Any, tell: Any) -> None:
     tell({"stage": "base", "done": 1, "total": 2})
     how = job.name.partition(".")[0]
     if how == "slow":
-        time.sleep(600)
+        threading.Event().wait()  # until the process is killed
     if how == "bad":
         raise InputError(f"{job.name}: no depth\nat all")
     if how == "bug":

@@ -17,6 +17,7 @@ from helpers import DATA
 from helpers.command import names_in, refuses, run
 from helpers.dataset_builds import SHORT, build, content, dying_build, is_alive, write_inputs
 from helpers.photos import picture
+from helpers.systems import needs_posix_signals
 from PIL import Image
 
 from spackle.paper.dataset import DatasetFiles
@@ -52,6 +53,7 @@ def test_one_worker_and_two_write_the_same_shards(whole: Path, place: Path, tmp_
     assert content(tmp_path / "two") == content(whole)
 
 
+@needs_posix_signals
 @pytest.mark.parametrize(
     ("patched", "at", "left"),
     [
@@ -80,6 +82,7 @@ def test_a_killed_build_resumes_and_ends_the_same(
     assert content(out) == content(whole)
 
 
+@needs_posix_signals
 def test_workers_end_with_a_killed_build(
     place: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -92,7 +95,7 @@ build.DatasetBuild._store = dying"""
     assert process.wait() == -signal.SIGKILL
     workers = [int(pid) for pid in capfd.readouterr().out.split()]
     assert len(workers) == 2
-    deadline = time.monotonic() + 30
+    deadline = time.monotonic() + 300  # seconds; they end at once unless the machine is busy
     while any(is_alive(pid) for pid in workers):
         assert time.monotonic() < deadline, "a worker goes on without its main process"
         time.sleep(0.05)

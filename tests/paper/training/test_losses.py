@@ -13,14 +13,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from spackle.paper.training.feature_networks import ResNet50, SqueezeNet, load_features
 from spackle.paper.training.losses import (
-    ResNet50,
-    SqueezeNet,
     alpha_loss,
     color_loss,
     hole_distance,
     hole_psnr,
-    load_features,
     perceptual_loss,
     preserve_loss,
     total_loss,

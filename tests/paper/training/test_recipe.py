@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from spackle.paper.training.recipe import OptimRecipe, Recipe, RgbdFolder, changed_keys, load_recipe
-from spackle.paper.training.train import ema_decay, learning_rate, samples_of_step
+from spackle.paper.training.schedule import ema_decay, learning_rate, samples_of_step
 from spackle.runtime.errors import InputError
 from spackle.weights import published_weights
 

@@ -27,6 +27,7 @@ from spackle.paper.training.losses import total_loss
 from spackle.paper.training.recipe import LossRecipe, OptimRecipe
 from spackle.paper.training.residual import complete_samples
 from spackle.paper.training.samples import Sample, load_sample, save_sample
+from spackle.paper.training.schedule import prefetch
 from spackle.render import get_renderer
 from spackle.residual.architectures import load_residual
 from spackle.runtime.files import file_lock
@@ -241,9 +242,11 @@ def test_unusable_input_is_refused(
 
 
 def test_batches_of_several_threads_keep_their_order() -> None:
-    assert list(
-        training.prefetch(lambda n: (time.sleep(0.01 * (3 - n % 4)), n)[1], range(12), 4)
-    ) == [*range(12)]
+    def slow_if_early(number: int) -> int:
+        time.sleep(0.01 * (3 - number % 4))  # of four batches, the first one takes longest
+        return number
+
+    assert list(prefetch(slow_if_early, range(12), 4)) == [*range(12)]
 
 
 def test_a_gradient_that_is_not_finite_ends_the_run(

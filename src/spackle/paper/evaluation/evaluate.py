@@ -54,7 +54,7 @@ from spackle.paper.evaluation.protocols import (
 from spackle.paper.evaluation.report import REPORT, check_matplotlib, make_report, means_table
 from spackle.paper.evaluation.table import NOT_RUN, plain
 from spackle.paper.evaluation.tables import FILES, make_tables, write_tables
-from spackle.paper.training.losses import load_features
+from spackle.paper.training.feature_networks import load_features
 from spackle.pipeline import FillOptions
 from spackle.render import Renderer, device_of, get_renderer
 from spackle.residual import ResidualNet, hole_mask

@@ -18,7 +18,8 @@ from spackle.paper.evaluation.case import Case, Points, Viewpoint
 from spackle.paper.evaluation.measurements import REMARK, Measurement
 from spackle.paper.evaluation.methods import Fill
 from spackle.paper.evaluation.metrics import METRICS, Metric, psnr, ssim_average, ssim_map
-from spackle.paper.training.losses import FeatureNet, hole_distance
+from spackle.paper.training.feature_networks import FeatureNet
+from spackle.paper.training.losses import hole_distance
 from spackle.residual import CELL, hole_area_ratio, hole_mask
 from spackle.runtime.errors import InputError, reason_in_a_line
 from spackle.scene_fill import FillContext

@@ -20,39 +20,50 @@ from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import atomic_path
 
 CHECKPOINT_FILE = "checkpoint.pt"
-BEST_WEIGHTS = "best.safetensors"
-LAST_WEIGHTS = "last.safetensors"
+BEST_WEIGHTS = "best.safetensors"  # the averaged weights of the best validation
+LAST_WEIGHTS = "last.safetensors"  # the averaged weights of the last save
 RUN_REPORT = "run.json"
 RUN_FILES = (CHECKPOINT_FILE, BEST_WEIGHTS, LAST_WEIGHTS, RUN_REPORT)
-PICTURES_FOLDER = "pictures"
-LOGS_FOLDER = "logs"
-Log = Callable[[str], None]
+PICTURES_FOLDER = "pictures"  # one picture a validation
+LOGS_FOLDER = "logs"  # of TensorBoard
+Log = Callable[[str], None]  # prints a line
 
 
 @dataclasses.dataclass
 class TrainingProgress:
-    """The progress of a run."""
+    """How far a run is, and its validations so far."""
 
     step: int = 0  # steps done
-    best: float | None = (
-        None  # lowest value of the task's `aim`, such as the loss; None before the first validation
-    )
-    best_step: int = 0
+    # Lowest value of the task's `selection_measure`, such as the loss; None before the first validation.
+    best: float | None = None
+    best_step: int = 0  # the step of that value
     stale: int = 0  # validations since `best_step`
     seconds: float = 0.0  # in total, over all restarts
-    history: list[dict[str, float]] = dataclasses.field(
-        default_factory=list
-    )  # the measures of each validation
+    # The measures of each validation by name, and its "step".
+    history: list[dict[str, float]] = dataclasses.field(default_factory=list)
 
-    def record_validation(self, measures: dict[str, float], aim: str, min_delta: float) -> bool:
-        """Record a validation; returns whether the measure `aim` is lower than the best by more than `min_delta`."""
+    def record_validation(
+        self, measures: dict[str, float], selection_measure: str, min_delta: float
+    ) -> bool:
+        """Record the measures of a validation; returns whether it is the best one so far.
+
+        Args:
+            measures: means over the validation items, by name.
+            selection_measure: the name of the measure that decides; lower is better. If it is missing from `measures`,
+                because it was never finite, the validation is no improvement.
+            min_delta: an improvement must be larger than this.
+        """
         self.history.append({"step": self.step, **measures})
-        best, value = math.inf if self.best is None else self.best, measures.get(aim, math.inf)
-        if value < best - min_delta:
-            self.best, self.best_step, self.stale = value, self.step, 0
+        best = math.inf if self.best is None else self.best
+        value = measures.get(selection_measure, math.inf)
+        is_best = value < best - min_delta
+        if is_best:
+            self.best = value
+            self.best_step = self.step
+            self.stale = 0
         else:
             self.stale += 1
-        return self.stale == 0
+        return is_best
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,18 +71,21 @@ class Checkpoint:
     """All state on which the next step depends; the number of a step determines the step's samples."""
 
     progress: TrainingProgress
-    network: dict[str, Tensor]
-    average: dict[str, Tensor]
-    optimizer: dict[str, Any]
-    recipe: dict[str, Any]
+    network: dict[str, Tensor]  # weights by name
+    average: dict[str, Tensor]  # moving average of the weights by name
+    optimizer: dict[str, Any]  # AdamW's state_dict
+    recipe: dict[str, Any]  # the settings, ready for JSON
     digest: str  # identifies the samples
-    method: str = "residual"
+    method: str = "residual"  # what is trained: the name of the task
 
 
 def save_checkpoint(checkpoint: Checkpoint, folder: Path) -> None:
     """Write checkpoint.pt; if the disk is full, raise InputError and keep the previous checkpoint."""
-    buffer = io.BytesIO()  # torch.save to a file hides that the disk is full
-    torch.save({**vars(checkpoint), "progress": dataclasses.asdict(checkpoint.progress)}, buffer)
+    state = {**vars(checkpoint), "progress": dataclasses.asdict(checkpoint.progress)}
+
+    # torch.save to a file would hide that the disk is full, so the bytes are made in memory.
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
     with atomic_path(folder / CHECKPOINT_FILE) as temporary:
         temporary.write_bytes(buffer.getbuffer())
 
@@ -81,42 +95,67 @@ def load_checkpoint(folder: Path) -> Checkpoint | None:
     path = folder / CHECKPOINT_FILE
     if not path.exists():
         return None
-    with as_input_error(path, "cannot be read ({reason}): --overwrite starts a new run"):
+    with as_input_error(path, "cannot be read ({reason}): `overwrite` starts a new run"):
         state = torch.load(path, map_location="cpu", weights_only=True)
-        return Checkpoint(**{**state, "progress": TrainingProgress(**state["progress"])})
+        progress = TrainingProgress(**state.pop("progress"))
+        return Checkpoint(progress=progress, **state)
 
 
 def find_checkpoint(
     output: Path, method: str, recipe: AnyRecipe, digest: str, log: Log
 ) -> Checkpoint | None:
-    """The checkpoint from which a run resumes, or None; InputError if the folder holds a different run."""
+    """The checkpoint from which a run resumes, or None if the folder has no checkpoint.
+
+    Args:
+        output: the folder of the run.
+        method: what is trained: the name of the task.
+        recipe: the settings of the run.
+        digest: identifies the samples.
+        log: receives a line if there is a checkpoint.
+
+    Raises:
+        InputError: the checkpoint belongs to a run of another method, with other settings or other samples.
+    """
     checkpoint = load_checkpoint(output)
     if checkpoint is None:
         return None
-    changed = [] if checkpoint.method == method else ["--method"]
-    changed += changed_keys(checkpoint.recipe, recipe)
-    changed += [] if checkpoint.digest == digest else ["the data's files"]
-    if changed:
+
+    changes = changed_keys(checkpoint.recipe, recipe)
+    if checkpoint.method != method:
+        changes.insert(0, "`method`")
+    if checkpoint.digest != digest:
+        changes.append("the data's files")
+    if changes:
         raise InputError(
-            f"{output}: holds a run with other settings ({', '.join(changed)}): choose another folder with -o, "
-            "or start a new run with --overwrite"
+            f"{output}: holds a run with other settings ({', '.join(changes)}): choose another "
+            "`output`, or start a new run with `overwrite`"
         )
+
     log(f"{output}: resuming from step {checkpoint.progress.step}")
     return checkpoint
 
 
 def remove_run(output: Path) -> None:
-    """Delete a run's files, except for its samples."""
-    for path in (output / name for name in (*RUN_FILES, PICTURES_FOLDER, LOGS_FOLDER)):
-        shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+    """Delete a run's files in the folder `output`, except for its samples."""
+    for name in (*RUN_FILES, PICTURES_FOLDER, LOGS_FOLDER):
+        path = output / name
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
 
 
-def open_logs(folder: Path, first: int, log: Log) -> AbstractContextManager[Any]:
-    """Open TensorBoard's writer as a context, and hide stored values after step `first`; None without TensorBoard."""
+def open_logs(folder: Path, first_step: int, log: Log) -> AbstractContextManager[Any]:
+    """TensorBoard's writer as a context that closes it; a context of None, and a line to `log`, without TensorBoard.
+
+    A resumed run repeats the steps after its checkpoint: values that the logs have for these steps, from `first_step`
+    on, are hidden.
+    """
     try:
-        import tensorboard  # noqa: F401  # if it is missing, torch's import raises another error
+        # If this package is missing, torch's import raises another error than ImportError.
+        import tensorboard  # noqa: F401
         from torch.utils.tensorboard import SummaryWriter
     except ImportError:
         log("no TensorBoard logs: pip install 'spackle-nvs[train]'")
         return contextlib.nullcontext()
-    return SummaryWriter(str(folder / LOGS_FOLDER), purge_step=first)
+    return SummaryWriter(str(folder / LOGS_FOLDER), purge_step=first_step)

@@ -1,202 +1,52 @@
-"""The four terms of eq. 12, two measures of a filled hole's error, and the feature networks.
+"""The four terms of eq. 12, and two measures of how well a hole was filled.
 
 Arguments of the terms: `rgb` [B, H, W, 3] sRGB 0..1 and `alpha` [B, H, W] of completed views, the base's view
-`base_rgb` [B, H, W, 3], the `target` [B, H, W, 3], the `hole` [B, H, W] bool. A term averages over an image's pixels
-inside or outside of the hole, then over images. An image without such pixels counts as a differentiable 0.
+`base_rgb` [B, H, W, 3], the `target` [B, H, W, 3], the `hole` [B, H, W] bool: pixels that the photo does not show. A
+term averages over an image's pixels inside or outside of the hole, then over images. An image without such pixels counts
+as a differentiable 0.
 """
 
 from __future__ import annotations
 
 import math
-from pathlib import Path
-from typing import Literal
 
-import numpy as np
 import torch
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 
 from spackle.core.filters import gaussian_blur, maximum_filter
+from spackle.paper.training.feature_networks import FeatureNet
 from spackle.paper.training.recipe import LossRecipe
-from spackle.runtime.errors import InputError, as_input_error
-from spackle.runtime.files import check_file
-from spackle.weights.checkpoints import load_strict, read_tensors
 
-ALPHA_FLOOR = 1e-3  # less than 1/255, the least alpha that is rendered: the clamp removes no visible splat's gradient
-NO_LENGTH = 1e-10  # least divisor of feature vectors, as in LPIPS
-TINY = 1e-6  # avoids division by zero
-IMAGENET_MEAN, IMAGENET_STD = (
-    (0.485, 0.456, 0.406),
-    (0.229, 0.224, 0.225),
-)  # of sRGB 0..1, as in torchvision
-CAFFE_MEAN = (104.0, 117.0, 123.0)  # of BGR 0..255
-# The input channels and squeezed channels of fire2 to fire9.
-SQUEEZED = dict(
-    enumerate(
-        [(96, 16), (128, 16), (128, 32), (256, 32), (256, 48), (384, 48), (384, 64), (512, 64)], 2
-    )
-)
-
-
-# Feature networks ---------------------------------------------------------------------------------
-
-
-class FeatureNet(nn.Module):
-    """Maps [B, 3, H, W] sRGB 0..1 to four feature maps [B, C, h, w], fine to coarse; weights get no gradients."""
-
-    head: str  # prefix of the classifier's tensors, which are ignored
-
-
-class Bottleneck(nn.Module):
-    """ResNet's block: maps [B, inside, h, w] to [B, 4 width, h / stride, w / stride]."""
-
-    def __init__(self, inside: int, width: int, stride: int) -> None:
-        super().__init__()
-        self.conv1, self.bn1 = nn.Conv2d(inside, width, 1, bias=False), nn.BatchNorm2d(width)
-        self.conv2, self.bn2 = (
-            nn.Conv2d(width, width, 3, stride, 1, bias=False),
-            nn.BatchNorm2d(width),
-        )
-        self.conv3, self.bn3 = nn.Conv2d(width, 4 * width, 1, bias=False), nn.BatchNorm2d(4 * width)
-        self.downsample = nn.Sequential()
-        if inside != 4 * width:
-            self.downsample.extend(
-                [nn.Conv2d(inside, 4 * width, 1, stride, bias=False), nn.BatchNorm2d(4 * width)]
-            )
-
-    def forward(self, x: Tensor) -> Tensor:
-        y = self.bn1(self.conv1(x)).relu()
-        y = self.bn2(self.conv2(y)).relu()
-        return torch.relu(self.bn3(self.conv3(y)) + self.downsample(x))
-
-
-class ResNet50(FeatureNet):
-    """The paper's feature network, with torchvision's names of tensors, for images of at least 32 pixels a side.
-
-    Outputs of layer1 to layer4: 256, 512, 1024, 2048 channels at 1/4, 1/8, 1/16, 1/32 of the image's size.
-    """
-
-    head = "fc."
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.conv1, self.bn1 = nn.Conv2d(3, 64, 7, 2, 3, bias=False), nn.BatchNorm2d(64)
-        for number, (inside, width, blocks) in enumerate(
-            [(64, 64, 3), (256, 128, 4), (512, 256, 6), (1024, 512, 3)]
-        ):
-            rest = [Bottleneck(4 * width, width, 1) for _ in range(blocks - 1)]
-            self.add_module(
-                f"layer{number + 1}",
-                nn.Sequential(Bottleneck(inside, width, min(2, number + 1)), *rest),
-            )
-
-    def forward(self, images: Tensor) -> list[Tensor]:
-        x = (images - _channels(IMAGENET_MEAN, images)) / _channels(IMAGENET_STD, images)
-        maps = [F.max_pool2d(self.bn1(self.conv1(x)).relu(), 3, 2, 1)]
-        for number in range(1, 5):
-            maps.append(self.get_submodule(f"layer{number}")(maps[-1]))
-        return maps[1:]
-
-
-class Fire(nn.Module):
-    """SqueezeNet's block: maps [B, inside, h, w] to [B, 8 squeeze, h, w]."""
-
-    def __init__(self, inside: int, squeeze: int) -> None:
-        super().__init__()
-        self.conv1x1_1 = nn.Conv2d(inside, squeeze, 1)
-        self.conv1x1_2 = nn.Conv2d(squeeze, 4 * squeeze, 1)
-        self.conv3x3_2 = nn.Conv2d(squeeze, 4 * squeeze, 3, padding=1)
-
-    def forward(self, x: Tensor) -> Tensor:
-        x = self.conv1x1_1(x).relu()
-        return torch.cat([self.conv1x1_2(x), self.conv3x3_2(x)], dim=1).relu()
-
-
-class SqueezeNet(FeatureNet):
-    """SqueezeNet 1.0 as in Caffe: 3 MB, much faster than ResNet-50, for images of at least 32 pixels a side.
-
-    Outputs of conv1, fire4, fire8, fire9: 96, 256, 512, 512 channels at about 1/2, 1/4, 1/8, 1/16 of the image's size.
-    """
-
-    head = "conv10."
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.conv1 = nn.Conv2d(3, 96, 7, 2)
-        for number, (inside, squeeze) in SQUEEZED.items():
-            self.add_module(f"fire{number}", Fire(inside, squeeze))
-
-    def forward(self, images: Tensor) -> list[Tensor]:
-        maps = {1: self.conv1(255 * images.flip(1) - _channels(CAFFE_MEAN, images)).relu()}
-        for number in SQUEEZED:
-            x = maps[number - 1]
-            if number in (2, 5, 9):  # Caffe's pooling windows may extend beyond the edge
-                x = F.max_pool2d(x, 3, 2, ceil_mode=True)
-            maps[number] = self.get_submodule(f"fire{number}")(x)
-        return [maps[number] for number in (1, 4, 8, 9)]
-
-
-def load_features(
-    name: Literal["resnet50", "squeezenet", "none"],
-    path: Path | None,
-    device: torch.device | str = "cpu",
-) -> FeatureNet | None:
-    """Load a frozen feature network; "none" gives None.
-
-    `path` is torchvision's .pth file of ResNet-50, or an .npz of SqueezeNet 1.0 with the names of Caffe: `conv1.w`,
-    `conv1.b`, `fire2/conv1x1_1.w`, ... InputError if the file is missing, broken, or holds another network.
-    """
-    if name == "none":
-        return None
-    if path is None:
-        raise InputError(
-            f"loss.features_path: missing: give the weights of {name}, download the weights of resnet50 with "
-            "`spackle weights get features`, or choose loss.features=none"
-        )
-    network: FeatureNet = ResNet50() if name == "resnet50" else SqueezeNet()
-    advice = f"give another file with {name}'s weights"
-    tensors = read_tensors(path, advice) if name == "resnet50" else _read_npz(path, advice)
-    tensors = {key: value for key, value in tensors.items() if not key.startswith(network.head)}
-    return load_strict(network, tensors, path, advice).to(device)
-
-
-def _read_npz(path: Path, advice: str) -> dict[str, Tensor]:
-    check_file(path, "weight file")
-    broken = as_input_error(path, f"not a file of weights ({{reason}}): {advice}")
-    with broken, open(path, "rb") as file, np.load(file, allow_pickle=False) as arrays:
-        names = {
-            name: name[:-1].replace("/", ".") + {"w": "weight", "b": "bias"}[name[-1]]
-            for name in arrays.files
-        }
-        return {ours: torch.from_numpy(arrays[name]) for name, ours in names.items()}
-
-
-def _channels(numbers: tuple[float, ...], images: Tensor) -> Tensor:
-    return torch.tensor(numbers, dtype=images.dtype).to(images.device, non_blocking=True)[
-        :, None, None
-    ]
-
-
-# Losses -------------------------------------------------------------------------------------------
+# The renderer draws no alpha below 1/255, so this floor takes no gradient from a visible Gaussian.
+MIN_ALPHA = 1e-3
+MIN_FEATURE_LENGTH = 1e-10  # least divisor of feature vectors, as in LPIPS
+MIN_DIVISOR = 1e-6  # avoids division by zero
 
 
 def color_loss(rgb: Tensor, target: Tensor, hole: Tensor, blur: float = 0.0) -> Tensor:
-    """[] mean |rgb - target| over a hole's pixels and the channels.
+    """[] mean |rgb - target| over the pixels of a hole and the channels, then over images.
 
-    With `blur` > 0 a Gaussian with this standard deviation in pixels first blurs the difference within the hole. The
-    perceptual term alone then determines texture.
+    Args:
+        rgb: completed views [B, H, W, 3], sRGB 0..1.
+        target: what they should look like [B, H, W, 3].
+        hole: [B, H, W] bool.
+        blur: if above 0, a Gaussian with this standard deviation in pixels first blurs the difference within the hole.
+            The perceptual term alone then determines texture.
     """
-    apart = torch.where(hole[..., None], rgb - target, 0)
+    difference = torch.where(hole[..., None], rgb - target, 0)
     if blur > 0:
-        mass = gaussian_blur(hole[..., None].to(rgb), blur).clamp_min(TINY)
-        apart = torch.where(hole[..., None], gaussian_blur(apart, blur) / mass, 0)
-    return _mean_of_images(apart.abs().mean(-1), hole)
+        # Dividing by the blurred hole gives weights that add up to 1 within the hole.
+        weight_sums = gaussian_blur(hole[..., None].to(rgb), blur).clamp_min(MIN_DIVISOR)
+        blurred_difference = gaussian_blur(difference, blur) / weight_sums
+        difference = torch.where(hole[..., None], blurred_difference, 0)
+    return mean_of_images(difference.abs().mean(-1), hole)
 
 
 def alpha_loss(alpha: Tensor, hole: Tensor) -> Tensor:
     """[] mean -log(max(alpha, 0.001)) over a hole: cross entropy towards 1."""
-    opaque = torch.where(hole, alpha, 1).clamp_min(ALPHA_FLOOR)
-    return _mean_of_images(-opaque.log(), hole)
+    hole_alpha = torch.where(hole, alpha, 1).clamp_min(MIN_ALPHA)
+    return mean_of_images(-hole_alpha.log(), hole)
 
 
 def preserve_loss(rgb: Tensor, base_rgb: Tensor, hole: Tensor) -> Tensor:
@@ -228,18 +78,22 @@ def perceptual_loss(
         size: longer side in pixels to which images are resized for the network; None: not resized.
         gram: weight of the Gram matrices.
     """
-    near = maximum_filter(hole, dilation // 2)
-    if (
-        near.device.type == "cpu" and not near.any()
-    ):  # reading a mask on a GPU would wait for the GPU
-        return rgb[:0].sum()  # 0, and a gradient of zeros, without the network
-    ours = features(_resized(torch.where(near[..., None], rgb, target), size))
+    near_hole = maximum_filter(hole, dilation // 2)  # [B, H, W] bool
+    # Without a hole the network need not run. On a GPU, reading the mask would wait for the GPU.
+    if near_hole.device.type == "cpu" and not near_hole.any():
+        return rgb[:0].sum()  # 0, and a gradient of zeros
+
+    prediction = torch.where(near_hole[..., None], rgb, target)
+    prediction_maps = features(resize_for_network(prediction, size))
     with torch.no_grad():
-        theirs = features(_resized(target, size))
-    terms = [
-        _layer_terms(f, t, covered_fraction(near, f)) for f, t in zip(ours, theirs, strict=True)
-    ]
-    return torch.stack([layer + gram * texture for layer, texture in terms]).sum()
+        target_maps = features(resize_for_network(target, size))
+
+    layer_losses = []
+    for prediction_map, target_map in zip(prediction_maps, target_maps, strict=True):
+        weight = covered_fraction(near_hole, prediction_map)
+        feature_term, gram_term = layer_terms(prediction_map, target_map, weight)
+        layer_losses.append(feature_term + gram * gram_term)
+    return torch.stack(layer_losses).sum()
 
 
 def total_loss(
@@ -253,7 +107,14 @@ def total_loss(
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """The weighted sum [] of eq. 12, and the unweighted, detached terms [] by name.
 
-    If `features` is None, there is no perceptual term.
+    Args:
+        rgb: completed views [B, H, W, 3], sRGB 0..1.
+        alpha: their opacity [B, H, W].
+        target: what they should look like [B, H, W, 3].
+        base_rgb: the views before completion [B, H, W, 3].
+        hole: [B, H, W] bool, what completion fills.
+        recipe: weights of the terms, and their settings.
+        features: the network of the perceptual term; None: the sum has no perceptual term.
     """
     terms = {
         "color": color_loss(rgb, target, hole, recipe.color_blur),
@@ -261,12 +122,20 @@ def total_loss(
         "preserve": preserve_loss(rgb, base_rgb, hole),
     }
     if features is not None:
-        size, dilation, gram = recipe.feature_size, recipe.dilation, recipe.gram
         terms["perceptual"] = perceptual_loss(
-            features, rgb, target, hole, dilation=dilation, size=size, gram=gram
+            features,
+            rgb,
+            target,
+            hole,
+            dilation=recipe.dilation,
+            size=recipe.feature_size,
+            gram=recipe.gram,
         )
-    total = torch.stack([getattr(recipe, name) * term for name, term in terms.items()]).sum()
-    return total, {name: term.detach() for name, term in terms.items()}
+
+    # The recipe has the weight of each term under the name of the term.
+    weighted_terms = [getattr(recipe, name) * term for name, term in terms.items()]
+    detached_terms = {name: term.detach() for name, term in terms.items()}
+    return torch.stack(weighted_terms).sum(), detached_terms
 
 
 @torch.no_grad()
@@ -279,12 +148,17 @@ def hole_distance(features: FeatureNet, rgb: Tensor, target: Tensor, hole: Tenso
     """
     if not hole.any():
         return math.nan
-    shown = torch.where(hole[..., None], rgb, target)
+
+    # Outside of the hole both images are the target, so that only the hole makes a difference.
+    prediction = torch.where(hole[..., None], rgb, target)
+    images = torch.stack([prediction, target]).movedim(-1, 1)  # [2, 3, H, W]
     total = 0.0
-    for both in features(torch.stack([shown, target]).movedim(-1, 1)):  # [2, C, h, w]
-        ours, theirs = both / both.norm(dim=1, keepdim=True).clamp_min(NO_LENGTH)
-        weight = covered_fraction(hole[None], both)[0, 0]
-        total += float(((ours - theirs).square().sum(0) * weight).sum() / weight.sum())
+    for feature_map in features(images):  # [2, C, h, w]
+        lengths = feature_map.norm(dim=1, keepdim=True).clamp_min(MIN_FEATURE_LENGTH)
+        prediction_unit, target_unit = feature_map / lengths
+        squared_distance = (prediction_unit - target_unit).square().sum(0)  # [h, w]
+        weight = covered_fraction(hole[None], feature_map)[0, 0]  # [h, w]
+        total += float((squared_distance * weight).sum() / weight.sum())
     return total
 
 
@@ -295,8 +169,10 @@ def hole_psnr(rgb: Tensor, target: Tensor, hole: Tensor) -> float:
     """
     if not hole.any():
         return math.nan
-    error = float((rgb - target)[hole].double().square().mean())
-    return math.inf if error == 0 else -10 * math.log10(error)
+    mean_squared_error = float((rgb - target)[hole].double().square().mean())
+    if mean_squared_error == 0:
+        return math.inf
+    return -10 * math.log10(mean_squared_error)
 
 
 def covered_fraction(mask: Tensor, features: Tensor) -> Tensor:
@@ -305,31 +181,56 @@ def covered_fraction(mask: Tensor, features: Tensor) -> Tensor:
     return F.adaptive_avg_pool2d(mask[:, None].to(features.dtype), (height, width))
 
 
-def _mean_of_images(values: Tensor, where: Tensor) -> Tensor:
-    """[] mean over each image's mask `where`, then over images, of values [B, H, W] that are 0 outside of the mask."""
-    return (values.sum((1, 2)) / where.sum((1, 2)).clamp_min(1)).mean()
+def mean_of_images(values: Tensor, mask: Tensor) -> Tensor:
+    """[] mean of values [B, H, W] over the mask [B, H, W] of each image, then over images.
+
+    The values must be 0 outside of the mask. An image with an empty mask counts as 0.
+    """
+    pixel_counts = mask.sum((1, 2)).clamp_min(1)  # [B]
+    return (values.sum((1, 2)) / pixel_counts).mean()
 
 
-def _resized(images: Tensor, size: int | None) -> Tensor:
-    images = images.movedim(-1, 1)
+def resize_for_network(images: Tensor, size: int | None) -> Tensor:
+    """Images [B, H, W, 3] as [B, 3, h, w] for a feature network, with a longer side of `size` pixels.
+
+    None keeps the size.
+    """
+    images = images.movedim(-1, 1)  # [B, 3, H, W]
     height, width = images.shape[-2:]
     if size is None or size == max(height, width):
         return images
     scale = size / max(height, width)
-    small = max(1, round(height * scale)), max(1, round(width * scale))
-    return F.interpolate(images, small, mode="bilinear", antialias=True, align_corners=False)
+    new_size = (max(1, round(height * scale)), max(1, round(width * scale)))
+    return F.interpolate(images, new_size, mode="bilinear", antialias=True, align_corners=False)
 
 
-def _layer_terms(ours: Tensor, theirs: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """The feature term and the Gram term of a layer, from features [B, C, h, w] and cell weights [B, 1, h, w]."""
-    rms = (theirs.square().mean(dim=(1, 2, 3), keepdim=True) + TINY**2).sqrt()
-    ours, theirs = ours / rms, theirs / rms
+def layer_terms(prediction: Tensor, target: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """The feature term [] and the Gram term [] of the perceptual loss for one layer of the feature network.
+
+    Both compare features of prediction and target [B, C, h, w], weighted by cell, with weights [B, 1, h, w]. The feature
+    term is the mean difference; the Gram term is the mean difference of the Gram matrices, which describe textures.
+    """
+    # Layers have features of different sizes; divided by the target's root mean square, all layers count alike.
+    mean_square = target.square().mean(dim=(1, 2, 3), keepdim=True)
+    root_mean_square = (mean_square + MIN_DIVISOR**2).sqrt()  # [B, 1, 1, 1]
+    prediction = prediction / root_mean_square
+    target = target / root_mean_square
+
     area = weight.sum(dim=(1, 2, 3))  # [B], 0 without a hole
-    apart = (weight * (ours - theirs).abs()).mean(1).sum((1, 2)) / area.clamp_min(TINY)
-    textures = (_gram(ours, weight, area) - _gram(theirs, weight, area)).abs().mean((1, 2))
-    return apart.mean(), textures.mean()
+    weighted_difference = (weight * (prediction - target).abs()).mean(1)  # [B, h, w]
+    feature_terms = weighted_difference.sum((1, 2)) / area.clamp_min(MIN_DIVISOR)
+    gram_difference = gram_matrix(prediction, weight, area) - gram_matrix(target, weight, area)
+    gram_terms = gram_difference.abs().mean((1, 2))
+    return feature_terms.mean(), gram_terms.mean()
 
 
-def _gram(features: Tensor, weight: Tensor, area: Tensor) -> Tensor:
-    together = (features * weight).flatten(2) @ features.flatten(2).mT
-    return together / area.clamp_min(TINY)[:, None, None]
+def gram_matrix(features: Tensor, weight: Tensor, area: Tensor) -> Tensor:
+    """The Gram matrices [B, C, C] of features [B, C, h, w]: G = (F w) F^T / area.
+
+    Args:
+        features: F, whose cells h · w are the columns of a matrix.
+        weight: w, the weights of the cells [B, 1, h, w].
+        area: the sum of the weights [B].
+    """
+    products = (features * weight).flatten(2) @ features.flatten(2).mT
+    return products / area.clamp_min(MIN_DIVISOR)[:, None, None]

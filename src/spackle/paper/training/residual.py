@@ -14,11 +14,13 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from spackle.formats.png import contact_sheet
-from spackle.paper.training.losses import hole_psnr, load_features, total_loss
+from spackle.paper.training.feature_networks import load_features
+from spackle.paper.training.losses import hole_psnr, total_loss
+from spackle.paper.training.ranks import rank
 from spackle.paper.training.recipe import Recipe
 from spackle.paper.training.samples import Sample, digest_of_samples, load_sample, make_samples
 from spackle.paper.training.sources import find_sources
-from spackle.paper.training.train import Task, rank
+from spackle.paper.training.task import Task
 from spackle.render import Renderer, device_of, get_renderer
 from spackle.render.protocol import Rendering
 from spackle.residual.architectures import (

@@ -22,8 +22,8 @@ from spackle.core.camera import Camera
 from spackle.core.color import linear_to_srgb, srgb_to_linear, to_uint8
 from spackle.core.filters import maximum_filter
 from spackle.core.gaussians import Gaussians
+from spackle.paper.training.ranks import rank, rank_count, wait_for_ranks
 from spackle.paper.training.recipe import DataRecipe
-from spackle.paper.training.train import rank, rank_count, wait_for_ranks
 from spackle.render import CpuRenderer
 from spackle.render.protocol import TILE, Rendering
 from spackle.residual.features import CELL, ViewFeatures, cell_centers, hole_mask

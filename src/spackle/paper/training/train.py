@@ -1,6 +1,7 @@
-"""The training loop: batch, forward, losses, step, validate, save.
+"""The training loop: `train` prepares a run, `run_steps` is the loop, `train_step` and `validate_and_save` its parts.
 
-A `Task` defines the network, the data and the loss. Several processes, started by torchrun, train one network together.
+A `Task` (task.py) defines the network, the data and the loss. Several processes, started by torchrun, train one network
+together (ranks.py): each step is divided between them, and process 0 writes all files.
 """
 
 from __future__ import annotations
@@ -8,21 +9,14 @@ from __future__ import annotations
 import contextlib
 import copy
 import dataclasses
-import functools
 import math
 import os
 import time
-from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from datetime import timedelta
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, TypeVar
+from typing import Any, TypeVar
 
-import numpy as np
 import torch
-import torch.distributed as dist
-from numpy.typing import NDArray
 from rich.console import Console
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
@@ -43,74 +37,85 @@ from spackle.paper.training.checkpoint import (
     remove_run,
     save_checkpoint,
 )
-from spackle.paper.training.recipe import AnyRecipe, OptimRecipe
+from spackle.paper.training.ranks import (
+    joined_ranks,
+    rank,
+    rank_count,
+    sum_of_ranks,
+    wait_for_ranks,
+)
+from spackle.paper.training.recipe import AnyRecipe
+from spackle.paper.training.schedule import ema_decay, learning_rate, prefetch, samples_of_step
+from spackle.paper.training.task import Task
 from spackle.runtime.device import hardware_facts, package_versions, pick_device
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import results_folder, write_json
 from spackle.runtime.progress import Reporter, catch_stop_signals
 
-EMA_WARMUP_STEPS = (
-    10  # the early decay is (step + 1) / (step + 10): the average soon forgets the initial weights
-)
-MAX_WAIT_FOR_RANKS = timedelta(
-    hours=24
-)  # a process waits so long for other processes, which may still make samples
+# Why a run ended, and the line that says so.
 END_MESSAGES = {
     "steps": "all steps are done",
     "patience": "the validation no longer improves",
     "stopped": "stopped; the same command resumes the run",
 }
 R = TypeVar("R", bound=AnyRecipe)
-K = TypeVar("K")
-V = TypeVar("V")
 
 
-class Task(Protocol):
-    """A network to train, and the items of its training data, numbered from 0.
+@dataclasses.dataclass
+class TrainingRun:
+    """A run in progress: its settings, and everything that a step changes."""
 
-    The constructor is quick and raises InputError for unusable input; `prepare` sets the last two attributes.
-    """
-
-    name: ClassVar[str]  # in `--method` and in checkpoints
-    selection_measure: ClassVar[str] = (
-        "loss"  # the measure by which the best weights are chosen; lower is better
+    recipe: AnyRecipe
+    task: Task
+    device: torch.device
+    output: Path
+    reporter: Reporter
+    facts: dict[str, Any]  # for run.json: settings, data, versions, hardware
+    network: nn.Module  # the weights that the optimiser changes
+    average: nn.Module  # moving average of these weights, which is validated and exported
+    optimizer: AdamW
+    progress: TrainingProgress = dataclasses.field(default_factory=TrainingProgress)
+    is_stopped: bool = False  # whether any process has received Ctrl-C or SIGTERM
+    logs: Any = (
+        None  # TensorBoard's writer; None without TensorBoard, and in processes other than 0
     )
-    micro_batch: ClassVar[int | None] = (
-        None  # items in one pass through the network; None: all items of a step
-    )
-    digest: str  # identifies the training data by content, not by paths
-    items_per_step: int  # over all processes
-    network: nn.Module  # weights with requires_grad are trained in place
-    measures: Sequence[str]  # names of the values that `measure` returns
-    items: int  # number of training items; an epoch has each item once
-    validation_items: int
 
-    def prepare(self, output: Path, reporter: Reporter) -> dict[str, Any]:
-        """Do all long preparations; returns facts for run.json. Every process calls this."""
+    def __post_init__(self) -> None:
+        """Let several processes average their gradients, by a wrapper around the network."""
+        self.wrapped = self.network
+        if rank_count() > 1:
+            self.wrapped = DistributedDataParallel(self.network)
 
-    def parameter_groups(self) -> list[dict[str, Any]]:
-        """The optimiser's groups of weights; a group's "lr_scale" is a factor on the learning rate."""
-        return [
-            {"params": [weight for weight in self.network.parameters() if weight.requires_grad]}
-        ]
+    def resume(self, checkpoint: Checkpoint) -> None:
+        """Continue from a checkpoint of this run; InputError if its network is another one."""
+        problem = (
+            "the checkpoint has another network ({reason}): choose another `output`, or `overwrite`"
+        )
+        with as_input_error(self.output, problem):
+            self.network.load_state_dict(checkpoint.network)
+            self.average.load_state_dict(checkpoint.average)
+            self.optimizer.load_state_dict(checkpoint.optimizer)
+        self.progress = checkpoint.progress
 
-    def load_batch(self, step: int | None, items: Sequence[int]) -> Any:
-        """Load items of a training step, or validation items if `step` is None; InputError if an item cannot be read.
+    def end_reason(self) -> str | None:
+        """Why the run ends now, as a key of `END_MESSAGES`; None if it continues."""
+        if self.progress.step >= self.recipe.optim.steps:
+            return "steps"
+        if self.progress.stale >= self.recipe.run.patience:
+            return "patience"
+        return "stopped" if self.is_stopped else None
 
-        The result depends on the arguments alone; any thread may call this.
-        """
+    def write_report(self, ended: str | None = None) -> None:
+        """Write run.json: the facts of the run, why it ended (None: it goes on), and its progress."""
+        if rank() == 0:
+            report = {**self.facts, "ended": ended, **dataclasses.asdict(self.progress)}
+            write_json(report, self.output / RUN_REPORT)
 
-    def loss(self, network: nn.Module, batch: Any) -> tuple[Tensor, dict[str, Tensor]]:
-        """The loss [] of a batch, with gradients, and the loss's terms []."""
-
-    def measure(self, network: nn.Module, batch: Any) -> dict[str, list[float]]:
-        """Measure a network on a batch of validation items; returns the values of each measure by name."""
-
-    def draw_picture(self, network: nn.Module) -> Tensor:
-        """[H, W, 3] sRGB: results of the network for a few validation items."""
-
-    def export(self, network: nn.Module, path: Path) -> None:
-        """Write the weights in the format that the package reads; InputError if that fails."""
+    def log_curves(self, group: str, values: Mapping[str, float]) -> None:
+        """Add a point to TensorBoard's curve of each value; `group` is "train" or "validation"."""
+        if self.logs is not None:
+            for name, value in values.items():
+                self.logs.add_scalar(f"{group}/{name}", value, self.progress.step)
 
 
 def train(
@@ -126,7 +131,7 @@ def train(
         recipe: the settings of the run.
         open_task: creates the task on a device.
         output: a folder for all results.
-        reporter: used by the first process.
+        reporter: shows progress; used by the first process.
         overwrite: delete an older run in `output`, but keep its samples.
 
     Returns:
@@ -135,295 +140,300 @@ def train(
     Raises:
         InputError: a file or folder cannot be used, or the loss is not finite.
     """
-    kind = pick_device(None if recipe.run.device == "auto" else recipe.run.device).type
-    with joined_ranks(kind) as device, contextlib.ExitStack() as stack:
-        if rank() == 0:  # the only process that writes
+    requested_device = None if recipe.run.device == "auto" else recipe.run.device
+    device_kind = pick_device(requested_device).type
+    with joined_ranks(device_kind) as device, contextlib.ExitStack() as stack:
+        # Only the first process writes and reports, so only this process locks the folder.
+        if rank() == 0:
             stack.enter_context(results_folder(output, RUN_FILES, locked=True))
         else:
             reporter = Reporter(console=Console(quiet=True))
+
         task = open_task(recipe, device)
         if task.items_per_step % rank_count():
             raise InputError(
                 f"optim.batch={recipe.optim.batch} cannot be divided between {rank_count()} processes"
             )
-        checkpoint = (
-            None
-            if overwrite
-            else find_checkpoint(output, task.name, recipe, task.digest, reporter.log)
-        )
+        checkpoint = None
+        if not overwrite:
+            checkpoint = find_checkpoint(output, task.name, recipe, task.digest, reporter.log)
         facts = task.prepare(output, reporter)
-        wait_for_ranks()  # all processes have looked for a checkpoint, so an old run may be deleted
+
+        # All processes have looked for a checkpoint, so an older run may be deleted.
+        wait_for_ranks()
         stack.enter_context(as_input_error(output, "cannot write: {reason}", OSError))
         if overwrite and rank() == 0:
             remove_run(output)
 
-        optim, run = recipe.optim, recipe.run
-        network: nn.Module = task.network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
-        average = copy.deepcopy(network).requires_grad_(False)
-        wrapped = DistributedDataParallel(network) if rank_count() > 1 else network
-        optimizer = AdamW(
-            task.parameter_groups(), optim.lr, betas=optim.betas, weight_decay=optim.weight_decay
-        )
-        progress, stopped = TrainingProgress(), False
-        if checkpoint:
-            with as_input_error(
-                output,
-                "the checkpoint has another network ({reason}): choose another -o, or --overwrite",
-            ):
-                network.load_state_dict(checkpoint.network)
-                average.load_state_dict(checkpoint.average)
-                optimizer.load_state_dict(checkpoint.optimizer)
-            progress = checkpoint.progress
-        facts |= {
+        run = open_run(recipe, task, device, output, reporter, facts)
+        if checkpoint is not None:
+            run.resume(checkpoint)
+        end_reason = run_steps(run)
+        run.write_report(end_reason)
+        reporter.log(f"{END_MESSAGES[end_reason]}, step {run.progress.step} -> {output}")
+        return end_reason
+
+
+def open_run(
+    recipe: AnyRecipe,
+    task: Task,
+    device: torch.device,
+    output: Path,
+    reporter: Reporter,
+    facts: Mapping[str, Any],
+) -> TrainingRun:
+    """A run at step 0: the network on its device, a copy for the average, and the optimiser.
+
+    `facts`, from the task's preparation, come first in run.json; settings, versions and hardware follow.
+    """
+    # Convolutions are faster if the channels of a pixel lie beside each other in memory.
+    layout = torch.channels_last
+    network: nn.Module = task.network.to(device, memory_format=layout)  # type: ignore[call-overload]
+    optim = recipe.optim
+    optimizer = AdamW(
+        task.parameter_groups(), optim.lr, betas=optim.betas, weight_decay=optim.weight_decay
+    )
+    return TrainingRun(
+        recipe=recipe,
+        task=task,
+        device=device,
+        output=output,
+        reporter=reporter,
+        facts={
+            **facts,
             "method": task.name,
             "aim": task.selection_measure,
             "recipe": recipe.model_dump(mode="json"),
-        }
-        facts |= {
             "processes": rank_count(),
             "versions": package_versions(),
             "hardware": hardware_facts(device),
-        }
+        },
+        network=network,
+        average=copy.deepcopy(network).requires_grad_(False),
+        optimizer=optimizer,
+    )
 
-        def ended() -> str:
-            """Why the run ends now; empty if the run continues."""
-            if progress.step >= optim.steps:
-                return "steps"
-            return "patience" if progress.stale >= run.patience else "stopped" if stopped else ""
 
-        def report(ended: str | None = None) -> None:
-            if rank() == 0:
-                write_json(
-                    {**facts, "ended": ended, **dataclasses.asdict(progress)}, output / RUN_REPORT
-                )
+def run_steps(run: TrainingRun) -> str:
+    """The loop: train step by step, log, validate and save, until the run ends; returns the reason of the end.
 
-        def parts(step: int) -> list[list[int]]:
-            """The items of this process at a step, divided into passes through the network."""
-            items = samples_of_step(
-                step, task.items, task.items_per_step, run.seed, rank(), rank_count()
-            )
-            size = task.micro_batch or len(items)
-            return [items[start : start + size] for start in range(0, len(items), size)]
+    The reason is "steps", "patience" or "stopped", see `train`.
+    """
+    progress, optim, settings = run.progress, run.recipe.optim, run.recipe.run
+    passes = (
+        (step, items)
+        for step in range(progress.step, optim.steps)
+        for items in items_of_passes(run, step)
+    )
+    # On a CPU the network itself needs the cores, so one thread reads; beside a GPU half of them read.
+    reader_threads = 1
+    if run.device.type != "cpu":
+        reader_threads = max(1, (os.cpu_count() or 1) // (2 * rank_count()))
 
-        def curves(group: str, values: Mapping[str, float]) -> None:
-            for name, value in values.items():
-                if logs is not None:
-                    logs.add_scalar(f"{group}/{name}", value, progress.step)
+    def load_pass(step_and_items: tuple[int, list[int]]) -> Any:
+        step, items = step_and_items
+        return run.task.load_batch(step, items)
 
-        readers = 1 if device.type == "cpu" else max(1, (os.cpu_count() or 1) // (2 * rank_count()))
-        todo = ((step, part) for step in range(progress.step, optim.steps) for part in parts(step))
-        with (
-            open_logs(output, progress.step, reporter.log)
-            if rank() == 0
-            else contextlib.nullcontext() as logs,
-            contextlib.closing(
-                prefetch(lambda key: task.load_batch(*key), todo, readers)
-            ) as batches,
-            reporter.steps("train", progress.step, optim.steps) as tell,
-            catch_stop_signals(single_process=rank_count() == 1) as asked,
-        ):
-            begun, before, recent = time.perf_counter(), progress.seconds, list[dict[str, float]]()
-            while not ended():
-                step = progress.step
+    with contextlib.ExitStack() as stack:
+        if rank() == 0:
+            run.logs = stack.enter_context(open_logs(run.output, progress.step, run.reporter.log))
+        batches = stack.enter_context(
+            contextlib.closing(prefetch(load_pass, passes, reader_threads))
+        )
+        show_progress = stack.enter_context(run.reporter.steps("train", progress.step, optim.steps))
+        stop_requested = stack.enter_context(catch_stop_signals(single_process=rank_count() == 1))
 
-                # Forward and backward: parts add up gradients; after the last part, processes average gradients
-                optimizer.zero_grad(set_to_none=True)
-                sums: dict[str, Tensor] = {}
-                for number, part in enumerate(split := parts(step), 1):
-                    share = len(part) * rank_count() / task.items_per_step
-                    alone = rank_count() > 1 and number < len(split)
-                    with wrapped.no_sync() if alone else contextlib.nullcontext():  # type: ignore[operator]
-                        loss, terms = task.loss(wrapped, next(batches))
-                        (share * loss).backward()  # type: ignore[no-untyped-call]
-                    for name, value in {"loss": loss.detach(), **terms}.items():
-                        sums[name] = sums.get(name, 0.0) + share * value.double()
-                sums["gradient"] = clip_grad_norm_(network.parameters(), optim.clip).double()
-                mine = dict(zip(sums, torch.stack(list(sums.values())).tolist(), strict=True))
-                totals = sum_of_ranks({**mine, "stop": float(asked())}, device)
-                stopped = totals.pop("stop") > 0
-                numbers = {name: total / rank_count() for name, total in totals.items()}
-                if bad := [name for name, value in numbers.items() if not math.isfinite(value)]:
-                    raise InputError(
-                        f"{output}: step {step}: {', '.join(bad)} not finite: lower optim.lr"
-                    )
+        start_time = time.perf_counter()
+        earlier_seconds = progress.seconds  # of the runs that this one resumes
+        recent_steps: list[
+            dict[str, float]
+        ] = []  # the numbers of each step since the last log line
+        while run.end_reason() is None:
+            recent_steps.append(train_step(run, batches, stop_requested))
+            progress.seconds = earlier_seconds + time.perf_counter() - start_time
 
-                # Step
-                rate = learning_rate(step, optim)
-                for group in optimizer.param_groups:
-                    group["lr"] = group.get("lr_scale", 1.0) * rate
-                optimizer.step()
-                with torch.no_grad():
-                    for mean, weight in zip(
-                        average.parameters(), network.parameters(), strict=True
-                    ):
-                        mean.lerp_(weight, 1 - ema_decay(step, optim.ema))
-                progress.step, progress.seconds = step + 1, before + time.perf_counter() - begun
-                recent.append({**numbers, "lr": rate})
-                last = progress.step == optim.steps
+            is_last_step = progress.step == optim.steps
+            if progress.step % settings.log_every == 0 or is_last_step:
+                means = mean_of_steps(recent_steps)
+                run.log_curves("train", means)
+                show_progress(progress.step, f"loss {means['loss']:.4f}")
+                recent_steps = []
+            validate_and_save(run, is_last_step)
 
-                # Log
-                if progress.step % run.log_every == 0 or last:
-                    numbers = {
-                        name: sum(each[name] for each in recent) / len(recent) for name in recent[0]
-                    }
-                    curves("train", numbers)
-                    tell(progress.step, f"loss {numbers['loss']:.4f}")
-                    recent = []
+    end_reason = run.end_reason()
+    assert end_reason is not None  # the loop ends for a reason
+    return end_reason
 
-                # Validate the averaged weights, and export them if they are the best so far
-                if progress.step % run.validate_every == 0 or last:
-                    measures = validate(task, average, device)
-                    best = progress.record_validation(
-                        measures, task.selection_measure, run.min_delta
-                    )
-                    if rank() == 0:
-                        sheet = task.draw_picture(average)
-                        (output / PICTURES_FOLDER).mkdir(exist_ok=True)
-                        save_png(sheet, output / PICTURES_FOLDER / f"{progress.step:07d}.png")
-                        if best:
-                            task.export(average, output / BEST_WEIGHTS)
-                        curves("validation", measures)
-                        if logs is not None:
-                            logs.add_image(
-                                "views", sheet.clamp(0, 1), progress.step, dataformats="HWC"
-                            )
-                        values = ", ".join(
-                            f"{name} {value:.4f}" for name, value in measures.items()
-                        )
-                        reporter.log(
-                            f"step {progress.step}: validation {values} (best step: {progress.best_step})"
-                        )
-                        report()
 
-                # Save
-                if rank() == 0 and (progress.step % run.save_every == 0 or ended()):
-                    task.export(average, output / LAST_WEIGHTS)
-                    states = network.state_dict(), average.state_dict(), optimizer.state_dict()
-                    save_checkpoint(
-                        Checkpoint(progress, *states, facts["recipe"], task.digest, task.name),
-                        output,
-                    )
-                    report()
-        report(ended())
-        reporter.log(f"{END_MESSAGES[ended()]}, step {progress.step} -> {output}")
-        return ended()
+def train_step(
+    run: TrainingRun, batches: Iterator[Any], stop_requested: Callable[[], bool]
+) -> dict[str, float]:
+    """Do the next step: forward, backward, update of the weights and of their average.
+
+    Args:
+        run: the run, whose weights and step number change.
+        batches: yields the batches of this process, one for each pass through the network.
+        stop_requested: whether this process has received Ctrl-C or SIGTERM. The run ends if any process has.
+
+    Returns:
+        The loss, its terms, the norm of the gradient ("gradient") and the learning rate ("lr"): means over the items of
+        all processes.
+
+    Raises:
+        InputError: one of these numbers is not finite; the weights have not changed then.
+    """
+    step = run.progress.step
+    run.optimizer.zero_grad(set_to_none=True)
+    sums = accumulate_gradients(run, batches)
+    gradient_norm = clip_grad_norm_(run.network.parameters(), run.recipe.optim.clip)
+    sums["gradient"] = gradient_norm.double()
+
+    # One transfer from the GPU, and one message between processes, for all numbers together.
+    own_numbers = dict(zip(sums, torch.stack(list(sums.values())).tolist(), strict=True))
+    totals = sum_of_ranks({**own_numbers, "stop": float(stop_requested())}, run.device)
+    run.is_stopped = totals.pop("stop") > 0
+    numbers = {name: total / rank_count() for name, total in totals.items()}
+    not_finite = [name for name, value in numbers.items() if not math.isfinite(value)]
+    if not_finite:
+        raise InputError(
+            f"{run.output}: step {step}: {', '.join(not_finite)} not finite: lower optim.lr"
+        )
+
+    numbers["lr"] = update_weights(run, step)
+    run.progress.step = step + 1
+    return numbers
+
+
+def accumulate_gradients(run: TrainingRun, batches: Iterator[Any]) -> dict[str, Tensor]:
+    """Add the gradients of a step's loss to the network's weights, pass by pass.
+
+    A pass is one run through the network with as many items as fit into memory. Each pass has a weight proportional to
+    its number of items, so that the sum is the gradient of the mean loss over all items.
+
+    Returns:
+        The mean loss [] of this process ("loss") and the means [] of its terms, in float64.
+    """
+    means: dict[str, Tensor] = {}
+    passes = items_of_passes(run, run.progress.step)
+    for number, items in enumerate(passes, 1):
+        weight = len(items) * rank_count() / run.task.items_per_step
+
+        # Processes average their gradients once a step: only the last pass lets them communicate.
+        communication: contextlib.AbstractContextManager[Any] = contextlib.nullcontext()
+        if rank_count() > 1 and number < len(passes):
+            communication = run.wrapped.no_sync()  # type: ignore[operator]
+        with communication:
+            loss, terms = run.task.loss(run.wrapped, next(batches))
+            (weight * loss).backward()  # type: ignore[no-untyped-call]
+
+        for name, value in {"loss": loss.detach(), **terms}.items():
+            means[name] = means.get(name, 0.0) + weight * value.double()
+    return means
+
+
+def items_of_passes(run: TrainingRun, step: int) -> list[list[int]]:
+    """Numbers of the items that this process uses at a step, divided into passes through the network."""
+    task = run.task
+    items = samples_of_step(
+        step, task.items, task.items_per_step, run.recipe.run.seed, rank(), rank_count()
+    )
+    pass_size = task.micro_batch or len(items)
+    return [items[start : start + pass_size] for start in range(0, len(items), pass_size)]
+
+
+def update_weights(run: TrainingRun, step: int) -> float:
+    """Let the optimiser change the weights, then update their average; returns the learning rate of the step."""
+    optim = run.recipe.optim
+    rate = learning_rate(step, optim)
+    for group in run.optimizer.param_groups:
+        group["lr"] = group.get("lr_scale", 1.0) * rate
+    run.optimizer.step()
+
+    # average ← decay · average + (1 - decay) · weights
+    decay = ema_decay(step, optim.ema)
+    pairs = zip(run.average.parameters(), run.network.parameters(), strict=True)
+    with torch.no_grad():
+        for average, weight in pairs:
+            average.lerp_(weight, 1 - decay)
+    return rate
+
+
+def mean_of_steps(steps: list[dict[str, float]]) -> dict[str, float]:
+    """The mean of each number over some steps; every step has the same names."""
+    return {name: sum(numbers[name] for numbers in steps) / len(steps) for name in steps[0]}
+
+
+def validate_and_save(run: TrainingRun, is_last_step: bool) -> None:
+    """After a step: validate if it is time, and write the weights and a checkpoint if it is time.
+
+    The recipe's run.validate_every and run.save_every say how often. The last step is always validated, and the state at
+    the end of a run is always saved. All processes validate; process 0 writes.
+    """
+    settings, progress = run.recipe.run, run.progress
+    if progress.step % settings.validate_every == 0 or is_last_step:
+        measures = validate(run.task, run.average, run.device)
+        is_best = progress.record_validation(
+            measures, run.task.selection_measure, settings.min_delta
+        )
+        if rank() == 0:
+            report_validation(run, measures, is_best)
+
+    # A validation may have ended the run, so this comes second.
+    is_time_to_save = progress.step % settings.save_every == 0 or run.end_reason() is not None
+    if rank() == 0 and is_time_to_save:
+        run.task.export(run.average, run.output / LAST_WEIGHTS)
+        checkpoint = Checkpoint(
+            progress=progress,
+            network=run.network.state_dict(),
+            average=run.average.state_dict(),
+            optimizer=run.optimizer.state_dict(),
+            recipe=run.facts["recipe"],
+            digest=run.task.digest,
+            method=run.task.name,
+        )
+        save_checkpoint(checkpoint, run.output)
+        run.write_report()
+
+
+def report_validation(run: TrainingRun, measures: Mapping[str, float], is_best: bool) -> None:
+    """Write the results of a validation: a picture, curves, a log line, run.json, and the weights if they are the best.
+
+    `measures` are the means over all validation items by name.
+    """
+    step = run.progress.step
+    picture = run.task.draw_picture(run.average)
+    (run.output / PICTURES_FOLDER).mkdir(exist_ok=True)
+    save_png(picture, run.output / PICTURES_FOLDER / f"{step:07d}.png")
+    if is_best:
+        run.task.export(run.average, run.output / BEST_WEIGHTS)
+
+    run.log_curves("validation", measures)
+    if run.logs is not None:
+        run.logs.add_image("views", picture.clamp(0, 1), step, dataformats="HWC")
+    values = ", ".join(f"{name} {value:.4f}" for name, value in measures.items())
+    run.reporter.log(f"step {step}: validation {values} (best step: {run.progress.best_step})")
+    run.write_report()
 
 
 @torch.no_grad()
 def validate(task: Task, network: nn.Module, device: torch.device) -> dict[str, float]:
-    """Means of a task's measures over all validation items; values that are not finite are left out.
+    """Means of a task's measures over all validation items, by name; values that are not finite are left out.
 
-    The processes divide the items, and each process gets the same means.
+    The processes divide the items, and each process gets the same means. A measure without finite values is missing.
     """
-    totals, counts = dict.fromkeys(task.measures, 0.0), dict.fromkeys(task.measures, 0.0)
-    mine, size = (
-        range(rank(), task.validation_items, rank_count()),
-        task.micro_batch or task.items_per_step // rank_count(),
-    )
-    for start in range(0, len(mine), size):
-        for name, values in task.measure(
-            network, task.load_batch(None, mine[start : start + size])
-        ).items():
+    own_items = range(rank(), task.validation_items, rank_count())
+    pass_size = task.micro_batch or task.items_per_step // rank_count()
+
+    totals = dict.fromkeys(task.measures, 0.0)
+    counts = dict.fromkeys(task.measures, 0.0)
+    for start in range(0, len(own_items), pass_size):
+        batch = task.load_batch(None, own_items[start : start + pass_size])
+        for name, values in task.measure(network, batch).items():
+            # PSNR, for example, is NaN for a view without a hole, and infinite for equal images.
             finite = [value for value in values if math.isfinite(value)]
             totals[name] += sum(finite)
             counts[name] += len(finite)
-    totals, counts = sum_of_ranks(totals, device), sum_of_ranks(counts, device)
+
+    totals = sum_of_ranks(totals, device)
+    counts = sum_of_ranks(counts, device)
     return {name: total / counts[name] for name, total in totals.items() if counts[name]}
-
-
-def prefetch(make: Callable[[K], V], keys: Iterable[K], threads: int) -> Generator[V, None, None]:
-    """Yield `make(key)` for each key, in order; each thread computes one value in advance."""
-    with ThreadPoolExecutor(threads, thread_name_prefix="batches") as workers:
-        begun = deque[Future[V]]()
-        for key in keys:
-            begun.append(workers.submit(make, key))
-            if len(begun) > threads:
-                yield begun.popleft().result()
-        yield from (last.result() for last in begun)
-
-
-def learning_rate(step: int, optim: OptimRecipe) -> float:
-    """The learning rate at a step: linear warm-up, then a cosine to `min_lr` ("Training Details and Loss Weights")."""
-    if step < optim.warmup:
-        return optim.lr * (step + 1) / optim.warmup
-    done = min(1.0, (step - optim.warmup) / max(1, optim.steps - optim.warmup))
-    return optim.min_lr + (optim.lr - optim.min_lr) * (1 + math.cos(math.pi * done)) / 2
-
-
-def ema_decay(step: int, decay: float) -> float:
-    """The share of the old average at a step; the new weights get the rest."""
-    return min(decay, (step + 1) / (step + EMA_WARMUP_STEPS))
-
-
-def samples_of_step(
-    step: int, count: int, batch: int, seed: int, rank: int = 0, ranks: int = 1
-) -> list[int]:
-    """Indices, below `count`, of the samples that one process uses at a step.
-
-    Every epoch is a permutation of all samples, chosen by `seed`; a batch may extend into the next epoch. `ranks`
-    processes divide each batch evenly.
-    """
-    share = batch // ranks
-    first = step * batch + rank * share
-    return [
-        int(order_of_epoch(seed, place // count, count)[place % count])
-        for place in range(first, first + share)
-    ]
-
-
-@functools.lru_cache(maxsize=2)
-def order_of_epoch(seed: int, epoch: int, count: int) -> NDArray[np.int64]:
-    return np.random.default_rng([seed, epoch]).permutation(count)
-
-
-# Several processes --------------------------------------------------------------------------------
-
-
-@contextlib.contextmanager
-def joined_ranks(kind: str) -> Iterator[torch.device]:
-    """Join the processes of this run by torchrun's environment variables; yields the device of this process.
-
-    `kind` "cuda" communicates by NCCL, "cpu" by Gloo. InputError if the processes cannot join.
-    """
-    local = 0
-    if "WORLD_SIZE" in os.environ:
-        with as_input_error(
-            "RANK and WORLD_SIZE are set", "but the processes cannot join: {reason}"
-        ):
-            local = int(os.environ.get("LOCAL_RANK", "0"))
-            dist.init_process_group(
-                "nccl" if kind == "cuda" else "gloo", timeout=MAX_WAIT_FOR_RANKS
-            )
-    if kind == "cuda":
-        torch.cuda.set_device(
-            local
-        )  # also for renderers and features, which use the current device
-    try:
-        yield torch.device(kind, local) if kind == "cuda" else torch.device(kind)
-    finally:
-        if dist.is_initialized():
-            dist.destroy_process_group()
-
-
-def rank() -> int:
-    """The number of this process among all training processes; process 0 writes and reports."""
-    return dist.get_rank() if dist.is_initialized() else 0
-
-
-def rank_count() -> int:
-    """The number of processes that train together."""
-    return dist.get_world_size() if dist.is_initialized() else 1
-
-
-def wait_for_ranks() -> None:
-    """Wait until all processes have reached this call."""
-    if rank_count() > 1:
-        dist.barrier()
-
-
-def sum_of_ranks(numbers: Mapping[str, float], device: torch.device) -> dict[str, float]:
-    """The sum of each number over all processes, in float64."""
-    tensor = torch.tensor(list(numbers.values()), dtype=torch.float64, device=device)
-    if rank_count() > 1:
-        dist.all_reduce(tensor)
-    return dict(zip(numbers, tensor.tolist(), strict=True))
