@@ -254,10 +254,10 @@ class ClipWriter(VideoWriter):
     @property
     def sound(self) -> bool:
         """Whether sound has been copied."""
-        return isinstance(self._encoder, _ClipEncoder) and self._encoder.sound
+        return isinstance(self.encoder, _ClipEncoder) and self.encoder.sound
 
-    def _open(self, height: int, width: int) -> StreamEncoder:
-        return _ClipEncoder(self._temporary, width, height, self.clip)
+    def make_encoder(self, height: int, width: int) -> StreamEncoder:
+        return _ClipEncoder(self.temporary_path, width, height, self.clip)
 
 
 class _ClipEncoder(StreamEncoder):
@@ -268,17 +268,17 @@ class _ClipEncoder(StreamEncoder):
         super().__init__(H264, path, width, height, self._even, 1)
         self._clip = clip
         self._input = None
-        if clip.audio in self._container.supported_codecs:
+        if clip.audio in self.container.supported_codecs:
             self._input = av.open(str(clip.path), metadata_errors="replace")
         self.sound = False
         if self._input is not None:
             source = self._input.streams.audio[0]
-            self._output = self._container.add_stream_from_template(source)
+            self._output = self.container.add_stream_from_template(source)
             self._sounds = self._input.demux(source)
             self._held: av.Packet[AudioStream] | None = None
 
     def finish(self) -> None:
-        self._write(self._stream.encode(None))
+        self.write_packets(self.stream.encode(None))
         self._copy_sound(self._clip.seconds)
         self.close()
 
@@ -287,7 +287,7 @@ class _ClipEncoder(StreamEncoder):
         if self._input is not None:
             self._input.close()
 
-    def _write(self, packets: list[av.Packet[VideoStream]]) -> None:
+    def write_packets(self, packets: list[av.Packet[VideoStream]]) -> None:
         for packet in packets:
             assert packet.time_base is not None
             assert packet.pts is not None
@@ -300,7 +300,7 @@ class _ClipEncoder(StreamEncoder):
             packet.pts, packet.dts = (round(time / CLOCK) for time in times)
             packet.duration = 0
             self._copy_sound(times[1])
-            self._container.mux(packet)
+            self.container.mux(packet)
 
     def _time(self, index: int) -> Fraction:
         """The time of a frame; before the first and after the last frame, times follow the mean rate."""
@@ -331,5 +331,5 @@ class _ClipEncoder(StreamEncoder):
                 continue  # before the first frame
             packet.pts, packet.dts = begin, None if packet.dts is None else packet.dts - ticks
             packet.stream = self._output
-            self._container.mux(packet)
+            self.container.mux(packet)
             self.sound = True

@@ -111,7 +111,7 @@ class VideoWriter:
     memory until the end; .webp is lossy. A thread encodes frames while the caller makes the next ones.
     """
 
-    _encoder: StreamEncoder
+    encoder: StreamEncoder
 
     def __init__(
         self, path: str | os.PathLike[str], fps: float = 30, loop: int | None = None
@@ -139,7 +139,7 @@ class VideoWriter:
         self._stack = contextlib.ExitStack()
 
     def __enter__(self: W) -> W:
-        self._temporary = self._stack.enter_context(atomic_path(self.path))
+        self.temporary_path = self._stack.enter_context(atomic_path(self.path))
         return self
 
     def add(self, frame: Tensor) -> None:
@@ -147,8 +147,8 @@ class VideoWriter:
         if frame.ndim != 3 or frame.shape[2] != 3 or 0 in frame.shape:
             raise ValueError(f"a video frame is [H, W, 3], got {tuple(frame.shape)}")
         if self.frames == 0:
-            self._encoder = self._open(*frame.shape[:2])
-            self._stack.callback(self._encoder.close)
+            self.encoder = self.make_encoder(*frame.shape[:2])
+            self._stack.callback(self.encoder.close)
             self._aside = self._stack.enter_context(ThreadPoolExecutor(1))
             self._shape = frame.shape
         if frame.shape != self._shape:
@@ -162,7 +162,7 @@ class VideoWriter:
         pixels = np.array(
             to_uint8(frame).numpy()
         )  # a copy, because the caller may reuse a frame of bytes
-        self._encoding.append(self._aside.submit(self._encoder.add, pixels))
+        self._encoding.append(self._aside.submit(self.encoder.add, pixels))
         self.frames += 1
 
     def _wait(self, most: int) -> None:
@@ -183,14 +183,14 @@ class VideoWriter:
             if self.frames == 0:
                 raise ValueError(f"{self.path}: a video needs at least one frame")
             self._wait(0)
-            self._encoder.finish()
+            self.encoder.finish()
 
-    def _open(self, height: int, width: int) -> StreamEncoder:
+    def make_encoder(self, height: int, width: int) -> StreamEncoder:
         if max(height, width) > (largest := self._kind.max_side):
             raise InputError(
                 f"{self.path}: {width}×{height} is too large for this format (at most {largest})"
             )
-        return StreamEncoder(self._kind, self._temporary, width, height, self._rate, self._plays)
+        return StreamEncoder(self._kind, self.temporary_path, width, height, self._rate, self._plays)
 
 
 def save_video(
@@ -222,10 +222,10 @@ class StreamEncoder:
         ):  # GIF counts repetitions, and -1 means none; WebP counts how often the video plays
             loop = {0: 0, 1: -1}.get(plays, plays - 1) if kind is GIF else plays
             options["loop"] = str(loop)
-        self._container = av.open(str(path), "w", format=kind.container, options=options)
-        stream = self._container.add_stream(kind.codec, rate=rate, options=kind.options)
+        self.container = av.open(str(path), "w", format=kind.container, options=options)
+        stream = self.container.add_stream(kind.codec, rate=rate, options=kind.options)
         assert isinstance(stream, VideoStream)
-        self._stream = stream
+        self.stream = stream
         self._reformatter = VideoReformatter()
         self._palette = PaletteFilter(width, height, 1 / rate) if kind is GIF else None
         stream.width, stream.height, stream.pix_fmt = width, height, kind.pixels
@@ -253,7 +253,7 @@ class StreamEncoder:
     def _encode(self, picture: av.VideoFrame | None) -> None:
         """Encode a frame; None: the video ends."""
         for each in [picture] if self._palette is None else self._palette.push(picture):
-            self._write(self._stream.encode(each))
+            self.write_packets(self.stream.encode(each))
 
     def finish(self) -> None:
         """Write the packets that the encoder still holds, and repeat all packets as often as needed."""
@@ -266,16 +266,16 @@ class StreamEncoder:
                 packet.pts, packet.dts = (
                     None if t is None else t + after - before for t in (packet.pts, packet.dts)
                 )
-                self._container.mux(packet)
+                self.container.mux(packet)
         self.close()
 
     def close(self) -> None:
         """Close the file; may be called twice."""
-        self._container.close()
+        self.container.close()
 
-    def _write(self, packets: list[av.Packet[VideoStream]]) -> None:
+    def write_packets(self, packets: list[av.Packet[VideoStream]]) -> None:
         for packet in packets:
-            self._container.mux(packet)
+            self.container.mux(packet)
             if self._plays > 1:
                 self._packets.append(packet)
 
