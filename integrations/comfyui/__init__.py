@@ -27,7 +27,7 @@ from spackle.core.gaussians import Gaussians
 from spackle.core.trajectories import MAX_DISPARITY, TRAJECTORIES, TrajectoryKind
 from spackle.depth.units import RELATIVE_FAR_M, RELATIVE_KINDS, RELATIVE_NEAR_M, relative_depth
 from spackle.formats.gaussian_columns import SH_C0
-from spackle.views import PATH_FRAMES
+from spackle.views import DEFAULT_FRAME_COUNT
 
 FILLS = ("auto", "network", "exemplar", "lama", "none")
 FORMATS = (".ply", ".spz", ".sog", ".glb", ".splat", ".html")
@@ -135,7 +135,7 @@ class RenderView:
     @classmethod
     def INPUT_TYPES(cls) -> dict[str, Any]:
         """`frames` is the number of views in the batch."""
-        frames = ("INT", {"default": PATH_FRAMES, "min": 1, "max": 1000})
+        frames = ("INT", {"default": DEFAULT_FRAME_COUNT, "min": 1, "max": 1000})
         given = {
             "scene": ("SPACKLE_SCENE",),
             "trajectory": TRAJECTORY,

@@ -143,7 +143,11 @@ class Pipeline:
             if fill.mode == "scene" or fill.texture == "none":
                 chosen = [] if fill.texture == "none" else views.views_to_fill
                 filled = fill_scene(
-                    context, [views.cameras[k] for k in chosen], self.given_views is not None, step
+                    context,
+                    [views.cameras[k] for k in chosen],
+                    self.given_views is not None,
+                    step,
+                    always_filled=[n for n, k in enumerate(chosen) if k in views.always_filled],
                 )
                 aux = filled.aux
                 if views.frame_maker.is_plain:

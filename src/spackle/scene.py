@@ -27,7 +27,7 @@ from spackle.residual.features import hole_mask
 from spackle.runtime.files import PathOrFile, write_atomic
 from spackle.video.encoding import check_video, save_video
 from spackle.video.frames import Fit, FrameMaker, Show, StereoLayout, VideoOptions, parse_size
-from spackle.views import PATH_FRAMES, PathOptions
+from spackle.views import DEFAULT_FRAME_COUNT, PathOptions
 
 DEFAULT_SIZE = (1280, 720)  # width and height for a file that stores no camera
 
@@ -93,7 +93,7 @@ class Scene:
         self,
         trajectory: TrajectoryKind = "rotate-forward",
         disparity: float | None = None,
-        frames: int = PATH_FRAMES,
+        frames: int = DEFAULT_FRAME_COUNT,
         looped: bool = False,
     ) -> list[Camera]:
         """Cameras of a path around the photo's camera position, of even width and height.

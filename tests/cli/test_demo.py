@@ -25,7 +25,7 @@ def test_the_demo_fills_the_hole_better_than_2d_inpainting(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("skimage.data")
-    monkeypatch.setattr("spackle.views.SECONDS", 1.0)  # of the video
+    monkeypatch.setattr("spackle.views.DEFAULT_VIDEO_SECONDS", 1.0)  # of the video
     folder = tmp_path / "out"
     result = run("demo", "-o", folder)
     assert result.code == 0, result.err

@@ -212,7 +212,7 @@ def test_impossible_paths_are_refused(kind: str, disparity: float, frames: int, 
 @pytest.mark.parametrize(
     ("usual", "allowed"), [(0.3, 0.5), (0.3, 0.06), (0.15, 0.03), (0.3, 0.001), (0.02, 0.001)]
 )
-def test_choose_move_finds_the_largest_disparity_within_the_limit(
+def test_choose_disparity_finds_the_largest_disparity_within_the_limit(
     usual: float, allowed: float
 ) -> None:
     scene, photo = box_before_wall(width=288, height=216, focal=240), Path("photo.png")

@@ -163,14 +163,14 @@ def save_views(done: CompletedPhoto, path: Path, renderer: Renderer, step: Progr
 @torch.no_grad()
 def _save_pictures(done: CompletedPhoto, folder: Path, renderer: Renderer, step: Progress) -> None:
     """Write each given view as PNG: 0000.png completed, 0000_base.png before, 0000_mask.png its holes (white)."""
-    for index, camera in enumerate(done.views.cameras[: done.views.stills]):
+    for index, camera in enumerate(done.views.cameras[: done.views.still_count]):
         before = renderer.render(done.scene.base, camera)
         save_png(
             renderer.render(done.scene.of_view(index), camera).rgb, folder / f"{index:04d}.png"
         )
         save_png(before.rgb, folder / f"{index:04d}_base.png")
         save_gray_png(hole_mask(before.alpha).to(torch.float32), folder / f"{index:04d}_mask.png")
-        step(index + 1, done.views.stills)
+        step(index + 1, done.views.still_count)
 
 
 @torch.no_grad()

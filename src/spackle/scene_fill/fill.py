@@ -8,7 +8,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -145,6 +145,8 @@ def fill_scene(
     cameras: Sequence[Camera],
     exact: bool = False,
     progress: Progress | None = None,
+    *,
+    always_filled: Collection[int] = (),
 ) -> FilledScene:
     """Complete all views of a path with one set of aux Gaussians.
 
@@ -159,6 +161,8 @@ def fill_scene(
         exact: check every view, and complete every view that has a hole. Otherwise invisibly small holes may remain,
             and only half of a long path's frames are checked.
         progress: called with (number of visited views, number of views to visit).
+        always_filled: indices of cameras that are checked even if they are not in that half. Order and half follow
+            from the places of the eyes alone, so a view that shows more from the same place would be left out.
     """
     if not cameras:
         return FilledScene(Gaussians.empty(context.base.means.device), {})
@@ -166,6 +170,7 @@ def fill_scene(
     order, stage = farthest_first(cameras, context.photo_camera), _Stage(placed)
     enough = 0 if exact else FEW_HOLES
     visited = order if exact else order[: max(LEAST_VISITS, len(order) // 2)]
+    visited = visited + [index for index in order[len(visited) :] if index in always_filled]
     guards, bare = {-1: context.photo_guard()}, dict[int, Rendering]()
     for index in order[:WIDEST]:
         bare[index] = stage.look(cameras[index])

@@ -31,7 +31,7 @@ from spackle.runtime.progress import Progress, Reporter
 from spackle.runtime.task_process import SendEvent
 from spackle.scene import Scene
 from spackle.video.frames import DEFAULT_FPS
-from spackle.views import MAX_FRAMES, SECONDS, PathOptions
+from spackle.views import DEFAULT_VIDEO_SECONDS, MAX_FRAME_COUNT, PathOptions
 from spackle.web.jobs import Job
 
 Download = Literal["scene.ply", "scene.spz", "scene.sog", "scene.glb", "scene.html", "report.json"]
@@ -69,9 +69,9 @@ class SceneOptions(BaseModel):
     )
     trajectory: TrajectoryKind = Field("rotate-forward", description="Camera path of the video.")
     frames: int = Field(
-        round(SECONDS * DEFAULT_FPS),
+        round(DEFAULT_VIDEO_SECONDS * DEFAULT_FPS),
         ge=1,
-        le=MAX_FRAMES,
+        le=MAX_FRAME_COUNT,
         description="Number of frames of the video, 30 per second.",
     )
     fill: FillTexture = Field("auto", description="Source of the texture in the holes.")
