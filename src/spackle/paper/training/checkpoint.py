@@ -34,7 +34,8 @@ class TrainingProgress:
     """How far a run is, and its validations so far."""
 
     step: int = 0  # steps done
-    # Lowest value of the task's `selection_measure`, such as the loss; None before the first validation.
+    # Lowest value of the task's `selection_measure`, such as the loss; None before the first
+    # validation.
     best: float | None = None
     best_step: int = 0  # the step of that value
     stale: int = 0  # validations since `best_step`
@@ -49,8 +50,9 @@ class TrainingProgress:
 
         Args:
             measures: means over the validation items, by name.
-            selection_measure: the name of the measure that decides; lower is better. If it is missing from `measures`,
-                because it was never finite, the validation is no improvement.
+            selection_measure: the name of the measure that decides; lower is better. If it is
+                missing from `measures`, because it was never finite, the validation is no
+                improvement.
             min_delta: an improvement must be larger than this.
         """
         self.history.append({"step": self.step, **measures})
@@ -68,7 +70,9 @@ class TrainingProgress:
 
 @dataclasses.dataclass(frozen=True)
 class Checkpoint:
-    """All state on which the next step depends; the number of a step determines the step's samples."""
+    """All state on which the next step depends; the number of a step determines the step's
+    samples.
+    """
 
     progress: TrainingProgress
     network: dict[str, Tensor]  # weights by name
@@ -80,7 +84,9 @@ class Checkpoint:
 
 
 def save_checkpoint(checkpoint: Checkpoint, folder: Path) -> None:
-    """Write checkpoint.pt; if the disk is full, raise InputError and keep the previous checkpoint."""
+    """Write checkpoint.pt; if the disk is full, raise InputError and keep the previous
+    checkpoint.
+    """
     state = {**vars(checkpoint), "progress": dataclasses.asdict(checkpoint.progress)}
 
     # torch.save to a file would hide that the disk is full, so the bytes are made in memory.
@@ -114,7 +120,8 @@ def find_checkpoint(
         log: receives a line if there is a checkpoint.
 
     Raises:
-        InputError: the checkpoint belongs to a run of another method, with other settings or other samples.
+        InputError: the checkpoint belongs to a run of another method, with other settings or other
+            samples.
     """
     checkpoint = load_checkpoint(output)
     if checkpoint is None:
@@ -146,10 +153,11 @@ def remove_run(output: Path) -> None:
 
 
 def open_logs(folder: Path, first_step: int, log: Log) -> AbstractContextManager[Any]:
-    """TensorBoard's writer as a context that closes it; a context of None, and a line to `log`, without TensorBoard.
+    """TensorBoard's writer as a context that closes it; a context of None, and a line to `log`,
+    without TensorBoard.
 
-    A resumed run repeats the steps after its checkpoint: values that the logs have for these steps, from `first_step`
-    on, are hidden.
+    A resumed run repeats the steps after its checkpoint: values that the logs have for these steps,
+    from `first_step` on, are hidden.
     """
     try:
         # If this package is missing, torch's import raises another error than ImportError.

@@ -1,4 +1,6 @@
-"""Networks that turn images into features, by which images are compared: ResNet-50, as in the paper, and SqueezeNet."""
+"""Networks that turn images into features, by which images are compared: ResNet-50, as in the
+paper, and SqueezeNet.
+"""
 
 from __future__ import annotations
 
@@ -14,12 +16,14 @@ from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import check_file
 from spackle.weights.checkpoints import load_strict, read_tensors
 
-# Mean and standard deviation of the red, green and blue of ImageNet's photos, sRGB 0..1, as in torchvision.
+# Mean and standard deviation of the red, green and blue of ImageNet's photos, sRGB 0..1, as in
+# torchvision.
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 # Mean of the blue, green and red of ImageNet's photos, 0..255, as in Caffe.
 CAFFE_MEAN_BGR = (104.0, 117.0, 123.0)
-# ResNet-50's four layers: input channels and inner channels of the first block, and number of blocks.
+# ResNet-50's four layers: input channels and inner channels of the first block, and number of
+# blocks.
 RESNET50_LAYERS = ((64, 64, 3), (256, 128, 4), (512, 256, 6), (1024, 512, 3))
 # SqueezeNet's blocks by the number in their names: input channels and squeezed channels.
 SQUEEZENET_BLOCKS = {
@@ -35,7 +39,9 @@ SQUEEZENET_BLOCKS = {
 
 
 class FeatureNet(nn.Module):
-    """Maps [B, 3, H, W] sRGB 0..1 to four feature maps [B, C, h, w], fine to coarse; weights get no gradients."""
+    """Maps [B, 3, H, W] sRGB 0..1 to four feature maps [B, C, h, w], fine to coarse; weights get no
+    gradients.
+    """
 
     head: str  # prefix of the names of the classifier's tensors, which are ignored
 
@@ -73,16 +79,19 @@ class Bottleneck(nn.Module):
 
 
 class ResNet50(FeatureNet):
-    """The paper's feature network, with torchvision's names of tensors, for images of at least 32 pixels a side.
+    """The paper's feature network, with torchvision's names of tensors, for images of at least 32
+    pixels a side.
 
-    The feature maps are the outputs of layer1 to layer4: 256, 512, 1024, 2048 channels at 1/4, 1/8, 1/16, 1/32 of the
-    image's size.
+    The feature maps are the outputs of layer1 to layer4: 256, 512, 1024, 2048 channels at 1/4, 1/8,
+    1/16, 1/32 of the image's size.
     """
 
     head = "fc."
 
     def __init__(self) -> None:
-        """Create the network with random weights, under the names of torchvision: conv1, bn1, layer1 to layer4."""
+        """Create the network with random weights, under the names of torchvision: conv1, bn1,
+        layer1 to layer4.
+        """
         super().__init__()
         self.conv1 = nn.Conv2d(3, 64, 7, stride=2, padding=3, bias=False)
         self.bn1 = nn.BatchNorm2d(64)
@@ -123,16 +132,19 @@ class Fire(nn.Module):
 
 
 class SqueezeNet(FeatureNet):
-    """SqueezeNet 1.0 as in Caffe: 3 MB, much faster than ResNet-50, for images of at least 32 pixels a side.
+    """SqueezeNet 1.0 as in Caffe: 3 MB, much faster than ResNet-50, for images of at least 32
+    pixels a side.
 
-    The feature maps are the outputs of conv1, fire4, fire8, fire9: 96, 256, 512, 512 channels at about 1/2, 1/4, 1/8,
-    1/16 of the image's size.
+    The feature maps are the outputs of conv1, fire4, fire8, fire9: 96, 256, 512, 512 channels at
+    about 1/2, 1/4, 1/8, 1/16 of the image's size.
     """
 
     head = "conv10."
 
     def __init__(self) -> None:
-        """Create the network with random weights, under the names of Caffe: conv1, fire2 to fire9."""
+        """Create the network with random weights, under the names of Caffe: conv1, fire2 to
+        fire9.
+        """
         super().__init__()
         self.conv1 = nn.Conv2d(3, 96, 7, stride=2)
         for number, (channels_in, squeeze) in SQUEEZENET_BLOCKS.items():
@@ -163,8 +175,8 @@ def load_features(
 
     Args:
         name: which network.
-        path: torchvision's .pth file of ResNet-50, or an .npz of SqueezeNet 1.0 with the names of Caffe: `conv1.w`,
-            `conv1.b`, `fire2/conv1x1_1.w`, ...
+        path: torchvision's .pth file of ResNet-50, or an .npz of SqueezeNet 1.0 with the names of
+            Caffe: `conv1.w`, `conv1.b`, `fire2/conv1x1_1.w`, ...
         device: where the network computes.
 
     Raises:
@@ -191,7 +203,8 @@ def load_features(
 
 
 def read_caffe_arrays(path: Path, advice: str) -> dict[str, Tensor]:
-    """The arrays of an .npz with Caffe's names, under torch's names: `fire2/conv1x1_1.w` is `fire2.conv1x1_1.weight`.
+    """The arrays of an .npz with Caffe's names, under torch's names: `fire2/conv1x1_1.w` is
+    `fire2.conv1x1_1.weight`.
 
     InputError if the file is missing or holds no such arrays; the message ends with `advice`.
     """
@@ -210,7 +223,9 @@ def read_caffe_arrays(path: Path, advice: str) -> dict[str, Tensor]:
 
 
 def channel_constants(numbers: tuple[float, ...], images: Tensor) -> Tensor:
-    """Numbers [C], one a channel, as [C, 1, 1] of the dtype and on the device of images [B, C, H, W]."""
+    """Numbers [C], one a channel, as [C, 1, 1] of the dtype and on the device of images [B, C, H,
+    W].
+    """
     # Made on the CPU and sent without waiting: making them on a GPU would wait for the GPU.
     constants = torch.tensor(numbers, dtype=images.dtype)
     return constants.to(images.device, non_blocking=True)[:, None, None]

@@ -1,9 +1,9 @@
 """The four terms of eq. 12, and two measures of how well a hole was filled.
 
-Arguments of the terms: `rgb` [B, H, W, 3] sRGB 0..1 and `alpha` [B, H, W] of completed views, the base's view
-`base_rgb` [B, H, W, 3], the `target` [B, H, W, 3], the `hole` [B, H, W] bool: pixels that the photo does not show. A
-term averages over an image's pixels inside or outside of the hole, then over images. An image without such pixels counts
-as a differentiable 0.
+Arguments of the terms: `rgb` [B, H, W, 3] sRGB 0..1 and `alpha` [B, H, W] of completed views, the
+base's view `base_rgb` [B, H, W, 3], the `target` [B, H, W, 3], the `hole` [B, H, W] bool: pixels
+that the photo does not show. A term averages over an image's pixels inside or outside of the hole,
+then over images. An image without such pixels counts as a differentiable 0.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ def color_loss(rgb: Tensor, target: Tensor, hole: Tensor, blur: float = 0.0) -> 
         rgb: completed views [B, H, W, 3], sRGB 0..1.
         target: what they should look like [B, H, W, 3].
         hole: [B, H, W] bool.
-        blur: if above 0, a Gaussian with this standard deviation in pixels first blurs the difference within the hole.
-            The perceptual term alone then determines texture.
+        blur: if above 0, a Gaussian with this standard deviation in pixels first blurs the
+            difference within the hole. The perceptual term alone then determines texture.
     """
     difference = torch.where(hole[..., None], rgb - target, 0)
     if blur > 0:
@@ -50,7 +50,9 @@ def alpha_loss(alpha: Tensor, hole: Tensor) -> Tensor:
 
 
 def preserve_loss(rgb: Tensor, base_rgb: Tensor, hole: Tensor) -> Tensor:
-    """[] mean |rgb - base_rgb| over pixels outside of the hole and channels; `base_rgb` gets no gradient."""
+    """[] mean |rgb - base_rgb| over pixels outside of the hole and channels; `base_rgb` gets no
+    gradient.
+    """
     return color_loss(rgb, base_rgb.detach(), ~hole)
 
 
@@ -66,14 +68,17 @@ def perceptual_loss(
 ) -> Tensor:
     """[] differences of features and of Gram matrices near the hole, summed over layers.
 
-    F and T are a layer's features [C, h, w] of prediction and target, divided by the root mean square of T. The weight
-    w [h, w] is the fraction of each cell that the dilated hole covers. A layer adds
+    F and T are a layer's features [C, h, w] of prediction and target, divided by the root mean
+    square of T. The weight w [h, w] is the fraction of each cell that the dilated hole covers. A
+    layer adds
 
-        sum(w |F - T|) / (C sum(w))  +  gram · mean |G(F) - G(T)|,    G(F) = (F w) F^T / sum(w),  [C, C].
+        sum(w |F - T|) / (C sum(w))  +  gram · mean |G(F) - G(T)|,    G(F) = (F w) F^T / sum(w),
+        [C, C].
 
     Args:
         features: the network.
-        rgb, target, hole: as in the other terms. Outside of the dilated hole, the target replaces the prediction.
+        rgb, target, hole: as in the other terms. Outside of the dilated hole, the target replaces
+            the prediction.
         dilation: side in pixels of the max-pool that dilates the hole.
         size: longer side in pixels to which images are resized for the network; None: not resized.
         gram: weight of the Gram matrices.
@@ -140,11 +145,13 @@ def total_loss(
 
 @torch.no_grad()
 def hole_distance(features: FeatureNet, rgb: Tensor, target: Tensor, hole: Tensor) -> float:
-    """Perceptual distance inside a hole, like LPIPS without learned weights; 0 if equal, NaN if the hole is empty.
+    """Perceptual distance inside a hole, like LPIPS without learned weights; 0 if equal, NaN if the
+    hole is empty.
 
-    Feature vectors are scaled to unit length. Their squared difference is averaged over a layer's cells, weighted by
-    the fraction of each cell that the hole covers, and summed over layers. Only distances by the same network are
-    comparable. `rgb` and `target` are [H, W, 3] sRGB 0..1, `hole` is [H, W] bool.
+    Feature vectors are scaled to unit length. Their squared difference is averaged over a layer's
+    cells, weighted by the fraction of each cell that the hole covers, and summed over layers. Only
+    distances by the same network are comparable. `rgb` and `target` are [H, W, 3] sRGB 0..1, `hole`
+    is [H, W] bool.
     """
     if not hole.any():
         return math.nan
@@ -176,7 +183,9 @@ def hole_psnr(rgb: Tensor, target: Tensor, hole: Tensor) -> float:
 
 
 def covered_fraction(mask: Tensor, features: Tensor) -> Tensor:
-    """[B, 1, h, w]: the fraction of each cell of a feature map [B, C, h, w] that a mask [B, H, W] covers."""
+    """[B, 1, h, w]: the fraction of each cell of a feature map [B, C, h, w] that a mask [B, H, W]
+    covers.
+    """
     height, width = features.shape[-2:]
     return F.adaptive_avg_pool2d(mask[:, None].to(features.dtype), (height, width))
 
@@ -191,7 +200,8 @@ def mean_of_images(values: Tensor, mask: Tensor) -> Tensor:
 
 
 def resize_for_network(images: Tensor, size: int | None) -> Tensor:
-    """Images [B, H, W, 3] as [B, 3, h, w] for a feature network, with a longer side of `size` pixels.
+    """Images [B, H, W, 3] as [B, 3, h, w] for a feature network, with a longer side of `size`
+    pixels.
 
     None keeps the size.
     """
@@ -205,12 +215,15 @@ def resize_for_network(images: Tensor, size: int | None) -> Tensor:
 
 
 def layer_terms(prediction: Tensor, target: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """The feature term [] and the Gram term [] of the perceptual loss for one layer of the feature network.
+    """The feature term [] and the Gram term [] of the perceptual loss for one layer of the feature
+    network.
 
-    Both compare features of prediction and target [B, C, h, w], weighted by cell, with weights [B, 1, h, w]. The feature
-    term is the mean difference; the Gram term is the mean difference of the Gram matrices, which describe textures.
+    Both compare features of prediction and target [B, C, h, w], weighted by cell, with weights [B,
+    1, h, w]. The feature term is the mean difference; the Gram term is the mean difference of the
+    Gram matrices, which describe textures.
     """
-    # Layers have features of different sizes; divided by the target's root mean square, all layers count alike.
+    # Layers have features of different sizes; divided by the target's root mean square, all layers
+    # count alike.
     mean_square = target.square().mean(dim=(1, 2, 3), keepdim=True)
     root_mean_square = (mean_square + MIN_DIVISOR**2).sqrt()  # [B, 1, 1, 1]
     prediction = prediction / root_mean_square

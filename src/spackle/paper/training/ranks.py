@@ -1,6 +1,7 @@
 """Several processes that train one network together, started by torchrun.
 
-Each process has a number, its rank. Without torchrun there is one process, of rank 0, and all functions work, too.
+Each process has a number, its rank. Without torchrun there is one process, of rank 0, and all
+functions work, too.
 """
 
 from __future__ import annotations
@@ -23,10 +24,12 @@ MAX_WAIT_FOR_RANKS = timedelta(hours=24)
 def joined_ranks(device_kind: str) -> Iterator[torch.device]:
     """Join the processes of this run during the block; yields the device of this process.
 
-    Under torchrun, environment variables say which processes there are. Without these variables nothing is joined.
+    Under torchrun, environment variables say which processes there are. Without these variables
+    nothing is joined.
 
     Args:
-        device_kind: "cuda", whose processes communicate by NCCL, or "cpu", whose processes use Gloo.
+        device_kind: "cuda", whose processes communicate by NCCL, or "cpu", whose processes use
+            Gloo.
 
     Raises:
         InputError: the environment variables are set, but the processes cannot join.

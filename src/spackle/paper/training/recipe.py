@@ -16,37 +16,49 @@ from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import check_file
 from spackle.weights import installed_weights
 
-PACKAGED = Path(__file__).parent / "recipes"
-MAY_CHANGE_ON_RESUME = "free"  # marks keys that may change when a run resumes; samples are compared by digest, not by these keys
+PACKAGED_RECIPES = Path(__file__).parent / "recipes"
+# Marks keys that may change when a run resumes; the samples are compared by digest, not by these
+# keys.
+MAY_CHANGE_ON_RESUME = "may change on resume"
+T = TypeVar("T")
 
 
-def must_hold(text: str, holds: Callable[[Any], bool]) -> AfterValidator:
-    """A validator that refuses a value for which `holds` is false; the message is `text`."""
+def must_hold(message: str, condition: Callable[[Any], bool]) -> AfterValidator:
+    """A validator of pydantic that refuses a value for which `condition` is false, with this
+    message.
+    """
 
     def check(value: Any) -> Any:
-        if not holds(value):
-            raise ValueError(text)
+        if not condition(value):
+            raise ValueError(message)
         return value
 
     return AfterValidator(check)
 
 
-T = TypeVar("T")
-Section = Annotated[
-    T, BeforeValidator(lambda value: {} if value is None else value)
-]  # an empty section has defaults
-# YAML reads 1e3 as text.
-Int = Annotated[
-    int,
-    BeforeValidator(lambda v: float(v) if re.fullmatch(r"\d+(\.\d*)?[eE]\+?\d+", str(v)) else v),
-]
+def empty_section_as_defaults(value: object) -> object:
+    """An empty dictionary for None, which is how YAML reads a section without keys."""
+    return {} if value is None else value
+
+
+def scientific_as_number(value: object) -> object:
+    """The number for a text such as 1e3, which YAML reads as text; other values stay as they
+    are.
+    """
+    if re.fullmatch(r"\d+(\.\d*)?[eE]\+?\d+", str(value)):
+        return float(str(value))
+    return value
+
+
+Section = Annotated[T, BeforeValidator(empty_section_as_defaults)]
+Int = Annotated[int, BeforeValidator(scientific_as_number)]
 NonNegative = Annotated[float, Field(ge=0, le=1e6)]
 Count = Annotated[Int, Field(ge=1, le=1_000_000)]  # file names of samples have six digits
 Beta = Annotated[float, Field(ge=0, lt=1)]
 Disparity = Annotated[float, Field(ge=0, le=MAX_DISPARITY)]
 Interval = Annotated[Int, Field(ge=1), MAY_CHANGE_ON_RESUME]  # steps
 OptionalPath = Annotated[Path | None, MAY_CHANGE_ON_RESUME]
-Seed = Annotated[Int, Field(ge=0, le=2**31 - 2)]
+Seed = Annotated[Int, Field(ge=0, le=2**31 - 2)]  # training and validation use 2 · seed and more
 
 
 class RecipePart(BaseModel):
@@ -68,7 +80,9 @@ class Shares(RecipePart):
 
     composites: NonNegative = 0.66
     rgbd: NonNegative = 0.12
-    stereo: NonNegative = 0.10  # `reverse_view` of the left photo
+    stereo: NonNegative = (
+        0.10  # the left photo is the target, with holes where a virtual camera sees nothing
+    )
     pairs: NonNegative = 0.12  # the right photo is the target
     pseudo: Annotated[NonNegative, MAY_CHANGE_ON_RESUME] = 1.0  # views of a dataset
 
@@ -83,7 +97,7 @@ class DataRecipe(RecipePart):
     shares: Section[Shares] = Shares()
     # Least and greatest disparity of the virtual camera.
     disparity: Annotated[
-        tuple[Disparity, Disparity], must_hold("must ascend", lambda of: of[0] <= of[1])
+        tuple[Disparity, Disparity], must_hold("must ascend", lambda pair: pair[0] <= pair[1])
     ] = (0.1, 0.6)
     views: Count = 20_000  # the paper: 20 views of 1,000 photos
     crops: Annotated[Int, Field(ge=1, le=100)] = 3  # most crops of a view
@@ -94,7 +108,9 @@ class DataRecipe(RecipePart):
 
 
 class LossRecipe(RecipePart):
-    """Weights of the terms of eq. 12, and settings of the terms (paper, "Training Details and Loss Weights")."""
+    """Weights of the terms of eq. 12, and settings of the terms (paper, "Training Details and Loss
+    Weights").
+    """
 
     color: NonNegative = 10.0
     alpha: NonNegative = 0.5
@@ -104,24 +120,28 @@ class LossRecipe(RecipePart):
     features_path: OptionalPath = None
     # Longer side in pixels to which crops are resized for the feature network; None: not resized.
     feature_size: Annotated[Int, Field(ge=64, le=4096)] | None = 512
+    # Side in pixels of the square by which the perceptual term extends a hole.
     dilation: Annotated[
         Int, Field(ge=1, le=1001), must_hold("must be odd", lambda side: side % 2 == 1)
-    ] = 21  # pixels
-    color_blur: Annotated[float, Field(ge=0, le=64)] = (
-        0.0  # standard deviation in pixels, see `color_loss`
-    )
+    ] = 21
+    # Standard deviation in pixels of a Gaussian that blurs the colour difference; 0: no blur.
+    color_blur: Annotated[float, Field(ge=0, le=64)] = 0.0
     gram: NonNegative = 1.0  # weight of Gram matrices within the perceptual term
 
     @property
     def features_file(self) -> Path | None:
-        """Weights of the feature network: `features_path`, else the file of `spackle weights get features`."""
-        return self.features_path or (
-            installed_weights("features") if self.features == "resnet50" else None
-        )
+        """Weights of the feature network: `features_path`, else the file of `spackle weights get
+        features`.
+        """
+        if self.features_path is not None or self.features != "resnet50":
+            return self.features_path
+        return installed_weights("features")
 
 
 class OptimRecipe(RecipePart):
-    """AdamW with a linear warm-up, then a cosine decay (paper, "Training Details and Loss Weights")."""
+    """AdamW with a linear warm-up, then a cosine decay (paper, "Training Details and Loss
+    Weights").
+    """
 
     lr: Annotated[float, Field(gt=0, le=1)] = 1.6e-4
     min_lr: Annotated[float, Field(ge=0, le=1)] = 1.6e-5
@@ -131,9 +151,8 @@ class OptimRecipe(RecipePart):
     betas: tuple[Beta, Beta] = (0.9, 0.999)
     weight_decay: Annotated[float, Field(ge=0, le=10)] = 1e-4
     clip: Annotated[float, Field(gt=0)] = 1.0  # largest norm of the gradient
-    ema: Beta = (
-        0.999  # decay of the averaged weights, which are validated and exported; 0: no average
-    )
+    # Decay of the averaged weights, which are validated and exported; 0: no average.
+    ema: Beta = 0.999
     precision: Precision = "auto"  # of the network; auto: bf16 if the hardware supports it natively
 
 
@@ -145,19 +164,18 @@ class RunRecipe(RecipePart):
     save_every: Interval = 1000
     log_every: Interval = 50
     patience: Interval = 10  # validations without improvement before the run ends
-    min_delta: Annotated[float, Field(ge=0), MAY_CHANGE_ON_RESUME] = (
-        1e-4  # smaller improvements do not count
-    )
-    device: Annotated[Literal["auto", "cpu", "cuda"], MAY_CHANGE_ON_RESUME] = (
-        "auto"  # of the networks, not of the renderer
-    )
+    # Smaller improvements do not count.
+    min_delta: Annotated[float, Field(ge=0), MAY_CHANGE_ON_RESUME] = 1e-4
+    # Of the networks, not of the renderer.
+    device: Annotated[Literal["auto", "cpu", "cuda"], MAY_CHANGE_ON_RESUME] = "auto"
 
 
 class AnyRecipe(RecipePart):
     """The sections that all recipes have."""
 
     optim: Annotated[
-        Section[OptimRecipe], must_hold("min_lr must be <= lr", lambda o: o.min_lr <= o.lr)
+        Section[OptimRecipe],
+        must_hold("min_lr must be <= lr", lambda optim: optim.min_lr <= optim.lr),
     ] = OptimRecipe()
     run: Section[RunRecipe] = RunRecipe()
 
@@ -167,28 +185,41 @@ class Recipe(AnyRecipe):
 
     data: Section[DataRecipe] = DataRecipe()
     loss: Section[LossRecipe] = LossRecipe()
-    network: Annotated[Literal["unet", "sharp-decoder"], MAY_CHANGE_ON_RESUME] = (
-        "unet"  # architecture of the residual
-    )
+    # Architecture of the residual.
+    network: Annotated[Literal["unet", "sharp-decoder"], MAY_CHANGE_ON_RESUME] = "unet"
     init: Path | None = None  # initial weights; sharp-decoder also takes SHARP's checkpoint
 
 
 R = TypeVar("R", bound=AnyRecipe)
 
 
-def changed_keys(stored: Mapping[str, Any], recipe: RecipePart, above: str = "") -> list[str]:
-    """Keys in which a recipe differs from a `stored` model_dump, prefixed by `above`; `MAY_CHANGE_ON_RESUME` keys are ignored."""
-    fields, now = type(recipe).model_fields, recipe.model_dump(mode="json")
-    keys = [
-        above + name for name, value in stored.items() if name not in fields and value is not None
-    ]
+def changed_keys(stored: Mapping[str, Any], recipe: RecipePart, prefix: str = "") -> list[str]:
+    """The sorted keys in which a recipe differs from a stored one, such as "optim.lr".
+
+    Keys that are marked as `MAY_CHANGE_ON_RESUME` are ignored.
+
+    Args:
+        stored: the earlier recipe, or a section of it, ready for JSON.
+        recipe: the recipe, or the same section of it.
+        prefix: the name of the section and a dot; it comes before the keys.
+    """
+    fields = type(recipe).model_fields
+    values = recipe.model_dump(mode="json")
+
+    # A stored key that this version does not know matters only if it had a value.
+    changes = []
+    for name, stored_value in stored.items():
+        if name not in fields and stored_value is not None:
+            changes.append(prefix + name)
+
     for name, field in fields.items():
-        part = getattr(recipe, name)
-        if isinstance(part, RecipePart):
-            keys += changed_keys(stored.get(name) or {}, part, f"{above}{name}.")
-        elif MAY_CHANGE_ON_RESUME not in field.metadata and stored.get(name) != now[name]:
-            keys.append(above + name)
-    return sorted(keys)
+        value = getattr(recipe, name)
+        if isinstance(value, RecipePart):
+            stored_section = stored.get(name) or {}
+            changes += changed_keys(stored_section, value, f"{prefix}{name}.")
+        elif MAY_CHANGE_ON_RESUME not in field.metadata and stored.get(name) != values[name]:
+            changes.append(prefix + name)
+    return sorted(changes)
 
 
 def load_recipe(kind: type[R], path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> R:
@@ -196,24 +227,20 @@ def load_recipe(kind: type[R], path: str | os.PathLike[str], overrides: Sequence
 
     Args:
         kind: the class of the recipe, such as `Recipe`.
-        path: a YAML file, or the name of a packaged recipe such as "cpu". Relative paths in the file are relative to
-            the working directory.
-        overrides: texts `key=value`, such as optim.steps=100 or data.rgbd.0.folder=kitchen; values are YAML.
+        path: a YAML file, or the name of a packaged recipe such as "cpu". Relative paths in the
+            file are relative to the working directory.
+        overrides: texts `key=value`, such as optim.steps=100 or data.rgbd.0.folder=kitchen; values
+            are YAML.
 
     Raises:
         InputError: the file is missing or broken, or has an unknown key or a value out of bounds.
     """
-    names = sorted(file.stem for file in PACKAGED.glob("*.yaml"))
-    if os.fspath(path) in names and not os.path.isfile(path):
-        path = PACKAGED / f"{os.fspath(path)}.yaml"
-    elif os.sep not in os.fspath(path) and not os.path.exists(path):
-        raise InputError(
-            f"{path}: no such recipe; choose from {', '.join(names)}, or give a YAML file"
-        )
+    path = find_recipe(path)
     check_file(path, "recipe")
     with as_input_error(path, "not a recipe: {reason}", OSError, UnicodeDecodeError):
         text = Path(path).read_text(encoding="utf-8")
-    content = parse_yaml(text, path) or {}
+    content = parse_yaml(text, path) or {}  # an empty file has defaults only
+
     for override in overrides:
         key, equals, value = override.partition("=")
         if not equals or not key:
@@ -222,11 +249,31 @@ def load_recipe(kind: type[R], path: str | os.PathLike[str], overrides: Sequence
             )
         with as_input_error(override, f"{path} has no such key ({{reason}})"):
             set_nested(content, key.split("."), parse_yaml(value, override))
+
     with as_input_error(path, "{reason}", ValidationError):
         return kind.model_validate(content)
 
 
+def find_recipe(path: str | os.PathLike[str]) -> str | os.PathLike[str]:
+    """The file of a packaged recipe, given by its name, such as "cpu"; other paths stay as they
+    are.
+
+    A file in the working directory goes before a packaged recipe of the same name. InputError if a
+    plain name is neither.
+    """
+    name = os.fspath(path)
+    packaged_names = sorted(file.stem for file in PACKAGED_RECIPES.glob("*.yaml"))
+    if name in packaged_names and not os.path.isfile(path):
+        return PACKAGED_RECIPES / f"{name}.yaml"
+    if os.sep not in name and not os.path.exists(path):
+        raise InputError(
+            f"{path}: no such recipe; choose from {', '.join(packaged_names)}, or give a YAML file"
+        )
+    return path
+
+
 def parse_yaml(text: str, where: object) -> Any:
+    """The value that a YAML text holds; InputError, which names `where`, if it is no YAML."""
     try:
         import yaml
     except ImportError as error:
@@ -238,11 +285,15 @@ def parse_yaml(text: str, where: object) -> Any:
 
 
 def set_nested(content: Any, keys: Sequence[str], value: object) -> None:
-    """Set a value in nested dictionaries and lists; missing dictionaries are created."""
-    for key, following in zip(keys, [*keys[1:], None], strict=True):
+    """Set `content[keys[0]][keys[1]]...` to a value, in nested dictionaries and lists.
+
+    Missing dictionaries are created. Any exception may come if a key leads into something else, or
+    a list has no such place.
+    """
+    for key in keys[:-1]:
         index = int(key) if isinstance(content, list) else key
-        if following is None:
-            content[index] = value
-        elif isinstance(content, dict) and not isinstance(content.get(index), (dict, list)):
+        if isinstance(content, dict) and not isinstance(content.get(index), dict | list):
             content[index] = {}
         content = content[index]
+    last_index = int(keys[-1]) if isinstance(content, list) else keys[-1]
+    content[last_index] = value

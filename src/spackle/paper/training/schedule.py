@@ -1,4 +1,6 @@
-"""What happens at which step: learning rate, averaging of weights, choice of samples, reading of samples in advance."""
+"""What happens at which step: learning rate, averaging of weights, choice of samples, reading of
+samples in advance.
+"""
 
 from __future__ import annotations
 
@@ -14,14 +16,16 @@ from numpy.typing import NDArray
 
 from spackle.paper.training.recipe import OptimRecipe
 
-# Early on, the average of the weights keeps the share (step + 1) / (step + 10), and so soon forgets the initial weights.
+# Early on, the average of the weights keeps the share (step + 1) / (step + 10), and so soon forgets
+# the initial weights.
 EMA_WARMUP_STEPS = 10
 K = TypeVar("K")
 V = TypeVar("V")
 
 
 def learning_rate(step: int, optim: OptimRecipe) -> float:
-    """The learning rate at a step, counted from 0: a linear warm-up, then half a cosine down to `optim.min_lr`.
+    """The learning rate at a step, counted from 0: a linear warm-up, then half a cosine down to
+    `optim.min_lr`.
 
     This is the paper's schedule ("Training Details and Loss Weights"):
 
@@ -38,7 +42,8 @@ def learning_rate(step: int, optim: OptimRecipe) -> float:
 
 
 def ema_decay(step: int, decay: float) -> float:
-    """The share of the old average in the moving average of the weights at a step; the new weights get the rest.
+    """The share of the old average in the moving average of the weights at a step; the new weights
+    get the rest.
 
     The share grows from 1/10 at step 0 towards `decay`.
     """
@@ -50,8 +55,9 @@ def samples_of_step(
 ) -> list[int]:
     """Indices of the training samples that one process uses at a step.
 
-    The samples follow each other in epochs. Each epoch has every sample once, in a random order; a batch may begin in
-    one epoch and end in the next. The result depends on the arguments alone, so that a resumed run uses the same samples.
+    The samples follow each other in epochs. Each epoch has every sample once, in a random order; a
+    batch may begin in one epoch and end in the next. The result depends on the arguments alone, so
+    that a resumed run uses the same samples.
 
     Args:
         step: the number of the step, counted from 0.
@@ -80,7 +86,8 @@ def order_of_epoch(seed: int, epoch: int, count: int) -> NDArray[np.int64]:
 
 
 def prefetch(make: Callable[[K], V], keys: Iterable[K], threads: int) -> Generator[V, None, None]:
-    """Yield `make(key)` for each key, in the order of the keys; threads compute the next values in advance.
+    """Yield `make(key)` for each key, in the order of the keys; threads compute the next values in
+    advance.
 
     At most one value for each thread waits to be used, because more values would only take memory.
     """

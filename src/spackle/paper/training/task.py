@@ -15,16 +15,16 @@ from spackle.runtime.progress import Reporter
 class Task(Protocol):
     """A network to train, and the items of its training data, numbered from 0.
 
-    An item is what the network learns from at once, such as a part of a view with its target. The constructor of a task
-    is quick and raises InputError for unusable input; `prepare` does the long work, and sets `items` and
-    `validation_items`.
+    An item is what the network learns from at once, such as a part of a view with its target. The
+    constructor of a task is quick and raises InputError for unusable input; `prepare` does the long
+    work, and sets `items` and `validation_items`.
     """
 
     #: Name in the option `method` and in checkpoints.
     name: ClassVar[str]
     #: The measure by which the best weights are chosen; lower is better.
     selection_measure: ClassVar[str] = "loss"
-    #: Items in one pass through the network, whose gradients are added up; None: all items of a step.
+    #: Items in one pass through the network; the gradients of passes add up. None: all of a step.
     micro_batch: ClassVar[int | None] = None
     #: Identifies the training data by content, not by paths.
     digest: str
@@ -40,10 +40,13 @@ class Task(Protocol):
     validation_items: int
 
     def prepare(self, output: Path, reporter: Reporter) -> dict[str, Any]:
-        """Do all long preparations; returns facts about the data for run.json. Every process calls this."""
+        """Do all long preparations; returns facts about the data for run.json. Every process calls
+        this.
+        """
 
     def parameter_groups(self) -> list[dict[str, Any]]:
-        """The groups of weights that the optimiser trains: here a single group of all weights with requires_grad.
+        """The groups of weights that the optimiser trains: here a single group of all weights with
+        requires_grad.
 
         A group is {"params": [weights]}, and may have an "lr_scale", a factor on the learning rate.
         """
@@ -53,17 +56,22 @@ class Task(Protocol):
     def load_batch(self, step: int | None, items: Sequence[int]) -> Any:
         """Load items of a training step, or validation items if `step` is None, by their numbers.
 
-        The result depends on the arguments alone; any thread may call this. InputError if an item cannot be read.
+        The result depends on the arguments alone; any thread may call this. InputError if an item
+        cannot be read.
         """
 
     def loss(self, network: nn.Module, batch: Any) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss [] of a batch, with gradients, and the terms [] of the loss by name."""
 
     def measure(self, network: nn.Module, batch: Any) -> dict[str, list[float]]:
-        """Measure a network on a batch of validation items; returns the values of each measure by name."""
+        """Measure a network on a batch of validation items; returns the values of each measure by
+        name.
+        """
 
     def draw_picture(self, network: nn.Module) -> Tensor:
-        """A picture [H, W, 3] sRGB that shows the results of the network for a few validation items."""
+        """A picture [H, W, 3] sRGB that shows the results of the network for a few validation
+        items.
+        """
 
     def export(self, network: nn.Module, path: Path) -> None:
         """Write the weights in the format that the package reads; InputError if that fails."""

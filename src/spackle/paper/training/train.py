@@ -1,7 +1,9 @@
-"""The training loop: `train` prepares a run, `run_steps` is the loop, `train_step` and `validate_and_save` its parts.
+"""The training loop: `train` prepares a run, `run_steps` is the loop, `train_step` and
+`validate_and_save` its parts.
 
-A `Task` (task.py) defines the network, the data and the loss. Several processes, started by torchrun, train one network
-together (ranks.py): each step is divided between them, and process 0 writes all files.
+A `Task` (task.py) defines the network, the data and the loss. Several processes, started by
+torchrun, train one network together (ranks.py): each step is divided between them, and process 0
+writes all files.
 """
 
 from __future__ import annotations
@@ -106,7 +108,9 @@ class TrainingRun:
         return "stopped" if self.is_stopped else None
 
     def write_report(self, ended: str | None = None) -> None:
-        """Write run.json: the facts of the run, why it ended (None: it goes on), and its progress."""
+        """Write run.json: the facts of the run, why it ended (None: it goes on), and its
+        progress.
+        """
         if rank() == 0:
             report = {**self.facts, "ended": ended, **dataclasses.asdict(self.progress)}
             write_json(report, self.output / RUN_REPORT)
@@ -135,7 +139,8 @@ def train(
         overwrite: delete an older run in `output`, but keep its samples.
 
     Returns:
-        Why the run ended: "steps" (all steps are done), "patience" (no improvement) or "stopped" (by a signal).
+        Why the run ended: "steps" (all steps are done), "patience" (no improvement) or "stopped"
+            (by a signal).
 
     Raises:
         InputError: a file or folder cannot be used, or the loss is not finite.
@@ -152,7 +157,8 @@ def train(
         task = open_task(recipe, device)
         if task.items_per_step % rank_count():
             raise InputError(
-                f"optim.batch={recipe.optim.batch} cannot be divided between {rank_count()} processes"
+                f"optim.batch={recipe.optim.batch} cannot be divided between {rank_count()} "
+                "processes"
             )
         checkpoint = None
         if not overwrite:
@@ -184,11 +190,14 @@ def open_run(
 ) -> TrainingRun:
     """A run at step 0: the network on its device, a copy for the average, and the optimiser.
 
-    `facts`, from the task's preparation, come first in run.json; settings, versions and hardware follow.
+    `facts`, from the task's preparation, come first in run.json; settings, versions and hardware
+    follow.
     """
     # Convolutions are faster if the channels of a pixel lie beside each other in memory.
-    layout = torch.channels_last
-    network: nn.Module = task.network.to(device, memory_format=layout)  # type: ignore[call-overload]
+    network: nn.Module = task.network.to(
+        device,
+        memory_format=torch.channels_last,  # type: ignore[call-overload]
+    )
     optim = recipe.optim
     optimizer = AdamW(
         task.parameter_groups(), optim.lr, betas=optim.betas, weight_decay=optim.weight_decay
@@ -215,7 +224,8 @@ def open_run(
 
 
 def run_steps(run: TrainingRun) -> str:
-    """The loop: train step by step, log, validate and save, until the run ends; returns the reason of the end.
+    """The loop: train step by step, log, validate and save, until the run ends; returns the reason
+    of the end.
 
     The reason is "steps", "patience" or "stopped", see `train`.
     """
@@ -225,7 +235,8 @@ def run_steps(run: TrainingRun) -> str:
         for step in range(progress.step, optim.steps)
         for items in items_of_passes(run, step)
     )
-    # On a CPU the network itself needs the cores, so one thread reads; beside a GPU half of them read.
+    # On a CPU the network itself needs the cores, so one thread reads; beside a GPU half of them
+    # read.
     reader_threads = 1
     if run.device.type != "cpu":
         reader_threads = max(1, (os.cpu_count() or 1) // (2 * rank_count()))
@@ -273,11 +284,12 @@ def train_step(
     Args:
         run: the run, whose weights and step number change.
         batches: yields the batches of this process, one for each pass through the network.
-        stop_requested: whether this process has received Ctrl-C or SIGTERM. The run ends if any process has.
+        stop_requested: whether this process has received Ctrl-C or SIGTERM. The run ends if any
+            process has.
 
     Returns:
-        The loss, its terms, the norm of the gradient ("gradient") and the learning rate ("lr"): means over the items of
-        all processes.
+        The loss, its terms, the norm of the gradient ("gradient") and the learning rate ("lr"):
+        means over the items of all processes.
 
     Raises:
         InputError: one of these numbers is not finite; the weights have not changed then.
@@ -307,8 +319,9 @@ def train_step(
 def accumulate_gradients(run: TrainingRun, batches: Iterator[Any]) -> dict[str, Tensor]:
     """Add the gradients of a step's loss to the network's weights, pass by pass.
 
-    A pass is one run through the network with as many items as fit into memory. Each pass has a weight proportional to
-    its number of items, so that the sum is the gradient of the mean loss over all items.
+    A pass is one run through the network with as many items as fit into memory. Each pass has a
+    weight proportional to its number of items, so that the sum is the gradient of the mean loss
+    over all items.
 
     Returns:
         The mean loss [] of this process ("loss") and the means [] of its terms, in float64.
@@ -332,7 +345,9 @@ def accumulate_gradients(run: TrainingRun, batches: Iterator[Any]) -> dict[str, 
 
 
 def items_of_passes(run: TrainingRun, step: int) -> list[list[int]]:
-    """Numbers of the items that this process uses at a step, divided into passes through the network."""
+    """Numbers of the items that this process uses at a step, divided into passes through the
+    network.
+    """
     task = run.task
     items = samples_of_step(
         step, task.items, task.items_per_step, run.recipe.run.seed, rank(), rank_count()
@@ -342,7 +357,9 @@ def items_of_passes(run: TrainingRun, step: int) -> list[list[int]]:
 
 
 def update_weights(run: TrainingRun, step: int) -> float:
-    """Let the optimiser change the weights, then update their average; returns the learning rate of the step."""
+    """Let the optimiser change the weights, then update their average; returns the learning rate of
+    the step.
+    """
     optim = run.recipe.optim
     rate = learning_rate(step, optim)
     for group in run.optimizer.param_groups:
@@ -366,8 +383,9 @@ def mean_of_steps(steps: list[dict[str, float]]) -> dict[str, float]:
 def validate_and_save(run: TrainingRun, is_last_step: bool) -> None:
     """After a step: validate if it is time, and write the weights and a checkpoint if it is time.
 
-    The recipe's run.validate_every and run.save_every say how often. The last step is always validated, and the state at
-    the end of a run is always saved. All processes validate; process 0 writes.
+    The recipe's run.validate_every and run.save_every say how often. The last step is always
+    validated, and the state at the end of a run is always saved. All processes validate; process 0
+    writes.
     """
     settings, progress = run.recipe.run, run.progress
     if progress.step % settings.validate_every == 0 or is_last_step:
@@ -396,7 +414,8 @@ def validate_and_save(run: TrainingRun, is_last_step: bool) -> None:
 
 
 def report_validation(run: TrainingRun, measures: Mapping[str, float], is_best: bool) -> None:
-    """Write the results of a validation: a picture, curves, a log line, run.json, and the weights if they are the best.
+    """Write the results of a validation: a picture, curves, a log line, run.json, and the weights
+    if they are the best.
 
     `measures` are the means over all validation items by name.
     """
@@ -417,9 +436,11 @@ def report_validation(run: TrainingRun, measures: Mapping[str, float], is_best: 
 
 @torch.no_grad()
 def validate(task: Task, network: nn.Module, device: torch.device) -> dict[str, float]:
-    """Means of a task's measures over all validation items, by name; values that are not finite are left out.
+    """Means of a task's measures over all validation items, by name; values that are not finite are
+    left out.
 
-    The processes divide the items, and each process gets the same means. A measure without finite values is missing.
+    The processes divide the items, and each process gets the same means. A measure without finite
+    values is missing.
     """
     own_items = range(rank(), task.validation_items, rank_count())
     pass_size = task.micro_batch or task.items_per_step // rank_count()
