@@ -183,7 +183,7 @@ class Pipeline:
             with reporter.stage("move"):
                 prediction = choose_disparity(prediction, self.renderer, photo.path)
         reporter.log(
-            f"{name}: {len(prediction.gaussians):,} Gaussians from {choice.base}, "
+            f"{name}: {len(prediction.gaussians):,} Gaussians from {choice.name}, "
             f"focal length {prediction.camera.focal[0]:.0f} px ({prediction.lens_source or photo.focal_source.value})"
         )
         if chosen:

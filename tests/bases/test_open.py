@@ -82,7 +82,7 @@ def test_auto_uses_the_photos_depth_then_sharp_then_lite(
     tmp_path: Path, photo: Path, portrait: Path, sharp: Path
 ) -> None:
     prediction, choice = pick(photo)
-    assert (choice.base, choice.why, len(prediction.gaussians)) == (
+    assert (choice.name, choice.reason, len(prediction.gaussians)) == (
         "sharp",
         NO_DEPTH,
         gaussians_of(MICRO_SIZE),
@@ -90,16 +90,16 @@ def test_auto_uses_the_photos_depth_then_sharp_then_lite(
     assert prediction.notes["weights"] == SHARP_FILE
     sharp.unlink()
     choice = pick(photo)[1]
-    assert (choice.base, choice.why, choice.failures) == ("lite", f"{NO_DEPTH}, {NO_SHARP}", ())
+    assert (choice.name, choice.reason, choice.failures) == ("lite", f"{NO_DEPTH}, {NO_SHARP}", ())
     assert "`spackle weights get depth` (140.6 MB, MIT)" in choice.note
     prediction, choice = pick(portrait)
-    assert (choice.base, choice.why) == ("rgbd", "the depth in the photo")
+    assert (choice.name, choice.reason) == ("rgbd", "the depth in the photo")
     assert str(prediction.notes["depth"]).startswith("portrait depth of the photo")
     named, choice = pick(portrait, name="rgbd")
-    assert (choice.why, choice.note) == ("--base rgbd", "")
+    assert (choice.reason, choice.note) == ("chosen by name", "")
     assert same_bits(named.gaussians, prediction.gaussians)
     given, choice = pick(portrait, depth=write_depth(tmp_path / "depth.npy"))
-    assert (choice.base, choice.why, choice.note) == ("rgbd", "--depth", "")
+    assert (choice.name, choice.reason, choice.note) == ("rgbd", "a depth map is given", "")
     assert float(given.gaussians.means[0, 2]) == pytest.approx(metres()[0, 0], rel=1e-5)
 
 
@@ -108,13 +108,17 @@ def test_weights_and_options_reach_sharp(
 ) -> None:
     given = write_tiny(tmp_path / "mine.pt")
     choice = pick(photo, checkpoint=given)[1]
-    assert (choice.base, choice.why, quick.pop()["path"]) == ("sharp", "-c", given)
+    assert (choice.name, choice.reason, quick.pop()["path"]) == (
+        "sharp",
+        "a checkpoint is given",
+        given,
+    )
     words: dict[str, Any] = {"precision": "fp32", "windows_per_batch": 9}
-    assert pick(photo, **words)[1].base == "sharp"
+    assert pick(photo, **words)[1].name == "sharp"
     assert quick == [{"path": sharp, "device": None, **words}]
-    assert pick(portrait, **words)[1].base == "rgbd"
+    assert pick(portrait, **words)[1].name == "rgbd"
     sharp.unlink()
-    assert pick(photo, **words)[1].base == "lite"
+    assert pick(photo, **words)[1].name == "lite"
     assert len(quick) == 1
 
 
@@ -132,7 +136,7 @@ def test_a_base_is_loaded_once_and_only_if_a_photo_needs_it(
     news = [base.predict(load_photo(photo))[1].note for _ in range(2)]
     assert ([bool(line) for line in news], len(quick)) == ([True, False], 1)
     model = open_base(BaseSettings(name="hf:me/small", precision="fp32", device="cpu"))
-    assert [model.predict(load_photo(photo))[1].base for _ in range(2)] == ["hf:me/small"] * 2
+    assert [model.predict(load_photo(photo))[1].name for _ in range(2)] == ["hf:me/small"] * 2
     assert quick[1:] == [{"path": "me/small", "precision": "fp32", "device": "cpu"}]
 
 
@@ -140,7 +144,7 @@ def test_the_chosen_base_predicts_all_frames_of_a_clip(photo: Path, portrait: Pa
     base = open_base(BaseSettings())
     prediction, choice = base.predict(load_photo(photo))
     kept, again = base.only_chosen(choice).predict(load_photo(portrait))
-    assert (choice.base, again.base) == ("lite", "lite")
+    assert (choice.name, again.name) == ("lite", "lite")
     assert kept.notes == prediction.notes
 
 
@@ -175,7 +179,7 @@ def test_auto_goes_on_if_the_depth_in_the_photo_is_broken(
     log = list[str]()
     photo = portraits.write(tmp_path / "photo.jpg", portraits.PORTRAITS["bad: GDepth, broken map"])
     choice = pick(photo, log)[1]
-    assert (choice.base, choice.why) == (
+    assert (choice.name, choice.reason) == (
         "lite",
         f"the depth in the photo cannot be used, {NO_SHARP}",
     )
@@ -198,7 +202,7 @@ def test_damaged_weights_fail_once_for_all_photos(photo: Path, sharp: Path) -> N
     sharp.write_bytes(content)
     said, log, base = "not a file of weights, or damaged", list[str](), open_base(BaseSettings())
     choices = [base.predict(load_photo(photo), log=log.append)[1] for _ in range(2)]
-    assert [choice.why for choice in choices] == [
+    assert [choice.reason for choice in choices] == [
         f"{NO_DEPTH}, SHARP cannot be used, no MoGe weights here"
     ] * 2
     assert (len(log), said in log[0], said in choices[0].failures[0]) == (1, True, True)
@@ -224,7 +228,7 @@ def test_a_base_that_fails_for_one_photo_is_tried_for_the_next(
     monkeypatch.setattr(StandIn, "predict", picky)
     log, base = list[str](), open_base(BaseSettings())
     paths = [write_photo(tmp_path / f"{name}.png") for name in "abcd"]
-    names = [base.predict(load_photo(path), log=log.append)[1].base for path in paths]
+    names = [base.predict(load_photo(path), log=log.append)[1].name for path in paths]
     assert names == ["sharp", "lite", "lite", "sharp"]
     assert ("not this one" in log[0], "range of float32" in log[1], len(quick)) == (True, True, 1)
     for path in paths[1:3]:
@@ -253,22 +257,22 @@ def test_given_depth_has_no_fallback(tmp_path: Path, photo: Path, portrait: Path
 @pytest.mark.parametrize(
     ("settings", "option"),
     [
-        ({"name": "lite", "depth": Path("d.npy")}, "--depth d.npy: the lite base"),
-        ({"name": "hf:a/b", "checkpoint": Path("x.pt")}, "-c x.pt: the hf base"),
-        ({"name": "hf:a/b", "windows_per_batch": 1}, "--sharp windows=1: the hf base"),
+        ({"name": "lite", "depth": Path("d.npy")}, "`depth` d.npy: the lite base"),
+        ({"name": "hf:a/b", "checkpoint": Path("x.pt")}, "`checkpoint` x.pt: the hf base"),
+        ({"name": "hf:a/b", "windows_per_batch": 1}, "`windows_per_batch` 1: the hf base"),
         ({"name": "hf:"}, "names no model"),
         ({"name": "shrap"}, r"did you mean sharp\?"),
-        ({"name": "sharp"}, "spackle weights get sharp.*-c FILE"),
-        ({"name": "rgbd", "checkpoint": Path("x.pt")}, "-c x.pt: the rgbd base"),
-        ({"calib": Path("c.txt")}, "--calib c.txt: there is no depth map to read"),
-        ({"depth_kind": "near-white"}, "--depth-kind near-white: there is no depth map to read"),
+        ({"name": "sharp"}, "spackle weights get sharp.*`checkpoint` FILE"),
+        ({"name": "rgbd", "checkpoint": Path("x.pt")}, "`checkpoint` x.pt: the rgbd base"),
+        ({"calib": Path("c.txt")}, "`calib` c.txt: there is no depth map to read"),
+        ({"depth_kind": "near-white"}, "`depth_kind` near-white: there is no depth map to read"),
         (
             {"depth": Path("d.npy"), "far": 9.0},
-            "--far 9.0: only for relative maps: add --depth-kind near-white",
+            "`far` 9.0: only for relative maps: add `depth_kind` near-white",
         ),
-        ({"depth": Path("d.npy"), "windows_per_batch": 1}, "--sharp windows=1: the rgbd base"),
+        ({"depth": Path("d.npy"), "windows_per_batch": 1}, "`windows_per_batch` 1: the rgbd base"),
         ({"precision": "fp8"}, "fp8"),
-        ({"windows_per_batch": 36}, "--sharp windows must be between 1 and 35, got 36"),
+        ({"windows_per_batch": 36}, "`windows_per_batch` must be between 1 and 35, got 36"),
     ],
     ids=str,
 )
@@ -287,3 +291,28 @@ def test_the_files_and_the_public_name_of_a_models_folder(tmp_path: Path) -> Non
         "hf:small",
         "hf:me/small",
     )
+
+
+PLUGIN = """
+from helpers.stand_in import StandIn
+
+class Box(StandIn):
+    def __init__(self):
+        super().__init__("box")
+"""
+
+
+def test_a_base_of_another_package_is_named_by_its_module_and_class(
+    tmp_path: Path, photo: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "box_base.py").write_text(PLUGIN)
+    monkeypatch.syspath_prepend(tmp_path)
+    prediction, choice = pick(photo, name="box_base:Box")
+    assert (choice.name, choice.reason) == ("box_base:Box", "chosen by name")
+    assert len(prediction.gaussians) > 0
+    assert BaseSettings(name="box_base:Box").model_files == {}
+    for name, problem in (("box_base:Sphere", "has no Sphere"), ("nowhere:Box", "cannot import")):
+        with pytest.raises(InputError, match=problem):
+            pick(photo, name=name)
+    with pytest.raises(InputError, match=r"`precision` fp32: the package\.module:Class base"):
+        pick(photo, name="box_base:Box", precision="fp32")

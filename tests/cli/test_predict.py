@@ -60,7 +60,7 @@ def test_predict_writes_a_scene_a_video_and_a_report(plain: tuple[Path, Run]) ->
     assert f"spackle_base {base}" in whole.comments
     known = {
         "name": "rgbd",
-        "chosen": "--depth",
+        "chosen": "a depth map is given",
         "gaussians": base,
         "depth_filled": 0.0,
         "usual_disparity": 0.3,

@@ -40,7 +40,7 @@ def test_a_photo_becomes_a_scene_and_is_done_again_for_other_weights_but_not_for
     assert (run(*arguments).code, names_in(folder)) == (0, FILES)
     report = report_of(folder)
     native = pick_dtype("auto", torch.device("cpu")) == torch.bfloat16
-    expected = {"name": "sharp", "chosen": "--base sharp", "gaussians": gaussians_of(MICRO_SIZE)}
+    expected = {"name": "sharp", "chosen": "chosen by name", "gaussians": gaussians_of(MICRO_SIZE)}
     expected |= {
         "precision": "bf16" if native else "fp32",
         "weights": weights.name,

@@ -128,7 +128,7 @@ def test_middlebury(tmp_path: Path, suffix: str, beside: bool) -> None:
         load_depth(tmp_path / "depth.npy").quantity == "depth"
     )  # although the folder has a calibration
     np.save(tmp_path / "motorcycle_disp.npy", ramp())
-    with pytest.raises(InputError, match="--calib"):
+    with pytest.raises(InputError, match="`calib`"):
         load_depth(tmp_path / "motorcycle_disp.npy")
     same(load_depth(name, calib=calib, focal_px=2001), 2 * expected, 1e-6)
     for focal in (0, -3, np.nan):
@@ -228,15 +228,15 @@ KINDS: list[tuple[bytes, dict[str, Any], str]] = [  # content, options, message
     (
         greys(SLOPE, "L"),
         {},
-        "an 8-bit PNG holds no metres: give 16 bits, or --depth-kind near-white",
+        "an 8-bit PNG holds no metres: give 16 bits, or `depth_kind` near-white",
     ),
-    (greys(SLOPE, "I;16"), {}, "fill the range of 16 bits, .*: give --depth-kind near-white"),
-    (greys(SLOPE, "RGBA"), {}, "mode RGBA holds no millimetres: give --depth-kind near-white"),
-    (greys(SLOPE, "L"), {"kind": "disparity"}, "its folder has no calibration: give --calib"),
+    (greys(SLOPE, "I;16"), {}, "fill the range of 16 bits, .*: give `depth_kind` near-white"),
+    (greys(SLOPE, "RGBA"), {}, "mode RGBA holds no millimetres: give `depth_kind` near-white"),
+    (greys(SLOPE, "L"), {"kind": "disparity"}, "its folder has no calibration: give `calib`"),
     (
         as_bytes(SLOPE),
         {"kind": "near-white", "near": 3.0, "far": 2.0},
-        "--near 3, --far 2: give two distances",
+        "`near` 3, `far` 2: give two distances",
     ),
     (as_bytes(np.ones((9, 9))), {"kind": "near-black"}, "the same nearly everywhere"),
     (

@@ -1,4 +1,9 @@
-"""The interface of every base. `settings` lists the bases that `--base` can name, and `open` opens them."""
+"""A base turns one photo into the 3D Gaussians of the surfaces that the photo shows.
+
+Here stand the interface `Base` and its result. `settings` lists the bases and their options, `open`
+opens and chooses them. The bases are SHARP and MoGe-2 (published networks), lite (two small networks
+in the package), transformers (any depth model of that library) and depth (a measured depth map).
+"""
 
 from __future__ import annotations
 
@@ -11,10 +16,14 @@ from spackle.core.gaussians import Gaussians
 from spackle.core.photo import Photo
 from spackle.runtime.progress import Progress
 
-DEFAULT_MAX_DISPARITY = (
-    0.3  # the camera's disparity if neither the user nor the base limits it; the paper's S1
-)
-DEFAULT_MAX_HOLE_RATIO = 0.125  # share of the widest views that may be holes if the user sets no disparity; more is conspicuous
+# The camera's move, as a share of the view that the nearest surface shifts by, if neither the user
+# nor the base limits it: the smallest move in the paper (S1).
+DEFAULT_MAX_DISPARITY = 0.3
+# Share of the widest views that may be holes if the user sets no disparity; more is conspicuous.
+DEFAULT_MAX_HOLE_RATIO = 0.125
+# A network's estimate of the focal length is plausible in this range of 35 mm equivalents, which are
+# fields of view from 130° to 4°.
+PLAUSIBLE_FOCALS_MM = (10.0, 600.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,13 +33,9 @@ class BasePrediction:
     gaussians: Gaussians
     camera: Camera  # the photo's camera, at its working size
     notes: dict[str, float | int | str]  # for the report: measured, filled or assumed values
-    lens_source: str = (
-        ""  # source of the focal length, if it is neither the photo's file nor the user
-    )
-    max_disparity: float = (
-        DEFAULT_MAX_DISPARITY  # largest disparity with correct geometry, used if the user sets none
-    )
-    max_hole_ratio: float = DEFAULT_MAX_HOLE_RATIO  # share of the widest views that may be holes, if the user sets no disparity
+    lens_source: str = ""  # who gave the focal length, if neither the photo's file nor the user did
+    max_disparity: float = DEFAULT_MAX_DISPARITY  # largest camera move with correct geometry
+    max_hole_ratio: float = DEFAULT_MAX_HOLE_RATIO  # share of the widest views that may be holes
 
 
 class Base(Protocol):
@@ -42,19 +47,16 @@ class Base(Protocol):
         """Predict Gaussians only for the surfaces that are visible in the photo.
 
         Args:
-            photo: at its full size. The prediction's camera has the working size (see `working_size`).
+            photo: at its full size. The prediction's camera has the working size (the long side is
+                at most 1536 pixels).
             progress: called with (steps done, number of steps), by bases whose work takes long.
         """
         ...
 
 
-PLAUSIBLE_FOCALS_MM = (
-    10.0,
-    600.0,
-)  # a network's estimate is plausible between these 35 mm equivalents (130° to 4°)
-
-
 def is_plausible_focal(focal_px: float, width: int, height: int) -> bool:
     """Whether a focal length that a network estimates is plausible for a photo of this size."""
-    shortest, longest = (focal_mm_to_px(mm, width, height) for mm in PLAUSIBLE_FOCALS_MM)
-    return shortest <= focal_px <= longest
+    shortest_mm, longest_mm = PLAUSIBLE_FOCALS_MM
+    shortest_px = focal_mm_to_px(shortest_mm, width, height)
+    longest_px = focal_mm_to_px(longest_mm, width, height)
+    return shortest_px <= focal_px <= longest_px

@@ -1,4 +1,4 @@
-"""Bases that lift a photo by a depth map: the map that comes with the photo, or one that a network predicted."""
+"""Bases that lift a photo by a depth map: the photo's own map, or one that a network predicted."""
 
 from __future__ import annotations
 
@@ -22,41 +22,70 @@ class RgbdBase:
     name = "rgbd"
 
     def __init__(self, depth: DepthMap, lens_source: str = "calibration") -> None:
+        """Use a depth map; `lens_source` says who gave its intrinsics, "" if it was the user."""
         self.depth = depth
-        self.lens_source = lens_source  # source of the map's intrinsics; "" if the user gave them
+        self.lens_source = lens_source
 
     def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
-        """Gaussians of the photo's pixels at its working size; InputError for a map of another aspect ratio."""
-        depth, (width, height) = self.depth, photo.framed_size
-        depth.check_aspect_ratio(height, width, photo.path)
-        own = None if depth.K is None else Camera(depth.K, torch.eye(4), *depth.depth.shape[::-1])
-        if photo.frame is not None:
-            frame = photo.frame
-            values, valid = (
-                frame.inside(grid, width, height) for grid in (depth.depth, depth.valid)
-            )
-            depth = dataclasses.replace(depth, depth=values, valid=valid)
-            own = own and own.resized(width, height).cropped(
-                frame.left, frame.top, photo.width, photo.height
-            )
-        photo = resize_photo(photo)
-        camera = photo.camera if own is None else own.resized(photo.width, photo.height)
-        prediction = lift_rgbd(photo.rgb, depth, camera)
-        notes = (
-            prediction.notes
-            | {"depth_range": self.depth.range_in_words}
-            | ({"depth": depth.note} if depth.note else {})
-        )
-        lens_source = "" if own is None else self.lens_source
+        """Gaussians of the photo's pixels at its working size; InputError for a map of other shape.
+
+        The focal length and principal point are the map's, if it has them, else the photo's.
+        """
+        depth, camera = self._cropped_to(photo)
+        resized = resize_photo(photo)
+        if camera is None:
+            camera = resized.camera
+            lens_source = ""
+        else:
+            camera = camera.resized(resized.width, resized.height)
+            lens_source = self.lens_source
+
+        prediction = lift_rgbd(resized.rgb, depth, camera)
+        notes = prediction.notes | {"depth_range": self.depth.range_in_words}
+        if depth.note:
+            notes["depth"] = depth.note
         return dataclasses.replace(prediction, notes=notes, lens_source=lens_source)
+
+    def _cropped_to(self, photo: Photo) -> tuple[DepthMap, Camera | None]:
+        """The map and its camera, without the border that was cropped from the photo.
+
+        The camera is None if the map has no intrinsics. InputError if the map has not the aspect
+        ratio of the photo with its border.
+        """
+        depth = self.depth
+        framed_width, framed_height = photo.framed_size
+        depth.check_aspect_ratio(framed_height, framed_width, photo.path)
+        rows, columns = depth.depth.shape
+        camera = None if depth.K is None else Camera(depth.K, torch.eye(4), columns, rows)
+        if photo.frame is None:
+            return depth, camera
+
+        frame = photo.frame
+        depth = dataclasses.replace(
+            depth,
+            depth=frame.inside(depth.depth, framed_width, framed_height),
+            valid=frame.inside(depth.valid, framed_width, framed_height),
+        )
+        if camera is not None:
+            camera = camera.resized(framed_width, framed_height)
+            camera = camera.cropped(frame.left, frame.top, photo.width, photo.height)
+        return depth, camera
 
 
 def lift_predicted_depth(photo: Photo, depth: DepthMap, camera: Camera) -> BasePrediction:
-    """Lift a photo with the depth that a network predicts; the photo's outermost lines are replaced first."""
+    """Lift a photo with the depth that a network predicts, as `lift_rgbd` does.
+
+    First the photo's outermost pixels are replaced by the pixels just inside, because they often
+    show a scan's edge or colours mixed by resizing.
+    """
     return lift_rgbd(replace_border(photo.rgb), depth, camera)
 
 
 def lift_rgbd(rgb: Tensor, depth: DepthMap, camera: Camera, levels: int = LEVELS) -> BasePrediction:
-    """Lift a photo [H, W, 3] and its depth map to Gaussians; see `lift_depth_map` for the arguments."""
+    """Turn a photo [H, W, 3] (sRGB in 0..1) and its depth map into Gaussians on the surfaces.
+
+    `camera` is the photo's camera. With `levels` = 0 each pixel gets its own Gaussian; with more
+    levels, flat areas share Gaussians. InputError if no pixel has a depth.
+    """
     lifted = lift_depth_map(rgb, depth, camera, levels)
     return BasePrediction(lifted.gaussians, lifted.camera, lifted.notes)

@@ -1,4 +1,8 @@
-"""The bases that `--base` can name, and the options for each base."""
+"""The bases that can be named, and the options that each of them takes.
+
+To add a base, write a class that follows `spackle.bases.Base`. Outside of this package it is named
+`package.module:Class`; inside, it needs a line in `BASE_KINDS` and one in `open`.
+"""
 
 from __future__ import annotations
 
@@ -16,81 +20,126 @@ from spackle.runtime.device import PRECISIONS, Precision
 from spackle.runtime.errors import InputError, check_name
 from spackle.weights import PUBLISHED_WEIGHTS, installed_weights
 
-AUTO, RGBD = "auto", "rgbd"
+AUTO = "auto"  # the best base that a photo and this machine allow
+RGBD = "rgbd"  # lifts a depth map that comes with the photo
 HF_PREFIX = "hf:"  # before a folder, or a Hugging Face model's owner/name
 AUTO_NETWORKS = ("sharp", "moge", "lite")  # in the order that `auto` tries them
 NETWORK_BASES = (*AUTO_NETWORKS, "hf:NAME_OR_FOLDER")
-READING = ("--depth-kind", "--near", "--far")  # how to read a depth map
-NOT_SHARP = "lifted; not SHARP, so not the paper's base"
-KINDS = {  # each base's description below tables, and the options that only some bases take
-    RGBD: (
-        f"the dataset's own depth, map or points, {NOT_SHARP}",
-        ("--depth", "--calib", *READING),
-    ),
-    "sharp": ("SHARP's network, from the photo alone", ("-c", "--precision", "--sharp")),
-    "moge": (f"MoGe-2, from the photo alone, {NOT_SHARP}", ("-c", "--precision")),
-    "lite": (f"Spackle's own small depth networks, from the photo alone, {NOT_SHARP}", ("-c",)),
-    "hf": (f"a depth model of transformers, from the photo alone, {NOT_SHARP}", ("--precision",)),
-    AUTO: ("", ("--calib", *READING, "--precision", "--sharp")),  # for the base that it chooses
-}
+PLUGIN_KIND = "package.module:Class"
+DEPTH_READING_OPTIONS = ("depth_kind", "near", "far")  # how to read a depth map
+
+# What a model's folder may hold that predictions depend on.
 HF_FILE_PATTERNS: tuple[str, ...] = (
     "config.json",
     "preprocessor_config.json",
     "processor_config.json",
+    "model.safetensors",
+    "model-*.safetensors",
+    "model.safetensors.index.json",
 )
-HF_FILE_PATTERNS += ("model.safetensors", "model-*.safetensors", "model.safetensors.index.json")
-Depth = (
-    Path | DepthMap | None
-)  # a photo's depth; a path may be a folder of depth maps named like the photos
+
+# A photo's depth; a path may be a folder of depth maps that are named like the photos.
+Depth = Path | DepthMap | None
 
 
-def _download(name: str) -> str:
-    return f"`spackle weights get {name}` ({decimal(PUBLISHED_WEIGHTS[name].bytes)}, {PUBLISHED_WEIGHTS[name].licence})"
+@dataclasses.dataclass(frozen=True)
+class BaseKind:
+    """What all bases of a kind have in common."""
+
+    description: str  # below tables of results
+    options: tuple[str, ...]  # the options of `BaseSettings` that only some bases take
 
 
-ROUGH_GEOMETRY_ADVICE = f"rough geometry; give --depth FILE for better geometry, or run {_download('depth')}, or {_download('sharp')}"
-MISSING_WEIGHTS_ADVICE = {  # what to do if a base's weights are missing
-    "sharp": f"no weights of SHARP on this machine: {_download('sharp')} downloads them, -c FILE takes a local copy",
-    "moge": f"no weights of MoGe on this machine: {_download('depth')} downloads them, -c FILE takes a local copy",
+_NOT_SHARP = "lifted; not SHARP, so not the paper's base"
+BASE_KINDS = {
+    RGBD: BaseKind(
+        f"the dataset's own depth, map or points, {_NOT_SHARP}",
+        ("depth", "calib", *DEPTH_READING_OPTIONS),
+    ),
+    "sharp": BaseKind(
+        "SHARP's network, from the photo alone", ("checkpoint", "precision", "windows_per_batch")
+    ),
+    "moge": BaseKind(f"MoGe-2, from the photo alone, {_NOT_SHARP}", ("checkpoint", "precision")),
+    "lite": BaseKind(
+        f"Spackle's own small depth networks, from the photo alone, {_NOT_SHARP}", ("checkpoint",)
+    ),
+    "hf": BaseKind(
+        f"a depth model of transformers, from the photo alone, {_NOT_SHARP}", ("precision",)
+    ),
+    PLUGIN_KIND: BaseKind("a base of another package, not the paper's base", ()),
+    # The options are for the base that `auto` chooses.
+    AUTO: BaseKind("", ("calib", *DEPTH_READING_OPTIONS, "precision", "windows_per_batch")),
 }
 
 
-def _weights_here(name: str) -> Path | None:
-    """The file with a base's weights on this machine; None if it is missing."""
-    if name == "lite":
+def _download_command(name: str) -> str:
+    """The command that downloads weights, with their size and licence, for a message."""
+    weights = PUBLISHED_WEIGHTS[name]
+    return f"`spackle weights get {name}` ({decimal(weights.bytes)}, {weights.licence})"
+
+
+ROUGH_GEOMETRY_ADVICE = (
+    "rough geometry; give `depth` FILE for better geometry, or run "
+    f"{_download_command('depth')}, or {_download_command('sharp')}"
+)
+# What to do if a base's weights are missing, by the base's name.
+MISSING_WEIGHTS_ADVICE = {
+    "sharp": (
+        f"no weights of SHARP on this machine: {_download_command('sharp')} downloads them, "
+        "`checkpoint` FILE takes a local copy"
+    ),
+    "moge": (
+        f"no weights of MoGe on this machine: {_download_command('depth')} downloads them, "
+        "`checkpoint` FILE takes a local copy"
+    ),
+}
+_PUBLISHED_NAMES = {"sharp": "sharp", "moge": "depth"}  # of weights, by the base's name
+
+
+def _installed_weights(base_name: str) -> Path | None:
+    """The file with a base's weights on this machine; None if it is missing, or there is none."""
+    if base_name == "lite":
         return lite.SHIPPED_WEIGHTS if lite.SHIPPED_WEIGHTS.is_file() else None
-    return (
-        installed_weights({"sharp": "sharp", "moge": "depth"}[name])
-        if name in MISSING_WEIGHTS_ADVICE
-        else None
-    )
+    if base_name in _PUBLISHED_NAMES:
+        return installed_weights(_PUBLISHED_NAMES[base_name])
+    return None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BaseSettings:
     """A base's name and options."""
 
-    name: str = AUTO  # or another name in `KINDS`, or `hf:…`
+    # "auto", "rgbd", "sharp", "moge", "lite", "hf:…" or package.module:Class
+    name: str = AUTO
     depth: Depth = None
     calib: Path | None = None  # calibration of a disparity map
     depth_kind: DepthKind = "auto"  # what the numbers of a depth map are
-    near: float | None = (
-        None  # nearest depth of a relative map in metres; None: `load_depth`'s default
-    )
-    far: float | None = None  # farthest depth of a relative map in metres
+    near: float | None = None  # nearest depth of a relative map in metres; None: 1.5
+    far: float | None = None  # farthest depth of a relative map in metres; None: 15
     checkpoint: Path | None = None  # weights of SHARP, MoGe or lite
-    precision: Precision = "auto"  # of the network
-    windows_per_batch: int | None = (
-        None  # number of windows that SHARP computes at once; 1 takes the least memory
-    )
-    device: str = "auto"
+    precision: Precision = "auto"  # of the network's arithmetic
+    # Of a photo's 35 windows, SHARP's transformer processes so many at once; 1 takes least memory.
+    windows_per_batch: int | None = None
+    device: str = "auto"  # "auto", "cpu" or a CUDA device
 
     @property
     def resolved_name(self) -> str:
-        """The base's name; `auto` becomes `rgbd` if a depth map is given, else `sharp` if a checkpoint is given."""
+        """The base's name, where `auto` is decided by the other options as far as possible.
+
+        It becomes `rgbd` if a depth map is given, else `sharp` if a checkpoint is given.
+        """
         if self.name != AUTO:
             return self.name
-        return RGBD if self.depth is not None else AUTO if self.checkpoint is None else "sharp"
+        if self.depth is not None:
+            return RGBD
+        return AUTO if self.checkpoint is None else "sharp"
+
+    @property
+    def kind(self) -> str:
+        """The base's key in `BASE_KINDS`: its name, "hf", or the kind of other packages' bases."""
+        if self.name.startswith(HF_PREFIX):
+            return "hf"
+        return PLUGIN_KIND if ":" in self.name else self.resolved_name
 
     @property
     def uses_network(self) -> bool:
@@ -101,82 +150,108 @@ class BaseSettings:
     def model_folder(self) -> Path | None:
         """The folder that `hf:…` names; None for a model on the hub and for other bases."""
         folder = os.path.expanduser(self.name.removeprefix(HF_PREFIX))
-        return Path(folder) if self.name.startswith(HF_PREFIX) and os.path.isdir(folder) else None
+        is_folder = self.name.startswith(HF_PREFIX) and os.path.isdir(folder)
+        return Path(folder) if is_folder else None
 
     @property
     def public_name(self) -> str:
-        """The base's name in published results; only the last part of a folder's path."""
-        return (
-            self.resolved_name
-            if self.model_folder is None
-            else HF_PREFIX + self.model_folder.resolve().name
-        )
+        """The base's name in published results; of a folder's path only the last part."""
+        folder = self.model_folder
+        return self.resolved_name if folder is None else HF_PREFIX + folder.resolve().name
 
     @property
     def description(self) -> str:
-        """The base's description below tables."""
-        return KINDS[self.resolved_name.partition(":")[0]][0]
+        """The base's description below tables of results."""
+        return BASE_KINDS[self.kind].description
 
     @property
     def model_files(self) -> dict[str, Path]:
-        """The files that predictions depend on: weights by the base's name, or a folder's files by their own names."""
-        if self.model_folder is not None:
-            return {
-                file.name: file
-                for p in HF_FILE_PATTERNS
-                for file in sorted(self.model_folder.glob(p))
-                if file.is_file()
-            }
-        names = AUTO_NETWORKS if self.resolved_name == AUTO else (self.resolved_name,)
-        found = {name: self.checkpoint or _weights_here(name) for name in names}
-        return {name: file for name, file in found.items() if file is not None}
+        """The files on this machine that predictions depend on.
 
-    def check(self, *, one: bool = False) -> None:
-        """InputError for an unknown base or an option that the base cannot use; if `one`, also for the base `auto`."""
-        if one and self.name == AUTO:
-            known = ", ".join((RGBD, *NETWORK_BASES))
+        Files of weights have their base's name as the key; files of a model's folder have their
+        own names.
+        """
+        if self.model_folder is not None:
+            matches = [
+                file
+                for pattern in HF_FILE_PATTERNS
+                for file in sorted(self.model_folder.glob(pattern))
+            ]
+            return {file.name: file for file in matches if file.is_file()}
+
+        files: dict[str, Path] = {}
+        for name in AUTO_NETWORKS if self.resolved_name == AUTO else (self.resolved_name,):
+            file = self.checkpoint or _installed_weights(name)
+            if file is not None:
+                files[name] = file
+        return files
+
+    def check(self, *, allow_auto: bool = True) -> None:
+        """InputError for an unknown base, an option that it does not take, or missing weights.
+
+        Without `allow_auto`, the base must be named, because the results name it.
+        """
+        self._check_base_name(allow_auto)
+        check_name("precision", self.precision, PRECISIONS)
+        self._check_option_of_other_bases()
+        check_window_batch(self.windows_per_batch)
+        check_name("depth_kind", self.depth_kind, DEPTH_KINDS)
+        self._check_depth_options()
+        if self.resolved_name in MISSING_WEIGHTS_ADVICE and not self.model_files:
+            advice = MISSING_WEIGHTS_ADVICE[self.resolved_name]
+            raise InputError(f"`base` {self.resolved_name}: {advice}")
+
+    def _check_base_name(self, allow_auto: bool) -> None:
+        """InputError unless the name is a known one, `hf:` with a model, or package.module:Class."""
+        if self.name == AUTO and not allow_auto:
             raise InputError(
-                f"--base {AUTO} is not allowed here, because the results name their base: give {known}"
+                f"`base` {AUTO} is not allowed here, because the results name their base: "
+                f"give {', '.join((RGBD, *NETWORK_BASES))}"
             )
         if self.name == HF_PREFIX:
             raise InputError(
-                f"--base {HF_PREFIX} names no model: give a Hugging Face model as owner/name, or a folder"
+                f"`base` {HF_PREFIX} names no model: "
+                "give a Hugging Face model as owner/name, or a folder"
             )
-        if not self.name.startswith(HF_PREFIX):
+        if ":" not in self.name:
             check_name("base", self.name, (AUTO, RGBD, *NETWORK_BASES))
-        check_name("precision", self.precision, PRECISIONS)
+
+    def _given_options(self) -> dict[str, object]:
+        """The options that only some bases take and that the user has set, with their values."""
         options = {
-            "--depth": self.depth.path if isinstance(self.depth, DepthMap) else self.depth,
-            "--calib": self.calib,
-            "--depth-kind": None if self.depth_kind == "auto" else self.depth_kind,
-            "--near": self.near,
-            "--far": self.far,
-            "-c": self.checkpoint,
-            "--precision": None if self.precision == "auto" else self.precision,
-            "--sharp": self.windows_per_batch and f"windows={self.windows_per_batch}",
+            "depth": self.depth.path if isinstance(self.depth, DepthMap) else self.depth,
+            "calib": self.calib,
+            "depth_kind": None if self.depth_kind == "auto" else self.depth_kind,
+            "near": self.near,
+            "far": self.far,
+            "checkpoint": self.checkpoint,
+            "precision": None if self.precision == "auto" else self.precision,
+            "windows_per_batch": self.windows_per_batch,
         }
-        kind = self.resolved_name.partition(":")[0]
-        for option, value in options.items():
-            if value is not None and option not in KINDS[kind][1]:
+        return {option: value for option, value in options.items() if value is not None}
+
+    def _check_option_of_other_bases(self) -> None:
+        """InputError if an option is set that this base does not take."""
+        for option, value in self._given_options().items():
+            if option not in BASE_KINDS[self.kind].options:
                 raise InputError(
-                    f"{option} {value}: the {kind} base does not take this option: leave it out"
+                    f"`{option}` {value}: the {self.kind} base does not take this option: "
+                    "leave it out"
                 )
-        check_window_batch("--sharp windows", self.windows_per_batch)
-        check_name("depth_kind", self.depth_kind, DEPTH_KINDS)
-        for option in ("--calib", *READING):
-            if (value := options[option]) is not None and self.depth is None:
+
+    def _check_depth_options(self) -> None:
+        """InputError for options about a depth map that is missing, or is not relative."""
+        given = self._given_options()
+        for option in ("calib", *DEPTH_READING_OPTIONS):
+            if option not in given:
+                continue
+            if self.depth is None:
                 raise InputError(
-                    f"{option} {value}: there is no depth map to read: give the map with --depth"
+                    f"`{option}` {given[option]}: there is no depth map to read: "
+                    "give the map with `depth`"
                 )
-            if (
-                value is not None
-                and option in ("--near", "--far")
-                and self.depth_kind not in RELATIVE_KINDS
-            ):
+            if option in ("near", "far") and self.depth_kind not in RELATIVE_KINDS:
                 raise InputError(
-                    f"{option} {value}: only for relative maps: add --depth-kind {' or '.join(RELATIVE_KINDS)}"
+                    f"`{option}` {given[option]}: only for relative maps: "
+                    f"add `depth_kind` {' or '.join(RELATIVE_KINDS)}"
                 )
-        if self.resolved_name in MISSING_WEIGHTS_ADVICE and not self.model_files:
-            raise InputError(
-                f"--base {self.resolved_name}: {MISSING_WEIGHTS_ADVICE[self.resolved_name]}"
-            )

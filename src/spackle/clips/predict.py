@@ -113,7 +113,7 @@ def predict_clip(
                     if choice.note:
                         reporter.log(f"{path.name}: {choice.note}")
                     reporter.log(
-                        f"{path.name}: {len(clip)} frames, {len(prediction.gaussians):,} Gaussians from {choice.base} "
+                        f"{path.name}: {len(clip)} frames, {len(prediction.gaussians):,} Gaussians from {choice.name} "
                         f"for each, focal length {prediction.camera.focal[0]:.0f} px "
                         f"({prediction.lens_source or photo.focal_source.value})"
                     )

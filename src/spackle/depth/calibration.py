@@ -147,7 +147,7 @@ def find_calibration(depth_file: Path) -> Calibration | None:
         return _read_middlebury(calib_txt)
     if stem.startswith("disp") or stem.endswith(("disp", "disparity")):
         raise InputError(
-            f"{depth_file}: the name announces a disparity map: give --calib, or rename the map"
+            f"{depth_file}: the name announces a disparity map: give `calib`, or rename the map"
         )
     return None
 

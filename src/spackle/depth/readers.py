@@ -105,7 +105,7 @@ def load_depth(
     """
     check_file(path, "depth map")
     if focal_px is not None and not 1 / LARGEST_NUMBER <= focal_px <= LARGEST_NUMBER:
-        raise InputError(f"--focal-px {focal_px:g}: give a focal length above 0, in pixels")
+        raise InputError(f"`focal_px` {focal_px:g}: give a focal length above 0, in pixels")
     if kind in RELATIVE_KINDS:
         stored, _ = read_array(path, grey=True)
         return relative_depth(stored, kind, path, near, far)
@@ -113,7 +113,7 @@ def load_depth(
     calibration = None if kind == "metric" else _calibration_of(Path(path), calib)
     if kind == "disparity" and calibration is None:
         raise InputError(
-            f"{path}: its folder has no calibration: give --calib FILE, or --depth-kind near-white"
+            f"{path}: its folder has no calibration: give `calib` FILE, or `depth_kind` near-white"
         )
     stored, is_png = read_array(path)
     if calibration is not None:

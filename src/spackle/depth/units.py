@@ -38,7 +38,7 @@ UNKNOWN_MILLIMETRES = 65535  # the highest number of 16 bits means unknown, as 0
 IMPLAUSIBLE_MEDIAN_M = 500  # whole numbers around or above this are hardly metres
 FULL_RANGE_SHARE = 0.05  # a relative PNG comes this close (as a share) to both ends of 16 bits
 KIND_ADVICE = (
-    "give --depth-kind near-white (as MiDaS, Depth Anything and ComfyUI write it), near-black "
+    "give `depth_kind` near-white (as MiDaS, Depth Anything and ComfyUI write it), near-black "
     "or metric"
 )
 
@@ -91,7 +91,7 @@ def millimetre_depth(stored: Array, path: StrPath) -> DepthMap:
     if stored.dtype == np.uint8:
         raise InputError(
             f"{path}: an 8-bit PNG holds no metres: "
-            "give 16 bits, or --depth-kind near-white or near-black"
+            "give 16 bits, or `depth_kind` near-white or near-black"
         )
     return build_depth_map(
         stored,
@@ -139,7 +139,7 @@ def relative_depth(
     """
     if not 0 < near < far < MAX_FAR_M:
         raise InputError(
-            f"--near {near:g}, --far {far:g}: give two distances in metres, the nearer one first"
+            f"`near` {near:g}, `far` {far:g}: give two distances in metres, the nearer one first"
         )
     known = np.isfinite(stored)
     values = stored.astype(np.float64)

@@ -204,7 +204,11 @@ def shared_report(
         "spackle": spackle.__version__,
         "focal_px": round(prediction.camera.focal[0], 3),
         "focal_source": prediction.lens_source or photo.focal_source.value,
-        "base": {"name": choice.base, "chosen": choice.why, "gaussians": len(prediction.gaussians)},
+        "base": {
+            "name": choice.name,
+            "chosen": choice.reason,
+            "gaussians": len(prediction.gaussians),
+        },
         "residual": {"weights": weights},
         "views": given.name if given else path.trajectory,
         "disparity_source": None if given else "photo" if path.disparity is None else "--disparity",

@@ -36,7 +36,7 @@ from spackle.weights.checkpoints import TensorShapes, load_strict, read_metadata
 
 CPU_WINDOW_BATCH = 5  # enough to keep two cores or a small GPU busy
 ADVICE = "give SHARP's checkpoint as it was downloaded"
-LESS_MEMORY = "try --sharp windows=1 and --precision bf16"
+LESS_MEMORY = "try `windows_per_batch` 1 and `precision` bf16"
 SOURCE_KEY = "spackle.gaussian_decoder"  # a decoder file's only metadata key, as JSON: safetensors shuffles several keys
 _ENCODER = "monodepth_model.monodepth_predictor.encoder."
 # Prefixes of tensors that are never read: the transformers' classifiers, and a U-Net that only training uses.
@@ -57,7 +57,7 @@ class SharpBase:
         self, network: SharpNetwork, *, windows_per_batch: int | None = None, weights: str = ""
     ) -> None:
         """Use a loaded network on its device; `weights` is the name of the weights in the report."""
-        check_window_batch("windows", windows_per_batch)
+        check_window_batch(windows_per_batch)
         self.network = network
         self.windows_per_batch = windows_per_batch or default_window_batch(self.device)
         self.weights = weights
@@ -125,10 +125,12 @@ def default_window_batch(device: torch.device) -> int:
     return CPU_WINDOW_BATCH if device.type == "cpu" else WINDOW_COUNT
 
 
-def check_window_batch(option: str, windows: int | None) -> None:
-    """InputError if the number of windows is out of range; `option` is its name in the message."""
-    if windows is not None and not 1 <= windows <= WINDOW_COUNT:
-        raise InputError(f"{option} must be between 1 and {WINDOW_COUNT}, got {windows}")
+def check_window_batch(windows_per_batch: int | None) -> None:
+    """InputError if the number of windows in a batch is not between 1 and 35; None is allowed."""
+    if windows_per_batch is not None and not 1 <= windows_per_batch <= WINDOW_COUNT:
+        raise InputError(
+            f"`windows_per_batch` must be between 1 and {WINDOW_COUNT}, got {windows_per_batch}"
+        )
 
 
 def to_metric(output: SharpOutput, photo: Photo) -> Gaussians:

@@ -92,7 +92,7 @@ class DatasetOptions:
 
     def check(self) -> None:
         """InputError if options contradict each other; inpainters check their options themselves."""
-        self.base.check(one=True)
+        self.base.check(allow_auto=False)
         depth = self.base.depth
         if depth is None and not self.base.uses_network:
             raise InputError(

@@ -124,7 +124,7 @@ class EvaluateOptions:
                 )
         if not self.methods:
             raise InputError(f"--methods: none is given: choose from {', '.join(METHODS)}")
-        self.opened.check(one=True)
+        self.opened.check(allow_auto=False)
         if self.residual == "none":
             raise InputError("--residual none: leaves the holes open: give --methods base instead")
         if "direct-ft" in self.methods and (self.base.name != "sharp" or self.direct_ft is None):
