@@ -1,11 +1,14 @@
-"""Measure the flicker in a clip's holes: `python benchmarks/clip.py [--side N] [--frames N]` (needs scikit-image).
+"""Measure the flicker in a clip's holes: `python benchmarks/clip.py [--side N] [--frames N]` (needs
+scikit-image).
 
-A camera moves through the Middlebury Motorcycle scene, in front of which a painted board stands or passes by. The
-scene's geometry is known, so each frame has its depth, and each completed view has a true view with the true motion of
-everything that the board hid. A hole's pixel, followed by that motion into the previous view, should have the same
-colour there: its flicker is the mean absolute difference in sRGB. "Alone" completes each frame by itself, "carried" is
-what `spackle predict` renders. "Seen" is the same figure for visible pixels, a lower bound. All are in units of 1/255.
-The method uses its own optical flow; the true motion and the true views serve for the measurement only.
+A camera moves through the Middlebury Motorcycle scene, in front of which a painted board stands or
+passes by. The scene's geometry is known, so each frame has its depth, and each completed view has a
+true view with the true motion of everything that the board hid. A hole's pixel, followed by that
+motion into the previous view, should have the same
+colour there: its flicker is the mean absolute difference in sRGB. "Alone" completes each frame by
+itself, "carried" is what `spackle predict` renders. "Seen" is the same figure for visible pixels, a
+lower bound. All are in units of 1/255. The method uses its own optical flow; the true motion and
+the true views serve for the measurement only.
 """
 
 from __future__ import annotations
@@ -42,7 +45,8 @@ PATH = 4  # the clip is the beginning of a camera path this many times as long
 Truth = tuple[Camera, Rendering]
 Sums = dict[str, list[Tensor]]  # for each figure, its pixels in each frame
 SAME_DEPTH = 0.02  # relative difference of depth up to which two views see the same surface
-# Simulated errors of a depth network, which vary between frames: scale, shift (over the median), waves.
+# Simulated errors of a depth network, which vary between frames: scale, shift (over the median),
+# waves.
 SCALE_NOISE, SHIFT_NOISE, WAVE_NOISE = 0.05, 0.02, 0.01
 
 
@@ -151,7 +155,9 @@ def play(
 
 
 def true_flow(now: Truth, was: Truth) -> tuple[Tensor, Tensor]:
-    """Flow [H, W, 2] of static surfaces from a true view to the previous one; [H, W] bool: where both see the same."""
+    """Flow [H, W, 2] of static surfaces from a true view to the previous one; [H, W] bool: where
+    both see the same.
+    """
     (camera, view), (camera_before, before) = now, was
     grid = pixel_grid(view.depth)
     uv, z = camera_before.project(camera.unproject(grid, view.depth))
@@ -185,7 +191,8 @@ def judge(world: World, clip: str, frames: int, noisy: bool) -> Sums:
 
 
 def flicker(view: Tensor, earlier: Tensor, flow: Tensor, chosen: Tensor) -> float | None:
-    """Mean absolute sRGB difference between a view [H, W, 3] and an earlier view warped by the flow [H, W, 2].
+    """Mean absolute sRGB difference between a view [H, W, 3] and an earlier view warped by the flow
+    [H, W, 2].
 
     The mean is over the pixels `chosen` [H, W]; None if there are none.
     """
@@ -225,6 +232,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=24)
     options = parser.parse_args()
     world = load_world(options.side)
+    # PSNR in the holes
     heads = (
         "depth",
         "holes",
@@ -234,7 +242,7 @@ def main() -> None:
         "ratio",
         "alone dB",
         "carried dB",
-    )  # PSNR in the holes
+    )
     print(f"{'clip':18}", *(f"{head:>10}" for head in heads))
     for noisy in (False, True):
         for clip in CLIPS:

@@ -1,11 +1,12 @@
-"""The first ten minutes on a machine with an NVIDIA GPU: a report in Markdown on what works, how exactly, how fast.
+"""The first ten minutes on a machine with an NVIDIA GPU: a report in Markdown on what works, how
+exactly, how fast.
 
 python benchmarks/gpu.py [-o gpu.md] [-c SHARP.pt] [--only STEP,...]
 
-Each step runs in its own process, because a fault in a kernel ends the process, and the report states what the step
-must show. A step that cannot run here is skipped with its reason; without a GPU this applies to all, as a dry run. The
-file is rewritten after each step and is meant for docs/performance.md. `benchmarks/random_weights.py sharp.pt` makes
-weights for -c.
+Each step runs in its own process, because a fault in a kernel ends the process, and the report
+states what the step must show. A step that cannot run here is skipped with its reason; without a
+GPU this applies to all, as a dry run. The file is rewritten after each step and is meant for
+docs/performance.md. `benchmarks/random_weights.py sharp.pt` makes weights for -c.
 """
 
 from __future__ import annotations
@@ -145,13 +146,17 @@ def empty(options: argparse.Namespace) -> Iterator[str]:
 
 
 def parity(options: argparse.Namespace) -> Iterator[str]:
-    """all tests of values, gradients, tiles, batches and memory pass, and none of gsplat's is skipped"""
+    """all tests of values, gradients, tiles, batches and memory pass, and none of gsplat's is
+    skipped
+    """
     renderer()
     yield list(run(sys.executable, "-m", "pytest", TESTS, "-q", "-rs"))[-1]
 
 
 def against_cpu(options: argparse.Namespace) -> Iterator[str]:
-    """with eps2d 0 nearly all pixels are within 2e-4 of the CPU's, and hardly any Gaussian is drawn by one alone"""
+    """with eps2d 0 nearly all pixels are within 2e-4 of the CPU's, and hardly any Gaussian is drawn
+    by one alone
+    """
     gpu, (scene, cameras) = renderer(), views()
     for camera in cameras:
         one, other = gpu.render(scene, camera), CpuRenderer().render(scene, camera)
@@ -182,7 +187,9 @@ def sanitizer(options: argparse.Namespace) -> Iterator[str]:
 
 
 def counted_waits(call: Callable[[], object]) -> list[str]:
-    """The lines of code where a call makes the host wait for the GPU; the call runs once before, to warm up."""
+    """The lines of code where a call makes the host wait for the GPU; the call runs once before, to
+    warm up.
+    """
     call()
     torch.cuda.synchronize()
     torch.cuda.set_sync_debug_mode("warn")
@@ -246,7 +253,9 @@ def speed(options: argparse.Namespace) -> Iterator[str]:
 
 
 def training(options: argparse.Namespace) -> Iterator[str]:
-    """a step with loss and gradients takes a twentieth of its time on the CPU, and waits for the GPU once"""
+    """a step with loss and gradients takes a twentieth of its time on the CPU, and waits for the
+    GPU once
+    """
     gpu = renderer()
     scene, camera = holed_scene(768)
     view = find_view(scene, camera, gpu)[1]
@@ -281,7 +290,9 @@ def training(options: argparse.Namespace) -> Iterator[str]:
 
 
 def completion(options: argparse.Namespace) -> Iterator[str]:
-    """a view completed on the GPU looks the same as on the CPU, has as few holes, and takes less time"""
+    """a view completed on the GPU looks the same as on the CPU, has as few holes, and takes less
+    time
+    """
     gpu = renderer()
     scene, camera = holed_scene()
     view = find_view(scene, camera, gpu)[1]

@@ -24,7 +24,9 @@ Arrays = tuple[Array, ...]  # a scene's five tensors
 
 
 def naive_render(scene: Gaussians, camera: Camera, lap: EndStage = lambda name: None) -> Tensor:
-    """Render Gaussians to [H, W, 3] sRGB, with `eps2d` 0; depth and alpha are computed too, as in ours."""
+    """Render Gaussians to [H, W, 3] sRGB, with `eps2d` 0; depth and alpha are computed too, as in
+    ours.
+    """
     tensors, view = tuple(t.numpy() for t in scene.tensors), KernelCamera.of(camera, 0.0)
     splats, boxes = np.empty((len(scene), 6), np.float32), np.zeros((len(scene), 4), np.int32)
     parallel_for_chunks(
@@ -49,7 +51,9 @@ def naive_render(scene: Gaussians, camera: Camera, lap: EndStage = lambda name: 
 def naive_project(
     first: int, last: int, scene: Arrays, view: KernelCamera, splats: Array, boxes: Array
 ) -> None:
-    """Write centre, depth and inverse covariance [N, 6], and pixel boxes [N, 4], of the Gaussians first..last."""
+    """Write centre, depth and inverse covariance [N, 6], and pixel boxes [N, 4], of the Gaussians
+    first..last.
+    """
     means, quats, scales, opacities, _ = scene
     lens, pose, width, height, _ = view
     for i in range(first, last):

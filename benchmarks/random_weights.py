@@ -1,4 +1,5 @@
-"""Make random weights in SHARP's or LaMa's shapes, the same each time, to try all commands without a download:
+"""Make random weights in SHARP's or LaMa's shapes, the same each time, to try all commands without
+a download:
 
     python benchmarks/random_weights.py sharp.pt                          # 702 M numbers, as published
     python benchmarks/random_weights.py tiny.safetensors --size tiny      # or micro, or lama
@@ -48,7 +49,9 @@ def deterministic_weights(shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Te
 
 
 def lama_weights(*size: int) -> dict[str, Tensor]:
-    """`deterministic_weights` for LaMa's generator, of the given width and depth if any; variances are around one."""
+    """`deterministic_weights` for LaMa's generator, of the given width and depth if any; variances
+    are around one.
+    """
     made = deterministic_weights(lama_shapes(*size))
     return {
         name: 1 + 5 * x.abs() if name.endswith("running_var") else x for name, x in made.items()

@@ -2,10 +2,12 @@
 
     python benchmarks/reproduce.py -o reproduction
 
-Each command that a reader would type is printed and run; docs/reproduction.md has them at the paper's size. Each of the
-six datasets is replaced by one scene in its layout: one is real (scikit-image's Motorcycle), five are synthetic, made
-from scikit-image's other pictures. SHARP is replaced by a network of its architecture for 512² pixels, with random
-weights, fitted to the synthetic scenes' depth; it predicts nearly the same depth for all photos.
+Each command that a reader would type is printed and run; docs/reproduction.md has them at the
+paper's size. Each of the
+six datasets is replaced by one scene in its layout: one is real (scikit-image's Motorcycle), five
+are synthetic, made from scikit-image's other pictures. SHARP is replaced by a network of its
+architecture for 512² pixels, with random weights, fitted to the synthetic scenes' depth; it
+predicts nearly the same depth for all photos.
 """
 
 from __future__ import annotations
@@ -35,9 +37,8 @@ from spackle.bases.sharp.encoder import MICRO_SIZE, WINDOW_COUNT
 from spackle.paper.evaluation.datasets import stereo
 
 WIDTH, HEIGHT = 192, 144
-FOCAL = (
-    math.hypot(WIDTH, HEIGHT) * 30 / math.hypot(36, 24)
-)  # the focal length assumed for photos without metadata
+# the focal length assumed for photos without metadata
+FOCAL = math.hypot(WIDTH, HEIGHT) * 30 / math.hypot(36, 24)
 WALL, OBJECT = 4.0, 2.2  # depths of a synthetic scene's two surfaces, in metres
 SIZE, LOW = 1.1, 0.1  # the object's size, and how far its middle is below the photo's, in metres
 EYES = (0.0, 0.35, -0.35)  # eyes' positions to the right, in metres; the first is the photo's
@@ -48,7 +49,9 @@ Array = NDArray[Any]
 
 
 class Scene(NamedTuple):
-    """An object in front of a wall, both flat and facing the camera, each showing a picture of scikit-image."""
+    """An object in front of a wall, both flat and facing the camera, each showing a picture of
+    scikit-image.
+    """
 
     wall: str
     front: str
@@ -120,7 +123,9 @@ def middlebury(scene: Path) -> None:
 
 
 def booster(scene: Path, made: Scene) -> None:
-    """Write a scene as in Booster, with OpenCV's calibration: millimetres, pixel centres at integers."""
+    """Write a scene as in Booster, with OpenCV's calibration: millimetres, pixel centres at
+    integers.
+    """
     photo, depth = made.seen()
     save(scene / "camera_00" / "im0.png", photo)
     save(scene / "camera_02" / "im0.png", made.seen(BASELINE)[0])
@@ -148,7 +153,9 @@ def wildrgbd(scene: Path, made: Scene, scale: float = 0.2) -> None:
 
 
 def colmap(photos: Path, model: Path, made: Scene, above: str = "") -> None:
-    """Write photos and a COLMAP model as text, with a point at every eighth pixel of the first photo."""
+    """Write photos and a COLMAP model as text, with a point at every eighth pixel of the first
+    photo.
+    """
     depth, images = made.seen()[1][4::8, 4::8], ""
     v, u = np.mgrid[4:HEIGHT:8, 4:WIDTH:8] + 0.5
     points = np.stack(
@@ -172,7 +179,9 @@ def colmap(photos: Path, model: Path, made: Scene, above: str = "") -> None:
 
 
 def llff(scene: Path, made: Scene) -> None:
-    """Write a scene as in LLFF: for each photo the columns down, right, backwards, eye and lens, then bounds."""
+    """Write a scene as in LLFF: for each photo the columns down, right, backwards, eye and lens,
+    then bounds.
+    """
     rows = []
     for number, eye in enumerate(EYES):
         save(scene / "images_4" / f"image{number:03d}.png", made.seen(eye)[0])
@@ -205,10 +214,12 @@ def make_data(data: Path, photos: Path) -> None:
 
 @torch.no_grad()
 def fit_sharp(random: Path, fitted: Path) -> None:
-    """Fit random weights to the depth of synthetic scenes; deltas start at zero, opacities near one.
+    """Fit random weights to the depth of synthetic scenes; deltas start at zero, opacities near
+    one.
 
-    The tokens of the whole image get low-frequency position embeddings. All of the decoder is zeroed but the path from
-    these tokens to the disparities, which is thus linear and nearly the same for all photos.
+    The tokens of the whole image get low-frequency position embeddings. All of the decoder is
+    zeroed but the path from these tokens to the disparities, which is thus linear and nearly the
+    same for all photos.
     """
     weights, grid, depths = (
         load_file(random),
@@ -272,7 +283,8 @@ def commands() -> list[str]:
     few = f"data.pseudo=pseudo data.validation_views={VIEWS} loss.features=none run.validate_every=10 optim.warmup=4"
     train = f"torchrun --nproc-per-node {RANKS} --no-python spackle train --recipe"
     crops = f"optim.steps={STEPS} optim.batch=4 data.views=30 data.crops=2 data.cells=32"
-    fast = f"optim.steps={STEPS // 2} optim.batch=8 optim.lr=4e-3 optim.min_lr=4e-4"  # high rates for few steps
+    # high rates for few steps
+    fast = f"optim.steps={STEPS // 2} optim.batch=8 optim.lr=4e-3 optim.min_lr=4e-4"
     methods = "--methods base,paper,spackle,direct-ft,dense --direct-ft direct-ft/best.safetensors"
     lines = [
         f"spackle dataset build photos -o pseudo {sharp} --views {VIEWS} --inpainter exemplar --disparity 0.3 0.6",
@@ -305,9 +317,8 @@ def run(out: Path, line: str) -> None:
     began, words = time.monotonic(), shlex.split(line)
     with (out / "log.txt").open("a") as log:
         programs = Path(sys.executable).parent
-        environment = os.environ | {
-            "PATH": f"{programs}{os.pathsep}{os.environ['PATH']}"
-        }  # torchrun starts spackle
+        # torchrun starts spackle
+        environment = os.environ | {"PATH": f"{programs}{os.pathsep}{os.environ['PATH']}"}
         command = [programs / words[0], *words[1:]]
         if subprocess.run(command, cwd=out, stdout=log, stderr=log, env=environment).returncode:
             sys.exit(f"this command failed: {out / 'log.txt'} says why")

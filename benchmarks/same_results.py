@@ -4,10 +4,11 @@
     (change the code)
     python benchmarks/same_results.py --against before.json
 
-The commands are `demo`, and `predict` of the demo's photo: with lite (three given cameras; keyframes), with its depth
-in view mode, and with its depth without weights. Run both versions on one machine, because the last bits depend on its
-processor and threads. Of reports, times and the digest of the request are ignored, because they differ between runs of
-one version. Videos are left out: the encoder's threads make their bytes vary, and they only show the scenes.
+The commands are `demo`, and `predict` of the demo's photo: with lite (three given cameras;
+keyframes), with its depth in view mode, and with its depth without weights. Run both versions on
+one machine, because the last bits depend on its processor and threads. Of reports, times and the
+digest of the request are ignored, because they differ between runs of one version. Videos are left
+out: the encoder's threads make their bytes vary, and they only show the scenes.
 """
 
 from __future__ import annotations

@@ -1,19 +1,22 @@
 """The scoreboard: measure the quality of lifted and completed scenes on stereo pairs.
 
-    python benchmarks/scoreboard.py PAIRS --features squeezenet_v1.0.npz [--small 4] [-o NOW.json] [--against OLD.json]
-    python benchmarks/scoreboard.py PAIRS ... --without "far bias" --without "network+texture"
-    python benchmarks/scoreboard.py PAIRS ... --ledger > ledger.md
-    python benchmarks/scoreboard.py --photos FOLDER [--without NAME] -o sheet.jpg
+    python benchmarks/scoreboard.py PAIRS --features squeezenet_v1.0.npz [--small 4] [-o NOW.json]
+    [--against OLD.json] python benchmarks/scoreboard.py PAIRS ... --without "far bias" --without
+    "network+texture" python benchmarks/scoreboard.py PAIRS ... --ledger > ledger.md python
+    benchmarks/scoreboard.py --photos FOLDER [--without NAME] -o sheet.jpg
 
-PAIRS has one folder per scene: two photos, a disparity map and a `scene.json` (`spackle.paper.training.sources.load_pair`).
-The left photo is lifted by its true depth, and the right camera's view is completed and compared with the right photo.
-PAIRS may also be a folder of photos. A fifth of the width is then cut off at each side of a photo, its middle is lifted
-by lite's depth for the whole photo, and the view to complete is the whole photo.
+PAIRS has one folder per scene: two photos, a disparity map and a `scene.json`
+(`spackle.paper.training.sources.load_pair`). The left photo is lifted by its true depth, and the
+right camera's view is completed and compared with the right photo. PAIRS may also be a folder of
+photos. A fifth of the width is then cut off at each side of a photo, its middle is lifted by lite's
+depth for the whole photo, and the view to complete is the whole photo.
 
-The hole is where the lifted photo's opacity in the view is below 0.95; the band is within 8 pixels of the hole.
+The hole is where the lifted photo's opacity in the view is below 0.95; the band is within 8 pixels
+of the hole.
 
 distance ↓    SqueezeNet 1.0 at conv1, fire3, fire5 and fire9: mean squared difference of unit feature vectors over the
-              cells, weighted by the fraction that is hole; outside the hole the view is replaced by the truth. 0 to 2
+              cells, weighted by the fraction that is hole; outside the hole the view is replaced by
+              the truth. 0 to 2
 texture ↓     Frobenius norm of the difference of the vectors' Gram matrices, over that of the truth's matrices
 sharpness     mean gradient magnitude in grey over the truth's, at least 3 pixels inside the hole; 1 is best
 PSNR ↑        in the hole; band ↑: in the band; elsewhere ↑: outside both; in dB
@@ -23,12 +26,13 @@ agreement ↑   the same against the lifted photo, at most 100 dB
 HAR ↓         the hole that is left, in percent of the view
 base, aux     thousands of Gaussians; s lift and s fill: CPU seconds of all threads
 
---small N lifts by depth maps of 1/N of the side, in 256 steps of inverse depth, as phones store them. --without runs
-once more with a mechanism of `MECHANISMS` switched off, or several joined by +; hole and band stay those of the
-default. --ledger does this with each mechanism and prints the changes. --against compares with another run's file: up :
-down counts the scenes whose figure rose and fell, p is the p-value of a two-sided sign test. --photos completes some
-photos with `lite` and writes a sheet with a row for each photo: at the left and the right end of its camera path, the
-lifted photo and the result of each run.
+--small N lifts by depth maps of 1/N of the side, in 256 steps of inverse depth, as phones store
+them. --without runs once more with a mechanism of `MECHANISMS` switched off, or several joined by
++; hole and band stay those of the default. --ledger does this with each mechanism and prints the
+changes. --against compares with another run's file: up : down counts the scenes whose figure rose
+and fell, p is the p-value of a two-sided sign test. --photos completes some
+photos with `lite` and writes a sheet with a row for each photo: at the left and the right end of
+its camera path, the lifted photo and the result of each run.
 """
 
 from __future__ import annotations
@@ -75,11 +79,12 @@ Replace = Callable[[Any], Any]  # from a function or constant to its replacement
 
 LAYERS = ("conv1", "fire3", "fire5", "fire9")
 BAND_PX = 8
+# for seams: pixels, pixels, relative depth step above which there is no seam
 NEAR, BESIDE, STEP = (
     2,
     20,
     0.05,
-)  # for seams: pixels, pixels, relative depth step above which there is no seam
+)
 STEPS = 255  # of inverse depth in a phone's map
 DIGITS = dict.fromkeys(("distance", "texture", "seam", "HAR"), 3)  # other figures have 2
 SECONDS = ("s lift", "s fill")
@@ -124,7 +129,8 @@ def one_surface(own: Any) -> Any:
     return layers
 
 
-# Mechanisms of lifting and of completion that can be switched off: names in the package, and their replacements.
+# Mechanisms of lifting and of completion that can be switched off: names in the package, and their
+# replacements.
 LIFT: dict[str, dict[str, Replace]] = {
     "smoothed": {"smoothed": first},
     "edges": {"find_edges": no_edges},
@@ -149,9 +155,11 @@ MECHANISMS = (*FILL, *LIFT)
 
 
 def holders(target: str) -> list[ModuleType]:
-    """Modules of the package that have an object under this name; `home.name` selects the module `home`'s object.
+    """Modules of the package that have an object under this name; `home.name` selects the module
+    `home`'s object.
 
-    LookupError unless it is a single object, so that removed or renamed mechanisms do not pass unnoticed.
+    LookupError unless it is a single object, so that removed or renamed mechanisms do not pass
+    unnoticed.
     """
     home, _, name = target.rpartition(".")
     modules = [
@@ -205,7 +213,9 @@ class Perception:
 
 
 class Pair:
-    """A stereo pair with the hole, band and former border in the right camera's view, which all runs share."""
+    """A stereo pair with the hole, band and former border in the right camera's view, which all
+    runs share.
+    """
 
     def __init__(self, place: Path, small: int) -> None:
         pair = load_pair(place) if place.is_dir() else load_cut(place)
@@ -245,7 +255,9 @@ class Pair:
 
 
 def load_cut(file: Path) -> tuple[Tensor, Tensor, DepthMap, Camera, Camera]:
-    """A photo and its middle three fifths as a pair, as returned by `load_pair`: the middle is the left photo."""
+    """A photo and its middle three fifths as a pair, as returned by `load_pair`: the middle is the
+    left photo.
+    """
     photo = resize_photo(load_photo(file))
     inverse, side = spackle.LiteBase.load().inverse_depth(photo.rgb), photo.width // 5
     inverse = F.interpolate(inverse[None, None], (photo.height, photo.width), mode="bilinear")[0, 0]
@@ -259,7 +271,9 @@ def load_cut(file: Path) -> tuple[Tensor, Tensor, DepthMap, Camera, Camera]:
 
 
 def smaller(depth: DepthMap, times: int) -> DepthMap:
-    """A depth map with sides `times` times smaller: the mean known inverse depth in each cell, in 256 steps."""
+    """A depth map with sides `times` times smaller: the mean known inverse depth in each cell, in
+    256 steps.
+    """
     valid = depth.valid.float()
     sums = F.avg_pool2d(
         torch.stack([valid / depth.depth.where(depth.valid, torch.ones(())), valid]), times
@@ -276,7 +290,9 @@ def smaller(depth: DepthMap, times: int) -> DepthMap:
 
 
 def crossings(depth: Tensor, camera: Camera, photo: Camera) -> list[Tensor]:
-    """Whether the photo's border passes between neighbours in rows [H, W − 1] and in columns [W, H − 1]."""
+    """Whether the photo's border passes between neighbours in rows [H, W − 1] and in columns [W, H
+    − 1].
+    """
     uv, _ = photo.project(camera.unproject(camera.pixel_centers(), depth))
     found = []
     for axis, size in enumerate((photo.width, photo.height)):
@@ -287,10 +303,11 @@ def crossings(depth: Tensor, camera: Camera, photo: Camera) -> list[Tensor]:
 
 
 def seam(rgb: Tensor, crossings: Sequence[Tensor]) -> float:
-    """Mean grey difference across the crossings, over that beside them; NaN if there are no crossings."""
-    sums = torch.zeros(
-        2, 2, dtype=torch.float64
-    )  # rows near and beside, columns sum of differences and their number
+    """Mean grey difference across the crossings, over that beside them; NaN if there are no
+    crossings.
+    """
+    # rows near and beside, columns sum of differences and their number
+    sums = torch.zeros(2, 2, dtype=torch.float64)
     for picture, crossing in zip(
         (rgb @ GREY_WEIGHTS, (rgb @ GREY_WEIGHTS).T), crossings, strict=True
     ):
@@ -322,7 +339,9 @@ def table(rows: Rows) -> str:
 
 
 def change(measure: str, before: Rows, now: Rows) -> tuple[float, float, int, int]:
-    """A measure's means before and now over the scenes that have both, and the numbers of rises and falls."""
+    """A measure's means before and now over the scenes that have both, and the numbers of rises and
+    falls.
+    """
     pairs = np.array(
         [(before[name][measure], now[name][measure]) for name in now if name in before]
     ).reshape(-1, 2)
@@ -388,7 +407,9 @@ def pictures_in(folder: Path, most: int) -> list[Path]:
 
 
 def sheet(folder: Path, runs: Sequence[str]) -> Image.Image:
-    """A row for each photo: at the left and right end of its path, the lifted photo and each run's result."""
+    """A row for each photo: at the left and right end of its path, the lifted photo and each run's
+    result.
+    """
     base, rows = spackle.LiteBase.load(), []
     for file in pictures_in(folder, PHOTOS):
         pictures = []

@@ -1,8 +1,10 @@
-"""Load test of `spackle serve`: photos after the server is killed, response times, and the cost of clients.
+"""Load test of `spackle serve`: photos after the server is killed, response times, and the cost of
+clients.
 
     python benchmarks/serve.py [--side 480] [--photos 20] [--workers 2] [-o results.json]
 
-Photos are completed by the real pipeline with `lite`; the server is a separate process on this machine.
+Photos are completed by the real pipeline with `lite`; the server is a separate process on this
+machine.
 """
 
 from __future__ import annotations
@@ -150,7 +152,9 @@ async def post(port: int, request: bytes) -> tuple[int, Any]:
 
 
 def killed_in_between(folder: Path, content: bytes, count: int, workers: int) -> dict[str, Any]:
-    """Upload all photos at once; kill and restart the server when a quarter is done, and when half is."""
+    """Upload all photos at once; kill and restart the server when a quarter is done, and when half
+    is.
+    """
     server = Server(folder, workers, count)
     before = server.facts()
     start = time.monotonic()
@@ -212,7 +216,9 @@ async def rate(port: int, id: str, connections: int, seconds: float) -> float:
 
 
 def crowd(folder: Path, content: bytes) -> dict[str, Any]:
-    """Measure a hundred simultaneous uploads, status answers per second, and the effect of slow clients."""
+    """Measure a hundred simultaneous uploads, status answers per second, and the effect of slow
+    clients.
+    """
     server = Server(folder, 1, 32)
     before = server.facts()
     start = time.monotonic()
@@ -248,7 +254,9 @@ def crowd(folder: Path, content: bytes) -> dict[str, Any]:
 
 
 async def _slow(server: Server, id: str, request: bytes) -> dict[str, Any]:
-    """How others are served while 200 clients send half of a request head and 20 send a photo byte by byte."""
+    """How others are served while 200 clients send half of a request head and 20 send a photo byte
+    by byte.
+    """
     connections = [await asyncio.open_connection("127.0.0.1", server.port) for _ in range(220)]
     for k, (_, writer) in enumerate(connections):
         writer.write(request[:20] if k < 200 else request[:400])

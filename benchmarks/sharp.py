@@ -1,10 +1,12 @@
 """Compare SHARP in Spackle with the original: one photo to a PLY on disk, each in its own process.
 
-python benchmarks/sharp.py --original CHECKOUT [--original-python PYTHON] [--weights FILE.pt] [--photo FILE]
+python benchmarks/sharp.py --original CHECKOUT [--original-python PYTHON] [--weights FILE.pt]
+[--photo FILE]
 
-CHECKOUT is a clone of github.com/apple/ml-sharp, PYTHON an interpreter with its requirements installed. Without
---weights, deterministic ones are made (2.8 GB in the temporary folder). Prints a Markdown table of seconds per stage,
-seconds of the whole process, and peak resident memory; then how far the Gaussians and two renders differ.
+CHECKOUT is a clone of github.com/apple/ml-sharp, PYTHON an interpreter with its requirements
+installed. Without --weights, deterministic ones are made (2.8 GB in the temporary folder). Prints a
+Markdown table of seconds per stage, seconds of the whole process, and peak resident memory; then
+how far the Gaussians and two renders differ.
 """
 
 from __future__ import annotations
@@ -73,8 +75,9 @@ def run_original(clock: Clock, weights: Path, photo: Path, output: Path, *, chec
 def declare_operators(folder: Path, namespace: str = "torchvision") -> list[str]:
     """Declare the operators of torchvision that are missing; returns their names.
 
-    If torch is of another build, torchvision's compiled operators do not load, and its import fails at the first one.
-    The original uses only torchvision's Python code, so declaring the names is enough.
+    If torch is of another build, torchvision's compiled operators do not load, and its import fails
+    at the first one. The original uses only torchvision's Python code, so declaring the names is
+    enough.
     """
     import torch
 
@@ -87,9 +90,8 @@ def declare_operators(folder: Path, namespace: str = "torchvision") -> list[str]
     library = torch.library.Library(namespace, "FRAGMENT")
     for name in missing:
         library.define(f"{name}(Tensor x) -> Tensor")
-    vars(declare_operators).setdefault("kept", []).append(
-        library
-    )  # the names exist as long as this object
+    # the names exist as long as this object
+    vars(declare_operators).setdefault("kept", []).append(library)
     return missing
 
 
@@ -112,7 +114,9 @@ def run_ours(clock: Clock, weights: Path, photo: Path, output: Path, **options: 
 
 
 def measure(name: str, python: str, arguments: dict[str, Any]) -> dict[str, Any]:
-    """Run one contender as a child process: seconds of its stages and from start to exit, and peak memory in GB."""
+    """Run one contender as a child process: seconds of its stages and from start to exit, and peak
+    memory in GB.
+    """
     print(f"{name} …", file=sys.stderr, flush=True)
     start = time.perf_counter()
     call = [python, __file__, "--child", json.dumps(arguments, default=str)]
@@ -168,7 +172,9 @@ def print_table(results: list[dict[str, Any]]) -> None:
 
 
 def make_inputs(weights: Path | None, photo: Path | None, folder: Path) -> tuple[Path, Path]:
-    """Weights and photo; by default deterministic weights, which are made here, and the demo's photo."""
+    """Weights and photo; by default deterministic weights, which are made here, and the demo's
+    photo.
+    """
     if weights is None:
         weights = Path(tempfile.gettempdir()) / "sharp_deterministic.pt"
         if not weights.exists():

@@ -1,10 +1,12 @@
 """Time every stage on this machine: hardware limits, the renderer, completion, a video, SHARP.
 
-python benchmarks/suite.py [-o FOLDER] [--only SECTION,...] [--runs N] [--device cuda] [-c SHARP.pt] [--residual FILE]
+python benchmarks/suite.py [-o FOLDER] [--only SECTION,...] [--runs N] [--device cuda] [-c SHARP.pt]
+[--residual FILE]
 
-Needs no dataset and no weights; SHARP is timed if -c gives a file, as made by `random_weights.py`. Writes suite.json
-(every run's value) and suite.md after each section. A section that cannot run here is listed with its reason. Tasks
-that are compared take turns within one process, after one untimed turn, which compiles.
+Needs no dataset and no weights; SHARP is timed if -c gives a file, as made by `random_weights.py`.
+Writes suite.json (every run's value) and suite.md after each section. A section that cannot run
+here is listed with its reason. Tasks that are compared take turns within one process, after one
+untimed turn, which compiles.
 """
 
 from __future__ import annotations
@@ -81,9 +83,8 @@ EACH, GUARDS = (
 )
 FORWARD, UNPROJECT, SAVE = "forward", "unprojection", "save as PLY"
 
-Peaks = Mapping[
-    str, float
-]  # for each measured limit, its best run in operations or bytes per millisecond
+# for each measured limit, its best run in operations or bytes per millisecond
+Peaks = Mapping[str, float]
 
 
 class Timed(NamedTuple):
@@ -99,7 +100,8 @@ Section = tuple[list[Timed], dict[str, Any]]  # the figures; and sizes and setti
 
 
 def limits_section(runs: int, device: torch.device = CPU, share: float = 1.0) -> Section:
-    """Time products of square matrices, 2·side³ operations each, and copies, whose bytes are read and written.
+    """Time products of square matrices, 2·side³ operations each, and copies, whose bytes are read
+    and written.
 
     `share` scales the sizes.
     """
@@ -124,7 +126,9 @@ def limits_section(runs: int, device: torch.device = CPU, share: float = 1.0) ->
 
 
 def renderer_section(runs: int, side: int, peaks: Peaks) -> Section:
-    """Time the CPU renderer on a scene of SHARP's size: its stages, a whole call, and the naive renderer."""
+    """Time the CPU renderer on a scene of SHARP's size: its stages, a whole call, and the naive
+    renderer.
+    """
     scene, camera = photo_scene(side)
     tasks: dict[str, TimedTask] = {
         "ours": lambda lap: render_in_laps(scene, camera, lap),
@@ -133,9 +137,8 @@ def renderer_section(runs: int, side: int, peaks: Peaks) -> Section:
     }
     times = time_tasks(runs, tasks)
     call, naive = times["call", TOTAL_STAGE], times["naive", TOTAL_STAGE]
-    least = (
-        len(scene) * GAUSSIAN_BYTES + side * side * PIXEL_BYTES
-    )  # bytes that must be read or written once
+    # bytes that must be read or written once
+    least = len(scene) * GAUSSIAN_BYTES + side * side * PIXEL_BYTES
     figures = [Timed(stage, times["ours", stage]) for stage in RENDER_STAGES]
     figures.append(Timed("whole call: RGB, depth, alpha", call, limit_ms=least / peaks[COPY]))
     figures += [Timed(f"naive: {stage}", times["naive", stage]) for stage in RENDER_STAGES]
@@ -174,7 +177,9 @@ def completion_section(
     network: ResidualNet | None,
     device: torch.device = CPU,
 ) -> Section:
-    """Time the completion of a view with 5 % holes, and the base's rendering; if `network` is None, by seeds."""
+    """Time the completion of a view with 5 % holes, and the base's rendering; if `network` is None,
+    by seeds.
+    """
     disparity, camera = find_view(base, photo_camera, renderer)
     context = FillContext(base, photo_camera, renderer, network)
     times = time_tasks(
@@ -205,11 +210,12 @@ def video_section(
     frames: int = FRAMES,
     device: torch.device = CPU,
 ) -> Section:
-    """Time a photo, lifted by `lift`, to an MP4 along `rotate-forward`: as one scene, and frame by frame.
+    """Time a photo, lifted by `lift`, to an MP4 along `rotate-forward`: as one scene, and frame by
+    frame.
 
-    Frame by frame, each frame is rendered and completed from scratch, including its occlusion guard; frames share only
-    the photo's Gaussians. Lifting and encoding are the same in both ways, and included in both. There are at most
-    `VIDEO_RUNS` runs.
+    Frame by frame, each frame is rendered and completed from scratch, including its occlusion
+    guard; frames share only the photo's Gaussians. Lifting and encoding are the same in both ways,
+    and included in both. There are at most `VIDEO_RUNS` runs.
     """
     prediction, aux = lift(), Gaussians.empty()
     depths = DepthRange.of(prediction.gaussians)
@@ -262,7 +268,9 @@ def video_section(
 def sharp_section(
     runs: int, base: SharpBase, photo: Photo, peaks: Peaks, device: torch.device = CPU
 ) -> Section:
-    """Time a photo to a scene on disk by SHARP, by stage; the time does not depend on the photo's content."""
+    """Time a photo to a scene on disk by SHARP, by stage; the time does not depend on the photo's
+    content.
+    """
     count = 0
 
     def whole(lap: EndStage) -> None:
@@ -276,7 +284,8 @@ def sharp_section(
             save_ply(gaussians, Path(folder) / "scene.ply", camera=photo.camera)
         lap(SAVE)
 
-    # Counting operations also warms up. A compiled network hides its operations, and is warmed up by `time_tasks`.
+    # Counting operations also warms up. A compiled network hides its operations, and is warmed up
+    # by `time_tasks`.
     flops = 0.0 if base.compiled else count_flops(lambda: whole(lambda name: None))
     times = time_tasks(runs, {"": whole}, device, warm=flops > 0)
     least = flops / peaks[PRODUCT.format(base.precision)] if flops else None

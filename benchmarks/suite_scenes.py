@@ -1,4 +1,6 @@
-"""Synthetic scenes of SHARP's size for benchmarks, views of them with holes, and the measured commit."""
+"""Synthetic scenes of SHARP's size for benchmarks, views of them with holes, and the measured
+commit.
+"""
 
 from __future__ import annotations
 
@@ -18,13 +20,14 @@ from spackle.runtime.errors import InputError
 
 SIDE = 1536  # pixels a side, as in SHARP
 CELL = 2
+# share of a view; steps and relative tolerance of the search
 HOLES, HALVINGS, CLOSE = (
     0.05,
     14,
     0.01,
-)  # share of a view; steps and relative tolerance of the search
-# Boxes in front of the wall: left, top, right, bottom as fractions of the image, and depth in metres.
-# They cover less than a tenth of it, so that camera paths look at the wall.
+)
+# Boxes in front of the wall: left, top, right, bottom as fractions of the image, and depth in
+# metres. They cover less than a tenth of it, so that camera paths look at the wall.
 BOXES = (
     (0.15, 0.20, 0.30, 0.40, 3.5),
     (0.60, 0.35, 0.80, 0.55, 3.0),
@@ -36,9 +39,11 @@ SPREAD_PX = 1.3
 
 
 def photo_scene(side: int = SIDE) -> tuple[Gaussians, Camera]:
-    """Two layers of (side/2)² Gaussians, aligned with the pixels of a photo, over smooth but varied depths.
+    """Two layers of (side/2)² Gaussians, aligned with the pixels of a photo, over smooth but varied
+    depths.
 
-    Opacities are between 0.04 and 0.99, so that more Gaussians are rendered than a surface would need.
+    Opacities are between 0.04 and 0.99, so that more Gaussians are rendered than a surface would
+    need.
     """
     generator = torch.Generator().manual_seed(0)
     camera, uv, xs, ys, grid = _pixels(side)
@@ -87,7 +92,9 @@ def holed_scene(side: int = SIDE) -> tuple[Gaussians, Camera]:
 
 
 def _pixels(side: int) -> tuple[Camera, Tensor, Tensor, Tensor, int]:
-    """The photo's camera; its cells' centres [g, g, 2], their columns and rows [g, g], and g, the cells a side."""
+    """The photo's camera; its cells' centres [g, g, 2], their columns and rows [g, g], and g, the
+    cells a side.
+    """
     grid = side // CELL
     ys, xs = torch.meshgrid(torch.arange(grid), torch.arange(grid), indexing="ij")
     uv = (torch.stack([xs, ys], dim=-1) + 0.5) * (side / grid)
@@ -97,7 +104,8 @@ def _pixels(side: int) -> tuple[Camera, Tensor, Tensor, Tensor, int]:
 def find_view(
     base: Gaussians, camera: Camera, renderer: Renderer, share: float = HOLES
 ) -> tuple[float, Camera]:
-    """Find by bisection the disparity at which the right view has this share of holes; returns it and the view.
+    """Find by bisection the disparity at which the right view has this share of holes; returns it
+    and the view.
 
     Raises:
         InputError: there is no such view.
@@ -115,7 +123,9 @@ def find_view(
 
 
 def commit() -> str:
-    """The commit of the checkout that this package runs from, with a + if files have changed; else "unknown"."""
+    """The commit of the checkout that this package runs from, with a + if files have changed; else
+    "unknown".
+    """
     git = ["git", "-C", str(Path(spackle.__file__).parent)]
     try:  # fails if the package is installed inside another project, which does not track it
         subprocess.run(

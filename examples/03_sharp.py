@@ -2,8 +2,9 @@
 
 python examples/03_sharp.py sharp.pt out photo.jpg...
 
-`spackle weights get sharp` downloads Apple's weights, for research only. `python benchmarks/random_weights.py sharp.pt`
-makes random weights, which take as long as Apple's weights but give meaningless scenes.
+`spackle weights get sharp` downloads Apple's weights, for research only. `python
+benchmarks/random_weights.py sharp.pt` makes random weights, which take as long as Apple's weights
+but give meaningless scenes.
 """
 
 import sys

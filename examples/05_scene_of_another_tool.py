@@ -2,7 +2,8 @@
 
 python examples/05_scene_of_another_tool.py scene.ply photo.jpg completed.ply
 
-The Gaussians must be in the frame of the photo's camera: x right, y down, z forward, camera at the origin.
+The Gaussians must be in the frame of the photo's camera: x right, y down, z forward, camera at the
+origin.
 """
 
 import sys
@@ -24,9 +25,8 @@ def main(file: Path, photo: Path, out: Path) -> None:
 
     holes = [spackle.hole_area_ratio(each.render(path[0]).alpha) for each in (before, scene)]
     print(f"holes at the left end of the path: {holes[0]:.1%} -> {holes[1]:.2%}")
-    scene.save(
-        out, disparity=0.3
-    )  # the first Gaussians are equal to the Gaussians of the file, bit for bit
+    # the first Gaussians are equal to the Gaussians of the file, bit for bit
+    scene.save(out, disparity=0.3)
 
 
 if __name__ == "__main__":

@@ -22,9 +22,8 @@ def main(file: Path, out: Path) -> None:
         out / "sbs.mp4", "swipe", disparity=0.05, fps=24, seconds=1, stereo="sbs", ipd=ipd
     )
 
-    glasses = Stereo(
-        "anaglyph", ipd, convergence=depth.focus
-    )  # what is at this depth appears in the screen's plane
+    # what is at this depth appears in the screen's plane
+    glasses = Stereo("anaglyph", ipd, convergence=depth.focus)
     left, right = scene.frames(glasses.eyes(scene.camera))
     save_png(glasses.pack(left.rgb, right.rgb), out / "anaglyph.png")
 

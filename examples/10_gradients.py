@@ -2,7 +2,8 @@
 
 python examples/10_gradients.py out
 
-A residual network is trained in the same way, with many photos, and with a network in place of the colours.
+A residual network is trained in the same way, with many photos, and with a network in place of the
+colours.
 """
 
 import dataclasses

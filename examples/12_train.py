@@ -1,9 +1,10 @@
-"""Make a dataset of your photos, train a residual network with the dataset, and complete a photo by the network.
+"""Make a dataset of your photos, train a residual network with the dataset, and complete a photo by
+the network.
 
 python examples/12_train.py photos out
 
-Give three or more photos; this takes a few minutes on two cores. The guides on datasets and training list the options
-for real runs.
+Give three or more photos; this takes a few minutes on two cores. The guides on datasets and
+training list the options for real runs.
 """
 
 import subprocess

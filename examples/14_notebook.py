@@ -1,4 +1,6 @@
-"""A notebook: editors run each part between the `# %%` lines as a cell; `jupytext` converts the file to .ipynb."""
+"""A notebook: editors run each part between the `# %%` lines as a cell; `jupytext` converts the
+file to .ipynb.
+"""
 
 # %% [markdown]
 # # A photo as a scene

@@ -3,8 +3,8 @@
     python research/rebuild_residual.py -o OUT data.photos=PHOTOS data.stereo=PAIRS \\
         data.rgbd.0.folder=KITCHEN data.rgbd.1.folder=OFFICE loss.features_path=squeezenet_v1.0.npz
 
-OUT gets a folder for each run, and residual.safetensors. The same command resumes a killed run. KEY=VALUE
-override values in every run.
+OUT gets a folder for each run, and residual.safetensors. The same command resumes a killed run.
+KEY=VALUE override values in every run.
 """
 
 from __future__ import annotations

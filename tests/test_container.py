@@ -1,4 +1,6 @@
-"""The Dockerfile without Docker: its files, and its steps in a shell, in an empty environment under another root."""
+"""The Dockerfile without Docker: its files, and its steps in a shell, in an empty environment under
+another root.
+"""
 
 from __future__ import annotations
 

@@ -17,6 +17,7 @@ from helpers.sharp_weights import write_tiny
 from PIL import Image
 
 import spackle
+from spackle.formats import scene_files
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
@@ -53,9 +54,8 @@ def test_examples_of_a_photo(photo: Path, tmp_path: Path) -> None:
     assert {path.suffix for path in (tmp_path / "1").iterdir()} == {".mp4", ".ply", ".html"}
     main_of(4)(photo, tmp_path / "4")
     own = spackle.Scene.load(tmp_path / "4" / "scene.ply")
-    assert float(own.base.means[:, 2].median()) == pytest.approx(
-        11, abs=3
-    )  # the depths are between 2 and 20 m
+    # the depths are between 2 and 20 m
+    assert float(own.base.means[:, 2].median()) == pytest.approx(11, abs=3)
     main_of(6)(photo, tmp_path / "6.mp4")
     assert len(decode(tmp_path / "6.mp4")) > 30
 
@@ -75,6 +75,18 @@ def test_the_example_completes_a_scene_of_another_tool(scene: Path, tmp_path: Pa
     completed = spackle.Scene.load(tmp_path / "completed.ply")
     assert len(completed.base) == len(base)
     assert len(completed.aux) > 100
+
+
+def test_the_example_of_an_own_format(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scene_files, "SCENE_ENCODERS", dict(scene_files.SCENE_ENCODERS))
+    main_of(15)(scene, tmp_path / "points.xyz")
+    lines = (tmp_path / "points.xyz").read_text().splitlines()
+    gaussians = spackle.Scene.load(scene).gaussians
+    assert len(lines) == len(gaussians)
+    first = [float(word) for word in lines[0].split()]
+    assert first[:3] == pytest.approx(gaussians.means[0].tolist(), abs=1e-5)
 
 
 def test_examples_of_videos(scene: Path, tmp_path: Path) -> None:

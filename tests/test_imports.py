@@ -79,7 +79,9 @@ def room_of(module: str) -> str:
 
 
 def imports_of(path: Path) -> Iterator[str]:
-    """Every module that a file imports, also within functions; `from a import b` counts as a.b if a.b is a module."""
+    """Every module that a file imports, also within functions; `from a import b` counts as a.b if
+    a.b is a module.
+    """
     package = module_of(path) if path.name == "__init__.py" else module_of(path).rpartition(".")[0]
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):

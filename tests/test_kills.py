@@ -1,4 +1,6 @@
-"""Commands that are killed ten times at random moments and resumed write the files of an uninterrupted run."""
+"""Commands that are killed ten times at random moments and resumed write the files of an
+uninterrupted run.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""The commands of the quick start work with the wheel in a new environment, outside of the checkout."""
+"""The commands of the quick start work with the wheel in a new environment, outside of the
+checkout.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +39,9 @@ def commands() -> list[list[str]]:
 
 @pytest.fixture(scope="module")
 def environment(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of an environment's programs; SPACKLE_EMPTY=1 lets pip install dependencies, which else are borrowed."""
+    """Folder of an environment's programs; SPACKLE_EMPTY=1 lets pip install dependencies, which
+    else are borrowed.
+    """
     folder = tmp_path_factory.mktemp("wheel")
     shutil.copytree(
         ROOT,

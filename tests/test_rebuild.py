@@ -1,4 +1,6 @@
-"""The scripts that rebuild the shipped weights, in miniature: from data to a file that the package loads."""
+"""The scripts that rebuild the shipped weights, in miniature: from data to a file that the package
+loads.
+"""
 
 from __future__ import annotations
 

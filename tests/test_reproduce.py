@@ -1,4 +1,6 @@
-"""`make reproduce`: the paper's experiment in miniature gives every table and figure within eight minutes."""
+"""`make reproduce`: the paper's experiment in miniature gives every table and figure within eight
+minutes.
+"""
 
 from __future__ import annotations
 
@@ -60,7 +62,8 @@ def test_the_papers_chain_gives_its_tables_and_figures(tmp_path: Path) -> None:
         cells = width * height / 4 / len(run.measured) ** 2
         assert har < 0.1 * before
         assert aux / (before * cells) == pytest.approx(1, abs=0.05)
-        # As in the paper's table 4, Direct FT damages pixels outside of holes, and the residual does not.
+        # As in the paper's table 4, Direct FT damages pixels outside of holes, and the residual
+        # does not.
         near = load_run(out / "runs" / f"{name}-near")
         assert sum_of(near, "direct-ft", "psnr_outside") < 0.9 * sum_of(
             near, "base", "psnr_outside"

@@ -1,7 +1,9 @@
-"""Spackle's nodes for ComfyUI: copy or link this folder into ComfyUI/custom_nodes, and install Spackle beside ComfyUI.
+"""Spackle's nodes for ComfyUI: copy or link this folder into ComfyUI/custom_nodes, and install
+Spackle beside ComfyUI.
 
-ComfyUI's type IMAGE is [B, H, W, 3] sRGB in 0..1, and MASK is [B, H, W] in 0..1; depth is a grey IMAGE. ComfyUI's type
-SPLAT is a batch of N Gaussians with linear scales, quaternions wxyz and spherical harmonics of sRGB.
+ComfyUI's type IMAGE is [B, H, W, 3] sRGB in 0..1, and MASK is [B, H, W] in 0..1; depth is a grey
+IMAGE. ComfyUI's type SPLAT is a batch of N Gaussians with linear scales, quaternions wxyz and
+spherical harmonics of sRGB.
 """
 
 from __future__ import annotations
@@ -43,7 +45,9 @@ class LoadBase:
 
     @classmethod
     def INPUT_TYPES(cls) -> dict[str, Any]:
-        """`checkpoint` is a file of the base's weights; if empty, the download of `spackle weights get` is used."""
+        """`checkpoint` is a file of the base's weights; if empty, the download of `spackle weights
+        get` is used.
+        """
         names = [AUTO, *AUTO_NETWORKS]
         return {
             "required": {"name": (names,)},
@@ -51,7 +55,9 @@ class LoadBase:
         }
 
     def load(self, name: str, checkpoint: str = "") -> tuple[OpenedBase]:
-        """InputError if the base is not installed, or the checkpoint does not hold the base's weights."""
+        """InputError if the base is not installed, or the checkpoint does not hold the base's
+        weights.
+        """
         return (
             open_base(BaseSettings(name=name, checkpoint=Path(checkpoint) if checkpoint else None)),
         )
@@ -65,7 +71,9 @@ class PredictScene:
 
     @classmethod
     def INPUT_TYPES(cls) -> dict[str, Any]:
-        """`fov` 0 means a 30 mm lens; `depth`, a relative map from `near` to `far` metres, replaces the base."""
+        """`fov` 0 means a 30 mm lens; `depth`, a relative map from `near` to `far` metres, replaces
+        the base.
+        """
         metres = {"min": 0.01, "max": 1000.0, "step": 0.1}
         optional = {
             "depth": ("IMAGE",),
@@ -95,9 +103,8 @@ class PredictScene:
         photo = Photo(rgb, *lens, Path("image"))
         if depth is not None:
             greys = depth[0].detach().float().cpu().mean(dim=-1).numpy()
-            eighth = (
-                1 / 255 if np.allclose(255 * greys, np.round(255 * greys), atol=0.01) else None
-            )  # of 8 bits
+            # of 8 bits
+            eighth = 1 / 255 if np.allclose(255 * greys, np.round(255 * greys), atol=0.01) else None
             given = relative_depth(greys, depth_kind, "depth", near, far, eighth)
             base = open_base(BaseSettings(depth=given))
         prediction, _ = base.predict(photo)
@@ -126,7 +133,9 @@ class CompleteScene:
 
 
 class RenderView:
-    """Renders views along a path: images, masks of remaining holes, and depth, with near surfaces in white."""
+    """Renders views along a path: images, masks of remaining holes, and depth, with near surfaces
+    in white.
+    """
 
     CATEGORY, FUNCTION = "Spackle", "render"
     RETURN_TYPES: ClassVar = ("IMAGE", "MASK", "IMAGE")

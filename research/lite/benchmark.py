@@ -1,13 +1,16 @@
-"""Compare the lite base's depth, and two guesses that need no photo, with measured depth, as a Markdown table.
+"""Compare the lite base's depth, and two guesses that need no photo, with measured depth, as a
+Markdown table.
 
-    python research/lite/benchmark.py --stereo FOLDER --rgbd FOLDER --unit 0.001 [--last 0.2] [--weights FILE] \
+    python research/lite/benchmark.py --stereo FOLDER --rgbd FOLDER --unit 0.001 [--last 0.2]
+    [--weights FILE] \
         [--pictures PNG] [--standing PHOTOS]
 
-Each --stereo is a folder of scenes, which have a scene.json, or a calib.txt as in ETH3D and Middlebury 2014. Each
---rgbd is a folder of NAME.color.jpg and NAME.depth.png, with its --unit in metres; --last uses only the last share of
-its frames, those that `lite.yaml` does not train on. Each guess is aligned by the best scale and shift
-(`depth_loss.py`). --standing makes 40 synthetic streets with standing objects, with textures cut from PHOTOS, and
-measures the error within objects (`standing.py`). The last line is the time for a photo of 640×480, median of 9 runs.
+Each --stereo is a folder of scenes, which have a scene.json, or a calib.txt as in ETH3D and
+Middlebury 2014. Each --rgbd is a folder of NAME.color.jpg and NAME.depth.png, with its --unit in
+metres; --last uses only the last share of its frames, those that `lite.yaml` does not train on.
+Each guess is aligned by the best scale and shift (`depth_loss.py`). --standing makes 40 synthetic
+streets with standing objects, with textures cut from PHOTOS, and measures the error within objects
+(`standing.py`). The last line is the time for a photo of 640×480, median of 9 runs.
 """
 
 from __future__ import annotations

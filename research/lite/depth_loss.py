@@ -1,6 +1,8 @@
-"""The loss of predicted inverse depth (up to a factor, up to scale and shift, and of its differences) and its score.
+"""The loss of predicted inverse depth (up to a factor, up to scale and shift, and of its
+differences) and its score.
 
-The score aligns a relative inverse depth to the truth by the best scale and shift; a guess without photo is a baseline.
+The score aligns a relative inverse depth to the truth by the best scale and shift; a guess without
+photo is a baseline.
 """
 
 from __future__ import annotations
@@ -18,7 +20,8 @@ from spackle.paper.training.recipe import NonNegative, RecipePart
 
 FARTHEST = 0.02  # part of the median inverse depth: farther surfaces, mostly sky, get this value
 NEAREST = 20.0
-AT_MOST = 2.0  # larger errors in log inverse depth are reduced to this: they are mostly errors of the true depth
+# larger errors in log inverse depth are reduced to this: they are mostly errors of the true depth
+AT_MOST = 2.0
 STEEPEST = 1.0  # upper bound for errors of differences between neighbours
 SCALES = (1, 2, 4, 8)  # strides between neighbours in the loss term steps
 
@@ -37,10 +40,11 @@ def depth_loss(
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """The loss [], and its terms [] unweighted, as means over the pictures.
 
-    Let t be the true inverse depth over its median, and e = predicted − log t, from which its own median is subtracted.
-    factor is mean |e|. line is mean |a·exp(predicted) + b − t| / (t + 0.2) with the least-squares a ≥ 0 and b, similar
-    to MiDaS (Ranftl et al. 2020). steps is the sum over `SCALES` of mean |∂e/∂x| + |∂e/∂y|. offset is the absolute
-    value of the subtracted median, which the other terms do not depend on.
+    Let t be the true inverse depth over its median, and e = predicted − log t, from which its own
+    median is subtracted. factor is mean |e|. line is mean |a·exp(predicted) + b − t| / (t + 0.2)
+    with the least-squares a ≥ 0 and b, similar to MiDaS (Ranftl et al. 2020). steps is the sum over
+    `SCALES` of mean |∂e/∂x| + |∂e/∂y|. offset is the absolute value of the subtracted median, which
+    the other terms do not depend on.
 
     Args:
         predicted: [B, H, W] log inverse depth.
@@ -135,7 +139,9 @@ def score_depth(inverse_depth: Tensor, depth: Tensor, valid: Tensor) -> DepthSco
 
 
 def align(values: Tensor, true: Tensor) -> Tensor:
-    """[N] a·values + b with the least-squares distance to `true` [N]; the mean of `true` if all values are equal."""
+    """[N] a·values + b with the least-squares distance to `true` [N]; the mean of `true` if all
+    values are equal.
+    """
     v, t = values - values.mean(), true - true.mean()
     spread = (v * v).sum()
     scale = (

@@ -1,4 +1,6 @@
-"""Photos with measured depth, from depth cameras and stereo pairs, and their augmentation: camera and light."""
+"""Photos with measured depth, from depth cameras and stereo pairs, and their augmentation: camera
+and light.
+"""
 
 from __future__ import annotations
 
@@ -42,16 +44,19 @@ class Turning:
 MEASURED = Turning((1.0, 1.6), (4.0, 4.0, 4.0))  # strong, because scenes are few
 MADE = Turning((1.0, 1.4), (2.0, 2.0, 3.0))  # synthetic scenes vary in their cameras already
 GUESSED = Turning((1.0, 1.4), (3.0, 3.0, 4.0))  # weak, because photos are many
+# range of the logarithm of the front frame's median inverse depth over the back frame's
 MINGLED_SCALE = (
     -0.2,
     0.8,
-)  # range of the logarithm of the front frame's median inverse depth over the back frame's
+)
 
 
 def turned(rng: Rng, frame: Frame, height: int, width: int, turning: Turning) -> Frame:
-    """The frame seen by a camera at the same position with another direction; mirrored in half of all cases.
+    """The frame seen by a camera at the same position with another direction; mirrored in half of
+    all cases.
 
-    The image depends on the direction alone; inverse depth changes by the known ratio of z in both cameras.
+    The image depends on the direction alone; inverse depth changes by the known ratio of z in both
+    cameras.
     """
     rows, columns = frame.inverse_depth.shape
     focal = FOCAL * columns
@@ -114,9 +119,8 @@ def relit(rng: Rng, rgb: Tensor) -> Tensor:
     tint = np.exp(rng.normal(0, 0.12, (3, 1, 1)) + rng.normal(0, 0.2)).astype(np.float32)
     rgb = rgb * torch.from_numpy(tint)
     mean = rgb.mean((1, 2), keepdim=True)
-    harsh = (
-        rng.uniform(0.3, 1.0) if rng.random() < 0.12 else 0.0
-    )  # black shadows and white highlights
+    # black shadows and white highlights
+    harsh = rng.uniform(0.3, 1.0) if rng.random() < 0.12 else 0.0
     rgb = mean + (rgb - mean) * math.exp(rng.normal(harsh, 0.25)) + harsh * rng.uniform(-0.1, 0.3)
     grey = rgb.mean(0, keepdim=True)
     rgb = grey + (rgb - grey) * (0.0 if rng.random() < 0.2 else math.exp(rng.normal(0, 0.3)))
@@ -133,7 +137,8 @@ SAME = 1.05  # neighbours belong to one surface if their depths differ by a smal
 
 
 def warp_to_right(depth: Tensor, valid: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
-    """Move each pixel's depth to its position in the right photo; the nearest of several depths at a position is kept.
+    """Move each pixel's depth to its position in the right photo; the nearest of several depths at
+    a position is kept.
 
     Args:
         depth: [H, W] in the left photo; both cameras have parallel axes and the same depth.
@@ -141,8 +146,9 @@ def warp_to_right(depth: Tensor, valid: Tensor, shift: Tensor) -> tuple[Tensor, 
         shift: [H, W] in pixels, positive to the right; usually negative.
 
     Returns:
-        Depth [H, W], and [H, W] bool where it is known: not where the left photo is occluded. Surfaces that are wider
-        in the right photo get cracks, which are closed if they are one pixel wide.
+        Depth [H, W], and [H, W] bool where it is known: not where the left photo is occluded.
+        Surfaces that are wider in the right photo get cracks, which are closed if they are one
+        pixel wide.
     """
     rows, columns = (place.numpy() for place in valid.nonzero(as_tuple=True))
     z = depth[valid].numpy()
@@ -196,7 +202,9 @@ class Measured:
 
 @dataclasses.dataclass(frozen=True)
 class Group:
-    """Similar validation frames; the score is a mean over groups, so that each group counts the same."""
+    """Similar validation frames; the score is a mean over groups, so that each group counts the
+    same.
+    """
 
     name: str
     files: Sequence[Measured]
@@ -219,7 +227,9 @@ def of_camera(camera: RgbdFolder, held: float) -> tuple[list[Measured], list[Mea
 
 
 def of_scenes(folder: Path, key: str, *, right: bool = False) -> list[Measured]:
-    """The left photos of all stereo pairs below a folder, with `right` both photos; InputError if there are none."""
+    """The left photos of all stereo pairs below a folder, with `right` both photos; InputError if
+    there are none.
+    """
     folders = [file.parent for file in find_files(folder, key, ("scene.json",), "scene.json")]
     return [
         Measured(pair, right=side)
@@ -231,7 +241,8 @@ def of_scenes(folder: Path, key: str, *, right: bool = False) -> list[Measured]:
 def read_all(
     files: Sequence[Measured], side: int, warn: Callable[[str], None]
 ) -> list[tuple[str, Frame]]:
-    """Read frames; returns them with their names. Unreadable ones are skipped and reported to `warn`.
+    """Read frames; returns them with their names. Unreadable ones are skipped and reported to
+    `warn`.
 
     Raises:
         InputError: no frame can be read.

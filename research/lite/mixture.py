@@ -1,4 +1,6 @@
-"""Training batches: pictures with depth from several sources, chosen by seed, step and index in the batch alone."""
+"""Training batches: pictures with depth from several sources, chosen by seed, step and index in the
+batch alone.
+"""
 
 from __future__ import annotations
 
@@ -77,7 +79,9 @@ class DepthBatch:
 
     @staticmethod
     def of(frames: Sequence[Frame], size: tuple[int, int]) -> DepthBatch:
-        """Resize frames of one size for a network with the input `size`; depth is sampled at the nearest pixel."""
+        """Resize frames of one size for a network with the input `size`; depth is sampled at the
+        nearest pixel.
+        """
         rgb, inverse_depth, valid = (
             torch.stack([getattr(frame, field.name) for frame in frames])
             for field in dataclasses.fields(Frame)
@@ -101,8 +105,11 @@ class Mixture:
     scales: Sequence[float] = (1.0,)  # factors on `size`; each step draws one
 
     def batch(self, step: int, places: Sequence[int]) -> DepthBatch:
-        """The pictures with these indices in a step, at a random scale; InputError if one cannot be read."""
-        # NumPy pads seeds with zeros, so [seed, step] equals [seed, step, 0]; pictures therefore add 1 (below).
+        """The pictures with these indices in a step, at a random scale; InputError if one cannot be
+        read.
+        """
+        # NumPy pads seeds with zeros, so [seed, step] equals [seed, step, 0]; pictures therefore
+        # add 1 (below).
         rng = np.random.default_rng([self.seed, step])
         height, width = self.size[::-1] if rng.random() < UPRIGHT else self.size
         scale = self.scales[int(rng.integers(len(self.scales)))]
@@ -132,14 +139,19 @@ class Mixture:
         ]
 
 
+# in both orientations; much smaller sizes agree less
 LOOKS_PX = (
     128 * 160,
     192 * 256,
     256 * 320,
     352 * 480,
-)  # in both orientations; much smaller sizes agree less
-UNSURE = 0.12  # a guess is ignored in pixels where predictions of all sizes and networks differ by more (logarithm)
-STEEP = 0.25  # a guess is ignored in pixels with a larger change to neighbours, because predicted outlines are blurred
+)
+# a guess is ignored in pixels where predictions of all sizes and networks differ by more
+# (logarithm)
+UNSURE = 0.12
+# a guess is ignored in pixels with a larger change to neighbours, because predicted outlines are
+# blurred
+STEEP = 0.25
 
 
 @dataclasses.dataclass(frozen=True)
@@ -195,7 +207,9 @@ class GuessedPhotos:
 
 
 def sure_inverse_depth(looks: Tensor) -> Tensor:
-    """[h, w] the geometric mean of predictions, given as logarithms [n, h, w]; 0 in pixels that differ or are steep."""
+    """[h, w] the geometric mean of predictions, given as logarithms [n, h, w]; 0 in pixels that
+    differ or are steep.
+    """
     looks = looks - looks.flatten(1).median(1).values[:, None, None]
     mean = looks.mean(0)
     around = max_pool2d(mean[None], 3, 1, 1) + max_pool2d(-mean[None], 3, 1, 1)

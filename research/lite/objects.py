@@ -96,7 +96,9 @@ Triple = tuple[float, float, float]
 
 
 def thing(rng: Rng, foot: Array, size: float, yaw: float) -> list[Solid]:
-    """An object like furniture: a box, perhaps with more on top, a table, a ball, a tube or a cut-out."""
+    """An object like furniture: a box, perhaps with more on top, a table, a ball, a tube or a
+    cut-out.
+    """
     wide, deep, tall = (
         size * rng.uniform(0.4, 1.3),
         size * rng.uniform(0.3, 1.2),

@@ -22,7 +22,9 @@ NUDGE = 1e-3  # relative distance from the surface at which a shadow ray starts
 
 @dataclasses.dataclass(frozen=True)
 class Solid:
-    """A placed unit shape: sheet |x|, |y| ≤ 1 at z = 0; cube |x|, |y|, |z| ≤ 1; ball, or tube |y| ≤ 1, of radius 1."""
+    """A placed unit shape: sheet |x|, |y| ≤ 1 at z = 0; cube |x|, |y|, |z| ≤ 1; ball, or tube |y| ≤
+    1, of radius 1.
+    """
 
     kind: int
     center: Floats  # [3] metres
@@ -54,9 +56,8 @@ def trace(
     skins = np.array([s.texture for s in solids])
     repeats = np.array([s.repeats for s in solids], np.float32)
     casts = np.array([s.casts for s in solids])
-    around = 1.001 * np.array(
-        [(s.axes.astype(np.float64) ** 2).sum() for s in solids]
-    )  # squared bounding radii
+    # squared bounding radii
+    around = 1.001 * np.array([(s.axes.astype(np.float64) ** 2).sum() for s in solids])
     colors, distances = sky.astype(np.float32).copy(), np.full(len(rays), np.inf, np.float32)
     _trace(
         kinds,
@@ -78,7 +79,9 @@ def trace(
 
 @kernel
 def _hit(kind: int, o: Any, d: Any, nearest: float, found: Any) -> Any:
-    """The t > `nearest` at which a ray o + t·d hits a unit shape, or FAR; writes u, v and the normal to `found`."""
+    """The t > `nearest` at which a ray o + t·d hits a unit shape, or FAR; writes u, v and the
+    normal to `found`.
+    """
     if kind == SHEET:
         if d[2] == 0.0:
             return FAR

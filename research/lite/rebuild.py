@@ -1,10 +1,11 @@
-"""Rebuild lite.safetensors, the shipped weights of the lite base: five training runs, and means of weights.
+"""Rebuild lite.safetensors, the shipped weights of the lite base: five training runs, and means of
+weights.
 
     python research/lite/rebuild.py -o OUT data.photos=PHOTOS data.stereo=PAIRS \\
         data.rgbd.0.folder=KITCHEN data.rgbd.1.folder=OFFICE data.validation_stereo=OTHER_PAIRS
 
-OUT gets a folder for each run, and lite.safetensors. The same command resumes a killed run. KEY=VALUE override
-values in every run.
+OUT gets a folder for each run, and lite.safetensors. The same command resumes a killed run.
+KEY=VALUE override values in every run.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ RUNS = {  # name: initial weights, teacher, and values that override lite.yaml
             " optim.steps=1356 optim.min_lr=3e-4"),
     "three": ("one+two", "one+two", f"{SMALL} optim.steps=400 optim.lr=7e-4 optim.min_lr=7e-4"),
     "four": ("one+three", "one+three", f"{SMALL} data.seed=7 optim.steps=1350 optim.lr=4e-4 optim.min_lr=1e-5"),
-    # Its schedule was planned for 5,800 steps; the shipped weights are from step 3,500, at a rate of 3.7e-4.
+    # Its schedule was planned for 5,800 steps; the shipped weights are from step 3,500, at a rate
+    # of 3.7e-4.
     "larger": ("", "smaller", "data.seed=11 data.made=4500 data.guesses=1525 optim.steps=3500 optim.min_lr=3.7e-4"),
 }  # fmt: skip
 MEANS = {

@@ -59,15 +59,17 @@ class LiteData(RecipePart):
     )
     guesses: Count = 1500  # at most this number of photos
     shares: LiteShares = LiteShares()
+    # height and width of pictures; swapped in a fifth of the steps
     size: tuple[Side, Side] = (
         256,
         320,
-    )  # height and width of pictures; swapped in a fifth of the steps
+    )
     # Factors on `size`; each step draws one, because the base uses several sizes.
     scales: Annotated[tuple[Scale, ...], Field(min_length=1)] = (1.0,)
     cache: OptionalPath = None  # a folder for synthetic scenes and guesses; None: inside the output
     seed: Seed = 0  # for synthetic scenes alone: runs that differ only in run.seed share them
-    # Share of each folder of `rgbd` for validation: the last frames by name, because neighbouring frames are alike.
+    # Share of each folder of `rgbd` for validation: the last frames by name, because neighbouring
+    # frames are alike.
     validation: Annotated[float, Field(ge=0, le=0.9)] = 0.2
     validation_stereo: OptionalPath = (
         None  # scenes for validation; all scenes of `stereo` are for training
@@ -118,7 +120,8 @@ class LiteFiles:
         """Find the files that a recipe names.
 
         Raises:
-            InputError: a folder is missing or has no such files, or there is nothing to train on or to validate with.
+            InputError: a folder is missing or has no such files, or there is nothing to train on or
+                to validate with.
         """
         shares, groups = data.shares, []
         photos = (
@@ -160,7 +163,9 @@ class LiteFiles:
 
     @property
     def scenes_digest(self) -> str:
-        """Twelve digits that identify the synthetic scenes, whatever the photos' folder and the number of scenes."""
+        """Twelve digits that identify the synthetic scenes, whatever the photos' folder and the
+        number of scenes.
+        """
         return short_digest(
             (SCENES_VERSION, self.data.seed, list(self.data.size), self._below(self.photos))
         )

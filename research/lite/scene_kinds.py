@@ -1,4 +1,6 @@
-"""Kinds of synthetic scenes, for a camera at the origin: rooms and tables, streets and yards, still lifes."""
+"""Kinds of synthetic scenes, for a camera at the origin: rooms and tables, streets and yards, still
+lifes.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,9 @@ Scene = tuple[list[Solid], float]  # the solids, and the downward angle of the c
 
 
 def room(rng: Rng) -> Scene:
-    """A rotated room: floor, three walls, sometimes a ceiling; objects along the walls and on the floor."""
+    """A rotated room: floor, three walls, sometimes a ceiling; objects along the walls and on the
+    floor.
+    """
     eye, ceiling = rng.uniform(0.8, 1.8), rng.uniform(2.2, 3.2)
     deep, left, right = rng.uniform(2.0, 7.0), rng.uniform(0.8, 4.0), rng.uniform(0.8, 4.0)
     yaw = math.radians(rng.uniform(-40, 40))
@@ -135,7 +139,9 @@ def street(rng: Rng) -> Scene:
 
 
 def yard(rng: Rng) -> Scene:
-    """A yard: posts, stones and trees nearby, sometimes a roof overhead, house fronts beside and far away, hills."""
+    """A yard: posts, stones and trees nearby, sometimes a roof overhead, house fronts beside and
+    far away, hills.
+    """
     eye = rng.uniform(1.1, 2.0)
     solids = [
         ground(
@@ -273,7 +279,9 @@ def _arcade(rng: Rng, eye: float) -> list[Solid]:
 
 
 def still_life(rng: Rng) -> Scene:
-    """A still life: many objects close together on a table near eye level, in front of boards and cloth."""
+    """A still life: many objects close together on a table near eye level, in front of boards and
+    cloth.
+    """
     reach = rng.uniform(0.9, 2.2)
     eye, near = reach * rng.uniform(0.12, 0.45), reach * rng.uniform(0.45, 0.7)
     solids = [
@@ -321,7 +329,9 @@ def heap(rng: Rng) -> Scene:
 
 
 def shelf(rng: Rng) -> Scene:
-    """A shelf seen almost frontally: boards with rows of objects, sometimes with something in front of them."""
+    """A shelf seen almost frontally: boards with rows of objects, sometimes with something in front
+    of them.
+    """
     away, deep, across = rng.uniform(0.9, 2.8), rng.uniform(0.2, 0.5), rng.uniform(0.8, 2.5)
     axes, skin = turn(rng.normal(0, 0.35)), int(rng.integers(WHOLE))
     at = np.array([rng.normal(0, 0.3), 0.0, away])

@@ -1,4 +1,6 @@
-"""Streets with objects that stand on the ground (people, cars, animals, posts), labels of pixels, and a score."""
+"""Streets with objects that stand on the ground (people, cars, animals, posts), labels of pixels,
+and a score.
+"""
 
 from __future__ import annotations
 
@@ -165,7 +167,9 @@ def animal(rng: Rng, foot: Array) -> list[Solid]:
 
 
 def post(rng: Rng, foot: Array) -> list[Solid]:
-    """A bollard, lamp post, sign or traffic light: thin, and tall enough to reach in front of distant background."""
+    """A bollard, lamp post, sign or traffic light: thin, and tall enough to reach in front of
+    distant background.
+    """
     tall, thick = rng.uniform(0.7, 6), rng.uniform(0.025, 0.12)
     made = [pole(rng, foot, tall, thick, lean(rng.normal(0, 0.02)))]
     if rng.random() < 0.6:
@@ -221,7 +225,9 @@ THINGS: tuple[tuple[Callable[[Rng, Array], list[Solid]], float], ...] = (
 
 
 def labelled_scene(rng: Rng, photos: DrawPhoto, height: int, width: int) -> tuple[Frame, Tensor]:
-    """A street, and labels [H, W] int64: 0 for background, else the number of the object that a pixel shows."""
+    """A street, and labels [H, W] int64: 0 for background, else the number of the object that a
+    pixel shows.
+    """
     owners: list[int] = []
 
     def build(rng: Rng) -> Scene:
@@ -264,13 +270,16 @@ SMALLEST = 0.001  # share of the picture; smaller objects are ignored
 class StandingScore:
     """The score of one picture's objects."""
 
-    within: float  # mean |log z − log z* − its median over the object|; 0 if every object has its true shape
+    # mean |log z − log z* − its median over the object|; 0 if every object has its true shape
+    within: float
     abs_rel: float  # mean |z − z*| / z* over objects, aligned by the whole picture
     things: int
 
 
 def score_standing(inverse_depth: Tensor, frame: Frame, owner: Tensor) -> StandingScore:
-    """Judge an inverse depth [H, W], up to scale and shift, within objects [H, W] (0: none), each with equal weight."""
+    """Judge an inverse depth [H, W], up to scale and shift, within objects [H, W] (0: none), each
+    with equal weight.
+    """
     true = frame.inverse_depth.double()
     near = true > 1 / FARTHEST_M
     v, t = inverse_depth.double(), true[near]

@@ -1,4 +1,6 @@
-"""Synthetic scenes with exact depth and textures cut from photos, stored with several scenes per file."""
+"""Synthetic scenes with exact depth and textures cut from photos, stored with several scenes per
+file.
+"""
 
 from __future__ import annotations
 
@@ -74,19 +76,19 @@ def drawn(
     focal = width * rng.uniform(0.7, 1.5)
     rays = _rays(height, width, focal, pitch, math.radians(rng.normal(0, 2.5)))
     behind = sky(rng, photos, height, width).repeat(SAMPLES, 0).repeat(SAMPLES, 1).reshape(-1, 3)
+    # y points down
     above = rng.normal(size=3) * (1.0, 0.4, 1.0) - (
         0.0,
         rng.uniform(0.5, 1.5),
         0.5,
-    )  # y points down
+    )
     light = (above / np.linalg.norm(above)).astype(np.float32)
     colors, distances = trace(solids, skins, rays, light, rng.uniform(0.25, 0.9), behind)
     fine = (height * SAMPLES, width * SAMPLES)
     rgb = _exposed(rng, torch.from_numpy(colors))
     rgb = avg_pool2d(rgb.reshape(*fine, 3).permute(2, 0, 1)[None], SAMPLES)[0]
-    inverse = torch.from_numpy(1.0 / distances).reshape(fine)[
-        ::SAMPLES, ::SAMPLES
-    ]  # one per pixel: no averages
+    # one per pixel: no averages
+    inverse = torch.from_numpy(1.0 / distances).reshape(fine)[::SAMPLES, ::SAMPLES]
     return Picture(rgb.permute(1, 2, 0).contiguous(), inverse.contiguous(), solids, skins, rays)
 
 
@@ -96,7 +98,9 @@ def _exposed(rng: Rng, rgb: Tensor) -> Tensor:
 
 
 def _rays(height: int, width: int, focal: float, pitch: float, roll: float) -> Floats:
-    """[N, 3] directions of depth one, for `SAMPLES`² rays a pixel, rotated by `pitch` (down) and `roll`."""
+    """[N, 3] directions of depth one, for `SAMPLES`² rays a pixel, rotated by `pitch` (down) and
+    `roll`.
+    """
     y, x = np.mgrid[: height * SAMPLES, : width * SAMPLES].astype(np.float32)
     x, y = ((x + 0.5) / SAMPLES - width / 2) / focal, ((y + 0.5) / SAMPLES - height / 2) / focal
     x, y = x * math.cos(roll) - y * math.sin(roll), x * math.sin(roll) + y * math.cos(roll)
@@ -134,7 +138,9 @@ class PhotoDraw:
 
 @dataclasses.dataclass(frozen=True)
 class SyntheticScenes:
-    """A folder of synthetic scenes, numbered from 0; number, seed, size and photos determine a scene."""
+    """A folder of synthetic scenes, numbered from 0; number, seed, size and photos determine a
+    scene.
+    """
 
     folder: Path
     photos: Sequence[Path]
@@ -143,7 +149,8 @@ class SyntheticScenes:
     count: int
 
     def fill(self, progress: Callable[[int, int], None], warn: Warn) -> None:
-        """Make missing scenes. Damaged files are reported and replaced; too short files are replaced silently.
+        """Make missing scenes. Damaged files are reported and replaced; too short files are
+        replaced silently.
 
         Args:
             progress: called with the number of scenes that exist.

@@ -1,4 +1,6 @@
-"""The lite base's task for the training loop: a network learns depth from synthetic and measured pictures."""
+"""The lite base's task for the training loop: a network learns depth from synthetic and measured
+pictures.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,9 @@ ENDS = (0.02, 0.98)  # quantiles that get the first and the last colour
 
 
 def colored(values: Tensor, low: float, high: float, known: Tensor | None = None) -> Tensor:
-    """[H, W, 3] sRGB of values [H, W]; values up to `low` get the first colour, values from `high` the last colour."""
+    """[H, W, 3] sRGB of values [H, W]; values up to `low` get the first colour, values from `high`
+    the last colour.
+    """
     place = ((values - low) / max(high - low, 1e-12)).clamp(0, 1) * (len(VIRIDIS) - 1)
     below = place.long().clamp_max(len(VIRIDIS) - 2)
     colors = torch.lerp(VIRIDIS[below], VIRIDIS[below + 1], (place - below)[..., None])
@@ -58,7 +62,9 @@ class LiteTask(Task):
     selection_measure: ClassVar[str] = "abs_rel"
 
     def __init__(self, recipe: LiteRecipe, device: torch.device) -> None:
-        """Find a recipe's files, without making scenes or reading frames; InputError if they cannot be used."""
+        """Find a recipe's files, without making scenes or reading frames; InputError if they cannot
+        be used.
+        """
         self.recipe, self.device, self.files = recipe, device, LiteFiles.of(recipe.data)
         self.network: nn.Module = freeze(first_network(recipe), recipe.optim.frozen)
         self.digest = self.files.digest
@@ -134,7 +140,9 @@ class LiteTask(Task):
     def load_batch(
         self, step: int | None, items: Sequence[int]
     ) -> DepthBatch | list[tuple[str, list[Frame]]]:
-        """A step's pictures, or groups of validation frames by name; InputError if a file cannot be read."""
+        """A step's pictures, or groups of validation frames by name; InputError if a file cannot be
+        read.
+        """
         if step is None:
             return [list(self.groups_of_frames.items())[item] for item in items]
         return self.mixture.batch(step, items)
@@ -158,7 +166,9 @@ class LiteTask(Task):
 
     @torch.no_grad()
     def draw_picture(self, network: nn.Module) -> Tensor:
-        """[H, W, 3] sRGB: for a few validation frames the photo, and predicted and true inverse depth."""
+        """[H, W, 3] sRGB: for a few validation frames the photo, and predicted and true inverse
+        depth.
+        """
         each, rows = max(1, PICTURED // self.validation_items), []
         chosen = [
             group[:: max(1, len(group) // each)][:each] for group in self.groups_of_frames.values()

@@ -15,14 +15,14 @@ from spackle.paper.training.sources import DrawPhoto, random_crop, random_outlin
 Floats = NDArray[np.float32]
 Rng = np.random.Generator
 SIDE = 160  # pixels of a texture
+# number of a scene's textures that cover a whole surface, and of those with an outline
 WHOLE, CUT = (
     9,
     3,
-)  # number of a scene's textures that cover a whole surface, and of those with an outline
+)
 FIRST_SHAPE = WHOLE + CUT
-LATTICE, LEAVES, RING, PEAK = (
-    FIRST_SHAPE + n for n in range(4)
-)  # one texture of each of these shapes
+# one texture of each of these shapes
+LATTICE, LEAVES, RING, PEAK = (FIRST_SHAPE + n for n in range(4))
 
 
 def textures(rng: Rng, photos: DrawPhoto) -> Floats:
@@ -35,9 +35,8 @@ def sky(rng: Rng, photos: DrawPhoto, height: int, width: int) -> Floats:
     if rng.random() < 0.2:
         return np.full((height, width, 3), rng.uniform(0.92, 1.0), np.float32)
     rows = torch.linspace(0, 1, height)[:, None, None]
-    red = [
-        rng.uniform(low, 1.0) for low in (0.35, 0.7)
-    ]  # never more red than blue; at the zenith and at the horizon
+    # never more red than blue; at the zenith and at the horizon
+    red = [rng.uniform(low, 1.0) for low in (0.35, 0.7)]
     above, below = (
         torch.tensor([r, rng.uniform(r, 1.0), 1.0]) * rng.uniform(0.7, 1.0) for r in red
     )
@@ -49,7 +48,9 @@ def sky(rng: Rng, photos: DrawPhoto, height: int, width: int) -> Floats:
 
 
 def _skin(rng: Rng, photos: DrawPhoto, number: int) -> Floats:
-    """[S, S, 4]: part of a photo, unchanged or as a faint pattern on a colour; `number` determines the outline."""
+    """[S, S, 4]: part of a photo, unchanged or as a faint pattern on a colour; `number` determines
+    the outline.
+    """
     picture = random_crop(rng, photos(rng), SIDE, SIDE)
     coverage = np.ones((SIDE, SIDE), np.float32)
     if number >= FIRST_SHAPE:

@@ -29,7 +29,8 @@ EPSILON = 1e-3  # of the encoder's batch normalisation
 
 
 def load_encoder(size: EncoderSize, path: Path | None = None) -> EfficientNetEncoder:
-    """Load an encoder trained on ImageNet; each batch normalisation is folded into the convolution before it.
+    """Load an encoder trained on ImageNet; each batch normalisation is folded into the convolution
+    before it.
 
     Args:
         size: which of the networks.
@@ -105,7 +106,8 @@ EVEN = 10.0  # standard deviation of the decoder's features after `balanced`
 
 
 def first_network(recipe: LiteRecipe) -> LiteNet:
-    """The initial network: from `init`, or else an ImageNet encoder and a random decoder by the run's seed.
+    """The initial network: from `init`, or else an ImageNet encoder and a random decoder by the
+    run's seed.
 
     Raises:
         InputError: a file is missing, or belongs to another network.
@@ -122,7 +124,9 @@ def first_network(recipe: LiteRecipe) -> LiteNet:
 
 @torch.no_grad()
 def start_decoder(network: LiteNet) -> LiteNet:
-    """Initialise the decoder in place: features are about one everywhere, and corrections start at zero."""
+    """Initialise the decoder in place: features are about one everywhere, and corrections start at
+    zero.
+    """
     for name, module in network.named_modules():
         if isinstance(module, nn.Conv2d) and not name.startswith("encoder."):
             nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
@@ -153,9 +157,9 @@ def _network_of(path: Path, size: EncoderSize) -> LiteNet:
 def balanced(network: LiteNet) -> LiteNet:
     """Rescale weights in place to similar magnitudes, without a change of the network's function.
 
-    During training, the decoder's features grow and the last weights shrink, until steps of the optimiser are too large
-    for these weights and the run diverges. Levels are linear except for ReLU: a factor can move from one level to the
-    next.
+    During training, the decoder's features grow and the last weights shrink, until steps of the
+    optimiser are too large for these weights and the run diverges. Levels are linear except for
+    ReLU: a factor can move from one level to the next.
     """
     spreads: list[float] = []
     hooks = [
@@ -179,10 +183,11 @@ def balanced(network: LiteNet) -> LiteNet:
 
 
 def freeze(network: LiteNet, stages: int) -> LiteNet:
-    """Freeze the encoder's stem and first stages, and the depthwise convolutions of all other stages.
+    """Freeze the encoder's stem and first stages, and the depthwise convolutions of all other
+    stages.
 
-    Depthwise convolutions have a sixteenth of the encoder's weights, but would take two thirds of a step's time on a
-    CPU. If `stages` is 0, nothing is frozen.
+    Depthwise convolutions have a sixteenth of the encoder's weights, but would take two thirds of a
+    step's time on a CPU. If `stages` is 0, nothing is frozen.
     """
     if stages:
         for part in (network.encoder.stem, *network.encoder.stages[:stages]):
@@ -193,15 +198,16 @@ def freeze(network: LiteNet, stages: int) -> LiteNet:
     return network
 
 
-FEW = 32  # layers with fewer weights per output, which are depthwise, stay in sixteen bits: they are small
+# layers with fewer weights per output, which are depthwise, stay in sixteen bits: they are small
+FEW = 32
 STEPS = 127  # steps of eight bits on either side of zero
 
 
 def save_networks(networks: Sequence[LiteNet], path: Path) -> None:
     """Write networks into one file, which `spackle.bases.lite.load_networks` reads.
 
-    Weights are stored in eight bits, with a scale for each output of a layer; biases and depthwise convolutions in half
-    precision. `InputScale.network` is the index of a network in this order.
+    Weights are stored in eight bits, with a scale for each output of a layer; biases and depthwise
+    convolutions in half precision. `InputScale.network` is the index of a network in this order.
 
     Raises:
         InputError: the file cannot be written.

@@ -1,4 +1,6 @@
-"""A program of somebody who uses the wheel; type checkers find what is wrong in the last function, and nothing else."""
+"""A program of somebody who uses the wheel; type checkers find what is wrong in the last function,
+and nothing else.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,9 @@
-"""Feeds damaged files to the readers: `make fuzz N=5000`, or `python tests/fuzz/fuzz.py --replay CASE.json`.
+"""Feeds damaged files to the readers: `make fuzz N=5000`, or `python tests/fuzz/fuzz.py --replay
+CASE.json`.
 
-A reader's name and a case's number determine the case. A reader may raise `InputError` and nothing else, within 10 s
-and 1.5 GB. Cases run in forked processes of bounded memory; after a failed case a new process continues.
+A reader's name and a case's number determine the case. A reader may raise `InputError` and nothing
+else, within 10 s and 1.5 GB. Cases run in forked processes of bounded memory; after a failed case a
+new process continues.
 """
 
 from __future__ import annotations
@@ -218,7 +220,9 @@ def case_of(name: str, seeds: Sequence[Files], number: int) -> Files:
 
 
 def run_cases(name: str, seeds: Sequence[Files], numbers: range, case: Path, said: Path) -> None:
-    """Run cases up to the first failure; the file `case` then holds this case, and `said` the problem."""
+    """Run cases up to the first failure; the file `case` then holds this case, and `said` the
+    problem.
+    """
     with open(said, "w") as file:
         os.dup2(file.fileno(), sys.stderr.fileno())
     bound_memory()
@@ -241,7 +245,9 @@ def seeds_of(name: str) -> list[Files]:
 
 
 def held(name: str, count: int) -> list[int]:
-    """Additional threads, open files and MB of this process after `count` cases without garbage collection."""
+    """Additional threads, open files and MB of this process after `count` cases without garbage
+    collection.
+    """
     seeds, process = seeds_of(name), Path("/proc/self")
     gc.disable()
 
@@ -261,7 +267,9 @@ def held(name: str, count: int) -> list[int]:
 
 
 def fuzz(name: str, count: int) -> int:
-    """The number of failed cases of a reader; each is written to FAILURES, and the problem is printed."""
+    """The number of failed cases of a reader; each is written to FAILURES, and the problem is
+    printed.
+    """
     seeds = seeds_of(name)
     first = failed = 0
     with tempfile.TemporaryDirectory() as place:

@@ -39,7 +39,9 @@ Files = dict[str, bytes]  # name in the case's folder → content
 
 
 def stored_files(name: str) -> list[Files]:
-    """Sets of files for a reader, each from a folder 0, 1, … of its archive; `sealed` packs .npz and .spz."""
+    """Sets of files for a reader, each from a folder 0, 1, … of its archive; `sealed` packs .npz
+    and .spz.
+    """
     found: dict[str, Files] = collections.defaultdict(dict)
     with tarfile.open(DATA / "fuzz" / f"{name}.tar.xz") as archive:
         for member in archive:

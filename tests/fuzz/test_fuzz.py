@@ -1,4 +1,6 @@
-"""A hundred damaged files for each reader; `make fuzz N=5000` tries more. Failures are kept in fuzz-failures/."""
+"""A hundred damaged files for each reader; `make fuzz N=5000` tries more. Failures are kept in
+fuzz-failures/.
+"""
 
 from __future__ import annotations
 
@@ -25,9 +27,8 @@ def run(*arguments: object) -> str:
 def test_damaged_files_leave_no_thread_no_file_and_no_memory_behind(count: int) -> None:
     for line in run("-n", count, "--held", "--readers", "clips", "pictures", "depth").splitlines():
         threads, files, megabytes = map(int, line.split()[1:])
-        assert (threads, files, megabytes < 40 + count // 50) == (0, 0, True), (
-            line
-        )  # Pillow's cycles: 12 KB a picture
+        # Pillow's cycles: 12 KB a picture
+        assert (threads, files, megabytes < 40 + count // 50) == (0, 0, True), line
 
 
 def test_damaged_files_are_refused_in_time_and_in_memory() -> None:

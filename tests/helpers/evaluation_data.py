@@ -32,7 +32,9 @@ def results(
     count: int = 2,
     name: str = "scene_{}",
 ) -> Run:
-    """An evaluation of `count` images with the metrics `figures(image)`, and of one image that could not be read."""
+    """An evaluation of `count` images with the metrics `figures(image)`, and of one image that
+    could not be read.
+    """
     config: dict[str, Any] = {
         "kind": "evaluate",
         "title": title,

@@ -1,4 +1,6 @@
-"""The four functions of gsplat 1.5.3 that Spackle calls, in PyTorch; they refuse all inputs that gsplat cannot take."""
+"""The four functions of gsplat 1.5.3 that Spackle calls, in PyTorch; they refuse all inputs that
+gsplat cannot take.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,9 @@ def fully_fused_projection(
     width: int, height: int, eps2d: float = 0.3, near_plane: float = 0.01, far_plane: float = 1e10, *,
     opacities: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, None]:  # fmt: skip
-    """Radii [C, N, 2] int, means [C, N, 2], depths [C, N], conics [C, N, 3]; radii are 0 for invisible Gaussians."""
+    """Radii [C, N, 2] int, means [C, N, 2], depths [C, N], conics [C, N, 3]; radii are 0 for
+    invisible Gaussians.
+    """
     assert quats is scales is None
     assert covars is not None
     assert opacities is not None
@@ -48,9 +52,8 @@ def fully_fused_projection(
     low, high = means2d - radii, means2d + radii
     inside = (high > 0).all(-1) & (low[..., 0] < width) & (low[..., 1] < height)
     seen = inside & (z >= near_plane) & (z <= far_plane) & (det > 0) & (opacities >= ALPHA_MIN)
-    rubbish = torch.where(
-        seen[..., None], means2d, torch.nan
-    )  # the kernel does not write these elements
+    # the kernel does not write these elements
+    rubbish = torch.where(seen[..., None], means2d, torch.nan)
     return (radii * seen[..., None]).detach().nan_to_num(0).int(), rubbish, z, conics, None
 
 

@@ -16,9 +16,8 @@ from helpers import DATA
 from helpers.sharp_weights import waves as planes
 from spackle.bases.moge.network import MogeNetwork, MogeOutput
 
-CONFIGS = json.loads(
-    (DATA / "moge_configs.json").read_text()
-)  # each is a `model_config` with a ViT-S
+# each is a `model_config` with a ViT-S
+CONFIGS = json.loads((DATA / "moge_configs.json").read_text())
 TINY, FULL = CONFIGS["tiny"], CONFIGS["full"]
 
 
@@ -58,7 +57,9 @@ HALF = math.hypot(160, 90) / 2  # half the diagonal of this scene
 
 
 def scene(shift: float, bend: float = 0.0, hole: bool = True, scale: float = 1.0) -> MogeOutput:
-    """A plausible output for waves at 90×160 and a focal length of 1.3 half diagonals; below is a hole of sky."""
+    """A plausible output for waves at 90×160 and a focal length of 1.3 half diagonals; below is a
+    hole of sky.
+    """
     y, x = (np.mgrid[:90, :160] + 0.5 - np.array([45, 80]).reshape(2, 1, 1)) / HALF
     depth = 3 + np.sin(4 * x) * np.cos(3 * y)
     z = depth + shift + 2 * bend * y

@@ -14,7 +14,9 @@ INNER = slice(PATCH_RADIUS, -PATCH_RADIUS)
 
 
 class Subject:
-    """A random picture with holes, in the arrays that the kernels take, and the costs by the module's formula."""
+    """A random picture with holes, in the arrays that the kernels take, and the costs by the
+    module's formula.
+    """
 
     def __init__(self, height: int, width: int) -> None:
         rgb = torch.rand(height, width, 3, generator=torch.Generator().manual_seed(0))
@@ -57,7 +59,9 @@ class Subject:
         patch_matching._score(0, len(self.cells), self.cells, self.places, *self.target, self.costs)
 
     def formula(self, y: int, x: int) -> np.ndarray:
-        """Costs [2, height, width] of all patches and mirrored patches; infinite for patches that touch the hole."""
+        """Costs [2, height, width] of all patches and mirrored patches; infinite for patches that
+        touch the hole.
+        """
         cells = np.argwhere(np.ones((PATCH_SIDE, PATCH_SIDE))) + np.array([y, x]) - PATCH_RADIUS
         deep = np.hypot(*(cells[:, None] - np.argwhere(~self.hole)).T).min(0)
         weights = np.where(((cells >= 0) & (cells < self.hole.shape)).all(1), 0.8**deep, 0).reshape(

@@ -1,4 +1,6 @@
-"""Independent readers of the formats, from bytes to means, quats (wxyz), scales, opacities, sRGB in the file's axes."""
+"""Independent readers of the formats, from bytes to means, quats (wxyz), scales, opacities, sRGB in
+the file's axes.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ Columns = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 def gaussians_of(columns: Columns, flipped: bool) -> Gaussians:
-    """Convert columns to Gaussians; `flipped` turns the axes y up, z backward into y down, z forward."""
+    """Convert columns to Gaussians; `flipped` turns the axes y up, z backward into y down, z
+    forward.
+    """
     means, quats, scales, opacities, srgb = (
         torch.tensor(np.asarray(column), dtype=torch.float32) for column in columns
     )
@@ -32,7 +36,9 @@ def gaussians_of(columns: Columns, flipped: bool) -> Gaussians:
 
 
 def with_largest(parts: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Quaternions [N, 4] from their three smaller components [N, 3] and the index of the largest one."""
+    """Quaternions [N, 4] from their three smaller components [N, 3] and the index of the largest
+    one.
+    """
     largest = np.sqrt(np.maximum(0, 1 - np.square(parts).sum(1)))
     return np.array([np.insert(*numbers) for numbers in zip(parts, places, largest, strict=True)])
 
@@ -44,9 +50,8 @@ def spz_columns(data: bytes) -> Columns:
     assert len(raw) == 16 + 20 * count
     body = np.frombuffer(raw, np.uint8, offset=16)
     places, alphas, colors, scales, turns = np.split(body, count * np.array([9, 10, 13, 16]))
-    means = (
-        np.pad(places.reshape(-1, 3), ((0, 0), (1, 0))).view("<i4").reshape(-1, 3) >> 8
-    )  # of 24 bits each
+    # of 24 bits each
+    means = np.pad(places.reshape(-1, 3), ((0, 0), (1, 0))).view("<i4").reshape(-1, 3) >> 8
     words = turns.view("<u4")[:, None] >> np.array([20, 10, 0])
     xyz = np.where(words >> 9 & 1, -1, 1) * (words & 511) / 511 / math.sqrt(2)
     quats = np.roll(with_largest(xyz, turns.view("<u4") >> 30), 1, axis=1)

@@ -1,4 +1,6 @@
-"""Photos with a depth map inside, in the layouts of Apple, GDepth and Dynamic Depth, and damaged ones."""
+"""Photos with a depth map inside, in the layouts of Apple, GDepth and Dynamic Depth, and damaged
+ones.
+"""
 
 from __future__ import annotations
 
@@ -19,9 +21,8 @@ def _files() -> dict[str, bytes]:
         return {entry.name: archive.extractfile(entry).read() for entry in archive}  # type: ignore[union-attr]
 
 
-PORTRAITS = (
-    _files()
-)  # each photo is `photos.picture`, each map `codes`, and "map.jpg" the map alone
+# each photo is `photos.picture`, each map `codes`, and "map.jpg" the map alone
+PORTRAITS = _files()
 PORTRAIT = PORTRAITS["Apple JPEG"]
 
 

@@ -69,7 +69,9 @@ def random_gaussians(
 def slanted_plane(
     near: float, far: float, axis: int, width: int = 160, height: int = 120, focal: float = 150
 ) -> Scene:
-    """A plane whose depth runs from `far` at the first row (axis 0) or column (axis 1) to `near` at the last."""
+    """A plane whose depth runs from `far` at the first row (axis 0) or column (axis 1) to `near` at
+    the last.
+    """
     ramp = torch.linspace(1 / far, 1 / near, (height, width)[axis])
     inverse = (ramp[:, None] if axis == 0 else ramp[None, :]).expand(height, width)
     return Scene(texture(height, width), 1 / inverse, Camera.from_focal(focal, width, height))
@@ -125,7 +127,9 @@ def random_scene(
     dtype: torch.dtype = torch.float32,
     sizes: tuple[float, float] = (0.6, 12.0),
 ) -> Gaussians:
-    """Gaussians at different depths around the view; `sizes` bound their standard deviations in pixels."""
+    """Gaussians at different depths around the view; `sizes` bound their standard deviations in
+    pixels.
+    """
     generator = torch.Generator().manual_seed(seed)
 
     def uniform(*shape: int) -> Tensor:

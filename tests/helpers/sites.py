@@ -20,9 +20,8 @@ class Site:
     ranges: bool = True
     status: int = 200
     headers: dict[str, str | None] = dataclasses.field(default_factory=dict)  # None omits a header
-    drops: list[int] = dataclasses.field(
-        default_factory=list
-    )  # bytes after which the next answers break off
+    # bytes after which the next answers break off
+    drops: list[int] = dataclasses.field(default_factory=list)
     hang_after: int | None = None  # bytes after which an answer waits for `go_on`
     go_on: threading.Event = dataclasses.field(default_factory=threading.Event)
     requests: list[dict[str, str]] = dataclasses.field(default_factory=list)  # headers and path

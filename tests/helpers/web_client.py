@@ -99,7 +99,9 @@ class Served:
         return connection
 
     def raw(self, data: bytes) -> tuple[int, bytes]:
-        """Status and body of the answer to these bytes; status 0 if the server closes the connection."""
+        """Status and body of the answer to these bytes; status 0 if the server closes the
+        connection.
+        """
         with self.dial(data) as connection:
             head, _, body = answer_of(connection).partition(b"\r\n\r\n")
             return int(head.split()[1]) if head else 0, body

@@ -1,4 +1,6 @@
-"""The nodes against a stand-in of ComfyUI's contract: declared types, a function by name, values that fit the types."""
+"""The nodes against a stand-in of ComfyUI's contract: declared types, a function by name, values
+that fit the types.
+"""
 
 from __future__ import annotations
 

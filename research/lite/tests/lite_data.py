@@ -23,7 +23,9 @@ def photo(rng: np.random.Generator) -> Tensor:
 
 
 def write_data(place: Path) -> None:
-    """Write photos (one is broken), kitchen/ with six depth camera frames, pairs/ and others/ with a stereo pair."""
+    """Write photos (one is broken), kitchen/ with six depth camera frames, pairs/ and others/ with
+    a stereo pair.
+    """
     write_photo(place / "photos" / "sub" / "a.png", 120, 90)
     Image.fromarray(255 - picture(90, 120)).save(place / "photos" / "b.png")
     (place / "photos" / "broken.jpg").write_bytes(b"\xff\xd8 no more")

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from ray_tracer import BOX, ELLIPSOID, NUDGE, SHEET, Solid
 
 Array = NDArray[Any]
-Hit = tuple[
-    float, float, float, Array
-]  # t, the texture's u and v, the normal in the unit shape's axes
+# t, the texture's u and v, the normal in the unit shape's axes
+Hit = tuple[float, float, float, Array]
 
 
 def plain_trace(
@@ -46,7 +45,9 @@ def plain_trace(
 
 
 def first_hit(solid: Solid, textures: Array, start: Array, ray: Array, beyond: float) -> Hit | None:
-    """A ray's first hit of a solid beyond `beyond`, where the texture covers it; None if there is none."""
+    """A ray's first hit of a solid beyond `beyond`, where the texture covers it; None if there is
+    none.
+    """
     axes = solid.axes.astype(np.float64)
     o, d = np.linalg.solve(axes, start - solid.center), np.linalg.solve(axes, ray)
     hits = sorted(unit_hits(solid.kind, o, d), key=lambda hit: hit[0])

@@ -65,9 +65,8 @@ def test_a_place_in_a_step_decides_what_stands_there_and_nothing_else() -> None:
     names = [mixture.name(step, 0) for step in range(300)]
     assert 70 < sum(name.startswith("9") for name in names) < 130
     assert 70 < sum(" and " in name for name in names) < 140
-    assert any(
-        name.startswith("9 and") and name != "9 and 9" for name in names
-    )  # merged from two sources
+    # merged from two sources
+    assert any(name.startswith("9 and") and name != "9 and 9" for name in names)
 
 
 def test_a_step_sees_its_pictures_large_or_small() -> None:
@@ -102,7 +101,9 @@ def test_a_step_sees_its_pictures_large_or_small() -> None:
 
 
 def test_of_two_frames_in_one_picture_the_nearer_one_shows() -> None:
-    """The front frame's median becomes e^scale of the back frame's; where one is unknown, the back frame stays."""
+    """The front frame's median becomes e^scale of the back frame's; where one is unknown, the back
+    frame stays.
+    """
     depth = torch.tensor([[1.0, 1.0, 4.0, 9.0, 1.0]])
     valid = torch.tensor([[True, True, True, False, True]])
     back = Frame(
@@ -112,9 +113,8 @@ def test_of_two_frames_in_one_picture_the_nearer_one_shows() -> None:
     )
     front = Frame(torch.ones(3, 1, 5), depth, valid)
     shown = mingled(np.random.default_rng(0), back, front)
-    scale = 2 * math.exp(
-        np.random.default_rng(0).uniform(*MINGLED_SCALE)
-    )  # medians where both are known
+    # medians where both are known
+    scale = 2 * math.exp(np.random.default_rng(0).uniform(*MINGLED_SCALE))
     assert scale > 2
     expected = torch.tensor([[scale, scale, 4 * scale, 2.0, 2.0]])
     torch.testing.assert_close(shown.inverse_depth, expected)
@@ -148,7 +148,8 @@ def test_the_right_photo_has_the_depth_of_the_left_one() -> None:
     seen, known = warp_to_right(depth, valid, -6 / depth + 0.75)  # far: 0; near: 2.25 to the left
     assert known.tolist() == [[True, True, True, True, False, False, True, False]]
     assert seen[known].tolist() == [8, 8, 2, 2, 8]
-    # A slope that becomes wider has a crack one pixel wide, which is closed if it is empty or shows the background.
+    # A slope that becomes wider has a crack one pixel wide, which is closed if it is empty or shows
+    # the background.
     slope, shift = (
         torch.tensor([[9.0, 2.0, 2.02, 2.04, 2.06]]),
         torch.tensor([[3.0, 0.0, 0.0, 1.0, 1.0]]),
@@ -245,9 +246,8 @@ def test_a_network_that_knows_the_depth_has_a_perfect_score(place: Path) -> None
 
     class Knowing(nn.Module):
         def forward(self, rgb: torch.Tensor) -> torch.Tensor:
-            return frame.inverse_depth[1::2, 1::2].log()[
-                None
-            ]  # between two pixels, the later one is sampled
+            # between two pixels, the later one is sampled
+            return frame.inverse_depth[1::2, 1::2].log()[None]
 
     judge = DepthJudge(DepthLossWeights(), 64 * 64, torch.float32, torch.device("cpu"))
     frame = Frame(

@@ -26,7 +26,9 @@ Kind = Callable[[np.random.Generator], Scene]
 
 
 def test_a_made_scene_has_the_inverse_depth_of_its_planes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A plane's inverse depth is an affine function of the pixel, whatever the lens and however the camera rolls."""
+    """A plane's inverse depth is an affine function of the pixel, whatever the lens and however the
+    camera rolls.
+    """
 
     def ground(rng: np.random.Generator) -> tuple[list[Solid], float]:
         """Ground 1.5 m below the eye, in front of a wall at 16 m."""
@@ -91,7 +93,8 @@ def test_each_pixel_of_a_street_knows_whose_it_is_and_the_score_asks_for_true_sh
     )
     assert perfect.within < 1e-6
     assert perfect.abs_rel < 1e-6
-    # An object moved in depth keeps its shape; if it leans, its error is the logarithm of the change in depth.
+    # An object moved in depth keeps its shape; if it leans, its error is the logarithm of the
+    # change in depth.
     near = owner == int(owner[owner > 0].mode().values)
     moved = score_standing(torch.where(near, 1.3 * true, true), frame, owner)
     rows = torch.arange(64)[:, None].expand(64, 96)

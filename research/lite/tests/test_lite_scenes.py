@@ -114,7 +114,9 @@ def test_a_camera_that_is_not_turned_sees_a_part_of_the_photo() -> None:
 
 
 def test_a_camera_turned_aside_sees_a_frontal_plane_aslant() -> None:
-    """Its inverse depth is n·ray, with the plane's normal n in the new camera, |n| = 1: affine in the pixel."""
+    """Its inverse depth is n·ray, with the plane's normal n in the new camera, |n| = 1: affine in
+    the pixel.
+    """
     seen = turned(
         np.random.default_rng(5), plane(48, 64), 48, 64, Turning((1.5, 1.5), (10.0, 10.0, 10.0))
     )
@@ -156,13 +158,16 @@ def terms(predicted: Tensor, truth: list[float], valid: list[bool]) -> dict[str,
 
 
 def test_each_term_of_the_loss_is_what_it_says_it_is() -> None:
-    """Inverse depths 1, 2, 4, 8 are ½, 1, 2, 4 medians; the third one's prediction is wrong by a factor of e^0.3."""
+    """Inverse depths 1, 2, 4, 8 are ½, 1, 2, 4 medians; the third one's prediction is wrong by a
+    factor of e^0.3.
+    """
     truth, known = [1.0, 2.0, 4.0, 8.0], [True] * 4
     error = torch.tensor([0.0, 0.0, 0.3, 0.0])
     right = torch.tensor(truth).log() + 7  # whatever the factor
     found = terms(right + error, truth, known)
     assert found["factor"] == pytest.approx(0.3 / 4, rel=1e-5)
-    # Neighbours: 0, 0.3, 0.3 over 4 pixels; every second pixel: 0.3 over 2; then only one pixel is left.
+    # Neighbours: 0, 0.3, 0.3 over 4 pixels; every second pixel: 0.3 over 2; then only one pixel is
+    # left.
     assert found["steps"] == pytest.approx(0.6 / 4 + 0.3 / 2, rel=1e-5)
     p, t = [0.5, 1.0, 2 * math.exp(0.3), 4.0], [0.5, 1.0, 2.0, 4.0]
     p, mean = [value - sum(p) / 4 for value in p], sum(t) / 4
@@ -175,14 +180,15 @@ def test_each_term_of_the_loss_is_what_it_says_it_is() -> None:
 
 
 def test_only_the_offset_knows_a_factor_and_pulls_it_back() -> None:
-    """Medians are over known pixels; one picture is too near by e^3, and in the third nothing is known."""
+    """Medians are over known pixels; one picture is too near by e^3, and in the third nothing is
+    known.
+    """
     truth = torch.tensor([[[1.0, 2.0, 4.0]]]).expand(3, 1, 3)
     valid = torch.tensor([True, True, False])[:, None, None].expand(3, 1, 3)
     predicted = (truth.log() + torch.tensor([3.0, 0.0, 9.0])[:, None, None]).requires_grad_()
     loss, found = depth_loss(predicted, truth, valid, DepthLossWeights(offset=0.6))
-    assert float(found["offset"]) == pytest.approx(
-        (3 + 2 * math.log(2)) / 3
-    )  # t is over its median, 2
+    # t is over its median, 2
+    assert float(found["offset"]) == pytest.approx((3 + 2 * math.log(2)) / 3)
     assert loss.item() == pytest.approx(0.6 * float(found["offset"]), abs=2e-3)
     (gradient,) = torch.autograd.grad(loss, predicted)
     assert gradient.sum((1, 2)).tolist() == pytest.approx([0.2, 0.2, 0], abs=1e-3)
@@ -299,7 +305,9 @@ def published(rng: torch.Generator, size: EncoderSize) -> dict[str, Tensor]:
 
 
 def plain_features(tensors: dict[str, Tensor], x: Tensor, size: EncoderSize) -> list[Tensor]:
-    """EfficientNet-Lite layer by layer, with separate convolution and normalisation, and TensorFlow's padding."""
+    """EfficientNet-Lite layer by layer, with separate convolution and normalisation, and
+    TensorFlow's padding.
+    """
 
     def layer(x: Tensor, convolution: str, norm: str, stride: int = 1, groups: int = 1) -> Tensor:
         weight = tensors[f"{convolution}.weight"]

@@ -1,4 +1,6 @@
-"""Training of the lite base: a run from photos to weights, resuming after an interruption, and errors."""
+"""Training of the lite base: a run from photos to weights, resuming after an interruption, and
+errors.
+"""
 
 from __future__ import annotations
 

@@ -190,7 +190,9 @@ class VideoWriter:
             raise InputError(
                 f"{self.path}: {width}×{height} is too large for this format (at most {largest})"
             )
-        return StreamEncoder(self._kind, self.temporary_path, width, height, self._rate, self._plays)
+        return StreamEncoder(
+            self._kind, self.temporary_path, width, height, self._rate, self._plays
+        )
 
 
 def save_video(
