@@ -61,7 +61,8 @@ from spackle.residual import ResidualNet, hole_area_ratio
 from spackle.residual.architectures import load_residual
 from spackle.runtime.device import hardware_facts, package_versions, parallel_for_chunks
 from spackle.runtime.errors import InputError, check_name
-from spackle.runtime.files import make_folder, write_atomic, write_json
+from spackle.runtime.files import write_atomic, write_json
+from spackle.runtime.folders import make_folder
 from spackle.scene_fill import FillContext, fill_scene, fill_view
 from spackle.video.encoding import save_video
 

@@ -24,7 +24,7 @@ from spackle.paper.training.ranks import rank, wait_for_ranks
 from spackle.paper.training.residual import CACHE, PICTURED
 from spackle.paper.training.task import Task
 from spackle.runtime.device import pick_dtype
-from spackle.runtime.files import make_folder
+from spackle.runtime.folders import make_folder
 from spackle.runtime.progress import Progress, Reporter
 
 PICTURE_SIDE = 320  # pixels of a picture's longer side

@@ -28,7 +28,7 @@ import spackle
 from spackle.core.focal_length import focal_mm_to_px
 from spackle.pipeline import FillOptions
 from spackle.residual.architectures import UNet
-from spackle.runtime.files import results_folder
+from spackle.runtime.folders import results_folder
 from spackle.weights import published_weights
 
 

@@ -31,8 +31,8 @@ from spackle.paper.evaluation.case import load_case
 from spackle.paper.evaluation.datasets import read_cases
 from spackle.paper.training.checkpoint import load_checkpoint
 from spackle.paper.training.recipe import Recipe, load_recipe
+from spackle.runtime.digests import json_digest
 from spackle.runtime.errors import printable_line
-from spackle.runtime.files import json_digest
 from spackle.weights.checkpoints import read_tensors
 
 Files = dict[str, bytes]  # name in the case's folder → content

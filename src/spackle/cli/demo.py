@@ -21,7 +21,8 @@ from spackle.pipeline import Pipeline, PipelineOptions, complete
 from spackle.render import Renderer
 from spackle.residual import hole_area_ratio, hole_mask
 from spackle.results.photo_folder import save_views
-from spackle.runtime.files import results_folder, write_json
+from spackle.runtime.files import write_json
+from spackle.runtime.folders import results_folder
 from spackle.runtime.progress import Reporter
 from spackle.views import PathOptions
 

@@ -27,15 +27,10 @@ from spackle.render import device_of
 from spackle.render.blend import blend_tiles
 from spackle.results.photo_folder import REPORT, PhotoOptions, earlier_report, predict_photo
 from spackle.runtime.device import thread_count
+from spackle.runtime.digests import file_fingerprint, json_digest, matches_records
 from spackle.runtime.errors import InputError
-from spackle.runtime.files import (
-    check_file,
-    file_fingerprint,
-    json_digest,
-    list_files,
-    matches_records,
-    results_folder,
-)
+from spackle.runtime.files import check_file, list_files
+from spackle.runtime.folders import results_folder
 from spackle.runtime.kernels import is_compiled
 from spackle.runtime.progress import BufferedReporter, Reporter, catch_stop_signals
 from spackle.runtime.workers import parallel_map, torch_threads

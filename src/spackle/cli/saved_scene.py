@@ -23,7 +23,8 @@ from spackle.formats.spz import MAX_GRID_COORDINATE, spz_grid
 from spackle.render import get_renderer
 from spackle.residual import hole_area_ratio
 from spackle.runtime.errors import InputError, as_input_error
-from spackle.runtime.files import results_folder, write_atomic
+from spackle.runtime.files import write_atomic
+from spackle.runtime.folders import results_folder
 from spackle.runtime.progress import Reporter
 from spackle.scene import Scene
 from spackle.video.encoding import VIDEO_FORMATS, save_video

@@ -38,7 +38,7 @@ def weights_get(
     from rich.filesize import decimal
 
     from spackle.cli.messages import CommandReporter
-    from spackle.runtime.files import results_folder
+    from spackle.runtime.folders import results_folder
     from spackle.weights import published_weights, weights_digest, weights_folder
     from spackle.weights.download import download
 

@@ -18,8 +18,10 @@ from spackle.inpaint.plain import OpenCV
 from spackle.pipeline import Pipeline, PipelineOptions, move_in_words
 from spackle.residual import hole_area_ratio
 from spackle.results.photo_folder import PhotoOptions, shared_report
+from spackle.runtime.digests import file_records
 from spackle.runtime.errors import InputError
-from spackle.runtime.files import atomic_files, file_records, results_folder, write_json
+from spackle.runtime.files import write_json
+from spackle.runtime.folders import atomic_files, results_folder
 from spackle.runtime.progress import Reporter
 from spackle.video.frames import VideoOptions
 from spackle.views import choose_disparity

@@ -22,7 +22,9 @@ from spackle.formats import save_gray_png, save_ply, save_png
 from spackle.pipeline import CompletedPhoto, Pipeline
 from spackle.render import Renderer
 from spackle.residual import hole_area_ratio, hole_mask
-from spackle.runtime.files import atomic_files, file_records, results_folder, write_json
+from spackle.runtime.digests import file_records
+from spackle.runtime.files import write_json
+from spackle.runtime.folders import atomic_files, results_folder
 from spackle.runtime.progress import Progress, Reporter
 from spackle.video.encoding import save_video
 

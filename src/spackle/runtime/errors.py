@@ -6,13 +6,16 @@ import contextlib
 import difflib
 import reprlib
 from collections.abc import Iterable, Iterator
-from typing import Any, ParamSpec, TypeVar
+from typing import Any
 
-P = ParamSpec("P")
-R = TypeVar("R")
+MAX_MESSAGE_LENGTH = 300  # characters of a message that may quote a program's values
+MAX_REASON_LENGTH = 200  # characters of a library's message that ours quotes
+MAX_VALUE_LENGTH = 60  # characters of a value that a message quotes
 
-_SHORT = reprlib.Repr()
-_SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother = 2, 60, 60
+_value_repr = reprlib.Repr()
+_value_repr.maxlevel = 2  # of nested lists and dictionaries
+_value_repr.maxstring = MAX_VALUE_LENGTH
+_value_repr.maxother = MAX_VALUE_LENGTH
 
 
 class InputError(ValueError):
@@ -21,26 +24,35 @@ class InputError(ValueError):
 
 def reason_in_a_line(error: object) -> str:
     """The text of a library's exception, at most 200 characters, for the middle of a message."""
-    if callable(getattr(error, "errors", None)):  # of pydantic
+    is_pydantic = callable(getattr(error, "errors", None))
+    if is_pydantic:
         return first_validation_problem(error)
-    text = (
-        getattr(error, "strerror", None) or error
-    )  # the system's text, without error number and file name
-    return printable_line(" ".join(str(text).split()))[:200] or type(error).__name__
+    # An error of the operating system also has a text without error number and file name.
+    text = str(getattr(error, "strerror", None) or error)
+    without_line_breaks = " ".join(text.split())
+    return printable_line(without_line_breaks)[:MAX_REASON_LENGTH] or type(error).__name__
 
 
 def first_validation_problem(error: Any) -> str:
-    """The key of the first value that pydantic refuses, and what the value must be."""
+    """The key of the first value that pydantic refuses, and what the value must be.
+
+    For example "optim.steps: input should be greater than 0, not -1".
+
+    Args:
+        error: pydantic's ValidationError, or FastAPI's RequestValidationError.
+    """
     first = error.errors()[0]
     if first["type"] == "extra_forbidden":
         problem = "there is no such key"
     else:
         message = first["msg"].removeprefix("Value error, ")
-        quoted = first["type"] not in ("missing", "json_invalid", "too_long", "too_short")
-        problem = (
-            f"{message[0].lower()}{message[1:]}" + f", not {short_repr(first['input'])}" * quoted
-        )
-    return ": ".join(filter(None, (".".join(str(name)[:60] for name in first["loc"]), problem)))
+        problem = f"{message[0].lower()}{message[1:]}"
+        # In these cases, pydantic's "input" is the whole object instead of the refused value.
+        if first["type"] not in ("missing", "json_invalid", "too_long", "too_short"):
+            problem += f", not {short_repr(first['input'])}"
+
+    key = ".".join(str(name)[:MAX_VALUE_LENGTH] for name in first["loc"])
+    return f"{key}: {problem}" if key else problem
 
 
 @contextlib.contextmanager
@@ -49,51 +61,66 @@ def as_input_error(what: object, problem: str, *errors: type[Exception]) -> Iter
 
     Args:
         what: subject of the message, usually the file that the block reads.
-        problem: what is wrong and what to do; "{reason}" stands for the library's message.
-        errors: exceptions that mean bad input; by default all, because untrusted bytes can raise any exception.
+        problem: what is wrong and what to do; the text "{reason}" in it is replaced by the
+            library's message.
+        errors: exceptions that mean bad input; by default all, because libraries that decode
+            untrusted bytes can raise any exception.
     """
-    caught = errors or (Exception,)
+    bad_input = errors or (Exception,)
     try:
         yield
-    except InputError:
+    except InputError:  # has a message for the user already
         raise
-    except caught as error:
-        raise InputError(
-            f"{what}: {problem.replace('{reason}', reason_in_a_line(error))}"
-        ) from error
+    except bad_input as error:
+        explained = problem.replace("{reason}", reason_in_a_line(error))
+        raise InputError(f"{what}: {explained}") from error
 
 
 @contextlib.contextmanager
 def shorten_input_errors() -> Iterator[None]:
-    """Shorten an InputError's message to 300 characters, because it may quote a program's values."""
+    """Shorten the message of an InputError from the block to 300 characters.
+
+    A program may pass a value that is megabytes long, which the message then quotes.
+    """
     try:
         yield
     except InputError as error:
         message = str(error)
-        if len(message) <= 300:
+        if len(message) <= MAX_MESSAGE_LENGTH:
             raise
-        raise InputError(f"{message[:148]} … {message[-148:]}") from error
+        side = MAX_MESSAGE_LENGTH // 2 - 2  # " … " between both ends takes three characters
+        raise InputError(f"{message[:side]} … {message[-side:]}") from error
 
 
 def printable_line(text: str) -> str:
-    """The text with control characters escaped, because file names can contain a terminal's escape codes."""
+    """The text in one line, its control characters escaped.
+
+    File names can contain escape codes, which would command the user's terminal.
+    """
     line = " ".join(text.splitlines())
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
+    return "".join(
+        character if character.isprintable() else character.encode("unicode_escape").decode()
+        for character in line
+    )
 
 
 def short_repr(value: object) -> str:
-    """A value from a file, shortened to 60 characters, for the middle of a message."""
-    return _SHORT.repr(value)[:60]
+    """A value from a file as Python writes it, at most 60 characters, for a message."""
+    return _value_repr.repr(value)[:MAX_VALUE_LENGTH]
 
 
 def check_name(option: str, name: str, known: Iterable[str]) -> None:
     """Raise an InputError for an unknown name; the message suggests the most similar known name.
 
-    `option` is the Python name of the option whose value is `name`, such as "depth_kind".
+    Args:
+        option: Python name of the option whose value is `name`, such as "depth_kind".
+        name: the user's value.
+        known: the values that the option can have.
     """
     names = list(known)
     if name in names:
         return
-    near = difflib.get_close_matches(name.lower(), names, n=1, cutoff=0.5)
-    advice = f"did you mean {near[0]}? There" if near else "there"
+    # Less than half of the letters in common is not similar.
+    similar = difflib.get_close_matches(name.lower(), names, n=1, cutoff=0.5)
+    advice = f"did you mean {similar[0]}? There" if similar else "there"
     raise InputError(f"`{option}` {name} is unknown: {advice} are {', '.join(names)}")

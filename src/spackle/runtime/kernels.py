@@ -1,4 +1,8 @@
-"""Typed decorators around numba, which has no type annotations."""
+"""Decorators that compile numeric functions by numba.
+
+`kernel` is the usual one. The decorators have types, which numba lacks, and recompile a kernel when
+a constant or another kernel that it uses has changed, which numba does not notice.
+"""
 
 from __future__ import annotations
 
@@ -12,61 +16,83 @@ from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
 R = TypeVar("R")
-Array = NDArray[Any]  # what kernels take
+Array = NDArray[Any]  # an argument of a kernel
 
 # Constants of float32 kernels: a Python float would widen a whole expression to float64.
-ZERO, HALF, ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
-MANTISSA_BITS = np.int32(23)  # bits of a float32's mantissa
+ZERO = np.float32(0.0)
+HALF = np.float32(0.5)
+ONE = np.float32(1.0)
+MANTISSA_BITS = np.int32(23)  # of a float32
 
-# Reordered sums are not allowed, because results must be the same bit for bit; "nnan" and "ninf" are not, because
-# kernels test for NaN and infinity.
+# Liberties that the compiler may take with floating point numbers: fuse a multiplication and an
+# addition, ignore the sign of zero, approximate functions. It may not reorder sums ("reassoc"),
+# because results must be the same bit for bit, and may not assume finite numbers ("nnan", "ninf"),
+# because kernels test for NaN and infinity.
 _FASTMATH = {"contract", "nsz", "afn"}
 
 
 def kernel(function: Callable[..., R]) -> Callable[..., R]:
-    """Compile a function at its first call, cache the machine code on disk, and run without the GIL."""
-    return _compiled(function, _FASTMATH)
+    """Compile a function at its first call, cache the machine code on disk, and free the GIL."""
+    return _compile(function, _FASTMATH)
 
 
 def reordering_kernel(function: Callable[..., R]) -> Callable[..., R]:
     """A `kernel` whose sums may be reordered, which allows vector instructions."""
-    return _compiled(function, {"reassoc", *_FASTMATH})
+    return _compile(function, {"reassoc", *_FASTMATH})
 
 
 def inlined_kernel(function: Callable[..., R]) -> Callable[..., R]:
     """A `kernel` that is inlined into the calling loops, which allows vector instructions."""
-    return _compiled(function, _FASTMATH, forceinline=True)
+    return _compile(function, _FASTMATH, forceinline=True)
 
 
 def is_compiled(function: Callable[..., Any]) -> bool:
     """Whether a kernel's machine code is on disk, or cannot be kept there."""
-    kept = _kept(function)
-    return kept is None or bool(kept._load_index())
+    disk_cache = _disk_cache_of(function)
+    if disk_cache is None:
+        return True
+    return bool(disk_cache._load_index())  # numba's table of the versions on disk
 
 
-def _compiled(function: Callable[..., R], fastmath: set[str], **more: Any) -> Callable[..., R]:
-    compiled = numba.njit(cache=True, nogil=True, fastmath=fastmath, error_model="numpy", **more)(
-        function
-    )
-    kept = _kept(compiled)
-    if kept is not None:
-        options = (sorted(fastmath), sorted(more.items()))
-        kept._source_stamp = (kept._source_stamp, _surroundings(function), repr(options))
+def _compile(function: Callable[..., R], fastmath: set[str], **options: Any) -> Callable[..., R]:
+    """Compile a function by numba, with a disk cache that notices changes of what it uses.
+
+    Numba keys its disk cache by a stamp of the function's own source file, so it would run old
+    machine code after a change of a kernel, constant or option elsewhere. The stamp is extended by
+    these. It is a private attribute, because numba has no public way: a cache locator of one's own
+    is set by an environment variable, for the kernels of all packages in the process, and is told
+    neither the options nor the function that calls for it.
+
+    Args:
+        function: the function in Python.
+        fastmath: names of LLVM's liberties with floating point numbers.
+        options: further options of `numba.njit`.
+    """
+    compiled = numba.njit(
+        cache=True, nogil=True, fastmath=fastmath, error_model="numpy", **options
+    )(function)
+    disk_cache = _disk_cache_of(compiled)
+    if disk_cache is not None:
+        disk_cache._source_stamp = (
+            disk_cache._source_stamp,
+            _digest_of_globals(function),
+            repr((sorted(fastmath), sorted(options.items()))),
+        )
     return cast("Callable[..., R]", compiled)
 
 
-def _surroundings(function: Callable[..., Any]) -> str:
-    """A hash of the numbers and kernels that a module has; numba notices only changes of the module's own text."""
-    seen = []
+def _digest_of_globals(function: Callable[..., Any]) -> str:
+    """A hash of the numbers and kernels that the function's module knows by name."""
+    stamps = []
     for name, value in sorted(function.__globals__.items()):
-        if isinstance(value, Dispatcher):
-            seen.append((name, repr(getattr(_kept(value), "_source_stamp", None))))
+        if isinstance(value, Dispatcher):  # another kernel
+            stamps.append((name, repr(getattr(_disk_cache_of(value), "_source_stamp", None))))
         elif isinstance(value, (int, float, np.generic)):
-            seen.append((name, repr(value)))
-    return hashlib.sha256(repr(seen).encode()).hexdigest()
+            stamps.append((name, repr(value)))
+    return hashlib.sha256(repr(stamps).encode()).hexdigest()
 
 
-def _kept(compiled: Any) -> Any:
+def _disk_cache_of(compiled: Any) -> Any:
     """Numba's internal disk cache of a kernel's machine code; None if the cache is off."""
-    file = getattr(getattr(compiled, "_cache", None), "_cache_file", None)
-    return file if hasattr(file, "_source_stamp") else None
+    cache_file = getattr(getattr(compiled, "_cache", None), "_cache_file", None)
+    return cache_file if hasattr(cache_file, "_source_stamp") else None

@@ -18,7 +18,8 @@ from fastapi import HTTPException
 from pydantic import BaseModel, Field
 
 from spackle.runtime.errors import InputError, reason_in_a_line
-from spackle.runtime.files import results_folder, write_json
+from spackle.runtime.files import write_json
+from spackle.runtime.folders import results_folder
 from spackle.runtime.task_process import WORKER_DIED, TaskEvent, TaskFunction, TaskProcess
 
 LOG = logging.getLogger("spackle.web")

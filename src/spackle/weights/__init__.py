@@ -8,8 +8,9 @@ import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from spackle.runtime.digests import sha256_of
 from spackle.runtime.errors import check_name
-from spackle.runtime.files import check_file, sha256_of
+from spackle.runtime.files import check_file
 
 HUB = "https://huggingface.co"
 

@@ -12,8 +12,9 @@ from pathlib import Path
 from urllib.error import HTTPError, URLError
 from urllib.request import Request, build_opener
 
+from spackle.runtime.digests import sha256_of
 from spackle.runtime.errors import InputError, reason_in_a_line
-from spackle.runtime.files import check_writable, sha256_of
+from spackle.runtime.files import check_writable
 from spackle.runtime.progress import Progress
 
 TIMEOUT = 30.0  # seconds without a byte

@@ -29,7 +29,7 @@ from spackle.paper.training.samples import Source, digest_of_samples
 from spackle.paper.training.sources import find_sources
 from spackle.render import get_renderer
 from spackle.runtime.errors import InputError
-from spackle.runtime.files import file_lock
+from spackle.runtime.folders import file_lock
 
 
 def test_one_worker_and_two_write_the_same_shards(whole: Path, place: Path, tmp_path: Path) -> None:

@@ -30,8 +30,8 @@ from spackle.paper.dataset.sample import (
 from spackle.paper.dataset.shards import load_manifest
 from spackle.render import get_renderer
 from spackle.residual import hole_mask
+from spackle.runtime.digests import json_digest
 from spackle.runtime.errors import InputError
-from spackle.runtime.files import json_digest
 
 
 @pytest.mark.filterwarnings(

@@ -30,7 +30,7 @@ from spackle.paper.training.samples import Sample, load_sample, save_sample
 from spackle.paper.training.schedule import prefetch
 from spackle.render import get_renderer
 from spackle.residual.architectures import load_residual
-from spackle.runtime.files import file_lock
+from spackle.runtime.folders import file_lock
 
 __all__ = ["one_thread"]  # a fixture
 

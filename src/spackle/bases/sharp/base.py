@@ -29,8 +29,8 @@ from spackle.runtime.device import (
     report_memory_shortage,
     without_autocast_or_tf32,
 )
+from spackle.runtime.digests import sha256_of
 from spackle.runtime.errors import InputError, as_input_error, printable_line
-from spackle.runtime.files import sha256_of
 from spackle.runtime.progress import Progress
 from spackle.weights.checkpoints import TensorShapes, load_strict, read_metadata, read_tensors
 

@@ -38,16 +38,10 @@ from spackle.paper.dataset.views import (
 )
 from spackle.render import get_renderer
 from spackle.residual import MASK_THRESHOLD
+from spackle.runtime.digests import config_differences, file_fingerprint, json_digest
 from spackle.runtime.errors import InputError, as_input_error, check_name
-from spackle.runtime.files import (
-    config_differences,
-    file_fingerprint,
-    json_digest,
-    make_folder,
-    remove_half_written,
-    results_folder,
-    write_atomic,
-)
+from spackle.runtime.files import remove_half_written, write_atomic
+from spackle.runtime.folders import make_folder, results_folder
 from spackle.runtime.progress import Reporter, catch_stop_signals, pluralized
 from spackle.runtime.workers import parallel_map
 from spackle.weights import weights_digest, weights_digests

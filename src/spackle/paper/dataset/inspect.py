@@ -25,7 +25,7 @@ from spackle.paper.dataset.shards import (
     open_dataset_file,
 )
 from spackle.runtime.errors import InputError, as_input_error, printable_line
-from spackle.runtime.files import results_folder
+from spackle.runtime.folders import results_folder
 from spackle.runtime.progress import Progress, Reporter, pluralized
 from spackle.video.encoding import save_video
 

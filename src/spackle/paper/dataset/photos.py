@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from spackle.core.photo import PHOTO_SUFFIXES, load_photo
+from spackle.runtime.digests import sha256_of
 from spackle.runtime.errors import InputError, as_input_error
-from spackle.runtime.files import list_files, sha256_of
+from spackle.runtime.files import list_files
 from spackle.runtime.progress import Progress
 
 DATASET_PHOTO_SUFFIXES = (*PHOTO_SUFFIXES, ".gif", ".bmp")

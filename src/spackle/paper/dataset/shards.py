@@ -13,8 +13,9 @@ from pydantic import BaseModel, Field, model_validator
 from torch.utils.data import Dataset
 
 from spackle.paper.dataset.sample import END_OF_ARCHIVE, PhotoGroup
+from spackle.runtime.digests import json_digest
 from spackle.runtime.errors import InputError, as_input_error
-from spackle.runtime.files import atomic_path, json_digest
+from spackle.runtime.files import atomic_path
 
 MANIFEST_NAME = "manifest.json"
 FORMAT_VERSION = 1  # version of shards and manifest; other versions are refused

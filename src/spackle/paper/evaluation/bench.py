@@ -28,7 +28,7 @@ from spackle.paper.evaluation.tables import make_tables, write_tables
 from spackle.render import device_of
 from spackle.residual import ResidualNet
 from spackle.runtime.device import hardware_facts, package_versions
-from spackle.runtime.files import results_folder
+from spackle.runtime.folders import results_folder
 from spackle.runtime.progress import Reporter
 from spackle.scene_fill import FillContext
 

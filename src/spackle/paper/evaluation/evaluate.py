@@ -59,8 +59,10 @@ from spackle.pipeline import FillOptions
 from spackle.render import Renderer, device_of, get_renderer
 from spackle.residual import ResidualNet, hole_mask
 from spackle.runtime.device import hardware_facts, package_versions, pick_device, pick_dtype
+from spackle.runtime.digests import json_digest
 from spackle.runtime.errors import InputError, check_name
-from spackle.runtime.files import json_digest, results_folder, write_atomic
+from spackle.runtime.files import write_atomic
+from spackle.runtime.folders import results_folder
 from spackle.runtime.progress import Reporter, pluralized
 from spackle.scene_fill import FillContext
 from spackle.weights import weights_digest, weights_digests

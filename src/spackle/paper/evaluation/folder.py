@@ -19,18 +19,16 @@ from spackle.bases.open import BaseError
 from spackle.paper.evaluation.case import Case
 from spackle.paper.evaluation.measurements import PROBLEM, Measurement, Run
 from spackle.paper.evaluation.table import NOT_RUN
-from spackle.runtime.errors import InputError, as_input_error
-from spackle.runtime.files import (
+from spackle.runtime.digests import (
     config_differences,
     file_records,
     json_digest,
-    make_folder,
     matches_records,
     photo_digest,
-    remove_half_written,
-    write_atomic,
-    write_json,
 )
+from spackle.runtime.errors import InputError, as_input_error
+from spackle.runtime.files import remove_half_written, write_atomic, write_json
+from spackle.runtime.folders import make_folder
 from spackle.runtime.progress import Reporter, catch_stop_signals
 
 CONFIG, ROWS, IMAGES = "config.json", "rows.jsonl", "images"

@@ -22,7 +22,8 @@ from spackle.paper.evaluation.metrics import METRICS
 from spackle.paper.evaluation.protocols import HOLE, INPUT, TRUTH
 from spackle.paper.evaluation.table import tex
 from spackle.runtime.errors import InputError
-from spackle.runtime.files import atomic_path, results_folder, write_atomic
+from spackle.runtime.files import atomic_path, write_atomic
+from spackle.runtime.folders import results_folder
 from spackle.runtime.progress import Reporter
 
 WORST, BEST = "worst.png", "best.png"

@@ -35,7 +35,8 @@ from spackle.residual.features import CELL, ViewFeatures, hole_area_ratio
 from spackle.residual.network import ResidualNet
 from spackle.runtime.device import pick_dtype
 from spackle.runtime.errors import InputError
-from spackle.runtime.files import make_folder, write_atomic
+from spackle.runtime.files import write_atomic
+from spackle.runtime.folders import make_folder
 from spackle.runtime.progress import Reporter
 from spackle.weights.checkpoints import load_strict, read_tensors
 

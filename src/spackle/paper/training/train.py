@@ -51,7 +51,8 @@ from spackle.paper.training.schedule import ema_decay, learning_rate, prefetch, 
 from spackle.paper.training.task import Task
 from spackle.runtime.device import hardware_facts, package_versions, pick_device
 from spackle.runtime.errors import InputError, as_input_error
-from spackle.runtime.files import results_folder, write_json
+from spackle.runtime.files import write_json
+from spackle.runtime.folders import results_folder
 from spackle.runtime.progress import Reporter, catch_stop_signals
 
 # Why a run ended, and the line that says so.

@@ -1,0 +1,128 @@
+"""Recognise files and settings: checksums, records of files in reports, differences of settings."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from spackle.runtime.errors import InputError
+from spackle.runtime.files import check_file
+
+HASH_BLOCK_BYTES = 1 << 20  # read at once, so that a large file needs little memory
+MAX_HASHED_BYTES = 200_000_000  # hashing takes a second; a larger file is known by size and time
+
+
+def sha256_of(file: BinaryIO) -> str:
+    """SHA-256, in hexadecimal digits, of an open file from its current position on."""
+    sha256 = hashlib.sha256()
+    while block := file.read(HASH_BLOCK_BYTES):
+        sha256.update(block)
+    return sha256.hexdigest()
+
+
+def json_digest(value: object) -> str:
+    """SHA-256, in hexadecimal digits, of a value as JSON; the order of keys does not matter."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
+
+
+def file_fingerprint(file: Path, kind: str) -> str:
+    """A text that changes whenever the file changes.
+
+    It is the SHA-256 of the content, but for a large file the size and the time of the last change.
+
+    Raises:
+        InputError: the file is missing or empty; the message names `kind`, such as "photo".
+    """
+    size = check_file(file, kind)
+    if size > MAX_HASHED_BYTES:
+        return f"{size} bytes of {file.stat().st_mtime_ns}"
+    return hashlib.sha256(file.read_bytes()).hexdigest()
+
+
+def photo_digest(path: Path) -> str:
+    """A text that changes whenever the photo changes, or "none" for a missing photo."""
+    with contextlib.suppress(InputError):
+        return file_fingerprint(path, "photo")
+    return "none"
+
+
+def file_records(folder: Path, files: Iterable[Path]) -> dict[str, dict[str, object]]:
+    """Size in bytes and SHA-256 of files in a folder, by their names in the folder, for a report.
+
+    For example {"scene.ply": {"bytes": 1234, "sha256": "9f86…"}}.
+    """
+    records: dict[str, dict[str, object]] = {}
+    for path in files:
+        with open(path, "rb") as file:
+            records[path.relative_to(folder).as_posix()] = {
+                "bytes": path.stat().st_size,
+                "sha256": sha256_of(file),
+            }
+    return records
+
+
+def matches_records(folder: Path, report: str, records: object) -> bool:
+    """Whether a folder still holds the files whose `file_records` a report contains.
+
+    Sizes are compared. Contents are compared, too, if a file is newer than the report, as in a
+    copied folder; hashing every file of every finished photo would take minutes.
+
+    Args:
+        folder: the folder of the files.
+        report: name of the report's file in the folder.
+        records: what the report contains; anything, because somebody may have edited it.
+    """
+    if not isinstance(records, Mapping) or not records:
+        return False
+    try:
+        report_time = (folder / report).stat().st_mtime_ns
+        return all(
+            _matches_record(folder, name, record, report_time) for name, record in records.items()
+        )
+    except (OSError, ValueError, KeyError, TypeError):  # a file is missing, a record is no record
+        return False
+
+
+def _matches_record(folder: Path, name: str, record: Any, report_time: int) -> bool:
+    """Whether a file has the recorded size and, if it is newer than the report, SHA-256.
+
+    Args:
+        folder: the folder of the file.
+        name: of the file in the folder.
+        record: as `file_records` makes it: {"bytes": …, "sha256": …}.
+        report_time: when the report was written, in nanoseconds.
+    """
+    facts = (folder / name).stat()
+    if facts.st_size != record["bytes"]:
+        return False
+    is_newer = max(facts.st_mtime_ns, facts.st_ctime_ns) > report_time
+    if not is_newer:
+        return True
+    return bool(file_records(folder, [folder / name])[name] == record)
+
+
+def config_differences(
+    old: Mapping[str, Any], new: Mapping[str, Any], prefix: str = ""
+) -> list[str]:
+    """List the differences of two nested configurations as lines "key: old -> new".
+
+    `prefix` stands before each key; the keys of nested configurations are joined by dots.
+    """
+    lines: list[str] = []
+    for key in sorted({*old, *new}):
+        old_value, new_value = old.get(key), new.get(key)
+        if isinstance(old_value, Mapping) and isinstance(new_value, Mapping):
+            lines += config_differences(old_value, new_value, f"{prefix}{key}.")
+        elif old_value != new_value:
+            lines.append(f"{prefix}{key}: {_short_json(old_value)} -> {_short_json(new_value)}")
+    return lines
+
+
+def _short_json(value: object) -> str:
+    """A value as JSON; a long one, such as a digest, is cut to 12 characters."""
+    text = json.dumps(value)
+    return text if len(text) <= 40 else text[:12] + "…"
