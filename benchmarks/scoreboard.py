@@ -6,7 +6,7 @@
     benchmarks/scoreboard.py --photos FOLDER [--without NAME] -o sheet.jpg
 
 PAIRS has one folder per scene: two photos, a disparity map and a `scene.json`
-(`spackle.paper.training.sources.load_pair`). The left photo is lifted by its true depth, and the
+(`spackle.paper.training.measured_photos.load_pair`). The left photo is lifted by its true depth, and the
 right camera's view is completed and compared with the right photo. PAIRS may also be a folder of
 photos. A fifth of the width is then cut off at each side of a photo, its middle is lifted by lite's
 depth for the whole photo, and the view to complete is the whole photo.
@@ -71,7 +71,7 @@ from spackle.lifting.silhouettes import Layers
 from spackle.paper.evaluation.metrics import GREY_WEIGHTS, sharpness
 from spackle.paper.training.feature_networks import FeatureNet, load_features
 from spackle.paper.training.losses import covered_fraction, hole_psnr
-from spackle.paper.training.sources import load_pair
+from spackle.paper.training.measured_photos import StereoPair, load_pair
 
 Row = dict[str, float]  # the figures of a scene, by name
 Rows = dict[str, Row]  # the rows of scenes, by name
@@ -219,8 +219,9 @@ class Pair:
 
     def __init__(self, place: Path, small: int) -> None:
         pair = load_pair(place) if place.is_dir() else load_cut(place)
-        self.left, self.right, depth, self.camera, self.beside = pair
-        self.depth = smaller(depth, small) if small > 1 else depth
+        self.left, self.right = pair.left, pair.right
+        self.camera, self.beside = pair.left_camera, pair.right_camera
+        self.depth = smaller(pair.depth, small) if small > 1 else pair.depth
         prediction = lift_rgbd(self.left, self.depth, self.camera)
         self.hole = hole_mask(RENDERER.render(prediction.gaussians, self.beside).alpha)
         self.near = maximum_filter(self.hole, BAND_PX)
@@ -254,10 +255,8 @@ class Pair:
         return row | dict(zip(SECONDS, seconds, strict=True))
 
 
-def load_cut(file: Path) -> tuple[Tensor, Tensor, DepthMap, Camera, Camera]:
-    """A photo and its middle three fifths as a pair, as returned by `load_pair`: the middle is the
-    left photo.
-    """
+def load_cut(file: Path) -> StereoPair:
+    """A photo and its middle three fifths as a pair: the middle is the left photo."""
     photo = resize_photo(load_photo(file))
     inverse, side = spackle.LiteBase.load().inverse_depth(photo.rgb), photo.width // 5
     inverse = F.interpolate(inverse[None, None], (photo.height, photo.width), mode="bilinear")[0, 0]
@@ -267,7 +266,8 @@ def load_cut(file: Path) -> tuple[Tensor, Tensor, DepthMap, Camera, Camera]:
     )
     cut = photo.camera.cropped(side, 0, depth.shape[1], photo.height)
     known = DepthMap(depth, depth > 0, None, None, "disparity", file)
-    return photo.rgb[:, middle].contiguous(), photo.rgb, known, cut, photo.camera
+    left = photo.rgb[:, middle].contiguous()
+    return StereoPair(left, photo.rgb, known, left_camera=cut, right_camera=photo.camera)
 
 
 def smaller(depth: DepthMap, times: int) -> DepthMap:

@@ -36,8 +36,8 @@ from spackle.core.photo import PHOTO_SUFFIXES, load_photo
 from spackle.formats import save_png
 from spackle.formats.png import contact_sheet
 from spackle.paper.evaluation.datasets.stereo import pair_of_2014
+from spackle.paper.training.measured_photos import find_files
 from spackle.paper.training.recipe import RgbdFolder
-from spackle.paper.training.sources import find_files
 
 GUESSES = ("constant", "ramp", "lite")
 STREETS, STREETS_SEED = 40, 202

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample, interpolate
 
+from spackle.paper.training.measured_photos import find_files, load_frame, load_pair
 from spackle.paper.training.recipe import RgbdFolder
-from spackle.paper.training.sources import find_files, load_frame, load_pair
 from spackle.runtime.errors import InputError
 
 Rng = np.random.Generator
@@ -192,12 +192,13 @@ class Measured:
         if self.unit_m is not None:
             rgb, stored = load_frame(self.path, self.unit_m)
             return reduced(rgb, stored.depth, stored.valid, side)
-        rgb, other, stored, camera, beside = load_pair(self.path)
+        pair = load_pair(self.path)
+        stored, camera, beside = pair.depth, pair.left_camera, pair.right_camera
         if not self.right:
-            return reduced(rgb, stored.depth, stored.valid, side)
+            return reduced(pair.left, stored.depth, stored.valid, side)
         moved = beside.world_to_camera[0, 3] * camera.K[0, 0]
         shift = beside.K[0, 2] - camera.K[0, 2] + moved / stored.depth.clamp_min(1e-6)
-        return reduced(other, *warp_to_right(stored.depth, stored.valid, shift), side)
+        return reduced(pair.right, *warp_to_right(stored.depth, stored.valid, shift), side)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,6 +14,7 @@ from pydantic import Field
 
 from spackle.bases.lite import SIDE_MULTIPLE, STAGES, EncoderSize
 from spackle.core.photo import PHOTO_SUFFIXES
+from spackle.paper.training.measured_photos import find_files
 from spackle.paper.training.recipe import (
     MAY_CHANGE_ON_RESUME,
     AnyRecipe,
@@ -26,7 +27,6 @@ from spackle.paper.training.recipe import (
     Seed,
 )
 from spackle.paper.training.samples import short_digest
-from spackle.paper.training.sources import find_files
 from spackle.runtime.errors import InputError
 
 RANDOM = Path("random")  # instead of the encoder's file: random weights, for tests and experiments

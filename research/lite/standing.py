@@ -19,7 +19,7 @@ from synthetic_scenes import SAMPLES, drawn
 from textures import LATTICE, LEAVES, RING, WHOLE
 from torch import Tensor
 
-from spackle.paper.training.sources import DrawPhoto
+from spackle.paper.training.composites import DrawPhoto
 
 Things = list[list[Solid]]
 MOST = 64  # more than a scene's number of objects

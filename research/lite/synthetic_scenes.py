@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from spackle.core.photo import load_photo
-from spackle.paper.training.sources import DrawPhoto
+from spackle.paper.training.composites import DrawPhoto
 from spackle.runtime.errors import InputError
 from spackle.runtime.files import atomic_path
 

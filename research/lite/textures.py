@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from spackle.paper.training.sources import DrawPhoto, random_crop, random_outline
+from spackle.paper.training.composites import DrawPhoto, random_crop, random_outline
 
 Floats = NDArray[np.float32]
 Rng = np.random.Generator

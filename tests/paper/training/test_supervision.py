@@ -30,7 +30,7 @@ from torch.nn.functional import max_pool2d
 
 from spackle.core.camera import Camera
 from spackle.core.filters import maximum_filter
-from spackle.paper.training import samples, sources
+from spackle.paper.training import composites, measured_photos, samples, sources
 from spackle.paper.training.recipe import DataRecipe
 from spackle.paper.training.residual import MIN_AUX, training_cells
 from spackle.paper.training.samples import (
@@ -236,9 +236,9 @@ def test_a_cut_out_is_nearer_than_its_background(
 ) -> None:
     def composite(objects: int) -> tuple[Tensor, Tensor]:
         """A composite of photos with one colour each; more objects do not change earlier objects."""
-        monkeypatch.setattr(sources, "OBJECTS", (objects, objects))
+        monkeypatch.setattr(composites, "CUTOUT_COUNT", (objects, objects))
         colors = iter(PALETTE)
-        return sources.compose_cutouts(
+        return composites.compose_cutouts(
             np.random.default_rng(seed), lambda rng: next(colors).expand(150, 200, 3), 120, 160
         )
 
@@ -250,7 +250,7 @@ def test_a_cut_out_is_nearer_than_its_background(
         assert (next_inverse > 1.03 * inverse)[moved].all()
         assert (
             not moved.any()
-            or sources.CUTOUT_AREA[0] < float(moved.float().mean()) < sources.CUTOUT_AREA[1]
+            or composites.CUTOUT_AREA[0] < float(moved.float().mean()) < composites.CUTOUT_AREA[1]
         )
         assert not (moved & ~painted).any()
         assert (painted & ~grow(moved)).float().mean() < 2e-3
@@ -352,7 +352,9 @@ def test_frames_of_a_depth_camera(tmp_path: Path, unit_m: float) -> None:
     color, depth = tmp_path / "frame-0.color.jpg", tmp_path / "frame-0.depth.png"
     Image.fromarray(stored).save(depth)
     Image.fromarray(picture(96, 72)).save(color, quality=95)
-    rgb, known, camera = sources.draw_rgbd_frame(np.random.default_rng(1), [color], 80.0, unit_m)
+    rgb, known, camera = measured_photos.draw_rgbd_frame(
+        np.random.default_rng(1), [color], 80.0, unit_m
+    )
     assert torch.equal(rgb, pixels(color))
     assert camera.focal == (80.0, 80.0)
     assert int((~known.valid).sum()) == 2 * 9
@@ -361,7 +363,7 @@ def test_frames_of_a_depth_camera(tmp_path: Path, unit_m: float) -> None:
     )
     write_depth(depth, metres(40, 72))
     with pytest.raises(InputError, match=r"is 40×72 but photo .* is 96×72"):
-        sources.load_frame(color, unit_m)
+        measured_photos.load_frame(color, unit_m)
 
 
 WALL_PX, BOX_PX = 4, 12  # disparities; the file's values are smaller by 3, its `doffs_px`
@@ -395,7 +397,7 @@ def test_targets_of_a_stereo_pair(tmp_path: Path) -> None:
     assert not (sample.hole & ~grow(expected)).any()
     assert not (~sample.hole & ~grow(~expected)).any()
     assert sample.hole[26:46, 57:61].all()
-    left = partial(sources.draw_left_photo, folders=[folder])
+    left = partial(measured_photos.draw_left_photo, folders=[folder])
     sample = sources.random_reverse_view(np.random.default_rng(0), left, (0.3, 0.6), CPU)
     assert torch.equal(sample.target, pixels(folder / "left.png"))
     assert torch.equal(sample.camera.world_to_camera, torch.eye(4))
@@ -415,5 +417,5 @@ def test_unusable_pairs_are_refused(tmp_path: Path, changes: dict[str, Any], sai
     write_photo(folder / "small.png", 32, 24)
     np.save(folder / "narrow.npy", np.full((72, 20), 4, np.float32))
     with pytest.raises(InputError, match=said) as caught:
-        sources.load_pair(folder)
+        measured_photos.load_pair(folder)
     assert str(folder) in str(caught.value)
