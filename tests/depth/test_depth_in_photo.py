@@ -45,7 +45,7 @@ def refused(tmp_path: Path, name: str, why: str) -> None:
     with pytest.raises(InputError, match=why) as caught:
         load_photo_depth(path)
     assert str(caught.value).startswith(f"{path}: the depth map in the photo cannot be used (")
-    assert str(caught.value).endswith("--depth FILE, or use --base lite")
+    assert str(caught.value).endswith("`depth` FILE, or use `base` lite")
     assert "\n" not in str(caught.value)
 
 

@@ -1,4 +1,4 @@
-"""Write depth maps as NumPy arrays, 16-bit PNG or OpenEXR."""
+"""Write depth maps as NumPy arrays, 16-bit PNG or OpenEXR; `save_depth` is the entry."""
 
 from __future__ import annotations
 
@@ -18,44 +18,62 @@ from torch import Tensor
 from spackle.runtime.errors import InputError
 from spackle.runtime.files import write_atomic
 
-Metres = NDArray[np.float32]
+Metres = NDArray[np.float32]  # [H, W], 0 where unknown
+DepthEncoder = Callable[[Metres], bytes]
+
+MILLIMETRES_PER_METRE = 1000
+MAX_MILLIMETRES = 65_535  # the highest number of 16 bits: 65.5 m
 
 
-def check_depth_name(path: str | os.PathLike[str]) -> Callable[[Metres], bytes]:
+def check_depth_name(path: str | os.PathLike[str]) -> DepthEncoder:
     """The encoder of depth maps for a file name's suffix; InputError for an unknown suffix."""
-    if (encode := ENCODERS.get(Path(path).suffix.lower())) is None:
+    encoder = DEPTH_ENCODERS.get(Path(path).suffix.lower())
+    if encoder is None:
         raise InputError(
-            f"{path}: not a name for a depth map: end the name with {', '.join(ENCODERS)}"
+            f"{path}: not a name for a depth map: end the name with {', '.join(DEPTH_ENCODERS)}"
         )
-    return encode
+    return encoder
 
 
 def save_depth(depth: Tensor, path: str | os.PathLike[str]) -> None:
-    """Write depth in metres [H, W], 0 where unknown: .npy and .exr as float32, .png as millimetres in 16 bits."""
-    write_atomic(path, check_depth_name(path)(depth.cpu().numpy().astype(np.float32)))
+    """Write depth [H, W] in metres, 0 where unknown.
+
+    The suffix decides the format: .npy and .exr hold metres as float32, .png holds millimetres in
+    16 bits. InputError for another suffix, and if the file cannot be written.
+    """
+    encode = check_depth_name(path)
+    write_atomic(path, encode(depth.cpu().numpy().astype(np.float32)))
 
 
-def _npy(depth: Metres) -> bytes:
-    np.save(file := io.BytesIO(), depth)
+def _encode_npy(depth: Metres) -> bytes:
+    """The bytes of a .npy file."""
+    file = io.BytesIO()
+    np.save(file, depth)
     return file.getvalue()
 
 
-def _png(depth: Metres) -> bytes:
-    millimetres = np.clip(np.round(depth * 1000), 0, 65_535).astype(np.uint16)  # 65.5 m at most
-    Image.fromarray(millimetres).save(file := io.BytesIO(), format="PNG")
+def _encode_png(depth: Metres) -> bytes:
+    """The bytes of a 16-bit PNG in millimetres; depths beyond 65.5 m become 65.5 m."""
+    millimetres = np.clip(np.round(depth * MILLIMETRES_PER_METRE), 0, MAX_MILLIMETRES)
+    file = io.BytesIO()
+    Image.fromarray(millimetres.astype(np.uint16)).save(file, format="PNG")
     return file.getvalue()
 
 
-def _exr(depth: Metres) -> bytes:
+def _encode_exr(depth: Metres) -> bytes:
+    """The bytes of an OpenEXR file with one channel, Y, as float32."""
     encoder = av.CodecContext.create("exr", "w")
     assert isinstance(encoder, VideoCodecContext)
     encoder.height, encoder.width = depth.shape
-    encoder.pix_fmt, encoder.time_base = "grayf32le", Fraction(1)
-    packets = [
-        *encoder.encode(av.VideoFrame.from_ndarray(depth, format="grayf32le")),
-        *encoder.encode(None),
-    ]
-    return b"".join(map(bytes, packets))
+    encoder.pix_fmt = "grayf32le"
+    encoder.time_base = Fraction(1)  # a codec needs one, also for a single picture
+    picture = av.VideoFrame.from_ndarray(depth, format="grayf32le")
+    packets = [*encoder.encode(picture), *encoder.encode(None)]
+    return b"".join(bytes(packet) for packet in packets)
 
 
-ENCODERS: dict[str, Callable[[Metres], bytes]] = {".npy": _npy, ".png": _png, ".exr": _exr}
+DEPTH_ENCODERS: dict[str, DepthEncoder] = {
+    ".npy": _encode_npy,
+    ".png": _encode_png,
+    ".exr": _encode_exr,
+}

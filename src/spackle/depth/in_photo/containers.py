@@ -1,4 +1,8 @@
-"""Read what an untrusted JPEG, HEIF or XMP holds beside the picture."""
+"""Read what an untrusted JPEG, HEIF or XMP packet holds beside the picture.
+
+A JPEG is a list of segments, some of which hold XMP (XML about the photo); further pictures may
+follow the main one. A HEIF consists of nested boxes; each picture in it is an item with properties.
+"""
 
 from __future__ import annotations
 
@@ -12,138 +16,206 @@ from xml.etree.ElementTree import Element
 
 from PIL.JpegImagePlugin import JpegImageFile
 
-XMP, MORE_XMP = b"http://ns.adobe.com/xap/1.0/\0", b"http://ns.adobe.com/xmp/extension/\0"
-MAX_PICTURES = 64
-_GUID = re.compile(rb"HasExtendedXMP\s*(?:=\s*[\"']|>\s*)([0-9A-Fa-f]{32})")
-_PICTURES = 0xB002
+XMP_MAGIC = b"http://ns.adobe.com/xap/1.0/\0"
+EXTENDED_XMP_MAGIC = b"http://ns.adobe.com/xmp/extension/\0"
+# The main XMP packet names the extended one by a GUID, as an attribute or as an element.
+_EXTENDED_XMP_GUID = re.compile(rb"HasExtendedXMP\s*(?:=\s*[\"']|>\s*)([0-9A-Fa-f]{32})")
+MAX_PICTURES = 64  # in a file; a photo has a handful
+_MPF_TAG_PICTURES = 0xB002  # the list of pictures in the Multi-Picture Format
 
 
 def open_jpeg(data: bytes) -> JpegImageFile | None:
     """A JPEG, opened with only its header read; None if Pillow cannot open it."""
     try:
         return JpegImageFile(io.BytesIO(data))
-    except Exception:
+    except Exception:  # untrusted bytes can raise any exception in a decoder
         return None
 
 
-def xmp_of(image: JpegImageFile | None) -> bytes:
-    """The main XMP packet; empty if there is none."""
-    segments = [] if image is None else image.applist
-    return next(
-        (body[len(XMP) :] for name, body in segments if name == "APP1" and body.startswith(XMP)),
-        b"",
-    )
+def xmp_of(image: JpegImageFile) -> bytes:
+    """The main XMP packet of a JPEG; empty if there is none."""
+    for name, body in image.applist:
+        if name == "APP1" and body.startswith(XMP_MAGIC):
+            return bytes(body[len(XMP_MAGIC) :])
+    return b""
 
 
 def extended_xmp_of(image: JpegImageFile) -> bytes:
-    """The extended XMP, which did not fit into the main packet; empty if there is none or a part is missing."""
-    named = _GUID.search(xmp_of(image))
-    bodies = [
-        body.removeprefix(MORE_XMP)
-        for name, body in image.applist
-        if name == "APP1" and MORE_XMP in body[:40]
-    ]
-    parts = [body for body in bodies if named and body[:32].lower() == named[1].lower()]
-    joined = b"".join(part[40:] for part in sorted(parts, key=lambda part: part[36:40]))
-    return joined if parts and parts[0][32:36] == len(joined).to_bytes(4, "big") else b""
+    """The extended XMP of a JPEG, which did not fit into the main packet.
+
+    It is empty if there is none, or if a part of it is missing. Each part begins with the GUID that
+    the main packet names (32 characters), the length of all parts together and the part's position
+    (4 bytes each).
+    """
+    guid = _EXTENDED_XMP_GUID.search(xmp_of(image))
+    if guid is None:
+        return b""
+
+    parts: list[bytes] = []
+    for name, segment in image.applist:
+        if name == "APP1" and segment.startswith(EXTENDED_XMP_MAGIC):
+            part = segment.removeprefix(EXTENDED_XMP_MAGIC)
+            if part[:32].lower() == guid[1].lower():
+                parts.append(part)
+    if not parts:
+        return b""
+
+    parts_in_order = sorted(parts, key=lambda part: part[36:40])
+    joined = b"".join(part[40:] for part in parts_in_order)
+    stated_length = parts[0][32:36]
+    return joined if stated_length == len(joined).to_bytes(4, "big") else b""
 
 
 def further_pictures(image: JpegImageFile) -> list[tuple[int, int]]:
-    """(begin, end) of the pictures that the Multi-Picture Format lists after the first, even beyond the file's end."""
-    try:  # the offsets count from the list's byte order mark
-        starts = [
-            (image.info["mpoffset"] + entry["DataOffset"], entry["Size"])
-            for entry in (image._getmp() or {})[_PICTURES]
+    """(begin, end) in bytes of the pictures behind the first one in a JPEG file.
+
+    The Multi-Picture Format lists them. A picture may end beyond the file's end, if the file was
+    cut off. The list is empty if there is none, or it cannot be read.
+    """
+    try:
+        listing = image._getmp()
+        if listing is None:
+            return []
+        list_begin = image.info["mpoffset"]  # offsets count from the list's byte order mark
+        pictures = [
+            (list_begin + entry["DataOffset"], entry["Size"])
+            for entry in listing[_MPF_TAG_PICTURES]
         ]
-    except Exception:  # there is no list, or none that can be read
+    except Exception:  # a broken list can raise any exception
         return []
-    return [(start, start + size) for start, size in starts[1:MAX_PICTURES]]
+    return [(begin, begin + size) for begin, size in pictures[1:MAX_PICTURES]]
 
 
 def xmp_packets(data: bytes) -> Iterator[bytes]:
-    """The XMP packets that are stored uncompressed in a file."""
+    """The XMP packets that are stored uncompressed anywhere in a file."""
     for part in data.split(b"<x:xmpmeta", MAX_PICTURES)[1:]:
         body, end, _ = part.partition(b"</x:xmpmeta>")
         yield b"<x:xmpmeta" + body + end
 
 
-# Turns are steps: t swaps rows and columns, x left and right, y top and bottom.
-BY_ORIENTATION = {
-    2: "x",
-    3: "xy",
-    4: "y",
-    5: "t",
-    6: "tx",
-    7: "txy",
-    8: "ty",
-}  # steps that make EXIF's upright
-# `irot` holds the number of anticlockwise quarter turns; `imir` is 0 if top and bottom are swapped.
-_TURNS = {b"irot": ("", "ty", "xy", "tx"), b"imir": ("y", "x")}
-_DEPTH_TYPES = {b"urn:mpeg:hevc:2015:auxid:2", b"urn:mpeg:avc:2015:auxid:2"}
-_DEPTH_TYPES |= {b"urn:mpeg:mpegB:cicp:systems:auxiliary:depth"}
-Boxes = Iterator[tuple[bytes, memoryview]]
+# --- Orientation
+
+# An orientation is a text of steps, which are done from left to right: "t" swaps rows and columns,
+# "x" swaps left and right, "y" swaps top and bottom.
+STEPS_OF_EXIF_ORIENTATION = {2: "x", 3: "xy", 4: "y", 5: "t", 6: "tx", 7: "txy", 8: "ty"}
+# HEIF's box `irot` holds the number of quarter turns against the clock; `imir` holds 0 if top and
+# bottom are swapped, 1 if left and right are.
+_STEPS_OF_HEIF_BOX = {b"irot": ("", "ty", "xy", "tx"), b"imir": ("y", "x")}
+
+# --- HEIF
+
+_DEPTH_ITEM_TYPES = {
+    b"urn:mpeg:hevc:2015:auxid:2",
+    b"urn:mpeg:avc:2015:auxid:2",
+    b"urn:mpeg:mpegB:cicp:systems:auxiliary:depth",
+}
+Box = tuple[bytes, memoryview]  # the type (four letters), and the content
 
 
-def turn_of_depth_item(data: bytes) -> str | None:
-    """The turn that a HEIF's depth map still needs after decoding; None for broken boxes, no map or several maps."""
+def steps_of_depth_item(data: bytes) -> str | None:
+    """The steps that make a HEIF's depth map upright after decoding, as in an orientation.
+
+    None for broken boxes, and if the file has no depth map or several ones.
+    """
     try:
         content = next(body for kind, body in _boxes(memoryview(data)) if kind == b"meta")
-        meta = dict(_boxes(content[4:]))
-        (primary,) = struct.unpack_from(">I" if meta[b"pitm"][0] else ">H", meta[b"pitm"], 4)
-        properties = _properties(meta[b"iprp"])
+        meta = dict(_boxes(content[4:]))  # behind version and flags
+        primary_item = _primary_item(meta[b"pitm"])
+        properties = _properties_of_items(meta[b"iprp"])
     except (struct.error, KeyError, IndexError, ValueError, StopIteration):
         return None
-    depth = [boxes for boxes in properties.values() if _types(boxes) & _DEPTH_TYPES]
-    if len(depth) != 1:
+
+    depth_items = [boxes for boxes in properties.values() if _item_types(boxes) & _DEPTH_ITEM_TYPES]
+    if len(depth_items) != 1:
         return None
-    # A decoder applies the map's turn. Apple turns the picture and leaves the map as the sensor saw it.
-    own, of_primary = _turn(depth[0]), _turn(properties.get(primary, []))
-    return of_primary or "" if own is None else ""
+    # A decoder turns the map as the map's own properties say. Apple gives turns to the photo alone,
+    # and leaves the map as the sensor saw it.
+    if _orientation_steps(depth_items[0]) is not None:
+        return ""
+    return _orientation_steps(properties.get(primary_item, [])) or ""
 
 
-def _boxes(body: memoryview) -> Boxes:
-    """(type, content) of consecutive boxes."""
-    at = 0
-    while at + 8 <= len(body):
-        size, kind = struct.unpack_from(">I4s", body, at)
-        head = 16 if size == 1 else 8
-        size = struct.unpack_from(">Q", body, at + 8)[0] if size == 1 else size or len(body) - at
-        if not head <= size <= len(body) - at:
+def _boxes(body: memoryview) -> Iterator[Box]:
+    """Consecutive boxes of a HEIF; ValueError if a box ends beyond `body`.
+
+    A box begins with its size (4 bytes) and type (4 bytes). Size 1 means that the size follows in 8
+    bytes, size 0 that the box reaches to the end.
+    """
+    position = 0
+    while position + 8 <= len(body):
+        size, kind = struct.unpack_from(">I4s", body, position)
+        header_size = 8
+        if size == 1:
+            (size,) = struct.unpack_from(">Q", body, position + 8)
+            header_size = 16
+        elif size == 0:
+            size = len(body) - position
+        if not header_size <= size <= len(body) - position:
             raise ValueError("a box that ends beyond its parent")
-        yield kind, body[at + head : at + size]
-        at += size
+        yield kind, body[position + header_size : position + size]
+        position += size
 
 
-def _properties(iprp: memoryview) -> dict[int, list[tuple[bytes, memoryview]]]:
-    """The property boxes of each item, in the order in which they apply."""
+def _primary_item(pitm: memoryview) -> int:
+    """The number of the item that is the photo, from the content of the box `pitm`."""
+    version = pitm[0]
+    (item,) = struct.unpack_from(">I" if version else ">H", pitm, 4)
+    return int(item)
+
+
+def _properties_of_items(iprp: memoryview) -> dict[int, list[Box]]:
+    """The property boxes of each item, in the order in which they apply.
+
+    `iprp` is the content of the box of that name: the box `ipco` with all properties, and boxes
+    `ipma`, which list for each item the numbers of its properties.
+    """
     parts = list(_boxes(iprp))
-    stored = [box for kind, body in parts if kind == b"ipco" for box in _boxes(body)]
-    found: dict[int, list[tuple[bytes, memoryview]]] = {}
-    for table in (body for kind, body in parts if kind == b"ipma"):
-        entry, at = struct.Struct(">IB" if table[0] else ">HB"), 8
-        index, mask = ("H", 0x7FFF) if table[3] & 1 else ("B", 0x7F)
-        for _ in range(*struct.unpack_from(">I", table, 4)):
-            item, count = entry.unpack_from(table, at)
-            indices = struct.unpack_from(f">{count}{index}", table, at + entry.size)
-            at += entry.size + struct.calcsize(f">{count}{index}")
-            found.setdefault(item, []).extend(
-                stored[(i & mask) - 1] for i in indices if 1 <= i & mask <= len(stored)
-            )
-    return found
+    all_properties = [box for kind, body in parts if kind == b"ipco" for box in _boxes(body)]
+    properties: dict[int, list[Box]] = {}
+    for kind, table in parts:
+        if kind != b"ipma":
+            continue
+        version = table[0]
+        has_wide_numbers = table[3] & 1  # the last flag
+        item_format = struct.Struct(">IB" if version else ">HB")  # item, count of its properties
+        number_letter = "H" if has_wide_numbers else "B"
+        number_mask = 0x7FFF if has_wide_numbers else 0x7F  # the first bit says "essential"
+
+        (item_count,) = struct.unpack_from(">I", table, 4)
+        position = 8
+        for _ in range(item_count):
+            item, property_count = item_format.unpack_from(table, position)
+            position += item_format.size
+            numbers_format = struct.Struct(f">{property_count}{number_letter}")
+            boxes = properties.setdefault(item, [])
+            for stored_number in numbers_format.unpack_from(table, position):
+                number = stored_number & number_mask  # from 1; 0 means none
+                if 1 <= number <= len(all_properties):
+                    boxes.append(all_properties[number - 1])
+            position += numbers_format.size
+    return properties
 
 
-def _types(properties: list[tuple[bytes, memoryview]]) -> set[bytes]:
-    return {bytes(body[4:]).partition(b"\0")[0] for kind, body in properties if kind == b"auxC"}
-
-
-def _turn(properties: list[tuple[bytes, memoryview]]) -> str | None:
-    """Rotations and mirrorings, in the order in which they apply; None if there are none."""
-    turns = [
-        _TURNS[kind][body[0] % len(_TURNS[kind])]
+def _item_types(properties: list[Box]) -> set[bytes]:
+    """What an auxiliary item is, such as depth: the texts in its boxes `auxC`."""
+    return {
+        bytes(body[4:]).partition(b"\0")[0]  # behind version and flags
         for kind, body in properties
-        if kind in _TURNS and body
+        if kind == b"auxC"
+    }
+
+
+def _orientation_steps(properties: list[Box]) -> str | None:
+    """The steps of an item's rotations and mirrorings, in their order; None if there are none."""
+    steps = [
+        _STEPS_OF_HEIF_BOX[kind][body[0] % len(_STEPS_OF_HEIF_BOX[kind])]
+        for kind, body in properties
+        if kind in _STEPS_OF_HEIF_BOX and body
     ]
-    return "".join(turns) if turns else None
+    return "".join(steps) if steps else None
+
+
+# --- XMP
 
 
 def parse_xmp(packet: bytes) -> Element:
@@ -151,21 +223,36 @@ def parse_xmp(packet: bytes) -> Element:
     return ElementTree.fromstring(packet.strip(b"\0"))
 
 
-def get(node: Element, name: str) -> str | None:
-    """A property of this element itself, stored as an attribute or a child element named "{namespace}name"."""
+def own_property(node: Element, name: str) -> str | None:
+    """A property of this element itself, called "{namespace}name"; None if it is missing.
+
+    XMP stores a property as an attribute or as a child element.
+    """
     text = node.get(name)
-    text = node.findtext(name) if text is None else text
+    if text is None:
+        text = node.findtext(name)
     return None if text is None else text.strip()
 
 
-def find(tree: Element, name: str) -> str | None:
+def find_property(tree: Element, name: str) -> str | None:
     """A property of this element, or of the first element below it that has the property."""
-    return next((value for node in tree.iter() if (value := get(node, name)) is not None), None)
+    for node in tree.iter():
+        text = own_property(node, name)
+        if text is not None:
+            return text
+    return None
 
 
-def number(tree: Element, name: str) -> float | None:
-    """A property, see `find`, as a number; ValueError if it is not a finite number."""
-    text = find(tree, name)
-    if text is not None and not math.isfinite(float(text)):
-        raise ValueError(f"{name.rpartition('}')[2]} is {text}")
-    return None if text is None else float(text)
+def find_number(tree: Element, name: str) -> float | None:
+    """A property of this element, or of one below, as a number; None if it is missing.
+
+    ValueError if it is not a finite number.
+    """
+    text = find_property(tree, name)
+    if text is None:
+        return None
+    number = float(text)
+    if not math.isfinite(number):
+        short_name = name.rpartition("}")[2]
+        raise ValueError(f"{short_name} is {text}")
+    return number

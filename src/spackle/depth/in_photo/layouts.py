@@ -1,4 +1,9 @@
-"""The depth map inside a portrait photo: Apple's in JPEG and HEIC, Android's GDepth and Dynamic Depth in JPEG."""
+"""The layouts in which phones put a depth map into a portrait photo.
+
+`load_photo_depth` is the entry. A map is stored as a picture of whole numbers (codes), and a
+`CodeScale` says which depth or disparity a code means. The layouts are Apple's in JPEG and HEIC,
+HEVC's in HEIC, and Android's GDepth and Dynamic Depth in JPEG.
+"""
 
 from __future__ import annotations
 
@@ -17,6 +22,7 @@ import numpy as np
 import torch
 from PIL import Image
 from PIL.JpegImagePlugin import JpegImageFile
+from torch import Tensor
 
 from spackle.core.image_files import check_pixel_count
 from spackle.depth.depth_map import (
@@ -28,28 +34,32 @@ from spackle.depth.depth_map import (
     quantisation_step,
 )
 from spackle.depth.in_photo.containers import (
-    BY_ORIENTATION,
+    STEPS_OF_EXIF_ORIENTATION,
     extended_xmp_of,
-    find,
+    find_number,
+    find_property,
     further_pictures,
-    get,
-    number,
     open_jpeg,
+    own_property,
     parse_xmp,
-    turn_of_depth_item,
+    steps_of_depth_item,
     xmp_of,
     xmp_packets,
 )
 from spackle.runtime.errors import InputError, reason_in_a_line
 from spackle.runtime.files import check_file
 
-_ORIENTATION = 0x0112
-PLAUSIBLE_M = (0.3, 30.0)  # median depths beyond these are rescaled if the file states no unit
-USUAL_M = 3.0  # the median after rescaling
+EXIF_TAG_ORIENTATION = 0x0112
+JPEG_MAGIC = b"\xff\xd8\xff"
+HEIF_BRAND_BOX = b"ftyp"  # the fifth to eighth byte of a HEIF file
+# Of a file that states no unit, depths are rescaled if their median is not in this range.
+MIN_PLAUSIBLE_MEDIAN_M = 0.3
+MAX_PLAUSIBLE_MEDIAN_M = 30.0
+USUAL_MEDIAN_M = 3.0  # the median after rescaling
 
 
 @dataclasses.dataclass(frozen=True)
-class Scale:
+class CodeScale:
     """A linear function from the numbers that a picture stores (codes) to depths or disparities."""
 
     quantity: Quantity
@@ -58,110 +68,166 @@ class Scale:
     source: str  # for the report: layout, quantity and accuracy
     unit_known: bool = True
 
+    def check(self) -> None:
+        """ValueError if the range is empty, holds nothing positive, or is not finite."""
+        is_finite = math.isfinite(self.first) and math.isfinite(self.last)
+        if not is_finite or self.first == self.last or max(self.first, self.last) <= 0:
+            raise ValueError(f"it announces a {self.quantity} from {self.first:g} to {self.last:g}")
+
 
 @dataclasses.dataclass(frozen=True)
 class CodedDepth:
     """A depth map as the file stores it."""
 
     codes: Array  # [H, W] whole numbers
-    full: int  # the highest code of the picture's format
-    scale: Scale
-    turn: str = ""  # the steps that make the codes upright, see `containers.BY_ORIENTATION`
+    max_code: int  # the highest code of the picture's format
+    scale: CodeScale
+    # What makes the codes upright, from left to right: "t" swaps rows and columns, "x" left and
+    # right, "y" top and bottom.
+    upright_steps: str = ""
 
     def decode(self) -> tuple[Array, float]:
-        """Metres [H, W] (0 or less: unknown), and the quantisation step of the stored depth or disparity."""
-        first, last = self.scale.first, self.scale.last
-        if (
-            not (math.isfinite(first) and math.isfinite(last))
-            or first == last
-            or max(first, last) <= 0
-        ):
-            raise ValueError(f"it announces a {self.scale.quantity} from {first:g} to {last:g}")
+        """Metres [H, W] (0 or less: unknown), and the quantisation step of what is stored.
+
+        The step is in metres for depth, and in 1/m for disparity. ValueError if the map's range is
+        impossible, or all codes are equal.
+        """
+        self.scale.check()
         if int(self.codes.min()) == int(self.codes.max()):
             raise ValueError("it has the same value everywhere")
-        slope = (last - first) / self.full
-        step = abs(slope) * (quantisation_step(self.codes) or 1)
-        with np.errstate(all="ignore"):  # the caller marks infinite results as unknown
-            values = first + slope * self.codes.astype(np.float64)
+
+        slope = (self.scale.last - self.scale.first) / self.max_code
+        code_step = quantisation_step(self.codes) or 1
+        step = abs(slope) * code_step
+        with np.errstate(all="ignore"):  # infinite results are unknown
+            values = self.scale.first + slope * self.codes.astype(np.float64)
             if self.scale.quantity == "depth":
                 return values, step
-            # Disparities that are not above zero are the horizon, or were pushed beyond it by noise: far, but known.
+            # Disparities that are not above zero are the horizon, or were pushed beyond it by
+            # noise: far, but known.
             return 1 / np.maximum(values, abs(slope) / 2), step
+
+    def upright(self, stored: Tensor) -> Tensor:
+        """A map [H, W] in the orientation of the codes, turned as the photo is shown."""
+        for step in self.upright_steps:
+            stored = stored.T if step == "t" else stored.flip(1 if step == "x" else 0)
+        return stored
 
 
 def load_photo_depth(path: StrPath) -> DepthMap | None:
     """The depth map inside a photo, upright as the photo itself is; None if it has none.
 
-    In HEIC this reads an auxiliary depth image with Apple's XMP or HEVC's depth information; in JPEG, Apple's auxiliary
-    pictures, Android's Dynamic Depth and the older GDepth. `DepthMap.note` says which format it was and how reliable
-    the metres are. The picture itself is not decoded. InputError for a missing file or a broken depth map.
+    In HEIC this reads an auxiliary depth image with Apple's XMP or HEVC's depth information; in
+    JPEG, Apple's auxiliary pictures, Android's Dynamic Depth and the older GDepth. `DepthMap.note`
+    says which format it was and how reliable the metres are. The picture itself is not decoded.
+    InputError for a missing file or a broken depth map.
     """
     check_file(path, "photo")
     try:
         with open(path, "rb") as file:
             start = file.read(8)
-            jpeg = start.startswith(b"\xff\xd8\xff")
-            data = start + file.read() if jpeg or start.endswith(b"ftyp") else b""
+            is_jpeg = start.startswith(JPEG_MAGIC)
+            is_heif = start.endswith(HEIF_BRAND_BOX)
+            if not (is_jpeg or is_heif):
+                return None
+            data = start + file.read()
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # Pillow's warnings about untrusted bytes are of no use
-            coded = _find_in_jpeg(data) if jpeg else _find_in_heif(data) if data else None
-            return None if coded is None else _depth_map(coded, Path(path))
+            warnings.simplefilter("ignore")  # Pillow's warnings about untrusted bytes are no use
+            coded = _find_in_jpeg(data) if is_jpeg else _find_in_heif(data)
+            return None if coded is None else _to_depth_map(coded, Path(path))
     except Exception as error:  # untrusted bytes can raise any exception in a decoder
-        problem = f"the depth map in the photo cannot be used ({reason_in_a_line(error)})"
         raise InputError(
-            f"{path}: {problem}: give another depth map with --depth FILE, or use --base lite"
+            f"{path}: the depth map in the photo cannot be used ({reason_in_a_line(error)}): "
+            "give another depth map with `depth` FILE, or use `base` lite"
         ) from error
 
 
-def _depth_map(coded: CodedDepth, path: Path) -> DepthMap:
+def _to_depth_map(coded: CodedDepth, path: Path) -> DepthMap:
+    """The upright depth map in metres; ValueError if no pixel has a depth.
+
+    If the file states no unit and the median is implausible, the map is scaled to a median of 3 m.
+    """
     stored, quantum = coded.decode()
-    depth = torch.from_numpy(stored)
-    for step in coded.turn:
-        depth = depth.T if step == "t" else depth.flip(1 if step == "x" else 0)
+    depth = coded.upright(torch.from_numpy(stored))
     note = f"portrait depth of the photo ({coded.scale.source}"
-    known = depth[is_valid_depth(depth)]
-    middle = float(known.median()) if len(known) and not coded.scale.unit_known else USUAL_M
-    if not PLAUSIBLE_M[0] <= middle <= PLAUSIBLE_M[1]:
-        factor = USUAL_M / middle
-        depth, note = depth * factor, f"{note}, scaled to a median of {USUAL_M:g} m"
+    factor = 1.0 if coded.scale.unit_known else _factor_to_plausible(depth)
+    if factor != 1:
+        depth = depth * factor
+        note += f", scaled to a median of {USUAL_MEDIAN_M:g} m"
         quantum *= factor if coded.scale.quantity == "depth" else 1 / factor
+
     metres = depth.float().contiguous()
     valid = is_valid_depth(metres)
     if not valid.any():
         raise ValueError("no pixel has a depth")
     return DepthMap(
-        metres.where(valid, 0.0), valid, None, quantum, coded.scale.quantity, path, f"{note})"
+        metres.where(valid, 0.0),
+        valid,
+        K=None,
+        quantum=quantum,
+        quantity=coded.scale.quantity,
+        path=path,
+        note=f"{note})",
     )
+
+
+def _factor_to_plausible(depth: Tensor) -> float:
+    """What brings the median of depths [H, W] to 3 m; 1 if it lies between 0.3 and 30 m."""
+    known = depth[is_valid_depth(depth)]
+    if not len(known):
+        return 1.0
+    median = float(known.median())
+    is_plausible = MIN_PLAUSIBLE_MEDIAN_M <= median <= MAX_PLAUSIBLE_MEDIAN_M
+    return 1.0 if is_plausible else USUAL_MEDIAN_M / median
 
 
 def _read_codes(picture: bytes) -> tuple[Array, int]:
     """[H, W] values of a JPEG or PNG, and the highest value that its format has."""
     with Image.open(io.BytesIO(picture), formats=("JPEG", "PNG")) as image:
-        check_pixel_count(*image.size, len(picture), "the map")
-        if image.mode.startswith("I"):
+        width, height = image.size
+        check_pixel_count(width, height, len(picture), "the map")
+        if image.mode.startswith("I"):  # 16 bits
             return np.asarray(image).astype(np.uint16), 65535
         return np.asarray(image.convert("L")), 255
 
 
 def _find_in_jpeg(data: bytes) -> CodedDepth | None:
-    """Apple's depth map, recognised among the further pictures by its XMP, or else Android's; None without either."""
-    if (image := open_jpeg(data)) is None:  # whoever decodes the photo will say what is wrong
+    """Apple's depth map in a JPEG, or else Android's; None without either.
+
+    Apple's is one of the further pictures behind the main one, and recognised by its XMP.
+    """
+    image = open_jpeg(data)
+    if image is None:  # whoever decodes the photo will say what is wrong
         return None
-    turn = ""
+    upright_steps = ""
     with contextlib.suppress(Exception):  # unreadable EXIF says nothing about the orientation
-        turn = BY_ORIENTATION.get(image.getexif().get(_ORIENTATION, 1), "")
+        orientation = image.getexif().get(EXIF_TAG_ORIENTATION, 1)
+        upright_steps = STEPS_OF_EXIF_ORIENTATION.get(orientation, "")
+
     for begin, end in further_pictures(image):
-        if scale := apple_scale(xmp_of(open_jpeg(data[begin:end]))):
+        further = open_jpeg(data[begin:end])
+        scale = None if further is None else apple_scale(xmp_of(further))
+        if scale is not None:
             if end > len(data):
                 raise ValueError("the file ends before the map does")
-            return CodedDepth(*_read_codes(data[begin:end]), scale, turn)
-    found = _find_android(data, image)
-    return found and CodedDepth(*_read_codes(found[0]), found[1], turn)
+            codes, max_code = _read_codes(data[begin:end])
+            return CodedDepth(codes, max_code, scale, upright_steps)
+
+    android = _find_android(data, image)
+    if android is None:
+        return None
+    picture, scale = android
+    codes, max_code = _read_codes(picture)
+    return CodedDepth(codes, max_code, scale, upright_steps)
 
 
-PIXELS, DEPTH = "{http://ns.apple.com/pixeldatainfo/1.0/}", "{http://ns.apple.com/depthData/1.0/}"
-# Core Video's formats of depth maps, half and full floats; any other is a matte, a gain map or a mask.
-_FORMATS: dict[str, Quantity] = {
+# --- Apple
+
+# Namespaces of XMP, in the notation of ElementTree.
+PIXEL_DATA = "{http://ns.apple.com/pixeldatainfo/1.0/}"
+DEPTH_DATA = "{http://ns.apple.com/depthData/1.0/}"
+# Core Video's formats of depth maps, half and full floats; others are mattes, gain maps or masks.
+_QUANTITY_OF_PIXEL_FORMAT: dict[str, Quantity] = {
     "hdis": "disparity",
     "fdis": "disparity",
     "hdep": "depth",
@@ -169,155 +235,217 @@ _FORMATS: dict[str, Quantity] = {
 }
 
 
-def _is_about(packet: bytes, space: str) -> bool:
-    return space.strip("{}").encode() in packet
+def _mentions(packet: bytes, namespace: str) -> bool:
+    """Whether an XMP packet uses a namespace, which is given as "{address}"."""
+    return namespace.strip("{}").encode() in packet
 
 
-def apple_scale(packet: bytes) -> Scale | None:
-    """The scale that an XMP packet states for a depth map; None if it is about something else, or states no range."""
-    if not _is_about(packet, PIXELS):
+def apple_scale(packet: bytes) -> CodeScale | None:
+    """The scale that an XMP packet states for a depth map.
+
+    None if it is about something else, or states no range.
+    """
+    if not _mentions(packet, PIXEL_DATA):
         return None
     tree = parse_xmp(packet)
-    quantity = _quantity(tree)
-    first, last = (number(tree, f"{PIXELS}{name}") for name in ("FloatMinValue", "FloatMaxValue"))
+    quantity = _apple_quantity(tree)
+    first = find_number(tree, f"{PIXEL_DATA}FloatMinValue")
+    last = find_number(tree, f"{PIXEL_DATA}FloatMaxValue")
     if quantity is None or first is None or last is None:
         return None
-    accuracy = find(tree, f"{DEPTH}Accuracy")
-    accuracy = accuracy if accuracy in ("absolute", "relative") else "of unknown accuracy"
-    return Scale(quantity, first, last, f"Apple {quantity}, {accuracy}")
+    accuracy = find_property(tree, f"{DEPTH_DATA}Accuracy")
+    if accuracy not in ("absolute", "relative"):
+        accuracy = "of unknown accuracy"
+    return CodeScale(quantity, first, last, f"Apple {quantity}, {accuracy}")
 
 
-def _quantity(tree: Element) -> Quantity | None:
-    native, kind = find(tree, f"{PIXELS}NativeFormat"), find(tree, f"{PIXELS}AuxiliaryImageType")
-    if native is not None:
-        if native.isdecimal() and len(native) <= 10:  # four characters, written as one number
-            native = int(native).to_bytes(5, "big")[1:].decode("latin-1")
-        return _FORMATS.get(native)
-    if (
-        find(tree, f"{PIXELS}AuxiliaryImageSubType") is not None
-    ):  # the mattes: they too are of type "depth"
+def _apple_quantity(tree: Element) -> Quantity | None:
+    """Whether Apple's XMP is about a map of depth or of disparity; None if about another picture.
+
+    The pixel format decides. Without one the type of the picture does, unless there is a subtype,
+    which only mattes have, although they, too, are of type "depth".
+    """
+    pixel_format = find_property(tree, f"{PIXEL_DATA}NativeFormat")
+    if pixel_format is not None:
+        if pixel_format.isdecimal() and len(pixel_format) <= 10:
+            # Four characters, written as one number. Ten digits may need a fifth byte.
+            pixel_format = int(pixel_format).to_bytes(5, "big")[1:].decode("latin-1")
+        return _QUANTITY_OF_PIXEL_FORMAT.get(pixel_format)
+
+    if find_property(tree, f"{PIXEL_DATA}AuxiliaryImageSubType") is not None:
         return None
-    return cast("Quantity", kind) if kind in ("depth", "disparity") else None
+    image_type = find_property(tree, f"{PIXEL_DATA}AuxiliaryImageType")
+    return cast("Quantity", image_type) if image_type in ("depth", "disparity") else None
 
+
+# --- Android
 
 GDEPTH = "{http://ns.google.com/photos/1.0/depthmap/}"
-MAP, ITEM = (f"{{http://ns.google.com/photos/dd/1.0/{name}/}}" for name in ("depthmap", "item"))
-_UNITS_M = {"m": 1.0, "meter": 1.0, "meters": 1.0, "mm": 0.001, "millimeters": 0.001}
-_PICTURE_START, _PICTURE_ENDS = (
-    re.compile(rb"\xff\xd8\xff|\x89PNG"),
-    (b"\xff\xd9", b"IEND\xaeB`\x82"),
-)
+DYNAMIC_DEPTH_MAP = "{http://ns.google.com/photos/dd/1.0/depthmap/}"
+DYNAMIC_DEPTH_ITEM = "{http://ns.google.com/photos/dd/1.0/item/}"
+_METRES_PER_UNIT = {"m": 1.0, "meter": 1.0, "meters": 1.0, "mm": 0.001, "millimeters": 0.001}
+_PICTURE_BEGIN = re.compile(rb"\xff\xd8\xff|\x89PNG")  # of a JPEG or a PNG
+_PICTURE_ENDS = (b"\xff\xd9", b"IEND\xaeB`\x82")  # of a JPEG, and of a PNG
 
 
-def _find_android(data: bytes, image: JpegImageFile) -> tuple[bytes, Scale] | None:
-    """Find the depth map's picture, which a JPEG's XMP holds or points to, and its scale; None without a depth map."""
-    main, extended = xmp_of(image), extended_xmp_of(image)
-    if not any(_is_about(packet, space) for space in (GDEPTH, MAP) for packet in (main, extended)):
+def _find_android(data: bytes, image: JpegImageFile) -> tuple[bytes, CodeScale] | None:
+    """The bytes of the depth map's picture and its scale; None without a depth map.
+
+    Dynamic Depth appends the picture to the photo `data`; the older GDepth holds it in XMP.
+    """
+    main = xmp_of(image)
+    extended = extended_xmp_of(image)
+    namespaces = (GDEPTH, DYNAMIC_DEPTH_MAP)
+    if not any(_mentions(main, name) or _mentions(extended, name) for name in namespaces):
         return None
     tree = parse_xmp(main)
     if extended:
         tree.append(parse_xmp(extended))
+
     for node in tree.iter():
-        uri = get(node, f"{MAP}DepthURI")
-        if uri is not None and (get(node, f"{MAP}ItemSemantic") or "Depth").lower() == "depth":
-            return _item(data, tree, uri), android_scale(node, MAP, "Dynamic Depth")
-    text = find(tree, f"{GDEPTH}Data")
+        address = own_property(node, f"{DYNAMIC_DEPTH_MAP}DepthURI")
+        content = own_property(node, f"{DYNAMIC_DEPTH_MAP}ItemSemantic") or "Depth"
+        if address is not None and content.lower() == "depth":
+            picture = _appended_picture(data, tree, address)
+            return picture, android_scale(node, DYNAMIC_DEPTH_MAP, "Dynamic Depth")
+
+    text = find_property(tree, f"{GDEPTH}Data")
     if text is None:  # editors may drop the extended XMP, and the depth with it, but leave the rest
         return None
-    return base64.b64decode(text + "=="), android_scale(tree, GDEPTH, "GDepth")
+    picture = base64.b64decode(text + "==")  # more padding than needed does no harm
+    return picture, android_scale(tree, GDEPTH, "GDepth")
 
 
-def android_scale(node: Element, space: str, layout: str) -> Scale:
-    """The scale of codes linear in depth or in inverse depth, from near to far; ValueError if it is unknown."""
-    near, far = number(node, f"{space}Near"), number(node, f"{space}Far")
+def android_scale(node: Element, namespace: str, layout: str) -> CodeScale:
+    """The scale of codes that are linear in depth or in inverse depth, from near to far.
+
+    ValueError if it is missing, impossible, or of a kind that is not read. `layout` is its name in
+    the report.
+    """
+    near = find_number(node, f"{namespace}Near")
+    far = find_number(node, f"{namespace}Far")
     if near is None or far is None:
         raise ValueError("Near or Far is missing")
-    unit, style, measure = (
-        (find(node, f"{space}{name}") or "").lower() for name in ("Units", "Format", "MeasureType")
-    )
-    # Pixel phones state diopters even for values that grow from near to far: the order counts, not the unit.
-    diopters = unit == "diopters" and near > far
-    known = unit in _UNITS_M or diopters
-    near, far = (value * _UNITS_M.get(unit, 1.0) for value in (near, far))
+    unit = (find_property(node, f"{namespace}Units") or "").lower()
+    style = (find_property(node, f"{namespace}Format") or "").lower()
+    measure = (find_property(node, f"{namespace}MeasureType") or "").lower()
     if style not in ("rangeinverse", "rangelinear") or measure == "opticray":
         raise ValueError(f"the format {style[:40]!r} and the measure {measure[:40]!r} are not read")
-    inverse = style == "rangeinverse"
-    if (
-        near == far
-        or min(near, far) < 0
-        or (near > far) != diopters
-        or (inverse and min(near, far) == 0)
-    ):
+
+    # Pixel phones state diopters even for values that grow from near to far: the order counts, not
+    # the unit.
+    in_diopters = unit == "diopters" and near > far
+    unit_known = unit in _METRES_PER_UNIT or in_diopters
+    near *= _METRES_PER_UNIT.get(unit, 1.0)
+    far *= _METRES_PER_UNIT.get(unit, 1.0)
+    is_inverse = style == "rangeinverse"
+    has_wrong_order = near == far or (near > far) != in_diopters
+    divides_by_zero = is_inverse and min(near, far) == 0
+    if has_wrong_order or min(near, far) < 0 or divides_by_zero:
         raise ValueError(f"nothing can lie between near {near:g} and far {far:g}")
-    if inverse:
-        near, far = 1 / near, 1 / far
-    source = f"{layout}, in {unit}" if known else f"{layout}, unit unknown"
-    return Scale("disparity" if inverse != diopters else "depth", near, far, source, known)
+
+    source = f"{layout}, in {unit}" if unit_known else f"{layout}, unit unknown"
+    if is_inverse:
+        near = 1 / near
+        far = 1 / far
+    # Diopters are inverse metres, and the inverse of an inverse is a depth.
+    quantity: Quantity = "disparity" if is_inverse != in_diopters else "depth"
+    return CodeScale(quantity, near, far, source, unit_known)
 
 
-def _item(data: bytes, tree: Element, uri: str) -> bytes:
-    """The picture of an item in the photo's directory; the items lie at the file's end, in the directory's order."""
-    entries = [
-        node
-        for node in tree.iter()
-        if (get(node, f"{ITEM}Mime") or get(node, f"{ITEM}Length")) is not None
-    ]
-    index = next((i for i, node in enumerate(entries) if get(node, f"{ITEM}DataURI") == uri), None)
-    if index is not None:
-        lengths = [int(number(node, f"{ITEM}Length") or 0) for node in entries[index:]]
-        last = len(data) - sum(
-            lengths
-        )  # the item begins here, or earlier if other bytes follow the items
-        for begin in reversed(
-            [found.start() for found in _PICTURE_START.finditer(data, 1) if found.start() <= last]
-        ):
-            if lengths[0] and (
-                begin == last or data.endswith(_PICTURE_ENDS, begin, begin + lengths[0])
-            ):
-                return data[begin : begin + lengths[0]]
-            if not lengths[0] and data.endswith(
-                (*_PICTURE_ENDS, b"\0"), 0, begin
-            ):  # it ends with the file
+def _appended_picture(data: bytes, tree: Element, address: str) -> bytes:
+    """The picture of the item `address` in the directory of the photo `data`.
+
+    The items lie at the file's end, in the order of the directory, which states their lengths. But
+    phones disagree: the item's own length may be missing, and other bytes may follow the items.
+    ValueError if no picture is found.
+    """
+    entries = [node for node in tree.iter() if _is_directory_entry(node)]
+    addresses = [own_property(node, f"{DYNAMIC_DEPTH_ITEM}DataURI") for node in entries]
+    if address in addresses:
+        lengths = [
+            int(find_number(node, f"{DYNAMIC_DEPTH_ITEM}Length") or 0)
+            for node in entries[addresses.index(address) :]
+        ]
+        length = lengths[0]
+        # The item begins here, or earlier if other bytes follow the items.
+        latest_begin = len(data) - sum(lengths)
+        begins = [match.start() for match in _PICTURE_BEGIN.finditer(data, 1)]
+        for begin in reversed(begins):
+            if begin > latest_begin:
+                continue
+            end = begin + length
+            if length and (begin == latest_begin or data.endswith(_PICTURE_ENDS, begin, end)):
+                return data[begin:end]
+            # Without a length, the item ends with the file, and the picture before it ends here.
+            if not length and data.endswith((*_PICTURE_ENDS, b"\0"), 0, begin):
                 return data[begin:]
     raise ValueError("the photo's directory of items does not lead to a picture")
 
 
-FULL_CODES = {"L": 255, "I;10": 1023, "I;12": 4095}
-ASSUMED = Scale(
+def _is_directory_entry(node: Element) -> bool:
+    """Whether an element of XMP describes an item: it has a type or a length."""
+    mime = own_property(node, f"{DYNAMIC_DEPTH_ITEM}Mime")
+    length = own_property(node, f"{DYNAMIC_DEPTH_ITEM}Length")
+    return bool(mime) or length is not None
+
+
+# --- HEIF
+
+MAX_CODE_OF_MODE = {"L": 255, "I;10": 1023, "I;12": 4095}
+ASSUMED_SCALE = CodeScale(  # usual in portraits
     "disparity", 0.1, 1.0, "HEIF depth of unknown range, assumed to be 1 to 10 m"
-)  # usual in portraits
+)
 
 
 def _find_in_heif(data: bytes) -> CodedDepth | None:
-    """The auxiliary depth image of the primary picture, in any of the representations of HEVC's depth information."""
+    """The depth map of a HEIF's primary picture; None if there is none.
+
+    Apple's XMP about its range takes precedence over HEVC's header.
+    """
     import pillow_heif
 
-    if (turn := turn_of_depth_item(data)) is None:
+    upright_steps = steps_of_depth_item(data)
+    if upright_steps is None:
         return None
-    image = pillow_heif.open_heif(io.BytesIO(data), hdr_to_16bit=False).info["depth_images"][0]
+    heif = pillow_heif.open_heif(io.BytesIO(data), hdr_to_16bit=False)
+    image = heif.info["depth_images"][0]
     width, height = image.size
     check_pixel_count(width, height, len(data), "the map")
-    codes, full = np.array(image), FULL_CODES[image.mode]
-    of_apple = next(
-        filter(None, map(apple_scale, xmp_packets(data))), None
-    )  # takes precedence over HEVC's range
-    return CodedDepth(codes, full, of_apple or hevc_scale(image.info.get("metadata") or {}), turn)
+    codes = np.array(image)
+    max_code = MAX_CODE_OF_MODE[image.mode]
+
+    for packet in xmp_packets(data):
+        scale = apple_scale(packet)
+        if scale is not None:
+            return CodedDepth(codes, max_code, scale, upright_steps)
+    scale = hevc_scale(image.info.get("metadata") or {})
+    return CodedDepth(codes, max_code, scale, upright_steps)
 
 
-def hevc_scale(stated: dict[str, Any]) -> Scale:
-    """The depth range that HEVC's depth representation information states, else the usual range of portraits."""
-    kind = stated.get("representation_type")
-    first, last = (
-        stated.get(name) for name in (("d_min", "d_max") if kind == 1 else ("z_near", "z_far"))
-    )
-    if kind == 3:
+# Values of HEVC's representation_type, which says what is linear in the codes; 0 is inverse depth.
+HEVC_DISPARITY = 1
+HEVC_DEPTH = 2
+HEVC_UNEVEN_DISPARITY = 3
+
+
+def hevc_scale(stated: dict[str, Any]) -> CodeScale:
+    """The scale that HEVC's depth representation information states, else 1 to 10 m.
+
+    ValueError for a range that is impossible, or steps of uneven size.
+    """
+    representation = stated.get("representation_type")
+    if representation == HEVC_UNEVEN_DISPARITY:
         raise ValueError("disparities with steps of uneven size are not read")
+    is_disparity = representation == HEVC_DISPARITY
+    first = stated.get("d_min" if is_disparity else "z_near")
+    last = stated.get("d_max" if is_disparity else "z_far")
     if first is None or last is None:
-        return ASSUMED
-    if kind == 1:
-        return Scale("disparity", first, last, "HEIF disparity")
+        return ASSUMED_SCALE
+    if is_disparity:
+        return CodeScale("disparity", first, last, "HEIF disparity")
     if not 0 < first < last:
         raise ValueError(f"nothing can lie between near {first:g} and far {last:g}")
-    if kind == 2:
-        return Scale("depth", first, last, "HEIF depth")
-    return Scale("disparity", 1 / last, 1 / first, "HEIF inverse depth")
+    if representation == HEVC_DEPTH:
+        return CodeScale("depth", first, last, "HEIF depth")
+    return CodeScale("disparity", 1 / last, 1 / first, "HEIF inverse depth")
