@@ -9,7 +9,7 @@ from pathlib import Path
 import spackle
 from spackle.core.trajectories import DepthRange
 from spackle.formats import save_png
-from spackle.video.frames import Stereo, default_ipd
+from spackle.video.stereo import Stereo, default_ipd
 
 
 def main(file: Path, out: Path) -> None:

@@ -26,8 +26,9 @@ from spackle.render.protocol import Rendering
 from spackle.residual.features import hole_mask
 from spackle.runtime.files import PathOrFile, write_atomic
 from spackle.video.encoding import check_video, save_video
-from spackle.video.frames import Fit, FrameMaker, Show, StereoLayout, VideoOptions, parse_size
-from spackle.views import DEFAULT_FRAME_COUNT, PathOptions
+from spackle.video.frames import FrameMaker
+from spackle.video.options import Fit, Show, StereoLayout, VideoOptions, parse_size
+from spackle.views import PATH_FRAMES, PathOptions
 
 DEFAULT_SIZE = (1280, 720)  # width and height for a file that stores no camera
 
@@ -252,7 +253,11 @@ class Scene:
             parts = [[self.base]] * compare + [[self.base, self.aux]]
             used = renderer or get_renderer()
             save_video(
-                (maker.render(parts, camera, used)[0] for camera in cameras), file, fps, loop
+                (maker.render(parts, camera, used)[0] for camera in cameras),
+                file,
+                fps,
+                loop,
+                name_in_messages=shown,
             )
             if not named:
                 write_atomic(target, file.read_bytes())

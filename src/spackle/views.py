@@ -33,7 +33,8 @@ from spackle.formats.camera_files import load_cameras, load_path
 from spackle.render.protocol import Renderer
 from spackle.residual.features import hole_area_ratio
 from spackle.runtime.errors import InputError, as_input_error, check_name
-from spackle.video.frames import FrameMaker, VideoOptions
+from spackle.video.frames import FrameMaker
+from spackle.video.options import VideoOptions
 
 DEFAULT_FRAME_COUNT = 60  # cameras of `Scene.path`; of a longer path, 60 to 119 frames are filled
 MAX_FRAME_COUNT = 10_000

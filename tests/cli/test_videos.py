@@ -19,7 +19,9 @@ from torch import Tensor
 import spackle
 from spackle.core.camera import Camera
 from spackle.render import CpuRenderer
-from spackle.video.frames import COMPARE_GAP_PX, Fit, Stereo, crop_camera_to_size
+from spackle.video.frames import COMPARE_GAP_PX, crop_camera_to_size
+from spackle.video.options import Fit
+from spackle.video.stereo import Stereo
 
 CPU = CpuRenderer()
 

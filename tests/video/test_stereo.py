@@ -21,7 +21,9 @@ from spackle.core.color import (
 )
 from spackle.core.trajectories import DepthRange, trajectory_cameras
 from spackle.render import CpuRenderer
-from spackle.video.frames import FrameMaker, Stereo, VideoOptions, anaglyph, default_ipd
+from spackle.video.frames import FrameMaker
+from spackle.video.options import VideoOptions
+from spackle.video.stereo import Stereo, anaglyph, default_ipd
 
 CAMERA = Camera.from_focal(60, 64, 48)
 

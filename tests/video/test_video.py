@@ -215,6 +215,17 @@ def test_what_a_format_does_not_know_is_refused(
     assert not os.listdir(tmp_path)
 
 
+def test_messages_name_the_file_as_the_caller_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("spackle.video.encoding.MAX_GIF_PIXELS", 1000)
+    path = tmp_path / "temporary.gif"
+    with pytest.raises(InputError, match=r"^video\.gif: at most"):
+        save_video(frames(2, 20, 30), path, name_in_messages="video.gif")
+    with pytest.raises(InputError, match=r"^video\.gif: frames a second"):
+        VideoWriter(path, fps=51, name_in_messages="video.gif")
+
+
 def test_depth_maps_are_read_back_by_other_programs(tmp_path: Path) -> None:
     depth = torch.linspace(0, 9, 37 * 53).reshape(37, 53)
     for suffix in (".npy", ".exr", ".png"):

@@ -218,7 +218,7 @@ def path_options(
         InputError: an option would have no effect, because --path or --cameras sets the views.
     """
     from spackle.core.trajectories import DEFAULT_OVERSCAN
-    from spackle.video.frames import VideoOptions, parse_size
+    from spackle.video.options import VideoOptions, parse_size
     from spackle.views import PathOptions
 
     useless: dict[str, object] = {

@@ -23,7 +23,7 @@ from spackle.runtime.errors import InputError
 from spackle.runtime.files import write_json
 from spackle.runtime.folders import atomic_files, results_folder
 from spackle.runtime.progress import Reporter
-from spackle.video.frames import VideoOptions
+from spackle.video.options import VideoOptions
 from spackle.views import choose_disparity
 
 RESULT_FILES = ("video.mp4", "report.json")

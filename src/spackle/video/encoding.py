@@ -1,4 +1,7 @@
-"""Write videos: the file's suffix selects H.264, VP9, GIF or animated WebP."""
+"""Write videos: the file's suffix selects H.264, VP9, GIF or animated WebP.
+
+`save_video` writes all frames, `VideoWriter` one after the other. `VIDEO_FORMATS` lists the formats.
+"""
 
 from __future__ import annotations
 
@@ -26,248 +29,425 @@ from spackle.core.color import to_uint8
 from spackle.runtime.errors import InputError
 from spackle.runtime.files import atomic_path, check_writable
 
-MAX_REPEATS = 1000  # for files that store every repetition
-MAX_GIF_PIXELS = 300 * 1536 * 1152  # of all frames, which take 4 bytes a pixel of memory
-MAX_PLAYS = 65_535  # GIF's and WebP's counters have 16 bits
-QUEUE = 4  # frames that may wait to be encoded; some frames are made at once, others take long
-BT709, LIMITED_RANGE = 1, 1  # FFmpeg's numbers, the same for primaries, transfer and matrix
+DEFAULT_FPS = 30
+
+# A file that stores every repetition plays at most this often.
+MAX_STORED_REPETITIONS = 1000
+# GIF's and WebP's counters of repetitions have 16 bits.
+MAX_PLAY_COUNT = 65_535
+PLAY_FOREVER = 0
+
+# Of all frames of a GIF together, which take 4 bytes of memory a pixel.
+MAX_GIF_PIXELS = 300 * 1536 * 1152
+
+# So many frames may wait to be encoded, because some frames are made at once and others take long.
+MAX_WAITING_FRAMES = 4
+
+# Frame rates are fractions with denominators up to this, such as 30000/1001 for 29.97.
+MAX_RATE_DENOMINATOR = 1001
+
+# FFmpeg's numbers; BT.709 has the same one as primaries, transfer function and matrix.
+BT709 = 1
+LIMITED_RANGE = 1
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class VideoFormat:
     """A video format's limits, and its settings for FFmpeg."""
 
     codec: str
     container: str
-    options: dict[str, str]  # of the encoder
-    container_options: dict[
-        str, str
-    ]  # put the index at the front, so that the video plays while it loads
-    pixels: str  # pixel format
-    counts: bool  # True: the file states how often it plays (0: for ever). False: the file stores every repetition
-    fps: tuple[float, float]  # lowest and highest rate
-    max_side: int
+    codec_options: dict[str, str] = dataclasses.field(default_factory=dict)
+    container_options: dict[str, str] = dataclasses.field(default_factory=dict)
+    pixel_format: str
+    # Whether the file states how often it plays; else it stores every repetition.
+    states_play_count: bool
+    min_fps: float
+    max_fps: float
+    max_side_px: int
 
     @property
-    def loop(self) -> int:
-        """How often a video plays by default; 0: for ever."""
-        return 0 if self.counts else 1
+    def default_play_count(self) -> int:
+        """How often a video plays by default: animations for ever, others once."""
+        return PLAY_FOREVER if self.states_play_count else 1
 
 
-# Without cpu-independent, x264 reads uninitialised memory, and equal frames give different bytes. The short search for
-# motion (me, subme) saves a third of the time; files grow by 8 %, and PSNR falls by 0.02 dB.
-_X264 = {"crf": "17", "preset": "veryfast", "x264-params": "cpu-independent=1:me=dia:subme=1"}
-# VP9 at crf 24 comes close to x264 at 17; cpu-used 4 costs little quality and saves most of the time.
-_VPX = {"crf": "24", "b": "0", "deadline": "good", "cpu-used": "4", "row-mt": "1"}
-_FAST_START = {"movflags": "+faststart"}
-H264 = VideoFormat("libx264", "mp4", _X264, _FAST_START, "yuv420p", False, (0.001, 1000), 16_384)
-_CUES_FIRST = {
-    "cues_to_front": "1",
-    "fflags": "+bitexact",
-}  # without bitexact the track number is random
-VP9 = VideoFormat("libvpx-vp9", "webm", _VPX, _CUES_FIRST, "yuv420p", False, (0.001, 1000), 16_384)
+H264 = VideoFormat(
+    codec="libx264",
+    container="mp4",
+    # Without cpu-independent, x264 reads uninitialised memory, and equal frames give different
+    # bytes. The short search for motion (me, subme) saves a third of the time; files grow by 8 %,
+    # and PSNR falls by 0.02 dB.
+    codec_options={
+        "crf": "17",
+        "preset": "veryfast",
+        "x264-params": "cpu-independent=1:me=dia:subme=1",
+    },
+    # The index comes first, so that the video plays while it loads.
+    container_options={"movflags": "+faststart"},
+    pixel_format="yuv420p",
+    states_play_count=False,
+    min_fps=0.001,
+    max_fps=1000,
+    max_side_px=16_384,
+)
+VP9 = VideoFormat(
+    codec="libvpx-vp9",
+    container="webm",
+    # VP9 at crf 24 comes close to x264 at 17; cpu-used 4 costs little quality and saves most of
+    # the time.
+    codec_options={"crf": "24", "b": "0", "deadline": "good", "cpu-used": "4", "row-mt": "1"},
+    # The index comes first, as above. Without bitexact the track number would be random.
+    container_options={"cues_to_front": "1", "fflags": "+bitexact"},
+    pixel_format="yuv420p",
+    states_play_count=False,
+    min_fps=0.001,
+    max_fps=1000,
+    max_side_px=16_384,
+)
 # Browsers show a frame of 10 ms or less for 100 ms; GIF counts time in 1/100 s, WebP in 1/1000 s.
-GIF = VideoFormat("gif", "gif", {}, {}, "pal8", True, (0.01, 50), 65_535)
-# libwebp converts to YUV better than FFmpeg. The encoder libwebp_anim would keep old blocks where little changes.
-WEBP = VideoFormat("libwebp", "webp", {"quality": "85"}, {}, "bgra", True, (0.01, 90), 16_383)
-VIDEO_FORMATS = {".mp4": H264, ".m4v": H264, ".mov": H264, ".webm": VP9, ".gif": GIF, ".webp": WEBP}
+GIF = VideoFormat(
+    codec="gif",
+    container="gif",
+    pixel_format="pal8",
+    states_play_count=True,
+    min_fps=0.01,
+    max_fps=50,
+    max_side_px=65_535,
+)
+# libwebp converts to YUV better than FFmpeg. The encoder libwebp_anim would keep old blocks where
+# little changes.
+WEBP = VideoFormat(
+    codec="libwebp",
+    container="webp",
+    codec_options={"quality": "85"},
+    pixel_format="bgra",
+    states_play_count=True,
+    min_fps=0.01,
+    max_fps=90,
+    max_side_px=16_383,
+)
+VIDEO_FORMATS = {
+    ".mp4": H264,
+    ".m4v": H264,
+    ".mov": H264,
+    ".webm": VP9,
+    ".gif": GIF,
+    ".webp": WEBP,
+}
+
+StrPath = str | os.PathLike[str]
 
 
-def check_video(path: str | os.PathLike[str], fps: float, loop: int | None = None) -> VideoFormat:
-    """Check a video's name, rate and loop count, and return its format.
+def check_video(path: StrPath, fps: float, loop: int | None = None) -> VideoFormat:
+    """Check a video's name, frame rate and loop count, and return its format.
+
+    Args:
+        path: the file's name, whose suffix selects the format.
+        fps: frames a second.
+        loop: how often the video plays, 0 for ever; None: the format's default.
 
     Raises:
         InputError: the suffix is unknown, or the format does not allow the rate or loop count.
     """
-    kind = VIDEO_FORMATS.get(Path(path).suffix.lower())
-    if kind is None:
-        raise InputError(f"{path}: not a name for a video: end it with {', '.join(VIDEO_FORMATS)}")
-    least, most = kind.fps
-    if not (math.isfinite(fps) and least <= fps <= most):
-        raise InputError(
-            f"{path}: frames a second must be a number from {least:g} to {most:g}, got {fps}"
-        )
-    least, most = (0, MAX_PLAYS) if kind.counts else (1, MAX_REPEATS)
-    if loop is not None and not least <= loop <= most:
-        hint = (
-            "0 is for ever"
-            if kind.counts
-            else "it holds every repetition; .gif and .webp can play for ever"
-        )
-        raise InputError(
-            f"{path}: a loop count of such a file must be from {least} to {most}, got {loop} ({hint})"
-        )
-    return kind
+    video_format = VIDEO_FORMATS.get(Path(path).suffix.lower())
+    if video_format is None:
+        suffixes = ", ".join(VIDEO_FORMATS)
+        raise InputError(f"{path}: not a name for a video: end it with {suffixes}")
+    check_fps(path, fps, video_format)
+    if loop is not None:
+        check_loop(path, loop, video_format)
+    return video_format
 
 
-W = TypeVar("W", bound="VideoWriter")
+def check_fps(subject: object, fps: float, video_format: VideoFormat) -> None:
+    """Raise an InputError, beginning with `subject`, unless the format allows the frame rate."""
+    low = video_format.min_fps
+    high = video_format.max_fps
+    if not (math.isfinite(fps) and low <= fps <= high):
+        limits = f"from {low:g} to {high:g}"
+        raise InputError(f"{subject}: frames a second must be a number {limits}, got {fps}")
+
+
+def check_loop(subject: object, loop: int, video_format: VideoFormat) -> None:
+    """Raise an InputError, beginning with `subject`, unless the format allows the loop count."""
+    if video_format.states_play_count:
+        low = PLAY_FOREVER
+        high = MAX_PLAY_COUNT
+        hint = "0 is for ever"
+    else:
+        low = 1
+        high = MAX_STORED_REPETITIONS
+        hint = "it holds every repetition; .gif and .webp can play for ever"
+    if not low <= loop <= high:
+        limits = f"from {low} to {high}"
+        problem = f"a loop count of such a file must be {limits}, got {loop}"
+        raise InputError(f"{subject}: {problem} ({hint})")
+
+
+Writer = TypeVar("Writer", bound="VideoWriter")
 
 
 class VideoWriter:
     """Writes frames to a video; the file appears if the `with` block ends without error.
 
-    .mp4, .m4v, .mov (H.264) and .webm (VP9) are yuv420p with BT.709 colours, and play while they load. An odd width or
-    height grows by one: the last column or row is repeated. .gif has one palette for all frames, which are in
-    memory until the end; .webp is lossy. A thread encodes frames while the caller makes the next ones.
+    .mp4, .m4v, .mov (H.264) and .webm (VP9) have yuv420p pixels with BT.709 colours, and play
+    while they load. An odd width or height grows by one: the last column or row is repeated. .gif
+    has one palette for all frames, which are in memory until the end; .webp is lossy. A thread
+    encodes frames while the caller makes the next ones.
     """
 
-    encoder: StreamEncoder
+    temporary_path: Path  # where the file is written, once the `with` block has begun
+    encoder: StreamEncoder  # once the first frame has come
 
     def __init__(
-        self, path: str | os.PathLike[str], fps: float = 30, loop: int | None = None
+        self,
+        path: StrPath,
+        fps: float = DEFAULT_FPS,
+        loop: int | None = None,
+        *,
+        name_in_messages: StrPath | None = None,
     ) -> None:
         """Prepare to write.
 
         Args:
-            path: file name; the suffix selects the format.
-            fps: frames a second; at most 50 for GIF and 90 for WebP, because browsers slow down faster animations.
-            loop: how often the video plays. GIF and WebP store this number; 0, their default, means for ever. Other
-                formats store every repetition; their default is 1.
+            path: the file's name; the suffix selects the format.
+            fps: frames a second; at most 50 for GIF and 90 for WebP, because browsers slow down
+                faster animations.
+            loop: how often the video plays. GIF and WebP store this number; 0, their default,
+                means for ever. Other formats store every repetition; their default is 1.
+            name_in_messages: what messages call the file, if `path` is a temporary name.
 
         Raises:
-            InputError: unknown suffix, unsuitable fps or loop, or a path that cannot be written.
+            InputError: the suffix is unknown, the format does not allow the rate or loop count,
+                or the file cannot be written.
         """
-        self._kind = check_video(path, fps, loop)
-        check_writable(path)
         self.path = path
-        self.frames = 0
-        self._plays = self._kind.loop if loop is None else loop
-        self._rate = max(
-            Fraction(fps).limit_denominator(1001), Fraction(1, 1001)
-        )  # 29.97 is 30000/1001
-        self._encoding = deque[Future[None]]()
-        self._stack = contextlib.ExitStack()
+        self.frame_count = 0
+        self._name = path if name_in_messages is None else name_in_messages
+        self._format = check_video(self._name, fps, loop)
+        self._play_count = self._format.default_play_count if loop is None else loop
+        # A very low rate would be rounded to 0.
+        rate = Fraction(fps).limit_denominator(MAX_RATE_DENOMINATOR)
+        self._rate = max(rate, Fraction(1, MAX_RATE_DENOMINATOR))
+        self._waiting = deque[Future[None]]()  # the frames that are being encoded
+        self._resources = contextlib.ExitStack()
+        check_writable(path)
 
-    def __enter__(self: W) -> W:
-        self.temporary_path = self._stack.enter_context(atomic_path(self.path))
+    def __enter__(self: Writer) -> Writer:
+        """Begin the file under a temporary name."""
+        self.temporary_path = self._resources.enter_context(atomic_path(self.path))
         return self
 
     def add(self, frame: Tensor) -> None:
-        """Append sRGB [H, W, 3] in 0..1, or uint8; all frames share one size."""
+        """Append a frame; returns before it is encoded.
+
+        Args:
+            frame: [H, W, 3] sRGB in 0..1, or uint8; all frames share one size. The caller may
+                reuse its memory afterwards.
+
+        Raises:
+            InputError: the frames are too large for the format.
+            ValueError: the frame has another shape.
+        """
         if frame.ndim != 3 or frame.shape[2] != 3 or 0 in frame.shape:
             raise ValueError(f"a video frame is [H, W, 3], got {tuple(frame.shape)}")
-        if self.frames == 0:
-            self.encoder = self.make_encoder(*frame.shape[:2])
-            self._stack.callback(self.encoder.close)
-            self._aside = self._stack.enter_context(ThreadPoolExecutor(1))
-            self._shape = frame.shape
+        if self.frame_count == 0:
+            self._start_encoding(frame)
         if frame.shape != self._shape:
-            raise ValueError(
-                f"frame {self.frames} is {tuple(frame.shape)}, the first one was {tuple(self._shape)}"
-            )
-        if self._kind is GIF and (self.frames + 1) * frame.shape.numel() // 3 > MAX_GIF_PIXELS:
-            most = f"at most {MAX_GIF_PIXELS // 10**6} megapixels in all frames of a GIF"
-            raise InputError(f"{self.path}: {most}: write an mp4, or fewer or smaller frames")
-        self._wait(QUEUE - 1)
-        pixels = np.array(
-            to_uint8(frame).numpy()
-        )  # a copy, because the caller may reuse a frame of bytes
-        self._encoding.append(self._aside.submit(self.encoder.add, pixels))
-        self.frames += 1
+            shapes = f"is {tuple(frame.shape)}, the first one was {tuple(self._shape)}"
+            raise ValueError(f"frame {self.frame_count} {shapes}")
+        self._check_gif_size(frame)
 
-    def _wait(self, most: int) -> None:
-        """Wait until at most `most` frames are left to encode; raises the encoder's error."""
-        while len(self._encoding) > most:
-            self._encoding.popleft().result()
+        self._wait_until(MAX_WAITING_FRAMES - 1)
+        # A copy, because the caller may reuse the memory of a frame of bytes.
+        pixels = np.array(to_uint8(frame).numpy())
+        self._waiting.append(self._thread.submit(self.encoder.add, pixels))
+        self.frame_count += 1
 
     def __exit__(
         self,
-        kind: type[BaseException] | None,
+        error_type: type[BaseException] | None,
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
+        """Finish the file and give it its name; after an error, remove it.
+
+        Raises:
+            ValueError: there are no frames.
+        """
         if error is not None:
-            self._stack.__exit__(kind, error, trace)  # closes the file and removes it
+            # Closes the file and removes it.
+            self._resources.__exit__(error_type, error, trace)
             return
-        with self._stack:  # closes the file and renames it, or removes it
-            if self.frames == 0:
-                raise ValueError(f"{self.path}: a video needs at least one frame")
-            self._wait(0)
+        # Closes the file, and renames it, or removes it if one of these steps fails.
+        with self._resources:
+            if self.frame_count == 0:
+                raise ValueError(f"{self._name}: a video needs at least one frame")
+            self._wait_until(0)
             self.encoder.finish()
 
     def make_encoder(self, height: int, width: int) -> StreamEncoder:
-        if max(height, width) > (largest := self._kind.max_side):
-            raise InputError(
-                f"{self.path}: {width}×{height} is too large for this format (at most {largest})"
-            )
+        """Open the encoder for frames of this size in pixels; a subclass may open another one.
+
+        Raises:
+            InputError: a side is too large for the format.
+        """
+        max_side = self._format.max_side_px
+        if max(height, width) > max_side:
+            problem = f"{width}×{height} is too large for this format (at most {max_side})"
+            raise InputError(f"{self._name}: {problem}")
         return StreamEncoder(
-            self._kind, self.temporary_path, width, height, self._rate, self._plays
+            self._format, self.temporary_path, width, height, self._rate, self._play_count
         )
+
+    def _start_encoding(self, first_frame: Tensor) -> None:
+        """Open the encoder for the size of the first frame [H, W, 3], and start its thread."""
+        height, width = first_frame.shape[:2]
+        self._shape = first_frame.shape
+        self.encoder = self.make_encoder(height, width)
+        # Resources are closed in reverse order: the thread ends before the encoder is closed.
+        self._resources.callback(self.encoder.close)
+        self._thread = self._resources.enter_context(ThreadPoolExecutor(1))
+
+    def _check_gif_size(self, frame: Tensor) -> None:
+        """Raise an InputError if a GIF's frames with this one [H, W, 3] take too much memory."""
+        frame_pixels = frame.shape[0] * frame.shape[1]
+        if self._format is GIF and (self.frame_count + 1) * frame_pixels > MAX_GIF_PIXELS:
+            megapixels = MAX_GIF_PIXELS // 10**6
+            problem = f"at most {megapixels} megapixels in all frames of a GIF"
+            raise InputError(f"{self._name}: {problem}: write an mp4, or fewer or smaller frames")
+
+    def _wait_until(self, max_waiting: int) -> None:
+        """Wait until at most `max_waiting` frames are left to encode; raises the encoder's error."""
+        while len(self._waiting) > max_waiting:
+            self._waiting.popleft().result()
 
 
 def save_video(
-    frames: Iterable[Tensor], path: str | os.PathLike[str], fps: float = 30, loop: int | None = None
+    frames: Iterable[Tensor],
+    path: StrPath,
+    fps: float = DEFAULT_FPS,
+    loop: int | None = None,
+    *,
+    name_in_messages: StrPath | None = None,
 ) -> None:
-    """Write frames, sRGB [H, W, 3] in 0..1, as a video; the arguments are those of `VideoWriter`.
+    """Write frames as a video; if `frames` is a generator that raises, no file is left.
 
-    If `frames` is a generator that raises, no file is left.
+    Args:
+        frames: [H, W, 3] sRGB in 0..1 each, all of one size.
+        path, fps, loop, name_in_messages: as in `VideoWriter`: the file's name, whose suffix
+            selects the format; frames a second; how often the video plays, 0 for ever; and what
+            messages call the file, if `path` is a temporary name.
+
+    Raises:
+        InputError: the format does not allow what is asked for, or the file cannot be written.
+        ValueError: there are no frames, or they differ in shape.
     """
-    with VideoWriter(path, fps, loop) as writer:
+    with VideoWriter(path, fps, loop, name_in_messages=name_in_messages) as writer:
         for frame in frames:
             writer.add(frame)
 
 
 class StreamEncoder:
-    """Encodes frames into a video that plays `plays` times."""
+    """Encodes frames into a video file, and repeats them as often as the video plays."""
 
     def __init__(
-        self, kind: VideoFormat, path: Path, width: int, height: int, rate: Fraction, plays: int
+        self,
+        video_format: VideoFormat,
+        path: Path,
+        width: int,
+        height: int,
+        rate: Fraction,
+        play_count: int,
     ) -> None:
-        self._kind, self._rate, self._count = kind, rate, 0
-        self._plays = 1 if kind.counts else plays
-        self._packets: list[
-            av.Packet[VideoStream]
-        ] = []  # compressed; kept only if they must be repeated
-        options = dict(kind.container_options)
-        if (
-            kind.counts
-        ):  # GIF counts repetitions, and -1 means none; WebP counts how often the video plays
-            loop = {0: 0, 1: -1}.get(plays, plays - 1) if kind is GIF else plays
-            options["loop"] = str(loop)
-        self.container = av.open(str(path), "w", format=kind.container, options=options)
-        stream = self.container.add_stream(kind.codec, rate=rate, options=kind.options)
+        """Open the file.
+
+        Args:
+            video_format: one of VIDEO_FORMATS.
+            path: the file, whose name may have any suffix.
+            width, height: size of the frames in pixels.
+            rate: frames a second.
+            play_count: how often the video plays; 0 for ever, where the format can state it.
+        """
+        self._format = video_format
+        self._rate = rate
+        self._frame_count = 0
+        # How often the compressed packets are written; they are kept only to be repeated.
+        self._stored_repetitions = 1 if video_format.states_play_count else play_count
+        self._kept_packets: list[av.Packet[VideoStream]] = []
+
+        container_options = dict(video_format.container_options)
+        if video_format.states_play_count:
+            container_options["loop"] = str(_loop_option(video_format, play_count))
+        self.container = av.open(
+            str(path), "w", format=video_format.container, options=container_options
+        )
+        stream = self.container.add_stream(
+            video_format.codec, rate=rate, options=video_format.codec_options
+        )
         assert isinstance(stream, VideoStream)
         self.stream = stream
+        self._set_stream_size(width, height)
         self._reformatter = VideoReformatter()
-        self._palette = PaletteFilter(width, height, 1 / rate) if kind is GIF else None
-        stream.width, stream.height, stream.pix_fmt = width, height, kind.pixels
-        if kind.pixels == "yuv420p":
-            stream.width, stream.height = width + width % 2, height + height % 2
-            context = stream.codec_context
+        self._palette: PaletteFilter | None = None
+        if video_format is GIF:
+            self._palette = PaletteFilter(width, height, 1 / rate)
+
+    def _set_stream_size(self, width: int, height: int) -> None:
+        """Set the stream's size in pixels and its pixel format; yuv420p needs even sides."""
+        self.stream.pix_fmt = self._format.pixel_format
+        self.stream.width = width
+        self.stream.height = height
+        if self._format.pixel_format == "yuv420p":
+            self.stream.width = width + width % 2
+            self.stream.height = height + height % 2
+            context = self.stream.codec_context
             context.color_range = LIMITED_RANGE
-            context.colorspace = context.color_primaries = context.color_trc = BT709
+            context.colorspace = BT709
+            context.color_primaries = BT709
+            context.color_trc = BT709
 
     def add(self, rgb: NDArray[np.uint8]) -> None:
-        """Append a frame [H, W, 3]."""
-        pixels, colors = self._kind.pixels, dict[str, Any]()
-        if pixels == "yuv420p":
-            rgb = np.pad(rgb, [(0, rgb.shape[0] % 2), (0, rgb.shape[1] % 2), (0, 0)], mode="edge")
-            colors = {"src_colorspace": "ITU709", "dst_colorspace": "ITU709"}
-            colors |= {"src_color_range": "JPEG", "dst_color_range": "MPEG"}
-        picture = av.VideoFrame.from_ndarray(rgb, format="rgb24")
-        picture = self._reformatter.reformat(
-            picture, format="bgra" if self._palette else pixels, **colors
-        )
-        picture.pts, picture.time_base = self._count, 1 / self._rate
-        self._encode(picture)
-        self._count += 1
+        """Append a frame [H, W, 3] of sRGB bytes."""
+        target_format = self._format.pixel_format
+        conversion: dict[str, Any] = {}
+        if target_format == "yuv420p":
+            # An odd side grows by one, which repeats the last row or column.
+            odd_rows = rgb.shape[0] % 2
+            odd_columns = rgb.shape[1] % 2
+            rgb = np.pad(rgb, [(0, odd_rows), (0, odd_columns), (0, 0)], mode="edge")
+            # BT.709 (ITU709), from full range (JPEG) to limited range (MPEG).
+            conversion = {
+                "src_colorspace": "ITU709",
+                "dst_colorspace": "ITU709",
+                "src_color_range": "JPEG",
+                "dst_color_range": "MPEG",
+            }
+        if self._palette is not None:
+            # The palette is found, and applied, by a filter that takes these pixels.
+            target_format = "bgra"
 
-    def _encode(self, picture: av.VideoFrame | None) -> None:
-        """Encode a frame; None: the video ends."""
-        for each in [picture] if self._palette is None else self._palette.push(picture):
-            self.write_packets(self.stream.encode(each))
+        picture = av.VideoFrame.from_ndarray(rgb, format="rgb24")
+        picture = self._reformatter.reformat(picture, format=target_format, **conversion)
+        picture.pts = self._frame_count
+        picture.time_base = 1 / self._rate
+        self._encode(picture)
+        self._frame_count += 1
 
     def finish(self) -> None:
-        """Write the packets that the encoder still holds, and repeat all packets as often as needed."""
+        """Write what the encoder still holds, repeat all packets as often as needed, and close."""
         self._encode(None)
-        for repetition in range(1, self._plays):
-            for packet in self._packets:
-                before, after = (
-                    self._ticks(packet, plays) for plays in (repetition - 1, repetition)
-                )
-                packet.pts, packet.dts = (
-                    None if t is None else t + after - before for t in (packet.pts, packet.dts)
-                )
+        for repetition in range(1, self._stored_repetitions):
+            for packet in self._kept_packets:
+                # The packets still have the times of the repetition before. Both offsets are
+                # rounded from exact times, so that errors do not add up.
+                old_offset = self._ticks(packet, repetition - 1)
+                new_offset = self._ticks(packet, repetition)
+                if packet.pts is not None:
+                    packet.pts += new_offset - old_offset
+                if packet.dts is not None:
+                    packet.dts += new_offset - old_offset
                 self.container.mux(packet)
         self.close()
 
@@ -276,42 +456,80 @@ class StreamEncoder:
         self.container.close()
 
     def write_packets(self, packets: list[av.Packet[VideoStream]]) -> None:
+        """Write compressed packets to the file, and keep them if they must be repeated."""
         for packet in packets:
             self.container.mux(packet)
-            if self._plays > 1:
-                self._packets.append(packet)
+            if self._stored_repetitions > 1:
+                self._kept_packets.append(packet)
 
-    def _ticks(self, packet: av.Packet[VideoStream], plays: int) -> int:
-        """Duration of `plays` repetitions, in the packet's time unit."""
+    def _encode(self, picture: av.VideoFrame | None) -> None:
+        """Encode a frame, and write the packets that are ready; None ends the video."""
+        if self._palette is None:
+            self.write_packets(self.stream.encode(picture))
+            return
+        for filtered_picture in self._palette.push(picture):
+            self.write_packets(self.stream.encode(filtered_picture))
+
+    def _ticks(self, packet: av.Packet[VideoStream], repetitions: int) -> int:
+        """Return the duration of some repetitions of the video, in the packet's unit of time."""
         assert packet.time_base is not None
-        return round(plays * self._count / self._rate / packet.time_base)
+        seconds = repetitions * self._frame_count / self._rate
+        return round(seconds / packet.time_base)
+
+
+def _loop_option(video_format: VideoFormat, play_count: int) -> int:
+    """Return FFmpeg's option `loop` for a GIF or WebP that plays `play_count` times, 0 for ever."""
+    # WebP counts how often the video plays, with 0 for ever.
+    if video_format is not GIF or play_count == PLAY_FOREVER:
+        return play_count
+    # GIF counts the repetitions after the first time, and -1 means none.
+    if play_count == 1:
+        return -1
+    return play_count - 1
 
 
 class PaletteFilter:
-    """Converts frames to one palette, so that no colour flickers, with error diffusion; keeps all frames in memory."""
+    """Converts frames to one palette with error diffusion; keeps all frames in memory.
 
-    def __init__(self, width: int, height: int, tick: Fraction) -> None:
+    With one palette for all frames, no colour flickers.
+    """
+
+    def __init__(self, width: int, height: int, frame_duration: Fraction) -> None:
+        """Connect FFmpeg's filters.
+
+        Args:
+            width, height: size of the frames in pixels.
+            frame_duration: in seconds.
+        """
+        # The frames go to palettegen, which gives one palette at the end, and to paletteuse,
+        # which waits for the palette.
         graph = av.filter.Graph()
         self._source = graph.add_buffer(
-            width=width, height=height, format=av.VideoFormat("bgra"), time_base=tick
+            width=width, height=height, format=av.VideoFormat("bgra"), time_base=frame_duration
         )
-        split, self._sink = graph.add("split"), graph.add("buffersink")
-        palette, use = graph.add("palettegen"), graph.add("paletteuse", "dither=sierra2_4a")
+        split = graph.add("split")
+        palette = graph.add("palettegen")
+        apply_palette = graph.add("paletteuse", "dither=sierra2_4a")
+        self._sink = graph.add("buffersink")
         self._source.link_to(split)
         split.link_to(palette, 0)
-        split.link_to(use, 1, 0)
-        palette.link_to(use, 0, 1)
-        use.link_to(self._sink)
+        split.link_to(apply_palette, 1, 0)
+        palette.link_to(apply_palette, 0, 1)
+        apply_palette.link_to(self._sink)
         graph.configure()
-        self._graph = graph
+        self._graph = graph  # must live as long as its filters
 
     def push(self, frame: av.VideoFrame | None) -> Iterator[av.VideoFrame | None]:
-        """Take a frame in "bgra" (None at the end), and yield the frames that are ready, at the end None."""
+        """Take a frame in "bgra", or None at the end, and yield the frames that are ready.
+
+        All frames are ready at the end; None comes after the last one.
+        """
         self._source.push(frame)
+        # The first of these errors means that no frame is ready, the second that none is left.
         with contextlib.suppress(av.BlockingIOError, av.EOFError):
             while True:
-                ready = self._sink.pull()
-                assert isinstance(ready, av.VideoFrame)
-                yield ready
+                ready_frame = self._sink.pull()
+                assert isinstance(ready_frame, av.VideoFrame)
+                yield ready_frame
         if frame is None:
             yield None

@@ -1,195 +1,42 @@
-"""Frames of a video: size, fit, one eye or two, colour or depth."""
+"""Frames of a video from renderings: size, margins, one eye or two, colour or depth.
+
+`FrameMaker` makes the frames; the functions below it change the size of views and images.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, cast, get_args
 
 import torch
 from torch import Tensor
-from torch.nn.functional import adaptive_avg_pool2d, interpolate
+from torch.nn.functional import interpolate
 
 from spackle.core.camera import Camera
-from spackle.core.color import DepthColorScale, linear_to_srgb, srgb_to_linear
+from spackle.core.color import DepthColorScale
 from spackle.core.gaussians import Gaussians
 from spackle.core.trajectories import DepthRange
 from spackle.render.protocol import Renderer, Rendering
-from spackle.runtime.errors import InputError, check_name
-from spackle.video.encoding import VIDEO_FORMATS, check_video
+from spackle.runtime.errors import InputError
+from spackle.video.options import MAX_VIDEO_SIDE_PX, VideoOptions
+from spackle.video.stereo import Stereo, default_ipd
 
-VideoFormatName = Literal["mp4", "webm", "gif", "webp"]
-Show = Literal["color", "depth"]
-StereoLayout = Literal["sbs", "sbs-half", "ou", "ou-half", "anaglyph"]
-PARALLAX = (
-    0.03  # difference in parallax between z_near and infinity, as a share of the image's width
-)
-Fit = Literal["pad", "blur", "crop"]
-PRESETS = {
-    "16:9": (1920, 1080),
-    "9:16": (1080, 1920),
-    "1:1": (1080, 1080),
-}  # names that --size accepts
-ALIKE = 0.01  # if aspect ratios differ by less, the view is cropped, which avoids thin margins
-BLURRED_PX, BLURRED_LIGHT = (
-    12,
-    0.6,
-)  # long side of the reduced image that makes blurred margins; margins' brightness
-COMPARE_GAP_PX = 6  # pixels between the two images of --compare
-MAX_VIDEO_SIDE = 8192
-MAX_IPD = 1e6
-DEFAULT_FPS = 30
-COVERED = 0.5  # a pixel of smaller opacity has no depth
+# If the aspect ratios of view and video differ by less, the view is cropped, because margins
+# would be very thin.
+SAME_ASPECT_TOLERANCE = 0.01
 
-# E. Dubois, "A projection method to generate anaglyph stereo images", ICASSP 2001, for red-cyan glasses, in linear
-# light. A row holds the weights of one eye's R, G and B in one channel of the result.
-DUBOIS_LEFT = ((0.456, 0.500, 0.176), (-0.040, -0.038, -0.016), (-0.015, -0.021, -0.005))
-DUBOIS_RIGHT = ((-0.043, -0.088, -0.002), (0.378, 0.734, -0.018), (-0.072, -0.113, 1.226))
+# Blurred margins are a copy of the image, reduced to this long side and enlarged again, and
+# darkened by this factor.
+BLURRED_MARGIN_LONG_SIDE_PX = 12
+BLURRED_MARGIN_BRIGHTNESS = 0.6
 
+# A white bar between the two images of a comparison.
+COMPARE_GAP_PX = 6
 
-@dataclasses.dataclass(frozen=True)
-class Stereo:
-    """The two eyes of a stereo view, and the layout of their images."""
-
-    layout: StereoLayout
-    ipd: float  # distance between the eyes, in the scene's unit (metres if the base is metric)
-    convergence: float  # depth without parallax, which appears at the screen; may be infinite
-
-    def eyes(self, camera: Camera) -> tuple[Camera, Camera]:
-        """Cameras of the left and the right eye: parallel, on both sides of `camera` along its x axis.
-
-        Principal points are shifted so that points at depth `convergence` have the same position in both images.
-        """
-        views = []
-        for right in (-self.ipd / 2, self.ipd / 2):
-            K, matrix = camera.K.clone(), camera.world_to_camera.clone()
-            matrix[0, 3] -= right
-            K[0, 2] += K[0, 0] * (right / self.convergence)
-            views.append(dataclasses.replace(camera, K=K, world_to_camera=matrix))
-        return views[0], views[1]
-
-    def pack(self, left: Tensor, right: Tensor) -> Tensor:
-        """Combine the eyes' images [H, W, 3], sRGB, in one frame.
-
-        In sbs [H, 2W, 3] the left eye is on the left, in ou [2H, W, 3] on top. The half variants squeeze the frame to
-        [H, W, 3] (an odd side grows by one). Anaglyph is for glasses with the red filter on the left eye.
-        """
-        if self.layout == "anaglyph":
-            return anaglyph(left, right)
-        side, half = self.layout.startswith("sbs"), self.layout.endswith("half")
-        pictures = [_halved(picture, side) if half else picture for picture in (left, right)]
-        return torch.cat(pictures, dim=1 if side else 0)
-
-    def frame_size(self, width: int, height: int) -> tuple[int, int]:
-        """Width and height of a frame, for eyes' images of this size."""
-        wide, tall = {"sbs": (2 * width, height), "ou": (width, 2 * height)}.get(
-            self.layout, (width, height)
-        )
-        if self.layout == "sbs-half":
-            wide += width % 2
-        elif self.layout == "ou-half":
-            tall += height % 2
-        return wide, tall
-
-
-def default_ipd(camera: Camera, depth_range: DepthRange) -> float:
-    """The distance between the eyes that gives a parallax of 3 % of the image's width between z_near and infinity."""
-    return PARALLAX * camera.width / camera.focal[0] * depth_range.near
-
-
-def anaglyph(left: Tensor, right: Tensor) -> Tensor:
-    """Mix two sRGB images [..., 3] to a red-cyan image, in linear light."""
-    one, other = srgb_to_linear(left), srgb_to_linear(right)
-    mixed = one @ one.new_tensor(DUBOIS_LEFT).T + other @ other.new_tensor(DUBOIS_RIGHT).T
-    return linear_to_srgb(mixed)
-
-
-def _halved(picture: Tensor, side: bool) -> Tensor:
-    """Halve an image's width (`side`) or its height (not `side`), in linear light."""
-    height, width = picture.shape[:2]
-    size = (height, (width + 1) // 2) if side else ((height + 1) // 2, width)
-    light = srgb_to_linear(picture).permute(2, 0, 1)[None]
-    return linear_to_srgb(adaptive_avg_pool2d(light, size))[0].permute(1, 2, 0)
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class VideoOptions:
-    """Options that all videos share."""
-
-    format: VideoFormatName | None = None  # None: mp4
-    fps: float | None = None  # None: 30; must be None for a clip, whose frame rate is kept
-    loop: int | None = None  # None: gif and webp repeat for ever, mp4 and webm play once
-    size: tuple[int, int] | None = None  # width and height of one eye's image; None: the photo's
-    fit: Fit = (
-        "pad"  # for a view of another aspect ratio: black margins, blurred margins, or cropping
-    )
-    show: Show = "color"
-    stereo: StereoLayout | None = None
-    ipd: float | None = None  # None: `default_ipd`
-    convergence: float | None = None  # None: the focus depth
-    compare: bool = (
-        False  # whether each frame shows the base on the left and the completed scene on the right
-    )
-
-    @property
-    def suffix(self) -> str:
-        """The suffix of a file name."""
-        return f".{self.format or 'mp4'}"
-
-    @property
-    def frames_per_second(self) -> float:
-        """Frames a second."""
-        return DEFAULT_FPS if self.fps is None else self.fps
-
-    @property
-    def plays(self) -> int:
-        """How often the video is shown; 0: for ever."""
-        return VIDEO_FORMATS[self.suffix].loop if self.loop is None else self.loop
-
-    def check(self) -> None:
-        """Raise an InputError for unknown names, and for options that contradict each other."""
-        check_name("fit", self.fit, get_args(Fit))
-        check_name("show", self.show, get_args(Show))
-        if self.stereo is not None:
-            check_name("stereo", self.stereo, get_args(StereoLayout))
-        for option, loop in (
-            (f"--fps {self.frames_per_second:g}", None),
-            (f"--loop {self.loop}", self.loop),
-        ):
-            try:
-                check_video(name := f"video{self.suffix}", self.frames_per_second, loop)
-            except InputError as error:
-                raise InputError(f"{option}: {str(error).removeprefix(f'{name}: ')}") from error
-        for option, value in {"--ipd": self.ipd, "--convergence": self.convergence}.items():
-            if value is None:
-                continue
-            if self.stereo is None:
-                raise InputError(
-                    f"{option} {value:g} needs --stereo: add --stereo, or leave {option} out"
-                )
-            if not value > 0 or (option == "--ipd" and value > MAX_IPD):
-                raise InputError(f"{option} must be a positive number, got {value:g}")
-        if self.compare and self.stereo is not None:
-            raise InputError(
-                f"--compare and --stereo {self.stereo} are given together: leave one of them out"
-            )
-        if self.show == "depth" and self.stereo == "anaglyph":
-            raise InputError(
-                "--show depth: an anaglyph would mix the colours that stand for depth: give --stereo sbs or ou"
-            )
-
-    def for_file(self, file: Path) -> VideoOptions:
-        """Set the format by a file's suffix; InputError if --format contradicts the suffix."""
-        suffix = file.suffix.lower()
-        meant = "mp4" if suffix in (".m4v", ".mov") else cast(VideoFormatName, suffix[1:])
-        if self.format not in (None, meant):
-            raise InputError(
-                f"--format {self.format}: the name {file} means {meant}: leave one of them out"
-            )
-        return dataclasses.replace(self, format=meant)
+# A pixel of smaller opacity is shown without a depth.
+MIN_ALPHA_WITH_DEPTH = 0.5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -197,30 +44,40 @@ class FrameMaker:
     """Makes frames of a video from renderings."""
 
     options: VideoOptions
-    stereo: Stereo | None = None
-    depth: DepthColorScale | None = None
+    stereo: Stereo | None = None  # None: one eye
+    depth: DepthColorScale | None = None  # None: colours are shown
 
     @staticmethod
     def of(
         options: VideoOptions, gaussians: Gaussians, cameras: Sequence[Camera], source: Path
     ) -> FrameMaker:
-        """Derive missing options from the scene and the cameras; InputError, naming `source`, for impossible videos."""
+        """Derive from the scene and the cameras what the options leave open.
+
+        Args:
+            options: what the video looks like.
+            gaussians: the scene.
+            cameras: the views of all frames, of one size.
+            source: the file that messages name.
+
+        Raises:
+            InputError: the video is impossible, or its frames are too large.
+        """
+        depth_scale = None
         try:
-            stereo = _stereo(options, gaussians, cameras[0])
-            depth = DepthColorScale.over(gaussians, cameras) if options.show == "depth" else None
+            stereo = _derive_stereo(options, gaussians, cameras[0])
+            if options.show == "depth":
+                depth_scale = DepthColorScale.over(gaussians, cameras)
         except ValueError as error:
             raise InputError(f"{source}: this video is impossible: {error}") from error
-        maker = FrameMaker(options, stereo, depth)
+
+        maker = FrameMaker(options, stereo, depth_scale)
         width, height = maker.frame_size(maker.resized_camera(cameras[0]))
-        if max(width, height) > MAX_VIDEO_SIDE:
-            hint = (
-                "give a smaller --size"
-                if stereo is None
-                else "give a smaller --size, or --stereo sbs-half"
-            )
-            raise InputError(
-                f"{source}: frames of {width}×{height} have more than {MAX_VIDEO_SIDE} pixels a side: {hint}"
-            )
+        if max(width, height) > MAX_VIDEO_SIDE_PX:
+            problem = f"frames of {width}×{height} have more than {MAX_VIDEO_SIDE_PX} pixels a side"
+            advice = "give a smaller `size`"
+            if stereo is not None:
+                advice += ", or `stereo` sbs-half"
+            raise InputError(f"{source}: {problem}: {advice}")
         return maker
 
     @property
@@ -229,70 +86,117 @@ class FrameMaker:
         return self.stereo is None and self.depth is None and self.options.size is None
 
     @property
-    def canvas(self) -> tuple[int, int] | None:
-        """Width and height of one eye's image, both even, if --size is given; else None."""
-        size = self.options.size
-        return size and (size[0] + size[0] % 2, size[1] + size[1] % 2)
+    def image_size(self) -> tuple[int, int] | None:
+        """Width and height in pixels of one eye's image with its margins, both made even.
+
+        None if the options give no size.
+        """
+        if self.options.size is None:
+            return None
+        width, height = self.options.size
+        return width + width % 2, height + height % 2
 
     def eyes(self, camera: Camera) -> tuple[Camera, ...]:
-        """The camera itself, or the cameras of a stereo view's left and right eye."""
-        return (camera,) if self.stereo is None else self.stereo.eyes(camera)
+        """Return the camera itself, or those of a stereo view's left and right eye."""
+        if self.stereo is None:
+            return (camera,)
+        return self.stereo.eyes(camera)
 
     def render(
         self, parts: Sequence[list[Gaussians]], camera: Camera, renderer: Renderer
     ) -> tuple[Tensor, list[Rendering]]:
-        """A frame, and renderings of each of `parts` (base and scene with `compare`, else the scene) by each eye."""
+        """Render a frame.
+
+        Args:
+            parts: the scene as one list of sets of Gaussians; for a comparison two lists, without
+                and with the Gaussians that fill holes.
+            camera: the view.
+            renderer: renders each list of `parts` for each eye.
+
+        Returns:
+            The frame [H, W, 3] sRGB, and the renderings from which it was made.
+        """
         with torch.no_grad():
             eyes = [self.resized_camera(eye) for eye in self.eyes(camera)]
-            views = [renderer.render(part, eye) for part in parts for eye in eyes]
-            return self.frame(views), views
+            renderings = [renderer.render(part, eye) for part in parts for eye in eyes]
+            return self.frame(renderings), renderings
 
-    def frame(self, views: Sequence[Rendering]) -> Tensor:
-        """One sRGB frame [H, W, 3] from renderings of `eyes`; with `compare`, from renderings of base and scene."""
-        pictures = [
-            v.rgb if self.depth is None else self.depth(v.depth, v.alpha >= COVERED) for v in views
-        ]
-        if self.canvas is not None:
-            pictures = [
-                with_margins(picture, *self.canvas, self.options.fit == "blur")
-                for picture in pictures
-            ]
+    def frame(self, renderings: Sequence[Rendering]) -> Tensor:
+        """Return one frame [H, W, 3] sRGB.
+
+        Args:
+            renderings: of each of `eyes`; for a comparison, of the scene without and with filled
+                holes.
+        """
+        pictures = [self._picture(rendering) for rendering in renderings]
+        if self.image_size is not None:
+            width, height = self.image_size
+            is_blurred = self.options.fit == "blur"
+            pictures = [with_margins(image, width, height, is_blurred) for image in pictures]
+
         if self.options.compare:
             left, right = pictures
-            return torch.cat([left, left.new_ones(len(left), COMPARE_GAP_PX, 3), right], dim=1)
-        return pictures[0] if self.stereo is None else self.stereo.pack(*pictures)
+            white_bar = left.new_ones(len(left), COMPARE_GAP_PX, 3)
+            return torch.cat([left, white_bar, right], dim=1)
+        if self.stereo is None:
+            return pictures[0]
+        left, right = pictures
+        return self.stereo.pack(left, right)
+
+    def _picture(self, rendering: Rendering) -> Tensor:
+        """Return what the video shows of a view, colours or depth, as [H, W, 3] sRGB."""
+        if self.depth is None:
+            return rendering.rgb
+        has_depth = rendering.alpha >= MIN_ALPHA_WITH_DEPTH
+        return self.depth(rendering.depth, has_depth)
 
     def resized_camera(self, camera: Camera) -> Camera:
-        """The camera at the size of one eye's image without margins."""
-        if self.canvas is None:
+        """Return the camera at the size of one eye's image without margins."""
+        if self.image_size is None:
             return camera
-        width, height = self.canvas
-        across, down = width / camera.width, height / camera.height
-        if self.options.fit == "crop" or abs(across / down - 1) < ALIKE:
+        width, height = self.image_size
+        scale_across = width / camera.width
+        scale_down = height / camera.height
+        is_same_aspect = abs(scale_across / scale_down - 1) < SAME_ASPECT_TOLERANCE
+        if self.options.fit == "crop" or is_same_aspect:
             return crop_camera_to_size(camera, width, height)
-        scale = min(across, down)
-        return camera.resized(
-            *(max(1, round(scale * side)) for side in (camera.width, camera.height))
-        )
+
+        scale = min(scale_across, scale_down)
+        inner_width = max(1, round(scale * camera.width))
+        inner_height = max(1, round(scale * camera.height))
+        return camera.resized(inner_width, inner_height)
 
     def frame_size(self, camera: Camera) -> tuple[int, int]:
-        """Width and height of a frame for a view of the camera's size."""
-        width, height = self.canvas or (camera.width, camera.height)
+        """Return width and height of a frame in pixels, for a view of the camera's size."""
+        width = camera.width
+        height = camera.height
+        if self.image_size is not None:
+            width, height = self.image_size
         if self.options.compare:
             return 2 * width + COMPARE_GAP_PX, height
-        return (width, height) if self.stereo is None else self.stereo.frame_size(width, height)
+        if self.stereo is not None:
+            return self.stereo.frame_size(width, height)
+        return width, height
 
     def report_entry(self, name: str, camera: Camera, frames: int) -> dict[str, object]:
-        """The report's entry for the video."""
+        """Return the entry for the video in report.json.
+
+        Args:
+            name: the video's file name.
+            camera: a view of the video.
+            frames: how many frames the video has.
+        """
         width, height = self.frame_size(self.resized_camera(camera))
-        stereo = None if self.stereo is None else dataclasses.asdict(self.stereo)
-        if stereo is not None and math.isinf(stereo["convergence"]):
-            stereo["convergence"] = None  # JSON has no infinity
+        stereo = None
+        if self.stereo is not None:
+            stereo = dataclasses.asdict(self.stereo)
+            if math.isinf(self.stereo.convergence):
+                stereo["convergence"] = None  # JSON has no infinity
         return {
             "file": name,
             "frames": frames,
             "fps": self.options.frames_per_second,
-            "plays": self.options.plays,
+            "plays": self.options.play_count,
             "width": width,
             "height": height,
             "show": self.options.show,
@@ -300,72 +204,100 @@ class FrameMaker:
         }
 
 
-def _stereo(options: VideoOptions, gaussians: Gaussians, camera: Camera) -> Stereo | None:
+def _derive_stereo(options: VideoOptions, gaussians: Gaussians, camera: Camera) -> Stereo | None:
+    """Return the eyes of a stereo video, with defaults from the scene's depth.
+
+    Args:
+        options: what the video looks like.
+        gaussians: the scene.
+        camera: the first view.
+
+    Raises:
+        ValueError: the eyes are too far apart: a point at the screen is in no image.
+    """
     if options.stereo is None:
         return None
-    ipd, convergence = options.ipd, options.convergence
+    ipd = options.ipd
+    convergence = options.convergence
     if ipd is None or convergence is None:
         depths = DepthRange.of(gaussians)
-        ipd = default_ipd(camera, depths) if ipd is None else ipd
-        convergence = depths.focus if convergence is None else convergence
-    if camera.focal[0] * ipd / convergence > camera.width:
-        raise ValueError(
-            f"eyes {ipd:g} apart, screen at {convergence:g}: give a smaller --ipd or larger --convergence"
-        )
+        if ipd is None:
+            ipd = default_ipd(camera, depths)
+        if convergence is None:
+            convergence = depths.focus
+
+    parallax_px = camera.focal[0] * ipd / convergence
+    if parallax_px > camera.width:
+        eyes = f"eyes {ipd:g} apart, screen at {convergence:g}"
+        raise ValueError(f"{eyes}: give a smaller `ipd` or larger `convergence`")
     return Stereo(options.stereo, ipd, convergence)
 
 
 def crop_camera_to_size(camera: Camera, width: int, height: int) -> Camera:
-    """The view at another size, scaled without distortion; two sides are cropped if the aspect ratio differs."""
+    """Return the view at another size in pixels, filled without distortion.
+
+    The view is scaled so that it covers the new size; if the aspect ratio differs, two sides are
+    cropped equally.
+    """
     scale = max(width / camera.width, height / camera.height)
     K = camera.zoomed(scale).K
-    center = torch.tensor([camera.width / 2, camera.height / 2])
-    K[:2, 2] = torch.tensor([width / 2, height / 2]) + scale * (camera.K[:2, 2] - center)
+    # The principal point keeps its scaled distance from the image's centre.
+    old_center = torch.tensor([camera.width / 2, camera.height / 2])
+    new_center = torch.tensor([width / 2, height / 2])
+    K[:2, 2] = new_center + scale * (camera.K[:2, 2] - old_center)
     return dataclasses.replace(camera, K=K, width=width, height=height)
 
 
 def with_margins(picture: Tensor, width: int, height: int, blurred: bool) -> Tensor:
-    """Centre an image [h, w, 3] in another [height, width, 3]; margins are black, or a blurred copy of the image."""
-    h, w = picture.shape[:2]
-    if (w, h) == (width, height):
+    """Put an image [h, w, 3] in the middle of another one.
+
+    Args:
+        picture: sRGB, at most as large as the result.
+        width, height: size of the result in pixels.
+        blurred: whether the margins show a blurred copy of the image; else they are black.
+
+    Returns:
+        [height, width, 3] sRGB.
+    """
+    inner_height, inner_width = picture.shape[:2]
+    if (inner_width, inner_height) == (width, height):
         return picture
     canvas = picture.new_zeros(height, width, 3)
     if blurred:
-        scale = max(width / w, height / h)
-        rows, columns = (
-            min(side, max(1, round(n / scale))) for side, n in ((h, height), (w, width))
-        )
-        top, left = (h - rows) // 2, (w - columns) // 2
-        seen = picture[top : top + rows, left : left + columns].permute(2, 0, 1)[None]
-        small = [max(1, round(BLURRED_PX * side / max(rows, columns))) for side in (rows, columns)]
-        coarse = interpolate(
-            interpolate(seen, size=small, mode="area"), size=(height, width), mode="bicubic"
-        )
-        canvas = BLURRED_LIGHT * coarse[0].clamp(0, 1).permute(1, 2, 0)
-    top, left = (height - h) // 2, (width - w) // 2
-    canvas[top : top + h, left : left + w] = picture
+        canvas = _blurred_background(picture, width, height)
+    top = (height - inner_height) // 2
+    left = (width - inner_width) // 2
+    canvas[top : top + inner_height, left : left + inner_width] = picture
     return canvas
 
 
+def _blurred_background(picture: Tensor, width: int, height: int) -> Tensor:
+    """Return the middle of an image [h, w, 3], enlarged to [height, width, 3], blurred and dark."""
+    inner_height, inner_width = picture.shape[:2]
+    # The part of the image that has the aspect ratio of the result.
+    scale = max(width / inner_width, height / inner_height)
+    row_count = min(inner_height, max(1, round(height / scale)))
+    column_count = min(inner_width, max(1, round(width / scale)))
+    top = (inner_height - row_count) // 2
+    left = (inner_width - column_count) // 2
+    middle = picture[top : top + row_count, left : left + column_count]
+    middle = middle.permute(2, 0, 1)[None]  # [1, 3, row_count, column_count]
+
+    # Reducing the image to a few pixels and enlarging it again blurs it.
+    long_side = max(row_count, column_count)
+    small_height = max(1, round(BLURRED_MARGIN_LONG_SIDE_PX * row_count / long_side))
+    small_width = max(1, round(BLURRED_MARGIN_LONG_SIDE_PX * column_count / long_side))
+    small = interpolate(middle, size=(small_height, small_width), mode="area")
+    blurred = interpolate(small, size=(height, width), mode="bicubic")
+    # Bicubic interpolation may overshoot 0..1.
+    return BLURRED_MARGIN_BRIGHTNESS * blurred[0].clamp(0, 1).permute(1, 2, 0)
+
+
 def video_problem(cameras: Sequence[Camera]) -> str | None:
-    """The reason why these views cannot be the frames of one video, or None."""
+    """Return the reason why these views cannot be the frames of one video; None if they can."""
     sizes = {(camera.width, camera.height) for camera in cameras}
     if len(sizes) > 1:
         return "the frames differ in size"
-    if max(max(size) for size in sizes) > MAX_VIDEO_SIDE:
-        return f"the frames have more than {MAX_VIDEO_SIDE} pixels a side"
+    if max(max(size) for size in sizes) > MAX_VIDEO_SIDE_PX:
+        return f"the frames have more than {MAX_VIDEO_SIDE_PX} pixels a side"
     return None
-
-
-def parse_size(text: str) -> tuple[int, int]:
-    """Parse WxH, or a name in `PRESETS`, as (width, height); InputError for anything else."""
-    if text in PRESETS:
-        return PRESETS[text]
-    match = re.fullmatch(r"([0-9]{1,5})[xX×]([0-9]{1,5})", text)
-    width, height = (int(side) for side in match.groups()) if match else (0, 0)
-    if not (1 <= width <= MAX_VIDEO_SIDE and 1 <= height <= MAX_VIDEO_SIDE):
-        some = ", ".join(["1280x720", *PRESETS])
-        raise InputError(
-            f"--size {text}: give width and height up to {MAX_VIDEO_SIDE}, such as {some}"
-        )
-    return width, height
