@@ -28,7 +28,7 @@ from spackle.runtime.files import PathOrFile, write_atomic
 from spackle.video.encoding import check_video, save_video
 from spackle.video.frames import FrameMaker
 from spackle.video.options import Fit, Show, StereoLayout, VideoOptions, parse_size
-from spackle.views import PATH_FRAMES, PathOptions
+from spackle.views import DEFAULT_FRAME_COUNT, PathOptions
 
 DEFAULT_SIZE = (1280, 720)  # width and height for a file that stores no camera
 

@@ -31,7 +31,7 @@ from spackle.runtime.progress import Progress, Reporter
 from spackle.runtime.task_process import SendEvent
 from spackle.scene import Scene
 from spackle.video.encoding import DEFAULT_FPS
-from spackle.views import MAX_FRAMES, SECONDS, PathOptions
+from spackle.views import DEFAULT_VIDEO_SECONDS, MAX_FRAME_COUNT, PathOptions
 from spackle.web.jobs import Job
 
 Download = Literal["scene.ply", "scene.spz", "scene.sog", "scene.glb", "scene.html", "report.json"]
