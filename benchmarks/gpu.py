@@ -39,10 +39,10 @@ from spackle.paper.training.recipe import LossRecipe
 from spackle.paper.training.residual import complete_samples
 from spackle.paper.training.samples import Sample
 from spackle.render import CpuRenderer
-from spackle.render.cpu import project, wanted_tiles
-from spackle.render.gsplat_backend import GsplatRenderer, Material, load_gsplat
+from spackle.render.drawing import project, tiles_to_draw
+from spackle.render.gsplat_backend import DeviceGaussians, GsplatRenderer, load_gsplat
 from spackle.render.project import KernelCamera
-from spackle.render.protocol import NEAR_PLANE, TILE, Rendering
+from spackle.render.protocol import NEAR_PLANE, TILE_PX, Rendering
 from spackle.residual import hole_area_ratio
 from spackle.residual.architectures import UNet, shipped_network
 from spackle.runtime.device import Precision, hardware_facts, package_versions
@@ -161,7 +161,7 @@ def against_cpu(options: argparse.Namespace) -> Iterator[str]:
     for camera in cameras:
         one, other = gpu.render(scene, camera), CpuRenderer().render(scene, camera)
         apart = (one.rgb - other.rgb).abs().amax(-1)
-        material, view = Material.of(scene, CUDA), camera.to(CUDA)
+        material, view = DeviceGaussians.of(scene, CUDA), camera.to(CUDA)
         radii = gpu._gsplat.fully_fused_projection(
             material.means, material.covariances, None, None, view.world_to_camera[None], view.K[None],
             camera.width, camera.height, eps2d=0.0, near_plane=NEAR_PLANE, opacities=material.opacities,
@@ -169,7 +169,7 @@ def against_cpu(options: argparse.Namespace) -> Iterator[str]:
         here = (radii > 0).all(-1).cpu()
         lens = KernelCamera.of(camera, 0.0)
         there = torch.from_numpy(
-            project([scene], lens, wanted_tiles(lens, None))[0].boxes[: len(scene), 1] > 0
+            project([scene], lens, tiles_to_draw(lens, None))[0].boxes[: len(scene), 1] > 0
         )
         yield (
             f"{len(scene):,} Gaussians: {float((apart < CLOSE).float().mean()):.4%} of pixels within {CLOSE:g}, worst "
@@ -230,12 +230,12 @@ def speed(options: argparse.Namespace) -> Iterator[str]:
     gpu, (scene, cameras) = renderer(), views()
     there, eyes = scene.to(CUDA), itertools.cycle(cameras)
     few = Gaussians(*(t[:30_000].contiguous() for t in there.tensors))
-    tiles = torch.zeros(SIDE // TILE, SIDE // TILE, dtype=torch.bool, device=CUDA)
+    tiles = torch.zeros(SIDE // TILE_PX, SIDE // TILE_PX, dtype=torch.bool, device=CUDA)
     tiles[:24, :24] = True
 
     def again(_: object) -> None:  # as in completion
         view: Rendering = gpu.render(there, cameras[0])
-        gpu.render([there, few], cameras[0], tiles=tiles, onto=view)
+        gpu.render([there, few], cameras[0], tiles=tiles, previous_rendering=view)
 
     yield from rows(
         {

@@ -14,9 +14,10 @@ from torch import Tensor
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
 from spackle.paper.evaluation.bench import EndStage
-from spackle.render.cpu import BLEND_GRAIN, PROJECT_GRAIN
-from spackle.render.project import KernelCamera, covariance
-from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, NEAR_PLANE, TILE, TRANSMITTANCE_STOP
+from spackle.render.covariance import projected_covariance
+from spackle.render.drawing import GAUSSIANS_PER_CHUNK, TILES_PER_CHUNK
+from spackle.render.project import KernelCamera
+from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, NEAR_PLANE, TILE_PX, TRANSMITTANCE_STOP
 from spackle.runtime.device import parallel_for_chunks
 
 Array = npt.NDArray[Any]
@@ -30,7 +31,9 @@ def naive_render(scene: Gaussians, camera: Camera, lap: EndStage = lambda name: 
     tensors, view = tuple(t.numpy() for t in scene.tensors), KernelCamera.of(camera, 0.0)
     splats, boxes = np.empty((len(scene), 6), np.float32), np.zeros((len(scene), 4), np.int32)
     parallel_for_chunks(
-        lambda a, b: naive_project(a, b, tensors, view, splats, boxes), len(scene), PROJECT_GRAIN
+        lambda a, b: naive_project(a, b, tensors, view, splats, boxes),
+        len(scene),
+        GAUSSIANS_PER_CHUNK,
     )
     lap("project")
     order = np.argsort(splats[:, 2], kind="stable")
@@ -41,7 +44,7 @@ def naive_render(scene: Gaussians, camera: Camera, lap: EndStage = lambda name: 
     parallel_for_chunks(
         lambda a, b: naive_blend(a, b, tensors, splats, boxes, starts, ids, images),
         len(starts) - 1,
-        BLEND_GRAIN,
+        TILES_PER_CHUNK,
     )
     lap("blend")
     return torch.from_numpy(images[..., :3])
@@ -66,7 +69,9 @@ def naive_project(
         splats[i, 2] = z
         if z < NEAR_PLANE or opacities[i] < ALPHA_MIN:
             continue
-        xx, xy, yy, det = covariance(x / z, y / z, 1 / z, quats[i], scales[i], view)
+        xx, xy, yy, det = projected_covariance(
+            x / z, y / z, 1 / z, quats[i], scales[i], lens, pose, view.eps2d
+        )
         if det <= 0:
             continue
         u, v = lens[0] * x / z + lens[2], lens[1] * y / z + lens[3]
@@ -83,14 +88,14 @@ def naive_bin(order: Array, boxes: Array, rows: int, columns: int) -> tuple[Arra
     """Make the list of Gaussians of each tile, front to back."""
     starts = np.zeros(rows * columns + 1, np.int64)
     for i in order:
-        for row in range(boxes[i, 2] // TILE, (boxes[i, 3] + TILE - 1) // TILE):
-            for column in range(boxes[i, 0] // TILE, (boxes[i, 1] + TILE - 1) // TILE):
+        for row in range(boxes[i, 2] // TILE_PX, (boxes[i, 3] + TILE_PX - 1) // TILE_PX):
+            for column in range(boxes[i, 0] // TILE_PX, (boxes[i, 1] + TILE_PX - 1) // TILE_PX):
                 starts[row * columns + column + 1] += 1
     starts = np.cumsum(starts)
     ends, ids = starts.copy(), np.empty(starts[-1], np.int32)
     for i in order:
-        for row in range(boxes[i, 2] // TILE, (boxes[i, 3] + TILE - 1) // TILE):
-            for column in range(boxes[i, 0] // TILE, (boxes[i, 1] + TILE - 1) // TILE):
+        for row in range(boxes[i, 2] // TILE_PX, (boxes[i, 3] + TILE_PX - 1) // TILE_PX):
+            for column in range(boxes[i, 0] // TILE_PX, (boxes[i, 1] + TILE_PX - 1) // TILE_PX):
                 ids[ends[row * columns + column]] = i
                 ends[row * columns + column] += 1
     return starts, ids
@@ -110,11 +115,11 @@ def naive_blend(
     """Blend the tiles first..last into [H, W, 5], which is zero before: sRGB, depth and alpha."""
     opacities, colors = scene[3], scene[4]
     height, width, _ = images.shape
-    columns = (width + TILE - 1) // TILE
+    columns = (width + TILE_PX - 1) // TILE_PX
     for tile in range(first, last):
-        top, left = tile // columns * TILE, tile % columns * TILE
-        bottom, right = min(top + TILE, height), min(left + TILE, width)
-        full = np.zeros((TILE, TILE), np.bool_)
+        top, left = tile // columns * TILE_PX, tile % columns * TILE_PX
+        bottom, right = min(top + TILE_PX, height), min(left + TILE_PX, width)
+        full = np.zeros((TILE_PX, TILE_PX), np.bool_)
         for k in range(starts[tile], starts[tile + 1]):
             i = ids[k]
             for py in range(max(top, boxes[i, 2]), min(bottom, boxes[i, 3])):

@@ -55,8 +55,14 @@ from spackle.paper.evaluation.datasets.stereo import load_motorcycle
 from spackle.paper.evaluation.measurements import COMPLETION_STAGES
 from spackle.render import CpuRenderer, Renderer, get_renderer
 from spackle.render.blend import blend_tiles
-from spackle.render.cpu import BLEND_GRAIN, list_tiles, project, sort_tiles, wanted_tiles
+from spackle.render.drawing import (
+    GAUSSIANS_PER_CHUNK,
+    TILES_PER_CHUNK,
+    project,
+    tiles_to_draw,
+)
 from spackle.render.project import KernelCamera
+from spackle.render.tile_lists import list_tiles, sort_tiles
 from spackle.residual import ResidualNet, hole_area_ratio
 from spackle.residual.architectures import load_residual
 from spackle.runtime.device import hardware_facts, package_versions, parallel_for_chunks
@@ -148,16 +154,16 @@ def renderer_section(runs: int, side: int, peaks: Peaks) -> Section:
 
 
 def render_in_laps(scene: Gaussians, camera: Camera, lap: EndStage) -> None:
-    """Do what `spackle.render.cpu.draw` does, with a lap after each step."""
+    """Do what `spackle.render.drawing.draw` does, with a lap after each step."""
     view = KernelCamera.of(camera, 0.0)
-    wanted = wanted_tiles(view, None)
+    wanted = tiles_to_draw(view, None)
     splats = project([scene], view, wanted)
     lap("project")
-    lists = list_tiles(splats.boxes, wanted)
+    lists = list_tiles(splats.boxes, wanted, GAUSSIANS_PER_CHUNK)
     lap("bin")
     tiles = np.flatnonzero(wanted)
     parallel_for_chunks(
-        lambda a, b: sort_tiles(a, b, tiles, lists, splats.records), len(tiles), BLEND_GRAIN
+        lambda a, b: sort_tiles(a, b, tiles, lists, splats.records), len(tiles), TILES_PER_CHUNK
     )
     lap("sort")
     size = camera.height, camera.width
@@ -165,7 +171,7 @@ def render_in_laps(scene: Gaussians, camera: Camera, lap: EndStage) -> None:
     parallel_for_chunks(
         lambda a, b: blend_tiles(a, b, tiles, lists, splats.records, images),
         len(tiles),
-        BLEND_GRAIN,
+        TILES_PER_CHUNK,
     )
     lap("blend")
 

@@ -246,7 +246,7 @@ def complete(
         exact: whether only these views will be rendered, and no views between them.
         network: the residual network, by default Spackle's; None fills the holes by the seeds alone.
         fill: see `open_texture`; "none" keeps the holes.
-        renderer: by default the CPU renderer.
+        renderer: by default the best of this machine, on its GPU if it has one.
         progress: called with (views done, all views).
     """
     chosen = shipped_network() if network == "shipped" else network

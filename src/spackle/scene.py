@@ -211,7 +211,7 @@ class Scene:
             loop: see `spackle.formats.VideoWriter`.
             overscan: relative gain in focal length, which hides most of the fill beyond the photo's border.
             format: "mp4", "webm", "gif" or "webp"; by default the path's suffix, or mp4 for an open file.
-            renderer: by default the CPU renderer.
+            renderer: by default the best of this machine, on its GPU if it has one.
             size, fit, show, stereo, ipd, convergence, compare: see the options of `spackle render`; `size` is
                 "1280x720", "16:9" or (width, height).
 

@@ -21,7 +21,7 @@ from spackle.core.hole_filling import fill_from_far_side
 from spackle.depth.depth_map import DepthMap
 from spackle.lifting import edges
 from spackle.lifting import lift as lifting
-from spackle.lifting.edges import HOLE, OPEN, find_edges, sample, settle
+from spackle.lifting.edges import HOLE, OPEN, assign_open_pixels, find_edges, sample
 from spackle.lifting.lift import DEVIATIONS, noise_level, smoothed
 from spackle.runtime.errors import InputError
 
@@ -47,9 +47,9 @@ def settled(
     """Resampled and sharpened inverse depth at the photo's size, and a mask of the pixels that are no holes."""
     depths, mask = inverse.numpy(), known.numpy()
     sampled = sample(depths, mask, find_edges(depths, mask, focal), *rgb.shape[:2])
-    return torch.from_numpy(settle(sampled, rgb.contiguous().numpy())), torch.from_numpy(
-        sampled.state != HOLE
-    )
+    return torch.from_numpy(
+        assign_open_pixels(sampled, rgb.contiguous().numpy())
+    ), torch.from_numpy(sampled.state != HOLE)
 
 
 def random_map(seed: int, height: int = 13, width: int = 17) -> tuple[np.ndarray, np.ndarray]:
@@ -102,7 +102,7 @@ def test_compiled_kernels_agree_with_plain_python(seed: int, size: tuple[int, in
         return [
             *images,
             *sampled.slope,
-            settle(sampled, rgb),
+            assign_open_pixels(sampled, rgb),
             smoothed(rough, known, np.float32(0.01)),
         ]
 
@@ -161,7 +161,7 @@ def test_cheapest_paths_are_those_of_dijkstra(seed: int) -> None:
         dataclasses.replace(sampled, slope=(flat, flat)),
         random_photo(seed, height, width),
     )
-    found, expected = settle(sampled, rgb), sampled.inverse_depth.copy()
+    found, expected = assign_open_pixels(sampled, rgb), sampled.inverse_depth.copy()
     for state in (OPEN, HOLE):
         far = fill_from_far_side(
             *map(torch.from_numpy, (expected, expected[None], sampled.state != HOLE))

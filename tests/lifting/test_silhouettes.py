@@ -20,8 +20,9 @@ from spackle.core.trajectories import DepthRange, leftmost_and_rightmost
 from spackle.lifting import silhouettes, splats
 from spackle.lifting.quadtree import LEVELS
 from spackle.lifting.silhouettes import find_layers
-from spackle.lifting.splats import WEIGHTS, blended_opacities, layered_gaussians, mixture
-from spackle.render import CpuRenderer
+from spackle.lifting.splats import WEIGHTS, blended_opacities, layered_gaussians
+from spackle.render import CpuRenderer, screen_blend
+from spackle.render.screen_blend import blend_screen_gaussians
 
 Image = np.ndarray
 CPU = CpuRenderer()
@@ -52,12 +53,12 @@ def test_compiled_kernels_agree_with_plain_python(seed: int) -> None:
 
     def arrays() -> list[Image]:
         found = find_layers(*made)
-        picture = mixture(spots, torch.from_numpy(spots[:, 2:] / 3), 15, 17).numpy()
+        picture = blend_screen_gaussians(spots, torch.from_numpy(spots[:, 2:] / 3), 15, 17).numpy()
         return [*dataclasses.astuple(found), blended_opacities(found.alpha, found.ring), picture]
 
     compiled = arrays()
     assert 0 < np.count_nonzero(compiled[0]) < compiled[0].size
-    with uncompiled(silhouettes, splats):
+    with uncompiled(silhouettes, splats, screen_blend):
         plain = arrays()
     for one, other in zip(compiled, plain, strict=True):
         np.testing.assert_allclose(one, other, rtol=2e-3, atol=2e-4)
@@ -116,7 +117,9 @@ def test_a_mixture_is_the_renderers_picture() -> None:
     uv, spread = torch.rand(n, 2) * torch.tensor([44, 308]) - 4, 0.4 + 3 * torch.rand(n, 2)
     depth = (0.2 + torch.rand(n)).sort(descending=True).values
     opacity, colors = 0.2 + 0.79 * torch.rand(n), torch.rand(n, 3)
-    mixed = mixture(torch.cat([uv, spread, opacity[:, None]], 1).numpy(), colors, 300, 40)
+    mixed = blend_screen_gaussians(
+        torch.cat([uv, spread, opacity[:, None]], 1).numpy(), colors, 300, 40
+    )
     gaussians = make_surfels(camera, uv, depth, torch.zeros(n, 2), spread, colors, opacity)
     assert psnr(linear_to_srgb(mixed), CPU.render(gaussians, camera).rgb) > 50
 

@@ -16,7 +16,12 @@ from helpers.scenes import box_before_wall, same_bits, shifted
 from spackle.core.gaussians import Gaussians
 from spackle.render import CpuRenderer, get_renderer
 from spackle.render import gsplat_backend as cuda
-from spackle.render.gsplat_backend import GsplatRenderer, SetStore, load_gsplat, upper_covariances
+from spackle.render.gsplat_backend import (
+    GsplatRenderer,
+    UploadCache,
+    load_gsplat,
+    upper_covariances,
+)
 from spackle.render.protocol import ALPHA_MAX, Rendering
 from spackle.runtime.device import NotEnoughMemory
 from spackle.runtime.errors import InputError
@@ -97,7 +102,7 @@ def test_only_wanted_tiles_change(gpu: GsplatRenderer) -> None:
     mask = TILES.repeat_interleave(16, 0).repeat_interleave(16, 1)[:35, :45]
     black = Rendering(*(torch.zeros_like(image) for image in whole.tensors))
     for onto in (under, None):
-        found = gpu.render(BASE, SIDE, tiles=TILES, onto=onto)
+        found = gpu.render(BASE, SIDE, tiles=TILES, previous_rendering=onto)
         for image, drawn, kept in zip(
             found.tensors, whole.tensors, (onto or black).tensors, strict=True
         ):
@@ -115,14 +120,15 @@ def test_a_batch_of_views_equals_single_views_bit_for_bit(gpu: GsplatRenderer) -
     ]
     cameras, tiles = [SIDE, SIDE, SCENE.camera], [None, TILES, TILES]
     onto = [None, None, CPU.render(BASE, SCENE.camera)]
-    together = gpu.render_batch(scenes, cameras, tiles=tiles, onto=onto)
+    together = gpu.render_batch(scenes, cameras, tiles=tiles, previous_renderings=onto)
     views = list(zip(scenes, cameras, tiles, onto, strict=True))
     alone = [
-        gpu.render(sets, camera, tiles=tile, onto=under) for sets, camera, tile, under in views
+        gpu.render(sets, camera, tiles=tile, previous_rendering=under)
+        for sets, camera, tile, under in views
     ]
     assert all(map(same_bits, together, alone))
     for one, (sets, camera, tile, under) in zip(together, views, strict=True):
-        agree(one, CPU.render(sets, camera, tiles=tile, onto=under))
+        agree(one, CPU.render(sets, camera, tiles=tile, previous_rendering=under))
     with pytest.raises(ValueError, match="one size"):
         gpu.render_batch([[BASE]] * 2, [SIDE, SIDE.resized(40, 40)])
 
@@ -140,7 +146,7 @@ def test_covariances_are_float32_under_autocast() -> None:
 def test_a_shortage_of_memory_is_reported(
     gpu: GsplatRenderer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cuda, "MOST_ENTRIES", 10)
+    monkeypatch.setattr(cuda, "MAX_LIST_ENTRIES", 10)
     with pytest.raises(NotEnoughMemory, match=f"{len(BASE):,} Gaussians at 45×35"):
         gpu.render(BASE, SIDE)
 
@@ -164,24 +170,24 @@ def test_the_stand_in_has_gsplats_own_signatures() -> None:
 
 
 def test_an_unchanged_scene_is_uploaded_once() -> None:
-    store = SetStore(torch.device("cpu"))
-    material = store.material
+    store = UploadCache(torch.device("cpu"))
+    upload = store.upload
     kept = Gaussians(*(tensor.clone() for tensor in BASE.tensors))
-    first = material(kept)
-    assert material(kept) is first
-    assert material(dataclasses.replace(kept, colors=kept.colors.clone())) is not first
-    again = material(kept)
+    first = upload(kept)
+    assert upload(kept) is first
+    assert upload(dataclasses.replace(kept, colors=kept.colors.clone())) is not first
+    again = upload(kept)
     kept.colors.mul_(0.5)
-    assert material(kept) is not again
-    torch.testing.assert_close(material(kept).colors, kept.colors)
+    assert upload(kept) is not again
+    torch.testing.assert_close(upload(kept).colors, kept.colors)
     asking = Gaussians(*(tensor.clone().requires_grad_() for tensor in BASE.tensors))
-    assert material(asking) is not material(asking)
+    assert upload(asking) is not upload(asking)
     with torch.inference_mode():
         passing = Gaussians(*(tensor.clone() for tensor in BASE.tensors))
-        assert material(passing) is not material(passing)
-    assert len(store._kept) == 1
+        assert upload(passing) is not upload(passing)
+    assert len(store._uploads) == 1
     del kept
-    assert len(store._kept) == 0
+    assert len(store._uploads) == 0
 
 
 def modules(version: str, backend: object) -> dict[str, Any]:
@@ -208,7 +214,7 @@ def test_an_unusable_gsplat_is_refused_and_auto_falls_back(
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     for name, module in UNUSABLE[says].items():
         monkeypatch.setitem(sys.modules, name, module)
-    with pytest.raises(InputError, match=f"^--device cuda: .*{says}") as caught:
+    with pytest.raises(InputError, match=f"^`device` cuda: .*{says}") as caught:
         get_renderer("cuda")
     assert "\n" not in str(caught.value)
     assert isinstance(get_renderer("auto"), CpuRenderer)
@@ -222,6 +228,6 @@ def test_auto_uses_an_available_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     assert load_gsplat(torch.device("cuda")).__name__ == "gsplat"
     assert isinstance(get_renderer("auto"), GsplatRenderer)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(InputError, match="--device cuda: PyTorch sees no NVIDIA GPU"):
+    with pytest.raises(InputError, match="`device` cuda: PyTorch sees no NVIDIA GPU"):
         get_renderer("cuda")
     assert isinstance(get_renderer("auto"), CpuRenderer)

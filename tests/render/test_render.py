@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from spackle.core.camera import Camera
 from spackle.core.color import linear_to_srgb, srgb_to_linear
 from spackle.core.gaussians import Gaussians
-from spackle.render import TILE, CpuRenderer, get_renderer, touched_tiles
-from spackle.render.blend import decode_srgb, encode_srgb, exp2
-from spackle.render.project import BLOCK, natural_log
+from spackle.render import TILE_PX, CpuRenderer, get_renderer, touched_tiles
+from spackle.render.fast_math import decode_srgb, encode_srgb, exp2, natural_log
+from spackle.render.project import BLOCK_GAUSSIANS
 from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_STOP, Rendering
 from spackle.render.reference import ReferenceRenderer, falloff, front_to_back
 from spackle.runtime.errors import InputError
@@ -66,7 +66,7 @@ def sturdy_pixels(gaussians: Gaussians, camera: Camera, eps2d: float) -> torch.T
 
 
 def tile_mask(tiles: torch.Tensor, camera: Camera) -> torch.Tensor:
-    return tiles.repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)[
+    return tiles.repeat_interleave(TILE_PX, 0).repeat_interleave(TILE_PX, 1)[
         : camera.height, : camera.width
     ]
 
@@ -201,7 +201,10 @@ def test_images_match_the_reference(scene):
     assert same_bits(CPU.render(parts, camera, eps2d=eps2d), fast)
 
 
-@pytest.mark.parametrize("count", [0, BLOCK - 1, BLOCK, BLOCK + 1, 3 * BLOCK + 50])
+@pytest.mark.parametrize(
+    "count",
+    [0, BLOCK_GAUSSIANS - 1, BLOCK_GAUSSIANS, BLOCK_GAUSSIANS + 1, 3 * BLOCK_GAUSSIANS + 50],
+)
 def test_any_number_of_blocks_matches_the_reference(count):
     camera = turned_camera(50, 40, 45.0)
     scene = random_scene(count, count, camera, sizes=(1e-2, 4.0))
@@ -296,12 +299,12 @@ def test_approximated_functions_are_accurate():
 @given(scenes(), SEEDS)
 def test_wanted_tiles_match_the_full_image(scene, tile_seed):
     gaussians, camera, eps2d, _ = scene
-    shape = -(-camera.height // TILE), -(-camera.width // TILE)
+    shape = -(-camera.height // TILE_PX), -(-camera.width // TILE_PX)
     tiles = torch.rand(shape, generator=torch.Generator().manual_seed(tile_seed)) < 0.5
     onto = Rendering(*(torch.rand(camera.height, camera.width, *rest) for rest in ((3,), (), ())))
     kept = [image.clone() for image in onto.tensors]
     full = CPU.render(gaussians, camera, eps2d=eps2d)
-    part = CPU.render(gaussians, camera, eps2d=eps2d, tiles=tiles, onto=onto)
+    part = CPU.render(gaussians, camera, eps2d=eps2d, tiles=tiles, previous_rendering=onto)
     black = CPU.render(gaussians, camera, eps2d=eps2d, tiles=tiles)
     mask = tile_mask(tiles, camera)
     for drawn, found, before, after, empty in zip(
@@ -337,7 +340,7 @@ def test_gradients_of_tiles():
     tiles[1, 1] = True
     mask = tile_mask(tiles, camera)
     onto = Rendering(*(torch.rand(40, 40, *rest).requires_grad_() for rest in ((3,), (), ())))
-    part = CPU.render(leaf, camera, tiles=tiles, onto=onto)
+    part = CPU.render(leaf, camera, tiles=tiles, previous_rendering=onto)
     backward(part)
     for image in onto.tensors:
         assert not image.grad[mask].any()
@@ -379,3 +382,32 @@ def test_frozen_sets_get_no_gradients():
     assert all(t.grad is None for t in frozen.tensors)
     for one, other in zip(aux.tensors, both.tensors, strict=True):
         torch.testing.assert_close(one.grad, other.grad[400:])
+
+
+@BOTH
+def test_a_batch_of_views_equals_single_views(renderer):
+    cameras = [
+        turned_camera(40, 33, 40.0),
+        turned_camera(40, 33, 60.0),
+        turned_camera(40, 33, 50.0),
+    ]
+    scene = random_scene(4, 30, cameras[0])
+    scenes = [[scene], [], [scene.select(slice(0, 9)), scene.select(slice(9, None))]]
+    tiles = [None, torch.ones(3, 3, dtype=torch.bool), torch.eye(3, dtype=torch.bool)]
+    previous = [None, None, renderer.render(scene, cameras[0])]
+    together = renderer.render_batch(
+        scenes, cameras, eps2d=0.3, tiles=tiles, previous_renderings=previous
+    )
+    for k, rendering in enumerate(together):
+        alone = renderer.render(
+            scenes[k], cameras[k], eps2d=0.3, tiles=tiles[k], previous_rendering=previous[k]
+        )
+        assert same_bits(rendering, alone)
+    plain = renderer.render_batch(scenes[:1], cameras[:1])
+    assert same_bits(plain[0], renderer.render(scenes[0], cameras[0]))
+    with pytest.raises(ValueError, match="one size"):
+        renderer.render_batch([[scene]] * 2, [CAMERA, cameras[0]])
+
+
+def test_renderers_name_their_device():
+    assert CPU.device == TWIN.device == torch.device("cpu")

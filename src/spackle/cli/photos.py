@@ -23,7 +23,6 @@ from spackle.depth.calibration import calibration_candidates
 from spackle.depth.readers import find_depth_file
 from spackle.depth.writers import check_depth_name
 from spackle.pipeline import Pipeline, PipelineOptions
-from spackle.render import device_of
 from spackle.render.blend import blend_tiles
 from spackle.results.photo_folder import REPORT, PhotoOptions, earlier_report, predict_photo
 from spackle.runtime.device import thread_count
@@ -100,7 +99,7 @@ def predict_all(
         if not clips
         else Pipeline.open(clip_options(options.scene, options.photo, options.workers))
     )
-    if device_of(pipeline.renderer).type == "cpu" and not is_compiled(blend_tiles):
+    if pipeline.renderer.device.type == "cpu" and not is_compiled(blend_tiles):
         reporter.log(
             "first use: kernels are compiled for this processor, which takes about half a minute, once"
         )

@@ -204,7 +204,9 @@ def propagate_colors(
     changed = _recoloured(
         aux, camera, light - made_up, torch.where(hole & (share >= FAINT), share, 0.0)
     )
-    view = renderer.render([base, changed], camera, tiles=touched_tiles(aux, camera), onto=own)
+    view = renderer.render(
+        [base, changed], camera, tiles=touched_tiles(aux, camera), previous_rendering=own
+    )
     return changed, FrameMemory(view, light, inverse_depth, _trust(hole, share, weight))
 
 

@@ -265,7 +265,7 @@ NEAR_COST = (
 )
 
 
-def settle(sampled: Sampled, rgb: Floats) -> Floats:
+def assign_open_pixels(sampled: Sampled, rgb: Floats) -> Floats:
     """Give every open pixel, then every hole pixel, the depth of the known pixel to which its cheapest path leads.
 
     A path costs its length plus the change of sRGB [H, W, 3] along it, so that depth spreads within objects and stops

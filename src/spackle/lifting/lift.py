@@ -14,7 +14,15 @@ from spackle.core.color import srgb_to_linear
 from spackle.core.gaussians import Gaussians
 from spackle.core.surfels import DEPTH_EDGE_RATIO
 from spackle.depth.depth_map import DepthMap
-from spackle.lifting.edges import HOLE, SETTLED, Bools, Floats, find_edges, sample, settle
+from spackle.lifting.edges import (
+    HOLE,
+    SETTLED,
+    Bools,
+    Floats,
+    assign_open_pixels,
+    find_edges,
+    sample,
+)
 from spackle.lifting.quadtree import LEVELS
 from spackle.lifting.splats import layered_gaussians
 from spackle.runtime.errors import InputError
@@ -57,7 +65,7 @@ def lift_depth_map(
         raise InputError(
             f"{depth.path}: no depth is left at {camera.width}×{camera.height}: give a denser map"
         )
-    inverse_depth = torch.from_numpy(settle(sampled, rgb.numpy()))
+    inverse_depth = torch.from_numpy(assign_open_pixels(sampled, rgb.numpy()))
     gaussians = layered_gaussians(inverse_depth, srgb_to_linear(rgb), camera, levels)
     notes: dict[str, float | int | str] = {
         "depth_filled": round(float((sampled.state == HOLE).mean()), 4)

@@ -28,8 +28,8 @@ from spackle.core.surfels import (
 from spackle.lifting.edges import Floats
 from spackle.lifting.quadtree import LEVELS, Quadtree, Tiles
 from spackle.lifting.silhouettes import Layers, find_layers
-from spackle.runtime.device import parallel_for_chunks
-from spackle.runtime.kernels import ONE, ZERO, inlined_kernel, kernel
+from spackle.render.screen_blend import blend_screen_gaussians
+from spackle.runtime.kernels import kernel
 
 # Gaussians of half a pixel reproduce the photo sharply, but light passes between them; wide ones would blur the photo.
 # A coarse backing, one Gaussian for 2×2 pixels or more, therefore closes the surface from behind. At the photo's
@@ -104,7 +104,7 @@ def _fitted(
     order = samples.depth.argsort(descending=True, stable=True)
     spots = torch.cat([samples.uv, samples.spread, samples.opacity[:, None]], dim=-1)[order].numpy()
     for _ in range(SWEEPS):
-        missing = colors - mixture(spots, fitted[order], *single.shape)
+        missing = colors - blend_screen_gaussians(spots, fitted[order], *single.shape)
         pixels = missing[single] * corrected[:, None]
         change = torch.cat([pixels, *(part.means(missing) for part in tiles)])
         fitted[: len(change)] = (fitted[: len(change)] + change).clamp(0, 1)
@@ -227,13 +227,6 @@ def _cells(image: Tensor) -> Tensor:
 WEIGHTS = np.exp(-0.5 / PIXEL_SIGMA_PX**2 * np.array([2, 1, 2, 1, 0, 1, 2, 1, 2])).astype(
     np.float32
 )  # 3×3 neighbours
-FAINT, STOP = (
-    np.float32(1 / 255),
-    np.float32(1e-4),
-)  # the renderer skips smaller alphas, stops at this transmittance
-REACH = np.sqrt(
-    -2 * np.log(FAINT)
-)  # an alpha of 1 falls to FAINT at this number of standard deviations
 
 
 def blended_opacities(alpha: Floats, ring: NDArray[np.uint8]) -> Floats:
@@ -260,76 +253,3 @@ def _thin(alpha: Any, ring: Any, result: Any) -> None:
                 if k != 4 and ring[v, u] > 0:
                     passes *= 1 - SURFEL_OPACITY * WEIGHTS[k] * result[v, u]
             result[y, x] = min(max(1 - (1 - alpha[y, x]) / passes, np.float32(0)), np.float32(1))
-
-
-def mixture(spots: Floats, colors: Tensor, height: int, width: int) -> Tensor:
-    """The picture [H, W, 3] of N Gaussians at the photo's camera, blended like the renderer blends.
-
-    `spots` [N, 5], nearest first: centre x and y and standard deviations along x and y in pixels, and opacity. `colors`
-    [N, 3] are linear RGB.
-    """
-    image = np.empty((height, width, 3), np.float32)
-    parallel_for_chunks(lambda a, b: _mix(a, b, spots, colors.numpy(), image), height, grain=128)
-    return torch.from_numpy(image)
-
-
-LANES = 16  # pixels in a vector register; rows are mixed in runs of so many pixels
-RED, GREEN, BLUE, RUN = (
-    np.uint64(k * LANES) for k in range(1, 5)
-)  # a run: transmittances, then light by channel
-
-
-@kernel
-def _mix(start: int, stop: int, spots: Any, colors: Any, image: Any) -> None:
-    width, half = image.shape[1], np.float32(0.5)
-    runs = (width + LANES - 1) // LANES
-    state = np.zeros(((stop - start) * runs, 1 + image.shape[2], LANES), np.float32)
-    state[:, 0] = 1
-    flat, across = state.reshape(-1), np.zeros(runs * LANES, np.float32)
-    for n in range(len(spots)):
-        u, v, spread_x, spread_y, opacity = spots[n]
-        top = max(int(np.ceil(v - REACH * spread_y - half)), start)
-        bottom = min(int(np.floor(v + REACH * spread_y - half)) + 1, stop)
-        left = max(int(np.ceil(u - REACH * spread_x - half)), 0)
-        right = min(int(np.floor(u + REACH * spread_x - half)) + 1, width)
-        if top >= bottom or left >= right:
-            continue
-        first, last = left // LANES, (right - 1) // LANES + 1
-        across[first * LANES : last * LANES] = 0
-        for x in range(left, right):
-            away = (np.float32(x) + half - u) / spread_x
-            across[x] = np.exp(-half * away * away)
-        for y in range(top, bottom):
-            away = (np.float32(y) + half - v) / spread_y
-            down = opacity * np.exp(-half * away * away)
-            for k in range(first, last):
-                _mix_run(
-                    flat,
-                    np.uint64((y - start) * runs + k) * RUN,
-                    across,
-                    np.uint64(k * LANES),
-                    down,
-                    colors[n],
-                )
-    for y in range(start, stop):
-        for x in range(width):
-            for channel in range(3):
-                image[y, x, channel] = state[
-                    (y - start) * runs + x // LANES, 1 + channel, x % LANES
-                ]
-
-
-@inlined_kernel
-def _mix_run(state: Any, offset: Any, across: Any, left: Any, down: Any, color: Any) -> None:
-    """Mix a row of a spot into a run of pixels; without branches, this loop runs in vector registers."""
-    red, green, blue = color[0], color[1], color[2]
-    for lane in range(LANES):
-        i = offset + np.uint64(lane)
-        alpha = down * across[left + np.uint64(lane)]
-        alpha = alpha if alpha >= FAINT else ZERO
-        after = state[i] * (ONE - alpha)
-        weight = alpha * state[i] if after > STOP else ZERO
-        state[i] = after if after > STOP else ZERO
-        state[i + RED] += weight * red
-        state[i + GREEN] += weight * green
-        state[i + BLUE] += weight * blue

@@ -1,15 +1,23 @@
-"""Renderers turn Gaussians and a camera into colour, depth and opacity."""
+"""Renderers turn Gaussians and a camera into colour, depth and opacity; nothing else splats.
+
+Read `protocol.py` first: it says what a renderer takes and returns. `reference.py` is the shortest
+renderer, and slow: it is the formula. `cpu.py` and `gsplat_backend.py` are those that people use.
+The CPU's work is divided so: `project.py` (Gaussians become ellipses in the image), `tile_lists.py`
+(which tile shows which Gaussians), `blend.py` (pixels), `drawing.py` (these three in a row),
+`gradients.py` (the way back). `screen_blend.py` blends ellipses that are given in the image.
+"""
 
 import logging
-from importlib import import_module
 
 import torch
 
-from spackle.render.cpu import CpuRenderer, touched_tiles
-from spackle.render.protocol import TILE, Renderer
+from spackle.render.cpu import CpuRenderer
+from spackle.render.drawing import touched_tiles
+from spackle.render.gsplat_backend import GsplatRenderer
+from spackle.render.protocol import TILE_PX, Renderer
 from spackle.runtime.errors import InputError
 
-__all__ = ["TILE", "CpuRenderer", "Renderer", "device_of", "get_renderer", "touched_tiles"]
+__all__ = ["TILE_PX", "CpuRenderer", "Renderer", "get_renderer", "touched_tiles"]
 
 LOG = logging.getLogger("spackle")
 
@@ -17,22 +25,19 @@ LOG = logging.getLogger("spackle")
 def get_renderer(device: str = "auto") -> Renderer:
     """The renderer for a device: "cpu", "cuda", or "auto" for "cuda" if available.
 
-    InputError if the device is unknown, or the renderer cannot run on this machine.
+    With "auto", a GPU that cannot be used is reported in the log, and the CPU renders.
+
+    Raises:
+        InputError: the device is unknown, or "cuda" cannot render on this machine.
     """
     if device not in ("auto", "cpu", "cuda"):
-        raise InputError(f"--device {device}: unknown device; use auto, cpu or cuda")
+        raise InputError(f"`device` {device}: unknown device; use auto, cpu or cuda")
+
     if device == "cuda" or (device == "auto" and torch.cuda.is_available()):
         try:
-            gpu: Renderer = import_module("spackle.render.gsplat_backend").GsplatRenderer()
-            return gpu
+            return GsplatRenderer()
         except InputError as error:
             if device == "cuda":
                 raise
             LOG.warning("rendering on the CPU: %s", error)
     return CpuRenderer()
-
-
-def device_of(renderer: Renderer) -> torch.device:
-    """The device of a renderer."""
-    place: torch.device = getattr(renderer, "device", torch.device("cpu"))
-    return place

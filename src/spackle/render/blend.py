@@ -1,191 +1,206 @@
 """Blend the Gaussians of a tile front to back in linear light.
 
-A tile's pixels are stored in patches of sixteen, the size of a vector register. Functions for pixels have neither
-branches nor calls: only then do loops over pixels run in vector registers.
+A tile's pixels are stored in patches of sixteen, the size of a vector register. Functions for
+pixels have neither branches nor calls that stay calls: only then do loops over pixels run in vector
+registers.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
-
 import numpy as np
-from numpy.polynomial import Chebyshev, Polynomial
 
-from spackle.render.project import RECORD, Arrays, Numbers, in_tile
-from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_STOP
-from spackle.runtime.kernels import MANTISSA_BITS, ONE, ZERO, Array, inlined_kernel, kernel
+from spackle.render.covariance import Numbers
+from spackle.render.fast_math import MIN_EXPONENT, encode_srgb, exp2
+from spackle.render.project import RECORD_FLOATS, Arrays, in_tile
+from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, TILE_PX, TRANSMITTANCE_STOP
+from spackle.render.tile_lists import TileLists
+from spackle.runtime.kernels import ONE, ZERO, Array, inlined_kernel, kernel
 
-LIMIT = np.float32(ALPHA_MAX)
-FAINT = np.float32(ALPHA_MIN)
-LOWEST = np.float32(-60.0)
-ROUND = np.float32(
-    1.5 * 2.0**23
-)  # this plus a small float has the rounded float as integer in its low bits
-ROUND_BITS = np.int32(0x4B400000)
-KNEE = np.float32(0.0031308)  # linear value at which sRGB changes from a line to a power
-LINE = np.float32(12.92)
+# The renderer's rules in float32: a Python float would widen a whole expression to float64.
+ALPHA_MAX_F32 = np.float32(ALPHA_MAX)
+ALPHA_MIN_F32 = np.float32(ALPHA_MIN)
+TRANSMITTANCE_STOP_F32 = np.float32(TRANSMITTANCE_STOP)
 
-
-def _power_series(function: Any, low: float, high: float, degree: int) -> list[np.float32]:
-    """Coefficients, lowest power first, of a near-minimax polynomial on low..high."""
-    fit = Chebyshev.interpolate(function, degree, [low, high])
-    return [np.float32(c) for c in fit.convert(kind=Polynomial).coef]
-
-
-# 2^x on -½..½; error 1e-7.
-E0, E1, E2, E3, E4, E5 = _power_series(np.exp2, -0.5, 0.5, 5)
-# sRGB's power as a polynomial in t, with the fourth root of the linear value = MIDDLE + SPREAD·t; error 2e-7.
-_root = float(KNEE) ** 0.25
-MIDDLE, SPREAD = np.float32((1 + _root) / 2), np.float32((1 - _root) / 2)
-S0, S1, S2, S3, S4, S5, S6, S7, S8 = _power_series(
-    lambda t: 1.055 * ((1 + _root) / 2 + (1 - _root) / 2 * t) ** (5 / 3) - 0.055, -1.0, 1.0, 8
+# A tile's state is a flat buffer of six planes: the transmittance (0 once a pixel is full), red,
+# green, blue, depth, alpha. In one buffer, the compiler knows that planes do not overlap. Alpha is
+# summed separately, because 1 - transmittance would lose digits of a small alpha.
+PLANE_FLOATS = TILE_PX * TILE_PX
+RED_PLANE, GREEN_PLANE, BLUE_PLANE, DEPTH_PLANE, ALPHA_PLANE = (
+    np.uint64(k * PLANE_FLOATS) for k in range(1, 6)
 )
-# The inverse power is y²·q^1.6, with q the fourth root of y; relative error of a few 1e-8.
-ENCODED_KNEE = np.float32(0.04045)
-_low_root = ((float(ENCODED_KNEE) + 0.055) / 1.055) ** 0.25
-D0, D1, D2, D3, D4, D5 = _power_series(lambda q: q**1.6, _low_root, 1.0, 5)
+TILE_STATE_FLOATS = 6 * PLANE_FLOATS
+
+# A plane stores its patches of 4×4 pixels one after the other. A typical Gaussian touches fewer
+# patches than rows of the tile.
+PATCH_PX = 4  # a patch's side
+PATCHES_PER_SIDE = TILE_PX // PATCH_PX
+PATCH_PIXELS = PATCH_PX * PATCH_PX
+
+ROUNDING_SLACK_PX = np.float32(1e-3)
+TILE_PX_F32 = np.float32(TILE_PX)
+GAUSSIANS_PER_CHECK = 16  # after so many, blending ends if the whole tile is full
 
 
 @kernel
-def exp2(x: np.float32) -> np.float32:
-    """2^x for x in -60..60."""
-    shifted = x + ROUND
-    f = x - (shifted - ROUND)
-    series = E0 + f * (E1 + f * (E2 + f * (E3 + f * (E4 + f * E5))))
-    exponent = (np.float32(shifted).view(np.int32) - ROUND_BITS) << MANTISSA_BITS
-    return np.int32(np.float32(series).view(np.int32) + exponent).view(np.float32)
+def alpha_from_log2(log2_alpha: np.float32) -> np.float32:
+    """Alpha = 2^log2_alpha, at most 0.999; 0 if it is below 1/255, too faint to be drawn."""
+    alpha = min(exp2(max(log2_alpha, MIN_EXPONENT)), ALPHA_MAX_F32)
+    return alpha if alpha >= ALPHA_MIN_F32 else ZERO
+
+
+@inlined_kernel
+def weight_and_transmittance(
+    alpha: np.float32, transmittance: np.float32
+) -> tuple[np.float32, np.float32]:
+    """The weight of a Gaussian's colour in a pixel, and the transmittance that is left behind it.
+
+    Both are 0 if the pixel would be full (transmittance 1e-4 or less): the Gaussian is skipped, and
+    so are all that follow.
+    """
+    after = transmittance * (ONE - alpha)
+    full = after <= TRANSMITTANCE_STOP_F32
+    weight = ZERO if full else alpha * transmittance
+    return weight, ZERO if full else after
 
 
 @kernel
-def alpha_of(power: np.float32) -> np.float32:
-    """Alpha = 2^power, clamped from above; 0 below the threshold."""
-    alpha = min(exp2(max(power, LOWEST)), LIMIT)
-    return alpha if alpha >= FAINT else ZERO
+def blend_tiles(
+    first: int, last: int, tiles: Array, lists: TileLists, records: Array, images: Arrays
+) -> None:
+    """Draw some tiles of an image.
+
+    Args:
+        first, last: the tiles `tiles[first]` to `tiles[last - 1]` are drawn.
+        tiles: [K] numbers of tiles, row by row.
+        lists: the Gaussians of each tile, sorted front to back.
+        records: [N, 12] float32 numbers of each Gaussian, see `spackle.render.project`.
+        images: rgb [H, W, 3] sRGB, depth [H, W], alpha [H, W] and linear colour [H, W, 3], whose
+            pixels in these tiles are written. An empty linear colour is not written.
+    """
+    ids, starts = lists
+    columns = (images[1].shape[1] + TILE_PX - 1) // TILE_PX
+    state = np.empty(TILE_STATE_FLOATS, np.float32)
+    next_records = np.empty((GAUSSIANS_PER_CHECK, RECORD_FLOATS), np.float32)
+    for k in range(first, last):
+        tile = tiles[k]
+        left = (tile % columns) * TILE_PX
+        top = (tile // columns) * TILE_PX
+
+        # Full transmittance, and nothing blended.
+        for i in range(TILE_STATE_FLOATS):
+            state[i] = ONE if i < PLANE_FLOATS else ZERO
+
+        end = starts[tile + 1]
+        for begin in range(starts[tile], end, GAUSSIANS_PER_CHECK):
+            count = min(GAUSSIANS_PER_CHECK, end - begin)
+            fetch_records(records, ids, begin, count, next_records)
+            blend_splats(state, next_records, count, left, top)
+            if count == GAUSSIANS_PER_CHECK and is_full(state):
+                break
+        store_tile(state, left, top, images)
 
 
 @kernel
-def encode_srgb(linear: np.float32) -> np.float32:
-    """Convert linear light to sRGB, both clamped to 0..1."""
-    value = min(max(linear, ZERO), ONE)
-    t = (np.sqrt(np.sqrt(value)) - MIDDLE) / SPREAD
-    curve = S0 + t * (S1 + t * (S2 + t * (S3 + t * (S4 + t * (S5 + t * (S6 + t * (S7 + t * S8)))))))
-    return LINE * value if value <= KNEE else min(curve, ONE)
+def fetch_records(records: Array, ids: Array, begin: int, count: int, next_records: Array) -> None:
+    """Copy the records of the Gaussians ids[begin], …, ids[begin + count - 1] to `next_records`.
+
+    `records` is [N, 12], `next_records` [16, 12]. Records are scattered in memory; in this loop,
+    their cache misses overlap.
+    """
+    for n in range(count):
+        record = records[ids[begin + n]]
+        for field in range(RECORD_FLOATS):
+            next_records[n, field] = record[field]
 
 
 @kernel
-def decode_srgb(encoded: np.float32) -> np.float32:
-    """Convert sRGB to linear light, both clamped to 0..1."""
-    value = min(max(encoded, ZERO), ONE)
-    y = (value + np.float32(0.055)) / np.float32(1.055)
-    q = np.sqrt(np.sqrt(y))
-    curve = y * y * (D0 + q * (D1 + q * (D2 + q * (D3 + q * (D4 + q * D5)))))
-    return value / LINE if value <= ENCODED_KNEE else min(curve, ONE)
+def blend_splats(state: Array, records: Array, count: int, left: int, top: int) -> None:
+    """Draw the first `count` of `records` [16, 12] into a tile.
+
+    `state` is the tile's buffer, (left, top) its first pixel in the image. This is a function of its
+    own so that constants stay in registers.
+    """
+    for index in range(count):
+        blend_splat(state, records[index], left, top)
 
 
-@kernel
-def srgb_slope(linear: np.float32, encoded: np.float32) -> np.float32:
-    """The derivative of `encode_srgb` at `linear`, given `encoded = encode_srgb(linear)`."""
-    slope = LINE if linear <= KNEE else (encoded + np.float32(0.055)) / (np.float32(2.4) * linear)
-    return slope if ZERO <= linear <= ONE else ZERO
+@inlined_kernel
+def blend_splat(state: Array, record: Array, left: int, top: int) -> None:
+    """Draw a Gaussian into the patches of a tile that it may touch.
 
-
-# A tile's state is a flat buffer of six planes: light (the transmittance, 0 once a pixel is full), red, green, blue,
-# depth, alpha. In one buffer, the compiler knows that planes do not overlap. Alpha is summed separately, because
-# 1 - light would lose digits of a small alpha.
-PLANE = TILE * TILE
-STATE = 6 * PLANE
-
-# A plane stores its patches of PATCH × PATCH pixels one after the other. A typical Gaussian touches fewer patches than
-# rows of the tile.
-PATCH = 4
-PATCHES = TILE // PATCH  # number of patches along a tile's side
-LANES = PATCH * PATCH
-
-STOP = np.float32(TRANSMITTANCE_STOP)
-SLACK = np.float32(1e-3)  # pixels, for rounding
-SIDE = np.float32(TILE)
-CHECK_EVERY = 16  # Gaussians per batch; after each batch, blending ends if the whole tile is full
-
-
-class TileLists(NamedTuple):
-    """The Gaussians of each tile, front to back once the tile has been drawn."""
-
-    ids: Array  # [E] int32, all lists one after the other
-    starts: Array  # [T + 1] int64, the start of each tile's list
+    `state` is the tile's buffer of six planes, `record` [12] describes the Gaussian, and (left,
+    top) is the tile's first pixel in the image.
+    """
+    x, y, slope, across, fall, peak, half_width, half_height, depth, red, green, blue = in_tile(
+        record, left, top
+    )
+    splat = x, y, slope, across, fall, peak, depth, red, green, blue
+    first_row, last_row = touched_patches(y, half_height)
+    first_column, last_column = touched_patches(x, half_width)
+    for row in range(first_row, last_row):
+        for column in range(first_column, last_column):
+            offset = np.uint64((row * PATCHES_PER_SIDE + column) * PATCH_PIXELS)
+            patch_left = np.float32(column * PATCH_PX)
+            patch_top = np.float32(row * PATCH_PX)
+            blend_patch(state, offset, patch_left, patch_top, splat)
 
 
 @kernel
 def blend_patch(
     state: Array, offset: np.uint64, left: np.float32, top: np.float32, splat: Numbers
 ) -> None:
-    """Draw a Gaussian into the patch with the first pixel (left, top), relative to the tile."""
+    """Draw a Gaussian into a patch of 4×4 pixels.
+
+    Args:
+        state: the tile's buffer of six planes, changed in place.
+        offset: where the patch begins in each plane.
+        left, top: the patch's first pixel, relative to the tile's.
+        splat: the Gaussian's record, with the centre relative to the tile and without half sizes.
+            In a row at the distance dy from the centre, log2 of alpha is
+            peak - fall·dy² - across·(x of the pixel - x - slope·dy)².
+    """
     x, y, slope, across, fall, peak, depth, red, green, blue = splat
-    for lane in range(LANES):
+    for lane in range(PATCH_PIXELS):
         i = offset + np.uint64(lane)
-        dy = np.float32(lane // PATCH) + top - y
-        u = np.float32(lane % PATCH) + left - (x + slope * dy)
-        alpha = alpha_of(peak - fall * dy * dy - across * u * u)
-        light = state[i]
-        after = light * (ONE - alpha)
-        full = after <= STOP
-        weight = ZERO if full else alpha * light
-        state[i] = ZERO if full else after
-        state[i + np.uint64(1 * PLANE)] += weight * red
-        state[i + np.uint64(2 * PLANE)] += weight * green
-        state[i + np.uint64(3 * PLANE)] += weight * blue
-        state[i + np.uint64(4 * PLANE)] += weight * depth
-        state[i + np.uint64(5 * PLANE)] += weight
+        dy = np.float32(lane // PATCH_PX) + top - y
+        u = np.float32(lane % PATCH_PX) + left - (x + slope * dy)
+        alpha = alpha_from_log2(peak - fall * dy * dy - across * u * u)
+        weight, after = weight_and_transmittance(alpha, state[i])
+        state[i] = after
+        state[i + RED_PLANE] += weight * red
+        state[i + GREEN_PLANE] += weight * green
+        state[i + BLUE_PLANE] += weight * blue
+        state[i + DEPTH_PLANE] += weight * depth
+        state[i + ALPHA_PLANE] += weight
 
 
 @kernel
-def span_of(center: np.float32, reach: np.float32) -> tuple[int, int]:
-    """The range first..last (exclusive) of a tile's rows or columns that a Gaussian may touch."""
-    # One is added before or after truncation to round up: ceil or floor would cost more than drawing a patch.
-    first = int(max(center - reach - SLACK, -ONE) + ONE)
-    last = min(int(min(center + reach + SLACK, SIDE)) + 1, TILE)
+def touched_pixels(center: np.float32, half_size: np.float32) -> tuple[int, int]:
+    """The range first..last (exclusive) of a tile's rows or columns that a Gaussian may touch.
+
+    `center` and `half_size` are in pixels along this axis, from the centre of the tile's first.
+    """
+    # One is added before or after truncation to round up: ceil or floor would cost more than
+    # drawing a patch.
+    first = int(max(center - half_size - ROUNDING_SLACK_PX, -ONE) + ONE)
+    last = min(int(min(center + half_size + ROUNDING_SLACK_PX, TILE_PX_F32)) + 1, TILE_PX)
     return first, last
 
 
 @kernel
-def patches_of(center: np.float32, reach: np.float32) -> tuple[int, int]:
-    """The range first..last (exclusive) of patches along one axis of a tile that a Gaussian may touch."""
-    first, last = span_of(center, reach)
-    return first // PATCH, (last + PATCH - 1) // PATCH
+def touched_patches(center: np.float32, half_size: np.float32) -> tuple[int, int]:
+    """The range first..last (exclusive) of a tile's patches that a Gaussian may touch on one axis.
 
-
-@inlined_kernel
-def blend_splat(state: Array, record: Array, left: int, top: int) -> None:
-    """Draw a Gaussian into the tile with the first pixel (left, top)."""
-    x, y, slope, across, fall, peak, half_width, half_height, depth, red, green, blue = in_tile(
-        record, left, top
-    )
-    splat = x, y, slope, across, fall, peak, depth, red, green, blue
-    first_row, last_row = patches_of(y, half_height)
-    first_column, last_column = patches_of(x, half_width)
-    for row in range(first_row, last_row):
-        for column in range(first_column, last_column):
-            offset = np.uint64((row * PATCHES + column) * LANES)
-            blend_patch(state, offset, np.float32(column * PATCH), np.float32(row * PATCH), splat)
-
-
-@inlined_kernel
-def pixel_index(row: int, column: int) -> int:
-    """The index of a tile's pixel in a plane."""
-    patch = row // PATCH * PATCHES + column // PATCH
-    return patch * LANES + row % PATCH * PATCH + column % PATCH
-
-
-@kernel
-def blend_splats(state: Array, records: Array, count: int, left: int, top: int) -> None:
-    """Draw the first `count` records into a tile; a separate function, so that constants stay in registers."""
-    for index in range(count):
-        blend_splat(state, records[index], left, top)
+    `center` and `half_size` are in pixels along this axis, from the centre of the tile's first.
+    """
+    first, last = touched_pixels(center, half_size)
+    return first // PATCH_PX, (last + PATCH_PX - 1) // PATCH_PX
 
 
 @kernel
 def is_full(state: Array) -> bool:
-    """Whether every pixel of the tile has reached the transmittance limit."""
-    for i in range(PLANE):  # noqa: SIM110 (numba has no generators)
+    """Whether no pixel of the tile takes more light: the first plane, transmittance, is all 0."""
+    for i in range(PLANE_FLOATS):  # noqa: SIM110 (numba has no generators)
         if state[i] > ZERO:
             return False
     return True
@@ -193,62 +208,48 @@ def is_full(state: Array) -> bool:
 
 @kernel
 def store_tile(state: Array, left: int, top: int, images: Arrays) -> None:
-    """Write a tile's colours, depth and alpha to the pixels inside the image."""
+    """Write a tile's colours, depth and alpha to its pixels inside the image.
+
+    Args:
+        state: the tile's buffer of six planes; its colours are converted to sRGB in place.
+        left, top: the tile's first pixel in the image.
+        images: rgb [H, W, 3], depth [H, W], alpha [H, W] and linear colour [H, W, 3], which are
+            written. An empty linear colour is not written.
+    """
     rgb, depth, alpha, linear = images
-    rows, columns = min(TILE, depth.shape[0] - top), min(TILE, depth.shape[1] - left)
+    rows = min(TILE_PX, depth.shape[0] - top)
+    columns = min(TILE_PX, depth.shape[1] - left)
+
     if len(linear) > 0:
         store_color(state, left, top, rows, columns, linear)
-    for i in range(PLANE, 4 * PLANE):
+    for i in range(PLANE_FLOATS, 4 * PLANE_FLOATS):  # the planes of red, green and blue
         state[i] = encode_srgb(state[i])
     store_color(state, left, top, rows, columns, rgb)
+
     for row in range(rows):
         for column in range(columns):
             i = pixel_index(row, column)
-            opacity = state[i + 5 * PLANE]
+            opacity = state[i + 5 * PLANE_FLOATS]
+            depth_sum = state[i + 4 * PLANE_FLOATS]
             alpha[top + row, left + column] = opacity
-            depth[top + row, left + column] = (
-                state[i + 4 * PLANE] / opacity if opacity > ZERO else ZERO
-            )
+            depth[top + row, left + column] = depth_sum / opacity if opacity > ZERO else ZERO
 
 
 @kernel
 def store_color(state: Array, left: int, top: int, rows: int, columns: int, image: Array) -> None:
-    """Write the three colour planes to an image [H, W, 3]."""
+    """Write the first rows and columns of a tile's red, green and blue planes to an image [H, W, 3].
+
+    (left, top) is the tile's first pixel in the image.
+    """
     for row in range(rows):
         for column in range(columns):
+            i = pixel_index(row, column)
             for channel in range(3):
-                image[top + row, left + column, channel] = state[
-                    pixel_index(row, column) + (1 + channel) * PLANE
-                ]
+                image[top + row, left + column, channel] = state[i + (1 + channel) * PLANE_FLOATS]
 
 
-@kernel
-def blend_tiles(
-    first: int, last: int, tiles: Array, lists: TileLists, records: Array, images: Arrays
-) -> None:
-    """Draw the tiles first..last of `tiles` [K] into the images rgb, depth, alpha and (unless empty) linear colour."""
-    ids, starts = lists
-    columns = (images[1].shape[1] + TILE - 1) // TILE
-    state, near = np.empty(STATE, np.float32), np.empty((CHECK_EVERY, RECORD), np.float32)
-    for k in range(first, last):
-        tile = tiles[k]
-        left, top = (tile % columns) * TILE, (tile // columns) * TILE
-        for i in range(STATE):
-            state[i] = ONE if i < PLANE else ZERO
-        end = starts[tile + 1]
-        for begin in range(starts[tile], end, CHECK_EVERY):
-            count = min(CHECK_EVERY, end - begin)
-            fetch(records, ids, begin, count, near)
-            blend_splats(state, near, count, left, top)
-            if count == CHECK_EVERY and is_full(state):
-                break
-        store_tile(state, left, top, images)
-
-
-@kernel
-def fetch(records: Array, ids: Array, begin: int, count: int, near: Array) -> None:
-    """Copy records, which are scattered in memory, to `near`; in this loop their cache misses overlap."""
-    for n in range(count):
-        record = records[ids[begin + n]]
-        for field in range(RECORD):
-            near[n, field] = record[field]
+@inlined_kernel
+def pixel_index(row: int, column: int) -> int:
+    """The index of a tile's pixel in a plane, which stores patches of 4×4 pixels one by one."""
+    patch = row // PATCH_PX * PATCHES_PER_SIDE + column // PATCH_PX
+    return patch * PATCH_PIXELS + row % PATCH_PX * PATCH_PX + column % PATCH_PX

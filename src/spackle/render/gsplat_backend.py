@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from types import ModuleType
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,82 +13,134 @@ from torch.utils.weak import WeakTensorKeyDictionary
 from spackle.core.camera import Camera
 from spackle.core.color import linear_to_srgb
 from spackle.core.gaussians import Gaussians, quat_to_matrix
-from spackle.render.project import FINITE
-from spackle.render.protocol import NEAR_PLANE, TILE, Rendering, check_tiles, paste, tile_grid
+from spackle.render.project import MAX_FINITE
+from spackle.render.protocol import (
+    NEAR_PLANE,
+    TILE_PX,
+    Renderer,
+    Rendering,
+    as_sets,
+    check_tiles,
+    common_size,
+    paste,
+    tile_grid,
+)
 from spackle.runtime.device import report_memory_shortage
 from spackle.runtime.errors import InputError, as_input_error
 
-INSTALL = "pip install 'spackle-nvs[cuda]'"
-MOST_ENTRIES = 2**31 - 1  # in the lists of tiles, which gsplat counts in int32
+INSTALL_ADVICE = "pip install 'spackle-nvs[cuda]'"
+GSPLAT_VERSION = "1.5."  # of the interface; another version may also clamp alpha elsewhere
+MAX_LIST_ENTRIES = 2**31 - 1  # in the lists of tiles, which gsplat counts in int32
 
 
 @dataclasses.dataclass(frozen=True)
-class Material:
+class DeviceGaussians:
     """A set of Gaussians on the GPU in float32, as input of gsplat."""
 
     means: Tensor  # [N, 3]
-    covariances: Tensor  # [N, 6]
+    covariances: Tensor  # [N, 6]: xx, xy, xz, yy, yz, zz
     opacities: Tensor  # [N]
-    colors: Tensor  # [N, 3] linear
+    colors: Tensor  # [N, 3] linear RGB
 
     @staticmethod
-    def of(part: Gaussians, device: torch.device) -> Material:
-        """Upload a set; Gaussians that are not finite become transparent."""
-        there = [tensor.to(device, torch.float32, non_blocking=True) for tensor in part.tensors]
-        finite = torch.stack(
-            [t.detach().isfinite().unsqueeze(-1).flatten(1).all(1) for t in there]
-        ).all(0)
-        usable = Gaussians(
-            *(torch.where(finite if t.ndim == 1 else finite[:, None], t, 0) for t in there)
+    def of(gaussians: Gaussians, device: torch.device) -> DeviceGaussians:
+        """Upload a set; Gaussians with a number that is not finite become transparent."""
+        fields = [
+            tensor.to(device, torch.float32, non_blocking=True) for tensor in gaussians.tensors
+        ]
+        finite_by_field = [
+            field.detach().isfinite().unsqueeze(-1).flatten(1).all(1)  # [N]
+            for field in fields
+        ]
+        finite = torch.stack(finite_by_field).all(0)
+        cleaned = Gaussians(
+            *(
+                torch.where(finite if field.ndim == 1 else finite[:, None], field, 0)
+                for field in fields
+            )
         )
-        return Material(usable.means, upper_covariances(usable), usable.opacities, usable.colors)
+        return DeviceGaussians(
+            cleaned.means, upper_covariances(cleaned), cleaned.opacities, cleaned.colors
+        )
 
 
-def upper_covariances(part: Gaussians) -> Tensor:
-    """[N, 6]: xx, xy, xz, yy, yz, zz of Σ; matrix products would be rounded by autocast and TF32."""
-    x, y, z = (quat_to_matrix(part.quats) * part.scales[:, None, :]).unbind(1)
+def upper_covariances(gaussians: Gaussians) -> Tensor:
+    """[N, 6]: the upper triangles xx, xy, xz, yy, yz, zz of the covariances Σ = (R S)(R S)ᵀ."""
+    factor = quat_to_matrix(gaussians.quats) * gaussians.scales[:, None, :]  # R S, [N, 3, 3]
+    x, y, z = factor.unbind(1)  # its rows, [N, 3] each
     pairs = ((x, x), (x, y), (x, z), (y, y), (y, z), (z, z))
+    # Not a matrix product, which autocast and TF32 would round.
     return torch.stack([(a * b).sum(-1) for a, b in pairs], dim=-1)
 
 
-class SetStore:
-    """Cache of sets on the GPU; an entry lives as long as the set's means. Sets with gradients are not cached."""
+@dataclasses.dataclass(frozen=True)
+class CachedUpload:
+    """A set on the GPU, and what tells whether the set has changed since it was uploaded."""
+
+    other_fields: tuple[Tensor, ...]  # the set's tensors without the means, which are the key
+    versions: list[tuple[int, int]]  # of each tensor: count of changes in place, memory address
+    on_device: DeviceGaussians
+
+
+class UploadCache:
+    """Sets of Gaussians that were uploaded to the GPU, by the tensor of their means.
+
+    An entry lives as long as this tensor. Sets with gradients are not cached.
+    """
 
     def __init__(self, device: torch.device) -> None:
         self.device = device
-        self._kept = WeakTensorKeyDictionary()
+        self._uploads = WeakTensorKeyDictionary()
 
-    def material(self, part: Gaussians) -> Material:
+    def upload(self, gaussians: Gaussians) -> DeviceGaussians:
         """The set on the GPU; it is uploaded again if a tensor was replaced or changed in place."""
-        if any(
-            t.requires_grad or t.is_inference() for t in part.tensors
-        ):  # inference tensors have no version counter
-            return Material.of(part, self.device)
-        others, state = part.tensors[1:], [(t._version, t.data_ptr()) for t in part.tensors]
-        kept = self._kept.get(part.means)  # type: ignore[no-untyped-call]
-        if (
-            kept is None
-            or kept[1] != state
-            or any(a is not b for a, b in zip(kept[0], others, strict=True))
-        ):
-            with torch.inference_mode(False):  # a later caller may need gradients
-                kept = self._kept[part.means] = others, state, Material.of(part, self.device)
-        material: Material = kept[2]
-        return material
+        # Inference tensors have no count of changes.
+        if any(tensor.requires_grad or tensor.is_inference() for tensor in gaussians.tensors):
+            return DeviceGaussians.of(gaussians, self.device)
+
+        means, *other_fields = gaussians.tensors
+        versions = [(tensor._version, tensor.data_ptr()) for tensor in gaussians.tensors]
+        cached: CachedUpload | None = self._uploads.get(means)  # type: ignore[no-untyped-call]
+        if cached is not None and cached.versions == versions:
+            pairs = zip(cached.other_fields, other_fields, strict=True)
+            if all(old is new for old, new in pairs):
+                return cached.on_device
+
+        # A later caller may need gradients, which tensors made in inference mode cannot have.
+        with torch.inference_mode(False):
+            on_device = DeviceGaussians.of(gaussians, self.device)
+        self._uploads[means] = CachedUpload(tuple(other_fields), versions, on_device)
+        return on_device
 
 
-class GsplatRenderer:
-    """Classic 3D Gaussian splatting by gsplat on an NVIDIA GPU; a `Renderer`.
+@dataclasses.dataclass(frozen=True)
+class ProjectedBatch:
+    """The n Gaussians of all views of a batch, one view after the other, as gsplat projects them."""
 
-    Gaussians may be on the CPU or on the GPU; images are on the device of the first set. Sets without gradients stay on
-    the GPU as long as their tensors exist.
+    view_index: Tensor  # [n] int64: the view that shows the Gaussian
+    radii: Tensor  # [n, 2] int32: half sizes in pixels; 0 for an invisible Gaussian
+    centers: Tensor  # [n, 2] pixels
+    depths: Tensor  # [n]
+    conics: Tensor  # [n, 3]: xx, xy, yy of the inverse projected covariance
+    opacities: Tensor  # [n]
+    colors: Tensor  # [n, 3] linear RGB
+
+
+class GsplatRenderer(Renderer):
+    """Classic 3D Gaussian splatting by gsplat on an NVIDIA GPU.
+
+    Gaussians may be on the CPU or on the GPU; images are on the device of the first set. Sets
+    without gradients stay on the GPU as long as their tensors exist.
     """
 
     def __init__(self, device: str | torch.device = "cuda") -> None:
-        """Load gsplat; InputError if there is no GPU or no gsplat, or gsplat's kernels cannot be built."""
+        """Load gsplat.
+
+        InputError if there is no GPU or no gsplat, or gsplat's kernels cannot be built.
+        """
         self.device = torch.device(device)
         self._gsplat = load_gsplat(self.device)
-        self._store = SetStore(self.device)
+        self._uploads = UploadCache(self.device)
 
     def render(
         self,
@@ -98,11 +149,29 @@ class GsplatRenderer:
         *,
         eps2d: float = 0.0,
         tiles: Tensor | None = None,
-        onto: Rendering | None = None,
+        previous_rendering: Rendering | None = None,
     ) -> Rendering:
-        """See `Renderer.render`; the result is float32. NotEnoughMemory if the GPU's memory is too small."""
-        sets = [gaussians] if isinstance(gaussians, Gaussians) else gaussians
-        return self.render_batch([sets], [camera], eps2d=eps2d, tiles=[tiles], onto=[onto])[0]
+        """Draw Gaussians as a camera sees them, in float32.
+
+        Args:
+            gaussians: one set, or several sets that are drawn together as if they were one.
+                Gradients reach tensors that require them.
+            camera: the view.
+            eps2d: added to the diagonal of each projected covariance, in pixels².
+            tiles: [ceil(H/16), ceil(W/16)] bool: the tiles of 16×16 pixels to draw; None: all.
+            previous_rendering: where all other tiles are copied from; None: they are black.
+
+        Raises:
+            NotEnoughMemory: the GPU's memory is too small.
+        """
+        renderings = self.render_batch(
+            [as_sets(gaussians)],
+            [camera],
+            eps2d=eps2d,
+            tiles=[tiles],
+            previous_renderings=[previous_rendering],
+        )
+        return renderings[0]
 
     def render_batch(
         self,
@@ -111,131 +180,187 @@ class GsplatRenderer:
         *,
         eps2d: float = 0.0,
         tiles: Sequence[Tensor | None] | None = None,
-        onto: Sequence[Rendering | None] | None = None,
+        previous_renderings: Sequence[Rendering | None] | None = None,
     ) -> list[Rendering]:
-        """Render several views of one size in one batch, with the same bits as `render`.
+        """Draw several views of one size at once; each has the bits that `render` would give.
 
-        ValueError if the views differ in size, or `tiles` do not fit. NotEnoughMemory if the GPU's memory is too small.
+        Args:
+            scenes: for each view, the sets of Gaussians that it shows.
+            cameras: one for each view. ValueError if they differ in width or height.
+            eps2d: added to the diagonal of each projected covariance, in pixels².
+            tiles: for each view [rows, columns] bool, the tiles of 16×16 pixels to draw, or None
+                for all; None: all tiles of all views. ValueError if a shape does not fit.
+            previous_renderings: for each view a rendering from which the other tiles are copied,
+                or None for black; None: black for all views.
+
+        Raises:
+            NotEnoughMemory: the GPU's memory is too small.
         """
-        width, height = cameras[0].width, cameras[0].height
-        if any((camera.width, camera.height) != (width, height) for camera in cameras):
-            raise ValueError("views that are drawn together must be of one size")
-        wanted: list[Tensor | None] = [None] * len(cameras)
-        for index, each in enumerate(tiles or []):
-            if each is not None:
-                check_tiles(each, height, width)
-                wanted[index] = each.to(self.device, torch.bool, non_blocking=True)
-        count = sum(len(part) for parts in scenes for part in parts)
-        what = f"to draw {count:,} Gaussians at {width}×{height} on the GPU"
-        with report_memory_shortage("make the picture smaller", "use --device cpu", what=what):
-            drawn = self._draw(scenes, cameras, eps2d, wanted)
-            results = []
-            for view, parts, here, under in zip(
-                drawn, scenes, wanted, onto or [None] * len(cameras), strict=True
-            ):
-                if here is not None:
-                    kept = (
-                        []
-                        if under is None
-                        else [t.to(view.rgb, non_blocking=True) for t in under.tensors]
+        width, height = common_size(cameras)
+        device_tiles: list[Tensor | None] = []
+        for view_tiles in tiles or [None] * len(cameras):
+            if view_tiles is not None:
+                check_tiles(view_tiles, height, width)
+                view_tiles = view_tiles.to(self.device, torch.bool, non_blocking=True)
+            device_tiles.append(view_tiles)
+
+        count = sum(len(gaussians) for sets in scenes for gaussians in sets)
+        purpose = f"to draw {count:,} Gaussians at {width}×{height} on the GPU"
+        with report_memory_shortage("make the picture smaller", "use `device` cpu", what=purpose):
+            drawn = self._draw(scenes, cameras, eps2d, device_tiles)
+            views = zip(
+                drawn,
+                scenes,
+                device_tiles,
+                previous_renderings or [None] * len(cameras),
+                strict=True,
+            )
+            return [
+                self._finished(rendering, sets, view_tiles, previous_rendering)
+                for rendering, sets, view_tiles, previous_rendering in views
+            ]
+
+    def _finished(
+        self,
+        rendering: Rendering,
+        sets: Sequence[Gaussians],
+        tiles: Tensor | None,
+        previous_rendering: Rendering | None,
+    ) -> Rendering:
+        """A drawn view with the tiles that were not drawn, on the device of the first set.
+
+        Where `tiles` [rows, columns] bool is false, pixels come from `previous_rendering`, or are
+        black if it is None. A view without sets comes back on the CPU.
+        """
+        if tiles is not None:
+            if previous_rendering is not None:
+                previous_rendering = Rendering(
+                    *(
+                        image.to(rendering.rgb, non_blocking=True)
+                        for image in previous_rendering.tensors
                     )
-                    view = paste(view, here, Rendering(*kept) if kept else None)
-                results.append(
-                    view.to(parts[0].means.device if len(parts) else torch.device("cpu"))
                 )
-        return results
+            rendering = paste(rendering, tiles, previous_rendering)
+        target = sets[0].means.device if len(sets) else torch.device("cpu")
+        return rendering.to(target)
 
     def _draw(
         self,
         scenes: Sequence[Sequence[Gaussians]],
         cameras: Sequence[Camera],
         eps2d: float,
-        wanted: Sequence[Tensor | None],
+        tiles: Sequence[Tensor | None],
     ) -> list[Rendering]:
-        """Draw the tiles `wanted` [rows, columns]; other pixels are undefined."""
+        """Draw views of one size on the GPU; pixels outside of a view's `tiles` are undefined.
+
+        `tiles` has for each view [rows, columns] bool on the GPU, or None for all tiles.
+        """
         width, height = cameras[0].width, cameras[0].height
         rows, columns = tile_grid(height, width)
-        materials: list[Material] = []
-        seen: list[
-            Any
-        ] = []  # for each set: number of the view, radii [N, 2], means2d [N, 2], depths, conics [N, 3]
-        for k, (parts, (view, lens)) in enumerate(
-            zip(scenes, self._matrices(cameras), strict=True)
-        ):
-            for part in parts:
-                if not len(part):  # gsplat 1.5.3 divides by the number of Gaussians
-                    continue
-                material = self._store.material(part)
-                found = self._gsplat.fully_fused_projection(
-                    material.means, material.covariances, None, None, view, lens, width, height,
-                    eps2d=eps2d, near_plane=NEAR_PLANE, far_plane=FINITE, opacities=material.opacities,
-                )  # fmt: skip
-                materials.append(material)
-                seen.append(
-                    (
-                        torch.full((len(part),), k, device=self.device),
-                        *(field[0] for field in found[:4]),
-                    )
-                )
-        if not seen:
+        batch = self._project(scenes, cameras, eps2d)
+        if batch is None:
             black = torch.zeros(len(cameras), height, width, 5, device=self.device)
             return [Rendering(image[..., :3], image[..., 3], image[..., 4]) for image in black]
-        of, radii, means2d, depths, conics = (torch.cat(field) for field in zip(*seen, strict=True))
-        _, keys, ids = self._gsplat.isect_tiles(
-            means2d.detach(), radii, depths.detach(), TILE, columns, rows,
-            packed=True, n_images=len(cameras), image_ids=of, gaussian_ids=of,
-        )  # fmt: skip
-        if len(ids) > MOST_ENTRIES:
-            raise MemoryError(f"out of memory: {len(ids):,} entries in the lists of tiles")
-        masks = None
-        if any(here is not None for here in wanted):
-            every = torch.ones(rows, columns, dtype=torch.bool, device=self.device)
-            masks = torch.stack([every if here is None else here for here in wanted])
-        colors = torch.cat(
-            [torch.cat([material.colors for material in materials]), depths[:, None]], dim=-1
-        )
-        drawn, alphas = self._gsplat.rasterize_to_pixels(
-            means2d, conics, colors, torch.cat([material.opacities for material in materials]), width, height, TILE,
-            self._gsplat.isect_offset_encode(keys, len(cameras), columns, rows), ids, masks=masks, packed=True,
-        )  # fmt: skip
-        return [
-            Rendering(
-                linear_to_srgb(image[..., :3]),
-                image[..., 3] / torch.where(alpha > 0, alpha, 1),
-                alpha,
-            )
-            for image, alpha in zip(drawn, alphas[..., 0], strict=True)
-        ]
 
-    def _matrices(self, cameras: Sequence[Camera]) -> Iterator[tuple[Tensor, Tensor]]:
-        """Extrinsics [1, 4, 4] and intrinsics [1, 3, 3] of each camera, in one upload."""
-        numbers = [
-            (*c.world_to_camera.flatten().tolist(), *c.K.flatten().tolist()) for c in cameras
-        ]
-        there = torch.tensor(numbers, dtype=torch.float32).to(self.device, non_blocking=True)
-        return zip(
-            there[:, :16].reshape(-1, 1, 4, 4), there[:, 16:].reshape(-1, 1, 3, 3), strict=True
+        # Lists of the Gaussians that each tile of each view shows, sorted by depth.
+        _, list_keys, ids = self._gsplat.isect_tiles(
+            batch.centers.detach(), batch.radii, batch.depths.detach(), TILE_PX, columns, rows,
+            packed=True, n_images=len(cameras),
+            image_ids=batch.view_index, gaussian_ids=batch.view_index,
+        )  # fmt: skip
+        if len(ids) > MAX_LIST_ENTRIES:
+            raise MemoryError(f"out of memory: {len(ids):,} entries in the lists of tiles")
+        list_starts = self._gsplat.isect_offset_encode(list_keys, len(cameras), columns, rows)
+
+        masks = None
+        if any(view_tiles is not None for view_tiles in tiles):
+            all_tiles = torch.ones(rows, columns, dtype=torch.bool, device=self.device)
+            masks = torch.stack([all_tiles if mask is None else mask for mask in tiles])
+
+        # Depth is blended as a fourth colour.
+        channels = torch.cat([batch.colors, batch.depths[:, None]], dim=-1)  # [n, 4]
+        images, alphas = self._gsplat.rasterize_to_pixels(
+            batch.centers, batch.conics, channels, batch.opacities, width, height, TILE_PX,
+            list_starts, ids, masks=masks, packed=True,
+        )  # fmt: skip
+        renderings = []
+        for image, alpha in zip(images, alphas[..., 0], strict=True):  # [H, W, 4] and [H, W]
+            depth = image[..., 3] / torch.where(alpha > 0, alpha, 1)
+            renderings.append(Rendering(linear_to_srgb(image[..., :3]), depth, alpha))
+        return renderings
+
+    def _project(
+        self, scenes: Sequence[Sequence[Gaussians]], cameras: Sequence[Camera], eps2d: float
+    ) -> ProjectedBatch | None:
+        """Upload and project the Gaussians of all views; None if there are none."""
+        width, height = cameras[0].width, cameras[0].height
+        extrinsics, intrinsics = self._upload_cameras(cameras)
+        parts: list[ProjectedBatch] = []
+        for view, sets in enumerate(scenes):
+            for gaussians in sets:
+                if not len(gaussians):  # gsplat 1.5.3 divides by the number of Gaussians
+                    continue
+                uploaded = self._uploads.upload(gaussians)
+                # Results have a first axis for cameras, of which there is one in each call.
+                radii, centers, depths, conics, _ = self._gsplat.fully_fused_projection(
+                    uploaded.means, uploaded.covariances, None, None,
+                    extrinsics[view], intrinsics[view], width, height,
+                    eps2d=eps2d, near_plane=NEAR_PLANE, far_plane=MAX_FINITE,
+                    opacities=uploaded.opacities,
+                )  # fmt: skip
+                parts.append(
+                    ProjectedBatch(
+                        view_index=torch.full((len(gaussians),), view, device=self.device),
+                        radii=radii[0],
+                        centers=centers[0],
+                        depths=depths[0],
+                        conics=conics[0],
+                        opacities=uploaded.opacities,
+                        colors=uploaded.colors,
+                    )
+                )
+        if not parts:
+            return None
+        names = [field.name for field in dataclasses.fields(ProjectedBatch)]
+        return ProjectedBatch(
+            **{name: torch.cat([getattr(part, name) for part in parts]) for name in names}
         )
+
+    def _upload_cameras(self, cameras: Sequence[Camera]) -> tuple[Tensor, Tensor]:
+        """World to camera [V, 1, 4, 4] and intrinsics [V, 1, 3, 3] of V cameras, in one upload."""
+        numbers = [
+            [*camera.world_to_camera.flatten().tolist(), *camera.K.flatten().tolist()]
+            for camera in cameras
+        ]
+        uploaded = torch.tensor(numbers, dtype=torch.float32).to(self.device, non_blocking=True)
+        extrinsics = uploaded[:, :16].reshape(-1, 1, 4, 4)
+        intrinsics = uploaded[:, 16:].reshape(-1, 1, 3, 3)
+        return extrinsics, intrinsics
 
 
 def load_gsplat(device: torch.device) -> ModuleType:
-    """Import gsplat with its kernels, which are built at the first import; see `GsplatRenderer` for errors."""
+    """Import gsplat with its kernels, which are built at the first import.
+
+    Raises:
+        InputError: PyTorch sees no GPU, gsplat is missing or of another version, or it has no
+            kernels, because they could not be built here.
+    """
     if device.type == "cuda" and not torch.cuda.is_available():
         raise InputError(
-            "--device cuda: PyTorch sees no NVIDIA GPU on this machine; use --device cpu"
+            "`device` cuda: PyTorch sees no NVIDIA GPU on this machine; use `device` cpu"
         )
-    with as_input_error(
-        "--device cuda", f"gsplat cannot be used ({{reason}}): {INSTALL}, or use --device cpu"
-    ):
+    problem = f"gsplat cannot be used ({{reason}}): {INSTALL_ADVICE}, or use `device` cpu"
+    with as_input_error("`device` cuda", problem):
         import gsplat
 
-        if not gsplat.__version__.startswith("1.5."):  # another version may clamp alpha elsewhere
+        if not gsplat.__version__.startswith(GSPLAT_VERSION):
             raise RuntimeError(f"its version is {gsplat.__version__}, not 1.5")
         from gsplat.cuda import _backend
 
         if _backend._C is None:
             raise RuntimeError(
-                "it has no kernels: it needs a CUDA toolkit (nvcc) or a wheel built for this PyTorch"
+                "it has no kernels: "
+                "it needs a CUDA toolkit (nvcc) or a wheel built for this PyTorch"
             )
     package: ModuleType = gsplat
     return package

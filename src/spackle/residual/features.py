@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from spackle.core.camera import Camera
-from spackle.render.blend import decode_srgb, encode_srgb
+from spackle.render.fast_math import decode_srgb, encode_srgb
 from spackle.render.protocol import Rendering
 from spackle.runtime.device import parallel_for_chunks
 from spackle.runtime.kernels import kernel

@@ -19,7 +19,7 @@ from spackle.core.filters import maximum_filter
 from spackle.core.gaussians import Gaussians
 from spackle.core.hole_filling import fill_from_far_side
 from spackle.core.surfels import BEHIND_SURFACE_RATIO, PIXEL_SIGMA_PX, inverse_depth_slope
-from spackle.render import Renderer, device_of, touched_tiles
+from spackle.render import Renderer, touched_tiles
 from spackle.render.protocol import Rendering
 from spackle.residual.completion import compose
 from spackle.residual.features import CELL, CPU, MASK_THRESHOLD, ViewFeatures, hole_area_ratio
@@ -76,7 +76,7 @@ class FillContext:
     @functools.cached_property
     def placed(self) -> FillContext:
         """The same context, with base and network on the renderer's device."""
-        device = device_of(self.renderer)
+        device = self.renderer.device
         if self.base.means.device.type == device.type:
             return self
         network = None if self.network is None else copy.deepcopy(self.network).to(device)
@@ -369,7 +369,7 @@ class _Stage:
     def __init__(self, context: FillContext) -> None:
         self._renderer, self._device, self._sets = (
             context.renderer,
-            device_of(context.renderer),
+            context.renderer.device,
             [context.base],
         )
 
@@ -395,6 +395,6 @@ class _Stage:
         tiles = touched_tiles(new, self._camera)
         if bool(tiles.any()):
             self._drawn = self._renderer.render(
-                self._sets, self._camera, tiles=tiles, onto=self._drawn
+                self._sets, self._camera, tiles=tiles, previous_rendering=self._drawn
             )
         return self._drawn.to(CPU)

@@ -184,7 +184,9 @@ def test_a_completed_crop_equals_a_part_of_the_completed_view(
     crop_aux = compose(crop.seeds.select(chosen), deltas, crop.camera)
     assert torch.allclose(aux.means, crop_aux.means, rtol=1e-5, atol=1e-5)
     expected = CPU.render([whole.base, aux], whole.camera)
-    found = CPU.render([crop.base, crop_aux], crop.camera, tiles=crop.tiles, onto=crop.rendering)
+    found = CPU.render(
+        [crop.base, crop_aux], crop.camera, tiles=crop.tiles, previous_rendering=crop.rendering
+    )
     assert crop.hole.any()
     assert (found.rgb - whole.rendering.rgb[part]).abs()[
         crop.hole

@@ -25,7 +25,6 @@ from spackle.paper.evaluation.measurements import BASE_STAGES, COMPLETION_STAGES
 from spackle.paper.evaluation.methods import make_method
 from spackle.paper.evaluation.protocols import large_views
 from spackle.paper.evaluation.tables import make_tables, write_tables
-from spackle.render import device_of
 from spackle.residual import ResidualNet
 from spackle.runtime.device import hardware_facts, package_versions
 from spackle.runtime.folders import results_folder
@@ -101,7 +100,7 @@ def time_case(case: Case, evaluation: Evaluation, config: Mapping[str, Any]) -> 
         InputError: a file cannot be used, the case lacks depth, or Gaussians are not finite.
         BaseError: the base would fail for every image.
     """
-    options, device = evaluation.options, device_of(evaluation.renderer)
+    options, device = evaluation.options, evaluation.renderer.device
     loaded = load_case(case, options.max_side)
     opened = evaluation.open(loaded)
     opened.load(loaded.full)  # not timed

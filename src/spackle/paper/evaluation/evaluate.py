@@ -56,7 +56,7 @@ from spackle.paper.evaluation.table import NOT_RUN, plain
 from spackle.paper.evaluation.tables import FILES, make_tables, write_tables
 from spackle.paper.training.feature_networks import load_features
 from spackle.pipeline import FillOptions
-from spackle.render import Renderer, device_of, get_renderer
+from spackle.render import Renderer, get_renderer
 from spackle.residual import ResidualNet, hole_mask
 from spackle.runtime.device import hardware_facts, package_versions, pick_device, pick_dtype
 from spackle.runtime.digests import json_digest
@@ -261,7 +261,7 @@ def _configuration(
         DATASETS[options.dataset],
         FillOptions(residual=options.residual),
     )
-    precision = str(pick_dtype(base.precision, device_of(renderer))).removeprefix("torch.")
+    precision = str(pick_dtype(base.precision, renderer.device)).removeprefix("torch.")
     config: dict[str, Any] = {
         "kind": "evaluate",
         "spackle": spackle.__version__,
@@ -284,7 +284,7 @@ def _configuration(
             "weights": weights_digests(base.model_files),
             "precision": base.precision,
         },
-        "device": device_of(renderer).type,  # of the renderer, the residual and the base's network
+        "device": renderer.device.type,  # of the renderer, the residual and the base's network
         "methods": list(options.methods),
         "residual": {
             "weights": "seeds"

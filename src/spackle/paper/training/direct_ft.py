@@ -35,7 +35,7 @@ from spackle.paper.training.recipe import Recipe
 from spackle.paper.training.residual import ViewBatch, ViewTask
 from spackle.paper.training.samples import short_digest
 from spackle.paper.training.sources import open_pseudo_dataset, split_photos
-from spackle.render import Renderer, device_of
+from spackle.render import Renderer
 from spackle.runtime.device import report_memory_shortage, without_autocast_or_tf32
 from spackle.runtime.errors import InputError
 from spackle.runtime.files import write_atomic
@@ -111,7 +111,7 @@ def render_views_of_photo(
     photo_camera = views[0].photo_camera
     with report_memory_shortage("try optim.precision=bf16"):
         gaussians = base.gaussians(
-            decoder, base.encode(views[0].photo, photo_camera), device_of(renderer)
+            decoder, base.encode(views[0].photo, photo_camera), renderer.device
         )
         drawn = [
             renderer.render(gaussians, normalised_camera(view.camera, photo_camera))

@@ -21,7 +21,7 @@ from spackle.paper.training.recipe import Recipe
 from spackle.paper.training.samples import Sample, digest_of_samples, load_sample, make_samples
 from spackle.paper.training.sources import find_sources
 from spackle.paper.training.task import Task
-from spackle.render import Renderer, device_of, get_renderer
+from spackle.render import Renderer, get_renderer
 from spackle.render.protocol import Rendering
 from spackle.residual.architectures import (
     NOTE,
@@ -134,7 +134,7 @@ def complete_samples(
     precision: torch.dtype = torch.float32,
 ) -> ViewBatch:
     """Complete samples of one size. Only the network gets gradients; its convolutions compute in `precision`."""
-    device = device_of(renderer)
+    device = renderer.device
     # Masks are read before the samples move to the renderer's device: reading them later would wait for a GPU.
     cells = [training_cells(sample.features).flatten().nonzero()[:, 0] for sample in samples]
     tiles = [sample.tiles for sample in samples]
@@ -147,15 +147,12 @@ def complete_samples(
         index = chosen.to(device, non_blocking=True)
         aux = compose(sample.seeds.select(index), field.flatten(1).T[index], sample.camera)
         scenes.append([sample.base, aux])
-    cameras, onto = [sample.camera for sample in samples], [sample.rendering for sample in samples]
-    if hasattr(renderer, "render_batch"):  # on a GPU
-        views = renderer.render_batch(scenes, cameras, tiles=tiles, onto=onto)
-    else:
-        parts = zip(scenes, cameras, tiles, onto, strict=True)
-        views = [
-            renderer.render(sets, camera, tiles=wanted, onto=under)
-            for sets, camera, wanted, under in parts
-        ]
+    views = renderer.render_batch(
+        scenes,
+        [sample.camera for sample in samples],
+        tiles=tiles,
+        previous_renderings=[sample.rendering for sample in samples],
+    )
     return ViewBatch.of(
         (view, s.rendering.rgb, s.target, s.hole) for view, s in zip(views, samples, strict=True)
     )
@@ -253,7 +250,7 @@ class ResidualTask(ViewTask):
         A run can raise PSNR only from the first value towards the second.
         """
         with torch.random.fork_rng(devices=[]):
-            network = open_residual(self.recipe.network).to(device_of(self.renderer))
+            network = open_residual(self.recipe.network).to(self.renderer.device)
         decibels: dict[str, list[float]] = {"untrained": [], "colours of the targets": []}
         for item in range(self.validation_items):
             (sample,) = self.load_batch(None, [item])

@@ -25,7 +25,7 @@ from spackle.core.gaussians import Gaussians
 from spackle.paper.training.ranks import rank, rank_count, wait_for_ranks
 from spackle.paper.training.recipe import DataRecipe
 from spackle.render import CpuRenderer
-from spackle.render.protocol import TILE, Rendering
+from spackle.render.protocol import TILE_PX, Rendering
 from spackle.residual.features import CELL, ViewFeatures, cell_centers, hole_mask
 from spackle.residual.initializer import InitialGaussians, initialize
 from spackle.residual.network import Rim, find_rim, network_input
@@ -96,7 +96,7 @@ class Sample:
     def tiles(self) -> Tensor:
         """[ceil(H/16), ceil(W/16)] bool: tiles of the renderer that aux Gaussians can touch."""
         near = maximum_filter(self.hole, REACH_PX)
-        return max_pool2d(near[None, None].float(), TILE, ceil_mode=True)[0, 0] > 0
+        return max_pool2d(near[None, None].float(), TILE_PX, ceil_mode=True)[0, 0] > 0
 
     def to(self, device: torch.device) -> Sample:
         """The sample's tensors on another device; the camera stays on the CPU."""

@@ -1,0 +1,379 @@
+"""The backward pass of blending: from gradients of an image to sums over pixels by Gaussian.
+
+Each tile is drawn again in chunks of Gaussians. The Gaussians of a chunk are then visited back to
+front, while the light of all Gaussians behind the current one is known.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from spackle.render.blend import (
+    ALPHA_MAX_F32,
+    GAUSSIANS_PER_CHECK,
+    PLANE_FLOATS,
+    TRANSMITTANCE_STOP_F32,
+    alpha_from_log2,
+    is_full,
+    touched_pixels,
+)
+from spackle.render.covariance import Numbers
+from spackle.render.fast_math import srgb_slope
+from spackle.render.project import Arrays, in_tile
+from spackle.render.protocol import ALPHA_MIN, TILE_PX
+from spackle.render.tile_lists import TileLists
+from spackle.runtime.kernels import ONE, ZERO, Array, kernel, reordering_kernel
+
+# Number of sums over a tile's pixels for one Gaussian. With u = x - centre, dy = y - centre, and
+# v = ∂L/∂ln(alpha), they are the sums of v, v·u, v·u², v·dy, v·dy², v·u·dy, then the gradients of
+# red, green, blue and depth.
+SUMS = 10
+
+# The workspace of a tile is a flat buffer of planes with pixels in row order: the transmittance,
+# the contribution of all Gaussians behind the current one to the loss, and the gradients of red,
+# green, blue, depth and alpha.
+BEHIND_PLANE = 1 * PLANE_FLOATS
+GRADIENT_PLANES = 2 * PLANE_FLOATS
+WORKSPACE_FLOATS = 7 * PLANE_FLOATS
+
+# While Gaussians are drawn again, a note is taken for each row of pixels: 16 alphas, then 16
+# transmittances. The notes of a chunk fit into the second-level cache.
+CHUNK_GAUSSIANS = 128
+NOTE_FLOATS = 2 * TILE_PX
+NOTES_FLOATS = CHUNK_GAUSSIANS * TILE_PX * NOTE_FLOATS
+
+# A row whose log2 of alpha stays below this shows nothing of the Gaussian; 1e-3 is for rounding.
+INVISIBLE_LOG2_ALPHA = np.float32(math.log2(ALPHA_MIN) - 1e-3)
+
+
+@kernel
+def backward_tiles(
+    first: int, last: int, tiles: Array, lists: TileLists, entry_needs: Array, records: Array,
+    images: Arrays, gradients: Arrays, rows_before: Array, sums: Array,
+) -> None:  # fmt: skip
+    """Sum gradients over the pixels of each tile, for each Gaussian in the tile's list.
+
+    Args:
+        first, last: the tiles `tiles[first]` to `tiles[last - 1]` are done.
+        tiles: [K] numbers of tiles, row by row.
+        lists: the E Gaussians of all tiles ("entries"), sorted front to back.
+        entry_needs: [E] bool: the entries whose sums are wanted.
+        records: [N, 12] float32 numbers of each Gaussian, see `spackle.render.project`.
+        images: the forward pass's rgb, depth, alpha and linear colour.
+        gradients: of rgb [H, W, 3], depth [H, W] and alpha [H, W].
+        rows_before: [T + 1] int64: where each tile's rows start in `sums`.
+        sums: [M, 10] float32, zero at first: one row for each entry with `entry_needs`.
+    """
+    work = np.empty(WORKSPACE_FLOATS, np.float32)
+    notes = np.empty(NOTES_FLOATS, np.float32)
+    first_notes = np.empty(CHUNK_GAUSSIANS, np.uint64)
+    room = work, notes, first_notes
+    columns = (images[1].shape[1] + TILE_PX - 1) // TILE_PX
+    for k in range(first, last):
+        tile = tiles[k]
+        left = (tile % columns) * TILE_PX
+        top = (tile // columns) * TILE_PX
+        load_gradients(work, left, top, images, gradients)
+        entries = slice(lists.starts[tile], lists.starts[tile + 1])
+        tile_sums = sums[rows_before[tile] : rows_before[tile + 1]]
+        backward_tile(room, records, lists.ids[entries], entry_needs[entries], left, top, tile_sums)
+
+
+@kernel
+def load_gradients(work: Array, left: int, top: int, images: Arrays, gradients: Arrays) -> None:
+    """Turn gradients of a tile's images into gradients of its blended sums, the last five planes.
+
+    Blending sums weighted linear colours, depths and alphas; the images have sRGB, and depth
+    divided by alpha. Pixels outside of the image get zeros.
+
+    Args:
+        work: the tile's workspace of seven planes; the last five are written.
+        left, top: the tile's first pixel in the image.
+        images: rgb [H, W, 3], depth [H, W], alpha [H, W], linear colour [H, W, 3].
+        gradients: of rgb, depth and alpha.
+    """
+    rgb, depth, alpha, linear = images
+    rgb_grad, depth_grad, alpha_grad = gradients
+    for i in range(GRADIENT_PLANES, GRADIENT_PLANES + 5 * PLANE_FLOATS):
+        work[i] = ZERO
+
+    for row in range(min(TILE_PX, depth.shape[0] - top)):
+        for column in range(min(TILE_PX, depth.shape[1] - left)):
+            i = GRADIENT_PLANES + row * TILE_PX + column
+            y = top + row
+            x = left + column
+            for channel in range(3):
+                slope = srgb_slope(linear[y, x, channel], rgb[y, x, channel])
+                work[i + channel * PLANE_FLOATS] = rgb_grad[y, x, channel] * slope
+            work[i + 4 * PLANE_FLOATS] = alpha_grad[y, x]
+            # depth = sum / alpha, so that alpha changes it, too.
+            if alpha[y, x] > ZERO:
+                depth_sum_grad = depth_grad[y, x] / alpha[y, x]
+                work[i + 3 * PLANE_FLOATS] = depth_sum_grad
+                work[i + 4 * PLANE_FLOATS] -= depth_sum_grad * depth[y, x]
+
+
+@kernel
+def backward_tile(
+    room: Arrays, records: Array, ids: Array, entry_needs: Array, left: int, top: int, sums: Array
+) -> None:
+    """Sum gradients over the pixels of one tile, for the Gaussians in its list that need them.
+
+    Args:
+        room: buffers for one tile: its workspace, with gradients filled in; the notes; and
+            [128] for the start of each Gaussian's notes.
+        records: [N, 12] float32 numbers of each Gaussian.
+        ids: [n] indices of the tile's Gaussians, front to back.
+        entry_needs: [n] bool: those whose sums are wanted.
+        left, top: the tile's first pixel in the image.
+        sums: [m, 10] float32, zero at first: one row for each of these.
+    """
+    work, notes, first_notes = room
+    chunks = (len(ids) + CHUNK_GAUSSIANS - 1) // CHUNK_GAUSSIANS
+
+    # Front to back: note the transmittance in front of each chunk.
+    chunk_transmittance = np.empty((chunks, PLANE_FLOATS), np.float32)
+    work[:PLANE_FLOATS] = ONE
+    work[BEHIND_PLANE : BEHIND_PLANE + PLANE_FLOATS] = ZERO
+    for chunk in range(chunks):
+        chunk_transmittance[chunk] = work[:PLANE_FLOATS]
+        if chunk < chunks - 1:
+            part = ids[chunk * CHUNK_GAUSSIANS : (chunk + 1) * CHUNK_GAUSSIANS]
+            redraw_chunk(work, notes, records, part, left, top, first_notes)
+
+    # Back to front: draw a chunk again with notes, and step back over its Gaussians.
+    row = len(sums)
+    for chunk in range(chunks - 1, -1, -1):
+        work[:PLANE_FLOATS] = chunk_transmittance[chunk]
+        part = ids[chunk * CHUNK_GAUSSIANS : (chunk + 1) * CHUNK_GAUSSIANS]
+        drawn = redraw_chunk(work, notes, records, part, left, top, first_notes)
+        for k in range(len(part) - 1, -1, -1):
+            if row == 0:  # no Gaussian further in front needs sums
+                return
+            need = entry_needs[chunk * CHUNK_GAUSSIANS + k]
+            if need:
+                row -= 1
+            # Gaussians behind the last drawn one are hidden: their sums stay 0.
+            if k < drawn:
+                own_sums = sums[row if need else 0]
+                record = records[part[k]]
+                step_back(work, notes, first_notes[k], record, left, top, need, own_sums)
+
+
+@kernel
+def redraw_chunk(
+    work: Array, notes: Array, records: Array, ids: Array, left: int, top: int, first_notes: Array
+) -> int:
+    """Draw up to 128 Gaussians of a tile again, noting alpha and transmittance of each pixel.
+
+    Args:
+        work: the tile's workspace; its first plane, the transmittance, is changed.
+        notes: written here: for each row of each Gaussian 16 alphas, then 16 transmittances.
+        records: [N, 12] float32 numbers of each Gaussian.
+        ids: [n] indices of the Gaussians to draw, front to back.
+        left, top: the tile's first pixel in the image.
+        first_notes: [128]: where each Gaussian's notes start, written here.
+
+    Returns:
+        The number of Gaussians that were drawn until the tile was full.
+    """
+    note = np.uint64(0)
+    for k in range(len(ids)):
+        first_notes[k] = note
+        x, y, slope, across, fall, peak, _, half_height, _, _, _, _ = in_tile(
+            records[ids[k]], left, top
+        )
+        first, last = touched_pixels(y, half_height)
+        for row in range(first, last):
+            dy = np.float32(row) - y
+            row_peak = peak - fall * dy * dy
+            if row_peak < INVISIBLE_LOG2_ALPHA:
+                continue
+            bell = (across, x + slope * dy)
+            redraw_row(work, np.uint64(row * TILE_PX), notes, note, row_peak, bell)
+            note += np.uint64(NOTE_FLOATS)
+        if k % GAUSSIANS_PER_CHECK == GAUSSIANS_PER_CHECK - 1 and is_full(work):
+            return k + 1
+    return len(ids)
+
+
+@kernel
+def redraw_row(
+    work: Array, offset: np.uint64, notes: Array, note: np.uint64, peak: np.float32, bell: Numbers
+) -> None:
+    """Draw a row of 16 pixels of a Gaussian, and note each pixel's alpha and transmittance.
+
+    Args:
+        work: the tile's workspace; its first plane, the transmittance, is changed.
+        offset: where the row starts in a plane.
+        notes: at `note`, 16 alphas (0 where nothing is drawn) and 16 transmittances are written.
+        note: where the row's note starts.
+        peak: largest log2 of alpha in the row.
+        bell: (rate, centre): log2 of alpha is peak - rate·(x - centre)².
+    """
+    across, center = bell
+    for x in range(TILE_PX):
+        i = offset + np.uint64(x)
+        n = note + np.uint64(x)
+        u = np.float32(x) - center
+        alpha = alpha_from_log2(peak - across * u * u)
+        transmittance = work[i]
+        after = transmittance * (ONE - alpha)
+        full = after <= TRANSMITTANCE_STOP_F32
+        work[i] = ZERO if full else after
+        notes[n] = ZERO if full else alpha
+        notes[n + np.uint64(TILE_PX)] = transmittance
+
+
+@kernel
+def step_back(
+    work: Array,
+    notes: Array,
+    note: np.uint64,
+    record: Array,
+    left: int,
+    top: int,
+    need: bool,
+    sums: Array,
+) -> None:
+    """Step back over a Gaussian: add its light to that behind the next one, and sum its gradients.
+
+    Args:
+        work: the tile's workspace of seven planes; the light behind is changed.
+        notes: of the chunk, as `redraw_chunk` writes them.
+        note: where this Gaussian's notes start.
+        record: [12] the Gaussian's numbers.
+        left, top: the tile's first pixel in the image.
+        need: whether the sums are wanted.
+        sums: [10]: the Gaussian's sums, to which those of this tile are added if `need`.
+    """
+    x, y, slope, _, fall, peak, _, half_height, depth, red, green, blue = in_tile(record, left, top)
+    look = (red, green, blue, depth)
+    first, last = touched_pixels(y, half_height)
+    for row in range(first, last):
+        dy = np.float32(row) - y
+        if peak - fall * dy * dy < INVISIBLE_LOG2_ALPHA:  # has no note
+            continue
+        offset = np.uint64(row * TILE_PX)
+        if need:
+            v, vu, vuu, red_grad, green_grad, blue_grad, depth_grad = step_back_and_sum_row(
+                work, offset, notes, note, x + slope * dy, look
+            )
+            sums[0] += v
+            sums[1] += vu
+            sums[2] += vuu
+            sums[3] += v * dy
+            sums[4] += v * dy * dy
+            sums[5] += vu * dy
+            sums[6] += red_grad
+            sums[7] += green_grad
+            sums[8] += blue_grad
+            sums[9] += depth_grad
+        else:
+            step_back_row(work, offset, notes, note, look)
+        note += np.uint64(NOTE_FLOATS)
+
+
+@kernel
+def step_back_row(
+    work: Array, offset: np.uint64, notes: Array, note: np.uint64, look: Numbers
+) -> None:
+    """Step back over a row of a Gaussian whose own gradient nobody needs.
+
+    The plane of contributions behind grows by weight·(look · gradients) in each pixel.
+
+    Args:
+        work: the tile's workspace of seven planes.
+        offset: where the row starts in a plane.
+        notes: alphas and transmittances of the row, from `note` on.
+        note: where the row's note starts.
+        look: the Gaussian's red, green, blue and depth.
+    """
+    red, green, blue, depth = look
+    for x in range(TILE_PX):
+        i = offset + np.uint64(x)
+        n = note + np.uint64(x)
+        g = i + np.uint64(GRADIENT_PLANES)
+        value = (
+            red * work[g]
+            + green * work[g + np.uint64(PLANE_FLOATS)]
+            + blue * work[g + np.uint64(2 * PLANE_FLOATS)]
+        )
+        value += (
+            depth * work[g + np.uint64(3 * PLANE_FLOATS)] + work[g + np.uint64(4 * PLANE_FLOATS)]
+        )
+        work[i + np.uint64(BEHIND_PLANE)] += notes[n] * notes[n + np.uint64(TILE_PX)] * value
+
+
+@reordering_kernel
+def step_back_and_sum_row(
+    work: Array, offset: np.uint64, notes: Array, note: np.uint64, center: np.float32, look: Numbers
+) -> tuple[np.float32, np.float32, np.float32, np.float32, np.float32, np.float32, np.float32]:
+    """Step back over a row of 16 pixels of a Gaussian, and sum its gradients over them.
+
+    Args:
+        work: the tile's workspace of seven planes; that of contributions behind is changed.
+        offset: where the row starts in a plane.
+        notes: alphas and transmittances of the row, from `note` on.
+        note: where the row's note starts.
+        center: the Gaussian's middle in this row, in pixels of the tile.
+        look: its red, green, blue and depth.
+
+    Returns:
+        The sums of v, v·u and v·u², with v = ∂L/∂ln(alpha) and u = x - center; then the gradients
+        of red, green, blue and depth.
+    """
+    red, green, blue, depth = look
+    sum_v, sum_vu, sum_vuu = ZERO, ZERO, ZERO
+    sum_red, sum_green, sum_blue, sum_depth = ZERO, ZERO, ZERO, ZERO
+    for x in range(TILE_PX):
+        i = offset + np.uint64(x)
+        n = note + np.uint64(x)
+        g = i + np.uint64(GRADIENT_PLANES)
+        red_grad = work[g]
+        green_grad = work[g + np.uint64(PLANE_FLOATS)]
+        blue_grad = work[g + np.uint64(2 * PLANE_FLOATS)]
+        depth_grad = work[g + np.uint64(3 * PLANE_FLOATS)]
+        alpha_grad = work[g + np.uint64(4 * PLANE_FLOATS)]
+        # What one unit of this Gaussian's weight adds to the loss.
+        value = (
+            red * red_grad + green * green_grad + blue * blue_grad + depth * depth_grad + alpha_grad
+        )
+        alpha = notes[n]
+        transmittance = notes[n + np.uint64(TILE_PX)]
+        behind = work[i + np.uint64(BEHIND_PLANE)]
+        weight = alpha * transmittance
+        work[i + np.uint64(BEHIND_PLANE)] = behind + weight * value
+
+        # A larger alpha shows more of this Gaussian and less of those behind; a clamped alpha has
+        # no gradient.
+        log_alpha_grad = alpha * (transmittance * value - behind / (ONE - alpha))
+        v = log_alpha_grad if alpha < ALPHA_MAX_F32 else ZERO
+        u = np.float32(x) - center
+        sum_v += v
+        sum_vu += v * u
+        sum_vuu += v * u * u
+        sum_red += weight * red_grad
+        sum_green += weight * green_grad
+        sum_blue += weight * blue_grad
+        sum_depth += weight * depth_grad
+    return sum_v, sum_vu, sum_vuu, sum_red, sum_green, sum_blue, sum_depth
+
+
+@kernel
+def collect_sums(first_row: int, last_row: int, sum_rows: Array, sums: Array, table: Array) -> None:
+    """Add the sums of all tiles to one row for each Gaussian, for some rows of the table.
+
+    Args:
+        first_row, last_row: the rows first_row..last_row (exclusive) of the table are written.
+        sum_rows: [M]: the row of the table to which each row of `sums` belongs.
+        sums: [M, 10] float32, in the order of tiles.
+        table: [G, 10] float32, zero at first.
+    """
+    for k in range(len(sum_rows)):
+        row = sum_rows[k]
+        if first_row <= row < last_row:
+            for s in range(SUMS):
+                table[row, s] += sums[k, s]

@@ -1,0 +1,251 @@
+"""The backward pass of projection: from sums over pixels to gradients of the Gaussians' tensors."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from spackle.render.covariance import (
+    FX,
+    FY,
+    MAX_X_SLOPE,
+    MAX_Y_SLOPE,
+    MIN_X_SLOPE,
+    MIN_Y_SLOPE,
+    Numbers,
+    covariance_factor,
+    projection_jacobian,
+    rotation_matrix,
+    widened_covariance,
+)
+from spackle.render.project import Arrays, KernelCamera
+from spackle.runtime.kernels import Array, kernel
+
+MIN_NORM = 1e-12  # of a quaternion, for a safe division
+
+
+@kernel
+def project_backward(
+    start: int, stop: int, scene: Arrays, camera: KernelCamera, table: Array, gradients: Arrays
+) -> None:
+    """Write the gradients of the Gaussians start..stop of a set, computed in float64.
+
+    Args:
+        start, stop: indices in the set.
+        scene: the set's arrays: means [n, 3], quats [n, 4], scales [n, 3], opacities [n],
+            colors [n, 3].
+        camera: the view.
+        table: [n, 10] sums over pixels: with u = x - centre, dy = y - centre and
+            v = ∂L/∂ln(alpha) the sums of v, v·u, v·u², v·dy, v·dy², v·u·dy; then the gradients of
+            red, green, blue and depth. A row of zeros belongs to an invisible Gaussian, which gets
+            no gradients.
+        gradients: of the arrays of `scene`, of the same shapes, zero at first; written here.
+    """
+    means, quats, scales, opacities, _ = scene
+    lens = camera.lens
+    pose = camera.pose
+    means_grad, quats_grad, scales_grad, opacities_grad, colors_grad = gradients
+    center = np.empty(3)  # in the camera's frame
+    factor_grad = np.empty((2, 3))
+    rotation_grad = np.empty((3, 3))
+    jacobian_grad = np.empty((2, 3))
+    for i in range(start, stop):
+        sums = table[i]
+        if not sums.any():
+            continue
+        colors_grad[i, 0] = sums[6]
+        colors_grad[i, 1] = sums[7]
+        colors_grad[i, 2] = sums[8]
+        # alpha is proportional to the opacity, so ∂ln(alpha)/∂opacity = 1 / opacity.
+        opacities_grad[i] = sums[0] / opacities[i]
+
+        # The forward pass once more, as in `project_block`.
+        for a in range(3):
+            center[a] = (
+                pose[a, 0] * means[i, 0]
+                + pose[a, 1] * means[i, 1]
+                + pose[a, 2] * means[i, 2]
+                + pose[a, 3]
+            )
+        nearness = 1.0 / center[2]
+        jacobian = projection_jacobian(center[0] * nearness, center[1] * nearness, nearness, lens)
+        rotation = rotation_matrix(quats[i])
+        factor = covariance_factor(jacobian, pose, rotation, scales[i])
+
+        # And back, step by step.
+        u_grad, v_grad = ellipse_backward(sums, factor, camera.eps2d, factor_grad)
+        factor_backward(
+            jacobian,
+            pose,
+            rotation,
+            scales[i],
+            factor_grad,
+            (jacobian_grad, rotation_grad),
+            scales_grad[i],
+        )
+        quat_backward(quats[i], rotation_grad, quats_grad[i])
+        center_grad = center_backward(center, lens, jacobian_grad, u_grad, v_grad, sums[9])
+        for b in range(3):
+            means_grad[i, b] = (
+                pose[0, b] * center_grad[0]
+                + pose[1, b] * center_grad[1]
+                + pose[2, b] * center_grad[2]
+            )
+
+
+@kernel
+def ellipse_backward(
+    sums: Array, factor: Numbers, eps2d: float, factor_grad: Array
+) -> tuple[float, float]:
+    """Turn sums over pixels into gradients of a projected Gaussian's shape and centre.
+
+    For a pixel at the offset d from the centre, ∂ln(alpha)/∂centre = p and
+    ∂ln(alpha)/∂Σ = ½ p pᵀ with p = Σ⁻¹ d = (A·u, D·dy - k·A·u), where A = Σyy/det, D = 1/Σyy, the
+    slope k = Σxy/Σyy, and u the pixel's distance from the middle of its row.
+
+    Args:
+        sums: [10] of the Gaussian, see `project_backward`.
+        factor: M row by row, with Σ = M Mᵀ + eps2d·I.
+        eps2d: pixels².
+        factor_grad: [2, 3]: the gradient of M is written here.
+
+    Returns:
+        The gradient of the centre's pixel position (u, v).
+    """
+    _, sum_vu, sum_vuu, sum_vdy, sum_vdydy, sum_vudy, _, _, _, _ = sums
+    _, xy, yy, det = widened_covariance(factor, eps2d)
+    across = yy / det
+    fall = 1.0 / yy
+    skew = xy / yy * across
+
+    # Twice the gradient of Σ; the other half is the gradient by Mᵀ.
+    xx_grad = across * across * sum_vuu
+    xy_grad = across * fall * sum_vudy - across * skew * sum_vuu
+    yy_grad = fall * fall * sum_vdydy - 2.0 * fall * skew * sum_vudy + skew * skew * sum_vuu
+    for k in range(3):
+        m = factor[k]
+        n = factor[3 + k]
+        factor_grad[0, k] = xx_grad * m + xy_grad * n
+        factor_grad[1, k] = xy_grad * m + yy_grad * n
+    return across * sum_vu, fall * sum_vdy - skew * sum_vu
+
+
+@kernel
+def factor_backward(
+    jacobian: Numbers,
+    pose: Array,
+    rotation: Numbers,
+    scale: Array,
+    factor_grad: Array,
+    grads: Arrays,
+    scale_grad: Array,
+) -> None:
+    """Turn the gradient of M = J W R S into gradients of J, of R and of the scales S.
+
+    Args:
+        jacobian: J = [[a, 0, b], [0, c, d]] as (a, b, c, d).
+        pose: [3, 4] world to camera; W is its rotation.
+        rotation: R, row by row.
+        scale: [3] standard deviations.
+        factor_grad: [2, 3] of M.
+        grads: of J [2, 3] and of R [3, 3], written here.
+        scale_grad: [3], written here.
+    """
+    jacobian_grad, rotation_grad = grads
+    jacobian_grad[:, :] = 0.0
+    for k in range(3):
+        scale_grad[k] = 0.0
+        for b in range(3):
+            # Column b of J W is multiplied by component b of the Gaussian's axis k.
+            h0 = jacobian[0] * pose[0, b] + jacobian[1] * pose[2, b]
+            h1 = jacobian[2] * pose[1, b] + jacobian[3] * pose[2, b]
+            along = h0 * factor_grad[0, k] + h1 * factor_grad[1, k]
+            axis = rotation[3 * b + k]
+            scale_grad[k] += along * axis
+            rotation_grad[b, k] = along * scale[k]
+            for a in range(2):
+                for c in range(3):
+                    jacobian_grad[a, c] += factor_grad[a, k] * scale[k] * axis * pose[c, b]
+
+
+@kernel
+def quat_backward(quat: Array, rotation_grad: Array, quat_grad: Array) -> None:
+    """Turn the gradient of a rotation matrix into that of its quaternion before normalisation.
+
+    Args:
+        quat: [4] wxyz, of any length.
+        rotation_grad: [3, 3].
+        quat_grad: [4], written here.
+    """
+    w = np.float64(quat[0])
+    x = np.float64(quat[1])
+    y = np.float64(quat[2])
+    z = np.float64(quat[3])
+    inverse_norm = 1.0 / max(math.sqrt(w * w + x * x + y * y + z * z), MIN_NORM)
+    w = w * inverse_norm
+    x = x * inverse_norm
+    y = y * inverse_norm
+    z = z * inverse_norm
+
+    # The derivative of the rotation matrix by each component of the unit quaternion.
+    r = rotation_grad
+    w_grad = 2 * (x * (r[2, 1] - r[1, 2]) + y * (r[0, 2] - r[2, 0]) + z * (r[1, 0] - r[0, 1]))
+    x_grad = 2 * (
+        w * (r[2, 1] - r[1, 2]) + y * (r[0, 1] + r[1, 0]) + z * (r[0, 2] + r[2, 0])
+    ) - 4 * x * (r[1, 1] + r[2, 2])
+    y_grad = 2 * (
+        w * (r[0, 2] - r[2, 0]) + x * (r[0, 1] + r[1, 0]) + z * (r[1, 2] + r[2, 1])
+    ) - 4 * y * (r[0, 0] + r[2, 2])
+    z_grad = 2 * (
+        w * (r[1, 0] - r[0, 1]) + x * (r[0, 2] + r[2, 0]) + y * (r[1, 2] + r[2, 1])
+    ) - 4 * z * (r[0, 0] + r[1, 1])
+
+    # Normalisation removes the part of the gradient along the quaternion.
+    along = w_grad * w + x_grad * x + y_grad * y + z_grad * z
+    quat_grad[0] = (w_grad - along * w) * inverse_norm
+    quat_grad[1] = (x_grad - along * x) * inverse_norm
+    quat_grad[2] = (y_grad - along * y) * inverse_norm
+    quat_grad[3] = (z_grad - along * z) * inverse_norm
+
+
+@kernel
+def center_backward(
+    center: Array,
+    lens: Array,
+    jacobian_grad: Array,
+    u_grad: float,
+    v_grad: float,
+    depth_grad: float,
+) -> tuple[float, float, float]:
+    """The gradient of a Gaussian's centre in the camera's frame.
+
+    Args:
+        center: [3] in the camera's frame.
+        lens: [8] focal lengths, principal point and bounds of x/z and y/z, see `KernelCamera`.
+        jacobian_grad: [2, 3] of the projection's Jacobian, which depends on the centre, too.
+        u_grad, v_grad: of the centre's pixel position.
+        depth_grad: of its depth z.
+    """
+    x, y, z = center
+    # The Jacobian uses these limited slopes; at a limit they do not move with the centre.
+    x_slope = min(lens[MAX_X_SLOPE], max(lens[MIN_X_SLOPE], x / z))
+    y_slope = min(lens[MAX_Y_SLOPE], max(lens[MIN_Y_SLOPE], y / z))
+    fx = lens[FX] / z
+    fy = lens[FY] / z
+
+    # By way of the pixel position u = fx·x/z, v = fy·y/z, and of the depth.
+    x_grad = fx * u_grad
+    y_grad = fy * v_grad
+    z_grad = depth_grad - (x_grad * x + y_grad * y) / z
+
+    # By way of the Jacobian [[fx/z, 0, -fx·slope/z], [0, fy/z, -fy·slope/z]].
+    z_grad -= (fx * jacobian_grad[0, 0] + fy * jacobian_grad[1, 1]) / z
+    z_grad += (fx * x_slope * jacobian_grad[0, 2] + fy * y_slope * jacobian_grad[1, 2]) / z
+    if lens[MIN_X_SLOPE] <= x / z <= lens[MAX_X_SLOPE]:
+        x_grad -= fx / z * jacobian_grad[0, 2]
+        z_grad += fx / z * x_slope * jacobian_grad[0, 2]
+    if lens[MIN_Y_SLOPE] <= y / z <= lens[MAX_Y_SLOPE]:
+        y_grad -= fy / z * jacobian_grad[1, 2]
+        z_grad += fy / z * y_slope * jacobian_grad[1, 2]
+    return x_grad, y_grad, z_grad

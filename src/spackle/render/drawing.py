@@ -1,0 +1,154 @@
+"""The forward pass of the CPU renderer: project Gaussians, list them by tile, sort, blend."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from spackle.core.camera import Camera
+from spackle.core.gaussians import Gaussians
+from spackle.render.blend import blend_tiles
+from spackle.render.project import (
+    RECORD_FLOATS,
+    Arrays,
+    KernelCamera,
+    Splats,
+    count_drawn_tiles,
+    project_gaussians,
+)
+from spackle.render.protocol import Rendering, as_sets, check_tiles
+from spackle.render.tile_lists import TileLists, list_tiles, sort_tiles
+from spackle.runtime.device import parallel_for_chunks
+from spackle.runtime.kernels import Array
+
+GAUSSIANS_PER_CHUNK = 1 << 16  # Gaussians that a thread projects at a time
+TILES_PER_CHUNK = 64  # tiles that a thread sorts and blends at a time
+
+
+@dataclasses.dataclass(frozen=True)
+class Drawing:
+    """A rendering, and the intermediate results that the backward pass needs."""
+
+    view: KernelCamera
+    drawn_tiles: Array  # [rows, columns] bool
+    splats: Splats
+    lists: TileLists  # sorted front to back in the drawn tiles
+    # Float32: rgb [H, W, 3] sRGB, depth [H, W], alpha [H, W], and linear colour [H, W, 3], or
+    # [0, 0, 3] if it was not asked for.
+    images: Arrays
+
+    def rendering(self) -> Rendering:
+        """The images as tensors that share the arrays' memory."""
+        rgb, depth, alpha, _ = self.images
+        return Rendering(torch.from_numpy(rgb), torch.from_numpy(depth), torch.from_numpy(alpha))
+
+
+def draw(
+    sets: Sequence[Gaussians],
+    view: KernelCamera,
+    drawn_tiles: Array,
+    background: Rendering | None,
+    *,
+    keep_linear: bool = False,
+) -> Drawing:
+    """Draw sets of Gaussians into some tiles of an image.
+
+    Args:
+        sets: drawn together as if they were one set.
+        view: the camera.
+        drawn_tiles: [rows, columns] bool: the tiles of 16×16 pixels to draw.
+        background: a rendering whose copy fills all other tiles; None: they are black and empty.
+        keep_linear: also store the linear colour, which the backward pass needs.
+    """
+    splats, lists = project_and_list(sets, view, drawn_tiles)
+    images = blank_images(view, background, keep_linear)
+    tiles = np.flatnonzero(drawn_tiles)
+
+    # Each chunk sorts its tiles just before it blends them, while they are in the cache.
+    def sort_and_blend(start: int, stop: int) -> None:
+        sort_tiles(start, stop, tiles, lists, splats.records)
+        blend_tiles(start, stop, tiles, lists, splats.records, images)
+
+    parallel_for_chunks(sort_and_blend, len(tiles), TILES_PER_CHUNK)
+    return Drawing(view, drawn_tiles, splats, lists, images)
+
+
+def blank_images(view: KernelCamera, background: Rendering | None, keep_linear: bool) -> Arrays:
+    """The images of a `Drawing` before anything is drawn: a copy of `background`, or zeros.
+
+    Returns rgb [H, W, 3], depth [H, W], alpha [H, W] and linear colour [H, W, 3] in float32. The
+    linear colour is zero, and has the shape [0, 0, 3] unless `keep_linear`.
+    """
+    height, width = view.height, view.width
+    linear = np.zeros((height, width, 3) if keep_linear else (0, 0, 3), np.float32)
+    if background is not None:
+        rgb, depth, alpha = (np.array(as_array(image)) for image in background.tensors)
+        return rgb, depth, alpha, linear
+    rgb = np.zeros((height, width, 3), np.float32)
+    depth = np.zeros((height, width), np.float32)
+    alpha = np.zeros((height, width), np.float32)
+    return rgb, depth, alpha, linear
+
+
+def touched_tiles(gaussians: Gaussians | Sequence[Gaussians], camera: Camera) -> Tensor:
+    """[ceil(H/16), ceil(W/16)] bool: tiles with pixels that these Gaussians can change."""
+    view = KernelCamera.of(camera, eps2d=0.0)
+    _, lists = project_and_list(as_sets(gaussians), view, tiles_to_draw(view, None))
+    list_lengths = np.diff(lists.starts)
+    return torch.from_numpy(list_lengths > 0).reshape(view.tiles)
+
+
+def project_and_list(
+    sets: Sequence[Gaussians], view: KernelCamera, drawn_tiles: Array
+) -> tuple[Splats, TileLists]:
+    """Project Gaussians, and list for each drawn tile those that may touch it (not yet sorted).
+
+    `drawn_tiles` is [rows, columns] bool; the lists of all other tiles are empty.
+    """
+    splats = project(sets, view, drawn_tiles)
+    return splats, list_tiles(splats.boxes, drawn_tiles, GAUSSIANS_PER_CHUNK)
+
+
+def project(sets: Sequence[Gaussians], view: KernelCamera, drawn_tiles: Array) -> Splats:
+    """Project the Gaussians of all sets; those that touch a drawn tile get a record for blending.
+
+    `drawn_tiles` is [rows, columns] bool.
+    """
+    count = sum(len(part) for part in sets)
+    drawn_before = count_drawn_tiles(drawn_tiles)
+    splats = Splats(
+        records=np.empty((count, RECORD_FLOATS), np.float32), boxes=np.empty((count, 4), np.uint16)
+    )
+    first_index = 0  # of the set's first Gaussian among those of all sets
+    for part in sets:
+        scene = tuple(as_array(tensor) for tensor in part.tensors)
+        offset = first_index
+
+        def project_some(
+            start: int, stop: int, offset: int = offset, scene: Arrays = scene
+        ) -> None:
+            project_gaussians(start, stop, offset, scene, view, drawn_before, splats)
+
+        parallel_for_chunks(project_some, len(part), GAUSSIANS_PER_CHUNK)
+        first_index += len(part)
+    return splats
+
+
+def tiles_to_draw(view: KernelCamera, tiles: Tensor | None) -> Array:
+    """A caller's choice of tiles as an array [rows, columns] bool; None chooses all tiles.
+
+    ValueError if the shape of `tiles` does not fit the view.
+    """
+    if tiles is None:
+        return np.ones(view.tiles, np.bool_)
+    check_tiles(tiles, view.height, view.width)
+    return tiles.detach().to(device="cpu", dtype=torch.bool).contiguous().numpy()
+
+
+def as_array(tensor: Tensor) -> Array:
+    """A tensor as a contiguous float32 array, without copy if possible."""
+    return tensor.detach().to(device="cpu", dtype=torch.float32).contiguous().numpy()
