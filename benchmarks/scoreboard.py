@@ -132,10 +132,10 @@ def one_surface(own: Any) -> Any:
 # Mechanisms of lifting and of completion that can be switched off: names in the package, and their
 # replacements.
 LIFT: dict[str, dict[str, Replace]] = {
-    "smoothed": {"smoothed": first},
+    "smoothed": {"smooth_inverse_depth": first},
     "edges": {"find_edges": no_edges},
     "two layers": {"find_layers": one_surface},
-    "colour fit": {"splats._fitted": first},
+    "colour fit": {"splats._correct_colors": first},
     "blended opacities": {"blended_opacities": first},
 }
 FILL: dict[str, dict[str, Replace]] = {

@@ -19,10 +19,11 @@ from spackle.core.camera import Camera
 from spackle.core.filters import gaussian_blur
 from spackle.core.hole_filling import fill_from_far_side
 from spackle.depth.depth_map import DepthMap
-from spackle.lifting import edges
-from spackle.lifting import lift as lifting
-from spackle.lifting.edges import HOLE, OPEN, assign_open_pixels, find_edges, sample
-from spackle.lifting.lift import DEVIATIONS, noise_level, smoothed
+from spackle.lifting import edges, open_pixels, resampling, smoothing
+from spackle.lifting.edges import find_edges
+from spackle.lifting.open_pixels import assign_open_pixels
+from spackle.lifting.resampling import HOLE, OPEN, resample_map
+from spackle.lifting.smoothing import NOISE_DEVIATIONS, estimate_noise, smooth_inverse_depth
 from spackle.runtime.errors import InputError
 
 FOCAL = (100.0, 110.0)
@@ -46,7 +47,7 @@ def settled(
 ) -> tuple[Tensor, Tensor]:
     """Resampled and sharpened inverse depth at the photo's size, and a mask of the pixels that are no holes."""
     depths, mask = inverse.numpy(), known.numpy()
-    sampled = sample(depths, mask, find_edges(depths, mask, focal), *rgb.shape[:2])
+    sampled = resample_map(depths, mask, find_edges(depths, mask, focal), *rgb.shape[:2])
     return torch.from_numpy(
         assign_open_pixels(sampled, rgb.contiguous().numpy())
     ), torch.from_numpy(sampled.state != HOLE)
@@ -90,25 +91,25 @@ def test_compiled_kernels_agree_with_plain_python(seed: int, size: tuple[int, in
 
     def arrays() -> list[np.ndarray]:
         found = find_edges(inverse, known, FOCAL)
-        sampled = sample(inverse, known, found, *size)
+        sampled = resample_map(inverse, known, found, *size)
         images = (
-            found.step,
-            found.across,
-            found.down,
+            found.smear_height,
+            found.right,
+            found.below,
             sampled.state,
             sampled.inverse_depth,
-            sampled.step,
+            sampled.edge_height,
         )
         return [
             *images,
             *sampled.slope,
             assign_open_pixels(sampled, rgb),
-            smoothed(rough, known, np.float32(0.01)),
+            smooth_inverse_depth(rough, known, np.float32(0.01)),
         ]
 
     compiled = arrays()
     assert compiled[0].any()
-    with uncompiled(edges, lifting):
+    with uncompiled(edges, open_pixels, resampling, smoothing):
         plain = arrays()
     for one, other in zip(compiled, plain, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6)
@@ -155,7 +156,7 @@ def test_a_plane_stays_that_plane_at_any_size(
 def test_cheapest_paths_are_those_of_dijkstra(seed: int) -> None:
     inverse, known = random_map(seed)
     height, width = ((13, 17), (21, 30))[seed % 2]
-    sampled = sample(inverse, known, find_edges(inverse, known, FOCAL), height, width)
+    sampled = resample_map(inverse, known, find_edges(inverse, known, FOCAL), height, width)
     flat = np.zeros((height, width), np.float32)
     sampled, rgb = (
         dataclasses.replace(sampled, slope=(flat, flat)),
@@ -168,13 +169,13 @@ def test_cheapest_paths_are_those_of_dijkstra(seed: int) -> None:
         )[0].numpy()
 
         def step(p: Pixel, q: Pixel, state: int = state, far: np.ndarray = far) -> float:
-            cost = edges.CHANGE_COST * float(np.abs(rgb[p] - rgb[q]).sum())
+            cost = open_pixels.COLOR_CHANGE_COST * float(np.abs(rgb[p] - rgb[q]).sum())
             if state == OPEN:
-                return cost + edges.CHANGE_COST * abs(
-                    float(expected[q] - expected[p]) / float(sampled.step[q])
+                return cost + open_pixels.COLOR_CHANGE_COST * abs(
+                    float(expected[q] - expected[p]) / float(sampled.edge_height[q])
                 )
             near = max(0.0, 1 - float(far[q] / expected[p])) if sampled.state[p] > state else 0.0
-            return cost + edges.NEAR_COST * near
+            return cost + open_pixels.NEAR_START_COST * near
 
         origin = cheapest(sampled.state > state, sampled.state == state, step)
         depths = {pixel: expected[start] for pixel, start in origin.items()}
@@ -209,8 +210,8 @@ def test_a_smeared_outline_snaps_to_the_photos(sigma: float, factor: int) -> Non
 def test_smoothing_changes_values_by_at_most_half_a_step_or_the_noise(quantum: float) -> None:
     inverse, known = random_map(1)
     inverse = noisy(inverse, 1)
-    found = smoothed(inverse, known, np.float32(quantum))
-    reach = np.maximum(quantum / 2, DEVIATIONS * noise_level(inverse, known) * inverse)
+    found = smooth_inverse_depth(inverse, known, np.float32(quantum))
+    reach = np.maximum(quantum / 2, NOISE_DEVIATIONS * estimate_noise(inverse, known) * inverse)
     assert np.array_equal(found[~known], inverse[~known])
     assert (np.abs(found - inverse) <= reach * (1 + 1e-3)).all()
     assert (found != inverse).mean() > 0.3
@@ -219,9 +220,9 @@ def test_smoothing_changes_values_by_at_most_half_a_step_or_the_noise(quantum: f
 @pytest.mark.parametrize("noise", [0.001, 0.003, 0.01])
 def test_the_noise_of_a_slanted_plane_is_measured(noise: float) -> None:
     inverse = noisy((1 / slanted_plane(1.5, 6, 1).depth).numpy(), 0, noise)
-    assert noise_level(inverse, np.ones(inverse.shape, bool)) == pytest.approx(noise, rel=0.05)
-    assert noise_level(np.ones((2, 9), np.float32), np.ones((2, 9), bool)) == 0
-    assert noise_level(np.ones((9, 9), np.float32), np.zeros((9, 9), bool)) == 0
+    assert estimate_noise(inverse, np.ones(inverse.shape, bool)) == pytest.approx(noise, rel=0.05)
+    assert estimate_noise(np.ones((2, 9), np.float32), np.ones((2, 9), bool)) == 0
+    assert estimate_noise(np.ones((9, 9), np.float32), np.zeros((9, 9), bool)) == 0
 
 
 def test_a_clean_map_is_not_smoothed() -> None:
@@ -234,7 +235,9 @@ def test_a_clean_map_is_not_smoothed() -> None:
         mesh,
     ):
         clean = inverse.numpy()
-        assert np.array_equal(smoothed(clean, np.ones(clean.shape, bool), np.float32(0)), clean)
+        assert np.array_equal(
+            smooth_inverse_depth(clean, np.ones(clean.shape, bool), np.float32(0)), clean
+        )
 
 
 def test_invalid_depths_are_filled() -> None:

@@ -29,7 +29,7 @@ from spackle.core.photo import Photo
 from spackle.core.photo_frame import PhotoFrame
 from spackle.core.trajectories import DepthRange, leftmost_and_rightmost, trajectory_cameras
 from spackle.depth.depth_map import DepthMap
-from spackle.lifting.quadtree import LEVELS
+from spackle.lifting.quadtree import TILE_LEVELS
 from spackle.render import CpuRenderer
 from spackle.residual import hole_area_ratio, hole_mask
 
@@ -91,7 +91,7 @@ def test_odd_and_tiny_photos_are_lifted(size: tuple[int, int]) -> None:
     assert len(scene.lift(levels=0).gaussians) == size[0] * size[1] + (size[0] // 2) * (
         size[1] // 2
     )
-    view = CPU.render(scene.lift(LEVELS).gaussians, scene.camera)
+    view = CPU.render(scene.lift(TILE_LEVELS).gaussians, scene.camera)
     assert hole_area_ratio(view.alpha) == 0
     if min(size) > 1:  # else there is no backing
         torch.testing.assert_close(view.depth, scene.depth, rtol=0.01, atol=0)
@@ -147,7 +147,7 @@ def test_the_intrinsics_come_from_the_calibration_else_from_the_photo() -> None:
 def test_the_holes_are_the_regions_that_a_box_uncovers(disparity: float, side: int) -> None:
     near, far = 2.0, 6.0
     scene = box_before_wall(near, far)
-    base = scene.lift(LEVELS).gaussians
+    base = scene.lift(TILE_LEVELS).gaussians
     camera = leftmost_and_rightmost(
         scene.camera, disparity, DepthRange.of(scene.lift(levels=0).gaussians)
     )[side]
@@ -175,7 +175,7 @@ def test_the_holes_are_the_regions_that_a_box_uncovers(disparity: float, side: i
 @pytest.mark.parametrize("kind", ["swipe", "shake"])
 def test_slanted_ground_has_no_pinholes(axis: int, kind: str) -> None:
     scene = slanted_plane(1.5, 6, axis)
-    base = scene.lift(LEVELS).gaussians
+    base = scene.lift(TILE_LEVELS).gaussians
     for camera in trajectory_cameras(kind, scene.camera, 0.5, DepthRange.of(base), frames=9):  # type: ignore[arg-type]
         interior = shows_plane(scene, camera)
         assert int(interior.sum()) > 1000
@@ -188,7 +188,7 @@ def test_rounded_disparities_leave_no_stairs() -> None:
     stored = (1 / scene.depth / quantum).round() * quantum
     depth = DepthMap(1 / stored, stored > 0, None, quantum, "disparity", Path("disp.png"))
     pixels, base = (
-        lift_rgbd(scene.rgb, depth, scene.camera, levels).gaussians for levels in (0, LEVELS)
+        lift_rgbd(scene.rgb, depth, scene.camera, levels).gaussians for levels in (0, TILE_LEVELS)
     )
     z = pixels.means[: scene.depth.numel(), 2].reshape(scene.depth.shape)
     error, before = (

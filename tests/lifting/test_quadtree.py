@@ -15,7 +15,7 @@ from spackle.core.camera import Camera
 from spackle.core.color import srgb_to_linear
 from spackle.core.surfels import DEPTH_EDGE_RATIO
 from spackle.core.trajectories import DepthRange, leftmost_and_rightmost
-from spackle.lifting.quadtree import BEND, LEVELS, Quadtree
+from spackle.lifting.quadtree import MAX_PLANE_DEVIATION, TILE_LEVELS, Quadtree
 from spackle.lifting.splats import layered_gaussians
 from spackle.render import CpuRenderer
 
@@ -30,7 +30,7 @@ def ground(height: int = 27, width: int = 38) -> tuple[Tensor, Tensor, Tensor, T
         ..., None
     ]
     inverse = 0.4 + 0.0004 * x + 0.0008 * y
-    inverse[20, 6] *= 1 + 2 * float(BEND)
+    inverse[20, 6] *= 1 + 2 * float(MAX_PLANE_DEVIATION)
     free = torch.ones(height, width, dtype=torch.bool)
     free[3, 30] = free[26] = False
     return picture, inverse, torch.tensor([0.0004, 0.0008]).expand(height, width, 2), free
@@ -47,7 +47,7 @@ def losses(picture: Tensor, height: int, width: int) -> Tensor:
 @pytest.mark.parametrize("level", [1, 2, 3])
 def test_a_blocks_loss_is_its_difference_from_interpolated_means(level: int) -> None:
     picture, inverse, slope, free = ground()
-    lost = Quadtree(picture, inverse, slope, free, LEVELS, DEPTH_EDGE_RATIO).lost[level - 1]
+    lost = Quadtree(picture, inverse, slope, free, TILE_LEVELS, DEPTH_EDGE_RATIO).losses[level - 1]
     side, (rows, columns) = 2**level, lost.shape[:2]
     assert (rows, columns) == (27 // side, 38 // side)
     whole = picture[: rows * side, : columns * side]
@@ -62,7 +62,7 @@ def test_a_blocks_loss_is_its_difference_from_interpolated_means(level: int) -> 
         center = depth[top : top + side, left : left + side].mean()
         y, x = np.indices(depth.shape)[(slice(None), *around)]
         plane = center + 0.0004 * (x - left - half + 0.5) + 0.0008 * (y - top - half + 0.5)
-        off = (abs(depth[around] - plane) > float(BEND) * center).any()
+        off = (abs(depth[around] - plane) > float(MAX_PLANE_DEVIATION) * center).any()
         blocked[row, column] = bool(off) or not bool(free[around].all())
     assert bool(blocked.any())
     assert not bool(blocked.all())
@@ -73,7 +73,7 @@ def test_a_blocks_loss_is_its_difference_from_interpolated_means(level: int) -> 
 @pytest.mark.parametrize("worth", [1e-6, 1e-3, 0.02, 10.0])
 def test_a_cut_covers_every_pixel_once_and_no_other_costs_less(worth: float) -> None:
     picture, inverse, slope, free = ground()
-    tree = Quadtree(picture, inverse, slope, free, LEVELS, DEPTH_EDGE_RATIO)
+    tree = Quadtree(picture, inverse, slope, free, TILE_LEVELS, DEPTH_EDGE_RATIO)
     single, tiles = tree.cut(worth)
     covered = single.long()
     for part in tiles:
@@ -90,7 +90,7 @@ def test_a_cut_covers_every_pixel_once_and_no_other_costs_less(worth: float) -> 
         if level == 0:
             return worth
         below = itertools.product((2 * row, 2 * row + 1), (2 * column, 2 * column + 1))
-        whole, flat, tall = tree.lost[level - 1][row, column].tolist()
+        whole, flat, tall = tree.losses[level - 1][row, column].tolist()
         return min(
             sum(best(level - 1, *at) for at in below), whole + worth, min(flat, tall) + 2 * worth
         )
@@ -106,7 +106,7 @@ def test_a_cut_covers_every_pixel_once_and_no_other_costs_less(worth: float) -> 
             count += int(mine.sum())
             side = max(part.height, part.width)
             shape = 0 if part.height == part.width else 1 if part.height < part.width else 2
-            lost = tree.lost[side.bit_length() - 2][..., shape]
+            lost = tree.losses[side.bit_length() - 2][..., shape]
             shares = 1 if shape == 0 else 2  # the stored loss belongs to both halves together
             at = part.rows[mine] * part.height // side, part.columns[mine] * part.width // side
             cost += float(lost[at].sum()) / shares

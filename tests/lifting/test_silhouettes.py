@@ -17,10 +17,10 @@ from spackle.core.camera import Camera
 from spackle.core.color import linear_to_srgb, srgb_to_linear
 from spackle.core.surfels import SURFEL_OPACITY, make_surfels
 from spackle.core.trajectories import DepthRange, leftmost_and_rightmost
-from spackle.lifting import silhouettes, splats
-from spackle.lifting.quadtree import LEVELS
+from spackle.lifting import silhouettes, splats, step_surfaces
+from spackle.lifting.quadtree import TILE_LEVELS
 from spackle.lifting.silhouettes import find_layers
-from spackle.lifting.splats import WEIGHTS, blended_opacities, layered_gaussians
+from spackle.lifting.splats import NEIGHBOR_FALLOFF, blended_opacities, layered_gaussians
 from spackle.render import CpuRenderer, screen_blend
 from spackle.render.screen_blend import blend_screen_gaussians
 
@@ -58,7 +58,7 @@ def test_compiled_kernels_agree_with_plain_python(seed: int) -> None:
 
     compiled = arrays()
     assert 0 < np.count_nonzero(compiled[0]) < compiled[0].size
-    with uncompiled(silhouettes, splats, screen_blend):
+    with uncompiled(silhouettes, splats, step_surfaces, screen_blend):
         plain = arrays()
     for one, other in zip(compiled, plain, strict=True):
         np.testing.assert_allclose(one, other, rtol=2e-3, atol=2e-4)
@@ -79,7 +79,7 @@ def blended() -> Scene:
 
 def wall_beside(scene: Scene) -> list[Tensor]:
     """[N, 3] colours of the wall in views from both sides."""
-    base = scene.lift(LEVELS).gaussians
+    base = scene.lift(TILE_LEVELS).gaussians
     assert psnr(CPU.render(base, scene.camera).rgb, scene.rgb) > 32
     views = [
         CPU.render(base, view)
@@ -139,9 +139,9 @@ def test_rings_are_distances_to_the_nearest_step(seed: int) -> None:
     ring = torch.from_numpy(find_layers(*steps(seed)).ring)
     within = [
         max_pool2d((ring == 1).float()[None], 2 * n + 1, 1, n)[0] > 0
-        for n in range(silhouettes.REACH)
+        for n in range(step_surfaces.MAX_RING)
     ]
-    expected = torch.where(within[-1], silhouettes.REACH + 1 - torch.stack(within).sum(0), 0)
+    expected = torch.where(within[-1], step_surfaces.MAX_RING + 1 - torch.stack(within).sum(0), 0)
     assert torch.equal(ring.long(), expected)
 
 
@@ -158,5 +158,5 @@ def test_opacities_blend_to_the_shares(seed: int) -> None:
                 min(max(x + dx, 0), inverse.shape[1] - 1),
             )
             if k != 4 and layers.ring[v, u]:
-                passes *= 1 - SURFEL_OPACITY * WEIGHTS[k] * opacity[v, u]
+                passes *= 1 - SURFEL_OPACITY * NEIGHBOR_FALLOFF[k] * opacity[v, u]
         assert 1 - passes * (1 - opacity[y, x]) == pytest.approx(layers.alpha[y, x], abs=0.03)

@@ -12,7 +12,7 @@ from spackle.core.camera import Camera
 from spackle.core.photo import Photo, replace_border, resize_photo
 from spackle.depth.depth_map import DepthMap
 from spackle.lifting.lift import lift_depth_map
-from spackle.lifting.quadtree import LEVELS
+from spackle.lifting.quadtree import TILE_LEVELS
 from spackle.runtime.progress import Progress
 
 
@@ -81,7 +81,9 @@ def lift_predicted_depth(photo: Photo, depth: DepthMap, camera: Camera) -> BaseP
     return lift_rgbd(replace_border(photo.rgb), depth, camera)
 
 
-def lift_rgbd(rgb: Tensor, depth: DepthMap, camera: Camera, levels: int = LEVELS) -> BasePrediction:
+def lift_rgbd(
+    rgb: Tensor, depth: DepthMap, camera: Camera, levels: int = TILE_LEVELS
+) -> BasePrediction:
     """Turn a photo [H, W, 3] (sRGB in 0..1) and its depth map into Gaussians on the surfaces.
 
     `camera` is the photo's camera. With `levels` = 0 each pixel gets its own Gaussian; with more

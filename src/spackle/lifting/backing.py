@@ -1,0 +1,126 @@
+"""The backing: wide Gaussians behind those of the pixels, which close the surface from behind.
+
+The unit is a *cell* of 2×2 pixels. In flat areas, several cells share a Gaussian.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from spackle.core.color import linear_to_srgb
+from spackle.core.surfels import BEHIND_SURFACE_RATIO, CREASE_RATIO, SURFEL_OPACITY
+from spackle.lifting.quadtree import Quadtree, Tiles
+from spackle.lifting.surfaces import (
+    TILE_SIGMA_SIDES,
+    PixelSurfaces,
+    Surface,
+    SurfelSamples,
+    without_border,
+)
+
+CELL_PX = 2
+# Standard deviations of backing Gaussians, in units of their sides: of those for several cells,
+# which lie away from depth steps, and of those at a near surface's rim, past which a wider one
+# would show.
+LARGE_SIGMA_SIDES = 0.65
+RIM_SIGMA_SIDES = 0.42
+# The backing recedes by the depth change over this number of its sides, to stay hidden.
+RECEDING_SIDES = 2
+VISIBLE_BACKING_SHARE = 0.02  # share of the backing's colour that is visible through the front
+SAME_SURFACE_RATIO = 0.02  # pixels that differ by less than this share are on one surface
+MIN_CENTER_RATIO = 0.5  # a cell's centre is never farther than this share of the least depth
+
+
+def backing_surfels(
+    pixels: PixelSurfaces, gaussian_cost: float, levels: int
+) -> list[SurfelSamples]:
+    """A wide Gaussian behind each cell of 2×2 pixels, on the surface of its farthest pixel.
+
+    A cell has no backing if it holds pixels of both sides of a depth step, or if its far surface is
+    visible only in pixels that mainly show the near one.
+
+    Args:
+        pixels: the surfaces that each pixel of the photo shows.
+        gaussian_cost: squared sRGB difference that justifies one more Gaussian in the front.
+        levels: number of sizes of larger backing Gaussians; 0: every cell has its own.
+
+    Returns:
+        One part for each size and place, none if the photo is one pixel high or wide.
+    """
+    hidden_far = pixels.mixed & pixels.near_is_main  # the far surface is the lesser one
+    deepest = pixels.main.replaced(hidden_far, pixels.other)
+    cell_depths = _cells(deepest.inverse_depth)  # [h, w, 4]
+    if cell_depths.numel() == 0:
+        return []
+    surface = _cell_surface(deepest, cell_depths)
+
+    # Which cells have a backing.
+    has_near = _cells(pixels.beside_step & pixels.near_is_main).any(-1)  # [h, w]
+    has_far = _cells(pixels.beside_step & ~pixels.near_is_main).any(-1)
+    only_hidden_far = _cells(hidden_far).any(-1)
+    backed = torch.where(has_far, ~has_near, ~only_hidden_far)
+
+    # Away from steps, cells may share a Gaussian. Little of it is seen, so that it may cost much.
+    may_share = without_border(backed & ~_cells(pixels.beside_step).any(-1))
+    picture = linear_to_srgb(surface.color)
+    slope_by_cell = CELL_PX * surface.slope
+    tree = Quadtree(picture, surface.inverse_depth, slope_by_cell, may_share, levels, CREASE_RATIO)
+    single, tiles = tree.cut(gaussian_cost / VISIBLE_BACKING_SHARE)
+
+    inner_cells = Tiles(1, 1, *(single & backed & ~has_near).nonzero(as_tuple=True))
+    rim_cells = Tiles(1, 1, *(single & backed & has_near).nonzero(as_tuple=True))
+    parts = [(same_size, LARGE_SIGMA_SIDES) for same_size in tiles]
+    parts += [(inner_cells, TILE_SIGMA_SIDES), (rim_cells, RIM_SIGMA_SIDES)]
+    return [
+        _receded(surface.tile_samples(part, sigma_sides, cell_px=CELL_PX), part)
+        for part, sigma_sides in parts
+    ]
+
+
+def _cell_surface(deepest: Surface, cell_depths: Tensor) -> Surface:
+    """The surface of each cell's farthest pixel, at the cell's centre: a surface of [h, w] cells.
+
+    Args:
+        deepest: the farthest surface of each pixel, [H, W].
+        cell_depths: [h, w, 4] inverse depths of each cell's pixels on this surface.
+    """
+    far, pick = cell_depths.min(dim=-1)  # [h, w]: inverse depth and number of the farthest pixel
+    pick_index = pick[..., None, None].expand(*pick.shape, 1, 2)
+    slope = _cells(deepest.slope).gather(2, pick_index).squeeze(2)  # [h, w, 2]
+
+    # The cell's centre lies half a pixel from the farthest pixel's centre, along x and along y.
+    offset = torch.stack([0.5 - pick % 2, 0.5 - pick // 2], dim=-1)
+    at_center = (far + (slope * offset).sum(-1)).clamp_min(MIN_CENTER_RATIO * far.min())
+
+    # The colour is the mean of the cell's pixels on the same surface.
+    difference = cell_depths - far[..., None]
+    same_surface = (difference < SAME_SURFACE_RATIO * far[..., None]).to(far)  # [h, w, 4]
+    color_sum = (_cells(deepest.color) * same_surface[..., None]).sum(2)
+    color = color_sum / same_surface.sum(2)[..., None]
+    return Surface(at_center, slope, color, torch.full_like(far, float(SURFEL_OPACITY)))
+
+
+def _receded(samples: SurfelSamples, tiles: Tiles) -> SurfelSamples:
+    """The backing moved behind the front Gaussians, further where the surface is steep.
+
+    `samples` has one Gaussian for each of `tiles`, which are rectangles of cells.
+    """
+    reach_px = CELL_PX * RECEDING_SIDES * torch.tensor([tiles.width, tiles.height])
+    change = (reach_px * samples.slope.abs()).sum(-1) / samples.inverse_depth  # relative
+    factor = 1 - BEHIND_SURFACE_RATIO - change
+    return samples._replace(
+        inverse_depth=samples.inverse_depth * factor, slope=samples.slope * factor[:, None]
+    )
+
+
+def _cells(image: Tensor) -> Tensor:
+    """[H, W, ...] to [H/2, W/2, 4, ...]: the pixels of each 2×2 cell in row-major order.
+
+    An odd last row or column is left out.
+    """
+    rows = image.shape[0] // CELL_PX
+    columns = image.shape[1] // CELL_PX
+    whole_cells = image[: CELL_PX * rows, : CELL_PX * columns]
+    grid = whole_cells.reshape(rows, CELL_PX, columns, CELL_PX, *image.shape[2:])
+    return grid.transpose(1, 2).flatten(2, 3)

@@ -1,0 +1,308 @@
+"""The near and the far surface beside each depth step: where they lie, and which colours they have.
+
+A *depth step* is a place where the inverse depths of two neighbouring pixels belong to two
+surfaces. A *ring* is the set of pixels at the same distance from the nearest step: the first ring
+touches it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spackle.core.surfels import CREASE_RATIO, DEPTH_EDGE_RATIO
+from spackle.lifting.edges import Floats
+from spackle.runtime.device import parallel_for_chunks
+from spackle.runtime.kernels import kernel
+
+MAX_RING = 3  # pixels on each side of a step that may be mixtures of both surfaces
+# A difference belongs to a steep plane if the differences on both sides exceed this share of it.
+STEADY_DIFFERENCE_RATIO = 0.5
+WINDOW_PX = 5  # both surfaces are estimated from this number of pixels to each side
+# Weights by ring; ring 0 stands for pixels away from steps. Colours of the first rings are mixed;
+# depths there are less sure, because round objects curve away at their rims.
+COLOR_WEIGHT_OF_RING = np.array([1.0, 0.01, 0.15, 1.0], np.float32)
+DEPTH_WEIGHT_OF_RING = np.array([1.0, 0.1, 0.5, 1.0], np.float32)
+OUTLINE_BLUR_PX = np.float32(1.2)  # standard deviation with which the map's outline is smoothed
+MIN_OUTLINE_DISTANCE_PX = np.float32(0.2)  # between a pixel's centre and the map's outline
+NO_STEP = 1000  # a squared distance larger than any in the window
+
+# A logistic function of 1.702·t is close to the normal distribution's share up to t.
+LOGISTIC_SCALE = 1.702
+MIN_SHARE, MAX_SHARE = 0.02, 0.98  # of a surface in the window, for a finite distance
+
+MIN_WEIGHT = 1e-6  # a surface with less weight in the window has no plane of its own
+# Added to the variances of pixel x and y in the window, in pixels²: few pixels give a flat plane.
+PLANE_REGULARIZATION = 0.3
+
+
+@kernel
+def find_step_rings(image: Any) -> Any:
+    """Find the depth steps of an image [H, W] of inverse depth, and the rings around them.
+
+    Returns:
+        [H, W] uint8: the distance to the nearest step in pixels, from 1 to 3; 0 beyond; and
+        [H, W, 2] float32: for pixels of the first ring the inverse depths on the near and the far
+        side of the step, else 0. If two steps touch a pixel, those of the higher step.
+    """
+    height, width = image.shape
+    rings = np.zeros((height, width), np.uint8)
+    side_depths = np.zeros((height, width, 2), np.float32)
+    for y in range(height):
+        for x in range(width):
+            for k in range(2):  # the neighbour to the right, then the one below
+                v = y + k
+                u = x + 1 - k
+                if v >= height or u >= width:
+                    continue
+                high = max(image[y, x], image[v, u])
+                low = min(image[y, x], image[v, u])
+                if high - low <= DEPTH_EDGE_RATIO * low:
+                    continue
+
+                # On a steep plane, such as ground near the horizon, the change continues on both
+                # sides. At the image's border, it is assumed to continue.
+                jump = image[v, u] - image[y, x]
+                has_pixel_before = y > 0 if k == 1 else x > 0
+                has_pixel_after = v + 1 < height if k == 1 else u + 1 < width
+                change_before = image[y, x] - image[y - k, x - 1 + k] if has_pixel_before else jump
+                change_after = image[v + k, u + 1 - k] - image[v, u] if has_pixel_after else jump
+                steady = min(change_before * jump, change_after * jump)
+                if steady > STEADY_DIFFERENCE_RATIO * jump * jump:
+                    continue
+
+                for row, column in ((y, x), (v, u)):
+                    known_step = side_depths[row, column, 0] - side_depths[row, column, 1]
+                    if rings[row, column] == 0 or high - low > known_step:
+                        rings[row, column] = 1
+                        side_depths[row, column, 0] = high
+                        side_depths[row, column, 1] = low
+
+    # Each further ring are the free pixels around the one before.
+    for ring in range(1, MAX_RING):
+        for y in range(height):
+            for x in range(width):
+                if rings[y, x] != ring:
+                    continue
+                for v in range(max(y - 1, 0), min(y + 2, height)):
+                    for u in range(max(x - 1, 0), min(x + 2, width)):
+                        if rings[v, u] == 0:
+                            rings[v, u] = ring + 1
+    return rings, side_depths
+
+
+def estimate_surfaces(
+    inverse_depth: Floats,
+    colors: Floats,
+    rings: NDArray[np.uint8],
+    side_depths: Floats,
+    depth: Floats,
+    slope: Floats,
+    color: Floats,
+) -> tuple[Floats, Floats]:
+    """Estimate the near and the far surface at each pixel beside a depth step.
+
+    Args:
+        inverse_depth: [H, W].
+        colors: [H, W, 3] the photo in linear RGB.
+        rings, side_depths: as `find_step_rings` returns them.
+        depth, slope, color: [2, H, W], [2, H, W, 2] and [2, H, W, 3]: inverse depth, its derivative
+            by pixel x and y, and mean colour of both surfaces. Pixels in a ring are written here.
+
+    Returns:
+        [H, W]: how far a pixel lies inside of the near surface's outline in the map, in pixels;
+        negative outside. [2, H, W]: the variance of each surface's colours.
+    """
+    height, width = inverse_depth.shape
+    inside = np.zeros((height, width), np.float32)
+    variance = np.zeros((2, height, width), np.float32)
+    parallel_for_chunks(
+        lambda start, stop: _estimate_surfaces(
+            start, stop, inverse_depth, colors, rings, side_depths,
+            inside, depth, slope, color, variance,
+        ),
+        height,
+    )  # fmt: skip
+    return inside, variance
+
+
+@kernel
+def _estimate_surfaces(
+    start: int, stop: int, image: Any, colors: Any, rings: Any, side_depths: Any,
+    inside: Any, depth: Any, slope: Any, color: Any, variance: Any,
+) -> None:  # fmt: skip
+    """Estimate the near surface (index 0) and the far one (1) at each ring pixel of some rows.
+
+    Args:
+        start, stop: the rows to estimate.
+        image: [H, W] inverse depth.
+        colors: [H, W, 3] linear RGB.
+        rings: [H, W] uint8: distance to the nearest step, or 0.
+        side_depths: [H, W, 2]: inverse depths on both sides of a step, in the first ring.
+        inside: [H, W]: the distance from the near surface's outline is written here.
+        depth, slope, color: [2, H, W, …] of both surfaces, written here.
+        variance: [2, H, W]: sum of the variances of the colour channels, written here.
+    """
+    width = image.shape[1]
+    # Sums over the window by surface. Of depths d at offsets (x, y): weight, x, y, d, xx, yy, xy,
+    # xd, yd. Of colours: weight, three channels, their three squares.
+    depth_moments = np.zeros((2, 9), np.float64)
+    color_moments = np.zeros((2, 7), np.float64)
+    surface_depths = np.zeros(2, np.float32)
+    for y in range(start, stop):
+        for x in range(width):
+            if rings[y, x] == 0:
+                continue
+            high, low = _closest_step(y, x, rings, side_depths)
+            middle = np.float32(0.5) * (high + low)
+            is_near = image[y, x] > middle
+            surface_depths[0] = high
+            surface_depths[1] = low
+            surface_depths[0 if is_near else 1] = image[y, x]
+            depth_moments[:, :] = 0
+            color_moments[:, :] = 0
+            share = _sum_window(
+                y, x, image, colors, rings, high, low, surface_depths, depth_moments, color_moments
+            )
+
+            # The share of the near surface, blurred, tells the distance from its outline.
+            share = min(max(share, MIN_SHARE), MAX_SHARE)
+            distance = np.float32(OUTLINE_BLUR_PX * np.log(share / (1 - share)) / LOGISTIC_SCALE)
+            if is_near:
+                inside[y, x] = max(distance, MIN_OUTLINE_DISTANCE_PX)
+            else:
+                inside[y, x] = min(distance, -MIN_OUTLINE_DISTANCE_PX)
+
+            for side in range(2):
+                # A pixel of the far surface keeps the map's depth there; near rims are ragged.
+                if is_near or side == 0:
+                    at_center, slope_x, slope_y = _fit_plane(
+                        depth_moments[side], surface_depths[side]
+                    )
+                    depth[side, y, x] = at_center
+                    slope[side, y, x, 0] = slope_x
+                    slope[side, y, x, 1] = slope_y
+                total_variance = 0.0
+                weight = color_moments[side, 0]
+                if weight > 0:
+                    for c in range(3):
+                        mean = color_moments[side, 1 + c] / weight
+                        color[side, y, x, c] = mean
+                        total_variance += max(
+                            color_moments[side, 4 + c] / weight - mean * mean, 0.0
+                        )
+                variance[side, y, x] = total_variance
+
+
+@kernel
+def _closest_step(y: int, x: int, rings: Any, side_depths: Any) -> Any:
+    """The inverse depths (near, far) on both sides of the depth step closest to a pixel.
+
+    `rings` [H, W] has the distance to the nearest step, and `side_depths` [H, W, 2] both sides'
+    inverse depths in the first ring.
+    """
+    height, width = rings.shape
+    high, low, closest = np.float32(0), np.float32(0), NO_STEP
+    for v in range(max(y - MAX_RING, 0), min(y + MAX_RING + 1, height)):
+        for u in range(max(x - MAX_RING, 0), min(x + MAX_RING + 1, width)):
+            squared_distance = (v - y) ** 2 + (u - x) ** 2
+            if rings[v, u] == 1 and squared_distance < closest:
+                high = side_depths[v, u, 0]
+                low = side_depths[v, u, 1]
+                closest = squared_distance
+    return high, low
+
+
+@kernel
+def _sum_window(
+    y: int, x: int, image: Any, colors: Any, rings: Any, high: Any, low: Any,
+    surface_depths: Any, depth_moments: Any, color_moments: Any,
+) -> Any:  # fmt: skip
+    """Sum depths and colours of both surfaces over the 11×11 pixels around a pixel.
+
+    Args:
+        y, x: the pixel.
+        image: [H, W] inverse depth.
+        colors: [H, W, 3] linear RGB.
+        rings: [H, W] uint8: distance to the nearest step, or 0.
+        high, low: inverse depths on both sides of the closest step.
+        surface_depths: [2] inverse depth of the near and the far surface at this pixel.
+        depth_moments, color_moments: [2, 9] and [2, 7], zero at first: the weighted sums.
+
+    Returns:
+        The share of near pixels in the 7×7 pixels around, blurred.
+    """
+    height, width = image.shape
+    middle = np.float32(0.5) * (high + low)
+    near_weight, total_weight = 0.0, 0.0
+    for v in range(max(y - WINDOW_PX, 0), min(y + WINDOW_PX + 1, height)):
+        for u in range(max(x - WINDOW_PX, 0), min(x + WINDOW_PX + 1, width)):
+            d = image[v, u]
+            dx = u - x
+            dy = v - y
+            side = 0 if d > middle else 1
+            if abs(dx) <= MAX_RING and abs(dy) <= MAX_RING:
+                weight = np.exp(
+                    -np.float32(dx * dx + dy * dy) / (2 * OUTLINE_BLUR_PX * OUTLINE_BLUR_PX)
+                )
+                total_weight += weight
+                near_weight += weight * (1 - side)
+
+            # A third surface, farther from the step than its other side, counts for neither.
+            if d > high + (high - middle) or d < low - (middle - low):
+                continue
+            weight = np.exp(-np.float32(dx * dx + dy * dy) / np.float32(MAX_RING * MAX_RING))
+            ring = rings[v, u]
+            if abs(d - surface_depths[side]) < np.float32(DEPTH_EDGE_RATIO) * 2 * d:
+                depth_weight = weight * DEPTH_WEIGHT_OF_RING[ring]
+                depth_moments[side, 0] += depth_weight
+                depth_moments[side, 1] += depth_weight * dx
+                depth_moments[side, 2] += depth_weight * dy
+                depth_moments[side, 3] += depth_weight * d
+                depth_moments[side, 4] += depth_weight * dx * dx
+                depth_moments[side, 5] += depth_weight * dy * dy
+                depth_moments[side, 6] += depth_weight * dx * dy
+                depth_moments[side, 7] += depth_weight * dx * d
+                depth_moments[side, 8] += depth_weight * dy * d
+            color_weight = weight * COLOR_WEIGHT_OF_RING[ring]
+            color_moments[side, 0] += color_weight
+            for c in range(3):
+                color_moments[side, 1 + c] += color_weight * colors[v, u, c]
+                color_moments[side, 4 + c] += color_weight * colors[v, u, c] * colors[v, u, c]
+    return near_weight / total_weight
+
+
+@kernel
+def _fit_plane(moments: Any, default: Any) -> Any:
+    """Fit a plane of inverse depth to weighted pixels, by least squares.
+
+    Args:
+        moments: [9] sums of weight, x, y, d, xx, yy, xy, xd, yd, for inverse depths d at (x, y).
+        default: the inverse depth to return if all weights are 0.
+
+    Returns:
+        The inverse depth at (0, 0), and its slopes by x and y, which are at most 1 % of it a pixel.
+    """
+    total = moments[0]
+    if total < MIN_WEIGHT:
+        return np.float32(default), np.float32(0), np.float32(0)
+    mean_x = moments[1] / total
+    mean_y = moments[2] / total
+    mean_d = moments[3] / total
+    var_x = moments[4] / total - mean_x * mean_x + PLANE_REGULARIZATION
+    var_y = moments[5] / total - mean_y * mean_y + PLANE_REGULARIZATION
+    cov_xy = moments[6] / total - mean_x * mean_y
+    cov_xd = moments[7] / total - mean_x * mean_d
+    cov_yd = moments[8] / total - mean_y * mean_d
+
+    # The normal equations of two unknowns, by Cramer's rule.
+    determinant = var_x * var_y - cov_xy * cov_xy
+    slope_x = (cov_xd * var_y - cov_yd * cov_xy) / determinant
+    slope_y = (cov_yd * var_x - cov_xd * cov_xy) / determinant
+    limit = np.float32(CREASE_RATIO) * mean_d
+    slope_x = min(max(slope_x, -limit), limit)
+    slope_y = min(max(slope_y, -limit), limit)
+    at_center = max(mean_d - slope_x * mean_x - slope_y * mean_y, 0.5 * mean_d)
+    return np.float32(at_center), np.float32(slope_x), np.float32(slope_y)
