@@ -145,7 +145,7 @@ def test_a_full_disk_is_refused(site: Site, target: Path, monkeypatch: pytest.Mo
 def test_servers_that_hang_are_refused(
     site: Site, target: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "TIMEOUT", 0.2)
+    monkeypatch.setattr(module, "TIMEOUT_S", 0.2)
     site.hang_after = 200_000
     refused(site.url, target, site.url, "no connection (timed out)")
     with socket.create_server(("127.0.0.1", 0)) as silent:

@@ -1,20 +1,16 @@
-"""Load weights from an untrusted safetensors, `torch.save` or TorchScript file without running code in the file.
+"""Load weights from untrusted files without running code in them: safetensors and PyTorch's formats.
 
-`torch.save` and TorchScript write a zip archive of tensors, code, and a pickle that places each tensor in a tree of
-objects. The pickle is read with inert stand-ins for all its classes and functions.
+`read_tensors` reads a file, `load_strict` puts its tensors into a network.
 """
 
 from __future__ import annotations
 
-import io
 import os
 import pickle
-import struct
 import warnings
-import zipfile
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import torch
 from safetensors import safe_open
@@ -23,297 +19,261 @@ from torch import Tensor, nn
 from spackle.runtime.device import report_memory_shortage
 from spackle.runtime.errors import InputError, as_input_error, printable_line
 from spackle.runtime.files import check_file
+from spackle.weights.archives import read_archive, tensors_in_tree
 
 Network = TypeVar("Network", bound=nn.Module)
+StrPath = str | os.PathLike[str]
 TensorShapes = dict[str, tuple[int, ...]]  # tensors' shapes by name
 
-NAMED = 3  # number of names that a message lists
-MAX_PICKLE = 4_000_000  # bytes; a pickle for a thousand tensors has a tenth
-MAX_NODES = 100_000  # nodes of the tree; a repeated object counts each time
-MAX_PATH = 1000  # characters of a path from the tree's root
-STORAGES = {
-    "torch FloatStorage": torch.float32,
-    "torch HalfStorage": torch.float16,
-    "torch BFloat16Storage": torch.bfloat16,
-    "torch DoubleStorage": torch.float64,
-    "torch LongStorage": torch.int64,
-    "torch IntStorage": torch.int32,
-}
+MAX_NAMES_IN_MESSAGE = 3
+
+# How the files of each format begin. A safetensors file begins with a length of 8 bytes, and then
+# a JSON object.
+ZIP_SIGNATURE = b"PK\x03\x04"
+PICKLE_SIGNATURE = b"\x80"
+SAFETENSORS_LENGTH_BYTES = 8
+JSON_OBJECT = b"{"
 
 
 def load_strict(
     network: Network,
     tensors: Mapping[str, Tensor],
-    path: str | os.PathLike[str],
+    path: StrPath,
     advice: str,
     *,
     prepare: Callable[[nn.Module], object] | None = None,
 ) -> Network:
-    """Fill a network with a file's tensors, converted to float32, and freeze it; integer buffers keep their values.
+    """Fill a network with a file's tensors, converted to float32, and freeze it.
+
+    Integer buffers keep the values that the network has.
 
     Args:
         network: the network, which may be on the meta device.
-        tensors: the file's tensors, see `read_tensors`.
-        path, advice: the file's name, and what to do about a wrong file; both are parts of messages.
-        prepare: changes the filled network in place; tensors that it leaves mapped from the file are copied afterwards.
+        tensors: the file's tensors, as `read_tensors` returns them.
+        path: the file's name, for messages.
+        advice: what to do about a wrong file, for messages.
+        prepare: changes the filled network in place. Tensors that are still mapped from the file
+            afterwards are copied.
+
+    Returns:
+        The same network.
 
     Raises:
         InputError: tensors are missing, unknown, of another shape, or not finite.
     """
-    ours = network.state_dict()
-    used = {
-        name: tuple(tensor.shape) for name, tensor in ours.items() if tensor.is_floating_point()
+    state = network.state_dict()
+    float_shapes = {
+        name: tuple(tensor.shape) for name, tensor in state.items() if tensor.is_floating_point()
     }
-    check_tensors(tensors, used, path, advice, ignored=ours.keys() - used.keys())
-    state = {name: tensors[name].float().contiguous() for name in used}
-    network.load_state_dict(state, strict=False, assign=True)
+    integer_names = state.keys() - float_shapes.keys()
+    check_tensors(tensors, float_shapes, path, advice, ignored=integer_names)
+
+    new_state = {name: tensors[name].float().contiguous() for name in float_shapes}
+    network.load_state_dict(new_state, strict=False, assign=True)
     network.eval().requires_grad_(False)
     if prepare is not None:
         prepare(network)
+
+    # The network must not depend on the file, which may be changed or deleted.
     for name, tensor in (*network.named_parameters(), *network.named_buffers()):
-        if (
-            name in used and tensor.data_ptr() == tensors[name].data_ptr()
-        ):  # still mapped from the file
+        if name in float_shapes and tensor.data_ptr() == tensors[name].data_ptr():
             tensor.data = tensor.data.clone()
     check_finite(network, path, advice)
     return network
 
 
 def to_channels_last(network: nn.Module) -> None:
-    """Convert kernels to channels-last, which is faster on a CPU."""
+    """Convert a network's kernels to the memory format channels-last, which is faster on a CPU."""
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs lack it
 
 
 def check_tensors(
-    found: Mapping[str, Tensor],
+    tensors: Mapping[str, Tensor],
     expected: TensorShapes,
-    path: str | os.PathLike[str],
+    path: StrPath,
     advice: str,
     ignored: Collection[str] = (),
 ) -> None:
-    """Raise an InputError unless a file has float tensors of the expected names and shapes, and no others.
+    """Check that a file has float tensors of the expected names and shapes, and no others.
 
-    Names in `ignored` are not checked.
+    Args:
+        tensors: the file's tensors by name.
+        expected: the shapes by name.
+        path: the file's name, for messages.
+        advice: what to do about a wrong file, for messages.
+        ignored: names of further tensors that the file may have.
+
+    Raises:
+        InputError: the tensors are others; the message names some of each kind of difference.
     """
-    kinds = {
-        "missing": sorted(expected.keys() - found.keys()),
-        "unknown": sorted(found.keys() - expected.keys() - set(ignored)),
-        "of another shape": [
-            f"{name} {list(found[name].shape)} instead of {list(shape)}"
-            for name, shape in expected.items()
-            if name in found and tuple(found[name].shape) != shape
-        ],
-        "not of floats": [
-            name for name in expected if name in found and not found[name].is_floating_point()
-        ],
-    }
-    problems = [f"{len(names)} {kind} ({_some(names)})" for kind, names in kinds.items() if names]
+    missing = sorted(expected.keys() - tensors.keys())
+    unknown = sorted(tensors.keys() - expected.keys() - set(ignored))
+    other_shapes = []
+    other_types = []
+    for name, shape in expected.items():
+        if name not in tensors:
+            continue
+        if tuple(tensors[name].shape) != shape:
+            other_shapes.append(f"{name} {list(tensors[name].shape)} instead of {list(shape)}")
+        if not tensors[name].is_floating_point():
+            other_types.append(name)
+
+    problems = []
+    for names, kind in (
+        (missing, "missing"),
+        (unknown, "unknown"),
+        (other_shapes, "of another shape"),
+        (other_types, "not of floats"),
+    ):
+        if names:
+            problems.append(f"{len(names)} {kind} ({_name_some(names)})")
     if problems:
-        raise InputError(
-            f"{path}: another network's weights ({'; '.join(problems)}; {len(expected)} tensors are expected): {advice}"
-        )
+        differences = "; ".join([*problems, f"{len(expected)} tensors are expected"])
+        raise InputError(f"{path}: another network's weights ({differences}): {advice}")
 
 
-def check_finite(network: nn.Module, path: str | os.PathLike[str], advice: str) -> None:
-    """Raise an InputError unless all numbers of a network are finite."""
-    # A finite sum is a cheap proof; the sum of finite numbers may overflow.
-    broken = [
-        name
-        for name, t in network.state_dict().items()
-        if not (t.sum().isfinite() or t.isfinite().all())
+def check_finite(network: nn.Module, path: StrPath, advice: str) -> None:
+    """Check that all numbers of a network are finite.
+
+    Args:
+        network: the network that was filled with a file's tensors.
+        path: the file's name, for messages.
+        advice: what to do about a wrong file, for messages.
+
+    Raises:
+        InputError: a tensor has NaN or inf; the message names some of these tensors.
+    """
+    broken_names = []
+    for name, tensor in network.state_dict().items():
+        # A finite sum proves it at little cost; but the sum of finite numbers may overflow.
+        is_finite = bool(tensor.sum().isfinite()) or bool(tensor.isfinite().all())
+        if not is_finite:
+            broken_names.append(name)
+    if broken_names:
+        problem = f"contains numbers that are not finite ({_name_some(broken_names)})"
+        raise InputError(f"{path}: {problem}: {advice}")
+
+
+def _name_some(names: list[str]) -> str:
+    """List the first names of tensors, and say how many more there are.
+
+    The names are a stranger's, so that they are shortened, and control characters are escaped.
+    """
+    shortened_names = [
+        printable_line(name[:120])[:200]  # escaping lengthens a name
+        for name in names[:MAX_NAMES_IN_MESSAGE]
     ]
-    if broken:
-        raise InputError(
-            f"{path}: contains numbers that are not finite ({_some(broken)}): {advice}"
-        )
+    text = ", ".join(shortened_names)
+    more_count = len(names) - MAX_NAMES_IN_MESSAGE
+    if more_count > 0:
+        text += f", and {more_count} more"
+    return text
 
 
-def _some(names: list[str]) -> str:
-    more = len(names) - NAMED
-    shown = ", ".join(printable_line(name[:120])[:200] for name in names[:NAMED])
-    return shown + (f", and {more} more" if more > 0 else "")
+def read_tensors(path: StrPath, advice: str) -> dict[str, Tensor]:
+    """Return the tensors of a file by name, mapped from the disk.
 
+    In TorchScript and in nested dicts, a name is the path to the tensor, joined by dots.
 
-def read_tensors(path: str | os.PathLike[str], advice: str) -> dict[str, Tensor]:
-    """The tensors of a file by name, mapped from the disk.
-
-    In TorchScript and in nested dicts, a name is the path to the tensor, joined by dots. Messages end with `advice`.
+    Args:
+        path: a safetensors, `torch.save` or TorchScript file.
+        advice: what to do about a wrong file, at the end of messages.
 
     Raises:
         InputError: the file is missing or broken, or holds no weights.
     """
-    with _reading_weights(path, advice):
-        tensors = _read(path)
+    with _weight_file_errors(path, advice):
+        tensors = _read_any_format(path)
         if not tensors:
             raise ValueError("no named tensors")
-    return tensors
+        return tensors
 
 
-def read_checkpoint(
-    path: str | os.PathLike[str], name: str, advice: str
-) -> tuple[object, dict[str, Tensor]]:
-    """The value `name` of the dict in a `torch.save` file, and the dict's tensors; see `read_tensors`.
+def read_checkpoint(path: StrPath, name: str, advice: str) -> tuple[object, dict[str, Tensor]]:
+    """Return one value of the dict in a `torch.save` file, and all tensors of the dict.
 
-    The value is untrusted, and consists of numbers, strings, lists, dicts and inert stand-ins.
+    Args:
+        path: the file.
+        name: the value's name, such as "config".
+        advice: what to do about a wrong file, at the end of messages.
+
+    Returns:
+        The value, which is untrusted and consists of numbers, texts, lists, dicts and objects
+        without behaviour; and the tensors by name, as `read_tensors` returns them.
+
+    Raises:
+        InputError: the file is missing or broken, or has no such value.
     """
-    with _reading_weights(path, advice):
-        root = _read_archive(path)
+    with _weight_file_errors(path, advice):
+        root = read_archive(path)
         if not isinstance(root, dict) or name not in root:
             raise ValueError(f"no {name}")
-        return root[name], _tensors(root)
+        return root[name], tensors_in_tree(root)
 
 
-def read_metadata(path: str | os.PathLike[str], name: str) -> str | None:
-    """The value `name` in a safetensors file's metadata; None if missing, or in another format."""
-    with open(path, "rb") as file:
-        if file.read(9)[8:] != b"{":
-            return None
+def read_metadata(path: StrPath, name: str) -> str | None:
+    """Return a value of a safetensors file's metadata; None if it, or the format, is another."""
+    if not _is_safetensors(_read_signature(path)):
+        return None
     with safe_open(path, framework="pt") as opened:
-        return (opened.metadata() or {}).get(name)
+        metadata = opened.metadata()  # None if there is none
+    return None if metadata is None else metadata.get(name)
 
 
 @contextmanager
-def _reading_weights(path: str | os.PathLike[str], advice: str) -> Iterator[None]:
+def _weight_file_errors(path: StrPath, advice: str) -> Iterator[None]:
+    """Turn any exception in the block, which reads a file of weights, into an InputError."""
     check_file(path, "weight file")
-    with (
-        as_input_error(path, f"not a file of weights, or damaged ({{reason}}): {advice}"),
-        report_memory_shortage(),
-    ):
+    problem = f"not a file of weights, or damaged ({{reason}}): {advice}"
+    with as_input_error(path, problem), report_memory_shortage():
         yield
 
 
-def _read(path: str | os.PathLike[str]) -> dict[str, Tensor]:
+def _read_signature(path: StrPath) -> bytes:
+    """Return the first bytes of a file, which tell its format."""
     with open(path, "rb") as file:
-        head = file.read(9)
-    if head.startswith(b"PK\x03\x04"):
-        return _tensors(_read_archive(path))
-    if head[8:] == b"{":
+        return file.read(SAFETENSORS_LENGTH_BYTES + len(JSON_OBJECT))
+
+
+def _is_safetensors(signature: bytes) -> bool:
+    """Return whether the first bytes are those of a safetensors file."""
+    return signature[SAFETENSORS_LENGTH_BYTES:] == JSON_OBJECT
+
+
+def _read_any_format(path: StrPath) -> dict[str, Tensor]:
+    """Return the tensors of a file by name; any exception if the file is no file of weights."""
+    signature = _read_signature(path)
+    if signature.startswith(ZIP_SIGNATURE):
+        return tensors_in_tree(read_archive(path))
+    if _is_safetensors(signature):
         with safe_open(path, framework="pt") as opened:
-            return {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118  # it is no dict
-    if not head.startswith(b"\x80"):
-        raise ValueError("neither safetensors nor PyTorch's format")
+            return {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118  # no dict
+    if signature.startswith(PICKLE_SIGNATURE):
+        return _read_old_pickle(path)
+    raise ValueError("neither safetensors nor PyTorch's format")
+
+
+def _read_old_pickle(path: StrPath) -> dict[str, Tensor]:
+    """Return the tensors of a dict that PyTorch before version 1.6 saved, which is a bare pickle.
+
+    Raises:
+        ValueError: the pickle holds more than tensors and plain values.
+    """
     try:
         with warnings.catch_warnings():
+            # About the old format.
             warnings.simplefilter("ignore")
-            loaded = torch.load(
-                path, map_location="cpu", weights_only=True
-            )  # the format of PyTorch before 1.6
+            content = torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
-        raise ValueError(
-            "a bare pickle with more than tensors; nothing in the pickle was run"
-        ) from error
-    tensors = {
-        name: x for name, x in loaded.items() if isinstance(name, str) and isinstance(x, Tensor)
-    }
-    dense = {
-        name: x
-        for name, x in tensors.items()
-        if (x.layout, x.device.type) == (torch.strided, "cpu")
-    }
-    return {
-        name: Tensor.detach(x) for name, x in dense.items()
-    }  # without attributes that replace methods
+        problem = "a bare pickle with more than tensors; nothing in the pickle was run"
+        raise ValueError(problem) from error
 
-
-def _read_archive(path: str | os.PathLike[str]) -> object:
-    """The root of the tree of objects in a zip archive."""
-    with zipfile.ZipFile(path) as archive:
-        names = [
-            name
-            for name in archive.namelist()
-            if name.count("/") == 1 and name.endswith("/data.pkl")
-        ]
-        if len(names) != 1:
-            raise ValueError("a zip archive without the pickle of a network")
-        root = names[0].removesuffix("data.pkl")
-        if archive.getinfo(names[0]).file_size > MAX_PICKLE:
-            raise ValueError("the pickle is too large for a network")
-        has_checksums = any(record.CRC for record in archive.infolist())  # torch.save can omit them
-        if has_checksums and (damaged := archive.testzip()) is not None:
-            raise ValueError(f"damaged at {damaged}")
-        return _Unpickler(archive.read(names[0]), archive, path, f"{root}data/").load()
-
-
-class _StandIn:
-    """Replaces an object of any class, or the result of any function."""
-
-    kind = ""  # in a subclass: module and name of the replaced class or function
-    fields: dict[object, object]
-
-    def __new__(cls, *arguments: Any) -> Any:
-        """A tensor, if `kind` is a function of torch that rebuilds tensors or parameters; else an empty stand-in."""
-        if cls.kind == "torch._utils _rebuild_tensor_v2" and isinstance(arguments[0], Tensor):
-            storage, offset, shape, stride = arguments[:4]
-            return storage.as_strided(shape, stride, offset)  # raises an error beyond the storage
-        if cls.kind == "torch._utils _rebuild_parameter":
-            return arguments[0]
-        made: _StandIn = super().__new__(cls)
-        made.fields = {}
-        return made
-
-    def __setitem__(self, name: object, value: object) -> None:
-        self.fields[name] = value
-
-    def __setstate__(self, state: object) -> None:
-        if isinstance(state, dict):
-            self.fields.update(state)
-
-
-class _Unpickler(
-    pickle._Unpickler
-):  # in Python; the one in C allocates any amount of memory that a pickle asks for
-    """Reads a pickle as plain values, `_StandIn` and tensors."""
-
-    def __init__(
-        self, data: bytes, archive: zipfile.ZipFile, path: str | os.PathLike[str], folder: str
-    ) -> None:
-        super().__init__(io.BytesIO(data))
-        self._archive, self._path, self._folder = archive, path, folder
-        self._mapped = torch.UntypedStorage.from_file(os.fspath(path), False, os.path.getsize(path))
-
-    def find_class(self, module: str, name: str) -> type[_StandIn]:
-        return type("_StandIn", (_StandIn,), {"kind": f"{module} {name}"})
-
-    def persistent_load(self, pid: Any) -> Tensor | None:
-        """A storage as a flat tensor; None for a type that is not in STORAGES."""
-        _, storage, key, _, count = pid
-        record = self._archive.getinfo(f"{self._folder}{key}")
-        if storage.kind not in STORAGES:
-            return None
-        numbers = torch.empty(0, dtype=STORAGES[storage.kind])
-        size = count * numbers.itemsize
-        if (
-            record.compress_type != zipfile.ZIP_STORED
-            or record.flag_bits & 1
-            or record.file_size != size
-        ):
-            raise ValueError(
-                f"storage {str(key)[:20]} is compressed, or has not the {size} bytes of its tensor"
-            )
-        with open(self._path, "rb") as file:
-            file.seek(record.header_offset + 26)
-            name, more = struct.unpack(
-                "<2H", file.read(4)
-            )  # lengths of the fields before the numbers
-        start = record.header_offset + 30 + name + more
-        return numbers.set_(self._mapped[start : start + size])
-
-
-def _tensors(root: object) -> dict[str, Tensor]:
-    """All tensors in a tree of objects and dicts, by their dotted paths."""
-    found: dict[str, Tensor] = {}
-    waiting, nodes = [("", root)], 0
-    while waiting:
-        path, node = waiting.pop()
-        if isinstance(node, Tensor) and path:
-            found[path] = node
-        fields = vars(node).get("fields") if isinstance(node, _StandIn) else node
-        if isinstance(fields, dict):
-            fields = {name: child for name, child in fields.items() if isinstance(name, str)}
-            nodes += len(fields)
-            if nodes > MAX_NODES or len(path) > MAX_PATH:
-                raise ValueError("objects that are too many or too deep, or contain themselves")
-            waiting += [
-                (f"{path}.{name}" if path else name, child) for name, child in fields.items()
-            ]
-    return found
+    tensors = {}
+    for name, value in content.items():
+        if not (isinstance(name, str) and isinstance(value, Tensor)):
+            continue
+        is_dense = value.layout == torch.strided and value.device.type == "cpu"
+        if is_dense:
+            # The class's method, because the file may give the tensor attributes of this name.
+            tensors[name] = Tensor.detach(value)
+    return tensors

@@ -1,4 +1,4 @@
-"""Download a file of known size and SHA-256: complete or not at all, and resumed after an interruption."""
+"""Download a file of known size and SHA-256: complete or not at all, and resumed where it stopped."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import shutil
 from collections.abc import Iterator
 from http.client import HTTPException, HTTPResponse, responses
 from pathlib import Path
+from typing import BinaryIO
 from urllib.error import HTTPError, URLError
 from urllib.request import Request, build_opener
 
@@ -17,116 +18,197 @@ from spackle.runtime.errors import InputError, reason_in_a_line
 from spackle.runtime.files import check_writable
 from spackle.runtime.progress import Progress
 
-TIMEOUT = 30.0  # seconds without a byte
-CHUNK = 1 << 18  # most bytes that are read at once
-AGAIN = "try again, and the download resumes where it stopped"
+TIMEOUT_S = 30.0  # without a byte
+MAX_READ_BYTES = 1 << 18  # at once
+PARTIAL_CONTENT = 206  # HTTP's status of an answer with a part of a file
+RETRY_ADVICE = "try again, and the download resumes where it stopped"
 
 
 def download(
     url: str, path: str | os.PathLike[str], size: int, sha256: str, progress: Progress | None = None
 ) -> None:
-    """Fetch `url` to `path` in an existing folder.
+    """Fetch a file; the complete file then replaces an older one.
 
-    The bytes are collected in NAME.part; the complete file then replaces an existing file. After a broken connection, a
-    kill or Ctrl-C the next call requests only the missing bytes. `progress` counts the bytes of earlier calls too.
-    InputError if the file cannot be fetched or written, or has other content.
+    The bytes are collected in NAME.part. After a broken connection, a kill or Ctrl-C, the next
+    call requests only the missing bytes.
+
+    Args:
+        url: an address with http or https, without a password.
+        path: the file, in an existing folder.
+        size: of the file in bytes.
+        sha256: of the file, as 64 hexadecimal digits.
+        progress: called with the bytes that are there, those of earlier calls too, and `size`.
+
+    Raises:
+        InputError: the file cannot be fetched or written, or has other content.
     """
+    # A user name stands before an @, in the part of the address after the two slashes.
     if re.match("[^/]*//[^/]*@", url):
-        raise InputError(
-            "an address with a user name or password (not shown): give one that needs no login"
-        )
+        problem = "an address with a user name or password (not shown)"
+        raise InputError(f"{problem}: give one that needs no login")
     if not re.match("https?://", url):
-        raise InputError(
-            f"{url!r}: not an address to download from: give one that begins with https:// or http://"
-        )
+        problem = "not an address to download from"
+        raise InputError(f"{url!r}: {problem}: give one that begins with https:// or http://")
+
     target = check_writable(path)
     part = target.with_name(f"{target.name}.part")
     try:
-        for continued in (part.exists(), False):  # an existing part may belong to another file
-            _receive(url, part, size, progress or (lambda done, total: None))
-            with open(part, "rb") as file:
-                found = sha256_of(file)
-            if found == sha256:
-                os.replace(part, target)
-                return
-            part.unlink()
-            if not continued:
-                raise InputError(
-                    f"{url}: the content's SHA-256 is not {sha256}: give another address"
-                )
+        # The bytes of an earlier call may belong to another file: if they do, begin anew once.
+        was_resumed = part.exists()
+        has_right_content = _complete_part(url, part, size, sha256, progress)
+        if was_resumed and not has_right_content:
+            has_right_content = _complete_part(url, part, size, sha256, progress)
+        if not has_right_content:
+            problem = f"the content's SHA-256 is not {sha256}"
+            raise InputError(f"{url}: {problem}: give another address")
+        os.replace(part, target)
     except OSError as error:
         reason = reason_in_a_line(error)
-        raise InputError(
-            f"{path}: cannot write: {reason}: make room or choose another folder"
-        ) from error
+        advice = "make room or choose another folder"
+        raise InputError(f"{path}: cannot write: {reason}: {advice}") from error
 
 
-def _receive(url: str, part: Path, size: int, progress: Progress) -> None:
-    """Complete `part` to `size` bytes; follows redirects, and obeys https_proxy and no_proxy."""
-    present = part.stat().st_size if part.exists() else 0
-    if present == size:
+def _complete_part(url: str, part: Path, size: int, sha256: str, progress: Progress | None) -> bool:
+    """Fetch the bytes that are missing in the file `part`, and check its content.
+
+    The arguments are those of `download`.
+
+    Returns:
+        Whether the content is right; if not, `part` is deleted.
+    """
+    _receive_missing_bytes(url, part, size, progress)
+    with open(part, "rb") as file:
+        digest = sha256_of(file)
+    if digest == sha256:
+        return True
+    part.unlink()
+    return False
+
+
+def _receive_missing_bytes(url: str, part: Path, size: int, progress: Progress | None) -> None:
+    """Complete the file `part` to `size` bytes, if the server has a file of this size.
+
+    Follows redirects, and obeys the variables https_proxy and no_proxy.
+
+    Raises:
+        InputError: the server cannot be reached, answers with something else or stops early, or
+            the disk is too small.
+    """
+    present_bytes = part.stat().st_size if part.exists() else 0
+    if present_bytes == size:
         return
+    # "identity": a compressed answer would have another size.
     headers = {"User-Agent": "spackle", "Accept-Encoding": "identity"}
-    if 0 < present < size:
-        headers["Range"] = f"bytes={present}-"
-    with _network(url):
-        response: HTTPResponse = build_opener().open(Request(url, headers=headers), timeout=TIMEOUT)
+    if 0 < present_bytes < size:
+        headers["Range"] = f"bytes={present_bytes}-"
+
+    with _network_errors(url):
+        request = Request(url, headers=headers)
+        response: HTTPResponse = build_opener().open(request, timeout=TIMEOUT_S)
     with response:
-        done = _first_byte(url, response, present, size)
-        if (
-            0 < shutil.disk_usage(part.parent).free < size - present
-        ):  # some network folders report 0
-            raise InputError(
-                f"{part.parent}: {size / 1e9:.1f} GB are needed: make room or choose another folder"
-            )
+        start = _start_of_answer(url, response, present_bytes, size)
+        free_bytes = shutil.disk_usage(part.parent).free
+        # Some network folders report 0 free bytes.
+        if 0 < free_bytes < size - present_bytes:
+            problem = f"{size / 1e9:.1f} GB are needed"
+            raise InputError(f"{part.parent}: {problem}: make room or choose another folder")
         with open(part, "ab") as file:
-            file.truncate(done)
-            progress(done, size)
-            while done < size:
-                with _network(url):
-                    block = response.read1(
-                        min(CHUNK, size - done)
-                    )  # read() would lose the bytes before a break
-                if not block:
-                    raise InputError(
-                        f"{url}: the connection ended {size - done:,} bytes early: {AGAIN}"
-                    )
-                file.write(block)
-                file.flush()
-                done += len(block)
-                progress(done, size)
-            os.fsync(file.fileno())  # before the file gets its final name
+            file.truncate(start)
+            _copy_answer(url, response, file, start, size, progress)
+            # Before the file gets its final name.
+            os.fsync(file.fileno())
+
+
+def _copy_answer(
+    url: str,
+    response: HTTPResponse,
+    file: BinaryIO,
+    start: int,
+    size: int,
+    progress: Progress | None,
+) -> None:
+    """Append the bytes of an answer to a file, until the file has `size` bytes.
+
+    Args:
+        url: the address, for messages.
+        response: the server's answer.
+        file: is open for appending.
+        start: how many bytes the file has.
+        size: how many bytes the file will have.
+        progress: called with the file's bytes and `size`.
+
+    Raises:
+        InputError: the connection breaks; the bytes that came are kept.
+    """
+    received_bytes = start
+    if progress is not None:
+        progress(received_bytes, size)
+    while received_bytes < size:
+        with _network_errors(url):
+            # read() would lose the bytes before a break of the connection.
+            block = response.read1(min(MAX_READ_BYTES, size - received_bytes))
+        if not block:
+            missing_bytes = size - received_bytes
+            problem = f"the connection ended {missing_bytes:,} bytes early"
+            raise InputError(f"{url}: {problem}: {RETRY_ADVICE}")
+        file.write(block)
+        file.flush()
+        received_bytes += len(block)
+        if progress is not None:
+            progress(received_bytes, size)
 
 
 @contextlib.contextmanager
-def _network(url: str) -> Iterator[None]:
-    """InputError if the server cannot be reached, or does not give the file."""
+def _network_errors(url: str) -> Iterator[None]:
+    """Turn errors in the block, which talks to a server, into an InputError.
+
+    The server cannot be reached, or does not give the file.
+    """
     try:
         yield
     except HTTPError as error:
         with error:
-            status = (
-                f"the server answers HTTP {error.code} {responses.get(error.code, '')}".rstrip()
-            )
+            name = responses.get(error.code, "")
+            status = f"the server answers HTTP {error.code} {name}".rstrip()
         raise InputError(f"{url}: {status}: check the address, or try again later") from error
-    except (OSError, HTTPException, ValueError) as error:  # ValueError: no address
+    # The library raises a ValueError for a text that is no address.
+    except (OSError, HTTPException, ValueError) as error:
         reason = reason_in_a_line(error.reason if isinstance(error, URLError) else error)
         problem = f"no connection ({reason}): check address, network and https_proxy"
-        raise InputError(f"{url}: {problem}, then {AGAIN}") from error
+        raise InputError(f"{url}: {problem}, then {RETRY_ADVICE}") from error
 
 
-def _first_byte(url: str, response: HTTPResponse, present: int, size: int) -> int:
-    """The offset at which an answer begins: 0 if the server sends the whole file; InputError for another answer."""
+def _start_of_answer(url: str, response: HTTPResponse, present_bytes: int, size: int) -> int:
+    """Return the offset in the file at which a server's answer begins.
+
+    Args:
+        url: the address, for messages.
+        response: the server's answer.
+        present_bytes: the offset that was asked for.
+        size: the size in bytes that the file must have.
+
+    Returns:
+        `present_bytes`, or 0 if the server sends the whole file.
+
+    Raises:
+        InputError: the answer is a web page, or the file has another size.
+    """
     if response.headers.get_content_type() == "text/html":
-        raise InputError(
-            f"{url}: the server's answer is not a file: check the address in a browser"
-        )
-    rest = re.fullmatch(r"bytes (\d+)-\d+/(\d+)", response.headers["Content-Range"] or "")
-    done, total = 0, size if response.length is None else response.length
-    if response.status == 206 and rest and int(rest[1]) == present:
-        done, total = present, int(rest[2])
-    if total != size:
-        raise InputError(
-            f"{url}: the file has {total:,} bytes instead of {size:,}: give another address"
-        )
-    return done
+        problem = "the server's answer is not a file"
+        raise InputError(f"{url}: {problem}: check the address in a browser")
+
+    # Without a length, the connection's end ends the file; its digest is checked later.
+    start = 0
+    total_bytes = size if response.length is None else response.length
+    if response.status == PARTIAL_CONTENT:
+        # "bytes FIRST-LAST/TOTAL"
+        content_range = response.headers["Content-Range"] or ""
+        match = re.fullmatch(r"bytes (\d+)-\d+/(\d+)", content_range)
+        if match is not None and int(match[1]) == present_bytes:
+            start = present_bytes
+            total_bytes = int(match[2])
+
+    if total_bytes != size:
+        problem = f"the file has {total_bytes:,} bytes instead of {size:,}"
+        raise InputError(f"{url}: {problem}: give another address")
+    return start
