@@ -25,8 +25,8 @@ MAX_FOCAL_PER_LONG_SIDE = 10_000.0
 MIN_PLAUSIBLE_MM = 3.0
 MAX_PLAUSIBLE_MM = 3000.0
 
-# SHARP's rule for EXIF that has the lens, but not the sensor: a lens under 10 mm belongs to a phone,
-# whose sensor is 8.4 times smaller than film.
+# SHARP's rule for EXIF that has the lens, but not the sensor: a lens under 10 mm belongs to a
+# phone, whose sensor is 8.4 times smaller than film.
 MAX_PHONE_LENS_MM = 10.0
 PHONE_CROP_FACTOR = 8.4
 

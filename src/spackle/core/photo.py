@@ -171,7 +171,8 @@ def _array_to_rgb(picture: NDArray[Any] | Tensor, name: Path) -> Tensor:
     # The test also refuses NaN, for which every comparison is false.
     if not (torch.isfinite(rgb).all() and rgb.min() >= 0 and rgb.max() <= 1):
         raise InputError(
-            f"{name}: colours from {rgb.min():g} to {rgb.max():g}: give floats from 0 to 1, or uint8"
+            f"{name}: colours from {rgb.min():g} to {rgb.max():g}: "
+            "give floats from 0 to 1, or uint8"
         )
     return rgb
 

@@ -1,8 +1,9 @@
-"""Device, memory, precision and threads of computations, and facts about the machine for reports."""
+"""Device, memory, precision and threads of computations, and facts about the machine."""
 
 from __future__ import annotations
 
 import functools
+import math
 import os
 import platform
 import threading
@@ -15,11 +16,12 @@ from typing import Any, Literal, get_args
 
 import torch
 
-import spackle
+import spackle  # for the version, which is written in this one place; it loads nothing else
 from spackle.runtime.errors import InputError, check_name
 
-# Torch reports a shortage of memory also by plain RuntimeErrors, whose messages contain one of these phrases.
-_SHORTAGES = (
+# Torch reports a shortage of memory also by plain RuntimeErrors, whose messages contain one of
+# these phrases.
+_SHORTAGE_PHRASES = (
     "DefaultCPUAllocator",
     "not enough memory",
     "allocate memory",
@@ -33,36 +35,48 @@ class NotEnoughMemory(InputError):
 
 
 def pick_device(device: torch.device | str | None) -> torch.device:
-    """The CPU or CUDA device of this name; None selects CUDA if available. InputError for any other device."""
-    present = torch.cuda.is_available()
+    """The CPU or CUDA device of this name, such as "cuda:1"; None picks CUDA if it is available.
+
+    Raises:
+        InputError: there is no such device, or it is neither a CPU nor CUDA's.
+    """
+    has_cuda = torch.cuda.is_available()
     if device is None:
-        return torch.device("cuda" if present else "cpu")
-    shown = f"device {str(device)[:40]!a}"
+        return torch.device("cuda" if has_cuda else "cpu")
+
+    name = f"device {str(device)[:40]!a}"  # for messages: shortened and quoted
     try:
-        target = torch.device(device)
+        picked = torch.device(device)
     except (RuntimeError, TypeError) as error:
-        raise InputError(f"{shown}: there is no such device: give cpu or cuda") from error
-    if target.type not in ("cpu", "cuda"):
-        raise InputError(f"{shown}: networks do not run on such a device: give cpu or cuda")
-    if target.type == "cuda" and not present:
+        raise InputError(f"{name}: there is no such device: give cpu or cuda") from error
+    if picked.type not in ("cpu", "cuda"):
+        raise InputError(f"{name}: networks do not run on such a device: give cpu or cuda")
+    if picked.type == "cuda" and not has_cuda:
         raise InputError(
-            f"{shown}: torch finds no CUDA device: give cpu, or install a torch and a driver for CUDA"
+            f"{name}: torch finds no CUDA device: "
+            "give cpu, or install a torch and a driver for CUDA"
         )
-    if target.type == "cuda" and (target.index or 0) >= torch.cuda.device_count():
-        raise InputError(
-            f"{shown}: there is no such CUDA device: give at most cuda:{torch.cuda.device_count() - 1}"
-        )
-    return target
+    if picked.type == "cuda" and (picked.index or 0) >= torch.cuda.device_count():
+        last = torch.cuda.device_count() - 1
+        raise InputError(f"{name}: there is no such CUDA device: give at most cuda:{last}")
+    return picked
 
 
 @contextmanager
 def report_memory_shortage(*advice: str, what: str = "for the network") -> Iterator[None]:
-    """Turn a shortage of memory into a `NotEnoughMemory` with advice."""
+    """Turn a shortage of memory in the block, on the CPU or GPU, into a `NotEnoughMemory`.
+
+    Args:
+        advice: what the user can do, such as "give a smaller model".
+        what: what the memory is for.
+    """
     try:
         yield
     except (MemoryError, RuntimeError) as error:
-        named = isinstance(error, (MemoryError, torch.OutOfMemoryError))
-        if not (named or any(words in str(error) for words in _SHORTAGES)):
+        is_shortage = isinstance(error, (MemoryError, torch.OutOfMemoryError)) or any(
+            phrase in str(error) for phrase in _SHORTAGE_PHRASES
+        )
+        if not is_shortage:
             raise
         remedies = ", or ".join([*advice, "close other programs"])
         raise NotEnoughMemory(f"not enough memory {what}: {remedies}") from error
@@ -70,23 +84,28 @@ def report_memory_shortage(*advice: str, what: str = "for the network") -> Itera
 
 @contextmanager
 def without_autocast_or_tf32(device: torch.device) -> Iterator[None]:
-    """Switch off autocast and TF32 during the block, so that networks compute in the dtypes of their tensors.
+    """Let networks compute in the dtypes of their tensors during the block, whatever is set.
 
-    TF32's switches hold for the whole process, so the block affects other threads too.
+    Autocast would compute in a shorter dtype, TF32 would round float32 to 10 bits of mantissa. The
+    switches of TF32 hold for the whole process, so the block affects other threads, too.
     """
     with torch.autocast("cpu", enabled=False), torch.autocast("cuda", enabled=False):
         if device.type != "cuda":
             yield
             return
-        switches = torch.backends.cuda.matmul, torch.backends.cudnn.conv  # type: ignore[attr-defined]  # torch's stubs
-        before = [switch.fp32_precision for switch in switches]
+
+        switches = (
+            torch.backends.cuda.matmul,
+            torch.backends.cudnn.conv,  # type: ignore[attr-defined]  # torch's stubs lack it
+        )
+        previous_precisions = [switch.fp32_precision for switch in switches]
         try:
             for switch in switches:
-                switch.fp32_precision = "ieee"
+                switch.fp32_precision = "ieee"  # all bits of float32
             yield
         finally:
-            for switch, value in zip(switches, before, strict=True):
-                switch.fp32_precision = value
+            for switch, precision in zip(switches, previous_precisions, strict=True):
+                switch.fp32_precision = precision
 
 
 Precision = Literal["auto", "fp32", "bf16"]
@@ -94,81 +113,112 @@ PRECISIONS: tuple[Precision, ...] = get_args(Precision)
 
 
 def pick_dtype(precision: Precision, device: torch.device) -> torch.dtype:
-    """The dtype for a precision on a device; "auto" is bfloat16 on hardware that multiplies bfloat16."""
+    """The dtype for a precision on a device; "auto" is bfloat16 on hardware that multiplies it.
+
+    Raises:
+        InputError: an unknown precision.
+    """
     check_name("precision", precision, PRECISIONS)
-    if precision == "auto":
-        return torch.bfloat16 if has_native_bf16(device) else torch.float32
-    return torch.float32 if precision == "fp32" else torch.bfloat16
+    if precision == "bf16":
+        return torch.bfloat16
+    if precision == "auto" and has_native_bf16(device):
+        return torch.bfloat16
+    return torch.float32
 
 
 def has_native_bf16(device: torch.device) -> bool:
-    """Whether the hardware multiplies bfloat16 natively: CPUs with AMX or AVX512-BF16, GPUs from Ampere on."""
+    """Whether the hardware multiplies bfloat16.
+
+    CPUs with AMX or AVX512-BF16 do, and GPUs from Ampere on.
+    """
     if device.type == "cuda":
-        return torch.cuda.get_device_capability(device) >= (8, 0)
-    has = torch.cpu.get_capabilities() if device.type == "cpu" else {}
-    return bool(has.get("amx_bf16") or has.get("avx512_bf16"))
+        ampere = (8, 0)
+        return torch.cuda.get_device_capability(device) >= ampere
+    if device.type == "cpu":
+        capabilities = torch.cpu.get_capabilities()
+        return bool(capabilities.get("amx_bf16") or capabilities.get("avx512_bf16"))
+    return False
 
 
 def thread_count() -> int:
-    """The number of threads; it is torch's, so that one setting controls torch and Spackle's kernels."""
+    """The number of threads; it is torch's, so that one setting controls torch and our kernels."""
     return torch.get_num_threads()
 
 
-CHUNKS = 6  # chunks of a task for each thread; several chunks balance uneven work
+CHUNKS_PER_THREAD = 6  # some chunks take longer than others; small ones keep all threads busy
 
 
 def parallel_for_chunks(
-    function: Callable[[int, int], object], total: int, grain: int | None = None
+    function: Callable[[int, int], object], total: int, chunk_length: int | None = None
 ) -> None:
-    """Call `function(start, stop)` for chunks of 0..total, each at most `grain` long, in any order, on several threads.
+    """Call `function(start, stop)` for consecutive chunks of 0..total on several threads.
 
-    Writes of different chunks must not overlap.
+    Args:
+        function: does the work for the indices start..stop−1. Chunks come in any order, several at
+            a time, so they must not write to the same memory. It should release the GIL.
+        total: number of indices.
+        chunk_length: the largest number of indices in a chunk; by default total / (6 · threads).
     """
-    grain = grain or max(-(-total // (CHUNKS * thread_count())), 1)
-    helpers = min(thread_count(), -(-total // grain)) - 1
-    starts = iter(range(0, total, grain))
+    if chunk_length is None:
+        chunk_length = max(math.ceil(total / (CHUNKS_PER_THREAD * thread_count())), 1)
+    chunk_count = math.ceil(total / chunk_length)
+    starts = iter(range(0, total, chunk_length))
     lock = threading.Lock()
 
-    def work() -> None:
+    def work_on_chunks() -> None:
+        """Take chunks until none is left."""
         while True:
-            with lock:
+            with lock:  # iterators are not safe to share
                 start = next(starts, None)
             if start is None:
                 return
-            function(start, min(start + grain, total))
+            function(start, min(start + chunk_length, total))
 
-    futures = [_threads(os.getpid()).submit(work) for _ in range(helpers)]
+    # The calling thread works, too.
+    helper_count = min(thread_count(), chunk_count) - 1
+    pool = _thread_pool(os.getpid())
+    helpers = [pool.submit(work_on_chunks) for _ in range(helper_count)]
     try:
-        work()
+        work_on_chunks()
     finally:
-        for future in futures:
-            future.result()
+        for helper in helpers:
+            helper.result()  # waits, and raises the helper's exception
 
 
 @functools.cache
-def _threads(process: int) -> ThreadPoolExecutor:
-    """The thread pool of a process; unlike numba's loops, it works for several Python threads and after a fork."""
-    return ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix=f"spackle-{process}")
+def _thread_pool(process_id: int) -> ThreadPoolExecutor:
+    """The pool of threads of a process.
+
+    A forked process inherits the pool's object without its threads, so the pool is cached by the
+    process's id. Numba's own parallel loops fail after a fork, and in several Python threads.
+    """
+    return ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix=f"spackle-{process_id}")
 
 
 def package_versions() -> dict[str, str]:
-    """Versions of Spackle, Python and the numerical packages."""
-    ours = {
+    """Versions of Spackle, Python and the numerical packages, by name."""
+    return {
         "spackle": spackle.__version__,
         "python": platform.python_version(),
         "torch": torch.__version__,
+        "numba": version("numba"),
+        "numpy": version("numpy"),
     }
-    return ours | {name: version(name) for name in ("numba", "numpy")}
 
 
 def hardware_facts(device: torch.device) -> dict[str, Any]:
     """Names of the CPU and, for a CUDA device, of the GPU; numbers of cores and threads."""
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text(encoding="utf-8").splitlines() if info.exists() else []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    facts = {
-        "cpu": names[0] if names else platform.machine(),
-        "cores": os.cpu_count(),
-        "threads": thread_count(),
-    }
-    return facts | ({"gpu": torch.cuda.get_device_name(device)} if device.type == "cuda" else {})
+    facts = {"cpu": _cpu_name(), "cores": os.cpu_count(), "threads": thread_count()}
+    if device.type == "cuda":
+        facts["gpu"] = torch.cuda.get_device_name(device)
+    return facts
+
+
+def _cpu_name() -> str:
+    """The name of the CPU where Linux tells it, else its architecture, such as "arm64"."""
+    cpu_info = Path("/proc/cpuinfo")
+    if cpu_info.exists():
+        for line in cpu_info.read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.machine()

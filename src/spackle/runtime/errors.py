@@ -19,7 +19,7 @@ _value_repr.maxother = MAX_VALUE_LENGTH
 
 
 class InputError(ValueError):
-    """Bad input from a user: one line that names the file or value, what is wrong and what to do."""
+    """Bad input from a user; its text is a line that says what is wrong and what to do."""
 
 
 def reason_in_a_line(error: object) -> str:

@@ -1,4 +1,8 @@
-"""Show the progress of long work as bars on a terminal or lines in a log, and end long work at Ctrl-C."""
+"""Show the progress of long work as bars on a terminal or lines in a log, and end it at Ctrl-C.
+
+Functions that take long have a parameter `progress` of the type `Progress`. Commands pass a
+`Reporter` around, which logs messages, times stages, and makes such `progress` functions.
+"""
 
 from __future__ import annotations
 
@@ -34,23 +38,27 @@ Progress = Callable[[int, int], None]  # reports (steps done, steps in all)
 
 
 def pluralized(count: int, thing: str) -> str:
-    """`1 shard`, `2 shards`."""
-    return f"{count:,} {thing}{'' if count == 1 else 's'}"
+    """A number with its noun: `1 shard`, `2 shards`."""
+    return f"{count:,} {thing}" if count == 1 else f"{count:,} {thing}s"
 
 
 class Reporter:
-    """Logs messages and progress to `console` (None: the standard error), and times stages.
-
-    `verbose` also logs details; `as_json` prints each result as a line of JSON on the standard output.
-    """
+    """Logs messages and progress, and times stages."""
 
     def __init__(
         self, verbose: bool = False, console: Console | None = None, *, as_json: bool = False
     ) -> None:
+        """Make a reporter.
+
+        Args:
+            verbose: also log details.
+            console: where messages and bars go; None is the standard error.
+            as_json: print each result as a line of JSON on the standard output.
+        """
         self.console = console or Console(stderr=True, highlight=False)
         self.verbose = verbose
         self.as_json = as_json
-        self.seconds: dict[str, float] = {}  # of each stage so far
+        self.seconds: dict[str, float] = {}  # durations of the stages so far
 
     def restarted(self) -> Reporter:
         """A copy of this reporter with no stage timed yet."""
@@ -59,7 +67,7 @@ class Reporter:
         return other
 
     def result(self, values: Mapping[str, object]) -> None:
-        """Print a result as a line of JSON if `as_json`."""
+        """Print a result as a line of JSON if the user asked for JSON."""
         if self.as_json:
             print(json.dumps(values, allow_nan=False, default=str), flush=True)
 
@@ -72,13 +80,16 @@ class Reporter:
         self.log(line)
 
     def detail(self, line: str) -> None:
-        """Print a line if `verbose`."""
+        """Print a line if the reporter is verbose."""
         if self.verbose:
             self.log(line)
 
     @contextlib.contextmanager
     def stage(self, name: str) -> Iterator[Progress]:
-        """Add the block's duration to `self.seconds[name]`; yield a function of (done, total) that reports progress."""
+        """Time the block, and show a bar on a terminal; yields the function that moves the bar.
+
+        The duration is added to `self.seconds[name]`.
+        """
         start = time.perf_counter()
         if self.console.is_terminal:
             with self._bars(MofNCompleteColumn()) as bars:
@@ -92,103 +103,136 @@ class Reporter:
 
     @contextlib.contextmanager
     def steps(self, name: str, start: int, total: int) -> Iterator[Callable[[int, str], None]]:
-        """Report equal steps from `start` to `total`; yield a function of (done, remark)."""
+        """Report equally long steps as a bar on a terminal, or as lines in a log.
+
+        Args:
+            name: of the work.
+            start: number of steps that an earlier run has done.
+            total: number of steps in all.
+
+        Yields:
+            A function of the number of steps done and a remark, such as the loss.
+        """
         if self.console.is_terminal:
             with self._bars(MofNCompleteColumn(), TextColumn("{task.fields[remark]}")) as bars:
                 task = bars.add_task(name, total=total, completed=start, remark="")
                 yield lambda done, remark: bars.update(task, completed=done, remark=remark)
-        else:
-            begin = time.monotonic()
+            return
 
-            def tell(done: int, remark: str) -> None:
-                left = (time.monotonic() - begin) / max(1, done - start) * (total - done)
-                self.log(
-                    f"{name}: {done} of {total}, {remark}, {timedelta(seconds=round(left))} left"
-                )
+        start_time = time.monotonic()
 
-            yield tell
+        def log_step(done: int, remark: str) -> None:
+            """Log the steps done, and the time left if all steps take equally long."""
+            seconds_per_step = (time.monotonic() - start_time) / max(1, done - start)
+            time_left = timedelta(seconds=round(seconds_per_step * (total - done)))
+            self.log(f"{name}: {done} of {total}, {remark}, {time_left} left")
+
+        yield log_step
 
     @contextlib.contextmanager
     def transfer(self, name: str) -> Iterator[Progress]:
-        """Report a transfer; yield a function of (bytes done, total bytes). A log gets a line for each tenth."""
+        """Report a transfer, such as a download; a log gets a line for each tenth.
+
+        Yields:
+            A function of the bytes done and the bytes in all.
+        """
         if self.console.is_terminal:
             with self._bars(DownloadColumn(), TransferSpeedColumn()) as bars:
                 task = bars.add_task(name, total=None)
                 yield lambda done, total: bars.update(task, completed=done, total=total)
-        else:
-            told = 0
+            return
 
-            def tell(done: int, total: int) -> None:
-                nonlocal told
-                if (tenth := done * 10 // total) != told and done < total:
-                    told = tenth
-                    self.log(f"{name}: {decimal(done)} of {decimal(total)}")
+        logged_tenth = 0
 
-            yield tell
+        def log_transfer(done: int, total: int) -> None:
+            """Log a line if another tenth of the bytes has arrived; the end needs none."""
+            nonlocal logged_tenth
+            tenth = done * 10 // total
+            if tenth != logged_tenth and done < total:
+                logged_tenth = tenth
+                self.log(f"{name}: {decimal(done)} of {decimal(total)}")
+
+        yield log_transfer
 
     def _bars(self, *columns: ProgressColumn) -> Bars:
-        description = TextColumn("{task.description:<12}")
+        """A display of progress bars with these columns between the bar and the remaining time."""
+        name_column = TextColumn("{task.description:<12}")  # the names of stages are shorter
         return Bars(
-            description,
+            name_column,
             BarColumn(),
             *columns,
             TimeRemainingColumn(),
             console=self.console,
-            transient=True,
+            transient=True,  # the bars vanish at the end
         )
 
 
 class LogReporter(Reporter):
-    """Logs to the logger "spackle"; with `progress`, draws a bar on the standard error."""
+    """Logs to the logger "spackle", for use as a library."""
 
     def __init__(self, progress: bool = False) -> None:
+        """Make a reporter; with `progress`, it draws bars on the standard error."""
         super().__init__(console=Console(stderr=True, force_terminal=progress, force_jupyter=False))
         self._log = logging.getLogger("spackle")
 
     def log(self, line: str) -> None:
+        """Log a line as information."""
         self._log.info(line)
 
     def warn(self, line: str) -> None:
+        """Log a line as a warning."""
         self._log.warning(line)
 
 
 class BufferedReporter(Reporter):
-    """Collects the messages of a worker, which the main process prints."""
+    """Collects the messages and results of a worker process, which the main process prints."""
 
     def __init__(self, verbose: bool = False) -> None:
+        """Make a reporter without messages; `verbose` also collects details."""
         super().__init__(verbose, Console(quiet=True, force_terminal=False))
-        self.said: list[str | Mapping[str, object]] = []
+        self.said: list[str | Mapping[str, object]] = []  # messages, and results, in order
 
     def result(self, values: Mapping[str, object]) -> None:
+        """Keep a result."""
         self.said.append(values)
 
     def log(self, line: str) -> None:
+        """Keep a line."""
         self.said.append(line)
 
 
 @contextlib.contextmanager
 def catch_stop_signals(single_process: bool) -> Iterator[Callable[[], bool]]:
-    """Yield a function that tells whether Ctrl-C or SIGTERM came, so that a run can end between two steps.
+    """Let Ctrl-C and SIGTERM ask for a stop, instead of ending the process, during the block.
 
-    If `single_process`, a second Ctrl-C ends the run at once; torchrun, which sends each Ctrl-C twice, needs `single_process=False`.
+    Outside of the main thread, which alone gets signals, nothing ever asks for a stop.
+
+    Args:
+        single_process: let a second Ctrl-C end the run at once. Under torchrun, which sends each
+            Ctrl-C twice to its processes, this must be False.
+
+    Yields:
+        A function that tells whether a signal came, so that a run can end between two steps.
     """
-    asked: list[
-        int
-    ] = []  # an Event could deadlock: a second signal may arrive while the first one holds its lock
-    if (
-        threading.current_thread() is not threading.main_thread()
-    ):  # only the main thread gets signals
+    if threading.current_thread() is not threading.main_thread():
         yield lambda: False
         return
 
-    def note(number: int, frame: object) -> None:
-        asked.append(number)
+    # A list, because threading.Event could deadlock: a second signal may arrive while the handler
+    # of the first one holds the event's lock.
+    caught_signals: list[int] = []
+
+    def remember(number: int, frame: object) -> None:
+        """Handle a signal."""
+        caught_signals.append(number)
         if single_process:
             signal.signal(signal.SIGINT, signal.default_int_handler)
 
-    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    previous_handlers = {
+        number: signal.signal(number, remember) for number in (signal.SIGINT, signal.SIGTERM)
+    }
     try:
-        yield lambda: bool(asked)
+        yield lambda: bool(caught_signals)
     finally:
-        for number, handler in before.items():
+        for number, handler in previous_handlers.items():
             signal.signal(number, handler)

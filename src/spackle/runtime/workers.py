@@ -18,20 +18,19 @@ import torch
 from spackle.runtime.errors import InputError
 from spackle.runtime.task_process import end_with_parent
 
-QUEUED = (
-    2  # jobs per process: the current and the next job; more jobs would keep more results in memory
-)
+# A process always has its next job at hand; more jobs would keep more results in memory.
+JOBS_PER_PROCESS = 2
 
 
 @contextlib.contextmanager
 def torch_threads(count: int) -> Iterator[None]:
     """Let torch use this number of threads inside the `with` block."""
-    before = torch.get_num_threads()
+    previous_count = torch.get_num_threads()
     torch.set_num_threads(count)
     try:
         yield
     finally:
-        torch.set_num_threads(before)
+        torch.set_num_threads(previous_count)
 
 
 @contextlib.contextmanager
@@ -46,9 +45,11 @@ def parallel_map(
     """Yield the results of jobs as they arrive, in any order.
 
     Args:
-        open_worker: makes an object whose `make(job)` returns a job's result; called once in each process. The
-            function, jobs and results are pickled.
-        stop: whether the user has asked the command to end; if so, a dead process is no error, but ends the results.
+        open_worker: makes an object whose `make(job)` returns a job's result; called once in each
+            process. The function, jobs and results are pickled.
+        jobs: arguments of `make`.
+        stop: whether the user has asked the command to end; if so, a dead process is no error, but
+            ends the results.
         count: number of processes; with 1, jobs run in this process.
         threads: torch's threads in each process.
         gpu: whether each process uses one GPU.
@@ -56,59 +57,89 @@ def parallel_map(
     Raises:
         InputError: no job can be done, or a process has died.
     """
-    count = min(count, len(jobs))
-    if count < 2:
+    process_count = min(count, len(jobs))
+    if process_count < 2:
         with torch_threads(threads):
             yield map(open_worker().make, jobs)
         return
+
     spawn = multiprocessing.get_context("spawn")  # torch's threads do not survive a fork
-    numbers = (
-        spawn.SimpleQueue()
-    )  # each process takes one number, which chooses its GPU; None: no GPU
-    for number in range(count):
-        numbers.put(number if gpu else None)
+    # Each process takes one number, which chooses its GPU; None means no GPU.
+    gpu_numbers = spawn.SimpleQueue()
+    for number in range(process_count):
+        gpu_numbers.put(number if gpu else None)
+
     pool = ProcessPoolExecutor(
-        count, spawn, initializer=_start, initargs=(threads, open_worker, numbers)
+        process_count,
+        spawn,
+        initializer=_start_process,
+        initargs=(threads, open_worker, gpu_numbers),
     )
     try:
-        yield _results(pool, jobs, QUEUED * count, stop)
+        yield _results_as_they_arrive(pool, jobs, JOBS_PER_PROCESS * process_count, stop)
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _results(
-    pool: ProcessPoolExecutor, jobs: Sequence[Any], most: int, stop: Callable[[], bool]
+def _results_as_they_arrive(
+    pool: ProcessPoolExecutor, jobs: Sequence[Any], max_pending: int, stop: Callable[[], bool]
 ) -> Iterator[Any]:
-    """Submit at most `most` jobs at a time; yield their results as they arrive."""
-    left, pending = iter(jobs), set[Future[Any]]()
+    """Yield the results of jobs in the order in which the processes of the pool finish them.
+
+    Args:
+        pool: its processes were set up by `_start_process`.
+        jobs: arguments of the worker's `make`.
+        max_pending: number of jobs that are in the hands of the pool at a time.
+        stop: whether the user has asked the command to end.
+
+    Raises:
+        InputError: a process has died, though the user did not stop the command.
+    """
+    remaining_jobs = iter(jobs)
+    pending: set[Future[Any]] = set()
     try:
-        while pending := pending | {
-            pool.submit(_make, job) for job in itertools.islice(left, most - len(pending))
-        }:
+        while True:
+            for job in itertools.islice(remaining_jobs, max_pending - len(pending)):
+                pending.add(pool.submit(_make, job))
+            if not pending:
+                return
             done, pending = wait(pending, return_when=FIRST_COMPLETED)
             for future in done:
                 yield future.result()
     except BrokenProcessPool as error:
+        # Ctrl-C ends the processes, too.
         if not stop():
             raise InputError(
-                "a worker process died, probably because memory ran out: give fewer --workers; the same command resumes"
+                "a worker process died, probably because memory ran out: give fewer `workers`; "
+                "the same command resumes"
             ) from error
 
 
-# Set in each worker process; the first job calls it, because only jobs can report errors.
-_open_worker: Callable[[], Any]
+# Set in each worker process. It makes the worker at the first job and then returns the same one:
+# only jobs can report errors to the main process, so it may not fail before.
+_get_worker: Callable[[], Any]
 
 
-def _start(threads: int, open_worker: Callable[[], Any], numbers: Any) -> None:
-    """Set up a process: it ignores Ctrl-C, ends with the main process, and chooses its GPU by the next of `numbers`."""
-    global _open_worker
-    _open_worker = functools.cache(open_worker)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+def _start_process(threads: int, open_worker: Callable[[], Any], gpu_numbers: Any) -> None:
+    """Set up a worker process: it ignores Ctrl-C, ends with the main process, and takes a GPU.
+
+    Args:
+        threads: torch's threads.
+        open_worker: makes the object that does the jobs.
+        gpu_numbers: a queue that holds one number, or None for no GPU, for each process.
+    """
+    global _get_worker
+    _get_worker = functools.cache(open_worker)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main process decides what Ctrl-C ends
     threading.Thread(target=end_with_parent, daemon=True).start()
     torch.set_num_threads(threads)
-    if (number := numbers.get()) is not None and torch.cuda.device_count() > 1:
-        torch.cuda.set_device(number % torch.cuda.device_count())
+
+    # With more processes than GPUs, several processes share one.
+    gpu_number = gpu_numbers.get()
+    if gpu_number is not None and torch.cuda.device_count() > 1:
+        torch.cuda.set_device(gpu_number % torch.cuda.device_count())
 
 
 def _make(job: Any) -> Any:
-    return _open_worker().make(job)
+    """Do a job in a worker process."""
+    return _get_worker().make(job)
