@@ -202,7 +202,7 @@ def pixel_sums(drawing: Drawing, gradients: Arrays, table_rows: Array, count: in
     def collect_shares(start: int, stop: int) -> None:
         collect_sums(start * share_size, stop * share_size, sum_rows, sums, table)
 
-    parallel_for_chunks(collect_shares, shares, grain=1)
+    parallel_for_chunks(collect_shares, shares, chunk_length=1)
     return table
 
 

@@ -39,7 +39,7 @@ def blend_screen_gaussians(spots: Array, colors: Tensor, height: int, width: int
     parallel_for_chunks(
         lambda start, stop: blend_rows(start, stop, spots, color_array, image),
         height,
-        grain=ROWS_PER_CHUNK,
+        chunk_length=ROWS_PER_CHUNK,
     )
     return torch.from_numpy(image)
 

@@ -40,7 +40,7 @@ def list_tiles(boxes: Array, drawn_tiles: Array, part_size: int) -> TileLists:
     parallel_for_chunks(
         lambda start, stop: count_entries(start, stop, part_size, boxes, drawn_tiles, counts),
         parts,
-        grain=1,
+        chunk_length=1,
     )
     starts = np.concatenate([[0], np.cumsum(counts.sum(axis=0))])
     counts_of_earlier_parts = np.cumsum(counts, axis=0) - counts
@@ -52,7 +52,7 @@ def list_tiles(boxes: Array, drawn_tiles: Array, part_size: int) -> TileLists:
             start, stop, part_size, boxes, drawn_tiles, positions, ids
         ),
         parts,
-        grain=1,
+        chunk_length=1,
     )
     return TileLists(ids, starts)
 
