@@ -223,11 +223,13 @@ def fit_sharp(random: Path, fitted: Path) -> None:
     """
     weights, grid, depths = (
         load_file(random),
-        MICRO_SIZE.grid,
+        MICRO_SIZE.tokens_per_side,
         "monodepth_model.monodepth_predictor.",
     )
     across = (np.arange(grid) + 0.5) * math.pi / grid
-    waves = sorted(((m, n) for m in range(grid) for n in range(grid)), key=sum)[: MICRO_SIZE.embed]
+    waves = sorted(((m, n) for m in range(grid) for n in range(grid)), key=sum)[
+        : MICRO_SIZE.embed_width
+    ]
     places = np.stack(
         [np.outer(np.cos(m * across), np.cos(n * across)).ravel() for m, n in waves], -1
     )

@@ -71,7 +71,7 @@ def run_small(config: SharpConfig, dtype: torch.dtype) -> tuple[Tensor, spackle.
         lambda head, x, out: heard.append(out[0])
     )
     with torch.inference_mode():
-        output = network(waves(config.side), 0.8, batch=5)
+        output = network(waves(config.side), 0.8, windows_per_batch=5)
         return heard[0], apply_deltas(output.initial, output.deltas)
 
 

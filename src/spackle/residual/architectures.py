@@ -129,7 +129,7 @@ class SharpDecoder(ResidualNet):
 
     def __init__(self, config: SharpConfig = FULL_SIZE) -> None:
         super().__init__()
-        dims = (config.depth_width, *config.pyramid)
+        dims = (config.depth_width, *config.pyramid_channels)
         self.stem = nn.Conv2d(VIEW_CHANNELS + 3, STEM_WIDTH, 3, padding=1)
         self.down = nn.ModuleList(
             nn.Conv2d(STEM_WIDTH, STEM_WIDTH, 3, stride=2, padding=1) for _ in dims[1:]

@@ -1,4 +1,8 @@
-"""The SHARP base: predict 1,179,648 Gaussians in metres from one photo, by Apple's weights or a retrained decoder."""
+"""The SHARP base: predict 1,179,648 Gaussians in metres from one photo.
+
+The weights are Apple's, or Apple's with a retrained Gaussian decoder. `SharpBase` is the base,
+`load_network` reads its weights, and `SourceCheckpoint` says on which weights a decoder was trained.
+"""
 
 from __future__ import annotations
 
@@ -36,16 +40,18 @@ from spackle.weights.checkpoints import TensorShapes, load_strict, read_metadata
 
 CPU_WINDOW_BATCH = 5  # enough to keep two cores or a small GPU busy
 ADVICE = "give SHARP's checkpoint as it was downloaded"
-LESS_MEMORY = "try `windows_per_batch` 1 and `precision` bf16"
-SOURCE_KEY = "spackle.gaussian_decoder"  # a decoder file's only metadata key, as JSON: safetensors shuffles several keys
-_ENCODER = "monodepth_model.monodepth_predictor.encoder."
-# Prefixes of tensors that are never read: the transformers' classifiers, and a U-Net that only training uses.
+MEMORY_ADVICE = "try `windows_per_batch` 1 and `precision` bf16"
+# A decoder file's only metadata key, with a value in JSON: safetensors shuffles several keys.
+SOURCE_KEY = "spackle.gaussian_decoder"
+PARAMETER_COUNT = 702_305_169  # in Apple's checkpoint, with the unused ones
+_ENCODER_PREFIX = "monodepth_model.monodepth_predictor.encoder."
+# Tensors that are never read: the transformers' classifiers, and a U-Net that only training uses.
 UNUSED_PREFIXES = (
-    f"{_ENCODER}patch_encoder.head.",
-    f"{_ENCODER}image_encoder.head.",
+    f"{_ENCODER_PREFIX}patch_encoder.head.",
+    f"{_ENCODER_PREFIX}image_encoder.head.",
     "depth_alignment.",
 )
-PARAMETER_COUNT = 702_305_169  # in Apple's checkpoint, with the unused ones
+DECODER_PREFIXES = ("feature_model.", "prediction_head.")  # of the Gaussian decoder's tensors
 
 
 class SharpBase:
@@ -56,7 +62,14 @@ class SharpBase:
     def __init__(
         self, network: SharpNetwork, *, windows_per_batch: int | None = None, weights: str = ""
     ) -> None:
-        """Use a loaded network on its device; `weights` is the name of the weights in the report."""
+        """Use a loaded network on its device.
+
+        Args:
+            network: from `load_network`.
+            windows_per_batch: of a photo's 35 windows, so many go through the transformer at once;
+                None: 5 on a CPU, all on a GPU.
+            weights: the name of the weights in the report.
+        """
         check_window_batch(windows_per_batch)
         self.network = network
         self.windows_per_batch = windows_per_batch or default_window_batch(self.device)
@@ -70,15 +83,19 @@ class SharpBase:
         windows_per_batch: int | None = None,
         device: torch.device | str | None = None,
     ) -> SharpBase:
-        """Read a checkpoint; InputError for an unusable file, device or number of windows, or too little memory.
+        """Read a checkpoint.
 
         Args:
             path: Apple's .pt file, a safetensors file with the same names, or a decoder that
                 `spackle train --method direct-ft` wrote; see `load_network`.
-            precision: number type of the heavy arithmetic; auto is bf16 if the hardware multiplies it natively.
-            windows: number of a photo's 35 windows that the transformer processes at once; None: 5 on a CPU, all on a
-                GPU. The last bits of the result depend on this number.
+            precision: number type of the heavy arithmetic; auto is bf16 if the hardware multiplies
+                it natively.
+            windows_per_batch: of a photo's 35 windows, so many go through the transformer at once;
+                None: 5 on a CPU, all on a GPU. The last bits of the result depend on this number.
             device: cpu or a CUDA device; None: CUDA if available.
+
+        Raises:
+            InputError: a file, device or number of windows cannot be used, or memory is short.
         """
         target = pick_device(device)
         network = load_network(path, pick_dtype(precision, target), target)
@@ -92,36 +109,37 @@ class SharpBase:
     @property
     def precision(self) -> str:
         """The number type of the heavy arithmetic: fp32 or bf16."""
-        return (
-            "bf16"
-            if self.network.feature_model.fusion.out_conv.weight.dtype == torch.bfloat16
-            else "fp32"
-        )
+        heavy_weights = self.network.feature_model.fusion.out_conv.weight
+        return "bf16" if heavy_weights.dtype == torch.bfloat16 else "fp32"
 
     def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
-        """Two layers of Gaussians in metres, the nearer layer first, row by row; InputError if memory is short."""
-        with report_memory_shortage(LESS_MEMORY):
+        """Two layers of Gaussians in metres, the nearer layer first, row by row.
+
+        InputError if memory is short. `progress` gets the number of windows of the picture that are
+        done, and that of all windows.
+        """
+        with report_memory_shortage(MEMORY_ADVICE):
             gaussians = to_metric(self.infer(photo, progress), photo)
         camera = Camera.from_focal(photo.focal_px, photo.width, photo.height)
+        width, height = working_size(photo.width, photo.height)
         notes: dict[str, float | int | str] = {"precision": self.precision, "weights": self.weights}
-        return BasePrediction(
-            gaussians, camera.resized(*working_size(photo.width, photo.height)), notes
-        )
+        return BasePrediction(gaussians, camera.resized(width, height), notes)
 
     @torch.no_grad()
     def infer(self, photo: Photo, progress: Progress | None = None) -> SharpOutput:
         """The network's output for a photo; `to_metric` turns it into Gaussians."""
-        image = resize_to_square(
-            photo.rgb.to(self.device, non_blocking=True), self.network.config.side
-        )
+        rgb = photo.rgb.to(self.device, non_blocking=True)
+        image = resize_to_square(rgb, self.network.config.side)
+        disparity_factor = photo.focal_px / photo.width
         with without_autocast_or_tf32(self.device):
-            factor = photo.focal_px / photo.width
-            output: SharpOutput = self.network(image, factor, self.windows_per_batch, progress)
+            output: SharpOutput = self.network(
+                image, disparity_factor, self.windows_per_batch, progress
+            )
         return output
 
 
 def default_window_batch(device: torch.device) -> int:
-    """The default for the number of windows that go through the transformer at once."""
+    """The number of windows that go through the transformer at once if the user sets none."""
     return CPU_WINDOW_BATCH if device.type == "cpu" else WINDOW_COUNT
 
 
@@ -134,128 +152,169 @@ def check_window_batch(windows_per_batch: int | None) -> None:
 
 
 def to_metric(output: SharpOutput, photo: Photo) -> Gaussians:
-    """Convert Gaussians from normalised space, where x / z and y / z run from -1 to 1, to metres, on the CPU."""
-    stretch = (photo.width / (2 * photo.focal_px), photo.height / (2 * photo.focal_px), 1.0)
+    """The network's Gaussians in metres, on the CPU.
+
+    The network's space is normalised: x / z and y / z run from -1 to 1 over the photo. Stretching
+    along x and y gives the photo's true field of view.
+    """
+    stretch_x = photo.width / (2 * photo.focal_px)
+    stretch_y = photo.height / (2 * photo.focal_px)
     with without_autocast_or_tf32(output.deltas.device):
-        return stretch_gaussians(apply_deltas(output.initial, output.deltas).to("cpu"), stretch)
+        normalised = apply_deltas(output.initial, output.deltas).to("cpu")
+        return stretch_gaussians(normalised, (stretch_x, stretch_y, 1.0))
 
 
 def resize_to_square(rgb: Tensor, side: int) -> Tensor:
-    """Resize [H, W, 3] sRGB to [1, 3, side, side], bilinearly with aligned corner pixels, as SHARP was trained."""
+    """Resize [H, W, 3] sRGB to [1, 3, side, side].
+
+    Bilinearly with aligned corner pixels, because SHARP was trained so.
+    """
     image = rgb.permute(2, 0, 1)[None].contiguous()
     return interpolate(image, size=(side, side), mode="bilinear", align_corners=True)
 
 
-# The checkpoint -----------------------------------------------------------------------------------
+# --- The checkpoint
 
 
 def load_network(
     path: str | os.PathLike[str], dtype: torch.dtype, device: torch.device | str = "cpu"
 ) -> SharpNetwork:
-    """A frozen network from Apple's .pt file, or a safetensors file with the same names, on a device.
+    """A frozen network on a device, from Apple's .pt file or safetensors with the same names.
 
-    The size, published or tiny, follows from the shapes. If a file holds only a trained Gaussian decoder, the other
-    weights come from the checkpoint that it names. The heavy arithmetic is in `dtype`, float32 or bfloat16. InputError
-    for a missing, broken or foreign file, or too little memory. Nothing in the file is executed.
+    The size, published or tiny, follows from the shapes. If a file holds only a trained Gaussian
+    decoder, the other weights come from the checkpoint that it names. The heavy arithmetic is in
+    `dtype`, float32 or bfloat16. Nothing in the file is executed. InputError for a missing, broken
+    or foreign file, or too little memory.
     """
     tensors: Mapping[str, Tensor] = read_tensors(path, ADVICE)
-    if (owner := source_checkpoint_of(path)) is not None:
-        tensors = _with_owner(tensors, path, owner)
-    tensors = {
+    source = source_checkpoint_of(path)
+    if source is not None:
+        tensors = _completed_by_source(tensors, path, source)
+    used = {
         name: tensor for name, tensor in tensors.items() if not name.startswith(UNUSED_PREFIXES)
     }
-    positions = tensors.get(f"{_ENCODER}patch_encoder.pos_embed", torch.empty(0)).shape
-    sizes: dict[tuple[int, ...], SharpConfig]
-    sizes = {(1, 1 + config.grid**2, config.embed): config for config in SIZES.values()}
-    with torch.device("meta"):
-        network = SharpNetwork(sizes.get(positions, SIZES["full"]))
-    with report_memory_shortage(LESS_MEMORY):
+
+    with torch.device("meta"):  # without memory; the weights come from the file
+        network = SharpNetwork(_size_of(used))
+    with report_memory_shortage(MEMORY_ADVICE):
         convert = functools.partial(set_precision, dtype=dtype)
-        load_strict(network, tensors, path, ADVICE, prepare=convert)
+        load_strict(network, used, path, ADVICE, prepare=convert)
         return network.to(device)
 
 
+def _size_of(tensors: Mapping[str, Tensor]) -> SharpConfig:
+    """The size of SHARP that a checkpoint's learned positions of tokens fit; else the published."""
+    positions = tensors.get(f"{_ENCODER_PREFIX}patch_encoder.pos_embed", torch.empty(0))
+    for config in SIZES.values():
+        if positions.shape == (1, 1 + config.tokens_per_side**2, config.embed_width):
+            return config
+    return SIZES["full"]
+
+
 def expected_shapes(config: SharpConfig) -> TensorShapes:
-    """The names and shapes of all tensors that `load_network` reads from a checkpoint of this size."""
+    """The names and shapes of all tensors that `load_network` reads from a checkpoint."""
     with torch.device("meta"):
-        return {
-            name: tuple(tensor.shape) for name, tensor in SharpNetwork(config).state_dict().items()
-        }
+        state = SharpNetwork(config).state_dict()
+    return {name: tuple(tensor.shape) for name, tensor in state.items()}
 
 
-# A trained decoder --------------------------------------------------------------------------------
+# --- A trained decoder
 
 
 @dataclasses.dataclass(frozen=True)
 class SourceCheckpoint:
-    """The checkpoint that a decoder was trained on, which holds the weights that were not trained."""
+    """The checkpoint that a decoder was trained on: it holds the weights that were not trained."""
 
     path: Path  # only the file's name if it was read from a decoder's file
     sha256: str
 
     @property
-    def places(self) -> tuple[str, str]:
-        """Possible names of the checkpoint in a decoder's folder: `link_source_checkpoint`'s link, and the file's own name."""
-        return f"trained-on-{printable_line(Path(self.sha256).name)[:12]}.link", self.path.name
+    def link_name(self) -> str:
+        """The name of `link_source_checkpoint`'s link, which no other file has."""
+        short_digest = printable_line(Path(self.sha256).name)[:12]
+        return f"trained-on-{short_digest}.link"
 
 
-def encode_decoder(decoder: nn.Module, owner: SourceCheckpoint) -> bytes:
-    """A `GaussianDecoder` as a safetensors file in float32, which restores unchanged weights bit for bit."""
+def encode_decoder(decoder: nn.Module, source: SourceCheckpoint) -> bytes:
+    """A `GaussianDecoder` as a safetensors file that names the checkpoint it was trained on.
+
+    Float32 restores unchanged weights bit for bit.
+    """
     tensors = {
         name: tensor.detach().float().cpu().contiguous()
         for name, tensor in decoder.state_dict().items()
     }
-    return save(
-        tensors, {SOURCE_KEY: json.dumps({"checkpoint": owner.path.name, "sha256": owner.sha256})}
-    )
+    note = json.dumps({"checkpoint": source.path.name, "sha256": source.sha256})
+    return save(tensors, {SOURCE_KEY: note})
 
 
-def link_source_checkpoint(owner: SourceCheckpoint, folder: Path) -> None:
-    """Put a link to a checkpoint into the folder of its decoders, under a name that no other file has."""
-    link = folder / owner.places[0]
-    with contextlib.suppress(
-        OSError
-    ):  # the link exists, or the file system has none: then the user copies the file
+def link_source_checkpoint(source: SourceCheckpoint, folder: Path) -> None:
+    """Put a link to a checkpoint into the folder of the decoders that were trained on it."""
+    link = folder / source.link_name
+    # The link exists, or the file system has none: then the user copies the file.
+    with contextlib.suppress(OSError):
         if link.is_symlink() and not link.exists():  # the checkpoint has moved
             link.unlink()
-        link.symlink_to(owner.path.absolute())
+        link.symlink_to(source.path.absolute())
 
 
 def source_checkpoint_of(path: str | os.PathLike[str]) -> SourceCheckpoint | None:
-    """The checkpoint that a decoder's file names; None for another file, InputError if the name is missing."""
+    """The checkpoint that a decoder's file names; None for another file.
+
+    InputError if it is a decoder's file without the name.
+    """
     note = read_metadata(path, SOURCE_KEY)
     if note is None:
         return None
     with as_input_error(path, "does not say which checkpoint it was trained on: train it again"):
         facts = json.loads(note)
-        return SourceCheckpoint(Path(Path(str(facts["checkpoint"])).name), str(facts["sha256"]))
+        file_name = Path(str(facts["checkpoint"])).name  # never a path: the file is untrusted
+        return SourceCheckpoint(Path(file_name), str(facts["sha256"]))
 
 
-def _with_owner(
-    decoder: Mapping[str, Tensor], path: str | os.PathLike[str], owner: SourceCheckpoint
+def _completed_by_source(
+    decoder: Mapping[str, Tensor], path: str | os.PathLike[str], source: SourceCheckpoint
 ) -> dict[str, Tensor]:
-    """The tensors of the checkpoint in a decoder's folder, with the decoder's tensors in place of the checkpoint's.
+    """A decoder's tensors, and all other tensors from the checkpoint in the decoder's folder.
 
-    InputError if the checkpoint is missing, unreadable or changed, or if the decoder belongs to another network.
+    InputError if the checkpoint is missing, unreadable or changed, or if the decoder belongs to
+    another network.
     """
-    beside = Path(path).absolute().parent
-    home = next((beside / name for name in owner.places if os.path.isfile(beside / name)), None)
-    name = printable_line(owner.path.name)
-    if home is None:
+    checkpoint = _find_source(path, source)
+    tensors = read_tensors(checkpoint, ADVICE)
+    trained_names = {name for name in tensors if name.startswith(DECODER_PREFIXES)}
+    wrong_names = sorted(trained_names ^ decoder.keys())  # in one of the two files only
+    if wrong_names:
+        example = printable_line(wrong_names[0])[:120]
         raise InputError(
-            f"{path}: trained on {name}, which is not in this folder: put the checkpoint or a link there"
+            f"{path}: not a decoder of {checkpoint}: {len(wrong_names)} names differ, "
+            f"e.g. {example}"
         )
-    with as_input_error(home, "cannot be read: {reason}", OSError), open(home, "rb") as file:
-        found = sha256_of(file)
-    if found != owner.sha256:
+    return {**tensors, **decoder}
+
+
+def _find_source(path: str | os.PathLike[str], source: SourceCheckpoint) -> Path:
+    """The file of the checkpoint that a decoder was trained on, in the decoder's folder.
+
+    It has the link's name, or its own. InputError if it is missing, unreadable or changed.
+    """
+    folder = Path(path).absolute().parent
+    shown_name = printable_line(source.path.name)
+    candidates = [folder / source.link_name, folder / source.path.name]
+    checkpoint = next((file for file in candidates if os.path.isfile(file)), None)
+    if checkpoint is None:
         raise InputError(
-            f"{path}: trained on a checkpoint with the SHA-256 {printable_line(owner.sha256)[:64]}, but {home} has another: "
-            f"put the right {name} into the folder"
+            f"{path}: trained on {shown_name}, which is not in this folder: "
+            "put the checkpoint or a link there"
         )
-    whole = read_tensors(home, ADVICE)
-    trained = {name for name in whole if name.startswith(("feature_model.", "prediction_head."))}
-    if wrong := sorted(trained ^ decoder.keys()):
+
+    unreadable = as_input_error(checkpoint, "cannot be read: {reason}", OSError)
+    with unreadable, open(checkpoint, "rb") as file:
+        sha256 = sha256_of(file)
+    if sha256 != source.sha256:
+        shown_digest = printable_line(source.sha256)[:64]
         raise InputError(
-            f"{path}: not a decoder of {home}: {len(wrong)} names differ, e.g. {printable_line(wrong[0])[:120]}"
+            f"{path}: trained on a checkpoint with the SHA-256 {shown_digest}, "
+            f"but {checkpoint} has another: put the right {shown_name} into the folder"
         )
-    return {**whole, **decoder}
+    return checkpoint

@@ -1,6 +1,8 @@
-"""SHARP's sizes, precision and encoder: a vision transformer over windows of the picture at three sizes.
+"""SHARP's sizes, precision and encoder: a vision transformer over windows of the picture.
 
-Modules are named as in the checkpoint.
+The picture (1536 pixels a side, as published) is cut into windows of 384 pixels at three sizes.
+`SlidingPyramid` is the whole encoder, `VisionTransformer` processes the windows. Modules are named
+as in Apple's checkpoint.
 """
 
 from __future__ import annotations
@@ -17,21 +19,26 @@ from spackle.weights.checkpoints import to_channels_last
 LAYER_COUNT = 2  # of Gaussians: the visible surface, and what may be behind it
 CELL_STRIDE = 2  # pixels of the network's picture for each cell of Gaussians
 
+# Number of windows along a side of the picture: at full size they overlap by a quarter, at half size
+# by a half. At a quarter of its size, the picture is one window.
+FULL_SIZE_WINDOWS = 5
+HALF_SIZE_WINDOWS = 3
+WINDOW_COUNT = FULL_SIZE_WINDOWS**2 + HALF_SIZE_WINDOWS**2 + 1
+
+NORM_EPS = 1e-6  # added to the variance in layer norms, as in DINOv2
+MLP_RATIO = 4  # width of a transformer's hidden layer over that of its tokens
+
 
 @dataclasses.dataclass(frozen=True)
 class SharpConfig:
     """Widths and depths of one size of SHARP; everything else is the same in all sizes."""
 
-    embed: int = 1024  # width of both vision transformers
-    depth: int = 24  # their blocks
-    heads: int = 16
-    taps: tuple[int, int] = (5, 11)  # blocks whose tokens become the two finest feature maps
-    pyramid: tuple[int, int, int, int] = (
-        256,
-        512,
-        1024,
-        1024,
-    )  # channels of the coarser feature maps, fine to coarse
+    embed_width: int = 1024  # channels of the tokens in both vision transformers
+    block_count: int = 24  # of each transformer
+    head_count: int = 16  # of each block's attention
+    early_blocks: tuple[int, int] = (5, 11)  # their tokens become the two finest feature maps
+    # Channels of the coarser feature maps, fine to coarse.
+    pyramid_channels: tuple[int, int, int, int] = (256, 512, 1024, 1024)
     depth_width: int = 256  # channels of the depth decoder, and of the finest feature map
     gaussian_width: int = 128  # channels of the Gaussian decoder
     feature_width: int = 32  # channels that the Gaussians are predicted from
@@ -39,197 +46,267 @@ class SharpConfig:
     window: int = 384  # side in pixels of a transformer's input, a multiple of 8 tokens
 
     @property
-    def side(self) -> int:  # of the network's square input, in pixels
+    def side(self) -> int:
+        """The side of the network's square input, in pixels."""
         return 4 * self.window
 
     @property
-    def grid(self) -> int:  # number of tokens along a window's side
+    def tokens_per_side(self) -> int:
+        """The number of tokens along a window's side."""
         return self.window // self.patch
 
 
 FULL_SIZE = SharpConfig()
 TINY_SIZE = SharpConfig(
-    48, 4, 3, (0, 1), (16, 24, 32, 32), depth_width=16, gaussian_width=16, feature_width=16
+    embed_width=48,
+    block_count=4,
+    head_count=3,
+    early_blocks=(0, 1),
+    pyramid_channels=(16, 24, 32, 32),
+    depth_width=16,
+    gaussian_width=16,
+    feature_width=16,
 )
 MICRO_SIZE = dataclasses.replace(TINY_SIZE, window=128)  # a ninth of the pixels
 SIZES = {"full": FULL_SIZE, "tiny": TINY_SIZE, "micro": MICRO_SIZE}
 
-_HEAVY = (nn.Linear, nn.Conv2d, nn.ConvTranspose2d, nn.GroupNorm)
+_EXPENSIVE_LAYERS = (nn.Linear, nn.Conv2d, nn.ConvTranspose2d, nn.GroupNorm)
 
 
 class Float32Conv(nn.Conv2d):
-    """A convolution that stays in float32: it is cheap, and reads the pixels or writes the Gaussians' values."""
+    """A convolution that stays in float32.
+
+    It stands where a network reads the pixels or writes the Gaussians' values, and is cheap there.
+    """
 
     def forward(self, x: Tensor) -> Tensor:
+        """Convolve features [B, C, H, W] of any float type, also under autocast."""
         with torch.autocast(x.device.type, enabled=False):  # the decoder is trained under autocast
             return super().forward(x.float())
 
 
 def to_precision_of(x: Tensor, module: nn.Module) -> Tensor:
-    """`x` in the module's precision."""
+    """`x` in the number type of the module's weights."""
     weight: Tensor = module.weight  # type: ignore[assignment]
     return x.to(weight.dtype)
 
 
 def set_precision(network: nn.Module, dtype: torch.dtype) -> None:
-    """Convert the expensive layers to `dtype`, in place, and kernels to channels-last, which is fast on a CPU."""
+    """Convert the expensive layers to `dtype`, in place.
+
+    Kernels become channels-last, which is fast on a CPU.
+    """
     for module in network.modules():
-        if isinstance(module, _HEAVY) and not isinstance(module, Float32Conv):
+        if isinstance(module, _EXPENSIVE_LAYERS) and not isinstance(module, Float32Conv):
             module.to(dtype)
     to_channels_last(network)
 
 
-NORM_EPS = 1e-6
-MLP_RATIO = 4
-
-
 class VisionTransformer(nn.Module):
-    """DINOv2's ViT without classifier; tokens stay float32, because bfloat16 would round away small residuals."""
+    """DINOv2's ViT without classifier.
+
+    Tokens stay float32, because bfloat16 would round away small residuals.
+    """
 
     def __init__(self, config: SharpConfig) -> None:
+        """Build the transformer of one size of SHARP; its weights are zeros or random."""
         super().__init__()
-        self.grid = config.grid
-        self.cls_token = nn.Parameter(torch.zeros(1, 1, config.embed))
-        self.pos_embed = nn.Parameter(torch.zeros(1, 1 + config.grid**2, config.embed))
-        self.patch_embed = nn.ModuleDict(
-            {"proj": Float32Conv(3, config.embed, config.patch, stride=config.patch)}
-        )
+        width = config.embed_width
+        self.tokens_per_side = config.tokens_per_side
+        self.cls_token = nn.Parameter(torch.zeros(1, 1, width))
+        self.pos_embed = nn.Parameter(torch.zeros(1, 1 + config.tokens_per_side**2, width))
+        patch_conv = Float32Conv(3, width, config.patch, stride=config.patch)
+        self.patch_embed = nn.ModuleDict({"proj": patch_conv})
         self.blocks = nn.ModuleList(
-            TransformerBlock(config.embed, config.heads) for _ in range(config.depth)
+            TransformerBlock(width, config.head_count) for _ in range(config.block_count)
         )
-        self.norm = nn.LayerNorm(config.embed, eps=NORM_EPS)
+        self.norm = nn.LayerNorm(width, eps=NORM_EPS)
 
-    def forward(self, windows: Tensor, taps: tuple[int, ...] = ()) -> tuple[Tensor, list[Tensor]]:
-        """Normalised features [B, C, G, G] of windows [B, 3, S, S] in -1..1, and raw features after blocks `taps`."""
-        tokens = self.patch_embed["proj"](windows).flatten(2).transpose(1, 2)
-        tokens = (
-            torch.cat([self.cls_token.expand(len(tokens), -1, -1), tokens], dim=1) + self.pos_embed
-        )
-        tapped = []
+    def forward(
+        self, windows: Tensor, early_blocks: tuple[int, ...] = ()
+    ) -> tuple[Tensor, list[Tensor]]:
+        """Encode windows of a picture.
+
+        Args:
+            windows: [B, 3, window, window] in -1..1, as published [B, 3, 384, 384].
+            early_blocks: numbers of blocks whose tokens are returned, too.
+
+        Returns:
+            The normalised features after the last block, as published [B, 1024, 24, 24], and the
+            features after each of `early_blocks`, of the same shape and not normalised.
+        """
+        patches = self.patch_embed["proj"](windows)  # [B, C, G, G], G tokens a side
+        tokens = patches.flatten(2).transpose(1, 2)  # [B, G², C]
+        class_tokens = self.cls_token.expand(len(tokens), -1, -1)  # [B, 1, C]
+        tokens = torch.cat([class_tokens, tokens], dim=1) + self.pos_embed  # [B, 1 + G², C]
+
+        early_features = []
         for index, block in enumerate(self.blocks):
             tokens = block(tokens)
-            if index in taps:
-                tapped.append(self._to_map(tokens))
-        return self._to_map(self.norm(tokens)), tapped
+            if index in early_blocks:
+                early_features.append(self._to_map(tokens))
+        return self._to_map(self.norm(tokens)), early_features
 
     def _to_map(self, tokens: Tensor) -> Tensor:
-        """[B, 1 + G², C] to [B, C, G, G], without the class token."""
-        return tokens[:, 1:].reshape(len(tokens), self.grid, self.grid, -1).permute(0, 3, 1, 2)
+        """Arrange tokens [B, 1 + G², C] as a map [B, C, G, G], without the class token."""
+        side = self.tokens_per_side
+        return tokens[:, 1:].reshape(len(tokens), side, side, -1).permute(0, 3, 1, 2)
 
 
 class TransformerBlock(nn.Module):
-    """DINOv2's block: self-attention, then an MLP, each scaled by channel and added to float32 tokens [B, T, C]."""
+    """DINOv2's block: self-attention, then an MLP.
 
-    def __init__(self, width: int, heads: int) -> None:
+    Each is scaled by channel and added to the float32 tokens.
+    """
+
+    def __init__(self, width: int, head_count: int) -> None:
+        """Build a block for tokens with `width` channels, which `head_count` must divide."""
         super().__init__()
-        self.heads = heads
-        self.norm1, self.norm2 = (nn.LayerNorm(width, eps=NORM_EPS) for _ in range(2))
+        self.heads = head_count
+        self.norm1 = nn.LayerNorm(width, eps=NORM_EPS)
+        self.norm2 = nn.LayerNorm(width, eps=NORM_EPS)
         self.attn = nn.ModuleDict(
             {"qkv": nn.Linear(width, 3 * width), "proj": nn.Linear(width, width)}
         )
         self.mlp = nn.ModuleDict(
             {"fc1": nn.Linear(width, MLP_RATIO * width), "fc2": nn.Linear(MLP_RATIO * width, width)}
         )
-        self.ls1, self.ls2 = (nn.ParameterDict({"gamma": torch.ones(width)}) for _ in range(2))
+        self.ls1 = nn.ParameterDict({"gamma": torch.ones(width)})
+        self.ls2 = nn.ParameterDict({"gamma": torch.ones(width)})
 
     def forward(self, tokens: Tensor) -> Tensor:
-        tokens = tokens + self._attended(self.norm1(tokens)) * self.ls1["gamma"]
+        """Tokens [B, T, C] in float32 to tokens of the same shape and type."""
+        tokens = tokens + self._attention(self.norm1(tokens)) * self.ls1["gamma"]
         hidden = gelu(self.mlp["fc1"](to_precision_of(self.norm2(tokens), self.mlp["fc1"])))
         out: Tensor = tokens + self.mlp["fc2"](hidden) * self.ls2["gamma"]
         return out
 
-    def _attended(self, tokens: Tensor) -> Tensor:
-        batch, count, width = tokens.shape
-        qkv = self.attn["qkv"](to_precision_of(tokens, self.attn["qkv"]))
-        query, key, value = qkv.view(batch, count, 3, self.heads, width // self.heads).permute(
-            2, 0, 3, 1, 4
-        )
+    def _attention(self, tokens: Tensor) -> Tensor:
+        """Multi-head self-attention of tokens [B, T, C]; the result has the precision of weights."""
+        batch, token_count, width = tokens.shape
+        qkv = self.attn["qkv"](to_precision_of(tokens, self.attn["qkv"]))  # [B, T, 3·C]
+        qkv = qkv.view(batch, token_count, 3, self.heads, width // self.heads)
+        query, key, value = qkv.permute(2, 0, 3, 1, 4)  # each [B, heads, T, C / heads]
         attended = scaled_dot_product_attention(query, key, value)
-        projected: Tensor = self.attn["proj"](attended.transpose(1, 2).flatten(2))
+        projected: Tensor = self.attn["proj"](attended.transpose(1, 2).flatten(2))  # [B, T, C]
         return projected
 
 
-# Number of windows along a side of the picture: at full size they overlap by a quarter, at half size by a half.
-# At a quarter of its size, the picture is one window.
-FULL_WINDOWS, HALF_WINDOWS = 5, 3
-WINDOW_COUNT = FULL_WINDOWS**2 + HALF_WINDOWS**2 + 1
-
-
 class SlidingPyramid(nn.Module):
-    """Encodes a picture to feature maps of five scales, [1, C, side/2, …] to [1, C, side/32, …]."""
+    """Encodes a picture to feature maps of five scales, [1, C, side/2, …] to [1, C, side/32, …].
+
+    One transformer sees the picture in 35 windows: 25 at full size, 9 at half size, and 1 at a
+    quarter of the size. A second one, `image_encoder`, sees only the last.
+    """
 
     def __init__(self, config: SharpConfig) -> None:
+        """Build the encoder of one size of SHARP; its weights are zeros or random."""
         super().__init__()
-        self.taps = config.taps
+        self.early_blocks = config.early_blocks
         self.window = config.window
-        self.full_trim, self.half_trim = (
-            config.grid // 8,
-            config.grid // 4,
-        )  # tokens: half an overlap
+        # In tokens, half of what neighbouring windows have in common.
+        self.full_size_trim = config.tokens_per_side // 8
+        self.half_size_trim = config.tokens_per_side // 4
         self.patch_encoder = VisionTransformer(config)
         self.image_encoder = VisionTransformer(config)
-        fine, embed, dims = config.depth_width, config.embed, config.pyramid
-        self.upsample_latent0 = _project_and_double(embed, dims[0], fine, 3)
-        self.upsample_latent1 = _project_and_double(embed, dims[0], dims[0], 2)
-        self.upsample0 = _project_and_double(embed, dims[1], dims[1], 1)
-        self.upsample1 = _project_and_double(embed, dims[2], dims[2], 1)
-        self.upsample2 = _project_and_double(embed, dims[3], dims[3], 1)
-        self.upsample_lowres = nn.ConvTranspose2d(embed, dims[3], 2, stride=2)
-        self.fuse_lowres = nn.Conv2d(2 * dims[3], dims[3], 1)
 
-    def forward(self, image: Tensor, batch: int, progress: Progress | None = None) -> list[Tensor]:
-        """Feature maps, fine to coarse, of a picture [1, 3, side, side] in -1..1, `batch` windows at a time."""
-        half, quarter = (interpolate(image, scale_factor=f, mode="bilinear") for f in (0.5, 0.25))
+        embed = config.embed_width
+        finest = config.depth_width
+        fine, middle, coarse, coarsest = config.pyramid_channels
+        self.upsample_latent0 = _project_and_upsample(embed, fine, finest, doublings=3)
+        self.upsample_latent1 = _project_and_upsample(embed, fine, fine, doublings=2)
+        self.upsample0 = _project_and_upsample(embed, middle, middle, doublings=1)
+        self.upsample1 = _project_and_upsample(embed, coarse, coarse, doublings=1)
+        self.upsample2 = _project_and_upsample(embed, coarsest, coarsest, doublings=1)
+        self.upsample_lowres = nn.ConvTranspose2d(embed, coarsest, 2, stride=2)
+        self.fuse_lowres = nn.Conv2d(2 * coarsest, coarsest, 1)
+
+    def forward(
+        self, image: Tensor, windows_per_batch: int, progress: Progress | None = None
+    ) -> list[Tensor]:
+        """Encode a picture [1, 3, side, side] in -1..1, as published [1, 3, 1536, 1536].
+
+        `windows_per_batch` windows go through the transformer at once; `progress` gets the number
+        of windows done and that of all windows.
+
+        Returns:
+            Five feature maps, fine to coarse; as published [1, 256, 768, 768], [1, 256, 384, 384],
+            [1, 512, 192, 192], [1, 1024, 96, 96] and [1, 1024, 48, 48].
+        """
+        half = interpolate(image, scale_factor=0.5, mode="bilinear")
+        quarter = interpolate(image, scale_factor=0.25, mode="bilinear")
         windows = torch.cat(
             [
-                cut_windows(image, self.window, FULL_WINDOWS),
-                cut_windows(half, self.window, HALF_WINDOWS),
+                cut_windows(image, self.window, FULL_SIZE_WINDOWS),
+                cut_windows(half, self.window, HALF_SIZE_WINDOWS),
                 quarter,
             ]
+        )  # [35, 3, window, window]
+        last, (early, later) = self._encode_windows(windows, windows_per_batch, progress)
+        last_full, last_half, last_quarter = torch.split(
+            last, [FULL_SIZE_WINDOWS**2, HALF_SIZE_WINDOWS**2, 1]
         )
-        maps, latents = self._encode(windows, batch, progress)
-        full, middle, whole = torch.split(maps, [FULL_WINDOWS**2, HALF_WINDOWS**2, 1])
-        whole = self.upsample2(whole)
-        lowres = self.upsample_lowres(
-            to_precision_of(self.image_encoder(quarter)[0], self.upsample_lowres)
-        )
+
+        # The coarsest map comes from both transformers.
+        coarsest = self.upsample2(last_quarter)
+        context, _ = self.image_encoder(quarter)
+        context = self.upsample_lowres(to_precision_of(context, self.upsample_lowres))
         return [
-            self.upsample_latent0(merge_windows(latents[0], self.full_trim)),
-            self.upsample_latent1(merge_windows(latents[1], self.full_trim)),
-            self.upsample0(merge_windows(full, self.full_trim)),
-            self.upsample1(merge_windows(middle, self.half_trim)),
-            self.fuse_lowres(torch.cat([whole, lowres], dim=1)),
+            self.upsample_latent0(merge_windows(early, self.full_size_trim)),
+            self.upsample_latent1(merge_windows(later, self.full_size_trim)),
+            self.upsample0(merge_windows(last_full, self.full_size_trim)),
+            self.upsample1(merge_windows(last_half, self.half_size_trim)),
+            self.fuse_lowres(torch.cat([coarsest, context], dim=1)),
         ]
 
-    def _encode(
-        self, windows: Tensor, batch: int, progress: Progress | None
+    def _encode_windows(
+        self, windows: Tensor, windows_per_batch: int, progress: Progress | None
     ) -> tuple[Tensor, list[Tensor]]:
-        found: list[list[Tensor]] = [[] for _ in range(1 + len(self.taps))]
-        for start in range(0, len(windows), batch):
-            features, tapped = self.patch_encoder(windows[start : start + batch], self.taps)
-            kept = max(0, FULL_WINDOWS**2 - start)  # only full-size windows need taps
-            for into, part in zip(found, [features, *(tap[:kept] for tap in tapped)], strict=True):
-                into.append(to_precision_of(part, self.fuse_lowres))
+        """Send windows [35, 3, window, window] through the transformer, a batch at a time.
+
+        Returns:
+            The last block's features, as published [35, 1024, 24, 24], and for each early block the
+            features of the full-size windows, as published [25, 1024, 24, 24].
+        """
+        last_batches: list[Tensor] = []
+        early_batches: list[list[Tensor]] = [[] for _ in self.early_blocks]
+        for start in range(0, len(windows), windows_per_batch):
+            end = start + windows_per_batch
+            last, early = self.patch_encoder(windows[start:end], self.early_blocks)
+            last_batches.append(to_precision_of(last, self.fuse_lowres))
+            # Only the full-size windows, which come first, need early features.
+            full_size_count = max(0, FULL_SIZE_WINDOWS**2 - start)
+            for batches, features in zip(early_batches, early, strict=True):
+                batches.append(to_precision_of(features[:full_size_count], self.fuse_lowres))
             if progress:
-                progress(min(start + batch, len(windows)), len(windows))
-        features, *latents = (torch.cat(parts) for parts in found)
-        return features, latents
+                progress(min(end, len(windows)), len(windows))
+        return torch.cat(last_batches), [torch.cat(batches) for batches in early_batches]
 
 
 def cut_windows(image: Tensor, window: int, count: int) -> Tensor:
-    """count² evenly overlapping windows [count², C, window, window] of [1, C, S, S], in row-major order."""
+    """Cut a picture [1, C, S, S] into count × count evenly overlapping windows.
+
+    They come in row-major order: [count², C, window, window].
+    """
     stride = (image.shape[-1] - window) // (count - 1)
-    rows = image.unfold(2, window, stride).unfold(
-        3, window, stride
-    )  # [1, C, count, count, window, window]
-    return rows[0].permute(1, 2, 0, 3, 4).flatten(0, 1)
+    rows = image.unfold(2, window, stride)  # [1, C, count, S, window]
+    windows = rows.unfold(3, window, stride)  # [1, C, count, count, window, window]
+    return windows[0].permute(1, 2, 0, 3, 4).flatten(0, 1)
 
 
 def merge_windows(maps: Tensor, trim: int) -> Tensor:
-    """The inverse of `cut_windows` for feature maps [n², C, G, G]; beside a neighbour, `trim` cells of a map are cut off."""
+    """Join feature maps [n², C, G, G] of n × n windows to one map [1, C, S, S].
+
+    It undoes `cut_windows`: `trim` cells, half of the overlap, are cut off beside each neighbour.
+    """
     count = int(len(maps) ** 0.5)
     size = maps.shape[-1]
-    spans = [slice(trim if i else 0, size - trim if i < count - 1 else size) for i in range(count)]
+    spans = []
+    for i in range(count):
+        begin = trim if i > 0 else 0
+        end = size - trim if i < count - 1 else size
+        spans.append(slice(begin, end))
+
     rows = []
     for i, vertical in enumerate(spans):
         tiles = [maps[i * count + j, :, vertical, horizontal] for j, horizontal in enumerate(spans)]
@@ -237,12 +314,16 @@ def merge_windows(maps: Tensor, trim: int) -> Tensor:
     return torch.cat(rows, dim=1)[None]
 
 
-def _project_and_double(
+def _project_and_upsample(
     dim_in: int, dim_middle: int, dim_out: int, doublings: int
 ) -> nn.Sequential:
+    """Layers that change channels from `dim_in` to `dim_out`, and double the size several times.
+
+    A 1×1 convolution projects to `dim_middle` channels; each doubling is a transposed convolution.
+    """
     layers: list[nn.Module] = [nn.Conv2d(dim_in, dim_middle, 1, bias=False)]
-    for index in range(doublings):
-        layers.append(
-            nn.ConvTranspose2d(dim_out if index else dim_middle, dim_out, 2, stride=2, bias=False)
-        )
+    channels = dim_middle
+    for _ in range(doublings):
+        layers.append(nn.ConvTranspose2d(channels, dim_out, 2, stride=2, bias=False))
+        channels = dim_out
     return nn.Sequential(*layers)
