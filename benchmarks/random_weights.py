@@ -21,7 +21,7 @@ from torch import Tensor
 
 from spackle.bases.sharp.base import expected_shapes as sharp_shapes
 from spackle.bases.sharp.encoder import SIZES
-from spackle.inpaint.lama import expected_shapes as lama_shapes
+from spackle.inpaint.lama_network import expected_shapes as lama_shapes
 
 
 def deterministic_weights(shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Tensor]:

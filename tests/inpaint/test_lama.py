@@ -15,14 +15,13 @@ from torch import Tensor
 
 from spackle.inpaint import InpainterOptions, get_inpainter
 from spackle.inpaint.lama import (
-    MARGIN,
+    MARGIN_PX,
     LamaInpainter,
-    LamaNetwork,
-    expected_shapes,
-    groups_of,
+    group_holes,
     load_network,
-    padded,
+    pad_to_accepted_size,
 )
+from spackle.inpaint.lama_network import LamaNetwork, expected_shapes
 from spackle.runtime.errors import InputError
 from spackle.weights import PUBLISHED_WEIGHTS
 
@@ -149,14 +148,17 @@ def test_only_holes_change_and_the_network_gets_crops(file: Path) -> None:
     )
     rgb, hole, depth = views(60, 700, (20, 10, 40, 20), (0, 690, 60, 700))
     painted = inpainter.paint(rgb, hole, depth)
-    assert seen == [(64, 32 + MARGIN), (64, 12 + MARGIN + 4)]
+    assert seen == [(64, 32 + MARGIN_PX), (64, 12 + MARGIN_PX + 4)]
     assert torch.equal(painted[~hole], rgb[~hole])
     assert bool((painted[hole] > 0).all() & (painted[hole] < 1).all())
     assert float(painted[hole].std(0).min()) > 1e-3
     assert torch.equal(inpainter.paint(rgb, hole, depth), painted)
     both = [torch.cat([x, torch.zeros_like(x)]) for x in (rgb, hole, depth)]
     assert torch.equal(inpainter.paint(*both), torch.cat([painted, torch.zeros_like(rgb)]))
-    part = padded(rgb[:, :, :160].permute(0, 3, 1, 2)), padded(hole[:, None, :, :160])
+    part = (
+        pad_to_accepted_size(rgb[:, :, :160].permute(0, 3, 1, 2)),
+        pad_to_accepted_size(hole[:, None, :, :160]),
+    )
     plain = load_network(file)(*part)[0, :, :60].permute(1, 2, 0)
     torch.testing.assert_close(painted[0, 20:40, 10:20], plain[20:40, 10:20])
 
@@ -181,7 +183,7 @@ def test_large_crops_are_reduced_and_no_hole_is_lost(file: Path) -> None:
 def test_each_hole_is_in_one_crop() -> None:
     holes = torch.rand(700, 800, generator=torch.Generator().manual_seed(0)) > 0.9999
     counts = torch.zeros(700, 800)
-    for crop, _ in groups_of(holes):
+    for crop, _ in group_holes(holes):
         counts[crop.slices] += 1
     assert bool((counts[holes] == 1).all())
 
@@ -204,7 +206,7 @@ def test_errors_are_one_line(file: Path, tmp_path: Path, monkeypatch: pytest.Mon
 
     monkeypatch.setattr(LamaNetwork, "forward", short)
     with pytest.raises(
-        InputError, match="not enough memory for LaMa at 40 pixels: lower --inpainter-side"
+        InputError, match="not enough memory for LaMa at 40 pixels: lower `inpainter_side`"
     ):
         inpainter.paint(*picture)
     monkeypatch.setattr(LamaNetwork, "forward", lambda self, rgb, hole: rgb * torch.nan)

@@ -14,11 +14,11 @@ from torch import Tensor, nn
 
 from spackle.inpaint import InpainterOptions, get_inpainter
 from spackle.inpaint.propainter import (
-    DILATION,
-    NETWORKS,
+    DILATION_PX,
+    NETWORK_NAMES,
     PropainterInpainter,
-    dilated,
-    weight_files,
+    dilate_holes,
+    find_weight_files,
 )
 from spackle.runtime.errors import InputError
 
@@ -35,7 +35,7 @@ def test_holes_are_dilated_by_steps() -> None:
     hole = torch.zeros(1, 1, 20, 20)
     hole[0, 0, 10, 8] = 1
     y, x = torch.meshgrid(torch.arange(20), torch.arange(20), indexing="ij")
-    assert torch.equal(dilated(hole)[0, 0] > 0, (y - 10).abs() + (x - 8).abs() <= DILATION)
+    assert torch.equal(dilate_holes(hole)[0, 0] > 0, (y - 10).abs() + (x - 8).abs() <= DILATION_PX)
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +67,7 @@ def weights(package: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     folder = tmp_path_factory.mktemp("weights")
     torch.manual_seed(0)
-    for name, make in zip(NETWORKS, (raft_things, propainter_rfc, propainter), strict=True):
+    for name, make in zip(NETWORK_NAMES, (raft_things, propainter_rfc, propainter), strict=True):
         torch.save(
             make().half().state_dict() | {"of_somebody_else": torch.zeros(1)},
             folder / f"{name}-0000-random.pth",
@@ -116,7 +116,7 @@ def test_the_networks_paint_only_holes(inpainter: PropainterInpainter) -> None:
     assert 0 <= float(painted[hole].min()) <= float(painted[hole].max()) <= 1
     assert float((painted - rgb)[hole].abs().mean()) > 0.05
     assert re.fullmatch(r"1, pytorchcv [\d.]+, long side 640", inpainter.version)
-    assert inpainter.weight_files.keys() == set(NETWORKS)
+    assert inpainter.weight_files.keys() == set(NETWORK_NAMES)
     assert "S-Lab" in inpainter.notice
 
 
@@ -127,7 +127,7 @@ def test_inputs_of_the_networks(video: type[Video], inpainter: PropainterInpaint
     assert frames.shape == (4, 3, 128, 152)
     assert masks.shape == (4, 1, 128, 152)
     torch.testing.assert_close(frames[:, :, :113, :150], 2 * rgb.permute(0, 3, 1, 2) - 1)
-    assert torch.equal(masks[:, :, :113, :150], dilated(hole[:, None].float()))
+    assert torch.equal(masks[:, :, :113, :150], dilate_holes(hole[:, None].float()))
     assert torch.equal(frames[:, :, 112:113].expand(-1, -1, 16, -1), frames[:, :, 112:])
     assert torch.equal(painted[~hole], rgb[~hole])
     torch.testing.assert_close(painted[hole], torch.full((int(hole.sum()), 3), 0.75))
@@ -150,12 +150,12 @@ def test_colours_that_are_not_finite_are_refused(
         raise torch.OutOfMemoryError("CUDA out of memory")
 
     monkeypatch.setattr(Video, "__iter__", short)
-    with pytest.raises(InputError, match="lower --inpainter-side"):
+    with pytest.raises(InputError, match="lower `inpainter_side`"):
         inpainter.paint(*views)
 
 
 def test_missing_weights_are_refused(tmp_path: Path) -> None:
-    published = [f"{name}-0000-d74fed4b.pth" for name in NETWORKS]
+    published = [f"{name}-0000-d74fed4b.pth" for name in NETWORK_NAMES]
     for given, files, said in (
         (None, [], "give a folder with one file for each of raft_things, .* unpacked from https"),
         (tmp_path / "missing", [], "holds 0 files named raft_things"),
@@ -164,9 +164,9 @@ def test_missing_weights_are_refused(tmp_path: Path) -> None:
         for name in files:
             (tmp_path / name).write_bytes(b"")
         with pytest.raises(InputError, match=said):
-            weight_files(given)
+            find_weight_files(given)
     (tmp_path / "propainter.safetensors").unlink()
-    assert [file.name for file in weight_files(tmp_path).values()] == published
+    assert [file.name for file in find_weight_files(tmp_path).values()] == published
 
 
 def test_a_missing_package_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,10 +1,12 @@
-"""ProPainter, the paper's inpainter, with the networks of pytorchcv (pip install 'spackle-nvs[propainter]').
+"""ProPainter, the inpainter of the paper, with the networks of the package pytorchcv.
 
-Pixels are propagated into holes along the optical flow; pixels that no frame shows are generated.
+Pixels are carried into holes along the optical flow; pixels that no view shows are generated. The
+package is optional: pip install 'spackle-nvs[propainter]'.
 """
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,19 +23,21 @@ from spackle.runtime.device import pick_device, report_memory_shortage
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.weights.checkpoints import load_strict, read_tensors
 
-NETWORKS = (
-    "raft_things",
-    "propainter_rfc",
-    "propainter",
-)  # flow, completion of flow, colours; prefixes of file names
-SOURCE = "https://github.com/osmr/imgclsmob/releases/tag/v0.0.570"
-SIDE = 640  # default for the long side of the input in pixels; the training had 432×240
-MULTIPLE = 8  # both sides of the networks' input are multiples of this
-DILATION = (
-    4  # steps by which holes are dilated, because rims have mixed colours; the authors' choice
-)
-INSTALL = "pip install 'spackle-nvs[propainter]'"
-ITERATIONS = 20  # of the flow; the authors' choice
+# The networks of the flow, of the flow's completion in holes, and of the colours. Names of files
+# of weights begin with these names.
+NETWORK_NAMES = ("raft_things", "propainter_rfc", "propainter")
+WEIGHTS_URL = "https://github.com/osmr/imgclsmob/releases/tag/v0.0.570"
+INSTALL_COMMAND = "pip install 'spackle-nvs[propainter]'"
+
+# The long side of the networks' input in pixels, if none is given; the training had 432×240.
+DEFAULT_INPUT_SIDE_PX = 640
+# Both sides of the input are multiples of this.
+SIDE_MULTIPLE = 8
+
+# Holes grow by this many pixels, because their borders have mixed colours; the authors' choice.
+DILATION_PX = 4
+# The network of the flow refines its result so often; the authors' choice.
+FLOW_ITERATIONS = 20
 
 
 class PropainterInpainter:
@@ -48,105 +52,154 @@ class PropainterInpainter:
     )
 
     def __init__(self, options: InpainterOptions) -> None:
-        """Load the networks; InputError for an invalid side, a missing package, or unsuitable weights."""
-        self._side = options.side_or(SIDE)
-        with as_input_error(
-            "inpainter propainter", f"cannot import its package ({{reason}}): {INSTALL}"
-        ):
+        """Load the networks.
+
+        Raises:
+            InputError: the side is impossible, the package is missing, or the weights are missing
+                or unsuitable.
+        """
+        self._input_side = options.side_or(DEFAULT_INPUT_SIDE_PX)
+        problem = f"cannot import its package ({{reason}}): {INSTALL_COMMAND}"
+        with as_input_error("inpainter propainter", problem):
             import pytorchcv
             import pytorchcv.models.propainter_stream
-        self.weight_files: Mapping[str, Path] = weight_files(options.weights)
-        self._networks = [_network(name, file) for name, file in self.weight_files.items()]
+        self.weight_files: Mapping[str, Path] = find_weight_files(options.weights)
+        self._networks = [_load_network(name, file) for name, file in self.weight_files.items()]
         self._device = pick_device(options.device)
-        self.version = f"1, pytorchcv {pytorchcv.__version__}, long side {self._side}"
+        self.version = f"1, pytorchcv {pytorchcv.__version__}, long side {self._input_side}"
 
     @torch.no_grad()
     def paint(self, rgb: Tensor, hole: Tensor, inverse_depth: Tensor) -> Tensor:
-        """Paint the views, see `Inpainter.paint`; InputError if memory is short, or the colours are not finite."""
+        """Paint the holes of V views, which are in the order of a moving camera.
+
+        Args:
+            rgb: [V, H, W, 3] sRGB in 0..1.
+            hole: [V, H, W] bool, True where a colour has to be painted.
+            inverse_depth: ignored.
+
+        Returns:
+            [V, H, W, 3] sRGB in 0..1, equal to `rgb` outside of the holes.
+
+        Raises:
+            InputError: memory is short, or the networks' colours are not finite.
+        """
         if not bool(hole.any()):
             return rgb
         height, width = hole.shape[1:]
-        small = working_size(width, height, self._side)[::-1]
-        frames = F.interpolate(rgb.permute(0, 3, 1, 2), small, mode="bicubic", antialias=True)
-        holes = F.interpolate(hole[:, None].float(), small, mode="area") > 0  # thin holes are kept
-        with report_memory_shortage(
-            "lower --inpainter-side", what=f"for ProPainter at {self._side} pixels"
-        ):
-            filled = self._fill(frames.clamp(0, 1), holes.float()).to(rgb)
-        if not bool(filled.isfinite().all()):
-            raise InputError(
-                "ProPainter: the colours are not finite: give the published --inpainter-weights"
-            )
-        painted = (
-            F.interpolate(filled, (height, width), mode="bicubic").clamp(0, 1).permute(0, 2, 3, 1)
-        )
-        return torch.where(hole[..., None], painted, rgb)
+        small_width, small_height = working_size(width, height, self._input_side)
+        small_size = (small_height, small_width)
+        frames = F.interpolate(rgb.permute(0, 3, 1, 2), small_size, mode="bicubic", antialias=True)
+        # A reduced pixel that contains any part of a hole is a hole, so that thin holes stay.
+        hole_share = F.interpolate(hole[:, None].float(), small_size, mode="area")
+        small_holes = (hole_share > 0).float()
 
-    def _fill(self, frames: Tensor, holes: Tensor) -> Tensor:
-        """Repaint frames [V, 3, h, w] (values 0..1) in and around the holes; `holes` [V, 1, h, w] is 1 in a hole."""
+        what = f"for ProPainter at {self._input_side} pixels"
+        with report_memory_shortage("lower `inpainter_side`", what=what):
+            filled = self._fill_frames(frames.clamp(0, 1), small_holes).to(rgb)
+        if not bool(filled.isfinite().all()):
+            problem = "the colours are not finite"
+            raise InputError(f"ProPainter: {problem}: give the published `inpainter_weights`")
+
+        # Bicubic interpolation may overshoot 0..1.
+        enlarged = F.interpolate(filled, (height, width), mode="bicubic").clamp(0, 1)
+        return torch.where(hole[..., None], enlarged.permute(0, 2, 3, 1), rgb)
+
+    def _fill_frames(self, frames: Tensor, holes: Tensor) -> Tensor:
+        """Repaint frames in and around the holes.
+
+        Args:
+            frames: [V, 3, h, w] colours in 0..1.
+            holes: [V, 1, h, w] 1 in a hole, else 0.
+
+        Returns:
+            [V, 3, h, w] colours in about 0..1.
+        """
         from pytorchcv.models.propainter_stream import ProPainterIterator, TensorSequencer
 
         count, _, height, width = frames.shape
-        turns = [*range(count), *[0] * (count == 1)]  # a video needs two frames
-        margin = (0, padded(width) - width, 0, padded(height) - height)
-        frames, holes = (
-            F.pad(x[turns].to(self._device), margin, mode="replicate") for x in (frames, holes)
-        )
+        # A video needs two frames.
+        frame_order = [0, 0] if count == 1 else list(range(count))
+        # Left, right, top, bottom.
+        margins = (0, padded_side(width) - width, 0, padded_side(height) - height)
+        frames = F.pad(frames[frame_order].to(self._device), margins, mode="replicate")
+        holes = F.pad(holes[frame_order].to(self._device), margins, mode="replicate")
+
         video = ProPainterIterator(
-            TensorSequencer(2 * frames - 1),
-            TensorSequencer(dilated(holes)),
+            TensorSequencer(2 * frames - 1),  # the networks take colours in -1..1
+            TensorSequencer(dilate_holes(holes)),
             *(network.to(self._device) for network in self._networks),
             use_cuda=self._device.type == "cuda",
-            step=len(turns),
+            step=len(frame_order),  # all frames at once
         )
-        drawn: Tensor = torch.cat(list(video))
-        return (drawn[:count, :, :height, :width] + 1) / 2
+        filled: Tensor = torch.cat(list(video))
+        return (filled[:count, :, :height, :width] + 1) / 2
 
 
-def padded(side: int) -> int:
-    """Round a side in pixels up to one that the networks accept."""
-    return max(MIN_INPUT_SIDE_PX, -(-side // MULTIPLE) * MULTIPLE)
+def padded_side(side: int) -> int:
+    """Return the next larger side in pixels that the networks accept."""
+    return max(MIN_INPUT_SIDE_PX, math.ceil(side / SIDE_MULTIPLE) * SIDE_MULTIPLE)
 
 
-def dilated(holes: Tensor) -> Tensor:
-    """Holes [V, 1, h, w], dilated by DILATION steps to the four neighbours."""
-    for _ in range(DILATION):
-        holes = torch.maximum(
-            max_pool2d(holes, (3, 1), 1, (1, 0)), max_pool2d(holes, (1, 3), 1, (0, 1))
-        )
+def dilate_holes(holes: Tensor) -> Tensor:
+    """Grow holes [V, 1, h, w] (1 in a hole, else 0) by DILATION_PX steps to the four neighbours."""
+    for _ in range(DILATION_PX):
+        from_rows = max_pool2d(holes, kernel_size=(3, 1), stride=1, padding=(1, 0))
+        from_columns = max_pool2d(holes, kernel_size=(1, 3), stride=1, padding=(0, 1))
+        holes = torch.maximum(from_rows, from_columns)
     return holes
 
 
-def _network(name: str, file: Path) -> nn.Module:
-    """A frozen network with a file's weights; unknown tensors in the file are ignored."""
+def _load_network(name: str, file: Path) -> nn.Module:
+    """Return a frozen network with a file's weights.
+
+    Args:
+        name: one of NETWORK_NAMES.
+        file: the weights; tensors that the network does not have are ignored.
+
+    Raises:
+        InputError: the file is broken, or lacks tensors.
+    """
     from pytorchcv.models.propainter import propainter
     from pytorchcv.models.propainter_rfc import propainter_rfc
     from pytorchcv.models.raft import raft_things
 
+    network: nn.Module
     if name == "raft_things":
-        network: nn.Module = raft_things(in_normalize=False, iters=ITERATIONS)
+        network = raft_things(in_normalize=False, iters=FLOW_ITERATIONS)
+    elif name == "propainter_rfc":
+        network = propainter_rfc()
     else:
-        network = propainter_rfc() if name == "propainter_rfc" else propainter()
-    advice = f"unpack the file of {name} from {SOURCE} again"
-    ours, found = network.state_dict().keys(), read_tensors(file, advice)
-    return load_strict(
-        network, {key: tensor for key, tensor in found.items() if key in ours}, file, advice
-    )
+        network = propainter()
+
+    advice = f"unpack the file of {name} from {WEIGHTS_URL} again"
+    tensors = read_tensors(file, advice)
+    needed_names = network.state_dict().keys()
+    needed_tensors = {key: tensor for key, tensor in tensors.items() if key in needed_names}
+    return load_strict(network, needed_tensors, file, advice)
 
 
-def weight_files(folder: Path | None) -> dict[str, Path]:
-    """The file NAME.pth, NAME-….pth or .safetensors of each of `NETWORKS`; InputError for a missing or second file."""
-    advice = (
-        f"give a folder with one file for each of {', '.join(NETWORKS)}, unpacked from {SOURCE}"
-    )
+def find_weight_files(folder: Path | None) -> dict[str, Path]:
+    """Find the weights of each network: NAME.pth, NAME-….pth, or .safetensors.
+
+    Args:
+        folder: the folder that the user gave, if any.
+
+    Returns:
+        The files by the names in NETWORK_NAMES.
+
+    Raises:
+        InputError: there is no folder, or a network has no file in it or more than one.
+    """
+    names = ", ".join(NETWORK_NAMES)
+    advice = f"give a folder with one file for each of {names}, unpacked from {WEIGHTS_URL}"
     if folder is None:
-        raise InputError(f"inpainter propainter: --inpainter-weights is missing: {advice}")
-    files = {}
-    for network in NETWORKS:
-        pattern = rf"{network}(-.*)?\.(pth|safetensors)"
-        found = [file for file in folder.glob("*") if re.fullmatch(pattern, file.name)]
-        if len(found) != 1:
-            what = f"holds {len(found)} files named {network}-….pth"
-            raise InputError(f"--inpainter-weights {folder}: {what}: {advice}")
-        files[network] = found[0]
-    return files
+        raise InputError(f"inpainter propainter: `inpainter_weights` is missing: {advice}")
+    weight_files = {}
+    for name in NETWORK_NAMES:
+        pattern = rf"{name}(-.*)?\.(pth|safetensors)"
+        files = [file for file in folder.glob("*") if re.fullmatch(pattern, file.name)]
+        if len(files) != 1:
+            problem = f"holds {len(files)} files named {name}-….pth"
+            raise InputError(f"`inpainter_weights` {folder}: {problem}: {advice}")
+        weight_files[name] = files[0]
+    return weight_files
