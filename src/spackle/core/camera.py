@@ -1,4 +1,4 @@
-"""Pinhole cameras in the OpenCV convention."""
+"""Pinhole cameras in the OpenCV convention: x right, y down, z forward."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ import math
 import torch
 from torch import Tensor
 
-SHORTEST_LOOK = 1e-6  # least distance of eye and target, relative to their largest coordinate
-LEAST_TILT = 1e-3  # least angle in radians between the viewing direction and up
+# Below these limits a viewing direction is made of rounding errors.
+MIN_EYE_TO_TARGET_RATIO = 1e-6  # distance of eye and target, relative to their largest coordinate
+MIN_ANGLE_TO_UP_RAD = 1e-3  # angle between the viewing direction and up
+MIN_UP_LENGTH = 1e-9
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,10 +24,11 @@ class Camera:
     height: int
 
     def __post_init__(self) -> None:
-        for name, shape in {"K": (3, 3), "world_to_camera": (4, 4)}.items():
-            found = tuple(getattr(self, name).shape)
-            if found != shape:
-                raise ValueError(f"Camera.{name} has shape {found}, expected {shape}")
+        """Raise a ValueError for matrices of a wrong shape or an image without pixels."""
+        for name, expected_shape in {"K": (3, 3), "world_to_camera": (4, 4)}.items():
+            shape = tuple(getattr(self, name).shape)
+            if shape != expected_shape:
+                raise ValueError(f"Camera.{name} has shape {shape}, expected {expected_shape}")
         if self.width < 1 or self.height < 1:
             raise ValueError(f"Camera size {self.width}×{self.height} is empty")
 
@@ -39,25 +42,28 @@ class Camera:
 
     @property
     def focal(self) -> tuple[float, float]:
-        """(fx, fy) in pixels."""
+        """Focal lengths (fx, fy) in pixels."""
         return float(self.K[0, 0]), float(self.K[1, 1])
 
     @property
     def position(self) -> Tensor:
-        """The camera's centre in world coordinates, [3]."""
-        return -self.world_to_camera[:3, :3].T @ self.world_to_camera[:3, 3]
+        """The camera's centre in world coordinates, [3]: −Rᵀ t."""
+        rotation = self.world_to_camera[:3, :3]
+        translation = self.world_to_camera[:3, 3]
+        return -rotation.T @ translation
 
     def to(
         self, device: torch.device | str | None = None, dtype: torch.dtype | None = None
     ) -> Camera:
         """Move or convert the matrices, as `Tensor.to` does."""
-        K, pose = (
-            matrix.to(device=device, dtype=dtype) for matrix in (self.K, self.world_to_camera)
+        return dataclasses.replace(
+            self,
+            K=self.K.to(device=device, dtype=dtype),
+            world_to_camera=self.world_to_camera.to(device=device, dtype=dtype),
         )
-        return dataclasses.replace(self, K=K, world_to_camera=pose)
 
     def resized(self, width: int, height: int) -> Camera:
-        """The same view with another number of pixels; the intrinsics are scaled along each axis."""
+        """The same view with another number of pixels; `K` is scaled along each axis."""
         factors = torch.tensor([width / self.width, height / self.height, 1.0]).to(self.K)
         return dataclasses.replace(self, K=self.K * factors[:, None], width=width, height=height)
 
@@ -79,10 +85,12 @@ class Camera:
         return dataclasses.replace(self, K=K)
 
     def looking(self, eye: Tensor, target: Tensor) -> Camera:
-        """The camera at `eye` [3], turned to `target` [3], with the world's y axis downwards; see `look_at`."""
-        return dataclasses.replace(
-            self, world_to_camera=look_at(eye, target).to(self.world_to_camera)
-        )
+        """This camera moved to `eye` [3] and turned to `target` [3], both in world coordinates.
+
+        The world's y axis points downwards in the image. ValueError if eye and target coincide.
+        """
+        pose = look_at(eye, target).to(self.world_to_camera)
+        return dataclasses.replace(self, world_to_camera=pose)
 
     def to_camera(self, points: Tensor) -> Tensor:
         """Convert world points [..., 3] to camera coordinates [..., 3]."""
@@ -91,53 +99,75 @@ class Camera:
 
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Project world points [..., 3] to pixel coordinates [..., 2] and depth z [...]."""
-        local = self.to_camera(points)
-        z = local[..., 2]
+        local_points = self.to_camera(points)
+        z = local_points[..., 2]
         K = to_like(self.K, points)
-        uv = local[..., :2] / z[..., None] * torch.stack([K[0, 0], K[1, 1]]) + K[:2, 2]
+        focal = torch.stack([K[0, 0], K[1, 1]])
+        principal_point = K[:2, 2]
+        uv = local_points[..., :2] / z[..., None] * focal + principal_point
         return uv, z
 
     def unproject(self, uv: Tensor, depth: Tensor) -> Tensor:
         """Unproject pixels [..., 2] at depth z [...] to world points [..., 3]."""
-        K, matrix = to_like(self.K, uv), to_like(self.world_to_camera, uv)
-        xy = (uv - K[:2, 2]) / torch.stack([K[0, 0], K[1, 1]]) * depth[..., None]
-        local = torch.cat([xy, depth[..., None]], dim=-1)
-        return (local - matrix[:3, 3]) @ matrix[:3, :3]
+        K = to_like(self.K, uv)
+        matrix = to_like(self.world_to_camera, uv)
+        focal = torch.stack([K[0, 0], K[1, 1]])
+        principal_point = K[:2, 2]
+        xy = (uv - principal_point) / focal * depth[..., None]
+        local_points = torch.cat([xy, depth[..., None]], dim=-1)  # [..., 3]
+        # Row vectors times R apply the inverse rotation Rᵀ.
+        return (local_points - matrix[:3, 3]) @ matrix[:3, :3]
 
     def pixel_centers(self, stride: int = 1) -> Tensor:
-        """Centres (x, y) of cells of stride×stride pixels, [H/stride, W/stride, 2]."""
+        """Centres (x, y) of blocks of stride×stride pixels, [H/stride, W/stride, 2]."""
         ys = (torch.arange(self.height // stride) + 0.5) * stride
         xs = (torch.arange(self.width // stride) + 0.5) * stride
         return torch.stack(torch.meshgrid(xs, ys, indexing="xy"), dim=-1)
 
 
 def look_at(eye: Tensor, target: Tensor, up: Tensor | None = None) -> Tensor:
-    """The matrix world_to_camera [4, 4], float64, of a camera at `eye` [3] that looks at `target` [3].
+    """The matrix world_to_camera [4, 4], float64, of a camera at `eye` that looks at `target`.
 
-    `up` [3], by default -y, points upwards in the image.
+    Args:
+        eye: [3] the camera's centre in world coordinates.
+        target: [3] a point in the middle of the view.
+        up: [3] a direction that points upwards in the image; by default −y.
 
     Raises:
-        ValueError: eye and target coincide, or `up` has no length or is parallel to the viewing direction.
+        ValueError: eye and target coincide, or `up` has no length or is parallel to the viewing
+            direction.
     """
-    eye, target = eye.double(), target.double()
-    forward, down = target - eye, eye.new_tensor([0.0, 1.0, 0.0])
+    eye = eye.double()
+    target = target.double()
+    forward = target - eye
     distance = float(forward.norm())
-    if distance <= SHORTEST_LOOK * max(1e-3, float(torch.cat([eye, target]).abs().max())):
+    largest_coordinate = float(torch.cat([eye, target]).abs().max())
+    # Around the origin, rounding errors are measured against a millimetre.
+    if distance <= MIN_EYE_TO_TARGET_RATIO * max(1e-3, largest_coordinate):
         raise ValueError("eye and target coincide: move one of them")
-    if up is not None:
-        if float(up.norm()) < 1e-9:
+
+    if up is None:
+        down = eye.new_tensor([0.0, 1.0, 0.0])
+    else:
+        if float(up.norm()) < MIN_UP_LENGTH:
             raise ValueError("up has no length")
         down = -up.double() / up.double().norm()
+
+    # The cross product's length is the distance times the sine of the angle to `up`.
     right = torch.linalg.cross(down, forward)
-    if float(right.norm()) < LEAST_TILT * distance:
+    if float(right.norm()) < MIN_ANGLE_TO_UP_RAD * distance:
         raise ValueError("up is parallel to the viewing direction: give another up")
-    forward, right = forward / forward.norm(), right / right.norm()
-    rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    forward = forward / forward.norm()
+    right = right / right.norm()
+    down = torch.linalg.cross(forward, right)  # now at a right angle to the viewing direction
+
+    rotation = torch.stack([right, down, forward])  # rows are the camera's axes in the world
     matrix = torch.eye(4, dtype=torch.float64)
-    matrix[:3, :3], matrix[:3, 3] = rotation, -rotation @ eye
+    matrix[:3, :3] = rotation
+    matrix[:3, 3] = -rotation @ eye
     return matrix
 
 
 def to_like(numbers: Tensor, other: Tensor) -> Tensor:
-    """Convert a small tensor to the dtype and device of another tensor, without waiting for a GPU."""
+    """Convert a small tensor to the dtype and device of another, without waiting for a GPU."""
     return numbers.to(other, non_blocking=other.device.type != "cpu")

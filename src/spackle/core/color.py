@@ -1,4 +1,4 @@
-"""Convert between sRGB and linear RGB, and show depth as colours."""
+"""Convert between sRGB and linear RGB, show depth as colours, and round colours to bytes."""
 
 from __future__ import annotations
 
@@ -29,10 +29,16 @@ def linear_to_srgb(linear: Tensor) -> Tensor:
     return torch.where(linear <= 0.0031308, linear * 12.92, power)
 
 
-MEASURED, LOOKS = 50_000, 60  # numbers of Gaussians and views that are sampled for the scale
-FARTHEST, NEAREST = 0.002, 0.998  # quantiles of inverse depth at the ends of the scale
+# The scale of depth is measured on a sample of the Gaussians and views, which is accurate enough.
+MAX_SAMPLED_GAUSSIANS = 50_000
+MAX_SAMPLED_VIEWS = 60
+# Quantiles of inverse depth at the ends of the scale; beyond are a few stray Gaussians.
+FAR_QUANTILE = 0.002
+NEAR_QUANTILE = 0.998
+MIN_DEPTH_IN_VIEW = 0.01  # in the scene's unit; a nearer Gaussian is behind or in the lens
+
 UNKNOWN_DEPTH_GREY = 0.5  # sRGB of unknown depth; the colour map contains no grey
-# Seventeen evenly spaced colours of matplotlib's inferno (CC0).
+# Seventeen evenly spaced colours of matplotlib's inferno (CC0), as sRGB, dark to bright.
 INFERNO_COLORS = (
     *((0.001, 0.000, 0.014), (0.042, 0.028, 0.141), (0.129, 0.047, 0.291), (0.238, 0.037, 0.396)),
     *((0.342, 0.062, 0.429), (0.441, 0.099, 0.432), (0.541, 0.135, 0.415), (0.640, 0.171, 0.381)),
@@ -44,7 +50,7 @@ INFERNO_COLORS = (
 
 @dataclasses.dataclass(frozen=True)
 class DepthColorScale:
-    """A scale of colours between two depths; a depth outside of the scale gets the colour of the closest end."""
+    """A scale of colours between two depths; beyond its ends, the colour stays the same."""
 
     near: float  # depth of the brightest colour
     far: float  # depth of the darkest colour
@@ -53,61 +59,76 @@ class DepthColorScale:
     def over(gaussians: Gaussians, cameras: Sequence[Camera]) -> DepthColorScale:
         """The scale for the depths in a set of views, without the nearest and the farthest 0.2 %.
 
+        One scale for all frames of a video keeps the colours from flickering.
+
         Raises:
             ValueError: no Gaussian is in a view.
         """
-        step = max(1, len(gaussians) // MEASURED)
-        means = gaussians.means.detach()[::step].cpu()
-        looks = cameras[:: max(1, len(cameras) // LOOKS)]
-        inverse = torch.cat([_inverse_in_frame(means, camera) for camera in looks]).double()
-        if len(inverse) == 0:
+        gaussian_step = max(1, len(gaussians) // MAX_SAMPLED_GAUSSIANS)
+        view_step = max(1, len(cameras) // MAX_SAMPLED_VIEWS)
+        means = gaussians.means.detach()[::gaussian_step].cpu()
+        inverse_depths = torch.cat(
+            [_inverse_depths_in_view(means, camera) for camera in cameras[::view_step]]
+        ).double()
+        if len(inverse_depths) == 0:
             raise ValueError("no Gaussian is in view")
-        low, high = torch.quantile(
-            inverse, torch.tensor([FARTHEST, NEAREST], dtype=torch.float64)
-        ).tolist()
-        return DepthColorScale(1 / high, 1 / low)
+        quantiles = torch.tensor([FAR_QUANTILE, NEAR_QUANTILE], dtype=torch.float64)
+        far_inverse, near_inverse = torch.quantile(inverse_depths, quantiles).tolist()
+        return DepthColorScale(near=1 / near_inverse, far=1 / far_inverse)
 
     def __call__(self, depth: Tensor, known: Tensor) -> Tensor:
-        """Depth [H, W] as sRGB [H, W, 3], linear in inverse depth; grey where `known` [H, W] is false."""
-        span = max(1 / self.near - 1 / self.far, 1e-12)
-        share = ((1 / depth.clamp_min(1e-6) - 1 / self.far) / span).clamp(0, 1)
+        """Depth [H, W] as sRGB [H, W, 3], linear in inverse depth; grey where `known` is false.
+
+        Args:
+            depth: [H, W] in the unit of the scale.
+            known: [H, W] bool.
+        """
+        # 0 at the far end of the scale, 1 at its near end.
+        span = max(1 / self.near - 1 / self.far, 1e-12)  # positive even for one single depth
+        brightness = ((1 / depth.clamp_min(1e-6) - 1 / self.far) / span).clamp(0, 1)
+
+        # Interpolate between the two closest colours of the table.
         table = depth.new_tensor(INFERNO_COLORS)
-        place = share * (len(INFERNO_COLORS) - 1)
-        below = place.floor().clamp_max(len(INFERNO_COLORS) - 2)
-        colors = torch.lerp(
-            table[below.long()], table[below.long() + 1], (place - below)[..., None]
-        )
+        last = len(INFERNO_COLORS) - 1
+        position = brightness * last
+        lower_index = position.floor().clamp_max(last - 1)
+        lower_color = table[lower_index.long()]
+        upper_color = table[lower_index.long() + 1]
+        colors = torch.lerp(lower_color, upper_color, (position - lower_index)[..., None])
         return colors.where(known[..., None], colors.new_tensor(UNKNOWN_DEPTH_GREY))
 
 
-def _inverse_in_frame(means: Tensor, camera: Camera) -> Tensor:
+def _inverse_depths_in_view(means: Tensor, camera: Camera) -> Tensor:
+    """1/z of those of the points [N, 3] that are in front of the camera and inside its image."""
     uv, z = camera.to("cpu").project(means)
-    inside = (
-        (z > 0.01)
-        & (uv >= 0).all(dim=-1)
-        & (uv < uv.new_tensor([camera.width, camera.height])).all(dim=-1)
-    )
-    return 1 / z[inside]
+    size = uv.new_tensor([camera.width, camera.height])
+    is_in_image = (uv >= 0).all(dim=-1) & (uv < size).all(dim=-1)
+    return 1 / z[(z > MIN_DEPTH_IN_VIEW) & is_in_image]
 
 
 def to_uint8(image: Tensor) -> Tensor:
-    """Round values in 0..1 to uint8 on the CPU; values outside are clamped, NaN becomes 0, and uint8 is kept."""
+    """Round values in 0..1 to uint8, 0..255, on the CPU.
+
+    Values outside are clamped, NaN becomes 0. An image of uint8 is returned as it is.
+    """
     if image.dtype == torch.uint8:
         return image.detach().cpu()
     values = image.detach().float().contiguous()
     if values.device.type != "cpu":
         return values.mul(255).nan_to_num_(0.0).clamp_(0, 255).round_().to("cpu", torch.uint8)
+    # On the CPU, one pass over the memory instead of five.
     result = torch.empty(values.shape, dtype=torch.uint8)
-    _round(values.numpy().reshape(-1), result.numpy().reshape(-1))
+    _round_to_bytes(values.numpy().reshape(-1), result.numpy().reshape(-1))
     return result
 
 
 @kernel
-def _round(values: Any, result: Any) -> None:
-    """Write 255 times the values, rounded, in one pass; both arrays are flat."""
+def _round_to_bytes(values: Any, result: Any) -> None:
+    """Write 255 times the float32 values, rounded and clamped, to the uint8 `result`; both flat."""
     for i in range(len(values)):
         scaled = values[i] * np.float32(255)
-        scaled = (
-            min(scaled, np.float32(255)) if scaled > 0 else np.float32(0)
-        )  # a comparison with NaN is false
+        if scaled > 0:  # false for NaN
+            scaled = min(scaled, np.float32(255))
+        else:
+            scaled = np.float32(0)
         result[i] = np.uint8(np.rint(scaled))

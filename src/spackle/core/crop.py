@@ -1,8 +1,13 @@
-"""Rectangles of a grid; `crops_around_mask` covers all masked cells with a few small rectangles."""
+"""Rectangles of a grid: `crops_around_mask` covers all masked cells with a few small rectangles.
+
+A network that looks at a limited neighbourhood then runs on these rectangles only. The grid is that
+of the network's input, and a cell is one element of it.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 import torch
@@ -13,10 +18,12 @@ from spackle.core.filters import maximum_filter
 
 Mask = NDArray[np.bool_]
 
-MARGIN = 32  # cells; farther cells change a delta of the shipped weights by less than bfloat16's rounding does
-WHOLE = 0.8  # if crops cover more than this fraction of the grid, the whole grid is used instead
-NEARLY = 1.1  # a rectangle is not cut if its area is below this multiple of the least possible area
-CALL_BLOCKS = 8  # fixed cost of a crop, in blocks of step×step cells
+# Cells around a masked cell that the network gets to see. Farther cells change an output of the
+# shipped weights by less than bfloat16's rounding does.
+DEFAULT_MARGIN_CELLS = 32
+MAX_CROPPED_RATIO = 0.8  # crops that cover more of the grid save too little: it is used whole
+GOOD_ENOUGH_RATIO = 1.1  # a rectangle is not cut if its area is below 1.1 times the lower bound
+CALL_COST_BLOCKS = 8  # a call of the network costs as much as this many blocks of cells
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,33 +42,54 @@ class Crop:
 
     @property
     def slices(self) -> tuple[slice, slice]:
-        """Slices for an array [h, w, ...]."""
+        """Slices of rows and columns, which cut the rectangle out of an array [h, w, ...]."""
         return slice(self.top, self.bottom), slice(self.left, self.right)
 
     def moved(self, down: int, right: int) -> Crop:
-        """The rectangle, translated."""
+        """The rectangle, translated by this number of rows and columns."""
         return Crop(self.top + down, self.left + right, self.bottom + down, self.right + right)
 
     def grown(self, margin: int, step: int, height: int, width: int) -> Crop:
-        """The rectangle with a margin, rounded outwards to multiples of `step` within the grid."""
-        top, left = (max(place - margin, 0) // step * step for place in (self.top, self.left))
-        far = ((self.bottom, height), (self.right, width))
+        """The rectangle with a margin, rounded outwards to multiples of `step`.
+
+        It is cut off at the border of the grid, which has `height` rows and `width` columns.
+        """
         return Crop(
-            top, left, *(min(-(-(place + margin) // step) * step, end) for place, end in far)
+            top=_round_down(max(self.top - margin, 0), step),
+            left=_round_down(max(self.left - margin, 0), step),
+            bottom=min(_round_up(self.bottom + margin, step), height),
+            right=min(_round_up(self.right + margin, step), width),
         )
 
     def touches(self, other: Crop) -> bool:
         """Whether the two rectangles overlap or adjoin."""
-        rows = self.top <= other.bottom and other.top <= self.bottom
-        return rows and self.left <= other.right and other.left <= self.right
+        rows_meet = self.top <= other.bottom and other.top <= self.bottom
+        columns_meet = self.left <= other.right and other.left <= self.right
+        return rows_meet and columns_meet
 
     def union(self, other: Crop) -> Crop:
         """The smallest rectangle that contains both."""
-        top, left = min(self.top, other.top), min(self.left, other.left)
-        return Crop(top, left, max(self.bottom, other.bottom), max(self.right, other.right))
+        return Crop(
+            top=min(self.top, other.top),
+            left=min(self.left, other.left),
+            bottom=max(self.bottom, other.bottom),
+            right=max(self.right, other.right),
+        )
 
 
-def crops_around_mask(mask: Tensor, step: int, margin: int = MARGIN) -> list[tuple[Crop, Crop]]:
+def _round_down(value: int, step: int) -> int:
+    """The largest multiple of `step` that is at most `value`."""
+    return value // step * step
+
+
+def _round_up(value: int, step: int) -> int:
+    """The smallest multiple of `step` that is at least `value`."""
+    return math.ceil(value / step) * step
+
+
+def crops_around_mask(
+    mask: Tensor, step: int, margin: int = DEFAULT_MARGIN_CELLS
+) -> list[tuple[Crop, Crop]]:
     """Cover all masked cells with a few small rectangles.
 
     Args:
@@ -70,70 +98,130 @@ def crops_around_mask(mask: Tensor, step: int, margin: int = MARGIN) -> list[tup
         margin: number of cells that the network needs around each masked cell.
 
     Returns:
-        Pairs (inner, outer) of rectangles; outer includes the margin. The inner rectangles contain each masked cell
-        exactly once. If cropping saves little, there is one pair, and both its rectangles are the whole grid.
+        Pairs (inner, outer) of rectangles; outer includes the margin. The inner rectangles contain
+        each masked cell exactly once. If cropping saves little, there is one pair, and both its
+        rectangles are the whole grid. Without a masked cell, there is no pair.
     """
     cells: Mask = mask.cpu().numpy()
-    whole = Crop(0, 0, *cells.shape)
+    height, width = cells.shape
     if not cells.any():
         return []
-    rest = [(0, -size % step) for size in cells.shape]
-    tall, wide = (-(-size // step) for size in cells.shape)
-    blocks: Mask = np.logical_or.reduce(
-        np.pad(cells, rest).reshape(tall, step, wide, step), axis=(1, 3)
-    )
-    found = []
-    for part in _cut(blocks, _tight(blocks, Crop(0, 0, tall, wide)), -(-margin // step)):
-        inner = _tight(cells, Crop(*(step * edge for edge in dataclasses.astuple(part))))
-        found.append((inner, inner.grown(margin, step, *cells.shape)))
-    if sum(outer.area for _, outer in found) > WHOLE * whole.area:
+
+    # The search works with blocks of step×step cells: cuts at multiples of the stride cost nothing,
+    # and blocks are fewer than cells.
+    blocks = _any_in_blocks(cells, step)
+    all_blocks = Crop(0, 0, *blocks.shape)
+    margin_blocks = math.ceil(margin / step)
+    crops = []
+    for part in _cut_in_parts(blocks, _shrink_to_mask(blocks, all_blocks), margin_blocks):
+        part_cells = Crop(part.top * step, part.left * step, part.bottom * step, part.right * step)
+        inner = _shrink_to_mask(cells, part_cells)
+        outer = inner.grown(margin, step, height, width)
+        crops.append((inner, outer))
+
+    whole = Crop(0, 0, height, width)
+    cropped_area = sum(outer.area for _, outer in crops)
+    if cropped_area > MAX_CROPPED_RATIO * whole.area:
         return [(whole, whole)]
-    return found
+    return crops
 
 
-def _tight(cells: Mask, crop: Crop) -> Crop:
-    """Shrink a rectangle to its masked cells; at least one cell must be masked."""
-    rows, columns = (np.flatnonzero(cells[crop.slices].any(axis)) for axis in (1, 0))
-    edges = (int(edge) for edge in (rows[0], columns[0], rows[-1] + 1, columns[-1] + 1))
-    return Crop(*edges).moved(crop.top, crop.left)
+def _any_in_blocks(cells: Mask, step: int) -> Mask:
+    """Whether any cell is masked in each block of step×step cells, [h/step, w/step] rounded up."""
+    height, width = cells.shape
+    padded = np.pad(cells, [(0, -height % step), (0, -width % step)])  # to multiples of `step`
+    rows = padded.shape[0] // step
+    columns = padded.shape[1] // step
+    blocks: Mask = padded.reshape(rows, step, columns, step).any(axis=(1, 3))
+    return blocks
 
 
-def _cut(blocks: Mask, crop: Crop, reach: int) -> list[Crop]:
-    """Cut a tight rectangle recursively in two if that saves work."""
-    own = crop.grown(reach, 1, *blocks.shape).area
-    if own <= NEARLY * _least(blocks, crop, reach):
-        return [crop]
-    inside = blocks[crop.slices]
-    halves = np.concatenate([_row_halves(inside), _row_halves(inside.T)[..., [1, 0, 3, 2]]])
-    halves += (crop.top, crop.left) * 2
-    low, high = (
-        np.maximum(halves[..., :2] - reach, 0),
-        np.minimum(halves[..., 2:] + reach, blocks.shape),
+def _shrink_to_mask(cells: Mask, crop: Crop) -> Crop:
+    """Shrink a rectangle to its masked cells; at least one cell of it must be masked."""
+    inside = cells[crop.slices]
+    rows = np.flatnonzero(inside.any(axis=1))
+    columns = np.flatnonzero(inside.any(axis=0))
+    tight = Crop(
+        top=int(rows[0]),
+        left=int(columns[0]),
+        bottom=int(rows[-1]) + 1,
+        right=int(columns[-1]) + 1,
     )
-    best = halves[(high - low).prod(-1).sum(1).argmin()]
-    parts = [part for half in best for part in _cut(blocks, Crop(*map(int, half)), reach)]
-    cost = sum(part.grown(reach, 1, *blocks.shape).area + CALL_BLOCKS for part in parts)
-    return parts if cost < own + CALL_BLOCKS else [crop]
+    return tight.moved(crop.top, crop.left)
 
 
-def _least(blocks: Mask, crop: Crop, reach: int) -> int:
-    """Lower bound for the number of blocks that the network must process, however the rectangle is cut."""
-    near = np.zeros_like(blocks)
-    near[crop.slices] = blocks[crop.slices]
-    return int(maximum_filter(torch.from_numpy(near), reach).sum())
+def _cut_in_parts(blocks: Mask, crop: Crop, margin: int) -> list[Crop]:
+    """Cut a rectangle in two, and its halves again, as long as that saves work of the network.
+
+    Args:
+        blocks: [h, w] mask; the network must run on each masked block.
+        crop: a rectangle of blocks that has masked blocks at its four sides.
+        margin: number of blocks that the network needs around each masked block.
+
+    Returns:
+        Rectangles, each shrunk to its masked blocks, which contain each masked block exactly once.
+    """
+    height, width = blocks.shape
+    uncut_area = crop.grown(margin, 1, height, width).area
+    if uncut_area <= GOOD_ENOUGH_RATIO * _min_area(blocks, crop, margin):
+        return [crop]
+
+    # Of all cuts between two rows or two columns, take the one with the least area in all.
+    inside = blocks[crop.slices]
+    row_cuts = _halves_of_row_cuts(inside)  # [cuts, 2 halves, 4]: top, left, bottom, right
+    column_cuts = _halves_of_row_cuts(inside.T)[..., [1, 0, 3, 2]]  # transposed back
+    halves = np.concatenate([row_cuts, column_cuts])
+    halves += (crop.top, crop.left, crop.top, crop.left)
+    grown_starts = np.maximum(halves[..., :2] - margin, 0)  # [cuts, 2 halves, 2]
+    grown_ends = np.minimum(halves[..., 2:] + margin, (height, width))
+    areas = (grown_ends - grown_starts).prod(-1).sum(1)  # [cuts]
+    best_halves = halves[areas.argmin()]  # [2, 4]
+
+    parts = []
+    for top, left, bottom, right in best_halves.tolist():
+        parts += _cut_in_parts(blocks, Crop(top, left, bottom, right), margin)
+    cut_cost = sum(part.grown(margin, 1, height, width).area + CALL_COST_BLOCKS for part in parts)
+    return parts if cut_cost < uncut_area + CALL_COST_BLOCKS else [crop]
 
 
-def _row_halves(inside: Mask) -> NDArray[np.int64]:
-    """Bounds [cuts, 2, 4] of the masked blocks above and below each cut between rows: top, left, bottom, right."""
-    height, width = inside.shape
-    row, filled = np.arange(height), inside.any(1)
-    left = np.where(filled, inside.argmax(1), width)
-    right = np.where(filled, width - inside[:, ::-1].argmax(1), 0)
-    upper, lower = (slice(None), slice(None, None, -1))
-    lefts = [np.minimum.accumulate(left[way])[way] for way in (upper, lower)]
-    rights = [np.maximum.accumulate(right[way])[way] for way in (upper, lower)]
-    last = np.maximum.accumulate(np.where(filled, row, 0))
-    first = np.minimum.accumulate(np.where(filled, row, height)[::-1])[::-1]
-    above = [np.zeros(height - 1, np.int64), lefts[0][:-1], last[:-1] + 1, rights[0][:-1]]
-    below = [first[1:], lefts[1][1:], np.full(height - 1, height), rights[1][1:]]
-    return np.stack([np.stack(above, 1), np.stack(below, 1)], 1)
+def _min_area(blocks: Mask, crop: Crop, margin: int) -> int:
+    """Least number of blocks that the network must process, however the rectangle is cut.
+
+    These are all blocks within `margin` of a masked block [h, w] of the rectangle.
+    """
+    inside_crop = np.zeros_like(blocks)
+    inside_crop[crop.slices] = blocks[crop.slices]
+    return int(maximum_filter(torch.from_numpy(inside_crop), margin).sum())
+
+
+def _halves_of_row_cuts(blocks: Mask) -> NDArray[np.int64]:
+    """Bounds of the masked blocks above and below each possible cut between two rows.
+
+    Args:
+        blocks: [h, w]; the first and the last row must have masked blocks.
+
+    Returns:
+        [h − 1 cuts, 2 halves, 4]: top, left, bottom (exclusive), right (exclusive).
+    """
+    height, width = blocks.shape
+    row_numbers = np.arange(height)
+    has_mask = blocks.any(axis=1)  # [h]
+
+    # First and last masked column of each row; a row without any must not win below.
+    first_column = np.where(has_mask, blocks.argmax(axis=1), width)
+    last_column_end = np.where(has_mask, width - blocks[:, ::-1].argmax(axis=1), 0)
+
+    # The same for all rows from the top down to each row, and from the bottom up to each row.
+    left_above = np.minimum.accumulate(first_column)
+    left_below = np.minimum.accumulate(first_column[::-1])[::-1]
+    right_above = np.maximum.accumulate(last_column_end)
+    right_below = np.maximum.accumulate(last_column_end[::-1])[::-1]
+    last_row_above = np.maximum.accumulate(np.where(has_mask, row_numbers, 0))
+    first_row_below = np.minimum.accumulate(np.where(has_mask, row_numbers, height)[::-1])[::-1]
+
+    # The cut number k lies between the rows k and k + 1.
+    top_of_upper = np.zeros(height - 1, np.int64)
+    upper = [top_of_upper, left_above[:-1], last_row_above[:-1] + 1, right_above[:-1]]
+    bottom_of_lower = np.full(height - 1, height)
+    lower = [first_row_below[1:], left_below[1:], bottom_of_lower, right_below[1:]]
+    return np.stack([np.stack(upper, axis=1), np.stack(lower, axis=1)], axis=1)

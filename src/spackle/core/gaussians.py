@@ -7,13 +7,16 @@ from collections.abc import Iterable
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
+
+ROTATION_TOLERANCE = 1e-5  # error of R Rᵀ at which a matrix is still a rotation
 
 
 @dataclasses.dataclass(frozen=True)
 class Gaussians:
     """A set of N anisotropic 3D Gaussians, without a batch axis.
 
-    World axes are OpenCV's: x right, y down, z forward; units are metres if the base is metric.
+    World axes are OpenCV's: x right, y down, z forward. Units are metres if the depth is metric.
     """
 
     means: Tensor  # [N, 3] centres
@@ -23,18 +26,19 @@ class Gaussians:
     colors: Tensor  # [N, 3] linear RGB
 
     def __post_init__(self) -> None:
-        n = len(self.means)
-        expected = {
-            "means": (n, 3),
-            "quats": (n, 4),
-            "scales": (n, 3),
-            "opacities": (n,),
-            "colors": (n, 3),
+        """Raise a ValueError for tensors of a wrong shape."""
+        count = len(self.means)
+        expected_shapes = {
+            "means": (count, 3),
+            "quats": (count, 4),
+            "scales": (count, 3),
+            "opacities": (count,),
+            "colors": (count, 3),
         }
-        for name, shape in expected.items():
-            found = tuple(getattr(self, name).shape)
-            if found != shape:
-                raise ValueError(f"Gaussians.{name} has shape {found}, expected {shape}")
+        for name, expected_shape in expected_shapes.items():
+            shape = tuple(getattr(self, name).shape)
+            if shape != expected_shape:
+                raise ValueError(f"Gaussians.{name} has shape {shape}, expected {expected_shape}")
 
     def __len__(self) -> int:
         return len(self.means)
@@ -44,34 +48,39 @@ class Gaussians:
 
     @property
     def tensors(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """The five tensors in field order."""
+        """The five tensors in the order of the fields."""
         return self.means, self.quats, self.scales, self.opacities, self.colors
 
     @staticmethod
     def empty(device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> Gaussians:
         """A set without Gaussians."""
-        shapes: list[tuple[int, ...]] = [(0, 3), (0, 4), (0, 3), (0,), (0, 3)]
-        return Gaussians(*(torch.empty(s, device=device, dtype=dtype) for s in shapes))
+        return Gaussians(
+            means=torch.empty((0, 3), device=device, dtype=dtype),
+            quats=torch.empty((0, 4), device=device, dtype=dtype),
+            scales=torch.empty((0, 3), device=device, dtype=dtype),
+            opacities=torch.empty((0,), device=device, dtype=dtype),
+            colors=torch.empty((0, 3), device=device, dtype=dtype),
+        )
 
     @staticmethod
     def cat(parts: Iterable[Gaussians]) -> Gaussians:
         """Join sets in the given order, without changing a bit."""
-        columns = zip(*(part.tensors for part in parts), strict=True)
-        return Gaussians(*(torch.cat(column) for column in columns))
+        tensors_of_fields = zip(*(part.tensors for part in parts), strict=True)
+        return Gaussians(*(torch.cat(tensors) for tensors in tensors_of_fields))
 
     def to(
         self, device: torch.device | str | None = None, dtype: torch.dtype | None = None
     ) -> Gaussians:
         """Move or convert every tensor, as `Tensor.to` does."""
-        return Gaussians(*(t.to(device=device, dtype=dtype) for t in self.tensors))
+        return Gaussians(*(tensor.to(device=device, dtype=dtype) for tensor in self.tensors))
 
     def detach(self) -> Gaussians:
         """The same values, detached from autograd."""
-        return Gaussians(*(t.detach() for t in self.tensors))
+        return Gaussians(*(tensor.detach() for tensor in self.tensors))
 
     def select(self, index: Tensor | slice) -> Gaussians:
         """Select Gaussians by a boolean mask [N], an index tensor [M] or a slice."""
-        return Gaussians(*(t[index] for t in self.tensors))
+        return Gaussians(*(tensor[index] for tensor in self.tensors))
 
     def transform(self, matrix: Tensor) -> Gaussians:
         """Apply a similarity [4, 4]: rotation, uniform scale and translation.
@@ -81,15 +90,18 @@ class Gaussians:
         """
         matrix = matrix.to(device=self.means.device, dtype=torch.float64)
         linear = matrix[:3, :3]
-        scale = torch.linalg.det(linear).abs() ** (1 / 3)
+        translation = matrix[:3, 3]
+        scale = torch.linalg.det(linear).abs() ** (1 / 3)  # the determinant scales as a volume
         rotation = linear / scale
-        orthogonal = torch.allclose(rotation @ rotation.T, torch.eye(3).to(rotation), atol=1e-5)
-        if not orthogonal or torch.linalg.det(linear) <= 0:
+        identity = torch.eye(3).to(rotation)
+        is_orthogonal = torch.allclose(rotation @ rotation.T, identity, atol=ROTATION_TOLERANCE)
+        if not is_orthogonal or torch.linalg.det(linear) <= 0:  # negative: a mirror image
             raise ValueError(
                 "Gaussians.transform takes a rotation, a uniform scale and a translation only"
             )
+
         dtype = self.means.dtype
-        means = (self.means.double() @ linear.T + matrix[:3, 3]).to(dtype)
+        means = (self.means.double() @ linear.T + translation).to(dtype)
         quats = quat_multiply(quat_from_matrix(rotation), self.quats.double()).to(dtype)
         return Gaussians(means, quats, self.scales * scale.to(dtype), self.opacities, self.colors)
 
@@ -100,37 +112,47 @@ class Gaussians:
 
     def covariances(self) -> Tensor:
         """World-space covariances Σ = R S Sᵀ Rᵀ, [N, 3, 3]."""
-        factor = quat_to_matrix(self.quats) * self.scales[:, None, :]
+        factor = quat_to_matrix(self.quats) * self.scales[:, None, :]  # R S
         return factor @ factor.transpose(1, 2)
 
 
 def quat_to_matrix(quats: Tensor) -> Tensor:
     """Convert quaternions [..., 4] (wxyz, of any length) to rotation matrices [..., 3, 3]."""
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
-    rows = [
+    w, x, y, z = normalize(quats, dim=-1).unbind(-1)
+    elements = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
         2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
     ]  # fmt: skip
-    return torch.stack(rows, dim=-1).reshape(*quats.shape[:-1], 3, 3)
+    return torch.stack(elements, dim=-1).reshape(*quats.shape[:-1], 3, 3)
 
 
 def quat_from_matrix(rotation: Tensor) -> Tensor:
     """Convert rotation matrices [..., 3, 3] to unit quaternions [..., 4] (wxyz, w ≥ 0).
 
-    The divisor is the largest of the four components, so the result is well conditioned for every rotation.
+    The elements of the matrix give the products of every two components of the quaternion, such as
+    m21 − m12 = 4wx. The four products with one component, divided by it, are the quaternion. The
+    largest component is the divisor, so the result is well conditioned for every rotation.
     """
-    (m00, m01, m02), (m10, m11, m12), (m20, m21, m22) = (
-        row.unbind(-1) for row in rotation.unbind(-2)
-    )
-    w = torch.stack([1 + m00 + m11 + m22, m21 - m12, m02 - m20, m10 - m01], -1)
-    x = torch.stack([m21 - m12, 1 + m00 - m11 - m22, m01 + m10, m02 + m20], -1)
-    y = torch.stack([m02 - m20, m01 + m10, 1 - m00 + m11 - m22, m12 + m21], -1)
-    z = torch.stack([m10 - m01, m02 + m20, m12 + m21, 1 - m00 - m11 + m22], -1)
-    candidates = torch.stack([w, x, y, z], dim=-2)  # row k is the quaternion times 4·component k
-    best = torch.stack([w[..., 0], x[..., 1], y[..., 2], z[..., 3]], -1).argmax(-1)
-    index = best[..., None, None].expand(*best.shape, 1, 4)
-    quats = torch.nn.functional.normalize(candidates.gather(-2, index).squeeze(-2), dim=-1)
+    row0, row1, row2 = rotation.unbind(-2)
+    m00, m01, m02 = row0.unbind(-1)
+    m10, m11, m12 = row1.unbind(-1)
+    m20, m21, m22 = row2.unbind(-1)
+
+    # The quaternion times 4w, 4x, 4y and 4z.
+    times_w = torch.stack([1 + m00 + m11 + m22, m21 - m12, m02 - m20, m10 - m01], -1)
+    times_x = torch.stack([m21 - m12, 1 + m00 - m11 - m22, m01 + m10, m02 + m20], -1)
+    times_y = torch.stack([m02 - m20, m01 + m10, 1 - m00 + m11 - m22, m12 + m21], -1)
+    times_z = torch.stack([m10 - m01, m02 + m20, m12 + m21, 1 - m00 - m11 + m22], -1)
+    candidates = torch.stack([times_w, times_x, times_y, times_z], dim=-2)  # [..., 4, 4]
+
+    squares = [times_w[..., 0], times_x[..., 1], times_y[..., 2], times_z[..., 3]]  # 4w², 4x², …
+    largest = torch.stack(squares, -1).argmax(-1)  # [...] 0 for w to 3 for z
+    row_index = largest[..., None, None].expand(*largest.shape, 1, 4)
+    best_rows = candidates.gather(-2, row_index).squeeze(-2)  # [..., 4]
+
+    # A quaternion and its negative are the same rotation; the one with w ≥ 0 is returned.
+    quats = normalize(best_rows, dim=-1)
     return torch.where(quats[..., :1] < 0, -quats, quats)
 
 
