@@ -14,7 +14,7 @@ import pytest
 import torch
 from helpers import portraits
 from helpers.command import decode
-from helpers.photos import HEIGHT, WIDTH, metres, write_depth, write_pair, write_photo
+from helpers.photos import HEIGHT, WIDTH, box, metres, write_depth, write_pair, write_photo
 from helpers.scenes import psnr, same_bits
 from PIL import Image
 
@@ -79,6 +79,32 @@ def test_paths_and_loaded_values_give_the_same_scene(
     assert same_bits(scene.base, alone.gaussians)
     assert len(scene.gaussians) == len(scene.base) + len(scene.aux) > len(scene.base)
     assert same_bits(scene.gaussians.select(torch.arange(len(scene.base))), scene.base)
+
+
+def test_a_scene_says_how_it_was_made(scene: spackle.Scene, pair: tuple[Path, Path]) -> None:
+    report = scene.report
+    assert report is not None
+    assert [view.view for view in report.holes] == ["-0.07", "+0.07"]
+    for view in report.holes:
+        assert 0.1 < view.before < 0.13
+        assert view.after < 0.01 * view.before
+    befores, afters = zip(*((view.before, view.after) for view in report.holes), strict=True)
+    assert report.hole_ratio_before == pytest.approx(sum(befores) / 2)
+    assert report.hole_ratio_after == pytest.approx(sum(afters) / 2)
+    assert (report.base, report.base_reason) == ("rgbd", "a depth map is given")
+    assert report.focal_px == scene.camera.focal[0]
+    assert (report.focal_source, report.warnings) == ("default 30 mm", ())
+    assert set(report.seconds) == {"prepare", "base", "move", "complete", "measure"}
+    assert all(seconds >= 0 for seconds in report.seconds.values())
+
+    # What is missing, guessed or replaced is a warning.
+    depth = np.where(box(640, 480), np.nan, 3).astype(np.float32)
+    mended = spackle.predict(pair[0], depth, fov=60, residual="seeds").report
+    assert mended is not None
+    assert mended.focal_source == "fov"
+    missing, resampled = mended.warnings
+    assert missing.endswith("of the depth was missing and has been filled")
+    assert resampled.endswith("the depth map is 640×480, and was resampled to the photo's size")
 
 
 def test_a_photo_and_its_depth_in_every_form(pair: tuple[Path, Path], tmp_path: Path) -> None:
@@ -162,6 +188,7 @@ def test_a_scene_is_loaded_exported_and_shown(scene: spackle.Scene, tmp_path: Pa
     for name in ("scene.ply", "scene.spz", "scene.html"):
         scene.export(tmp_path / name)
     loaded = spackle.Scene.load(tmp_path / "scene.ply")
+    assert loaded.report is None
     assert repr(loaded) == repr(scene)
     assert (loaded.disparity, torch.equal(loaded.base.means, scene.base.means)) == (
         scene.disparity,
@@ -208,6 +235,9 @@ def test_complete_fills_the_given_views(scene: spackle.Scene, tmp_path: Path) ->
     )
     assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
     assert all(spackle.hole_area_ratio(made.render(camera).alpha) < 2e-3 for camera in cameras)
+    assert made.report is not None
+    assert (made.report.focal_px, made.report.base) == (prediction.camera.focal[0], None)
+    assert (made.report.hole_ratio_before, list(made.report.seconds)) == (None, ["complete"])
     seeds = spackle.complete(prediction, cameras, exact=True, network=None)
     assert (
         10 < psnr(made.render(cameras[0]).rgb, seeds.render(cameras[0]).rgb) < 60

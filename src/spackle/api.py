@@ -1,4 +1,7 @@
-"""The Python interface: a photo from a file, bytes, an array or a tensor becomes a completed scene."""
+"""The Python interface: a photo from a file, bytes, an array or a tensor becomes a scene.
+
+`predict` completes one photo; a `Spackle` keeps its networks and completes many.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,7 @@ from torch import Tensor
 
 from spackle.bases import Base
 from spackle.bases.open import open_base, wrap_loaded_base
-from spackle.bases.settings import AUTO, BaseSettings
+from spackle.bases.settings import AUTO, RGBD, BaseSettings
 from spackle.core.photo import Photo, load_photo, photo_from_picture
 from spackle.core.trajectories import TrajectoryKind
 from spackle.depth.depth_map import DepthMap
@@ -53,31 +56,44 @@ class Spackle:
         """Choose base, fill and device.
 
         Args:
-            base: a name as for `--base`, or a loaded base, such as `SharpBase.load(weights)`. "auto" takes the best
-                base for each photo: a depth map, SHARP or MoGe if their weights have been downloaded, or else
-                "lite", which is rough. The choice is logged to the logger "spackle".
-            residual: a weight file, a loaded network, "seeds" to fill without a network, or "none" to keep the holes;
-                None takes the weights that come with Spackle.
-            fill: source of the texture in the holes, see `spackle.pipeline.open_texture`; "none" keeps the holes.
+            base: the network that turns a photo into Gaussians: a name as for `spackle predict
+                --base`, or a loaded base, such as `SharpBase.load(weights)`. "auto" takes the best
+                for each photo: a depth map, SHARP or MoGe if their weights have been downloaded,
+                or else "lite", which is rough. The choice is logged to the logger "spackle".
+            residual: the network that fills holes: a weight file, a loaded network, "seeds" to
+                fill without a network, or "none" to keep the holes; None takes the weights that
+                come with Spackle.
+            fill: source of the texture in the holes, see `spackle.pipeline.open_texture`; "none"
+                keeps the holes.
             device: "auto", "cpu" or "cuda", for base and renderer.
             renderer: by default the renderer of the device.
 
         Raises:
             InputError: an unknown name, or weights that cannot be used.
         """
-        name = base if isinstance(base, str) else AUTO
-        network = residual if isinstance(residual, ResidualNet) else None
-        if residual is None or isinstance(residual, ResidualNet):
-            weights = None
+        if isinstance(residual, ResidualNet):
+            fill_options = FillOptions(fill=fill)
+            network: ResidualNet | None = residual
         else:
-            weights = os.fspath(residual)
-        chosen = FillOptions(residual=weights, fill=fill)
-        options = PipelineOptions(base=BaseSettings(name=name, device=device), fill=chosen)
-        options.base.check()
-        opened = open_base(options.base) if isinstance(base, str) else wrap_loaded_base(base)
-        self._given = not isinstance(base, str) or base not in (AUTO, "rgbd")
+            weights = None if residual is None else os.fspath(residual)
+            fill_options = FillOptions(residual=weights, fill=fill)
+            network = fill_options.load_network()
+
+        if isinstance(base, str):
+            base_settings = BaseSettings(name=base, device=device)
+            opened_base = open_base(base_settings)
+            # A depth map replaces these two: `auto` chooses it anyway, and "rgbd" means it.
+            self._accepts_depth = base in (AUTO, RGBD)
+        else:
+            base_settings = BaseSettings(device=device)
+            opened_base = wrap_loaded_base(base)
+            self._accepts_depth = False
+
         self._pipeline = Pipeline(
-            options, opened, network or chosen.load(), renderer or get_renderer(device)
+            options=PipelineOptions(base=base_settings, fill=fill_options),
+            base=opened_base,
+            network=network,
+            renderer=renderer or get_renderer(device),
         )
 
     @shorten_input_errors()
@@ -95,36 +111,40 @@ class Spackle:
         fov: float | None = None,
         progress: bool = False,
     ) -> Scene:
-        """Turn a photo into a scene without holes along a camera path; see `spackle.predict`."""
-        if depth is not None and self._given:
+        """Turn a photo into a scene without holes along a camera path.
+
+        Arguments and errors are those of `spackle.predict`.
+        """
+        if depth is not None and not self._accepts_depth:
             raise InputError(
                 'a depth map and a base are given: leave one of them out, or give base="rgbd"'
             )
-        lens = {"focal_px": focal_px, "focal_mm": focal_mm, "fov": fov}
-        if isinstance(photo, Photo) and lens != dict.fromkeys(lens):
+        has_lens = focal_px is not None or focal_mm is not None or fov is not None
+        if isinstance(photo, Photo) and has_lens:
             raise InputError(
-                "a loaded photo has a focal length already: give focal_px, focal_mm or fov to load_photo"
+                "a loaded photo has a focal length already: "
+                "give focal_px, focal_mm or fov to load_photo"
             )
-        pipeline, options = self._pipeline, self._pipeline.options
-        options = dataclasses.replace(
-            options, path=PathOptions(trajectory=trajectory, disparity=disparity)
-        )
-        options.path.check()
-        with contextlib.ExitStack() as stack:
+        path = PathOptions(trajectory=trajectory, disparity=disparity)
+        path.check()
+        options = dataclasses.replace(self._pipeline.options, path=path)
+        pipeline = dataclasses.replace(self._pipeline, options=options)
+
+        # Files of photo and depth have to be there until the scene is complete.
+        with contextlib.ExitStack() as open_files:
             if depth is not None:
-                source = stack.enter_context(_depth(depth, depth_kind))
-                options = dataclasses.replace(
-                    options,
-                    base=dataclasses.replace(options.base, depth=source, depth_kind=depth_kind),
+                depth_source = open_files.enter_context(_open_depth(depth, depth_kind))
+                pipeline = _with_depth(pipeline, depth_source, depth_kind)
+            loaded_photo = open_files.enter_context(
+                _open_photo(
+                    photo,
+                    keep_frame=keep_frame or pipeline.options.has_given_geometry,
+                    focal_px=focal_px,
+                    focal_mm=focal_mm,
+                    fov=fov,
                 )
-                pipeline = dataclasses.replace(pipeline, base=open_base(options.base))
-            keep = keep_frame or options.give_geometry
-            loaded = stack.enter_context(_photo(photo, keep_frame=keep, **lens))
-            return (
-                dataclasses.replace(pipeline, options=options)
-                .complete(loaded, LogReporter(progress))
-                .scene
             )
+            return pipeline.complete(loaded_photo, LogReporter(progress)).scene
 
 
 def predict(
@@ -145,28 +165,40 @@ def predict(
     fov: float | None = None,
     progress: bool = False,
 ) -> Scene:
-    """Turn a photo into a scene without holes along a camera path; for many photos keep a `Spackle`.
+    """Turn a photo into a scene without holes along a camera path.
+
+    For many photos keep a `Spackle`, which loads its networks once. The scene's `report` says how
+    it was made: its holes, base, focal length, warnings and times.
 
     Args:
-        photo: a path, the bytes of a file, an open file, a PIL picture, a loaded photo, or an array or tensor
-            [H, W, 3] or [3, H, W] of sRGB as uint8 or as floats in 0..1.
-        depth: the photo's depth as a path, bytes or an open file in a format of `load_depth`, an array or tensor [H, W]
-            in metres (0, NaN or inf: unknown), or a loaded depth map.
-        base, residual, fill, device, renderer: see `Spackle`.
-        trajectory: the path for which the scene is completed, in addition to the leftmost and rightmost views.
-        disparity: size of the camera's movement, see `spackle.core.trajectories.disparity_to_offset`; None lets `choose_disparity` decide,
-            with a limit of 0.15 for lite and 0.3 for other bases.
+        photo: a path, the bytes of a file, an open file, a PIL picture, a loaded photo, or an
+            array or tensor [H, W, 3] or [3, H, W] of sRGB as uint8 or as floats in 0..1.
+        depth: the photo's depth as a path, bytes or an open file in a format of `load_depth`, an
+            array or tensor [H, W] in metres (0, NaN or inf: unknown), or a loaded depth map.
+        base: what turns the photo into Gaussians, see `Spackle`.
+        trajectory: the path for which the scene is completed, in addition to the leftmost and
+            rightmost views.
+        disparity: size of the camera's movement, see
+            `spackle.core.trajectories.disparity_to_offset`; None chooses it for the photo, with a
+            limit of 0.15 for lite and 0.3 for other bases.
         depth_kind: the meaning of a depth map's numbers, see `spackle.load_depth`.
-        keep_frame: keep a uniform frame around a picture. Otherwise the frame is cropped, unless depth or a focal
-            length is given.
-        focal_px, focal_mm, fov: the focal length, see `load_photo`.
+        residual: the network that fills holes, see `Spackle`.
+        fill: source of the texture in the holes, see `Spackle`.
+        device: "auto", "cpu" or "cuda", for base and renderer.
+        renderer: by default the renderer of the device.
+        keep_frame: keep a uniform frame around a picture. Otherwise the frame is cropped, unless
+            depth or a focal length is given.
+        focal_px: focal length in pixels of the photo.
+        focal_mm: focal length in millimetres, as a 35 mm equivalent.
+        fov: horizontal field of view in degrees.
         progress: draw a bar on the standard error.
 
     Raises:
-        InputError: a photo, a depth map, a name or weights that cannot be used; `base` together with `depth`, or a
-            focal length for a loaded photo.
+        InputError: a photo, a depth map, a name or weights that cannot be used; `base` together
+            with `depth`, or a focal length for a loaded photo.
     """
-    return Spackle(base, residual=residual, fill=fill, device=device, renderer=renderer).predict(
+    session = Spackle(base, residual=residual, fill=fill, device=device, renderer=renderer)
+    return session.predict(
         photo,
         depth,
         trajectory=trajectory,
@@ -180,46 +212,80 @@ def predict(
     )
 
 
+def _with_depth(pipeline: Pipeline, depth: Path | DepthMap, depth_kind: DepthKind) -> Pipeline:
+    """The same pipeline, with a base that lifts a photo by this depth."""
+    base_settings = dataclasses.replace(pipeline.options.base, depth=depth, depth_kind=depth_kind)
+    return dataclasses.replace(
+        pipeline,
+        options=dataclasses.replace(pipeline.options, base=base_settings),
+        base=open_base(base_settings),
+    )
+
+
 @contextlib.contextmanager
-def _photo(source: PhotoSource, **options: Any) -> Iterator[Photo]:
-    """Load the photo; during the block, bytes lie in a temporary file, from which a base can read the photo's depth."""
+def _open_photo(
+    source: PhotoSource,
+    *,
+    keep_frame: bool,
+    focal_px: float | None,
+    focal_mm: float | None,
+    fov: float | None,
+) -> Iterator[Photo]:
+    """Load the photo.
+
+    Bytes lie in a temporary file during the block, because a base may read the photo's depth from
+    its file.
+    """
     if isinstance(source, Photo):
         yield source
     elif isinstance(source, Image.Image | np.ndarray | Tensor):
-        yield photo_from_picture(source, **options)
+        yield photo_from_picture(
+            source, keep_frame=keep_frame, focal_px=focal_px, focal_mm=focal_mm, fov=fov
+        )
     else:
         with _as_file(source, "photo") as path:
-            yield load_photo(path, **options)
+            yield load_photo(
+                path, keep_frame=keep_frame, focal_px=focal_px, focal_mm=focal_mm, fov=fov
+            )
 
 
 @contextlib.contextmanager
-def _depth(source: DepthSource, kind: DepthKind) -> Iterator[Path | DepthMap]:
-    if isinstance(source, np.ndarray | Tensor):
-        array = source.detach().cpu().numpy() if isinstance(source, Tensor) else source
-        yield depth_from_array(array, Path("depth"), kind)
-    elif isinstance(source, DepthMap | str | os.PathLike):
-        yield source if isinstance(source, DepthMap) else Path(source)
+def _open_depth(source: DepthSource, kind: DepthKind) -> Iterator[Path | DepthMap]:
+    """The path of a depth map, which the base will read, or the depth map from a value or bytes."""
+    if isinstance(source, DepthMap):
+        yield source
+    elif isinstance(source, str | os.PathLike):
+        yield Path(source)
+    elif isinstance(source, Tensor):
+        yield depth_from_array(source.detach().cpu().numpy(), Path("depth"), kind)
+    elif isinstance(source, np.ndarray):
+        yield depth_from_array(source, Path("depth"), kind)
     else:
         with _as_file(source, "depth") as path:
             yield load_depth(path, kind=kind)
 
 
 @contextlib.contextmanager
-def _as_file(source: str | os.PathLike[str] | bytes | BinaryIO, kind: str) -> Iterator[Path]:
-    """A path to the source's bytes; messages contain `kind` instead of the name of a temporary file."""
+def _as_file(source: str | os.PathLike[str] | bytes | BinaryIO, name: str) -> Iterator[Path]:
+    """The path of a file with the source's bytes, which may be temporary.
+
+    An InputError of the block names the source as `name` instead of a temporary file. InputError
+    for a source of another type.
+    """
     if isinstance(source, str | os.PathLike):
         yield Path(source)
         return
+
     content = source.read() if hasattr(source, "read") else source
     if not isinstance(content, bytes):
-        accepted = "a path, bytes, a file opened in binary mode, or an array"
         raise InputError(
-            f"{kind}: {type(source).__name__} {short_repr(source)} is not accepted: give {accepted}"
+            f"{name}: {type(source).__name__} {short_repr(source)} is not accepted: "
+            "give a path, bytes, a file opened in binary mode, or an array"
         )
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / kind
+        path = Path(folder) / name
         path.write_bytes(content)
         try:
             yield path
         except InputError as error:
-            raise InputError(str(error).replace(str(path), kind)) from error
+            raise InputError(str(error).replace(str(path), name)) from error

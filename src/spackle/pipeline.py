@@ -1,13 +1,23 @@
-"""The pipeline from a photo to a completed scene: base, camera path, fill. Begin with `Pipeline.complete`."""
+"""The way of a photo to its completed scene. Begin with `Pipeline.complete`.
+
+    photo --> base --> Gaussians --+
+                                   +--> render --> holes --> fill --> aux --> merge
+    camera path -------------------+
+
+The base turns the photo into Gaussians. Seen from other places along a camera path, they show
+holes. The fill adds "aux" Gaussians in these holes; base and aux Gaussians together are the scene.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Iterator, Mapping, Sequence
+import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
+import torch
 from torch import Tensor
 
 from spackle.bases import BasePrediction
@@ -19,17 +29,18 @@ from spackle.core.photo import Photo, check_photo_size
 from spackle.core.trajectories import KeyframePath
 from spackle.inpaint import InpainterOptions, get_inpainter
 from spackle.render import Renderer, get_renderer
+from spackle.residual import hole_area_ratio
 from spackle.residual.architectures import SHIPPED, load_residual, shipped_network
 from spackle.residual.network import ResidualNet
 from spackle.runtime.errors import InputError
 from spackle.runtime.progress import Progress, Reporter
-from spackle.scene import Scene
+from spackle.scene import Scene, SceneReport, ViewHoles
 from spackle.scene_fill.fill import FillContext, fill_scene, fill_view
 from spackle.scene_fill.texture import Texture, exemplar_texture, painted_texture
 from spackle.views import PathOptions, PlannedViews, choose_disparity, plan_views
 from spackle.weights import installed_weights
 
-# Where the texture in the holes comes from.
+# Where the texture in the holes comes from; see `open_texture`.
 FillTexture = Literal["auto", "network", "exemplar", "lama", "none"]
 # One set of aux Gaussians for all views, or one set for each view.
 FillMode = Literal["scene", "view"]
@@ -37,195 +48,344 @@ FillMode = Literal["scene", "view"]
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FillOptions:
-    """Options of the fill."""
+    """Options of the fill, which adds Gaussians in the holes of views."""
 
-    residual: str | None = (
-        None  # a file of weights, "seeds", "none", or None for the shipped weights if there are any
-    )
+    # A file of weights for the network; "seeds": no network; "none": no fill; None: the shipped
+    # weights if there are any.
+    residual: str | None = None
     fill: FillTexture = "auto"
     mode: FillMode = "scene"
 
     @property
     def texture(self) -> FillTexture:
-        """The fill, with "auto" resolved; "none" if `residual` is "none".
-
-        In view mode "auto" means "exemplar", because inpainting would take seconds for each view.
-        """
+        """Where the texture comes from, with "auto" decided; "none" if nothing is to be filled."""
         if self.residual == "none":
             return "none"
-        return "exemplar" if self.mode == "view" and self.fill == "auto" else resolved(self.fill)
+        # Inpainting by LaMa takes seconds for each view; so without an explicit wish it is left to
+        # the one set of Gaussians for all views.
+        if self.mode == "view" and self.fill == "auto":
+            return "exemplar"
+        return resolve_texture(self.fill)
 
     @property
-    def weights(self) -> str:
-        """The weights' name in reports: "shipped", a file, "seeds" or "none"."""
-        return (
-            "none"
-            if self.texture == "none"
-            else self.residual or ("shipped" if SHIPPED.is_file() else "seeds")
-        )
+    def weights_name(self) -> str:
+        """The name of the network's weights in reports: "shipped", a file, "seeds" or "none"."""
+        if self.texture == "none":
+            return "none"
+        if self.residual is not None:
+            return self.residual
+        return "shipped" if SHIPPED.is_file() else "seeds"
 
     @property
-    def file(self) -> Path | None:
-        """The file of the weights; None without a network."""
-        if self.weights in ("seeds", "none"):
+    def weights_file(self) -> Path | None:
+        """The file of the network's weights; None if no network is used."""
+        if self.weights_name in ("seeds", "none"):
             return None
-        return SHIPPED if self.weights == "shipped" else Path(self.weights)
+        return SHIPPED if self.weights_name == "shipped" else Path(self.weights_name)
 
-    def load(self) -> ResidualNet | None:
-        """The network, if any; InputError for a file that cannot be used."""
-        return None if self.file is None else load_residual(self.file)
+    def load_network(self) -> ResidualNet | None:
+        """Load the network, or None if none is used; InputError for a file that cannot be used."""
+        return None if self.weights_file is None else load_residual(self.weights_file)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PipelineOptions:
-    """All options for a photo: base, camera path and fill."""
+    """All options for turning a photo into a scene: those of the base, the path and the fill."""
 
     base: BaseSettings = dataclasses.field(default_factory=BaseSettings)
     path: PathOptions = dataclasses.field(default_factory=PathOptions)
     fill: FillOptions = dataclasses.field(default_factory=FillOptions)
 
     @property
-    def give_geometry(self) -> bool:
-        """Whether a depth map or cameras are given; both belong to the whole photo, so its border is kept."""
+    def has_given_geometry(self) -> bool:
+        """Whether a depth map or cameras are given.
+
+        Both belong to the whole photo, so the photo's uniform frame must not be cropped.
+        """
         return self.base.depth is not None or self.path.cameras is not None
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PredictedPhoto:
+    """What the base made of a photo."""
+
+    prediction: BasePrediction  # the Gaussians, the camera, and how far the camera may move
+    base: ResolvedBase  # which base it was, and why
+    warnings: tuple[str, ...]  # what the user should know about the photo, its depth and its base
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FilledHoles:
+    """The aux Gaussians of all planned views."""
+
+    aux: Gaussians  # for all views; in view mode, those of the view `saved_view`
+    by_view: tuple[Gaussians, ...] | None = None  # in view mode: of each view
+    saved_view: str | None = (
+        None  # in view mode: the name of the view whose aux Gaussians are saved
+    )
+    # [H, W, 3] uint8 sRGB by the view's index: completed views that the fill has rendered already
+    pictures: Mapping[int, Tensor] = dataclasses.field(default_factory=dict)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class CompletedPhoto:
-    """A photo's scene, and the results from which it was made."""
+    """A photo's scene, and everything from which it was made."""
 
     photo: Photo  # at its full size
-    prediction: BasePrediction
-    choice: ResolvedBase
+    predicted: PredictedPhoto
     views: PlannedViews
+    filled: FilledHoles
     scene: Scene  # its disparity is None for given views and keyframes
-    pictures: Mapping[
-        int, Tensor
-    ]  # [H, W, 3] uint8, by index: the completed views that completion has rendered
-    saved_view: str | None = None  # in view mode: the view that `scene.aux` belongs to
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Pipeline:
-    """A base, a residual network and a renderer, opened once for many photos."""
+    """A base, a network for the fill and a renderer, opened once for many photos."""
 
     options: PipelineOptions
     base: OpenedBase
-    network: ResidualNet | None
+    network: ResidualNet | None  # None: holes are filled without a network
     renderer: Renderer
-    given_views: list[Camera] | None = None  # from --cameras; they replace a path
-    keyframes: KeyframePath | None = None  # from --path
+    given_views: list[Camera] | None = None  # the views of `options.path.cameras`, if given
+    keyframes: KeyframePath | None = None  # those of `options.path.path`, if given
 
     @staticmethod
     def open(options: PipelineOptions) -> Pipeline:
-        """Check the options, and load the files that they name; InputError for an option that no photo can use."""
+        """Check the options, and load the files that they name.
+
+        The base's network is loaded later, for the first photo. InputError for an option that no
+        photo can use.
+        """
         options.base.check()
         options.path.check()
-        network = options.fill.load()
-        open_texture(options.fill.texture)  # fails before long work
+        network = options.fill.load_network()
+        open_texture(options.fill.texture)  # missing weights must be known before long work
         given_views, keyframes = options.path.load()
-        renderer = get_renderer(options.base.device)
-        return Pipeline(options, open_base(options.base), network, renderer, given_views, keyframes)
+        return Pipeline(
+            options=options,
+            base=open_base(options.base),
+            network=network,
+            renderer=get_renderer(options.base.device),
+            given_views=given_views,
+            keyframes=keyframes,
+        )
 
     def complete(self, photo: Photo, reporter: Reporter) -> CompletedPhoto:
-        """Complete the scene of a photo at its full size; InputError if the photo or its depth map cannot be used."""
-        fill, precision = self.options.fill, self.options.base.precision
-        prediction, choice = self.predict(photo, reporter)
+        """Turn a photo into its completed scene.
+
+        Args:
+            photo: the photo at its full size.
+            reporter: gets messages and progress, and times the stages.
+
+        Raises:
+            InputError: the photo or its depth map cannot be used.
+        """
+        # photo --> base --> Gaussians
+        predicted = self.predict(photo, reporter)
+        prediction = predicted.prediction
+
+        # camera path --> views
         views = plan_views(
             prediction, self.options.path, photo.path, self.given_views, self.keyframes
         )
-        base, camera, texture = prediction.gaussians, prediction.camera, open_texture(fill.texture)
-        context = FillContext(
-            base, camera, self.renderer, self.network, texture, precision=precision
-        )
-        saved_view, by_view, pictures = None, None, dict[int, Tensor]()
-        with reporter.stage("complete") as step:
-            if fill.mode == "scene" or fill.texture == "none":
-                chosen = [] if fill.texture == "none" else views.views_to_fill
-                filled = fill_scene(
-                    context,
-                    [views.cameras[k] for k in chosen],
-                    self.given_views is not None,
-                    step,
-                    always_filled=[n for n, k in enumerate(chosen) if k in views.always_filled],
-                )
-                aux = filled.aux
-                if views.frame_maker.is_plain:
-                    pictures = {chosen[k]: picture for k, picture in filled.pictures.items()}
-            else:
-                by_view = tuple(_fill_each(context, views.cameras, step))
-                eye = camera.position.double()
-                far = {
-                    name: (views.cameras[k].position.double() - eye).norm()
-                    for name, k in views.measured.items()
-                }
-                saved_view = max(
-                    far, key=lambda name: float(far[name])
-                )  # a file holds one set of aux Gaussians
-                aux = by_view[views.measured[saved_view]]
-        if not aux.finite:
+
+        # render --> holes --> fill --> aux
+        with reporter.stage("complete") as progress:
+            filled = self._fill_holes(prediction, views, progress)
+        if not filled.aux.finite:
             source = self.options.path.cameras or photo.path
             raise InputError(f"{source}: views too extreme to complete: check their K")
-        scene = Scene(base, aux, camera, by_view, self._disparity(prediction))
-        return CompletedPhoto(photo, prediction, choice, views, scene, pictures, saved_view)
 
-    def predict(self, photo: Photo, reporter: Reporter) -> tuple[BasePrediction, ResolvedBase]:
-        """Predict the photo's Gaussians, and choose the size of the camera's movement; also return the chosen base."""
+        # merge
+        scene = Scene(
+            base=prediction.gaussians,
+            aux=filled.aux,
+            camera=prediction.camera,
+            by_view=filled.by_view,
+            disparity=self._path_disparity(prediction),
+        )
+
+        with reporter.stage("measure"):
+            holes = measure_holes(scene, views, self.renderer)
+        report = SceneReport(
+            holes=holes,
+            base=predicted.base.name,
+            base_reason=predicted.base.reason,
+            focal_px=prediction.camera.focal[0],
+            focal_source=prediction.lens_source or photo.focal_source.value,
+            warnings=predicted.warnings,
+            seconds=dict(reporter.seconds),
+        )
+        return CompletedPhoto(
+            photo=photo,
+            predicted=predicted,
+            views=views,
+            filled=filled,
+            scene=dataclasses.replace(scene, report=report),
+        )
+
+    def predict(self, photo: Photo, reporter: Reporter) -> PredictedPhoto:
+        """Turn a photo into Gaussians, and choose how far the camera moves.
+
+        InputError if the photo or its depth map cannot be used.
+        """
         check_photo_size(photo.width, photo.height, photo.path)
         name = photo.path.name
+        warnings: list[str] = []
+
+        def warn(line: str) -> None:
+            """Log what the user should know, and keep it for the scene's report."""
+            warnings.append(line)
+            reporter.log(line)
+
+        def warn_of_base(line: str) -> None:
+            """Keep why a better base could not be used; programs get this as a warning."""
+            warnings.append(line)
+            reporter.warn(line)
+
         if photo.frame is not None:
-            reporter.log(f"{name}: {photo.frame.note}; --keep-frame keeps it")
-        prediction, choice = self.base.predict(photo, log=reporter.warn, stage=reporter.stage)
-        if choice.note:
-            reporter.log(f"{name}: {choice.note}")
-        chosen = self._disparity(prediction) is not None and self.options.path.disparity is None
-        if chosen:
+            warn(f"{name}: {photo.frame.note}; `keep_frame` keeps it")
+        prediction, base = self.base.predict(photo, log=warn_of_base, stage=reporter.stage)
+        if base.note:
+            warn(f"{name}: {base.note}")
+
+        # Views and keyframes that the user gives say themselves where the camera goes.
+        follows_trajectory = self._path_disparity(prediction) is not None
+        chooses_disparity = follows_trajectory and self.options.path.disparity is None
+        if chooses_disparity:
             with reporter.stage("move"):
                 prediction = choose_disparity(prediction, self.renderer, photo.path)
+
+        focal_source = prediction.lens_source or photo.focal_source.value
         reporter.log(
-            f"{name}: {len(prediction.gaussians):,} Gaussians from {choice.name}, "
-            f"focal length {prediction.camera.focal[0]:.0f} px ({prediction.lens_source or photo.focal_source.value})"
+            f"{name}: {len(prediction.gaussians):,} Gaussians from {base.name}, "
+            f"focal length {prediction.camera.focal[0]:.0f} px ({focal_source})"
         )
-        if chosen:
-            reporter.log(f"{name}: {move_in_words(prediction)}")
-        if depth_range := prediction.notes.get("depth_range"):
-            reporter.log(f"{name}: its depth is {depth_range}")
-        if missing := float(prediction.notes.get("depth_filled", 0)):
-            reporter.log(f"{name}: {missing:.1%} of the depth was missing and has been filled")
-        if self.options.base.depth is not None and (
-            size := prediction.notes.get("depth_resampled_from")
-        ):
-            reporter.log(f"{name}: the depth map is {size}, and was resampled to the photo's size")
-        return prediction, choice
+        if chooses_disparity:
+            reporter.log(f"{name}: {describe_movement(prediction)}")
+        if "depth_range" in prediction.notes:
+            reporter.log(f"{name}: its depth is {prediction.notes['depth_range']}")
+        for line in self._depth_warnings(prediction):
+            warn(f"{name}: {line}")
+        return PredictedPhoto(prediction=prediction, base=base, warnings=tuple(warnings))
 
-    def _disparity(self, prediction: BasePrediction) -> float | None:
-        """The path's disparity; None if views or keyframes are given."""
-        given = self.given_views is not None or self.keyframes is not None
-        return None if given else self.options.path.disparity_or(prediction.max_disparity)
+    def _depth_warnings(self, prediction: BasePrediction) -> list[str]:
+        """Lines about what had to be done to the photo's depth: parts filled, or resampled."""
+        lines: list[str] = []
+        missing_ratio = float(prediction.notes.get("depth_filled", 0))
+        if missing_ratio:
+            lines.append(f"{missing_ratio:.1%} of the depth was missing and has been filled")
+        map_size = prediction.notes.get("depth_resampled_from")
+        if map_size and self.options.base.depth is not None:
+            lines.append(f"the depth map is {map_size}, and was resampled to the photo's size")
+        return lines
+
+    def _path_disparity(self, prediction: BasePrediction) -> float | None:
+        """How far the camera moves along the trajectory; None for given views or keyframes."""
+        if self.given_views is not None or self.keyframes is not None:
+            return None
+        return self.options.path.disparity_or(prediction.max_disparity)
+
+    def _fill_holes(
+        self, prediction: BasePrediction, views: PlannedViews, progress: Progress
+    ) -> FilledHoles:
+        """Add Gaussians in the holes of all planned views: one set for all, or one for each."""
+        texture = self.options.fill.texture
+        if texture == "none":
+            return FilledHoles(aux=Gaussians.empty(prediction.gaussians.means.device))
+
+        context = FillContext(
+            prediction.gaussians,
+            prediction.camera,
+            self.renderer,
+            self.network,
+            open_texture(texture),
+            precision=self.options.base.precision,
+        )
+        if self.options.fill.mode == "scene":
+            return self._fill_together(context, views, progress)
+        return _fill_each_view(context, views, progress)
+
+    def _fill_together(
+        self, context: FillContext, views: PlannedViews, progress: Progress
+    ) -> FilledHoles:
+        """Fill the holes of all views by one set of Gaussians."""
+        cameras = [views.cameras[index] for index in views.views_to_fill]
+        always_filled = [
+            position
+            for position, index in enumerate(views.views_to_fill)
+            if index in views.always_filled
+        ]
+        filled = fill_scene(
+            context,
+            cameras,
+            exact=self.given_views is not None,
+            progress=progress,
+            always_filled=always_filled,
+        )
+        if not views.frame_maker.is_plain:
+            return FilledHoles(aux=filled.aux)
+
+        # The fill has rendered some views in their final state; the video need not do so again.
+        pictures = {
+            views.views_to_fill[position]: picture for position, picture in filled.pictures.items()
+        }
+        return FilledHoles(aux=filled.aux, pictures=pictures)
 
 
-def move_in_words(prediction: BasePrediction) -> str:
-    """A line for the log about the disparity that `choose_disparity` has chosen."""
-    reach, usual, invented = (
-        prediction.max_disparity,
-        prediction.notes["usual_disparity"],
-        prediction.notes["uncovered"],
-    )
-    of, more = (
-        (f" of {usual:g}", f"; `--disparity {usual:g}` moves farther")
-        if reach != usual
-        else ("", "")
-    )
-    return f"camera moves by disparity {reach:g}{of}: {invented:.1%} of the widest view is invented{more}"
-
-
-def _fill_each(
-    context: FillContext, cameras: Sequence[Camera], step: Progress
-) -> Iterator[Gaussians]:
+def _fill_each_view(context: FillContext, views: PlannedViews, progress: Progress) -> FilledHoles:
+    """Fill the holes of each view by Gaussians of its own, as the paper does."""
+    # Added Gaussians must not hide what the photo shows.
     guards = [context.photo_guard()]
-    for index, camera in enumerate(cameras):
-        yield fill_view(context, camera, guards).aux
-        step(index + 1, len(cameras))
+    by_view: list[Gaussians] = []
+    for camera in views.cameras:
+        by_view.append(fill_view(context, camera, guards).aux)
+        progress(len(by_view), len(views.cameras))
+
+    # A file holds one set of aux Gaussians: that of the reported view farthest from the photo.
+    photo_eye = context.photo_camera.position.double()
+
+    def distance_from_photo(name: str) -> float:
+        camera = views.cameras[views.measured[name]]
+        return float((camera.position.double() - photo_eye).norm())
+
+    saved_view = max(views.measured, key=distance_from_photo)
+    return FilledHoles(
+        aux=by_view[views.measured[saved_view]], by_view=tuple(by_view), saved_view=saved_view
+    )
+
+
+@torch.no_grad()
+def measure_holes(scene: Scene, views: PlannedViews, renderer: Renderer) -> tuple[ViewHoles, ...]:
+    """The share of holes (eq. 11) in each reported view, before and after completion."""
+    holes: list[ViewHoles] = []
+    for name, index in views.measured.items():
+        camera = views.cameras[index]
+        before = renderer.render([scene.base], camera)
+        after = renderer.render(scene.of_view(index), camera)
+        holes.append(
+            ViewHoles(
+                view=name,
+                before=hole_area_ratio(before.alpha),
+                after=hole_area_ratio(after.alpha),
+            )
+        )
+    return tuple(holes)
+
+
+def describe_movement(prediction: BasePrediction) -> str:
+    """A line for the log about the size of the camera's movement that was chosen for a photo."""
+    chosen = prediction.max_disparity
+    usual = prediction.notes["usual_disparity"]  # what the base allows for a photo without holes
+    hole_ratio = prediction.notes["uncovered"]
+    if chosen == usual:
+        return (
+            f"camera moves by disparity {chosen:g}: {hole_ratio:.1%} of the widest view is invented"
+        )
+    return (
+        f"camera moves by disparity {chosen:g} of {usual:g}: "
+        f"{hole_ratio:.1%} of the widest view is invented; `disparity` {usual:g} moves farther"
+    )
 
 
 def complete(
@@ -238,26 +398,37 @@ def complete(
     renderer: Renderer | None = None,
     progress: Progress | None = None,
 ) -> Scene:
-    """Fill the holes of all views by one set of aux Gaussians, see `fill_scene`.
+    """Fill the holes of all views by one set of Gaussians, which are added to the base's.
 
     Args:
         prediction: a base's result.
         cameras: the views.
         exact: whether only these views will be rendered, and no views between them.
-        network: the residual network, by default Spackle's; None fills the holes by the seeds alone.
-        fill: see `open_texture`; "none" keeps the holes.
+        network: the network that improves the added Gaussians, by default Spackle's; None adds
+            them without a network.
+        fill: where the texture comes from, see `open_texture`; "none" keeps the holes.
         renderer: by default the best of this machine, on its GPU if it has one.
         progress: called with (views done, all views).
     """
-    chosen = shipped_network() if network == "shipped" else network
-    base, camera = prediction.gaussians, prediction.camera
-    context = FillContext(base, camera, renderer or get_renderer(), chosen, open_texture(fill))
-    return Scene(
-        base, fill_scene(context, cameras if fill != "none" else (), exact, progress).aux, camera
+    context = FillContext(
+        prediction.gaussians,
+        prediction.camera,
+        renderer or get_renderer(),
+        shipped_network() if network == "shipped" else network,
+        open_texture(fill),
     )
+    views_to_fill = cameras if fill != "none" else ()
+    start = time.perf_counter()
+    filled = fill_scene(context, views_to_fill, exact, progress)
+    report = SceneReport(
+        focal_px=prediction.camera.focal[0],
+        focal_source=prediction.lens_source or None,
+        seconds={"complete": round(time.perf_counter() - start, 3)},
+    )
+    return Scene(prediction.gaussians, filled.aux, prediction.camera, report=report)
 
 
-def resolved(fill: FillTexture) -> FillTexture:
+def resolve_texture(fill: FillTexture) -> FillTexture:
     """Replace "auto" by "lama" if LaMa's weights have been downloaded, else by "exemplar"."""
     if fill != "auto":
         return fill
@@ -265,14 +436,21 @@ def resolved(fill: FillTexture) -> FillTexture:
 
 
 def open_texture(fill: FillTexture) -> Texture | None:
-    """The texture function of a fill: "lama" inpaints the widest views, "exemplar" takes patches of each view.
+    """The function that draws texture into the holes of a view.
 
-    "auto" is one of the two, see `resolved`; "network" and "none" give None. InputError for "lama" without its weights.
+    "lama" inpaints the widest views by the network LaMa, "exemplar" copies patches of the same
+    view, and "auto" is "lama" if its weights have been downloaded, else "exemplar". None for
+    "network" and "none", which add no texture. InputError for "lama" without its weights.
     """
-    chosen = resolved(fill)
-    return _lama() if chosen == "lama" else exemplar_texture if chosen == "exemplar" else None
+    texture = resolve_texture(fill)
+    if texture == "lama":
+        return _open_lama()
+    if texture == "exemplar":
+        return exemplar_texture
+    return None
 
 
 @functools.cache
-def _lama() -> Texture:
+def _open_lama() -> Texture:
+    """The function that inpaints views by LaMa; it is kept, because loading LaMa takes seconds."""
     return functools.partial(painted_texture, get_inpainter("lama", InpainterOptions()))

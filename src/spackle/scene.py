@@ -1,4 +1,7 @@
-"""A photo's completed scene: render it along a path, save it, export it, show it."""
+"""A photo's completed scene: render it along a path, save it, export it, show it.
+
+Read `Scene` first; `SceneReport` says how a scene was made.
+"""
 
 from __future__ import annotations
 
@@ -6,21 +9,26 @@ import dataclasses
 import html
 import os
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from spackle.bases import DEFAULT_MAX_DISPARITY
-from spackle.core import trajectories as camera_path
 from spackle.core.camera import Camera
 from spackle.core.focal_length import resolve_focal_length
 from spackle.core.gaussians import Gaussians
-from spackle.core.trajectories import DEFAULT_OVERSCAN, DepthRange, KeyframePath, TrajectoryKind
+from spackle.core.trajectories import (
+    DEFAULT_OVERSCAN,
+    DepthRange,
+    KeyframePath,
+    TrajectoryKind,
+    trajectory_cameras,
+)
 from spackle.formats.html import PageScene, page_scene, single_html
 from spackle.formats.scene_content import SceneFile, is_at_origin
-from spackle.formats.scene_files import Encoder, encoder_for, load_scene
+from spackle.formats.scene_files import encoder_for, load_scene
 from spackle.render import Renderer, get_renderer
 from spackle.render.protocol import Rendering
 from spackle.residual.features import hole_mask
@@ -30,55 +38,113 @@ from spackle.video.frames import FrameMaker
 from spackle.video.options import Fit, Show, StereoLayout, VideoOptions, parse_size
 from spackle.views import DEFAULT_FRAME_COUNT, PathOptions
 
-DEFAULT_SIZE = (1280, 720)  # width and height for a file that stores no camera
+DEFAULT_SIZE_PX = (1280, 720)  # width and height of the views of a file that stores no camera
+KEYFRAMES_FPS = 30  # frame rate of a path through keyframes if no number of frames is given
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ViewHoles:
+    """The holes of one view, as shares of the view's pixels (hole-area ratio, eq. 11)."""
+
+    view: str  # its name: the disparity, such as "-0.3", a keyframe, or a given view's number
+    before: float  # in the base
+    after: float  # in the completed scene
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SceneReport:
+    """How a scene was made from a photo.
+
+    `spackle.complete`, which gets a prediction instead of a photo, knows neither the holes nor the
+    base.
+    """
+
+    holes: tuple[ViewHoles, ...] = ()  # of the widest views, or of the given views
+    base: str | None = None  # the base's name, such as "sharp"
+    base_reason: str | None = None  # why this base
+    focal_px: float  # focal length in pixels of the scene's camera
+    focal_source: str | None = None  # where it comes from, such as "EXIF"; None: unknown
+    warnings: tuple[str, ...] = ()  # about the photo, its depth and its base
+    seconds: Mapping[str, float]  # duration of each stage
+
+    @property
+    def hole_ratio_before(self) -> float | None:
+        """The mean share of holes in the base, over the measured views; None if there are none."""
+        if not self.holes:
+            return None
+        return sum(view.before for view in self.holes) / len(self.holes)
+
+    @property
+    def hole_ratio_after(self) -> float | None:
+        """The mean share of holes that completion leaves; None if no view was measured."""
+        if not self.holes:
+            return None
+        return sum(view.after for view in self.holes) / len(self.holes)
 
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """Base and aux Gaussians of a photo, in the coordinates of the photo's camera."""
+    """Base and aux Gaussians of a photo, in the coordinates of the photo's camera.
+
+    "Aux" are the Gaussians that completion adds where views of the base show holes.
+    """
 
     base: Gaussians  # predicted from the photo; never changed
     aux: Gaussians  # added by completion
     camera: Camera  # the photo's camera, at the origin
-    by_view: tuple[Gaussians, ...] | None = (
-        None  # in view mode: the aux Gaussians of each completed view
-    )
-    disparity: float | None = None  # the disparity for which the scene was completed, if known
+    # In view mode, where each view is completed on its own: the aux Gaussians of each view.
+    by_view: tuple[Gaussians, ...] | None = None
+    disparity: float | None = None  # the camera's movement for which the scene was completed
+    report: SceneReport | None = None  # how it was made; None for a scene from a file
 
     def __repr__(self) -> str:
         size = f"{self.camera.width}×{self.camera.height}"
-        return f"Scene({len(self.base):,} base + {len(self.aux):,} aux Gaussians, {size}, {self.base.means.device})"
+        counts = f"{len(self.base):,} base + {len(self.aux):,} aux Gaussians"
+        return f"Scene({counts}, {size}, {self.base.means.device})"
 
     @staticmethod
     def load(
         path: str | os.PathLike[str], *, focal_px: float | None = None, fov: float | None = None
     ) -> Scene:
-        """Read a PLY (ours, INRIA's, SHARP's or PlayCanvas's), SPZ, SOG or .splat file; InputError for any other.
+        """Read a PLY (ours, INRIA's, SHARP's or PlayCanvas's), SPZ, SOG or .splat file.
 
         Args:
             path: the file.
-            focal_px: focal length in pixels; by default the stored focal length, or a 35 mm equivalent of 30 mm.
+            focal_px: focal length in pixels; by default the stored focal length, or a 35 mm
+                equivalent of 30 mm.
             fov: horizontal field of view in degrees, instead of `focal_px`.
+
+        Raises:
+            InputError: another kind of file, a damaged one, or two focal lengths.
         """
         return Scene.of_file(load_scene(Path(path)), focal_px=focal_px, fov=fov)
 
     @staticmethod
     def of_file(
-        file: SceneFile, size: tuple[int, int] | None = None, **lens: float | None
+        file: SceneFile,
+        size: tuple[int, int] | None = None,
+        *,
+        focal_px: float | None = None,
+        fov: float | None = None,
     ) -> Scene:
-        """The scene in a loaded file; see `load`. `size` is the camera's size if a lens is given, or none is stored."""
-        gaussians, camera = file.gaussians, file.camera
-        if camera is None or any(value is not None for value in lens.values()):
-            width, height = size or ((camera.width, camera.height) if camera else DEFAULT_SIZE)
-            focal, _ = resolve_focal_length(file.path, width, height, {}, **lens)
-            given = Camera.from_focal(focal, width, height)
-            pose = given.world_to_camera if camera is None else camera.world_to_camera
-            camera = dataclasses.replace(given, world_to_camera=pose)
+        """The scene in a loaded file, in the coordinates of its camera; arguments as for `load`.
+
+        `size` is the camera's width and height in pixels if a focal length is given or no camera is
+        stored; by default that of the stored camera, or 1280×720.
+        """
+        camera = file.camera
+        if camera is None or focal_px is not None or fov is not None:
+            camera = _camera_with_lens(file, size, focal_px, fov)
+
+        # Paths begin at the origin, so that is where the camera has to be.
+        gaussians = file.gaussians
         if not is_at_origin(camera):
             gaussians = gaussians.transform(camera.world_to_camera)
             camera = dataclasses.replace(camera, world_to_camera=torch.eye(4))
-        count = len(gaussians) if file.base_count is None else file.base_count
-        base, aux = gaussians.select(slice(0, count)), gaussians.select(slice(count, None))
+
+        base_count = len(gaussians) if file.base_count is None else file.base_count
+        base = gaussians.select(slice(0, base_count))
+        aux = gaussians.select(slice(base_count, None))
         return Scene(base, aux, camera, disparity=file.disparity)
 
     @property
@@ -87,7 +153,10 @@ class Scene:
         return Gaussians.cat([self.base, self.aux])
 
     def of_view(self, index: int) -> list[Gaussians]:
-        """The sets of Gaussians from which a completed view is rendered."""
+        """The sets of Gaussians from which a completed view is rendered: the base's and the aux.
+
+        `index` is the view's number if each view was completed on its own, else without effect.
+        """
         return [self.base, self.aux if self.by_view is None else self.by_view[index]]
 
     def path(
@@ -101,24 +170,27 @@ class Scene:
 
         Args:
             trajectory: see `spackle.core.trajectories.trajectory_cameras`.
-            disparity: by default `Scene.disparity`.
+            disparity: size of the camera's movement; by default `Scene.disparity`.
             frames: number of cameras.
             looped: make a path that repeats without a jump.
         """
-        usual = DEFAULT_MAX_DISPARITY if self.disparity is None else self.disparity
-        reach, depths = usual if disparity is None else disparity, DepthRange.of(self.base)
-        return camera_path.trajectory_cameras(
-            trajectory, self.camera.even(), reach, depths, frames, looped
+        if disparity is None:
+            disparity = self.disparity
+        if disparity is None:
+            disparity = DEFAULT_MAX_DISPARITY
+        depth_range = DepthRange.of(self.base)
+        return trajectory_cameras(
+            trajectory, self.camera.even(), disparity, depth_range, frames, looped
         )
 
     def along(self, keyframes: KeyframePath, frames: int | None = None) -> list[Camera]:
-        """Cameras through keyframes (see `spackle.formats.load_path`), by default 30 for each second.
+        """Cameras through keyframes (see `spackle.formats.load_path`), by default 30 a second.
 
         Raises:
             ValueError: a view between two keyframes is impossible.
         """
-        count = frames or keyframes.frame_count(30)
-        return keyframes.cameras(self.camera.even(), count, DepthRange.of(self.base))
+        frame_count = frames or keyframes.frame_count(KEYFRAMES_FPS)
+        return keyframes.cameras(self.camera.even(), frame_count, DepthRange.of(self.base))
 
     def render(self, camera: Camera, renderer: Renderer | None = None) -> Rendering:
         """Render one view of the whole scene."""
@@ -134,7 +206,7 @@ class Scene:
             yield self.render(camera, renderer)
 
     def depth_map(self, renderer: Renderer | None = None) -> Tensor:
-        """Depth [H, W] of the base at the photo's camera, in metres for a metric base; 0 in holes."""
+        """Depth [H, W] of the base at the photo's camera, 0 in holes; metres for a metric base."""
         with torch.no_grad():
             view = (renderer or get_renderer()).render(self.base, self.camera)
         return torch.where(hole_mask(view.alpha), 0, view.depth)
@@ -144,13 +216,17 @@ class Scene:
 
         Args:
             target: a path, or a file that is open for writing bytes.
-            disparity: limit of the camera's movement in `spackle view`; by default `Scene.disparity`.
+            disparity: limit of the camera's movement in `spackle view`; by default
+                `Scene.disparity`.
         """
         scene = self if disparity is None else dataclasses.replace(self, disparity=disparity)
         write_atomic(target, scene.to_bytes("ply"))
 
     def page(self, name: str, note: str = "") -> PageScene:
-        """The scene in the form that `spackle view` shows; see `page_scene`."""
+        """The scene in the form that the page of `spackle view` shows.
+
+        `name` is the title on the page, `note` a line for the user below it.
+        """
         return page_scene(name, self.base, self.aux, self.camera, self.disparity, note)
 
     def export(self, target: PathOrFile, format: str | None = None) -> None:
@@ -158,26 +234,36 @@ class Scene:
 
         Args:
             target: a path, or a file that is open for writing bytes.
-            format: "ply", "compressed.ply", "spz", "splat", "sog", "glb", or "html" (viewer and scene in one file); by
-                default the path's suffix.
+            format: "ply", "compressed.ply", "spz", "splat", "sog", "glb", or "html" (viewer and
+                scene in one file); by default the path's suffix.
 
         Raises:
             InputError: an unknown format, or a scene too large for the format.
         """
-        name = target if isinstance(target, str | os.PathLike) else "scene"
-        write_atomic(target, self._encoded(Path(f"scene.{format}" if format else name)))
+        if format:
+            name = Path(f"scene.{format}")
+        elif isinstance(target, str | os.PathLike):
+            name = Path(target)
+        else:
+            name = Path("scene")  # without a suffix, so the message asks for the format
+        write_atomic(target, self._encoded(name))
 
     def to_bytes(self, format: str) -> bytes:
         """The bytes that `export` would write."""
         return self._encoded(Path(f"scene.{format}"))
 
     def _encoded(self, name: Path) -> bytes:
-        page: Encoder = lambda file: single_html(self.page(file.path.stem))  # noqa: E731
-        file = SceneFile(name, self.gaussians, self.camera, len(self.base), self.disparity)
-        return encoder_for(name, {".html": page})(file)
+        """The bytes of a file called `name`, whose suffix is the format."""
+
+        def encode_page(file: SceneFile) -> bytes:
+            return single_html(self.page(file.path.stem))
+
+        encode = encoder_for(name, {".html": encode_page})
+        content = SceneFile(name, self.gaussians, self.camera, len(self.base), self.disparity)
+        return encode(content)
 
     def show(self, height: int = 480) -> InlinePage:
-        """A viewer with the scene, `height` pixels high, which a notebook displays as the value of a cell."""
+        """A viewer with the scene, `height` pixels high, which a notebook displays in a cell."""
         return InlinePage(single_html(self.page("scene")).decode(), height)
 
     def save_video(
@@ -201,66 +287,108 @@ class Scene:
         convergence: float | None = None,
         compare: bool = False,
     ) -> None:
-        """Write a video of a camera path that repeats without a jump, as `spackle render` does; see `path`.
+        """Write a video of a camera path that repeats without a jump, as `spackle render` does.
 
         Args:
             target: a path, or a file that is open for writing bytes.
-            trajectory, disparity: see `path`.
-            frames, seconds: number of frames or duration; by default, the video lasts 4 seconds.
+            trajectory: the camera path, see `spackle.core.trajectories.trajectory_cameras`.
+            disparity: size of the camera's movement; by default `Scene.disparity`.
+            frames: number of frames; by default the video lasts 4 seconds.
             fps: frames per second.
-            loop: see `spackle.formats.VideoWriter`.
-            overscan: relative gain in focal length, which hides most of the fill beyond the photo's border.
-            format: "mp4", "webm", "gif" or "webp"; by default the path's suffix, or mp4 for an open file.
+            loop: how often the video is shown; see `spackle.formats.VideoWriter`.
+            overscan: relative gain in focal length, which hides most of the fill beyond the
+                photo's border.
+            format: "mp4", "webm", "gif" or "webp"; by default the path's suffix, or mp4 for an
+                open file.
             renderer: by default the best of this machine, on its GPU if it has one.
-            size, fit, show, stereo, ipd, convergence, compare: see the options of `spackle render`; `size` is
-                "1280x720", "16:9" or (width, height).
+            seconds: duration, instead of `frames`.
+            size: of one eye's view: "1280x720", "16:9" or (width, height); by default the photo's.
+            fit: how to reach the aspect ratio of `size`: "pad", "blur" or "crop".
+            show: "color", or "depth" as colours.
+            stereo: layout of a stereo video: "sbs", "sbs-half", "ou", "ou-half" or "anaglyph".
+            ipd: distance of the eyes in metres.
+            convergence: depth in metres that appears in the plane of the screen.
+            compare: show the base on the left and the completed scene on the right.
 
         Raises:
             InputError: an option is impossible, or contradicts another one.
         """
-        named = format is None and isinstance(target, str | os.PathLike)
-        pixels = (
-            None
-            if size is None
-            else parse_size(size if isinstance(size, str) else "x".join(map(str, size)))
+        if size is not None and not isinstance(size, str):
+            size = "x".join(map(str, size))
+        video = VideoOptions(
+            fps=fps,
+            loop=loop,
+            size=None if size is None else parse_size(size),
+            fit=fit,
+            show=show,
+            stereo=stereo,
+            ipd=ipd,
+            convergence=convergence,
+            compare=compare,
         )
+        path = PathOptions(
+            trajectory=trajectory,
+            disparity=disparity,
+            frames=frames,
+            seconds=seconds,
+            video=video,
+            overscan=overscan,
+        )
+
+        if format is None and isinstance(target, str | os.PathLike):
+            self._write_video(Path(target), Path(target), path, renderer)
+            return
+
+        # The encoder writes files; messages must not name this temporary one.
         with tempfile.TemporaryDirectory() as folder:
-            file = Path(target) if named else Path(folder) / f"video.{format or 'mp4'}"  # type: ignore[arg-type]
-            shown = file if named else Path(file.name)
-            check_video(shown, fps, loop)
-            video = VideoOptions(
-                fps=fps,
-                loop=loop,
-                size=pixels,
-                fit=fit,
-                show=show,
-                stereo=stereo,
-                ipd=ipd,
-                convergence=convergence,
-                compare=compare,
-            ).for_file(file)
-            path = PathOptions(
-                trajectory=trajectory,
-                disparity=disparity,
-                frames=frames,
-                seconds=seconds,
-                video=video,
-                overscan=overscan,
-            )
-            path.check()
-            cameras = path.video_cameras(self.base, self.camera, None, self.disparity)
-            maker = FrameMaker.of(video, self.base, cameras, shown)
-            parts = [[self.base]] * compare + [[self.base, self.aux]]
-            used = renderer or get_renderer()
-            save_video(
-                (maker.render(parts, camera, used)[0] for camera in cameras),
-                file,
-                fps,
-                loop,
-                name_in_messages=shown,
-            )
-            if not named:
-                write_atomic(target, file.read_bytes())
+            name = Path(f"video.{format or 'mp4'}")
+            file = Path(folder) / name
+            self._write_video(file, name, path, renderer)
+            write_atomic(target, file.read_bytes())
+
+    def _write_video(
+        self, file: Path, name: Path, path: PathOptions, renderer: Renderer | None
+    ) -> None:
+        """Render the scene along a path to a video file; `name` stands for it in messages."""
+        fps = path.video.frames_per_second
+        check_video(name, fps, path.video.loop)
+        video = path.video.for_file(file)
+        path = dataclasses.replace(path, video=video)
+        path.check()
+
+        cameras = path.video_cameras(self.base, self.camera, None, self.disparity)
+        frame_maker = FrameMaker.of(video, self.base, cameras, name)
+        used_renderer = renderer or get_renderer()
+        gaussian_sets = [[self.base, self.aux]]
+        if video.compare:
+            gaussian_sets.insert(0, [self.base])
+
+        def render_frames() -> Iterator[Tensor]:
+            for camera in cameras:
+                frame, _ = frame_maker.render(gaussian_sets, camera, used_renderer)
+                yield frame
+
+        save_video(render_frames(), file, fps, video.loop, name_in_messages=name)
+
+
+def _camera_with_lens(
+    file: SceneFile, size: tuple[int, int] | None, focal_px: float | None, fov: float | None
+) -> Camera:
+    """A camera of this focal length where the file's camera is, or at the origin without one.
+
+    InputError if both `focal_px` and `fov` are given, or one is impossible.
+    """
+    if size is not None:
+        width, height = size
+    elif file.camera is not None:
+        width, height = file.camera.width, file.camera.height
+    else:
+        width, height = DEFAULT_SIZE_PX
+    focal, _ = resolve_focal_length(file.path, width, height, {}, focal_px=focal_px, fov=fov)
+    camera = Camera.from_focal(focal, width, height)
+    if file.camera is None:
+        return camera
+    return dataclasses.replace(camera, world_to_camera=file.camera.world_to_camera)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -271,7 +399,7 @@ class InlinePage:
     height: int  # pixels
 
     def _repr_html_(self) -> str:
+        """The page in a frame, as notebooks ask for it."""
         style = f"width: 100%; height: {self.height}px; border: 0"
-        return (
-            f'<iframe style="{style}" allowfullscreen srcdoc="{html.escape(self.html)}"></iframe>'
-        )
+        page = html.escape(self.html)
+        return f'<iframe style="{style}" allowfullscreen srcdoc="{page}"></iframe>'

@@ -20,7 +20,7 @@ from spackle.paper.training.losses import hole_psnr
 from spackle.pipeline import Pipeline, PipelineOptions, complete
 from spackle.render import Renderer
 from spackle.residual import hole_area_ratio, hole_mask
-from spackle.results.photo_folder import save_views
+from spackle.results.photo_folder import save_planned_video
 from spackle.runtime.files import write_json
 from spackle.runtime.folders import results_folder
 from spackle.runtime.progress import Reporter
@@ -64,7 +64,7 @@ def run_demo(output: Path, reporter: Reporter) -> None:
             )
             scene.save(output / "scene.ply")
         with reporter.stage("video") as step:
-            save_views(done, output / "video.mp4", renderer, step)
+            save_planned_video(done, output / "video.mp4", renderer, step)
         with torch.no_grad():
             widest = [views.cameras[index] for index in views.measured.values()]
             drawn = [
@@ -80,7 +80,7 @@ def run_demo(output: Path, reporter: Reporter) -> None:
             sum(hole_area_ratio(view.alpha) for view in row) / len(row) for row in drawn
         )
         with reporter.stage("truth"):
-            scores = _compare_truth(done.prediction, pair, renderer, output)
+            scores = _compare_truth(done.predicted.prediction, pair, renderer, output)
         seconds = round(time.perf_counter() - start, 3)
         report: dict[str, Any] = {
             "disparity": DISPARITY,
@@ -88,7 +88,7 @@ def run_demo(output: Path, reporter: Reporter) -> None:
             "aux_gaussians": len(scene.aux),
             "hole_area_ratio": {"before": before, "after": after},
             "right_camera": scores,
-            "residual": {"weights": pipeline.options.fill.weights},
+            "residual": {"weights": pipeline.options.fill.weights_name},
             "seconds": {**reporter.seconds, "total": seconds},
         }
         write_json(report, output / "report.json")

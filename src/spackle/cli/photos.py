@@ -24,7 +24,12 @@ from spackle.depth.readers import find_depth_file
 from spackle.depth.writers import check_depth_name
 from spackle.pipeline import Pipeline, PipelineOptions
 from spackle.render.blend import blend_tiles
-from spackle.results.photo_folder import REPORT, PhotoOptions, earlier_report, predict_photo
+from spackle.results.photo_folder import (
+    REPORT_NAME,
+    PhotoOptions,
+    predict_photo,
+    read_earlier_report,
+)
 from spackle.runtime.device import thread_count
 from spackle.runtime.digests import file_fingerprint, json_digest, matches_records
 from spackle.runtime.errors import InputError
@@ -231,12 +236,12 @@ class Predictor:
     def is_done(self, photo: NamedPhoto) -> bool:
         """Whether an earlier run with the same input and options has left complete results."""
         folder = self.output / photo.name
-        earlier = {} if self.single or self.options.overwrite else earlier_report(folder)
+        earlier = {} if self.single or self.options.overwrite else read_earlier_report(folder)
         with contextlib.suppress(InputError):  # `predict` reports a missing file
             return (
                 bool(earlier)
                 and earlier.get("request") == self.request(photo)
-                and matches_records(folder, REPORT, earlier.get("files"))
+                and matches_records(folder, REPORT_NAME, earlier.get("files"))
             )
         return False
 
@@ -288,7 +293,7 @@ def _shared_digest(options: PredictOptions) -> str:
         "calibration": base.calib,
         "camera file": path.cameras,
         "path file": path.path,
-        "weights": fill.file,
+        "weights": fill.weights_file,
     }
     files |= {
         "LaMa": installed_weights("lama") if fill.texture == "lama" else None,
@@ -307,5 +312,5 @@ def _shared_digest(options: PredictOptions) -> str:
     path = dataclasses.replace(path, cameras=None, path=None)
     choices = [dataclasses.asdict(each) for each in (base, path, options.photo)]
     return json_digest(
-        [spackle.__version__, *choices, fill.weights, fill.texture, fill.mode, prints]
+        [spackle.__version__, *choices, fill.weights_name, fill.texture, fill.mode, prints]
     )

@@ -15,9 +15,9 @@ from spackle.core.focal_length import FocalSource, resolve_focal_length
 from spackle.core.photo import Photo, check_photo_size, resize_photo
 from spackle.depth.units import RELATIVE_KINDS
 from spackle.inpaint.plain import OpenCV
-from spackle.pipeline import Pipeline, PipelineOptions, move_in_words
+from spackle.pipeline import Pipeline, PipelineOptions, describe_movement
 from spackle.residual import hole_area_ratio
-from spackle.results.photo_folder import PhotoOptions, shared_report
+from spackle.results.photo_folder import PhotoOptions, report_run
 from spackle.runtime.digests import file_records
 from spackle.runtime.errors import InputError
 from spackle.runtime.files import write_json
@@ -107,7 +107,7 @@ def predict_clip(
                     if completer.disparity is None:
                         prediction = choose_disparity(prediction, pipeline.renderer, photo.path)
                         completer.disparity = prediction.max_disparity
-                        reporter.log(f"{path.name}: {move_in_words(prediction)}")
+                        reporter.log(f"{path.name}: {describe_movement(prediction)}")
                     first, base = (photo, prediction, choice), base.only_chosen(choice)
                     if prediction.lens_source:
                         seen = prediction.camera.focal[0] * clip.width / prediction.camera.width
@@ -136,7 +136,7 @@ def predict_clip(
             )
         assert first is not None
         report = {
-            **shared_report(*first, pipeline, reporter),
+            **report_run(*first, pipeline, reporter).to_json(),
             "clip": {
                 "file": path.name,
                 "width": clip.width,

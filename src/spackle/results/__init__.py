@@ -1,0 +1,1 @@
+"""Results on disk: a photo's folder with its scene, video, pictures and report."""

@@ -1,4 +1,7 @@
-"""Write a photo's scene, video and report to a folder; used by the command line and the server."""
+"""Write a photo's scene, video and report to a folder; used by the command line and the server.
+
+Read `predict_photo` first. `PhotoReport` is what report.json says.
+"""
 
 from __future__ import annotations
 
@@ -15,31 +18,129 @@ from torch import Tensor
 import spackle
 from spackle.bases import BasePrediction
 from spackle.bases.open import ResolvedBase
-from spackle.core.gaussians import Gaussians
 from spackle.core.photo import Photo, load_photo
 from spackle.depth.writers import save_depth
 from spackle.formats import save_gray_png, save_ply, save_png
 from spackle.pipeline import CompletedPhoto, Pipeline
 from spackle.render import Renderer
-from spackle.residual import hole_area_ratio, hole_mask
+from spackle.residual import hole_mask
 from spackle.runtime.digests import file_records
 from spackle.runtime.files import write_json
 from spackle.runtime.folders import atomic_files, results_folder
 from spackle.runtime.progress import Progress, Reporter
+from spackle.scene import ViewHoles
 from spackle.video.encoding import save_video
 
-REPORT = "report.json"
+REPORT_NAME = "report.json"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PhotoOptions:
-    """Options of reading a photo, and the files to write; other options belong to the pipeline."""
+    """How to read a photo, and which files to write; all other options belong to the pipeline."""
 
     lens: Mapping[str, float | None]  # `focal_px`, `focal_mm` and `fov`, as `load_photo` takes them
     render: bool = True  # write a video
     keep_base: bool = False  # write base.ply, the Gaussians of what the photo shows
-    depth_out: str | None = None  # write the photo's depth, under this name
+    depth_out: str | None = None  # write the photo's depth to a file of this name
     keep_frame: bool = False  # keep a uniform frame around the photo
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RunReport:
+    """What the reports of photos and of clips have in common."""
+
+    focal_px: float  # in pixels of the scene's camera
+    focal_source: str  # such as "EXIF"
+    base: str  # the base's name, such as "sharp"
+    base_reason: str  # why this base
+    base_gaussians: int
+    passed_over: tuple[str, ...]  # better bases that could not be used, each with the error
+    weights: str  # of the network that fills holes: "shipped", a file, "seeds" or "none"
+    views: str  # the trajectory, or the name of the file with views or keyframes
+    disparity_source: str | None  # "disparity": by the option; "photo": chosen; None: no trajectory
+    seconds: Mapping[str, float]  # duration of each stage
+
+    @property
+    def total_seconds(self) -> float:
+        """The duration of all stages together."""
+        return round(sum(self.seconds.values()), 3)
+
+    def to_json(self) -> dict[str, Any]:
+        """The fields as report.json has them."""
+        base: dict[str, Any] = {
+            "name": self.base,
+            "chosen": self.base_reason,
+            "gaussians": self.base_gaussians,
+        }
+        if self.passed_over:
+            base["passed_over"] = list(self.passed_over)
+        return {
+            "spackle": spackle.__version__,
+            "focal_px": round(self.focal_px, 3),
+            "focal_source": self.focal_source,
+            "base": base,
+            "residual": {"weights": self.weights},
+            "views": self.views,
+            "disparity_source": self.disparity_source,
+            "seconds": {**self.seconds, "total": self.total_seconds},
+        }
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PhotoReport:
+    """What report.json says about a photo's results."""
+
+    run: RunReport
+    base_notes: Mapping[str, float | int | str]  # what the base measured, filled or assumed
+    texture: str  # in the holes: "network", "exemplar", "lama" or "none"
+    mode: str  # "scene": one set of aux Gaussians for all views; "view": one set for each view
+    disparity: float | None  # size of the camera's movement; None for given views and keyframes
+    video: Mapping[str, object] | None  # file, frames and size of the video, if one was written
+    holes: tuple[ViewHoles, ...]  # of the measured views
+    request: str | None  # digest of the input and options; None: predict again in the next run
+    photo_name: str
+    photo_size: tuple[int, int]  # width and height of the scene's camera, in pixels
+    frame_cut_off: Mapping[str, int] | None  # widths of the uniform frame that was cropped
+    aux_gaussians: int  # number of Gaussians added in holes
+    saved_view: str | None  # in view mode: the view whose aux Gaussians scene.ply holds
+    files: Mapping[str, Mapping[str, object]]  # size and SHA-256 of each file, by name
+
+    @property
+    def aux_ratio(self) -> float:
+        """The number of aux Gaussians as a share of the base's."""
+        return self.aux_gaussians / self.run.base_gaussians
+
+    @property
+    def hole_ratio_before(self) -> float:
+        """The mean share of holes in the base, over the measured views."""
+        return sum(view.before for view in self.holes) / len(self.holes)
+
+    @property
+    def hole_ratio_after(self) -> float:
+        """The mean share of holes that completion leaves, over the measured views."""
+        return sum(view.after for view in self.holes) / len(self.holes)
+
+    def to_json(self) -> dict[str, Any]:
+        """The content of report.json, whose fields and order are published."""
+        report = self.run.to_json()
+        report["base"] |= self.base_notes
+        report["residual"]["fill"] = self.texture
+        report["merged"] = self.run.base_gaussians + self.aux_gaussians
+        report["mode"] = self.mode
+        report["disparity"] = self.disparity
+        report["video"] = self.video
+        report["hole_area_ratio"] = [dataclasses.asdict(view) for view in self.holes]
+        report["request"] = self.request
+
+        width, height = self.photo_size
+        report["photo"] = {"file": self.photo_name, "width": width, "height": height}
+        if self.frame_cut_off is not None:
+            report["photo"]["frame_cut_off"] = dict(self.frame_cut_off)
+        report["aux"] = {"gaussians": self.aux_gaussians, "share": self.aux_ratio}
+        if self.saved_view is not None:
+            report["scene_ply_view"] = self.saved_view
+        report["files"] = dict(self.files)
+        return report
 
 
 def predict_photo(
@@ -47,184 +148,245 @@ def predict_photo(
     folder: Path,
     pipeline: Pipeline,
     reporter: Reporter,
-    wanted: PhotoOptions,
+    options: PhotoOptions,
     request: str | None = None,
-) -> None:
-    """Predict one photo into `folder`: scene.ply, report.json, and the files that `wanted` and --cameras add.
+) -> PhotoReport:
+    """Turn a photo into scene.ply, report.json and the files that the options add.
 
-    The report stores the digest `request`. The files move to `folder` once all are complete.
+    The files appear in the folder together, once all are complete.
+
+    Args:
+        path: the photo.
+        folder: where the files go.
+        pipeline: the opened base, network and renderer, and the options of the scene.
+        reporter: gets messages, progress and the result.
+        options: which files to write.
+        request: a digest of the input and options, which the report stores.
+
+    Returns:
+        The content of report.json.
 
     Raises:
         InputError: the photo, its depth map or the folder cannot be used.
     """
-    reporter, options = reporter.restarted(), pipeline.options
+    reporter = reporter.restarted()
+    keep_frame = options.keep_frame or pipeline.options.has_given_geometry
     with reporter.stage("load"):
-        photo = load_photo(
-            path, keep_frame=wanted.keep_frame or options.give_geometry, **wanted.lens
-        )
-    video_file = f"video{options.path.video.suffix}"
+        photo = load_photo(path, keep_frame=keep_frame, **options.lens)
+
     with contextlib.ExitStack() as folders:
-        files = (
-            ["base.ply"] * wanted.keep_base + ["scene.ply", REPORT] + [video_file] * wanted.render
-        )
-        files += [wanted.depth_out] if wanted.depth_out else []
-        folders.enter_context(results_folder(folder, files, locked=True))
-        stills = range(len(pipeline.given_views or []))
-        if stills:
-            pictures = [
-                f"{index:04d}{kind}.png" for index in stills for kind in ("", "_base", "_mask")
-            ]
-            folders.enter_context(results_folder(folder / "views", pictures))
-        done = pipeline.complete(photo, reporter)
-        scene, views = done.scene, done.views
-        new = folders.enter_context(atomic_files(folder, REPORT))
-        with reporter.stage("write"):
-            parts = {"scene.ply": scene.gaussians} | (
-                {"base.ply": scene.base} if wanted.keep_base else {}
-            )
-            for file, part in parts.items():
-                save_ply(
-                    part,
-                    new / file,
-                    camera=scene.camera,
-                    base_count=len(scene.base),
-                    disparity=scene.disparity,
-                )
-            if wanted.depth_out is not None:
-                save_depth(scene.depth_map(pipeline.renderer), new / wanted.depth_out)
-        video = None
-        if wanted.render:
-            video = views.frame_maker.report_entry(
-                video_file, views.cameras[views.frames[0][0]], len(views.frames)
-            )
-            with reporter.stage("video") as step:
-                save_views(done, new / video_file, pipeline.renderer, step)
-        if stills:
-            (new / "views").mkdir()
-            with reporter.stage("views") as step:
-                _save_pictures(done, new / "views", pipeline.renderer, step)
-        with reporter.stage("measure"):
-            holes = _measure_holes(done, pipeline.renderer)
-        report = {
-            **shared_report(photo, done.prediction, done.choice, pipeline, reporter),
-            "merged": len(scene.gaussians),
-            "mode": options.fill.mode,
-            "disparity": scene.disparity,
-            "video": video,
-            "hole_area_ratio": holes,
-            "request": request
-            if done.choice.lasting
-            else None,  # None: the next run predicts the photo again
-        }
-        size = {"width": scene.camera.width, "height": scene.camera.height}
-        frame = {} if photo.frame is None else {"frame_cut_off": photo.frame._asdict()}
-        report["photo"] = {"file": path.name, **size, **frame}
-        report["base"] |= done.prediction.notes
-        report["residual"]["fill"] = options.fill.texture
-        report["aux"] = {"gaussians": len(scene.aux), "share": len(scene.aux) / len(scene.base)}
-        if done.saved_view is not None:
-            report["scene_ply_view"] = (
-                done.saved_view
-            )  # the view whose aux Gaussians scene.ply holds
-        report["files"] = file_records(
-            new, sorted(file for file in new.rglob("*") if file.is_file())
-        )
-        write_json(report, new / REPORT)
-    before, after = (sum(view[key] for view in holes) / len(holes) for key in ("before", "after"))
+        # Whether all files can be written has to be known before minutes of work.
+        names = _result_names(pipeline, options)
+        folders.enter_context(results_folder(folder, names, locked=True))
+        picture_names = _picture_names(pipeline)
+        if picture_names:
+            folders.enter_context(results_folder(folder / "views", picture_names))
+
+        completed = pipeline.complete(photo, reporter)
+
+        new_folder = folders.enter_context(atomic_files(folder, REPORT_NAME))
+        video = _write_files(completed, new_folder, pipeline, reporter, options)
+        report = _report_of(completed, new_folder, pipeline, reporter, video, request)
+        write_json(report.to_json(), new_folder / REPORT_NAME)
+
     reporter.log(
-        f"{path.name}: {len(scene.aux):,} aux Gaussians ({report['aux']['share']:.1%} of the base's number, "
-        f"residual weights: {report['residual']['weights']}), holes {before:.2%} -> {after:.3%}, "
-        f"{report['seconds']['total']:.1f} s -> {folder}"
+        f"{path.name}: {report.aux_gaussians:,} aux Gaussians "
+        f"({report.aux_ratio:.1%} of the base's number, residual weights: {report.run.weights}), "
+        f"holes {report.hole_ratio_before:.2%} -> {report.hole_ratio_after:.3%}, "
+        f"{report.run.total_seconds:.1f} s -> {folder}"
     )
-    reporter.result({"folder": folder, **report})
-
-
-def save_views(done: CompletedPhoto, path: Path, renderer: Renderer, step: Progress) -> None:
-    """Write the planned views, which have one size, as a video; InputError if the file cannot be written."""
-    views, video = done.views, done.views.frame_maker.options
-
-    def frames() -> Iterator[Tensor]:
-        for index, frame in enumerate(views.frames):
-            if frame[0] in done.pictures:
-                yield done.pictures[frame[0]]
-            else:
-                with torch.no_grad():
-                    eyes = [
-                        renderer.render(
-                            done.scene.of_view(k),
-                            views.frame_maker.resized_camera(views.cameras[k]),
-                        )
-                        for k in frame
-                    ]
-                    yield views.frame_maker.frame(eyes)
-            step(index + 1, len(views.frames))
-
-    save_video(frames(), path, video.frames_per_second, video.loop)
-
-
-@torch.no_grad()
-def _save_pictures(done: CompletedPhoto, folder: Path, renderer: Renderer, step: Progress) -> None:
-    """Write each given view as PNG: 0000.png completed, 0000_base.png before, 0000_mask.png its holes (white)."""
-    for index, camera in enumerate(done.views.cameras[: done.views.still_count]):
-        before = renderer.render(done.scene.base, camera)
-        save_png(
-            renderer.render(done.scene.of_view(index), camera).rgb, folder / f"{index:04d}.png"
-        )
-        save_png(before.rgb, folder / f"{index:04d}_base.png")
-        save_gray_png(hole_mask(before.alpha).to(torch.float32), folder / f"{index:04d}_mask.png")
-        step(index + 1, done.views.still_count)
-
-
-@torch.no_grad()
-def _measure_holes(done: CompletedPhoto, renderer: Renderer) -> list[dict[str, Any]]:
-    """Measure HAR (eq. 11) of each measured view, before and after completion."""
-
-    def har(gaussians: list[Gaussians], view: int) -> float:
-        return hole_area_ratio(renderer.render(gaussians, done.views.cameras[view]).alpha)
-
-    return [
-        {
-            "view": name,
-            "before": har([done.scene.base], index),
-            "after": har(done.scene.of_view(index), index),
-        }
-        for name, index in done.views.measured.items()
-    ]
-
-
-def shared_report(
-    photo: Photo,
-    prediction: BasePrediction,
-    choice: ResolvedBase,
-    pipeline: Pipeline,
-    reporter: Reporter,
-) -> dict[str, Any]:
-    """The fields that reports of photos and of clips have in common, ready for JSON."""
-    path, weights = pipeline.options.path, pipeline.options.fill.weights
-    given = path.cameras or path.path
-    report: dict[str, Any] = {
-        "spackle": spackle.__version__,
-        "focal_px": round(prediction.camera.focal[0], 3),
-        "focal_source": prediction.lens_source or photo.focal_source.value,
-        "base": {
-            "name": choice.name,
-            "chosen": choice.reason,
-            "gaussians": len(prediction.gaussians),
-        },
-        "residual": {"weights": weights},
-        "views": given.name if given else path.trajectory,
-        "disparity_source": None if given else "photo" if path.disparity is None else "--disparity",
-        "seconds": {**reporter.seconds, "total": round(sum(reporter.seconds.values()), 3)},
-    }
-    if choice.failures:
-        report["base"]["passed_over"] = list(choice.failures)
+    reporter.result({"folder": folder, **report.to_json()})
     return report
 
 
-def earlier_report(folder: Path) -> dict[str, Any]:
-    """The report of an earlier run; empty if the report is missing or damaged."""
+def _result_names(pipeline: Pipeline, options: PhotoOptions) -> list[str]:
+    """The names of a photo's files, without the pictures of given views."""
+    names = ["scene.ply", REPORT_NAME]
+    if options.keep_base:
+        names.append("base.ply")
+    if options.render:
+        names.append(_video_name(pipeline))
+    if options.depth_out is not None:
+        names.append(options.depth_out)
+    return names
+
+
+def _video_name(pipeline: Pipeline) -> str:
+    """The name of a photo's video, such as "video.mp4"."""
+    return f"video{pipeline.options.path.video.suffix}"
+
+
+def _picture_names(pipeline: Pipeline) -> list[str]:
+    """The names of the pictures of given views; empty for a path."""
+    names: list[str] = []
+    for index in range(len(pipeline.given_views or [])):
+        names += [f"{index:04d}.png", f"{index:04d}_base.png", f"{index:04d}_mask.png"]
+    return names
+
+
+def _write_files(
+    completed: CompletedPhoto,
+    folder: Path,
+    pipeline: Pipeline,
+    reporter: Reporter,
+    options: PhotoOptions,
+) -> dict[str, object] | None:
+    """Write all files of a photo but its report; returns the report's entry for the video."""
+    scene, views = completed.scene, completed.views
+    with reporter.stage("write"):
+        parts = {"scene.ply": scene.gaussians}
+        if options.keep_base:
+            parts["base.ply"] = scene.base
+        for name, gaussians in parts.items():
+            save_ply(
+                gaussians,
+                folder / name,
+                camera=scene.camera,
+                base_count=len(scene.base),
+                disparity=scene.disparity,
+            )
+        if options.depth_out is not None:
+            save_depth(scene.depth_map(pipeline.renderer), folder / options.depth_out)
+
+    video_entry = None
+    if options.render:
+        video_name = _video_name(pipeline)
+        first_view = views.cameras[views.frames[0][0]]
+        video_entry = views.frame_maker.report_entry(video_name, first_view, len(views.frames))
+        with reporter.stage("video") as progress:
+            save_planned_video(completed, folder / video_name, pipeline.renderer, progress)
+
+    if views.still_count:
+        (folder / "views").mkdir()
+        with reporter.stage("views") as progress:
+            _save_pictures(completed, folder / "views", pipeline.renderer, progress)
+    return video_entry
+
+
+def save_planned_video(
+    completed: CompletedPhoto, path: Path, renderer: Renderer, progress: Progress
+) -> None:
+    """Write the video of a photo's planned views, which have one size.
+
+    InputError if the file cannot be written.
+    """
+    views, scene = completed.views, completed.scene
+    frame_maker = views.frame_maker
+
+    def render_frames() -> Iterator[Tensor]:
+        """Each frame as uint8 if the fill has rendered it already, else as floats in 0..1."""
+        for frame_index, eye_views in enumerate(views.frames):
+            picture = completed.filled.pictures.get(eye_views[0])
+            if picture is not None:
+                yield picture
+            else:
+                with torch.no_grad():
+                    renderings = [
+                        renderer.render(
+                            scene.of_view(view), frame_maker.resized_camera(views.cameras[view])
+                        )
+                        for view in eye_views
+                    ]
+                    yield frame_maker.frame(renderings)
+            progress(frame_index + 1, len(views.frames))
+
+    video = frame_maker.options
+    save_video(render_frames(), path, video.frames_per_second, video.loop)
+
+
+@torch.no_grad()
+def _save_pictures(
+    completed: CompletedPhoto, folder: Path, renderer: Renderer, progress: Progress
+) -> None:
+    """Write each given view as PNG files.
+
+    0000.png is the completed view, 0000_base.png the view before, 0000_mask.png its holes in white.
+    """
+    views, scene = completed.views, completed.scene
+    for index in range(views.still_count):
+        camera = views.cameras[index]
+        before = renderer.render(scene.base, camera)
+        after = renderer.render(scene.of_view(index), camera)
+        holes = hole_mask(before.alpha).to(torch.float32)
+        save_png(after.rgb, folder / f"{index:04d}.png")
+        save_png(before.rgb, folder / f"{index:04d}_base.png")
+        save_gray_png(holes, folder / f"{index:04d}_mask.png")
+        progress(index + 1, views.still_count)
+
+
+def _report_of(
+    completed: CompletedPhoto,
+    folder: Path,
+    pipeline: Pipeline,
+    reporter: Reporter,
+    video: Mapping[str, object] | None,
+    request: str | None,
+) -> PhotoReport:
+    """The report of a completed photo, whose other files lie in `folder`."""
+    photo, predicted, scene = completed.photo, completed.predicted, completed.scene
+    assert scene.report is not None
+    files = sorted(file for file in folder.rglob("*") if file.is_file())
+    return PhotoReport(
+        run=report_run(photo, predicted.prediction, predicted.base, pipeline, reporter),
+        base_notes=predicted.prediction.notes,
+        texture=pipeline.options.fill.texture,
+        mode=pipeline.options.fill.mode,
+        disparity=scene.disparity,
+        video=video,
+        holes=scene.report.holes,
+        # A better base may have lacked memory by chance; then the next run has to try it again.
+        request=request if predicted.base.lasting else None,
+        photo_name=photo.path.name,
+        photo_size=(scene.camera.width, scene.camera.height),
+        frame_cut_off=None if photo.frame is None else photo.frame._asdict(),
+        aux_gaussians=len(scene.aux),
+        saved_view=completed.filled.saved_view,
+        files=file_records(folder, files),
+    )
+
+
+def report_run(
+    photo: Photo,
+    prediction: BasePrediction,
+    base: ResolvedBase,
+    pipeline: Pipeline,
+    reporter: Reporter,
+) -> RunReport:
+    """What the reports of photos and of clips have in common, after all stages are done.
+
+    Args:
+        photo: the photo, or the clip's first frame.
+        prediction: what the base made of it.
+        base: which base it was, and why.
+        pipeline: the pipeline, whose options are reported.
+        reporter: the reporter that timed the stages.
+    """
+    path = pipeline.options.path
+    given_file = path.cameras or path.path
+    if given_file is not None:
+        disparity_source = None
+    elif path.disparity is None:
+        disparity_source = "photo"
+    else:
+        disparity_source = "disparity"
+    return RunReport(
+        focal_px=prediction.camera.focal[0],
+        focal_source=prediction.lens_source or photo.focal_source.value,
+        base=base.name,
+        base_reason=base.reason,
+        base_gaussians=len(prediction.gaussians),
+        passed_over=base.failures,
+        weights=pipeline.options.fill.weights_name,
+        views=path.trajectory if given_file is None else given_file.name,
+        disparity_source=disparity_source,
+        seconds=dict(reporter.seconds),
+    )
+
+
+def read_earlier_report(folder: Path) -> dict[str, Any]:
+    """The content of an earlier run's report.json; empty if the file is missing or damaged."""
     try:
-        report = json.loads((folder / REPORT).read_text(encoding="utf-8"))
+        report = json.loads((folder / REPORT_NAME).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
     return report if isinstance(report, dict) else {}

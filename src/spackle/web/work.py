@@ -24,7 +24,7 @@ from spackle.formats.html import html_safe_json, single_html
 from spackle.formats.scene_files import scene_suffix
 from spackle.pipeline import FillOptions, FillTexture, Pipeline, PipelineOptions
 from spackle.render import get_renderer
-from spackle.results.photo_folder import REPORT, PhotoOptions, predict_photo
+from spackle.results.photo_folder import REPORT_NAME, PhotoOptions, predict_photo
 from spackle.runtime.errors import InputError
 from spackle.runtime.files import write_atomic
 from spackle.runtime.progress import Progress, Reporter
@@ -152,12 +152,11 @@ class SceneWork:
         wanted = PhotoOptions(
             lens=lens, render="video.mp4" in options.files, keep_frame=options.keep_frame
         )
-        predict_photo(job.folder / job.source, job.results, pipeline, teller, wanted)
-        report = json.loads((job.results / REPORT).read_text(encoding="utf-8"))
-        return ROUGH_GEOMETRY_ADVICE if report["base"]["name"] == LiteBase.name else ""
+        report = predict_photo(job.folder / job.source, job.results, pipeline, teller, wanted)
+        return ROUGH_GEOMETRY_ADVICE if report.run.base == LiteBase.name else ""
 
     def _make(self, target: Path, scene: Scene, job: Job, options: SceneOptions) -> None:
-        if target.name == REPORT:
+        if target.name == REPORT_NAME:
             raise InputError(f"{job.name}: has no report, because it was opened as a scene")
         if target.suffix == ".mp4":
             kind = next((kind for kind in TRAJECTORIES if kind == target.stem), options.trajectory)

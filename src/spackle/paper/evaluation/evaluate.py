@@ -197,7 +197,7 @@ def open_evaluation(options: EvaluateOptions, more_metrics: Sequence[str] = ()) 
     options.check()
     base, cases = options.base, _cases_of(options)
     network, direct, features, inpainter = (
-        FillOptions(residual=options.residual).load(),
+        FillOptions(residual=options.residual).load_network(),
         None,
         None,
         None,
@@ -288,12 +288,12 @@ def _configuration(
         "methods": list(options.methods),
         "residual": {
             "weights": "seeds"
-            if fill.file is None
+            if fill.weights_file is None
             else "shipped"
             if options.residual is None
             else "given",
-            "sha256": None if fill.file is None else weights_digest(fill.file),
-            "precision": None if fill.file is None else precision,
+            "sha256": None if fill.weights_file is None else weights_digest(fill.weights_file),
+            "precision": None if fill.weights_file is None else precision,
         },
         "direct_ft": None if options.direct_ft is None else weights_digest(options.direct_ft),
     }
