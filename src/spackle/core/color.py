@@ -127,8 +127,6 @@ def _round_to_bytes(values: Any, result: Any) -> None:
     """Write 255 times the float32 values, rounded and clamped, to the uint8 `result`; both flat."""
     for i in range(len(values)):
         scaled = values[i] * np.float32(255)
-        if scaled > 0:  # false for NaN
-            scaled = min(scaled, np.float32(255))
-        else:
-            scaled = np.float32(0)
+        # No comparison with NaN is true, so NaN becomes 0.
+        scaled = min(scaled, np.float32(255)) if scaled > 0 else np.float32(0)
         result[i] = np.uint8(np.rint(scaled))

@@ -14,51 +14,74 @@ from torch.nn.functional import avg_pool2d, interpolate, pad
 
 from spackle.runtime.kernels import kernel
 
-UNREACHABLE_PX = 1 << 14  # distance, in pixels, of a pixel that does not exist
+UNREACHABLE_PX = 1 << 14  # distance of a pixel that does not exist; larger than every image
 
 
 def gaussian_blur(image: Tensor, sigma: float) -> Tensor:
-    """Blur a picture [..., H, W, C] with a Gaussian of `sigma` pixels, normalised by the weights inside the picture."""
-    weights = [math.exp(-0.5 * (offset / sigma) ** 2) for offset in range(math.ceil(3 * sigma) + 1)]
+    """Blur a picture [..., H, W, C] with a Gaussian of `sigma` pixels.
+
+    The weights are normalised by their sum inside the picture, so its border does not darken.
+    """
+    radius = math.ceil(3 * sigma)  # farther pixels have less than 1 % of the weight
+    weights = [math.exp(-0.5 * (offset / sigma) ** 2) for offset in range(radius + 1)]
+    # A Gaussian is separable: blur along the rows, then along the columns.
     for dim in (-2, -3):
-        mass = _weighted_sum(image.new_ones(image.shape[dim]), weights, 0)
-        image = _weighted_sum(image, weights, dim) / mass.view(-1, *[1] * (-1 - dim))
+        side = image.shape[dim]
+        weight_sums = _weighted_sum_of_neighbors(image.new_ones(side), weights, 0)  # [side]
+        axes_after = -1 - dim
+        weight_sums = weight_sums.view(-1, *[1] * axes_after)  # aligned with the axis `dim`
+        image = _weighted_sum_of_neighbors(image, weights, dim) / weight_sums
     return image
 
 
 def approximate_gaussian_blur(image: Tensor, sigma: float) -> Tensor:
-    """Approximate `gaussian_blur` of a picture [H, W, C] for a large `sigma`: reduce the picture, blur it, and enlarge it."""
-    step = max(int(sigma / 2), 1)
-    means = avg_pool2d(image.movedim(-1, 0)[None], step, ceil_mode=True, count_include_pad=False)[0]
-    coarse = gaussian_blur(means.movedim(0, -1), sigma / step).movedim(-1, 0)
+    """Blur a picture [H, W, C] with a Gaussian of a large `sigma` in pixels, fast but not exactly.
+
+    The picture is reduced, blurred, and enlarged again.
+    """
     height, width, _ = image.shape
-    return interpolate(coarse[None], scale_factor=step, mode="bilinear")[
-        0, :, :height, :width
-    ].movedim(0, -1)
+    factor = max(int(sigma / 2), 1)  # two reduced pixels for each `sigma` suffice
+    planes = image.movedim(-1, 0)[None]  # [1, C, H, W], as torch's functions want it
+    reduced = avg_pool2d(planes, factor, ceil_mode=True, count_include_pad=False)[0]
+    blurred = gaussian_blur(reduced.movedim(0, -1), sigma / factor).movedim(-1, 0)
+    enlarged = interpolate(blurred[None], scale_factor=factor, mode="bilinear")
+    # The last reduced row and column may cover less than `factor` pixels.
+    return enlarged[0, :, :height, :width].movedim(0, -1)
 
 
-def _weighted_sum(values: Tensor, weights: Sequence[float], dim: int) -> Tensor:
-    """Weighted sum of neighbours along a dimension, many times faster on a CPU than a convolution."""
+def _weighted_sum_of_neighbors(values: Tensor, weights: Sequence[float], dim: int) -> Tensor:
+    """Sum of each element and its neighbours along a dimension, many times faster than convolution.
+
+    Args:
+        values: any shape.
+        weights: the weight of the element itself, of both its neighbours, of their neighbours, …
+        dim: the dimension.
+    """
     size = values.shape[dim]
     total = weights[0] * values
     for offset, weight in enumerate(weights[1:size], start=1):
-        total.narrow(dim, 0, size - offset).add_(
-            values.narrow(dim, offset, size - offset), alpha=weight
-        )
-        total.narrow(dim, offset, size - offset).add_(
-            values.narrow(dim, 0, size - offset), alpha=weight
-        )
+        count = size - offset  # elements that have a neighbour at this offset
+        without_end = total.narrow(dim, 0, count)
+        without_start = total.narrow(dim, offset, count)
+        without_end.add_(values.narrow(dim, offset, count), alpha=weight)
+        without_start.add_(values.narrow(dim, 0, count), alpha=weight)
     return total
 
 
-def maximum_filter(image: Tensor, reach: int) -> Tensor:
-    """For each pixel the maximum of an image or mask [..., H, W] within `reach` rows and columns."""
-    size = 2 * reach + 1
-    image = pad(image, (reach,) * 4, value=0 if image.dtype == torch.bool else -math.inf)
+def maximum_filter(image: Tensor, radius: int) -> Tensor:
+    """For each pixel the maximum of an image or mask [..., H, W] within `radius` rows and columns.
+
+    For a mask, this is a dilation by a square of 2·radius + 1 pixels.
+    """
+    smallest = 0 if image.dtype == torch.bool else -math.inf
+    image = pad(image, (radius, radius, radius, radius), value=smallest)
+    full_width = 2 * radius + 1
     for dim in (-1, -2):
-        width = 1  # window size so far; doubling is faster on a CPU than pooling
-        while width < size:
-            step = min(width, size - width)
+        # The maximum of two neighbouring windows is that of a window of their joint width, so a few
+        # doublings suffice; on a CPU this is faster than pooling.
+        width = 1
+        while width < full_width:
+            step = min(width, full_width - width)
             count = image.shape[dim] - step
             image = torch.maximum(image.narrow(dim, 0, count), image.narrow(dim, step, count))
             width += step
@@ -68,33 +91,50 @@ def maximum_filter(image: Tensor, reach: int) -> Tensor:
 def nearest_known_pixels(hole: NDArray[np.bool_]) -> NDArray[np.int32]:
     """For each pixel the row and column [2, H, W] of the nearest pixel outside of a hole [H, W].
 
-    In rare cases the second nearest pixel is found. If the whole image is a hole, rows and columns are `-FAR`.
+    In rare cases the second nearest pixel is returned: only a few sweeps spread the nearest pixels
+    from neighbour to neighbour, which is much faster than an exact search. If the whole image is a
+    hole, all rows and columns are `-UNREACHABLE_PX`.
     """
-    near = np.where(hole, -UNREACHABLE_PX, np.indices(hole.shape)).astype(np.int32)
-    _propagate_nearest(hole, near)
-    return near
+    own_positions = np.indices(hole.shape)
+    nearest = np.where(hole, -UNREACHABLE_PX, own_positions).astype(np.int32)
+    _spread_nearest(hole, nearest)
+    return nearest
 
 
-def distance_to_nearest(near: NDArray[np.int32]) -> Tensor:
-    """The distance [H, W] in pixels from each pixel to its nearest known pixel, given by `nearest_known_pixels`."""
-    row, column = torch.from_numpy(near - np.indices(near.shape[1:], np.int32)).float()
-    return torch.hypot(row, column)
+def distance_to_nearest(nearest: NDArray[np.int32]) -> Tensor:
+    """The distance [H, W] in pixels from each pixel to its nearest known pixel.
+
+    `nearest` [2, H, W] holds the row and column of the nearest known pixel of each pixel.
+    """
+    own_positions = np.indices(nearest.shape[1:], np.int32)
+    rows_apart, columns_apart = torch.from_numpy(nearest - own_positions).float()
+    return torch.hypot(rows_apart, columns_apart)
 
 
 @kernel
-def _propagate_nearest(hole: Any, near: Any) -> None:
-    """In four sweeps, give each pixel of a hole a neighbour's known pixel if that is nearer than its own."""
+def _spread_nearest(hole: Any, nearest: Any) -> None:
+    """Give each pixel of a hole a neighbour's nearest known pixel if that is nearer than its own.
+
+    Four sweeps start alternately at the first and at the last pixel, so that positions spread in
+    all directions.
+
+    Args:
+        hole: [H, W] bool.
+        nearest: [2, H, W] int32 row and column of the nearest known pixel; improved in place.
+    """
     height, width = hole.shape
-    for turn in range(4):
+    for sweep in range(4):
         for i in range(height):
-            y = i if turn % 2 == 0 else height - 1 - i
+            y = i if sweep % 2 == 0 else height - 1 - i
             for j in range(width):
-                x = j if turn % 2 == 0 else width - 1 - j
+                x = j if sweep % 2 == 0 else width - 1 - j
                 if not hole[y, x]:
                     continue
+                # The 3×3 pixels around (y, x).
                 for v in range(max(y - 1, 0), min(y + 2, height)):
                     for u in range(max(x - 1, 0), min(x + 2, width)):
-                        row, column = near[0, v, u], near[1, v, u]
-                        apart = (near[0, y, x] - y) ** 2 + (near[1, y, x] - x) ** 2
-                        if (row - y) ** 2 + (column - x) ** 2 < apart:
-                            near[0, y, x], near[1, y, x] = row, column
+                        row, column = nearest[0, v, u], nearest[1, v, u]
+                        own_distance2 = (nearest[0, y, x] - y) ** 2 + (nearest[1, y, x] - x) ** 2
+                        if (row - y) ** 2 + (column - x) ** 2 < own_distance2:
+                            nearest[0, y, x] = row
+                            nearest[1, y, x] = column

@@ -1,4 +1,8 @@
-"""Image filters: blurs, the maximum in a window, a distance transform, and the fill of holes from their rims."""
+"""Fill holes of an inverse depth image from their rims, mostly from the far side.
+
+`fill_from_far_side` works from coarse to fine: `_fill_level` reduces the image, fills the reduced
+one by calling itself, interpolates its values into the holes, and smooths them.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +16,15 @@ from torch import Tensor
 from spackle.runtime.device import parallel_for_chunks
 from spackle.runtime.kernels import kernel
 
-FAR_SIDE_BIAS = 80.0  # preference for the far side of a rim: a sample 5 % nearer than the fill has the weight 1/50
-RELAXATION_SWEEPS = 12  # relaxation sweeps at each resolution
+# Preference for the far side of a rim: a sample 5 % nearer than the fill has the weight 1/50.
+FAR_SIDE_BIAS = 80.0
+RELAXATION_SWEEPS = 12  # at each resolution; the coarser ones have settled the large distances
 
-MIN_TRUST = 1e-6  # least weight of a rim sample; a hole with only a near rim needs a weight above 0
+MIN_RIM_WEIGHT = 1e-6  # above 0, so that a hole with only a near rim is filled from it
 MAX_EXPONENT = 30.0  # keeps weights within single precision
-LIGHTEST, HEAVIEST = (np.float32(np.exp(sign * MAX_EXPONENT)) for sign in (-1, 1))
-AROUND = 4  # neighbours of a pixel
+SMALLEST_WEIGHT = np.float32(np.exp(-MAX_EXPONENT))
+LARGEST_WEIGHT = np.float32(np.exp(MAX_EXPONENT))
+NEIGHBOR_COUNT = 4  # above, below, left and right of a pixel
 
 Floats = NDArray[np.float32]
 Bools = NDArray[np.bool_]
@@ -31,11 +37,13 @@ def fill_from_far_side(
     *,
     far_bias: Tensor | float = FAR_SIDE_BIAS,
 ) -> tuple[Tensor, Tensor]:
-    """Fill the unknown part of an inverse depth image and of further values, mostly from the far side of each hole.
+    """Fill the unknown part of an inverse depth image and of further values, such as colours.
 
-    A moving camera uncovers the surface behind, so a hole between a near and a far surface belongs to the far surface.
-    From coarse to fine, each level interpolates a guess, and relaxes it to a membrane that the rim holds. A rim sample
-    has the weight min(1, fill / sample)^far_bias, with the inverse depths `fill` in the hole and `sample` at the rim.
+    A moving camera uncovers the surface behind, so a hole between a near and a far surface belongs
+    to the far surface. From coarse to fine, each level interpolates a guess, and relaxes it to a
+    membrane that the rim (the known pixels around the hole) holds. A rim sample has the weight
+    min(1, fill / sample)^far_bias, with the inverse depths `fill` in the hole and `sample` at the
+    rim.
 
     Args:
         inverse_depth: [H, W], positive at known pixels.
@@ -44,59 +52,112 @@ def fill_from_far_side(
         far_bias: one number, or one for each pixel [H, W]; 0 treats both sides of the rim alike.
 
     Returns:
-        Inverse depth [H, W] and values [C, H, W], float32, on the input's device; known pixels are unchanged.
+        Inverse depth [H, W] and values [C, H, W], float32, on the input's device; known pixels are
+        unchanged.
 
     Raises:
         ValueError: nothing is known.
     """
     if not bool(known.any()):
         raise ValueError("no pixel is known")
-    # Channels last, because a hole's pixels are scattered in memory.
-    depths = inverse_depth.detach().cpu().float().clone(memory_format=torch.contiguous_format)
-    others = (
-        values.detach().cpu().float().permute(1, 2, 0).clone(memory_format=torch.contiguous_format)
+    # The work is done in place, so these must be copies. Channels come last, because a hole's
+    # pixels are scattered in memory.
+    filled_depth = _contiguous_copy(inverse_depth.detach().cpu().float())  # [H, W]
+    filled_values = _contiguous_copy(values.detach().cpu().float().permute(1, 2, 0))  # [H, W, C]
+    bias = torch.as_tensor(far_bias, dtype=torch.float32).cpu().expand(inverse_depth.shape)
+    _fill_level(
+        filled_depth.numpy(),
+        filled_values.numpy(),
+        known.cpu().contiguous().numpy(),
+        bias.contiguous().numpy(),
     )
-    bias = (
-        torch.as_tensor(far_bias, dtype=torch.float32)
-        .cpu()
-        .expand(inverse_depth.shape)
-        .contiguous()
-    )
-    _fill_level(depths.numpy(), others.numpy(), known.cpu().contiguous().numpy(), bias.numpy())
-    return depths.to(inverse_depth.device), others.permute(2, 0, 1).to(inverse_depth.device)
+    device = inverse_depth.device
+    return filled_depth.to(device), filled_values.permute(2, 0, 1).to(device)
+
+
+def _contiguous_copy(tensor: Tensor) -> Tensor:
+    """A copy whose elements lie in memory in the order of the axes."""
+    return tensor.clone(memory_format=torch.contiguous_format)
 
 
 def _fill_level(depths: Floats, values: Floats, known: Bools, bias: Floats) -> None:
-    """Fill inverse depths [H, W] and values [H, W, C] in place from the next coarser level, then relax them."""
-    count, channels = known.size - np.count_nonzero(known), values.shape[-1]
-    if count == 0:
+    """Fill the unknown pixels of one resolution in place, after filling the next coarser one.
+
+    Args:
+        depths: [H, W] inverse depths, filled in place.
+        values: [H, W, C] further values, filled in place.
+        known: [H, W]; at least one pixel must be known.
+        bias: [H, W] preference for the far side.
+    """
+    hole_count = known.size - np.count_nonzero(known)
+    if hole_count == 0:
         return
-    reference = np.float32(
-        torch.from_numpy(depths[known]).median() if bias.any() else 1
-    )  # the lower of two medians
-    size = [-(-side // 2) for side in known.shape]
-    coarse = (np.empty(size, np.float32), np.empty((*size, channels), np.float32))
-    masks = (np.empty(size, np.bool_), np.empty(size, np.float32))
-    fine = (depths, values, known, bias, reference)
-    parallel_for_chunks(lambda start, stop: _coarsen(start, stop, *fine, *coarse, *masks), size[0])
-    _fill_level(*coarse, *masks)
-    holes, links, rim = _find_holes(known, count)
-    flat, pixels = depths.reshape(-1), values.reshape(known.size, channels)
-    samples = np.empty(
-        (count + len(rim), 1 + channels), np.float32
-    )  # first of the holes, then of the rim
-    _guess(known.shape[1], *coarse, holes, samples)
-    samples[count:, 0], samples[count:, 1:] = flat[rim], pixels[rim]
-    samples = _relax(samples, samples.copy(), links, bias.ravel()[holes], RELAXATION_SWEEPS)
-    flat[holes], pixels[holes] = samples[:count, 0], samples[:count, 1:]
+    channels = values.shape[-1]
+
+    # Fill an image of half the size.
+    coarse_shape = ((known.shape[0] + 1) // 2, (known.shape[1] + 1) // 2)
+    coarse_depths = np.empty(coarse_shape, np.float32)
+    coarse_values = np.empty((*coarse_shape, channels), np.float32)
+    coarse_known = np.empty(coarse_shape, np.bool_)
+    coarse_bias = np.empty(coarse_shape, np.float32)
+    reference = _reference_depth(depths, known, bias)
+
+    def reduce_rows(start: int, stop: int) -> None:
+        """Compute the rows start..stop of the coarser images."""
+        _reduce_by_half(
+            start, stop, depths, values, known, bias, reference,
+            coarse_depths, coarse_values, coarse_known, coarse_bias,
+        )  # fmt: skip
+
+    parallel_for_chunks(reduce_rows, coarse_shape[0])
+    _fill_level(coarse_depths, coarse_values, coarse_known, coarse_bias)
+
+    # Collect the samples of the holes and then of their rims: column 0 is the inverse depth, the
+    # others are the values. The holes begin with a guess from the coarser level.
+    hole_pixels, neighbors, rim_pixels = _find_holes(known, hole_count)
+    flat_depths = depths.reshape(-1)
+    flat_values = values.reshape(known.size, channels)
+    samples = np.empty((hole_count + len(rim_pixels), 1 + channels), np.float32)
+    _interpolate_guess(known.shape[1], coarse_depths, coarse_values, hole_pixels, samples)
+    samples[hole_count:, 0] = flat_depths[rim_pixels]
+    samples[hole_count:, 1:] = flat_values[rim_pixels]
+
+    hole_bias = bias.ravel()[hole_pixels]
+    samples = _relax(samples, samples.copy(), neighbors, hole_bias, RELAXATION_SWEEPS)
+    flat_depths[hole_pixels] = samples[:hole_count, 0]
+    flat_values[hole_pixels] = samples[:hole_count, 1:]
+
+
+def _reference_depth(depths: Floats, known: Bools, bias: Floats) -> np.float32:
+    """The median inverse depth of the known pixels [H, W], which keeps weights in a usual range.
+
+    Without any preference for the far side it does not matter, and is 1.
+    """
+    if not bias.any():
+        return np.float32(1)
+    return np.float32(torch.from_numpy(depths[known]).median())  # the lower of two medians
 
 
 @kernel
-def _coarsen(
+def _reduce_by_half(
     start: int, stop: int, depths: Any, values: Any, known: Any, bias: Any, reference: Any,
     coarse_depths: Any, coarse_values: Any, coarse_known: Any, coarse_bias: Any,
 ) -> None:  # fmt: skip
-    """Reduce 2×2 pixels to one, in rows start..stop of the coarser level; far pixels have the largest weights."""
+    """Reduce blocks of 2×2 pixels to weighted means; far pixels have the largest weights.
+
+    Args:
+        start: first row of the coarser images that is written.
+        stop: the row after the last one that is written.
+        depths: [H, W] inverse depths.
+        values: [H, W, C] further values.
+        known: [H, W]; only known pixels count.
+        bias: [H, W] preference for far pixels.
+        reference: usual inverse depth.
+        coarse_depths: [⌈H/2⌉, ⌈W/2⌉] written; unset where no pixel of the block is known.
+        coarse_values: [⌈H/2⌉, ⌈W/2⌉, C] written; unset where no pixel of the block is known.
+        coarse_known: [⌈H/2⌉, ⌈W/2⌉] written: whether any pixel of the block is known.
+        coarse_bias: [⌈H/2⌉, ⌈W/2⌉] written.
+    """
     height, width = depths.shape
     channels = values.shape[2]
     weights = np.empty(4, np.float32)
@@ -104,51 +165,70 @@ def _coarsen(
         for column in range(coarse_depths.shape[1]):
             top, left = 2 * row, 2 * column
             bottom, right = min(top + 1, height - 1), min(left + 1, width - 1)
-            corners = (bias[top, left], bias[top, right], bias[bottom, left], bias[bottom, right])
             coarse_bias[row, column] = (
-                corners[0] / 4 + corners[1] / 4 + corners[2] / 4 + corners[3] / 4
+                bias[top, left] / 4
+                + bias[top, right] / 4
+                + bias[bottom, left] / 4
+                + bias[bottom, right] / 4
             )
-            mass, depth = np.float32(0), np.float32(0)
+
+            weight_sum, depth_sum = np.float32(0), np.float32(0)
             for k in range(4):
                 y, x = top + k // 2, left + k % 2
                 weights[k] = 0
                 if y < height and x < width and known[y, x]:
                     weights[k] = _far_weight(depths[y, x] / reference, bias[y, x])
-                    mass += weights[k]
-                    depth += weights[k] * depths[y, x]
-            coarse_known[row, column] = mass > 0
-            if not mass > 0:
+                    weight_sum += weights[k]
+                    depth_sum += weights[k] * depths[y, x]
+            coarse_known[row, column] = weight_sum > 0
+            if not weight_sum > 0:
                 continue
-            coarse_depths[row, column] = depth / mass
+
+            coarse_depths[row, column] = depth_sum / weight_sum
             for channel in range(channels):
-                total = np.float32(0)
+                value_sum = np.float32(0)
                 for k in range(4):
                     if weights[k] > 0:
-                        total += weights[k] * values[top + k // 2, left + k % 2, channel]
-                coarse_values[row, column, channel] = total / mass
+                        value_sum += weights[k] * values[top + k // 2, left + k % 2, channel]
+                coarse_values[row, column, channel] = value_sum / weight_sum
 
 
 @kernel
-def _far_weight(relative: Any, bias: Any) -> Any:
-    """relative^−bias, within single precision."""
+def _far_weight(relative_depth: Any, bias: Any) -> Any:
+    """The weight relative_depth^−bias, float32, of a pixel for the mean of its block.
+
+    `relative_depth` is the inverse depth over the usual one: far pixels, below 1, weigh more.
+    """
     if bias == 0:
         return np.float32(1)
-    exponent = -bias * np.log(max(relative, np.float32(1e-6)))
+    exponent = -bias * np.log(max(relative_depth, np.float32(1e-6)))
     if abs(exponent) < MAX_EXPONENT:
         return np.float32(np.exp(np.float64(exponent)))
-    return HEAVIEST if exponent > 0 else LIGHTEST
+    return LARGEST_WEIGHT if exponent > 0 else SMALLEST_WEIGHT
 
 
 @kernel
-def _find_holes(known: Any, count: int) -> Any:
-    """Flat positions of the n hole pixels, numbers [n, 4] of their neighbours, and flat positions of the rim's pixels.
+def _find_holes(known: Any, hole_count: int) -> Any:
+    """Number the unknown pixels and the known pixels around them, and link each hole pixel.
 
-    Pixels of the rim have higher numbers than those of the hole. At the image's border, a pixel is its own neighbour.
+    Args:
+        known: [H, W].
+        hole_count: number n of unknown pixels.
+
+    Returns:
+        hole_pixels [n]: positions y·W + x of the unknown pixels; the k-th has the number k.
+        neighbors [n, 4]: numbers of the pixels above, below, left and right of each; at the image's
+            border, a pixel is its own neighbour.
+        rim_pixels [m]: positions of the known pixels around the holes; the k-th has the number
+            n + k.
     """
     height, width = known.shape
-    holes, links = np.empty(count, np.int32), np.empty((count, AROUND), np.int32)
-    rim = np.empty(min(AROUND * count, height * width - count), np.int32)
-    numbers = np.empty((height, width), np.int32)
+    hole_pixels = np.empty(hole_count, np.int32)
+    neighbors = np.empty((hole_count, NEIGHBOR_COUNT), np.int32)
+    max_rim_count = min(NEIGHBOR_COUNT * hole_count, height * width - hole_count)
+    rim_pixels = np.empty(max_rim_count, np.int32)
+    numbers = np.empty((height, width), np.int32)  # of all pixels; -1 as long as there is none
+
     n = 0
     for y in range(height):
         for x in range(width):
@@ -156,87 +236,125 @@ def _find_holes(known: Any, count: int) -> Any:
                 numbers[y, x] = -1
             else:
                 numbers[y, x] = n
-                holes[n] = y * width + x
+                hole_pixels[n] = y * width + x
                 n += 1
-    met = 0
-    for n in range(count):
-        y, x = holes[n] // width, holes[n] % width
-        for k in range(AROUND):
-            v = min(max(y + (k == 1) - (k == 0), 0), height - 1)
-            u = min(max(x + (k == 3) - (k == 2), 0), width - 1)
-            if numbers[v, u] < 0:
-                numbers[v, u] = count + met
-                rim[met] = v * width + u
-                met += 1
-            links[n, k] = numbers[v, u]
-    return holes, links, rim[:met]
+
+    rim_count = 0
+    for n in range(hole_count):
+        y, x = hole_pixels[n] // width, hole_pixels[n] % width
+        for k in range(NEIGHBOR_COUNT):
+            neighbor_y, neighbor_x = y, x
+            if k == 0:
+                neighbor_y = max(y - 1, 0)
+            elif k == 1:
+                neighbor_y = min(y + 1, height - 1)
+            elif k == 2:
+                neighbor_x = max(x - 1, 0)
+            else:
+                neighbor_x = min(x + 1, width - 1)
+            if numbers[neighbor_y, neighbor_x] < 0:  # a known pixel that is met first here
+                numbers[neighbor_y, neighbor_x] = hole_count + rim_count
+                rim_pixels[rim_count] = neighbor_y * width + neighbor_x
+                rim_count += 1
+            neighbors[n, k] = numbers[neighbor_y, neighbor_x]
+    return hole_pixels, neighbors, rim_pixels[:rim_count]
 
 
 @kernel
-def _guess(width: int, coarse_depths: Any, coarse_values: Any, holes: Any, samples: Any) -> None:
-    """Interpolate the holes' samples [n, 1 + C] bilinearly from the coarser level."""
+def _interpolate_guess(
+    width: int, coarse_depths: Any, coarse_values: Any, hole_pixels: Any, samples: Any
+) -> None:
+    """Interpolate the values of hole pixels bilinearly from the image of half the size.
+
+    Args:
+        width: W of the finer image.
+        coarse_depths: [⌈H/2⌉, ⌈W/2⌉] inverse depths.
+        coarse_values: [⌈H/2⌉, ⌈W/2⌉, C] further values.
+        hole_pixels: [n] positions y·W + x.
+        samples: the first n rows are written: inverse depth, then C values.
+    """
     rows, columns, channels = coarse_values.shape
-    for n in range(len(holes)):
-        y, x = holes[n] // width, holes[n] % width
-        # A fine pixel's centre lies a quarter of a coarse pixel from its parent's centre.
-        y0, x0 = (y - 1) // 2, (x - 1) // 2
-        fy = np.float32(0.75) if y % 2 == 0 else np.float32(0.25)
-        fx = np.float32(0.75) if x % 2 == 0 else np.float32(0.25)
-        top, bottom = max(y0, 0), min(y0 + 1, rows - 1)
-        left, right = max(x0, 0), min(x0 + 1, columns - 1)
-        upper = coarse_depths[top, left] * (1 - fx) + coarse_depths[top, right] * fx
-        lower = coarse_depths[bottom, left] * (1 - fx) + coarse_depths[bottom, right] * fx
-        samples[n, 0] = upper * (1 - fy) + lower * fy
+    for n in range(len(hole_pixels)):
+        y, x = hole_pixels[n] // width, hole_pixels[n] % width
+        # A fine pixel's centre lies a quarter of a coarse pixel from the centre of the coarse pixel
+        # that covers it: before it if the fine pixel's number is even, else behind it.
+        upper_row, left_column = (y - 1) // 2, (x - 1) // 2
+        down = np.float32(0.75) if y % 2 == 0 else np.float32(0.25)
+        across = np.float32(0.75) if x % 2 == 0 else np.float32(0.25)
+        top, bottom = max(upper_row, 0), min(upper_row + 1, rows - 1)
+        left, right = max(left_column, 0), min(left_column + 1, columns - 1)
+
+        upper = coarse_depths[top, left] * (1 - across) + coarse_depths[top, right] * across
+        lower = coarse_depths[bottom, left] * (1 - across) + coarse_depths[bottom, right] * across
+        samples[n, 0] = upper * (1 - down) + lower * down
         for channel in range(channels):
             upper = (
-                coarse_values[top, left, channel] * (1 - fx)
-                + coarse_values[top, right, channel] * fx
+                coarse_values[top, left, channel] * (1 - across)
+                + coarse_values[top, right, channel] * across
             )
             lower = (
-                coarse_values[bottom, left, channel] * (1 - fx)
-                + coarse_values[bottom, right, channel] * fx
+                coarse_values[bottom, left, channel] * (1 - across)
+                + coarse_values[bottom, right, channel] * across
             )
-            samples[n, 1 + channel] = upper * (1 - fy) + lower * fy
+            samples[n, 1 + channel] = upper * (1 - down) + lower * down
 
 
 @kernel
-def _relax(samples: Any, copy: Any, links: Any, bias: Any, sweeps: int) -> Any:
-    """Jacobi sweeps over the samples of holes, which come before the samples of the rim."""
-    count, channels = len(links), samples.shape[1]
-    old, new = samples, copy
+def _relax(samples: Any, buffer: Any, neighbors: Any, bias: Any, sweeps: int) -> Any:
+    """Replace each hole sample by the weighted mean of its four neighbours, several times (Jacobi).
+
+    Args:
+        samples: [n + m, 1 + C] samples of n hole pixels, then of m rim pixels, which stay: inverse
+            depth, then C values. Overwritten.
+        buffer: a copy of `samples`. Overwritten.
+        neighbors: [n, 4] numbers of the rows of the neighbours.
+        bias: [n] preference for the far side; 0 makes a plain mean.
+        sweeps: number of repetitions.
+
+    Returns:
+        `samples` or `buffer`, whichever was written last.
+    """
+    hole_count, channels = len(neighbors), samples.shape[1]
+    old, new = samples, buffer
     for _ in range(sweeps):
-        for n in range(count):
-            up, down, left, right = links[n]
-            if bias[n] == 0 or max(up, down, left, right) < count:
+        for n in range(hole_count):
+            up, down, left, right = neighbors[n]
+            # Inside of a hole, all neighbours have the same weight.
+            if bias[n] == 0 or max(up, down, left, right) < hole_count:
                 for channel in range(channels):
-                    both = (
+                    neighbor_sum = (
                         old[up, channel]
                         + old[down, channel]
                         + old[left, channel]
                         + old[right, channel]
                     )
-                    new[n, channel] = both / AROUND
+                    new[n, channel] = neighbor_sum / NEIGHBOR_COUNT
                 continue
-            here, mass = old[n, 0], np.float32(0)
+
+            weight_sum = np.float32(0)
             new[n] = 0
-            for k in range(AROUND):
-                link = links[n, k]
-                conductance = (
-                    np.float32(1) if link < count else _conductance(here, old[link, 0], bias[n])
+            for k in range(NEIGHBOR_COUNT):
+                neighbor = neighbors[n, k]
+                is_rim = neighbor >= hole_count
+                weight = (
+                    _rim_weight(old[n, 0], old[neighbor, 0], bias[n]) if is_rim else np.float32(1)
                 )
-                mass += conductance
+                weight_sum += weight
                 for channel in range(channels):
-                    new[n, channel] += conductance * old[link, channel]
+                    new[n, channel] += weight * old[neighbor, channel]
             for channel in range(channels):
-                new[n, channel] /= mass
+                new[n, channel] /= weight_sum
         old, new = new, old
     return old
 
 
 @kernel
-def _conductance(here: Any, there: Any, bias: Any) -> Any:
-    """The weight min(1, here / there)^bias of a rim sample `there` for the fill `here`."""
-    if there <= here:
+def _rim_weight(fill_depth: Any, rim_depth: Any, bias: Any) -> Any:
+    """The weight min(1, fill_depth / rim_depth)^bias, float32, of a rim sample for a hole's fill.
+
+    Both are inverse depths, so a rim that is nearer than the fill weighs less than 1.
+    """
+    if rim_depth <= fill_depth:
         return np.float32(1)
-    ratio = max(here / max(there, np.float32(1e-12)), np.float32(1e-6))
-    return np.float32(max(np.exp(bias * np.log(np.float64(ratio))), MIN_TRUST))
+    ratio = max(fill_depth / max(rim_depth, np.float32(1e-12)), np.float32(1e-6))
+    return np.float32(max(np.exp(bias * np.log(np.float64(ratio))), MIN_RIM_WEIGHT))
