@@ -26,7 +26,7 @@ from torch import Tensor
 
 from spackle.bases.depth import lift_rgbd
 from spackle.clips.complete import ClipCompleter, CompletedView
-from spackle.clips.temporal import inside, pixel_grid, sample
+from spackle.clips.flow import inside, pixel_grid, sample
 from spackle.core.camera import Camera
 from spackle.core.color import srgb_to_linear
 from spackle.core.gaussians import Gaussians
@@ -135,7 +135,13 @@ def play(
     renderer, dice = get_renderer(), torch.Generator().manual_seed(0)
     path, flow, network = PATH * frames, OpenCV("this").flow, shipped_network()
     completer = ClipCompleter(
-        "rotate", DISPARITY, path, renderer, flow, align=steady, network=network
+        trajectory="rotate",
+        disparity=DISPARITY,
+        frame_count=path,
+        renderer=renderer,
+        flow=flow,
+        align=steady,
+        network=network,
     )
     for index in range(frames):
         part, ((x, y, z), board_m) = index / max(1, frames - 1), CLIPS[clip]
@@ -180,7 +186,7 @@ def judge(world: World, clip: str, frames: int, noisy: bool) -> Sums:
         now = {"carried": runs[0], "alone": runs[-1]}
         sums["holes"].append(runs[0][0].hole)
         for name, (drawn, (_, truth)) in now.items():
-            view = drawn.alone if name == "alone" else drawn.view
+            view = drawn.independent_rendering if name == "alone" else drawn.rendering
             sums[f"{name} off"].append(
                 (view.rgb - truth.rgb)[drawn.hole & (truth.alpha > 0.99)].square()
             )
@@ -212,7 +218,9 @@ def compare(
     (drawn, truth), (earlier, before) = now, was
     flow, same = true_flow(truth, before)
     held = sample(earlier.hole[..., None].float(), pixel_grid(flow) + flow)[..., 0]
-    view, view_before = (d.alone if name == "alone" else d.view for d in (drawn, earlier))
+    view, view_before = (
+        d.independent_rendering if name == "alone" else d.rendering for d in (drawn, earlier)
+    )
     for kind, chosen in (
         ("hole", drawn.hole & (held > 0.999)),
         ("seen", ~drawn.hole & (held < 0.001)),

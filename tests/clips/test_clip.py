@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -12,15 +13,9 @@ from torch import Tensor
 
 from spackle.bases import BasePrediction
 from spackle.bases.depth import lift_rgbd
+from spackle.clips.alignment import DepthAlignment, align_depth
 from spackle.clips.complete import ClipCompleter, CompletedView
-from spackle.clips.temporal import (
-    DepthAlignment,
-    Track,
-    align_depth,
-    extend_flow,
-    pixel_grid,
-    sample,
-)
+from spackle.clips.flow import Track, extend_flow, pixel_grid, sample
 from spackle.core.camera import Camera
 from spackle.depth.depth_map import DepthMap
 from spackle.inpaint.plain import OpenCV
@@ -58,7 +53,9 @@ def test_scale_and_shift_of_depth_are_recovered() -> None:
         align_depth(now, then, found).of(now)[12:], then[12:], rtol=0.02, atol=0.0
     )
     assert (
-        align_depth(now, then, dataclasses.replace(found, sure=torch.zeros_like(found.sure)))
+        align_depth(
+            now, then, dataclasses.replace(found, reliable=torch.zeros_like(found.reliable))
+        )
         == DepthAlignment()
     )
 
@@ -98,8 +95,19 @@ def frame_of(right: float) -> tuple[Camera, Tensor, BasePrediction]:
     return camera, rgb, lifted(rgb, torch.where(box, BOX, WALL))
 
 
+def completer_of(disparity: float | None, frame_count: int, **options: Any) -> ClipCompleter:
+    return ClipCompleter(
+        trajectory="rotate",
+        disparity=disparity,
+        frame_count=frame_count,
+        renderer=CPU,
+        flow=OpenCV("this").flow,
+        **options,
+    )
+
+
 def test_propagated_colours_flicker_less_with_no_larger_error() -> None:
-    completer = ClipCompleter("rotate", 0.3, 80, CPU, OpenCV("this").flow, align=False)
+    completer = completer_of(0.3, 80, align=False)
     past: tuple[CompletedView, Camera] | None = None
     flickers, errors = (
         torch.zeros(2),
@@ -111,16 +119,22 @@ def test_propagated_colours_flicker_less_with_no_larger_error() -> None:
         pose = drawn.camera.world_to_camera @ taken_by.world_to_camera
         camera = dataclasses.replace(drawn.camera, world_to_camera=pose)
         points, hole = cast(camera, WALL), drawn.hole
-        assert not drawn.cut
+        assert not drawn.starts_shot
         if past is not None:
             before, uv = past[0], past[1].project(points)[0]
             both = hole & (sample(before.hole[..., None].float(), uv)[..., 0] > 0.999)
             for k, (one, other) in enumerate(
-                ((drawn.alone, before.alone), (drawn.view, before.view))
+                (
+                    (drawn.independent_rendering, before.independent_rendering),
+                    (drawn.rendering, before.rendering),
+                )
             ):
                 flickers[k] += (one.rgb - sample(other.rgb, uv)).abs().mean(-1)[both].mean()
         errors += torch.stack(
-            [(v.rgb - paint(points))[hole].square().mean() for v in (drawn.alone, drawn.view)]
+            [
+                (v.rgb - paint(points))[hole].square().mean()
+                for v in (drawn.independent_rendering, drawn.rendering)
+            ]
         )
         past = (drawn, camera)
     assert float(flickers[1]) < 0.6 * float(flickers[0])
@@ -129,21 +143,19 @@ def test_propagated_colours_flicker_less_with_no_larger_error() -> None:
 
 @pytest.mark.parametrize("fill", [True, False])
 def test_a_cut_resets_the_state_and_holes_can_be_kept(fill: bool) -> None:
-    completer = ClipCompleter("rotate", None, 20, CPU, OpenCV("this").flow, fill=fill)
+    completer = completer_of(None, 20, fill=fill)
     _, rgb, prediction = frame_of(0.0)
     noise = torch.rand(72, 96, 3, generator=torch.Generator().manual_seed(0))
     drawn = [
         completer.add(rgb, prediction),
         completer.add(noise, lifted(noise, torch.full((72, 96), 3.0))),
     ]
-    assert [one.cut for one in drawn] == [False, True]
-    assert torch.equal(drawn[1].view.rgb, drawn[1].alone.rgb)
-    assert drawn[0].gaussians[0] is prediction.gaussians
-    given = ClipCompleter(
-        "rotate", prediction.max_disparity, 20, CPU, OpenCV("this").flow, fill=False
-    )
+    assert [one.starts_shot for one in drawn] == [False, True]
+    assert torch.equal(drawn[1].rendering.rgb, drawn[1].independent_rendering.rgb)
+    assert drawn[0].base is prediction.gaussians
+    given = completer_of(prediction.max_disparity, 20, fill=False)
     assert torch.equal(
         given.add(rgb, prediction).camera.world_to_camera, drawn[0].camera.world_to_camera
     )
-    assert bool(len(drawn[0].gaussians[1])) == fill
-    assert fill or bool(hole_mask(drawn[0].view.alpha).any())
+    assert bool(len(drawn[0].aux)) == fill
+    assert fill or bool(hole_mask(drawn[0].rendering.alpha).any())

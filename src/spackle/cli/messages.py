@@ -41,7 +41,8 @@ def _known_flags() -> set[str]:
     while commands:
         command = commands.pop()
         for parameter in command.params:
-            flags.update(option for option in parameter.opts if option.startswith("--"))
+            names = [*parameter.opts, *parameter.secondary_opts]  # --render and --no-render
+            flags.update(name for name in names if name.startswith("--"))
         if isinstance(command, TyperGroup):
             commands.extend(command.commands.values())
     return flags

@@ -16,8 +16,7 @@ from typing import NamedTuple
 import spackle
 from spackle.bases.open import BaseError
 from spackle.clips.files import is_clip
-from spackle.clips.predict import RESULT_FILES as CLIP_FILES
-from spackle.clips.predict import clip_options, predict_clip
+from spackle.clips.predict import VIDEO_FILE, clip_options, predict_clip
 from spackle.core.photo import PHOTO_SUFFIXES
 from spackle.depth.calibration import calibration_candidates
 from spackle.depth.readers import find_depth_file
@@ -113,7 +112,7 @@ def predict_all(
         folder = output / named[0].name
         with results_folder(output):
             predict_clip(clips[0], folder, pipeline, options.photo.lens, reporter)
-        reporter.log(f"Look at {folder / CLIP_FILES[0]}")
+        reporter.log(f"Look at {folder / VIDEO_FILE}")
         return 0
     if single:
         check_file(named[0].path, "photo")

@@ -1,4 +1,4 @@
-"""Complete a view for each frame of a clip, consistent with the depth and colours of the previous frame."""
+"""Complete a view for each frame of a clip, consistent with the previous frame."""
 
 from __future__ import annotations
 
@@ -8,14 +8,9 @@ import torch
 from torch import Tensor
 
 from spackle.bases import BasePrediction
-from spackle.clips.temporal import (
-    DepthAlignment,
-    Flow,
-    FrameMemory,
-    align_depth,
-    propagate_colors,
-    track,
-)
+from spackle.clips.alignment import DepthAlignment, align_depth
+from spackle.clips.flow import Flow, track
+from spackle.clips.propagation import FrameMemory, propagate_colors
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
 from spackle.core.trajectories import DepthRange, TrajectoryKind, trajectory_cameras
@@ -25,117 +20,178 @@ from spackle.residual import ResidualNet, hole_mask
 from spackle.runtime.device import Precision
 from spackle.scene_fill import FillContext, OcclusionGuard, fill_view
 
-FOLLOW = (
-    0.05  # in each frame, the path's depth range moves by this part towards the frame's depth range
-)
+# In each frame, the path's depth range moves by this part towards the frame's own depth range.
+DEPTH_RANGE_FOLLOWING = 0.05
 
 
 @dataclasses.dataclass(frozen=True)
 class CompletedView:
-    """The completed view of a frame."""
+    """The completed view of a frame: the frame's surfaces ("base") and what fills its holes."""
 
     camera: Camera
-    gaussians: tuple[Gaussians, Gaussians]  # base and aux
-    view: Rendering  # of base and aux Gaussians
-    before: Rendering  # of base Gaussians
-    alone: Rendering  # completed without earlier frames
-    cut: bool = False  # whether the previous frame belongs to another shot
+    base: Gaussians  # what the frame shows, with aligned depth
+    aux: Gaussians  # what fills the view's holes
+    rendering: Rendering  # of base and aux Gaussians
+    base_rendering: Rendering  # of base Gaussians alone
+    independent_rendering: Rendering  # as completed without earlier frames
+    starts_shot: bool = False  # whether the previous frame belongs to another shot
 
     @property
     def hole(self) -> Tensor:
         """[H, W] bool: pixels that the base does not cover."""
-        return hole_mask(self.before.alpha)
+        return hole_mask(self.base_rendering.alpha)
 
 
 @dataclasses.dataclass(frozen=True)
-class _Past:
-    """The state of a frame that the next frame needs."""
+class _FrameState:
+    """What the next frame needs to know of a frame."""
 
-    rgb: Tensor  # [H, W, 3] the input
-    inverse_depth: Tensor  # [H, W] as predicted by the base, 0 if unknown
-    alignment: DepthAlignment
-    depths: DepthRange  # of the path
-    memory: FrameMemory | None = None
+    rgb: Tensor  # [H, W, 3] the input, sRGB
+    inverse_depth: Tensor  # [H, W] as predicted by the base network, 0 if unknown
+    alignment: DepthAlignment  # of the predicted depth
+    depth_range: DepthRange  # of the camera's path
+    memory: FrameMemory | None = None  # of the completed view; None if holes are not filled
 
 
-@dataclasses.dataclass
+@dataclasses.dataclass(frozen=True)
+class _AlignedFrame:
+    """A frame whose depth agrees with that of the previous frame."""
+
+    base: Gaussians
+    guard: OcclusionGuard  # keeps fillings from hiding what the frame shows
+    state: _FrameState  # for the next frame, still without memory
+    previous: _FrameState | None  # of the previous frame; None after a cut
+
+
+@dataclasses.dataclass(kw_only=True)
 class ClipCompleter:
-    """Completes the views of frames in order; only one earlier frame is in memory."""
+    """Completes the views of a clip's frames in order; only one earlier frame is in memory."""
 
     trajectory: TrajectoryKind
-    disparity: float | None  # None: the disparity of each prediction
-    frames: int  # number of frames in the clip
+    disparity: float | None  # size of the camera's movement; None: that of each prediction
+    frame_count: int  # of the clip: the trajectory has as many cameras
     renderer: Renderer
-    flow: Flow
-    align: bool = True  # align the base's depth with the depth of the previous frame
+    flow: Flow  # finds the optical flow between two images
+    align: bool = True  # align a frame's depth with the depth of the previous frame
     fill: bool = True  # fill holes
-    network: ResidualNet | None = None
-    precision: Precision = "auto"
+    network: ResidualNet | None = None  # corrects the Gaussians that fill holes
+    precision: Precision = "auto"  # of the network
     overscan: float = 0.0  # fraction by which the view's focal length exceeds the photo's
-    _past: _Past | None = None
-    _count: int = 0
+    _previous: _FrameState | None = None
+    _completed_frames: int = 0
 
     @torch.no_grad()
     def add(self, rgb: Tensor, prediction: BasePrediction) -> CompletedView:
-        """Complete the next frame, `rgb` [H, W, 3] sRGB, from the base's prediction for this frame.
+        """Complete the view of the next frame.
 
-        ValueError if depths and focal length allow no path.
+        Args:
+            rgb: [H, W, 3] sRGB of the frame.
+            prediction: the frame's Gaussians, from the base network or measured depth.
+
+        Raises:
+            ValueError: depths and focal length allow no path.
         """
-        base, guard, now, past = self._aligned(rgb, prediction)
-        even = prediction.camera.even()
+        frame = self._align(rgb, prediction)
+        camera = self._camera(prediction, frame.state.depth_range)
+        base_rendering = self.renderer.render(frame.base, camera)
+        starts_shot = frame.previous is not self._previous
+
+        if self.fill:
+            view, memory = self._fill(frame, prediction.camera, camera, base_rendering)
+        else:
+            memory = None
+            view = CompletedView(
+                camera,
+                frame.base,
+                Gaussians.empty(),
+                base_rendering,
+                base_rendering,
+                base_rendering,
+            )
+        self._previous = dataclasses.replace(frame.state, memory=memory)
+        self._completed_frames += 1
+        return dataclasses.replace(view, starts_shot=starts_shot)
+
+    def _camera(self, prediction: BasePrediction, depth_range: DepthRange) -> Camera:
+        """The trajectory's camera for the next frame; ValueError if there is no path."""
         disparity = prediction.max_disparity if self.disparity is None else self.disparity
         (camera,) = trajectory_cameras(
-            self.trajectory, even, disparity, now.depths, self.frames, only=self._count
+            self.trajectory,
+            prediction.camera.even(),
+            disparity,
+            depth_range,
+            self.frame_count,
+            only=self._completed_frames,
         )
-        camera = camera.zoomed(1 + self.overscan)
-        before, aux = self.renderer.render(base, camera), Gaussians.empty()
-        alone = before
-        if self.fill:
-            parts = (base, prediction.camera, self.renderer, self.network)
-            # Without texture, which would flicker: each frame would find other patches.
-            context = FillContext(*parts, texture=None, precision=self.precision)
-            filled = fill_view(context, camera, [guard], before)
-            aux, alone = filled.aux, filled.rendering
-        drawn, memory = (
-            CompletedView(camera, (base, aux), alone, before, alone, cut=past is not self._past),
-            None,
-        )
-        if self.fill:
-            memory_before = None if past is None else past.memory
-            views = (before, alone)
-            aux, memory = propagate_colors(
-                base, aux, camera, self.renderer, views, memory_before, self.flow
-            )
-            drawn = dataclasses.replace(drawn, gaussians=(base, aux), view=memory.view)
-        self._past = dataclasses.replace(now, memory=memory)
-        self._count += 1
-        return drawn
+        return camera.zoomed(1 + self.overscan)
 
-    def _aligned(
-        self, rgb: Tensor, prediction: BasePrediction
-    ) -> tuple[Gaussians, OcclusionGuard, _Past, _Past | None]:
-        """Align the base's depth with the previous frame's depth.
+    def _fill(
+        self,
+        frame: _AlignedFrame,
+        photo_camera: Camera,
+        camera: Camera,
+        base_rendering: Rendering,
+    ) -> tuple[CompletedView, FrameMemory]:
+        """Fill the holes of a view, with colours of the previous frame where it shows them.
 
-        Returns the aligned base, the photo's occlusion guard, the state for the next frame, and the state of the
-        previous frame (None after a cut).
+        Args:
+            frame: the frame.
+            photo_camera: that took the frame.
+            camera: the view.
+            base_rendering: the view of the frame's own Gaussians.
         """
-        seen = self.renderer.render(prediction.gaussians, prediction.camera)
-        known = ~hole_mask(seen.alpha) & (seen.depth > 0)
-        inverse_depth = torch.where(known, 1 / seen.depth.clamp_min(1e-6), 0.0)
-        past, alignment = self._past, DepthAlignment()
-        if past is not None:
-            found = track(rgb, past.rgb, self.flow)
-            if not found.same_shot():
-                past = None
-            elif self.align:
-                alignment = past.alignment.after(
-                    align_depth(inverse_depth, past.inverse_depth, found)
-                ).leaked()
-        base = alignment.of_gaussians(prediction.gaussians)
-        guard = OcclusionGuard.of(
-            dataclasses.replace(seen, depth=alignment.of_depth(seen.depth)), prediction.camera
+        # Without texture, which would flicker: each frame would find other patches.
+        context = FillContext(
+            frame.base,
+            photo_camera,
+            self.renderer,
+            self.network,
+            texture=None,
+            precision=self.precision,
         )
-        depths = DepthRange.of(base)
-        if past is not None:
-            depths = past.depths.towards(depths, FOLLOW)
-        return base, guard, _Past(rgb, inverse_depth, alignment, depths), past
+        filled = fill_view(context, camera, [frame.guard], base_rendering)
+        aux, memory = propagate_colors(
+            frame.base,
+            filled.aux,
+            camera,
+            self.renderer,
+            (base_rendering, filled.rendering),
+            None if frame.previous is None else frame.previous.memory,
+            self.flow,
+        )
+        view = CompletedView(
+            camera, frame.base, aux, memory.rendering, base_rendering, filled.rendering
+        )
+        return view, memory
+
+    def _align(self, rgb: Tensor, prediction: BasePrediction) -> _AlignedFrame:
+        """Align the depth of a frame, [H, W, 3] sRGB, with the previous frame's depth.
+
+        The first frame of a shot keeps its depth. So does every frame if `align` is off.
+        """
+        photo_rendering = self.renderer.render(prediction.gaussians, prediction.camera)
+        depth = photo_rendering.depth
+        known = ~hole_mask(photo_rendering.alpha) & (depth > 0)
+        inverse_depth = torch.where(known, 1 / depth.clamp_min(1e-6), 0.0)  # [H, W]
+
+        previous = self._previous
+        alignment = DepthAlignment()
+        if previous is not None:
+            tracked = track(rgb, previous.rgb, self.flow)
+            if not tracked.same_shot():
+                previous = None
+            elif self.align:
+                # From this frame's depth to the previous one's as predicted, and then as aligned.
+                to_previous = align_depth(inverse_depth, previous.inverse_depth, tracked)
+                alignment = previous.alignment.after(to_previous).leaked()
+
+        base = alignment.of_gaussians(prediction.gaussians)
+        aligned_rendering = dataclasses.replace(photo_rendering, depth=alignment.of_depth(depth))
+        guard = OcclusionGuard.of(aligned_rendering, prediction.camera)
+
+        # The path's depth range follows the frames' slowly, so that the camera moves smoothly.
+        depth_range = DepthRange.of(base)
+        if previous is not None:
+            depth_range = previous.depth_range.towards(depth_range, DEPTH_RANGE_FOLLOWING)
+        state = _FrameState(rgb, inverse_depth, alignment, depth_range)
+        return _AlignedFrame(base, guard, state, previous)

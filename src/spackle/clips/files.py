@@ -1,4 +1,4 @@
-"""Read clips in any format of FFmpeg, and write clips as H.264 with the times and the sound of the original."""
+"""Read clips in any format of FFmpeg."""
 
 from __future__ import annotations
 
@@ -12,50 +12,31 @@ from pathlib import Path
 import av
 import numpy as np
 import torch
-from av.audio.stream import AudioStream
 from av.container import InputContainer
 from av.stream import Disposition
 from av.video.reformatter import VideoReformatter
 from av.video.stream import VideoStream
 from torch import Tensor
 
-from spackle.core.image_files import check_pixel_count
+from spackle.core.photo import check_pixel_count
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import check_file
 from spackle.runtime.progress import Progress
-from spackle.video.encoding import BT709, H264, StreamEncoder, VideoWriter
+from spackle.video.encoding import BT709
 
-SUFFIXES = {
-    ".mp4",
-    ".m4v",
-    ".mov",
-    ".webm",
-    ".mkv",
-    ".avi",
-    ".gif",
-    ".mpg",
-    ".mpeg",
-    ".ts",
-    ".mts",
-    ".m2ts",
-    ".wmv",
+CLIP_SUFFIXES = {
+    *(".mp4", ".m4v", ".mov", ".webm", ".mkv", ".avi", ".gif", ".mpg", ".mpeg"),
+    *(".ts", ".mts", ".m2ts", ".wmv", ".flv", ".3gp", ".ogv"),
 }
-SUFFIXES |= {".flv", ".3gp", ".ogv"}
-UNSPECIFIED, BT601 = 2, 5  # FFmpeg's numbers of colour matrices
-HD_ROWS = 720  # from this height on, a video without declared colour matrix is read as BT.709, as players do
-LISTS = {
-    "concat",
-    "dash",
-    "hls",
-    "rtsp",
-    "sdp",
-    "webm_dash_manifest",
-}  # formats that make FFmpeg open other files
-DECODING = (av.FFmpegError, ValueError)  # errors of a damaged file
-HDR = {16: "PQ", 18: "HLG"}  # FFmpeg's numbers of transfers
-DEFAULT_RATE = Fraction(25)
-CLOCK = Fraction(1, 90_000)  # unit of written times, in seconds
-RATES = (Fraction(1, 1000), Fraction(1000))  # lowest and highest frame rate that an encoder accepts
+# FFmpeg's numbers of colour matrices, which convert a video's YUV to RGB.
+UNSPECIFIED_MATRIX, BT601 = 2, 5
+# From this height on, a video without declared colour matrix is read as BT.709, as players do.
+HD_ROWS = 720
+# Formats of FFmpeg that only list other files, which it would open.
+PLAYLIST_FORMATS = {"concat", "dash", "hls", "rtsp", "sdp", "webm_dash_manifest"}
+DECODING_ERRORS = (av.FFmpegError, ValueError)  # what PyAV raises for a damaged file
+HDR_TRANSFERS = {16: "PQ", 18: "HLG"}  # by FFmpeg's number of the transfer function
+DEFAULT_FRAME_RATE = Fraction(25)  # frames a second, if the file states none
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,33 +47,46 @@ class Clip:
     width: int  # of an upright frame with square pixels
     height: int
     times: tuple[Fraction, ...]  # of the frames, in seconds, increasing from 0
-    start: Fraction  # time of the first frame in the file
+    start: Fraction  # time of the first frame in the file, in seconds
     rate: Fraction  # mean number of frames a second
     audio: str | None  # codec of the sound
     hdr: str | None  # transfer function, if it is an HDR one: "PQ" or "HLG"
 
     def __len__(self) -> int:
+        """The number of frames."""
         return len(self.times)
 
     @property
     def seconds(self) -> Fraction:
         """The length of the clip; the last frame lasts as long as the frame before."""
-        last = self.times[-1] - self.times[-2] if len(self) > 1 else 1 / self.rate
-        return self.times[-1] + last
+        if len(self) == 1:
+            return 1 / self.rate
+        last_duration = self.times[-1] - self.times[-2]
+        return self.times[-1] + last_duration
 
 
 def is_clip(path: Path) -> bool:
-    """Whether a file is a video, judged by the suffix; a GIF with a single frame is a photo."""
-    if path.suffix.lower() not in SUFFIXES or os.path.isdir(path):
+    """Whether a file is a video, judged by the suffix; a GIF with a single frame is a photo.
+
+    A file that cannot be read as a GIF is no clip.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in CLIP_SUFFIXES or os.path.isdir(path):
         return False
-    if path.suffix.lower() != ".gif":
+    if suffix != ".gif":
         return True
     try:
         with av.open(str(path), metadata_errors="replace") as container:
-            pictures = (packet for packet in container.demux(video=0) if packet.size)
-            return next(pictures, None) is not None and next(pictures, None) is not None
+            # Empty packets mark the end.
+            pictures = 0
+            for packet in container.demux(video=0):
+                if packet.size > 0:
+                    pictures += 1
+                if pictures == 2:
+                    return True
     except (av.FFmpegError, ValueError, IndexError):
         return False
+    return False
 
 
 def read_clip(
@@ -108,228 +102,192 @@ def read_clip(
         progress: called with (number of frames read, number of frames in the file).
 
     Raises:
-        InputError: the file is not a clip, truncated, damaged, without video, or of an unknown codec.
+        InputError: the file is not a clip, truncated, damaged, without video, or of an unknown
+            codec.
     """
     check_file(path, "clip")
     try:
         return _read_clip(path, first, progress)
     except InputError as error:
-        message, cause = str(error), error.__cause__
-    # The first error's traceback refers to the decoder, whose threads would live as long as the error.
-    raise InputError(message) from (cause and cause.with_traceback(None))
+        message = str(error)
+        cause = error.__cause__
+
+    # A new error, because the traceback of the first one refers to the decoder, whose threads would
+    # live as long as the error.
+    if cause is not None:
+        cause = cause.with_traceback(None)
+    raise InputError(message) from cause
 
 
 def _read_clip(path: str | os.PathLike[str], first: int | None, progress: Progress | None) -> Clip:
-    ticks: list[Fraction | None] = []
+    """Decode the first frames of a clip (None: all), and collect its facts.
+
+    `progress` is called with (number of frames read, number of frames in the file). InputError if
+    the file is not a clip, damaged, or has no frames.
+    """
+    times_in_file: list[Fraction | None] = []
     frame = None
-    with _opened(path) as (container, stream):
-        aspect = stream.sample_aspect_ratio or Fraction(1)
-        rate = stream.average_rate or stream.guessed_rate or DEFAULT_RATE
-        sounds = container.streams.audio
-        audio = sounds[0].codec_context.name if sounds and sounds[0].codec_context else None
-        for frame in _decoded(path, container, stream, first):
-            ticks.append(
-                None
-                if frame.pts is None or frame.time_base is None
-                else frame.pts * frame.time_base
-            )
-            if progress:
-                progress(len(ticks), max(len(ticks), first or stream.frames))
+    with _open_video(path) as (container, stream):
+        pixel_aspect = stream.sample_aspect_ratio or Fraction(1)
+        rate = stream.average_rate or stream.guessed_rate or DEFAULT_FRAME_RATE
+        audio = None
+        audio_streams = container.streams.audio
+        if audio_streams and audio_streams[0].codec_context:
+            audio = audio_streams[0].codec_context.name
+
+        for frame in _decode_frames(path, container, stream, first):
+            if frame.pts is None or frame.time_base is None:
+                times_in_file.append(None)
+            else:
+                times_in_file.append(frame.pts * frame.time_base)
+            if progress is not None:
+                frames_read = len(times_in_file)
+                # A file may state too few frames, or none.
+                progress(frames_read, max(frames_read, first or stream.frames))
     if frame is None:
         raise InputError(f"{path}: has no frames: give another clip")
-    width, height = _square_size(frame, aspect)
-    if _quarters(frame) % 2:
+
+    width, height = _square_pixel_size(frame, pixel_aspect)
+    if _quarter_turns(frame) % 2 == 1:
         width, height = height, width
     check_pixel_count(width, height, os.path.getsize(path), path)
-    times = _rising(ticks, Fraction(rate))
-    hdr = HDR.get(int(frame.color_trc))
     return Clip(
-        Path(path), width, height, times, ticks[0] or Fraction(0), Fraction(rate), audio, hdr
+        path=Path(path),
+        width=width,
+        height=height,
+        times=_increasing_times(times_in_file, Fraction(rate)),
+        start=times_in_file[0] or Fraction(0),
+        rate=Fraction(rate),
+        audio=audio,
+        hdr=HDR_TRANSFERS.get(int(frame.color_trc)),
     )
 
 
 def clip_frames(clip: Clip) -> Iterator[Tensor]:
-    """The frames of a clip, [H, W, 3] float32 sRGB in 0..1."""
-    with _opened(clip.path) as (container, stream):
-        aspect, reformatter = stream.sample_aspect_ratio or Fraction(1), VideoReformatter()
-        for frame in _decoded(clip.path, container, stream, len(clip)):
-            yield _picture(frame, aspect, reformatter)
+    """The frames of a clip, upright, [H, W, 3] float32 sRGB in 0..1.
+
+    InputError if the file has changed or gone since the clip was read.
+    """
+    with _open_video(clip.path) as (container, stream):
+        pixel_aspect = stream.sample_aspect_ratio or Fraction(1)
+        reformatter = VideoReformatter()
+        for frame in _decode_frames(clip.path, container, stream, len(clip)):
+            yield _frame_to_rgb(frame, pixel_aspect, reformatter)
 
 
 @contextlib.contextmanager
-def _opened(path: str | os.PathLike[str]) -> Iterator[tuple[InputContainer, VideoStream]]:
-    """Open a file, and find the video stream."""
+def _open_video(path: str | os.PathLike[str]) -> Iterator[tuple[InputContainer, VideoStream]]:
+    """Open a file, and find the video in it; both are closed after the `with` block.
+
+    InputError if the file is no video, only a list of files, too large, or of an unknown codec.
+    """
     with as_input_error(
-        path, "not a video, or damaged at the beginning or end ({reason})", *DECODING
+        path, "not a video, or damaged at the beginning or end ({reason})", *DECODING_ERRORS
     ):
-        container = av.open(
-            str(path), metadata_errors="replace"
-        )  # in strict mode, the file stays open after an error
+        # In strict mode, which replaces no metadata, the file stays open after an error.
+        container = av.open(str(path), metadata_errors="replace")
     with container:
-        if LISTS & set(container.format.name.split(",")):
+        if PLAYLIST_FORMATS & set(container.format.name.split(",")):
             raise InputError(
                 f"{path}: is a list of other files, not a video: give one of these files"
             )
-        pictures = [
-            s for s in container.streams.video if not s.disposition & Disposition.attached_pic
+        # A music file's cover is a stream of pictures, too.
+        videos = [
+            stream
+            for stream in container.streams.video
+            if not stream.disposition & Disposition.attached_pic
         ]
-        if not pictures:
+        if not videos:
             raise InputError(f"{path}: has no moving picture: give a video")
-        stream = pictures[0]
-        if stream.codec_context is None:
+        stream = videos[0]
+        codec = stream.codec_context
+        if codec is None:
             raise InputError(
                 f"{path}: FFmpeg does not know the codec: convert the clip to H.264 first"
             )
-        check_pixel_count(
-            stream.codec_context.width, stream.codec_context.height, os.path.getsize(path), path
-        )
+        check_pixel_count(codec.width, codec.height, os.path.getsize(path), path)
         stream.thread_type = "AUTO"
         yield container, stream
 
 
-def _decoded(
+def _decode_frames(
     path: str | os.PathLike[str], container: InputContainer, stream: VideoStream, first: int | None
 ) -> Iterator[av.VideoFrame]:
-    """Decode frames, which must all have the same size."""
-    size, count, packets = None, 0, 0
+    """Decode the first frames of a video (None: all), which must all have the same size.
+
+    InputError, which names `path`, if a frame is damaged or missing or has another size.
+    """
+    first_shape: tuple[int, int, int] | None = None
+    frame_count = 0
+    packet_count = 0
     with as_input_error(
-        path, "damaged or truncated ({reason}): give a whole clip, or fewer --frames", *DECODING
+        path,
+        "damaged or truncated ({reason}): give a whole clip, or fewer `frames`",
+        *DECODING_ERRORS,
     ):
         for packet in container.demux(stream):
-            packets += packet.size > 0
+            if packet.size > 0:  # the last packet is empty
+                packet_count += 1
             for frame in packet.decode():
                 shape = (frame.width, frame.height, frame.rotation)
-                if size not in (None, shape):
-                    raise InputError(f"{path}: frame {count} has a new size: use --frames {count}")
-                size = shape
+                if first_shape is None:
+                    first_shape = shape
+                if shape != first_shape:
+                    raise InputError(
+                        f"{path}: frame {frame_count} has a new size: use `frames` {frame_count}"
+                    )
                 yield frame
-                count += 1
-                if count == first:
+                frame_count += 1
+                if frame_count == first:
                     return
-        if packets < stream.frames:
-            raise ValueError(f"{packets} of {stream.frames} frames")
+        # FFmpeg ends a truncated file without an error.
+        if packet_count < stream.frames:
+            raise ValueError(f"{packet_count} of {stream.frames} frames")
 
 
-def _picture(frame: av.VideoFrame, aspect: Fraction, reformatter: VideoReformatter) -> Tensor:
-    """A frame as an upright image [H, W, 3] sRGB in 0..1."""
-    width, height = _square_size(frame, aspect)
+def _frame_to_rgb(
+    frame: av.VideoFrame, pixel_aspect: Fraction, reformatter: VideoReformatter
+) -> Tensor:
+    """A frame as an upright image [H, W, 3] sRGB in 0..1 with square pixels.
+
+    `pixel_aspect` is the width of a stored pixel over its height.
+    """
+    width, height = _square_pixel_size(frame, pixel_aspect)
     matrix = frame.colorspace
-    if matrix == UNSPECIFIED:
+    if matrix == UNSPECIFIED_MATRIX:
         matrix = BT709 if frame.height >= HD_ROWS else BT601
     # `frame.reformat` would start new threads for each frame.
     rgb = reformatter.reformat(frame, width, height, "rgb24", src_colorspace=matrix).to_ndarray()
-    turned = np.ascontiguousarray(np.rot90(rgb, _quarters(frame)))
-    return torch.from_numpy(turned).float().div_(255)
+    upright = np.ascontiguousarray(np.rot90(rgb, _quarter_turns(frame)))
+    return torch.from_numpy(upright).float().div_(255)
 
 
-def _quarters(frame: av.VideoFrame) -> int:
-    """The number of counter-clockwise quarter turns that make a frame upright."""
+def _quarter_turns(frame: av.VideoFrame) -> int:
+    """The number of counter-clockwise quarter turns that make a frame upright, 0 to 3."""
     return round(frame.rotation / 90) % 4
 
 
-def _square_size(frame: av.VideoFrame, aspect: Fraction) -> tuple[int, int]:
-    """The size of a frame in square pixels, if its stored pixels are `aspect` times as wide as high."""
-    wide, high = max(aspect, Fraction(1)), max(1 / aspect, Fraction(1))
-    return max(1, round(frame.width * wide)), max(1, round(frame.height * high))
+def _square_pixel_size(frame: av.VideoFrame, pixel_aspect: Fraction) -> tuple[int, int]:
+    """The width and height of a frame in square pixels, before it is turned upright.
+
+    The frame's stored pixels are `pixel_aspect` times as wide as high. The shorter of their sides
+    becomes the side of the square pixels, so that no detail is lost.
+    """
+    stretch_x = max(pixel_aspect, Fraction(1))
+    stretch_y = max(1 / pixel_aspect, Fraction(1))
+    return max(1, round(frame.width * stretch_x)), max(1, round(frame.height * stretch_y))
 
 
-def _rising(ticks: list[Fraction | None], rate: Fraction) -> tuple[Fraction, ...]:
-    """Increasing times from zero; a missing or decreasing time is replaced by the time at the mean rate."""
+def _increasing_times(times_in_file: list[Fraction | None], rate: Fraction) -> tuple[Fraction, ...]:
+    """Increasing times from zero, in seconds, for frames whose times may be missing or wrong.
+
+    A missing or decreasing time is replaced by that of the frame before, plus 1 / `rate`.
+    """
     times: list[Fraction] = []
-    start = ticks[0] or Fraction(0)
-    for tick in ticks:
-        at_rate = times[-1] + 1 / rate if times else Fraction(0)
-        time = at_rate if tick is None else tick - start
-        times.append(time if not times or time > times[-1] else at_rate)
+    start = times_in_file[0] or Fraction(0)
+    for time_in_file in times_in_file:
+        expected = times[-1] + 1 / rate if times else Fraction(0)
+        time = expected if time_in_file is None else time_in_file - start
+        is_increasing = not times or time > times[-1]
+        times.append(time if is_increasing else expected)
     return tuple(times)
-
-
-class ClipWriter(VideoWriter):
-    """Writes an .mp4 with the times and the sound of a clip; the file appears if the block succeeds."""
-
-    def __init__(self, path: str | os.PathLike[str], clip: Clip) -> None:
-        super().__init__(path)
-        self.clip = clip
-
-    @property
-    def sound(self) -> bool:
-        """Whether sound has been copied."""
-        return isinstance(self.encoder, _ClipEncoder) and self.encoder.sound
-
-    def make_encoder(self, height: int, width: int) -> StreamEncoder:
-        return _ClipEncoder(self.temporary_path, width, height, self.clip)
-
-
-class _ClipEncoder(StreamEncoder):
-    """Encodes frames at evenly spaced times, and then gives the packets the clip's times."""
-
-    def __init__(self, path: Path, width: int, height: int, clip: Clip) -> None:
-        self._even = min(max(clip.rate.limit_denominator(1001), RATES[0]), RATES[1])
-        super().__init__(H264, path, width, height, self._even, 1)
-        self._clip = clip
-        self._input = None
-        if clip.audio in self.container.supported_codecs:
-            self._input = av.open(str(clip.path), metadata_errors="replace")
-        self.sound = False
-        if self._input is not None:
-            source = self._input.streams.audio[0]
-            self._output = self.container.add_stream_from_template(source)
-            self._sounds = self._input.demux(source)
-            self._held: av.Packet[AudioStream] | None = None
-
-    def finish(self) -> None:
-        self.write_packets(self.stream.encode(None))
-        self._copy_sound(self._clip.seconds)
-        self.close()
-
-    def close(self) -> None:
-        super().close()
-        if self._input is not None:
-            self._input.close()
-
-    def write_packets(self, packets: list[av.Packet[VideoStream]]) -> None:
-        for packet in packets:
-            assert packet.time_base is not None
-            assert packet.pts is not None
-            assert packet.dts is not None
-            times = [
-                self._time(round(ticks * packet.time_base * self._even))
-                for ticks in (packet.pts, packet.dts)
-            ]
-            packet.time_base = CLOCK
-            packet.pts, packet.dts = (round(time / CLOCK) for time in times)
-            packet.duration = 0
-            self._copy_sound(times[1])
-            self.container.mux(packet)
-
-    def _time(self, index: int) -> Fraction:
-        """The time of a frame; before the first and after the last frame, times follow the mean rate."""
-        times = self._clip.times
-        if 0 <= index < len(times):
-            return times[index]
-        return (
-            times[0] + index / self._even
-            if index < 0
-            else times[-1] + (index - len(times) + 1) / self._even
-        )
-
-    def _copy_sound(self, until: Fraction) -> None:
-        """Copy the clip's sound up to a time; stop at the first damaged packet."""
-        while self._input is not None:
-            try:
-                packet = self._held or next(self._sounds, None)
-            except av.FFmpegError:
-                return
-            if packet is None or packet.pts is None or packet.time_base is None:
-                return
-            ticks = round(self._clip.start / packet.time_base)
-            begin, lasts = packet.pts - ticks, packet.duration or 0
-            self._held = packet if begin * packet.time_base >= until else None
-            if self._held is not None:
-                return
-            if begin + lasts <= 0:
-                continue  # before the first frame
-            packet.pts, packet.dts = begin, None if packet.dts is None else packet.dts - ticks
-            packet.stream = self._output
-            self.container.mux(packet)
-            self.sound = True
