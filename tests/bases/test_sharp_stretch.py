@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from spackle.bases.sharp.stretch import BLOCK, GRAIN, stretch_gaussians
+from spackle.bases.sharp.stretch import BLOCK_SIZE, CHUNK_SIZE, stretch_gaussians
 from spackle.core.gaussians import Gaussians
 
 PROPERTY = settings(deadline=None, max_examples=40)
@@ -141,13 +141,13 @@ def test_means_are_multiplied_and_the_rest_is_passed_on() -> None:
 
 
 def test_results_repeat_whatever_threads_neighbours_and_layout() -> None:
-    before = random_set(2 * GRAIN + BLOCK + 5)
+    before = random_set(2 * CHUNK_SIZE + BLOCK_SIZE + 5)
     wide = torch.cat(before.tensors[1:3], dim=1).requires_grad_()
     strided = Gaussians(before.means, wide[:, :4], wide[:, 4:], before.opacities, before.colors)
     parts = [
         before.select(slice(0, 3)),
-        before.select(slice(3, GRAIN)),
-        before.select(slice(GRAIN, None)),
+        before.select(slice(3, CHUNK_SIZE)),
+        before.select(slice(CHUNK_SIZE, None)),
     ]
     expected = Gaussians.cat(stretch_gaussians(part, PHOTO) for part in parts)
     threads = torch.get_num_threads()

@@ -1,4 +1,9 @@
-"""Stretch Gaussians along the world's axes, which converts SHARP's Gaussians to metres."""
+"""Stretch Gaussians along the world's axes, which converts SHARP's Gaussians to metres.
+
+`stretch_gaussians` is the entry and states the method. The kernels below it process blocks of 64
+Gaussians; a block is an array [9, 64], whose rows 0 to 2, 3 to 5 and 6 to 8 hold the columns of
+64 matrices of 3 × 3.
+"""
 
 from __future__ import annotations
 
@@ -12,33 +17,45 @@ from spackle.core.gaussians import Gaussians
 from spackle.runtime.device import parallel_for_chunks
 from spackle.runtime.kernels import kernel
 
-SWEEPS = 4  # the cosine between two columns is at worst 3e-3 after three sweeps, 1e-15 after four
-UPRIGHT = 0.5  # if the squared sine of the angle between two columns is smaller, the shorter column is noise
-BLOCK = 64  # number of Gaussians that the first-level cache holds
-LEAST = 1e-300  # avoids 0/0, and is smaller than the square of any positive float32
-GRAIN = 256 * BLOCK  # number of Gaussians that a thread takes at a time
+# The cosine between two columns is at worst 3e-3 after three sweeps, 1e-15 after four.
+JACOBI_SWEEPS = 4
+# If the squared sine of the angle between two columns is smaller, the shorter column is noise.
+MIN_SQUARED_SINE = 0.5
+BLOCK_SIZE = 64  # number of Gaussians that the first-level cache holds
+CHUNK_SIZE = 256 * BLOCK_SIZE  # number of Gaussians that a thread takes at a time
+TINY = 1e-300  # avoids 0/0, and is smaller than the square of any positive float32
+MIN_SQUARED_QUAT = 1e-24  # a shorter quaternion counts as no rotation
 
 
 def stretch_gaussians(gaussians: Gaussians, stretch: tuple[float, float, float]) -> Gaussians:
     """Map N Gaussians on the CPU by D = diag(stretch), which rotates and reshapes each Gaussian.
 
-    A covariance R S² Rᵀ becomes M Mᵀ with M = D R S. Rotations from the right leave M Mᵀ unchanged and make M's columns
-    orthogonal (one-sided Jacobi); then the columns' lengths are the new scales, and their directions are the new axes.
-    The covariance itself is never formed, because squared scales would lose the small scales.
+    A covariance R S² Rᵀ becomes M Mᵀ with M = D R S. Rotations from the right leave M Mᵀ unchanged
+    and make M's columns orthogonal (one-sided Jacobi); then the columns' lengths are the new
+    scales, and their directions are the new axes. The covariance itself is never formed, because
+    squared scales would lose the small scales.
 
-    The result has descending scales and unit quats with w ≥ 0; a zero quat counts as no rotation. Opacities and colors
-    are the same tensors; means, quats and scales are detached from autograd.
+    The result has descending scales and unit quaternions with w ≥ 0; a zero quaternion counts as no
+    rotation. Opacities and colours are the same tensors; means, quaternions and scales are detached
+    from autograd.
     """
-    means, quats, scales = (t.detach() for t in gaussians.tensors[:3])
-    source = quats.contiguous().numpy(), scales.contiguous().numpy()
-    result = np.empty((len(quats), 4), np.float32), np.empty((len(quats), 3), np.float32)
-    factors = float(stretch[0]), float(stretch[1]), float(stretch[2])
-    parallel_for_chunks(
-        lambda start, stop: stretch_chunk(start, stop, *source, factors, *result), len(quats), GRAIN
-    )
-    turned, scaled = torch.from_numpy(result[0]), torch.from_numpy(result[1])
+    means = gaussians.means.detach()
+    quats = gaussians.quats.detach().contiguous().numpy()
+    scales = gaussians.scales.detach().contiguous().numpy()
+    factors = (float(stretch[0]), float(stretch[1]), float(stretch[2]))
+    new_quats = np.empty((len(quats), 4), np.float32)
+    new_scales = np.empty((len(quats), 3), np.float32)
+
+    def stretch_range(start: int, stop: int) -> None:
+        stretch_chunk(start, stop, quats, scales, factors, new_quats, new_scales)
+
+    parallel_for_chunks(stretch_range, len(quats), CHUNK_SIZE)
     return Gaussians(
-        means * means.new_tensor(stretch), turned, scaled, gaussians.opacities, gaussians.colors
+        means * means.new_tensor(stretch),
+        torch.from_numpy(new_quats),
+        torch.from_numpy(new_scales),
+        gaussians.opacities,
+        gaussians.colors,
     )
 
 
@@ -46,118 +63,181 @@ def stretch_gaussians(gaussians: Gaussians, stretch: tuple[float, float, float])
 def stretch_chunk(
     start: int, stop: int, quats: Any, scales: Any, stretch: Any, new_quats: Any, new_scales: Any
 ) -> None:
-    """Stretch Gaussians start..stop (quats [N, 4], scales [N, 3]) block by block in float64; fills the new arrays."""
-    columns = np.zeros((9, BLOCK))
-    for first in range(start, stop, BLOCK):
-        count = min(BLOCK, stop - first)
-        _load_block(first, count, quats, scales, stretch, columns)
-        for _ in range(SWEEPS):
-            _sweep_block(columns)
-        _store_block(first, count, columns, new_quats, new_scales)
+    """Stretch Gaussians start..stop by the factors `stretch` (x, y, z), block by block in float64.
+
+    quats [N, 4] (w, x, y, z) and scales [N, 3] are read; rows start..stop of new_quats [N, 4] and
+    new_scales [N, 3] are written.
+    """
+    block = np.zeros((9, BLOCK_SIZE))
+    for first in range(start, stop, BLOCK_SIZE):
+        count = min(BLOCK_SIZE, stop - first)
+        _load_block(first, count, quats, scales, stretch, block)
+        for _ in range(JACOBI_SWEEPS):
+            _orthogonalise_block(block)
+        _store_block(first, count, block, new_quats, new_scales)
 
 
 @kernel
-def _load_block(
-    first: int, count: int, quats: Any, scales: Any, stretch: Any, columns: Any
-) -> None:
-    """Write D R S to [9, BLOCK]: three rows for each column of the matrix."""
-    sx, sy, sz = stretch
+def _load_block(first: int, count: int, quats: Any, scales: Any, stretch: Any, block: Any) -> None:
+    """Write the matrices M = D R S of `count` Gaussians from `first` on to `block` [9, 64].
+
+    D stretches (factors x, y, z), R is the rotation of a quaternion [N, 4] of any length, S holds
+    the scales [N, 3]. Rows 0 to 2 get the first column of M, and so on.
+    """
+    stretch_x, stretch_y, stretch_z = stretch
     for i in range(count):
         n = first + i
-        w, x, y, z = (
-            np.float64(quats[n, 0]),
-            np.float64(quats[n, 1]),
-            np.float64(quats[n, 2]),
-            np.float64(quats[n, 3]),
-        )
-        two = 2.0 / max(
-            w * w + x * x + y * y + z * z, 1e-24
-        )  # 2/‖q‖² makes the rotation a unit one
-        a, b, c = np.float64(scales[n, 0]), np.float64(scales[n, 1]), np.float64(scales[n, 2])
-        columns[0, i] = sx * a * (1.0 - two * (y * y + z * z))
-        columns[1, i] = sy * a * two * (x * y + w * z)
-        columns[2, i] = sz * a * two * (x * z - w * y)
-        columns[3, i] = sx * b * two * (x * y - w * z)
-        columns[4, i] = sy * b * (1.0 - two * (x * x + z * z))
-        columns[5, i] = sz * b * two * (y * z + w * x)
-        columns[6, i] = sx * c * two * (x * z + w * y)
-        columns[7, i] = sy * c * two * (y * z - w * x)
-        columns[8, i] = sz * c * (1.0 - two * (x * x + y * y))
+        w = np.float64(quats[n, 0])
+        x = np.float64(quats[n, 1])
+        y = np.float64(quats[n, 2])
+        z = np.float64(quats[n, 3])
+        # 2/‖q‖² instead of 2 makes R the rotation of the unit quaternion.
+        two = 2.0 / max(w * w + x * x + y * y + z * z, MIN_SQUARED_QUAT)
+        a = np.float64(scales[n, 0])
+        b = np.float64(scales[n, 1])
+        c = np.float64(scales[n, 2])
+        block[0, i] = stretch_x * a * (1.0 - two * (y * y + z * z))
+        block[1, i] = stretch_y * a * two * (x * y + w * z)
+        block[2, i] = stretch_z * a * two * (x * z - w * y)
+        block[3, i] = stretch_x * b * two * (x * y - w * z)
+        block[4, i] = stretch_y * b * (1.0 - two * (x * x + z * z))
+        block[5, i] = stretch_z * b * two * (y * z + w * x)
+        block[6, i] = stretch_x * c * two * (x * z + w * y)
+        block[7, i] = stretch_y * c * two * (y * z - w * x)
+        block[8, i] = stretch_z * c * (1.0 - two * (x * x + y * y))
 
 
 @kernel
-def _sweep_block(columns: Any) -> None:
-    """Rotate each pair of columns once for the whole block, without branches, so that the loop is vectorised."""
-    for i in range(BLOCK):
-        a, b, c = _column(columns, 0, i), _column(columns, 1, i), _column(columns, 2, i)
-        a, b = _turn(a, b)
-        a, c = _turn(a, c)
-        b, c = _turn(b, c)
-        columns[0, i], columns[1, i], columns[2, i] = a
-        columns[3, i], columns[4, i], columns[5, i] = b
-        columns[6, i], columns[7, i], columns[8, i] = c
+def _orthogonalise_block(block: Any) -> None:
+    """Rotate each pair of columns of all matrices in `block` [9, 64] once, in place (a sweep).
+
+    After a rotation the two columns are orthogonal; the next rotation disturbs this a little. There
+    are no branches, so that the compiler vectorises the loop.
+    """
+    for i in range(BLOCK_SIZE):
+        a = _column(block, 0, i)
+        b = _column(block, 1, i)
+        c = _column(block, 2, i)
+        a, b = _rotate_to_orthogonal(a, b)
+        a, c = _rotate_to_orthogonal(a, c)
+        b, c = _rotate_to_orthogonal(b, c)
+        block[0, i], block[1, i], block[2, i] = a
+        block[3, i], block[4, i], block[5, i] = b
+        block[6, i], block[7, i], block[8, i] = c
 
 
 @kernel
-def _column(columns: Any, k: int, i: int) -> Any:
-    return columns[3 * k, i], columns[3 * k + 1, i], columns[3 * k + 2, i]
+def _column(block: Any, k: int, i: int) -> Any:
+    """Column k (0 to 2) of matrix i in `block` [9, 64], as three numbers."""
+    return block[3 * k, i], block[3 * k + 1, i], block[3 * k + 2, i]
 
 
 @kernel
-def _turn(p: Any, q: Any) -> Any:
-    skew, lead = 2.0 * _dot(p, q), _dot(q, q) - _dot(p, p)
-    tangent = skew / (abs(lead) + math.sqrt(lead * lead + skew * skew) + LEAST)
-    tangent = -tangent if lead < 0.0 else tangent
+def _rotate_to_orthogonal(p: Any, q: Any) -> Any:
+    """Rotate the pair of vectors (p, q) into each other until they are orthogonal (Jacobi).
+
+    The result is (cos·p - sin·q, sin·p + cos·q), with the angle of at most 45° for which
+    tan(2·angle) = 2 p·q / (q·q - p·p).
+    """
+    twice_dot = 2.0 * _dot(p, q)
+    difference = _dot(q, q) - _dot(p, p)
+    hypotenuse = math.sqrt(difference * difference + twice_dot * twice_dot)
+    tangent = twice_dot / (abs(difference) + hypotenuse + TINY)
+    tangent = -tangent if difference < 0.0 else tangent
     cosine = 1.0 / math.sqrt(1.0 + tangent * tangent)
     sine = tangent * cosine
-    turned = cosine * p[0] - sine * q[0], cosine * p[1] - sine * q[1], cosine * p[2] - sine * q[2]
-    return turned, (
+    rotated_p = (
+        cosine * p[0] - sine * q[0],
+        cosine * p[1] - sine * q[1],
+        cosine * p[2] - sine * q[2],
+    )
+    rotated_q = (
         sine * p[0] + cosine * q[0],
         sine * p[1] + cosine * q[1],
         sine * p[2] + cosine * q[2],
     )
+    return rotated_p, rotated_q
 
 
 @kernel
-def _store_block(first: int, count: int, columns: Any, new_quats: Any, new_scales: Any) -> None:
-    """Compute scales and rotations from orthogonal columns, longest first."""
+def _store_block(first: int, count: int, block: Any, new_quats: Any, new_scales: Any) -> None:
+    """Write scales and rotations of matrices with orthogonal columns, the longest axis first.
+
+    `block` [9, 64] holds the matrices of `count` Gaussians; their rows from `first` on of new_quats
+    [N, 4] and new_scales [N, 3] are written.
+    """
     for i in range(count):
+        a = _column(block, 0, i)
+        b = _column(block, 1, i)
+        c = _column(block, 2, i)
+        length_a = math.sqrt(_dot(a, a))
+        length_b = math.sqrt(_dot(b, b))
+        length_c = math.sqrt(_dot(c, c))
+        # Three exchanges sort the columns by length.
+        if length_a < length_b:
+            length_a, length_b = length_b, length_a
+            a, b = b, a
+        if length_b < length_c:
+            length_b, length_c = length_c, length_b
+            b, c = c, b
+        if length_a < length_b:
+            length_a, length_b = length_b, length_a
+            a, b = b, a
+
         n = first + i
-        a, b, c = _column(columns, 0, i), _column(columns, 1, i), _column(columns, 2, i)
-        la, lb, lc = math.sqrt(_dot(a, a)), math.sqrt(_dot(b, b)), math.sqrt(_dot(c, c))
-        if la < lb:
-            la, a, lb, b = lb, b, la, a
-        if lb < lc:
-            lb, b, lc, c = lc, c, lb, b
-        if la < lb:
-            la, a, lb, b = lb, b, la, a
-        new_scales[n, 0], new_scales[n, 1], new_scales[n, 2] = la, lb, lc
-        a = _scaled(a, 1.0 / la) if la > 0.0 else (1.0, 0.0, 0.0)
-        b, c = _other_axes(a, _scaled(b, 1.0 / max(lb, LEAST)))
-        new_quats[n, 0], new_quats[n, 1], new_quats[n, 2], new_quats[n, 3] = _quat_of_axes(a, b, c)
+        new_scales[n, 0] = length_a
+        new_scales[n, 1] = length_b
+        new_scales[n, 2] = length_c
+        # A Gaussian without any extent keeps the axes of the world.
+        a = _scaled(a, 1.0 / length_a) if length_a > 0.0 else (1.0, 0.0, 0.0)
+        b, c = _other_axes(a, _scaled(b, 1.0 / max(length_b, TINY)))
+        w, x, y, z = _quat_of_axes(a, b, c)
+        new_quats[n, 0] = w
+        new_quats[n, 1] = x
+        new_quats[n, 2] = y
+        new_quats[n, 3] = z
 
 
 @kernel
 def _other_axes(a: Any, b: Any) -> Any:
-    """The second and third axis of a right-handed frame: b made orthogonal to a, or any axis if b is parallel to a."""
+    """The second and third axis of a right-handed frame whose first axis is the unit vector `a`.
+
+    The second axis is the unit vector `b`, made orthogonal to `a`. If b is nearly parallel to a, or
+    zero, any orthogonal axis is taken.
+    """
     c = _cross(a, b)
-    if not _dot(c, c) > UPRIGHT:
-        x, y, z = abs(a[0]), abs(a[1]), abs(a[2])
+    if not _dot(c, c) > MIN_SQUARED_SINE:
+        # The world's axis that is most different from a.
+        x = abs(a[0])
+        y = abs(a[1])
+        z = abs(a[2])
         if x <= y and x <= z:
             c = _cross(a, (1.0, 0.0, 0.0))
+        elif y <= z:
+            c = _cross(a, (0.0, 1.0, 0.0))
         else:
-            c = _cross(a, (0.0, 1.0, 0.0) if y <= z else (0.0, 0.0, 1.0))
+            c = _cross(a, (0.0, 0.0, 1.0))
     c = _scaled(c, 1.0 / math.sqrt(_dot(c, c)))
     return _cross(c, a), c
 
 
 @kernel
 def _quat_of_axes(a: Any, b: Any, c: Any) -> Any:
-    """`spackle.core.gaussians.quat_from_matrix` of a rotation's columns."""
-    ww, xx = 1.0 + a[0] + b[1] + c[2], 1.0 + a[0] - b[1] - c[2]
-    yy, zz = 1.0 - a[0] + b[1] - c[2], 1.0 - a[0] - b[1] + c[2]
-    wx, wy, wz = b[2] - c[1], c[0] - a[2], a[1] - b[0]
-    xy, xz, yz = b[0] + a[1], c[0] + a[2], c[1] + b[2]
+    """The unit quaternion (w ≥ 0, x, y, z) of the rotation matrix with the columns a, b, c.
+
+    With ww = 4 w², wx = 4 w x and so on, each row of (4 q qᵀ) is a multiple of q; the row with the
+    largest diagonal entry is the most exact.
+    """
+    ww = 1.0 + a[0] + b[1] + c[2]
+    xx = 1.0 + a[0] - b[1] - c[2]
+    yy = 1.0 - a[0] + b[1] - c[2]
+    zz = 1.0 - a[0] - b[1] + c[2]
+    wx = b[2] - c[1]
+    wy = c[0] - a[2]
+    wz = a[1] - b[0]
+    xy = b[0] + a[1]
+    xz = c[0] + a[2]
+    yz = c[1] + b[2]
     if ww >= max(xx, yy, zz):
         w, x, y, z = ww, wx, wy, wz
     elif xx >= max(yy, zz):
@@ -166,21 +246,25 @@ def _quat_of_axes(a: Any, b: Any, c: Any) -> Any:
         w, x, y, z = wy, xy, yy, yz
     else:
         w, x, y, z = wz, xz, yz, zz
-    unit = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
-    unit = -unit if w < 0.0 else unit
-    return w * unit, x * unit, y * unit, z * unit
+
+    factor = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
+    factor = -factor if w < 0.0 else factor
+    return w * factor, x * factor, y * factor, z * factor
 
 
 @kernel
 def _dot(p: Any, q: Any) -> Any:
+    """The scalar product of two vectors of three numbers."""
     return p[0] * q[0] + p[1] * q[1] + p[2] * q[2]
 
 
 @kernel
 def _cross(p: Any, q: Any) -> Any:
+    """The vector product of two vectors of three numbers."""
     return p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]
 
 
 @kernel
 def _scaled(p: Any, factor: float) -> Any:
+    """A vector of three numbers times a factor."""
     return factor * p[0], factor * p[1], factor * p[2]
