@@ -67,7 +67,7 @@ def test_the_published_vit_s_has_these_tensors() -> None:
 )
 def test_maps_agree_with_the_original(base: MogeBase, name: str, tokens: int, step: int) -> None:
     image = waves(*SIZES[name])
-    output = base.ask(image, tokens, SIZES[name])
+    output = base.run_network(image, tokens, SIZES[name])
     agrees(output.points[::step, ::step], f"{name}_points")
     agrees(output.metric_scale, f"{name}_metric_scale")
     agrees(output.mask_logits[::step, ::step], f"{name}_mask_logits")
@@ -90,7 +90,7 @@ def test_depth_focal_length_and_mask_agree_with_the_original(
     base: MogeBase, name: str, tokens: int, fov: float | None, step: int
 ) -> None:
     height, width = SIZES[name.partition("_")[0]]
-    output = base.ask(waves(height, width), tokens, (height, width))
+    output = base.run_network(waves(height, width), tokens, (height, width))
     view = to_view(output, width, height, fov and width / 2 / math.tan(math.radians(fov / 2)))
     agrees(view.focal_px / math.hypot(width, height) * 2, f"{name}_focal_converged")
     agrees(view.shift, f"{name}_shift_converged")
@@ -128,7 +128,7 @@ def test_whose_focal_length_is_used_and_the_distance_of_the_sky(
     base: MogeBase, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     photo, output = photo_of(torch.from_numpy(picture(160, 90)) / 255), scene(0.5, scale=2.0)
-    monkeypatch.setattr(base, "ask", lambda *given: output)
+    monkeypatch.setattr(base, "run_network", lambda *given: output)
     for source in (FocalSource.FOCAL_PX, FocalSource.EXIF):
         kept = base.predict(dataclasses.replace(photo, focal_source=source))
         assert (kept.camera.focal[0], kept.lens_source) == (120, "")
@@ -178,7 +178,7 @@ def test_predict_takes_a_checkpoint_and_a_clip_keeps_one_lens(
             output, points=output.points * torch.tensor([stretch, stretch, 1])
         )
 
-    monkeypatch.setattr(MogeBase, "ask", ask)
+    monkeypatch.setattr(MogeBase, "run_network", ask)
     monkeypatch.setattr(
         "spackle.bases.depth.lift_rgbd",
         lambda *given: (seen.append(given[2].focal[0]), lift_rgbd(*given))[1],

@@ -1,1 +1,1 @@
-"""MoGe-2, a network that predicts metric depth and focal length from one photo, reimplemented in plain PyTorch."""
+"""MoGe-2 predicts metric depth and the focal length from one photo: `base` uses `network`."""

@@ -1,10 +1,15 @@
-"""The moge base: lift the depth of MoGe-2, and take MoGe-2's focal length if the photo's is unknown."""
+"""The moge base: lift the depth of MoGe-2, and take MoGe-2's focal length if the photo's is unknown.
+
+The network predicts points up to a shift along z. `to_view` finds the shift and the focal length
+with which the points project to their pixels, and turns the points into depth in metres.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 import os
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -35,11 +40,9 @@ from spackle.runtime.errors import InputError
 from spackle.runtime.progress import Progress
 
 USUAL_TOKENS = 1800  # for a photo, limited to the checkpoint's range
-SAMPLES = 64  # points along each side of the map that determine focal length and shift
-MAX_STEPS, MIN_STEP = (
-    200,
-    1e-9,
-)  # the search for the shift: most steps, and the smallest step relative to 1 + shift
+SAMPLES_PER_SIDE = 64  # points along each side of the map that determine focal length and shift
+MAX_SHIFT_STEPS = 200  # of the search for the shift along z
+SHIFT_TOLERANCE = 1e-9  # the search ends at a smaller step, relative to 1 + |shift|
 SKY_DISTANCE_FACTOR = 10.0  # distance of the sky, as a multiple of the farthest surface's distance
 
 Floats = NDArray[np.float64]
@@ -54,6 +57,20 @@ class MogeView:
     focal_px: float  # in pixels of the photo
     shift: float  # of the network's points along z
 
+    def depth_map(self, path: Path) -> DepthMap:
+        """The view as a depth map, in which the sky lies behind all surfaces; path: the photo.
+
+        InputError if there is no surface with a depth.
+        """
+        known = self.surface & (self.depth > 0) & self.depth.isfinite()
+        if not known.any():
+            raise InputError(f"{path}: MoGe finds no surface: give another photo, or `base` lite")
+        sky_depth = SKY_DISTANCE_FACTOR * self.depth[known].max()
+        depth = torch.where(self.surface, self.depth.where(known, 0.0), sky_depth)
+        return DepthMap(
+            depth, known | ~self.surface, K=None, quantum=None, quantity="depth", path=path
+        )
+
 
 class MogeBase:
     """MoGe-2 (Wang et al. 2025), frozen."""
@@ -62,7 +79,8 @@ class MogeBase:
 
     def __init__(self, network: MogeNetwork, precision: str) -> None:
         """Use a loaded network on its device; `precision` is its name in the report."""
-        self.network, self.precision = network, precision
+        self.network = network
+        self.precision = precision
 
     @classmethod
     def load(
@@ -72,50 +90,35 @@ class MogeBase:
         precision: Precision = "auto",
         device: torch.device | str | None = None,
     ) -> MogeBase:
-        """Read MoGe-2's model.pt; InputError for a missing device, a foreign or broken file, or too little memory."""
+        """Read MoGe-2's model.pt.
+
+        `device` is cpu or a CUDA device; None: CUDA if available. InputError for a missing device,
+        a foreign or broken file, or too little memory.
+        """
         target = pick_device(device)
         dtype = pick_dtype(precision, target)
         with report_memory_shortage():
-            return cls(
-                load_network(path, dtype).to(target), "bf16" if dtype == torch.bfloat16 else "fp32"
-            )
+            network = load_network(path, dtype).to(target)
+        return cls(network, "bf16" if dtype == torch.bfloat16 else "fp32")
 
     def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
-        """Gaussians of the pixels of the photo at its working size, as `lift_rgbd` makes them.
+        """Gaussians of the photo's pixels at its working size, on the surfaces that MoGe sees.
 
-        The user's or the file's focal length is kept. Without one, MoGe's focal length is used if it is plausible, else
-        the default. The sky lies behind all surfaces. InputError if the network finds no surface, or memory is short.
+        The user's or the file's focal length is kept. Without one, MoGe's focal length is used if
+        it is plausible, else the assumed one. The sky lies behind all surfaces. InputError if the
+        network finds no surface, or memory is short.
         """
         photo = resize_photo(photo)
         tokens = min(max(USUAL_TOKENS, self.network.least_tokens), self.network.most_tokens)
         rows, columns = token_grid(photo.height, photo.width, tokens)
-        size = min(
-            (PIXELS_PER_TOKEN * rows, PIXELS_PER_TOKEN * columns), (photo.height, photo.width)
-        )  # `lift_rgbd` enlarges
-        known = not photo.focal_source.is_assumed
+        # The maps need not be finer than the network's finest level: lifting enlarges them.
+        finest_size = (PIXELS_PER_TOKEN * rows, PIXELS_PER_TOKEN * columns)
+        size = min(finest_size, (photo.height, photo.width))
         with report_memory_shortage():
-            output = self.ask(photo.rgb, tokens, size)
-        view = to_view(output, photo.width, photo.height, photo.focal_px if known else None)
-        camera, lens_source = photo.camera, ""
-        if not known and is_plausible_focal(view.focal_px, photo.width, photo.height):
-            camera, lens_source = (
-                Camera.from_focal(view.focal_px, photo.width, photo.height),
-                "MoGe",
-            )
-        elif not known:
-            view = to_view(output, photo.width, photo.height, photo.focal_px)
-        valid = view.surface & (view.depth > 0) & view.depth.isfinite()
-        if not valid.any():
-            raise InputError(
-                f"{photo.path}: MoGe finds no surface: give another photo, or --base lite"
-            )
-        depth = torch.where(
-            view.surface,
-            view.depth.where(valid, 0.0),
-            SKY_DISTANCE_FACTOR * view.depth[valid].max(),
-        )
-        depth_map = DepthMap(depth, valid | ~view.surface, None, None, "depth", photo.path)
-        prediction = lift_predicted_depth(photo, depth_map, camera)
+            output = self.run_network(photo.rgb, tokens, size)
+
+        view, camera, lens_source = self._choose_focal(output, photo)
+        prediction = lift_predicted_depth(photo, view.depth_map(photo.path), camera)
         notes = {
             **prediction.notes,
             "precision": self.precision,
@@ -123,61 +126,130 @@ class MogeBase:
         }
         return dataclasses.replace(prediction, notes=notes, lens_source=lens_source)
 
+    @staticmethod
+    def _choose_focal(output: MogeOutput, photo: Photo) -> tuple[MogeView, Camera, str]:
+        """The view and the camera with the best known focal length, and its source for the report.
+
+        The source is "MoGe", or "" if the photo's focal length is taken.
+        """
+        if photo.focal_source.is_assumed:
+            view = to_view(output, photo.width, photo.height)
+            if is_plausible_focal(view.focal_px, photo.width, photo.height):
+                camera = Camera.from_focal(view.focal_px, photo.width, photo.height)
+                return view, camera, "MoGe"
+        return to_view(output, photo.width, photo.height, photo.focal_px), photo.camera, ""
+
     @torch.no_grad()
-    def ask(self, rgb: Tensor, tokens: int, size: tuple[int, int]) -> MogeOutput:
-        """The network's output, on the CPU, for a photo [H, W, 3], sRGB in 0..1, with maps of `size` (h, w)."""
+    def run_network(self, rgb: Tensor, tokens: int, size: tuple[int, int]) -> MogeOutput:
+        """The network's output, on the CPU, for a photo [H, W, 3], sRGB in 0..1.
+
+        The photo is encoded as about `tokens` tokens; the output has maps of `size` (h, w).
+        """
         device = next(self.network.parameters()).device
+        image = rgb.float().permute(2, 0, 1)[None].to(device)  # [1, 3, H, W]
         with without_autocast_or_tf32(device):
-            output = self.network(rgb.float().permute(2, 0, 1)[None].to(device), tokens, size)
+            output = self.network(image, tokens, size)
         return MogeOutput(output.points.cpu(), output.mask_logits.cpu(), output.metric_scale.cpu())
 
 
 def to_view(output: MogeOutput, width: int, height: int, focal_px: float | None = None) -> MogeView:
-    """Convert the output for a width×height photo to metres, by the shift and focal length of `focal_and_shift`."""
+    """Convert the network's output for a width×height photo to metres.
+
+    The depth is (z + shift) · metric scale, with the shift and the focal length that project the
+    points to their pixels best. A given `focal_px`, in pixels of the photo, is kept.
+    """
     rows, columns = output.mask_logits.shape
-    half_diagonal = math.hypot(width, height) / 2
-    down, right = (torch.arange(SAMPLES) * n // SAMPLES for n in (rows, columns))
-    points = output.points[down][:, right].double()
-    plane = view_plane(rows, columns, width / height)[0].permute(1, 2, 0)[down][:, right].double()
-    chosen = (output.mask_logits[down][:, right] > 0) & points.isfinite().all(-1)
-    known = focal_px and focal_px / half_diagonal
-    focal, shift = focal_and_shift(points[chosen].numpy(), plane[chosen].numpy(), known)
+    sampled_rows = (torch.arange(SAMPLES_PER_SIDE) * rows // SAMPLES_PER_SIDE)[:, None]
+    sampled_columns = torch.arange(SAMPLES_PER_SIDE) * columns // SAMPLES_PER_SIDE
+    points = output.points[sampled_rows, sampled_columns].double()  # [64, 64, 3]
+    plane = view_plane(rows, columns, width / height)[0].permute(1, 2, 0)  # [h, w, 2]
+    places = plane[sampled_rows, sampled_columns].double()  # [64, 64, 2]
+    is_surface = output.mask_logits[sampled_rows, sampled_columns] > 0
+    usable = is_surface & points.isfinite().all(-1)
+
+    half_diagonal = math.hypot(width, height) / 2  # the unit of places and of the focal length
+    known_focal = None if focal_px is None else focal_px / half_diagonal
+    focal, shift = focal_and_shift(points[usable].numpy(), places[usable].numpy(), known_focal)
     depth = (output.points[..., 2] + shift) * output.metric_scale
     return MogeView(depth, output.mask_logits > 0, focal * half_diagonal, shift)
 
 
-def focal_and_shift(
-    points: Floats, places: Floats, focal: float | None = None
-) -> tuple[float, float]:
-    """The focal length f and the shift s along z with which points [N, 3] project to `places` [N, 2].
+@dataclasses.dataclass(frozen=True)
+class _Fit:
+    """How points, shifted along z, project to their places."""
 
-    Gauss-Newton steps from s = 0 minimise |f (x, y) / (z + s) - place|²; a step is halved until the error falls. The
-    best f for a shift has a closed form. The unit of f and of `places` is half the diagonal; a given f is kept. Fewer
-    than two points give f = 1 and s = 0.
+    focal: float
+    projected: Floats  # [N, 2] (x, y) / (z + shift)
+    residual: Floats  # [N, 2] focal · projected - places
+
+    @property
+    def error(self) -> float:
+        """The sum of squared residuals; NaN if a shift puts a point into the camera."""
+        return float((self.residual**2).sum())
+
+
+def _fit_at(shift: float, points: Floats, places: Floats, known_focal: float | None) -> _Fit:
+    """Project points [N, 3], shifted along z, by the best focal length or a known one.
+
+    The best one for a shift has a closed form, because the residual is linear in it.
+    """
+    with np.errstate(all="ignore"):  # a shift may put a point into the camera
+        projected = points[:, :2] / (points[:, 2:] + shift)
+        focal = known_focal
+        if focal is None:
+            focal = float((projected * places).sum() / (projected * projected).sum())
+        return _Fit(focal, projected, focal * projected - places)
+
+
+def focal_and_shift(
+    points: Floats, places: Floats, known_focal: float | None = None
+) -> tuple[float, float]:
+    """The focal length f and the shift s along z with which points project to their places.
+
+    Gauss-Newton steps from s = 0 minimise the sum of |f (x, y) / (z + s) - place|²; a step is
+    halved until the error falls.
+
+    Args:
+        points: [N, 3]; fewer than two points give f = 1 and s = 0.
+        places: [N, 2] on the photo, from its centre.
+        known_focal: a focal length that is kept; None: it is found. Its unit, and that of `places`
+            and of the result, is half the photo's diagonal.
     """
     if len(points) < 2:
-        return focal or 1.0, 0.0
-
-    def at(shift: float) -> tuple[float, Floats, Floats]:
-        with np.errstate(all="ignore"):  # a shift may put a point into the camera
-            seen = points[:, :2] / (points[:, 2:] + shift)
-            best = focal or float((seen * places).sum() / (seen * seen).sum())
-            return best, seen, best * seen - places
+        return known_focal or 1.0, 0.0
 
     shift = 0.0
-    for _ in range(MAX_STEPS):
-        best, seen, off = at(shift)
-        moved = -seen / (points[:, 2:] + shift)  # the derivative of `seen` by the shift
-        change = best * moved  # the derivative of `off` by the shift
-        if focal is None:
-            change += float((moved * (places - 2 * best * seen)).sum() / (seen * seen).sum()) * seen
-        step = -float((change * off).sum() / ((change * change).sum() or 1.0))
-        while (
-            abs(step) > MIN_STEP * (1 + abs(shift))
-            and not (at(shift + step)[2] ** 2).sum() < (off**2).sum()
-        ):
+    fit = _fit_at(shift, points, places, known_focal)
+    for _ in range(MAX_SHIFT_STEPS):
+        step = _gauss_newton_step(fit, shift, points, places, known_focal)
+        shortest = SHIFT_TOLERANCE * (1 + abs(shift))
+        # An error that is not a number does not fall.
+        while abs(step) > shortest:
+            if _fit_at(shift + step, points, places, known_focal).error < fit.error:
+                break
             step /= 2
         shift += step
-        if not abs(step) > MIN_STEP * (1 + abs(shift)):
+        fit = _fit_at(shift, points, places, known_focal)
+        if not abs(step) > SHIFT_TOLERANCE * (1 + abs(shift)):
             break
-    return at(shift)[0], shift
+    return fit.focal, shift
+
+
+def _gauss_newton_step(
+    fit: _Fit, shift: float, points: Floats, places: Floats, known_focal: float | None
+) -> float:
+    """The change of the shift that would make the residuals smallest if they were linear in it.
+
+    points [N, 3] are shifted by `shift` so far; places [N, 2] are where they should project to.
+    """
+    projected_slope = -fit.projected / (points[:, 2:] + shift)  # d projected / d shift
+    residual_slope = fit.focal * projected_slope  # d residual / d shift, at this focal length
+    if known_focal is None:
+        # The best focal length changes with the shift, too.
+        focal_slope = float(
+            (projected_slope * (places - 2 * fit.focal * fit.projected)).sum()
+            / (fit.projected * fit.projected).sum()
+        )
+        residual_slope += focal_slope * fit.projected
+    squared_slope = (residual_slope * residual_slope).sum()
+    return -float((residual_slope * fit.residual).sum() / (squared_slope or 1.0))

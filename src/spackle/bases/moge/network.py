@@ -1,7 +1,9 @@
-"""MoGe-2 (Wang et al. 2025, arXiv 2507.02546): a DINOv2 backbone, a pyramid of features, and a pyramid for each output.
+"""MoGe-2 (Wang et al. 2025, arXiv 2507.02546): predict points, a mask and a scale from one photo.
 
-Modules are named as in the checkpoint. The checkpoint's `model_config` gives the sizes; options that no published
-checkpoint uses are refused.
+A DINOv2 transformer makes features of the photo, the neck spreads them over a pyramid of five
+levels, and a pyramid for each output (a head) makes maps of them. Modules are named as in the
+checkpoint. The checkpoint's `model_config` gives the sizes; options that no published checkpoint
+uses are refused.
 """
 
 from __future__ import annotations
@@ -22,19 +24,17 @@ from spackle.runtime.errors import as_input_error, short_repr
 from spackle.weights.checkpoints import load_strict, read_checkpoint, to_channels_last
 
 ADVICE = "give MoGe-2's model.pt as it was downloaded"
-BACKBONES = {
+BACKBONES = {  # channels of the tokens, number of blocks, and attention heads of each block
     "dinov2_vits14": (384, 12, 6),
     "dinov2_vitb14": (768, 12, 12),
     "dinov2_vitl14": (1024, 24, 16),
 }
-PATCH_PX = 14  # side of a token in pixels
+TOKEN_PX = 14  # side of a token in pixels
 TRAINED_GRID = 37  # tokens along a side for which the positions were learned
 LEVEL_COUNT = 5  # of a pyramid; each level is twice as fine as the previous level
-PIXELS_PER_TOKEN = 2 ** (LEVEL_COUNT - 1)  # output pixels along a token's side
-conv3 = functools.partial(nn.Conv2d, kernel_size=3, padding=1, padding_mode="replicate")
-
-MOST_BLOCKS = 64  # of a pyramid's level
-USUAL = {  # options of a pyramid that are the same in all published checkpoints
+PIXELS_PER_TOKEN = 2 ** (LEVEL_COUNT - 1)  # pixels of the finest level along a token's side
+MAX_BLOCKS_PER_LEVEL = 64  # of a pyramid; a damaged file may ask for millions
+PUBLISHED_PYRAMID_OPTIONS = {  # the same in all published checkpoints
     "res_block_in_norm": "none",
     "res_block_hidden_norm": "none",
     "dim_times_res_block_hidden": 1,
@@ -46,9 +46,8 @@ USUAL = {  # options of a pyramid that are the same in all published checkpoints
 class MogeOutput:
     """The network's output on a grid [h, w] over the photo; float32."""
 
-    points: (
-        Tensor  # [h, w, 3] x right, y down, z forward, up to the metric scale and a shift along z
-    )
+    # [h, w, 3] x right, y down, z forward, up to the metric scale and a shift along z
+    points: Tensor
     mask_logits: Tensor  # [h, w] above 0 for a surface, else sky
     metric_scale: Tensor  # [] metres for each unit of the points
 
@@ -56,77 +55,124 @@ class MogeOutput:
 class DinoBackbone(nn.Module):
     """DINOv2 (Oquab et al. 2023) without registers."""
 
-    def __init__(self, width: int, depth: int, heads: int) -> None:
+    def __init__(self, width: int, block_count: int, head_count: int) -> None:
+        """Build the transformer for tokens with `width` channels; weights are zeros or random."""
         super().__init__()
         self.cls_token = nn.Parameter(torch.zeros(1, 1, width))
         self.pos_embed = nn.Parameter(torch.zeros(1, 1 + TRAINED_GRID**2, width))
         self.mask_token = nn.Parameter(torch.zeros(1, width))  # for training only
-        self.patch_embed = nn.ModuleDict({"proj": nn.Conv2d(3, width, PATCH_PX, stride=PATCH_PX)})
-        self.blocks = nn.ModuleList(TransformerBlock(width, heads) for _ in range(depth))
+        patch_conv = nn.Conv2d(3, width, TOKEN_PX, stride=TOKEN_PX)
+        self.patch_embed = nn.ModuleDict({"proj": patch_conv})
+        self.blocks = nn.ModuleList(TransformerBlock(width, head_count) for _ in range(block_count))
         self.norm = nn.LayerNorm(width, eps=NORM_EPS)
 
     def forward(self, image: Tensor, layers: Sequence[int]) -> list[Tensor]:
-        """Normalised tokens [1, 1 + T, C] (class token first) after the blocks `layers`; image [1, 3, 14·h, 14·w]."""
-        patches, positions = self.patch_embed["proj"](image), self.pos_embed
+        """Normalised tokens [1, 1 + h·w, C], the class token first, after the blocks `layers`.
+
+        `image` is [1, 3, 14·h, 14·w], normalised as DINOv2 was trained.
+        """
+        patches = self.patch_embed["proj"](image)  # [1, C, h, w]
         rows, columns = patches.shape[2:]
-        if (rows, columns) != (TRAINED_GRID, TRAINED_GRID):
-            # DINOv2 resizes by a factor of (n + 0.1) / 37, which puts positions a little off the grid.
-            factors = ((rows + 0.1) / TRAINED_GRID, (columns + 0.1) / TRAINED_GRID)
-            grid = positions[:, 1:].reshape(1, TRAINED_GRID, TRAINED_GRID, -1).permute(0, 3, 1, 2)
-            grid = interpolate(grid, scale_factor=factors, mode="bicubic", align_corners=False)
-            positions = torch.cat([positions[:, :1], grid.flatten(2).transpose(1, 2)], dim=1)  # type: ignore[assignment]
-        tokens = torch.cat([self.cls_token, patches.flatten(2).transpose(1, 2)], dim=1) + positions
-        after = []
+        tokens = patches.flatten(2).transpose(1, 2)  # [1, h·w, C]
+        tokens = torch.cat([self.cls_token, tokens], dim=1) + self._positions(rows, columns)
+
+        tokens_after_block = []
         for block in self.blocks:
             tokens = block(tokens)
-            after.append(tokens)
-        return [self.norm(after[layer]) for layer in layers]
+            tokens_after_block.append(tokens)
+        return [self.norm(tokens_after_block[layer]) for layer in layers]
+
+    def _positions(self, rows: int, columns: int) -> Tensor:
+        """The learned positions, interpolated to a grid of tokens: [1, 1 + rows·columns, C].
+
+        The first is that of the class token.
+        """
+        if (rows, columns) == (TRAINED_GRID, TRAINED_GRID):
+            return self.pos_embed
+        grid = self.pos_embed[:, 1:].reshape(1, TRAINED_GRID, TRAINED_GRID, -1)
+        # DINOv2 resizes by a factor of (n + 0.1) / 37, which puts positions a little off the grid.
+        factors = ((rows + 0.1) / TRAINED_GRID, (columns + 0.1) / TRAINED_GRID)
+        resized = interpolate(
+            grid.permute(0, 3, 1, 2), scale_factor=factors, mode="bicubic", align_corners=False
+        )  # [1, C, rows, columns]
+        return torch.cat([self.pos_embed[:, :1], resized.flatten(2).transpose(1, 2)], dim=1)
 
 
 class DinoEncoder(nn.Module):
-    """Encodes an image to features [1, C, h, w] and the class token [1, C']."""
+    """Encodes an image to features [1, C, h, w] and the class token [1, C'].
+
+    The features are a sum over several blocks of the transformer, each projected to C channels.
+    """
 
     def __init__(self, config: Mapping[str, Any]) -> None:
+        """Build the encoder for the part `encoder` of a checkpoint's `model_config`."""
         super().__init__()
-        width, depth, heads = BACKBONES[config["backbone"]]
-        self.layers = [range(depth)[layer] for layer in config["intermediate_layers"]]
+        width, block_count, head_count = BACKBONES[config["backbone"]]
+        blocks = range(block_count)
+        self.layers = [blocks[layer] for layer in config["intermediate_layers"]]
         self.register_buffer("image_mean", torch.zeros(1, 3, 1, 1))
         self.register_buffer("image_std", torch.ones(1, 3, 1, 1))
-        self.backbone = DinoBackbone(width, depth, heads)
+        self.backbone = DinoBackbone(width, block_count, head_count)
         self.output_projections = nn.ModuleList(
             nn.Conv2d(width, config["dim_out"], 1) for _ in self.layers
         )
 
     def forward(self, image: Tensor, rows: int, columns: int) -> tuple[Tensor, Tensor]:
-        size = (PATCH_PX * rows, PATCH_PX * columns)
-        seen = interpolate(image, size=size, mode="bilinear", align_corners=False, antialias=True)
-        tokens = self.backbone(
-            (seen - self.get_buffer("image_mean")) / self.get_buffer("image_std"), self.layers
+        """Features [1, C, rows, columns] and class token [1, C'] of an image [1, 3, H, W].
+
+        The image is sRGB in 0..1.
+        """
+        resized = interpolate(
+            image,
+            size=(TOKEN_PX * rows, TOKEN_PX * columns),
+            mode="bilinear",
+            align_corners=False,
+            antialias=True,
         )
-        maps = [each[:, 1:].transpose(1, 2).unflatten(2, (rows, columns)) for each in tokens]
-        features = [
-            project(each) for project, each in zip(self.output_projections, maps, strict=True)
-        ]
-        return torch.stack(features).sum(0), tokens[-1][:, 0]
+        normalised = (resized - self.get_buffer("image_mean")) / self.get_buffer("image_std")
+        tokens_by_layer = self.backbone(normalised, self.layers)
+
+        features = []
+        for project, tokens in zip(self.output_projections, tokens_by_layer, strict=True):
+            token_map = tokens[:, 1:].transpose(1, 2).unflatten(2, (rows, columns))
+            features.append(project(token_map))  # [1, C, rows, columns]
+        class_token = tokens_by_layer[-1][:, 0]
+        return torch.stack(features).sum(0), class_token
+
+
+def conv3(inputs: int, outputs: int) -> nn.Conv2d:
+    """A 3×3 convolution that keeps the size: beyond the border, pixels are repeated."""
+    return nn.Conv2d(inputs, outputs, kernel_size=3, padding=1, padding_mode="replicate")
 
 
 class ConvBlock(nn.Module):
     """Two convolutions, whose output is added to the input [1, C, h, w] in float32."""
 
     def __init__(self, width: int) -> None:
+        """Build the block for features with `width` channels."""
         super().__init__()
-        first, second = conv3(width, width), conv3(width, width)
+        # The identities stand where other kinds of MoGe have norms: the checkpoint counts them.
         self.layers = nn.Sequential(
-            nn.Identity(), nn.ReLU(), first, nn.Identity(), nn.ReLU(), second
+            nn.Identity(),
+            nn.ReLU(),
+            conv3(width, width),
+            nn.Identity(),
+            nn.ReLU(),
+            conv3(width, width),
         )
 
     def forward(self, x: Tensor) -> Tensor:
-        out: Tensor = x + self.layers(x.to(next(self.parameters()).dtype))
+        """Features [1, C, h, w] in float32 to features of the same shape and type."""
+        dtype = next(self.parameters()).dtype  # float32 or bfloat16
+        out: Tensor = x + self.layers(x.to(dtype))
         return out
 
 
 def make_resampler(kind: str, inputs: int, outputs: int) -> nn.Sequential:
-    """Layers that double the size of feature maps."""
+    """Layers that double the size of feature maps, and change channels from `inputs` to `outputs`.
+
+    ValueError for a kind that is neither "conv_transpose" nor "bilinear".
+    """
     if kind == "conv_transpose":
         return nn.Sequential(
             nn.ConvTranspose2d(inputs, outputs, 2, stride=2), conv3(outputs, outputs)
@@ -139,81 +185,123 @@ def make_resampler(kind: str, inputs: int, outputs: int) -> nn.Sequential:
 
 
 class Pyramid(nn.Module):
-    """Features from coarse to fine: each level adds its input to the upsampled features of the coarser level."""
+    """Makes features from coarse to fine.
+
+    Each of the five levels adds its input to the upsampled features of the coarser level.
+    """
 
     def __init__(self, config: Mapping[str, Any]) -> None:
+        """Build the pyramid for a part of a checkpoint's `model_config`, such as `neck`.
+
+        A kind that was never published raises ValueError, or another exception.
+        """
         super().__init__()
-        options = {"dim_times_res_block_hidden": 1, "activation": "relu", **config}
-        for key, value in USUAL.items():
-            if options.get(key) != value:
-                raise ValueError(f"{key} is {short_repr(options.get(key))}")
-        widths, counts, outs = (
-            config["dim_res_blocks"],
-            config["num_res_blocks"],
-            config["dim_out"] or [None] * LEVEL_COUNT,
-        )
-        if len(widths) != LEVEL_COUNT or max(counts) > MOST_BLOCKS:
-            raise ValueError(f"num_res_blocks is {short_repr(counts)}")
+        _check_pyramid_options(config)
+        widths = config["dim_res_blocks"]  # channels of each level
+        output_channels = config["dim_out"] or [None] * LEVEL_COUNT  # None: as many as the level
+
         self.input_blocks = nn.ModuleList(
-            map(functools.partial(nn.Conv2d, kernel_size=1), config["dim_in"], widths)
+            nn.Conv2d(inputs, width, kernel_size=1)
+            for inputs, width in zip(config["dim_in"], widths, strict=False)
         )
         self.res_blocks = nn.ModuleList(
-            nn.Sequential(*(ConvBlock(width) for _ in range(count)))
-            for width, count in zip(widths, counts, strict=True)
+            nn.Sequential(*(ConvBlock(width) for _ in range(block_count)))
+            for width, block_count in zip(widths, config["num_res_blocks"], strict=True)
         )
         self.output_blocks = nn.ModuleList(
-            nn.Identity() if out is None else nn.Conv2d(width, out, 1)
-            for width, out in zip(widths, outs, strict=True)
+            nn.Identity() if channels is None else nn.Conv2d(width, channels, 1)
+            for width, channels in zip(widths, output_channels, strict=True)
         )
         self.resamplers = nn.ModuleList(
-            map(make_resampler, config["resamplers"], widths[:-1], widths[1:])
+            make_resampler(kind, coarse_width, fine_width)
+            for kind, coarse_width, fine_width in zip(
+                config["resamplers"], widths[:-1], widths[1:], strict=False
+            )
         )
 
     def forward(self, inputs: Sequence[Tensor]) -> list[Tensor]:
-        """The outputs of all levels [1, C, 2^l·h, 2^l·w]; each level's input has the same height and width."""
+        """The outputs of all levels, coarse to fine: level l is [1, C, 2^l·h, 2^l·w].
+
+        `inputs` are one map for each level, with that level's height and width.
+        """
         outputs: list[Tensor] = []
-        carried: Tensor | None = None
-        for level, x in enumerate(inputs):
-            x = self.input_blocks[level](x)
-            carried = self.res_blocks[level](
-                x if carried is None else x + self.resamplers[level - 1](carried)
-            )
-            outputs.append(self.output_blocks[level](carried))
+        features: Tensor | None = None  # of the coarser level
+        for level, level_input in enumerate(inputs):
+            x = self.input_blocks[level](level_input)
+            if features is not None:
+                x = x + self.resamplers[level - 1](features)
+            features = self.res_blocks[level](x)
+            outputs.append(self.output_blocks[level](features))
         return outputs
+
+
+def _check_pyramid_options(config: Mapping[str, Any]) -> None:
+    """ValueError unless a pyramid has five levels, few blocks, and the published options."""
+    defaults = {"dim_times_res_block_hidden": 1, "activation": "relu"}
+    options = {**defaults, **config}
+    for key, value in PUBLISHED_PYRAMID_OPTIONS.items():
+        if options.get(key) != value:
+            raise ValueError(f"{key} is {short_repr(options.get(key))}")
+    block_counts = config["num_res_blocks"]
+    if len(config["dim_res_blocks"]) != LEVEL_COUNT or max(block_counts) > MAX_BLOCKS_PER_LEVEL:
+        raise ValueError(f"num_res_blocks is {short_repr(block_counts)}")
 
 
 class MogeNetwork(nn.Module):
     """Predicts points, mask and metric scale from a photo."""
 
     def __init__(self, config: Mapping[str, Any]) -> None:
-        """Build the network for a checkpoint's `model_config`; an unpublished kind can raise any exception."""
+        """Build the network for a checkpoint's `model_config`.
+
+        A kind that was never published raises ValueError, or another exception.
+        """
         super().__init__()
-        self.least_tokens, self.most_tokens = map(int, config["num_tokens_range"])
-        self.plain_exp = {"exp": True, "sinh_exp": False}[config["remap_output"]]
+        least_tokens, most_tokens = config["num_tokens_range"]
+        self.least_tokens = int(least_tokens)
+        self.most_tokens = int(most_tokens)
+        if config["remap_output"] not in ("exp", "sinh_exp"):
+            raise ValueError(f"remap_output is {short_repr(config['remap_output'])}")
+        self.remap_output = config["remap_output"]
         self.encoder = DinoEncoder(config["encoder"])
         self.neck = Pyramid(config["neck"])
-        self.points_head, self.mask_head = (
-            Pyramid(config["points_head"]),
-            Pyramid(config["mask_head"]),
+        self.points_head = Pyramid(config["points_head"])
+        self.mask_head = Pyramid(config["mask_head"])
+
+        inputs, hidden_1, hidden_2, outputs = config["scale_head"]["dims"]
+        self.scale_head = nn.Sequential(
+            nn.Linear(inputs, hidden_1),
+            nn.ReLU(),
+            nn.Linear(hidden_1, hidden_2),
+            nn.ReLU(),
+            nn.Linear(hidden_2, outputs),
         )
-        dims = config["scale_head"]["dims"]
-        first, second, third = map(nn.Linear, dims[:-1], dims[1:])
-        self.scale_head = nn.Sequential(first, nn.ReLU(), second, nn.ReLU(), third)
 
     def forward(self, image: Tensor, tokens: int, size: tuple[int, int]) -> MogeOutput:
-        """Maps of `size` (h, w) from an image [1, 3, H, W], sRGB in 0..1, which is encoded as about `tokens` tokens."""
-        levels, scale = self.features(image, tokens)
-        x, y, z = self.decode(self.points_head, levels, size).unbind(-1)
-        z = z.exp()
-        x, y = (x * z, y * z) if self.plain_exp else (x.sinh(), y.sinh())
+        """Predict maps of `size` (h, w) from an image [1, 3, H, W], sRGB in 0..1.
+
+        The image is encoded as about `tokens` tokens.
+        """
+        levels, metric_scale = self.features(image, tokens)
+        x, y, log_z = self.decode(self.points_head, levels, size).unbind(-1)  # each [h, w]
+        z = log_z.exp()
+        if self.remap_output == "exp":  # the network predicts x / z, y / z and log z
+            x = x * z
+            y = y * z
+        else:
+            x = x.sinh()
+            y = y.sinh()
         mask_logits = self.decode(self.mask_head, levels, size)[..., 0]
-        return MogeOutput(torch.stack([x, y, z], dim=-1), mask_logits, scale)
+        return MogeOutput(torch.stack([x, y, z], dim=-1), mask_logits, metric_scale)
 
     def features(self, image: Tensor, tokens: int) -> tuple[list[Tensor], Tensor]:
-        """The neck's features [1, C, 2^l·h, 2^l·w] of all levels, and the metric scale []."""
+        """The neck's features of all levels, and the metric scale [], of an image [1, 3, H, W].
+
+        Level l is [1, C, 2^l·h, 2^l·w], where h·w is about `tokens`.
+        """
         height, width = image.shape[2:]
         rows, columns = token_grid(height, width, tokens)
         features, class_token = self.encoder(image, rows, columns)
+        # Each level also gets the direction of its pixels, in which the aspect ratio shows.
         planes = [
             view_plane(rows << level, columns << level, width / height).to(image)
             for level in range(LEVEL_COUNT)
@@ -223,51 +311,61 @@ class MogeNetwork(nn.Module):
 
     @staticmethod
     def decode(head: Pyramid, levels: Sequence[Tensor], size: tuple[int, int]) -> Tensor:
-        """A head's finest output, resized to `size` (h, w): [h, w, C]."""
-        return interpolate(head(levels)[-1], size=size, mode="bilinear", align_corners=False)[
-            0
-        ].permute(1, 2, 0)
+        """A head's finest output, from the neck's levels, resized to `size` (h, w): [h, w, C]."""
+        finest = head(levels)[-1]
+        resized = interpolate(finest, size=size, mode="bilinear", align_corners=False)
+        return resized[0].permute(1, 2, 0)
 
 
 def token_grid(height: int, width: int, tokens: int) -> tuple[int, int]:
-    """(rows, columns) of a grid of about the given number of tokens over a photo."""
-    return max(1, round(math.sqrt(tokens / (width / height)))), max(
-        1, round(math.sqrt(tokens * (width / height)))
-    )
+    """(rows, columns) of a grid of about `tokens` tokens over a photo of this size in pixels."""
+    aspect = width / height
+    rows = max(1, round(math.sqrt(tokens / aspect)))
+    columns = max(1, round(math.sqrt(tokens * aspect)))
+    return rows, columns
 
 
 def view_plane(rows: int, columns: int, aspect: float) -> Tensor:
-    """[1, 2, rows, columns]: x and y of each cell's centre, from the photo's centre, in units of half its diagonal."""
-    x, y = (((2 * torch.arange(n, dtype=torch.float64) + 1) / n - 1) for n in (columns, rows))
+    """[1, 2, rows, columns]: x and y of each cell's centre on the photo.
+
+    They count from the photo's centre, in units of half its diagonal; `aspect` is width over
+    height.
+    """
+    # From -1 to 1 across the photo.
+    x = (2 * torch.arange(columns, dtype=torch.float64) + 1) / columns - 1
+    y = (2 * torch.arange(rows, dtype=torch.float64) + 1) / rows - 1
     diagonal = math.hypot(1, aspect)
     grid = torch.meshgrid(x * (aspect / diagonal), y / diagonal, indexing="xy")
     return torch.stack(grid)[None].float()
 
 
 def load_network(path: str | os.PathLike[str], dtype: torch.dtype) -> MogeNetwork:
-    """A frozen network from MoGe-2's model.pt, on the CPU; InputError for a wrong file or too little memory.
+    """A frozen network from MoGe-2's model.pt, on the CPU.
 
-    Residual blocks compute in `dtype`, float32 or bfloat16, and add to float32 features, because bfloat16's eight bits
-    would turn slanted surfaces into stairs. Nothing in the file is executed.
+    Residual blocks compute in `dtype`, float32 or bfloat16, and add to float32 features, because
+    bfloat16's eight bits would turn slanted surfaces into stairs. Nothing in the file is executed.
+    InputError for a wrong file or too little memory.
     """
     config, tensors = read_checkpoint(path, "model_config", ADVICE)
-    with (
-        as_input_error(path, f"not a published kind of MoGe-2 ({{reason}}): {ADVICE}"),
-        torch.device("meta"),
-    ):
+    unpublished = as_input_error(path, f"not a published kind of MoGe-2 ({{reason}}): {ADVICE}")
+    with unpublished, torch.device("meta"):  # without memory; the weights come from the file
         network = MogeNetwork(config)  # type: ignore[arg-type]
-    weights = {  # without the head for normals, which Spackle does not use
+
+    weights = {
         name.removeprefix("model."): tensor
         for name, tensor in tensors.items()
+        # Spackle does not use the head for normals.
         if name.startswith("model.") and not name.startswith("model.normal_head.")
     }
-    return load_strict(
-        network, weights, path, ADVICE, prepare=functools.partial(set_precision, dtype=dtype)
-    )
+    convert = functools.partial(set_precision, dtype=dtype)
+    return load_strict(network, weights, path, ADVICE, prepare=convert)
 
 
 def set_precision(network: nn.Module, dtype: torch.dtype) -> None:
-    """Convert the residual blocks to `dtype`, in place, and kernels to channels-last."""
+    """Convert the layers of residual blocks to `dtype`, in place, and kernels to channels-last.
+
+    These layers take most of the time; the others stay float32.
+    """
     for block in network.modules():
         if isinstance(block, (TransformerBlock, ConvBlock)):
             for layer in block.modules():
