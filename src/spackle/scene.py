@@ -33,9 +33,10 @@ from spackle.render import Renderer, get_renderer
 from spackle.render.protocol import Rendering
 from spackle.residual.features import hole_mask
 from spackle.runtime.files import PathOrFile, write_atomic
-from spackle.video.encoding import check_video, save_video
+from spackle.video.encoding import save_video
 from spackle.video.frames import FrameMaker
 from spackle.video.options import Fit, Show, StereoLayout, VideoOptions, parse_size
+from spackle.video.video_formats import check_video
 from spackle.views import DEFAULT_FRAME_COUNT, PathOptions
 
 DEFAULT_SIZE_PX = (1280, 720)  # width and height of the views of a file that stores no camera

@@ -34,8 +34,8 @@ from spackle.scene import Scene
 
 CPU = CpuRenderer()
 BOX = box_before_wall(width=64, height=48, focal=54)
-# Bounds of a format's rounding: PSNR between renders, and the largest errors of position (in standard deviations), of
-# the logarithm of a scale, of an axis, of sRGB and of opacity.
+# Bounds of a format's rounding: PSNR between renders, and the largest errors of position (in
+# standard deviations), of the logarithm of a scale, of an axis, of sRGB and of opacity.
 BOUNDS = {
     "compressed.ply": (50, 0.1, 0.01, 0.005, 0.003, 0.003),
     "spz": (43, 0.04, 0.04, 0.01, 0.008, 0.003),

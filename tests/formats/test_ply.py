@@ -35,7 +35,8 @@ def raw(gaussians: Gaussians) -> np.ndarray[Any, np.dtype[np.float64]]:
 
 
 def ply(rows: Any, kind: str = "float") -> bytes:
-    header = f"ply\nformat binary_little_endian 1.0\ncomment made by a test\nelement vertex {len(rows)}\n"
+    header = "ply\nformat binary_little_endian 1.0\ncomment made by a test\n"
+    header += f"element vertex {len(rows)}\n"
     header += "".join(f"property {kind} {name}\n" for name in GIVEN) + "end_header\n"
     return header.encode() + rows.astype({"float": "<f4", "double": "<f8"}[kind]).tobytes()
 

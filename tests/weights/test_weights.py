@@ -197,7 +197,7 @@ def test_the_folder_of_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 @pytest.fixture
 def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder of weights, which does not exist yet; the site's content counts as Apple's weights."""
+    """The folder of weights, which is not there yet; the site's content counts as Apple's."""
     monkeypatch.setenv("SPACKLE_WEIGHTS", str(tmp_path / "weights"))
     publish(monkeypatch, "sharp", CONTENT)
     return tmp_path / "weights"

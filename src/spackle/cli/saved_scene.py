@@ -27,8 +27,9 @@ from spackle.runtime.files import write_atomic
 from spackle.runtime.folders import results_folder
 from spackle.runtime.progress import Reporter
 from spackle.scene import Scene
-from spackle.video.encoding import VIDEO_FORMATS, save_video
+from spackle.video.encoding import save_video
 from spackle.video.frames import FrameMaker, video_problem
+from spackle.video.video_formats import VIDEO_FORMATS
 from spackle.views import PathOptions
 
 TOLERATED = 0.01  # fraction of a frame that may be holes before the log mentions it

@@ -1,6 +1,6 @@
 """JSON files of cameras: views to render, or keyframes of a path.
 
-`load_cameras` and `load_path` read files; `checked_camera` turns matrices of any file into a camera.
+`load_cameras` and `load_path` read files; `checked_camera` makes a camera of matrices.
 """
 
 from __future__ import annotations
@@ -87,8 +87,8 @@ def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
     down, z forward); K is in pixels. A frame may have its own width and height.
 
     Raises:
-        InputError: the file has other content, no frame or more than 10,000, or a camera that
-            `checked_camera` refuses.
+        InputError: the file has other content, no frame or more than 10,000, or an impossible
+            camera: without a size, with skew, or with a pose that is no rotation and translation.
     """
     content = _read_json(_CameraFile, path, "camera file")
     cameras = []

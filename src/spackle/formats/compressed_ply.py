@@ -141,6 +141,8 @@ def _spread_bits(numbers: NDArray[np.uint32]) -> NDArray[np.uint32]:
 def _to_fractions(values: Floats, chunk_starts: NDArray[np.int64]) -> tuple[Floats, Floats]:
     """Express values [N, 3] as fractions between the smallest and largest value of their chunk.
 
+    A chunk is 256 consecutive Gaussians; the last one may be shorter.
+
     Args:
         values: one row for each Gaussian.
         chunk_starts: [C] the first row of each chunk.
@@ -236,6 +238,8 @@ def _unpack_fractions(words: NDArray[np.uint32], bit_counts: tuple[int, ...]) ->
 
 def _from_fractions(fractions: Floats, chunks: NDArray[Any], bound_names: list[str]) -> Floats:
     """Return the values of fractions between their chunk's bounds; inverts `_to_fractions`.
+
+    A chunk is 256 consecutive Gaussians; the last one may be shorter.
 
     Args:
         fractions: [N, 3] in 0..1, one row for each Gaussian.

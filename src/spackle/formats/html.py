@@ -11,6 +11,7 @@ import gzip
 import hashlib
 import json
 import math
+from collections.abc import Mapping
 from importlib import resources
 
 import numpy as np
@@ -104,20 +105,7 @@ def page_scene(
     # most of what was filled in beyond the photo's border.
     shown_camera = camera if disparity is None else camera.zoomed(1 + DEFAULT_OVERSCAN)
 
-    files: dict[str, bytes] = {}
-    layers: list[dict[str, object]] = []
-    for layer_name, gaussians in (("base", base), ("aux", aux)):
-        file_name = f"{layer_name}.splats"
-        files[file_name], scale_low, scale_step = encode_layer(gaussians)
-        layers.append(
-            {
-                "name": layer_name,
-                "file": file_name,
-                "count": len(gaussians),
-                "scaleLow": scale_low,
-                "scaleStep": scale_step,
-            }
-        )
+    files, layers = _encode_layers({"base": base, "aux": aux})
     description: dict[str, object] = {
         "name": name,
         "note": note,
@@ -133,6 +121,32 @@ def page_scene(
         "layers": layers,
     }
     return PageScene(description, files)
+
+
+def _encode_layers(
+    layers: Mapping[str, Gaussians],
+) -> tuple[dict[str, bytes], list[dict[str, object]]]:
+    """Pack layers of Gaussians by name for the page.
+
+    Returns:
+        The packed bytes of each layer by file name, and the description of each layer, which says
+        how its bytes are to be read.
+    """
+    files = {}
+    descriptions: list[dict[str, object]] = []
+    for name, gaussians in layers.items():
+        file_name = f"{name}.splats"
+        files[file_name], scale_low, scale_step = encode_layer(gaussians)
+        descriptions.append(
+            {
+                "name": name,
+                "file": file_name,
+                "count": len(gaussians),
+                "scaleLow": scale_low,
+                "scaleStep": scale_step,
+            }
+        )
+    return files, descriptions
 
 
 def _movement_limit(disparity: float | None, is_filled: bool) -> float:

@@ -80,7 +80,7 @@ def save_ply(
         ValueError: a Gaussian is not finite.
     """
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        file.writelines(_encoded_parts(gaussians, camera, base_count, disparity))
+        file.writelines(_encode_parts(gaussians, camera, base_count, disparity))
 
 
 def encode_ply(scene: SceneFile) -> bytes:
@@ -89,18 +89,22 @@ def encode_ply(scene: SceneFile) -> bytes:
     Raises:
         ValueError: a Gaussian is not finite.
     """
-    parts = _encoded_parts(
+    parts = _encode_parts(
         scene.gaussians, scene.camera_at_origin, scene.base_count, scene.disparity
     )
     return b"".join(parts)
 
 
-def _encoded_parts(
+def _encode_parts(
     gaussians: Gaussians, camera: Camera | None, base_count: int | None, disparity: float | None
 ) -> Iterator[bytes]:
     """Yield the header of a PLY file, and then its rows, ROWS_PER_BLOCK at a time.
 
-    The arguments are those of `save_ply`.
+    Args:
+        gaussians: the scene.
+        camera: the photo's camera, if it is known.
+        base_count: how many Gaussians come from the photo, if it is known.
+        disparity: the relative camera movement for which the scene was completed, if known.
     """
     vertex = NewTable(
         name="vertex", row_count=len(gaussians), type="float", properties=WRITTEN_PROPERTIES
@@ -108,6 +112,7 @@ def _encoded_parts(
     yield ply_header(vertex, camera=camera, base_count=base_count, disparity=disparity)
 
     gaussians = gaussians.detach().to("cpu", torch.float32)
+    # All blocks are converted at full size, so that a row's bits do not depend on those after it.
     padding = Gaussians(
         *(torch.zeros(ROWS_PER_BLOCK, *tensor.shape[1:]) for tensor in gaussians.tensors)
     )
@@ -205,8 +210,14 @@ class PlyFile:
         opacities = torch.empty(count, 1)
         scales = torch.empty(count, 3)
         quats = torch.empty(count, 4)
-        groups = ((means, MEANS), (colors, COLORS), (opacities, OPACITIES))
-        groups += ((scales, SCALES), (quats, QUATS))
+        # Which rows of the block below go into each tensor.
+        groups = [
+            (means, MEANS),
+            (colors, COLORS),
+            (opacities, OPACITIES),
+            (scales, SCALES),
+            (quats, QUATS),
+        ]
 
         # One array serves all blocks; a row holds one property.
         block = np.zeros((len(READ_PROPERTIES), ROWS_PER_BLOCK), np.float32)
@@ -232,6 +243,7 @@ class PlyFile:
         Raises:
             InputError: the stored camera is impossible.
         """
+        # A cropped photo's principal point may be negative.
         numbers = self._tables.numbers_in_comment("spackle_camera", 6, lowest=-math.inf)
         if numbers is not None:
             fx, fy, cx, cy, width, height = numbers

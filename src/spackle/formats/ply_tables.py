@@ -203,7 +203,14 @@ class PlyTables:
         return numbers
 
     def _parse_line(self, words: list[str]) -> None:
-        """Take one line of the header, split into words, into `elements` and `comments`.
+        """Take one line of the header into `elements` and `comments`.
+
+        Lines are, for example, "format binary_little_endian 1.0", "comment made by hand",
+        "element vertex 100" (a table of 100 rows), and "property float x" (a column of the
+        table before).
+
+        Args:
+            words: the line, split into words.
 
         Raises:
             ValueError, KeyError, IndexError: the line has no meaning, or stands in a wrong place.

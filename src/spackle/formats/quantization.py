@@ -38,8 +38,9 @@ def decode_smallest_three(largest: NDArray[Any], others: Floats) -> Floats:
         others: [N, 3] the other components, in their order.
     """
     quats = np.empty((len(others), 4), np.float32)
-    np.put_along_axis(quats, OTHER_COMPONENTS[largest], others, axis=1)
-    # Rounding may make the three squares sum to a little more than 1.
+    other_columns = OTHER_COMPONENTS[largest]  # [N, 3]
+    np.put_along_axis(quats, other_columns, others, axis=1)
+    # The four squares sum to 1. After rounding, three of them may sum to a little more.
     largest_value = np.sqrt(np.maximum(0, 1 - np.square(others).sum(axis=1)))  # [N]
     largest_column = largest[:, None].astype(np.int64)  # [N, 1]
     np.put_along_axis(quats, largest_column, largest_value[:, None], axis=1)

@@ -164,7 +164,8 @@ def _quantize_positions(means: Floats) -> tuple[NDArray[np.uint16], Floats, Floa
 def _encode_rotations(quats: Floats) -> NDArray[np.uint8]:
     """Encode unit quaternions [N, 4] (w, x, y, z) as pixels [N, 4].
 
-    Red, green and blue hold the three smaller components, alpha the index of the largest one.
+    Red, green and blue hold the three smaller components, with 0 for -√½ and 255 for √½. Alpha is
+    252 plus the index of the largest component.
     """
     largest, others = encode_smallest_three(quats)
     other_codes = np.round(components_to_fractions(others) * 255)  # [N, 3]
@@ -277,7 +278,10 @@ def _look_up_codes(codes: NDArray[np.uint8], book: object) -> Floats:
 
 
 def _decode_rotations(rgba: NDArray[np.uint8]) -> Floats:
-    """Return unit quaternions [N, 4] (w, x, y, z); the inverse of `_encode_rotations`.
+    """Return unit quaternions [N, 4] (w, x, y, z) from pixels [N, 4].
+
+    Red, green and blue hold the three smaller components, with 0 for -√½ and 255 for √½. Alpha is
+    252 plus the index of the largest component.
 
     Raises:
         ValueError: an alpha does not name a component.

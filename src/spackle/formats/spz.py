@@ -164,6 +164,11 @@ def _shrink_into_grid(columns: GaussianColumns, fraction_bits: int) -> GaussianC
     """Scale each Gaussian outside of the grid, about the origin, until it fits.
 
     Position and size shrink by the same factor, so the view from the origin stays the same.
+
+    Args:
+        columns: N Gaussians.
+        fraction_bits: how many bits of a coordinate, a fixed-point number of 24 bits, are
+            fractional; the grid ends at the largest such number.
     """
     largest_coordinate = np.abs(columns.means).max(axis=1, initial=0).astype(np.float64)  # [N]
     grid_end = MAX_GRID_COORDINATE / 2.0**fraction_bits
@@ -213,7 +218,7 @@ def _encode_sections(
 
     # srgb = 0.5 + SH_C0 · f_dc, and a byte stands for 0.5 + COLOR_SCALE · f_dc.
     byte_per_srgb = np.float32(COLOR_SCALE * 255 / SH_C0)
-    color_bytes = (columns.srgb - np.float32(0.5)) * byte_per_srgb + np.float32(127.5)
+    color_bytes = (columns.srgb - np.float32(0.5)) * byte_per_srgb + np.float32(0.5 * 255)
     colors = np.clip(np.round(color_bytes), 0, 255).astype(np.uint8)
 
     step_per_log = np.float32(SCALE_STEPS / rounding.scale_step)
@@ -238,18 +243,27 @@ def _encode_positions(
         relative_step: positions are rounded to a power of two of at most this many standard
             deviations along the Gaussian's middle axis, because finer detail is invisible.
     """
-    a, b, c = columns.log_scales.T  # [N] each
-    middle_log_scale = np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c))
-    # The base-2 logarithm of the rounding step, in steps of the grid.
+    middle_log_scale = _middle_of_three(columns.log_scales)  # [N]
+    # The rounding step in steps of the grid: the largest power of two that is not above
+    # relative_step · scale · 2^fraction_bits.
     log2_scale = middle_log_scale / np.float32(np.log(2))
     exponent = np.floor(log2_scale + np.float32(np.log2(relative_step) + fraction_bits))
-    step = np.exp2(np.clip(exponent, 0, 20))[:, None]  # [N, 1]; 2^20 leaves 3 of the 23 bits
+    # A step below 1 is finer than the grid; 2^20 leaves 3 of a number's 23 bits.
+    step = np.exp2(np.clip(exponent, 0, 20))[:, None]  # [N, 1]
 
     grid_positions = columns.means * np.float64(2.0**fraction_bits)
     rounded = np.round(grid_positions / step) * step
     numbers = np.clip(rounded, -MAX_GRID_COORDINATE, MAX_GRID_COORDINATE).astype("<i4")
-    all_bytes = numbers.view(np.uint8).reshape(-1, 3, 4)
-    return np.ascontiguousarray(all_bytes[:, :, :3])  # without the highest byte, which is the sign
+    four_bytes = numbers.view(np.uint8).reshape(-1, 3, 4)
+    # The highest byte only repeats the sign, because 24 bits hold the number.
+    return np.ascontiguousarray(four_bytes[:, :, :3])
+
+
+def _middle_of_three(values: Floats) -> Floats:
+    """Return the middle one of the three values in each row [N, 3], as [N]."""
+    a, b, c = values.T
+    middle: Floats = np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c))
+    return middle
 
 
 def _encode_rotations(quats: Floats, component_bits: int) -> NDArray[np.uint32]:
@@ -266,8 +280,9 @@ def _encode_rotations(quats: Floats, component_bits: int) -> NDArray[np.uint32]:
     rounded = np.round(np.abs(others) * code_per_component) * step
     sizes = np.minimum(MAX_COMPONENT_CODE, rounded).astype("<u4")
     is_negative = (others < 0) & (sizes > 0)  # zero has no sign, so that equal values stay equal
-    codes = sizes | is_negative.astype("<u4") << 9  # [N, 3]
+    codes = sizes | is_negative.astype("<u4") << 9  # [N, 3]; the sign is above the nine bits
 
+    # The index of the largest component ends up in the two highest of the 32 bits.
     words: NDArray[np.uint32] = largest.astype("<u4")
     for component in range(3):
         words = words << 10 | codes[:, component]
@@ -340,9 +355,14 @@ def _decode_positions(positions: NDArray[np.uint8], fraction_bits: int) -> Float
 
 
 def _decode_rotations(rotations: NDArray[np.uint8]) -> Floats:
-    """Return unit quaternions [N, 4] (w, x, y, z) from words of version 3, as bytes [N, 4]."""
+    """Return unit quaternions [N, 4] (w, x, y, z) from words of version 3, as bytes [N, 4].
+
+    From the highest bit on, a word has two bits for the index of the largest component of
+    (x, y, z, w), and for each other component its sign and nine bits of its size.
+    """
     words = rotations.copy().view("<u4")  # [N, 1]
-    codes = words >> np.array([20, 10, 0], np.uint32)  # [N, 3]; the lowest ten bits count
+    # The ten bits of each component, below bits that belong to others and are masked out.
+    codes = words >> np.array([20, 10, 0], np.uint32)  # [N, 3]
     sizes = (codes & MAX_COMPONENT_CODE).astype(np.float32)
     sizes = sizes / np.float32(MAX_COMPONENT_CODE * 2**0.5)
     others = np.where(codes & COMPONENT_SIGN_BIT, -sizes, sizes)

@@ -105,7 +105,7 @@ class LamaInpainter:
         return painted
 
     def _predict_colors(self, rgb: Tensor, hole: Tensor) -> Tensor:
-        """Return the network's colours of an image, which is reduced for the network if it is large.
+        """Return the network's colours of an image; the network gets a large image reduced.
 
         Args:
             rgb: [h, w, 3] sRGB in 0..1.

@@ -1,4 +1,6 @@
-"""The network of LaMa, with fast Fourier convolutions, for inference only (Suvorov et al., WACV 2022).
+"""The network of LaMa, for inference only (Suvorov et al., WACV 2022).
+
+Its convolutions are fast Fourier convolutions: part of the channels passes through a spectrum.
 
 `expected_shapes` names the published tensors, `LamaNetwork` computes with them.
 """
@@ -241,7 +243,7 @@ class FourierLayer(nn.Module):
         self.widen = _linear(wide_weight * global_scale.view(-1, 1, 1, 1), None)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map features [B, C, h, w], of which the first quarter of C is local, to the same shape."""
+        """Map features [B, C, h, w] to the same shape; the first quarter of C is local."""
         local_count = x.shape[1] // LOCAL_CHANNEL_DIVISOR
         padded = _pad_by_reflection(x, 1)
         local = self.to_local(padded)

@@ -1,14 +1,11 @@
 """Write videos: the file's suffix selects H.264, VP9, GIF or animated WebP.
 
-`save_video` writes all frames, `VideoWriter` one after the other. `VIDEO_FORMATS` lists the formats.
+`save_video` writes all frames, `VideoWriter` one after the other, with a `StreamEncoder`.
 """
 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
-import math
-import os
 from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -28,14 +25,14 @@ from torch import Tensor
 from spackle.core.color import to_uint8
 from spackle.runtime.errors import InputError
 from spackle.runtime.files import atomic_path, check_writable
-
-DEFAULT_FPS = 30
-
-# A file that stores every repetition plays at most this often.
-MAX_STORED_REPETITIONS = 1000
-# GIF's and WebP's counters of repetitions have 16 bits.
-MAX_PLAY_COUNT = 65_535
-PLAY_FOREVER = 0
+from spackle.video.video_formats import (
+    DEFAULT_FPS,
+    GIF,
+    PLAY_FOREVER,
+    StrPath,
+    VideoFormat,
+    check_video,
+)
 
 # Of all frames of a GIF together, which take 4 bytes of memory a pixel.
 MAX_GIF_PIXELS = 300 * 1536 * 1152
@@ -49,140 +46,6 @@ MAX_RATE_DENOMINATOR = 1001
 # FFmpeg's numbers; BT.709 has the same one as primaries, transfer function and matrix.
 BT709 = 1
 LIMITED_RANGE = 1
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class VideoFormat:
-    """A video format's limits, and its settings for FFmpeg."""
-
-    codec: str
-    container: str
-    codec_options: dict[str, str] = dataclasses.field(default_factory=dict)
-    container_options: dict[str, str] = dataclasses.field(default_factory=dict)
-    pixel_format: str
-    # Whether the file states how often it plays; else it stores every repetition.
-    states_play_count: bool
-    min_fps: float
-    max_fps: float
-    max_side_px: int
-
-    @property
-    def default_play_count(self) -> int:
-        """How often a video plays by default: animations for ever, others once."""
-        return PLAY_FOREVER if self.states_play_count else 1
-
-
-H264 = VideoFormat(
-    codec="libx264",
-    container="mp4",
-    # Without cpu-independent, x264 reads uninitialised memory, and equal frames give different
-    # bytes. The short search for motion (me, subme) saves a third of the time; files grow by 8 %,
-    # and PSNR falls by 0.02 dB.
-    codec_options={
-        "crf": "17",
-        "preset": "veryfast",
-        "x264-params": "cpu-independent=1:me=dia:subme=1",
-    },
-    # The index comes first, so that the video plays while it loads.
-    container_options={"movflags": "+faststart"},
-    pixel_format="yuv420p",
-    states_play_count=False,
-    min_fps=0.001,
-    max_fps=1000,
-    max_side_px=16_384,
-)
-VP9 = VideoFormat(
-    codec="libvpx-vp9",
-    container="webm",
-    # VP9 at crf 24 comes close to x264 at 17; cpu-used 4 costs little quality and saves most of
-    # the time.
-    codec_options={"crf": "24", "b": "0", "deadline": "good", "cpu-used": "4", "row-mt": "1"},
-    # The index comes first, as above. Without bitexact the track number would be random.
-    container_options={"cues_to_front": "1", "fflags": "+bitexact"},
-    pixel_format="yuv420p",
-    states_play_count=False,
-    min_fps=0.001,
-    max_fps=1000,
-    max_side_px=16_384,
-)
-# Browsers show a frame of 10 ms or less for 100 ms; GIF counts time in 1/100 s, WebP in 1/1000 s.
-GIF = VideoFormat(
-    codec="gif",
-    container="gif",
-    pixel_format="pal8",
-    states_play_count=True,
-    min_fps=0.01,
-    max_fps=50,
-    max_side_px=65_535,
-)
-# libwebp converts to YUV better than FFmpeg. The encoder libwebp_anim would keep old blocks where
-# little changes.
-WEBP = VideoFormat(
-    codec="libwebp",
-    container="webp",
-    codec_options={"quality": "85"},
-    pixel_format="bgra",
-    states_play_count=True,
-    min_fps=0.01,
-    max_fps=90,
-    max_side_px=16_383,
-)
-VIDEO_FORMATS = {
-    ".mp4": H264,
-    ".m4v": H264,
-    ".mov": H264,
-    ".webm": VP9,
-    ".gif": GIF,
-    ".webp": WEBP,
-}
-
-StrPath = str | os.PathLike[str]
-
-
-def check_video(path: StrPath, fps: float, loop: int | None = None) -> VideoFormat:
-    """Check a video's name, frame rate and loop count, and return its format.
-
-    Args:
-        path: the file's name, whose suffix selects the format.
-        fps: frames a second.
-        loop: how often the video plays, 0 for ever; None: the format's default.
-
-    Raises:
-        InputError: the suffix is unknown, or the format does not allow the rate or loop count.
-    """
-    video_format = VIDEO_FORMATS.get(Path(path).suffix.lower())
-    if video_format is None:
-        suffixes = ", ".join(VIDEO_FORMATS)
-        raise InputError(f"{path}: not a name for a video: end it with {suffixes}")
-    check_fps(path, fps, video_format)
-    if loop is not None:
-        check_loop(path, loop, video_format)
-    return video_format
-
-
-def check_fps(subject: object, fps: float, video_format: VideoFormat) -> None:
-    """Raise an InputError, beginning with `subject`, unless the format allows the frame rate."""
-    low = video_format.min_fps
-    high = video_format.max_fps
-    if not (math.isfinite(fps) and low <= fps <= high):
-        limits = f"from {low:g} to {high:g}"
-        raise InputError(f"{subject}: frames a second must be a number {limits}, got {fps}")
-
-
-def check_loop(subject: object, loop: int, video_format: VideoFormat) -> None:
-    """Raise an InputError, beginning with `subject`, unless the format allows the loop count."""
-    if video_format.states_play_count:
-        low = PLAY_FOREVER
-        high = MAX_PLAY_COUNT
-        hint = "0 is for ever"
-    else:
-        low = 1
-        high = MAX_STORED_REPETITIONS
-        hint = "it holds every repetition; .gif and .webp can play for ever"
-    if not low <= loop <= high:
-        limits = f"from {low} to {high}"
-        problem = f"a loop count of such a file must be {limits}, got {loop}"
-        raise InputError(f"{subject}: {problem} ({hint})")
 
 
 Writer = TypeVar("Writer", bound="VideoWriter")
@@ -319,7 +182,7 @@ class VideoWriter:
             raise InputError(f"{self._name}: {problem}: write an mp4, or fewer or smaller frames")
 
     def _wait_until(self, max_waiting: int) -> None:
-        """Wait until at most `max_waiting` frames are left to encode; raises the encoder's error."""
+        """Wait until at most so many frames are left to encode; raises the encoder's error."""
         while len(self._waiting) > max_waiting:
             self._waiting.popleft().result()
 
@@ -436,7 +299,11 @@ class StreamEncoder:
         self._frame_count += 1
 
     def finish(self) -> None:
-        """Write what the encoder still holds, repeat all packets as often as needed, and close."""
+        """Write what the encoder still holds, repeat all packets as often as needed, and close.
+
+        A packet is a compressed frame; it has the times of its presentation (pts) and decoding
+        (dts).
+        """
         self._encode(None)
         for repetition in range(1, self._stored_repetitions):
             for packet in self._kept_packets:
@@ -512,9 +379,9 @@ class PaletteFilter:
         apply_palette = graph.add("paletteuse", "dither=sierra2_4a")
         self._sink = graph.add("buffersink")
         self._source.link_to(split)
-        split.link_to(palette, 0)
-        split.link_to(apply_palette, 1, 0)
-        palette.link_to(apply_palette, 0, 1)
+        split.link_to(palette, output_idx=0, input_idx=0)
+        split.link_to(apply_palette, output_idx=1, input_idx=0)
+        palette.link_to(apply_palette, output_idx=0, input_idx=1)
         apply_palette.link_to(self._sink)
         graph.configure()
         self._graph = graph  # must live as long as its filters

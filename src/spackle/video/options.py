@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal, cast, get_args
 
 from spackle.runtime.errors import InputError, check_name
-from spackle.video.encoding import DEFAULT_FPS, VIDEO_FORMATS, check_fps, check_loop
+from spackle.video.video_formats import DEFAULT_FPS, VIDEO_FORMATS, check_fps, check_loop
 
 VideoFormatName = Literal["mp4", "webm", "gif", "webp"]
 # For a view of another aspect ratio than the video's: black margins, blurred margins, or cropping.

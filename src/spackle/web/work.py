@@ -30,7 +30,7 @@ from spackle.runtime.files import write_atomic
 from spackle.runtime.progress import Progress, Reporter
 from spackle.runtime.task_process import SendEvent
 from spackle.scene import Scene
-from spackle.video.encoding import DEFAULT_FPS
+from spackle.video.video_formats import DEFAULT_FPS
 from spackle.views import DEFAULT_VIDEO_SECONDS, MAX_FRAME_COUNT, PathOptions
 from spackle.web.jobs import Job
 

@@ -1,4 +1,6 @@
-"""Load weights from untrusted files without running code in them: safetensors and PyTorch's formats.
+"""Load weights from untrusted files without running code in them.
+
+The formats are safetensors and those of PyTorch.
 
 `read_tensors` reads a file, `load_strict` puts its tensors into a network.
 """

@@ -1,4 +1,4 @@
-"""Download a file of known size and SHA-256: complete or not at all, and resumed where it stopped."""
+"""Download a file of known size and SHA-256: complete or not at all, and resumed after a break."""
 
 from __future__ import annotations
 
