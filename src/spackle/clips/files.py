@@ -22,8 +22,7 @@ from spackle.core.photo import check_pixel_count
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import check_file
 from spackle.runtime.progress import Progress
-from spackle.video.encoding import BT709, StreamEncoder, VideoWriter
-from spackle.video.video_formats import H264
+from spackle.video.encoding import BT709
 
 CLIP_SUFFIXES = {
     *(".mp4", ".m4v", ".mov", ".webm", ".mkv", ".avi", ".gif", ".mpg", ".mpeg"),

@@ -11,7 +11,8 @@ from av.audio.stream import AudioStream
 from av.video.stream import VideoStream
 
 from spackle.clips.files import Clip
-from spackle.video.encoding import H264, StreamEncoder, VideoWriter
+from spackle.video.encoding import StreamEncoder, VideoWriter
+from spackle.video.video_formats import H264
 
 TIME_UNIT = Fraction(1, 90_000)  # of written times, in seconds; usual for MPEG
 # Lowest and highest frame rate that an encoder accepts.
