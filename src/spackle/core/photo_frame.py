@@ -1,23 +1,22 @@
-"""Detect the uniform frame around a picture, such as a scan's margin, letterbox bars or a white mount."""
+"""Detect the uniform frame around a picture: a scan's margin, letterbox bars or a white mount."""
 
 from __future__ import annotations
 
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-NARROWEST, WIDEST = (
-    2,
-    0.25,
-)  # bounds for the width of a side: in pixels, and as a share of the photo's side
-NOISE, STEP = (
-    9 / 255,
-    20 / 255,
-)  # mean difference from the frame's colour: at most in the frame, at least beyond
-STRAIGHT = 0.8  # least share of an edge's pixels that differ by STEP
-EDGE_PX = 6  # width of a blurred edge
+MIN_FRAME_PX = 2  # a thinner line is not taken for a side of a frame
+MAX_FRAME_RATIO = 0.25  # widest side of a frame, as a share of the photo's width or height
+# Colours are compared by the largest difference of a channel of sRGB in 0..1.
+MAX_FRAME_NOISE = 9 / 255  # mean difference of a frame's line from the frame's colour
+MIN_PICTURE_CONTRAST = 20 / 255  # difference of a pixel that does not belong to the frame
+MIN_STRAIGHT_RATIO = 0.8  # share of an inner edge's pixels that must differ so much
+BLURRED_EDGE_PX = 6  # width of a blurred inner edge
+
+Floats = NDArray[np.float32]
 
 
 class PhotoFrame(NamedTuple):
@@ -41,50 +40,95 @@ class PhotoFrame(NamedTuple):
         )
 
     def inside(self, picture: Tensor, width: int, height: int) -> Tensor:
-        """Cut the frame off a picture [H, W, ...] of any size; the frame is in pixels of a width×height photo."""
+        """Cut the frame off a picture [H, W, ...] of any size, such as a depth map.
+
+        The frame's widths are in pixels of a width×height photo, and are scaled to the picture.
+        """
         rows, columns = picture.shape[:2]
-        left, right = (round(side * columns / width) for side in (self.left, self.right))
-        top, bottom = (round(side * rows / height) for side in (self.top, self.bottom))
+        left = round(self.left * columns / width)
+        right = round(self.right * columns / width)
+        top = round(self.top * rows / height)
+        bottom = round(self.bottom * rows / height)
         return picture[top : rows - bottom, left : columns - right].contiguous()
 
 
 def find_frame(rgb: Tensor) -> PhotoFrame | None:
     """The uniform frame of an sRGB picture [H, W, 3] in 0..1, or None.
 
-    Two opposite sides must have one colour and straight inner edges, because a false frame would crop the picture.
+    Two opposite sides must have one colour and straight inner edges, because a false frame would
+    crop the picture. A frame within the frame, such as a line inside a mount, is added to it.
     """
-    across, down = rgb.numpy().swapaxes(0, 1), rgb.numpy()
-    inwards = (
-        across,
-        down,
-        across[::-1],
-        down[::-1],
-    )  # lines [N, M, 3] from the left, the top, the right, the bottom
-    colors = np.stack([np.median(lines[0], axis=0) for lines in inwards])
-    limits = [int(WIDEST * len(lines)) for lines in inwards]
+    rows = rgb.numpy()  # [H, W, 3]
+    columns = rows.swapaxes(0, 1)  # [W, H, 3]
+    # The picture as lines of pixels from each side inwards, in the order of PhotoFrame: from the
+    # left, the top, the right and the bottom.
+    sides = [_Side(lines) for lines in (columns, rows, columns[::-1], rows[::-1])]
+
+    uniform_widths = [side.uniform_width() for side in sides]
     widths = np.zeros(4, int)
+    for index, side in enumerate(sides):
+        # The sides of index 0 and 2 are adjacent to those of index 1 and 3.
+        before = uniform_widths[1 - index % 2]
+        after = uniform_widths[3 - index % 2]
+        widths[index] = side.frame_width(uniform_widths[index], before, after)
 
-    def apart(side: int, start: int, stop: int) -> NDArray[np.float32]:
-        """Differences of the lines start..stop of a side from its colour; no further lines are read."""
-        differences = np.abs(inwards[side][start : min(stop, limits[side])] - colors[side])
-        return cast("NDArray[np.float32]", differences.max(-1))
-
-    plain = [
-        next((n for n in range(limits[k]) if apart(k, n, n + 1).mean() > NOISE), limits[k])
-        for k in range(4)
-    ]
-    for side in range(4):
-        before, after = plain[1 - side % 2], plain[3 - side % 2]  # widths of the two adjacent sides
-        lines = apart(side, plain[side], plain[side] + EDGE_PX)
-        edge = (lines[:, before : lines.shape[1] - after] > STEP).mean(1)
-        if plain[side] >= NARROWEST and edge.max(initial=0.0) >= STRAIGHT:
-            widths[side] = plain[side] + int((edge >= 0.95 * edge.max()).argmax()) + 1
-    for side in (0, 1):
-        alike = np.where(np.abs(colors - colors[side]).max(1) <= NOISE, widths, 0)
-        if alike[side] and alike[side + 2]:
-            frame = PhotoFrame(*alike.tolist())
-            inner = find_frame(
-                frame.inside(rgb, *down.shape[1::-1])
-            )  # such as a line inside a mount
-            return PhotoFrame(*(alike + (inner or (0, 0, 0, 0))).tolist())
+    colors = np.stack([side.color for side in sides])  # [4, 3]
+    for index in (0, 1):
+        # Only sides of the same colour are of one frame.
+        color_difference = np.abs(colors - colors[index]).max(axis=1)
+        frame_widths = np.where(color_difference <= MAX_FRAME_NOISE, widths, 0)
+        if frame_widths[index] and frame_widths[index + 2]:  # two opposite sides
+            height, width = rows.shape[:2]
+            outer = PhotoFrame(*frame_widths.tolist())
+            inner = find_frame(outer.inside(rgb, width, height))
+            if inner is None:
+                return outer
+            return PhotoFrame(*(frame_widths + inner).tolist())
     return None
+
+
+class _Side:
+    """One side of a picture, seen as lines of pixels from the border inwards."""
+
+    def __init__(self, lines: Floats) -> None:
+        """Take the median colour of the outermost line for the colour of a possible frame.
+
+        `lines` [N, M, 3] are N lines of M pixels; the first one is the border.
+        """
+        self.color: Floats = np.median(lines[0], axis=0)  # [3]
+        self._max_width = int(MAX_FRAME_RATIO * len(lines))
+        self._lines = lines
+
+    def _differences(self, start: int, stop: int) -> Floats:
+        """Differences [n, M] of the pixels of the lines start..stop from the side's colour.
+
+        Lines beyond the widest frame are left out.
+        """
+        lines = self._lines[start : min(stop, self._max_width)]
+        differences: Floats = np.abs(lines - self.color).max(axis=-1)
+        return differences
+
+    def uniform_width(self) -> int:
+        """The number of lines at the border that have the side's colour."""
+        for line in range(self._max_width):
+            if self._differences(line, line + 1).mean() > MAX_FRAME_NOISE:
+                return line
+        return self._max_width
+
+    def frame_width(self, uniform_width: int, before: int, after: int) -> int:
+        """The width of the frame in pixels, with its blurred inner edge; 0 if there is no frame.
+
+        Args:
+            uniform_width: number of lines at the border that have the side's colour.
+            before: width of the frame at the beginning of each line; these pixels do not count.
+            after: the same at the end of each line.
+        """
+        edge_lines = self._differences(uniform_width, uniform_width + BLURRED_EDGE_PX)  # [n, M]
+        between = edge_lines[:, before : edge_lines.shape[1] - after]
+        differing_ratio = (between > MIN_PICTURE_CONTRAST).mean(axis=1)  # [n]
+        is_straight = differing_ratio.max(initial=0.0) >= MIN_STRAIGHT_RATIO
+        if uniform_width < MIN_FRAME_PX or not is_straight:
+            return 0
+        # The edge ends at the first line that differs about as much as any.
+        end_of_edge = int((differing_ratio >= 0.95 * differing_ratio.max()).argmax())
+        return uniform_width + end_of_edge + 1

@@ -1,4 +1,4 @@
-"""Gaussians that lie in a surface given as an image of inverse depth."""
+"""Surfels: flat Gaussians that lie in a surface, which an image of inverse depth describes."""
 
 from __future__ import annotations
 
@@ -14,18 +14,20 @@ from spackle.core.gaussians import Gaussians, quat_from_matrix
 from spackle.runtime.device import parallel_for_chunks
 from spackle.runtime.kernels import kernel
 
-DEPTH_EDGE_RATIO = 0.03  # a larger relative difference of inverse depth between neighbouring pixels is a depth edge
-CREASE_RATIO = (
-    0.01  # a larger relative difference between the slopes on both sides of a pixel is a crease
-)
-SURFEL_THICKNESS_RATIO = 0.05  # third axis, in units of the smaller of the other two
-# Opacity of a solid Gaussian. The renderer skips a Gaussian that would bring the transmittance below 1e-4, so a
-# Gaussian of opacity 0.999 behind another of alpha 0.9 would be skipped and leave a hole.
+# Relative difference of inverse depth between neighbouring pixels above which there is an edge
+# between two surfaces.
+DEPTH_EDGE_RATIO = 0.03
+# Difference of the slopes on both sides of a pixel, relative to the inverse depth, above which one
+# surface has a crease.
+CREASE_RATIO = 0.01
+SURFEL_THICKNESS_RATIO = 0.05  # third axis of a surfel, in units of the smaller of the other two
+# Opacity of a solid Gaussian. The renderer skips a Gaussian that would bring the transmittance
+# below 1e-4, so one of opacity 0.999 behind another of alpha 0.9 would be skipped and leave a hole.
 SURFEL_OPACITY = np.float32(0.99)
-PIXEL_SIGMA_PX = (
-    0.5  # standard deviation, in pixels, of a Gaussian for one pixel in front of a wider Gaussian
-)
-BEHIND_SURFACE_RATIO = 0.005  # relative distance behind a surface at which a Gaussian does not show through the surface
+# Standard deviation, in pixels, of a Gaussian for one pixel in front of a wider Gaussian.
+PIXEL_SIGMA_PX = 0.5
+# Relative distance behind a surface at which a Gaussian does not show through the surface.
+BEHIND_SURFACE_RATIO = 0.005
 
 
 def make_surfels(
@@ -44,76 +46,130 @@ def make_surfels(
         uv: [N, 2] pixel positions.
         inverse_depth: [N] 1/z.
         slope: [N, 2] derivative of the inverse depth by pixel x and y.
-        spread: standard deviation in pixels of `camera`, as [N], as [N, 2] along pixel x and y, or as one number.
+        spread: standard deviation in pixels of `camera`, as [N], as [N, 2] along pixel x and y, or
+            as one number.
         colors: [N, 3] linear RGB.
         opacities: [N].
     """
-    (fx, fy), K = camera.focal, to_like(camera.K, uv)
+    fx, fy = camera.focal
+    K = to_like(camera.K, uv)
     z = 1.0 / inverse_depth
     ray = torch.cat([(uv - K[:2, 2]) / K.diagonal()[:2], torch.ones_like(uv[:, :1])], dim=-1)
-    # P = z·ray, so dP/du = z·d(ray)/du + dz/du·ray with dz/du = −z²·d(1/z)/du.
-    dz = -(z**2)[:, None] * slope
-    across = dz[:, :1] * ray + pad(z[:, None] * (1 / fx), (0, 2))
-    down = dz[:, 1:] * ray + pad(z[:, None] * (1 / fy), (1, 1))
-    widths = (
-        spread.to(uv)[..., None].flatten(1)
-        if isinstance(spread, Tensor)
-        else uv.new_full((1, 1), spread)
-    )
-    rotation, scales = _principal_axes(across * widths[:, :1], down * widths[:, -1:])
-    scales = torch.cat([scales, SURFEL_THICKNESS_RATIO * scales.amin(dim=-1, keepdim=True)], dim=-1)
-    local_to_world = to_like(camera.world_to_camera, uv)[:3, :3].T
-    means = camera.unproject(uv, z)
-    return Gaussians(means, quat_from_matrix(local_to_world @ rotation), scales, opacities, colors)
+
+    # How far the point P = z·ray on the surface moves if the pixel moves by one:
+    # dP/du = dz/du·ray + z·d(ray)/du, with dz/du = −z²·d(1/z)/du and d(ray)/du = (1/fx, 0, 0).
+    dz = -(z**2)[:, None] * slope  # [N, 2] by pixel x and y
+    move_along_x = dz[:, :1] * ray + pad(z[:, None] * (1 / fx), (0, 2))  # [N, 3]
+    move_along_y = dz[:, 1:] * ray + pad(z[:, None] * (1 / fy), (1, 1))  # [N, 3]
+
+    # The Gaussian is the image of a circle, or of an ellipse, of `spread` pixels.
+    if isinstance(spread, Tensor):
+        spreads = spread.to(uv)[..., None].flatten(1)  # [N, 1], or [N, 2] along x and y
+    else:
+        spreads = uv.new_full((1, 1), spread)
+    rotation, scales = _ellipse_axes(move_along_x * spreads[:, :1], move_along_y * spreads[:, -1:])
+    thickness = SURFEL_THICKNESS_RATIO * scales.amin(dim=-1, keepdim=True)
+    scales = torch.cat([scales, thickness], dim=-1)  # [N, 3]
+
+    camera_to_world = to_like(camera.world_to_camera, uv)[:3, :3].T
+    quats = quat_from_matrix(camera_to_world @ rotation)
+    return Gaussians(camera.unproject(uv, z), quats, scales, opacities, colors)
 
 
-def _principal_axes(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-    """Axes and normals of the ellipses a·cos t + b·sin t, as columns [N, 3, 3], and the lengths of the axes [N, 2]."""
-    theta = 0.5 * torch.atan2(2 * (a * b).sum(-1), (a * a).sum(-1) - (b * b).sum(-1))[:, None]
-    p = a * theta.cos() + b * theta.sin()
-    q = b * theta.cos() - a * theta.sin()
-    lengths = torch.stack([p.norm(dim=-1), q.norm(dim=-1)], dim=-1).clamp_min(1e-12)
-    p, q = p / lengths[:, :1], q / lengths[:, 1:]
-    return torch.stack([p, q, torch.linalg.cross(p, q)], dim=-1), lengths
+def _ellipse_axes(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+    """Axes of the ellipses a·cos t + b·sin t in space.
+
+    Args:
+        a: [N, 3] a vector from the centre to the ellipse.
+        b: [N, 3] the vector for which t is a quarter turn larger.
+
+    Returns:
+        Rotations [N, 3, 3], whose columns are the directions of both axes and the normal, and the
+        lengths [N, 2] of both half axes.
+    """
+    # The axes are where the distance from the centre is extreme: tan 2t = 2 a·b / (a·a − b·b).
+    t = 0.5 * torch.atan2(2 * (a * b).sum(-1), (a * a).sum(-1) - (b * b).sum(-1))[:, None]
+    first_axis = a * t.cos() + b * t.sin()
+    second_axis = b * t.cos() - a * t.sin()
+    lengths = torch.stack([first_axis.norm(dim=-1), second_axis.norm(dim=-1)], dim=-1)
+    lengths = lengths.clamp_min(1e-12)  # no division by zero
+    first_axis = first_axis / lengths[:, :1]
+    second_axis = second_axis / lengths[:, 1:]
+    normal = torch.linalg.cross(first_axis, second_axis)
+    return torch.stack([first_axis, second_axis, normal], dim=-1), lengths
 
 
 def inverse_depth_slope(inverse_depth: Tensor) -> Tensor:
-    """Derivative of the inverse depth by pixel x and y, [H, W, 2], that never crosses a depth edge.
+    """Derivative of the inverse depth by pixel x and y, [H, W, 2], never across a depth edge.
 
-    The inverse depth of a plane changes linearly across the image, so the differences to both neighbours agree. If
-    they differ, the smaller one is used; if even the smaller one is large, the slope is 0.
+    The inverse depth of a plane changes linearly across the image, so the differences to both
+    neighbours agree, and the slope is their mean. If they differ, the smaller one is used; if even
+    the smaller one is large, the slope is 0.
 
     Args:
         inverse_depth: [H, W] float32 or float64, positive everywhere; gradients do not pass.
     """
     image = inverse_depth.detach().cpu().contiguous().numpy()
     slopes = np.empty((*image.shape, 2), image.dtype)
-    bounds = tuple(image.dtype.type(bound) for bound in (CREASE_RATIO, DEPTH_EDGE_RATIO))
+    crease_ratio = image.dtype.type(CREASE_RATIO)
+    edge_ratio = image.dtype.type(DEPTH_EDGE_RATIO)
     parallel_for_chunks(
-        lambda start, stop: _slopes(start, stop, image, *bounds, slopes), len(image)
+        lambda start, stop: _slopes_of_rows(start, stop, image, crease_ratio, edge_ratio, slopes),
+        len(image),
     )
     return torch.from_numpy(slopes).to(inverse_depth.device)
 
 
 @kernel
-def _slopes(start: int, stop: int, image: Any, crease: Any, edge: Any, slopes: Any) -> None:
+def _slopes_of_rows(
+    start: int, stop: int, image: Any, crease_ratio: Any, edge_ratio: Any, slopes: Any
+) -> None:
+    """Write the slopes along x and y for the rows start..stop of an image.
+
+    Args:
+        start: the first row.
+        stop: the row after the last one.
+        image: [H, W] inverse depth.
+        crease_ratio: relative difference of slopes at a crease.
+        edge_ratio: relative difference of inverse depth at an edge.
+        slopes: [H, W, 2] written.
+    """
     height, width = image.shape
     for y in range(start, stop):
         above, below = max(y - 1, 0), min(y + 1, height - 1)
         for x in range(width):
-            here, left, right = image[y, x], max(x - 1, 0), min(x + 1, width - 1)
-            # At a border, one difference serves for both sides.
-            ahead, behind = image[y, right] - here, here - image[y, left]
-            forward, backward = ahead if right > x else behind, behind if left < x else ahead
-            slopes[y, x, 0] = _slope(here, backward, forward, crease, edge)
-            ahead, behind = image[below, x] - here, here - image[above, x]
-            forward, backward = ahead if below > y else behind, behind if above < y else ahead
-            slopes[y, x, 1] = _slope(here, backward, forward, crease, edge)
+            left, right = max(x - 1, 0), min(x + 1, width - 1)
+            here = image[y, x]
+
+            # At a border of the image, the one difference serves for both sides.
+            to_right, to_left = image[y, right] - here, here - image[y, left]
+            forward = to_right if right > x else to_left
+            backward = to_left if left < x else to_right
+            slopes[y, x, 0] = _slope(here, backward, forward, crease_ratio, edge_ratio)
+
+            to_below, to_above = image[below, x] - here, here - image[above, x]
+            forward = to_below if below > y else to_above
+            backward = to_above if above < y else to_below
+            slopes[y, x, 1] = _slope(here, backward, forward, crease_ratio, edge_ratio)
 
 
 @kernel
-def _slope(here: Any, backward: Any, forward: Any, crease: Any, edge: Any) -> Any:
-    smooth = abs(forward - backward) <= crease * here
+def _slope(here: Any, backward: Any, forward: Any, crease_ratio: Any, edge_ratio: Any) -> Any:
+    """The slope of inverse depth at a pixel along one axis, from the differences on its two sides.
+
+    Args:
+        here: inverse depth at the pixel.
+        backward: the pixel's value minus the previous one.
+        forward: the next value minus the pixel's.
+        crease_ratio: difference of both, relative to `here`, up to which the surface is smooth.
+        edge_ratio: largest slope of a smooth surface, relative to `here`.
+
+    Returns:
+        The mean on a smooth surface; at a crease or beside an edge the flatter difference, because
+        the steeper one may cross to another surface; 0 if that is still too steep.
+    """
+    is_smooth = abs(forward - backward) <= crease_ratio * here
     flatter = backward if abs(backward) < abs(forward) else forward
-    slope = (forward + backward) / 2 if smooth else flatter
-    return slope if abs(slope) <= (edge if smooth else crease) * here else 0 * here
+    slope = (forward + backward) / 2 if is_smooth else flatter
+    max_slope = (edge_ratio if is_smooth else crease_ratio) * here
+    return slope if abs(slope) <= max_slope else 0 * here
