@@ -37,8 +37,8 @@ from PIL import Image
 
 from spackle.runtime.errors import InputError
 from spackle.runtime.task_process import WORKER_DIED
-from spackle.web.app import safe_display_name
 from spackle.web.jobs import RetentionLimits
+from spackle.web.uploads import safe_display_name
 
 
 @pytest.fixture(scope="module")

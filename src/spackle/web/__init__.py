@@ -1,4 +1,8 @@
-"""The page, and the server of the page and of the HTTP interface. Read `create_app`."""
+"""The page, and the server of the page and of the HTTP interface.
+
+Read `create_app` in app.py first. guard.py refuses strangers, uploads.py checks what clients send,
+jobs.py keeps the queue and the results, work.py is what a worker process does.
+"""
 
 from spackle.web.app import create_app
 

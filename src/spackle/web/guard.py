@@ -1,7 +1,7 @@
 """The outermost layer of the app: checks access and the size of uploads.
 
-A stranger's page can make a browser send requests to this machine; by DNS rebinding, even under the stranger's host
-name. The headers Host, Origin and Sec-Fetch-Site reveal such a request.
+A stranger's page can make a browser send requests to this machine; by DNS rebinding, even under the
+stranger's host name. The headers Host, Origin and Sec-Fetch-Site reveal such a request.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import ipaddress
 import logging
 import re
 import socket
+from collections.abc import Callable
 from typing import NamedTuple
 
 from starlette.datastructures import Headers, MutableHeaders
@@ -23,16 +24,22 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from spackle.runtime.errors import printable_line
 
 LOG = logging.getLogger("spackle.web")
+# A Host header: a name or a numeric address, and perhaps a port.
 HOST_PATTERN = re.compile(r"(\[[0-9a-f:.%]+\]|[0-9a-z._-]+)(?::\d{1,5})?", re.IGNORECASE)
-OWN_SITES = {"same-origin", "none"}  # none: an address that a person typed, or a bookmark
+# Values of Sec-Fetch-Site that are admitted; none: an address that a person typed, or a bookmark.
+OWN_SITES = {"same-origin", "none"}
 MAX_SEND_S = 20.0  # seconds that a client may take to read a part of an answer
 MAX_UPLOAD_BYTES = 200_000_000  # of an upload: photo and depth map
-# The page loads scripts and styles from this server only and sends nothing elsewhere; no other page can frame it.
+# The page loads scripts and styles from this server only and sends nothing elsewhere; no other page
+# can frame it.
+CONTENT_SECURITY_POLICY = (
+    "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; style-src 'self'; "
+    "connect-src 'self'; img-src 'self' data: blob:; media-src blob:; worker-src 'self' blob:; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
 SECURITY_HEADERS = {
     "Cache-Control": "no-store",  # a photo is private
-    "Content-Security-Policy": "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; style-src 'self'; "
-    "connect-src 'self'; img-src 'self' data: blob:; media-src blob:; worker-src 'self' blob:; "
-    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "Content-Security-Policy": CONTENT_SECURITY_POLICY,
     "Cross-Origin-Resource-Policy": "same-origin",
     "Referrer-Policy": "no-referrer",
     "Server": "spackle",  # strangers learn no versions
@@ -42,107 +49,193 @@ SECURITY_HEADERS = {
 
 
 class Access(NamedTuple):
-    """Access rules of a stand-alone server."""
+    """Access rules of a stand-alone server: who may send which request."""
 
-    token: (
-        str | None
-    )  # a request has it as the first part of the path, or as Bearer; None: no photo is accepted
+    # A request has it as the first part of the path, or as Bearer; None: no photo is accepted.
+    token: str | None
     names: frozenset[str] = frozenset({"localhost"})  # accepted host names
     local: bool = True  # only this machine can connect
 
     @staticmethod
     def for_listener(host: str, address: str, token: str | None) -> Access:
-        """The rules for a server that listens at `host`, whose numeric address is `address`."""
+        """The rules for a server that listens at `host`, whose numeric address is `address`.
+
+        If other machines can connect, the names by which they call this machine are accepted, too.
+        """
         if is_loopback(address):
             return Access(token)
         machine = socket.gethostname().lower()
-        short = machine.partition(".")[0]
-        return Access(
-            token, frozenset({"localhost", machine, short, f"{short}.local", host.lower()}), False
-        )
+        short_name = machine.partition(".")[0]
+        # NAME.local is the name that machines of a home network use without a name server.
+        names = frozenset({"localhost", machine, short_name, f"{short_name}.local", host.lower()})
+        return Access(token, names, local=False)
 
     def authorize(self, scope: Scope, headers: Headers) -> Scope:
-        """Check a request, and strip the token from its path; HTTPException without a valid token."""
-        hosts = headers.getlist("host")
-        match = HOST_PATTERN.fullmatch(hosts[0].strip()) if len(hosts) == 1 else None
-        if match is None or not self._is_own(match[1].lower()):
-            raise HTTPException(403, "this server does not have that Host name")
-        ours = {
-            f"{scheme}://{hosts[0].strip().lower()}" for scheme in ("http", "https")
-        }  # https: through a tunnel
-        sites = {site.strip().lower() for site in headers.getlist("sec-fetch-site")}
-        if (
-            not {origin.strip().lower() for origin in headers.getlist("origin")} <= ours
-            or not sites <= OWN_SITES
-        ):
-            raise HTTPException(403, "the request comes from a page of another site")
+        """Check a request, and strip the token from its path.
+
+        Args:
+            scope: the request, as ASGI passes it: method, path and others.
+            headers: the request's headers.
+
+        Returns:
+            The request for the app, whose root path includes the token if the path began with it.
+
+        Raises:
+            HTTPException: 403 for the name of another host or the page of another site, 401 without
+                the token.
+        """
+        check_same_site(headers, self._is_own_name)
+
+        # An address of the page holds the token: /TOKEN/viewer.css.
         root, path = scope["root_path"], scope["path"]
-        first = path.removeprefix(root).split("/")[1] if path.count("/") > 1 else ""
-        if self._is_token(first):
-            return {**scope, "root_path": f"{root}/{first}"}
-        may_ask = scope["method"] in ("GET", "HEAD") if self.token is None else path == "/healthz"
-        if not may_ask and not self._is_token(
-            headers.get("authorization", "").removeprefix("Bearer ")
-        ):
-            closed = "this page takes no photos: it was opened without a token"
-            raise HTTPException(
-                401, "this needs the token that the server printed" if self.token else closed
-            )
+        parts = path.removeprefix(root).split("/")
+        first_part = parts[1] if path.count("/") > 1 else ""
+        if self._is_token(first_part):
+            return {**scope, "root_path": f"{root}/{first_part}"}
+
+        # Programs send the token as a header.
+        bearer = headers.get("authorization", "").removeprefix("Bearer ")
+        if self._is_token(bearer):
+            return scope
+
+        # Without the token, a server that has none lets everybody read, another only asks for
+        # health.
+        if self.token is None:
+            if scope["method"] not in ("GET", "HEAD"):
+                raise HTTPException(401, "this page takes no photos: it was opened without a token")
+        elif path != "/healthz":
+            raise HTTPException(401, "this needs the token that the server printed")
         return scope
 
-    def _is_own(self, name: str) -> bool:
-        try:  # DNS rebinding needs a name: a numeric host is safe
+    def _is_own_name(self, name: str) -> bool:
+        """Whether a host name without its port, in lower case, is one of this machine.
+
+        DNS rebinding needs a name, so a numeric address is safe; but a server that only this
+        machine can reach has no other address than loopback.
+        """
+        try:
             return is_loopback(name.strip("[]")) or not self.local
-        except ValueError:
+        except ValueError:  # no numeric address
             return name.rstrip(".") in self.names
 
     def _is_token(self, word: str) -> bool:
+        """Whether a word is the token, compared in a time that tells a stranger nothing about
+        it.
+        """
         return self.token is not None and hmac.compare_digest(word.encode(), self.token.encode())
 
 
 def is_loopback(address: str) -> bool:
     """Whether only this machine can reach a numeric address; ValueError for a name."""
-    return ipaddress.ip_address(address.partition("%")[0]).is_loopback
+    without_zone = address.partition("%")[0]  # of IPv6: fe80::1%eth0
+    return ipaddress.ip_address(without_zone).is_loopback
+
+
+def check_same_site(headers: Headers, is_own_name: Callable[[str], bool]) -> None:
+    """Refuse a request that a page of another site has made a browser send; HTTPException 403.
+
+    Args:
+        headers: of the request. Browsers set Host, Origin and Sec-Fetch-Site; no page can change
+            them. Programs need not send Origin and Sec-Fetch-Site.
+        is_own_name: whether a host name in lower case belongs to this server.
+    """
+    hosts = headers.getlist("host")
+    match = HOST_PATTERN.fullmatch(hosts[0].strip()) if len(hosts) == 1 else None
+    if match is None or not is_own_name(match[1].lower()):
+        raise HTTPException(403, "this server does not have that Host name")
+
+    # Through a tunnel, a browser may see this server by https.
+    own_host = hosts[0].strip().lower()
+    own_origins = {f"http://{own_host}", f"https://{own_host}"}
+    origins = {origin.strip().lower() for origin in headers.getlist("origin")}
+    sites = {site.strip().lower() for site in headers.getlist("sec-fetch-site")}
+    if not origins <= own_origins or not sites <= OWN_SITES:
+        raise HTTPException(403, "the request comes from a page of another site")
 
 
 class Guard:
     """Middleware that refuses or limits requests, and sets security headers in every answer."""
 
     def __init__(self, app: ASGIApp, access: Access | None, max_bytes: int) -> None:
-        self.app, self.access, self.max_bytes = app, access, max_bytes
+        """Guard an app.
+
+        Args:
+            app: receives the requests that are admitted.
+            access: the rules; None admits every request.
+            max_bytes: size limit of a request's body.
+        """
+        self.app = app
+        self.access = access
+        self.max_bytes = max_bytes
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http":  # no WebSocket
-            return await self.app(scope, receive, send) if scope["type"] == "lifespan" else None
-        headers, count = Headers(scope=scope), 0
+        """Answer a request, as ASGI asks of an app: `receive` gives its body, `send` takes the
+        answer.
+        """
+        if scope["type"] == "lifespan":  # the start and the end of the server
+            await self.app(scope, receive, send)
+        if scope["type"] != "http":  # this app has no WebSocket
+            return
 
-        def check(size: int) -> None:
-            if size > self.max_bytes:
-                raise HTTPException(
-                    413, f"more than {self.max_bytes / 1e6:g} MB: send a smaller photo"
-                )
-
-        async def bounded() -> Message:
-            nonlocal count
-            message = await receive()
-            check(count := count + len(message.get("body", b"")))
-            return message
-
-        async def answer(message: Message) -> None:
-            if message["type"] == "http.response.start":
-                MutableHeaders(scope=message).update(SECURITY_HEADERS)
-                path = scope["path"].replace((self.access and self.access.token) or "/", "…", 1)
-                LOG.debug(printable_line(f"{scope['method']} {path} {message['status']}"))
-            await asyncio.wait_for(send(message), MAX_SEND_S)
-
+        headers = Headers(scope=scope)
+        receive_limited = self._limited(receive)
+        send_guarded = self._guarded(scope, send)
         try:
-            admitted = scope if self.access is None else self.access.authorize(scope, headers)
-            check(int(headers.get("content-length", 0)))
-            await self.app(admitted, bounded, answer)
+            admitted = scope
+            if self.access is not None:
+                admitted = self.access.authorize(scope, headers)
+            # A body that announces its size is refused before it comes.
+            self._check_size(int(headers.get("content-length", 0)))
+            await self.app(admitted, receive_limited, send_guarded)
         except HTTPException as error:
-            await JSONResponse({"error": error.detail}, error.status_code)(scope, receive, answer)
+            answer = JSONResponse({"error": error.detail}, error.status_code)
+            await answer(scope, receive, send_guarded)
         except (asyncio.TimeoutError, ClientDisconnect):
             LOG.debug("a client disconnected, or does not read its answer")
         except Exception:
             LOG.exception("this went wrong:")
             raise
+
+    def _check_size(self, byte_count: int) -> None:
+        """HTTPException 413 if a body has more bytes than allowed."""
+        if byte_count > self.max_bytes:
+            limit = f"{self.max_bytes / 1e6:g} MB"
+            raise HTTPException(413, f"more than {limit}: send a smaller photo")
+
+    def _limited(self, receive: Receive) -> Receive:
+        """A `receive` that counts the bytes of a body, and raises HTTPException 413 beyond the
+        limit.
+
+        A body need not announce its size, and may be longer than announced.
+        """
+        received_bytes = 0
+
+        async def receive_limited() -> Message:
+            nonlocal received_bytes
+            message = await receive()
+            received_bytes += len(message.get("body", b""))
+            self._check_size(received_bytes)
+            return message
+
+        return receive_limited
+
+    def _guarded(self, scope: Scope, send: Send) -> Send:
+        """A `send` that adds the security headers to an answer, and logs the request `scope`.
+
+        asyncio.TimeoutError comes if the client does not read the answer.
+        """
+
+        async def send_guarded(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                MutableHeaders(scope=message).update(SECURITY_HEADERS)
+                self._log_request(scope, message["status"])
+            await asyncio.wait_for(send(message), MAX_SEND_S)
+
+        return send_guarded
+
+    def _log_request(self, scope: Scope, status: int) -> None:
+        """Log a request and the status of its answer; the token is replaced by "…"."""
+        path = scope["path"]
+        if self.access is not None and self.access.token is not None:
+            path = path.replace(self.access.token, "…", 1)
+        LOG.debug(printable_line(f"{scope['method']} {path} {status}"))

@@ -32,7 +32,7 @@ TIDY_INTERVAL_S = 60.0  # seconds between two searches for results that are too 
 class RetentionLimits(NamedTuple):
     """Limits of the folder; the oldest finished jobs are removed first."""
 
-    seconds: float = 7 * 86400.0  # since a job ended
+    seconds: float = 7 * 86400.0  # since a job ended: a week
     size: float = 20e9  # bytes
     waiting: int = 32  # jobs in the queue
 
@@ -57,190 +57,276 @@ class SceneState(BaseModel):
 
 
 class Job(SceneState):
-    """A photo's state, and fields that only the server uses; RECORD stores every field except the folder."""
+    """A photo's state, and fields that only the server uses.
+
+    `RECORD_FILE` stores every field except the folder.
+    """
 
     source: str  # the photo: a name in the job's folder, or an absolute path
-    depth: str | None = None
-    options: dict[str, Any] = {}
+    depth: str | None = None  # its depth map, in the same way
+    options: dict[str, Any] = {}  # what the client has set
     folder: Path = Field(default=Path(), exclude=True)
 
     @property
     def results(self) -> Path:
+        """The folder of the scene's files."""
         return self.folder / "results"
 
     def save(self) -> None:
+        """Write the record of the job into its folder; InputError if the disk is full."""
         write_json(self.model_dump(mode="json"), self.folder / RECORD_FILE)
 
 
 class Jobs:
-    """The jobs in a folder, by id, and the processes that work on them; for the arguments see `create_app`.
+    """The jobs in a folder, by id, and the processes that work on them.
 
-    `work` takes (job, file) and reports {stage, done, total} or {line}. If `file` is None, `work` makes a scene of the
-    photo; else it adds this file to a finished scene, in one more process.
+    A thread belongs to each process: it hands a photo over, and waits for the scene. One more
+    thread, with a process of its own, adds files to finished scenes. Jobs in `by_id` never change;
+    a change replaces a job by a new one, so that readers need no lock.
     """
 
     def __init__(
         self, folder: Path, work: TaskFunction, workers: int, keep: RetentionLimits
     ) -> None:
-        self.folder, self.limits = folder, keep
-        self._held = contextlib.ExitStack()
-        self._held.enter_context(results_folder(folder, locked=True))
-        self._lock, self._closed = threading.RLock(), threading.Event()
-        self.by_id: dict[str, Job] = {}  # a change replaces a job by a new one
-        self._work, self._processes, self._of_thread = work, list[TaskProcess](), threading.local()
-        self._running: dict[str, TaskProcess] = {}  # by job
-        self._photos, self._files = ThreadPoolExecutor(workers), ThreadPoolExecutor(1)
-        self._photos.submit(self._process)  # starts while the first photo is uploaded
-        self._take_up()
+        """Open a folder of jobs, start the processes, and go on with unfinished jobs.
+
+        Args:
+            folder: holds a folder for each job; created if it is missing.
+            work: takes (job, file) in a worker process, and reports {stage, done, total} or {line}.
+                If `file` is None, it makes a scene of the photo; else it adds this file to a
+                finished scene.
+            workers: number of processes that make scenes.
+            keep: limits of the folder.
+
+        Raises:
+            InputError: another server uses the folder, or it cannot be used.
+        """
+        self.folder = folder
+        self.limits = keep
+        self._folder_lock = contextlib.ExitStack()
+        self._folder_lock.enter_context(results_folder(folder, locked=True))
+
+        self.by_id: dict[str, Job] = {}
+        self._lock = threading.RLock()  # of `by_id`, and of the processes
+        self._is_closed = threading.Event()
+        self._work = work
+        self._processes: list[TaskProcess] = []
+        self._own_process = threading.local()  # the process of the calling thread
+        self._process_of_job: dict[str, TaskProcess] = {}  # by the id of a running job
+        self._scene_threads = ThreadPoolExecutor(workers)
+        self._file_thread = ThreadPoolExecutor(1)
+
+        # A process takes seconds to start: it does so while the first photo is uploaded.
+        self._scene_threads.submit(self._process)
+        self._resume_jobs()
         threading.Thread(target=self._tidy_until_closed, daemon=True).start()
 
-    def _take_up(self) -> None:
+    def _resume_jobs(self) -> None:
         """Queue the unfinished jobs of an earlier server again, and delete incomplete uploads."""
         for folder in self.folder.iterdir():
             if folder.name.startswith(UPLOAD_PREFIX):
                 shutil.rmtree(folder, ignore_errors=True)
+            # Other folders without a readable record are none of ours.
             with contextlib.suppress(OSError, ValueError):
                 job = Job.model_validate_json((folder / RECORD_FILE).read_bytes())
                 self.by_id[job.id] = job.model_copy(update={"folder": folder})
+
         for job in sorted(self.by_id.values(), key=lambda job: job.created):
             if job.ended is None:
                 self._change(job.id, state="queued")
-                self._photos.submit(self._run, job.id)
+                self._scene_threads.submit(self._run, job.id)
 
     def _change(self, id: str, **values: object) -> None:
+        """Set fields of the state of a job, unless `remove` has deleted the job."""
         with self._lock:
-            if id in self.by_id:  # `remove` may have deleted the job
+            if id in self.by_id:
                 self.by_id[id] = self.by_id[id].model_copy(update=values)
 
     @contextlib.contextmanager
     def reserve_place(self) -> Iterator[Path]:
-        """Reserve a place in the queue, and yield a folder that receives the photo; 429 if the queue is full."""
+        """Reserve a place in the queue, and yield a folder that receives the photo.
+
+        The folder is deleted at the end of the block, unless `add` has made it the folder of a job.
+        HTTPException 429 if the queue is full.
+        """
         folder = self.folder / f"{UPLOAD_PREFIX}{secrets.token_hex(8)}"
         with self._lock:
-            waiting = len([*self.folder.glob(f"{UPLOAD_PREFIX}*")]) + sum(
-                job.state == "queued" for job in self.by_id.values()
-            )
-            if waiting >= self.limits.waiting:
-                line = f"too many photos are waiting: try again in {RETRY_AFTER_S} seconds"
-                raise HTTPException(429, line, {"Retry-After": str(RETRY_AFTER_S)})
+            upload_count = len(list(self.folder.glob(f"{UPLOAD_PREFIX}*")))
+            queued_count = sum(job.state == "queued" for job in self.by_id.values())
+            if upload_count + queued_count >= self.limits.waiting:
+                raise HTTPException(
+                    429,
+                    f"too many photos are waiting: try again in {RETRY_AFTER_S} seconds",
+                    {"Retry-After": str(RETRY_AFTER_S)},
+                )
             folder.mkdir()
         try:
             yield folder
         finally:
-            shutil.rmtree(
-                folder, ignore_errors=True
-            )  # `add` has renamed the folder of an accepted photo
+            # An accepted photo is no longer here: `add` has renamed its folder.
+            shutil.rmtree(folder, ignore_errors=True)
 
     def add(
         self, folder: Path, name: str, source: str, depth: str | None, options: dict[str, Any]
     ) -> Job:
-        """Add a job for a photo in a folder that `place` yielded; `source` and `depth` may be absolute paths."""
+        """Add a job for a photo, and queue it; returns the job.
+
+        Args:
+            folder: a folder that `reserve_place` has yielded; it becomes the folder of the job.
+            name: what messages and the page call the photo.
+            source: the photo's file, a name in the folder or an absolute path.
+            depth: its depth map, in the same way; None if there is none.
+            options: what the client has set.
+        """
         id = folder.name.removeprefix(UPLOAD_PREFIX)
         job = Job(id=id, name=name, source=source, depth=depth, options=options, folder=folder)
         job.save()
-        with self._lock:  # `place` counts folders and jobs
-            self.by_id[id] = job = job.model_copy(
-                update={"folder": folder.rename(self.folder / id)}
-            )
-        self._photos.submit(self._run, id)
+        # `reserve_place` counts folders and jobs, so the two change together.
+        with self._lock:
+            job_folder = folder.rename(self.folder / id)
+            job = job.model_copy(update={"folder": job_folder})
+            self.by_id[id] = job
+        self._scene_threads.submit(self._run, id)
         return job
 
     def make_file(self, job: Job, file: str) -> Future[str | None]:
-        """Add a file to a finished scene; the future's result is None, or the reason for failure."""
-        return self._files.submit(lambda: self._process().do((job, file), lambda event: None))
+        """Add a file to a finished scene; the future's result is None, or the reason for
+        failure.
+        """
+
+        def add_file() -> str | None:
+            return self._process().do((job, file), lambda event: None)
+
+        return self._file_thread.submit(add_file)
 
     def remove(self, id: str) -> None:
         """Delete a job and its files, and kill the process that works on it."""
         with self._lock:
             job = self.by_id.pop(id, None)
-            if process := self._running.pop(id, None):
+            process = self._process_of_job.pop(id, None)
+            if process is not None:
                 process.kill()
-        if job:
+        if job is not None:
             shutil.rmtree(job.folder, ignore_errors=True)
 
     def close(self) -> None:
         """Kill the processes; jobs resume when a server next opens the folder."""
         with self._lock:
-            self._closed.set()
+            self._is_closed.set()
             for process in self._processes:
                 process.kill()
-        for pool in (self._photos, self._files):
+        for pool in (self._scene_threads, self._file_thread):
             pool.shutdown(cancel_futures=True)
-        self._held.close()
+        self._folder_lock.close()
 
     def _process(self) -> TaskProcess:
-        """The calling thread's process; a new one if the old one died."""
-        process: TaskProcess | None = getattr(self._of_thread, "process", None)
+        """The calling thread's process; a new one if there is none, or the old one died."""
+        process: TaskProcess | None = getattr(self._own_process, "process", None)
         with self._lock:
-            if process is None or not (process.alive or self._closed.is_set()):
-                self._processes = [each for each in self._processes if each.alive]
-                self._of_thread.process = process = TaskProcess(self._work)
-                self._processes.append(process)
+            # A dead process is replaced, but not after `close`, which has killed it: its tasks
+            # fail.
+            is_usable = process is not None and (process.alive or self._is_closed.is_set())
+            if process is None or not is_usable:
+                process = TaskProcess(self._work)
+                self._own_process.process = process
+                alive = [each for each in self._processes if each.alive]
+                self._processes = [*alive, process]
         return process
 
     def _run(self, id: str) -> None:
-        """Give a photo to the thread's process, and wait for the scene."""
+        """Give a job's photo to the thread's process, wait for the scene, and record the end.
+
+        Nothing is recorded if the server is closed meanwhile: the next server repeats the job.
+        """
         process = self._process()
         with self._lock:
-            if self._closed.is_set() or id not in self.by_id:
+            if self._is_closed.is_set() or id not in self.by_id:
                 return
             self._change(id, state="running")
-            self._running[id], job = process, self.by_id[id]
+            self._process_of_job[id] = process
+            job = self.by_id[id]
+
         try:
+            # Results of an earlier server may be incomplete.
             shutil.rmtree(job.results, ignore_errors=True)
             job.results.mkdir()
             job.save()
-            error = process.do((job, None), lambda event: self._tell(id, event))
+            error = process.do((job, None), lambda event: self._note_event(id, event))
         except (OSError, InputError) as problem:
             error = f"{job.name}: cannot be stored here: {reason_in_a_line(problem)}"
-        if error == WORKER_DIED:
-            self._closed.wait(
-                1
-            )  # a signal to end the whole service may reach the worker process first
-        self._running.pop(id, None)
-        if not self._closed.is_set():
-            self._end(id, error)
 
-    def _tell(self, id: str, event: TaskEvent) -> None:
+        # A signal to end the whole service may reach the worker process first: wait a second for
+        # it.
+        if error == WORKER_DIED:
+            self._is_closed.wait(1)
+        self._process_of_job.pop(id, None)
+        if not self._is_closed.is_set():
+            self._record_end(id, error)
+
+    def _note_event(self, id: str, event: TaskEvent) -> None:
+        """Note in a job's state what its process reports: {line}, or {stage, done, total}.
+
+        A total of 0 means that nobody knows how much there is to do.
+        """
         if "line" in event:
             LOG.info(event["line"])
             self._change(id, line=event["line"])
-        else:
-            total = event["total"]
-            self._change(id, stage=event["stage"], share=event["done"] / total if total else None)
+            return
+        share = None
+        if event["total"]:
+            share = event["done"] / event["total"]
+        self._change(id, stage=event["stage"], share=share)
 
-    def _end(self, id: str, error: str | None) -> None:
-        """Record a job's end on the disk, then tell clients; delete the photo."""
+    def _record_end(self, id: str, error: str | None) -> None:
+        """Record a job's end on the disk, then tell clients; delete the photo, which is private.
+
+        `error` is the reason for failure, None for a finished scene.
+        """
         with self._lock:
-            if (job := self.by_id.get(id)) is None:
+            job = self.by_id.get(id)
+            if job is None:
                 return
-            end = {"state": "failed" if error else "done", "error": error, "ended": time.time()}
-            ended = job.model_copy(update={**end, "stage": None, "share": None})
-            with contextlib.suppress(
-                InputError
-            ):  # the disk is full: the next server repeats the job
-                ended.save()
+            ended_job = job.model_copy(
+                update={
+                    "state": "failed" if error else "done",
+                    "error": error,
+                    "ended": time.time(),
+                    "stage": None,
+                    "share": None,
+                }
+            )
+            # If the disk is full, the next server repeats the job, and needs the photo.
+            with contextlib.suppress(InputError):
+                ended_job.save()
                 for file in (job.source, job.depth):
+                    # An absolute path is a file of the user, which is not ours to delete.
                     if file is not None and not os.path.isabs(file):
                         (job.folder / file).unlink(missing_ok=True)
-            self.by_id[id] = ended
+            self.by_id[id] = ended_job
         if error:
             LOG.error("error: %s", error)
 
     def _tidy_until_closed(self) -> None:
-        while not self._closed.wait(TIDY_INTERVAL_S):
-            with contextlib.suppress(OSError):  # a worker may rename a file meanwhile
+        """Remove expired jobs from time to time, until the server is closed."""
+        while not self._is_closed.wait(TIDY_INTERVAL_S):
+            # A worker may rename a file while its size is read.
+            with contextlib.suppress(OSError):
                 self.remove_expired()
 
     def remove_expired(self) -> None:
-        """Remove jobs that are too old, and the oldest jobs while the folder is too large."""
-        ended = [
-            (job.ended, sum(file.stat().st_size for file in job.folder.rglob("*")), job.id)
-            for job in [*self.by_id.values()]
-            if job.ended
-        ]
-        total = sum(size for _, size, _ in ended)
-        for when, size, id in sorted(ended):
-            if when + self.limits.seconds < time.time() or total > self.limits.size:
-                total -= size
-                self.remove(id)
+        """Remove jobs that ended too long ago, and the oldest jobs while the folder is too
+        large.
+        """
+        ended_jobs = [job for job in list(self.by_id.values()) if job.ended is not None]
+        sizes = {job.id: size_of_folder(job.folder) for job in ended_jobs}  # bytes
+        total_size = sum(sizes.values())
+        for job in sorted(ended_jobs, key=lambda job: job.ended or 0.0):
+            is_old = (job.ended or 0.0) + self.limits.seconds < time.time()
+            if is_old or total_size > self.limits.size:
+                total_size -= sizes[job.id]
+                self.remove(job.id)
+
+
+def size_of_folder(folder: Path) -> int:
+    """The size in bytes of all files below a folder."""
+    return sum(file.stat().st_size for file in folder.rglob("*"))

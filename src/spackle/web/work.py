@@ -1,4 +1,6 @@
-"""The work of a worker process: turn a photo or scene into the page's data and files to download."""
+"""The work of a worker process: turn a photo or scene into the page's data and files to
+download.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +8,7 @@ import contextlib
 import dataclasses
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -36,9 +38,15 @@ from spackle.web.jobs import Job
 
 Download = Literal["scene.ply", "scene.spz", "scene.sog", "scene.glb", "scene.html", "report.json"]
 Video = Literal[
-    "video.mp4", "swipe.mp4", "shake.mp4", "rotate.mp4", "rotate-forward.mp4", "vertical.mp4", "orbit.mp4",
+    "video.mp4",
+    "swipe.mp4",
+    "shake.mp4",
+    "rotate.mp4",
+    "rotate-forward.mp4",
+    "vertical.mp4",
+    "orbit.mp4",
     "dolly-zoom.mp4",
-]  # fmt: skip
+]
 FileName = Literal[Download, Video]  # one list, so that a refusal names all
 DEFAULT_FILES: list[FileName] = [
     "scene.ply",
@@ -47,9 +55,10 @@ DEFAULT_FILES: list[FileName] = [
     "scene.html",
     "video.mp4",
     "report.json",
-]  # the default
-PAGE = "page.json"
-PREVIEW = "photo.jpg"
+]
+SCENE_FILE = "scene.ply"  # the scene, of which all other files are made
+PAGE = "page.json"  # what the page draws, without the Gaussians
+PREVIEW = "photo.jpg"  # the small photo that the page shows until the scene is ready
 PREVIEW_SIDE_PX = 1280  # pixels of the preview's long side
 # The formats that Pillow may decode: for EPS, for example, Pillow would start another program.
 PILLOW_FORMATS = frozenset({"JPEG", "MPO", "PNG", "WEBP", "HEIF", "TIFF"})
@@ -88,84 +97,139 @@ class SceneOptions(BaseModel):
 
 @dataclasses.dataclass
 class SceneWork:
-    """The function of a worker process; it keeps the last base loaded."""
+    """The function of a worker process: it makes scenes of photos, and files of scenes.
 
-    base: BaseSettings = dataclasses.field(default_factory=BaseSettings)
-    usual: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # default options of jobs
-    verbose: bool = False
-    opened: Pipeline | None = None
+    A base is the network, or the depth map, that turns a photo into Gaussians. The process keeps
+    the base that it used last, because loading a network takes seconds.
+    """
+
+    base: BaseSettings = dataclasses.field(default_factory=BaseSettings)  # the server's own base
+    # Options of photos whose clients do not set them.
+    default_options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    verbose: bool = False  # whether to report details
+    pipeline: Pipeline | None = None  # with the base that was used last
 
     def bases(self) -> list[str]:
-        """The bases that a client may choose: the server's base, "auto", and those with weights on this machine."""
-        return list(dict.fromkeys([self.base.name, AUTO, *BaseSettings().model_files]))
+        """The names of the bases that a client may choose, without duplicates.
 
-    def __call__(self, task: tuple[Job, str | None], tell: SendEvent) -> None:
-        """Do a task; InputError, without any path of this server, for an unusable photo, depth map or scene."""
+        They are the server's base, "auto", and those whose weights are on this machine.
+        """
+        names = [self.base.name, AUTO, *BaseSettings().model_files]
+        return list(dict.fromkeys(names))
+
+    def __call__(self, task: tuple[Job, str | None], send_event: SendEvent) -> None:
+        """Do a task: make the scene of a job's photo, or add a file to the job's finished scene.
+
+        Args:
+            task: the job, and the name of the file to add; None: make the scene, and the files that
+                the job's options name.
+            send_event: takes progress and log lines for the server.
+
+        Raises:
+            InputError: the photo, depth map or scene is unusable. The message has no path of this
+                server.
+        """
         job, file = task
-        options, teller = (
-            SceneOptions.model_validate({**self.usual, **job.options}),
-            JobReporter(job, tell, self.verbose),
-        )
-        ply, source, note = job.results / "scene.ply", job.folder / job.source, ""
+        options = SceneOptions.model_validate({**self.default_options, **job.options})
+        reporter = JobReporter(job, send_event, self.verbose)
         try:
             if file is None:
-                if scene_suffix(source):
-                    Scene.load(source, focal_px=options.focal_px, fov=options.fov).save(ply)
-                else:
-                    note = self._complete(job, options, teller)
-                scene = Scene.load(ply)
-                with teller.stage("page"):
-                    page = scene.page(job.name, note)
-                    for name, data in {
-                        **page.files,
-                        PAGE: html_safe_json(page.description),
-                    }.items():
-                        write_atomic(job.results / name, data)
+                scene = self._make_scene(job, options, reporter)
+                files: Sequence[str] = options.files
             else:
-                scene = Scene.load(ply)
-            for name in options.files if file is None else [file]:
+                scene = Scene.load(job.results / SCENE_FILE)
+                files = [file]
+            for name in files:
+                # Making the scene has made some of its files.
                 if not (job.results / name).exists():
-                    with teller.stage(name):
-                        self._make(job.results / name, scene, job, options)
+                    with reporter.stage(name):
+                        self._make_file(job.results / name, scene, job, options)
         except InputError as error:
-            raise InputError(teller.cleaned(str(error))) from error
+            raise InputError(reporter.without_paths(str(error))) from error
 
-    def _complete(self, job: Job, options: SceneOptions, teller: JobReporter) -> str:
-        """Complete a photo: make the files of `predict_photo`; returns a note for the user."""
-        settings = self.base
-        if job.depth is not None:
-            depth, kind = job.folder / job.depth, options.depth_kind
-            settings = dataclasses.replace(
-                settings, name=AUTO, checkpoint=None, depth=depth, depth_kind=kind
-            )
-        elif options.base not in (None, settings.name):
-            settings = dataclasses.replace(settings, name=options.base, checkpoint=None)
+    def _make_scene(self, job: Job, options: SceneOptions, reporter: JobReporter) -> Scene:
+        """Make the scene of a job's photo, or open the job's scene, and write what the page
+        draws.
+        """
+        source = job.folder / job.source
+        scene_file = job.results / SCENE_FILE
+        note = ""
+        if scene_suffix(source):
+            Scene.load(source, focal_px=options.focal_px, fov=options.fov).save(scene_file)
+        else:
+            note = self._complete_photo(job, options, reporter)
+
+        # Read again, so that the page shows exactly what is in the file.
+        scene = Scene.load(scene_file)
+        with reporter.stage("page"):
+            page = scene.page(job.name, note)
+            for name, content in page.files.items():
+                write_atomic(job.results / name, content)
+            write_atomic(job.results / PAGE, html_safe_json(page.description))
+        return scene
+
+    def _complete_photo(self, job: Job, options: SceneOptions, reporter: JobReporter) -> str:
+        """Complete a photo: make the files of `predict_photo` in the job's folder of results.
+
+        Returns:
+            A note for the user about the scene's quality; empty if there is nothing to say.
+        """
+        settings = self._base_settings(job, options)
         path = PathOptions(
             trajectory=options.trajectory, disparity=options.disparity, frames=options.frames
         )
-        chosen = PipelineOptions(base=settings, path=path, fill=FillOptions(fill=options.fill))
-        if self.opened is None or self.opened.options.base != settings:
-            self.opened = None  # frees the network before another one is loaded
-            self.opened = Pipeline.open(chosen)
-        pipeline = dataclasses.replace(self.opened, options=chosen)
-        lens = options.model_dump(include={"focal_px", "focal_mm", "fov"})
-        wanted = PhotoOptions(
-            lens=lens, render="video.mp4" in options.files, keep_frame=options.keep_frame
+        pipeline_options = PipelineOptions(
+            base=settings, path=path, fill=FillOptions(fill=options.fill)
         )
-        report = predict_photo(job.folder / job.source, job.results, pipeline, teller, wanted)
+        if self.pipeline is None or self.pipeline.options.base != settings:
+            # The old network is freed before another one is loaded: both may not fit into memory.
+            self.pipeline = None
+            self.pipeline = Pipeline.open(pipeline_options)
+        pipeline = dataclasses.replace(self.pipeline, options=pipeline_options)
+
+        photo_options = PhotoOptions(
+            lens=options.model_dump(include={"focal_px", "focal_mm", "fov"}),
+            render="video.mp4" in options.files,
+            keep_frame=options.keep_frame,
+        )
+        photo = job.folder / job.source
+        report = predict_photo(photo, job.results, pipeline, reporter, photo_options)
         return ROUGH_GEOMETRY_ADVICE if report.run.base == LiteBase.name else ""
 
-    def _make(self, target: Path, scene: Scene, job: Job, options: SceneOptions) -> None:
+    def _base_settings(self, job: Job, options: SceneOptions) -> BaseSettings:
+        """The base for a photo: by its depth map, as the client chose, or the server's own."""
+        if job.depth is not None:
+            # "auto" takes depth before any network; `checkpoint` belongs to the server's network.
+            return dataclasses.replace(
+                self.base,
+                name=AUTO,
+                checkpoint=None,
+                depth=job.folder / job.depth,
+                depth_kind=options.depth_kind,
+            )
+        if options.base is not None and options.base != self.base.name:
+            return dataclasses.replace(self.base, name=options.base, checkpoint=None)
+        return self.base
+
+    def _make_file(self, target: Path, scene: Scene, job: Job, options: SceneOptions) -> None:
+        """Write a video, a page or another format of a scene; the name of `target` says which.
+
+        InputError for the report of a scene that no photo gave.
+        """
         if target.name == REPORT_NAME:
             raise InputError(f"{job.name}: has no report, because it was opened as a scene")
         if target.suffix == ".mp4":
-            kind = next((kind for kind in TRAJECTORIES if kind == target.stem), options.trajectory)
-            scene.save_video(
-                target, kind, frames=options.frames, renderer=get_renderer(self.base.device)
-            )
+            # swipe.mp4, for example, shows the path of this name; video.mp4 the job's own path.
+            trajectory = options.trajectory
+            for name in TRAJECTORIES:
+                if name == target.stem:
+                    trajectory = name
+            renderer = get_renderer(self.base.device)
+            scene.save_video(target, trajectory, frames=options.frames, renderer=renderer)
         elif target.suffix == ".html":
-            note = json.loads((job.results / PAGE).read_bytes())["note"]
-            write_atomic(target, single_html(scene.page(job.name, note)))
+            description = json.loads((job.results / PAGE).read_bytes())
+            page = scene.page(job.name, description["note"])
+            write_atomic(target, single_html(page))
         else:
             scene.export(target)
 
@@ -173,42 +237,62 @@ class SceneWork:
 class JobReporter(Reporter):
     """Reports log lines and progress to the server, with the photo's name in place of paths."""
 
-    def __init__(self, job: Job, tell: SendEvent, verbose: bool) -> None:
+    def __init__(self, job: Job, send_event: SendEvent, verbose: bool) -> None:
+        """Report the work on a job through `send_event`; with `verbose`, details, too."""
         super().__init__(verbose, Console(quiet=True, force_terminal=False))
-        self._job, self._tell = job, tell
+        self._job = job
+        self._send_event = send_event
 
-    def cleaned(self, line: str) -> str:
+    def without_paths(self, line: str) -> str:
+        """A line for clients: they know the photo's name, and must not learn paths of this
+        server.
+        """
         job = self._job
-        line = line.removesuffix(f" -> {job.results}").replace(f"{job.folder}{os.sep}", "")
+        line = line.removesuffix(f" -> {job.results}")
+        line = line.replace(f"{job.folder}{os.sep}", "")
         return line.replace(job.source, job.name)
 
     def log(self, line: str) -> None:
-        self._tell({"line": self.cleaned(line)})
+        """Send a line to the server."""
+        self._send_event({"line": self.without_paths(line)})
 
     @contextlib.contextmanager
     def stage(self, name: str) -> Iterator[Progress]:
-        """Like `Reporter.stage`; a total of 0 means unknown."""
-        self._tell({"stage": name, "done": 0, "total": 0})
+        """Send the name of a stage and its progress to the server, and time it as `Reporter` does.
+
+        Yields a function of (done, total); a total of 0 means that nobody knows the total.
+        """
+
+        def send_progress(done: int, total: int) -> None:
+            self._send_event({"stage": name, "done": done, "total": total})
+
+        send_progress(0, 0)
         with super().stage(name):
-            yield lambda done, total: self._tell({"stage": name, "done": done, "total": total})
+            yield send_progress
 
 
 def check_photo(path: Path, name: str, preview: Path) -> None:
-    """Decode a photo, and write a small JPEG to `preview`, which the page shows until the scene is ready.
+    """Decode a photo, and write a small JPEG of it, which the page shows until the scene is ready.
 
-    InputError, naming the file `name`, if the file is no photo of an accepted format.
+    Args:
+        path: the photo.
+        name: what messages call it.
+        preview: the file for the small JPEG.
+
+    Raises:
+        InputError: the file is no photo of an accepted format, or too small or too large.
     """
 
-    def decode(image: Image.Image) -> None:
+    def write_preview(image: Image.Image) -> None:
         if image.format not in PILLOW_FORMATS:
             raise InputError(f"{path}: a {image.format} picture: give {', '.join(PHOTO_SUFFIXES)}")
         check_photo_size(image.width, image.height, path)
-        image.load()
+        image.load()  # decodes all pixels, and so finds damage
         upright = ImageOps.exif_transpose(image)
         upright.thumbnail((PREVIEW_SIDE_PX, PREVIEW_SIDE_PX))
         upright.convert("RGB").save(preview, quality=85)
 
     try:
-        read_image(path, decode)
+        read_image(path, write_preview)
     except InputError as error:
         raise InputError(str(error).replace(str(path), name)) from error
