@@ -42,6 +42,7 @@ from spackle.core.photo import Photo
 from spackle.core.trajectories import DepthRange, trajectory_cameras
 from spackle.formats import save_ply
 from spackle.paper.evaluation.bench import (
+    COMPLETION_STAGES,
     CPU,
     MS_PER_S,
     TOTAL_STAGE,
@@ -52,7 +53,6 @@ from spackle.paper.evaluation.bench import (
     time_tasks,
 )
 from spackle.paper.evaluation.datasets.stereo import load_motorcycle
-from spackle.paper.evaluation.measurements import COMPLETION_STAGES
 from spackle.render import CpuRenderer, Renderer, get_renderer
 from spackle.render.blend import blend_tiles
 from spackle.render.drawing import (

@@ -14,7 +14,8 @@ from spackle.paper.evaluation.case import Viewpoint
 from spackle.paper.evaluation.datasets.stereo import load_motorcycle
 from spackle.paper.evaluation.measurements import Measurement
 from spackle.paper.evaluation.methods import Fill, MethodView, make_method
-from spackle.paper.evaluation.protocols import MetricSuite, measure_views
+from spackle.paper.evaluation.metric_suite import MetricSuite
+from spackle.paper.evaluation.protocols import measure_views
 
 
 def mean_color(camera: spackle.Camera, before: spackle.Rendering) -> MethodView:
@@ -36,11 +37,12 @@ def main() -> list[Measurement]:
     methods |= {
         name: partial(make_method, name, context=context) for name in ("base", "seeds", "spackle")
     }
-    image = Measurement("Middlebury", "Motorcycle", "", "", "", "", None)
-    rows, _ = measure_views(image, context, views, methods, MetricSuite(["psnr", "ssim"], {}, None))
-    return rows
+    measurements, _ = measure_views(
+        "Middlebury", "Motorcycle", context, views, methods, MetricSuite(["psnr", "ssim"])
+    )
+    return measurements
 
 
 if __name__ == "__main__":
-    for row in main():
-        print(row.method, row.metric, row.value)
+    for measurement in main():
+        print(measurement.method, measurement.metric, measurement.value)

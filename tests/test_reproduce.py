@@ -31,7 +31,7 @@ TABLES = (  # the paper's labels
 
 def sum_of(run: Run, method: str, metric: str) -> float:
     return sum(
-        float(row.value or 0) for row in run.rows if (row.method, row.metric) == (method, metric)
+        float(row.value or 0) for row in run.measurements if (row.method, row.metric) == (method, metric)
     )
 
 
@@ -59,7 +59,7 @@ def test_the_papers_chain_gives_its_tables_and_figures(tmp_path: Path) -> None:
         run = load_run(out / "runs" / f"{name}-large")
         width, height = (sum_of(run, "", metric) for metric in ("width", "height"))
         har, before, aux = (sum_of(run, "paper", metric) for metric in ("har", "har_before", "aux"))
-        cells = width * height / 4 / len(run.measured) ** 2
+        cells = width * height / 4 / len(run.measured_images) ** 2
         assert har < 0.1 * before
         assert aux / (before * cells) == pytest.approx(1, abs=0.05)
         # As in the paper's table 4, Direct FT damages pixels outside of holes, and the residual

@@ -55,8 +55,8 @@ def frames_of(arguments: argparse.Namespace) -> Iterator[tuple[str, list[Frame]]
             yield folder.name, [file.read(JUDGED_SIDE) for file in of_scenes(folder, "--stereo")]
         for scene in plain:
             case = pair_of_2014(scene)
-            assert case.depth is not None
-            known = case.depth()
+            assert case.read_depth is not None
+            known = case.read_depth()
             yield (
                 scene.name,
                 [reduced(load_photo(case.photo).rgb, known.depth, known.valid, JUDGED_SIDE)],

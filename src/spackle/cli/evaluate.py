@@ -134,8 +134,8 @@ def evaluate(
     """Evaluate on a dataset by the paper's protocols: rows.jsonl, tables.md, tables.tex, worst.png, best.png."""
     from spackle.bases.settings import BaseSettings
     from spackle.cli.messages import CommandReporter
-    from spackle.paper.evaluation.evaluate import EvaluateOptions, parse_disparities, split_words
     from spackle.paper.evaluation.evaluate import evaluate as run
+    from spackle.paper.evaluation.options import EvaluateOptions, parse_disparities, split_words
 
     options = EvaluateOptions(
         dataset=dataset,
@@ -158,10 +158,10 @@ def evaluate(
         inpainter=inpainter,
         features=features,
         limit=limit,
-        download=download_metrics,
+        download_metrics=download_metrics,
     )
     results = output or Path(f"evaluation-{dataset}-{protocol}")
-    if run(options, results, CommandReporter(verbose, as_json=as_json), html) == "stopped":
+    if run(options, results, CommandReporter(verbose, as_json=as_json), html) is None:
         raise typer.Exit(INTERRUPTED)
 
 
@@ -203,7 +203,7 @@ def figures(
 ) -> None:
     """Draw the paper's figures of views: PDF, PNG, and captions in figures.tex."""
     from spackle.cli.messages import CommandReporter
-    from spackle.paper.evaluation.pictures import make_figures
+    from spackle.paper.evaluation.figures import make_figures
 
     make_figures(results, rows, output, CommandReporter())
 
@@ -238,17 +238,14 @@ def bench(
     """Count the Gaussians and measure the time that Spackle adds to a base: rows.jsonl, bench.md, bench.tex."""
     from spackle.bases.settings import BaseSettings
     from spackle.cli.messages import CommandReporter
-    from spackle.paper.evaluation.bench import TIMED
     from spackle.paper.evaluation.bench import bench as run
-    from spackle.paper.evaluation.evaluate import EvaluateOptions, parse_disparities
+    from spackle.paper.evaluation.options import BenchOptions, parse_disparities
 
-    options = EvaluateOptions(
+    options = BenchOptions(
         dataset=dataset,
         root=folder,
-        methods=TIMED,
         disparities=parse_disparities(disparity),
         side=side,
-        metrics=(),
         base=BaseSettings(
             name=base,
             checkpoint=checkpoint,
@@ -258,10 +255,9 @@ def bench(
         ),
         residual=residual,
         limit=limit,
+        runs=runs,
+        base_runs=base_runs,
     )
     results = output or Path(f"bench-{dataset}-{UNFIT.sub('-', base)}")
-    if (
-        run(options, runs, base_runs, results, CommandReporter(verbose, as_json=as_json))
-        == "stopped"
-    ):
+    if run(options, results, CommandReporter(verbose, as_json=as_json)) is None:
         raise typer.Exit(INTERRUPTED)

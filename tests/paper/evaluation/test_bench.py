@@ -15,16 +15,15 @@ from helpers.scenes import box_before_wall
 from spackle.bases.settings import BaseSettings
 from spackle.paper.evaluation import bench
 from spackle.paper.evaluation.case import Points
-from spackle.paper.evaluation.evaluate import EvaluateOptions, open_evaluation
+from spackle.paper.evaluation.evaluation import open_evaluation
 from spackle.paper.evaluation.folder import load_run
 from spackle.paper.evaluation.measurements import (
-    BASE_STAGES,
-    COMPLETION_STAGES,
-    PAPER,
     Measurement,
-    pivot,
+    group_values,
 )
 from spackle.paper.evaluation.measurements import Run as Results
+from spackle.paper.evaluation.options import TIMED_METHODS, BenchOptions
+from spackle.paper.evaluation.paper_numbers import PAPER_PARAMETERS, PAPER_TABLES
 from spackle.paper.evaluation.protocols import large_views
 from spackle.paper.evaluation.tables import make_tables
 from spackle.render import get_renderer
@@ -33,7 +32,7 @@ from spackle.runtime.errors import InputError
 from spackle.scene_fill import FillContext, fill_view
 
 EXPANDED = "tab:expanded_efficiency_gaussian_overhead"
-PAPER_LABELS = {table["label"] for table in PAPER["tables"]}  # the paper's six tables
+PAPER_LABELS = {table.label for table in PAPER_TABLES}  # the paper's six tables
 STAGE_MS = {"base": 1000.0, "view": 400.0, "photo": 1.0, "completion": 13.0}
 
 
@@ -42,7 +41,7 @@ def results(title: str = "Middlebury", factor: float = 1.0) -> Results:
     config: dict[str, Any] = {
         "kind": "bench",
         "protocol": "bench",
-        "methods": list(bench.TIMED),
+        "methods": list(TIMED_METHODS),
         "title": title,
     }
     config |= {
@@ -82,12 +81,12 @@ def results(title: str = "Middlebury", factor: float = 1.0) -> Results:
 
 @pytest.mark.parametrize(("name", "count"), [("unet", 8_023_153), ("sharp-decoder", 8_022_894)])
 def test_the_networks_have_the_papers_parameters(name: str, count: int) -> None:
-    found, paper = bench.count_parameters(open_residual(name)), PAPER["parameters"]
+    found, paper = bench.count_parameters(open_residual(name)), PAPER_PARAMETERS
     assert (found["base"], found["residual"]) == (702_305_169, count)
-    assert round(found["base"] / 1e6, 2) == paper["base_m"]
-    assert round(found["residual"] / 1e6, 2) == paper["residual_m"]
-    assert round(100 * found["share"], 2) == paper["share_percent"]
-    assert (found["base"] + found["residual"]) / 1e6 == pytest.approx(paper["merged_m"], abs=0.01)
+    assert round(found["base"] / 1e6, 2) == paper.base_m
+    assert round(found["residual"] / 1e6, 2) == paper.residual_m
+    assert round(100 * found["share"], 2) == paper.share_percent
+    assert (found["base"] + found["residual"]) / 1e6 == pytest.approx(paper.merged_m, abs=0.01)
     assert 0.9 * found["base"] < found["base_used"] < found["base"]
 
 
@@ -127,7 +126,9 @@ def test_costs_are_joined_over_datasets_and_with_large_views() -> None:
             for note in table.notes
         )
         assert any("1 of 4 images" in note and "broken" in note for note in table.notes)
-    assert {table.label for table in make_tables([counted], whole=True)} == {*PAPER_LABELS}
+    assert {table.label for table in make_tables([counted], with_unmeasured=True)} == {
+        *PAPER_LABELS
+    }
 
 
 def test_a_view_costs_what_a_completion_adds() -> None:
@@ -136,35 +137,31 @@ def test_a_view_costs_what_a_completion_adds() -> None:
     camera = large_views(prediction, (0.3,), 1280)[0].camera
     paper, spackle = (
         len(bench.complete_view_in_stages(context, camera, laps.append, name))
-        for name in bench.TIMED
+        for name in TIMED_METHODS
     )
     assert spackle == len(fill_view(context, camera).aux) > paper > 64
-    assert laps == [*BASE_STAGES[1:], *COMPLETION_STAGES] * 2
+    assert laps == [*bench.BASE_STAGES[1:], *bench.COMPLETION_STAGES] * 2
 
 
 def test_points_suffice_and_without_depth_a_case_is_refused(scenes: Path) -> None:
-    settings: dict[str, Any] = {
-        "methods": ("spackle",),
-        "disparities": (0.3,),
-        "metrics": (),
-        "residual": "seeds",
-    }
-    tools = open_evaluation(
-        EvaluateOptions("middlebury", scenes, base=BaseSettings(name="rgbd"), **settings)
+    options = BenchOptions(
+        dataset="middlebury",
+        root=scenes,
+        base=BaseSettings(name="rgbd"),
+        disparities=(0.3,),
+        residual="seeds",
     )
-    case, config = (
-        tools.cases[0],
-        {"title": "Middlebury", "base_runs": 1, "runs": 1, "base": {"device": "cpu"}},
-    )
-    assert case.depth is not None
-    known = case.depth()
+    evaluation = open_evaluation(options.as_evaluation)
+    case = evaluation.cases[0]
+    assert case.read_depth is not None
+    known = case.read_depth()
     points = Points(known.valid.nonzero().flip(-1) + 0.5, known.depth[known.valid])
-    found = bench.time_case(
-        dataclasses.replace(case, depth=None, points=lambda: points), tools, config
-    )
+    case_with_points = dataclasses.replace(case, read_depth=None, read_points=lambda: points)
+    found = bench.time_case(case_with_points, evaluation, runs=1, base_runs=1)
     assert next(row.value for row in found if row.metric == "base_gaussians")
+    case_without_depth = dataclasses.replace(case, read_depth=None)
     with pytest.raises(InputError, match="neither a depth map nor points"):
-        bench.time_case(dataclasses.replace(case, depth=None), tools, config)
+        bench.time_case(case_without_depth, evaluation, runs=1, base_runs=1)
 
 
 def test_from_files_to_tables(scenes: Path, tmp_path: Path) -> None:
@@ -186,10 +183,10 @@ def test_from_files_to_tables(scenes: Path, tmp_path: Path) -> None:
     assert names_in(output) == {"rows.jsonl", "bench.md", "bench.tex", "config.json", "images"}
     found = load_run(output)
     assert found.about["parameters"]["residual"] == 8_023_153
-    assert (found.settings, found.measured) == (["0.3", "0.5"], ["Ball", "Door"])
-    values = pivot(found.rows, "metric", "setting", "method")
+    assert (found.settings, found.measured_images) == (["0.3", "0.5"], ["Ball", "Door"])
+    values = group_values(found.measurements, "metric", "setting", "method")
     for setting in found.settings:
-        for method in bench.TIMED:  # at both ends of the swipe
+        for method in TIMED_METHODS:  # at both ends of the swipe
             bases = [base for base in values["base_gaussians", "", ""] for _ in range(2)]
             added = zip(bases, values["aux", setting, method], strict=True)
             assert values["merged", setting, method] == [base + aux for base, aux in added]

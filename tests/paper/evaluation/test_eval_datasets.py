@@ -20,11 +20,12 @@ from spackle.core.camera import Camera
 from spackle.core.focal_length import FocalSource
 from spackle.core.photo import working_size
 from spackle.depth.depth_map import DepthMap
+from spackle.paper.evaluation.alignment import align, camera_in_base_scene
 from spackle.paper.evaluation.case import Case, Points, known_depth, load_case
 from spackle.paper.evaluation.datasets import read_cases
-from spackle.paper.evaluation.datasets.multiview import spread
-from spackle.paper.evaluation.evaluate import EvaluateOptions, open_evaluation
-from spackle.paper.evaluation.protocols import align, to_base
+from spackle.paper.evaluation.datasets.multiview import spread_over_scenes
+from spackle.paper.evaluation.evaluation import open_evaluation
+from spackle.paper.evaluation.options import EvaluateOptions
 from spackle.runtime.errors import InputError
 
 Array = NDArray[Any]
@@ -160,11 +161,11 @@ def assert_pair(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Check where the right camera sees the centre of a left pixel; returns the pixels with known depth, and K."""
     assert case.camera is not None
-    assert case.depth is not None
-    known, K = case.depth(), case.camera.K
+    assert case.read_depth is not None
+    known, K = case.read_depth(), case.camera.K
     assert bool(known.valid[y, x])
     point = case.camera.unproject(torch.tensor([x + 0.5, y + 0.5]), known.depth[y, x])
-    uv, depth = case.seconds[0].camera.project(point)
+    uv, depth = case.second_views[0].camera.project(point)
     torch.testing.assert_close(uv, torch.tensor([x + 0.5 - disparity, y + 0.5]), atol=1e-3, rtol=0)
     torch.testing.assert_close([float(depth), float(known.depth[y, x])], [z, z], rtol=1e-5, atol=0)
     return known.valid, K
@@ -197,7 +198,7 @@ def test_booster(tmp_path: Path) -> None:
     (scene / "camera_00/im0.png").write_bytes(b"no picture")  # affects no other photo
     first, second = read_cases("booster", tmp_path)
     assert [first.name, second.name] == ["Bathroom/im0", "Bathroom/im1"]
-    assert second.seconds[0].photo == scene / "camera_02/im1.png"
+    assert second.second_views[0].photo == scene / "camera_02/im1.png"
     valid, K = assert_pair(second, 7.0, FOCAL * 0.08 / (7.0 + 3.0))
     assert (K[:2, 2].tolist(), bool(valid[:2].any())) == ([22.5, 18.5], False)
     with pytest.raises(InputError, match=r"im0\.png"):
@@ -222,7 +223,7 @@ def test_points_land_on_their_pixels(name: str, tree: str, scale: float, tmp_pat
     assert (
         names == sorted(names) == [case.name for case in read_cases(name, tmp_path / PLACES[name])]
     )
-    assert sum(len(case.seconds) for case in found) > 5
+    assert sum(len(case.second_views) for case in found) > 5
     for case, eye in zip(found, EYES, strict=True):
         assert case.camera is not None
         assert torch.equal(case.camera.world_to_camera, torch.eye(4))
@@ -230,15 +231,15 @@ def test_points_land_on_their_pixels(name: str, tree: str, scale: float, tmp_pat
         local = torch.from_numpy(POINTS @ own[:3, :3].T + own[:3, 3]).float() * scale
         views = [
             (case.camera, eye),
-            *((view.camera, EYES[names.index(view.name)]) for view in case.seconds),
+            *((view.camera, EYES[names.index(view.name)]) for view in case.second_views),
         ]
         for camera, other in views:
             uv, z = camera.project(local)
             expected = torch.tensor([other.pixel(point) for point in POINTS]).float()
             torch.testing.assert_close(uv, expected[:, :2], atol=2e-3, rtol=0)
             torch.testing.assert_close(z / scale, expected[:, 2], atol=1e-4, rtol=1e-5)
-        if case.points is not None:
-            points = case.points()
+        if case.read_points is not None:
+            points = case.read_points()
             expected = torch.tensor(
                 [eye.pixel(point) for point in POINTS]
             ).float()  # the model's point with an error of 7 px is left out
@@ -250,13 +251,13 @@ def test_second_views_are_the_nearest_but_not_the_same(tmp_path: Path) -> None:
     # Cameras at x = 0, 0.01, 0.3, 0.35, 0.4, 0.5, 3, and at 0.25 turned by one radian; the middle depth is 4.
     stored("llff-beside", tmp_path / "fern")
     first = read_cases("llff", tmp_path)[0]
-    assert [view.name for view in first.seconds if view.near] == [
+    assert [view.name for view in first.second_views if view.is_among_nearest] == [
         "fern/image002",
         "fern/image003",
         "fern/image004",
     ]
-    assert len(first.seconds) == 7  # all other photos, the nearest first
-    assert [view.name for view in first.seconds][::6] == ["fern/image001", "fern/image006"]
+    assert len(first.second_views) == 7  # all other photos, the nearest first
+    assert [view.name for view in first.second_views][::6] == ["fern/image001", "fern/image006"]
     settings: dict[str, Any] = {
         "base": BaseSettings(name="lite"),
         "metrics": (),
@@ -264,16 +265,22 @@ def test_second_views_are_the_nearest_but_not_the_same(tmp_path: Path) -> None:
     }
     for choice, count in (("all", 7), ("nearest", 3)):
         evaluation = open_evaluation(
-            EvaluateOptions("llff", tmp_path, "near-view", second_views=choice, **settings)
+            EvaluateOptions(
+                dataset="llff",
+                root=tmp_path,
+                protocol="near-view",
+                second_views=choice,
+                **settings,
+            )
         )
-        assert len(evaluation.cases[0].seconds) == count
+        assert len(evaluation.cases[0].second_views) == count
         assert evaluation.config["second_views"] == choice
-    assert first.bounds == (3.0, 6.0)
+    assert first.depth_bounds == (3.0, 6.0)
 
 
 def test_frames_are_spread_evenly() -> None:
     sizes = {"Barn": 10, "Church": 1000, "Truck": 100}
-    taken = spread(list(sizes), lambda name: range(sizes[name]), 60)
+    taken = spread_over_scenes(list(sizes), lambda name: range(sizes[name]), 60)
     assert {name: len(frames) for name, frames in taken.items()} == {
         "Barn": 10,
         "Church": 25,
@@ -281,14 +288,19 @@ def test_frames_are_spread_evenly() -> None:
     }
     assert [np.ptp(np.diff(frames)) for frames in taken.values()] == [0, 0, 0]
     assert (
-        sum(map(len, spread(list(sizes), lambda name: range(sizes[name]), 5000).values())) == 1110
+        sum(
+            map(
+                len, spread_over_scenes(list(sizes), lambda name: range(sizes[name]), 5000).values()
+            )
+        )
+        == 1110
     )
     scenes = [
         f"{group}/scene_{k:03d}"
         for group, n in (("apple", 200), ("box", 30), ("car", 5))
         for k in range(n)
     ]
-    more = spread(
+    more = spread_over_scenes(
         scenes, lambda scene: range(300), 45
     )  # with more scenes than frames each category gets its share
     assert list(more.values()) == [[150]] * 45
@@ -324,14 +336,14 @@ def test_photos_and_cameras_are_brought_to_the_working_size(tmp_path: Path) -> N
     case = read_cases("llff", tmp_path)[0]
     big = dataclasses.replace(case, photo=write_photo(tmp_path / "big.png", 96, 72))
     seconds = [
-        dataclasses.replace(case.seconds[0], photo=write_photo(tmp_path / "odd.png", 36, 27))
+        dataclasses.replace(case.second_views[0], photo=write_photo(tmp_path / "odd.png", 36, 27))
     ]
-    loaded = load_case(dataclasses.replace(big, seconds=tuple(seconds)), max_side=64)
-    assert (loaded.full.width, loaded.photo.width, loaded.photo.height) == (96, 64, 48)
+    loaded = load_case(dataclasses.replace(big, second_views=tuple(seconds)), max_side=64)
+    assert (loaded.full_photo.width, loaded.photo.width, loaded.photo.height) == (96, 64, 48)
     assert loaded.photo.focal_px == pytest.approx(FOCAL * 64 / 48)
-    (second,) = loaded.seconds
-    assert second.truth is not None
-    assert second.truth().shape == (26, 36, 3)
+    (second,) = loaded.second_viewpoints
+    assert second.read_true_picture is not None
+    assert second.read_true_picture().shape == (26, 36, 3)
     for eye, camera, width in ((EYES[0], loaded.camera, 64), (EYES[1], second.camera, 36)):
         uv, _ = camera.project(torch.tensor(POINTS).float())
         expected = torch.tensor([eye.pixel(point)[:2] for point in POINTS]).float() * width / WIDTH
@@ -347,7 +359,7 @@ def test_files_that_are_no_photos_of_the_case(tmp_path: Path) -> None:
     ):
         load_case(case)
     lonely = load_case(Case("lonely", write_photo(tmp_path / "lonely.png", WIDTH, HEIGHT)))
-    assert (lonely.camera.width, lonely.photo.focal_source, lonely.seconds) == (
+    assert (lonely.camera.width, lonely.photo.focal_source, lonely.second_viewpoints) == (
         WIDTH,
         FocalSource.ASSUMED,
         (),
@@ -378,19 +390,19 @@ def test_a_known_factor_comes_back_under_outliers() -> None:
     depth = DepthMap(truth, torch.rand(truth.shape) < 0.7, None, None, "depth", Path("d.npy"))
     z_base = ramp(spoilt=0.3) / 3.7
     z_base[:, :5] = torch.nan
-    assert aligned(z_base, slice(5, 10), depth=lambda: depth) == pytest.approx(3.7, rel=0.01)
+    assert aligned(z_base, slice(5, 10), read_depth=lambda: depth) == pytest.approx(3.7, rel=0.01)
     y, x = torch.meshgrid(
         torch.arange(2, 120, 10) + 0.3, torch.arange(3, 160, 10) + 0.9, indexing="ij"
     )
     inside = torch.stack([x, y], -1).reshape(-1, 2)
     uv = torch.cat([inside, torch.tensor([[500.0, 5.0], [-1.0, 5.0]])])
     points = Points(uv, 0.25 * (2 + 3 * uv[:, 1] / 120))
-    assert aligned(ramp(spoilt=0.2), points=lambda: points) == pytest.approx(0.25, rel=0.02)
+    assert aligned(ramp(spoilt=0.2), read_points=lambda: points) == pytest.approx(0.25, rel=0.02)
 
 
 def test_bounds_are_the_last_resort_and_nothing_is_an_error() -> None:
-    assert aligned(ramp(), bounds=(4.0, 10.0)) == pytest.approx(2.0, rel=1e-3)
-    for known in ({}, {"points": lambda: Points(torch.ones(3, 2), torch.ones(3))}):
+    assert aligned(ramp(), depth_bounds=(4.0, 10.0)) == pytest.approx(2.0, rel=1e-3)
+    for known in ({}, {"read_points": lambda: Points(torch.ones(3, 2), torch.ones(3))}):
         with pytest.raises(InputError, match="case: the base's scale cannot be found"):
             aligned(ramp(), **known)
 
@@ -413,7 +425,7 @@ def test_a_second_camera_in_the_bases_world(
     )
     z_base = torch.linspace(0.8, 3.0, 50)
     expected, z = view.project(given.unproject(2 * pixels, scale * z_base))
-    moved = to_base(view, given, base, scale)
+    moved = camera_in_base_scene(view, given, base, scale)
     uv, z_moved = moved.project(base.unproject(pixels, z_base))
     torch.testing.assert_close(uv, expected, atol=tolerance * 96, rtol=0)
     torch.testing.assert_close(z_moved * scale, z, rtol=0.02, atol=0)
@@ -428,9 +440,9 @@ def test_points_are_a_depth_map_with_gaps_and_the_nearest_stay() -> None:
         [[0.5, 0.5], [5.9, 3.9], [2.2, 1.7], [2.9, 1.1], [6.0, 1.0], [1.0, -0.1], [3.5, 2.5]]
     )
     points = Points(uv, torch.tensor([4.0, 5.0, 7.0, 3.0, 2.0, 2.0, -1.0]))
-    found = known_depth(Case("a", Path("a.png"), camera, points=lambda: points))
+    found = known_depth(Case("a", Path("a.png"), camera, read_points=lambda: points))
     assert found.valid.nonzero().tolist() == [[0, 0], [1, 2], [3, 5]]
     assert found.depth[found.valid].tolist() == [4.0, 3.0, 5.0]
     outside = Points(uv[4:6], torch.ones(2))
     with pytest.raises(InputError, match="not one of its 2 points lies in the photo"):
-        known_depth(Case("a", Path("a.png"), camera, points=lambda: outside))
+        known_depth(Case("a", Path("a.png"), camera, read_points=lambda: outside))

@@ -23,12 +23,14 @@ from torch import Tensor
 
 from spackle.core.trajectories import DepthRange, disparity_to_offset
 from spackle.paper.evaluation.folder import load_run
-from spackle.paper.evaluation.measurements import Measurement, mean
 from spackle.paper.evaluation.measurements import Run as Results
+from spackle.paper.evaluation.measurements import mean_of_known
 from spackle.paper.evaluation.methods import make_method
-from spackle.paper.evaluation.metrics import DEFINITIONS, open_metrics, psnr, ssim_average, ssim_map
-from spackle.paper.evaluation.protocols import MetricSuite, large_views, measure_views
-from spackle.paper.evaluation.table import Table, latex, mark_best, markdown
+from spackle.paper.evaluation.metric_suite import MetricSuite
+from spackle.paper.evaluation.metrics import psnr, ssim_average, ssim_map
+from spackle.paper.evaluation.protocols import large_views, measure_views
+from spackle.paper.evaluation.published_metrics import PUBLISHED_METRICS, open_published_metrics
+from spackle.paper.evaluation.table import Table, mark_best, to_latex, to_markdown
 from spackle.paper.evaluation.tables import make_tables
 from spackle.render import get_renderer
 from spackle.residual import hole_mask
@@ -88,9 +90,9 @@ def test_variants_are_pinned_and_no_weights_are_downloaded(monkeypatch: pytest.M
 
     fake_pyiqa(monkeypatch, create)
     lookup = socket.getaddrinfo
-    metrics, states = open_metrics(list(DEFINITIONS), "cpu", download=False)
+    metrics, states = open_published_metrics(list(PUBLISHED_METRICS), "cpu", download=False)
     assert socket.getaddrinfo is lookup
-    assert "weights are not on this machine (--download-metrics" in states["niqe"]
+    assert "weights are not on this machine (`download_metrics`" in states["niqe"]
     assert "'no such variant'" in states["dists"]
     assert {states[name] for name in metrics} == {"pyiqa 9.9"}
     assert (asked["lpips"], asked["musiq"]) == (
@@ -211,12 +213,12 @@ def test_a_table_as_markdown_and_latex() -> None:
         [[("x_1", "**1**", "a|b")], [("", "2", "±<3")]],
     )
     table = Table("tab:x", "X", "Ours & theirs, 5 %.", heads, bodies, notes=("n.",))
-    assert "| A | both: B | both: C |\n|---|---|---|\n| x_1 | **1** | a\\|b |" in markdown(table)
-    assert "\\label{tab:x:one}" in latex(table, ":one")
-    assert "x\\_1 & \\textbf{1} & a|b \\\\\n\\midrule\n & 2 & $\\pm$$<$3 \\\\" in latex(table)
-    assert mark_best([1.0, None, 2.0], ["1", "", "2"], lower=True) == ["**1**", "", "2"]
-    assert mark_best([1.0, 1.0001], ["1.0", "1.0"], lower=False) == ["1.0", "1.0"]
-    assert mark_best([1.0, 1.1, 1.1001], ["1.0", "1.1", "1.1"], lower=False) == [
+    assert "| A | both: B | both: C |\n|---|---|---|\n| x_1 | **1** | a\\|b |" in to_markdown(table)
+    assert "\\label{tab:x:one}" in to_latex(table, ":one")
+    assert "x\\_1 & \\textbf{1} & a|b \\\\\n\\midrule\n & 2 & $\\pm$$<$3 \\\\" in to_latex(table)
+    assert mark_best([1.0, None, 2.0], ["1", "", "2"], lower_is_better=True) == ["**1**", "", "2"]
+    assert mark_best([1.0, 1.0001], ["1.0", "1.0"], lower_is_better=False) == ["1.0", "1.0"]
+    assert mark_best([1.0, 1.1, 1.1001], ["1.0", "1.1", "1.1"], lower_is_better=False) == [
         "1.0",
         "**1.1**",
         "**1.1**",
@@ -279,21 +281,17 @@ def test_large_views_end_a_swipe_and_a_failed_metric_is_a_remark() -> None:
     def broken(picture: Tensor, truth: Tensor | None) -> float:
         raise RuntimeError("svd did not converge")
 
-    gauges, image = (
-        MetricSuite(("niqe",), {"niqe": broken}, None),
-        Measurement("Boxes", "box", "", "", "", "", None),
-    )
+    suite = MetricSuite(("niqe",), {"niqe": broken})
     context = FillContext(prediction.gaussians, prediction.camera, get_renderer())
-    rows, pictures = measure_views(
-        image, context, views, {"base": partial(make_method, "base", context=context)}, gauges
-    )
+    methods = {"base": partial(make_method, "base", context=context)}
+    rows, pictures = measure_views("Boxes", "box", context, views, methods, suite)
     assert {row.value for row in rows if row.metric == "remark"} == {
         "niqe failed: svd did not converge"
     }
     assert [row.value for row in rows if row.metric == "niqe"] == [None] * 4
     assert {row[:2] for row in rows} == {("Boxes", "box")}
     known = results("Boxes", False, lambda image: LARGE)
-    assert make_tables([dataclasses.replace(known, rows=[*known.rows, *rows])])
+    assert make_tables([dataclasses.replace(known, measurements=[*known.measurements, *rows])])
     assert pictures["base"].shape == pictures["hole"].shape == (72, 96, 3)  # both sides even
 
 
@@ -302,8 +300,8 @@ def evaluate(root: Path, output: Path, *more: object) -> Run:
 
 
 def mean_of(run: Results, setting: str, method: str, metric: str) -> float:
-    value = mean(
-        [row.value for row in run.rows if row[2:3] + row[4:6] == (setting, method, metric)]
+    value = mean_of_known(
+        [row.value for row in run.measurements if row[2:3] + row[4:6] == (setting, method, metric)]
     ).value
     assert value is not None
     return value
@@ -329,7 +327,7 @@ def test_large_views_from_files_to_tables(
     assert ending[0] == ["NIQE", "↓", "MUSIQ", "↑", "HAR", "↓", "added", "GS"]
     niqe, har = (f"{mean_of(found, '0.3', 'base', metric):.4f}" for metric in ("niqe", "har"))
     assert ending[1] == ["S1", "base", "(rgbd)", niqe, har, "0"]
-    assert (found.problems, found.settings, len(found.measured)) == ({}, ["0.3", "0.5"], 3)
+    assert (found.problems, found.settings, len(found.measured_images)) == ({}, ["0.3", "0.5"], 3)
     for setting in ("0.3", "0.5"):
         before = mean_of(found, setting, "base", "har")
         assert before > 0.02

@@ -77,7 +77,7 @@ def results(near: bool) -> Results:
 
 def test_a_page_is_well_formed_and_contains_everything(tmp_path: Path) -> None:
     runs = results(near=True), results(near=False)
-    for index in range(len(runs[0].measured)):
+    for index in range(len(runs[0].measured_images)):
         for method in (*METHODS, "truth"):
             file = image_file(tmp_path, index, runs[0].images[index], f".{method}.webp")
             file.parent.mkdir(exist_ok=True)
@@ -104,7 +104,7 @@ def test_a_page_is_well_formed_and_contains_everything(tmp_path: Path) -> None:
     assert all(image["alt"] for image in page.named("img"))
     written = [word for around, word in page.words if {"td", "th"} & set(around)]
     rows = [(table, cells) for table in tables for body in table.bodies for cells in body]
-    cells = [cell.strip("*") for table, line in rows for cell in line[table.words - 1 :]]
+    cells = [cell.strip("*") for table, line in rows for cell in line[table.word_columns - 1 :]]
     assert all(written.count(cell) >= cells.count(cell) for cell in set(cells) - {""})
     for table in tables:
         assert table.caption in page.text("figcaption")

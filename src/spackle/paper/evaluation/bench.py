@@ -1,28 +1,47 @@
-"""`spackle bench`: count the added Gaussians and time the stages on a dataset, for the paper's efficiency tables."""
+"""`spackle bench`: count the added Gaussians and time the stages on a dataset, for the paper's
+tables of costs.
+
+`bench` runs a whole benchmark, `time_case` times one photo, `time_tasks` is the clock.
+"""
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable, Mapping
-from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
 from spackle.bases import BasePrediction
+from spackle.bases.open import OpenedBase
 from spackle.bases.sharp.base import PARAMETER_COUNT
 from spackle.bases.sharp.encoder import FULL_SIZE
 from spackle.bases.sharp.network import SharpNetwork
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
-from spackle.paper.evaluation.case import Case, load_case
-from spackle.paper.evaluation.evaluate import EvaluateOptions, Evaluation, open_evaluation
-from spackle.paper.evaluation.folder import ROWS, measure_images, write_rows
-from spackle.paper.evaluation.measurements import BASE_STAGES, COMPLETION_STAGES, NOTE, Measurement
+from spackle.core.photo import Photo
+from spackle.paper.evaluation.case import Case, Viewpoint, load_case
+from spackle.paper.evaluation.evaluation import Evaluation, open_evaluation
+from spackle.paper.evaluation.folder import (
+    MEASUREMENTS_FILE,
+    ImageResults,
+    RunPlan,
+    measure_images,
+    write_measurements,
+)
+from spackle.paper.evaluation.measurements import (
+    NOTE_PREFIX,
+    Measurement,
+    Run,
+    Value,
+    image_measurement,
+)
 from spackle.paper.evaluation.methods import make_method
+from spackle.paper.evaluation.options import TIMED_METHODS, BenchOptions
 from spackle.paper.evaluation.protocols import large_views
 from spackle.paper.evaluation.tables import make_tables, write_tables
 from spackle.residual import ResidualNet
@@ -31,9 +50,11 @@ from spackle.runtime.folders import results_folder
 from spackle.runtime.progress import Reporter
 from spackle.scene_fill import FillContext
 
-FILES = ("bench.md", "bench.tex")
-# Keys of an evaluation's configuration that a benchmark's configuration has, too.
-SHARED = (
+MARKDOWN_FILE = "bench.md"
+LATEX_FILE = "bench.tex"
+
+# What a benchmark's configuration has in common with that of an evaluation with the same options.
+CONFIG_KEYS_OF_EVALUATION = (
     "dataset",
     "title",
     "terms",
@@ -44,134 +65,294 @@ SHARED = (
     "residual",
     "device",
 )
-TOTAL_STAGE = "total"
+
+# The stages of a view without Spackle: from the photo to the base's Gaussians, rendering of the
+# view.
+BASE_STAGES = ("base", "view")
+# The stages that Spackle adds: rendering at the photo's camera, from the mask to the completed
+# view.
+COMPLETION_STAGES = ("photo", "completion")
+TOTAL_STAGE = "total"  # all stages of a task
+
 MS_PER_S = 1000.0
 CPU = torch.device("cpu")
-TIMED = ("paper", "spackle")  # the methods that are timed
 
-EndStage = Callable[[str], None]
+EndStage = Callable[[str], None]  # is called with the name of a stage when the stage ends
 TimedTask = Callable[[EndStage], Any]
-RunValues = npt.NDArray[np.float64]  # one value per run
-Times = dict[tuple[str, str], RunValues]  # (task, stage) → milliseconds
+RunValues = npt.NDArray[np.float64]  # one value for each timed run
+Times = dict[tuple[str, str], RunValues]  # from (task, stage) to milliseconds
 
 
-def bench(
-    options: EvaluateOptions, runs: int, base_runs: int | None, output: Path, reporter: Reporter
-) -> str:
-    """Time a dataset, or resume an earlier run; returns "complete", or "stopped" after Ctrl-C.
+def bench(options: BenchOptions, output: Path, reporter: Reporter) -> Run | None:
+    """Time a dataset, or resume an earlier run.
 
-    Writes rows.jsonl, bench.md, bench.tex and images/ into `output`. A folder holds the times of one machine only.
-    Later stages are timed `runs` times, the base `base_runs` times. If `base_runs` is None, SHARP is timed
-    once, because it is slow, and other bases `runs` times.
+    Writes rows.jsonl (all numbers), bench.md, bench.tex and images/ into `output`. A folder holds
+    the times of one machine only.
+
+    Args:
+        options: what to time, and how often.
+        output: the folder for the results.
+        reporter: gets progress.
+
+    Returns:
+        The results; None after Ctrl-C.
 
     Raises:
-        InputError: options, dataset or folder cannot be used, `output` holds another benchmark, or memory is too small
-            for the base.
+        InputError: options, dataset or folder cannot be used, `output` holds another benchmark, or
+            memory is too small for the base.
     """
-    evaluation, slow = open_evaluation(options), options.base.resolved_name == "sharp"
-    config: dict[str, Any] = {"kind": "bench", "protocol": "bench", "methods": list(TIMED)}
-    config |= {name: evaluation.config[name] for name in SHARED}
-    config |= {"runs": runs, "base_runs": base_runs or (1 if slow else runs)}
-    config["base"] |= {"device": options.device.type if options.base.uses_network else "cpu"}
-    config |= {"hardware": hardware_facts(options.device), "versions": package_versions()}
-    about = {"parameters": count_parameters(evaluation.network)}
-    with results_folder(output, (ROWS, *FILES), locked=True):
+    evaluation = open_evaluation(options.as_evaluation)
+    config = _configuration(options, evaluation)
+    plan = RunPlan(
+        cases=evaluation.cases,
+        root=options.root,
+        output=output,
+        config=config,
+        about={"parameters": count_parameters(evaluation.network)},
+    )
 
-        def measure_one(index: int, case: Case) -> tuple[list[Measurement], list[Path]]:
-            return time_case(case, evaluation, config), []
-
-        run = measure_images(
-            evaluation.cases, measure_one, output, config, about, options.root, reporter
+    def measure(index: int, case: Case) -> ImageResults:
+        """The times of one image; a benchmark has no pictures."""
+        measurements = time_case(
+            case, evaluation, runs=options.runs, base_runs=options.timed_runs_of_base
         )
+        return ImageResults(measurements, files=[])
+
+    files = (MEASUREMENTS_FILE, MARKDOWN_FILE, LATEX_FILE)
+    with results_folder(output, files, locked=True):
+        run = measure_images(plan, measure, reporter)
         if run is None:
-            return "stopped"
-        write_tables(make_tables([run]), output, FILES, f":{run.title}-bench".lower())
-        write_rows(run.rows, output / ROWS)
-    count, total = len(run.measured), len(run.images)
-    reporter.log(f"{run.title}: {count} of {total} images -> {output}")
-    reporter.result({"folder": output, "images": total, "measured": count})
-    return "complete"
+            return None
+        write_tables(
+            make_tables([run]),
+            output,
+            markdown_file=MARKDOWN_FILE,
+            latex_file=LATEX_FILE,
+            label_suffix=f":{run.title}-bench".lower(),
+        )
+        # Last, because this file says that the results are complete.
+        write_measurements(run.measurements, output / MEASUREMENTS_FILE)
+
+    measured_count = len(run.measured_images)
+    image_count = len(run.images)
+    reporter.log(f"{run.title}: {measured_count} of {image_count} images -> {output}")
+    reporter.result({"folder": output, "images": image_count, "measured": measured_count})
+    return run
 
 
-def time_case(case: Case, evaluation: Evaluation, config: Mapping[str, Any]) -> list[Measurement]:
-    """Time all settings of an image.
+def _configuration(options: BenchOptions, evaluation: Evaluation) -> dict[str, Any]:
+    """Everything that determines the times, ready for JSON: also machine and versions.
+
+    A later run in the same folder must have the same configuration; tables show it.
+    """
+    device = evaluation.options.device
+    base_device = device.type if options.base.uses_network else "cpu"
+
+    config: dict[str, Any] = {"kind": "bench", "protocol": "bench", "methods": list(TIMED_METHODS)}
+    config |= {name: evaluation.config[name] for name in CONFIG_KEYS_OF_EVALUATION}
+    config |= {
+        "base": evaluation.config["base"] | {"device": base_device},
+        "runs": options.runs,
+        "base_runs": options.timed_runs_of_base,
+        "hardware": hardware_facts(device),
+        "versions": package_versions(),
+    }
+    return config
+
+
+def time_case(
+    case: Case, evaluation: Evaluation, *, runs: int, base_runs: int
+) -> list[Measurement]:
+    """Time the base on a photo, and the completion of the photo's views, at all settings.
+
+    Args:
+        case: the photo.
+        evaluation: networks and options; its settings are sizes of the camera move.
+        runs: how often each stage after the base is timed.
+        base_runs: how often the base, which makes the photo's Gaussians, is timed.
+
+    Returns:
+        Counts of Gaussians, and times; those of views for each method of `TIMED_METHODS`.
 
     Raises:
         InputError: a file cannot be used, the case lacks depth, or Gaussians are not finite.
-        BaseError: the base would fail for every image.
+        BaseError: every image would fail, for instance because memory is too small.
     """
-    options, device = evaluation.options, evaluation.renderer.device
+    options = evaluation.options
     loaded = load_case(case, options.max_side)
-    opened = evaluation.open(loaded)
-    opened.load(loaded.full)  # not timed
-    # SHARP on a CPU takes a minute, of which compiling kernels is a small part: the first prediction is timed.
-    warm = options.base.resolved_name == "sharp" and config["base"]["device"] == "cpu"
-    latest: dict[str, BasePrediction] = {}
-    predict = {"": lambda _: latest.update(base=opened.predict(loaded.full)[0])}
-    seconds = (
-        time_tasks(config["base_runs"], predict, device, warm=warm)["", TOTAL_STAGE] / MS_PER_S
-    )
-    prediction = latest["base"]
-    context = evaluation.context(prediction)
-    facts: dict[str, Any] = {"width": loaded.photo.width, "height": loaded.photo.height}
-    facts |= {"base_gaussians": len(prediction.gaussians)}
-    facts |= {f"{NOTE}{name}": value for name, value in prediction.notes.items()}
-    image = Measurement(config["title"], case.name, "", "", "", "", None)
-    rows = [image._replace(metric=metric, value=value) for metric, value in facts.items()]
-    added: dict[str, int] = {}
+    base = evaluation.base_of_case(loaded)
+    base.load(loaded.full_photo)  # loading the network is not timed
 
-    def complete(camera: Camera, method: str, lap: EndStage) -> None:
-        added[method] = len(complete_view_in_stages(context, camera, lap, method))
+    timed_base = _time_base(base, loaded.full_photo, evaluation, base_runs)
+    prediction = timed_base.prediction
+    context = evaluation.fill_context(prediction)
+    title = str(evaluation.config["title"])
 
+    facts: dict[str, Value] = {
+        "width": loaded.photo.width,
+        "height": loaded.photo.height,
+        "base_gaussians": len(prediction.gaussians),
+    }
+    for name, value in prediction.notes.items():
+        facts[f"{NOTE_PREFIX}{name}"] = value
+
+    measurements = [
+        image_measurement(title, case.name, name, value) for name, value in facts.items()
+    ]
     for view in large_views(prediction, options.disparities, options.max_side):
-        tasks = {method: partial(complete, view.camera, method) for method in TIMED}
-        times = time_tasks(config["runs"], tasks, device)
-        for method, count in added.items():
-            stages = {
-                stage: values / MS_PER_S
-                for (name, stage), values in times.items()
-                if name == method
-            }
-            row = image._replace(setting=view.setting, view=view.name, method=method)
-            numbers = view_numbers(len(context.base), count, stages | {"base": seconds})
-            rows += [row._replace(metric=metric, value=value) for metric, value in numbers.items()]
-    return rows
+        for method in _time_view(view, context, evaluation.renderer.device, runs):
+            numbers = view_numbers(
+                base_count=len(context.base),
+                added_count=method.added_count,
+                seconds=method.seconds | {"base": timed_base.seconds},
+            )
+            for metric, number in numbers.items():
+                measurement = Measurement(
+                    dataset=title,
+                    image=case.name,
+                    setting=view.setting,
+                    view=view.name,
+                    method=method.name,
+                    metric=metric,
+                    value=number,
+                )
+                measurements.append(measurement)
+    return measurements
 
 
-def view_numbers(base: int, added: int, seconds: Mapping[str, RunValues]) -> dict[str, float]:
-    """A view's numbers for tables, from counts of Gaussians and the seconds of each stage in each run.
+class _TimedBase(NamedTuple):
+    """A photo's Gaussians, and the seconds in which the base made them, in each run."""
 
-    Returns counts, milliseconds (medians over runs), shares (not percent) and views per second.
+    prediction: BasePrediction
+    seconds: RunValues
+
+
+def _time_base(
+    base: OpenedBase, photo: Photo, evaluation: Evaluation, base_runs: int
+) -> _TimedBase:
+    """Time the base, the network (or depth map) that turns a photo into Gaussians.
+
+    Args:
+        base: the base, with its network loaded.
+        photo: the photo at its stored size.
+        evaluation: its options say which base this is and where it runs.
+        base_runs: the number of timed runs.
     """
-    before, extra = (
-        sum(MS_PER_S * float(np.median(seconds[stage])) for stage in stages)
-        for stages in (BASE_STAGES, COMPLETION_STAGES)
-    )
+    options = evaluation.options
+    prediction: BasePrediction | None = None
+
+    def predict(end_stage: EndStage) -> None:
+        """The task, which has no stages; it keeps its latest result."""
+        nonlocal prediction
+        # Beside the prediction, a base returns which candidate made it; here there is only one.
+        prediction, _ = base.predict(photo)
+
+    # SHARP on a CPU takes a minute, of which compiling kernels is a small part: already the first
+    # prediction is timed.
+    is_warm = options.base.resolved_name == "sharp" and options.device.type == "cpu"
+    device = evaluation.renderer.device
+    times = time_tasks(base_runs, {"base": predict}, device, warm=is_warm)
+    assert prediction is not None
+    return _TimedBase(prediction, times["base", TOTAL_STAGE] / MS_PER_S)
+
+
+class _TimedMethod(NamedTuple):
+    """The cost of a view by one method."""
+
+    name: str
+    added_count: int  # of Gaussians
+    seconds: dict[str, RunValues]  # of each stage
+
+
+def _time_view(
+    view: Viewpoint, context: FillContext, device: torch.device, runs: int
+) -> list[_TimedMethod]:
+    """Time the completion of a view by each method of `TIMED_METHODS`.
+
+    Args:
+        view: the view.
+        context: the base's Gaussians, the renderer and the residual network.
+        device: whose work is waited for when a stage ends.
+        runs: the number of timed runs.
+    """
+    added_counts: dict[str, int] = {}
+
+    def complete(method: str, end_stage: EndStage) -> None:
+        """The task of a method."""
+        aux = complete_view_in_stages(context, view.camera, end_stage, method)
+        added_counts[method] = len(aux)
+
+    tasks = {method: functools.partial(complete, method) for method in TIMED_METHODS}
+    times = time_tasks(runs, tasks, device)
+
+    timed_methods = []
+    for method in TIMED_METHODS:
+        seconds = {
+            stage: milliseconds / MS_PER_S
+            for (task, stage), milliseconds in times.items()
+            if task == method
+        }
+        timed_methods.append(_TimedMethod(method, added_counts[method], seconds))
+    return timed_methods
+
+
+def view_numbers(
+    base_count: int, added_count: int, seconds: Mapping[str, RunValues]
+) -> dict[str, float]:
+    """A view's numbers for tables.
+
+    Args:
+        base_count: the number of the base's Gaussians.
+        added_count: the number of Gaussians that the method added.
+        seconds: for each stage of `BASE_STAGES` and `COMPLETION_STAGES` the seconds in each run.
+
+    Returns:
+        Counts; times in milliseconds (sums of the stages' medians over runs); "aux_share" and
+        "overhead" as shares (not percent); "fps" in views per second.
+    """
+    base_ms = sum(_median_ms(seconds[stage]) for stage in BASE_STAGES)
+    completion_ms = sum(_median_ms(seconds[stage]) for stage in COMPLETION_STAGES)
     return {
-        "aux": added,
-        "aux_share": added / base,
-        "merged": base + added,
-        "base_ms": before,
-        "spackle_ms": before + extra,
-        "overhead": extra / before,
-        "base_fps": MS_PER_S / before,
-        "spackle_fps": MS_PER_S / (before + extra),
+        "aux": added_count,
+        "aux_share": added_count / base_count,
+        "merged": base_count + added_count,
+        "base_ms": base_ms,
+        "spackle_ms": base_ms + completion_ms,
+        "overhead": completion_ms / base_ms,
+        "base_fps": MS_PER_S / base_ms,
+        "spackle_fps": MS_PER_S / (base_ms + completion_ms),
     }
 
 
-def count_parameters(residual: ResidualNet | None) -> dict[str, float]:
-    """Parameters of SHARP's checkpoint (702.31 M), of its part for inference and of the residual; the residual's share.
+def _median_ms(seconds: RunValues) -> float:
+    """The median of seconds, in milliseconds."""
+    return MS_PER_S * float(np.median(seconds))
 
-    Inference uses neither SHARP's classifiers nor the part that aligns depths.
+
+def count_parameters(residual: ResidualNet | None) -> dict[str, float]:
+    """The numbers of network parameters that the tables of costs compare.
+
+    Args:
+        residual: the residual network; None: there is none.
+
+    Returns:
+        "base": of SHARP's published checkpoint (702.31 million). "base_used": of the part that
+        inference uses, without classifiers and the part that aligns depths. "residual": of the
+        residual network. "share": the residual network's over SHARP's.
     """
-    with torch.device("meta"):
-        used = sum(p.numel() for p in SharpNetwork(FULL_SIZE).parameters())
-    extra = 0 if residual is None else sum(p.numel() for p in residual.parameters())
+    with torch.device("meta"):  # without memory for the parameters
+        sharp = SharpNetwork(FULL_SIZE)
+    used_count = sum(parameter.numel() for parameter in sharp.parameters())
+
+    residual_count = 0
+    if residual is not None:
+        residual_count = sum(parameter.numel() for parameter in residual.parameters())
+
     return {
         "base": PARAMETER_COUNT,
-        "base_used": used,
-        "residual": extra,
-        "share": extra / PARAMETER_COUNT,
+        "base_used": used_count,
+        "residual": residual_count,
+        "share": residual_count / PARAMETER_COUNT,
     }
 
 
@@ -181,48 +362,84 @@ def count_parameters(residual: ResidualNet | None) -> dict[str, float]:
 def time_tasks(
     runs: int, tasks: Mapping[str, TimedTask], device: torch.device = CPU, *, warm: bool = False
 ) -> Times:
-    """Time each task (stage "total") and each stage of a task in milliseconds, in each run.
+    """Time tasks and their stages.
 
-    A task gets a function and calls it with a stage's name when the stage ends; stages of the same name within a run
-    add up. A stage ends when the device has done its work. The tasks take turns, so that a busy machine slows all
-    tasks alike. Unless the tasks are `warm`, an untimed run comes first, for compilation and warm-up.
+    A task gets a function and calls it with a stage's name when the stage ends; stages of the same
+    name within a run add up. The tasks take turns, so that a busy machine slows all tasks alike.
+
+    Args:
+        runs: the number of timed runs of each task.
+        tasks: the tasks, by name.
+        device: a stage ends when this device has done its work.
+        warm: whether the tasks have run before; if not, an untimed run comes first, which compiles
+            kernels and fills caches.
+
+    Returns:
+        For each task and stage the milliseconds in each run; the stage "total" is the whole task.
     """
-
-    def now() -> float:
-        if device.type == "cuda":
-            torch.cuda.synchronize(device)
-        return MS_PER_S * time.perf_counter()
-
+    untimed_runs = 0 if warm else 1
     times: dict[tuple[str, str], list[float]] = {}
-    for run in range(1 if warm else 0, runs + 1):
+    for run in range(untimed_runs + runs):
         for name, task in tasks.items():
-            laps: dict[str, float] = {}
-            start = last = now()
-
-            def lap(stage: str, laps: dict[str, float] = laps) -> None:
-                nonlocal last
-                end = now()
-                laps[stage] = laps.get(stage, 0.0) + end - last
-                last = end
-
-            task(lap)
-            laps[TOTAL_STAGE] = now() - start
-            for stage, milliseconds in laps.items() if run else ():
+            stage_times = _time_stages(task, device)
+            if run < untimed_runs:
+                continue
+            for stage, milliseconds in stage_times.items():
                 times.setdefault((name, stage), []).append(milliseconds)
     return {key: np.array(values) for key, values in times.items()}
 
 
+def _time_stages(task: TimedTask, device: torch.device) -> dict[str, float]:
+    """Run a task once; the milliseconds of each of its stages, and of the whole task ("total")."""
+    stage_times: dict[str, float] = {}
+    start = _now_ms(device)
+    stage_start = start
+
+    def end_stage(stage: str) -> None:
+        """Add the time since the last stage's end to this stage's time."""
+        nonlocal stage_start
+        end = _now_ms(device)
+        stage_times[stage] = stage_times.get(stage, 0.0) + end - stage_start
+        stage_start = end
+
+    task(end_stage)
+    stage_times[TOTAL_STAGE] = _now_ms(device) - start
+    return stage_times
+
+
+def _now_ms(device: torch.device) -> float:
+    """The time in milliseconds, once the device has done the work that it was given."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return MS_PER_S * time.perf_counter()
+
+
 @torch.no_grad()
 def complete_view_in_stages(
-    context: FillContext, camera: Camera, lap: EndStage, method: str = "spackle"
+    context: FillContext, camera: Camera, end_stage: EndStage, method: str = "spackle"
 ) -> Gaussians:
-    """A view's aux Gaussians; calls `lap` after the stages "view", "photo" and "completion"."""
+    """Complete a view of a scene, with a call of `end_stage` after each stage.
+
+    The stages are "view" (the base is rendered from the view), "photo" (and from the photo's
+    camera) and "completion" (from the mask to the completed view).
+
+    Args:
+        context: the base's Gaussians, the renderer and the residual network.
+        camera: the view.
+        end_stage: stops the time of a stage.
+        method: one of `TIMED_METHODS`.
+
+    Returns:
+        The Gaussians that the method adds for the view.
+    """
     context = context.placed
-    before = context.renderer.render(context.base, camera)
-    lap("view")
+    base_rendering = context.renderer.render(context.base, camera)
+    end_stage("view")
+
     fill = make_method(method, [camera], context)
-    lap("photo")
-    aux = fill(camera, before).aux
-    lap("completion")
+    end_stage("photo")
+
+    aux = fill(camera, base_rendering).aux
+    end_stage("completion")
     assert aux is not None
     return aux

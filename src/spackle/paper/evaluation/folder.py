@@ -1,23 +1,33 @@
-"""A folder of results: config.json, images/ with a file for each finished image, and finally rows.jsonl.
+"""A folder of results, which a killed run resumes.
 
-config.json holds the options that determine the renders; rows.jsonl exists once all images are done. A killed run
-resumes.
+- config.json: the options that determine the results;
+- images/: for each finished image a file with its numbers, and its pictures;
+- rows.jsonl: all numbers, one a line; written last, so it exists only once all images are done.
+
+`measure_images` writes the images' files, `write_measurements` and `load_run` write and read the
+rest.
 """
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import functools
 import json
 import re
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from spackle.bases.open import BaseError
 from spackle.paper.evaluation.case import Case
-from spackle.paper.evaluation.measurements import PROBLEM, Measurement, Run
+from spackle.paper.evaluation.measurements import (
+    PROBLEM_METRIC,
+    Measurement,
+    Run,
+    image_measurement,
+)
 from spackle.paper.evaluation.table import NOT_RUN
 from spackle.runtime.digests import (
     config_differences,
@@ -27,152 +37,279 @@ from spackle.runtime.digests import (
     photo_digest,
 )
 from spackle.runtime.errors import InputError, as_input_error
-from spackle.runtime.files import remove_half_written, write_atomic, write_json
+from spackle.runtime.files import (
+    remove_half_written,
+    write_atomic,
+    write_json,
+)
 from spackle.runtime.folders import make_folder
 from spackle.runtime.progress import Reporter, catch_stop_signals
 
-CONFIG, ROWS, IMAGES = "config.json", "rows.jsonl", "images"
-FORMAT = 3
+CONFIG_FILE = "config.json"
+MEASUREMENTS_FILE = "rows.jsonl"
+IMAGES_FOLDER = "images"
+FORMAT_VERSION = 3  # of config.json and rows.jsonl
 DAMAGED = "not written by `spackle evaluate` or `spackle bench` ({reason}): run the command again"
-# From index and case to the case's rows and written files.
-Measure = Callable[[int, Case], tuple[list[Measurement], list[Path]]]
+# An image's file is named after the last letters of the image's name, as many as file systems
+# allow.
+MAX_NAME_LETTERS = 80
 
 
-def write_rows(rows: Iterable[Measurement], path: Path) -> None:
-    """Write rows atomically, one JSON object per line."""
-    lines = (json.dumps(row._asdict(), allow_nan=False) + "\n" for row in rows)
+class ImageResults(NamedTuple):
+    """What the measurement of one image gives."""
+
+    measurements: list[Measurement]
+    files: list[Path]  # pictures that were written into images/
+
+
+# Measures the case with this index.
+MeasureImage = Callable[[int, Case], ImageResults]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RunPlan:
+    """What an evaluation or a benchmark measures, and where its results go."""
+
+    cases: Sequence[Case]  # the dataset's images
+    root: Path  # the dataset's folder; left out of messages about images
+    output: Path  # the folder of the results
+    config: Mapping[str, Any]  # options that determine the results; they may not change on resuming
+    about: Mapping[str, Any]  # versions, machine, and for each metric how it is measured
+
+
+def write_measurements(measurements: Iterable[Measurement], path: Path) -> None:
+    """Write measurements to a file, one JSON object a line; the file appears complete or not at
+    all."""
+    lines = [json.dumps(one._asdict(), allow_nan=False) + "\n" for one in measurements]
     write_atomic(path, "".join(lines).encode())
 
 
 def load_run(folder: Path) -> Run:
-    """Read the finished results in a folder; InputError for missing results or a damaged file."""
-    if not (folder / ROWS).is_file():
-        state = (
-            "not finished: run its command again" if (folder / CONFIG).is_file() else "no results"
-        )
-        raise InputError(f"{folder}: {state}: {ROWS} is missing")
-    with as_input_error(folder / ROWS, DAMAGED):
-        rows = [
-            Measurement(**json.loads(line))
-            for line in (folder / ROWS).read_text("utf-8").splitlines()
-        ]
-    with as_input_error(folder / CONFIG, DAMAGED):
-        config = json.loads((folder / CONFIG).read_text("utf-8"))
-        if config.pop("format") != FORMAT:
+    """Read the finished results of `spackle evaluate` or `spackle bench` from their folder.
+
+    Raises:
+        InputError: the results are missing, unfinished, damaged or of another version.
+    """
+    measurements_path = folder / MEASUREMENTS_FILE
+    config_path = folder / CONFIG_FILE
+
+    if not measurements_path.is_file():
+        was_begun = config_path.is_file()
+        state = "not finished: run its command again" if was_begun else "no results"
+        raise InputError(f"{folder}: {state}: {MEASUREMENTS_FILE} is missing")
+
+    with as_input_error(measurements_path, DAMAGED):
+        lines = measurements_path.read_text("utf-8").splitlines()
+        measurements = [Measurement(**json.loads(line)) for line in lines]
+
+    with as_input_error(config_path, DAMAGED):
+        config = json.loads(config_path.read_text("utf-8"))
+        if config.pop("format") != FORMAT_VERSION:
             raise ValueError("of another version")
-        return Run(config, rows, config.pop("about"))
+        about = config.pop("about")
+        return Run(config, measurements, about)
 
 
-def earlier_metrics(folder: Path) -> list[str]:
-    """The metrics that an earlier run in the folder measured."""
+def metrics_of_earlier_run(folder: Path) -> list[str]:
+    """The metrics that an earlier run measured in this folder; empty if there is none."""
+    # A damaged file of any content counts as no earlier run: `measure_images` refuses it later.
     with contextlib.suppress(OSError, ValueError, LookupError, TypeError, AttributeError):
-        metrics = json.loads((folder / CONFIG).read_text("utf-8"))["about"]["metrics"]
-        return [name for name, state in metrics.items() if not state.startswith(NOT_RUN)]
+        config = json.loads((folder / CONFIG_FILE).read_text("utf-8"))
+        states = config["about"]["metrics"]
+        return [metric for metric, state in states.items() if not state.startswith(NOT_RUN)]
     return []
 
 
 def image_file(output: Path, index: int, name: str, suffix: str) -> Path:
-    """The path of the file with an image's rows (.json), or with a picture (.METHOD.webp)."""
-    return output / IMAGES / f"{index:05d}-{re.sub(r'[^A-Za-z0-9.-]+', '_', name)[-80:]}{suffix}"
+    """The path in images/ of an image's numbers (suffix .json) or of a picture (.METHOD.webp).
+
+    Args:
+        output: the folder of the results.
+        index: the image's place in the dataset; it keeps shortened names apart.
+        name: the image's name; letters that are unusual in file names become "_".
+        suffix: the end of the file's name.
+    """
+    safe_name = re.sub(r"[^A-Za-z0-9.-]+", "_", name)
+    return output / IMAGES_FOLDER / f"{index:05d}-{safe_name[-MAX_NAME_LETTERS:]}{suffix}"
 
 
-def measure_images(
-    cases: Sequence[Case],
-    measure: Measure,
-    output: Path,
-    config: Mapping[str, Any],
-    about: Mapping[str, Any],
-    root: Path,
-    reporter: Reporter,
-) -> Run | None:
-    """Measure the images that earlier runs in the folder have not finished; returns all results, None after Ctrl-C.
+def measure_images(plan: RunPlan, measure: MeasureImage, reporter: Reporter) -> Run | None:
+    """Measure the images that earlier runs in the folder have not finished, and return all results.
 
-    A finished image is measured again if its photos or `about["metrics"]` have changed. An image that cannot be used
-    gives one row with the problem, and the next run tries that image again.
+    A finished image is measured again if its photos or the versions of the metrics have changed.
+    An image that cannot be used gives one measurement with the problem, and the next run tries
+    that image again.
+
+    Args:
+        plan: the images, the options and the folder.
+        measure: measures one image.
+        reporter: gets progress, and a line for each image that cannot be used.
+
+    Returns:
+        The results of all images; None after Ctrl-C.
 
     Raises:
-        BaseError: the base would fail for every image.
-        InputError: no image could be measured, or the folder holds results of another configuration.
+        BaseError: every image would fail, for instance because memory is too small.
+        InputError: no image could be measured, or the folder holds results of other options.
     """
-    _open_folder(output, config, about)
-    rows: list[Measurement] = []
-    begun, failed, digest = (
-        False,
-        0,
-        functools.cache(photo_digest),
-    )  # many cases may share a second photo
-    with reporter.stage("images") as step, catch_stop_signals(single_process=True) as stop:
-        for index, case in enumerate(cases):
-            if stop():
+    _open_folder(plan)
+    cached_photo_digest = functools.cache(photo_digest)  # many cases may share a second photo
+    all_measurements: list[Measurement] = []
+    has_measured = False
+    failed_count = 0
+
+    with (
+        reporter.stage("images") as progress,
+        catch_stop_signals(single_process=True) as is_stopped,
+    ):
+        for index, case in enumerate(plan.cases):
+            if is_stopped():
                 reporter.log("stopped; the same command resumes from here")
                 return None
-            part = image_file(output, index, case.name, ".json")
-            photos = [
-                digest(photo) for photo in (case.photo, *(second.photo for second in case.seconds))
-            ]
-            inputs = json_digest([photos, about.get("metrics")])
-            done = _load_part(part, inputs)
-            if done is None:
-                if index and not begun:
-                    reporter.log(f"{output}: going on, {index} of {len(cases)} images are done")
-                begun, start = True, time.perf_counter()
-                (output / ROWS).unlink(missing_ok=True)  # results are incomplete from now on
+
+            inputs_digest = _inputs_digest(case, plan, cached_photo_digest)
+            results_path = image_file(plan.output, index, case.name, ".json")
+            measurements = _load_image_results(results_path, inputs_digest)
+
+            if measurements is None:
+                if index > 0 and not has_measured:
+                    done = f"{index} of {len(plan.cases)} images are done"
+                    reporter.log(f"{plan.output}: going on, {done}")
+                has_measured = True
+
+                # From now on the results are incomplete.
+                (plan.output / MEASUREMENTS_FILE).unlink(missing_ok=True)
+
                 try:
-                    done, files = measure(index, case)
-                except BaseError:  # every other image would fail too, as when memory is too small
+                    measurements = _measure_and_save(
+                        index, case, measure, results_path, inputs_digest, reporter
+                    )
+                except BaseError:
                     raise
                 except InputError as error:
-                    problem = " ".join(str(error).replace(f"{root}/", "").splitlines())
-                    if not problem.startswith(case.name):  # several cases may share a photo
-                        problem = f"{case.name}: {problem}"
-                    reporter.log(f"passed over: {problem}")
-                    rows.append(
-                        Measurement(str(config["title"]), case.name, "", "", "", PROBLEM, problem)
-                    )
-                    failed += 1
-                else:
-                    content = {
-                        "inputs": inputs,
-                        "files": file_records(part.parent, files),
-                        "rows": done,
-                    }
-                    write_atomic(part, (json.dumps(content, allow_nan=False) + "\n").encode())
-                    reporter.detail(f"  {case.name}: {time.perf_counter() - start:.1f} s")
-            rows += done or ()
-            step(index + 1, len(cases))
-    if failed == len(cases):
+                    problem = _problem_of(case, error, plan)
+                    reporter.log(f"passed over: {problem.value}")
+                    measurements = [problem]
+                    failed_count += 1
+
+            all_measurements += measurements
+            progress(index + 1, len(plan.cases))
+
+    if failed_count == len(plan.cases):
         raise InputError(
-            f"{root}: none of {len(cases)} images could be measured (the lines above say why)"
+            f"{plan.root}: none of {len(plan.cases)} images could be measured "
+            "(the lines above say why)"
         )
-    return Run(config, rows, about)
+    return Run(plan.config, all_measurements, plan.about)
 
 
-def _open_folder(output: Path, config: Mapping[str, Any], about: Mapping[str, Any]) -> None:
-    """Make a folder for this configuration; InputError if the folder has another configuration."""
-    make_folder(output / IMAGES)
-    remove_half_written(output, output / IMAGES)
-    path, kind = output / CONFIG, config["kind"]
-    if path.exists():
-        with as_input_error(path, "damaged, or not JSON ({reason}): choose another -o"):
-            old = json.loads(path.read_text("utf-8"))
-        if not isinstance(old, dict) or (old.pop("format", None), old.get("kind")) != (
-            FORMAT,
-            kind,
-        ):
-            raise InputError(f"{path}: not written by `spackle {kind}`: choose another -o")
-        old.pop("about", None)
-        if lines := config_differences(old, json.loads(json.dumps(config))):
-            raise InputError(
-                f"{output}: holds results with other options ({'; '.join(lines)}): choose another -o"
-            )
-    write_json({"format": FORMAT, **config, "about": about}, path)
+def _inputs_digest(case: Case, plan: RunPlan, digest_of_photo: Callable[[Path], str]) -> str:
+    """A digest of what may change between runs: the case's photos, and how metrics are measured."""
+    photos = [case.photo, *(view.photo for view in case.second_views)]
+    photo_digests = [digest_of_photo(photo) for photo in photos]
+    return json_digest([photo_digests, plan.about.get("metrics")])
 
 
-def _load_part(path: Path, inputs: str) -> list[Measurement] | None:
-    """An image's rows from an earlier run; None if files are missing, or the inputs have changed."""
+def _measure_and_save(
+    index: int,
+    case: Case,
+    measure: MeasureImage,
+    results_path: Path,
+    inputs_digest: str,
+    reporter: Reporter,
+) -> list[Measurement]:
+    """Measure one image, and save its numbers in images/ so that a later run need not measure it.
+
+    Args:
+        index: the image's place in the dataset.
+        case: the image.
+        measure: measures the image.
+        results_path: the file for the numbers.
+        inputs_digest: tells a later run whether photos or metrics have changed.
+        reporter: gets the seconds that this took.
+
+    Raises:
+        InputError: a file of the image cannot be used.
+    """
+    start = time.perf_counter()
+    results = measure(index, case)
+
+    content = {
+        "inputs": inputs_digest,
+        "files": file_records(results_path.parent, results.files),
+        "rows": results.measurements,
+    }
+    write_atomic(results_path, (json.dumps(content, allow_nan=False) + "\n").encode())
+    reporter.detail(f"  {case.name}: {time.perf_counter() - start:.1f} s")
+    return results.measurements
+
+
+def _problem_of(case: Case, error: InputError, plan: RunPlan) -> Measurement:
+    """The measurement that stands for an image that could not be measured; its value is the
+    reason."""
+    # Results hold no paths of this machine.
+    reason = str(error).replace(f"{plan.root}/", "")
+    reason = " ".join(reason.splitlines())
+    if not reason.startswith(case.name):  # several cases may share a photo
+        reason = f"{case.name}: {reason}"
+    return image_measurement(str(plan.config["title"]), case.name, PROBLEM_METRIC, reason)
+
+
+def _open_folder(plan: RunPlan) -> None:
+    """Make the folder of the results, or check that it is the folder of an earlier run with the
+    same options.
+
+    Raises:
+        InputError: the folder holds results of another command or with other options.
+    """
+    make_folder(plan.output / IMAGES_FOLDER)
+    remove_half_written(plan.output, plan.output / IMAGES_FOLDER)
+
+    config_path = plan.output / CONFIG_FILE
+    if config_path.exists():
+        _check_same_config(config_path, plan)
+    write_json({"format": FORMAT_VERSION, **plan.config, "about": plan.about}, config_path)
+
+
+def _check_same_config(config_path: Path, plan: RunPlan) -> None:
+    """Raise an InputError unless an earlier run's config.json has the same options as this run."""
+    with as_input_error(config_path, "damaged, or not JSON ({reason}): choose another `output`"):
+        earlier = json.loads(config_path.read_text("utf-8"))
+
+    kind = plan.config["kind"]
+    is_same_kind = (
+        isinstance(earlier, dict)
+        and earlier.get("format") == FORMAT_VERSION
+        and earlier.get("kind") == kind
+    )
+    if not is_same_kind:
+        raise InputError(f"{config_path}: not written by `spackle {kind}`: choose another `output`")
+
+    # Versions and the machine may change between runs.
+    del earlier["format"]
+    earlier.pop("about", None)
+
+    # The configuration goes through JSON, because tuples come back from a file as lists.
+    changed_options = config_differences(earlier, json.loads(json.dumps(plan.config)))
+    if changed_options:
+        raise InputError(
+            f"{plan.output}: holds results with other options ({'; '.join(changed_options)}): "
+            "choose another `output`"
+        )
+
+
+def _load_image_results(path: Path, inputs_digest: str) -> list[Measurement] | None:
+    """Read an image's numbers from an earlier run.
+
+    Returns:
+        The measurements; None if the image is to be measured: the file is missing or damaged, a
+        picture is missing or was changed, or photos or metrics are not those of `inputs_digest`.
+    """
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
         content = json.loads(path.read_text("utf-8"))
-        whole = not content["files"] or matches_records(path.parent, path.name, content["files"])
-        if whole and content["inputs"] == inputs:
-            return [Measurement(*row) for row in content["rows"]]
+        pictures_match = not content["files"] or matches_records(
+            path.parent, path.name, content["files"]
+        )
+        if pictures_match and content["inputs"] == inputs_digest:
+            return [Measurement(*values) for values in content["rows"]]
     return None

@@ -1,88 +1,101 @@
-"""Measured numbers and the paper's numbers (paper.json), one row per number; tables are pivots of rows."""
+"""Measured and published numbers, one `Measurement` a number; tables are made by grouping them.
+
+Read in this order: `Measurement` (a number with its keys), `group_values` and `mean_of_known`
+(from numbers to the entries of a table), `Run` (all numbers of an evaluation or benchmark),
+`paper_measurements`.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-import json
 import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from importlib import resources
 from typing import Any, NamedTuple
 
-NEAR = "near"  # the setting of views at the viewpoints of second photos
-PROBLEM, REMARK, NOTE = (
-    "problem",
-    "remark",
-    "note.",
-)  # metrics with text as values; "note." precedes a note's name
-BASE_STAGES = (
-    "base",
-    "view",
-)  # stages of a view without Spackle: photo to base Gaussians, render of the view
-COMPLETION_STAGES = (
-    "photo",
-    "completion",
-)  # stages that Spackle adds: render at the photo's camera; mask to rendered view
+from spackle.paper.evaluation.paper_numbers import PAPER_SETTINGS, PAPER_TABLES
+
+# The setting of views from the viewpoints of second photos.
+NEAR_SETTING = "near"
+
+# Metrics whose values are texts: why an image could not be measured; a remark about an image;
+# and, with a name after the prefix, a fact that a base tells about its prediction.
+PROBLEM_METRIC = "problem"
+REMARK_METRIC = "remark"
+NOTE_PREFIX = "note."
+
 Value = float | str | None
 
 
-def load_data(name: str) -> dict[str, Any]:
-    """The content of a JSON file beside this module."""
-    content: dict[str, Any] = json.loads(
-        resources.files("spackle.paper.evaluation").joinpath(name).read_text("utf-8")
-    )
-    return content
-
-
-PAPER = load_data("paper.json")
-IMAGES: dict[str, int] = PAPER[
-    "images"
-]  # the number of images of each dataset, in the order of the tables
-SETTINGS: list[str] = PAPER["settings"]  # S1, S2, S3
-DISPARITIES = tuple(map(float, SETTINGS))
-
-
 class Measurement(NamedTuple):
-    """One number. A number of a whole image has an empty setting, view and method."""
+    """One number, with what it is about; a line of rows.jsonl."""
 
     dataset: str  # the dataset's name in the paper's tables
     image: str
-    setting: str  # "0.3" (a disparity), or "near"
-    view: str
-    method: str
+    setting: str  # a disparity as text, such as "0.3", or "near"; "" for a number of a whole image
+    view: str  # "" for a number of a whole image
+    method: str  # "" for a number of a whole image
     metric: str
     value: Value  # None if the number is not finite; text for a problem, a remark or a note
+
+
+def image_measurement(dataset: str, image: str, metric: str, value: Value) -> Measurement:
+    """A number of a whole image: it has no setting, view or method, and is valid for all of
+    them."""
+    return Measurement(
+        dataset=dataset, image=image, setting="", view="", method="", metric=metric, value=value
+    )
 
 
 class Mean(NamedTuple):
     """The mean of a metric over views."""
 
     value: float | None  # None if no view has a finite value
-    bad: int  # the number of views without a finite value
+    missing: int  # the number of views without a finite value
 
 
-def mean(values: Sequence[Value], of: Callable[[list[float]], float] = statistics.fmean) -> Mean:
-    """The mean of the finite values; `of` may be another statistic, such as `statistics.median`."""
+def mean_of_known(
+    values: Sequence[Value], statistic: Callable[[list[float]], float] = statistics.fmean
+) -> Mean:
+    """The mean of the values that are known, and the number of those that are not.
+
+    Args:
+        values: numbers, or None where a metric gave no finite number.
+        statistic: what is computed instead of the mean, such as `statistics.median`.
+    """
     known = [float(value) for value in values if value is not None]
-    return Mean(of(known) if known else None, len(values) - len(known))
+    missing = len(values) - len(known)
+    return Mean(statistic(known) if known else None, missing)
 
 
-def pivot(rows: Iterable[Measurement], *columns: str) -> dict[tuple[str, ...], list[Value]]:
-    """Group the values of rows by the rows' entries in `columns`."""
+def group_values(
+    measurements: Iterable[Measurement], *fields: str
+) -> dict[tuple[str, ...], list[Value]]:
+    """The values of measurements, grouped by the measurements' entries in the named fields.
+
+    For instance, ``group_values(measurements, "method", "metric")["base", "psnr"]`` lists all
+    PSNR of the method "base". Groups and values keep the order of the measurements.
+    """
     groups: dict[tuple[str, ...], list[Value]] = {}
-    for row in rows:
-        groups.setdefault(tuple(getattr(row, column) for column in columns), []).append(row.value)
+    for measurement in measurements:
+        key = tuple(getattr(measurement, field) for field in fields)
+        groups.setdefault(key, []).append(measurement.value)
     return groups
 
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """The results of an evaluation or a benchmark of one dataset."""
+    """The results of an evaluation or a benchmark of one dataset.
 
-    config: Mapping[str, Any]
-    rows: Sequence[Measurement]
-    about: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # versions, machine, metrics
+    A method is one way to render new views of a photo. The base is the network (or depth map)
+    that turns the photo into Gaussians, from which all methods start.
+    """
+
+    config: Mapping[str, Any]  # the content of config.json: options that determine the results
+    measurements: Sequence[Measurement]
+    # What did not determine the renders: versions, machine, and for each metric how it was
+    # measured.
+    about: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     @property
     def title(self) -> str:
@@ -90,85 +103,120 @@ class Run:
         return str(self.config["title"])
 
     @property
-    def base(self) -> str:
+    def base_title(self) -> str:
+        """The name of the base in tables, such as "SHARP"."""
         return str(self.config["base"]["title"])
 
     @property
-    def timed(self) -> bool:
+    def is_benchmark(self) -> bool:
+        """Whether `spackle bench` measured times, rather than `spackle evaluate` pictures."""
         return bool(self.config["kind"] == "bench")
 
     @property
-    def near(self) -> bool:
+    def is_near_view(self) -> bool:
+        """Whether the views are at the viewpoints of second photos, and were compared with
+        these."""
         return bool(self.config["protocol"] == "near-view")
 
     @property
     def methods(self) -> list[str]:
+        """The names of the compared methods, in the order of the options."""
         return list(self.config["methods"])
 
     @property
     def settings(self) -> list[str]:
-        """The settings: disparities as text, or "near"."""
-        return (
-            [NEAR] if self.near else [f"{disparity:g}" for disparity in self.config["disparities"]]
-        )
+        """The settings: the disparities of the camera moves as text, or "near" alone."""
+        if self.is_near_view:
+            return [NEAR_SETTING]
+        return [f"{disparity:g}" for disparity in self.config["disparities"]]
 
     @property
     def problems(self) -> dict[str, str]:
         """Images that could not be measured, each with the reason."""
-        return {row.image: str(row.value) for row in self.rows if row.metric == PROBLEM}
+        return {
+            measurement.image: str(measurement.value)
+            for measurement in self.measurements
+            if measurement.metric == PROBLEM_METRIC
+        }
 
     @property
     def images(self) -> list[str]:
-        """All images, in the dataset's order."""
-        return list(dict.fromkeys(row.image for row in self.rows))
+        """The names of all images, in the dataset's order."""
+        return list(dict.fromkeys(measurement.image for measurement in self.measurements))
 
     @property
-    def measured(self) -> list[str]:
+    def measured_images(self) -> list[str]:
+        """The names of the images without a problem, in the dataset's order."""
         problems = self.problems
         return [image for image in self.images if image not in problems]
 
-    def by_image(self, metric: str, method: str) -> dict[str, float]:
-        """The mean of a metric over each image's views; images without a finite value are left out."""
-        rows = (row for row in self.rows if (row.method, row.metric) == (method, metric))
-        means = {image: mean(values).value for (image,), values in pivot(rows, "image").items()}
-        return {image: value for image, value in means.items() if value is not None}
+    def mean_by_image(self, metric: str, method: str) -> dict[str, float]:
+        """The mean of a metric over each image's views, by the image's name.
 
-    def largest_hole(self, image: str) -> tuple[str, str]:
-        """Setting and view of the image's view with the largest hole in the base; pictures show this view."""
-        holes = [row for row in self.rows if (row.image, row.metric) == (image, "har_before")]
-        shown = max(holes, key=lambda row: float(row.value or 0))
-        return shown.setting, shown.view
+        Images without a finite value are left out.
+        """
+        of_method = (
+            measurement
+            for measurement in self.measurements
+            if measurement.method == method and measurement.metric == metric
+        )
+
+        means = {}
+        for (image,), values in group_values(of_method, "image").items():
+            mean = mean_of_known(values).value
+            if mean is not None:
+                means[image] = mean
+        return means
+
+    def view_with_largest_hole(self, image: str) -> tuple[str, str]:
+        """Setting and name of the image's view in which the base leaves the largest hole.
+
+        A hole is where the base's Gaussians cover too little. Pictures show this view.
+        """
+        hole_ratios = [
+            measurement
+            for measurement in self.measurements
+            if measurement.image == image and measurement.metric == "har_before"
+        ]
+        largest = max(hole_ratios, key=lambda measurement: float(measurement.value or 0))
+        return largest.setting, largest.view
 
 
 @functools.cache
-def paper_rows(label: str) -> tuple[Measurement, ...]:
-    """The numbers of a table of the paper, with shares instead of percent."""
-    rows = []
-    for table in (table for table in PAPER["tables"] if table["label"] == label):
-        metrics = table["metrics"]
-        for dataset, method, *values in table["values"]:
-            settings = SETTINGS if len(values) > len(metrics) else [NEAR]
-            keys = [(setting, metric) for setting in settings for metric in metrics]
-            for (setting, metric), value in zip(keys, values, strict=True):
-                name = metric.removesuffix("_percent")
-                rows.append(
-                    Measurement(
-                        dataset,
-                        "",
-                        setting,
-                        "",
-                        method,
-                        name,
-                        value if name == metric else value / 100,
+def paper_measurements(label: str) -> tuple[Measurement, ...]:
+    """The paper's numbers in the table with this LaTeX label, with shares (0..1) instead of
+    percent."""
+    measurements = []
+    tables = [table for table in PAPER_TABLES if table.label == label]
+    for table in tables:
+        for row in table.rows:
+            # A row with a single setting is one of near views.
+            settings = PAPER_SETTINGS if len(row.values_by_setting) > 1 else (NEAR_SETTING,)
+
+            for setting, values in zip(settings, row.values_by_setting, strict=True):
+                for metric, value in zip(table.metrics, values, strict=True):
+                    is_percent = metric.endswith("_percent")
+                    measurement = Measurement(
+                        dataset=row.dataset,
+                        image="",
+                        setting=setting,
+                        view="",
+                        method=row.method,
+                        metric=metric.removesuffix("_percent"),
+                        value=value / 100 if is_percent else value,
                     )
-                )
-    return tuple(rows)
+                    measurements.append(measurement)
+    return tuple(measurements)
 
 
 def setting_title(setting: str, pattern: str = "{}") -> str:
-    """The title of a setting: `pattern` filled with "S1" and "0.3" for "0.3"; "disparity 0.6" if not in the paper."""
-    return (
-        pattern.format(f"S{SETTINGS.index(setting) + 1}", setting)
-        if setting in SETTINGS
-        else f"disparity {setting}"
-    )
+    """The title of a setting in tables: "S1" for the paper's disparity "0.3", else "disparity 0.6".
+
+    Args:
+        setting: a disparity as text.
+        pattern: for the paper's settings, a format string that gets "S1" and "0.3".
+    """
+    if setting not in PAPER_SETTINGS:
+        return f"disparity {setting}"
+    number = PAPER_SETTINGS.index(setting) + 1
+    return pattern.format(f"S{number}", setting)

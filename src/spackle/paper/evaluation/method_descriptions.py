@@ -1,4 +1,5 @@
-"""The names, texts and plot styles of the compared methods; `methods.py` has the methods themselves."""
+"""The names, texts and plot styles of the compared methods; `methods.py` has the methods
+themselves."""
 
 from __future__ import annotations
 
@@ -7,7 +8,7 @@ import dataclasses
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class MethodDescription:
-    """How tables and plots present a method, that is, one way to render new views of a photo."""
+    """How tables and plots present a method."""
 
     title: str  # its name in tables
     summary: str  # half a sentence for the notes below a table
@@ -15,6 +16,10 @@ class MethodDescription:
     marker: str  # its shape in plots, in matplotlib's notation
     uses_residual: bool = False  # whether the residual network runs
 
+
+# Methods of other packages look alike in plots.
+PLUGIN_COLOR = "#000000"
+PLUGIN_MARKER = "*"
 
 METHODS = {
     "base": MethodDescription(
@@ -32,7 +37,9 @@ METHODS = {
     ),
     "spackle": MethodDescription(
         title="Spackle",
-        summary="ours: each view by itself in two passes, behind what the photo shows, with texture",
+        summary=(
+            "ours: each view by itself in two passes, behind what the photo shows, with texture"
+        ),
         color="#0072b2",
         marker="D",
         uses_residual=True,
@@ -70,3 +77,17 @@ METHODS = {
         marker="X",
     ),
 }
+
+
+def describe_method(name: str) -> MethodDescription:
+    """How tables and plots present a method: one of `METHODS`, or a plug-in
+    `package.module:Name`."""
+    if name in METHODS:
+        return METHODS[name]
+    _, _, plugin_name = name.partition(":")
+    return MethodDescription(
+        title=plugin_name,
+        summary=f"the function {plugin_name} of another package",
+        color=PLUGIN_COLOR,
+        marker=PLUGIN_MARKER,
+    )

@@ -1,16 +1,13 @@
-"""Image metrics (metrics.json): our own, and published ones through pyiqa.
+"""The image metrics of the tables: their descriptions, and those that are computed here.
 
-pyiqa is optional (pip install 'spackle-nvs[eval]'), and its licence forbids commercial use.
+`METRICS` describes all of them. PSNR, SSIM and sharpness are below; the perceptual distance is
+`spackle.paper.training.losses.hole_distance`; the others are published networks
+(published_metrics.py).
 """
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import io
-import socket
-import warnings
-from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,195 +15,224 @@ import torch
 from torch import Tensor
 
 from spackle.core.filters import gaussian_blur, maximum_filter
-from spackle.paper.evaluation.measurements import load_data
-from spackle.paper.evaluation.table import NOT_RUN
 from spackle.paper.training.losses import hole_psnr
-from spackle.runtime.errors import reason_in_a_line
 
-OWN = "own"
-NOTICE = (
-    "pyiqa: PolyForm Noncommercial licence 1.0.0; several of its networks are for research only"
-)
-NOT_INSTALLED = "pyiqa is not installed: pip install 'spackle-nvs[eval]'"
-WINDOW, SIGMA = 11, 1.5  # SSIM's window, in pixels (Wang et al. 2004)
-C1, C2 = 0.01**2, 0.03**2  # SSIM's constants K1 = 0.01, K2 = 0.03, for values in 0..1
-GREY_WEIGHTS = torch.tensor([0.299, 0.587, 0.114])
-INNER = 7  # side in pixels of the square around a pixel that must lie in the mask, for sharpness
+# SSIM as published (Wang et al. 2004), for values in 0..1.
+SSIM_WINDOW_PX = 11  # side of the window
+SSIM_SIGMA_PX = 1.5  # of the Gaussian weights in the window
+SSIM_C1 = 0.01**2
+SSIM_C2 = 0.03**2
 
-Metric = Callable[
-    [Tensor, Tensor | None], float
-]  # from (image, truth), each [H, W, 3] sRGB 0..1, to a score
+GREY_WEIGHTS = torch.tensor([0.299, 0.587, 0.114])  # of red, green and blue in grey (Rec. 601)
+
+# Sharpness counts a pixel if the square of this side around it lies in the mask.
+SHARPNESS_SQUARE_PX = 7
 
 
-@dataclasses.dataclass(frozen=True)
-class MetricFacts:
-    """The description of a metric."""
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class MetricDescription:
+    """What a metric of images is called, what it measures exactly, and what it needs."""
 
-    title: str  # with an arrow for the better direction
-    definition: str  # the exact definition, for captions
-    lower: bool  # whether lower is better
-    digits: int = 4
-    truth: bool = False  # whether it needs a true second view
-    options: dict[str, Any] | None = (
-        None  # for pyiqa, all explicit, because defaults may change; None: our own metric
-    )
+    title: str  # its name, a space, and an arrow for the better direction
+    definition: str  # the exact definition, for the notes below tables
+    lower_is_better: bool
+    decimals: int = 4  # in tables
+    needs_true_picture: bool = False  # whether it compares with the true photo of the same view
+    # For pyiqa, all explicit, because its defaults may change; None: not one of pyiqa's metrics.
+    pyiqa_options: dict[str, Any] | None = None
 
-    def text(self, value: float) -> str:
-        return f"{value:.{self.digits}f}"
+    @property
+    def name(self) -> str:
+        """The title without its arrow."""
+        return self.title[: -len(" ↑")]
+
+    def format(self, value: float) -> str:
+        """A value as tables show it."""
+        return f"{value:.{self.decimals}f}"
 
 
-METRICS = {name: MetricFacts(**facts) for name, facts in load_data("metrics.json").items()}
-DEFINITIONS = {
-    name: facts for name, facts in METRICS.items() if facts.options is not None
-}  # pyiqa's metrics
+METRICS = {
+    "clipiqa": MetricDescription(
+        title="CLIPIQA ↑",
+        definition=(
+            "CLIP RN50 without positional embedding at the picture's own size; mean over the "
+            "prompt pairs Good/bad image, Sharp/blurry image, sharp/blurry edges, High/low "
+            "resolution image, Noise-free/noisy image"
+        ),
+        lower_is_better=False,
+        pyiqa_options={"model_type": "clipiqa", "backbone": "RN50", "pos_embedding": False},
+    ),
+    "niqe": MetricDescription(
+        title="NIQE ↓",
+        definition=(
+            "on the float render, of which pyiqa rounds the luma (YIQ) to 0..255; blocks of 96×96, "
+            "the pristine model of the authors' release"
+        ),
+        lower_is_better=True,
+        pyiqa_options={"test_y_channel": True},
+    ),
+    "musiq": MetricDescription(
+        title="MUSIQ ↑",
+        definition="trained on KonIQ-10k; scales 224, 384 and the picture's own",
+        lower_is_better=False,
+        pyiqa_options={"pretrained": "koniq10k"},
+    ),
+    "psnr": MetricDescription(
+        title="PSNR ↑",
+        definition="in dB over sRGB pixels and channels in 0..1",
+        lower_is_better=False,
+        decimals=2,
+        needs_true_picture=True,
+    ),
+    "ssim": MetricDescription(
+        title="SSIM ↑",
+        definition=(
+            "Gaussian window of 11 pixels, σ 1.5, K 0.01 and 0.03, mean of the sRGB channels"
+        ),
+        lower_is_better=False,
+        needs_true_picture=True,
+    ),
+    "distance": MetricDescription(
+        title="distance ↓",
+        definition=(
+            "masked perceptual distance in the hole: SqueezeNet 1.0 at conv1, fire4, fire8 and "
+            "fire9, unit feature vectors, 0 to 8 (spackle.paper.training.losses.hole_distance); "
+            "not LPIPS"
+        ),
+        lower_is_better=True,
+        needs_true_picture=True,
+    ),
+    "dists": MetricDescription(
+        title="DISTS ↓",
+        definition="VGG16 with the authors' weights, at the picture's own size",
+        lower_is_better=True,
+        needs_true_picture=True,
+        pyiqa_options={},
+    ),
+    "lpips": MetricDescription(
+        title="LPIPS ↓",
+        definition=(
+            "AlexNet, version 0.1, at the picture's own size (the paper does not say which network "
+            "it took)"
+        ),
+        lower_is_better=True,
+        needs_true_picture=True,
+        pyiqa_options={"net": "alex", "version": "0.1"},
+    ),
+}
+
+# The metrics that are measured unless others are chosen, by protocol.
 DEFAULT_METRICS = {
-    "large-view": [name for name, facts in METRICS.items() if not facts.truth],
-    "near-view": [name for name, facts in METRICS.items() if facts.truth],
+    "large-view": [name for name, metric in METRICS.items() if not metric.needs_true_picture],
+    "near-view": [name for name, metric in METRICS.items() if metric.needs_true_picture],
 }
 
 
-def metric_name(column: str) -> str | None:
-    """The metric of a column such as "psnr", "psnr_hole" or "psnr_outside"; None for counts and shares."""
-    name = column.partition("_")[0]
+def metric_of_column(column: str) -> str | None:
+    """The metric that a table's column shows: "psnr" for "psnr", "psnr_hole" and "psnr_outside".
+
+    Returns None for columns of counts and shares, which are no image metrics.
+    """
+    name, _, _ = column.partition("_")
     return name if name in METRICS else None
 
 
-def psnr(image: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
-    """PSNR in dB, in float64, over the pixels of `mask` [H, W] (None: all); see `hole_psnr`. Higher is better."""
-    everywhere = torch.ones(image.shape[:2], dtype=torch.bool)
-    return hole_psnr(image.double(), truth.double(), everywhere if mask is None else mask)
+def psnr(image: Tensor, true_picture: Tensor, mask: Tensor | None = None) -> float:
+    """Peak signal-to-noise ratio in dB, computed in float64: -10 · log10(mean squared error).
 
+    Args:
+        image: [H, W, 3] sRGB 0..1.
+        true_picture: [H, W, 3] sRGB 0..1, what the image should be.
+        mask: [H, W] bool, the pixels that count; None: all.
 
-def sharpness(image: Tensor, truth: Tensor, mask: Tensor) -> float:
-    """Ratio of the mean gradient magnitude in grey to the truth's: 1 is as sharp as the truth, 0 has no detail.
-
-    Counts pixels inside `mask` [H, W], at least 3 pixels from the mask's border; NaN if no pixel counts. `image` and
-    `truth` are [H, W, 3] sRGB 0..1.
+    Returns:
+        The ratio, higher is better; infinite for equal images, NaN if no pixel counts.
     """
-    inner = ~maximum_filter(~mask, INNER // 2)
-    ours, theirs = (
-        torch.hypot(*torch.gradient(picture @ GREY_WEIGHTS))[inner].mean()
-        for picture in (image, truth)
-    )
-    return float(ours / theirs)
+    if mask is None:
+        mask = torch.ones(image.shape[:2], dtype=torch.bool)
+    return hole_psnr(image.double(), true_picture.double(), mask)
+
+
+def sharpness(image: Tensor, true_picture: Tensor, mask: Tensor) -> float:
+    """The image's mean gradient magnitude in grey, divided by that of the true picture.
+
+    1 is as sharp as the true picture, 0 has no detail. Only pixels at least 3 pixels inside the
+    mask count, because the mask's border is an edge of its own.
+
+    Args:
+        image: [H, W, 3] sRGB 0..1.
+        true_picture: [H, W, 3] sRGB 0..1, what the image should be.
+        mask: [H, W] bool.
+
+    Returns:
+        The ratio; NaN if no pixel counts.
+    """
+    is_inside = ~maximum_filter(~mask, SHARPNESS_SQUARE_PX // 2)
+    return float(_mean_gradient(image, is_inside) / _mean_gradient(true_picture, is_inside))
+
+
+def _mean_gradient(picture: Tensor, mask: Tensor) -> Tensor:
+    """The mean gradient magnitude of a picture [H, W, 3] in grey, over the pixels of a mask [H,
+    W]."""
+    grey = picture @ GREY_WEIGHTS  # [H, W]
+    down, right = torch.gradient(grey)
+    return torch.hypot(down, right)[mask].mean()
 
 
 def ssim_average(similarity: Tensor, mask: Tensor | None = None) -> float:
-    """Average a map of structural similarity (Wang et al. 2004); 1 is equal, higher is better.
+    """The structural similarity of two images (Wang et al. 2004), averaged over pixels and
+    channels.
 
-    Without a mask, pixels count if their window lies within the image, as published. With a mask, all pixels of the
-    mask count, also at the image's border, because much of a hole is at the border.
-
-    Args:
-        similarity: [H, W, 3], from `ssim_map`.
-        mask: [H, W] bool, the pixels that count.
-
-    Returns:
-        The average over pixels and channels; NaN if no pixel counts.
-    """
-    edge = WINDOW // 2
-    return float((similarity[edge:-edge, edge:-edge] if mask is None else similarity[mask]).mean())
-
-
-def ssim_map(image: Tensor, truth: Tensor) -> Tensor:
-    """SSIM at each pixel and channel, [H, W, 3] float64, under a Gaussian window of 11 pixels with σ 1.5.
-
-    At the border the image is mirrored to fill the window. `image` and `truth` are [H, W, 3] sRGB 0..1.
-    """
-    x, y = image.double(), truth.double()
-    mean_x, mean_y, square_x, square_y, product = (
-        _blur(moment) for moment in (x, y, x * x, y * y, x * y)
-    )
-    variance_x, variance_y = square_x - mean_x**2, square_y - mean_y**2
-    covariance = product - mean_x * mean_y
-    likeness = (2 * mean_x * mean_y + C1) * (2 * covariance + C2)
-    return likeness / ((mean_x**2 + mean_y**2 + C1) * (variance_x + variance_y + C2))
-
-
-def _blur(image: Tensor) -> Tensor:
-    reach = WINDOW // 2
-    wide = np.pad(image.numpy(), ((reach, reach), (reach, reach), (0, 0)), "symmetric")
-    return gaussian_blur(torch.from_numpy(wide), SIGMA)[reach:-reach, reach:-reach]
-
-
-def open_metrics(
-    names: Sequence[str], device: str, download: bool
-) -> tuple[dict[str, Metric], dict[str, str]]:
-    """Load metrics by their names in `DEFINITIONS`; a missing package or missing weights are no error.
+    Without a mask, pixels count if their window lies within the image, as published. With a mask,
+    all its pixels count, also at the image's border, because much of a hole is at the border.
 
     Args:
-        names: metrics to load; pyiqa is imported only for a non-empty list.
-        device: "cpu" or "cuda".
-        download: let pyiqa download missing weights; if False, network access is blocked while pyiqa loads.
+        similarity: [H, W, 3] similarity at each pixel, from `ssim_map`.
+        mask: [H, W] bool, the pixels that count; None: as published.
 
     Returns:
-        The metrics that were loaded; and for each name pyiqa's version, or the reason why the metric is "not run".
+        The average: 1 for equal images, higher is better, NaN if no pixel counts.
     """
-    metrics: dict[str, Metric] = {}
-    states: dict[str, str] = {}
-    if not names:
-        return metrics, states
-    try:
-        with _quiet():
-            import pyiqa
-    except Exception as error:  # pyiqa needs torchvision, which may not match the installed torch
-        absent = isinstance(error, ModuleNotFoundError) and error.name == "pyiqa"
-        why = NOT_INSTALLED if absent else f"pyiqa cannot be imported: {reason_in_a_line(error)}"
-        return metrics, dict.fromkeys(names, f"{NOT_RUN}: {why}")
-    for name in names:
-        try:
-            with _quiet(), contextlib.nullcontext() if download else _off_the_network():
-                network = pyiqa.create_metric(
-                    name, device=torch.device(device), **(DEFINITIONS[name].options or {})
-                )
-            metrics[name], states[name] = _measure_by(network), f"pyiqa {pyiqa.__version__}"
-        except Exception as error:  # a foreign package may raise anything; the report gets one line
-            why = f"pyiqa cannot load this metric: {reason_in_a_line(error)}"
-            if not download:
-                why += " (--download-metrics lets pyiqa fetch missing weights)"
-            states[name] = f"{NOT_RUN}: {why}"
-    return metrics, states
+    if mask is None:
+        margin = SSIM_WINDOW_PX // 2
+        counted = similarity[margin:-margin, margin:-margin]
+    else:
+        counted = similarity[mask]
+    return float(counted.mean())
 
 
-def _measure_by(network: Callable[..., Any]) -> Metric:
-    """Make a metric from a pyiqa network; the metric gives one number, possibly NaN."""
+def ssim_map(image: Tensor, true_picture: Tensor) -> Tensor:
+    """Structural similarity of two images x and y at each pixel and channel (Wang et al. 2004).
 
-    def measure(picture: Tensor, truth: Tensor | None = None) -> float:
-        images = [
-            image.clamp(0, 1).permute(2, 0, 1)[None].float()
-            for image in (picture, truth)
-            if image is not None
-        ]
-        with torch.no_grad(), warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            return float(network(*images))
+    SSIM = (2 μx μy + C1) (2 σxy + C2) / ((μx² + μy² + C1) (σx² + σy² + C2)), with means μ,
+    variances σ² and covariance σxy under a Gaussian window of 11 pixels with σ 1.5. At the border
+    the images are mirrored to fill the window.
 
-    return measure
+    Args:
+        image: [H, W, 3] sRGB 0..1.
+        true_picture: [H, W, 3] sRGB 0..1.
+
+    Returns:
+        [H, W, 3] float64, 1 where the images are equal.
+    """
+    x = image.double()
+    y = true_picture.double()
+
+    mean_x = _windowed_mean(x)
+    mean_y = _windowed_mean(y)
+    variance_x = _windowed_mean(x * x) - mean_x**2
+    variance_y = _windowed_mean(y * y) - mean_y**2
+    covariance = _windowed_mean(x * y) - mean_x * mean_y
+
+    numerator = (2 * mean_x * mean_y + SSIM_C1) * (2 * covariance + SSIM_C2)
+    denominator = (mean_x**2 + mean_y**2 + SSIM_C1) * (variance_x + variance_y + SSIM_C2)
+    return numerator / denominator
 
 
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Suppress what pyiqa and its dependencies print, log and warn while they load."""
-    output = io.StringIO()
-    with (
-        contextlib.redirect_stdout(output),
-        contextlib.redirect_stderr(output),
-        warnings.catch_warnings(),
-    ):
-        warnings.simplefilter("ignore")
-        yield
-
-
-@contextlib.contextmanager
-def _off_the_network() -> Iterator[None]:
-    """Block lookups of host names, with which every download begins."""
-    lookup = socket.getaddrinfo
-
-    def refuse(*given: Any, **more: Any) -> Any:
-        raise OSError("weights are not on this machine")
-
-    socket.getaddrinfo = refuse
-    try:
-        yield
-    finally:
-        socket.getaddrinfo = lookup
+def _windowed_mean(image: Tensor) -> Tensor:
+    """The mean of [H, W, C] around each pixel under SSIM's Gaussian window; the border is
+    mirrored."""
+    margin = SSIM_WINDOW_PX // 2
+    widths = ((margin, margin), (margin, margin), (0, 0))
+    mirrored = torch.from_numpy(np.pad(image.numpy(), widths, "symmetric"))
+    return gaussian_blur(mirrored, SSIM_SIGMA_PX)[margin:-margin, margin:-margin]

@@ -1,347 +1,319 @@
-"""Pictures of an evaluation: pictures of each image, contact sheets, and the paper's figures (`spackle figures`)."""
+"""Pictures of an evaluation: those of each image, and contact sheets of the best and the worst
+images."""
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-import torch
 from PIL import Image, ImageDraw
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
 
 from spackle.core.color import to_uint8
 from spackle.formats.png import thumbnail
-from spackle.paper.evaluation.folder import image_file, load_run
-from spackle.paper.evaluation.measurements import Run, load_data
-from spackle.paper.evaluation.method_descriptions import METHODS
+from spackle.paper.evaluation.folder import image_file
+from spackle.paper.evaluation.measurements import Run
+from spackle.paper.evaluation.method_descriptions import describe_method
 from spackle.paper.evaluation.metrics import METRICS
-from spackle.paper.evaluation.protocols import HOLE, INPUT, TRUTH
-from spackle.paper.evaluation.table import tex
-from spackle.runtime.errors import InputError
-from spackle.runtime.files import atomic_path, write_atomic
-from spackle.runtime.folders import results_folder
-from spackle.runtime.progress import Reporter
+from spackle.paper.evaluation.protocols import HOLE_PICTURE, INPUT_PICTURE, TRUE_PICTURE
+from spackle.runtime.files import atomic_path
 
-WORST, BEST = "worst.png", "best.png"
-SHEET_CELL, SHEET_FONT, CASES = 320, 14, 6  # pixels, pixels, rows of a contact sheet
-# Images are ranked by the first metric of a protocol that the method has.
-ORDER = {
+WORST_SHEET_FILE = "worst.png"
+BEST_SHEET_FILE = "best.png"
+SHEET_PICTURE_PX = 320  # width of a picture in a contact sheet
+SHEET_FONT_PX = 14
+SHEET_IMAGES = 6  # rows of a contact sheet
+
+MAX_STORED_SIDE_PX = 960  # the most pixels on a stored picture's longer side
+WEBP_QUALITY = 85
+WEBP_EFFORT = 4  # of 0 to 6; higher is slower and smaller
+
+BOX_COLOR = "#e3191c"  # red
+OTHER_PICTURES = (TRUE_PICTURE, INPUT_PICTURE, HOLE_PICTURE)  # those that no method made
+
+# Images are ranked by the first metric of a protocol that their method has.
+RANKING_METRICS = {
     "near-view": ("distance", "lpips", "psnr_hole"),
     "large-view": ("clipiqa", "musiq", "har", "har_before"),
 }
-NAMES = {"psnr_hole": "PSNR in the hole ↑", "har": "HAR ↓", "har_before": "the base's HAR ↓"}
-LARGE_SIDE = 960  # the most pixels on a stored picture's longer side
-QUALITY = 85  # WebP quality
-RED = "#e3191c"
-OTHERS = (TRUTH, INPUT, HOLE)
-UP = ("psnr_hole", "clipiqa", "musiq")  # metrics of `ORDER` for which higher is better
-CAPTIONS = "figures.tex"
-DPI, WIDTH = 400, 5.5  # dots per inch, and the paper's text width in inches
-POINTS = 7  # font size
-MOST_BOXES, BOX = (
-    2,
-    0.22,
-)  # the most boxes in a picture; side of a box over the picture's longer side
-LEAST_SCORE = 0.02  # the least product of the shares of hole pixels and other pixels in a box
+RANKING_METRICS_HIGHER_IS_BETTER = ("psnr_hole", "clipiqa", "musiq")
+# Titles of the ranking metrics that are not in `METRICS`.
+RANKING_TITLES = {
+    "psnr_hole": "PSNR in the hole ↑",
+    "har": "HAR ↓",
+    "har_before": "the base's HAR ↓",
+}
 
-Boxes = Sequence[
-    tuple[float, float, float, float]
-]  # left, top, right, bottom, as fractions of the picture
+# Left, top, right and bottom of a box, as fractions of a picture's width and height.
+Box = tuple[float, float, float, float]
 
 
-class Cell(NamedTuple):
-    """A picture in a grid."""
+class GridPicture(NamedTuple):
+    """A picture in a grid, with what is drawn over it."""
 
     picture: Image.Image
     tag: str = ""  # text in the top right corner
-    boxes: Boxes = ()  # red boxes around details
+    boxes: Sequence[Box] = ()  # red boxes around details
+
+
+class GridRow(NamedTuple):
+    """A row of a grid: one picture for each column, below a caption."""
+
+    caption: str  # "": no space is left for it
+    pictures: Sequence[GridPicture]
 
 
 def draw_grid(
     titles: Sequence[str],
-    rows: Sequence[tuple[str, Sequence[Cell]]],
-    cell: int,
-    font: int,
+    rows: Sequence[GridRow],
+    picture_width: int,
+    font_size: int,
     heading: str = "",
 ) -> Image.Image:
-    """Draw rows of pictures below the titles of their columns; each row is below its caption.
+    """Draw rows of pictures below the titles of their columns.
 
     Args:
         titles: titles of the columns.
         rows: for each row its caption and a picture for each column.
-        cell: width of a picture in pixels.
-        font: height of letters in pixels.
-        heading: a line above everything.
+        picture_width: width of each picture, in pixels.
+        font_size: height of letters, in pixels.
+        heading: a line above everything; "": no space is left for it.
     """
-    gap, line = max(4, font // 3), round(1.5 * font)
-    shown = [[_as_wide(one.picture, cell) for one in cells] for _, cells in rows]
-    heights = [max(picture.height for picture in pictures) for pictures in shown]
-    captions = [line if caption else 0 for caption, _ in rows]
-    height = line * (1 + bool(heading)) + sum(heights) + sum(captions) + gap * len(rows)
-    canvas = Image.new("RGB", (len(titles) * (cell + gap) - gap, height), "white")
+    gap = max(4, font_size // 3)  # between pictures, in pixels
+    line_height = round(1.5 * font_size)
+
+    resized_rows = [
+        [_resized_to_width(one.picture, picture_width) for one in row.pictures] for row in rows
+    ]
+    row_heights = [max(picture.height for picture in pictures) for pictures in resized_rows]
+    caption_heights = [line_height if row.caption else 0 for row in rows]
+    heading_height = line_height if heading else 0
+
+    width = len(titles) * (picture_width + gap) - gap
+    height = heading_height + line_height  # the titles' line
+    height += sum(row_heights) + sum(caption_heights) + gap * len(rows)
+    canvas = Image.new("RGB", (width, height), "white")
     draw = ImageDraw.Draw(canvas)
+
+    # `y` is where the next line or row begins. Texts are anchored at their middle ("m").
     if heading:
-        draw.text((gap, line // 2), heading, "black", font_size=font, anchor="lm")
-    y = line * bool(heading)
+        draw.text((gap, line_height // 2), heading, "black", font_size=font_size, anchor="lm")
+    y = heading_height
+
     for column, title in enumerate(titles):
-        draw.text(
-            (column * (cell + gap) + cell // 2, y + line // 2),
-            title,
-            "black",
-            font_size=font,
-            anchor="mm",
-        )
-    y += line
-    for (caption, cells), pictures, tall, above in zip(rows, shown, heights, captions, strict=True):
-        if caption:
-            draw.text((gap, y + above // 2), caption, "black", font_size=font, anchor="lm")
-        y += above
-        for column, (one, picture) in enumerate(zip(cells, pictures, strict=True)):
-            x = column * (cell + gap)
-            canvas.paste(picture, (x, y))
-            for left, top, right, bottom in one.boxes:
-                near = x + left * cell, y + top * picture.height
-                far = x + right * cell - 1, y + bottom * picture.height - 1
-                draw.rectangle((near, far), outline=RED, width=max(2, font // 10))
+        middle = (column * (picture_width + gap) + picture_width // 2, y + line_height // 2)
+        draw.text(middle, title, "black", font_size=font_size, anchor="mm")
+    y += line_height
+
+    for index, row in enumerate(rows):
+        caption_height = caption_heights[index]
+        if row.caption:
+            place = (gap, y + caption_height // 2)
+            draw.text(place, row.caption, "black", font_size=font_size, anchor="lm")
+        y += caption_height
+
+        for column, one in enumerate(row.pictures):
+            resized = resized_rows[index][column]
+            x = column * (picture_width + gap)
+            canvas.paste(resized, (x, y))
+            _draw_boxes(draw, one.boxes, (x, y), resized.size, max(2, font_size // 10))
             if one.tag:
-                at = x + cell - gap, y + gap
-                edges = draw.textbbox(at, one.tag, font_size=font, anchor="ra")
-                draw.rectangle(
-                    (edges[0] - gap, edges[1] - gap, x + cell, edges[3] + gap), fill="white"
-                )
-                draw.text(at, one.tag, "black", font_size=font, anchor="ra")
-        y += tall + gap
+                _draw_tag(draw, one.tag, (x + picture_width, y), gap, font_size)
+        y += row_heights[index] + gap
     return canvas
 
 
-def _as_wide(picture: Image.Image, width: int) -> Image.Image:
-    return picture.resize(
-        (width, round(width * picture.height / picture.width)), Image.Resampling.LANCZOS
-    )
+def _draw_boxes(
+    draw: ImageDraw.ImageDraw,
+    boxes: Sequence[Box],
+    corner: tuple[int, int],
+    size: tuple[int, int],
+    line_width: int,
+) -> None:
+    """Draw red boxes over a picture.
+
+    Args:
+        draw: draws on the canvas.
+        boxes: as fractions of the picture's size.
+        corner: (x, y) of the picture's upper left corner on the canvas, in pixels.
+        size: (width, height) of the picture, in pixels.
+        line_width: of the boxes, in pixels.
+    """
+    x, y = corner
+    width, height = size
+    for left, top, right, bottom in boxes:
+        upper_left = (x + left * width, y + top * height)
+        lower_right = (x + right * width - 1, y + bottom * height - 1)
+        draw.rectangle((upper_left, lower_right), outline=BOX_COLOR, width=line_width)
+
+
+def _draw_tag(
+    draw: ImageDraw.ImageDraw, tag: str, corner: tuple[int, int], gap: int, font_size: int
+) -> None:
+    """Write a short text on white into a picture's upper right corner.
+
+    Args:
+        draw: draws on the canvas.
+        tag: the text.
+        corner: (x, y) of the picture's upper right corner on the canvas, in pixels.
+        gap: white space around the text, in pixels.
+        font_size: height of letters, in pixels.
+    """
+    x, y = corner
+    place = (x - gap, y + gap)
+    left, top, _, bottom = draw.textbbox(place, tag, font_size=font_size, anchor="ra")
+    draw.rectangle((left - gap, top - gap, x, bottom + gap), fill="white")
+    draw.text(place, tag, "black", font_size=font_size, anchor="ra")
+
+
+def _resized_to_width(picture: Image.Image, width: int) -> Image.Image:
+    """A picture with this width in pixels, and the same aspect ratio."""
+    height = round(width * picture.height / picture.width)
+    return picture.resize((width, height), Image.Resampling.LANCZOS)
 
 
 # --- the pictures of an evaluation
 
 
+def picture_file(output: Path, index: int, image: str, name: str) -> Path:
+    """The path of an image's picture in a folder of results.
+
+    Args:
+        output: the folder.
+        index: the image's place in the dataset.
+        image: the image's name.
+        name: the picture's name: a method, "truth", "input" or "hole".
+    """
+    # A method of another package is named package.module:Name, which not all systems allow.
+    safe_name = re.sub(r"[^A-Za-z0-9-]+", "_", name)
+    return image_file(output, index, image, f".{safe_name}.webp")
+
+
 def save_picture(picture: Tensor, path: Path) -> None:
-    """Write [H, W, 3] sRGB 0..1 as WebP, with a longer side of at most `LARGE_SIDE` pixels."""
-    image = Image.fromarray(to_uint8(thumbnail(picture, LARGE_SIDE)).numpy())
+    """Write [H, W, 3] sRGB 0..1 as WebP, with a longer side of at most 960 pixels."""
+    image = Image.fromarray(to_uint8(thumbnail(picture, MAX_STORED_SIDE_PX)).numpy())
     with atomic_path(path) as temporary:
-        image.save(temporary, format="WEBP", quality=QUALITY, method=4)
+        image.save(temporary, format="WEBP", quality=WEBP_QUALITY, method=WEBP_EFFORT)
 
 
-def kept_pictures(run: Run, folder: Path, image: str) -> dict[str, Path]:
-    """The stored pictures of an image: by each method, then "truth", "input" and "hole"."""
+def stored_pictures(run: Run, folder: Path, image: str) -> dict[str, Path]:
+    """The files of an image's pictures: by each method, then "truth", "input" and "hole".
+
+    Pictures without a file are left out.
+
+    Args:
+        run: the results of an evaluation.
+        folder: their folder.
+        image: the image's name.
+    """
     index = run.images.index(image)
-    files = {
-        name: image_file(folder, index, image, f".{name}.webp") for name in (*METHODS, *OTHERS)
+    paths = {
+        name: picture_file(folder, index, image, name) for name in (*run.methods, *OTHER_PICTURES)
     }
-    return {name: path for name, path in files.items() if path.is_file()}
+    return {name: path for name, path in paths.items() if path.is_file()}
 
 
-def column_title(run: Run, name: str) -> str:
-    """The title of a column of pictures."""
-    return (
-        name if name in OTHERS else f"base ({run.base})" if name == "base" else METHODS[name].title
-    )
+def picture_title(run: Run, name: str) -> str:
+    """The title of a column of pictures: a method's title, or "truth", "input" or "hole"."""
+    if name in OTHER_PICTURES:
+        return name
+    if name == "base":
+        return f"base ({run.base_title})"
+    return describe_method(name).title
 
 
 class Ranking(NamedTuple):
-    """Images from best to worst."""
+    """The images of an evaluation, from best to worst."""
 
     names: list[str]
-    criterion: str  # the metric and method of the ranking
-    values: dict[str, float]
+    criterion: str  # the titles of the metric and of the method
+    values: dict[str, float]  # each image's mean of the metric
 
 
-def rank(run: Run) -> Ranking | None:
-    """Rank a run's images by the method spackle, or else the last method; None if nothing was measured."""
+def ranking_of_run(run: Run) -> Ranking | None:
+    """The images of a run from best to worst; None if nothing was measured.
+
+    They are ranked by the method "spackle", or else by the last method.
+    """
     method = "spackle" if "spackle" in run.methods else run.methods[-1]
-    for metric in ORDER[str(run.config["protocol"])]:
-        if values := run.by_image(metric, method):
-            title = METRICS[metric].title if metric in METRICS else NAMES[metric]
-            return Ranking(ranked(values, metric), f"{title} of {METHODS[method].title}", values)
+    for metric in RANKING_METRICS[str(run.config["protocol"])]:
+        values = run.mean_by_image(metric, method)
+        if values:
+            title = METRICS[metric].title if metric in METRICS else RANKING_TITLES[metric]
+            criterion = f"{title} of {describe_method(method).title}"
+            return Ranking(best_first(values, metric), criterion, values)
     return None
 
 
-def write_sheets(run: Run, folder: Path) -> None:
-    """Write best.png and worst.png: six images, each by all methods, with the truth. Without a ranking, do nothing."""
-    ranking = rank(run)
-    if ranking is None:
-        return
-    columns = [*run.methods, *([TRUTH] if run.near else [])]
-    heading = f"{run.title}, {run.config['protocol']}, by {ranking.criterion}"
-    heading = heading.replace("↑", "(higher is better)").replace(
-        "↓", "(lower is better)"
-    )  # the font has no arrows
-    for file, order in ((BEST, ranking.names), (WORST, ranking.names[::-1])):
-        rows = []
-        for name in order[:CASES]:
-            pictures = kept_pictures(run, folder, name)
-            caption = f"{name}, {' '.join(run.largest_hole(name))}: {ranking.values[name]:.4g}"
-            rows.append(
-                (caption, [Cell(Image.open(pictures[column]).convert("RGB")) for column in columns])
-            )
-        titles = [column_title(run, column) for column in columns]
-        with atomic_path(folder / file) as temporary:
-            draw_grid(titles, rows, SHEET_CELL, SHEET_FONT, heading).save(temporary)
+def best_first(values: Mapping[str, float], metric: str) -> list[str]:
+    """The names of images from best to worst; images with equal values are in the order of names.
 
-
-def ranked(values: Mapping[str, float], metric: str) -> list[str]:
-    """Names of images from best to worst."""
-    sign = -1 if metric in UP else 1
+    Args:
+        values: for each image's name its value.
+        metric: the metric of the values; it says whether higher is better.
+    """
+    sign = -1 if metric in RANKING_METRICS_HIGHER_IS_BETTER else 1
     return sorted(values, key=lambda name: (sign * values[name], name))
 
 
-def evenly(count: int, most: int) -> list[int]:
-    """At most `most` of `count` indices, evenly spaced, including the first and the last."""
-    if count <= most:
-        return list(range(count))
-    return [math.floor(k * (count - 1) / max(1, most - 1) + 0.5) for k in range(most)]
+def write_contact_sheets(run: Run, folder: Path) -> None:
+    """Write best.png and worst.png: six images each, by all methods, with the true picture.
 
+    If no image could be measured, nothing is written.
 
-# --- the paper's figures
-
-
-class PaperFigure(NamedTuple):
-    """A figure in the paper's layout."""
-
-    name: str
-    columns: Sequence[str]  # names of pictures; methods that no run has are left out
-    needs: str
-    caption: str
-
-
-FIGURES = [PaperFigure(name, **facts) for name, facts in load_data("figures.json").items()]
-TITLES = {INPUT: "Input", HOLE: "Occluded regions", "direct-ft": "Direct FT"}
-
-
-def make_figures(folders: Sequence[Path], rows: int, output: Path, reporter: Reporter) -> None:
-    """Draw figures from large-view evaluations as PDF and PNG, and write their captions for LaTeX.
-
-    Each image is shown in its view with the largest hole. A figure has at most `rows` images, but at least one per run.
-
-    Raises:
-        InputError: a folder has no results, or no large-view evaluation has pictures.
+    Args:
+        run: the results of an evaluation.
+        folder: the folder that has their pictures.
     """
-    runs = [(load_run(folder), folder) for folder in folders]
-    runs = [(run, folder) for run, folder in runs if not run.timed and not run.near]
-    made = {}
-    for figure in FIGURES:
-        having = [(run, folder) for run, folder in runs if figure.needs in run.methods]
-        if drawn := _draw(figure, having, rows):
-            made[figure.name] = drawn
-    if not made:
-        raise InputError(
-            f"{folders[0]}: nothing to draw: give folders of `spackle evaluate` with --disparity 0.6"
-        )
-    for name in [figure.name for figure in FIGURES if figure.name not in made]:
-        reporter.log(f"no figure {name}: no large-view run has the pictures of its methods")
-    files = [f"{name}.{end}" for name in made for end in ("pdf", "png")]
-    with results_folder(output, (*files, CAPTIONS), locked=True):
-        for name, (image, _) in made.items():
-            for form, more in (
-                ("pdf", {"resolution": DPI, "quality": 95}),
-                ("png", {"dpi": (DPI, DPI)}),
-            ):
-                with atomic_path(output / f"{name}.{form}") as temporary:
-                    image.save(temporary, format=form, **more)
-        write_atomic(output / CAPTIONS, "\n".join(text for _, text in made.values()).encode())
-    reporter.log(f"{', '.join((*files, CAPTIONS))} -> {output}")
+    ranking = ranking_of_run(run)
+    if ranking is None:
+        return
+
+    names = [*run.methods, TRUE_PICTURE] if run.is_near_view else run.methods
+    titles = [picture_title(run, name) for name in names]
+    heading = f"{run.title}, {run.config['protocol']}, by {ranking.criterion}"
+    # The font has no arrows.
+    heading = heading.replace("↑", "(higher is better)").replace("↓", "(lower is better)")
+
+    for file, images in (
+        (BEST_SHEET_FILE, ranking.names),
+        (WORST_SHEET_FILE, ranking.names[::-1]),
+    ):
+        rows = [
+            _contact_sheet_row(run, folder, image, names, ranking.values[image])
+            for image in images[:SHEET_IMAGES]
+        ]
+        sheet = draw_grid(titles, rows, SHEET_PICTURE_PX, SHEET_FONT_PX, heading)
+        with atomic_path(folder / file) as temporary:
+            sheet.save(temporary)
 
 
-def _draw(
-    figure: PaperFigure, runs: Sequence[tuple[Run, Path]], most: int
-) -> tuple[Image.Image, str] | None:
-    """Draw a figure; returns the picture and its LaTeX, or None if no image has all pictures."""
-    columns = [
-        name
-        for name in figure.columns
-        if name in (INPUT, HOLE) or any(name in run.methods for run, _ in runs)
-    ]
-    rows = []
-    for run, folder in runs:
-        kept = {image: kept_pictures(run, folder, image) for image in run.measured}
-        whole = [image for image, pictures in kept.items() if pictures.keys() >= {*columns, HOLE}]
-        for place in evenly(len(whole), max(1, most // len(runs))):
-            pictures = {
-                name: Image.open(path).convert("RGB") for name, path in kept[whole[place]].items()
-            }
-            rows.append(
-                ("", [_cell(run, whole[place], name, pictures, figure) for name in columns])
-            )
-    if not rows:
-        return None
-    bases = ", ".join(dict.fromkeys(run.base for run, _ in runs))
-    titles = [
-        bases if name == "base" else TITLES.get(name) or METHODS[name].title for name in columns
-    ]
-    font = round(POINTS / 72 * DPI)
-    image = draw_grid(titles, rows, round(WIDTH * DPI / len(columns)), font)
-    ours = " and by ".join(
-        title for name, title in zip(columns, titles, strict=True) if name in ("paper", "spackle")
-    )
-    return image, _latex(figure, [run for run, _ in runs], bases, ours)
+def _contact_sheet_row(
+    run: Run, folder: Path, image: str, names: Sequence[str], value: float
+) -> GridRow:
+    """An image's row in a contact sheet.
+
+    Args:
+        run: the results of an evaluation.
+        folder: the folder that has their pictures.
+        image: the image's name.
+        names: which pictures: names of methods, or "truth".
+        value: the image's value of the metric that ranks images, for the caption.
+    """
+    setting, view = run.view_with_largest_hole(image)
+    files = stored_pictures(run, folder, image)
+    pictures = [GridPicture(Image.open(files[name]).convert("RGB")) for name in names]
+    return GridRow(f"{image}, {setting} {view}: {value:.4g}", pictures)
 
 
-def _cell(
-    run: Run, image: str, name: str, pictures: dict[str, Image.Image], figure: PaperFigure
-) -> Cell:
-    """A picture with marks: the base's holes get boxes, a method's picture the share of added Gaussians."""
-    if name == HOLE:  # framed, because a hole may be white on a white page
-        width, height = pictures[name].size
-        ImageDraw.Draw(pictures[name]).rectangle((0, 0, width - 1, height - 1), outline="grey")
-    if HOLE in figure.columns:
-        return Cell(pictures[name])
-    if name == "base":
-        return Cell(pictures[name], boxes=hole_boxes(pictures[HOLE]))
-    view = (image, *run.largest_hole(image), name, "aux_share")
-    share = next((row.value for row in run.rows if row[1:6] == view), None)
-    return Cell(pictures[name], "" if share is None else f"+{100 * float(share):.2f} %")
-
-
-def hole_boxes(hole: Image.Image) -> Boxes:
-    """Disjoint boxes in which hole pixels (white) and other pixels mix most evenly."""
-    mask = torch.from_numpy(np.asarray(hole.convert("L")) > 127).float()
-    height, width = mask.shape
-    side = min(round(BOX * max(mask.shape)), *mask.shape)
-    share = avg_pool2d(mask[None], side, stride=1)[
-        0
-    ]  # for each position of a square's upper left corner
-    score, boxes = share * (1 - share), list[tuple[float, float, float, float]]()
-    while len(boxes) < MOST_BOXES and float(score.max()) > LEAST_SCORE:
-        y, x = divmod(int(score.argmax()), score.shape[1])
-        boxes.append((x / width, y / height, (x + side) / width, (y + side) / height))
-        score[max(0, y - side) : y + side, max(0, x - side) : x + side] = 0
-    return boxes
-
-
-def _latex(figure: PaperFigure, runs: Sequence[Run], bases: str, ours: str) -> str:
-    """LaTeX for a figure across both columns, with its caption."""
-    settings = dict.fromkeys(max(run.settings, key=float) for run in runs)
-    weights = dict.fromkeys(run.config["residual"]["weights"] for run in runs)
-    says = {
-        "shipped": "The residual has the weights that ship with Spackle, which the paper's recipe did not train."
-    }
-    says["seeds"] = "The residual has no weights: its deltas are 0."
-    caption = figure.caption.format(
-        views=f"disparity {', '.join(settings)}",
-        bases=bases,
-        ours=ours,
-        weights=" ".join(says[name] for name in weights if name in says),
-    )
-    lines = [
-        r"\begin{figure*}[t]",
-        r"\centering",
-        rf"\includegraphics[width=\textwidth]{{{figure.name}}}",
-    ]
-    lines += [
-        rf"\caption{{{tex(caption.strip())}}}",
-        rf"\label{{fig:{figure.name}}}",
-        r"\end{figure*}",
-    ]
-    return "\n".join(lines) + "\n"
+def evenly_spaced_indices(count: int, max_count: int) -> list[int]:
+    """At most `max_count` of the indices 0 … count - 1, evenly spaced, with the first and the
+    last."""
+    if count <= max_count:
+        return list(range(count))
+    intervals = max(1, max_count - 1)
+    # Half a step is added, so that indices are rounded to the nearest.
+    return [math.floor(k * (count - 1) / intervals + 0.5) for k in range(max_count)]

@@ -1,53 +1,60 @@
-"""An evaluation as one self-contained HTML page with tables, plots and pictures (template: report.html).
-
-matplotlib draws the plots as SVG: holes against disparity, and numbers scene by scene.
-"""
+"""Evaluations as one self-contained HTML page with tables, plots and pictures (template:
+report.html)."""
 
 from __future__ import annotations
 
 import base64
-import importlib.util
-import io
-import math
+import dataclasses
 import re
-import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import NamedTuple
 
 from jinja2 import Environment
 from markupsafe import Markup, escape
 from PIL import Image
 
 from spackle.paper.evaluation.measurements import (
-    IMAGES,
-    REMARK,
+    REMARK_METRIC,
     Measurement,
     Run,
-    mean,
-    paper_rows,
-    pivot,
+    Value,
+    group_values,
+    mean_of_known,
     setting_title,
 )
-from spackle.paper.evaluation.method_descriptions import METHODS
 from spackle.paper.evaluation.metrics import METRICS
-from spackle.paper.evaluation.pictures import column_title, evenly, kept_pictures, rank, ranked
-from spackle.paper.evaluation.protocols import TRUTH
-from spackle.paper.evaluation.table import EMPTY, TEXTS, Cells, Table, groups
-from spackle.paper.evaluation.tables import grouped, make_tables, method_name
-from spackle.runtime.errors import InputError
+from spackle.paper.evaluation.paper_numbers import PAPER_IMAGE_COUNTS
+from spackle.paper.evaluation.pictures import (
+    Ranking,
+    evenly_spaced_indices,
+    picture_title,
+    ranking_of_run,
+    stored_pictures,
+)
+from spackle.paper.evaluation.plots import Plot, plots_of_run
+from spackle.paper.evaluation.protocols import TRUE_PICTURE
+from spackle.paper.evaluation.table import (
+    NO_NUMBER,
+    NUMBER_FORMATS,
+    NumberFormat,
+    RowTexts,
+    Table,
+    group_widths,
+)
+from spackle.paper.evaluation.table_texts import method_row_name
+from spackle.paper.evaluation.tables import make_tables, prepend_group_name
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes as Axes
+REPORT_FILE = "report.html"  # the page, and in this package its template
+MAX_IMAGES = 8  # on a page
+MIN_IMAGES_EACH = 2  # of each evaluation, even if this makes more than `MAX_IMAGES`
 
-REPORT = "report.html"
-MOST, LEAST = 8, 2  # the most images on a page, and the least of each evaluation
-# A slider shows the first `MOST_SHOWN` existing pictures of this list, to limit the page's size.
-SHOWN = (
+# A slider shows the first existing pictures of this list, not more, to limit the page's size.
+SLIDER_PICTURES = (
     "base",
     "spackle",
-    TRUTH,
+    TRUE_PICTURE,
     "inpaint2d",
     "paper",
     "seeds",
@@ -55,289 +62,246 @@ SHOWN = (
     "spackle-scene",
     "dense",
 )
-MOST_SHOWN = 6
-# The columns of a method's means, in order; a column without numbers is left out.
-COLUMNS: dict[str, tuple[str, Callable[[float], str]]] = {
-    "psnr_hole": ("PSNR in the hole ↑", "{:.2f}".format),
-    "ssim_hole": ("SSIM in the hole ↑", "{:.4f}".format),
-    **{name: (facts.title, facts.text) for name, facts in METRICS.items() if name != "ssim"},
-    "har": ("HAR ↓", TEXTS["ratio"]),
-    "aux": ("added GS", TEXTS["count"]),
-}
-RC: Any = {
-    "svg.fonttype": "none",  # keep text as text
-    "svg.hashsalt": "spackle",  # makes bytes reproducible
-    "text.parse_math": False,  # a $ in a scene's name is no formula
-    "font.family": "sans-serif",
-    "font.size": 9,
-    "axes.grid": True,
-    "grid.color": "#d5d9de",
-    "lines.markersize": 5,
-}
-WIDTH, HEIGHT = 4.6, 3.4  # size of a plot in inches, about as wide as a phone
-ROW = 0.21  # height of a scene's row in inches
-SCENES, LETTERS = 30, 14  # the most scenes in a plot, and letters of a scene's name
-SCENE_PLOTS = {  # titles of the plot and of its x axis
-    "psnr_hole": ("PSNR in the hole, scene by scene", "PSNR (dB), higher is better"),
-    "distance": ("Distance in the hole, scene by scene", "distance (0 to 8), lower is better"),
+MAX_SLIDER_PICTURES = 6
+
+
+class MeansColumn(NamedTuple):
+    """A column in the table of a method's means."""
+
+    title: str
+    format: NumberFormat
+
+
+# By metric, in the order of the columns; a column without numbers is left out.
+MEANS_COLUMNS = {
+    "psnr_hole": MeansColumn("PSNR in the hole ↑", "{:.2f}".format),
+    "ssim_hole": MeansColumn("SSIM in the hole ↑", "{:.4f}".format),
+    **{
+        name: MeansColumn(metric.title, metric.format)
+        for name, metric in METRICS.items()
+        if name != "ssim"
+    },
+    "har": MeansColumn("HAR ↓", NUMBER_FORMATS["ratio"]),
+    "aux": MeansColumn("added GS", NUMBER_FORMATS["count"]),
 }
 
 
-def make_report(sources: Sequence[tuple[Run, Path]], *, whole: bool = False) -> str:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ReportImage:
+    """The page's entry on an image, in the view in which the base leaves the largest hole."""
+
+    name: str
+    position: str  # in the ranking, such as "worst" or "3 of 12"; "" without a ranking
+    setting: str  # a disparity as text, or "near"
+    view: str
+    hole: str | None  # the hole's share of the view, such as "4.2 %"
+    titles: Mapping[str, str]  # of the slider's pictures, by name
+    pictures: Mapping[str, str]  # data URLs, by name
+    left: str  # the name of the picture that the slider shows on the left at first
+    right: str
+    width: int  # of a picture, in pixels
+    height: int
+    table: Table  # the numbers of the view
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ReportPart:
+    """The page's sections on an evaluation."""
+
+    run: Run
+    paper_images: int | None  # the number of the dataset's images in the paper
+    methods: Sequence[str]  # names of the methods' rows
+    summary: Table
+    plots: Sequence[Plot]
+    ranking: Ranking | None
+    images: Sequence[ReportImage]
+    remarks: Sequence[tuple[str, Value]]  # names of images, and what is to be said about them
+
+
+def make_report(sources: Sequence[tuple[Run, Path]], *, with_unmeasured: bool = False) -> str:
     """Make a report as a self-contained HTML page; the same results give the same bytes.
 
     Args:
         sources: evaluations and benchmarks with joint tables, each with the folder of its pictures.
-        whole: see `make_tables`.
+        with_unmeasured: whether to show all tables of the paper, also those without measured
+            numbers.
     """
-    runs, measured = (
-        [run for run, _ in sources],
-        [source for source in sources if not source[0].timed],
-    )
-    count = max(LEAST, MOST // max(1, len(measured)))
-    text = resources.files("spackle.paper.evaluation").joinpath(REPORT).read_text(encoding="utf-8")
+    runs = [run for run, _ in sources]
+    evaluations = [source for source in sources if not source[0].is_benchmark]
+    images_each = max(MIN_IMAGES_EACH, MAX_IMAGES // max(1, len(evaluations)))
+    datasets = ", ".join(dict.fromkeys(run.title for run in runs))
+
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    environment.filters |= {"groups": groups, "bold": _bold}
-    page = environment.from_string(text).render(
-        title=f"Spackle: evaluation on {', '.join(dict.fromkeys(run.title for run in runs))}",
-        parts=[_part(run, folder, count) for run, folder in measured],
-        tables=make_tables(runs, whole=whole),
+    environment.filters["group_widths"] = group_widths
+    environment.filters["bold"] = _bold_markup
+    template_file = resources.files("spackle.paper.evaluation").joinpath(REPORT_FILE)
+    template = environment.from_string(template_file.read_text(encoding="utf-8"))
+
+    page = template.render(
+        title=f"Spackle: evaluation on {datasets}",
+        parts=[_part_of_run(run, folder, images_each) for run, folder in evaluations],
+        tables=make_tables(runs, with_unmeasured=with_unmeasured),
         runs=runs,
-        most=MOST,
-        least=LEAST,
+        max_images=MAX_IMAGES,
+        min_images=MIN_IMAGES_EACH,
     )
     return page + "\n"
 
 
-def _bold(text: str) -> Markup:
+def _bold_markup(text: str) -> Markup:
+    """A text as HTML, escaped, with bold type for what stands between **."""
     return Markup(re.sub(r"\*\*(.+?)\*\*", r"<strong>\1</strong>", str(escape(text))))
 
 
-def _part(run: Run, folder: Path, count: int) -> dict[str, Any]:
-    """The page's section on an evaluation, with `count` images, evenly spaced from the worst to the best."""
-    ranking = rank(run)
-    names, cases = ranking.names[::-1] if ranking else run.measured, []
-    for place in evenly(len(names), count):
-        pictures = kept_pictures(run, folder, names[place])
-        shown = {
-            name: pictures[name]
-            for name in [name for name in SHOWN if name in pictures][:MOST_SHOWN]
-        }
-        position = {0: "worst", len(names) - 1: "best"}.get(place, f"{place + 1} of {len(names)}")
-        if shown:
-            cases.append(
-                _case(run, names[place], position if ranking and len(names) > 1 else "", shown)
-            )
-    return {
-        "run": run,
-        "paper_images": IMAGES.get(run.title),
-        "methods": [method_name(run, method) for method in run.methods],
-        "summary": means_table(run, run.rows),
-        "plots": plots_of(run),
-        "ranking": ranking,
-        "cases": cases,
-        "remarks": list(
-            dict.fromkeys((row.image, row.value) for row in run.rows if row.metric == REMARK)
-        ),
-    }
+def _part_of_run(run: Run, folder: Path, max_images: int) -> ReportPart:
+    """The page's sections on an evaluation, with some images, evenly spaced from the worst to the
+    best.
 
+    Args:
+        run: the evaluation.
+        folder: the folder of its pictures.
+        max_images: the most images to show.
+    """
+    ranking = ranking_of_run(run)
+    names = run.measured_images if ranking is None else ranking.names[::-1]  # worst first
 
-def means_table(run: Run, rows: Iterable[Measurement]) -> Table:
-    """Means of metrics over a run's images: a row for each method, grouped by setting if there are several settings."""
-    values = pivot((row for row in rows if row.metric in COLUMNS), "setting", "method", "metric")
-    settings = list(dict.fromkeys(setting for setting, *_ in values))
-    keys = [key for key in COLUMNS if any(metric == key for *_, metric in values)]
-    bodies: list[list[Cells]] = []
-    for setting in settings:
-        lines = []
-        for method in run.methods:
-            means = [mean(values.get((setting, method, key), ())).value for key in keys]
-            cells = [
-                EMPTY if v is None else COLUMNS[key][1](v)
-                for key, v in zip(keys, means, strict=True)
-            ]
-            lines.append([column_title(run, method), *cells])
-        bodies.append(grouped(setting_title(setting), lines) if len(settings) > 1 else list(lines))
-    heads = [re.sub(" ([↑↓])", "\N{NO-BREAK SPACE}\\1", COLUMNS[key][0]) for key in keys]
-    words = ["", ""][len(settings) == 1 :]
-    return Table("", "", "", [("", head) for head in (*words, *heads)], bodies, words=len(words))
+    images = []
+    for index in evenly_spaced_indices(len(names), max_images):
+        files = stored_pictures(run, folder, names[index])
+        slider_names = [name for name in SLIDER_PICTURES if name in files][:MAX_SLIDER_PICTURES]
+        if not slider_names:
+            continue
+        slider_files = {name: files[name] for name in slider_names}
+        position = "" if ranking is None else _position_text(index, len(names))
+        images.append(_report_image(run, names[index], position, slider_files))
 
-
-def _case(run: Run, name: str, position: str, files: Mapping[str, Path]) -> dict[str, Any]:
-    """The page's entry on an image: pictures for the slider, and the numbers of the view in these pictures."""
-    setting, view = run.largest_hole(name)
-    shown = [row for row in run.rows if (row.image, row.setting, row.view) == (name, setting, view)]
-    hole = next(
-        (float(row.value) for row in shown if row.metric == "har_before" and row.value is not None),
-        None,
+    remarks = [(one.image, one.value) for one in run.measurements if one.metric == REMARK_METRIC]
+    return ReportPart(
+        run=run,
+        paper_images=PAPER_IMAGE_COUNTS.get(run.title),
+        methods=[method_row_name(run, method) for method in run.methods],
+        summary=means_table(run, run.measurements),
+        plots=plots_of_run(run),
+        ranking=ranking,
+        images=images,
+        remarks=list(dict.fromkeys(remarks)),
     )
+
+
+def _position_text(index: int, count: int) -> str:
+    """An image's place among `count` images from the worst to the best, such as "worst" or "3 of
+    12"."""
+    if count == 1:
+        return ""
+    if index == 0:
+        return "worst"
+    if index == count - 1:
+        return "best"
+    return f"{index + 1} of {count}"
+
+
+def means_table(run: Run, measurements: Iterable[Measurement]) -> Table:
+    """Means of metrics over an evaluation's images: a row for each method.
+
+    If there are several settings (sizes of the camera move), the rows are grouped by setting, and a
+    first column has the setting's title.
+
+    Args:
+        run: the evaluation, which names methods and base.
+        measurements: the numbers to average: all, or those of one view.
+    """
+    shown = [one for one in measurements if one.metric in MEANS_COLUMNS]
+    values = group_values(shown, "setting", "method", "metric")
+    settings = list(dict.fromkeys(setting for setting, _, _ in values))
+    measured_metrics = {metric for _, _, metric in values}
+    metrics = [metric for metric in MEANS_COLUMNS if metric in measured_metrics]
+
+    bodies: list[list[RowTexts]] = []
+    for setting in settings:
+        rows: list[RowTexts] = []
+        for method in run.methods:
+            row = [picture_title(run, method)]
+            for metric in metrics:
+                mean = mean_of_known(values.get((setting, method, metric), ())).value
+                row.append(NO_NUMBER if mean is None else MEANS_COLUMNS[metric].format(mean))
+            rows.append(row)
+        if len(settings) > 1:
+            rows = prepend_group_name(setting_title(setting), rows)
+        bodies.append(rows)
+
+    word_heads = [""] if len(settings) == 1 else ["", ""]
+    # An arrow stays on the line of its metric's name.
+    metric_heads = [
+        re.sub(" ([↑↓])", "\N{NO-BREAK SPACE}\\1", MEANS_COLUMNS[metric].title)
+        for metric in metrics
+    ]
+    return Table(
+        label="",
+        title="",
+        caption="",
+        heads=[("", head) for head in (*word_heads, *metric_heads)],
+        bodies=bodies,
+        word_columns=len(word_heads),
+    )
+
+
+def _report_image(run: Run, name: str, position: str, files: Mapping[str, Path]) -> ReportImage:
+    """The page's entry on an image: pictures for the slider, and the numbers of the view in them.
+
+    Args:
+        run: the evaluation.
+        name: the image's name.
+        position: the image's place in the ranking, in words.
+        files: the slider's pictures, by name: methods, or "truth".
+    """
+    setting, view = run.view_with_largest_hole(name)
+    view_measurements = [
+        one
+        for one in run.measurements
+        if one.image == name and one.setting == setting and one.view == view
+    ]
     names = list(files)
-    left = "base" if "base" in names and len(names) > 1 else names[0]
+    left, right = _first_slider_pictures(names)
     with Image.open(files[left]) as image:
         width, height = image.size
-    data = {method: base64.b64encode(file.read_bytes()).decode() for method, file in files.items()}
-    return {
-        "name": name,
-        "position": position,
-        "setting": setting,
-        "view": view,
-        "hole": None if hole is None else f"{100 * hole:.2g} %",
-        "titles": {method: column_title(run, method) for method in names},
-        "pictures": {method: f"data:image/webp;base64,{text}" for method, text in data.items()},
-        "left": left,
-        "right": next((n for n in ("spackle", *reversed(names)) if n in names and n != left), left),
-        "width": width,
-        "height": height,
-        "table": means_table(run, shown),
-    }
 
-
-# --- plots
-
-
-class Series(NamedTuple):
-    """The points of one method in a plot."""
-
-    title: str
-    method: str  # a name in `METHODS`
-    points: Sequence[tuple[float, float]]
-    hollow: bool = False
-    line: str = "none"  # or "-" or "--", as in matplotlib
-
-
-class Plot(NamedTuple):
-    """A plot with title and texts."""
-
-    title: str
-    alt: str  # text for readers who cannot see the plot
-    address: str  # the plot as a data URL
-    note: str
-
-
-def check_matplotlib(option: str) -> None:
-    if importlib.util.find_spec("matplotlib") is None:
-        raise InputError(f"{option}: needs matplotlib: pip install 'spackle-nvs[eval]'")
-
-
-def plots_of(run: Run) -> list[Plot]:
-    """All plots that can be drawn from an evaluation's numbers."""
-    made = [scenes_plot(run, metric) for metric in SCENE_PLOTS] if run.near else [holes_plot(run)]
-    return [plot for plot in made if plot]
-
-
-def _draw(
-    title: str,
-    series: Sequence[Series],
-    x: str,
-    y: str,
-    finish: Callable[[Axes], object],
-    note: str = "",
-    height: float = HEIGHT,
-) -> Plot:
-    """Plot series as an SVG file `height` inches high, with axes titled `x` and `y`; `finish` sets scales and ticks."""
-    from matplotlib import rc_context
-    from matplotlib.figure import Figure
-
-    with rc_context(RC), warnings.catch_warnings():
-        # matplotlib warns about letters without a glyph; the browser's font has these letters.
-        warnings.simplefilter("ignore")
-        figure = Figure(figsize=(WIDTH, height), layout="constrained")
-        axes = figure.subplots()
-        for one in series:
-            color, form = METHODS[one.method].color, METHODS[one.method].marker
-            places = ([p[0] for p in one.points], [p[1] for p in one.points])
-            face = "white" if one.hollow else color
-            axes.plot(*places, form, color=color, ls=one.line, mfc=face, alpha=0.8, label=one.title)
-        axes.set(xlabel=x, ylabel=y)
-        finish(axes)
-        figure.legend(loc="outside lower left", frameon=False, ncols=1)
-        file = io.BytesIO()
-        figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None})
-    address = f"data:image/svg+xml;base64,{base64.b64encode(file.getvalue()).decode()}"
-    return Plot(title, f"{title}. {', '.join(one.title for one in series)}", address, note)
-
-
-def holes_plot(run: Run) -> Plot | None:
-    """HAR against disparity, before and after completion, with the paper's values; None if nothing was measured."""
-
-    def means(rows: Iterable[Measurement], metric: str, method: str) -> list[tuple[float, float]]:
-        chosen = (
-            row
-            for row in rows
-            if (row.method, row.metric, row.dataset) == (method, metric, run.title)
-        )
-        by_setting = {
-            float(setting): mean(values).value
-            for (setting,), values in pivot(chosen, "setting").items()
-        }
-        return [(move, value) for move, value in sorted(by_setting.items()) if value is not None]
-
-    papers, theirs = paper_rows("tab:controlled_disocclusion"), "Spackle on SHARP (paper)"
-    series = [
-        Series(
-            f"before: {run.base} alone",
-            "base",
-            means(run.rows, "har_before", run.methods[0]),
-            line="--",
-        )
-    ]
-    filling = [method for method in run.methods if method != "base"]
-    series += [
-        Series(f"after: {method_name(run, m)}", m, means(run.rows, "har", m), line="-")
-        for m in filling
-    ]
-    series.append(
-        Series("before: SHARP (paper)", "base", means(papers, "har_before", theirs), True, "--")
+    return ReportImage(
+        name=name,
+        position=position,
+        setting=setting,
+        view=view,
+        hole=_hole_share_text(view_measurements),
+        titles={picture: picture_title(run, picture) for picture in names},
+        pictures={picture: _data_url(file) for picture, file in files.items()},
+        left=left,
+        right=right,
+        width=width,
+        height=height,
+        table=means_table(run, view_measurements),
     )
-    series.append(Series(f"after: {theirs}", "spackle", means(papers, "har", theirs), True, "-"))
-    series = [one for one in series if one.points]
-    values = [value for one in series for _, value in one.points]
-    positive = [value for value in values if value > 0]
-
-    def finish(axes: Axes) -> None:
-        """Set a logarithmic y axis; if a HAR is zero, the axis is linear near zero."""
-        if len(positive) == len(values):
-            axes.set_yscale("log")
-        elif positive:
-            axes.set_yscale("symlog", linthresh=10.0 ** math.floor(math.log10(min(positive))))
-            axes.set_ylim(bottom=0)
-        axes.set_xticks(sorted({move for one in series for move, _ in one.points}))
-        axes.yaxis.set_major_formatter(lambda value, _: f"{100 * value:g} %")
-
-    title, y = "Hole Area Ratio against disparity", "HAR, share of the pixels"
-    return _draw(title, series, "disparity of the view", y, finish) if series else None
 
 
-def scenes_plot(run: Run, metric: str) -> Plot | None:
-    """A metric of each scene by each method; scenes are ranked by the method spackle, or else the last method."""
-    values = {
-        method: by_image for method in run.methods if (by_image := run.by_image(metric, method))
-    }
-    if not values:
-        return None
-    leader = "spackle" if "spackle" in values else list(values)[-1]
-    order = ranked(values[leader], metric)
-    names = [order[k] for k in evenly(len(order), SCENES)]
-    series = []
-    for method, by_image in values.items():
-        points = [
-            (by_image[name], float(row)) for row, name in enumerate(names) if name in by_image
-        ]
-        series.append(Series(method_name(run, method), method, points))
+def _first_slider_pictures(names: Sequence[str]) -> tuple[str, str]:
+    """The names of the pictures that a slider shows at first on the left and on the right.
 
-    def finish(axes: Axes) -> None:
-        axes.set_yticks(range(len(names)), [_short(name) for name in names])
-        axes.set_ylim(len(names) - 0.5, -0.5)
-
-    title, x = SCENE_PLOTS[metric]
-    some = (
-        f" {len(names)} of {len(order)} scenes, spread evenly." if len(names) < len(order) else ""
-    )
-    note = f"In the order of {METHODS[leader].title}, best first.{some}"
-    return _draw(title, series, x, "", finish, note, HEIGHT / 2 + ROW * len(names))
+    On the left is the base, on the right "spackle", or else the last picture; a single picture is
+    on both sides.
+    """
+    left = "base" if "base" in names and len(names) > 1 else names[0]
+    for name in ("spackle", *reversed(names)):
+        if name in names and name != left:
+            return left, name
+    return left, left
 
 
-def _short(name: str) -> str:
-    """Shorten a name in its middle, because names may differ at both ends."""
-    half = LETTERS // 2
-    return name if len(name) <= LETTERS else f"{name[: half - 1]}…{name[-half:]}"
+def _hole_share_text(view_measurements: Sequence[Measurement]) -> str | None:
+    """The hole's share of a view before completion, such as "4.2 %"; None if unknown."""
+    for one in view_measurements:
+        if one.metric == "har_before" and one.value is not None:
+            return f"{100 * float(one.value):.2g} %"
+    return None
+
+
+def _data_url(file: Path) -> str:
+    """A WebP file as a data URL, so that the page needs no other file."""
+    return f"data:image/webp;base64,{base64.b64encode(file.read_bytes()).decode()}"

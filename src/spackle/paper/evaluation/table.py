@@ -1,4 +1,7 @@
-"""A table of texts, written as Markdown and LaTeX; the template report.html writes it as HTML."""
+"""A table of texts, and how to write it as Markdown, LaTeX and plain lines.
+
+The template report.html writes tables as HTML.
+"""
 
 from __future__ import annotations
 
@@ -7,35 +10,51 @@ import itertools
 import re
 from collections.abc import Callable, Sequence
 
-EMPTY = ""  # a cell without a number
-NOT_RUN = "not run"  # the name of an empty row
-BEST = "**"  # put around the text of the best cell
-Cells = Sequence[str]
-Text = Callable[[float], str]
+NO_NUMBER = ""  # the entry of a table for which there is no number
+NOT_RUN = "not run"  # the name of a row that stands for results that do not exist
+BOLD_MARK = "**"  # before and after the text of the best entry of a column
+
+RowTexts = Sequence[str]  # a row of a table: a text for each column
+NumberFormat = Callable[[float], str]
 
 
 @dataclasses.dataclass(frozen=True)
 class Table:
-    """Cells under column heads of one or two levels."""
+    """Rows of texts under column heads of one or two levels."""
 
     label: str  # the label in the paper's source, if the paper has the table
     title: str
     caption: str
-    heads: Sequence[
-        tuple[str, str]
-    ]  # for each column the head of its group ("" without a group) and the column's head
-    bodies: Sequence[Sequence[Cells]]  # groups of rows, with a rule between groups
-    words: int = 1  # text columns on the left; the first of several shows a group's name in the group's first row
+    # For each column the head of its group ("" without a group), and its own head.
+    heads: Sequence[tuple[str, str]]
+    # Groups of rows, with a rule between groups.
+    bodies: Sequence[Sequence[RowTexts]]
+    # The number of columns on the left with words instead of numbers. If there are several, the
+    # first shows the group's name in the group's first row.
+    word_columns: int = 1
     notes: Sequence[str] = ()
 
 
 def _ratio(value: float) -> str:
-    """Four decimals, as in the paper; two significant digits where four decimals would show zero."""
-    return f"{value:.1e}" if 0 < value < 0.5e-4 else f"{value:.4f}"
+    """Four decimals, as in the paper; two significant digits where four decimals would show
+    zero."""
+    would_show_zero = 0 < value < 0.5e-4
+    return f"{value:.1e}" if would_show_zero else f"{value:.4f}"
 
 
-# Overheads below 10 % have two decimals: readers ask whether the overhead is below 1 %.
-TEXTS: dict[str, Text] = {
+def _overhead(value: float) -> str:
+    """A share as percent; below 10 % with two decimals, because readers ask whether it is below 1
+    %."""
+    return f"{100 * value:.2f}%" if value < 0.1 else f"{100 * value:.1f}%"
+
+
+def _rate(value: float) -> str:
+    """Three decimals; three significant digits for small values."""
+    return f"{value:.3f}" if value >= 0.1 else f"{value:.3g}"
+
+
+# How tables write numbers of different kinds.
+NUMBER_FORMATS: dict[str, NumberFormat] = {
     "count": "{:,.0f}".format,
     "hundredths": "{:,.2f}".format,
     "tenths": "{:,.1f}".format,
@@ -43,103 +62,167 @@ TEXTS: dict[str, Text] = {
     "share": lambda value: f"{100 * value:.2f}",
     "percent": lambda value: f"{100 * value:.2f}%",
     "tenths %": lambda value: f"{100 * value:.1f}%",
-    "overhead": lambda value: f"{100 * value:.2f}%" if value < 0.1 else f"{100 * value:.1f}%",
-    "rate": lambda value: f"{value:.3f}" if value >= 0.1 else f"{value:.3g}",
+    "overhead": _overhead,
+    "rate": _rate,
 }
 
 
-def mark_best(values: Sequence[float | None], texts: Sequence[str], lower: bool) -> list[str]:
-    """Make the best value's text bold, and all texts equal to that text; if all are equal, none becomes bold."""
-    known = {value: text for value, text in zip(values, texts, strict=True) if value is not None}
-    if len(set(known.values())) < 2:
+def mark_best(
+    values: Sequence[float | None], texts: Sequence[str], lower_is_better: bool
+) -> list[str]:
+    """The texts of a column's numbers, with the best number's text between ** (bold).
+
+    All texts that look like the best are marked, although their numbers may differ in digits that
+    are not shown. If all texts are equal, none is marked.
+
+    Args:
+        values: the numbers; None where there is none.
+        texts: the number's texts.
+        lower_is_better: whether the smallest number is the best.
+    """
+    text_of_value = {
+        value: text for value, text in zip(values, texts, strict=True) if value is not None
+    }
+    if len(set(text_of_value.values())) < 2:
         return list(texts)
-    best = known[min(known) if lower else max(known)]
-    return [f"{BEST}{text}{BEST}" if text == best else text for text in texts]
+
+    best_value = min(text_of_value) if lower_is_better else max(text_of_value)
+    best_text = text_of_value[best_value]
+    return [f"{BOLD_MARK}{text}{BOLD_MARK}" if text == best_text else text for text in texts]
 
 
-def groups(heads: Sequence[tuple[str, str]]) -> list[tuple[str, int]]:
-    """The name of each upper head and the number of columns below it."""
-    return [
-        (name, len(list(columns)))
-        for name, columns in itertools.groupby(heads, key=lambda head: head[0])
-    ]
+def group_widths(heads: Sequence[tuple[str, str]]) -> list[tuple[str, int]]:
+    """The upper heads of a table, each with the number of columns below it, from left to right.
+
+    `heads` has for each column the head of its group ("" without a group), and its own head.
+    """
+    neighbours = itertools.groupby(heads, key=lambda head: head[0])
+    return [(group, len(list(columns))) for group, columns in neighbours]
 
 
-def markdown(table: Table) -> str:
-    """A table in Markdown; a column's head begins with the head of its group."""
-    head = [f"{group}: {column}" if group else column for group, column in table.heads]
+def to_markdown(table: Table) -> str:
+    """A table in Markdown, with title, caption and notes; a column's head begins with its
+    group's."""
+    heads = [f"{group}: {head}" if group else head for group, head in table.heads]
     lines = [
         f"**{table.title}** (`{table.label}`). {table.caption}",
         "",
-        _row(head),
-        "|" + "---|" * len(head),
+        _markdown_row(heads),
+        "|" + "---|" * len(heads),
     ]
-    lines += [_row(cells) for rows in table.bodies for cells in rows]
-    lines += ["", *(f"- {note}" for note in table.notes)] if table.notes else []
+    lines += [_markdown_row(texts) for rows in table.bodies for texts in rows]
+
+    if table.notes:
+        lines.append("")
+        lines += [f"- {note}" for note in table.notes]
     return "\n".join(lines) + "\n"
 
 
-def plain(table: Table) -> list[str]:
+def _markdown_row(texts: RowTexts) -> str:
+    """A row of a Markdown table; vertical bars in the texts are escaped."""
+    escaped_texts = [text.replace("|", "\\|") for text in texts]
+    return "| " + " | ".join(escaped_texts) + " |"
+
+
+def to_plain_lines(table: Table) -> list[str]:
     """A table as lines for a terminal, without title and notes; numbers are right-aligned."""
     heads = [head.replace("\N{NO-BREAK SPACE}", " ") for _, head in table.heads]
-    rows = [heads, *(cells for rows in table.bodies for cells in rows)]
+    rows = [heads, *(texts for body in table.bodies for texts in body)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    sides = "<" * table.words + ">" * (len(widths) - table.words)
-    shapes = list(zip(sides, widths, strict=True))
-    return [
-        "  ".join(f"{c:{side}{wide}}" for c, (side, wide) in zip(r, shapes, strict=True)).rstrip()
-        for r in rows
-    ]
+
+    lines = []
+    for texts in rows:
+        padded_texts = []
+        for column, (text, width) in enumerate(zip(texts, widths, strict=True)):
+            is_words = column < table.word_columns
+            padded_texts.append(text.ljust(width) if is_words else text.rjust(width))
+        lines.append("  ".join(padded_texts).rstrip())
+    return lines
 
 
-def _row(cells: Cells) -> str:
-    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
-
-
-SIGNS = {
-    "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "#": r"\#", "_": r"\_", "$": r"\$", "{": r"\{", "}": r"\}",
-    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "↑": r"$\uparrow$", "↓": r"$\downarrow$", "×": r"$\times$",
-    "±": r"$\pm$", "−": "$-$", "–": "--", "…": r"\ldots{}", "σ": r"$\sigma$", "<": "$<$", ">": "$>$", "≥": r"$\geq$",
-    "†": r"$\dagger$", "‡": r"$\ddagger$", "→": r"$\to$",
+# LaTeX for characters that mean something to LaTeX, or that its fonts lack.
+LATEX_ESCAPES = {
+    "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "#": r"\#", "_": r"\_", "$": r"\$",
+    "{": r"\{", "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
+    "↑": r"$\uparrow$", "↓": r"$\downarrow$", "→": r"$\to$", "×": r"$\times$", "±": r"$\pm$",
+    "−": "$-$", "–": "--", "…": r"\ldots{}", "σ": r"$\sigma$", "<": "$<$", ">": "$>$",
+    "≥": r"$\geq$", "†": r"$\dagger$", "‡": r"$\ddagger$",
 }  # fmt: skip
 
 
-def tex(text: str) -> str:
-    """Escape text for LaTeX; characters that its fonts lack become "?", and text between ** becomes bold."""
-    safe = "".join(SIGNS.get(sign, sign if " " <= sign <= "\u017f" else "?") for sign in text)
-    return re.sub(r"\*\*(.+?)\*\*", r"\\textbf{\1}", safe)
+def escape_latex(text: str) -> str:
+    """Escape a text for LaTeX; text between ** becomes bold.
+
+    Characters that LaTeX's fonts lack become "?": all beyond Latin Extended-A.
+    """
+
+    def escape_character(character: str) -> str:
+        """LaTeX for one character."""
+        if character in LATEX_ESCAPES:
+            return LATEX_ESCAPES[character]
+        is_in_fonts = " " <= character <= "\u017f"  # the end of Latin Extended-A
+        return character if is_in_fonts else "?"
+
+    escaped_text = "".join(escape_character(character) for character in text)
+    return re.sub(r"\*\*(.+?)\*\*", r"\\textbf{\1}", escaped_text)
 
 
-def latex(table: Table, suffix: str = "") -> str:
-    """A table in LaTeX, for booktabs and graphicx; the label ends with `suffix`, and notes are below the table."""
-    shape = "l" * table.words + "c" * (len(table.heads) - table.words)
+def to_latex(table: Table, label_suffix: str = "") -> str:
+    """A table in LaTeX across both columns of a page, with its notes below.
+
+    The document needs the packages booktabs and graphicx.
+
+    Args:
+        table: the table.
+        label_suffix: the end of its label, which lets a document include several files of tables.
+    """
+    shape = "l" * table.word_columns + "c" * (len(table.heads) - table.word_columns)
     lines = [
         r"\begin{table*}[t]",
         r"\centering",
         r"\scriptsize",
-        rf"\caption{{{tex(table.caption)}}}",
-    ]
-    lines += [
-        rf"\label{{{table.label}{suffix}}}\smallskip",
+        rf"\caption{{{escape_latex(table.caption)}}}",
+        rf"\label{{{table.label}{label_suffix}}}\smallskip",
         r"\resizebox{\textwidth}{!}{",
         rf"\begin{{tabular}}{{{shape}}}",
         r"\toprule",
     ]
-    column, over, rules = 1, [], []
-    for name, count in groups(table.heads):
-        over.append(
-            rf"\multicolumn{{{count}}}{{c}}{{{tex(name)}}}" if name else " & ".join([""] * count)
-        )
-        rules += [rf"\cmidrule(lr){{{column}-{column + count - 1}}}"] if name else []
-        column += count
-    lines += [" & ".join(over) + r" \\", *rules] if rules else []
-    lines.append(" & ".join(tex(head) for _, head in table.heads) + r" \\")
+    lines += _latex_group_heads(table.heads)
+    lines.append(_latex_row([head for _, head in table.heads]))
+
     for rows in table.bodies:
-        lines += [r"\midrule", *(" & ".join(map(tex, cells)) + r" \\" for cells in rows)]
+        lines.append(r"\midrule")
+        lines += [_latex_row(texts) for texts in rows]
     lines += [r"\bottomrule", r"\end{tabular}", "}"]
-    lines += (
-        [rf"\par\smallskip\parbox{{\textwidth}}{{\tiny {tex(' '.join(table.notes))}}}"]
-        if table.notes
-        else []
-    )
-    return "\n".join([*lines, r"\end{table*}"]) + "\n"
+
+    if table.notes:
+        notes = escape_latex(" ".join(table.notes))
+        lines.append(rf"\par\smallskip\parbox{{\textwidth}}{{\tiny {notes}}}")
+    lines.append(r"\end{table*}")
+    return "\n".join(lines) + "\n"
+
+
+def _latex_row(texts: RowTexts) -> str:
+    """A row of a LaTeX table."""
+    return " & ".join(map(escape_latex, texts)) + r" \\"
+
+
+def _latex_group_heads(heads: Sequence[tuple[str, str]]) -> list[str]:
+    """The upper line of a LaTeX table's heads, and a rule below each; empty if there are no groups.
+
+    `heads` has for each column the head of its group ("" without a group), and its own head.
+    """
+    group_heads = []
+    rules = []
+    first_column = 1  # LaTeX counts columns from 1
+    for group, width in group_widths(heads):
+        if group:
+            group_heads.append(rf"\multicolumn{{{width}}}{{c}}{{{escape_latex(group)}}}")
+            rules.append(rf"\cmidrule(lr){{{first_column}-{first_column + width - 1}}}")
+        else:
+            group_heads.append(" & ".join([""] * width))  # empty columns
+        first_column += width
+
+    if not rules:
+        return []
+    return [" & ".join(group_heads) + r" \\", *rules]

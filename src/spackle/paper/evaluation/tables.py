@@ -1,416 +1,598 @@
-"""The paper's six tables and one more, made as pivots of rows; the paper's numbers stand beside ours.
+"""Fill the paper's six tables and one more with measured numbers; the paper's stand beside them.
 
-tables.json has titles, captions, columns (group, title, metric, number format) and notes.
+Read `make_tables` first. table_layouts.py says what each table shows, table_texts.py names rows
+and writes notes, table.py writes the finished tables as Markdown and LaTeX.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import statistics
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from spackle.paper.evaluation.measurements import (
-    IMAGES,
-    NEAR,
-    NOTE,
-    PAPER,
-    SETTINGS,
+    NEAR_SETTING,
     Mean,
     Measurement,
     Run,
     Value,
-    load_data,
-    mean,
-    paper_rows,
-    pivot,
+    group_values,
+    mean_of_known,
+    paper_measurements,
     setting_title,
 )
-from spackle.paper.evaluation.method_descriptions import METHODS
-from spackle.paper.evaluation.metrics import METRICS, metric_name
+from spackle.paper.evaluation.metrics import METRICS, metric_of_column
+from spackle.paper.evaluation.paper_numbers import PAPER_IMAGE_COUNTS, PAPER_SETTINGS
 from spackle.paper.evaluation.table import (
-    EMPTY,
+    NO_NUMBER,
     NOT_RUN,
-    TEXTS,
-    Cells,
+    NUMBER_FORMATS,
+    NumberFormat,
+    RowTexts,
     Table,
-    latex,
     mark_best,
-    markdown,
+    to_latex,
+    to_markdown,
 )
+from spackle.paper.evaluation.table_layouts import (
+    EXPANDED_OVERHEAD,
+    NEAR_VIEW_QUALITY,
+    OVERHEAD,
+    TABLE_LAYOUTS,
+    ColumnLayout,
+    Source,
+    TableLayout,
+)
+from spackle.paper.evaluation.table_texts import notes_of_table, shown_methods
 from spackle.runtime.errors import InputError
 from spackle.runtime.files import write_atomic
 
-FILES = ("tables.md", "tables.tex")
-TABLES, NOTES = load_data("tables.json").values()
-EFFICIENCY, EXPANDED = (
-    "tab:efficiency_gaussian_overhead",
-    "tab:expanded_efficiency_gaussian_overhead",
-)
-FROM_PAPER = " (paper)"  # the end of the method's name in the paper's rows
-# Derived metrics: a metric over a second metric of the same method, or of a third entry's method.
+MARKDOWN_FILE = "tables.md"
+LATEX_FILE = "tables.tex"
+
+PAPER_SUFFIX = " (paper)"  # the end of the method's name in the paper's rows
+DISPARITY_PATTERN = "{}: disparity {}"  # a head above columns, such as "S1: disparity 0.3"
+
+# Of these metrics tables show medians, because a busy machine makes some times far too long.
+TIME_METRICS = ("base_ms", "spackle_ms", "overhead", "base_fps", "spackle_fps")
+
+
+class Ratio(NamedTuple):
+    """A metric that is computed from the means of two others."""
+
+    numerator: str
+    denominator: str
+    denominator_method: str | None = None  # whose denominator; None: that of the row's own method
+    is_reduction: bool = False  # whether the metric is 1 minus the ratio
+
+
 RATIOS = {
-    "aux_per_cell": ("aux", "hole_cells", ""),
-    "reduction": ("har", "har_before", ""),  # 1 minus this ratio (paper, eq. 11)
-    "aux_reduction": ("aux", "aux", "dense"),  # 1 minus this ratio
+    # Added Gaussians over masked cells of 2×2 pixels.
+    "aux_per_cell": Ratio("aux", "hole_cells"),
+    # By how much completion reduces the hole area ratio (paper, eq. 11).
+    "reduction": Ratio("har", "har_before", is_reduction=True),
+    # How many Gaussians fewer than with a Gaussian for every cell.
+    "aux_reduction": Ratio("aux", "aux", denominator_method="dense", is_reduction=True),
 }
-TIMES = (
-    "base_ms",
-    "spackle_ms",
-    "overhead",
-    "base_fps",
-    "spackle_fps",
-)  # tables show medians of these
 
 
-class Column(NamedTuple):
-    """A column: a metric at a setting."""
+@dataclasses.dataclass(frozen=True)
+class Column:
+    """A column of a finished table: a metric at a setting (a camera move, or near views)."""
 
-    group: str
+    group: str  # the head above this and neighbouring columns; "" without a group
     title: str
     setting: str
     metric: str
-    text: Callable[[float], str]
-    lower: bool | None = None  # whether lower is better; None: do not mark the best
+    format: NumberFormat
+    lower_is_better: bool | None = None  # None: the best number is not marked
 
 
-Layout = tuple[list[tuple[str, str]], list[list[Cells]]]  # heads and bodies of a `Table`
-Values = Mapping[tuple[str, ...], Sequence[Value]]  # by method, setting and metric
+class DatasetRow(NamedTuple):
+    """A row of a dataset: a method's numbers, the paper's, or "not run"."""
+
+    name: str
+    image_count: str  # "20/23": 20 measured images of the paper's 23
+    texts: list[str]  # one for each column
 
 
-def make_tables(runs: Sequence[Run], *, whole: bool = False) -> list[Table]:
-    """Make the tables for which the runs have numbers; with `whole`, make all tables of the paper.
+class TableContent(NamedTuple):
+    """The heads and rows of a table, as in `Table`."""
 
-    Counts of Gaussians and times come from benchmarks; for datasets without a benchmark, counts come from large views.
+    heads: list[tuple[str, str]]
+    bodies: list[list[RowTexts]]
+
+
+# The values of measurements by (method, setting, metric).
+GroupedValues = Mapping[tuple[str, ...], Sequence[Value]]
+
+
+def make_tables(runs: Sequence[Run], *, with_unmeasured: bool = False) -> list[Table]:
+    """Make the tables for which the runs have numbers.
+
+    Counts of Gaussians and times come from benchmarks; for datasets without a benchmark, counts
+    come from evaluations of large views.
+
+    Args:
+        runs: results of `spackle evaluate` and `spackle bench`, at most one of each kind for a
+            dataset and base.
+        with_unmeasured: whether to make all tables of the paper, also those without measured
+            numbers.
 
     Raises:
-        InputError: two runs have the same dataset, protocol and base, or runs differ in their disparities.
+        InputError: two runs have the same dataset, protocol and base, or runs differ in their
+            disparities (sizes of camera moves).
     """
-    keys = [(str(run.config["protocol"]), run.title, run.base) for run in runs]
-    for protocol, title, base in keys:
-        if keys.count((protocol, title, base)) > 1:
-            raise InputError(
-                f"two results for {title} under {protocol} with the base {base}: give one of the two"
-            )
-    of = {"near": [run for run in runs if run.near]}
-    of["large"] = [run for run in runs if not run.near and not run.timed]
-    of["cost"] = [run for run in runs if run.timed]
-    of["cost"] += [run for run in of["large"] if ("bench", run.title, run.base) not in keys]
-    disparities = {tuple(run.settings) for run in runs if not run.near} or {tuple(SETTINGS)}
-    if len(disparities) > 1:
-        raise InputError("the results have different disparities: make a separate table for each")
-    layouts = {"tab:near_view": _near_table, EFFICIENCY: _overhead_table, EXPANDED: _expanded_table}
+    _check_distinct(runs)
+    runs_by_source = _runs_by_source(runs)
+    large_settings = _settings_of_large_views(runs)
+
     tables = []
-    for label, spec in TABLES.items():
-        chosen = of[spec["of"]]
-        if chosen or (whole and paper_rows(label)):
-            settings = [NEAR] if spec["of"] == "near" else [*next(iter(disparities))]
-            heads, bodies = layouts.get(label, _dataset_table)(label, spec, chosen, settings)
-            notes = [*dict.fromkeys(_notes(spec, chosen)), *spec.get("notes", ())]
-            tables.append(
-                Table(
-                    label,
-                    spec["title"],
-                    spec["caption"],
-                    heads,
-                    bodies,
-                    spec.get("words", 2),
-                    notes,
-                )
-            )
+    for layout in TABLE_LAYOUTS:
+        shown_runs = runs_by_source[layout.source]
+        is_wanted = bool(shown_runs) or (with_unmeasured and paper_measurements(layout.label))
+        if not is_wanted:
+            continue
+        settings = [NEAR_SETTING] if layout.source == "near" else large_settings
+
+        if layout is NEAR_VIEW_QUALITY:
+            content = _near_view_content(layout, shown_runs, settings)
+        elif layout is OVERHEAD:
+            content = _overhead_content(layout, shown_runs, settings)
+        elif layout is EXPANDED_OVERHEAD:
+            content = _expanded_overhead_content(layout, shown_runs, settings)
+        else:
+            content = _content_by_dataset(layout, shown_runs, settings)
+
+        table = Table(
+            label=layout.label,
+            title=layout.title,
+            caption=layout.caption,
+            heads=content.heads,
+            bodies=content.bodies,
+            word_columns=layout.word_columns,
+            notes=notes_of_table(layout, shown_runs),
+        )
+        tables.append(table)
     return tables
 
 
-def write_tables(
-    tables: Sequence[Table], folder: Path, files: Sequence[str] = FILES, suffix: str = ""
-) -> None:
-    """Write tables as Markdown and as LaTeX; labels end with `suffix`, so that a document can include several files."""
-    write_atomic(folder / files[0], "\n".join(map(markdown, tables)).encode())
-    head = "% needs \\usepackage{booktabs,graphicx}\n"
-    write_atomic(
-        folder / files[1], (head + "\n".join(latex(table, suffix) for table in tables)).encode()
-    )
-
-
-def method_name(run: Run, method: str, title: str = "") -> str:
-    """The name of a method's row: with the base's name, and ‡ unless the residual's weights were given."""
-    if method == "base":
-        return f"{run.base} alone"
-    mark = (
-        NOTES["recipe"][0]
-        if METHODS[method].uses_residual and run.config["residual"]["weights"] != "given"
-        else ""
-    )
-    return f"{title or METHODS[method].title}{mark} ({run.base})"
-
-
-def _notes(spec: Mapping[str, Any], runs: Sequence[Run]) -> list[str]:
-    """Notes below a table, some of them repeated: views, bases, rows, weights, metrics, missing images, times."""
-    names = dict.fromkeys(name for column in spec["columns"] if (name := metric_name(column[2])))
-    rows = {
-        method: spec.get("rows", {}).get(method) for run in runs for method in _row_names(spec, run)
-    }
-    notes = [
-        NOTES[run.config["second_views"] if run.near else "large"].format(**run.config)
-        for run in runs
-    ]
-    notes += [f"Base {run.base}: {run.config['base']['says']}." for run in runs]
-    said = [
-        f"{title or METHODS[method].title}: {METHODS[method].summary}"
-        for method, title in rows.items()
-    ]
-    notes += [f"Rows: {'; '.join(said)}."] if said else []
-    notes += [_residual_note(run) for run in runs]
-    notes += [f"{METRICS[name].title[:-2]}: {METRICS[name].definition}." for name in names]
+def _check_distinct(runs: Sequence[Run]) -> None:
+    """Raise an InputError if two runs would fill the same rows of a table."""
+    known_keys = set()
     for run in runs:
-        states = {name: str(run.about.get("metrics", {}).get(name)) for name in names}
-        for why in dict.fromkeys(state for state in states.values() if state.startswith(NOT_RUN)):
-            notes.append(
-                f"{', '.join(METRICS[name].title[:-2] for name in names if states[name] == why)} {why}."
+        protocol = run.config["protocol"]
+        key = (protocol, run.title, run.base_title)
+        if key in known_keys:
+            raise InputError(
+                f"two results for {run.title} under {protocol} with the base {run.base_title}: "
+                "give one of the two"
             )
-        if problems := list(run.problems):
-            listed = ", ".join([*problems[:5], *(["…"] if len(problems) > 5 else [])])
-            notes.append(
-                f"{run.title}: {len(problems)} of {len(run.images)} images could not be measured: {listed}."
-            )
-    return notes + [note for run in runs if run.timed for note in _timed_notes(run)]
+        known_keys.add(key)
 
 
-def _residual_note(run: Run) -> str:
-    residual = run.config["residual"]
-    digest = str(residual["sha256"])[:8]
-    if residual["weights"] == "given":
-        return f"Residual: given weights ({digest})."
-    shipped = f"the residual has the weights that ship with Spackle ({digest})"
-    weights = shipped if residual["sha256"] else "the residual has no weights (deltas are 0)"
-    note: str = NOTES["recipe"].format(residual=weights)
-    return note
+def _runs_by_source(runs: Sequence[Run]) -> dict[Source, list[Run]]:
+    """The runs that tables of each kind show: large views, near views, and costs.
+
+    Costs come from benchmarks. An evaluation of large views has counts of Gaussians, too, and
+    stands in for a benchmark of its dataset and base if there is none.
+    """
+    near_runs = [run for run in runs if run.is_near_view]
+    large_runs = [run for run in runs if not run.is_near_view and not run.is_benchmark]
+    benchmarks = [run for run in runs if run.is_benchmark]
+
+    benchmarked = {(run.title, run.base_title) for run in benchmarks}
+    stand_ins = [run for run in large_runs if (run.title, run.base_title) not in benchmarked]
+    return {"near": near_runs, "large": large_runs, "cost": benchmarks + stand_ins}
 
 
-def _timed_notes(run: Run) -> list[str]:
-    base, residual, hardware = run.config["base"], run.config["residual"], run.config["hardware"]
-    precision = next((row.value for row in run.rows if row.metric == f"{NOTE}precision"), None)
-    network = f"{run.base}'s network in {precision} on {base['device']}; " if precision else ""
-    network += f"residual in {residual['precision']}; " if residual["precision"] else ""
-    machine = [hardware["cpu"], f"{hardware['cores']} cores", f"{hardware['threads']} threads"]
-    machine += [hardware["gpu"]] if "gpu" in hardware else []
-    versions = ", ".join(f"{name} {version}" for name, version in run.config["versions"].items())
-    counted = {name: value / 1e6 for name, value in run.about["parameters"].items()}
-    sizes = {"base": counted["base"], "used": counted["base_used"], "residual": counted["residual"]}
-    sizes |= {"merged": counted["base"] + counted["residual"], "share": 1e8 * counted["share"]}
-    return [
-        f"Times: {network}renderer and residual on {run.config['device']}. Machine: {', '.join(machine)}; {versions}.",
-        NOTES["runs"].format(**run.config),
-        NOTES["parameters"].format(**sizes, **PAPER["parameters"]),
-    ]
+def _settings_of_large_views(runs: Sequence[Run]) -> list[str]:
+    """The settings that all runs of large views share: their disparities, as text.
+
+    Without such runs these are the paper's 0.3, 0.4, 0.5.
+
+    Raises:
+        InputError: the runs have different disparities.
+    """
+    settings = {tuple(run.settings) for run in runs if not run.is_near_view}
+    if len(settings) > 1:
+        raise InputError("the results have different disparities: make a separate table for each")
+    if not settings:
+        return list(PAPER_SETTINGS)
+    (shared_settings,) = settings
+    return list(shared_settings)
 
 
-# --- the pivots
+def write_tables(
+    tables: Sequence[Table],
+    folder: Path,
+    *,
+    markdown_file: str = MARKDOWN_FILE,
+    latex_file: str = LATEX_FILE,
+    label_suffix: str = "",
+) -> None:
+    """Write tables as Markdown and as LaTeX.
+
+    Args:
+        tables: the tables.
+        folder: an existing folder.
+        markdown_file: the name of the Markdown file.
+        latex_file: the name of the LaTeX file.
+        label_suffix: the end of each label, which lets a document include several files.
+    """
+    markdown = "\n".join(to_markdown(table) for table in tables)
+    write_atomic(folder / markdown_file, markdown.encode())
+
+    head = "% needs \\usepackage{booktabs,graphicx}\n"
+    latex = head + "\n".join(to_latex(table, label_suffix) for table in tables)
+    write_atomic(folder / latex_file, latex.encode())
 
 
-def _columns(spec: Mapping[str, Any], settings: Iterable[str], over: str = "") -> list[Column]:
-    """A table's columns, once for each setting; `over` is a pattern for the heading above a setting's columns."""
+# --- columns and numbers
+
+
+def _columns(
+    column_layouts: Sequence[ColumnLayout],
+    settings: Iterable[str],
+    *,
+    group_pattern: str = "",
+    marks_best: bool = False,
+) -> list[Column]:
+    """A table's columns, repeated for each setting.
+
+    Args:
+        column_layouts: the columns of one setting.
+        settings: disparities (sizes of camera moves) as text, or "near".
+        group_pattern: the head above the columns of a setting, a format string that gets "S1" and
+            "0.3"; if empty, each column has the head of its layout.
+        marks_best: whether the best number of a column with image metrics is bold.
+    """
     columns = []
     for setting in settings:
-        for group, title, metric, *text in spec["columns"]:
-            name, group = metric_name(metric), setting_title(setting, over) if over else group
-            best = METRICS[name].lower if name and spec.get("best") else None
-            write = TEXTS[text[0]] if text else METRICS[str(name)].text
-            columns.append(Column(group, title, setting, metric, write, best))
+        for layout in column_layouts:
+            image_metric = metric_of_column(layout.metric)
+
+            if layout.number_format is not None:
+                number_format = NUMBER_FORMATS[layout.number_format]
+            else:
+                number_format = METRICS[str(image_metric)].format
+
+            lower_is_better = None
+            if marks_best and image_metric is not None:
+                lower_is_better = METRICS[image_metric].lower_is_better
+
+            column = Column(
+                group=setting_title(setting, group_pattern) if group_pattern else layout.group,
+                title=layout.title,
+                setting=setting,
+                metric=layout.metric,
+                format=number_format,
+                lower_is_better=lower_is_better,
+            )
+            columns.append(column)
     return columns
 
 
-def _find(values: Values, method: str, setting: str, metric: str) -> Mean | None:
-    """A metric's mean, or the ratio of two means; values of whole images are valid for all methods."""
-    if known := values.get((method, setting, metric)) or values.get(("", "", metric)):
-        return mean(known, statistics.median if metric in TIMES else statistics.fmean)
+def _mean_of_metric(values: GroupedValues, method: str, setting: str, metric: str) -> Mean | None:
+    """The mean of a method's metric over the views of a setting, for an entry of a table.
+
+    Times give the median. A metric of `RATIOS` that was not measured itself gives the ratio of two
+    means. Numbers of whole images are valid for all methods and settings.
+
+    Args:
+        values: measured numbers by (method, setting, metric).
+        method: the method's name.
+        setting: a disparity as text, or "near".
+        metric: the metric's name.
+
+    Returns:
+        The mean; None if nothing was measured.
+    """
+    measured = values.get((method, setting, metric)) or values.get(("", "", metric))
+    if measured:
+        statistic = statistics.median if metric in TIME_METRICS else statistics.fmean
+        return mean_of_known(measured, statistic)
     if metric in RATIOS:
-        of, over, other = RATIOS[metric]
-        part, whole = (
-            _find(values, method, setting, of),
-            _find(values, other or method, setting, over),
-        )
-        if method != other and part and part.value is not None and whole and whole.value:
-            ratio = part.value / whole.value
-            return Mean(1 - ratio if metric.endswith("reduction") else ratio, 0)
+        return _ratio_of_means(values, method, setting, RATIOS[metric])
     return None
 
 
-def _text(found: Mean | None, column: Column, method: str) -> str:
-    """A cell: the number, and the count of views without a number; the paper's percentages keep their digits."""
-    if found is None:
-        return EMPTY
-    write = (
-        TEXTS["tenths %"]
-        if method.endswith(FROM_PAPER) and column.metric == "overhead"
-        else column.text
-    )
-    bad = f"({found.bad} NaN)" if found.bad else ""
-    return f"{EMPTY if found.value is None else write(found.value)} {bad}".strip()
+def _ratio_of_means(values: GroupedValues, method: str, setting: str, ratio: Ratio) -> Mean | None:
+    """A metric that is the ratio of two means, or 1 minus the ratio.
+
+    Args:
+        values: measured numbers by (method, setting, metric).
+        method: the name of the numerator's method.
+        setting: a disparity as text, or "near".
+        ratio: which two metrics.
+
+    Returns:
+        The ratio; None if a mean is unknown, if the denominator is 0, or if the method would be
+        compared with itself.
+    """
+    if method == ratio.denominator_method:
+        return None
+    denominator_method = ratio.denominator_method or method
+    numerator = _mean_of_metric(values, method, setting, ratio.numerator)
+    denominator = _mean_of_metric(values, denominator_method, setting, ratio.denominator)
+
+    if numerator is None or numerator.value is None:
+        return None
+    if denominator is None or not denominator.value:
+        return None
+    quotient = numerator.value / denominator.value
+    return Mean(1 - quotient if ratio.is_reduction else quotient, 0)
 
 
-def _cells(
-    rows: Iterable[Measurement], columns: Sequence[Column], methods: Sequence[str]
+def _entry_text(mean: Mean | None, column: Column, method: str) -> str:
+    """The text of a table's entry: the number, and in brackets the count of views without one."""
+    if mean is None:
+        return NO_NUMBER
+
+    # The paper's overheads keep their one decimal.
+    is_paper_overhead = method.endswith(PAPER_SUFFIX) and column.metric == "overhead"
+    number_format = NUMBER_FORMATS["tenths %"] if is_paper_overhead else column.format
+
+    number = NO_NUMBER if mean.value is None else number_format(mean.value)
+    missing = f"({mean.missing} NaN)" if mean.missing else ""
+    return f"{number} {missing}".strip()
+
+
+def _texts_of_methods(
+    measurements: Iterable[Measurement], columns: Sequence[Column], methods: Sequence[str]
 ) -> list[list[str]]:
-    """A row of texts for each method; the best of a column is marked."""
-    values, texts = pivot(rows, "method", "setting", "metric"), []
+    """For each method a list of texts, one for each column; the best of a column is marked bold."""
+    values = group_values(measurements, "method", "setting", "metric")
+
+    texts_by_column = []
     for column in columns:
-        means = {method: _find(values, method, column.setting, column.metric) for method in methods}
-        cells = [_text(found, column, method) for method, found in means.items()]
-        if column.lower is not None:
-            cells = mark_best(
-                [found.value if found else None for found in means.values()], cells, column.lower
-            )
-        texts.append(cells)
-    return [list(cells) for cells in zip(*texts, strict=True)]
+        means = [
+            _mean_of_metric(values, method, column.setting, column.metric) for method in methods
+        ]
+        texts = [
+            _entry_text(mean, column, method) for mean, method in zip(means, methods, strict=True)
+        ]
+        if column.lower_is_better is not None:
+            numbers = [None if mean is None else mean.value for mean in means]
+            texts = mark_best(numbers, texts, column.lower_is_better)
+        texts_by_column.append(texts)
+
+    return [list(texts) for texts in zip(*texts_by_column, strict=True)]
 
 
-def _row_names(spec: Mapping[str, Any], run: Run) -> dict[str, str]:
-    """The methods of a run that a table shows, with the names of their rows."""
-    if "rows" in spec:
-        return {
-            name: method_name(run, name, title)
-            for name, title in spec["rows"].items()
-            if name in run.methods
-        }
-    having = (
-        {row.method for row in run.rows if row.metric == spec["having"]} - {"base"}
-        if "having" in spec
-        else None
-    )
-    return {
-        method: method_name(run, method)
-        for method in run.methods
-        if having is None or method in having
-    }
+# --- rows
 
 
 def _datasets(runs: Sequence[Run]) -> list[str]:
-    return list(dict.fromkeys([*IMAGES, *(run.title for run in runs)]))
+    """The titles of the paper's datasets, and then those of other datasets among the runs."""
+    return list(dict.fromkeys([*PAPER_IMAGE_COUNTS, *(run.title for run in runs)]))
 
 
-def grouped(name: str, rows: Sequence[Cells]) -> list[Cells]:
-    """Prepend a column with the rows' common name in the first row."""
-    return [(EMPTY if k else name, *cells) for k, cells in enumerate(rows)]
+def prepend_group_name(name: str, rows: Sequence[RowTexts]) -> list[RowTexts]:
+    """Rows of a table with one more column on the left: the group's name, in the first row only."""
+    rows_with_name: list[RowTexts] = []
+    for texts in rows:
+        shown_name = name if not rows_with_name else NO_NUMBER
+        rows_with_name.append((shown_name, *texts))
+    return rows_with_name
 
 
-def _rows(
-    label: str,
-    spec: Mapping[str, Any],
-    runs: Sequence[Run],
+def _rows_of_dataset(
     dataset: str,
+    layout: TableLayout,
+    runs: Sequence[Run],
     columns: Sequence[Column],
-) -> list[tuple[str, str, list[str]]]:
-    """A dataset's rows, ours (or "not run") before the paper's; a row is a name, a number of images, and cells."""
+    *,
+    paper_label: str,
+) -> list[DatasetRow]:
+    """A dataset's rows: first those of the runs (or "not run"), then the paper's.
+
+    Args:
+        dataset: the dataset's title.
+        layout: the table, which says which methods have a row.
+        runs: results of all datasets.
+        columns: the table's columns of numbers.
+        paper_label: the label of the paper's table with the numbers for these columns.
+    """
     rows = []
-    for run in (run for run in runs if run.title == dataset):
-        names, of = _row_names(spec, run), f"/{IMAGES[dataset]}" if dataset in IMAGES else ""
-        lines = _cells(run.rows, columns, list(names))
-        rows += [
-            (name, f"{len(run.measured)}{of}", cells)
-            for name, cells in zip(names.values(), lines, strict=True)
-        ]
-    rows = rows or [(NOT_RUN, EMPTY, [EMPTY] * len(columns))]
-    papers = [row for row in paper_rows(label) if row.dataset == dataset]
-    for name in dict.fromkeys(row.method for row in papers):
-        cells = _cells(papers, columns, [name])[0]
-        rows += [(name, str(IMAGES[dataset]), cells)] if any(cells) else []
+    for run in runs:
+        if run.title != dataset:
+            continue
+        names = shown_methods(layout, run)
+        image_count = str(len(run.measured_images))
+        if dataset in PAPER_IMAGE_COUNTS:
+            image_count += f"/{PAPER_IMAGE_COUNTS[dataset]}"
+
+        texts_of_methods = _texts_of_methods(run.measurements, columns, list(names))
+        for name, texts in zip(names.values(), texts_of_methods, strict=True):
+            rows.append(DatasetRow(name, image_count, texts))
+    if not rows:
+        rows.append(DatasetRow(NOT_RUN, NO_NUMBER, [NO_NUMBER] * len(columns)))
+
+    published = [one for one in paper_measurements(paper_label) if one.dataset == dataset]
+    for method in dict.fromkeys(one.method for one in published):
+        (texts,) = _texts_of_methods(published, columns, [method])
+        has_numbers = any(texts)
+        if has_numbers:
+            rows.append(DatasetRow(method, str(PAPER_IMAGE_COUNTS[dataset]), texts))
     return rows
 
 
-def _dataset_table(
-    label: str, spec: Mapping[str, Any], runs: Sequence[Run], settings: Sequence[str]
-) -> Layout:
-    """A table with rows for our methods and the paper's, by dataset; the columns are repeated for each disparity."""
-    columns = _columns(spec, settings, "" if settings == [NEAR] else "{}: disparity {}")
-    heads = [
-        ("", "Dataset"),
-        ("", "Method"),
-        ("", "n"),
-        *((column.group, column.title) for column in columns),
-    ]
-    of = {dataset: _rows(label, spec, runs, dataset, columns) for dataset in _datasets(runs)}
-    return heads, [
-        grouped(dataset, [(name, n, *cells) for name, n, cells in rows])
-        for dataset, rows in of.items()
-    ]
+# --- the contents of the tables
 
 
-def _near_table(
-    label: str, spec: Mapping[str, Any], runs: Sequence[Run], settings: Sequence[str]
-) -> Layout:
-    """A table with a row for each method, and columns for each dataset."""
-    columns, titles = _columns(spec, settings), _datasets(runs)
-    ours: dict[str, dict[str, list[str]]] = {}
-    theirs: dict[str, dict[str, list[str]]] = {}
-    for title in titles:
-        for name, _, cells in _rows(label, spec, runs, title, columns):
-            if name != NOT_RUN:
-                (theirs if name.endswith(FROM_PAPER) else ours).setdefault(name, {})[title] = cells
-    empty = [EMPTY] * len(columns)
-    bodies: list[list[Cells]] = [
-        [
-            (name, *(cell for title in titles for cell in by.get(title, empty)))
-            for name, by in group.items()
-        ]
-        for group in (ours or {NOT_RUN: {}}, theirs)
-    ]
-    return [
-        ("", "Method"),
-        *((title, column.title) for title in titles for column in columns),
-    ], bodies
+def _content_by_dataset(
+    layout: TableLayout, runs: Sequence[Run], settings: Sequence[str]
+) -> TableContent:
+    """Heads and rows of a table with a group of rows for each dataset: our methods, the paper's.
 
-
-def _overhead_table(
-    label: str, spec: Mapping[str, Any], runs: Sequence[Run], settings: Sequence[str]
-) -> Layout:
-    """A table of added Gaussians, by dataset and on average; times are medians of the datasets' medians."""
-    counts = _columns(spec, settings, "{}: disparity {}")
-    of = {dataset: _rows(EXPANDED, spec, runs, dataset, counts) for dataset in _datasets(runs)}
-    bodies = [
-        grouped(dataset, [(name, *cells) for name, _, cells in rows])
-        for dataset, rows in of.items()
-    ]
-    pools: dict[str, list[Measurement]] = {}  # for each row's name, the numbers of all datasets
-    for run in runs:
-        values, names = pivot(run.rows, "method", "setting", "metric"), _row_names(spec, run)
-        for method, setting, metric in values:
-            if method in names and (found := _find(values, method, setting, metric)):
-                row = Measurement("", run.title, setting, "", names[method], metric, found.value)
-                pools.setdefault(names[method], []).append(row)
-    for row in paper_rows(label):
-        pools.setdefault(row.method, []).append(row)
-    bodies.append(
-        grouped(
-            "Average", [(name, *_cells(pool, counts, [name])[0]) for name, pool in pools.items()]
-        )
+    The columns are repeated for each setting, that is, for each size of the camera move.
+    """
+    is_near_view = list(settings) == [NEAR_SETTING]
+    columns = _columns(
+        layout.columns,
+        settings,
+        group_pattern="" if is_near_view else DISPARITY_PATTERN,
+        marks_best=layout.marks_best,
     )
-    times: list[Cells] = [("Runtime efficiency", *[EMPTY] * (1 + len(counts)))]
-    for column in spec["runtime"]:
-        columns = _columns({"columns": [column]}, settings)
-        medians = {name: _cells(pool, columns, [name])[0] for name, pool in pools.items()}
-        spread = [
-            (name, *(part for cell in cells for part in (cell, EMPTY)))
-            for name, cells in medians.items()
-        ]
-        times += grouped(column[1], spread)
-    return [("", "Dataset"), ("", "From"), *((column.group, column.title) for column in counts)], [
-        *bodies,
-        times,
-    ]
+    heads = [("", "Dataset"), ("", "Method"), ("", "n")]
+    heads += [(column.group, column.title) for column in columns]
 
-
-def _expanded_table(
-    label: str, spec: Mapping[str, Any], runs: Sequence[Run], settings: Sequence[str]
-) -> Layout:
-    """A table of counts, times and rates, with a row for each setting and method."""
     bodies = []
     for dataset in _datasets(runs):
-        rows: list[Cells] = []
+        rows = _rows_of_dataset(dataset, layout, runs, columns, paper_label=layout.label)
+        row_texts = [(row.name, row.image_count, *row.texts) for row in rows]
+        bodies.append(prepend_group_name(dataset, row_texts))
+    return TableContent(heads, bodies)
+
+
+def _near_view_content(
+    layout: TableLayout, runs: Sequence[Run], settings: Sequence[str]
+) -> TableContent:
+    """Heads and rows of a table with a row for each method, and columns for each dataset.
+
+    Our methods stand in a group above the paper's.
+    """
+    columns = _columns(layout.columns, settings, marks_best=layout.marks_best)
+    datasets = _datasets(runs)
+    heads = [("", "Method")]
+    heads += [(dataset, column.title) for dataset in datasets for column in columns]
+
+    # For each method's name the texts of its columns, by dataset.
+    measured_rows: dict[str, dict[str, list[str]]] = {}
+    paper_rows: dict[str, dict[str, list[str]]] = {}
+    for dataset in datasets:
+        for row in _rows_of_dataset(dataset, layout, runs, columns, paper_label=layout.label):
+            if row.name == NOT_RUN:
+                continue
+            rows = paper_rows if row.name.endswith(PAPER_SUFFIX) else measured_rows
+            rows.setdefault(row.name, {})[dataset] = row.texts
+    if not measured_rows:
+        measured_rows[NOT_RUN] = {}
+
+    no_numbers = [NO_NUMBER] * len(columns)
+    bodies: list[list[RowTexts]] = []
+    for rows in (measured_rows, paper_rows):
+        body: list[RowTexts] = []
+        for name, texts_by_dataset in rows.items():
+            row_texts = [name]
+            for dataset in datasets:
+                row_texts += texts_by_dataset.get(dataset, no_numbers)
+            body.append(row_texts)
+        bodies.append(body)
+    return TableContent(heads, bodies)
+
+
+def _overhead_content(
+    layout: TableLayout, runs: Sequence[Run], settings: Sequence[str]
+) -> TableContent:
+    """Heads and rows of the table of costs: added Gaussians by dataset and on average, then times.
+
+    Each setting (size of the camera move) has the same columns. Times are medians of the datasets'
+    medians; each stands in the first column of its setting.
+    """
+    columns = _columns(layout.columns, settings, group_pattern=DISPARITY_PATTERN)
+    heads = [("", "Dataset"), ("", "From")]
+    heads += [(column.group, column.title) for column in columns]
+
+    bodies = []
+    for dataset in _datasets(runs):
+        # The paper's numbers for single datasets stand in its expanded table.
+        rows = _rows_of_dataset(dataset, layout, runs, columns, paper_label=EXPANDED_OVERHEAD.label)
+        bodies.append(prepend_group_name(dataset, [(row.name, *row.texts) for row in rows]))
+
+    means = _means_of_datasets(layout, runs)
+    average_rows = []
+    for name, measurements in means.items():
+        (texts,) = _texts_of_methods(measurements, columns, [name])
+        average_rows.append((name, *texts))
+    bodies.append(prepend_group_name("Average", average_rows))
+
+    bodies.append(_time_rows(layout, settings, means))
+    return TableContent(heads, bodies)
+
+
+def _means_of_datasets(layout: TableLayout, runs: Sequence[Run]) -> dict[str, list[Measurement]]:
+    """For each row's name the means of all metrics of each dataset, as measurements.
+
+    Averages over datasets are computed from these, so that each dataset counts once, whatever its
+    number of images. The paper's averages are added as they are.
+    """
+    means: dict[str, list[Measurement]] = {}
+    for run in runs:
+        names = shown_methods(layout, run)
+        values = group_values(run.measurements, "method", "setting", "metric")
+        for method, setting, metric in values:
+            if method not in names:
+                continue
+            mean = _mean_of_metric(values, method, setting, metric)
+            if mean is not None:
+                name = names[method]
+                measurement = Measurement(
+                    dataset="",
+                    image=run.title,
+                    setting=setting,
+                    view="",
+                    method=name,
+                    metric=metric,
+                    value=mean.value,
+                )
+                means.setdefault(name, []).append(measurement)
+
+    for measurement in paper_measurements(layout.label):
+        means.setdefault(measurement.method, []).append(measurement)
+    return means
+
+
+def _time_rows(
+    layout: TableLayout, settings: Sequence[str], means: Mapping[str, Sequence[Measurement]]
+) -> list[RowTexts]:
+    """The rows of times below a table of costs: a heading, and for each kind of time the methods.
+
+    Args:
+        layout: the table; each setting has a column for each of `layout.columns`.
+        settings: disparities (sizes of camera moves), as text.
+        means: for each row's name the numbers of all datasets.
+    """
+    count_columns = len(layout.columns) * len(settings)
+    rows: list[RowTexts] = [("Runtime efficiency", *[NO_NUMBER] * (1 + count_columns))]
+
+    for time_column in layout.time_columns:
+        columns = _columns([time_column], settings)  # one for each setting
+        rows_of_methods = []
+        for name, measurements in means.items():
+            (texts,) = _texts_of_methods(measurements, columns, [name])
+
+            # A setting has several columns of counts; the time stands in the first.
+            row_texts = [name]
+            for text in texts:
+                row_texts.append(text)
+                row_texts += [NO_NUMBER] * (len(layout.columns) - 1)
+            rows_of_methods.append(row_texts)
+        rows += prepend_group_name(time_column.title, rows_of_methods)
+    return rows
+
+
+def _expanded_overhead_content(
+    layout: TableLayout, runs: Sequence[Run], settings: Sequence[str]
+) -> TableContent:
+    """Heads and rows of the table of counts, times and rates.
+
+    A dataset's group has rows for each setting (size of the camera move), and of these one for each
+    method.
+    """
+    titles = ["Dataset", "Setting", "From", *(column.title for column in layout.columns), "n"]
+    heads = [("", title) for title in titles]
+
+    bodies = []
+    for dataset in _datasets(runs):
+        group: list[RowTexts] = []
         for setting in settings:
-            lines = _rows(label, spec, runs, dataset, _columns(spec, [setting]))
-            rows += [(setting_title(setting), name, *cells, n) for name, n, cells in lines]
-        bodies.append(grouped(dataset, rows))
-    return [
-        ("", head) for head in ("Dataset", "Setting", "From", *(c[1] for c in spec["columns"]), "n")
-    ], bodies
+            columns = _columns(layout.columns, [setting])
+            rows = _rows_of_dataset(dataset, layout, runs, columns, paper_label=layout.label)
+            for row in rows:
+                group.append((setting_title(setting), row.name, *row.texts, row.image_count))
+        bodies.append(prepend_group_name(dataset, group))
+    return TableContent(heads, bodies)

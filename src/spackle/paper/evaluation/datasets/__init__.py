@@ -1,97 +1,109 @@
-"""The paper's six evaluation datasets, and the search for their scenes in a folder."""
+"""The datasets of the evaluation, and the search for their scenes in a folder.
+
+To add a dataset: write a file in this folder that defines an `EvalDataset` (dataset.py says what
+that is; eth3d.py is the shortest), and add a line to `_ALL_DATASETS` below.
+"""
 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 from spackle.paper.evaluation.case import Case
-from spackle.paper.evaluation.datasets import posed_photos, stereo
-from spackle.paper.evaluation.measurements import load_data
+from spackle.paper.evaluation.datasets.booster import BOOSTER
+from spackle.paper.evaluation.datasets.dataset import EvalDataset
+from spackle.paper.evaluation.datasets.eth3d import ETH3D
+from spackle.paper.evaluation.datasets.llff import LLFF
+from spackle.paper.evaluation.datasets.middlebury import MIDDLEBURY
+from spackle.paper.evaluation.datasets.tanks import TANKS
+from spackle.paper.evaluation.datasets.wildrgbd import WILDRGBD
 from spackle.runtime.errors import InputError
 
 __all__ = ["DATASETS", "EvalDataset", "read_cases"]
 
+# The paper's six datasets, in the order of its tables. A further dataset is a further line here.
+_ALL_DATASETS = (
+    MIDDLEBURY,
+    BOOSTER,
+    WILDRGBD,
+    TANKS,
+    ETH3D,
+    LLFF,
+)
+DATASETS: dict[str, EvalDataset] = {dataset.name: dataset for dataset in _ALL_DATASETS}
 
-@dataclasses.dataclass(frozen=True)
-class EvalDataset:
-    """The description of a dataset in its official layout (datasets.json)."""
-
-    name: str  # for --dataset
-    cases: Callable[
-        [Mapping[str, Path]], list[Case]
-    ]  # from scene names to folders; InputError for bad files
-    title: str  # the name in the paper's tables
-    terms: str  # terms of use, in a few words
-    markers: Sequence[str]  # a folder is a scene if it holds one of these files or folders
-    expected: str  # the files of a scene, for messages
-    skip: Sequence[str] = ()  # names of folders without ground truth, or with the same photos again
-
-
-_READERS = {
-    "middlebury": stereo.middlebury_cases,
-    "booster": stereo.booster_cases,
-    "wildrgbd": posed_photos.wildrgbd_cases,
-    "tanks": posed_photos.tanks_cases,
-    "eth3d": posed_photos.eth3d_cases,
-    "llff": posed_photos.llff_cases,
-}
-# In the order of the paper's tables.
-DATASETS = {
-    name: EvalDataset(name, _READERS[name], **facts)
-    for name, facts in load_data("datasets.json").items()
-}
-MAX_DEPTH = 4  # of scenes below the root; the deepest official layout is root/train/balanced/SCENE
+# How many levels of folders below the root are searched for scenes; the deepest published layout is
+# root/train/balanced/SCENE.
+MAX_SCENE_DEPTH = 4
 
 
 def read_cases(name: str, root: Path) -> list[Case]:
-    """All cases of a dataset at or below `root`, in an order that depends on names alone.
+    """All cases (input photos with what is known about them) of a dataset's scenes in a folder.
+
+    Args:
+        name: a key of `DATASETS`.
+        root: the folder of the unpacked dataset, or a folder of it.
+
+    Returns:
+        The cases, in an order that depends on names alone.
 
     Raises:
-        InputError: there is no such folder, no scene (the message names the expected files) or no photo; two scenes
-            have the same name; or a scene's files are missing or damaged.
+        InputError: there is no such folder, no scene (the message names the expected files) or no
+            photo; two scenes have the same name; or a scene's files are missing or damaged.
     """
     dataset = DATASETS[name]
     if not root.is_dir():
         raise InputError(f"{root}: no such folder: give the folder of the unpacked dataset {name}")
-    if root.name in ("", ".."):  # a scene is named after its folder
+    if root.name in ("", ".."):  # scenes are named after folders, so the path must end with a name
         root = root.resolve()
-    folders = sorted(_scenes(root, dataset), key=lambda folder: (folder.name, folder.as_posix()))
+
+    folders = sorted(
+        _scene_folders(root, dataset), key=lambda folder: (folder.name, folder.as_posix())
+    )
     if not folders:
         raise InputError(
             f"{root}: no scene of {name} in this folder or below: expected {dataset.expected}"
         )
+
     scenes: dict[str, Path] = {}
     for folder in folders:
-        scene = posed_photos.category_and_scene(folder) if name == "wildrgbd" else folder.name
-        other = scenes.setdefault(scene, folder)
-        if other is not folder:
+        scene = dataset.scene_name(folder)
+        if scene in scenes:
             raise InputError(
-                f"{folder}: same scene name as {other}: give a folder with a single size or part"
+                f"{folder}: same scene name as {scenes[scene]}: give a folder with a single size "
+                "or part"
             )
-    if not (cases := dataset.cases(scenes)):
+        scenes[scene] = folder
+
+    cases = dataset.read_cases(scenes)
+    if not cases:
         raise InputError(
             f"{root}: the scenes of {name} have no photos with a pose: unpack the dataset again"
         )
     return cases
 
 
-def _scenes(folder: Path, dataset: EvalDataset, depth: int = MAX_DEPTH) -> Iterator[Path]:
-    """The scene folders at or below a folder; folders inside a scene are skipped."""
+def _scene_folders(
+    folder: Path, dataset: EvalDataset, depth: int = MAX_SCENE_DEPTH
+) -> Iterator[Path]:
+    """The folders of scenes at or below a folder; nothing is searched inside a scene.
+
+    Args:
+        folder: where to search.
+        dataset: says what a scene's folder holds, and which folders are not searched.
+        depth: how many levels of folders below `folder` are searched.
+    """
     if any((folder / marker).exists() for marker in dataset.markers):
         yield folder
-    elif depth:
-        with (
-            contextlib.suppress(OSError),
-            os.scandir(folder) as entries,
-        ):  # the folder may be unreadable
-            for entry in entries:
-                if (
-                    entry.is_dir()
-                    and not entry.name.startswith(".")
-                    and entry.name not in dataset.skip
-                ):
-                    yield from _scenes(folder / entry.name, dataset, depth - 1)
+        return
+    if depth == 0:
+        return
+
+    # A folder that cannot be read has no scenes.
+    with contextlib.suppress(OSError), os.scandir(folder) as entries:
+        for entry in entries:
+            is_hidden = entry.name.startswith(".")
+            if entry.is_dir() and not is_hidden and entry.name not in dataset.skipped_folders:
+                yield from _scene_folders(folder / entry.name, dataset, depth - 1)

@@ -1,0 +1,248 @@
+"""An opened evaluation: the cases of a dataset, and the networks and metrics that all cases
+share."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import spackle
+from spackle.bases import BasePrediction
+from spackle.bases.depth import RgbdBase
+from spackle.bases.open import OpenedBase, open_base, wrap_loaded_base
+from spackle.inpaint import Inpainter, InpainterOptions, get_inpainter
+from spackle.paper.evaluation.case import Case, LoadedCase, SecondView, known_depth
+from spackle.paper.evaluation.datasets import DATASETS, read_cases
+from spackle.paper.evaluation.datasets.multiview import evenly_spaced_items
+from spackle.paper.evaluation.metric_suite import MetricSuite
+from spackle.paper.evaluation.metrics import DEFAULT_METRICS, METRICS
+from spackle.paper.evaluation.options import EvaluateOptions
+from spackle.paper.evaluation.published_metrics import PUBLISHED_METRICS, open_published_metrics
+from spackle.paper.evaluation.table import NOT_RUN
+from spackle.paper.training.feature_networks import load_features
+from spackle.pipeline import FillOptions
+from spackle.render import Renderer, get_renderer
+from spackle.residual import ResidualNet
+from spackle.runtime.device import pick_dtype
+from spackle.runtime.digests import json_digest
+from spackle.scene_fill import FillContext
+from spackle.weights import weights_digest, weights_digests
+
+OWN_METRIC = "own"  # how a metric is measured that no other package measures
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Evaluation:
+    """A dataset's cases (photos with what is known about them), and the objects that all cases
+    share."""
+
+    options: EvaluateOptions
+    cases: Sequence[Case]
+    base: OpenedBase  # turns photos into Gaussians; `base_of_case` is the one to use
+    tuned_base: OpenedBase | None  # for the method direct-ft
+    network: ResidualNet | None  # makes the Gaussians that are added
+    inpainter: Inpainter | None  # for the method inpaint2d
+    renderer: Renderer
+    suite: MetricSuite
+    # Everything that determines the renders, ready for JSON, without paths.
+    config: dict[str, Any]
+    # For each chosen metric what measures it, or "not run" and the reason.
+    metric_states: dict[str, str]
+
+    def base_of_case(self, loaded: LoadedCase) -> OpenedBase:
+        """The base that makes a case's Gaussians: a network, or else the case's own depth or
+        points.
+
+        Raises:
+            InputError: the base is no network, and the case has neither depth nor points.
+        """
+        if self.options.base.uses_network:
+            return self.base
+        return wrap_loaded_base(RgbdBase(known_depth(loaded.case)))
+
+    def fill_context(self, prediction: BasePrediction) -> FillContext:
+        """What the methods need for filling the holes in views of a predicted scene."""
+        return FillContext(
+            prediction.gaussians,
+            prediction.camera,
+            self.renderer,
+            self.network,
+            precision=self.options.base.precision,
+        )
+
+
+def open_evaluation(options: EvaluateOptions, earlier_metrics: Sequence[str] = ()) -> Evaluation:
+    """Check the options, and open the dataset, networks and metrics.
+
+    The base's network is loaded later, with the first image.
+
+    Args:
+        options: what to evaluate.
+        earlier_metrics: metrics that an earlier run has measured; they are measured besides the
+            options' metrics, so that a resumed run loses none.
+
+    Raises:
+        InputError: an option, the dataset, weights or a package cannot be used.
+    """
+    options.check()
+    cases = _cases_to_evaluate(options)
+    network = FillOptions(residual=options.residual).load_network()
+
+    inpainter = None
+    if "inpaint2d" in options.methods:
+        inpainter_options = InpainterOptions(device=options.device.type)
+        inpainter = get_inpainter(options.inpainter, inpainter_options)
+
+    tuned_base = None
+    if options.direct_ft is not None:
+        tuned_base = open_base(dataclasses.replace(options.base, checkpoint=options.direct_ft))
+
+    suite, metric_states = _open_metrics(options, earlier_metrics)
+    renderer = get_renderer(options.base.device)
+    return Evaluation(
+        options=options,
+        cases=cases,
+        base=open_base(options.settings_of_base),
+        tuned_base=tuned_base,
+        network=network,
+        inpainter=inpainter,
+        renderer=renderer,
+        suite=suite,
+        config=_configuration(options, cases, inpainter, renderer),
+        metric_states=metric_states,
+    )
+
+
+def _cases_to_evaluate(options: EvaluateOptions) -> list[Case]:
+    """The dataset's cases, at most `options.limit`, each with the second photos to compare with.
+
+    InputError if the dataset's files cannot be used.
+    """
+    cases = read_cases(options.dataset, options.root)
+    if options.limit is not None and options.limit < len(cases):
+        cases = evenly_spaced_items(cases, options.limit)
+
+    chosen_cases = []
+    for case in cases:
+        if not options.is_near_view:
+            second_views: tuple[SecondView, ...] = ()
+        elif options.second_views == "nearest":
+            second_views = tuple(view for view in case.second_views if view.is_among_nearest)
+        else:
+            second_views = case.second_views
+        chosen_cases.append(dataclasses.replace(case, second_views=second_views))
+    return chosen_cases
+
+
+def _open_metrics(
+    options: EvaluateOptions, earlier_metrics: Sequence[str]
+) -> tuple[MetricSuite, dict[str, str]]:
+    """Load the metrics of an evaluation.
+
+    Args:
+        options: which metrics, and the weights that some need.
+        earlier_metrics: further metrics, which an earlier run has measured.
+
+    Returns:
+        suite: the metrics, ready to use.
+        states: for each metric what measures it, or "not run" and the reason.
+    """
+    chosen = DEFAULT_METRICS[options.protocol] if options.metrics is None else options.metrics
+    chosen = [*chosen, *earlier_metrics]
+    names = tuple(name for name in METRICS if name in chosen)  # in the order of the tables
+    published_names = [name for name in names if name in PUBLISHED_METRICS]
+
+    features = None
+    if options.features is not None:
+        features = load_features("squeezenet", options.features)
+
+    published, published_states = open_published_metrics(
+        published_names, options.device.type, options.download_metrics
+    )
+    states = dict.fromkeys(names, OWN_METRIC) | published_states
+    if "distance" in names:
+        if options.features is None:
+            states["distance"] = f"{NOT_RUN}: weights: give SqueezeNet's with `features` FILE"
+        else:
+            digest_start = weights_digest(options.features)[:16]
+            states["distance"] = f"{OWN_METRIC}, weights {digest_start}"
+    return MetricSuite(names, published, features), states
+
+
+def _configuration(
+    options: EvaluateOptions,
+    cases: Sequence[Case],
+    inpainter: Inpainter | None,
+    renderer: Renderer,
+) -> dict[str, Any]:
+    """Everything that determines the renders, ready for JSON, without paths.
+
+    A later run in the same folder must have the same configuration; tables and reports show it.
+
+    Args:
+        options: what is evaluated.
+        cases: the dataset's cases; their number and names are recorded.
+        inpainter: of the method inpaint2d.
+        renderer: its device is recorded.
+    """
+    dataset = DATASETS[options.dataset]
+    names_digest = json_digest([case.name for case in cases])
+
+    direct_ft = None
+    if options.direct_ft is not None:
+        direct_ft = weights_digest(options.direct_ft)
+
+    config: dict[str, Any] = {
+        "kind": "evaluate",
+        "spackle": spackle.__version__,
+        "dataset": dataset.name,
+        "title": dataset.title,
+        "terms": dataset.terms,
+        "images": {"count": len(cases), "limit": options.limit, "names": names_digest},
+        "protocol": options.protocol,
+        "side": options.max_side,
+        "disparities": None if options.is_near_view else list(options.disparities),
+        "second_views": options.second_views if options.is_near_view else None,
+        "base": _base_configuration(options),
+        "device": renderer.device.type,  # of the renderer, the residual and the base's network
+        "methods": list(options.methods),
+        "residual": _residual_configuration(options, renderer),
+        "direct_ft": direct_ft,
+    }
+    if inpainter is not None:
+        weights = {name: weights_digest(file) for name, file in inpainter.weight_files.items()}
+        config["inpainter"] = {
+            "name": inpainter.name,
+            "version": inpainter.version,
+            "weights": weights,
+        }
+    return config
+
+
+def _base_configuration(options: EvaluateOptions) -> dict[str, Any]:
+    """What config.json records about the base, the network or depth map that makes the
+    Gaussians."""
+    base = options.base
+    return {
+        "name": base.public_name,
+        "title": "SHARP" if base.resolved_name == "sharp" else base.public_name,
+        "says": base.description,
+        "weights": weights_digests(base.model_files),
+        "precision": base.precision,
+    }
+
+
+def _residual_configuration(options: EvaluateOptions, renderer: Renderer) -> dict[str, Any]:
+    """What config.json records about the residual network: source and digest of weights,
+    precision."""
+    weights_file = FillOptions(residual=options.residual).weights_file
+    if weights_file is None:
+        return {"weights": "seeds", "sha256": None, "precision": None}
+
+    dtype = pick_dtype(options.base.precision, renderer.device)
+    return {
+        "weights": "shipped" if options.residual is None else "given",
+        "sha256": weights_digest(weights_file),
+        "precision": str(dtype).removeprefix("torch."),
+    }

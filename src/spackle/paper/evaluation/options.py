@@ -1,0 +1,194 @@
+"""The options of `spackle evaluate` and `spackle bench`."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+import torch
+
+from spackle.bases.settings import BaseSettings
+from spackle.core.photo import MAX_WORKING_SIDE_PX
+from spackle.core.trajectories import MAX_DISPARITY
+from spackle.paper.evaluation.datasets import DATASETS
+from spackle.paper.evaluation.method_descriptions import METHODS
+from spackle.paper.evaluation.metrics import METRICS
+from spackle.paper.evaluation.paper_numbers import PAPER_DISPARITIES
+from spackle.runtime.device import pick_device
+from spackle.runtime.errors import InputError, check_name
+from spackle.runtime.plugins import load_plugin
+
+Protocol = Literal["large-view", "near-view"]
+SecondViews = Literal["all", "nearest"]
+
+# Long side of the paper's large views. That it is not 1536, as of near views, follows from the
+# paper's counts of added Gaussians: they are (1280 / 1536)² of the masked cells that views of
+# 1536 would have.
+LARGE_VIEW_SIDE_PX = 1280
+
+PAPER_BASE = BaseSettings(name="sharp")
+TIMED_METHODS = ("paper", "spackle")  # the methods that `spackle bench` times
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class EvaluateOptions:
+    """The options of `spackle evaluate`.
+
+    A method is one way to render new views of a photo; the base is the network (or depth map)
+    that turns the photo into Gaussians, from which all methods start. Some methods add Gaussians
+    with the residual network.
+    """
+
+    dataset: str  # a key of `DATASETS`
+    root: Path  # the folder of the unpacked dataset
+    # "large-view": camera moves to the left and right; "near-view": viewpoints of second photos.
+    protocol: Protocol = "large-view"
+    # Keys of `METHODS`, or `package.module:Name` for a function of (cameras, context) that returns
+    # a function like those in methods.py.
+    methods: Sequence[str] = ("base", "paper", "spackle")
+    disparities: Sequence[float] = PAPER_DISPARITIES  # sizes of the camera moves of large views
+    metrics: Sequence[str] | None = None  # keys of `METRICS`; None: all of the protocol
+    base: BaseSettings = PAPER_BASE  # precision and device also apply to the residual network
+    residual: str | None = None  # a file of weights, or "seeds"; None: the shipped weights, if any
+    direct_ft: Path | None = None  # weights of the method direct-ft
+    inpainter: str = "opencv"  # of the method inpaint2d
+    features: Path | None = None  # SqueezeNet's weights, for the metric distance
+    second_views: SecondViews = "all"  # which second photos of a case near views use
+    # Long side of the views, in pixels; None: the paper's, 1280 for large views, 1536 for near
+    # ones.
+    side: int | None = None
+    limit: int | None = None  # the number of images, spread over the dataset; None: all
+    download_metrics: bool = False  # whether pyiqa may fetch the weights of metrics
+
+    @property
+    def is_near_view(self) -> bool:
+        """Whether the views are at the viewpoints of second photos, and are compared with these."""
+        return self.protocol == "near-view"
+
+    @property
+    def max_side(self) -> int:
+        """The long side of the views, in pixels."""
+        if self.side is not None:
+            return self.side
+        return MAX_WORKING_SIDE_PX if self.is_near_view else LARGE_VIEW_SIDE_PX
+
+    @property
+    def device(self) -> torch.device:
+        """The device of networks."""
+        name = None if self.base.device == "auto" else self.base.device
+        return pick_device(name)
+
+    @property
+    def settings_of_base(self) -> BaseSettings:
+        """The base's settings, without a precision if the base has no such option.
+
+        The precision then applies to the residual network alone.
+        """
+        lacks_precision = self.base.resolved_name in ("rgbd", "lite")
+        if lacks_precision:
+            return dataclasses.replace(self.base, precision="auto")
+        return self.base
+
+    def check(self) -> None:
+        """Raise an InputError if an option cannot be used; the dataset's files are not read."""
+        check_name("dataset", self.dataset, DATASETS)
+        self._check_methods()
+        self._check_metrics()
+        self.settings_of_base.check(allow_auto=False)
+        if self.residual == "none":
+            raise InputError("`residual` none: leaves the holes open: give `methods` base instead")
+        self._check_disparities()
+
+    def _check_methods(self) -> None:
+        """Raise an InputError if a method is unknown, or lacks its weights."""
+        if not self.methods:
+            raise InputError(f"`methods`: none is given: choose from {', '.join(METHODS)}")
+        for method in self.methods:
+            if ":" in method:
+                load_plugin(method, "methods")
+            else:
+                check_name("methods", method, METHODS)
+
+        has_tuned_base = self.base.name == "sharp" and self.direct_ft is not None
+        if "direct-ft" in self.methods and not has_tuned_base:
+            raise InputError(
+                "`methods` direct-ft: is SHARP after further training: add `base` sharp, and "
+                "`direct_ft` FILE with the weights of `spackle train` for the method direct-ft"
+            )
+
+    def _check_metrics(self) -> None:
+        """Raise an InputError if a metric is unknown, or needs true pictures of the views."""
+        for metric in self.metrics or ():
+            check_name("metrics", metric, METRICS)
+            if METRICS[metric].needs_true_picture and not self.is_near_view:
+                raise InputError(
+                    f"`metrics` {metric}: needs a true second view: add `protocol` near-view"
+                )
+
+    def _check_disparities(self) -> None:
+        """Raise an InputError if a size of the camera move is impossible, or none is given."""
+        if not self.disparities:
+            raise InputError("`disparity`: give at least one number")
+        for disparity in self.disparities:
+            is_possible = 0 < disparity <= MAX_DISPARITY  # false for NaN
+            if not is_possible:
+                raise InputError(
+                    f"`disparity` {disparity:g}: must be above 0 and up to {MAX_DISPARITY:g}"
+                )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class BenchOptions:
+    """The options of `spackle bench`, which counts added Gaussians and measures times."""
+
+    dataset: str  # a key of `DATASETS`
+    root: Path  # the folder of the unpacked dataset
+    disparities: Sequence[float] = PAPER_DISPARITIES  # sizes of the camera moves
+    base: BaseSettings = PAPER_BASE  # turns photos into Gaussians
+    residual: str | None = None  # a file of weights, or "seeds"; None: the shipped weights, if any
+    side: int | None = None  # long side of the views, in pixels; None: 1280, as in the paper
+    limit: int | None = None  # the number of images, spread over the dataset; None: all
+    runs: int = 5  # how often each stage after the base is timed
+    base_runs: int | None = None  # how often the base is timed; None: see `timed_runs_of_base`
+
+    @property
+    def timed_runs_of_base(self) -> int:
+        """How often the base is timed: unless given, once for SHARP, which is slow, else `runs`
+        times."""
+        if self.base_runs is not None:
+            return self.base_runs
+        return 1 if self.base.resolved_name == "sharp" else self.runs
+
+    @property
+    def as_evaluation(self) -> EvaluateOptions:
+        """The options of an evaluation that opens the same dataset, base and residual network."""
+        return EvaluateOptions(
+            dataset=self.dataset,
+            root=self.root,
+            methods=TIMED_METHODS,
+            disparities=self.disparities,
+            metrics=(),
+            base=self.base,
+            residual=self.residual,
+            side=self.side,
+            limit=self.limit,
+        )
+
+
+def split_words(text: str) -> tuple[str, ...]:
+    """The words of a text such as "a, b,c", without repetitions."""
+    words = [word.strip() for word in text.split(",")]
+    return tuple(dict.fromkeys(word for word in words if word))
+
+
+def parse_disparities(text: str) -> tuple[float, ...]:
+    """The numbers of a text such as "0.3,0.4", without repetitions; InputError for other texts."""
+    try:
+        numbers = [float(word) for word in split_words(text)]
+    except ValueError as error:
+        raise InputError(
+            f"`disparity` {text}: not numbers: give numbers with commas, such as 0.3,0.4,0.5"
+        ) from error
+    return tuple(dict.fromkeys(numbers))

@@ -1,0 +1,287 @@
+"""The plots of a report, drawn by matplotlib as SVG: holes against disparity, and numbers scene
+by scene.
+
+matplotlib is optional (pip install 'spackle-nvs[eval]'); this is the only file that imports it.
+"""
+
+from __future__ import annotations
+
+import base64
+import importlib.util
+import io
+import math
+import warnings
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from spackle.paper.evaluation.measurements import (
+    Measurement,
+    Run,
+    group_values,
+    mean_of_known,
+    paper_measurements,
+)
+from spackle.paper.evaluation.method_descriptions import describe_method
+from spackle.paper.evaluation.pictures import best_first, evenly_spaced_indices
+from spackle.paper.evaluation.table_layouts import HOLE_AREA
+from spackle.paper.evaluation.table_texts import method_row_name
+from spackle.runtime.errors import InputError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes as Axes
+
+MATPLOTLIB_SETTINGS: Any = {
+    "svg.fonttype": "none",  # keep text as text
+    "svg.hashsalt": "spackle",  # makes bytes reproducible
+    "text.parse_math": False,  # a $ in a scene's name is no formula
+    "font.family": "sans-serif",
+    "font.size": 9,
+    "axes.grid": True,
+    "grid.color": "#d5d9de",
+    "lines.markersize": 5,
+}
+PLOT_WIDTH_INCHES = 4.6  # about as wide as a phone
+PLOT_HEIGHT_INCHES = 3.4
+SCENE_HEIGHT_INCHES = 0.21  # of a scene's row in a plot scene by scene
+MAX_PLOTTED_SCENES = 30
+MAX_NAME_LETTERS = 14  # of a scene's name beside a plot
+
+PAPER_METHOD = "Spackle on SHARP (paper)"  # the paper's row name in its table of hole areas
+
+# The plots of near views: for each metric the titles of the plot and of its x axis.
+SCENE_PLOTS = {
+    "psnr_hole": ("PSNR in the hole, scene by scene", "PSNR (dB), higher is better"),
+    "distance": ("Distance in the hole, scene by scene", "distance (0 to 8), lower is better"),
+}
+
+Point = tuple[float, float]  # x and y
+
+
+class Series(NamedTuple):
+    """The points of one method in a plot; a method is one way to render new views of a photo."""
+
+    title: str
+    method: str  # gives the color and the shape of the markers
+    points: Sequence[Point]
+    is_hollow: bool = False  # whether the markers are filled with white
+    line_style: str = "none"  # or "-" or "--", as in matplotlib
+
+
+class Plot(NamedTuple):
+    """A finished plot with its texts."""
+
+    title: str
+    alt_text: str  # for readers who cannot see the plot
+    address: str  # the SVG image as a data URL
+    note: str
+
+
+def check_matplotlib(option: str) -> None:
+    """Raise an InputError that names `option`, which needs matplotlib, if it is not installed."""
+    if importlib.util.find_spec("matplotlib") is None:
+        raise InputError(f"{option}: needs matplotlib: pip install 'spackle-nvs[eval]'")
+
+
+def plots_of_run(run: Run) -> list[Plot]:
+    """All plots that can be drawn from an evaluation's numbers.
+
+    Evaluations against second photos have plots scene by scene, those of large camera moves a plot
+    of the area of holes.
+    """
+    if run.is_near_view:
+        plots = [scenes_plot(run, metric) for metric in SCENE_PLOTS]
+    else:
+        plots = [hole_area_plot(run)]
+    return [plot for plot in plots if plot is not None]
+
+
+def _draw_plot(
+    title: str,
+    series: Sequence[Series],
+    x_title: str,
+    y_title: str,
+    finish_axes: Callable[[Axes], object],
+    note: str = "",
+    height_inches: float = PLOT_HEIGHT_INCHES,
+) -> Plot:
+    """Draw series of points as an SVG image; the same series give the same bytes.
+
+    Args:
+        title: the plot's title, which stands outside of the image.
+        series: the points of each method.
+        x_title: the title of the x axis.
+        y_title: the title of the y axis.
+        finish_axes: sets scales and ticks.
+        note: a sentence below the plot.
+        height_inches: of the image.
+    """
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    with rc_context(MATPLOTLIB_SETTINGS), warnings.catch_warnings():
+        # matplotlib warns about letters without a glyph; the browser's font has these letters.
+        warnings.simplefilter("ignore")
+        figure = Figure(figsize=(PLOT_WIDTH_INCHES, height_inches), layout="constrained")
+        axes = figure.subplots()
+
+        for one in series:
+            description = describe_method(one.method)
+            axes.plot(
+                [x for x, _ in one.points],
+                [y for _, y in one.points],
+                description.marker,
+                color=description.color,
+                ls=one.line_style,
+                mfc="white" if one.is_hollow else description.color,
+                alpha=0.8,  # markers may lie on each other
+                label=one.title,
+            )
+        axes.set(xlabel=x_title, ylabel=y_title)
+        finish_axes(axes)
+        figure.legend(loc="outside lower left", frameon=False, ncols=1)
+
+        file = io.BytesIO()
+        figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None})
+
+    svg = base64.b64encode(file.getvalue()).decode()
+    alt_text = f"{title}. {', '.join(one.title for one in series)}"
+    return Plot(title, alt_text, f"data:image/svg+xml;base64,{svg}", note)
+
+
+def hole_area_plot(run: Run) -> Plot | None:
+    """The mean hole area ratio (HAR) against disparity, before and after completion.
+
+    HAR is the fraction of a view's pixels that the Gaussians leave open; a disparity is a size of
+    the camera move. The paper's numbers are drawn with hollow markers. None if nothing was
+    measured.
+    """
+    series = _hole_area_series(run)
+    if not series:
+        return None
+
+    disparities = sorted({disparity for one in series for disparity, _ in one.points})
+    hole_ratios = [hole_ratio for one in series for _, hole_ratio in one.points]
+
+    def finish_axes(axes: Axes) -> None:
+        """Mark the disparities on the x axis, and show percent on the y axis."""
+        _set_logarithmic_scale(axes, hole_ratios)
+        axes.set_xticks(disparities)
+        axes.yaxis.set_major_formatter(lambda value, _: f"{100 * value:g} %")
+
+    return _draw_plot(
+        "Hole Area Ratio against disparity",
+        series,
+        "disparity of the view",
+        "HAR, share of the pixels",
+        finish_axes,
+    )
+
+
+def _hole_area_series(run: Run) -> list[Series]:
+    """The points (disparity, mean HAR) of a run and of the paper, before and after completion.
+
+    Series without points are left out.
+    """
+    before = _mean_by_disparity(run.measurements, run.title, "har_before", run.methods[0])
+    series = [Series(f"before: {run.base_title} alone", "base", before, line_style="--")]
+    for method in run.methods:
+        if method != "base":
+            after = _mean_by_disparity(run.measurements, run.title, "har", method)
+            title = f"after: {method_row_name(run, method)}"
+            series.append(Series(title, method, after, line_style="-"))
+
+    published = paper_measurements(HOLE_AREA.label)
+    before = _mean_by_disparity(published, run.title, "har_before", PAPER_METHOD)
+    after = _mean_by_disparity(published, run.title, "har", PAPER_METHOD)
+    series.append(Series("before: SHARP (paper)", "base", before, is_hollow=True, line_style="--"))
+    series.append(
+        Series(f"after: {PAPER_METHOD}", "spackle", after, is_hollow=True, line_style="-")
+    )
+    return [one for one in series if one.points]
+
+
+def _mean_by_disparity(
+    measurements: Iterable[Measurement], dataset: str, metric: str, method: str
+) -> list[Point]:
+    """The mean of a method's metric over a dataset's views, for each disparity: (disparity, mean).
+
+    Disparities, sizes of the camera move, ascend; those without a finite number are left out.
+    """
+    chosen = (
+        one
+        for one in measurements
+        if one.dataset == dataset and one.metric == metric and one.method == method
+    )
+    points = []
+    for (setting,), values in group_values(chosen, "setting").items():
+        mean = mean_of_known(values).value
+        if mean is not None:
+            points.append((float(setting), mean))
+    return sorted(points)
+
+
+def _set_logarithmic_scale(axes: Axes, values: Sequence[float]) -> None:
+    """Make the y axis logarithmic; if a value is 0, it is linear below the smallest other value.
+
+    If all values are 0, the axis stays linear.
+    """
+    positive_values = [value for value in values if value > 0]
+    if len(positive_values) == len(values):
+        axes.set_yscale("log")
+    elif positive_values:
+        exponent = math.floor(math.log10(min(positive_values)))
+        axes.set_yscale("symlog", linthresh=10.0**exponent)
+        axes.set_ylim(bottom=0)
+
+
+def scenes_plot(run: Run, metric: str) -> Plot | None:
+    """A plot of a metric with a row for each scene, best first, and a marker for each method.
+
+    Scenes are ranked by the method "spackle", or else the last method. If there are too many, a
+    selection from the best to the worst is shown. None if nothing was measured.
+
+    Args:
+        run: an evaluation against second photos.
+        metric: a key of `SCENE_PLOTS`.
+    """
+    values_by_method = {}
+    for method in run.methods:
+        values = run.mean_by_image(metric, method)
+        if values:
+            values_by_method[method] = values
+    if not values_by_method:
+        return None
+
+    ranking_method = "spackle" if "spackle" in values_by_method else list(values_by_method)[-1]
+    ranked_scenes = best_first(values_by_method[ranking_method], metric)
+    shown_indices = evenly_spaced_indices(len(ranked_scenes), MAX_PLOTTED_SCENES)
+    scenes = [ranked_scenes[index] for index in shown_indices]
+
+    series = []
+    for method, values in values_by_method.items():
+        points = [
+            (values[scene], float(row)) for row, scene in enumerate(scenes) if scene in values
+        ]
+        series.append(Series(method_row_name(run, method), method, points))
+
+    def finish_axes(axes: Axes) -> None:
+        """Name the rows, and let the first be at the top."""
+        axes.set_yticks(range(len(scenes)), [_shortened_name(scene) for scene in scenes])
+        axes.set_ylim(len(scenes) - 0.5, -0.5)
+
+    note = f"In the order of {describe_method(ranking_method).title}, best first."
+    if len(scenes) < len(ranked_scenes):
+        note += f" {len(scenes)} of {len(ranked_scenes)} scenes, spread evenly."
+
+    title, x_title = SCENE_PLOTS[metric]
+    height_inches = PLOT_HEIGHT_INCHES / 2 + SCENE_HEIGHT_INCHES * len(scenes)
+    return _draw_plot(title, series, x_title, "", finish_axes, note, height_inches)
+
+
+def _shortened_name(name: str) -> str:
+    """A name of at most 14 letters, shortened in its middle, because names may differ at both
+    ends."""
+    if len(name) <= MAX_NAME_LETTERS:
+        return name
+    half = MAX_NAME_LETTERS // 2
+    return f"{name[: half - 1]}…{name[-half:]}"

@@ -1,0 +1,211 @@
+"""The names of rows in tables, and the notes below tables.
+
+The notes say what a reader needs for judging the numbers: views, base (the network that turns
+photos into Gaussians), methods, weights, definitions of metrics, missing images, machine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from spackle.paper.evaluation.measurements import NOTE_PREFIX, Run
+from spackle.paper.evaluation.method_descriptions import describe_method
+from spackle.paper.evaluation.metrics import METRICS, metric_of_column
+from spackle.paper.evaluation.paper_numbers import PAPER_PARAMETERS
+from spackle.paper.evaluation.table import NOT_RUN
+from spackle.paper.evaluation.table_layouts import TableLayout
+
+# Marks methods whose residual network was not trained by the paper's recipe.
+RECIPE_MARK = "‡"
+MAX_LISTED_IMAGES = 5  # the most names in a note about images that could not be measured
+
+
+def method_row_name(run: Run, method: str, title: str = "") -> str:
+    """The name of a method's row: its title, and in brackets the base that it starts from.
+
+    Args:
+        run: the results; they say which base was used, and which weights the residual network had.
+        method: the method's name.
+        title: a title instead of the method's own.
+
+    Returns:
+        For instance "Spackle‡ (SHARP)". The mark ‡ says that the weights of the residual network
+        do not come from the paper's recipe, because no other weights were given.
+    """
+    if method == "base":
+        return f"{run.base_title} alone"
+    description = describe_method(method)
+    needs_mark = description.uses_residual and run.config["residual"]["weights"] != "given"
+    mark = RECIPE_MARK if needs_mark else ""
+    return f"{title or description.title}{mark} ({run.base_title})"
+
+
+def shown_methods(layout: TableLayout, run: Run) -> dict[str, str]:
+    """The methods of a run that have a row in a table, each with the name of its row."""
+    if layout.row_titles is not None:
+        return {
+            method: method_row_name(run, method, title)
+            for method, title in layout.row_titles.items()
+            if method in run.methods
+        }
+
+    methods = run.methods
+    if layout.needed_metric is not None:
+        methods_with_metric = {
+            measurement.method
+            for measurement in run.measurements
+            if measurement.metric == layout.needed_metric
+        }
+        methods = [
+            method for method in methods if method in methods_with_metric and method != "base"
+        ]
+    return {method: method_row_name(run, method) for method in methods}
+
+
+def notes_of_table(layout: TableLayout, runs: Sequence[Run]) -> list[str]:
+    """The notes below a table that shows these runs, without repetitions."""
+    metrics = [metric_of_column(column.metric) for column in layout.columns]
+    image_metrics = list(dict.fromkeys(metric for metric in metrics if metric is not None))
+
+    notes = [_views_note(run) for run in runs]
+    notes += [f"Base {run.base_title}: {run.config['base']['says']}." for run in runs]
+    notes += _methods_notes(layout, runs)
+    notes += [_residual_note(run) for run in runs]
+    notes += [f"{METRICS[name].name}: {METRICS[name].definition}." for name in image_metrics]
+    for run in runs:
+        notes += _missing_metrics_notes(run, image_metrics)
+        notes += _missing_images_notes(run)
+    for run in runs:
+        if run.is_benchmark:
+            notes += _timing_notes(run)
+
+    # Runs of several datasets share most notes.
+    return [*dict.fromkeys(notes), *layout.notes]
+
+
+def _views_note(run: Run) -> str:
+    """The note that says which views of each image were rendered."""
+    if not run.is_near_view:
+        return (
+            "Views: both ends of a swipe at each disparity, where the camera is farthest left and "
+            "farthest right and looks at the focus point; "
+            f"long side {run.config['side']} pixels."
+        )
+    if run.config["second_views"] == "nearest":
+        return (
+            "Views: of the scene's other photos the three nearest that show the same, from their "
+            "own cameras."
+        )
+    return "Views: all other photos of the scene, from their own cameras."
+
+
+def _methods_notes(layout: TableLayout, runs: Sequence[Run]) -> list[str]:
+    """A note that explains the methods in a table's rows; empty if the table shows no run."""
+    row_titles = layout.row_titles or {}
+    explanations = {}
+    for run in runs:
+        for method in shown_methods(layout, run):
+            description = describe_method(method)
+            title = row_titles.get(method) or description.title
+            explanations[method] = f"{title}: {description.summary}"
+
+    if not explanations:
+        return []
+    return [f"Rows: {'; '.join(explanations.values())}."]
+
+
+def _residual_note(run: Run) -> str:
+    """The note that says which weights the residual network had."""
+    residual = run.config["residual"]
+    digest_start = str(residual["sha256"])[:8]
+    if residual["weights"] == "given":
+        return f"Residual: given weights ({digest_start})."
+
+    if residual["sha256"]:
+        weights = f"the residual has the weights that ship with Spackle ({digest_start})"
+    else:
+        weights = "the residual has no weights (deltas are 0)"
+    return f"{RECIPE_MARK} Not the paper's recipe: {weights}."
+
+
+def _missing_metrics_notes(run: Run, image_metrics: Sequence[str]) -> list[str]:
+    """Notes on the image metrics that a run did not measure, one for each reason."""
+    states = run.about.get("metrics", {})
+    names_by_reason: dict[str, list[str]] = {}
+    for metric in image_metrics:
+        state = str(states.get(metric))
+        if state.startswith(NOT_RUN):
+            names_by_reason.setdefault(state, []).append(METRICS[metric].name)
+    return [f"{', '.join(names)} {reason}." for reason, names in names_by_reason.items()]
+
+
+def _missing_images_notes(run: Run) -> list[str]:
+    """A note on the images that could not be measured; empty if there are none."""
+    missing_images = list(run.problems)
+    if not missing_images:
+        return []
+    listed_images = missing_images[:MAX_LISTED_IMAGES]
+    if len(missing_images) > MAX_LISTED_IMAGES:
+        listed_images.append("…")
+    return [
+        f"{run.title}: {len(missing_images)} of {len(run.images)} images could not be measured: "
+        f"{', '.join(listed_images)}."
+    ]
+
+
+def _timing_notes(run: Run) -> list[str]:
+    """Notes on a benchmark: machine and number formats, numbers of timed runs, sizes of
+    networks."""
+    return [_machine_note(run), _timed_runs_note(run), _parameters_note(run)]
+
+
+def _machine_note(run: Run) -> str:
+    """The note that says where a benchmark ran, and in which number formats the networks
+    computed."""
+    base_precision = None  # a base without a network tells none
+    for measurement in run.measurements:
+        if measurement.metric == f"{NOTE_PREFIX}precision":
+            base_precision = measurement.value
+            break
+
+    places = []
+    if base_precision:
+        base_device = run.config["base"]["device"]
+        places.append(f"{run.base_title}'s network in {base_precision} on {base_device}")
+    if run.config["residual"]["precision"]:
+        places.append(f"residual in {run.config['residual']['precision']}")
+    places.append(f"renderer and residual on {run.config['device']}")
+
+    hardware = run.config["hardware"]
+    machine = [hardware["cpu"], f"{hardware['cores']} cores", f"{hardware['threads']} threads"]
+    if "gpu" in hardware:
+        machine.append(hardware["gpu"])
+
+    versions = [f"{package} {version}" for package, version in run.config["versions"].items()]
+    return f"Times: {'; '.join(places)}. Machine: {', '.join(machine)}; {', '.join(versions)}."
+
+
+def _timed_runs_note(run: Run) -> str:
+    """The note that says how often a benchmark timed each stage."""
+    return (
+        f"Each stage: median of {run.config['runs']} runs after an untimed run; the base: "
+        f"{run.config['base_runs']} per image. Files are read before the clock starts, and nothing "
+        "is written."
+    )
+
+
+def _parameters_note(run: Run) -> str:
+    """The note on the numbers of network parameters, counted here and as the paper has them."""
+    counts = run.about["parameters"]
+    base_m = counts["base"] / 1e6  # millions
+    used_m = counts["base_used"] / 1e6
+    residual_m = counts["residual"] / 1e6
+    share_percent = 100 * counts["share"]
+
+    paper = PAPER_PARAMETERS
+    return (
+        f"Parameters in millions, counted in the networks: SHARP {base_m:.2f}, of which inference "
+        f"uses {used_m:.2f}; with Spackle {base_m + residual_m:.2f}; Spackle alone "
+        f"{residual_m:.2f} ({share_percent:.2f} %). The paper: {paper.base_m}, {paper.merged_m}, "
+        f"{paper.residual_m} ({paper.share_percent} %)."
+    )
