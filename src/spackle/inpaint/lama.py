@@ -207,6 +207,8 @@ def pad_to_accepted_size(x: Tensor) -> Tensor:
 def load_network(path: Path) -> LamaNetwork:
     """Load the network, of any width and depth, without running code in the file.
 
+    LaMa was trained beside a discriminator; the network that paints is called the generator.
+
     Args:
         path: a file of TorchScript, `torch.save` or safetensors. The names of its tensors may
             begin with the path to the generator, such as "generator."; tensors of other networks
@@ -240,13 +242,22 @@ def load_network(path: Path) -> LamaNetwork:
 
 
 def _generator_prefix(tensors: Mapping[str, Tensor]) -> str | None:
-    """Return what the names of LaMa's generator begin with, "" or "….generator."; None if it lacks.
+    """Return what the names of the generator's tensors begin with in a file.
 
-    Of several, the shortest one.
+    The generator is the network of LaMa that paints; a file may hold further networks.
+
+    Args:
+        tensors: the file's tensors by name.
+
+    Returns:
+        "", "generator.", or a longer path to the generator, and the shortest one of several; None
+        if the file has no generator.
     """
     prefixes = []
     for name in tensors:
+        if not name.endswith(FIRST_WEIGHT):
+            continue
         prefix = name.removesuffix(FIRST_WEIGHT)
-        if name.endswith(FIRST_WEIGHT) and (not prefix or prefix.endswith("generator.")):
+        if prefix == "" or prefix.endswith("generator."):
             prefixes.append(prefix)
     return min(prefixes, key=len, default=None)

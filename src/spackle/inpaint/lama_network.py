@@ -143,12 +143,17 @@ class LamaNetwork(nn.Module):
     """
 
     def __init__(self, tensors: Tensors) -> None:
-        """Take tensors with the names of `expected_shapes`, in float32."""
+        """Take the published tensors, in float32, by the names of `expected_shapes`.
+
+        In these names, l is local and g is global: convl2g leads from local to global channels,
+        and bn_g is the batch norm of the global outputs.
+        """
         super().__init__()
         block_count = count_blocks(tensors)
         self.first = _convolution(*_fold_batch_norm(tensors, "model.1.ffc.convl2l", "model.1.bn_l"))
 
-        # The last one makes the local and the global channels, which lie one behind the other.
+        # Three layers halve the sides. The last one makes the local and the global channels, which
+        # lie one behind the other.
         local = _fold_batch_norm(tensors, "model.4.ffc.convl2l", "model.4.bn_l")
         global_ = _fold_batch_norm(tensors, "model.4.ffc.convl2g", "model.4.bn_g")
         down = [
@@ -217,7 +222,11 @@ class FourierLayer(nn.Module):
     """A fast Fourier convolution, with local and global channels in and out."""
 
     def __init__(self, tensors: Tensors, name: str) -> None:
-        """Take the tensors of the layer `name` from those of the network."""
+        """Take the tensors of the layer `name` from those of the network.
+
+        In the tensors' names, l is local and g is global: convl2g leads from local to global
+        channels, and bn_g is the batch norm of the global outputs.
+        """
         super().__init__()
         spectral = f"{name}.ffc.convg2g"
         # Both inputs of the local outputs have one batch norm, so one convolution computes them.
@@ -243,7 +252,11 @@ class FourierLayer(nn.Module):
         self.widen = _linear(wide_weight * global_scale.view(-1, 1, 1, 1), None)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map features [B, C, h, w] to the same shape; the first quarter of C is local."""
+        """Map features [B, C, h, w] to the same shape.
+
+        The first quarter of the channels is local, and is made by convolutions alone; the others
+        are global, and pass through a Fourier transform.
+        """
         local_count = x.shape[1] // LOCAL_CHANNEL_DIVISOR
         padded = _pad_by_reflection(x, 1)
         local = self.to_local(padded)
@@ -263,6 +276,7 @@ class FourierLayer(nn.Module):
         """
         x = self.narrow(x).relu_()  # [B, h, w, D / 2]
         spectrum = torch.fft.rfft2(x, dim=(1, 2), norm="ortho")
+        # The real part of a channel, and then its imaginary part, become two channels.
         parts = torch.view_as_real(spectrum.contiguous()).flatten(-2)  # [B, h, w / 2 + 1, D]
         parts = self.spectrum(parts).relu_().unflatten(-1, (-1, 2))
         filtered_spectrum = torch.view_as_complex(parts)

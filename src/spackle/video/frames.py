@@ -125,8 +125,8 @@ class FrameMaker:
         """Return one frame [H, W, 3] sRGB.
 
         Args:
-            renderings: of each of `eyes`; for a comparison, of the scene without and with filled
-                holes.
+            renderings: one for each eye; for a comparison, two of one eye: of the scene without
+                and with filled holes.
         """
         pictures = [self._picture(rendering) for rendering in renderings]
         if self.image_size is not None:
@@ -213,7 +213,7 @@ def _derive_stereo(options: VideoOptions, gaussians: Gaussians, camera: Camera) 
         camera: the first view.
 
     Raises:
-        ValueError: the eyes are too far apart: a point at the screen is in no image.
+        ValueError: the eyes are so far apart that their images have nothing in common.
     """
     if options.stereo is None:
         return None

@@ -100,6 +100,7 @@ def tensors_in_tree(root: object) -> dict[str, Tensor]:
         name, node = remaining.pop()
         if isinstance(node, Tensor) and name:
             tensors[name] = node
+        # A stand-in replaces an object of any class, such as a layer, and has its attributes.
         fields = node.fields if isinstance(node, _StandIn) else node
         if not isinstance(fields, dict):
             continue
@@ -174,9 +175,10 @@ class _InertUnpickler(pickle._Unpickler):
         self._archive = archive
         self._path = path
         self._data_folder = data_folder
-        file_bytes = os.path.getsize(path)
-        # False: the file is mapped privately, so that nothing can be written to it.
-        self._mapped_file = torch.UntypedStorage.from_file(os.fspath(path), False, file_bytes)
+        # Not shared: a change of a tensor is never written to the file.
+        self._mapped_file = torch.UntypedStorage.from_file(
+            os.fspath(path), shared=False, nbytes=os.path.getsize(path)
+        )
 
     def find_class(self, module: str, name: str) -> type[_StandIn]:
         """Return a stand-in for a class or function that the pickle names."""
@@ -184,6 +186,8 @@ class _InertUnpickler(pickle._Unpickler):
 
     def persistent_load(self, pid: Any) -> Tensor | None:
         """Return the numbers of a storage, to which the pickle refers, as a flat tensor.
+
+        A storage holds the numbers of one or several tensors.
 
         Args:
             pid: five values, of which the second is the class of the storage, the third the name

@@ -50,7 +50,7 @@ def load_strict(
     Integer buffers keep the values that the network has.
 
     Args:
-        network: the network, which may be on the meta device.
+        network: the network, which may be on the meta device, where tensors take no memory.
         tensors: the file's tensors, as `read_tensors` returns them.
         path: the file's name, for messages.
         advice: what to do about a wrong file, for messages.
