@@ -31,7 +31,9 @@ TABLES = (  # the paper's labels
 
 def sum_of(run: Run, method: str, metric: str) -> float:
     return sum(
-        float(row.value or 0) for row in run.measurements if (row.method, row.metric) == (method, metric)
+        float(row.value or 0)
+        for row in run.measurements
+        if (row.method, row.metric) == (method, metric)
     )
 
 

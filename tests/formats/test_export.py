@@ -333,7 +333,7 @@ def test_bad_requests_leave_nothing(
 
 LIMITS = [
     ("spz", "spz.MAX_COUNT", 3000),
-    ("sog", "sog.LARGEST_SIDE", 40),
+    ("sog", "sog.MAX_IMAGE_SIDE_PX", 40),
     ("glb", "gltf.MAX_GLB_BYTES", 1 << 17),
 ]
 

@@ -81,7 +81,7 @@ def _attribute_arrays(columns: GaussianColumns) -> dict[str, NDArray[Any]]:
     """
     linear_rgb = srgb_to_linear(torch.from_numpy(columns.srgb)).numpy()
     rgba = np.concatenate([linear_rgb, columns.opacities[:, None]], axis=1)  # [N, 4]
-    xyzw = columns.quats[:, [1, 2, 3, 0]]
+    xyzw = columns.quats[:, [1, 2, 3, 0]]  # glTF has w last
     return {
         "POSITION": columns.means.astype("<f4"),
         f"{EXTENSION}:ROTATION": xyzw.astype("<f4"),
@@ -185,6 +185,7 @@ def _describe_photo_node(camera: Camera) -> dict[str, Any]:
 def _describe_lens(camera: Camera) -> dict[str, Any]:
     """Return glTF's perspective camera; `extras` keep the principal point, which glTF lacks."""
     fx, fy = camera.focal
+    # The field of view is the vertical one, in radians.
     lens = {
         "yfov": 2 * math.atan2(camera.height, 2 * fy),
         "aspectRatio": camera.width * fy / (camera.height * fx),

@@ -106,6 +106,9 @@ def page_scene(
     shown_camera = camera if disparity is None else camera.zoomed(1 + DEFAULT_OVERSCAN)
 
     files, layers = _encode_layers({"base": base, "aux": aux})
+    # How far a disparity of 1 moves the page's camera, in metres.
+    metres_per_disparity = disparity_to_offset(camera, 1.0, depths)
+    # The names are those that the page's script reads.
     description: dict[str, object] = {
         "name": name,
         "note": note,
@@ -116,7 +119,7 @@ def page_scene(
         },
         "focus": depths.focus,
         "zNear": depths.near,
-        "orbit": {"unit": disparity_to_offset(camera, 1.0, depths), "free": limit, "limit": limit},
+        "orbit": {"unit": metres_per_disparity, "free": limit, "limit": limit},
         "paths": {kind: _path_positions(kind, camera, depths) for kind in SHARP_TRAJECTORIES},
         "layers": layers,
     }
@@ -129,8 +132,8 @@ def _encode_layers(
     """Pack layers of Gaussians by name for the page.
 
     Returns:
-        The packed bytes of each layer by file name, and the description of each layer, which says
-        how its bytes are to be read.
+        The packed bytes of each layer by file name; and the description of each layer, with the
+        logarithm of the scale for byte 0 (scaleLow) and its increase per step (scaleStep).
     """
     files = {}
     descriptions: list[dict[str, object]] = []
@@ -150,7 +153,7 @@ def _encode_layers(
 
 
 def _movement_limit(disparity: float | None, is_filled: bool) -> float:
-    """Return how far the page's camera may go, as a disparity.
+    """Return how far the page's camera may go, as a disparity (relative to the scene's depth).
 
     Args:
         disparity: the disparity for which the scene was completed, if it is known.
@@ -167,6 +170,11 @@ def _path_positions(
     kind: TrajectoryKind, camera: Camera, depths: DepthRange
 ) -> dict[str, list[list[float]]]:
     """Return the camera positions along a path as the page needs them, to nine digits.
+
+    Args:
+        kind: the kind of path, such as "swipe".
+        camera: the photo's camera, at the path's middle.
+        depths: the scene's depths; the nearest one sets how far a disparity of 1 leads.
 
     Returns:
         "still": positions [PATH_POSITIONS][3] in metres for a disparity of 0; and "moving":

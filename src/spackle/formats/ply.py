@@ -84,7 +84,7 @@ def save_ply(
 
 
 def encode_ply(scene: SceneFile) -> bytes:
-    """Encode a scene as `save_ply` does.
+    """Encode a scene as a binary PLY file in INRIA's layout, as `save_ply` writes it.
 
     Raises:
         ValueError: a Gaussian is not finite.
@@ -312,6 +312,7 @@ class PlyFile:
         advice = "export it as a plain Gaussian scene"
         if vertex.row_count == 0:
             raise InputError(f"{self.path}: holds no Gaussians: {advice}")
+        # Behind a table with lists, no table has a known place.
         if vertex.start_byte < 0:
             raise InputError(f"{self.path}: holds lists in or before its vertices: {advice}")
         return vertex

@@ -26,7 +26,8 @@ def encode_smallest_three(quats: Floats) -> tuple[NDArray[np.int64], Floats]:
     largest = np.abs(quats).argmax(axis=1)  # [N]
     largest_value = np.take_along_axis(quats, largest[:, None], axis=1)  # [N, 1]
     sign = np.where(largest_value < 0, np.float32(-1), np.float32(1))
-    others = np.take_along_axis(quats * sign, OTHER_COMPONENTS[largest], axis=1)  # [N, 3]
+    other_columns = OTHER_COMPONENTS[largest]  # [N, 3], the indices of the other components
+    others = np.take_along_axis(quats * sign, other_columns, axis=1)  # [N, 3]
     return largest, others
 
 

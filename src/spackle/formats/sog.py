@@ -27,7 +27,7 @@ from spackle.formats.quantization import (
 from spackle.formats.scene_content import SceneFile
 from spackle.runtime.errors import InputError
 
-LARGEST_SIDE = 16_380  # pixels; the largest multiple of four that a WebP image can have
+MAX_IMAGE_SIDE_PX = 16_380  # pixels; the largest multiple of four that a WebP image can have
 MAX_MEMBER_BYTES = 1 << 28  # of a file in an archive that is read
 
 CODEBOOK_SIZE = 256
@@ -66,7 +66,7 @@ def encode_sog(scene: SceneFile) -> bytes:
         raise InputError("SOG cannot hold a scene without Gaussians: use another format")
     # About square images, whose sides are multiples of four.
     width = math.ceil(math.sqrt(count) / 4) * 4
-    if width > LARGEST_SIDE:
+    if width > MAX_IMAGE_SIDE_PX:
         raise InputError(f"{count:,} Gaussians are too many for SOG: use another format")
 
     columns = GaussianColumns.from_gaussians(scene.gaussians)
@@ -246,7 +246,7 @@ def _read_images(archive: zipfile.ZipFile, names: list[str], count: int) -> list
         # Only WebP, so that a stranger's file cannot reach the decoders of rare formats.
         with Image.open(content, formats=["WEBP"]) as image:
             pixel_count = image.width * image.height
-            if max(image.size) > LARGEST_SIDE or not 0 < count <= pixel_count:
+            if max(image.size) > MAX_IMAGE_SIDE_PX or not 0 < count <= pixel_count:
                 size = f"{image.width}×{image.height}"
                 raise ValueError(f"{name} has {size} pixels for {count:,} Gaussians")
             rgba = np.asarray(image.convert("RGBA"))

@@ -136,10 +136,12 @@ def encode_spz(scene: SceneFile) -> bytes:
 
 
 def spz_grid(gaussians: Gaussians) -> SpzGrid:
-    """Choose the grid for the positions of a scene.
+    """Choose the grid to which the positions of a scene are rounded.
 
-    The grid is as fine as the farthest Gaussian allows; but if it would be too coarse for the
-    nearest ones, it is finer, and distant Gaussians lie outside.
+    SPZ stores a coordinate as a fixed-point number of 24 bits. The more of these bits are
+    fractional, the finer is the grid, and the nearer is its end. The grid is as fine as the
+    farthest Gaussian allows; but if it would be too coarse for the nearest ones, it is finer, and
+    distant Gaussians lie outside.
     """
     means = gaussians.means.detach().to("cpu").double().numpy()  # [N, 3]
     if len(means) == 0:
@@ -150,7 +152,9 @@ def spz_grid(gaussians: Gaussians) -> SpzGrid:
     near_index = int(NEAR_QUANTILE * len(distance))
     near_distance = float(np.partition(distance, near_index)[near_index])
     farthest_coordinate = float(largest_coordinate.max())
+    # The most bits with which all coordinates fit: farthest · 2^bits ≤ MAX_GRID_COORDINATE.
     bits_for_all = np.floor(np.log2(MAX_GRID_COORDINATE / max(farthest_coordinate, MIN_LENGTH)))
+    # The fewest bits with which the grid is fine enough: near · 2^bits ≥ MIN_NEAR_STEPS.
     bits_for_near = np.ceil(np.log2(MIN_NEAR_STEPS / max(near_distance, MIN_LENGTH)))
     fraction_bits = int(
         np.clip(max(bits_for_all, bits_for_near), MIN_FRACTION_BITS, MAX_FRACTION_BITS)
@@ -197,7 +201,8 @@ def _finest_rounding_of_samples(columns: GaussianColumns, fraction_bits: int) ->
         sections = _encode_sections(sampled_columns, fraction_bits, rounding)
         return len(_deflate(b"".join(sections))) <= max_bytes
 
-    # Coarser roundings give smaller files, so bisection finds the first one that is enough.
+    # Coarser roundings give smaller files, so bisection finds the first one that is enough. The
+    # last one need not be tried, because it is taken if no other is enough.
     return bisect.bisect_left(ROUNDINGS[:-1], True, key=is_small_enough)
 
 
