@@ -25,8 +25,8 @@ from spackle.bases.open import OpenedBase, ResolvedBase, open_base
 from spackle.bases.settings import BaseSettings
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
+from spackle.core.keyframes import KeyframePath
 from spackle.core.photo import Photo, check_photo_size
-from spackle.core.trajectories import KeyframePath
 from spackle.inpaint import InpainterOptions, get_inpainter
 from spackle.render import Renderer, get_renderer
 from spackle.residual import hole_area_ratio

@@ -19,10 +19,10 @@ from spackle.bases import DEFAULT_MAX_DISPARITY
 from spackle.core.camera import Camera
 from spackle.core.focal_length import resolve_focal_length
 from spackle.core.gaussians import Gaussians
+from spackle.core.keyframes import KeyframePath
 from spackle.core.trajectories import (
     DEFAULT_OVERSCAN,
     DepthRange,
-    KeyframePath,
     TrajectoryKind,
     trajectory_cameras,
 )

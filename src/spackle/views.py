@@ -17,14 +17,13 @@ import torch
 from spackle.bases import DEFAULT_MAX_DISPARITY, BasePrediction
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
+from spackle.core.keyframes import KeyframePath, PathError
 from spackle.core.photo import working_size
 from spackle.core.trajectories import (
     DEFAULT_OVERSCAN,
     MAX_DISPARITY,
     TRAJECTORIES,
     DepthRange,
-    KeyframePath,
-    PathError,
     TrajectoryKind,
     leftmost_and_rightmost,
     trajectory_cameras,

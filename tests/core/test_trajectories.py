@@ -14,15 +14,12 @@ from torch import Tensor
 
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
+from spackle.core.keyframes import Keyframe, KeyframePath, PathError, interpolate_monotone
 from spackle.core.trajectories import (
     TRAJECTORIES,
     DepthRange,
-    Keyframe,
-    KeyframePath,
-    PathError,
     TrajectoryKind,
     disparity_to_offset,
-    interpolate_monotone,
     leftmost_and_rightmost,
     trajectory_cameras,
 )

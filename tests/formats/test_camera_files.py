@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 
-from spackle.core.trajectories import Keyframe
+from spackle.core.keyframes import Keyframe
 from spackle.formats import load_cameras, load_path
 from spackle.runtime.errors import InputError
 

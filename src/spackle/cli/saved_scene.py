@@ -14,7 +14,7 @@ from rich.filesize import decimal
 from torch import Tensor
 
 from spackle.core.focal_length import ASSUMED_FOCAL_MM
-from spackle.core.trajectories import PathError
+from spackle.core.keyframes import PathError
 from spackle.formats import save_png
 from spackle.formats.html import single_html
 from spackle.formats.scene_content import SceneFile

@@ -16,7 +16,7 @@ from pydantic import BaseModel, Field, Strict, ValidationError
 from torch import Tensor
 
 from spackle.core.camera import Camera
-from spackle.core.trajectories import WORLD_UP, Keyframe, KeyframePath, PathError, PathUnit
+from spackle.core.keyframes import WORLD_UP, Keyframe, KeyframePath, PathError, PathUnit
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import check_file
 
