@@ -204,7 +204,11 @@ SLOPE = torch.linspace(2, 5, 96).expand(1, 64, 96).contiguous()
     [
         (torch.zeros(1, 64, 96), "metres", "predicts 0 to 0, which cannot be depth"),
         (torch.full((1, 64, 96), 3.0), "relative disparity", "predicts 3 to 3"),
-        (torch.full((1, 64, 96), math.nan), "metres", "predicts nan to nan"),
+        (
+            torch.full((1, 64, 96), math.nan),
+            "metres",
+            "predicts no finite number, which cannot be depth",
+        ),
         (-SLOPE, "metres", "predicts -5 to -2"),
         (SLOPE[0], "metres", r"fails \(.*\): give another photo or model"),
     ],
