@@ -44,11 +44,12 @@ from spackle.render.gsplat_backend import DeviceGaussians, GsplatRenderer, load_
 from spackle.render.project import KernelCamera
 from spackle.render.protocol import NEAR_PLANE, TILE_PX, Rendering
 from spackle.residual import hole_area_ratio
-from spackle.residual.architectures import UNet, shipped_network
+from spackle.residual.architectures import shipped_network
 from spackle.runtime.device import Precision, hardware_facts, package_versions
 from spackle.runtime.errors import InputError
 from spackle.runtime.files import write_atomic
 from spackle.scene_fill import FillContext, fill_view
+from spackle.scene_fill.unet import UNet
 
 REPOSITORY = Path(__file__).parents[1]
 SKIPPED, LIMIT_S, RUNS = 77, 1200, 20
@@ -272,7 +273,7 @@ def training(options: argparse.Namespace) -> Iterator[str]:
         network = UNet().to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
 
         def step() -> None:
-            done = complete_samples(network, crops, drawer)
+            done = complete_samples(network, network.inputs, crops, drawer)
             tensors = {
                 name: tensor.to(device, non_blocking=True) for name, tensor in vars(done).items()
             }

@@ -64,11 +64,11 @@ def commands(folder: Path) -> dict[str, list[str]]:
         "lite-cameras": [*photo, "--base", "lite", "--cameras", f"{folder}/cameras.json"],
         "lite-path": [*photo, "--base", "lite", "--path", f"{folder}/path.json"],
         "depth-view": [*photo, *depth, "--mode", "view", "--trajectory", "swipe", "--frames", "6"],
-        "depth-seeds": [
+        "depth-initial": [
             *photo,
             *depth,
             "--residual",
-            "seeds",
+            "initial",
             "--frames",
             "6",
             "--stereo",

@@ -185,7 +185,7 @@ def completion_section(
     device: torch.device = CPU,
 ) -> Section:
     """Time the completion of a view with 5 % holes, and the base's rendering; if `network` is None,
-    by seeds.
+    by the initial Gaussians alone.
     """
     disparity, camera = find_view(base, photo_camera, renderer)
     context = FillContext(base, photo_camera, renderer, network)
@@ -379,7 +379,9 @@ def main(arguments: list[str]) -> None:
         "--device", choices=("cpu", "cuda"), default="cpu", help="of all but the renderer's section"
     )
     parser.add_argument(
-        "--residual", type=Path, help="weights of the residual; default: the seeds alone"
+        "--residual",
+        type=Path,
+        help="weights of the residual; default: the initial Gaussians alone",
     )
     parser.add_argument("-c", "--checkpoint", type=Path, help="weights of SHARP")
     parser.add_argument("--base-runs", type=int, default=1, help="of SHARP")

@@ -35,7 +35,7 @@ def main() -> list[Measurement]:
         "mine": lambda cameras: mean_color
     }
     methods |= {
-        name: partial(make_method, name, context=context) for name in ("base", "seeds", "spackle")
+        name: partial(make_method, name, context=context) for name in ("base", "initial", "spackle")
     }
     measurements, _ = measure_views(
         "Middlebury", "Motorcycle", context, views, methods, MetricSuite(["psnr", "ssim"])

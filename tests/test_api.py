@@ -118,7 +118,7 @@ def test_a_photo_and_its_depth_in_every_form(pair: tuple[Path, Path], tmp_path: 
     ]
     photos = [photo.read_bytes(), io.BytesIO(photo.read_bytes()), Image.open(photo), pixels]
     photos += [(tensor := torch.from_numpy(pixels / 255)), tensor.movedim(2, 0)]
-    session = spackle.Spackle(residual="seeds")
+    session = spackle.Spackle(residual="initial")
     expected = session.predict(photo, depth)
     for form in photos:
         assert same_bits(session.predict(form, depth).gaussians, expected.gaussians)
@@ -210,7 +210,7 @@ def test_predict_takes_a_focal_length_and_draws_its_progress(
     pair: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     photo, depth = pair
-    made = spackle.predict(photo, depth, fov=90, disparity=0.1, residual="seeds", progress=True)
+    made = spackle.predict(photo, depth, fov=90, disparity=0.1, residual="initial", progress=True)
     assert [frame.rgb.shape for frame in made.frames(made.path("swipe", frames=2))] == [
         (HEIGHT, WIDTH, 3)
     ] * 2

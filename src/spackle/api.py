@@ -60,7 +60,7 @@ class Spackle:
                 --base`, or a loaded base, such as `SharpBase.load(weights)`. "auto" takes the best
                 for each photo: a depth map, SHARP or MoGe if their weights have been downloaded,
                 or else "lite", which is rough. The choice is logged to the logger "spackle".
-            residual: the network that fills holes: a weight file, a loaded network, "seeds" to
+            residual: the network that fills holes: a weight file, a loaded network, "initial" to
                 fill without a network, or "none" to keep the holes; None takes the weights that
                 come with Spackle.
             fill: source of the texture in the holes, see `spackle.pipeline.open_texture`; "none"

@@ -35,7 +35,8 @@ from spackle.residual.network import ResidualNet
 from spackle.runtime.errors import InputError
 from spackle.runtime.progress import Progress, Reporter
 from spackle.scene import Scene, SceneReport, ViewHoles
-from spackle.scene_fill.fill import FillContext, fill_scene, fill_view
+from spackle.scene_fill.context import FillContext
+from spackle.scene_fill.fill import fill_scene, fill_view
 from spackle.scene_fill.texture import Texture, exemplar_texture, painted_texture
 from spackle.views import PathOptions, PlannedViews, choose_disparity, plan_views
 from spackle.weights import installed_weights
@@ -50,7 +51,7 @@ FillMode = Literal["scene", "view"]
 class FillOptions:
     """Options of the fill, which adds Gaussians in the holes of views."""
 
-    # A file of weights for the network; "seeds": no network; "none": no fill; None: the shipped
+    # A file of weights for the network; "initial": no network; "none": no fill; None: the shipped
     # weights if there are any.
     residual: str | None = None
     fill: FillTexture = "auto"
@@ -69,17 +70,17 @@ class FillOptions:
 
     @property
     def weights_name(self) -> str:
-        """The name of the network's weights in reports: "shipped", a file, "seeds" or "none"."""
+        """The name of the network's weights in reports: "shipped", a file, "initial" or "none"."""
         if self.texture == "none":
             return "none"
         if self.residual is not None:
             return self.residual
-        return "shipped" if SHIPPED.is_file() else "seeds"
+        return "shipped" if SHIPPED.is_file() else "initial"
 
     @property
     def weights_file(self) -> Path | None:
         """The file of the network's weights; None if no network is used."""
-        if self.weights_name in ("seeds", "none"):
+        if self.weights_name in ("initial", "none"):
             return None
         return SHIPPED if self.weights_name == "shipped" else Path(self.weights_name)
 

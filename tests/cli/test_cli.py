@@ -174,7 +174,7 @@ def test_each_result_and_each_error_is_a_line_of_json(tmp_path: Path) -> None:
         "--frames",
         2,
         "--residual",
-        "seeds",
+        "initial",
         "--json",
     )
     first, again = (run("predict", photos, *options) for _ in range(2))

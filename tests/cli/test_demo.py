@@ -12,7 +12,7 @@ from PIL import Image
 
 SIZE = (741, 500)  # of the photo
 INPAINTING = "2D inpainting (biharmonic)"
-SPACKLE, TRAINED = "Spackle (seeds)", "Spackle (trained)"
+SPACKLE, TRAINED = "Spackle (initial Gaussians)", "Spackle (trained)"
 
 
 def size_of(path: Path) -> tuple[int, int]:

@@ -27,8 +27,8 @@ from safetensors.torch import save_file
 import spackle
 from spackle.core.focal_length import focal_mm_to_px
 from spackle.pipeline import FillOptions
-from spackle.residual.architectures import UNet
 from spackle.runtime.folders import results_folder
+from spackle.scene_fill.unet import UNet
 from spackle.weights import published_weights
 
 
@@ -183,8 +183,8 @@ def test_weights_and_texture_are_named_and_change_the_scene(
         (("--fill", "network"), "shipped", "network"),
         (("--fill", "none"), "none", "none"),
         (("--residual", weights), str(weights), "exemplar"),
-        (("--residual", "seeds"), "seeds", "exemplar"),
-        ((), "seeds", "exemplar"),  # no weights are shipped
+        (("--residual", "initial"), "initial", "exemplar"),
+        ((), "initial", "exemplar"),  # no weights are shipped
     ):
         if not words:
             monkeypatch.setattr("spackle.pipeline.SHIPPED", tmp_path / "none.safetensors")

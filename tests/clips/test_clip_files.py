@@ -91,7 +91,7 @@ def test_a_clip_becomes_one_of_the_same_times_and_sound(tmp_path: Path) -> None:
             "--depth",
             depths(tmp_path / "d", 5),
         ),
-        *("--residual", "seeds", "--trajectory", "rotate", "--disparity", 0.1),
+        *("--residual", "initial", "--trajectory", "rotate", "--disparity", 0.1),
     )
     assert done.code == 0, done.err
     out = tmp_path / "uneven with sound"

@@ -6,15 +6,15 @@ import dataclasses
 
 import numpy as np
 import torch
-from helpers.holes import features_of, shipped
+from helpers.holes import shipped, view_of
 from helpers.scenes import Scene, texture
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from spackle.core.camera import Camera
-from spackle.core.crop import crops_around_mask
+from spackle.core.crop import crops_around
 from spackle.core.trajectories import DepthRange, leftmost_and_rightmost
-from spackle.residual.network import STRIDE, predict_deltas
+from spackle.residual.network import STRIDE
 
 
 @settings(deadline=None, max_examples=60)
@@ -31,7 +31,7 @@ def test_each_masked_cell_is_in_one_crop_with_a_margin(
     mask, times = torch.zeros(size, dtype=torch.bool), torch.zeros(size)
     for y, x, height, width in rng.integers([0, 0, 1, 1], [*size, 20, 20], (spots, 4)):
         mask[y : y + height, x : x + width] = True
-    pairs = crops_around_mask(mask, STRIDE, margin)
+    pairs = crops_around(mask, STRIDE, margin)
     for inner, outer in pairs:
         times[inner.slices] += 1
         inside, shown = dataclasses.astuple(inner), dataclasses.astuple(outer)
@@ -50,12 +50,16 @@ def test_crops_give_the_deltas_of_the_whole_view() -> None:
     depth[20:70, 40:90] = 2.0  # a board in front of a long wall
     scene = Scene(texture(96, 640), depth, Camera.from_focal(500, 640, 96))
     base = scene.base()
-    view = features_of(
+    view = view_of(
         base, leftmost_and_rightmost(scene.camera, 0.1, DepthRange.of(base))[1], scene.camera
     )
-    mask = view[0].mask
-    one = predict_deltas(shipped(), *view, "fp32", dense=True)
-    other, bf16 = predict_deltas(shipped(), *view, "fp32"), predict_deltas(shipped(), *view, "bf16")
+    mask = view.mask
+    one = view.deltas(shipped(), "fp32", dense=True)
+    other = view.deltas(shipped(), "fp32")
+    bf16 = view.deltas(shipped(), "bf16")
+    assert one is not None
+    assert other is not None
+    assert bf16 is not None
     assert bool(one.any(-1)[::47, ::53].all())
     assert not bf16[~mask].any()
     difference = (other - one)[mask].abs()

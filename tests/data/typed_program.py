@@ -26,7 +26,7 @@ class Own:
 
 def main(photo: Path) -> None:
     scene: spackle.Scene = spackle.predict(photo, fov=60, trajectory="swipe", progress=True)
-    session = spackle.Spackle(Own(), residual="seeds", fill="exemplar", device="cpu")
+    session = spackle.Spackle(Own(), residual="initial", fill="exemplar", device="cpu")
     other: spackle.Scene = session.predict(np.zeros((48, 64, 3), np.uint8), disparity=0.1)
     scene.save("scene.ply")
     scene.export(io.BytesIO(), "spz")

@@ -14,10 +14,9 @@ from spackle.core.gaussians import Gaussians
 from spackle.core.trajectories import DepthRange, leftmost_and_rightmost
 from spackle.render import CpuRenderer
 from spackle.render.protocol import Rendering
-from spackle.residual import InitialGaussians, ResidualNet, ViewFeatures, initialize
+from spackle.residual import ResidualNet
 from spackle.residual.architectures import open_residual, shipped_network
-from spackle.residual.network import Rim, find_rim
-from spackle.scene_fill import FillContext
+from spackle.scene_fill import FillContext, SceneViewCompletion
 
 CPU = CpuRenderer()
 
@@ -44,13 +43,13 @@ def box_view(
     ]
 
 
-def features_of(
+def view_of(
     base: Gaussians | Rendering, camera: Camera, photo_camera: Camera, photo: Tensor | None = None
-) -> tuple[ViewFeatures, InitialGaussians, Rim]:
-    """The inputs of f_res for a view of Gaussians, or for a rendering."""
-    features = ViewFeatures.of(base if isinstance(base, Rendering) else CPU.render(base, camera))
-    seeds = initialize(features, camera, photo_camera)
-    return features, seeds, find_rim(features, seeds, camera, photo_camera, photo)[0]
+) -> SceneViewCompletion:
+    """The completion of a view of Gaussians, or of a rendering."""
+    rendering = base if isinstance(base, Rendering) else CPU.render(base, camera)
+    render_photo = None if photo is None else lambda: photo
+    return SceneViewCompletion(rendering, camera, photo_camera, render_photo)
 
 
 def random_network(seed: int = 0, size: float = 0.02, name: str = "unet") -> ResidualNet:

@@ -7,7 +7,7 @@ import math
 
 import pytest
 import torch
-from helpers.holes import CPU, random_network
+from helpers.holes import CPU, box_view, random_network, view_of
 from helpers.scenes import away, box_before_wall, shifted
 from torch import Tensor
 
@@ -15,15 +15,16 @@ from spackle.core.camera import Camera
 from spackle.core.color import linear_to_srgb, srgb_to_linear
 from spackle.core.gaussians import Gaussians
 from spackle.core.surfels import make_surfels
-from spackle.core.trajectories import DepthRange, leftmost_and_rightmost
+from spackle.core.trajectories import DepthRange, extremes
 from spackle.render.protocol import Rendering
 from spackle.render.reference import ReferenceRenderer
-from spackle.residual import InitialGaussians, ResidualNet, ViewFeatures, complete_view, initialize
+from spackle.residual import InitialGaussians, ResidualNet, ViewCompletion, complete_view
 from spackle.residual.architectures import open_residual
-from spackle.residual.completion import compose
-from spackle.residual.network import COLOR_MARGIN, DELTA_CHANNELS, find_rim, network_input
+from spackle.residual.composer import COLOR_MARGIN, DELTA_CHANNELS, compose
+from spackle.residual.features import ViewFeatures
+from spackle.scene_fill import fill_view
 
-R = ReferenceRenderer()
+REFERENCE = ReferenceRenderer()
 
 
 def logit(p: float) -> float:
@@ -36,21 +37,21 @@ def sigmoid(x: float) -> float:
 
 
 def augmented(
-    seeds: InitialGaussians, row: int, column: int, delta: list[float], camera: Camera
+    initial: InitialGaussians, row: int, column: int, delta: list[float], camera: Camera
 ) -> Gaussians:
-    """g_i of eq. 5: the base values of a cell plus the deltas, composed as in SHARP."""
-    u, v = (float(x) + d for x, d in zip(seeds.uv[row, column], delta[:2], strict=True))
-    relative = float(seeds.inverse_depth[row, column]) / seeds.unit
-    inverse = seeds.unit * math.log1p(
+    """g_i of eq. 5: the initial Gaussian of a cell plus the deltas, composed as in SHARP."""
+    u, v = (float(x) + d for x, d in zip(initial.uv[row, column], delta[:2], strict=True))
+    relative = float(initial.inverse_depth[row, column]) / initial.unit
+    inverse = initial.unit * math.log1p(
         math.expm1(relative) * math.exp(0.1 * delta[2])
     )  # softplus(softplus⁻¹ + δ)
     rgb = [
         sigmoid(logit(float(c)) + d)
-        for c, d in zip(seeds.rgb[row, column], delta[10:13], strict=True)
+        for c, d in zip(initial.rgb[row, column], delta[10:13], strict=True)
     ]
     opacity = sigmoid(logit(0.99) + delta[13])
     surfel = make_surfels(
-        camera, torch.tensor([[u, v]]), torch.tensor([inverse]), seeds.slope[row, column][None], 1.3,
+        camera, torch.tensor([[u, v]]), torch.tensor([inverse]), initial.slope[row, column][None], 1.3,
         srgb_to_linear(torch.tensor([rgb])), torch.tensor([opacity]),
     )  # fmt: skip
     # A scale grows by a sigmoid from 1/4 to 4 whose value and slope at zero are one.
@@ -71,29 +72,26 @@ def paper(
     base: Gaussians, camera: Camera, photo: Camera, f_res: ResidualNet
 ) -> tuple[Gaussians, Rendering]:
     """𝒢̃_aug(v), and the final view."""
-    view = R.render(base, camera)  # eqs. 2 and 3
+    view = REFERENCE.render(base, camera)  # eqs. 2 and 3
     holes = [[float(a) < 0.95 for a in row] for row in view.alpha]  # eq. 4
-    features = ViewFeatures.of(view)
-    seeds = initialize(features, camera, photo)
-    deltas: Tensor = f_res(
-        network_input(features, seeds, find_rim(features, seeds, camera, photo)[0])
-    )[0]  # eq. 5
+    steps = view_of(view, camera, photo)
+    deltas: Tensor = f_res(steps.network_input(f_res.inputs))[0]  # eq. 5
     chosen = []
     for row in range(deltas.shape[1]):
         for column in range(deltas.shape[2]):
             if holes[2 * row][2 * column]:  # eq. 7, on a grid of every second pixel
                 chosen.append(
-                    augmented(seeds, row, column, deltas[:, row, column].tolist(), camera)
+                    augmented(steps.initial, row, column, deltas[:, row, column].tolist(), camera)
                 )
     aux = Gaussians.cat(chosen)
-    return aux, R.render(Gaussians.cat([base, aux]), camera)  # eqs. 8 and 9
+    return aux, REFERENCE.render(Gaussians.cat([base, aux]), camera)  # eqs. 8 and 9
 
 
 @pytest.mark.parametrize("size", [(48, 36), (47, 35)])
 def test_a_completed_view_matches_the_equations(size: tuple[int, int]) -> None:
     scene = box_before_wall(width=size[0], height=size[1], focal=40)
     base, network = scene.base(), random_network()
-    camera = leftmost_and_rightmost(scene.camera, 0.3, DepthRange.of(base))[1]
+    camera = extremes(scene.camera, 0.3, DepthRange.of(base))[1]
     aux = complete_view(base, camera, scene.camera, CPU, network, precision="fp32")
     with torch.no_grad():
         expected, final = paper(base, camera, scene.camera, network)
@@ -115,39 +113,115 @@ def test_the_least_number_of_gaussians() -> None:
         assert len(complete_view(base, scene.camera, scene.camera, CPU, network, least=64)) == 64
 
 
+@pytest.mark.parametrize("hole_share", [0.0, 0.1, 0.5, 1.0])
+@pytest.mark.parametrize("size", [(1, 9), (7, 8), (8, 8), (14, 13)])
+def test_cells_are_those_whose_first_pixel_is_a_hole_or_else_the_least_opaque(
+    size: tuple[int, int], hole_share: float
+) -> None:
+    rows, columns = size
+    generator = torch.Generator().manual_seed(rows)
+    hole = torch.rand(2 * rows, 2 * columns, generator=generator) < hole_share
+    # Many equal opacities, all holes below the threshold.
+    steps = (4 * torch.rand(hole.shape, generator=generator)).round() / 4
+    alpha = torch.where(hole, 0.9 * steps, 0.95 + 0.05 * steps)
+    rendering = Rendering(torch.zeros(*hole.shape, 3), torch.ones(hole.shape), alpha)
+    camera = Camera.from_focal(20, 2 * columns, 2 * rows)
+    view = ViewCompletion(rendering, camera, camera)
+    masked = hole[::2, ::2]
+    assert torch.equal(view.cells(), masked)
+    cells = view.cells(at_least=64)
+    if int(masked.sum()) >= 64:
+        assert torch.equal(cells, masked)
+    else:
+        assert int(cells.sum()) == min(64, cells.numel())
+        opacity = ViewFeatures.of(rendering).alpha
+        if not cells.all():
+            assert opacity[cells].max() <= opacity[~cells].min()
+
+
+class CountedView(ViewCompletion):
+    """Notes which inputs a network asks for."""
+
+    def __init__(self, rendering: Rendering, camera: Camera, photo_camera: Camera) -> None:
+        super().__init__(rendering, camera, photo_camera, self.render_photo)
+        self.asked: list[str] = []
+
+    def render_photo(self) -> Tensor:
+        self.asked.append("the photo's rendering")
+        return torch.rand(72, 96, 3, generator=torch.Generator().manual_seed(0))
+
+    def input(self, name: str) -> Tensor:
+        self.asked.append(name)
+        return super().input(name)
+
+
+def test_a_network_gets_only_the_inputs_that_it_names() -> None:
+    context, camera = box_view()
+    rendering = CPU.render(context.base, camera)
+    for names in (("rgb", "mask"), ("photo", "depth"), ("initial",)):
+        view = CountedView(rendering, camera, context.photo_camera)
+        channels = sum(ViewCompletion.INPUT_CHANNELS[name] for name in names)
+        assert view.network_input(names).shape == (1, channels, 36, 48)
+        expected = list(names)
+        if "photo" in names:
+            expected.insert(1, "the photo's rendering")
+        assert view.asked == expected
+        # Each part is computed when it is asked for.
+        assert ("initial" in vars(view)) == (names != ("rgb", "mask"))
+    with pytest.raises(ValueError, match="unknown input 'rim'"):
+        view.network_input(("rim",))
+
+
+def test_the_papers_network_matches_no_patches_and_traces_no_lines_for_its_inputs(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    calls: list[str] = []
+    for name in ("match_patches", "trace_epipolar_lines"):
+        monkeypatch.setattr(
+            f"spackle.scene_fill.view_completion.{name}", lambda *_, name=name: calls.append(name)
+        )
+    context, camera = box_view()
+    network = random_network(name="sharp-decoder")
+    aux = complete_view(context.base, camera, context.photo_camera, CPU, network)
+    whole = fill_view(dataclasses.replace(context, network=network, texture=None), camera).aux
+    assert len(aux) > 100
+    assert len(whole) > 100
+    assert not calls
+
+
 @pytest.mark.parametrize("name", ["unet", "sharp-decoder"])
-def test_no_holes_give_nothing_and_no_network_the_seeds(name: str) -> None:
+def test_no_holes_give_nothing_and_no_network_the_initial_gaussians(name: str) -> None:
     scene = box_before_wall(width=48, height=36, focal=40)
     base = scene.base()
     assert len(complete_view(base, scene.camera, scene.camera, CPU, None)) == 0
     camera = away(scene.camera)
-    seeds, untrained = (
+    initial, untrained = (
         complete_view(base, camera, scene.camera, CPU, f_res)
         for f_res in (None, open_residual(name))
     )
-    assert len(seeds) == 24 * 18  # all cells
-    torch.testing.assert_close(seeds.means, untrained.means, rtol=1e-3, atol=1e-3)
+    assert len(initial) == 24 * 18  # all cells
+    torch.testing.assert_close(initial.means, untrained.means, rtol=1e-3, atol=1e-3)
 
 
 VIEW = shifted(Camera.from_focal(60, 64, 48), 0.4)
 DRAWN = torch.rand(20, 8, generator=torch.Generator().manual_seed(0))
 UV = DRAWN[:, :2] * torch.tensor([64.0, 48.0])
-SEEDS = InitialGaussians(
+INITIAL = InitialGaussians(
     UV, 0.1 + DRAWN[:, 2], 0.01 * (DRAWN[:, 3:5] - 0.5), 0.1 + 0.8 * DRAWN[:, 5:]
 )
-BEFORE = compose(SEEDS, None, VIEW)
+BEFORE = compose(INITIAL, None, VIEW)
 
 
-def test_zero_deltas_give_the_seeds() -> None:
+def test_zero_deltas_give_the_initial_gaussians() -> None:
     zeros = torch.zeros(20, DELTA_CHANNELS)
-    for one, other in zip(BEFORE.tensors, compose(SEEDS, zeros, VIEW).tensors, strict=True):
+    for one, other in zip(BEFORE.tensors, compose(INITIAL, zeros, VIEW).tensors, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
     uv, z = VIEW.project(BEFORE.means)
-    torch.testing.assert_close(uv, SEEDS.uv, rtol=0, atol=1e-3)
-    torch.testing.assert_close(z, 1 / SEEDS.inverse_depth)
-    torch.testing.assert_close(linear_to_srgb(BEFORE.colors), SEEDS.rgb)
-    assert len(compose(SEEDS.select(torch.zeros(20, dtype=torch.bool)), zeros[:0], VIEW)) == 0
-    extremes = dataclasses.replace(SEEDS, rgb=(DRAWN[:, 5:] > 0.5).float())  # black and white
+    torch.testing.assert_close(uv, INITIAL.uv, rtol=0, atol=1e-3)
+    torch.testing.assert_close(z, 1 / INITIAL.inverse_depth)
+    torch.testing.assert_close(linear_to_srgb(BEFORE.colors), INITIAL.rgb)
+    assert len(compose(INITIAL.select(torch.zeros(20, dtype=torch.bool)), zeros[:0], VIEW)) == 0
+    extremes = dataclasses.replace(INITIAL, rgb=(DRAWN[:, 5:] > 0.5).float())  # black and white
     found = linear_to_srgb(compose(extremes, zeros, VIEW).colors)
     assert (
         float((found - extremes.rgb).abs().max()) <= COLOR_MARGIN * 1.01
@@ -158,11 +232,11 @@ def test_zero_deltas_give_the_seeds() -> None:
 def test_deltas_keep_bounds(by: float) -> None:
     deltas = torch.zeros(20, DELTA_CHANNELS)
     deltas[:, 2] = deltas[:, 10:] = by
-    after = compose(SEEDS, deltas, VIEW)
+    after = compose(INITIAL, deltas, VIEW)
     _, z = VIEW.project(after.means)
     assert float(z.min()) > 0  # never behind the camera
     assert bool(
-        ((z < 1 / SEEDS.inverse_depth) == (by > 0)).all()
+        ((z < 1 / INITIAL.inverse_depth) == (by > 0)).all()
     )  # a larger inverse depth is nearer
     for one, other in ((BEFORE.colors, after.colors), (BEFORE.opacities, after.opacities)):
         assert 0 <= float(other.min()) <= float(other.max()) <= 1

@@ -1,4 +1,4 @@
-"""Base values of holes behind objects, and beyond the photo's border."""
+"""Initial Gaussians of holes behind objects, and beyond the photo's border."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from spackle.core.camera import Camera
 from spackle.core.surfels import BEHIND_SURFACE_RATIO
 from spackle.residual import CELL, ViewFeatures, initialize
 from spackle.residual.features import cell_centers
-from spackle.residual.initializer import BLOB_CELLS, inside_photo
+from spackle.residual.initializer import GAUSSIAN_REACH_CELLS, inside_photo
 
 PHOTO = Camera.from_focal(150, 240, 160)
 VIEW = PHOTO.looking(torch.tensor([-1.2, 0.0, 0.0]), torch.tensor([0.3, 0.0, 4.0]))
@@ -25,25 +25,26 @@ GROUND, BACK = 1.0, 6.0  # y of the floor and z of the wall
 
 @settings(deadline=None, max_examples=40)
 @given(st.integers(0, 2**32 - 1), st.tuples(*[st.integers(1, 40)] * 2))
-def test_seeds_lie_behind_visible_surfaces(seed: int, size: tuple[int, int]) -> None:
+def test_initial_gaussians_lie_behind_visible_surfaces(seed: int, size: tuple[int, int]) -> None:
     features, camera = (
         ViewFeatures.of(random_view(seed, *size)),
         Camera.from_focal(25, size[1], size[0]),
     )
-    seeds = initialize(features, camera, camera)
+    initial = initialize(features, camera, camera)
     assert all(
-        bool(t.isfinite().all()) for t in (seeds.uv, seeds.inverse_depth, seeds.slope, seeds.rgb)
+        bool(t.isfinite().all())
+        for t in (initial.uv, initial.inverse_depth, initial.slope, initial.rgb)
     )
-    assert float(seeds.inverse_depth.min()) > 0
-    assert 0 <= float(seeds.rgb.min()) <= float(seeds.rgb.max()) <= 1
+    assert float(initial.inverse_depth.min()) > 0
+    assert 0 <= float(initial.rgb.min()) <= float(initial.rgb.max()) <= 1
     seen = torch.where(features.inverse_depth > 0, features.inverse_depth, torch.inf)
-    farthest = -max_pool2d(-seen[None], 2 * BLOB_CELLS + 1, 1, BLOB_CELLS)[0]
+    farthest = -max_pool2d(-seen[None], 2 * GAUSSIAN_REACH_CELLS + 1, 1, GAUSSIAN_REACH_CELLS)[0]
     assert bool(
-        (seeds.inverse_depth <= farthest * (1 - BEHIND_SURFACE_RATIO / 2))[features.mask].all()
+        (initial.inverse_depth <= farthest * (1 - BEHIND_SURFACE_RATIO / 2))[features.mask].all()
     )
-    chosen = seeds.select(features.mask)
+    chosen = initial.select(features.mask)
     for name in ("uv", "inverse_depth", "slope", "rgb"):
-        assert torch.equal(getattr(chosen, name), getattr(seeds, name)[features.mask])
+        assert torch.equal(getattr(chosen, name), getattr(initial, name)[features.mask])
 
 
 def test_inside_photo_matches_projected_points() -> None:
@@ -57,7 +58,9 @@ def test_inside_photo_matches_projected_points() -> None:
 
 
 def room() -> tuple[ViewFeatures, Tensor, Tensor]:
-    """Features of an endless floor and wall, inverse depth of all cells, and the floor's cells [h, w] bool."""
+    """Features of an endless floor and wall, inverse depth of all cells, and the floor's cells [h,
+    w] bool.
+    """
     rays = (
         VIEW.unproject(cell_centers(VIEW), torch.ones(VIEW.height // CELL, VIEW.width // CELL))
         - VIEW.position
@@ -76,13 +79,13 @@ def room() -> tuple[ViewFeatures, Tensor, Tensor]:
 
 def test_floor_and_wall_are_extended_beyond_the_border() -> None:
     features, inverse_depth, floor = room()
-    seeds, beyond = initialize(features, VIEW, PHOTO), features.mask
+    initial, beyond = initialize(features, VIEW, PHOTO), features.mask
     assert float(beyond.float().mean()) > 0.2
-    off = (seeds.inverse_depth / inverse_depth - 1).abs()[beyond]
+    off = (initial.inverse_depth / inverse_depth - 1).abs()[beyond]
     assert float(off.median()) < 0.015
     assert float(off.mean()) < 0.06
     for surface, color in ((floor, FLOOR), (~floor, WALL)):
-        assert float((seeds.rgb - color).abs().mean(-1)[beyond & surface].mean()) < 0.12
+        assert float((initial.rgb - color).abs().mean(-1)[beyond & surface].mean()) < 0.12
     within = initialize(
         dataclasses.replace(features, inverse_depth=torch.ones_like(inverse_depth)), VIEW, VIEW
     )
@@ -100,5 +103,5 @@ def test_nearer_objects_are_not_extended_beyond_the_border() -> None:
         torch.where(near, 0.22, features.inverse_depth),
         torch.where(near, 1.0, features.alpha),
     )
-    seeds = initialize(ViewFeatures(red, inverse, alpha, features.mask & ~near), VIEW, PHOTO)
-    assert float((seeds.rgb[20:28, edge + 16 :] - WALL).abs().mean()) < 0.3  # of 0.53
+    initial = initialize(ViewFeatures(red, inverse, alpha, features.mask & ~near), VIEW, PHOTO)
+    assert float((initial.rgb[20:28, edge + 16 :] - WALL).abs().mean()) < 0.3  # of 0.53

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers.holes import CPU, box_view, features_of, random_network, random_view
+from helpers.holes import CPU, box_view, random_network, random_view, view_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.torch import save_file
@@ -18,19 +18,22 @@ from spackle.core.color import linear_to_srgb, srgb_to_linear
 from spackle.paper.training.residual import first_network
 from spackle.render.protocol import Rendering
 from spackle.residual import ViewFeatures, hole_area_ratio, hole_mask
-from spackle.residual.architectures import NOTE, SharpDecoder, load_residual, open_residual
-from spackle.residual.initializer import seen_in_photo
-from spackle.residual.network import (
-    DELTA_CHANNELS,
-    PHOTO,
-    RIM_CHANNELS,
-    network_input,
-    predict_deltas,
-)
+from spackle.residual.architectures import NOTE, load_residual, open_residual
+from spackle.residual.composer import DELTA_CHANNELS
+from spackle.residual.initializer import sample_photo
+from spackle.residual.network import ResidualNet
+from spackle.residual.sharp_decoder import SharpDecoder
 from spackle.runtime.errors import InputError
+from spackle.scene_fill.unet import UNet
+from spackle.scene_fill.view_completion import SceneViewCompletion
 from spackle.weights.checkpoints import read_tensors, to_channels_last
 
 ARCHITECTURES = ("unet", "sharp-decoder")
+
+
+def channels_of(network: ResidualNet) -> int:
+    """The number of channels of a network's input."""
+    return sum(SceneViewCompletion.INPUT_CHANNELS[name] for name in network.inputs)
 
 
 def test_hole_mask_and_ratio() -> None:
@@ -84,7 +87,8 @@ def test_the_network_takes_any_size_and_does_not_mix_a_batch(
     assert sum(parameter.numel() for parameter in network.parameters()) == pytest.approx(
         8.02e6, rel=2e-3
     )
-    features = torch.randn(2, PHOTO.stop, *size, generator=torch.Generator().manual_seed(0))
+    channels = channels_of(network)
+    features = torch.randn(2, channels, *size, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
         deltas, alone = network(features), torch.cat([network(f[None]) for f in features])
     assert deltas.shape == (2, DELTA_CHANNELS, *size)
@@ -101,8 +105,8 @@ def test_the_networks_input_does_not_depend_on_the_unit() -> None:
         pose[:3, 3] *= unit
         seen = dataclasses.replace(view, depth=view.depth * unit)
         scaled = dataclasses.replace(camera, world_to_camera=pose)
-        found.append(network_input(*features_of(seen, scaled, context.photo_camera)))
-    assert found[0].shape == (1, RIM_CHANNELS, 36, 48)
+        found.append(view_of(seen, scaled, context.photo_camera).network_input(UNet.inputs))
+    assert found[0].shape == (1, 21, 36, 48)
     assert bool(found[0].isfinite().all())
     torch.testing.assert_close(found[1], found[0], rtol=0, atol=0.02)
 
@@ -119,18 +123,22 @@ def test_a_loaded_network_equals_the_saved_one(name: str, tmp_path: Path) -> Non
     loaded = load_residual(path)
     assert loaded.name == name
     context, camera = box_view()
-    view = features_of(
+    view = view_of(
         context.base,
         camera,
         context.photo_camera,
         CPU.render(context.base, context.photo_camera).rgb,
     )
-    assert torch.equal(
-        predict_deltas(loaded, *view, "fp32"), predict_deltas(network, *view, "fp32")
-    )
+    expected = view.deltas(network, "fp32")
+    found = view.deltas(loaded, "fp32")
+    assert expected is not None
+    assert found is not None
+    assert torch.equal(found, expected)
     for wrong, said in (
         (next(n for n in ARCHITECTURES if n != name), "another network's"),
         ("vit", "unknown architecture"),
+        ("os:remove", "not a subclass"),
+        ("never_imported:Network", "unknown architecture"),
     ):
         save_file(tensors, path, {NOTE: wrong})
         with pytest.raises(InputError, match=said):
@@ -147,7 +155,7 @@ def test_colours_of_the_photo_at_projected_points() -> None:
     )
     cells = photo.unflatten(1, (32, 2)).unflatten(0, (24, 2)).mean((1, 3))
     view = dataclasses.replace(camera, world_to_camera=pose)
-    seen = seen_in_photo(photo, nowhere, torch.full((24, 32), 0.5), view, camera)
+    seen = sample_photo(photo, nowhere, torch.full((24, 32), 0.5), view, camera)
     torch.testing.assert_close(seen[:, :24], cells[:, 8:])
     assert not seen[:, 24:].any()
 
@@ -160,6 +168,6 @@ def test_the_papers_network_starts_with_sharps_decoder(made: dict[str, Path]) ->
         f"feature_model.{key}": value for key, value in network.feature_model.state_dict().items()
     }
     assert all(torch.equal(value, theirs[key]) for key, value in weights.items())
-    assert not network(torch.randn(1, PHOTO.stop, 16, 16)).any()
+    assert not network(torch.randn(1, 13, 16, 16)).any()
     with pytest.raises(InputError, match=rf"{made['sharp'].name}: .*another network"):
         first_network("unet", made["sharp"])

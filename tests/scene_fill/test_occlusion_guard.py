@@ -33,7 +33,9 @@ SEEDS = st.integers(0, 2**32 - 1)
 def plain_push(
     aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]
 ) -> tuple[list[float], list[int]]:
-    """The factors and indices of the Gaussians that `move_behind_surfaces` keeps, in plain Python."""
+    """The factors and indices of the Gaussians that `move_behind_surfaces` keeps, in plain
+    Python.
+    """
 
     def blocked(point: Tensor, covariance: Tensor) -> bool:
         for guard in guards:

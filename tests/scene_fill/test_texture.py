@@ -8,7 +8,7 @@ import functools
 import numpy as np
 import pytest
 import torch
-from helpers.holes import CPU, box_view, features_of
+from helpers.holes import CPU, box_view, view_of
 from helpers.plain_patches import Subject
 from torch import Tensor
 
@@ -20,12 +20,11 @@ from spackle.core.trajectories import DepthRange, trajectory_cameras
 from spackle.inpaint import InpainterOptions
 from spackle.inpaint.plain import PlainInpainter
 from spackle.residual import InitialGaussians, hole_mask
-from spackle.residual.completion import compose
-from spackle.residual.network import find_rim
+from spackle.residual.composer import compose
 from spackle.scene_fill import FillContext, exemplar_texture, fill_scene, fill_view, painted_texture
 from spackle.scene_fill import texture as room
-from spackle.scene_fill.fill import OPPOSITE
-from spackle.scene_fill.texture import HoleView
+from spackle.scene_fill.fill import OPPOSITE_VIEWS
+from spackle.scene_fill.view_completion import SceneViewCompletion
 
 
 @pytest.mark.parametrize("period", [4.0, 6.0, 8.0])  # pixels
@@ -75,7 +74,7 @@ def test_painted_textures_are_visible(size: tuple[int, int], threshold: float) -
     texture = functools.partial(painted_texture, painter)
     context = dataclasses.replace(context, texture=texture, threshold=threshold)
     view = CPU.render(context.base, camera)
-    filled, hole = fill_view(context, camera, rendering=view), hole_mask(view.alpha)
+    filled, hole = fill_view(context, camera, rendering=view), hole_mask(view.alpha, threshold)
     ((rgb, asked, inverse_depth),) = painter.asked
     assert torch.equal(rgb[0], view.rgb)
     assert torch.equal(asked[0], hole)
@@ -89,49 +88,45 @@ def test_painted_textures_are_visible(size: tuple[int, int], threshold: float) -
         "rotate-forward", context.photo_camera, 0.4, DepthRange.of(context.base), 9
     )
     assert len(fill_scene(context, path, exact=True).aux)
-    assert len(painter.asked) == OPPOSITE  # only the widest views
+    assert len(painter.asked) == OPPOSITE_VIEWS  # only the widest views
 
 
-def hole_view() -> tuple[HoleView, FillContext, Camera]:
-    """A view of the box with random structure."""
+def hole_view() -> tuple[SceneViewCompletion, Tensor, FillContext]:
+    """A view of the box, and random colours of its cells."""
     context, camera = box_view(0.3)
-    view = CPU.render(context.base, camera)
-    features, seeds, _ = features_of(view, camera, context.photo_camera)
-    structure = torch.rand(features.rgb.shape, generator=torch.Generator().manual_seed(0))
-    rim = find_rim(features, seeds, camera, context.photo_camera)
-    return HoleView(view, features, seeds, *rim, structure), context, camera
+    view = view_of(context.base, camera, context.photo_camera)
+    generator = torch.Generator().manual_seed(0)
+    return view, torch.rand(view.features.rgb.shape, generator=generator), context
 
 
 def test_texture_has_no_low_frequencies() -> None:
-    view, _, _ = hole_view()
-    bad = dataclasses.replace(view.patches, mismatch=view.patches.mismatch + 100)
-    found, plain = (
-        exemplar_texture(dataclasses.replace(view, patches=patches))
-        for patches in (view.patches, bad)
-    )
-    fine, mask = found - plain, view.features.mask
-    assert float(room.in_cells(fine)[mask].abs().mean()) > 1e-3
+    view, structure, _ = hole_view()
+    textured = exemplar_texture(view, structure)
+    view.patches = dataclasses.replace(view.patches, mismatch=view.patches.mismatch + 100)
+    plain = exemplar_texture(view, structure)
+    fine, mask = textured - plain, view.mask
+    assert float(room.group_by_cell(fine)[mask].abs().mean()) > 1e-3
     assert float(gaussian_blur(fine, 4 * room.TEXTURE_PX).abs().max()) < 0.1 * float(
         fine.abs().max()
     )
-    assert torch.equal(room.in_cells(plain)[~mask], room.in_cells(view.rendering.rgb)[~mask])
+    rendered = room.group_by_cell(view.rendering.rgb)
+    assert torch.equal(room.group_by_cell(plain)[~mask], rendered[~mask])
 
 
 def test_colours_at_the_border_are_extended() -> None:
-    view, context, camera = hole_view()
-    features, seeds, beyond = view.features, view.seeds, view.rim.beyond
-    uv, z = context.photo_camera.project(camera.unproject(seeds.uv, 1 / seeds.inverse_depth))
+    view, structure, context = hole_view()
+    features, beyond = view.features, view.beyond_photo
+    points = view.camera.unproject(view.initial.uv, 1 / view.initial.inverse_depth)
+    uv, z = context.photo_camera.project(points)
     outside = (uv < 0).any(-1) | (uv[..., 0] > 96) | (uv[..., 1] > 72) | (z <= 0)
     assert torch.equal(beyond, outside & features.mask)
-    found = room.extended(view)
-    assert torch.equal(found[~beyond], view.structure[~beyond])
+    found = room.extended(view, structure)
+    assert torch.equal(found[~beyond], structure[~beyond])
     cells, known = beyond.nonzero(), (~features.mask).nonzero()
     apart, nearest = torch.cdist(cells.float(), known.float()).min(1)
     near, far = apart == 1, apart == apart.max()
-    shown, changed = (
-        features.rgb[tuple(known[nearest].T)] - found[beyond],
-        (found - view.structure)[beyond].abs(),
-    )
+    shown = features.rgb[tuple(known[nearest].T)] - found[beyond]
+    changed = (found - structure)[beyond].abs()
     assert float(shown[near].abs().mean()) < 0.3 * float(changed[near].mean())
     assert float(changed[far].mean()) < 0.3 * float(changed[near].mean())
 

@@ -53,7 +53,7 @@ VIEW = ("swipe", 0.3, 1.0)  # far to the right, where there are holes
 
 @functools.cache
 def box() -> Scene:
-    """A small scene, completed by the seeds."""
+    """A small scene, completed by initial Gaussians."""
     prediction = box_before_wall(width=64, height=48, focal=53).lift()
     depths = DepthRange.of(prediction.gaussians)
     return complete(

@@ -95,9 +95,9 @@ def predict(
     residual: Annotated[
         str | None,
         typer.Option(
-            metavar="PATH|seeds|none",
+            metavar="PATH|initial|none",
             hidden=True,
-            help="Weights of the residual. seeds: no network; none: no fill. Default: the weights in the package.",
+            help="Weights of the residual. initial: no network; none: no fill. Default: the weights in the package.",
         ),
     ] = None,
     fill: Annotated[

@@ -123,7 +123,7 @@ def _compare_truth(
     methods = {
         "base": before.rgb,
         "2D inpainting (biharmonic)": torch.from_numpy(flat).float().clamp(0, 1),
-        "Spackle (seeds)": seeds.render(pair.right_camera, renderer).rgb,
+        "Spackle (initial Gaussians)": seeds.render(pair.right_camera, renderer).rgb,
         "Spackle (trained)": after.rgb,
     }
     save_png(after.rgb, output / "right_view.png")

@@ -39,8 +39,8 @@ Checkpoint = Annotated[Path | None, typer.Option("-c", "--checkpoint", help="Wei
 Residual = Annotated[
     str | None,
     typer.Option(
-        metavar="PATH|seeds",
-        help="Weights of the residual; default: those in the package, else seeds.",
+        metavar="PATH|initial",
+        help="Weights of the residual; default: those in the package, else initial.",
     ),
 ]
 Side = Annotated[
@@ -84,7 +84,7 @@ def evaluate(
         str,
         typer.Option(
             metavar="A,B,…",
-            help="Methods, with commas: base, paper, spackle, spackle-scene, seeds, dense, inpaint2d, direct-ft.",
+            help="Methods, with commas: base, paper, spackle, spackle-scene, initial, dense, inpaint2d, direct-ft.",
         ),
     ] = "base,paper,spackle",
     disparity: Disparity = "0.3,0.4,0.5",

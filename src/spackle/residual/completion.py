@@ -1,33 +1,202 @@
-"""Complete one view as in the paper: eqs. 2 to 7 (eq. 8 is `Gaussians.cat([base, aux])`, eq. 9 its rendering)."""
+"""Complete one view as in the paper, eqs. 2 to 7: `ViewCompletion` is the only place where this
+happens.
+
+Eq. 8 is `Gaussians.cat([base, aux])`, and eq. 9 the rendering of these Gaussians.
+"""
 
 from __future__ import annotations
 
-import dataclasses
-import math
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from typing import ClassVar
 
 import torch
 from torch import Tensor
-from torch.nn.functional import softplus
 
 from spackle.core.camera import Camera
-from spackle.core.color import srgb_to_linear
 from spackle.core.gaussians import Gaussians
-from spackle.core.surfels import SURFEL_OPACITY, make_surfels
 from spackle.render import Renderer
 from spackle.render.protocol import Rendering
+from spackle.residual.composer import compose
 from spackle.residual.features import CELL, MASK_THRESHOLD, ViewFeatures, hole_mask
-from spackle.residual.initializer import InitialGaussians, initialize
-from spackle.residual.network import DELTAS, ResidualNet, color_logit, find_rim, predict_deltas
+from spackle.residual.initializer import InitialGaussians, initialize, sample_photo
+from spackle.residual.network import ResidualNet, predict_deltas
 from spackle.runtime.device import Precision
 
-SPREAD_PX = 1.3  # standard deviation: Gaussians two pixels apart reach alpha 0.95 everywhere
-# A delta of 1 changes the position by a pixel, and colour and opacity by 1 in the sigmoid's domain, but the quaternion
-# by GAIN, and the inverse depth by GAIN times the view's median.
-GAIN = 0.1
-LEAST_DEPTH = 1e-4  # least inverse depth, as part of the view's median
-MAX_SCALE = (
-    4.0  # scale factors lie between 1 / MAX_SCALE and MAX_SCALE; for delta 0, value and slope are 1
-)
+MIN_AUX_GAUSSIANS = 64  # least number of aux Gaussians in a view (paper, "Training Details")
+MIN_RELATIVE_DEPTH = 1e-4  # smaller inverse depths, as fractions of the view's median, are raised
+
+
+class ViewCompletion:
+    """Fills the holes of one rendered view with aux Gaussians, step by step; each step runs when it
+    is asked for.
+
+        view = ViewCompletion(renderer.render(base, camera), camera, photo_camera)
+        deltas = view.deltas(network)                 # eq. 5
+        aux = view.gaussians(view.cells(), deltas)    # eq. 7
+
+    The grid of a view has a cell for each 2×2 pixels: h = ceil(H/2) rows, w = ceil(W/2) columns.
+    Each cell has an initial Gaussian, a first guess of what fills the hole; a network changes it by
+    14 numbers, the deltas.
+
+    A network names its inputs. To add inputs, extend `INPUT_CHANNELS` and `input` in a subclass,
+    and make the subclass the network's `view_type`.
+    """
+
+    # The inputs that a network may name, with their numbers of channels.
+    INPUT_CHANNELS: ClassVar[Mapping[str, int]] = {
+        "rgb": 3,  # the rendered colour
+        "depth": 1,  # the rendered depth
+        "alpha": 1,  # the rendered opacity
+        "mask": 1,  # 1 where a cell has a hole
+        "initial": 4,  # depth and colour of the initial Gaussian
+        "photo": 3,  # the photo's colour at the initial Gaussian
+    }
+
+    def __init__(
+        self,
+        rendering: Rendering,
+        camera: Camera,
+        photo_camera: Camera,
+        render_photo: Callable[[], Tensor] | None = None,
+        threshold: float = MASK_THRESHOLD,
+    ) -> None:
+        """Keep the view; nothing is computed yet.
+
+        Args:
+            rendering: the base's Gaussians rendered from the view, on any device (eqs. 2 and 3).
+            camera: of the view.
+            photo_camera: of the photo from which the base was predicted.
+            render_photo: returns the photo [H', W', 3], sRGB; called only for a network that names
+                "photo".
+            threshold: τ_α of eq. 4: a pixel with a lower opacity is a hole.
+        """
+        self.rendering = rendering
+        self.camera = camera
+        self.photo_camera = photo_camera
+        self.threshold = threshold
+        self._render_photo = render_photo
+
+    @functools.cached_property
+    def features(self) -> ViewFeatures:
+        """The rendered view, averaged in cells."""
+        return ViewFeatures.of(self.rendering, self.threshold)
+
+    @property
+    def mask(self) -> Tensor:
+        """[h, w] bool: the cells with at least one hole pixel."""
+        return self.features.mask
+
+    def cells(self, at_least: int = 0) -> Tensor:
+        """[h, w] bool: the cells that get an aux Gaussian, those whose first pixel is a hole (eqs.
+        4 and 7).
+
+        About HAR · h · w cells are thus chosen, as in the paper's tables (HAR: the fraction of hole
+        pixels). If these are fewer than `at_least`, the `at_least` least opaque cells are chosen
+        instead.
+        """
+        hole = hole_mask(self.rendering.alpha, self.threshold)
+        cells = hole[::CELL, ::CELL].cpu()
+        if int(cells.count_nonzero()) >= at_least:
+            return cells
+
+        # A stable order makes the choice among equal opacities reproducible.
+        by_opacity = self.features.alpha.flatten().argsort(stable=True)
+        cells = torch.zeros_like(cells)
+        cells.view(-1)[by_opacity[:at_least]] = True
+        return cells
+
+    @functools.cached_property
+    def initial(self) -> InitialGaussians:
+        """The initial Gaussians of all cells."""
+        return initialize(self.features, self.camera, self.photo_camera)
+
+    @functools.cached_property
+    def photo_colors(self) -> Tensor:
+        """[h, w, 3] sRGB of the photo at the initial Gaussians; outside of the photo, their own
+        colour.
+        """
+        if self._render_photo is None:
+            raise ValueError('a network names the input "photo", but no photo was given')
+        return sample_photo(
+            self._render_photo(),
+            self.initial.rgb,
+            self.initial.inverse_depth,
+            self.camera,
+            self.photo_camera,
+        )
+
+    def input(self, name: str) -> Tensor:
+        """[h, w, c] float32: the channels of one input, by its name in `INPUT_CHANNELS`.
+
+        Colours are moved to -0.5..0.5. Depths are log(inverse depth / median), so their unit does
+        not matter.
+        """
+        if name == "rgb":
+            return self.features.rgb - 0.5
+        if name == "depth":
+            log_depth = self._log_depth(self.features.inverse_depth)
+            visible = self.features.inverse_depth > 0
+            return torch.where(visible, log_depth, 0.0)[..., None]
+        if name == "alpha":
+            return self.features.alpha[..., None]
+        if name == "mask":
+            return self.mask.to(self.features.alpha)[..., None]
+        if name == "initial":
+            log_depth = self._log_depth(self.initial.inverse_depth)
+            return torch.cat([log_depth[..., None], self.initial.rgb - 0.5], dim=-1)
+        if name == "photo":
+            return self.photo_colors - 0.5
+        raise ValueError(f"a network names the unknown input {name!r}")
+
+    def _log_depth(self, inverse_depth: Tensor) -> Tensor:
+        """log(inverse depth / the view's median), of inverse depths [h, w]."""
+        return (inverse_depth / self.initial.unit).clamp_min(MIN_RELATIVE_DEPTH).log()
+
+    def network_input(self, names: Sequence[str]) -> Tensor:
+        """[1, C, h, w] float32, without gradients: the named inputs, one after the other."""
+        channels = torch.cat([self.input(name) for name in names], dim=-1)  # [h, w, C]
+        return channels.permute(2, 0, 1)[None].detach()
+
+    def deltas(
+        self, network: ResidualNet | None, precision: Precision = "auto", *, dense: bool = False
+    ) -> Tensor | None:
+        """The network's changes [h, w, 14] of the initial Gaussians (eq. 5), float32 on the CPU;
+        None without a network.
+
+        Args:
+            network: f_res, on any device.
+            precision: of its convolutions; auto is bfloat16 if the hardware multiplies it natively.
+            dense: predict for all cells; otherwise cells without a hole get zeros.
+        """
+        if network is None:
+            return None
+        cells = torch.ones_like(self.mask) if dense else self.mask
+        return predict_deltas(network, self.network_input(network.inputs), cells, precision)
+
+    def gaussians(self, cells: Tensor, deltas: Tensor | None) -> Gaussians:
+        """Aux Gaussians [n] of n cells (eq. 7); gradients reach the deltas.
+
+        Args:
+            cells: which cells, as a boolean grid [h, w] or row-major indices [n].
+            deltas: [h, w, 14] of all cells; None: zero.
+        """
+        chosen = self.initial.select(cells)
+        if deltas is None:
+            return compose(chosen, None, self.camera)
+        index = cells.flatten().nonzero()[:, 0] if cells.dtype == torch.bool else cells
+        return compose(chosen, deltas.flatten(0, 1)[index], self.camera)
+
+
+def view_type_of(
+    network: ResidualNet | None, default: type[ViewCompletion]
+) -> type[ViewCompletion]:
+    """The class that computes the inputs of a network; `default` without a network, or if it states
+    none.
+    """
+    if network is None or network.view_type is None:
+        return default
+    return network.view_type
 
 
 @torch.no_grad()
@@ -44,9 +213,8 @@ def complete_view(
     photo: Tensor | None = None,
     precision: Precision = "auto",
 ) -> Gaussians:
-    """𝒢̃_aug of a view (eq. 7): one Gaussian for each masked cell.
-
-    A cell is masked if its first pixel is masked. So about HAR times all cells are masked, as in the paper's tables.
+    """𝒢̃_aug of a view (eq. 7): one Gaussian for each cell of 2×2 pixels whose first pixel is a
+    hole.
 
     Args:
         base: 𝒢_base, N Gaussians in the world's frame.
@@ -55,65 +223,24 @@ def complete_view(
         renderer: ℛ.
         network: f_res, on any device; None: all deltas are 0.
         threshold: τ_α.
-        least: if fewer cells are masked, this number of the least opaque cells is used (paper, training details: 64).
+        least: if fewer cells have a hole, so many of the least opaque cells are filled (paper,
+            training details: 64).
         rendering: ℛ(𝒢_base, v), if already available.
-        photo: I as [H, W, 3] sRGB, for a network that `sees_photo`; None: the rendering of the base.
+        photo: I as [H, W, 3] sRGB, for a network that names the input "photo"; None: the rendering
+            of the base.
         precision: of the network; auto is bfloat16 if the hardware multiplies it natively.
     """
-    view = renderer.render(base, camera) if rendering is None else rendering  # eqs. 2 and 3
-    features = ViewFeatures.of(view, threshold)
-    mask = hole_mask(view.alpha, threshold)[::CELL, ::CELL].cpu()  # eq. 4
-    if int(mask.count_nonzero()) < least:
-        mask = torch.zeros_like(mask)
-        mask.view(-1)[features.alpha.flatten().argsort(stable=True)[:least]] = True
-    if not bool(mask.any()):
+
+    def render_photo() -> Tensor:
+        """The photo [H, W, 3], sRGB."""
+        return renderer.render(base, photo_camera).rgb if photo is None else photo
+
+    if rendering is None:
+        rendering = renderer.render(base, camera)  # eqs. 2 and 3
+    view_type = view_type_of(network, ViewCompletion)
+    view = view_type(rendering, camera, photo_camera, render_photo, threshold)
+    cells = view.cells(least)  # eq. 4
+    if not bool(cells.any()):
         return Gaussians.empty(base.means.device)
-    seeds, deltas = initialize(features, camera, photo_camera), None
-    if network is not None:
-        if network.sees_photo and photo is None:
-            photo = renderer.render(base, photo_camera).rgb
-        rim, _ = find_rim(features, seeds, camera, photo_camera, photo)
-        deltas = predict_deltas(network, features, seeds, rim, precision)[mask]  # eq. 5
-    return compose(seeds.select(mask), deltas, camera).to(base.means.device)  # eq. 7
-
-
-def compose(
-    seeds: InitialGaussians, deltas: Tensor | None, camera: Camera, spread_px: float = SPREAD_PX
-) -> Gaussians:
-    """Aux Gaussians [n] from seeds and deltas (SHARP's composition); gradients reach the deltas.
-
-    Args:
-        seeds: flat fields [n, ...], see `InitialGaussians.select`.
-        deltas: [n, 14]; None: zero.
-        camera: the view of the seeds.
-        spread_px: standard deviation of a Gaussian in pixels.
-    """
-    uv, inverse_depth, rgb = seeds.uv, seeds.inverse_depth, seeds.rgb
-    opacities = torch.full_like(inverse_depth, float(SURFEL_OPACITY))
-    if deltas is None:
-        colors = srgb_to_linear(rgb)
-        return make_surfels(camera, uv, inverse_depth, seeds.slope, spread_px, colors, opacities)
-    shift, nearer, scale, turn, color, opacity = torch.split(deltas, DELTAS, dim=1)
-    inverse_depth = _shift_positive(inverse_depth, GAIN * nearer.squeeze(1), seeds.unit)
-    colors = srgb_to_linear(torch.sigmoid(color_logit(rgb) + color))
-    opacities = torch.sigmoid(color_logit(opacities) + opacity.squeeze(1))
-    surfels = make_surfels(
-        camera, uv + shift, inverse_depth, seeds.slope, spread_px, colors, opacities
-    )
-    scales, quats = surfels.scales * _scale_factor(scale), surfels.quats + GAIN * turn
-    return dataclasses.replace(surfels, quats=quats, scales=scales)
-
-
-def _shift_positive(base: Tensor, delta: Tensor, unit: float) -> Tensor:
-    """softplus(softplus⁻¹(base) + delta), with base and result in multiples of `unit`."""
-    relative = (base / unit).clamp_min(LEAST_DEPTH)
-    return unit * softplus(relative + torch.log(-torch.expm1(-relative)) + delta).clamp_min(
-        LEAST_DEPTH
-    )
-
-
-def _scale_factor(delta: Tensor) -> Tensor:
-    low, high = 1 / MAX_SCALE, MAX_SCALE
-    center = math.log((1 - low) / (high - 1))
-    steepness = (high - low) / ((1 - low) * (high - 1))
-    return low + (high - low) * torch.sigmoid(steepness * delta + center)
+    deltas = view.deltas(network, precision)  # eq. 5
+    return view.gaussians(cells, deltas).to(base.means.device)  # eq. 7

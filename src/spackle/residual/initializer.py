@@ -1,15 +1,15 @@
-"""Base values ("seeds") of the aux Gaussians (paper, section 3.3), to which f_res adds deltas.
+"""Initial Gaussians: a first guess for each hole cell of a view (paper, section 3.3), which the
+network then corrects.
 
-Behind a surface of the photo, colour and depth are propagated from the far side of a hole's rim. Beyond the photo's
-border, the surface at the border is extended along the epipolar line, at constant depth in the photo's frame.
+Behind a surface of the photo, colour and depth are continued from the far side of the hole's rim.
+Beyond the photo's border, the surface at the border is extended along the epipolar line, at
+constant depth in the photo's frame.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample
@@ -18,251 +18,297 @@ from spackle.core.camera import Camera, to_like
 from spackle.core.filters import maximum_filter
 from spackle.core.hole_filling import FAR_SIDE_BIAS, fill_from_far_side
 from spackle.core.surfels import BEHIND_SURFACE_RATIO, inverse_depth_slope
-from spackle.residual.features import CELL, LEAST, ViewFeatures, cell_centers
-from spackle.runtime.device import parallel_for_chunks
-from spackle.runtime.kernels import kernel
+from spackle.residual.epipolar import trace_epipolar_lines
+from spackle.residual.features import CELL, MIN_DIVISOR, ViewFeatures, cell_centers
 
-AT_BORDER = 0.03  # of the photo's width: a surface that ends farther inside is not extended beyond the border
-BLOB_CELLS = (
-    2  # a seed lies behind all visible surfaces within so many cells, the reach of its Gaussian
-)
-SAME_DEPTH = 1.1  # a cell mirrored at the rim and the rim belong to one surface if inverse depths differ by less
-SAME_EYE = 1e-9 * CELL  # a shorter offset between cell and epipole (homogeneous) has no direction
+# A surface that ends farther inside the photo, as a fraction of the photo's width, is not extended
+# beyond the border.
+AT_BORDER_WIDTHS = 0.03
+# An initial Gaussian reaches so many cells, so it lies behind all visible surfaces within this
+# distance.
+GAUSSIAN_REACH_CELLS = 2
+EMPTY_VIEW_GREY = 0.5  # sRGB of the wall that fills a view in which nothing is visible
+EMPTY_VIEW_INVERSE_DEPTH = 0.1  # 1/m: this wall stands ten metres away
 
 
 @dataclasses.dataclass(frozen=True)
 class InitialGaussians:
-    """Base values for every cell of a grid."""
+    """The first guess of one Gaussian for every cell (2×2 pixels) of a view: a point of a surface,
+    and its colour.
+    """
 
-    uv: Tensor  # [h, w, 2] pixels
-    inverse_depth: Tensor  # [h, w]
-    slope: Tensor  # [h, w, 2] derivative of the inverse depth per pixel
+    uv: Tensor  # [h, w, 2] pixels (x, y)
+    inverse_depth: Tensor  # [h, w] 1/z
+    slope: Tensor  # [h, w, 2] derivative of the inverse depth per pixel, by x and y
     rgb: Tensor  # [h, w, 3] sRGB
-    unit: float = (
-        1.0  # the view's median inverse depth, the unit of inverse depths and their deltas
-    )
+    unit: float = 1.0  # the view's median inverse depth: the unit of the network's inverse depths
 
     def select(self, cells: Tensor) -> InitialGaussians:
-        """Flat fields [n, ...] of the cells `cells`: a boolean grid [h, w], or row-major indices [n]."""
+        """The same fields for n cells only, flat: [n, ...].
+
+        `cells` is a boolean grid [h, w], or holds row-major indices [n].
+        """
         index = cells.flatten().nonzero()[:, 0] if cells.dtype == torch.bool else cells
-        lead = self.inverse_depth.ndim - 1
-        fields = (self.uv, self.inverse_depth, self.slope, self.rgb)
-        uv, inverse_depth, slope, rgb = (
-            field.flatten(0, lead)[index.to(field.device)] for field in fields
+
+        # Fields that are already flat can be selected again.
+        last_cell_axis = self.inverse_depth.ndim - 1
+
+        def pick(field: Tensor) -> Tensor:
+            return field.flatten(0, last_cell_axis)[index.to(field.device)]
+
+        return InitialGaussians(
+            uv=pick(self.uv),
+            inverse_depth=pick(self.inverse_depth),
+            slope=pick(self.slope),
+            rgb=pick(self.rgb),
+            unit=self.unit,
         )
-        return InitialGaussians(uv, inverse_depth, slope, rgb, self.unit)
 
 
 def initialize(features: ViewFeatures, camera: Camera, photo_camera: Camera) -> InitialGaussians:
-    """Seeds for all cells of a view; unmasked cells keep their rendered colour and depth."""
-    known, uv = ~features.mask, to_like(cell_centers(camera), features.rgb)
+    """Initial Gaussians for all cells [h, w] of a view; cells outside of holes keep their rendered
+    colour and depth.
+
+    Args:
+        features: the rendered view, in cells of 2×2 pixels.
+        camera: of the view.
+        photo_camera: of the photo. Cells that it does not see are filled by extending the surfaces
+            at the photo's border, all other cells from the far side of their hole.
+    """
+    uv = to_like(cell_centers(camera), features.rgb)
+
+    # If every cell touches a hole, cells with at least one visible pixel must do.
+    known = ~features.mask
     if not bool(known.any()):
         known = features.inverse_depth > 0
     if not bool(known.any()):
-        # Nothing is visible: assume a grey wall ten metres away.
-        grey = torch.full_like(features.rgb, 0.5)
-        return InitialGaussians(
-            uv, torch.full_like(features.alpha, 0.1), torch.zeros_like(uv), grey, 0.1
-        )
-    across, _ = fill_from_far_side(
-        features.inverse_depth, features.rgb.permute(2, 0, 1)[:0], known, far_bias=0.0
+        return _grey_wall(features, uv)
+
+    # A first fill, from all sides of a hole alike, tells which cells lie beyond the photo's border.
+    no_values = features.rgb.permute(2, 0, 1)[:0]
+    even_inverse_depth, _ = fill_from_far_side(
+        features.inverse_depth, no_values, known, far_bias=0.0
     )
-    inside = inside_photo(across, camera, photo_camera)
-    filled, rgb = fill_around(features, across, uv, known, inside, camera, photo_camera)
-    inverse_depth = placed_behind_surfaces(
-        filled, features.mask, features.inverse_depth, BLOB_CELLS
+    inside = inside_photo(even_inverse_depth, camera, photo_camera)
+    filled, rgb = fill_around(features, even_inverse_depth, uv, known, inside, camera, photo_camera)
+    inverse_depth = place_behind_surfaces(
+        filled, features.mask, features.inverse_depth, GAUSSIAN_REACH_CELLS
     )
-    slope = inverse_depth_slope(inverse_depth) / CELL
     return InitialGaussians(
-        uv, inverse_depth, slope, rgb.permute(1, 2, 0), float(inverse_depth.median())
+        uv=uv,
+        inverse_depth=inverse_depth,
+        slope=inverse_depth_slope(inverse_depth) / CELL,  # from a cell to a pixel
+        rgb=rgb.permute(1, 2, 0),  # [h, w, 3]
+        unit=float(inverse_depth.median()),
     )
+
+
+def _grey_wall(features: ViewFeatures, uv: Tensor) -> InitialGaussians:
+    """A grey wall that faces the camera ten metres away, for a view in which nothing is visible.
+
+    `uv` [h, w, 2] are the centres of the cells in pixels.
+    """
+    return InitialGaussians(
+        uv=uv,
+        inverse_depth=torch.full_like(features.alpha, EMPTY_VIEW_INVERSE_DEPTH),
+        slope=torch.zeros_like(uv),
+        rgb=torch.full_like(features.rgb, EMPTY_VIEW_GREY),
+        unit=EMPTY_VIEW_INVERSE_DEPTH,
+    )
+
+
+# Points of the view in the photo ------------------------------------------------------------------
 
 
 def inside_photo(inverse_depth: Tensor, camera: Camera, photo_camera: Camera) -> Tensor:
-    """[h, w] bool: whether the point of a cell projects into the photo."""
-    place, z = _place_in_photo(inverse_depth, camera, photo_camera)
-    return ((z > 0) & (place >= 0) & (place < z)).all(-1)
+    """[h, w] bool: whether the photo's camera sees the point of a cell, were nothing in front of
+    it.
+
+    `inverse_depth` [h, w] is 1/z of the cells' points as `camera` sees them.
+    """
+    place, z = _project_into_photo(inverse_depth, camera, photo_camera)
+    return _is_inside(place, z).all(-1)
 
 
-def seen_in_photo(
+def sample_photo(
     photo: Tensor, elsewhere: Tensor, inverse_depth: Tensor, camera: Camera, photo_camera: Camera
 ) -> Tensor:
-    """[h, w, 3] sRGB: the colour of the photo [H, W, 3] at each cell's point; `elsewhere` outside of the photo."""
-    place, z = _place_in_photo(inverse_depth, camera, photo_camera)
-    cells = avg_pool2d(
-        photo.cpu().movedim(-1, 0)[None], CELL, ceil_mode=True, count_include_pad=False
-    )
-    grid = (2 * place / z.clamp_min(LEAST) - 1).clamp(-2, 2).to(cells)[None]
-    seen = grid_sample(cells, grid, padding_mode="border", align_corners=False)[0].movedim(0, -1)
-    return torch.where(
-        ((z > 0) & (place >= 0) & (place < z)).all(-1, keepdim=True), seen, elsewhere
-    )
+    """[h, w, 3] sRGB: the photo's colour at the point of each cell (2×2 pixels) of a view.
+
+    Args:
+        photo: [H', W', 3] sRGB.
+        elsewhere: [h, w, 3] sRGB for points that lie outside of the photo, or behind its camera.
+        inverse_depth: [h, w] 1/z of the cells' points as `camera` sees them.
+        camera: of the view.
+        photo_camera: of the photo.
+    """
+    place, z = _project_into_photo(inverse_depth, camera, photo_camera)
+
+    # The photo is averaged over cells as well, since a cell has one colour.
+    photo_channels_first = photo.cpu().movedim(-1, 0)[None]  # [1, 3, H', W']
+    photo_cells = avg_pool2d(photo_channels_first, CELL, ceil_mode=True, count_include_pad=False)
+
+    # grid_sample counts from -1 to 1; the clamp keeps points near the camera's plane finite.
+    grid = (2 * place / z.clamp_min(MIN_DIVISOR) - 1).clamp(-2, 2).to(photo_cells)[None]
+    sampled = grid_sample(photo_cells, grid, padding_mode="border", align_corners=False)
+    photo_colors = sampled[0].movedim(0, -1)  # [h, w, 3]
+    return torch.where(_is_inside(place, z).all(-1, keepdim=True), photo_colors, elsewhere)
 
 
-def _place_in_photo(
+def _is_inside(place: Tensor, z: Tensor) -> Tensor:
+    """[h, w, 2] bool: whether the projected points lie in the photo, along x and along y.
+
+    `place` [h, w, 2] is the position from 0 to 1 across the photo, times the depth z [h, w, 1]; a
+    comparison with z needs no division.
+    """
+    return (z > 0) & (place >= 0) & (place < z)
+
+
+def _project_into_photo(
     inverse_depth: Tensor, camera: Camera, photo_camera: Camera
 ) -> tuple[Tensor, Tensor]:
-    """Project cells' points into the photo: (x, y)·z [h, w, 2] and z [h, w, 1]; in the photo x and y are in 0..1."""
+    """Project the points of a view's cells into the photo: (x·z, y·z) [h, w, 2] and z [h, w, 1].
+
+    x and y run from 0 to 1 across the photo. They are not divided by z, so points at the camera's
+    plane are harmless. Each point is scaled by its inverse depth [h, w] in the view, which leaves x
+    and y and the sign of z unchanged.
+    """
     rays, motion = _rays_in_photo(cell_centers(camera).double(), camera, photo_camera)
-    points, lens = rays + inverse_depth[..., None] * motion[:3, 3], photo_camera.K.cpu().double()
-    place, z = (
-        points[..., :2] * lens.diagonal()[:2] + points[..., 2:] * lens[:2, 2],
-        points[..., 2:],
-    )
-    return place / torch.tensor([photo_camera.width, photo_camera.height]), z
+    points = rays + inverse_depth[..., None] * motion[:3, 3]  # [h, w, 3]
+    z = points[..., 2:]
+    photo_K = photo_camera.K.cpu().double()
+    pixels = points[..., :2] * photo_K.diagonal()[:2] + z * photo_K[:2, 2]
+    return pixels / torch.tensor([photo_camera.width, photo_camera.height]), z
 
 
 def _rays_in_photo(uv: Tensor, camera: Camera, photo_camera: Camera) -> tuple[Tensor, Tensor]:
-    """Rays [h, w, 3] of a view's cells in the photo's frame, and the transform [4, 4] from view to photo.
+    """Rays [h, w, 3] through a view's cells in the frame of the photo's camera, and the motion view
+    → photo [4, 4].
 
-    A point times its inverse depth is ray + translation · inverse depth.
+    A point X at depth z in the view is X / z = ray + t / z in the photo's frame, with the motion's
+    translation t. `uv` [h, w, 2] are the cells' pixels.
     """
-    here, photo = (view.world_to_camera.cpu().double() for view in (camera, photo_camera))
-    motion, lens = to_like(photo @ here.inverse(), uv), to_like(camera.K, uv)
-    return (uv - lens[:2, 2]) / lens.diagonal()[:2] @ motion[:3, :2].T + motion[:3, 2], motion
+    world_to_view = camera.world_to_camera.cpu().double()
+    world_to_photo = photo_camera.world_to_camera.cpu().double()
+    motion = to_like(world_to_photo @ world_to_view.inverse(), uv)
+    K = to_like(camera.K, uv)
+    directions = (uv - K[:2, 2]) / K.diagonal()[:2]  # x and y at z = 1
+    return directions @ motion[:3, :2].T + motion[:3, 2], motion
 
 
-def placed_behind_surfaces(filled: Tensor, chosen: Tensor, seen: Tensor, radius: int) -> Tensor:
-    """Move the filled inverse depth [h, w] of chosen cells ([h, w] bool) behind all surfaces within `radius` cells.
+# Depth of holes -----------------------------------------------------------------------------------
 
-    `seen` [h, w] is the inverse depth of visible surfaces; 0: none.
+
+def place_behind_surfaces(filled: Tensor, cells: Tensor, visible: Tensor, radius: int) -> Tensor:
+    """Move the inverse depth of some cells behind all visible surfaces nearby; others keep theirs.
+    Returns [h, w].
+
+    Args:
+        filled: [h, w] inverse depth of all cells.
+        cells: [h, w] bool: the cells to move.
+        visible: [h, w] inverse depth of visible surfaces; 0: none.
+        radius: surfaces within so many rows and columns of a cell count.
     """
-    farthest = -maximum_filter(-torch.where(seen > 0, seen, torch.inf), radius)
-    return torch.where(chosen, torch.minimum(filled, farthest) * (1 - BEHIND_SURFACE_RATIO), filled)
+    # The least inverse depth nearby, as a maximum of the negative.
+    farthest_nearby = -maximum_filter(-torch.where(visible > 0, visible, torch.inf), radius)
+    behind = torch.minimum(filled, farthest_nearby) * (1 - BEHIND_SURFACE_RATIO)
+    return torch.where(cells, behind, filled)
 
 
 def fill_around(
     features: ViewFeatures,
-    across: Tensor,
+    even_inverse_depth: Tensor,
     uv: Tensor,
     known: Tensor,
     inside: Tensor,
     camera: Camera,
     photo_camera: Camera,
 ) -> tuple[Tensor, Tensor]:
-    """Inverse depth [h, w] and colours [3, h, w] of all cells, extended beyond the photo's border.
+    """Inverse depth [h, w] and sRGB [3, h, w] of all cells, with holes filled, also beyond the
+    photo's border.
 
-    `across` [h, w] is the inverse depth with holes filled from all sides; `uv` [h, w, 2] are the cells' pixels.
-    Values are propagated from the cells `known` ([h, w] bool). Cells `inside` ([h, w] bool) project into the photo;
-    their holes are filled from the far surface.
-    """
-    mask, bias, colors = features.mask, FAR_SIDE_BIAS * inside, features.rgb.movedim(-1, 0)
-    beyond = mask & ~inside
-    if not bool(beyond.any()):
-        return fill_from_far_side(features.inverse_depth, colors, known, far_bias=bias)
-    rays, motion = _rays_in_photo(uv, camera, photo_camera)
-    points, lens = rays + motion[:3, 3] * across[..., None], to_like(photo_camera.K, uv)
-    depth = points[..., 2:].clamp_min(LEAST)
-    place = points[..., :2] / depth * lens.diagonal()[:2] + lens[:2, 2]
-    size = to_like(torch.tensor([photo_camera.width, photo_camera.height]), place)
-    ends = torch.minimum(place, size - place).amin(-1) < AT_BORDER * photo_camera.width
-    values = torch.stack([across / depth[..., 0], ends.to(across)], dim=-1)
-
-    far, _, steps = trace_epipolar_lines(uv, values, across, mask, camera, photo_camera.position)
-    away = 1 / far[..., 0].clamp_min(LEAST) - motion[2, 3]
-    hidden = beyond & (steps > 0) & (far[..., 1] == 0)  # behind a nearer surface inside the photo
-    traced = beyond & ~hidden & (steps > 0) & (away > 0) & (rays[..., 2] > 0)
-    nearest = torch.where(known, features.inverse_depth, 0).amax()
-    extended = torch.minimum((rays[..., 2] / away.clamp_min(LEAST)).clamp_min(LEAST), nearest)
-
-    bias = torch.where(hidden, FAR_SIDE_BIAS, bias)
-    filled, mixed = fill_from_far_side(features.inverse_depth, colors, known, far_bias=bias)
-    filled = torch.where(traced, extended, filled)
-    others = beyond & ~traced
-    if bool(others.any()):
-        refilled, _ = fill_from_far_side(filled, colors[:0], traced | known, far_bias=bias)
-        filled = torch.where(others, refilled, filled)
-    return filled, mixed
-
-
-# Epipolar lines -----------------------------------------------------------------------------------
-
-
-def trace_epipolar_lines(
-    uv: Tensor, values: Tensor, inverse_depth: Tensor, mask: Tensor, camera: Camera, eye: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Walk from each masked cell in both directions along its epipolar line, and take the farther surface.
+    Holes inside the photo are filled from the far side of their rim. Beyond the border, the surface
+    that ends at the border is extended; a hole there that lies behind a nearer surface is filled
+    like one inside.
 
     Args:
+        features: the rendered view, in cells of 2×2 pixels.
+        even_inverse_depth: [h, w], holes filled from all sides alike.
         uv: [h, w, 2] pixels of the cells.
-        values: [h, w, c], read at the rim.
-        inverse_depth: [h, w], positive.
-        mask: [h, w] bool.
+        known: [h, w] bool: the cells whose depth and colour are continued into the holes.
+        inside: [h, w] bool: the cells whose points project into the photo.
         camera: of the view.
-        eye: [3] position of the other camera; its projection into the view is the epipole.
+        photo_camera: of the photo.
+    """
+    colors = features.rgb.movedim(-1, 0)  # [3, h, w]
+    bias = FAR_SIDE_BIAS * inside
+    beyond = features.mask & ~inside
+    if not bool(beyond.any()):
+        return fill_from_far_side(features.inverse_depth, colors, known, far_bias=bias)
+
+    hidden, extended, extended_inverse_depth = _extend_border_surfaces(
+        features, even_inverse_depth, uv, beyond, known, camera, photo_camera
+    )
+
+    # Cells behind a nearer surface belong to the far side of their hole, although they lie beyond
+    # the border.
+    bias = torch.where(hidden, FAR_SIDE_BIAS, bias)
+    filled, filled_colors = fill_from_far_side(features.inverse_depth, colors, known, far_bias=bias)
+    filled = torch.where(extended, extended_inverse_depth, filled)
+
+    # The other cells beyond the border continue the extended surfaces, which are known only now.
+    others = beyond & ~extended
+    if bool(others.any()):
+        refilled, _ = fill_from_far_side(filled, colors[:0], extended | known, far_bias=bias)
+        filled = torch.where(others, refilled, filled)
+    return filled, filled_colors
+
+
+def _extend_border_surfaces(
+    features: ViewFeatures,
+    even_inverse_depth: Tensor,
+    uv: Tensor,
+    beyond: Tensor,
+    known: Tensor,
+    camera: Camera,
+    photo_camera: Camera,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Extend the surfaces that end at the photo's border to the cells `beyond` ([h, w] bool) the
+    border.
+
+    A surface is extended along epipolar lines, at constant depth z in the photo's frame; a floor
+    thus stays a floor.
+
+    Args: as for `fill_around`.
 
     Returns:
-        Values [h, w, c] at the far rim; values [h, w, c] at the cell's mirror image beyond the rim; distance [h, w] to
-        the rim in cells. If the mirror image lies on another surface, the rim's values replace it. Unmasked cells, and
-        cells whose line meets no surface, have their own values and distance 0.
+        Three grids [h, w]: cells that lie behind a surface which ends inside the photo (bool);
+        cells that continue a surface (bool); and the inverse depth of this surface.
     """
-    eye = eye.double()
-    # Homogeneous, because the epipole may lie at infinity.
-    epipole = (camera.K.to(eye) @ camera.to_camera(eye)).detach().cpu().numpy()
-    view = [image.contiguous().numpy() for image in (uv, values, inverse_depth, mask)]
-    grids = (view[1].copy(), view[1].copy(), np.zeros(mask.shape, np.float32))
-    parallel_for_chunks(
-        lambda start, stop: _walk(start, stop, *view, epipole, SAME_DEPTH, *grids), len(mask)
+    rays, motion = _rays_in_photo(uv, camera, photo_camera)
+    points = rays + motion[:3, 3] * even_inverse_depth[..., None]  # X / z in the photo's frame
+    relative_z = points[..., 2:].clamp_min(MIN_DIVISOR)  # z in the photo / z in the view
+    photo_K = to_like(photo_camera.K, uv)
+    photo_pixels = points[..., :2] / relative_z * photo_K.diagonal()[:2] + photo_K[:2, 2]
+
+    # Whether a surface ends at the photo's border, or inside because something nearer covers it.
+    photo_size = to_like(torch.tensor([photo_camera.width, photo_camera.height]), photo_pixels)
+    to_border_px = torch.minimum(photo_pixels, photo_size - photo_pixels).amin(-1)
+    ends_at_border = to_border_px < AT_BORDER_WIDTHS * photo_camera.width
+    photo_inverse_depth = even_inverse_depth / relative_z[..., 0]
+    values = torch.stack([photo_inverse_depth, ends_at_border.to(even_inverse_depth)], dim=-1)
+    at_rim, _, steps = trace_epipolar_lines(
+        uv, values, even_inverse_depth, features.mask, camera, photo_camera.position
     )
-    far, mirrored, distance = map(torch.from_numpy, grids)
-    return far, mirrored, distance
+    rim_photo_inverse_depth = at_rim[..., 0]
+    rim_ends_inside = at_rim[..., 1] == 0
 
+    # z_photo = ray_z · z_view + t_z, solved for z_view = (z_photo − t_z) / ray_z.
+    ahead = 1 / rim_photo_inverse_depth.clamp_min(MIN_DIVISOR) - motion[2, 3]
+    hidden = beyond & (steps > 0) & rim_ends_inside
+    extended = beyond & ~hidden & (steps > 0) & (ahead > 0) & (rays[..., 2] > 0)
+    inverse_depth = (rays[..., 2] / ahead.clamp_min(MIN_DIVISOR)).clamp_min(MIN_DIVISOR)
 
-@kernel
-def _walk(
-    start: int, stop: int, uv: Any, rgb: Any, depths: Any, mask: Any, epipole: Any, same: float,
-    found: Any, mirrored: Any, distance: Any,
-) -> None:  # fmt: skip
-    height, width = depths.shape
-    for y in range(start, stop):
-        for x in range(width):
-            if not mask[y, x]:
-                continue
-            across, down = _line(epipole, uv[y, x, 0], uv[y, x, 1])
-            best, steps, side = np.float32(np.inf), 0, 0.0
-            for turn in (1.0, -1.0):
-                k = _steps_to_rim(mask, y, x, turn * down, turn * across)
-                if k == 0:
-                    continue
-                v, u = _cell(y, x, k * turn * down, k * turn * across)
-                if depths[v, u] < best:
-                    best, steps, side = depths[v, u], k, turn
-            if steps == 0:
-                continue
-            dy, dx = side * down, side * across
-            v, u = _cell(y, x, steps * dy, steps * dx)
-            found[y, x], mirrored[y, x], distance[y, x] = rgb[v, u], rgb[v, u], steps
-            q, p = _cell(y, x, 2 * steps * dy, 2 * steps * dx)
-            if 0 <= q < height and 0 <= p < width and not mask[q, p]:
-                ratio = depths[q, p] / best
-                if ratio < same and ratio > 1.0 / same:
-                    mirrored[y, x] = rgb[q, p]
-
-
-@kernel
-def _line(epipole: Any, u: float, v: float) -> Any:
-    """The unit vector (x, y) along a pixel's epipolar line; (1, 0) if both camera positions coincide."""
-    x, y = epipole[0] - epipole[2] * u, epipole[1] - epipole[2] * v
-    length = np.sqrt(x * x + y * y)
-    if length > SAME_EYE:
-        return x / length, y / length
-    return 1.0, 0.0
-
-
-@kernel
-def _steps_to_rim(mask: Any, y: int, x: int, dy: float, dx: float) -> int:
-    """The number of one-cell steps to the first unmasked cell; 0 if the steps leave the image first."""
-    height, width = mask.shape
-    k = 1
-    while True:
-        v, u = _cell(y, x, k * dy, k * dx)
-        if v < 0 or u < 0 or v >= height or u >= width:
-            return 0
-        if not mask[v, u]:
-            return k
-        k += 1
-
-
-@kernel
-def _cell(y: int, x: int, dy: float, dx: float) -> Any:
-    return int(np.floor(y + dy + 0.5)), int(np.floor(x + dx + 0.5))
+    # No extended surface comes nearer than the nearest visible one.
+    nearest = torch.where(known, features.inverse_depth, 0).amax()
+    return hidden, extended, torch.minimum(inverse_depth, nearest)

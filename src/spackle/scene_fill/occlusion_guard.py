@@ -16,7 +16,7 @@ from spackle.core.filters import maximum_filter
 from spackle.core.gaussians import Gaussians
 from spackle.core.surfels import BEHIND_SURFACE_RATIO
 from spackle.render.protocol import ALPHA_MIN, Rendering
-from spackle.residual.features import CPU, MASK_THRESHOLD
+from spackle.residual.features import MASK_THRESHOLD
 from spackle.runtime.device import parallel_for_chunks
 from spackle.runtime.kernels import kernel
 
@@ -31,7 +31,9 @@ STEPS = 48  # candidate positions along the line of sight, evenly spaced in inve
 
 @dataclasses.dataclass(frozen=True)
 class OcclusionGuard:
-    """The farthest surface near each pixel of a view; no new Gaussian may lie in front of this surface."""
+    """The farthest surface near each pixel of a view; no new Gaussian may lie in front of this
+    surface.
+    """
 
     camera: Camera
     depth: Tensor  # [H, W]; 0 in holes
@@ -41,7 +43,7 @@ class OcclusionGuard:
         rendering: Rendering, camera: Camera, threshold: float = MASK_THRESHOLD
     ) -> OcclusionGuard:
         """The guard of a rendered view."""
-        view = rendering.to(CPU).detach()
+        view = rendering.to(torch.device("cpu")).detach()
         seen = torch.where(view.alpha < threshold, 0, view.depth).float()
         return OcclusionGuard(camera, maximum_filter(seen, WINDOW_PX))
 
@@ -49,12 +51,16 @@ class OcclusionGuard:
 def move_behind_surfaces(
     aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]
 ) -> Gaussians:
-    """Move Gaussians away from an eye [3] until they hide no guarded surface, see `unoccluding_scales`."""
-    return moved_away(aux, eye, unoccluding_scales(aux, eye, guards))
+    """Move Gaussians away from an eye [3] until they hide no guarded surface, see
+    `unoccluding_scales`.
+    """
+    return move_from_eye(aux, eye, unoccluding_scales(aux, eye, guards))
 
 
-def moved_away(aux: Gaussians, eye: Tensor, factors: Tensor) -> Gaussians:
-    """Scale Gaussians about the eye [3] by factors [N]; the eye sees no change. Factor 0 removes a Gaussian."""
+def move_from_eye(aux: Gaussians, eye: Tensor, factors: Tensor) -> Gaussians:
+    """Scale Gaussians about the eye [3] by factors [N]; the eye sees no change. Factor 0 removes a
+    Gaussian.
+    """
     eye, factor = to_like(eye, aux.means), factors[:, None]
     moved = dataclasses.replace(
         aux, means=eye + factor * (aux.means - eye), scales=aux.scales * factor
@@ -63,7 +69,8 @@ def moved_away(aux: Gaussians, eye: Tensor, factors: Tensor) -> Gaussians:
 
 
 def unoccluding_scales(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) -> Tensor:
-    """Factors [N] ≥ 1 by which Gaussians must move away from an eye to hide no guarded surface; 0 if impossible.
+    """Factors [N] ≥ 1 by which Gaussians must move away from an eye to hide no guarded surface; 0
+    if impossible.
 
     Args:
         aux: N Gaussians in the world's frame.
@@ -93,7 +100,9 @@ def unoccluding_scales(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGu
 
 
 def without_pits(depths: Tensor, cells: Tensor) -> Tensor:
-    """Depths [n] of the cells `cells` ([h, w] bool), after a morphological closing that removes narrow near parts."""
+    """Depths [n] of the cells `cells` ([h, w] bool), after a morphological closing that removes
+    narrow near parts.
+    """
     reach = max(1, round(PIT * cells.shape[1]))
     grid = depths.new_zeros(cells.shape)
     grid[cells] = depths
@@ -174,7 +183,9 @@ def _blocks(
 
 @kernel
 def _reach(lens: Any, row: int, scale: float, tangent: float, covariance: Any) -> float:
-    """A Gaussian's extent in pixels from its centre, along one image axis; `row` is the axis' place in `lens`."""
+    """A Gaussian's extent in pixels from its centre, along one image axis; `row` is the axis' place
+    in `lens`.
+    """
     a = scale * (lens[row] - tangent * lens[12])
     b = scale * (lens[row + 1] - tangent * lens[13])
     c = scale * (lens[row + 2] - tangent * lens[14])

@@ -261,7 +261,7 @@ def test_second_views_are_the_nearest_but_not_the_same(tmp_path: Path) -> None:
     settings: dict[str, Any] = {
         "base": BaseSettings(name="lite"),
         "metrics": (),
-        "residual": "seeds",
+        "residual": "initial",
     }
     for choice, count in (("all", 7), ("nearest", 3)):
         evaluation = open_evaluation(

@@ -230,7 +230,7 @@ def test_each_method_starts_from_the_same_base() -> None:
     context = FillContext(prediction.gaussians, prediction.camera, renderer)
     cameras = [shifted(prediction.camera, side) for side in (0.4, -0.4)]
     renderings = [renderer.render(context.base, camera) for camera in cameras]
-    names = ("base", "seeds", "spackle-scene", "dense", "paper", "spackle")
+    names = ("base", "initial", "spackle-scene", "dense", "paper", "spackle")
     fills = [make_method(name, cameras, context) for name in names]
     alone, per_view, scene, dense, paper, spackle = (
         [fill(camera, before) for camera, before in zip(cameras, renderings, strict=True)]
@@ -314,7 +314,7 @@ def test_large_views_from_files_to_tables(
         return lambda image: image.mean() if name == "niqe" else torch.tensor(math.nan)
 
     fake_pyiqa(monkeypatch, create)
-    methods = f"base,{FLAT}seeds,paper,spackle,spackle-scene"
+    methods = f"base,{FLAT}initial,paper,spackle,spackle-scene"
     done = evaluate(
         scenes, tmp_path, "--methods", methods, "--metrics", "niqe,musiq", "--disparity", "0.3,0.5"
     )
@@ -331,7 +331,7 @@ def test_large_views_from_files_to_tables(
     for setting in ("0.3", "0.5"):
         before = mean_of(found, setting, "base", "har")
         assert before > 0.02
-        for method in ("seeds", "paper", "spackle", "spackle-scene"):
+        for method in ("initial", "paper", "spackle", "spackle-scene"):
             most = 0.5 if method == "paper" else 0.05  # one pass, or two passes
             assert mean_of(found, setting, method, "har") < most * before
             assert mean_of(found, setting, method, "merged") > mean_of(
@@ -347,7 +347,7 @@ def test_large_views_from_files_to_tables(
 def test_metrics_are_added_to_a_finished_run(
     scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    words = ("--protocol", "near-view", "--methods", "base,seeds", "--limit", 2)
+    words = ("--protocol", "near-view", "--methods", "base,initial", "--limit", 2)
     once, later = tmp_path / "once", tmp_path / "later"
     monkeypatch.setitem(sys.modules, "pyiqa", None)
     assert evaluate(scenes, later, *words, "--metrics", "ssim,dists").code == 0
@@ -364,7 +364,7 @@ def test_metrics_are_added_to_a_finished_run(
         f"{once}: holds the metric dists, which cannot be measured",
     )
     hole, outside = (
-        [mean_of(load_run(once), "near", m, f"psnr_{w}") for m in ("base", "seeds")]
+        [mean_of(load_run(once), "near", m, f"psnr_{w}") for m in ("base", "initial")]
         for w in ("hole", "outside")
     )
     assert hole[1] > hole[0] + 3
@@ -400,7 +400,7 @@ def test_a_broken_image_is_named_and_the_others_are_measured(scenes: Path, tmp_p
 def test_a_run_resumes_to_the_same_bytes_and_runs_share_tables(
     scenes: Path, tmp_path: Path
 ) -> None:
-    choices = ("--methods", "base,seeds", "--metrics", "none", "--disparity", "0.3,0.5")
+    choices = ("--methods", "base,initial", "--metrics", "none", "--disparity", "0.3,0.5")
     one, two, both = tmp_path / "one", tmp_path / "two", tmp_path / "both"
     assert evaluate(scenes, one, *choices).code == 0
     stopped = shutil.copytree(one, tmp_path / "stopped")

@@ -21,7 +21,7 @@ from spackle.paper.evaluation.tables import make_tables
 
 pytest.importorskip("matplotlib")
 EVIL = "<script>alert('1')</script>&\"$x_{$"
-METHODS = ("base", "inpaint2d", "seeds", "spackle")
+METHODS = ("base", "inpaint2d", "initial", "spackle")
 
 
 class Page(HTMLParser):
@@ -126,7 +126,7 @@ def test_evaluate_and_tables_write_the_report(
         "-o",
         out,
         "--methods",
-        "base,seeds",
+        "base,initial",
         "--metrics",
         "psnr",
         "--limit",

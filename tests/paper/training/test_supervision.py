@@ -32,10 +32,10 @@ from spackle.core.camera import Camera
 from spackle.core.filters import maximum_filter
 from spackle.paper.training import composites, measured_photos, samples, sources
 from spackle.paper.training.recipe import DataRecipe
-from spackle.paper.training.residual import MIN_AUX, training_cells
 from spackle.paper.training.samples import (
-    EXACT,
-    HOLE_SHARE,
+    FIELDS_BY_FILE_NAME,
+    FLOAT32_TENSORS,
+    HOLE_RATIO_RANGE,
     Sample,
     Source,
     load_sample,
@@ -45,9 +45,9 @@ from spackle.paper.training.samples import (
 from spackle.paper.training.samples import random_crops as crops_of
 from spackle.render import CpuRenderer
 from spackle.render.protocol import tile_mask
-from spackle.residual.completion import compose
-from spackle.residual.features import CELL, ViewFeatures, cell_centers
-from spackle.residual.network import DELTA_CHANNELS
+from spackle.residual import MIN_AUX_GAUSSIANS
+from spackle.residual.composer import DELTA_CHANNELS, compose
+from spackle.residual.features import CELL, cell_centers
 from spackle.runtime.errors import InputError
 
 CPU = CpuRenderer()
@@ -154,18 +154,18 @@ def test_a_completed_crop_equals_a_part_of_the_completed_view(
     whole: Sample, row: int, column: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     side = 24  # cells
-    monkeypatch.setattr(samples, "GAUSSIANS_A_PIXEL", 9)
+    monkeypatch.setattr(samples, "MAX_GAUSSIANS_PER_PIXEL", 9)
     crop = whole.crop(row, column, side, side)
     part = slice(CELL * row, CELL * (row + side)), slice(CELL * column, CELL * (column + side))
     cells = slice(row, row + side), slice(column, column + side)
-    for name in ("features", "rim"):
+    for name in ("features", "surroundings"):
         for mine, yours in zip(
             tensors_of(getattr(crop, name)), tensors_of(getattr(whole, name)), strict=True
         ):
             assert torch.equal(mine, yours[cells])
     assert torch.equal(crop.target, whole.target[part])
     assert torch.equal(crop.hole, whole.hole[part])
-    assert torch.equal(crop.seeds.uv, cell_centers(crop.camera))
+    assert torch.equal(crop.initial.uv, cell_centers(crop.camera))
     # Fewer Gaussians give the same image; the completed crop equals the crop of the completed view.
     assert len(crop.base) < 0.7 * len(whole.base)
     inside = tile_mask(crop.tiles, CELL * side, CELL * side)
@@ -174,14 +174,14 @@ def test_a_completed_crop_equals_a_part_of_the_completed_view(
         assert (getattr(drawn, name) - getattr(whole.rendering, name)[part]).abs()[
             inside
         ].max() < tolerance
-    chosen = training_cells(crop.features)
+    chosen = crop.view.cells(MIN_AUX_GAUSSIANS)
     masked = torch.zeros_like(whole.features.mask)
     masked[cells] = chosen
     deltas = 0.5 * torch.randn(
         int(chosen.sum()), DELTA_CHANNELS, generator=torch.Generator().manual_seed(row)
     )
-    aux = compose(whole.seeds.select(masked), deltas, whole.camera)
-    crop_aux = compose(crop.seeds.select(chosen), deltas, crop.camera)
+    aux = compose(whole.initial.select(masked), deltas, whole.camera)
+    crop_aux = compose(crop.initial.select(chosen), deltas, crop.camera)
     assert torch.allclose(aux.means, crop_aux.means, rtol=1e-5, atol=1e-5)
     expected = CPU.render([whole.base, aux], whole.camera)
     found = CPU.render(
@@ -210,19 +210,11 @@ def test_random_crops_have_holes_and_lie_within_the_picture(width: int, height: 
         assert 0 <= left <= width - 32
         assert 0 <= top <= height - 32
         assert torch.equal(crop.target, scene.rgb[top : top + 32, left : left + 32])
-        assert HOLE_SHARE[0] < float((crop.rendering.alpha < 0.95).float().mean()) < HOLE_SHARE[1]
-
-
-@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 1.0])
-@pytest.mark.parametrize("size", [(1, 9), (7, 8), (8, 8), (14, 13)])
-def test_training_cells(size: tuple[int, int], share: float) -> None:
-    mask = torch.rand(size) < share
-    alpha = (4 * torch.rand(size)).round() / 4  # many equal values
-    cells = training_cells(ViewFeatures(torch.zeros(*size, 3), torch.zeros(size), alpha, mask))
-    assert (cells | ~mask).all()
-    assert int(cells.sum()) == max(int(mask.sum()), min(MIN_AUX, mask.numel()))
-    if (cells & ~mask).any() and not cells.all():
-        assert alpha[cells & ~mask].max() <= alpha[~cells].min()
+        assert (
+            HOLE_RATIO_RANGE[0]
+            < float((crop.rendering.alpha < 0.95).float().mean())
+            < HOLE_RATIO_RANGE[1]
+        )
 
 
 # Composites ---------------------------------------------------------------------------------------
@@ -274,14 +266,15 @@ def test_a_sample_file_is_small_and_renders_the_same(tmp_path: Path) -> None:
     found, content = load_sample(path), path.read_bytes()
     assert len(content) < 55 * 128**2
     assert len(found.base) < 0.5 * len(base)
-    for name in (*EXACT, "seeds.uv"):
-        part, _, field = name.partition(".")
+    assert torch.equal(found.initial.uv, crop.initial.uv)
+    for name in FLOAT32_TENSORS:
+        part, _, field = FIELDS_BY_FILE_NAME.get(name, name).partition(".")
         assert torch.equal(
             getattr(getattr(found, part), field), getattr(getattr(crop, part), field)
         ), name
     for mine, yours in (
-        (found.rim, crop.rim),
-        (found.seeds, crop.seeds),
+        (found.surroundings, crop.surroundings),
+        (found.initial, crop.initial),
         (found.rendering, crop.rendering),
     ):
         for one, other in zip(tensors_of(mine), tensors_of(yours), strict=True):

@@ -255,7 +255,7 @@ def test_a_gradient_that_is_not_finite_ends_the_run(
     cache = shutil.copytree(place / "cache", tmp_path / "cache")
     for path in cache.glob("*/train/*.safetensors"):
         sample = load_sample(path)
-        sample.seeds.slope.fill_(math.nan)
+        sample.initial.slope.fill_(math.nan)
         save_sample(sample, path)
     done = train(place, tmp_path / "out", f"data.cache={cache}")
     assert (done.code, "out: step 0: gradient not finite" in done.lines[-1]) == (2, True)
@@ -274,9 +274,9 @@ def test_gradients_reach_the_whole_network_but_not_the_base(name: str) -> None:
     assert not any(tensor.requires_grad for tensor in tensors_of(sample))
     assert not any(tensor.requires_grad for tensor in tensors_of(sample.crop(2, 3, 24, 24)))
     network = random_network(name=name)
-    total_loss(**vars(complete_samples(network, [sample], get_renderer())), recipe=LossRecipe())[
-        0
-    ].backward()
+    views = complete_samples(network, network.inputs, [sample], get_renderer())
+    loss, _ = total_loss(**vars(views), recipe=LossRecipe())
+    loss.backward()
     assert all(tensor.grad is None for tensor in base.tensors)
     assert all(p.grad is not None and bool(p.grad.any()) for p in network.parameters())
 

@@ -119,7 +119,7 @@ def complete_views(
 
 @torch.no_grad()
 def render_completed(views: ViewStack, renderer: Renderer) -> tuple[Tensor, Tensor]:
-    """Colours [V, H, W, 3] and inverse depth [V, H, W] of one scene completed by seeds, so that all views agree.
+    """Colours [V, H, W, 3] and inverse depth [V, H, W] of one scene completed by initial Gaussians, so that all views agree.
 
     Pixels that stay uncovered take the colour and depth of their neighbours.
     """

@@ -51,8 +51,8 @@ METHODS = {
         marker="P",
         uses_residual=True,
     ),
-    "seeds": MethodDescription(
-        title="seeds",
+    "initial": MethodDescription(
+        title="initial Gaussians",
         summary="as Spackle, without a network: deltas of zero",
         color="#008a66",
         marker="^",

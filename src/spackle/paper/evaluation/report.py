@@ -57,7 +57,7 @@ SLIDER_PICTURES = (
     TRUE_PICTURE,
     "inpaint2d",
     "paper",
-    "seeds",
+    "initial",
     "direct-ft",
     "spackle-scene",
     "dense",

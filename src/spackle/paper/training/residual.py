@@ -21,26 +21,19 @@ from spackle.paper.training.recipe import Recipe
 from spackle.paper.training.samples import Sample, digest_of_samples, load_sample, make_samples
 from spackle.paper.training.sources import find_sources
 from spackle.paper.training.task import Task
-from spackle.render import Renderer, get_renderer
+from spackle.render import Renderer, device_of, get_renderer
 from spackle.render.protocol import Rendering
-from spackle.residual.architectures import (
-    NOTE,
-    SharpDecoder,
-    decoder_size,
-    load_residual,
-    open_residual,
-)
-from spackle.residual.completion import compose
-from spackle.residual.features import CELL, ViewFeatures, hole_area_ratio
+from spackle.residual.architectures import NOTE, load_residual, open_residual
+from spackle.residual.completion import MIN_AUX_GAUSSIANS
+from spackle.residual.features import CELL, hole_area_ratio
 from spackle.residual.network import ResidualNet
+from spackle.residual.sharp_decoder import SharpDecoder
 from spackle.runtime.device import pick_dtype
 from spackle.runtime.errors import InputError
-from spackle.runtime.files import write_atomic
-from spackle.runtime.folders import make_folder
+from spackle.runtime.files import make_folder, write_atomic
 from spackle.runtime.progress import Reporter
 from spackle.weights.checkpoints import load_strict, read_tensors
 
-MIN_AUX = 64  # least number of aux Gaussians in a view (paper, "Training Details and Loss Weights")
 PICTURED = 6  # number of views in a picture
 PICTURE_SIDE = 512  # pixels of a picture's longer side
 CACHE = "cache"  # default folder of the samples, in the output
@@ -58,7 +51,9 @@ class ViewBatch:
 
     @staticmethod
     def of(images: Iterable[tuple[Rendering, Tensor, Tensor, Tensor]]) -> ViewBatch:
-        """Stack completed views, base views, targets and holes on the device of the completed views."""
+        """Stack completed views, base views, targets and holes on the device of the completed
+        views.
+        """
         fields = zip(*((view.rgb, view.alpha, *others) for view, *others in images), strict=True)
         return ViewBatch(
             *(torch.stack([tensor.to(field[0].device) for tensor in field]) for field in fields)
@@ -99,8 +94,9 @@ class ViewTask(Task):
         return total_loss(**tensors, recipe=self.recipe.loss, features=self.features)
 
     def measure(self, network: nn.Module, batch: Any) -> dict[str, list[float]]:
-        """Values for each view: the loss and its terms (means of the batch), and the share of hole pixels before and
-        after completion. PSNR in dB compares the hole with the target, and the other pixels with the base.
+        """Values for each view: the loss and its terms (means of the batch), and the share of hole
+        pixels before and after completion. PSNR in dB compares the hole with the target, and the
+        other pixels with the base.
         """
         views = self.complete(network, batch)
         loss, terms = self._loss_of(views)
@@ -129,57 +125,70 @@ class ViewTask(Task):
 
 def complete_samples(
     network: nn.Module,
+    inputs: tuple[str, ...],
     samples: Sequence[Sample],
     renderer: Renderer,
     precision: torch.dtype = torch.float32,
 ) -> ViewBatch:
-    """Complete samples of one size. Only the network gets gradients; its convolutions compute in `precision`."""
-    device = renderer.device
-    # Masks are read before the samples move to the renderer's device: reading them later would wait for a GPU.
-    cells = [training_cells(sample.features).flatten().nonzero()[:, 0] for sample in samples]
+    """Complete samples of one size; only the network gets gradients.
+
+    Args:
+        network: f_res, or a wrapper that distributes it over processes.
+        inputs: the names of the network's inputs.
+        samples: views with holes, on the CPU.
+        renderer: draws the completed views; its device does the rest of the work, too.
+        precision: of the network's convolutions.
+    """
+    device = device_of(renderer)
+    # Masks are read before the samples move to the renderer's device: reading them later would wait
+    # for a GPU.
+    cells = [
+        sample.view.cells(MIN_AUX_GAUSSIANS).flatten().nonzero()[:, 0].to(device, non_blocking=True)
+        for sample in samples
+    ]
     tiles = [sample.tiles for sample in samples]
-    inputs = torch.cat([sample.inputs for sample in samples]).to(next(network.parameters()).device)
-    with torch.autocast(inputs.device.type, precision, enabled=precision != torch.float32):
-        fields = network(inputs.contiguous(memory_format=torch.channels_last)).float().to(device)
+
+    features = torch.cat([sample.network_input(inputs) for sample in samples])
+    features = features.to(next(network.parameters()).device)
+    with torch.autocast(features.device.type, precision, enabled=precision != torch.float32):
+        deltas = network(features.contiguous(memory_format=torch.channels_last))  # [B, 14, h, w]
+    deltas = deltas.float().to(device)
+
     samples = [sample.to(device) for sample in samples]
     scenes = []
-    for sample, field, chosen in zip(samples, fields, cells, strict=True):
-        index = chosen.to(device, non_blocking=True)
-        aux = compose(sample.seeds.select(index), field.flatten(1).T[index], sample.camera)
+    for sample, sample_deltas, index in zip(samples, deltas, cells, strict=True):
+        aux = sample.view.gaussians(index, sample_deltas.permute(1, 2, 0))
         scenes.append([sample.base, aux])
-    views = renderer.render_batch(
-        scenes,
-        [sample.camera for sample in samples],
-        tiles=tiles,
-        previous_renderings=[sample.rendering for sample in samples],
-    )
+
+    cameras = [sample.camera for sample in samples]
+    base_renderings = [sample.rendering for sample in samples]
+    if hasattr(renderer, "render_batch"):  # on a GPU
+        views = renderer.render_batch(scenes, cameras, tiles=tiles, onto=base_renderings)
+    else:
+        views = [
+            renderer.render(scene, camera, tiles=touched, onto=base_rendering)
+            for scene, camera, touched, base_rendering in zip(
+                scenes, cameras, tiles, base_renderings, strict=True
+            )
+        ]
     return ViewBatch.of(
-        (view, s.rendering.rgb, s.target, s.hole) for view, s in zip(views, samples, strict=True)
+        (view, sample.rendering.rgb, sample.target, sample.hole)
+        for view, sample in zip(views, samples, strict=True)
     )
-
-
-def training_cells(features: ViewFeatures, least: int = MIN_AUX) -> Tensor:
-    """[h, w] bool: the masked cells, and the most transparent unmasked cells until there are `least` cells."""
-    missing = least - int(features.mask.sum())
-    if missing <= 0:
-        return features.mask
-    rest = torch.where(features.mask, torch.inf, features.alpha).flatten()
-    cells = features.mask.flatten().clone()
-    cells[rest.topk(min(missing, int((~cells).sum())), largest=False).indices] = True
-    return cells.view_as(features.mask)
 
 
 def first_network(name: str, init: Path | None = None) -> ResidualNet:
     """The initial network of a run: untrained, or read from the file `init`.
 
-    The file holds weights of the same network. For "sharp-decoder", SHARP's checkpoint is also accepted: the decoder is
-    read, stem and heads stay untrained. InputError if the file is missing, broken or of another network.
+    The file holds weights of the same network. For "sharp-decoder", SHARP's checkpoint is also
+    accepted: the decoder is read, stem and heads stay untrained. InputError if the file is missing,
+    broken or of another network.
     """
     if init is None:
         return open_residual(name)
     tensors, prefix = read_tensors(init, "give init=FILE"), "feature_model."
     if name == SharpDecoder.name and "prediction_head.geometry_prediction_head.weight" in tensors:
-        sharp = SharpDecoder(decoder_size(tensors))
+        sharp = SharpDecoder.untrained_for(tensors)
         decoder = {
             key.removeprefix(prefix): tensor
             for key, tensor in tensors.items()
@@ -245,18 +254,21 @@ class ResidualTask(ViewTask):
 
     @torch.no_grad()
     def limits(self) -> dict[str, float]:
-        """Mean hole PSNR in dB of validation samples: untrained, then with seeds in the targets' colours.
+        """Mean hole PSNR in dB of validation samples: untrained, then with seeds in the targets'
+        colours.
 
         A run can raise PSNR only from the first value towards the second.
         """
         with torch.random.fork_rng(devices=[]):
-            network = open_residual(self.recipe.network).to(self.renderer.device)
+            network = open_residual(self.recipe.network).to(device_of(self.renderer))
         decibels: dict[str, list[float]] = {"untrained": [], "colours of the targets": []}
         for item in range(self.validation_items):
             (sample,) = self.load_batch(None, [item])
             height, width = sample.features.mask.shape
             colors = sample.target.view(height, CELL, width, CELL, 3).mean((1, 3))
-            best = dataclasses.replace(sample, seeds=dataclasses.replace(sample.seeds, rgb=colors))
+            best = dataclasses.replace(
+                sample, initial=dataclasses.replace(sample.initial, rgb=colors)
+            )
             for values, case in zip(decibels.values(), (sample, best), strict=True):
                 views = self.complete(network, [case])
                 values.append(hole_psnr(views.rgb[0], views.target[0], views.hole[0]))
@@ -268,13 +280,13 @@ class ResidualTask(ViewTask):
         samples = [load_sample(files[item]) for item in items]
         for sample in samples:
             _ = (
-                sample.inputs,
+                sample.network_input(self.network.inputs),
                 sample.tiles,
             )  # computed in this thread, so that the training loop does not wait for them
         return samples
 
     def complete(self, network: nn.Module, batch: Sequence[Sample]) -> ViewBatch:
-        return complete_samples(network, batch, self.renderer, self.precision)
+        return complete_samples(network, self.network.inputs, batch, self.renderer, self.precision)
 
     def export(self, network: nn.Module, path: Path) -> None:
         """Write the weights in half precision, for `spackle predict --residual`."""

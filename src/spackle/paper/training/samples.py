@@ -1,4 +1,6 @@
-"""Training samples: views with holes and their targets, and crops of such views, which are stored in files."""
+"""Training samples: views with holes and their targets, and crops of such views, which are stored
+in files.
+"""
 
 from __future__ import annotations
 
@@ -25,41 +27,86 @@ from spackle.core.gaussians import Gaussians
 from spackle.paper.training.ranks import rank, rank_count, wait_for_ranks
 from spackle.paper.training.recipe import DataRecipe
 from spackle.render import CpuRenderer
-from spackle.render.protocol import TILE_PX, Rendering
+from spackle.render.protocol import TILE, Rendering
 from spackle.residual.features import CELL, ViewFeatures, cell_centers, hole_mask
-from spackle.residual.initializer import InitialGaussians, initialize
-from spackle.residual.network import Rim, find_rim, network_input
+from spackle.residual.initializer import InitialGaussians
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import write_atomic
 from spackle.runtime.progress import Progress
+from spackle.scene_fill.view_completion import FarRim, SceneViewCompletion
 
-REACH_PX = 16  # aux Gaussians of a hole reach at most so many pixels beyond the hole
-# Files store the tensors `EXACT` in float32, the tensors `EIGHT_BITS` in eight bits, and all others in half precision.
-EXACT = (
+HOLE_REACH_PX = 16  # aux Gaussians, which fill a hole, reach at most so many pixels beyond the hole
+# The names of a sample's tensors in its file, and their places in a `Sample`. Two prefixes are
+# older than the present names of the fields.
+FIELDS_BY_FILE_NAME = {
+    **{
+        f"base.{name}": f"base.{name}"
+        for name in ("means", "quats", "scales", "opacities", "colors")
+    },
+    **{f"rendering.{name}": f"rendering.{name}" for name in ("rgb", "depth", "alpha")},
+    **{f"seeds.{name}": f"initial.{name}" for name in ("inverse_depth", "slope", "rgb")},
+    "rim.rgb": "surroundings.rim_rgb",
+    "rim.mirrored": "surroundings.mirrored_rgb",
+    "rim.distance": "surroundings.rim_distance",
+    "rim.exemplar": "surroundings.patch_rgb",
+    "rim.mismatch": "surroundings.patch_mismatch",
+    "rim.beyond": "surroundings.beyond_photo",
+    "rim.photo": "surroundings.photo_rgb",
+}
+# Files store these tensors in float32, the next ones in eight bits, and all others in half
+# precision.
+FLOAT32_TENSORS = (
     "camera.K",
     "camera.world_to_camera",
     "base.means",
     "rendering.alpha",
     "seeds.inverse_depth",
 )
-RIM_COLORS = ("rim.rgb", "rim.mirrored", "rim.exemplar", "rim.photo")
-EIGHT_BITS = ("target", "rendering.rgb", "seeds.rgb", "base.opacities", "base.colors", *RIM_COLORS)
-PARTS = ("base", "rendering", "rim", "seeds")  # fields of a sample that are dataclasses of tensors
-GAUSSIANS_A_PIXEL = 1.35  # a crop keeps at most so many base Gaussians per pixel
-HOLE_SHARE = (0.02, 0.85)  # least and greatest share of hole pixels in a crop
+EIGHT_BIT_TENSORS = (
+    "target",
+    "rendering.rgb",
+    "seeds.rgb",
+    "base.opacities",
+    "base.colors",
+    "rim.rgb",
+    "rim.mirrored",
+    "rim.exemplar",
+    "rim.photo",
+)
+MAX_GAUSSIANS_PER_PIXEL = 1.35  # a crop keeps at most so many base Gaussians for each of its pixels
+HOLE_RATIO_RANGE = (0.02, 0.85)  # least and greatest fraction of hole pixels in a crop
 SAMPLES_VERSION = 7  # increase this whenever a recipe would give different samples
-P = TypeVar("P")
+Part = TypeVar("Part")
+
+
+@dataclasses.dataclass(frozen=True)
+class HoleSurroundings:
+    """The inputs of networks that take long to compute: what lies around the holes of a view, for
+    each cell [h, w].
+
+    A cell is a block of 2×2 pixels. Colours are sRGB; outside of holes they are the cell's own.
+    """
+
+    rim_rgb: Tensor  # [h, w, 3] at the far rim of the cell's hole
+    mirrored_rgb: Tensor  # [h, w, 3] at the cell's mirror image beyond the rim
+    rim_distance: Tensor  # [h, w] cells to the rim; 0 outside of holes
+    patch_rgb: Tensor  # [h, w, 3] of patches elsewhere in the view that match the hole
+    patch_mismatch: Tensor  # [h, w] how badly the patches match; 0 outside of holes
+    beyond_photo: Tensor  # [h, w] bool: hole cells that the photo's camera does not see
+    photo_rgb: Tensor  # [h, w, 3] of the photo at the cell's initial Gaussian
 
 
 @dataclasses.dataclass(frozen=True)
 class Sample:
-    """A view of frozen Gaussians with holes, and the view's target. No tensor requires gradients."""
+    """A view of frozen Gaussians with holes, and the view's target. No tensor requires
+    gradients.
+    """
 
     camera: Camera
     base: Gaussians  # in a crop only the Gaussians that contribute to `tiles`
     rendering: Rendering  # of the whole base
-    seeds: InitialGaussians  # [h, w]: one for each 2×2 pixels
-    rim: Rim  # [h, w]
+    initial: InitialGaussians  # [h, w]: the first guess of what fills each cell of 2×2 pixels
+    surroundings: HoleSurroundings  # [h, w]
     target: Tensor  # [H, W, 3] sRGB
 
     @staticmethod
@@ -71,16 +118,65 @@ class Sample:
         photo: Tensor,
         target: Tensor,
     ) -> Sample:
-        """A sample of a whole view, from its `rendering`, its `target` [H, W, 3] and the base's `photo` [h, w, 3]."""
-        rendering, features = rendering.detach(), ViewFeatures.of(rendering)
-        seeds = initialize(features, camera, photo_camera)
-        rim, _ = find_rim(features, seeds, camera, photo_camera, photo)
-        return Sample(camera, base.detach(), rendering, seeds, rim, target)
+        """A sample of a whole view, with the inputs of all networks.
+
+        Args:
+            base: the Gaussians predicted from a photo.
+            rendering: the base, as the view shows it.
+            camera: of the view.
+            photo_camera: of the photo.
+            photo: [H', W', 3] sRGB.
+            target: [H, W, 3] sRGB, what the completed view should look like.
+        """
+        rendering = rendering.detach()
+        view = SceneViewCompletion(rendering, camera, photo_camera, lambda: photo)
+        surroundings = HoleSurroundings(
+            rim_rgb=view.far_rim.rgb,
+            mirrored_rgb=view.far_rim.mirrored,
+            rim_distance=view.far_rim.distance,
+            patch_rgb=view.patch_colors,
+            patch_mismatch=view.patch_mismatch,
+            beyond_photo=view.beyond_photo,
+            photo_rgb=view.photo_colors,
+        )
+        return Sample(camera, base.detach(), rendering, view.initial, surroundings, target)
 
     @functools.cached_property
+    def view(self) -> SceneViewCompletion:
+        """The completion of the view from the stored parts; only the features must be computed, on
+        the CPU.
+        """
+        # The photo's camera is not stored: whatever depends on it is.
+        view = SceneViewCompletion(self.rendering, self.camera, photo_camera=self.camera)
+        view.initial = self.initial
+        view.far_rim = FarRim(
+            self.surroundings.rim_rgb,
+            self.surroundings.mirrored_rgb,
+            self.surroundings.rim_distance,
+        )
+        view.patch_colors = self.surroundings.patch_rgb
+        view.patch_mismatch = self.surroundings.patch_mismatch
+        view.beyond_photo = self.surroundings.beyond_photo
+        view.photo_colors = self.surroundings.photo_rgb
+        return view
+
+    @property
     def features(self) -> ViewFeatures:
-        """The features of the view; the sample must be on the CPU."""
-        return ViewFeatures.of(self.rendering)
+        """The rendered view, averaged in cells of 2×2 pixels; the sample must be on the CPU."""
+        return self.view.features
+
+    @functools.cached_property
+    def _network_inputs(self) -> dict[tuple[str, ...], Tensor]:
+        """The inputs that were computed so far, by the names of their parts."""
+        return {}
+
+    def network_input(self, names: tuple[str, ...]) -> Tensor:
+        """[1, C, h, w]: the named inputs of a network, kept for the next call; the sample must be
+        on the CPU.
+        """
+        if names not in self._network_inputs:
+            self._network_inputs[names] = self.view.network_input(names)
+        return self._network_inputs[names]
 
     @property
     def hole(self) -> Tensor:
@@ -88,54 +184,68 @@ class Sample:
         return hole_mask(self.rendering.alpha)
 
     @functools.cached_property
-    def inputs(self) -> Tensor:
-        """[1, C, h, w]: the network's input; the sample must be on the CPU."""
-        return network_input(self.features, self.seeds, self.rim)
-
-    @functools.cached_property
     def tiles(self) -> Tensor:
-        """[ceil(H/16), ceil(W/16)] bool: tiles of the renderer that aux Gaussians can touch."""
-        near = maximum_filter(self.hole, REACH_PX)
-        return max_pool2d(near[None, None].float(), TILE_PX, ceil_mode=True)[0, 0] > 0
+        """[ceil(H/16), ceil(W/16)] bool: tiles of the renderer that aux Gaussians, which fill the
+        hole, can touch.
+        """
+        near_hole = maximum_filter(self.hole, HOLE_REACH_PX)
+        return max_pool2d(near_hole[None, None].float(), TILE, ceil_mode=True)[0, 0] > 0
 
     def to(self, device: torch.device) -> Sample:
         """The sample's tensors on another device; the camera stays on the CPU."""
         move = functools.partial(Tensor.to, device=device, non_blocking=device.type != "cpu")
-        parts = {name: _mapped(getattr(self, name), move) for name in PARTS}
-        return dataclasses.replace(self, **parts, target=move(self.target))
+        return dataclasses.replace(
+            self,
+            base=_map_tensors(self.base, move),
+            rendering=_map_tensors(self.rendering, move),
+            initial=_map_tensors(self.initial, move),
+            surroundings=_map_tensors(self.surroundings, move),
+            target=move(self.target),
+        )
 
     def crop(self, row: int, column: int, height: int, width: int) -> Sample:
-        """Crop height × width cells, from the upper left cell (row, column)."""
-        top, left = CELL * row, CELL * column
+        """Cut out height × width cells of 2×2 pixels, from the upper left cell (row, column)."""
+        top = CELL * row
+        left = CELL * column
         pixels = (slice(top, top + CELL * height), slice(left, left + CELL * width))
         cells = (slice(row, row + height), slice(column, column + width))
         camera = self.camera.cropped(left, top, CELL * width, CELL * height)
 
-        def cut(grid: Tensor) -> Tensor:
+        # Copies, so that the whole view's memory can be freed.
+        def cut_pixels(image: Tensor) -> Tensor:
+            return image[pixels].clone()
+
+        def cut_cells(grid: Tensor) -> Tensor:
             return grid[cells].clone()
 
-        return Sample(
+        initial = _map_tensors(self.initial, cut_cells)
+        crop = Sample(
             camera=camera,
             base=self.base,
-            rendering=_mapped(self.rendering, lambda t: t[pixels].clone()),
-            seeds=dataclasses.replace(_mapped(self.seeds, cut), uv=cell_centers(camera)),
-            rim=_mapped(self.rim, cut),
-            target=self.target[pixels].clone(),
-        )._with_visible_base()
+            rendering=_map_tensors(self.rendering, cut_pixels),
+            initial=dataclasses.replace(initial, uv=cell_centers(camera)),
+            surroundings=_map_tensors(self.surroundings, cut_cells),
+            target=cut_pixels(self.target),
+        )
+        return crop._with_visible_base()
 
     def _with_visible_base(self) -> Sample:
-        """Keep the base Gaussians that contribute most to `tiles`, at most `GAUSSIANS_A_PIXEL`."""
-        with (
-            torch.enable_grad()
-        ):  # a Gaussian's contribution is the gradient with respect to its colour
+        """The sample with only the base Gaussians that contribute most to `tiles`: at most 1.35 for
+        each pixel.
+        """
+        # A Gaussian's contribution to the picture is the gradient of the picture's sum by the
+        # Gaussian's colour.
+        with torch.enable_grad():
             grey = torch.full_like(self.base.colors, 0.5).requires_grad_()
             scene = dataclasses.replace(self.base, colors=grey)
-            drawn = CpuRenderer().render(scene, self.camera, tiles=self.tiles)
-            (shown,) = torch.autograd.grad(drawn.rgb.sum(), grey)
-        room = int(GAUSSIANS_A_PIXEL * self.camera.width * self.camera.height)
-        kept = torch.zeros(len(grey), dtype=torch.bool)
-        kept[shown[:, 0].topk(min(len(grey), room)).indices] = True
-        return dataclasses.replace(self, base=self.base.select(kept & (shown[:, 0] > 0)))
+            rendering = CpuRenderer().render(scene, self.camera, tiles=self.tiles)
+            (color_gradient,) = torch.autograd.grad(rendering.rgb.sum(), grey)
+        contribution = color_gradient[:, 0]  # [N]
+
+        most = int(MAX_GAUSSIANS_PER_PIXEL * self.camera.width * self.camera.height)
+        is_kept = torch.zeros(len(grey), dtype=torch.bool)
+        is_kept[contribution.topk(min(len(grey), most)).indices] = True
+        return dataclasses.replace(self, base=self.base.select(is_kept & (contribution > 0)))
 
 
 def random_crops(sample: Sample, rng: np.random.Generator, count: int, cells: int) -> list[Sample]:
@@ -153,36 +263,37 @@ def random_crops(sample: Sample, rng: np.random.Generator, count: int, cells: in
         top = min(max(row - int(shift[0]), 0), rows - cells)
         left = min(max(column - int(shift[1]), 0), columns - cells)
         hole = sample.hole[CELL * top : CELL * (top + cells), CELL * left : CELL * (left + cells)]
-        if HOLE_SHARE[0] < float(hole.float().mean()) < HOLE_SHARE[1]:
+        if HOLE_RATIO_RANGE[0] < float(hole.float().mean()) < HOLE_RATIO_RANGE[1]:
             crops.append(sample.crop(top, left, cells, cells))
     return crops
 
 
 def save_sample(sample: Sample, path: Path) -> None:
-    """Write a sample atomically."""
-    camera = sample.camera
+    """Write a sample to a safetensors file; a killed run leaves the whole file or none."""
     tensors = {
-        "camera.K": camera.K,
-        "camera.world_to_camera": camera.world_to_camera,
-        "camera.size": torch.tensor([camera.width, camera.height]),
+        "camera.K": sample.camera.K,
+        "camera.world_to_camera": sample.camera.world_to_camera,
+        "camera.size": torch.tensor([sample.camera.width, sample.camera.height]),
         "target": sample.target,
+        "seeds.unit": torch.tensor(sample.initial.unit, dtype=torch.float64),
     }
-    for part in PARTS:
-        tensors |= {f"{part}.{name}": value for name, value in vars(getattr(sample, part)).items()}
-    tensors["seeds.unit"] = torch.tensor(sample.seeds.unit, dtype=torch.float64)
-    del tensors["seeds.uv"]  # computed from the camera
+    for file_name, field in FIELDS_BY_FILE_NAME.items():
+        part, _, name = field.partition(".")
+        tensors[file_name] = getattr(getattr(sample, part), name)
+
+    # sRGB spends its 8 bits where the eye sees them.
     tensors["base.colors"] = linear_to_srgb(sample.base.colors)
-    tensors |= {name: to_uint8(tensors[name]) for name in EIGHT_BITS}
-    quats = sample.base.quats  # not normalised: the largest component becomes 127
-    tensors["base.quats"] = (
-        (127 * quats / quats.abs().amax(-1, keepdim=True)).round().to(torch.int8)
-    )
-    halved = [
-        name
-        for name, tensor in tensors.items()
-        if tensor.dtype == torch.float32 and name not in EXACT
-    ]
-    tensors |= {name: tensors[name].half() for name in halved}
+    for name in EIGHT_BIT_TENSORS:
+        tensors[name] = to_uint8(tensors[name])
+
+    # Quaternions need no unit length: the largest component becomes 127, the greatest int8.
+    quats = sample.base.quats
+    largest = quats.abs().amax(-1, keepdim=True)
+    tensors["base.quats"] = (127 * quats / largest).round().to(torch.int8)
+
+    for name, tensor in tensors.items():
+        if tensor.dtype == torch.float32 and name not in FLOAT32_TENSORS:
+            tensors[name] = tensor.half()
     write_atomic(path, save({name: tensor.contiguous() for name, tensor in tensors.items()}))
 
 
@@ -191,29 +302,44 @@ def load_sample(path: str | os.PathLike[str]) -> Sample:
     with as_input_error(
         path, "not a training sample, or damaged: delete the file; the next run makes it again"
     ):
-        parts: dict[str, dict[str, Any]] = {}
-        for name, tensor in load_file(path).items():
-            part, _, field = name.partition(".")
-            value = tensor.float() / 255 if name in EIGHT_BITS else tensor
-            parts.setdefault(part, {})[field] = (
-                value.float() if value.dtype in (torch.float16, torch.int8) else value
-            )
-        lens, unit = parts["camera"], float(parts["seeds"].pop("unit"))
-        camera = Camera(lens["K"], lens["world_to_camera"], *lens["size"].tolist())
+        tensors = {name: _to_float(name, tensor) for name, tensor in load_file(path).items()}
+        tensors["base.colors"] = srgb_to_linear(tensors["base.colors"])
+        camera = Camera(
+            tensors["camera.K"], tensors["camera.world_to_camera"], *tensors["camera.size"].tolist()
+        )
+        fields: dict[str, dict[str, Tensor]] = {}
+        for file_name, field in FIELDS_BY_FILE_NAME.items():
+            part, _, name = field.partition(".")
+            fields.setdefault(part, {})[name] = tensors[file_name]
         return Sample(
             camera=camera,
-            base=Gaussians(**{**parts["base"], "colors": srgb_to_linear(parts["base"]["colors"])}),
-            rendering=Rendering(**parts["rendering"]),
-            seeds=InitialGaussians(cell_centers(camera), **parts["seeds"], unit=unit),
-            rim=Rim(**parts["rim"]),
-            target=parts["target"][""],
+            base=Gaussians(**fields["base"]),
+            rendering=Rendering(**fields["rendering"]),
+            initial=InitialGaussians(
+                uv=cell_centers(camera), **fields["initial"], unit=float(tensors["seeds.unit"])
+            ),
+            surroundings=HoleSurroundings(**fields["surroundings"]),
+            target=tensors["target"],
         )
 
 
-def _mapped(part: P, function: Callable[[Tensor], Tensor]) -> P:
-    """Apply a function to all tensors of a dataclass."""
-    tensors = {name: value for name, value in vars(part).items() if isinstance(value, Tensor)}
-    return dataclasses.replace(part, **{name: function(value) for name, value in tensors.items()})  # type: ignore[type-var]
+def _to_float(name: str, tensor: Tensor) -> Tensor:
+    """A tensor of a sample's file in float32; integers other than colours, opacities and
+    quaternions stay.
+    """
+    if name in EIGHT_BIT_TENSORS:
+        return tensor.float() / 255
+    if tensor.dtype in (torch.float16, torch.int8):
+        return tensor.float()
+    return tensor
+
+
+def _map_tensors(part: Part, function: Callable[[Tensor], Tensor]) -> Part:
+    """A copy of a dataclass, with a function applied to all its tensors."""
+    changed = {
+        name: function(value) for name, value in vars(part).items() if isinstance(value, Tensor)
+    }
+    return dataclasses.replace(part, **changed)  # type: ignore[type-var]
 
 
 class Source(NamedTuple):
@@ -251,10 +377,11 @@ def make_samples(
     progress: Progress,
     warn: Callable[[str], None],
 ) -> list[Path]:
-    """Make the samples of the first `views` views that a folder lacks; returns the files of all samples in order.
+    """Make the samples of the first `views` views that a folder lacks; returns the files of all
+    samples in order.
 
-    `seed` determines the views; the processes of a run share the work. `warn` is called with the reason if a view
-    cannot be made. InputError if no file can be written, or no view gave a sample.
+    `seed` determines the views; the processes of a run share the work. `warn` is called with the
+    reason if a view cannot be made. InputError if no file can be written, or no view gave a sample.
     """
     folder.mkdir(parents=True, exist_ok=True)
     if len(sources) == 1 and sources[0].views is not None:

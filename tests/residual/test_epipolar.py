@@ -1,4 +1,4 @@
-"""Values at a hole's far rim, against hand-computed values and a walk in plain Python."""
+"""Values at a hole's far rim, against hand-computed values and lines traced in plain Python."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ import torch
 from torch import Tensor
 
 from spackle.core.camera import Camera
+from spackle.render.protocol import Rendering
 from spackle.residual import InitialGaussians, ViewFeatures
+from spackle.residual.epipolar import SAME_SURFACE_RATIO
 from spackle.residual.features import cell_centers
-from spackle.residual.initializer import SAME_DEPTH
-from spackle.residual.network import Rim, find_rim
+from spackle.scene_fill.view_completion import FarRim, SceneViewCompletion
 
 HEIGHT, WIDTH = 12, 20  # cells
 CAMERA = Camera.from_focal(40.0, 2 * WIDTH, 2 * HEIGHT)
@@ -29,15 +30,24 @@ def moved(*eye: float, width: int = WIDTH, height: int = HEIGHT) -> Camera:
     return dataclasses.replace(CAMERA, world_to_camera=matrix, width=2 * width, height=2 * height)
 
 
-def rim_of(mask: Tensor, inverse_depth: Tensor, rgb: Tensor, *eye: float) -> Rim:
-    camera = moved(*eye, width=mask.shape[1], height=mask.shape[0])
-    features = ViewFeatures(rgb, inverse_depth, (~mask).float(), mask)
-    seeds = InitialGaussians(cell_centers(camera), inverse_depth, torch.zeros(*mask.shape, 2), rgb)
-    return find_rim(features, seeds, camera, CAMERA)[0]
+def rim_of(mask: Tensor, inverse_depth: Tensor, rgb: Tensor, *eye: float) -> FarRim:
+    """The rims of a view with these cells, whose initial Gaussians have the cells' own values."""
+    height, width = mask.shape
+    camera = moved(*eye, width=width, height=height)
+    empty = torch.zeros(2 * height, 2 * width)
+    view = SceneViewCompletion(
+        Rendering(empty[..., None].repeat(1, 1, 3), empty, empty), camera, CAMERA
+    )
+    view.features = ViewFeatures(rgb, inverse_depth, (~mask).float(), mask)
+    slope = torch.zeros(*mask.shape, 2)
+    view.initial = InitialGaussians(cell_centers(camera), inverse_depth, slope, rgb)
+    return view.far_rim
 
 
 def row_of(first: int, last: int, depth: Tensor) -> tuple[list[int], list[int], list[int]]:
-    """For a hole in columns first..last: the columns found at the rim, the mirrored columns, and the distances."""
+    """For a hole in columns first..last: the columns found at the rim, the mirrored columns, and
+    the distances.
+    """
     mask = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
     mask[:, first : last + 1] = True
     rim = rim_of(mask, depth.expand(HEIGHT, WIDTH).contiguous(), RAMP, *SIDEWAYS)
@@ -59,9 +69,9 @@ def test_a_sideways_move_finds_the_farther_side_of_a_row() -> None:
         list(range(20)),
         list(range(20)),
         [0] * 20,
-    )  # no rim: seeds are kept
+    )  # no rim: the initial colours are kept
     _, mirrored, _ = row_of(
-        8, 11, torch.where(torch.arange(WIDTH) < 6, 0.2 * SAME_DEPTH * 1.01, 0.2)
+        8, 11, torch.where(torch.arange(WIDTH) < 6, 0.2 * SAME_SURFACE_RATIO * 1.01, 0.2)
     )
     assert mirrored in ([6, 7, 7, 7], [16, 15, 14, 13])  # other surfaces are not mirrored
 
@@ -96,7 +106,7 @@ def plain_rim(mask: Tensor, depth: Tensor, rgb: Tensor, camera: Camera) -> tuple
 @pytest.mark.parametrize(
     "eye", [SIDEWAYS, (-0.2, 0.31, 0.0), (0.1, -0.05, 0.6), (0.013, 0.007, -0.5)]
 )
-def test_any_move_matches_a_plain_walk(eye: tuple[float, float, float]) -> None:
+def test_any_move_matches_lines_in_plain_python(eye: tuple[float, float, float]) -> None:
     generator = torch.Generator().manual_seed(3)
     mask = torch.rand(HEIGHT, WIDTH, generator=generator) < 0.6
     depth = 0.1 + torch.rand(HEIGHT, WIDTH, generator=generator)

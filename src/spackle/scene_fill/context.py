@@ -1,0 +1,109 @@
+"""What a fill starts from: the base of a photo, the renderer, the network, the texture, and all
+other settings.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import functools
+
+from torch import Tensor
+
+from spackle.core.camera import Camera
+from spackle.core.gaussians import Gaussians
+from spackle.render import Renderer, device_of
+from spackle.render.protocol import Rendering
+from spackle.residual.completion import view_type_of
+from spackle.residual.features import MASK_THRESHOLD
+from spackle.residual.network import ResidualNet
+from spackle.runtime.device import Precision
+from spackle.scene_fill.occlusion_guard import OcclusionGuard
+from spackle.scene_fill.texture import Texture, exemplar_texture
+from spackle.scene_fill.view_completion import SceneViewCompletion
+
+
+class PhotoRendering:
+    """Renders a base from its photo's camera, and keeps the rendering until another one is asked
+    for.
+    """
+
+    def __init__(self) -> None:
+        self._inputs: tuple[Renderer, Gaussians, Camera] | None = None
+        self._rendering: Rendering | None = None
+
+    def render(self, renderer: Renderer, base: Gaussians, photo_camera: Camera) -> Rendering:
+        """The rendering of these very objects; rendered anew only if one of them is another object
+        than before.
+        """
+        inputs = (renderer, base, photo_camera)
+        if self._rendering is None or self._inputs is None:
+            is_current = False
+        else:
+            is_current = all(a is b for a, b in zip(inputs, self._inputs, strict=True))
+        if not is_current:
+            self._rendering = renderer.render(base, photo_camera)
+            self._inputs = inputs
+        assert self._rendering is not None
+        return self._rendering
+
+
+@dataclasses.dataclass(frozen=True)
+class FillContext:
+    """The base of a photo (its Gaussians, with holes in other views), and all settings for filling
+    these holes.
+    """
+
+    base: Gaussians
+    photo_camera: Camera
+    renderer: Renderer
+    network: ResidualNet | None = None  # None: the initial Gaussians are not changed
+    # None: Gaussians keep the colours of the network, or of the initial Gaussians
+    texture: Texture | None = exemplar_texture
+    threshold: float = MASK_THRESHOLD  # pixels with a lower opacity are holes
+    # Of the network; auto is bfloat16 if the hardware multiplies it natively.
+    precision: Precision = "auto"
+    # Shared by all contexts that `dataclasses.replace` makes of this one, so that none renders the
+    # photo again.
+    photo_cache: PhotoRendering = dataclasses.field(
+        default_factory=PhotoRendering, repr=False, compare=False
+    )
+
+    @functools.cached_property
+    def placed(self) -> FillContext:
+        """The same context, with base and network on the renderer's device."""
+        device = device_of(self.renderer)
+        if self.base.means.device.type == device.type:
+            return self
+        network = None if self.network is None else copy.deepcopy(self.network).to(device)
+        return dataclasses.replace(self, base=self.base.to(device), network=network)
+
+    @property
+    def photo_rendering(self) -> Rendering:
+        """The base rendered from the photo's camera, on the renderer's device."""
+        return self.photo_cache.render(self.renderer, self.placed.base, self.photo_camera)
+
+    @property
+    def without_network(self) -> FillContext:
+        """The same context, without network and texture: the initial Gaussians alone fill the
+        holes.
+        """
+        return dataclasses.replace(self, network=None, texture=None)
+
+    def photo_guard(self) -> OcclusionGuard:
+        """The surfaces that the photo shows, in front of which no new Gaussian may lie."""
+        return OcclusionGuard.of(self.photo_rendering, self.photo_camera, self.threshold)
+
+    def view(self, rendering: Rendering, camera: Camera) -> SceneViewCompletion:
+        """The completion of one view, from the rendering of the base (and of earlier aux Gaussians)
+        at its camera.
+        """
+        view_type = view_type_of(self.network, SceneViewCompletion)
+        if not issubclass(view_type, SceneViewCompletion):
+            raise TypeError(f"{view_type.__name__} must be a subclass of SceneViewCompletion")
+
+        def render_photo() -> Tensor:
+            """The photo [H, W, 3], sRGB, as the base shows it."""
+            return self.photo_rendering.rgb
+
+        return view_type(rendering, camera, self.photo_camera, render_photo, self.threshold)

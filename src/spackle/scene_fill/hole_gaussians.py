@@ -1,0 +1,167 @@
+"""New Gaussians for the holes of one view, behind all surfaces that other views show."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from spackle.core.camera import Camera
+from spackle.core.color import linear_to_srgb, srgb_to_linear
+from spackle.core.gaussians import Gaussians
+from spackle.core.surfels import BEHIND_SURFACE_RATIO, PIXEL_SIGMA_PX
+from spackle.residual.composer import compose
+from spackle.residual.features import CELL_PIXELS
+from spackle.residual.initializer import InitialGaussians
+from spackle.scene_fill.context import FillContext
+from spackle.scene_fill.occlusion_guard import (
+    OcclusionGuard,
+    move_from_eye,
+    unoccluding_scales,
+    without_pits,
+)
+from spackle.scene_fill.texture import group_by_cell, sharpened
+from spackle.scene_fill.view_completion import SceneViewCompletion
+
+# sRGB: a cell whose pixels differ less from their mean gets one Gaussian, any other also one for
+# each pixel.
+UNIFORM_CELL_RANGE = 0.01
+# Pixel centres of a cell of 2×2 pixels, as (x, y) from the cell's centre in pixels, row by row.
+PIXEL_OFFSETS = torch.tensor([[-0.5, -0.5], [0.5, -0.5], [-0.5, 0.5], [0.5, 0.5]])
+
+
+@dataclasses.dataclass(frozen=True)
+class HoleFilling:
+    """The new Gaussians in the holes of a view, and the surfaces that they continue."""
+
+    gaussians: Gaussians
+    # The first guess for all cells of the view, from which the surfaces beneath the rims of holes
+    # are continued.
+    surfaces: InitialGaussians
+
+
+def fill_holes(
+    context: FillContext, view: SceneViewCompletion, guards: Sequence[OcclusionGuard]
+) -> HoleFilling:
+    """Gaussians for all cells (2×2 pixels) of a view that touch a hole.
+
+    Each cell has one Gaussian; with a texture, a cell whose pixels differ has a Gaussian for each
+    pixel, too.
+
+    Args:
+        context: network and texture, if any, and the precision of the network.
+        view: the view, with its holes.
+        guards: surfaces of other views, in front of which no new Gaussian may lie.
+    """
+    mask = view.mask
+    eye = view.camera.position
+    deltas = view.deltas(context.network, context.precision)
+    cells = view.gaussians(mask, deltas)
+
+    # Gaussians that would hide a guarded surface move away along their line of sight.
+    depths = view.camera.to_camera(cells.means)[:, 2]
+    scales = unoccluding_scales(cells, eye, guards)
+    smooth_scales = without_pits(depths * scales, mask) / depths
+    scales = torch.where(scales > 0, smooth_scales, 0)
+
+    pixels = Gaussians.empty()
+    if context.texture is not None:
+        structure = view.features.rgb.clone()
+        structure[mask] = linear_to_srgb(cells.colors)
+        picture = context.texture(view, structure)
+        pixels = _textured_pixels(view, deltas, picture, scales)
+
+        # As in a lifted photo, a cell's own Gaussian lies behind the Gaussians of its pixels.
+        scales = scales / (1 - BEHIND_SURFACE_RATIO)
+        cell_pixels = group_by_cell(picture)[mask]
+        linear_means = srgb_to_linear(cell_pixels.clamp(0, 1)).mean((1, 2))
+        cells = dataclasses.replace(cells, colors=linear_means)
+
+    surfaces = view.initial
+    if context.network is not None or context.texture is not None:
+        surfaces = _follow_beyond_photo(view, depths * scales, scales > 0)
+    cells = move_from_eye(cells, eye, scales)
+    return HoleFilling(Gaussians.cat([pixels, cells]), surfaces)
+
+
+def _textured_pixels(
+    view: SceneViewCompletion, deltas: Tensor | None, picture: Tensor, scales: Tensor
+) -> Gaussians:
+    """Gaussians for the single pixels of the hole cells whose pixels differ in colour.
+
+    Args:
+        view: the view.
+        deltas: [h, w, 14] the network's changes of the initial Gaussians; None: no changes.
+        picture: [2h, 2w, 3] sRGB of all pixels of the view.
+        scales: [n] factors by which the Gaussians of the n hole cells move away from the eye; 0
+            removes them.
+    """
+    mask = view.mask
+    cell_pixels = group_by_cell(picture)[mask]  # [n, 2, 2, 3] sRGB
+    cell_means = cell_pixels.mean((1, 2), keepdim=True)
+    differs = (cell_pixels - cell_means).abs().amax((1, 2, 3)) > UNIFORM_CELL_RANGE
+    textured = differs.nonzero()[:, 0]
+    pixels = pixel_gaussians(
+        view.initial.select(mask).select(textured),
+        None if deltas is None else deltas[mask][textured],
+        view.camera,
+        group_by_cell(sharpened(picture))[mask][textured],
+    )
+    return move_from_eye(
+        pixels, view.camera.position, scales[textured].repeat_interleave(CELL_PIXELS)
+    )
+
+
+def _follow_beyond_photo(
+    view: SceneViewCompletion, depths: Tensor, is_kept: Tensor
+) -> InitialGaussians:
+    """The view's initial Gaussians, with those beyond the photo's border moved to the depths of the
+    new Gaussians.
+
+    There, the surfaces beneath the rims of holes must follow the Gaussians that were moved away.
+
+    Args:
+        view: the view.
+        depths: [n] z of the new Gaussians of the n hole cells.
+        is_kept: [n] bool, false for Gaussians that were removed.
+    """
+    inverse_depth = view.initial.inverse_depth.clone()
+    moved = view.beyond_photo[view.mask] & is_kept
+    inverse_depth[view.mask] = torch.where(moved, 1 / depths, inverse_depth[view.mask])
+    return dataclasses.replace(view.initial, inverse_depth=inverse_depth)
+
+
+def pixel_gaussians(
+    initial: InitialGaussians, deltas: Tensor | None, camera: Camera, colors: Tensor
+) -> Gaussians:
+    """Gaussians [4n] for the single pixels of n cells of 2×2 pixels.
+
+    Args:
+        initial: the first guess for the n cells, flat fields [n, ...].
+        deltas: [n, 14] the network's changes of the guess; None: no changes.
+        camera: of the view.
+        colors: [n, 2, 2, 3] sRGB of the pixels.
+    """
+    pixels_a_cell = len(PIXEL_OFFSETS)
+
+    def repeat(field: Tensor) -> Tensor:
+        """The values of each cell, once for each of its pixels."""
+        return field.repeat_interleave(pixels_a_cell, 0)
+
+    # The pixels lie on the cell's plane, but never more than twice as far as its centre.
+    cell_inverse_depth = repeat(initial.inverse_depth)
+    rise = (initial.slope[:, None] * PIXEL_OFFSETS).sum(-1).flatten()
+    inverse_depth = (cell_inverse_depth + rise).clamp_min(0.5 * cell_inverse_depth)
+    pixels = InitialGaussians(
+        uv=(initial.uv[:, None] + PIXEL_OFFSETS).flatten(0, 1),
+        inverse_depth=inverse_depth,
+        slope=repeat(initial.slope),
+        rgb=repeat(initial.rgb),
+        unit=initial.unit,
+    )
+    pixel_deltas = None if deltas is None else repeat(deltas)
+    composed = compose(pixels, pixel_deltas, camera, PIXEL_SIGMA_PX)
+    linear_colors = srgb_to_linear(colors.flatten(0, 2).clamp(0, 1))
+    return dataclasses.replace(composed, colors=linear_colors)

@@ -1,0 +1,65 @@
+"""Render a scene that grows: after Gaussians were added, only the parts of a view that they touch
+are redrawn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+
+from spackle.core.camera import Camera
+from spackle.core.gaussians import Gaussians
+from spackle.render import Renderer, device_of, touched_tiles
+from spackle.render.protocol import Rendering
+
+CPU = torch.device("cpu")
+
+
+class IncrementalRenderer:
+    """Holds the base and all Gaussians that were added to it, and the last rendering, on the
+    renderer's device.
+    """
+
+    def __init__(self, renderer: Renderer, base: Gaussians) -> None:
+        """Start with the base alone; `base` is on the renderer's device."""
+        self._renderer = renderer
+        self._device = device_of(renderer)
+        self._base = base
+        self._added: list[Gaussians] = []
+        self._camera: Camera | None = None
+        self._last: Rendering | None = None
+
+    def add(self, *gaussians: Gaussians) -> None:
+        """Add Gaussians from any device to the scene, without rendering."""
+        self._added += [part.to(self._device) for part in gaussians]
+
+    def render(self, camera: Camera, base_rendering: Rendering | None = None) -> Rendering:
+        """The scene as a camera sees it, on the CPU.
+
+        `base_rendering`, if given, is the rendering of the base alone from this camera. Then only
+        the parts of the image that added Gaussians touch are drawn.
+        """
+        self._camera = camera
+        if base_rendering is None:
+            self._last = self._renderer.render([self._base, *self._added], camera)
+            return self._last.to(CPU)
+        self._last = base_rendering.to(self._device)
+        return self._redraw(self._added)
+
+    def render_added(self, gaussians: Gaussians) -> Rendering:
+        """Add Gaussians, and return the scene as the last camera sees it, on the CPU."""
+        self.add(gaussians)
+        return self._redraw([gaussians])
+
+    def _redraw(self, changed: Sequence[Gaussians]) -> Rendering:
+        """Draw the tiles of the last view that the Gaussians `changed` touch, and copy all
+        others.
+        """
+        assert self._camera is not None
+        assert self._last is not None
+        tiles = touched_tiles(changed, self._camera)
+        if bool(tiles.any()):
+            scene = [self._base, *self._added]
+            self._last = self._renderer.render(scene, self._camera, tiles=tiles, onto=self._last)
+        return self._last.to(CPU)

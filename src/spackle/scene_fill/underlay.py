@@ -1,0 +1,72 @@
+"""Underlays: Gaussians beneath the rims of holes, which close the slits that other views would show
+there.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+from torch import Tensor
+
+from spackle.core.camera import Camera
+from spackle.core.filters import maximum_filter
+from spackle.core.gaussians import Gaussians
+from spackle.core.hole_filling import fill_from_far_side
+from spackle.core.surfels import inverse_depth_slope
+from spackle.residual.composer import compose
+from spackle.residual.features import CELL
+from spackle.residual.initializer import (
+    GAUSSIAN_REACH_CELLS,
+    InitialGaussians,
+    place_behind_surfaces,
+)
+
+# An underlay is smooth, so each of its Gaussians is three times as large as usual and covers 3×3
+# cells.
+UNDERLAY_STRIDE = 3
+# An underlay extends this far beneath a rim: the reach of one of its Gaussians.
+UNDERLAY_REACH_CELLS = UNDERLAY_STRIDE * GAUSSIAN_REACH_CELLS
+
+
+def rim_underlay(mask: Tensor, surfaces: InitialGaussians, camera: Camera) -> Gaussians:
+    """Gaussians that continue the filling of holes beneath the surfaces around the holes.
+
+    From another view, a slit appears between the rim of a hole and the hole's filling. The underlay
+    closes most slits in advance.
+
+    Args:
+        mask: [h, w] bool: the cells (2×2 pixels) of the view that touch a hole.
+        surfaces: the surfaces of all cells: the filling inside of holes, the visible surface
+            elsewhere.
+        camera: of the view.
+    """
+    coarse = (slice(None, None, UNDERLAY_STRIDE), slice(None, None, UNDERLAY_STRIDE))
+    around_holes = maximum_filter(mask, UNDERLAY_REACH_CELLS) & ~mask
+    rim = around_holes[coarse]
+    if not bool(rim.any()) or bool(rim.all()):
+        return Gaussians.empty()
+
+    # All cells that are not at a rim are known: the filling of the holes, and visible surfaces.
+    coarse_inverse_depth, coarse_rgb = fill_from_far_side(
+        surfaces.inverse_depth[coarse], surfaces.rgb[coarse].permute(2, 0, 1), ~rim
+    )
+
+    # The underlay lies behind every cell of the fine grid that it can reach.
+    inverse_depth = surfaces.inverse_depth.clone()
+    inverse_depth[coarse] = coarse_inverse_depth
+    is_underlay = mask.new_zeros(mask.shape)
+    is_underlay[coarse] = rim
+    behind = place_behind_surfaces(
+        inverse_depth, is_underlay, surfaces.inverse_depth, UNDERLAY_REACH_CELLS
+    )[coarse]
+
+    cells = InitialGaussians(
+        uv=surfaces.uv[coarse],
+        inverse_depth=behind,
+        slope=inverse_depth_slope(behind)
+        / (UNDERLAY_STRIDE * CELL),  # from a coarse cell to a pixel
+        rgb=coarse_rgb.permute(1, 2, 0),
+        unit=surfaces.unit,
+    )
+    underlay = compose(cells.select(rim), None, camera)
+    return dataclasses.replace(underlay, scales=UNDERLAY_STRIDE * underlay.scales)
