@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from spackle.core.camera import Camera
-from spackle.core.crop import crops_around
+from spackle.core.crop import crops_around_mask
 from spackle.core.trajectories import DepthRange, leftmost_and_rightmost
 from spackle.residual.network import STRIDE
 
@@ -31,7 +31,7 @@ def test_each_masked_cell_is_in_one_crop_with_a_margin(
     mask, times = torch.zeros(size, dtype=torch.bool), torch.zeros(size)
     for y, x, height, width in rng.integers([0, 0, 1, 1], [*size, 20, 20], (spots, 4)):
         mask[y : y + height, x : x + width] = True
-    pairs = crops_around(mask, STRIDE, margin)
+    pairs = crops_around_mask(mask, STRIDE, margin)
     for inner, outer in pairs:
         times[inner.slices] += 1
         inside, shown = dataclasses.astuple(inner), dataclasses.astuple(outer)

@@ -15,7 +15,7 @@ from spackle.core.camera import Camera
 from spackle.core.color import linear_to_srgb, srgb_to_linear
 from spackle.core.gaussians import Gaussians
 from spackle.core.surfels import make_surfels
-from spackle.core.trajectories import DepthRange, extremes
+from spackle.core.trajectories import DepthRange, leftmost_and_rightmost
 from spackle.render.protocol import Rendering
 from spackle.render.reference import ReferenceRenderer
 from spackle.residual import InitialGaussians, ResidualNet, ViewCompletion, complete_view
@@ -91,7 +91,7 @@ def paper(
 def test_a_completed_view_matches_the_equations(size: tuple[int, int]) -> None:
     scene = box_before_wall(width=size[0], height=size[1], focal=40)
     base, network = scene.base(), random_network()
-    camera = extremes(scene.camera, 0.3, DepthRange.of(base))[1]
+    camera = leftmost_and_rightmost(scene.camera, 0.3, DepthRange.of(base))[1]
     aux = complete_view(base, camera, scene.camera, CPU, network, precision="fp32")
     with torch.no_grad():
         expected, final = paper(base, camera, scene.camera, network)

@@ -14,9 +14,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from spackle.core.crop import Crop, crops_around
+from spackle.core.crop import Crop, crops_around_mask
 from spackle.residual.composer import DELTA_CHANNELS
-from spackle.runtime.device import Precision, own_arithmetic, pick_dtype
+from spackle.runtime.device import Precision, pick_dtype, without_autocast_or_tf32
 
 STRIDE = 16  # cells along the side of one cell of a network's coarsest grid, after four halvings
 
@@ -87,13 +87,16 @@ def predict_deltas(
     dtype = pick_dtype(precision, device)
     deltas = torch.zeros(*cells.shape, DELTA_CHANNELS)
     if network.local:
-        crops = crops_around(cells, STRIDE)
+        crops = crops_around_mask(cells, STRIDE)
     else:
         whole_view = Crop(0, 0, *cells.shape)
         crops = [(whole_view, whole_view)]
 
     # One autocast block around all crops, so that the weights are converted once.
-    with own_arithmetic(device), torch.autocast(device.type, dtype, enabled=dtype != torch.float32):
+    with (
+        without_autocast_or_tf32(device),
+        torch.autocast(device.type, dtype, enabled=dtype != torch.float32),
+    ):
         for inner, outer in crops:
             # The outer rectangle gives context to the cells of the inner one.
             crop = features[(..., *outer.slices)]

@@ -6,7 +6,7 @@ The renderer and the network run on the renderer's device; all other code runs o
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -90,6 +90,8 @@ def fill_scene(
     cameras: Sequence[Camera],
     exact: bool = False,
     progress: Progress | None = None,
+    *,
+    always_filled: Collection[int] = (),
 ) -> FilledScene:
     """Complete all views of a path with one set of Gaussians.
 
@@ -104,11 +106,14 @@ def fill_scene(
         exact: check every view, and complete every view that has a hole. Otherwise invisibly small
             holes may remain, and only half of a long path's frames are checked.
         progress: called with (number of visited views, number of views to visit).
+        always_filled: indices of cameras that are checked even if they are not in that half. Order
+            and half follow from the places of the eyes alone, so a view that shows more from the
+            same place would be left out.
     """
     device = context.base.means.device
     if not cameras:
         return FilledScene(Gaussians.empty(device), {})
-    filling = _SceneFilling(context.placed, cameras, exact)
+    filling = _SceneFilling(context.placed, cameras, exact, always_filled)
     for count, index in enumerate(filling.views_to_fill, start=1):
         filling.visit(index)
         if progress:
@@ -120,7 +125,13 @@ def fill_scene(
 class _SceneFilling:
     """The state of `fill_scene` between two views."""
 
-    def __init__(self, context: FillContext, cameras: Sequence[Camera], exact: bool) -> None:
+    def __init__(
+        self,
+        context: FillContext,
+        cameras: Sequence[Camera],
+        exact: bool,
+        always_filled: Collection[int],
+    ) -> None:
         """Render the widest views, and guard their surfaces and the photo's.
 
         Args: as for `fill_scene`; the context lies on the renderer's device.
@@ -133,7 +144,9 @@ class _SceneFilling:
             self.views_to_fill = order
             self.max_hole_ratio = 0.0
         else:
-            self.views_to_fill = order[: max(MIN_VIEWS_TO_FILL, len(order) // 2)]
+            checked = max(MIN_VIEWS_TO_FILL, len(order) // 2)
+            others = [index for index in order[checked:] if index in always_filled]
+            self.views_to_fill = [*order[:checked], *others]
             self.max_hole_ratio = INVISIBLE_HOLE_RATIO
 
         self.renderer = IncrementalRenderer(context.renderer, context.base)
