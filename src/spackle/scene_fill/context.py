@@ -12,7 +12,7 @@ from torch import Tensor
 
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
-from spackle.render import Renderer, device_of
+from spackle.render import Renderer
 from spackle.render.protocol import Rendering
 from spackle.residual.completion import view_type_of
 from spackle.residual.features import MASK_THRESHOLD
@@ -72,7 +72,7 @@ class FillContext:
     @functools.cached_property
     def placed(self) -> FillContext:
         """The same context, with base and network on the renderer's device."""
-        device = device_of(self.renderer)
+        device = self.renderer.device
         if self.base.means.device.type == device.type:
             return self
         network = None if self.network is None else copy.deepcopy(self.network).to(device)

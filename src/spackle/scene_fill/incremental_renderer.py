@@ -10,7 +10,7 @@ import torch
 
 from spackle.core.camera import Camera
 from spackle.core.gaussians import Gaussians
-from spackle.render import Renderer, device_of, touched_tiles
+from spackle.render import Renderer, touched_tiles
 from spackle.render.protocol import Rendering
 
 CPU = torch.device("cpu")
@@ -24,7 +24,7 @@ class IncrementalRenderer:
     def __init__(self, renderer: Renderer, base: Gaussians) -> None:
         """Start with the base alone; `base` is on the renderer's device."""
         self._renderer = renderer
-        self._device = device_of(renderer)
+        self._device = renderer.device
         self._base = base
         self._added: list[Gaussians] = []
         self._camera: Camera | None = None
@@ -61,5 +61,7 @@ class IncrementalRenderer:
         tiles = touched_tiles(changed, self._camera)
         if bool(tiles.any()):
             scene = [self._base, *self._added]
-            self._last = self._renderer.render(scene, self._camera, tiles=tiles, onto=self._last)
+            self._last = self._renderer.render(
+                scene, self._camera, tiles=tiles, previous_rendering=self._last
+            )
         return self._last.to(CPU)

@@ -21,7 +21,7 @@ from spackle.paper.training.recipe import Recipe
 from spackle.paper.training.samples import Sample, digest_of_samples, load_sample, make_samples
 from spackle.paper.training.sources import find_sources
 from spackle.paper.training.task import Task
-from spackle.render import Renderer, device_of, get_renderer
+from spackle.render import Renderer, get_renderer
 from spackle.render.protocol import Rendering
 from spackle.residual.architectures import NOTE, load_residual, open_residual
 from spackle.residual.completion import MIN_AUX_GAUSSIANS
@@ -30,7 +30,8 @@ from spackle.residual.network import ResidualNet
 from spackle.residual.sharp_decoder import SharpDecoder
 from spackle.runtime.device import pick_dtype
 from spackle.runtime.errors import InputError
-from spackle.runtime.files import make_folder, write_atomic
+from spackle.runtime.files import write_atomic
+from spackle.runtime.folders import make_folder
 from spackle.runtime.progress import Reporter
 from spackle.weights.checkpoints import load_strict, read_tensors
 
@@ -139,7 +140,7 @@ def complete_samples(
         renderer: draws the completed views; its device does the rest of the work, too.
         precision: of the network's convolutions.
     """
-    device = device_of(renderer)
+    device = renderer.device
     # Masks are read before the samples move to the renderer's device: reading them later would wait
     # for a GPU.
     cells = [
@@ -160,17 +161,12 @@ def complete_samples(
         aux = sample.view.gaussians(index, sample_deltas.permute(1, 2, 0))
         scenes.append([sample.base, aux])
 
-    cameras = [sample.camera for sample in samples]
-    base_renderings = [sample.rendering for sample in samples]
-    if hasattr(renderer, "render_batch"):  # on a GPU
-        views = renderer.render_batch(scenes, cameras, tiles=tiles, onto=base_renderings)
-    else:
-        views = [
-            renderer.render(scene, camera, tiles=touched, onto=base_rendering)
-            for scene, camera, touched, base_rendering in zip(
-                scenes, cameras, tiles, base_renderings, strict=True
-            )
-        ]
+    views = renderer.render_batch(
+        scenes,
+        [sample.camera for sample in samples],
+        tiles=tiles,
+        previous_renderings=[sample.rendering for sample in samples],
+    )
     return ViewBatch.of(
         (view, sample.rendering.rgb, sample.target, sample.hole)
         for view, sample in zip(views, samples, strict=True)
@@ -260,7 +256,7 @@ class ResidualTask(ViewTask):
         A run can raise PSNR only from the first value towards the second.
         """
         with torch.random.fork_rng(devices=[]):
-            network = open_residual(self.recipe.network).to(device_of(self.renderer))
+            network = open_residual(self.recipe.network).to(self.renderer.device)
         decibels: dict[str, list[float]] = {"untrained": [], "colours of the targets": []}
         for item in range(self.validation_items):
             (sample,) = self.load_batch(None, [item])

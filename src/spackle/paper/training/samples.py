@@ -27,7 +27,7 @@ from spackle.core.gaussians import Gaussians
 from spackle.paper.training.ranks import rank, rank_count, wait_for_ranks
 from spackle.paper.training.recipe import DataRecipe
 from spackle.render import CpuRenderer
-from spackle.render.protocol import TILE, Rendering
+from spackle.render.protocol import TILE_PX, Rendering
 from spackle.residual.features import CELL, ViewFeatures, cell_centers, hole_mask
 from spackle.residual.initializer import InitialGaussians
 from spackle.runtime.errors import InputError, as_input_error
@@ -189,7 +189,7 @@ class Sample:
         hole, can touch.
         """
         near_hole = maximum_filter(self.hole, HOLE_REACH_PX)
-        return max_pool2d(near_hole[None, None].float(), TILE, ceil_mode=True)[0, 0] > 0
+        return max_pool2d(near_hole[None, None].float(), TILE_PX, ceil_mode=True)[0, 0] > 0
 
     def to(self, device: torch.device) -> Sample:
         """The sample's tensors on another device; the camera stays on the CPU."""
