@@ -43,7 +43,7 @@ class SharpDecoder(ResidualNet):
         channels = self.slices[self.inputs[-1]].stop
         widths = (
             config.depth_width,
-            *config.pyramid,
+            *config.pyramid_channels,
         )  # channels of the decoder's maps, finest first
         self.stem = nn.Conv2d(channels, STEM_WIDTH, 3, padding=1)
         self.down = nn.ModuleList(

@@ -55,7 +55,7 @@ class RunReport:
     base_reason: str  # why this base
     base_gaussians: int
     passed_over: tuple[str, ...]  # better bases that could not be used, each with the error
-    weights: str  # of the network that fills holes: "shipped", a file, "seeds" or "none"
+    weights: str  # of the network that fills holes: "shipped", a file, "initial" or "none"
     views: str  # the trajectory, or the name of the file with views or keyframes
     disparity_source: str | None  # "disparity": by the option; "photo": chosen; None: no trajectory
     seconds: Mapping[str, float]  # duration of each stage
