@@ -27,9 +27,10 @@ from spackle.paper.evaluation.paper_numbers import PAPER_PARAMETERS, PAPER_TABLE
 from spackle.paper.evaluation.protocols import large_views
 from spackle.paper.evaluation.tables import make_tables
 from spackle.render import get_renderer
-from spackle.residual.architectures import UNet, open_residual
+from spackle.residual.architectures import open_residual
 from spackle.runtime.errors import InputError
 from spackle.scene_fill import FillContext, fill_view
+from spackle.scene_fill.unet import UNet
 
 EXPANDED = "tab:expanded_efficiency_gaussian_overhead"
 PAPER_LABELS = {table.label for table in PAPER_TABLES}  # the paper's six tables
@@ -149,7 +150,7 @@ def test_points_suffice_and_without_depth_a_case_is_refused(scenes: Path) -> Non
         root=scenes,
         base=BaseSettings(name="rgbd"),
         disparities=(0.3,),
-        residual="seeds",
+        residual="initial",
     )
     evaluation = open_evaluation(options.as_evaluation)
     case = evaluation.cases[0]

@@ -6,6 +6,7 @@ tables of costs.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import time
 from collections.abc import Callable, Mapping
@@ -49,6 +50,7 @@ from spackle.runtime.device import hardware_facts, package_versions
 from spackle.runtime.folders import results_folder
 from spackle.runtime.progress import Reporter
 from spackle.scene_fill import FillContext
+from spackle.scene_fill.context import PhotoRendering
 
 MARKDOWN_FILE = "bench.md"
 LATEX_FILE = "bench.tex"
@@ -432,7 +434,8 @@ def complete_view_in_stages(
     Returns:
         The Gaussians that the method adds for the view.
     """
-    context = context.placed
+    # Without the rendering of the photo that earlier repetitions have left in the context.
+    context = dataclasses.replace(context.placed, photo_cache=PhotoRendering())
     base_rendering = context.renderer.render(context.base, camera)
     end_stage("view")
 

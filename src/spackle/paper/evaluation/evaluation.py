@@ -238,7 +238,7 @@ def _residual_configuration(options: EvaluateOptions, renderer: Renderer) -> dic
     precision."""
     weights_file = FillOptions(residual=options.residual).weights_file
     if weights_file is None:
-        return {"weights": "seeds", "sha256": None, "precision": None}
+        return {"weights": "initial", "sha256": None, "precision": None}
 
     dtype = pick_dtype(options.base.precision, renderer.device)
     return {

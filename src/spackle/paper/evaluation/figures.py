@@ -87,7 +87,7 @@ WEIGHTS_SENTENCES = {
         "The residual has the weights that ship with Spackle, which the paper's recipe did not "
         "train."
     ),
-    "seeds": "The residual has no weights: its deltas are 0.",
+    "initial": "The residual has no weights: its deltas are 0.",
 }
 
 
