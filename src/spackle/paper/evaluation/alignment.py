@@ -72,6 +72,8 @@ def _ratio_of_bounds(depth_bounds: tuple[float, float], base_depth: Tensor) -> f
     Returns:
         The geometric mean of the ratio at the nearest and the ratio at the farthest depth.
     """
+    # The bounds are quantiles of the depth of a scene's points, near 0 and near 1. They are compared
+    # with the same quantiles of the base's depth.
     ascending = base_depth.double().sort().values
     ratios = []
     for bound, quantile in zip(depth_bounds, DEPTH_BOUND_QUANTILES, strict=True):
@@ -165,8 +167,7 @@ def camera_in_base_scene(
 
 
 def _intrinsics_times_rotation(matrix: Tensor) -> tuple[Tensor, Tensor]:
-    """Split a matrix [3, 3] into upper triangular intrinsics with positive diagonal times a
-    rotation.
+    """Split a matrix [3, 3] into intrinsics (upper triangular, diagonal > 0) times a rotation.
 
     This is an RQ decomposition, made from torch's QR decomposition: reversing rows and columns
     turns an upper triangular matrix into a lower triangular one, which transposed is upper again.

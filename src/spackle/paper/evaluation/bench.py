@@ -1,5 +1,4 @@
-"""`spackle bench`: count the added Gaussians and time the stages on a dataset, for the paper's
-tables of costs.
+"""`spackle bench`: count added Gaussians and time the stages, for the paper's tables of costs.
 
 `bench` runs a whole benchmark, `time_case` times one photo, `time_tasks` is the clock.
 """
@@ -342,7 +341,8 @@ def count_parameters(residual: ResidualNet | None) -> dict[str, float]:
         inference uses, without classifiers and the part that aligns depths. "residual": of the
         residual network. "share": the residual network's over SHARP's.
     """
-    with torch.device("meta"):  # without memory for the parameters
+    # SHARP as published, but without memory for its parameters.
+    with torch.device("meta"):
         sharp = SharpNetwork(FULL_SIZE)
     used_count = sum(parameter.numel() for parameter in sharp.parameters())
 
@@ -429,16 +429,17 @@ def complete_view_in_stages(
         context: the base's Gaussians, the renderer and the residual network.
         camera: the view.
         end_stage: stops the time of a stage.
-        method: one of `TIMED_METHODS`.
+        method: "paper" or "spackle".
 
     Returns:
         The Gaussians that the method adds for the view.
     """
-    # Without the rendering of the photo that earlier repetitions have left in the context.
+    # On the renderer's device, and without the rendering of the photo that earlier repetitions left.
     context = dataclasses.replace(context.placed, photo_cache=PhotoRendering())
     base_rendering = context.renderer.render(context.base, camera)
     end_stage("view")
 
+    # What a method prepares is the base rendered from the photo's camera.
     fill = make_method(method, [camera], context)
     end_stage("photo")
 

@@ -169,8 +169,7 @@ def _check_aspect_ratio(path: Path, photo: Photo, camera: Camera) -> None:
 
 
 def known_depth(case: Case) -> DepthMap:
-    """The case's depth map; if it has points only, a map of the case's camera with depth at these
-    points.
+    """The case's depth map; if it has only points, a depth map that is known at these points.
 
     Raises:
         InputError: the case has neither a depth map nor points, or a file cannot be used.
@@ -182,12 +181,18 @@ def known_depth(case: Case) -> DepthMap:
             f"{case.name}: has neither a depth map nor points: the base rgbd needs one of them"
         )
     depth = _depth_of_points(case.read_points(), case.camera, case.name)
-    return DepthMap(depth, depth > 0, case.camera.K, None, "depth", case.photo)
+    return DepthMap(
+        depth=depth,
+        valid=depth > 0,
+        K=case.camera.K,
+        quantum=None,  # the depths are not rounded
+        quantity="depth",
+        path=case.photo,
+    )
 
 
 def _depth_of_points(points: Points, camera: Camera, case_name: str) -> Tensor:
-    """Depth of the nearest point in each pixel of a camera, [H, W] float32; 0 in pixels without a
-    point.
+    """Depth of the nearest point in each pixel, [H, W] float32; 0 in pixels without a point.
 
     Raises:
         InputError: no point lies in the image and in front of the camera.

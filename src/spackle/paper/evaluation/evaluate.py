@@ -1,5 +1,4 @@
-"""`spackle evaluate` and `spackle tables`: measure a dataset; write numbers, tables, pictures and
-pages.
+"""`spackle evaluate` and `spackle tables`: measure a dataset, and write numbers and tables.
 
 `evaluate` runs a whole evaluation, `measure_case` measures one photo, `merge_tables` joins
 evaluations.
@@ -285,8 +284,7 @@ def _methods(
 
     @functools.cache
     def tuned_gaussians() -> tuple[Gaussians, float]:
-        """For the method direct-ft: Gaussians by the fine-tuned base, predicted once for all
-        views."""
+        """Gaussians by the fine-tuned base, for the method direct-ft; predicted only once."""
         return _predict_by_tuned_base(evaluation, loaded, scale)
 
     def built_in_method(name: str, cameras: Sequence[Camera]) -> Fill:

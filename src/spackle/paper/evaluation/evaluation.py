@@ -1,5 +1,4 @@
-"""An opened evaluation: the cases of a dataset, and the networks and metrics that all cases
-share."""
+"""An opened evaluation: a dataset's cases, and the networks and metrics that they share."""
 
 from __future__ import annotations
 
@@ -34,8 +33,7 @@ OWN_METRIC = "own"  # how a metric is measured that no other package measures
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """A dataset's cases (photos with what is known about them), and the objects that all cases
-    share."""
+    """A dataset's cases (photos with what is known about them), and what all cases share."""
 
     options: EvaluateOptions
     cases: Sequence[Case]
@@ -51,8 +49,7 @@ class Evaluation:
     metric_states: dict[str, str]
 
     def base_of_case(self, loaded: LoadedCase) -> OpenedBase:
-        """The base that makes a case's Gaussians: a network, or else the case's own depth or
-        points.
+        """The base that makes a case's Gaussians: a network, or the case's own known depth.
 
         Raises:
             InputError: the base is no network, and the case has neither depth nor points.
@@ -125,7 +122,7 @@ def _cases_to_evaluate(options: EvaluateOptions) -> list[Case]:
 
     chosen_cases = []
     for case in cases:
-        if not options.is_near_view:
+        if not options.is_near_view:  # large views are not compared with photos
             second_views: tuple[SecondView, ...] = ()
         elif options.second_views == "nearest":
             second_views = tuple(view for view in case.second_views if view.is_among_nearest)
@@ -221,23 +218,21 @@ def _configuration(
 
 
 def _base_configuration(options: EvaluateOptions) -> dict[str, Any]:
-    """What config.json records about the base, the network or depth map that makes the
-    Gaussians."""
+    """What config.json records about the base, which turns photos into Gaussians."""
     base = options.base
     return {
         "name": base.public_name,
-        "title": "SHARP" if base.resolved_name == "sharp" else base.public_name,
-        "says": base.description,
+        "title": "SHARP" if base.resolved_name == "sharp" else base.public_name,  # in tables
+        "says": base.description,  # in notes below tables
         "weights": weights_digests(base.model_files),
         "precision": base.precision,
     }
 
 
 def _residual_configuration(options: EvaluateOptions, renderer: Renderer) -> dict[str, Any]:
-    """What config.json records about the residual network: source and digest of weights,
-    precision."""
+    """What config.json records about the residual network: its weights and its precision."""
     weights_file = FillOptions(residual=options.residual).weights_file
-    if weights_file is None:
+    if weights_file is None:  # the initial Gaussians fill holes as they are
         return {"weights": "initial", "sha256": None, "precision": None}
 
     dtype = pick_dtype(options.base.precision, renderer.device)

@@ -45,8 +45,7 @@ MIN_BOX_SCORE = 0.02
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PaperFigure:
-    """A figure of views in the paper's layout: a row for each image, and a column for each
-    picture."""
+    """A figure of views in the paper's layout: a row for each image."""
 
     name: str
     columns: tuple[
@@ -169,12 +168,15 @@ def _draw_figure(
     `max_rows` is the most images in the figure; but there is at least one of each evaluation.
     """
     columns = _drawn_columns(figure, runs)
+
+    # Also a figure without the hole's picture needs it, to find where to draw boxes.
+    needed_pictures = [*columns, HOLE_PICTURE]
     rows = []
     for run, folder in runs:
         complete_images = []
         for image in run.measured_images:
             files = stored_pictures(run, folder, image)
-            if HOLE_PICTURE in files and all(column in files for column in columns):
+            if all(name in files for name in needed_pictures):
                 complete_images.append(image)
 
         rows_of_run = max(1, max_rows // len(runs))
@@ -209,8 +211,7 @@ def _drawn_columns(figure: PaperFigure, runs: Sequence[RunWithFolder]) -> list[s
 
 
 def _column_title(column: str, bases: str) -> str:
-    """The title above a figure's column; `bases` names the bases, whose plain renders one column
-    has."""
+    """The title above a figure's column; "base" has the names of the bases, `bases`."""
     if column == "base":
         return bases
     return COLUMN_TITLES.get(column) or METHODS[column].title
@@ -279,7 +280,8 @@ def find_hole_boxes(hole: Image.Image) -> list[Box]:
     There the reader sees what was filled, and what it was filled next to. A box's score is the
     share of hole pixels times the share of other pixels, at most 1/4.
     """
-    is_hole = torch.from_numpy(np.asarray(hole.convert("L")) > 127).float()  # [H, W], half of 255
+    # WebP blurs edges a little, so all pixels above half of white (255) count as white.
+    is_hole = torch.from_numpy(np.asarray(hole.convert("L")) > 127).float()  # [H, W]
     height, width = is_hole.shape
     side = min(round(BOX_SIDE * max(height, width)), height, width)
 
@@ -289,6 +291,7 @@ def find_hole_boxes(hole: Image.Image) -> list[Box]:
 
     boxes: list[Box] = []
     while len(boxes) < MAX_BOXES and float(score.max()) > MIN_BOX_SCORE:
+        # `argmax` counts positions row by row.
         y, x = divmod(int(score.argmax()), score.shape[1])
         boxes.append((x / width, y / height, (x + side) / width, (y + side) / height))
 

@@ -78,8 +78,7 @@ class RunPlan:
 
 
 def write_measurements(measurements: Iterable[Measurement], path: Path) -> None:
-    """Write measurements to a file, one JSON object a line; the file appears complete or not at
-    all."""
+    """Write measurements as JSON, one a line; the file appears complete or not at all."""
     lines = [json.dumps(one._asdict(), allow_nan=False) + "\n" for one in measurements]
     write_atomic(path, "".join(lines).encode())
 
@@ -156,7 +155,6 @@ def measure_images(plan: RunPlan, measure: MeasureImage, reporter: Reporter) -> 
     cached_photo_digest = functools.cache(photo_digest)  # many cases may share a second photo
     all_measurements: list[Measurement] = []
     has_measured = False
-    failed_count = 0
 
     with (
         reporter.stage("images") as progress,
@@ -167,40 +165,30 @@ def measure_images(plan: RunPlan, measure: MeasureImage, reporter: Reporter) -> 
                 reporter.log("stopped; the same command resumes from here")
                 return None
 
-            inputs_digest = _inputs_digest(case, plan, cached_photo_digest)
             results_path = image_file(plan.output, index, case.name, ".json")
+            inputs_digest = _inputs_digest(case, plan, cached_photo_digest)
             measurements = _load_image_results(results_path, inputs_digest)
 
             if measurements is None:
                 if index > 0 and not has_measured:
-                    done = f"{index} of {len(plan.cases)} images are done"
-                    reporter.log(f"{plan.output}: going on, {done}")
+                    finished = f"{index} of {len(plan.cases)} images are done"
+                    reporter.log(f"{plan.output}: going on, {finished}")
                 has_measured = True
 
                 # From now on the results are incomplete.
                 (plan.output / MEASUREMENTS_FILE).unlink(missing_ok=True)
-
-                try:
-                    measurements = _measure_and_save(
-                        index, case, measure, results_path, inputs_digest, reporter
-                    )
-                except BaseError:
-                    raise
-                except InputError as error:
-                    problem = _problem_of(case, error, plan)
-                    reporter.log(f"passed over: {problem.value}")
-                    measurements = [problem]
-                    failed_count += 1
+                measurements = _measure_image(index, case, measure, plan, inputs_digest, reporter)
 
             all_measurements += measurements
             progress(index + 1, len(plan.cases))
 
-    if failed_count == len(plan.cases):
+    run = Run(plan.config, all_measurements, plan.about)
+    if not run.measured_images:
         raise InputError(
             f"{plan.root}: none of {len(plan.cases)} images could be measured "
             "(the lines above say why)"
         )
-    return Run(plan.config, all_measurements, plan.about)
+    return run
 
 
 def _inputs_digest(case: Case, plan: RunPlan, digest_of_photo: Callable[[Path], str]) -> str:
@@ -210,11 +198,11 @@ def _inputs_digest(case: Case, plan: RunPlan, digest_of_photo: Callable[[Path], 
     return json_digest([photo_digests, plan.about.get("metrics")])
 
 
-def _measure_and_save(
+def _measure_image(
     index: int,
     case: Case,
     measure: MeasureImage,
-    results_path: Path,
+    plan: RunPlan,
     inputs_digest: str,
     reporter: Reporter,
 ) -> list[Measurement]:
@@ -224,16 +212,28 @@ def _measure_and_save(
         index: the image's place in the dataset.
         case: the image.
         measure: measures the image.
-        results_path: the file for the numbers.
+        plan: has the folder of the results.
         inputs_digest: tells a later run whether photos or metrics have changed.
-        reporter: gets the seconds that this took.
+        reporter: gets the seconds that this took, or the problem.
+
+    Returns:
+        The numbers; if a file of the image cannot be used, a measurement with this problem, which
+        is not saved.
 
     Raises:
-        InputError: a file of the image cannot be used.
+        BaseError: every image would fail, for instance because memory is too small.
     """
     start = time.perf_counter()
-    results = measure(index, case)
+    try:
+        results = measure(index, case)
+    except BaseError:  # an InputError, too, but about all images
+        raise
+    except InputError as error:
+        problem = _problem_of(case, error, plan)
+        reporter.log(f"passed over: {problem.value}")
+        return [problem]
 
+    results_path = image_file(plan.output, index, case.name, ".json")
     content = {
         "inputs": inputs_digest,
         "files": file_records(results_path.parent, results.files),
@@ -245,8 +245,7 @@ def _measure_and_save(
 
 
 def _problem_of(case: Case, error: InputError, plan: RunPlan) -> Measurement:
-    """The measurement that stands for an image that could not be measured; its value is the
-    reason."""
+    """The measurement of an image that could not be measured: its value is the reason."""
     # Results hold no paths of this machine.
     reason = str(error).replace(f"{plan.root}/", "")
     reason = " ".join(reason.splitlines())
@@ -256,8 +255,7 @@ def _problem_of(case: Case, error: InputError, plan: RunPlan) -> Measurement:
 
 
 def _open_folder(plan: RunPlan) -> None:
-    """Make the folder of the results, or check that it is the folder of an earlier run with the
-    same options.
+    """Make the folder of the results; if it exists, check that its options are the same.
 
     Raises:
         InputError: the folder holds results of another command or with other options.
@@ -305,6 +303,7 @@ def _load_image_results(path: Path, inputs_digest: str) -> list[Measurement] | N
         The measurements; None if the image is to be measured: the file is missing or damaged, a
         picture is missing or was changed, or photos or metrics are not those of `inputs_digest`.
     """
+    # A file that is missing, or damaged in any way, counts as not measured.
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
         content = json.loads(path.read_text("utf-8"))
         pictures_match = not content["files"] or matches_records(

@@ -40,8 +40,7 @@ class Measurement(NamedTuple):
 
 
 def image_measurement(dataset: str, image: str, metric: str, value: Value) -> Measurement:
-    """A number of a whole image: it has no setting, view or method, and is valid for all of
-    them."""
+    """A number of a whole image, which is valid for all its settings, views and methods."""
     return Measurement(
         dataset=dataset, image=image, setting="", view="", method="", metric=metric, value=value
     )
@@ -114,8 +113,7 @@ class Run:
 
     @property
     def is_near_view(self) -> bool:
-        """Whether the views are at the viewpoints of second photos, and were compared with
-        these."""
+        """Whether the views are those of second photos, and were compared with these."""
         return bool(self.config["protocol"] == "near-view")
 
     @property
@@ -184,8 +182,10 @@ class Run:
 
 @functools.cache
 def paper_measurements(label: str) -> tuple[Measurement, ...]:
-    """The paper's numbers in the table with this LaTeX label, with shares (0..1) instead of
-    percent."""
+    """The numbers of one table of the paper, with shares (0..1) instead of percent.
+
+    `label` is the table's label in the paper's LaTeX source.
+    """
     measurements = []
     tables = [table for table in PAPER_TABLES if table.label == label]
     for table in tables:

@@ -1,5 +1,4 @@
-"""The names, texts and plot styles of the compared methods; `methods.py` has the methods
-themselves."""
+"""The names, texts and plot styles of the compared methods (which are in methods.py)."""
 
 from __future__ import annotations
 
@@ -80,8 +79,7 @@ METHODS = {
 
 
 def describe_method(name: str) -> MethodDescription:
-    """How tables and plots present a method: one of `METHODS`, or a plug-in
-    `package.module:Name`."""
+    """How tables and plots present one of `METHODS`, or a plug-in `package.module:Name`."""
     if name in METHODS:
         return METHODS[name]
     _, _, plugin_name = name.partition(":")

@@ -31,9 +31,9 @@ class MetricSuite:
     ) -> Iterator[tuple[str, float | str]]:
         """Measure a rendered view, and yield the name and value of each number.
 
-        A published metric that fails gives NaN, and a remark with the error. PSNR and SSIM are
-        measured three
-        times: over the view, in the hole ("psnr_hole") and outside ("psnr_outside").
+        Published metrics are networks of another package; one that fails gives NaN, and a remark
+        with the error. PSNR and SSIM are measured three times: over the view, in the hole
+        ("psnr_hole") and outside ("psnr_outside").
 
         Args:
             rgb: [H, W, 3] the view, sRGB 0..1.
@@ -55,14 +55,13 @@ class MetricSuite:
                 yield "ssim", ssim_average(similarity)
                 yield "ssim_hole", ssim_average(similarity, hole)
                 yield "ssim_outside", ssim_average(similarity, ~hole)
-            elif name == "distance" and self.features is not None:
+            elif name == "distance" and self.features is not None:  # it compares features
                 yield "distance", hole_distance(self.features, rgb, true_picture, hole)
 
     def _measure_published(
         self, name: str, rgb: Tensor, true_picture: Tensor | None
     ) -> Iterator[tuple[str, float | str]]:
-        """Measure a view by one published metric; if it fails, yield NaN and a remark with the
-        error.
+        """Measure a view by one published metric; an error gives NaN and a remark.
 
         `rgb` and `true_picture` are [H, W, 3] sRGB 0..1.
         """

@@ -140,6 +140,8 @@ def metric_of_column(column: str) -> str | None:
 def psnr(image: Tensor, true_picture: Tensor, mask: Tensor | None = None) -> float:
     """Peak signal-to-noise ratio in dB, computed in float64: -10 · log10(mean squared error).
 
+    The peak, which is the largest possible value, is 1.
+
     Args:
         image: [H, W, 3] sRGB 0..1.
         true_picture: [H, W, 3] sRGB 0..1, what the image should be.
@@ -172,16 +174,14 @@ def sharpness(image: Tensor, true_picture: Tensor, mask: Tensor) -> float:
 
 
 def _mean_gradient(picture: Tensor, mask: Tensor) -> Tensor:
-    """The mean gradient magnitude of a picture [H, W, 3] in grey, over the pixels of a mask [H,
-    W]."""
+    """The mean gradient magnitude of a picture [H, W, 3] in grey, in a mask [H, W]."""
     grey = picture @ GREY_WEIGHTS  # [H, W]
     down, right = torch.gradient(grey)
     return torch.hypot(down, right)[mask].mean()
 
 
 def ssim_average(similarity: Tensor, mask: Tensor | None = None) -> float:
-    """The structural similarity of two images (Wang et al. 2004), averaged over pixels and
-    channels.
+    """The mean structural similarity of two images (Wang et al. 2004).
 
     Without a mask, pixels count if their window lies within the image, as published. With a mask,
     all its pixels count, also at the image's border, because much of a hole is at the border.
@@ -230,8 +230,7 @@ def ssim_map(image: Tensor, true_picture: Tensor) -> Tensor:
 
 
 def _windowed_mean(image: Tensor) -> Tensor:
-    """The mean of [H, W, C] around each pixel under SSIM's Gaussian window; the border is
-    mirrored."""
+    """The mean of [H, W, C] around each pixel under a Gaussian window; borders are mirrored."""
     margin = SSIM_WINDOW_PX // 2
     widths = ((margin, margin), (margin, margin), (0, 0))
     mirrored = torch.from_numpy(np.pad(image.numpy(), widths, "symmetric"))

@@ -96,6 +96,7 @@ class EvaluateOptions:
         check_name("dataset", self.dataset, DATASETS)
         self._check_methods()
         self._check_metrics()
+        # Results name their base, so it may not be chosen by what is installed.
         self.settings_of_base.check(allow_auto=False)
         if self.residual == "none":
             raise InputError("`residual` none: leaves the holes open: give `methods` base instead")
@@ -106,7 +107,7 @@ class EvaluateOptions:
         if not self.methods:
             raise InputError(f"`methods`: none is given: choose from {', '.join(METHODS)}")
         for method in self.methods:
-            if ":" in method:
+            if ":" in method:  # package.module:Name
                 load_plugin(method, "methods")
             else:
                 check_name("methods", method, METHODS)
@@ -155,8 +156,7 @@ class BenchOptions:
 
     @property
     def timed_runs_of_base(self) -> int:
-        """How often the base is timed: unless given, once for SHARP, which is slow, else `runs`
-        times."""
+        """How often the base is timed: if not given, once for SHARP (slow), else `runs` times."""
         if self.base_runs is not None:
             return self.base_runs
         return 1 if self.base.resolved_name == "sharp" else self.runs

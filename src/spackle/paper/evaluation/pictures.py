@@ -1,5 +1,4 @@
-"""Pictures of an evaluation: those of each image, and contact sheets of the best and the worst
-images."""
+"""Pictures of each image, and contact sheets of the best and the worst images."""
 
 from __future__ import annotations
 
@@ -98,7 +97,8 @@ def draw_grid(
     canvas = Image.new("RGB", (width, height), "white")
     draw = ImageDraw.Draw(canvas)
 
-    # `y` is where the next line or row begins. Texts are anchored at their middle ("m").
+    # `y` is where the next line or row begins. A text's anchor is its left end ("l") or its middle
+    # ("m") horizontally, and its middle vertically.
     if heading:
         draw.text((gap, line_height // 2), heading, "black", font_size=font_size, anchor="lm")
     y = heading_height
@@ -119,7 +119,8 @@ def draw_grid(
             resized = resized_rows[index][column]
             x = column * (picture_width + gap)
             canvas.paste(resized, (x, y))
-            _draw_boxes(draw, one.boxes, (x, y), resized.size, max(2, font_size // 10))
+            box_line_width = max(2, font_size // 10)
+            _draw_boxes(draw, one.boxes, (x, y), resized.size, box_line_width)
             if one.tag:
                 _draw_tag(draw, one.tag, (x + picture_width, y), gap, font_size)
         y += row_heights[index] + gap
@@ -163,6 +164,7 @@ def _draw_tag(
         font_size: height of letters, in pixels.
     """
     x, y = corner
+    # The anchor "ra" (right, ascender) means that `place` is the text's upper right corner.
     place = (x - gap, y + gap)
     left, top, _, bottom = draw.textbbox(place, tag, font_size=font_size, anchor="ra")
     draw.rectangle((left - gap, top - gap, x, bottom + gap), fill="white")
@@ -236,7 +238,8 @@ class Ranking(NamedTuple):
 def ranking_of_run(run: Run) -> Ranking | None:
     """The images of a run from best to worst; None if nothing was measured.
 
-    They are ranked by the method "spackle", or else by the last method.
+    They are ranked by the results of the method "spackle", or else of the last method. (A method
+    is one way to render new views of a photo.) The first metric counts that was measured.
     """
     method = "spackle" if "spackle" in run.methods else run.methods[-1]
     for metric in RANKING_METRICS[str(run.config["protocol"])]:
@@ -310,8 +313,7 @@ def _contact_sheet_row(
 
 
 def evenly_spaced_indices(count: int, max_count: int) -> list[int]:
-    """At most `max_count` of the indices 0 … count - 1, evenly spaced, with the first and the
-    last."""
+    """At most `max_count` of the indices 0 to count - 1, evenly spaced, with both ends."""
     if count <= max_count:
         return list(range(count))
     intervals = max(1, max_count - 1)

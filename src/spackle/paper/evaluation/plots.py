@@ -1,5 +1,4 @@
-"""The plots of a report, drawn by matplotlib as SVG: holes against disparity, and numbers scene
-by scene.
+"""The plots of a report: areas of holes against disparity, and numbers scene by scene.
 
 matplotlib is optional (pip install 'spackle-nvs[eval]'); this is the only file that imports it.
 """
@@ -180,9 +179,12 @@ def hole_area_plot(run: Run) -> Plot | None:
 def _hole_area_series(run: Run) -> list[Series]:
     """The points (disparity, mean HAR) of a run and of the paper, before and after completion.
 
-    Series without points are left out.
+    HAR is the hole area ratio, the fraction of pixels that are left open; "har_before" is that of
+    the base, to which methods add. Series without points are left out.
     """
-    before = _mean_by_disparity(run.measurements, run.title, "har_before", run.methods[0])
+    # The area before completion is the same for all methods.
+    any_method = run.methods[0]
+    before = _mean_by_disparity(run.measurements, run.title, "har_before", any_method)
     series = [Series(f"before: {run.base_title} alone", "base", before, line_style="--")]
     for method in run.methods:
         if method != "base":
@@ -267,20 +269,20 @@ def scenes_plot(run: Run, metric: str) -> Plot | None:
     def finish_axes(axes: Axes) -> None:
         """Name the rows, and let the first be at the top."""
         axes.set_yticks(range(len(scenes)), [_shortened_name(scene) for scene in scenes])
-        axes.set_ylim(len(scenes) - 0.5, -0.5)
+        axes.set_ylim(len(scenes) - 0.5, -0.5)  # half a row beyond the outermost rows
 
     note = f"In the order of {describe_method(ranking_method).title}, best first."
     if len(scenes) < len(ranked_scenes):
         note += f" {len(scenes)} of {len(ranked_scenes)} scenes, spread evenly."
 
     title, x_title = SCENE_PLOTS[metric]
+    # Axes and legend need half of a usual plot's height.
     height_inches = PLOT_HEIGHT_INCHES / 2 + SCENE_HEIGHT_INCHES * len(scenes)
     return _draw_plot(title, series, x_title, "", finish_axes, note, height_inches)
 
 
 def _shortened_name(name: str) -> str:
-    """A name of at most 14 letters, shortened in its middle, because names may differ at both
-    ends."""
+    """Shorten a name to 14 letters in its middle, because names may differ at both ends."""
     if len(name) <= MAX_NAME_LETTERS:
         return name
     half = MAX_NAME_LETTERS // 2

@@ -41,7 +41,8 @@ def large_views(
     """The views of the paper's controlled rendering (section 4.1): two for each disparity.
 
     At disparity m the camera moves sideways by m · ‖(W/f, H/f)‖ · z_near, once to the left and once
-    to the right, and looks at the focus point. The paper does not state this rule.
+    to the right, where z_near is the scene's nearest depth. It keeps looking at one point of the
+    scene, the focus point. The paper does not state this rule.
 
     Args:
         prediction: the base's Gaussians and its camera of the photo, whose intrinsics the views
@@ -182,8 +183,9 @@ def _hole_numbers(
     """The area of a view's hole before and after filling, and counts of Gaussians, by their names.
 
     HAR is the hole area ratio (paper, eq. 11), the fraction of pixels that are too transparent;
-    coverage is 1 - HAR (eq. 10). "hole_cells" is HAR times the number of cells of 2×2 pixels, for
-    each of which the paper's method adds a Gaussian.
+    coverage is 1 - HAR (eq. 10). "aux" counts the Gaussians that a method adds to the base's.
+    "hole_cells" is HAR times the number of cells of 2×2 pixels; the paper's method adds a Gaussian
+    for each such cell.
 
     Args:
         filled: the view by a method. Methods that inpaint the flat picture have no opacity;
@@ -204,5 +206,5 @@ def _hole_numbers(
         numbers.append(("aux", added_count))
         numbers.append(("aux_share", added_count / base_count))
         numbers.append(("merged", base_count + added_count))
-        numbers.append(("hole_cells", hole_ratio * pixel_count / CELL**2))
+        numbers.append(("hole_cells", hole_ratio * pixel_count / CELL**2))  # CELL: 2 pixels
     return numbers

@@ -102,8 +102,7 @@ def _load_metric(pyiqa: ModuleType, name: str, device: str, download: bool) -> M
 
 
 def _metric_of_network(network: Callable[..., Any]) -> Metric:
-    """A function that measures pictures [H, W, 3] with a pyiqa network, which takes [1, 3, H,
-    W]."""
+    """A function that measures pictures [H, W, 3] with one of pyiqa's networks."""
 
     def measure(picture: Tensor, true_picture: Tensor | None = None) -> float:
         """The network's score for a picture, compared with the true one if given; it may be NaN."""

@@ -1,5 +1,4 @@
-"""Evaluations as one self-contained HTML page with tables, plots and pictures (template:
-report.html)."""
+"""Evaluations as one self-contained HTML page; report.html is its template."""
 
 from __future__ import annotations
 
@@ -128,6 +127,7 @@ def make_report(sources: Sequence[tuple[Run, Path]], *, with_unmeasured: bool = 
     """
     runs = [run for run, _ in sources]
     evaluations = [source for source in sources if not source[0].is_benchmark]
+    # The page's images are shared out among the evaluations.
     images_each = max(MIN_IMAGES_EACH, MAX_IMAGES // max(1, len(evaluations)))
     datasets = ", ".join(dict.fromkeys(run.title for run in runs))
 
@@ -154,8 +154,10 @@ def _bold_markup(text: str) -> Markup:
 
 
 def _part_of_run(run: Run, folder: Path, max_images: int) -> ReportPart:
-    """The page's sections on an evaluation, with some images, evenly spaced from the worst to the
-    best.
+    """The page's sections on an evaluation, with some images from the worst to the best.
+
+    Of each image the page has a slider, which shows two pictures side by side. Images without
+    pictures are left out.
 
     Args:
         run: the evaluation.
@@ -189,8 +191,7 @@ def _part_of_run(run: Run, folder: Path, max_images: int) -> ReportPart:
 
 
 def _position_text(index: int, count: int) -> str:
-    """An image's place among `count` images from the worst to the best, such as "worst" or "3 of
-    12"."""
+    """An image's place among `count` images, worst first: "worst", "3 of 12" or "best"."""
     if count == 1:
         return ""
     if index == 0:

@@ -36,15 +36,13 @@ class Table:
 
 
 def _ratio(value: float) -> str:
-    """Four decimals, as in the paper; two significant digits where four decimals would show
-    zero."""
+    """Four decimals, as in the paper; two significant digits where this would show zero."""
     would_show_zero = 0 < value < 0.5e-4
     return f"{value:.1e}" if would_show_zero else f"{value:.4f}"
 
 
 def _overhead(value: float) -> str:
-    """A share as percent; below 10 % with two decimals, because readers ask whether it is below 1
-    %."""
+    """A share as percent, with two decimals below 10 %: readers ask if it is below 1 %."""
     return f"{100 * value:.2f}%" if value < 0.1 else f"{100 * value:.1f}%"
 
 
@@ -101,8 +99,7 @@ def group_widths(heads: Sequence[tuple[str, str]]) -> list[tuple[str, int]]:
 
 
 def to_markdown(table: Table) -> str:
-    """A table in Markdown, with title, caption and notes; a column's head begins with its
-    group's."""
+    """A table in Markdown, with title, caption and notes."""
     heads = [f"{group}: {head}" if group else head for group, head in table.heads]
     lines = [
         f"**{table.title}** (`{table.label}`). {table.caption}",
@@ -176,7 +173,9 @@ def to_latex(table: Table, label_suffix: str = "") -> str:
         table: the table.
         label_suffix: the end of its label, which lets a document include several files of tables.
     """
-    shape = "l" * table.word_columns + "c" * (len(table.heads) - table.word_columns)
+    # One letter for each column: words are left-aligned, numbers centred.
+    number_columns = len(table.heads) - table.word_columns
+    shape = "l" * table.word_columns + "c" * number_columns
     lines = [
         r"\begin{table*}[t]",
         r"\centering",

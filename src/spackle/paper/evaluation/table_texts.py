@@ -41,7 +41,11 @@ def method_row_name(run: Run, method: str, title: str = "") -> str:
 
 
 def shown_methods(layout: TableLayout, run: Run) -> dict[str, str]:
-    """The methods of a run that have a row in a table, each with the name of its row."""
+    """The methods of a run that have a row in a table, each with the name of its row.
+
+    A table either lists its methods, or has all of the run; of these it may leave out methods that
+    lack the metric it is about.
+    """
     if layout.row_titles is not None:
         return {
             method: method_row_name(run, method, title)
@@ -154,14 +158,12 @@ def _missing_images_notes(run: Run) -> list[str]:
 
 
 def _timing_notes(run: Run) -> list[str]:
-    """Notes on a benchmark: machine and number formats, numbers of timed runs, sizes of
-    networks."""
+    """Notes on a benchmark: machine and number formats, timed runs, sizes of networks."""
     return [_machine_note(run), _timed_runs_note(run), _parameters_note(run)]
 
 
 def _machine_note(run: Run) -> str:
-    """The note that says where a benchmark ran, and in which number formats the networks
-    computed."""
+    """The note on a benchmark's machine, and on the number formats of the networks."""
     base_precision = None  # a base without a network tells none
     for measurement in run.measurements:
         if measurement.metric == f"{NOTE_PREFIX}precision":

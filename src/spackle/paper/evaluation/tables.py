@@ -132,8 +132,8 @@ def make_tables(runs: Sequence[Run], *, with_unmeasured: bool = False) -> list[T
     tables = []
     for layout in TABLE_LAYOUTS:
         shown_runs = runs_by_source[layout.source]
-        is_wanted = bool(shown_runs) or (with_unmeasured and paper_measurements(layout.label))
-        if not is_wanted:
+        is_in_paper = len(paper_measurements(layout.label)) > 0
+        if not shown_runs and not (with_unmeasured and is_in_paper):
             continue
         settings = [NEAR_SETTING] if layout.source == "near" else large_settings
 
@@ -257,7 +257,8 @@ def _columns(
             if layout.number_format is not None:
                 number_format = NUMBER_FORMATS[layout.number_format]
             else:
-                number_format = METRICS[str(image_metric)].format
+                assert image_metric is not None
+                number_format = METRICS[image_metric].format
 
             lower_is_better = None
             if marks_best and image_metric is not None:
@@ -290,7 +291,9 @@ def _mean_of_metric(values: GroupedValues, method: str, setting: str, metric: st
     Returns:
         The mean; None if nothing was measured.
     """
-    measured = values.get((method, setting, metric)) or values.get(("", "", metric))
+    measured = values.get((method, setting, metric))
+    if not measured:
+        measured = values.get(("", "", metric))  # of whole images
     if measured:
         statistic = statistics.median if metric in TIME_METRICS else statistics.fmean
         return mean_of_known(measured, statistic)
@@ -359,6 +362,7 @@ def _texts_of_methods(
             texts = mark_best(numbers, texts, column.lower_is_better)
         texts_by_column.append(texts)
 
+    # From one list for each column to one for each method.
     return [list(texts) for texts in zip(*texts_by_column, strict=True)]
 
 
@@ -401,6 +405,8 @@ def _rows_of_dataset(
         if run.title != dataset:
             continue
         names = shown_methods(layout, run)
+
+        # Such as "20/23": 20 measured images of the 23 in the paper.
         image_count = str(len(run.measured_images))
         if dataset in PAPER_IMAGE_COUNTS:
             image_count += f"/{PAPER_IMAGE_COUNTS[dataset]}"

@@ -107,8 +107,7 @@ class Model:
     xyz: Array  # [m, 3] positions in the world
 
     def points(self, view: ColmapView) -> Points:
-        """The reliable points that a view sees, with their depth in the view; those behind it are
-        left out."""
+        """The reliable points in front of a view that the view sees, with their depth."""
         _, in_view, in_model = np.intersect1d(
             view.point_ids, self.point_ids, assume_unique=True, return_indices=True
         )
@@ -136,8 +135,9 @@ def model_folder(scene: Path) -> Path:
 
 
 def read_model(folder: Path) -> Model:
-    """Read cameras, images and points3D, from binary files if there is a cameras.bin, else from
-    text files.
+    """Read a model's cameras, images and points.
+
+    Files are binary if there is a cameras.bin, else text.
 
     Raises:
         InputError: a file is missing or damaged, or a lens differs too much from a pinhole.
@@ -249,7 +249,8 @@ def _max_distortion_shift(distortion: Sequence[float], squared_radius: float) ->
     tangential = distortion[2:]
     shift = 0.0
     for order, k in enumerate(radial):
-        shift += abs(k) * squared_radius ** (order + 1.5)  # r³, then r⁵
+        # (r²)^1.5 is r³, and (r²)^2.5 is r⁵.
+        shift += abs(k) * squared_radius ** (order + 1.5)
     return shift + 3 * sum(abs(p) for p in tangential) * squared_radius
 
 
@@ -372,7 +373,7 @@ def _images_txt(path: Path) -> Iterator[ImageRecord]:
     for line in lines:
         if not line.strip():
             continue
-        _, *pose, camera_key, name = line.split(maxsplit=9)  # a name may have spaces
+        _, *pose, camera_key, name = line.split(maxsplit=9)  # 10 words; a name may have spaces
 
         words = next(lines, "").split()
         numbers = np.array(words, np.float64).reshape(-1, 3)
@@ -385,8 +386,7 @@ def _images_txt(path: Path) -> Iterator[ImageRecord]:
 
 
 def _points_txt(path: Path) -> Iterator[PointRecord]:
-    """Yield the points of a points3D.txt: key, x, y, z, colour (3 numbers), error in pixels,
-    photos."""
+    """Yield the points of a points3D.txt: key, x, y, z, 3 colours, error in pixels, photos."""
     for line in _lines(path):
         if not line.strip():
             continue

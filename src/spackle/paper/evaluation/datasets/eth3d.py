@@ -14,8 +14,9 @@ MODEL_FOLDER = "dslr_calibration_undistorted"
 
 
 def eth3d_cases(scenes: Mapping[str, Path]) -> list[Case]:
-    """A case (an input photo with what is known about it) for each photo, all others as second
-    views.
+    """A case (an input photo with what is known about it) for each photo of each scene.
+
+    All other photos of the scene are second views of the case.
 
     A scene has the COLMAP model SCENE/dslr_calibration_undistorted/{cameras,images,points3D}.txt
     and the photos SCENE/images/dslr_images_undistorted/*.JPG. The model was aligned to laser

@@ -39,8 +39,9 @@ FARTHEST_DEPTH_COLUMN = 16
 
 
 def llff_cases(scenes: Mapping[str, Path]) -> list[Case]:
-    """A case (an input photo with what is known about it) for each photo, all others as second
-    views.
+    """A case (an input photo with what is known about it) for each photo of each scene.
+
+    All other photos of the scene are second views of the case.
 
     A scene has photos in images_4, images or images_8, and poses in poses_bounds.npy, sparse/0,
     or both. A COLMAP model (sparse/0), from which the dataset's poses were made, gives cameras
@@ -73,6 +74,7 @@ def _photos_of_scene(folder: Path) -> list[PosedPhoto]:
             farthest = float(row[FARTHEST_DEPTH_COLUMN])
             depth_bounds[file] = (nearest, farthest)
 
+    # A COLMAP model is better: it has points, too, and the table's poses were made from it.
     if (folder / "sparse").is_dir():
         model = read_model(model_folder(folder))
         model_files = _files_of_model(folder, [view.name for view in model.views], files)
@@ -117,7 +119,8 @@ def _read_table(path: Path, photo_count: int) -> NDArray[Any]:
     with as_input_error(path, "not LLFF's table ({reason}): expected finite floats, [photos, 17]"):
         table: NDArray[Any] = np.load(path, allow_pickle=False)
         has_shape = table.ndim == 2 and table.shape[1] == ROW_LENGTH
-        if not has_shape or table.dtype.kind != "f" or not np.isfinite(table).all():
+        has_floats = table.dtype.kind == "f"
+        if not has_shape or not has_floats or not np.isfinite(table).all():
             raise ValueError(f"{table.dtype} of shape {table.shape}")
 
         positive_columns = [
@@ -148,6 +151,7 @@ def _camera_of_row(row: NDArray[Any], where: str) -> Camera:
     Raises:
         InputError: the camera is impossible.
     """
+    # The last two numbers are depths.
     matrix = torch.from_numpy(np.asarray(row[:15], np.float64).reshape(3, 5))
     down, right, backwards, position, size_and_focal = matrix.unbind(1)
     height, width, focal = size_and_focal
@@ -155,6 +159,7 @@ def _camera_of_row(row: NDArray[Any], where: str) -> Camera:
     # OpenCV's axes are right, down and forward.
     camera_to_world = torch.eye(4, dtype=torch.float64)
     camera_to_world[:3] = torch.stack([right, down, -backwards, position], dim=1)
+    # The principal point is the image's middle.
     K = torch.tensor(
         [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float64
     )

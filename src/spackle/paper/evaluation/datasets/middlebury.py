@@ -1,5 +1,4 @@
-"""Middlebury's rectified pairs of photos (2014 and MiddEval3), and other pairs with a
-scene.json."""
+"""Middlebury's rectified pairs of photos, and other pairs that a scene.json describes."""
 
 from __future__ import annotations
 

@@ -68,6 +68,7 @@ def camera_from_pose(
     Raises:
         InputError: intrinsics or pose are impossible.
     """
+    # The pose is checked as the file has it, because messages are about the file.
     camera = checked_camera(
         K,
         camera_to_world,
@@ -81,8 +82,7 @@ def camera_from_pose(
 
 
 def posed_photos_of_model(scene: Path, model: Model, photos: Sequence[Path]) -> list[PosedPhoto]:
-    """The photos of a COLMAP model, each with its camera, the points that it sees, and their
-    middle depth.
+    """The photos of a COLMAP model, each with its camera and the points that it sees.
 
     Args:
         scene: the scene's folder, which gives the first part of the photos' names.
@@ -149,8 +149,7 @@ class _PosedScene:
 
 
 def _make_case(scene: _PosedScene, index: int) -> Case:
-    """The case of one photo of a scene, with all others as second views, the nearest camera
-    first."""
+    """The case of one photo of a scene, with all others as second views, the nearest first."""
     photo = scene.photos[index]
     distances = np.linalg.norm(scene.positions - scene.positions[index], axis=1)  # [N]
     other_indices = [other for other in range(len(scene.photos)) if other != index]

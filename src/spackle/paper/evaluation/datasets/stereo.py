@@ -73,14 +73,15 @@ def size_of_photos(photos: Sequence[Path]) -> tuple[int, int] | None:
 
 
 def with_origin_at_corner(calibration: Calibration) -> Calibration:
-    """A calibration whose (0, 0) is the middle of the first pixel, with (0, 0) at the pixel's
-    corner."""
+    """Move a calibration's origin from the middle of the first pixel to the pixel's corner."""
     return replace(calibration, cx=calibration.cx + HALF_PIXEL, cy=calibration.cy + HALF_PIXEL)
 
 
 def pair_of_2014(folder: Path) -> Case:
-    """The case of a folder as in Middlebury 2014: im0.png, im1.png, calib.txt, and disp0.pfm or
-    disp0GT.pfm.
+    """The case of a folder with the files of Middlebury 2014.
+
+    These are im0.png and im1.png (left and right photo), calib.txt, and the left photo's true
+    disparities, disp0.pfm or disp0GT.pfm.
 
     Raises:
         InputError: calibration or disparity map are missing or damaged.

@@ -34,8 +34,9 @@ MIDDLE_DEPTH_M = 0.8
 
 
 def wildrgbd_cases(scenes: Mapping[str, Path]) -> list[Case]:
-    """Cases (input photos with what is known about them) of videos, with all other frames as
-    second views.
+    """Cases (input photos with what is known about them) of chosen frames of each video.
+
+    All other frames of the video are second views of a case.
 
     A scene, CATEGORY/scenes/SCENE/, has the frames rgb/00000.png, depth/00000.png (in
     millimetres), and the files metadata and cam_poses.txt.
