@@ -21,13 +21,13 @@ from weights import first_network, freeze, save_networks
 from spackle.bases.lite import LiteBase, LiteNet
 from spackle.formats.png import contact_sheet
 from spackle.paper.training.ranks import rank, wait_for_ranks
-from spackle.paper.training.residual import CACHE, PICTURED
+from spackle.paper.training.residual import CACHE, MAX_PICTURED_ITEMS
 from spackle.paper.training.task import Task
 from spackle.runtime.device import pick_dtype
 from spackle.runtime.folders import make_folder
 from spackle.runtime.progress import Progress, Reporter
 
-PICTURE_SIDE = 320  # pixels of a picture's longer side
+PICTURE_SIDE_PX = 320  # pixels of a picture's longer side
 # Nine colours of Viridis, which is perceptually uniform, also in grey and for colour-blind readers.
 VIRIDIS = torch.tensor(
     [
@@ -169,7 +169,7 @@ class LiteTask(Task):
         """[H, W, 3] sRGB: for a few validation frames the photo, and predicted and true inverse
         depth.
         """
-        each, rows = max(1, PICTURED // self.validation_items), []
+        each, rows = max(1, MAX_PICTURED_ITEMS // self.validation_items), []
         chosen = [
             group[:: max(1, len(group) // each)][:each] for group in self.groups_of_frames.values()
         ]
@@ -183,7 +183,7 @@ class LiteTask(Task):
                     colored(true, *ends(true[frame.valid]), frame.valid),
                 ]
             )
-        return contact_sheet(rows, PICTURE_SIDE)
+        return contact_sheet(rows, PICTURE_SIDE_PX)
 
     def export(self, network: nn.Module, path: Path) -> None:
         """Write the weights in eight bits, for `spackle predict --base lite`."""

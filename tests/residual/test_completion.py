@@ -51,9 +51,14 @@ def augmented(
     ]
     opacity = sigmoid(logit(0.99) + delta[13])
     surfel = make_surfels(
-        camera, torch.tensor([[u, v]]), torch.tensor([inverse]), initial.slope[row, column][None], 1.3,
-        srgb_to_linear(torch.tensor([rgb])), torch.tensor([opacity]),
-    )  # fmt: skip
+        camera,
+        torch.tensor([[u, v]]),
+        torch.tensor([inverse]),
+        initial.slope[row, column][None],
+        1.3,
+        srgb_to_linear(torch.tensor([rgb])),
+        torch.tensor([opacity]),
+    )
     # A scale grows by a sigmoid from 1/4 to 4 whose value and slope at zero are one.
     factors = [
         0.25 + 3.75 * sigmoid(d * 3.75 / (0.75 * 3) + math.log(0.75 / 3)) for d in delta[3:6]

@@ -17,10 +17,10 @@ from spackle.core.gaussians import Gaussians
 from spackle.core.surfels import BEHIND_SURFACE_RATIO
 from spackle.scene_fill import OcclusionGuard
 from spackle.scene_fill.occlusion_guard import (
+    DEPTH_STEPS,
     MAX_REACH_PX,
-    PIT,
-    REACH,
-    STEPS,
+    PIT_RADIUS_WIDTHS,
+    VISIBLE_SIGMAS,
     WINDOW_PX,
     move_behind_surfaces,
     without_pits,
@@ -50,7 +50,7 @@ def plain_push(
                 row = torch.zeros(3, dtype=torch.float64)
                 row[axis], row[2] = 1 / z, -local[axis] / z**2
                 deviation = float(camera.K[axis, axis] * (row @ spread @ row).clamp_min(0).sqrt())
-                reach.append(min(REACH * deviation + 1, MAX_REACH_PX))
+                reach.append(min(VISIBLE_SIGMAS * deviation + 1, MAX_REACH_PX))
             (u, v), (height, width) = uv.tolist(), guard.depth.shape
             if not (-reach[0] <= u <= width + reach[0] and -reach[1] <= v <= height + reach[1]):
                 continue
@@ -65,8 +65,8 @@ def plain_push(
     factors, kept = [], []
     covariances = aux.covariances().double()
     for index, mean in enumerate(aux.means.double()):
-        for step in range(STEPS):
-            factor = 1 / (1 - step / STEPS)
+        for step in range(DEPTH_STEPS):
+            factor = 1 / (1 - step / DEPTH_STEPS)
             if not blocked(
                 eye.double() + factor * (mean - eye.double()), factor**2 * covariances[index]
             ):
@@ -117,7 +117,7 @@ def test_closing_of_depths_matches_a_plain_loop(seed: int, share: float) -> None
     )
     cells[0, 0] = True
     found, places = without_pits(depth[cells], cells), cells.nonzero()
-    near = (places[:, None] - places).abs().amax(-1) <= round(75 * PIT)
+    near = (places[:, None] - places).abs().amax(-1) <= round(75 * PIT_RADIUS_WIDTHS)
     farthest = torch.where(near, depth[cells], 0).amax(1)
     assert torch.equal(found, torch.where(near, farthest, torch.inf).amin(1))
     assert (found >= depth[cells]).all()

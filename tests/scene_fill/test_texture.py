@@ -45,7 +45,7 @@ def test_sharpening_balances_overlap(period: float) -> None:
 
     assert strength(wanted) < 0.96
     assert (
-        1.05 < strength(room.sharpened(wanted)) < 1.6
+        1.05 < strength(room.sharpen_for_overlap(wanted)) < 1.6
     )  # more than 1, to balance the blur of votes
 
 
@@ -106,7 +106,7 @@ def test_texture_has_no_low_frequencies() -> None:
     plain = exemplar_texture(view, structure)
     fine, mask = textured - plain, view.mask
     assert float(room.group_by_cell(fine)[mask].abs().mean()) > 1e-3
-    assert float(gaussian_blur(fine, 4 * room.TEXTURE_PX).abs().max()) < 0.1 * float(
+    assert float(gaussian_blur(fine, 4 * room.TEXTURE_SIGMA_PX).abs().max()) < 0.1 * float(
         fine.abs().max()
     )
     rendered = room.group_by_cell(view.rendering.rgb)
@@ -120,7 +120,7 @@ def test_colours_at_the_border_are_extended() -> None:
     uv, z = context.photo_camera.project(points)
     outside = (uv < 0).any(-1) | (uv[..., 0] > 96) | (uv[..., 1] > 72) | (z <= 0)
     assert torch.equal(beyond, outside & features.mask)
-    found = room.extended(view, structure)
+    found = room.continue_border(view, structure)
     assert torch.equal(found[~beyond], structure[~beyond])
     cells, known = beyond.nonzero(), (~features.mask).nonzero()
     apart, nearest = torch.cdist(cells.float(), known.float()).min(1)
@@ -137,7 +137,7 @@ def test_blocks_are_weighted_means_of_matches() -> None:
     places[tuple(subject.cells.T)], costs[tuple(subject.cells.T)] = subject.places, subject.costs
     blocks = rng.random((24, 31, 2, 3, 1)).astype(np.float32)
     grids = [torch.from_numpy(grid) for grid in (subject.level.rgb, np.sqrt(costs), places)]
-    found = room.patch_blocks(Patches(*grids), torch.from_numpy(blocks)).numpy()
+    found = room.copy_patch_blocks(Patches(*grids), torch.from_numpy(blocks)).numpy()
     assert np.array_equal(found[~subject.level.hole], blocks[~subject.level.hole])
     sources = (blocks, blocks[:, ::-1, :, ::-1])
     for cell in subject.cells:

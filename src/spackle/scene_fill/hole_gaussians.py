@@ -22,7 +22,7 @@ from spackle.scene_fill.occlusion_guard import (
     unoccluding_scales,
     without_pits,
 )
-from spackle.scene_fill.texture import group_by_cell, sharpened
+from spackle.scene_fill.texture import group_by_cell, sharpen_for_overlap
 from spackle.scene_fill.view_completion import SceneViewCompletion
 
 # sRGB: a cell whose pixels differ less from their mean gets one Gaussian, any other also one for
@@ -107,7 +107,7 @@ def _textured_pixels(
         view.initial.select(mask).select(textured),
         None if deltas is None else deltas[mask][textured],
         view.camera,
-        group_by_cell(sharpened(picture))[mask][textured],
+        group_by_cell(sharpen_for_overlap(picture))[mask][textured],
     )
     return move_from_eye(
         pixels, view.camera.position, scales[textured].repeat_interleave(CELL_PIXELS)

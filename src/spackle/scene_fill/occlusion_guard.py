@@ -1,4 +1,9 @@
-"""Keep aux Gaussians behind the surfaces that the photo and other views show."""
+"""Keep new Gaussians behind the surfaces that the photo and other views show.
+
+Gaussians that fill the holes of one view must not appear in front of a surface in another view. So
+they move away from the eye for which they were made, until they hide nothing. That eye sees no
+difference, because the Gaussians grow as they move.
+"""
 
 from __future__ import annotations
 
@@ -20,175 +25,234 @@ from spackle.residual.features import MASK_THRESHOLD
 from spackle.runtime.device import parallel_for_chunks
 from spackle.runtime.kernels import kernel
 
-WINDOW_PX = 4  # radius of the guard's window: most aux Gaussians reach no farther
-REACH = math.sqrt(
-    -2 * math.log(ALPHA_MIN)
-)  # a Gaussian is visible up to so many standard deviations from its centre
+WINDOW_PX = 4  # radius of the guard's windows: most new Gaussians reach no farther
+# A Gaussian is visible up to so many standard deviations from its centre: exp(-x² / 2) = ALPHA_MIN.
+VISIBLE_SIGMAS = math.sqrt(-2 * math.log(ALPHA_MIN))
 MAX_REACH_PX = 40.0  # a Gaussian is checked only up to this distance from its centre
-PIT = 0.027  # of a view's width: a near spot less than twice as wide is removed
-STEPS = 48  # candidate positions along the line of sight, evenly spaced in inverse depth
+# A near spot in the depths of a hole is removed if it is less than twice as wide, as a fraction of
+# the view's width.
+PIT_RADIUS_WIDTHS = 0.027
+DEPTH_STEPS = 48  # candidate positions along the line of sight, evenly spaced in inverse depth
 
 
 @dataclasses.dataclass(frozen=True)
 class OcclusionGuard:
-    """The farthest surface near each pixel of a view; no new Gaussian may lie in front of this
-    surface.
-    """
+    """The farthest surface near each pixel of a view; no new Gaussian may lie in front of it."""
 
     camera: Camera
-    depth: Tensor  # [H, W]; 0 in holes
+    depth: Tensor  # [H, W] z of the farthest surface within WINDOW_PX pixels; 0 in holes
 
     @staticmethod
     def of(
         rendering: Rendering, camera: Camera, threshold: float = MASK_THRESHOLD
     ) -> OcclusionGuard:
-        """The guard of a rendered view."""
+        """The guard of a rendered view; pixels with an opacity below the threshold are holes."""
         view = rendering.to(torch.device("cpu")).detach()
-        seen = torch.where(view.alpha < threshold, 0, view.depth).float()
-        return OcclusionGuard(camera, maximum_filter(seen, WINDOW_PX))
+        surface_depth = torch.where(view.alpha < threshold, 0, view.depth).float()
+        return OcclusionGuard(camera, maximum_filter(surface_depth, WINDOW_PX))
 
 
 def move_behind_surfaces(
-    aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]
+    gaussians: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]
 ) -> Gaussians:
-    """Move Gaussians away from an eye [3] until they hide no guarded surface, see
-    `unoccluding_scales`.
-    """
-    return move_from_eye(aux, eye, unoccluding_scales(aux, eye, guards))
-
-
-def move_from_eye(aux: Gaussians, eye: Tensor, factors: Tensor) -> Gaussians:
-    """Scale Gaussians about the eye [3] by factors [N]; the eye sees no change. Factor 0 removes a
-    Gaussian.
-    """
-    eye, factor = to_like(eye, aux.means), factors[:, None]
-    moved = dataclasses.replace(
-        aux, means=eye + factor * (aux.means - eye), scales=aux.scales * factor
-    )
-    return moved.select(factors > 0)
-
-
-def unoccluding_scales(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) -> Tensor:
-    """Factors [N] ≥ 1 by which Gaussians must move away from an eye to hide no guarded surface; 0
-    if impossible.
+    """Move Gaussians away from an eye until they hide no guarded surface; others are removed.
 
     Args:
-        aux: N Gaussians in the world's frame.
-        eye: [3] position of the camera for which the Gaussians were made.
-        guards: the views to protect.
+        gaussians: N Gaussians in the world's frame.
+        eye: [3] position of the camera for which they were made; it sees no change.
+        guards: the surfaces of other views.
     """
-    if not len(aux) or not guards:
-        return torch.ones_like(aux.opacities)
-    rays = (aux.means - to_like(eye, aux.means)).detach().cpu().double().numpy()
-    covariances = (
-        aux.detach().to(dtype=torch.float64).covariances().cpu().flatten(1).numpy()
-    )  # [N, 9]
-    lenses = np.empty((len(guards), 16))  # fx, fy, cx, cy and the 3×4 extrinsics of each view
-    for lens, camera in zip(lenses, [guard.camera for guard in guards], strict=True):
-        lens[:4] = camera.K.detach().cpu().numpy()[[0, 1, 0, 1], [0, 1, 2, 2]]
-        lens[4:] = camera.world_to_camera.detach().cpu().numpy()[:3].ravel()
-    depths = np.concatenate([guard.depth.numpy().ravel() for guard in guards])
-    sizes = np.array([guard.depth.shape for guard in guards])
-    starts = np.concatenate([[0], np.cumsum(sizes.prod(axis=1))])
-    place, factors = to_like(eye, aux.means).cpu().double().numpy(), np.empty(len(rays))
-    views = (lenses, depths, sizes, starts)
-    parallel_for_chunks(
-        lambda first, last: _free_factors(first, last, place, rays, covariances, *views, factors),
-        len(rays),
+    return move_from_eye(gaussians, eye, unoccluding_scales(gaussians, eye, guards))
+
+
+def move_from_eye(gaussians: Gaussians, eye: Tensor, scales: Tensor) -> Gaussians:
+    """Scale Gaussians about an eye [3] by factors `scales` [N], so that the eye sees no change.
+
+    A factor of 0 removes a Gaussian.
+    """
+    eye = to_like(eye, gaussians.means)
+    factor = scales[:, None]
+    moved = dataclasses.replace(
+        gaussians,
+        means=eye + factor * (gaussians.means - eye),
+        scales=gaussians.scales * factor,
     )
-    return torch.from_numpy(factors).to(aux.means)
+    return moved.select(scales > 0)
+
+
+def unoccluding_scales(
+    gaussians: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]
+) -> Tensor:
+    """Factors [N] ≥ 1 by which Gaussians must move away from an eye to hide no guarded surface.
+
+    The factor is 0 if a Gaussian hides a surface wherever it moves.
+
+    Args:
+        gaussians: N Gaussians in the world's frame.
+        eye: [3] position of the camera for which the Gaussians were made.
+        guards: the surfaces to protect.
+    """
+    if not len(gaussians) or not guards:
+        return torch.ones_like(gaussians.opacities)
+    eye = to_like(eye, gaussians.means)
+    eye_position = eye.cpu().double().numpy()
+    rays = (gaussians.means - eye).detach().cpu().double().numpy()  # [N, 3]
+    exact = gaussians.detach().to(dtype=torch.float64)
+    covariances = exact.covariances().cpu().flatten(1).numpy()  # [N, 9]
+
+    # The guards' depth images, one behind the other.
+    cameras = np.stack([_camera_numbers(guard.camera) for guard in guards])
+    depths = np.concatenate([guard.depth.numpy().ravel() for guard in guards])
+    sizes = np.array([guard.depth.shape for guard in guards])  # [guards, 2]
+    starts = np.concatenate([[0], np.cumsum(sizes.prod(axis=1))])
+
+    scales = np.empty(len(rays))
+
+    def search(first: int, stop: int) -> None:
+        """Write the factors of the Gaussians first..stop."""
+        _find_scales(
+            first, stop, eye_position, rays, covariances, cameras, depths, sizes, starts, scales
+        )
+
+    parallel_for_chunks(search, len(rays))
+    return torch.from_numpy(scales).to(gaussians.means)
+
+
+def _camera_numbers(camera: Camera) -> Any:
+    """A camera as 16 numbers, float64: fx, fy, cx, cy, and the 3×4 extrinsics row by row."""
+    numbers = np.empty(16)
+    K = camera.K.detach().cpu().numpy()
+    numbers[:4] = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    numbers[4:] = camera.world_to_camera.detach().cpu().numpy()[:3].ravel()
+    return numbers
 
 
 def without_pits(depths: Tensor, cells: Tensor) -> Tensor:
-    """Depths [n] of the cells `cells` ([h, w] bool), after a morphological closing that removes
-    narrow near parts.
+    """Depths [n] of n cells, after a morphological closing: narrow near parts move to the depth
+    around them.
+
+    Args:
+        depths: [n] z of the cells.
+        cells: [h, w] bool, where the n cells lie in the view's grid.
     """
-    reach = max(1, round(PIT * cells.shape[1]))
+    radius = max(1, round(PIT_RADIUS_WIDTHS * cells.shape[1]))
     grid = depths.new_zeros(cells.shape)
     grid[cells] = depths
-    farthest = maximum_filter(grid, reach)
-    return -maximum_filter(torch.where(cells, -farthest, -torch.inf), reach)[cells]
+
+    # A closing is a maximum followed by a minimum, here the maximum of the negative.
+    farthest = maximum_filter(grid, radius)
+    closed = -maximum_filter(torch.where(cells, -farthest, -torch.inf), radius)
+    return closed[cells]
 
 
 @kernel
-def _free_factors(
-    first: int, last: int, eye: Any, rays: Any, covariances: Any,
-    lenses: Any, depths: Any, sizes: Any, starts: Any, factors: Any,
+def _find_scales(
+    first: int, stop: int, eye: Any, rays: Any, covariances: Any,
+    cameras: Any, depths: Any, sizes: Any, starts: Any, scales: Any,
 ) -> None:  # fmt: skip
-    """Find the least factor 1 / (1 − k / STEPS), or 0, for the Gaussians first..last."""
-    for n in range(first, last):
-        factors[n] = 0
-        for step in range(STEPS):
-            factor = 1.0 / (1.0 - step / STEPS)
-            x, y, z = (
-                eye[0] + factor * rays[n, 0],
-                eye[1] + factor * rays[n, 1],
-                eye[2] + factor * rays[n, 2],
-            )
-            blocked = False
-            for s in range(len(lenses)):
-                if _blocks(
-                    lenses[s],
-                    depths,
-                    starts[s],
-                    sizes[s, 0],
-                    sizes[s, 1],
-                    x,
-                    y,
-                    z,
-                    covariances[n],
-                    factor,
-                ):
-                    blocked = True
+    """Write the least factor 1 / (1 − k / 48) by which each Gaussian hides no surface, or 0.
+
+    Args:
+        first, stop: the Gaussians first..stop are done.
+        eye: [3] position from which the Gaussians move away.
+        rays: [N, 3] from the eye to the Gaussians' centres.
+        covariances: [N, 9] in the world's frame.
+        cameras: [guards, 16], see `_camera_numbers`: fx, fy, cx, cy, 3×4 extrinsics.
+        depths: the pixels of all guards' depth images, one behind the other; 0 is no surface.
+        sizes: [guards, 2] height and width of the images.
+        starts: [guards + 1] the place of each image's first pixel in `depths`.
+        scales: output [N].
+    """
+    for n in range(first, stop):
+        scales[n] = 0
+        for step in range(DEPTH_STEPS):
+            # Even steps in inverse depth: 1 / scale = 1 - step / DEPTH_STEPS.
+            scale = 1.0 / (1.0 - step / DEPTH_STEPS)
+            x = eye[0] + scale * rays[n, 0]
+            y = eye[1] + scale * rays[n, 1]
+            z = eye[2] + scale * rays[n, 2]
+            hides_surface = False
+            for k in range(len(cameras)):
+                if _hides_surface(
+                    cameras[k], depths, starts[k], sizes[k, 0], sizes[k, 1],
+                    x, y, z, covariances[n], scale,
+                ):  # fmt: skip
+                    hides_surface = True
                     break
-            if not blocked:
-                factors[n] = factor
+            if not hides_surface:
+                scales[n] = scale
                 break
 
 
 @kernel
-def _blocks(
-    lens: Any, guards: Any, start: int, height: int, width: int,
-    x: float, y: float, z: float, covariance: Any, factor: float,
+def _hides_surface(
+    camera: Any, depths: Any, start: int, height: int, width: int,
+    x: float, y: float, z: float, covariance: Any, scale: float,
 ) -> bool:  # fmt: skip
-    """Whether any part of a Gaussian lies in front of a view's surface."""
-    depth = lens[12] * x + lens[13] * y + lens[14] * z + lens[15]
+    """Whether any part of a Gaussian lies in front of a surface of one guarded view.
+
+    Args:
+        camera: [16] fx, fy, cx, cy, 3×4 extrinsics.
+        depths: depth images of all guards, in one row; 0 is no surface.
+        start: the place of this guard's first pixel in `depths`.
+        height, width: of this guard's image.
+        x, y, z: the Gaussian's centre in the world.
+        covariance: [9] of the Gaussian before it was scaled.
+        scale: factor on the Gaussian's standard deviations.
+    """
+    # Row by row of the extrinsics, (camera[4:8], camera[8:12], camera[12:16]) · (x, y, z, 1).
+    depth = camera[12] * x + camera[13] * y + camera[14] * z + camera[15]
     if not depth > 0:
         return False
-    tan_u = (lens[4] * x + lens[5] * y + lens[6] * z + lens[7]) / depth
-    tan_v = (lens[8] * x + lens[9] * y + lens[10] * z + lens[11]) / depth
-    u, v = lens[0] * tan_u + lens[2], lens[1] * tan_v + lens[3]
-    if (
-        u < -MAX_REACH_PX
-        or v < -MAX_REACH_PX
-        or u > width + MAX_REACH_PX
-        or v > height + MAX_REACH_PX
-    ):
+    tan_u = (camera[4] * x + camera[5] * y + camera[6] * z + camera[7]) / depth
+    tan_v = (camera[8] * x + camera[9] * y + camera[10] * z + camera[11]) / depth
+    u = camera[0] * tan_u + camera[2]
+    v = camera[1] * tan_v + camera[3]
+
+    # A cheap test with the greatest reach that counts, then one with the Gaussian's own reach.
+    if u < -MAX_REACH_PX or v < -MAX_REACH_PX:
         return False
-    reach_u = _reach(lens, 4, lens[0] * factor / depth, tan_u, covariance)
-    reach_v = _reach(lens, 8, lens[1] * factor / depth, tan_v, covariance)
+    if u > width + MAX_REACH_PX or v > height + MAX_REACH_PX:
+        return False
+    reach_u = _reach_px(camera, 4, camera[0] * scale / depth, tan_u, covariance)
+    reach_v = _reach_px(camera, 8, camera[1] * scale / depth, tan_v, covariance)
     if u < -reach_u or v < -reach_v or u > width + reach_u or v > height + reach_v:
         return False
-    # Adjacent windows of the guard cover the Gaussian's extent.
-    steps_u = int(np.ceil(max(reach_u - WINDOW_PX, 0.0) / (2 * WINDOW_PX)))
-    steps_v = int(np.ceil(max(reach_v - WINDOW_PX, 0.0) / (2 * WINDOW_PX)))
+
+    # A pixel of the guard stands for a window around it; adjacent windows cover the Gaussian.
+    window_px = 2 * WINDOW_PX
+    steps_u = int(np.ceil(max(reach_u - WINDOW_PX, 0.0) / window_px))
+    steps_v = int(np.ceil(max(reach_v - WINDOW_PX, 0.0) / window_px))
     for j in range(-steps_v, steps_v + 1):
-        row = min(max(int(np.floor(v + 2 * WINDOW_PX * j)), 0), height - 1)
+        row = min(max(int(np.floor(v + window_px * j)), 0), height - 1)
         for i in range(-steps_u, steps_u + 1):
-            column = min(max(int(np.floor(u + 2 * WINDOW_PX * i)), 0), width - 1)
-            if depth < guards[start + row * width + column] * (1 + BEHIND_SURFACE_RATIO):
+            column = min(max(int(np.floor(u + window_px * i)), 0), width - 1)
+            surface_depth = depths[start + row * width + column]
+            if depth < surface_depth * (1 + BEHIND_SURFACE_RATIO):
                 return True
     return False
 
 
 @kernel
-def _reach(lens: Any, row: int, scale: float, tangent: float, covariance: Any) -> float:
-    """A Gaussian's extent in pixels from its centre, along one image axis; `row` is the axis' place
-    in `lens`.
+def _reach_px(
+    camera: Any, axis_row: int, px_per_unit: float, tangent: float, covariance: Any
+) -> float:
+    """How many pixels from its centre a Gaussian is visible along one image axis, at most 40.
+
+    Args:
+        camera: [16] fx, fy, cx, cy, 3×4 extrinsics.
+        axis_row: where the axis' row of the extrinsics begins in `camera`: 4 for x, 8 for y.
+        px_per_unit: pixels for a unit of length at the Gaussian's depth.
+        tangent: x / z or y / z of the Gaussian's centre in the camera's frame.
+        covariance: [9] of the Gaussian in the world's frame.
     """
-    a = scale * (lens[row] - tangent * lens[12])
-    b = scale * (lens[row + 1] - tangent * lens[13])
-    c = scale * (lens[row + 2] - tangent * lens[14])
+    # The derivative (a, b, c) of the pixel by the world's x, y, z; row 12 of `camera` gives z.
+    a = px_per_unit * (camera[axis_row] - tangent * camera[12])
+    b = px_per_unit * (camera[axis_row + 1] - tangent * camera[13])
+    c = px_per_unit * (camera[axis_row + 2] - tangent * camera[14])
+
+    # The variance along the axis is (a, b, c) Σ (a, b, c)ᵀ; Σ is symmetric.
     variance = a * a * covariance[0] + b * b * covariance[4] + c * c * covariance[8]
     variance += 2 * (a * b * covariance[1] + a * c * covariance[2] + b * c * covariance[5])
-    return float(min(REACH * np.sqrt(max(variance, 0.0)) + 1.0, MAX_REACH_PX))
+    reach = VISIBLE_SIGMAS * np.sqrt(max(variance, 0.0)) + 1.0  # a pixel's own width
+    return float(min(reach, MAX_REACH_PX))

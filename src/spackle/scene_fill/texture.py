@@ -1,5 +1,5 @@
-"""Colours of filled holes: low frequencies from the residual, high frequencies (texture) from
-patches or an inpainter.
+"""Colours of filled holes: smooth colours from the network, and texture (fine detail) from patches
+or an inpainter.
 
 A network that learns from true views predicts smooth colours if the truth is ambiguous, so texture
 is added afterwards.
@@ -26,19 +26,18 @@ from spackle.inpaint import Inpainter, known_inverse_depth
 from spackle.residual.features import CELL, MIN_DIVISOR, hole_mask
 from spackle.scene_fill.view_completion import SceneViewCompletion
 
-TEXTURE_PX = (
-    2.0  # standard deviation of the blur that separates structure (low frequencies) from texture
-)
-TEXTURE_FADING = 0.16  # mismatch at which the texture has faded to 1/e
-EXTENDED_CELLS, SAME_DEPTH = (
-    4.0,
-    0.05,
-)  # reach of the rim's colours beyond the photo's border; relative depth
-OVERLAP_PX = (
-    0.8  # standard deviation of the blur that overlapping Gaussians and votes of patches cause
-)
-STEPS = 2  # Jacobi steps of `sharpened`
-
+# Standard deviation of the blur that separates structure (low frequencies) from texture.
+TEXTURE_SIGMA_PX = 2.0
+FADED_MISMATCH = 0.16  # of a patch, in sRGB, at which its texture has faded to 1/e
+# Just beyond the photo's border, the rim's colour continues: it fades to 1/e at this distance, and
+# at this relative difference in depth.
+BORDER_FADE_CELLS = 4.0
+BORDER_FADE_DEPTH_RATIO = 0.05
+# Standard deviation of the blur that overlapping Gaussians and votes of patches cause.
+OVERLAP_SIGMA_PX = 0.8
+SHARPENING_STEPS = 2
+MIN_INVERSE_DEPTH = 1e-9  # keeps the logarithm finite
+MIN_COVERAGE = 1e-6  # least weight of the cells that contribute to an interpolated pixel
 
 # Computes the colours of a view's holes. Takes the view, and the smooth colours [h, w, 3] of all
 # its cells (2×2 pixels) that initial Gaussians and network give; returns [2h, 2w, 3] sRGB of all
@@ -47,129 +46,184 @@ Texture = Callable[[SceneViewCompletion, Tensor], Tensor]
 
 
 def exemplar_texture(view: SceneViewCompletion, structure: Tensor) -> Tensor:
-    """Colours [2h, 2w, 3] sRGB: the residual's structure plus texture copied from elsewhere in the
+    """[2h, 2w, 3] sRGB: the smooth colours `structure` plus texture copied from elsewhere in the
     view.
+
+    Args:
+        view: a view with holes, and patches that match them.
+        structure: [h, w, 3] sRGB of all cells of 2×2 pixels; in holes, the colours of the predicted
+            Gaussians.
     """
-    features, patches = view.features, view.patches
-    pixels = group_by_cell(view.rendering.rgb)
-    painted = ungroup_cells(patch_blocks(patches, pixels))
-    fine = painted - gaussian_blur(painted, TEXTURE_PX)
-    gain = (-patches.mismatch / TEXTURE_FADING).exp() * _in_proportion(fine, view)
-    smooth = group_by_cell(_magnified(extended(view, structure), features.mask))
-    picture = ungroup_cells(torch.where(features.mask[..., None, None, None], smooth, pixels))
-    return fine.mul_(
-        ungroup_cells(gain[..., None, None, None].expand(*gain.shape, CELL, CELL, 1))
-    ).add_(picture)
+    patches = view.patches
+    rendered = group_by_cell(view.rendering.rgb)  # [h, w, 2, 2, 3]
+    copied = ungroup_cells(copy_patch_blocks(patches, rendered))
+    texture = copied - gaussian_blur(copied, TEXTURE_SIGMA_PX)
+
+    # Patches that match badly, and texture stronger than that around the hole, would be
+    # conspicuous.
+    trust = (-patches.mismatch / FADED_MISMATCH).exp()
+    gain = trust * _gain_to_surroundings(texture, view)  # [h, w]
+    pixel_gain = ungroup_cells(gain[..., None, None, None].expand(*gain.shape, CELL, CELL, 1))
+
+    smooth = group_by_cell(_interpolate_cells(continue_border(view, structure), view.mask))
+    in_hole = view.mask[..., None, None, None]
+    picture = ungroup_cells(torch.where(in_hole, smooth, rendered))
+    return texture.mul_(pixel_gain).add_(picture)
 
 
 def painted_texture(painter: Inpainter, view: SceneViewCompletion, structure: Tensor) -> Tensor:
-    """Colours [2h, 2w, 3] sRGB of the view with its holes painted by an inpainter, without the
-    residual's structure.
+    """[2h, 2w, 3] sRGB: the view with its holes painted by an inpainter.
+
+    Args:
+        painter: takes a batch of views, here of one.
+        view: a view with holes.
+        structure: smooth colours of the holes; not used, because the painter makes its own.
     """
-    hole = hole_mask(view.rendering.alpha, view.threshold)
-    views = (
-        view.rendering.rgb[None],
-        hole[None],
-        known_inverse_depth(view.rendering.depth, hole)[None],
-    )
-    return ungroup_cells(group_by_cell(painter.paint(*views)[0]))
+    rendering = view.rendering
+    hole = hole_mask(rendering.alpha, view.threshold)
+    inverse_depth = known_inverse_depth(rendering.depth, hole)
+    painted = painter.paint(rendering.rgb[None], hole[None], inverse_depth[None])
+    return pad_to_even(painted[0])
 
 
-def patch_blocks(patches: Patches, blocks: Tensor) -> Tensor:
-    """Fill the blocks [H, W, k, k, c] of an image's masked cells with blocks from elsewhere in the
-    image.
+def copy_patch_blocks(patches: Patches, blocks: Tensor) -> Tensor:
+    """Fill the blocks of an image's hole cells with blocks from elsewhere in the image. Returns [h,
+    w, k, k, c].
 
-    The matches of a cell and of its eight neighbours each propose a block. The filled block is the
-    weighted mean of these blocks; better matches weigh more. `Patches.rgb`, a vote of whole
-    patches, loses fine detail.
+    The matching patches of a cell and of its eight neighbours each propose a block. The filled
+    block is the weighted mean of these blocks; better matches weigh more. `Patches.rgb`, a mean of
+    whole patches, loses fine detail.
+
+    Args:
+        patches: for each hole cell, the cell at the centre of its best patch.
+        blocks: [h, w, k, k, c] the pixels of each cell.
     """
     height, width = patches.mismatch.shape
-    sources = torch.stack([blocks, blocks.flip(1, 3)])
-    matched = patches.matches[..., 0] >= 0
-    y, x = matched.nonzero(as_tuple=True)
+    sources = torch.stack([blocks, blocks.flip(1, 3)])  # the image, and the image mirrored
+    is_matched = patches.matches[..., 0] >= 0
+    y, x = is_matched.nonzero(as_tuple=True)  # of n cells
     costs = patches.mismatch.square()
-    limit = costs[matched].mean().clamp_min(MIN_MEAN_COST)
-    total, mass = torch.zeros_like(blocks[y, x]), torch.zeros_like(costs[y, x])
+    mean_cost = costs[is_matched].mean().clamp_min(MIN_MEAN_COST)
+
+    weighted_sum = torch.zeros_like(blocks[y, x])  # [n, k, k, c]
+    total_weight = torch.zeros_like(costs[y, x])  # [n]
     for dy, dx in itertools.product((-1, 0, 1), repeat=2):
-        v, u = (y + dy).clamp(0, height - 1), (x + dx).clamp(0, width - 1)
-        source, row, column = patches.matches[v, u].long().unbind(-1)
-        votes = (
-            (v == y + dy) & (u == x + dx) & matched[v, u]
-        )  # a matched cell's patch lies within its source
-        weight = votes * ((-costs[v, u] / limit).exp() + MIN_VOTE_WEIGHT)
+        row = (y + dy).clamp(0, height - 1)
+        column = (x + dx).clamp(0, width - 1)
+        is_inside = (row == y + dy) & (column == x + dx)
+        is_neighbor = is_inside & is_matched[row, column]
+        weight = is_neighbor * ((-costs[row, column] / mean_cost).exp() + MIN_VOTE_WEIGHT)
+
+        # The neighbour's patch covers the cell itself by the block one step back from the patch's
+        # centre.
+        source, source_row, source_column = patches.matches[row, column].long().unbind(-1)
         block = sources[
-            source.clamp_min(0), (row - dy).clamp(0, height - 1), (column - dx).clamp(0, width - 1)
+            source.clamp_min(0),
+            (source_row - dy).clamp(0, height - 1),
+            (source_column - dx).clamp(0, width - 1),
         ]
-        total += weight[:, None, None, None] * block
-        mass += weight
+        weighted_sum += weight[:, None, None, None] * block
+        total_weight += weight
+
     filled = blocks.clone()
-    filled[y, x] = total / mass[:, None, None, None]
+    filled[y, x] = weighted_sum / total_weight[:, None, None, None]
     return filled
 
 
-def _in_proportion(fine: Tensor, view: SceneViewCompletion) -> Tensor:
-    """Factors [h, w] ≤ 1 that make the texture `fine` [2h, 2w, 3] no stronger than the texture
-    around a hole.
+def _gain_to_surroundings(texture: Tensor, view: SceneViewCompletion) -> Tensor:
+    """Factors [h, w] ≤ 1 that make a hole's texture no stronger than the texture around the hole.
+
+    Args:
+        texture: [2h, 2w, 3] the high frequencies of the view, filled in holes.
+        view: the view, whose cells are 2×2 pixels.
     """
-    energy, hole = avg_pool2d(fine.square().sum(-1)[None], CELL)[0], view.features.mask.float()
-    parts = torch.stack([energy * hole, hole, energy * (1 - hole), 1 - hole], dim=-1)
-    own, masked, others, seen = (
-        approximate_gaussian_blur(parts, TONE_BLUR_CELLS).clamp_min(MIN_DIVISOR).unbind(-1)
-    )
-    around, known = (others / seen).log(), ~view.features.mask
+    energy = avg_pool2d(texture.square().sum(-1)[None], CELL)[0]  # [h, w]
+    hole = view.mask.float()
+
+    # Local means of the energy over hole cells, and over visible cells.
+    sums = torch.stack([energy * hole, hole, energy * (1 - hole), 1 - hole], dim=-1)
+    sums = approximate_gaussian_blur(sums, TONE_BLUR_CELLS).clamp_min(MIN_DIVISOR)
+    hole_energy, hole_weight, visible_energy, visible_weight = sums.unbind(-1)
+    log_energy_around = (visible_energy / visible_weight).log()
+
+    # Into the hole, the energy is continued from the far side, whose surface fills the hole.
+    known = ~view.mask
     if bool(known.any()):
-        bias = FAR_SIDE_BIAS * ~view.beyond_photo
-        around = fill_from_far_side(view.initial.inverse_depth, around[None], known, far_bias=bias)[
-            1
-        ][0]
-    return (around.exp() / (own / masked)).sqrt().clamp_max(1)
+        far_bias = FAR_SIDE_BIAS * ~view.beyond_photo
+        _, filled = fill_from_far_side(
+            view.initial.inverse_depth, log_energy_around[None], known, far_bias=far_bias
+        )
+        log_energy_around = filled[0]
+    ratio = log_energy_around.exp() / (hole_energy / hole_weight)
+    return ratio.sqrt().clamp_max(1)
 
 
-def _magnified(cells: Tensor, mask: Tensor) -> Tensor:
-    """Interpolate colours [h, w, 3] to pixels [2h, 2w, 3]; only cells in `mask` ([h, w] bool)
-    contribute.
+def _interpolate_cells(colors: Tensor, mask: Tensor) -> Tensor:
+    """Colours [2h, 2w, 3] of pixels, interpolated between the colours [h, w, 3] of cells in `mask`
+    ([h, w] bool).
     """
-    both = torch.cat([cells * mask[..., None], mask[..., None]], dim=-1).permute(2, 0, 1)
-    pixels = interpolate(both[None], scale_factor=CELL, mode="bilinear")[0].permute(1, 2, 0)
-    return pixels[..., :3] / pixels[..., 3:].clamp_min(1e-6)
+    weight = mask[..., None]
+    weighted = torch.cat([colors * weight, weight], dim=-1).permute(2, 0, 1)  # [4, h, w]
+    pixels = interpolate(weighted[None], scale_factor=CELL, mode="bilinear")[0].permute(1, 2, 0)
+
+    # Cells outside of the mask have the weight 0, so they do not bleed in.
+    return pixels[..., :3] / pixels[..., 3:].clamp_min(MIN_COVERAGE)
 
 
-def extended(view: SceneViewCompletion, structure: Tensor) -> Tensor:
-    """Structure [h, w, 3]; just beyond the photo's border it has the colour of the nearest visible
-    cell.
+def continue_border(view: SceneViewCompletion, structure: Tensor) -> Tensor:
+    """`structure` [h, w, 3] sRGB; just beyond the photo's border, it continues the nearest visible
+    cell's colour.
 
-    The colour fades to `structure` with the distance to that cell, and with the difference in
-    depth. Holes behind an object keep `structure`, because their nearest visible cell may belong to
-    the object.
+    That colour fades to `structure` with the distance to the visible cell, and with the difference
+    in depth. Holes behind an object keep `structure`, because their nearest visible cell may belong
+    to the object.
     """
     features = view.features
-    near = nearest_known_pixels(features.mask.numpy())
-    row, column = torch.from_numpy(near).long().clamp_min(0)
-    apart = (view.initial.inverse_depth / features.inverse_depth[row, column].clamp_min(1e-9)).log()
-    fading = torch.exp(
-        (1 - distance_to_nearest(near)) / EXTENDED_CELLS - (apart / SAME_DEPTH).square()
+    nearest = nearest_known_pixels(view.mask.numpy())  # [2, h, w] row and column
+    row, column = torch.from_numpy(nearest).long().clamp_min(0)
+    nearest_inverse_depth = features.inverse_depth[row, column].clamp_min(MIN_INVERSE_DEPTH)
+    log_depth_ratio = (view.initial.inverse_depth / nearest_inverse_depth).log()
+
+    # The first cell beyond the border, at the distance 1, has the full colour.
+    fade = torch.exp(
+        (1 - distance_to_nearest(nearest)) / BORDER_FADE_CELLS
+        - (log_depth_ratio / BORDER_FADE_DEPTH_RATIO).square()
     )
-    return torch.lerp(structure, features.rgb[row, column], (fading * view.beyond_photo)[..., None])
+    return torch.lerp(structure, features.rgb[row, column], (fade * view.beyond_photo)[..., None])
 
 
-def sharpened(wanted: Tensor) -> Tensor:
-    """Colours [H, W, c] that Gaussians need to show the `wanted` colours although they overlap; by
-    Jacobi steps.
+def sharpen_for_overlap(target: Tensor) -> Tensor:
+    """Colours [H, W, c] that Gaussians need to show the colours `target` [H, W, c] although they
+    overlap.
+
+    Overlap blurs: what is seen is blur(colours). Jacobi steps solve blur(colours) = target
+    approximately.
     """
-    colors = wanted
-    for _ in range(STEPS):
-        colors = colors + wanted - gaussian_blur(colors, OVERLAP_PX)
+    colors = target
+    for _ in range(SHARPENING_STEPS):
+        colors = colors + target - gaussian_blur(colors, OVERLAP_SIGMA_PX)
     return colors
+
+
+# Pixels and cells ---------------------------------------------------------------------------------
+
+
+def pad_to_even(picture: Tensor) -> Tensor:
+    """A picture [H, W, c] with even sides: an odd last row or column is repeated."""
+    for axis in (0, 1):
+        if picture.shape[axis] % CELL:
+            last = picture.narrow(axis, -1, 1)
+            picture = torch.cat([picture, last], dim=axis)
+    return picture
 
 
 def group_by_cell(picture: Tensor) -> Tensor:
     """Group an image's pixels [H, W, c] by cell: [h, w, 2, 2, c]; an odd last row or column is
     repeated.
     """
-    for dim in (0, 1):
-        if picture.shape[dim] % CELL:
-            picture = torch.cat([picture, picture.narrow(dim, -1, 1)], dim=dim)
-    rows, columns = (size // CELL for size in picture.shape[:2])
+    picture = pad_to_even(picture)
+    rows = picture.shape[0] // CELL
+    columns = picture.shape[1] // CELL
     return picture.reshape(rows, CELL, columns, CELL, -1).transpose(1, 2)
 
 

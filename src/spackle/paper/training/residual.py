@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 import functools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -23,7 +23,12 @@ from spackle.paper.training.sources import find_sources
 from spackle.paper.training.task import Task
 from spackle.render import Renderer, get_renderer
 from spackle.render.protocol import Rendering
-from spackle.residual.architectures import NOTE, load_residual, open_residual
+from spackle.residual.architectures import (
+    NOTE,
+    load_residual,
+    network_class,
+    open_residual,
+)
 from spackle.residual.completion import MIN_AUX_GAUSSIANS
 from spackle.residual.features import CELL, hole_area_ratio
 from spackle.residual.network import ResidualNet
@@ -35,29 +40,38 @@ from spackle.runtime.folders import make_folder
 from spackle.runtime.progress import Reporter
 from spackle.weights.checkpoints import load_strict, read_tensors
 
-PICTURED = 6  # number of views in a picture
-PICTURE_SIDE = 512  # pixels of a picture's longer side
+MAX_PICTURED_ITEMS = 6  # rows of the picture that shows results of a run
+PICTURE_SIDE_PX = 512  # longer side of that picture
 CACHE = "cache"  # default folder of the samples, in the output
+SHARP_TENSOR = "prediction_head.geometry_prediction_head.weight"  # only SHARP's checkpoints have it
+SHARP_DECODER_PREFIX = "feature_model."  # of the names of the decoder's tensors there
 
 
 @dataclasses.dataclass(frozen=True)
 class ViewBatch:
     """Stacked images of completed views, and their targets."""
 
-    rgb: Tensor  # [B, H, W, 3] sRGB of base and aux Gaussians, with gradients
-    alpha: Tensor  # [B, H, W] of base and aux Gaussians, with gradients
+    rgb: Tensor  # [B, H, W, 3] sRGB of base and added Gaussians, with gradients
+    alpha: Tensor  # [B, H, W] opacity of base and added Gaussians, with gradients
     base_rgb: Tensor  # [B, H, W, 3] sRGB of the base alone
-    target: Tensor  # [B, H, W, 3]
+    target: Tensor  # [B, H, W, 3] sRGB of what the view should look like
     hole: Tensor  # [B, H, W] bool
 
     @staticmethod
     def of(images: Iterable[tuple[Rendering, Tensor, Tensor, Tensor]]) -> ViewBatch:
-        """Stack completed views, base views, targets and holes on the device of the completed
-        views.
+        """Stack images of B views, on the device of the completed views.
+
+        For each view: the completed view, sRGB [H, W, 3] of the base, target [H, W, 3], and hole
+        [H, W].
         """
-        fields = zip(*((view.rgb, view.alpha, *others) for view, *others in images), strict=True)
+        views = list(images)
+        device = views[0][0].rgb.device
         return ViewBatch(
-            *(torch.stack([tensor.to(field[0].device) for tensor in field]) for field in fields)
+            rgb=torch.stack([completed.rgb for completed, _, _, _ in views]),
+            alpha=torch.stack([completed.alpha for completed, _, _, _ in views]),
+            base_rgb=torch.stack([base_rgb.to(device) for _, base_rgb, _, _ in views]),
+            target=torch.stack([target.to(device) for _, _, target, _ in views]),
+            hole=torch.stack([hole.to(device) for _, _, _, hole in views]),
         )
 
 
@@ -77,51 +91,71 @@ class ViewTask(Task):
     )
 
     def __init__(self, recipe: Recipe, device: torch.device) -> None:
-        """Load the feature network; InputError if it cannot be read."""
-        self.recipe, self.device, self.renderer = recipe, device, get_renderer()
+        """Load the network of the perceptual loss; InputError if it cannot be read."""
+        self.recipe = recipe
+        self.device = device
+        self.renderer = get_renderer()
         self.precision = pick_dtype(recipe.optim.precision, device)
-        features = recipe.loss.features if recipe.loss.perceptual else "none"
-        self.features = load_features(features, recipe.loss.features_file, device)
+        feature_network = recipe.loss.features if recipe.loss.perceptual else "none"
+        self.features = load_features(feature_network, recipe.loss.features_file, device)
 
     @abc.abstractmethod
     def complete(self, network: nn.Module, batch: Any) -> ViewBatch:
-        """Complete the views of a batch."""
+        """Complete the views of a batch by the network that is trained."""
 
     def loss(self, network: nn.Module, batch: Any) -> tuple[Tensor, dict[str, Tensor]]:
+        """The loss [] of a batch, with gradients, and its terms [] by name."""
         return self._loss_of(self.complete(network, batch))
 
     def _loss_of(self, views: ViewBatch) -> tuple[Tensor, dict[str, Tensor]]:
-        tensors = {name: tensor.to(self.device) for name, tensor in vars(views).items()}
-        return total_loss(**tensors, recipe=self.recipe.loss, features=self.features)
+        """The loss [] of completed views, and its terms [] by name."""
+        return total_loss(
+            rgb=views.rgb.to(self.device),
+            alpha=views.alpha.to(self.device),
+            target=views.target.to(self.device),
+            base_rgb=views.base_rgb.to(self.device),
+            hole=views.hole.to(self.device),
+            recipe=self.recipe.loss,
+            features=self.features,
+        )
 
     def measure(self, network: nn.Module, batch: Any) -> dict[str, list[float]]:
-        """Values for each view: the loss and its terms (means of the batch), and the share of hole
-        pixels before and after completion. PSNR in dB compares the hole with the target, and the
-        other pixels with the base.
+        """The values of each measure for the B views of a batch, by the measure's name.
+
+        The loss and its terms are means of the batch. PSNR in dB compares the hole with the target
+        ("hole_psnr"), and the other pixels with the base ("seen_psnr"). HAR is the fraction of hole
+        pixels before and after completion.
         """
         views = self.complete(network, batch)
         loss, terms = self._loss_of(views)
-        return {
-            **{
-                name: [float(value)] * len(views.rgb)
-                for name, value in {"loss": loss, **terms}.items()
-            },
-            "hole_psnr": list(map(hole_psnr, views.rgb, views.target, views.hole)),
-            "seen_psnr": list(map(hole_psnr, views.rgb, views.base_rgb, ~views.hole)),
-            "har_before": [float(hole.double().mean()) for hole in views.hole],
-            "har_after": [hole_area_ratio(alpha) for alpha in views.alpha],
-        }
+        values: dict[str, list[float]] = {}
+        for name, mean in {"loss": loss, **terms}.items():
+            values[name] = [float(mean)] * len(views.rgb)
+
+        values["hole_psnr"] = []
+        values["seen_psnr"] = []
+        for rgb, target, base_rgb, hole in zip(
+            views.rgb, views.target, views.base_rgb, views.hole, strict=True
+        ):
+            values["hole_psnr"].append(hole_psnr(rgb, target, hole))
+            values["seen_psnr"].append(hole_psnr(rgb, base_rgb, ~hole))
+        values["har_before"] = [float(hole.double().mean()) for hole in views.hole]
+        values["har_after"] = [hole_area_ratio(alpha) for alpha in views.alpha]
+        return values
 
     @torch.no_grad()
     def draw_picture(self, network: nn.Module) -> Tensor:
-        """[H, W, 3] sRGB, one row per validation item: base, completed view, target."""
-        items = range(0, self.validation_items, max(1, self.validation_items // PICTURED))[
-            :PICTURED
-        ]
-        views = [self.complete(network, self.load_batch(None, [item])) for item in items]
-        return contact_sheet(
-            [(view.base_rgb[-1], view.rgb[-1], view.target[-1]) for view in views], PICTURE_SIDE
-        )
+        """[H, W, 3] sRGB, one row for each of a few validation items: base, completed view,
+        target.
+        """
+        step = max(1, self.validation_items // MAX_PICTURED_ITEMS)
+        items = range(0, self.validation_items, step)[:MAX_PICTURED_ITEMS]
+        rows = []
+        for item in items:
+            views = self.complete(network, self.load_batch(None, [item]))
+            # A batch may hold all views of a photo; the last is the farthest.
+            rows.append((views.base_rgb[-1], views.rgb[-1], views.target[-1]))
+        return contact_sheet(rows, PICTURE_SIDE_PX)
 
 
 def complete_samples(
@@ -177,111 +211,148 @@ def first_network(name: str, init: Path | None = None) -> ResidualNet:
     """The initial network of a run: untrained, or read from the file `init`.
 
     The file holds weights of the same network. For "sharp-decoder", SHARP's checkpoint is also
-    accepted: the decoder is read, stem and heads stay untrained. InputError if the file is missing,
-    broken or of another network.
+    accepted: the decoder is read, stem and heads stay untrained.
+
+    Raises:
+        InputError: the file is missing, broken or of another network.
     """
     if init is None:
         return open_residual(name)
-    tensors, prefix = read_tensors(init, "give init=FILE"), "feature_model."
-    if name == SharpDecoder.name and "prediction_head.geometry_prediction_head.weight" in tensors:
-        sharp = SharpDecoder.untrained_for(tensors)
-        decoder = {
-            key.removeprefix(prefix): tensor
-            for key, tensor in tensors.items()
-            if key.startswith(prefix)
-        }
-        load_strict(
-            sharp.feature_model, decoder, init, "give SHARP's checkpoint as it was downloaded"
-        )
-        return sharp
+    network_class(name)  # imports a network of another package, so that its weights are accepted
+    if name == SharpDecoder.name:
+        tensors = read_tensors(init, "give init=FILE")
+        if SHARP_TENSOR in tensors:
+            return _with_sharps_decoder(tensors, init)
+
     network = load_residual(init)
     if network.name != name:
         raise InputError(
-            f"{init}: has weights of network {network.name}: set network={network.name} or another init"
+            f"{init}: has weights of network {network.name}: set network={network.name} or another "
+            "init"
         )
     return network
 
 
+def _with_sharps_decoder(tensors: Mapping[str, Tensor], path: Path) -> SharpDecoder:
+    """The paper's network with the decoder of SHARP's checkpoint `tensors` and an untrained stem.
+
+    InputError, which names the file `path`, if the decoder's tensors are not as they should be.
+    """
+    network = SharpDecoder.untrained_for(tensors)
+    decoder = {
+        name.removeprefix(SHARP_DECODER_PREFIX): tensor
+        for name, tensor in tensors.items()
+        if name.startswith(SHARP_DECODER_PREFIX)
+    }
+    advice = "give SHARP's checkpoint as it was downloaded"
+    load_strict(network.feature_model, decoder, path, advice)
+    return network
+
+
 class ResidualTask(ViewTask):
-    """Trains the residual network; its items are samples of one size."""
+    """Trains the residual network; its items are samples, crops of views of one size."""
 
     name: ClassVar[str] = "residual"
 
     def __init__(self, recipe: Recipe, device: torch.device) -> None:
         """Find the files of a recipe, without making samples; InputError if they cannot be used."""
         super().__init__(recipe, device)
+        # The seed of the run decides about the initial weights, whatever was drawn before.
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(recipe.run.seed)
             self.network = first_network(recipe.network, recipe.init).requires_grad_()
-        self.sources = [
-            find_sources(recipe.data, self.renderer, validation=which) for which in (False, True)
-        ]
-        self.digest, self.items_per_step = (
-            digest_of_samples(recipe.data, self.sources[0]),
-            recipe.optim.batch,
-        )
+        self.training_sources = find_sources(recipe.data, self.renderer, validation=False)
+        self.validation_sources = find_sources(recipe.data, self.renderer, validation=True)
+        self.digest = digest_of_samples(recipe.data, self.training_sources)
+        self.items_per_step = recipe.optim.batch
 
     def prepare(self, output: Path, reporter: Reporter) -> dict[str, Any]:
-        """Make the missing samples."""
+        """Make the missing samples; returns their numbers and the range of reachable PSNR, for
+        run.json.
+        """
         data = self.recipe.data
-        skip = functools.cache(
-            lambda reason: reporter.log(f"skipped: {reason}")
-        )  # each reason is logged once
         folder = data.cache or output / CACHE
         make_folder(folder)
-        # Training and validation use different seeds, and different photos of a dataset.
-        parts = (
-            ("validation", self.sources[True], 2 * data.seed + 1, data.validation_views),
-            ("train", self.sources[False], 2 * data.seed, data.views),
-        )
         reporter.log(f"samples of {data.views + data.validation_views} views in {folder}")
-        with reporter.stage("samples") as step:
-            self.validation_files, self.training_files = (
-                make_samples(data, of, folder / self.digest / name, seed, views, step, skip)
-                for name, of, seed, views in parts
+
+        @functools.cache
+        def log_once(reason: str) -> None:
+            """Report why a view is missing; the cache keeps each reason from being repeated."""
+            reporter.log(f"skipped: {reason}")
+
+        # Training and validation use different seeds, and different photos of a dataset.
+        with reporter.stage("samples") as progress:
+            self.validation_files = make_samples(
+                data,
+                self.validation_sources,
+                folder / self.digest / "validation",
+                2 * data.seed + 1,
+                data.validation_views,
+                progress,
+                log_once,
             )
-        self.items, self.validation_items = len(self.training_files), len(self.validation_files)
+            self.training_files = make_samples(
+                data,
+                self.training_sources,
+                folder / self.digest / "train",
+                2 * data.seed,
+                data.views,
+                progress,
+                log_once,
+            )
+        self.items = len(self.training_files)
+        self.validation_items = len(self.validation_files)
         reporter.log(f"{self.items} training samples, {self.validation_items} validation samples")
-        samples = {"train": self.items, "validation": self.validation_items, "digest": self.digest}
         return {
-            "samples": samples,
-            "hole_psnr": self.limits() if rank() == 0 else {},
-        }  # only rank 0 writes run.json
+            "samples": {
+                "train": self.items,
+                "validation": self.validation_items,
+                "digest": self.digest,
+            },
+            # Only the process of rank 0 writes run.json.
+            "hole_psnr": self.reachable_psnr() if rank() == 0 else {},
+        }
 
     @torch.no_grad()
-    def limits(self) -> dict[str, float]:
-        """Mean hole PSNR in dB of validation samples: untrained, then with seeds in the targets'
-        colours.
+    def reachable_psnr(self) -> dict[str, float]:
+        """Mean PSNR in dB in the holes of the validation samples, untrained and at best.
 
-        A run can raise PSNR only from the first value towards the second.
+        "untrained" is the PSNR of the initial Gaussians, the first guess that a network changes.
+        For "colours of the targets" they have the targets' colours. A run can raise PSNR only from
+        the first value towards the second.
         """
         with torch.random.fork_rng(devices=[]):
             network = open_residual(self.recipe.network).to(self.renderer.device)
-        decibels: dict[str, list[float]] = {"untrained": [], "colours of the targets": []}
+        untrained: list[float] = []
+        with_target_colors: list[float] = []
         for item in range(self.validation_items):
             (sample,) = self.load_batch(None, [item])
-            height, width = sample.features.mask.shape
-            colors = sample.target.view(height, CELL, width, CELL, 3).mean((1, 3))
-            best = dataclasses.replace(
-                sample, initial=dataclasses.replace(sample.initial, rgb=colors)
-            )
-            for values, case in zip(decibels.values(), (sample, best), strict=True):
-                views = self.complete(network, [case])
-                values.append(hole_psnr(views.rgb[0], views.target[0], views.hole[0]))
-        return {name: sum(values) / len(values) for name, values in decibels.items()}
+            untrained.append(self._sample_psnr(network, sample))
+            with_target_colors.append(self._sample_psnr(network, _with_target_colors(sample)))
+        return {
+            "untrained": sum(untrained) / len(untrained),
+            "colours of the targets": sum(with_target_colors) / len(with_target_colors),
+        }
+
+    def _sample_psnr(self, network: nn.Module, sample: Sample) -> float:
+        """PSNR in dB in the hole of a sample that the network completes."""
+        views = self.complete(network, [sample])
+        return hole_psnr(views.rgb[0], views.target[0], views.hole[0])
 
     def load_batch(self, step: int | None, items: Sequence[int]) -> list[Sample]:
-        """Read samples; InputError if one cannot be read."""
+        """Read samples, for validation if `step` is None; InputError if one cannot be read."""
         files = self.validation_files if step is None else self.training_files
         samples = [load_sample(files[item]) for item in items]
+
+        # Samples keep these. They are computed here, in the thread that reads ahead, so that the
+        # training loop does not wait for them.
         for sample in samples:
-            _ = (
-                sample.network_input(self.network.inputs),
-                sample.tiles,
-            )  # computed in this thread, so that the training loop does not wait for them
+            sample.network_input(self.network.inputs)
+            _ = sample.tiles
         return samples
 
     def complete(self, network: nn.Module, batch: Sequence[Sample]) -> ViewBatch:
+        """Complete samples of one size; only the network gets gradients."""
         return complete_samples(network, self.network.inputs, batch, self.renderer, self.precision)
 
     def export(self, network: nn.Module, path: Path) -> None:
@@ -291,3 +362,11 @@ class ResidualTask(ViewTask):
             for name, tensor in network.state_dict().items()
         }
         write_atomic(path, save(tensors, {NOTE: self.recipe.network}))
+
+
+def _with_target_colors(sample: Sample) -> Sample:
+    """The sample with initial Gaussians in the colours that the target shows at their cells."""
+    rows, columns = sample.features.mask.shape
+    cell_pixels = sample.target.view(rows, CELL, columns, CELL, 3)
+    initial = dataclasses.replace(sample.initial, rgb=cell_pixels.mean((1, 3)))
+    return dataclasses.replace(sample, initial=initial)

@@ -4,11 +4,9 @@ in files.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
 import hashlib
-import itertools
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -249,19 +247,28 @@ class Sample:
 
 
 def random_crops(sample: Sample, rng: np.random.Generator, count: int, cells: int) -> list[Sample]:
-    """Up to `count` square crops around hole cells of a view, each with `cells` cells a side."""
-    rows, columns = sample.camera.height // CELL, sample.camera.width // CELL
+    """Up to `count` square crops around hole cells of a view, each with `cells` cells of 2×2 pixels
+    a side.
+
+    Crops with almost no hole, or with almost nothing else, are left out.
+    """
+    rows = sample.camera.height // CELL
+    columns = sample.camera.width // CELL
     if min(rows, columns) < cells:
         return []
-    where = sample.features.mask[:rows, :columns].nonzero()
+    hole_cells = sample.features.mask[:rows, :columns].nonzero()  # [n, 2]
+    if not len(hole_cells):
+        return []
+
     crops: list[Sample] = []
     for _ in range(2 * count):  # two tries for each crop
-        if not len(where) or len(crops) == count:
+        if len(crops) == count:
             break
-        row, column = where[rng.integers(len(where))].tolist()
-        shift = rng.integers(0, cells, size=2)
-        top = min(max(row - int(shift[0]), 0), rows - cells)
-        left = min(max(column - int(shift[1]), 0), columns - cells)
+        # A hole cell at a random place of the crop, as far as the crop stays within the view.
+        row, column = hole_cells[rng.integers(len(hole_cells))].tolist()
+        shift_down, shift_right = rng.integers(0, cells, size=2)
+        top = min(max(row - int(shift_down), 0), rows - cells)
+        left = min(max(column - int(shift_right), 0), columns - cells)
         hole = sample.hole[CELL * top : CELL * (top + cells), CELL * left : CELL * (left + cells)]
         if HOLE_RATIO_RANGE[0] < float(hole.float().mean()) < HOLE_RATIO_RANGE[1]:
             crops.append(sample.crop(top, left, cells, cells))
@@ -346,21 +353,21 @@ class Source(NamedTuple):
     """A source of views with holes and targets."""
 
     share: float  # weight among all sources
-    view: Callable[
-        [np.random.Generator, int], Sample
-    ]  # makes a view by its number; InputError for an unusable file
+    # Makes a view by its number; InputError for an unusable file.
+    view: Callable[[np.random.Generator, int], Sample]
     names: Sequence[str]  # the names of the source and of its files, relative to their folder
     views: int | None = None  # number of views, numbered from 0; None: any number, drawn at random
 
 
 def digest_of_samples(data: DataRecipe, sources: Sequence[Source]) -> str:
     """Twelve digits that identify the content of samples, whatever their number and paths."""
-    others = dict.fromkeys(
-        ("photos", "stereo", "pseudo", "cache", "views", "validation_views"), True
-    )
-    facts = data.model_dump(mode="json", exclude={**others, "rgbd": {"__all__": {"folder"}}})
+    paths_and_numbers = ("photos", "stereo", "pseudo", "cache", "views", "validation_views")
+    excluded: dict[str, Any] = dict.fromkeys(paths_and_numbers, True)
+    excluded["rgbd"] = {"__all__": {"folder"}}
+    settings = data.model_dump(mode="json", exclude=excluded)
     names = [name for source in sources for name in source.names]
-    return short_digest((SAMPLES_VERSION, facts, [source.share for source in sources], names))
+    shares = [source.share for source in sources]
+    return short_digest((SAMPLES_VERSION, settings, shares, names))
 
 
 def short_digest(value: Any) -> str:
@@ -377,59 +384,112 @@ def make_samples(
     progress: Progress,
     warn: Callable[[str], None],
 ) -> list[Path]:
-    """Make the samples of the first `views` views that a folder lacks; returns the files of all
-    samples in order.
+    """Make the samples of the first `views` views that a folder lacks; returns all samples' files
+    in order.
 
-    `seed` determines the views; the processes of a run share the work. `warn` is called with the
-    reason if a view cannot be made. InputError if no file can be written, or no view gave a sample.
+    The processes of a run share the work, and wait for each other.
+
+    Args:
+        data: how many crops are cut from a view, and how large.
+        sources: where views come from, each with its share.
+        folder: for the files.
+        seed: determines the views.
+        views: how many views; fewer, if the only source has fewer.
+        progress: called with (views done, all views) of this process.
+        warn: called with the reason if a view cannot be made.
+
+    Raises:
+        InputError: a file cannot be written, or no view gave a sample.
     """
     folder.mkdir(parents=True, exist_ok=True)
     if len(sources) == 1 and sources[0].views is not None:
         views = min(views, sources[0].views)
-    shares = np.array([source.share for source in sources])
+    planned_views = _plan_views(sources, seed, views)
 
-    def drawn(index: int) -> tuple[int, np.random.Generator]:
-        """The source of a view, and the generator for the rest of the view."""
-        rng = np.random.default_rng([seed, index])
-        return int(rng.choice(len(sources), p=shares / shares.sum())), rng
-
-    counts = [itertools.count() for _ in sources]
-    places = [
-        next(counts[drawn(index)[0]]) for index in range(views)
-    ]  # numbers of the views in their sources
-    mine = range(
-        *(views * part // rank_count() for part in (rank(), rank() + 1))
-    )  # one process reads a photo's views
-    for done, index in enumerate(mine, 1):
+    # Each process makes a range of neighbouring views, because neighbours share a photo.
+    first = views * rank() // rank_count()
+    stop = views * (rank() + 1) // rank_count()
+    for index in range(first, stop):
         if _crop_files(folder, index) is None:
-            choice, rng = drawn(index)
-            source, place, crops = sources[choice], places[index], list[Sample]()
+            crops: list[Sample] = []
             try:
-                view = source.view(rng, place if source.views is None else place % source.views)
-                crops = random_crops(view, rng, data.crops, data.cells)
+                crops = _make_crops(data, planned_views[index], seed, index, sources)
             except (InputError, ValueError) as error:
                 warn(str(error))
             for number, crop in enumerate(crops):
-                save_sample(crop, folder / f"{index:06d}-{number}.safetensors")
-            write_atomic(
-                folder / f"{index:06d}.done", f"{len(crops)}\n".encode()
-            )  # written after all crops
-        progress(done, len(mine))
+                save_sample(crop, _crop_file(folder, index, number))
+            # Written after all crops, so that its presence proves that they are complete.
+            write_atomic(_count_file(folder, index), f"{len(crops)}\n".encode())
+        progress(index - first + 1, stop - first)
     wait_for_ranks()
+
     files = [file for index in range(views) for file in _crop_files(folder, index) or ()]
     if not files:
         raise InputError(
-            f"{folder}: none of {views} views gave a sample: photos must be readable and larger than "
-            f"{2 * data.cells} pixels each way, and data.disparity must be large enough for holes"
+            f"{folder}: none of {views} views gave a sample: photos must be readable and larger "
+            f"than {CELL * data.cells} pixels each way, and data.disparity must be large enough "
+            "for holes"
         )
     return files
 
 
+class _PlannedView(NamedTuple):
+    """Which source a view comes from, and which number it has there."""
+
+    source_index: int
+    number: int
+
+
+def _plan_views(sources: Sequence[Source], seed: int, views: int) -> list[_PlannedView]:
+    """The sources of the first `views` views, drawn by their shares; each source counts its own
+    views from 0.
+    """
+    counts = [0] * len(sources)
+    planned = []
+    for index in range(views):
+        source_index, _ = _draw_source(sources, seed, index)
+        planned.append(_PlannedView(source_index, counts[source_index]))
+        counts[source_index] += 1
+    return planned
+
+
+def _draw_source(
+    sources: Sequence[Source], seed: int, index: int
+) -> tuple[int, np.random.Generator]:
+    """The index of a view's source, and the random generator for the rest of the view."""
+    shares = np.array([source.share for source in sources])
+    rng = np.random.default_rng([seed, index])
+    return int(rng.choice(len(sources), p=shares / shares.sum())), rng
+
+
+def _make_crops(
+    data: DataRecipe, planned: _PlannedView, seed: int, index: int, sources: Sequence[Source]
+) -> list[Sample]:
+    """The crops of one view; a source with a limited number of views begins again after the
+    last.
+    """
+    _, rng = _draw_source(sources, seed, index)
+    source = sources[planned.source_index]
+    number = planned.number if source.views is None else planned.number % source.views
+    view = source.view(rng, number)
+    return random_crops(view, rng, data.crops, data.cells)
+
+
+def _crop_file(folder: Path, index: int, number: int) -> Path:
+    """The file of one crop of a view."""
+    return folder / f"{index:06d}-{number}.safetensors"
+
+
+def _count_file(folder: Path, index: int) -> Path:
+    """The file that holds the number of a view's crops."""
+    return folder / f"{index:06d}.done"
+
+
 def _crop_files(folder: Path, index: int) -> list[Path] | None:
     """The files of a view's crops; None if they are not complete."""
-    with contextlib.suppress(FileNotFoundError, ValueError):
-        count = int((folder / f"{index:06d}.done").read_text())
-        files = [folder / f"{index:06d}-{number}.safetensors" for number in range(count)]
-        if all(file.is_file() for file in files):
-            return files
-    return None
+    try:
+        count = int(_count_file(folder, index).read_text())
+    except (FileNotFoundError, ValueError):
+        return None
+    files = [_crop_file(folder, index, number) for number in range(count)]
+    return files if all(file.is_file() for file in files) else None
