@@ -1,4 +1,6 @@
-"""A server whose worker only pretends to complete photos, and clients over sockets of this machine."""
+"""A server whose worker only pretends to complete photos, and clients over sockets of this
+machine.
+"""
 
 from __future__ import annotations
 

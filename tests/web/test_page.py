@@ -11,7 +11,7 @@ import itertools
 import json
 import re
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -147,7 +147,8 @@ def shown(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Op
 @pytest.fixture
 def page(shown: Opened) -> Any:
     """The page in its first state."""
-    first = "spackle.setCompare(null), spackle.setHeat(false), spackle.setLayers('both'), spackle.setView(...view)"
+    first = "spackle.setCompare(null), spackle.setHeat(false), "
+    first += "spackle.setLayers('both'), spackle.setView(...view)"
     shown.page.evaluate(f"(view) => Promise.all([{first}])", list(VIEW))
     return shown.page
 
@@ -176,9 +177,15 @@ def camera_of(page: Any, width: int, height: int) -> Camera:
 
 
 def hole_and_rest(page: Any, height: int, width: int) -> tuple[Tensor, Tensor]:
-    """Two masks [H, W]: pixels inside the base's hole, and pixels outside, both without edges and rounded corners."""
+    """Two masks [H, W]: pixels inside the base's hole, and pixels outside, both without edges
+    and rounded corners.
+    """
     alpha = CPU.render(box().base, camera_of(page, width, height)).alpha[None, None]
-    pool: Callable[[Tensor], Tensor] = lambda x: torch.nn.functional.max_pool2d(x, 9, 1, 4)[0, 0]  # noqa: E731
+
+    def pool(image: Tensor) -> Tensor:
+        """[H, W]: the greatest value of each pixel's 9×9 neighbours."""
+        return torch.nn.functional.max_pool2d(image, 9, 1, 4)[0, 0]
+
     inside = torch.zeros(height, width, dtype=torch.bool)
     inside[12:-12, 12:-12] = True
     hole, rest = (pool(alpha) < 0.5) & inside, (pool(1 - alpha) < 0.02) & inside
@@ -298,7 +305,9 @@ def test_the_whole_photo_and_every_control_has_room(page: Any, size: tuple[int, 
 
 
 def drag_moves_the_eye(page: Any) -> None:
-    """Drag from the middle of the picture to the left, as a hand does; the eye must go to the right."""
+    """Drag from the middle of the picture to the left, as a hand does; the eye must go to the
+    right.
+    """
     settled(page, "spackle.settled()")
     frame = page.locator("#frame").bounding_box()
     x, y = frame["x"] + frame["width"] / 2, frame["y"] + frame["height"] / 2

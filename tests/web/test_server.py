@@ -1,4 +1,6 @@
-"""The server's answers to programs, browsers, strangers and broken clients, over sockets of this machine."""
+"""The server's answers to programs, browsers, strangers and broken clients, over sockets of this
+machine.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""`spackle view` and `spackle serve`: the page opens, photos become scenes, and signals end the server."""
+"""`spackle view` and `spackle serve`: the page opens, photos become scenes, and signals end the
+server.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +42,9 @@ def page_of(server: Served, id: str) -> Any:
 
 @pytest.fixture
 def visit(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Run]:
-    """Run `spackle view` with a function as the browser; a signal ends the command when the function returns."""
+    """Run `spackle view` with a function as the browser; a signal ends the command when the
+    function returns.
+    """
     monkeypatch.setenv("BROWSER", "anything")
 
     def run_view(

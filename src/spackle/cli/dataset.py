@@ -130,13 +130,14 @@ def dataset_build(
     """Build a pseudo-supervised dataset: manifest.json and shard-000000.tar, … (the paper's appendix)."""
     from spackle.bases.settings import BaseSettings
     from spackle.cli.messages import CommandReporter
-    from spackle.paper.dataset.build import DatasetOptions, build_dataset
+    from spackle.paper.dataset.build import build_dataset
+    from spackle.paper.dataset.options import DatasetOptions
 
     settings = BaseSettings(
         name=base, depth=depth, checkpoint=checkpoint, precision=precision, device=device
     )
     options = DatasetOptions(
-        settings,
+        base=settings,
         images=images,
         sample=sample,
         seed=seed,

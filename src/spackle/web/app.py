@@ -98,11 +98,23 @@ def add_scene_routes(app: FastAPI, handlers: SceneHandlers) -> None:
     """Add the HTTP interface to an app: the routes below /api/v1/scenes."""
     form = {"requestBody": {"content": {"multipart/form-data": UPLOAD_FORM}}}
     one_scene = SCENES_PATH + "/{id}"
-    app.post(SCENES_PATH, status_code=202, openapi_extra=form)(handlers.post_photo)
-    app.get(one_scene)(handlers.get_state)
-    app.delete(one_scene, status_code=204)(handlers.delete)
-    app.get(one_scene + "/events", response_class=EventSourceResponse)(handlers.get_events)
-    app.get(one_scene + "/files/{file}", response_class=FileResponse)(handlers.get_file)
+    app.add_api_route(
+        SCENES_PATH, handlers.post_photo, methods=["POST"], status_code=202, openapi_extra=form
+    )
+    app.add_api_route(one_scene, handlers.get_state, methods=["GET"])
+    app.add_api_route(one_scene, handlers.delete, methods=["DELETE"], status_code=204)
+    app.add_api_route(
+        one_scene + "/events",
+        handlers.get_events,
+        methods=["GET"],
+        response_class=EventSourceResponse,
+    )
+    app.add_api_route(
+        one_scene + "/files/{file}",
+        handlers.get_file,
+        methods=["GET"],
+        response_class=FileResponse,
+    )
 
 
 def add_page_routes(app: FastAPI, handlers: SceneHandlers) -> None:
@@ -113,9 +125,10 @@ def add_page_routes(app: FastAPI, handlers: SceneHandlers) -> None:
         template = Template(read_page_file("docs.html").decode(), autoescape=True)
         return HTMLResponse(template.render(api=app.openapi()))
 
-    app.get("/page.json", include_in_schema=False)(handlers.get_page_state)
-    app.get("/healthz", include_in_schema=False)(handlers.get_health)
-    app.get("/docs", include_in_schema=False)(get_docs)
+    # These routes serve the page and are no part of the interface for programs.
+    app.add_api_route("/page.json", handlers.get_page_state, include_in_schema=False)
+    app.add_api_route("/healthz", handlers.get_health, include_in_schema=False)
+    app.add_api_route("/docs", get_docs, include_in_schema=False)
     # The last route, because it takes every other path.
     app.mount("/", StaticFiles(packages=[("spackle.web", "page")], html=True))
 
@@ -210,8 +223,10 @@ class SceneHandlers:
         return FileResponse(path, filename=PurePosixPath(job.name).stem + path.suffix)
 
     async def get_page_state(self) -> dict[str, object]:
-        """What the page may send: kinds of files, size limit and bases; {"upload": null} if
-        nothing.
+        """What the page may send: kinds of files, size limit, and bases, the networks to choose
+        from.
+
+        {"upload": null} if it may send nothing.
         """
         if not self.takes_photos:
             return {"upload": None}

@@ -24,7 +24,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from spackle.runtime.errors import printable_line
 
 LOG = logging.getLogger("spackle.web")
-# A Host header: a name or a numeric address, and perhaps a port.
+# A Host header: a name or a numeric address, which is group 1, and perhaps a port.
 HOST_PATTERN = re.compile(r"(\[[0-9a-f:.%]+\]|[0-9a-z._-]+)(?::\d{1,5})?", re.IGNORECASE)
 # Values of Sec-Fetch-Site that are admitted; none: an address that a person typed, or a bookmark.
 OWN_SITES = {"same-origin", "none"}
@@ -87,7 +87,8 @@ class Access(NamedTuple):
         check_same_site(headers, self._is_own_name)
 
         # An address of the page holds the token: /TOKEN/viewer.css.
-        root, path = scope["root_path"], scope["path"]
+        root = scope["root_path"]  # where another app has mounted this one
+        path = scope["path"]
         parts = path.removeprefix(root).split("/")
         first_part = parts[1] if path.count("/") > 1 else ""
         if self._is_token(first_part):

@@ -215,9 +215,10 @@ class Jobs:
             self._is_closed.set()
             for process in self._processes:
                 process.kill()
+        # The threads see that their processes are gone, and end.
         for pool in (self._scene_threads, self._file_thread):
             pool.shutdown(cancel_futures=True)
-        self._folder_lock.close()
+        self._folder_lock.close()  # another server may open the folder
 
     def _process(self) -> TaskProcess:
         """The calling thread's process; a new one if there is none, or the old one died."""
@@ -317,14 +318,20 @@ class Jobs:
         """Remove jobs that ended too long ago, and the oldest jobs while the folder is too
         large.
         """
-        ended_jobs = [job for job in list(self.by_id.values()) if job.ended is not None]
-        sizes = {job.id: size_of_folder(job.folder) for job in ended_jobs}  # bytes
+        end_times: dict[str, float] = {}  # by the id of a job
+        sizes: dict[str, int] = {}  # bytes
+        # A copy of the list, because other threads add and remove jobs meanwhile.
+        for job in list(self.by_id.values()):
+            if job.ended is not None:
+                end_times[job.id] = job.ended
+                sizes[job.id] = size_of_folder(job.folder)
+
         total_size = sum(sizes.values())
-        for job in sorted(ended_jobs, key=lambda job: job.ended or 0.0):
-            is_old = (job.ended or 0.0) + self.limits.seconds < time.time()
+        for id in sorted(end_times, key=end_times.__getitem__):  # the oldest first
+            is_old = end_times[id] + self.limits.seconds < time.time()
             if is_old or total_size > self.limits.size:
-                total_size -= sizes[job.id]
-                self.remove(job.id)
+                total_size -= sizes[id]
+                self.remove(id)
 
 
 def size_of_folder(folder: Path) -> int:

@@ -84,8 +84,8 @@ def accept_photo(form: FormData, upload_folder: Path, jobs: Jobs, bases: list[st
 def read_options(text: str, bases: list[str]) -> SceneOptions:
     """The options of a JSON text; HTTPException 422 if one is unknown or has a bad value.
 
-    A base that is not among `bases` is refused with the reason: the name is unknown, or its
-    weights are not on this server.
+    A base, the network for a photo's geometry, must be among `bases`. Another is refused with the
+    reason: the name is unknown, or its weights are not on this server.
     """
     try:
         options = SceneOptions.model_validate_json(text)

@@ -154,7 +154,7 @@ class SceneWork:
         source = job.folder / job.source
         scene_file = job.results / SCENE_FILE
         note = ""
-        if scene_suffix(source):
+        if scene_suffix(source):  # a scene, not a photo: nothing is to be completed
             Scene.load(source, focal_px=options.focal_px, fov=options.fov).save(scene_file)
         else:
             note = self._complete_photo(job, options, reporter)
@@ -197,7 +197,11 @@ class SceneWork:
         return ROUGH_GEOMETRY_ADVICE if report.run.base == LiteBase.name else ""
 
     def _base_settings(self, job: Job, options: SceneOptions) -> BaseSettings:
-        """The base for a photo: by its depth map, as the client chose, or the server's own."""
+        """The settings of the base, which turns a photo into Gaussians.
+
+        A photo with a depth map needs no network. Otherwise the client may have chosen one; else
+        it is the server's own.
+        """
         if job.depth is not None:
             # "auto" takes depth before any network; `checkpoint` belongs to the server's network.
             return dataclasses.replace(
@@ -284,6 +288,7 @@ def check_photo(path: Path, name: str, preview: Path) -> None:
     """
 
     def write_preview(image: Image.Image) -> None:
+        """Check a photo that Pillow has opened, and write the small JPEG, turned upright."""
         if image.format not in PILLOW_FORMATS:
             raise InputError(f"{path}: a {image.format} picture: give {', '.join(PHOTO_SUFFIXES)}")
         check_photo_size(image.width, image.height, path)

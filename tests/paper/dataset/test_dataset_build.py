@@ -1,4 +1,6 @@
-"""Building a dataset: the same bytes with any number of workers and after a kill; bad input ends in one line."""
+"""Building a dataset: the same bytes with any number of workers and after a kill; bad input ends
+in one line.
+"""
 
 from __future__ import annotations
 
@@ -71,7 +73,10 @@ def test_a_killed_build_resumes_and_ends_the_same(
 ) -> None:
     out = tmp_path / "out"
     patch = f"original, calls = {patched}, iter(range(1, 99))\n"
-    patch += f"{patched} = lambda *given, **more: die() if next(calls) == {at} else original(*given, **more)"
+    patch += f"""
+def dying(*given, **more):
+    return die() if next(calls) == {at} else original(*given, **more)
+{patched} = dying"""
     assert dying_build(tmp_path / "script.py", patch, place, out).wait() == -signal.SIGKILL
     assert names_in(out) == left
     assert "not finished" in run("dataset", "verify", out).err
@@ -144,7 +149,7 @@ def test_odd_photos_are_used_and_bad_ones_are_named(tmp_path: Path) -> None:
     for words in ("tiny.png: 8×8 pixels", "cut.png: ", "empty.jpg: ", "two.png: the same photo as"):
         assert words in done.err
     (entry,) = [line for shard in manifest.shards for line in shard.passed_over]
-    assert entry.startswith("cmyk.jpg: no depth map in --depth: ")
+    assert entry.startswith("cmyk.jpg: no depth map in the depth folder: ")
 
 
 def test_coco_annotations_name_the_photos(place: Path, tmp_path: Path) -> None:
@@ -184,7 +189,7 @@ def test_a_subset_depends_on_the_seed_alone(place: Path) -> None:
 
     assert subset(3, 0) == sorted(subset(3, 0)) == subset(3, 0, -1)
     assert len({tuple(subset(2, seed)) for seed in range(6)}) > 1
-    with pytest.raises(InputError, match="--sample asks for 6"):
+    with pytest.raises(InputError, match="`sample` asks for 6"):
         subset(6, 0)
 
 
@@ -197,7 +202,7 @@ def test_no_usable_photo_is_a_line(tmp_path: Path) -> None:
     Image.fromarray(picture(72, 54)).save(tmp_path / "photos" / "0.png")
     done = build(tmp_path, tmp_path / "out")
     assert (
-        "none of 1 photos gave a sample; for example 0.png: no depth map in --depth: "
+        "none of 1 photos gave a sample; for example 0.png: no depth map in the depth folder: "
         in done.lines[-1]
     )
     assert not (tmp_path / "out").exists()
@@ -206,15 +211,27 @@ def test_no_usable_photo_is_a_line(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (("--threads", 0), "--threads"), (("--disparity", 0.5, 0.1), "--disparity 0.5 0.1"),
-        (("--disparity", 0.1, 9), "--disparity 0.1 9"), (("--base", "sharp"), "--depth"),
+        (("--threads", 0), "--threads"),
+        (("--disparity", 0.5, 0.1), "--disparity 0.5 0.1"),
+        (("--disparity", 0.1, 9), "--disparity 0.1 9"),
+        (("--base", "sharp"), "--depth"),
         (("--depth", __file__), f"--depth {__file__}: no such folder"),
-        (("--inpainter", "nobody"), "--inpainter nobody"), (("--inpainter", "propainter"), "inpainter propainter"),
-        (("--inpainter", "geometry", "--inpainter-weights", "w"), "geometry takes neither --inpainter-weights"),
-        (("--inpainter", "opencv", "--inpainter-side", 320), "opencv takes neither --inpainter-weights"),
-        (("--inpainter", "propainter", "--inpainter-side", 64), "--inpainter-side must be between 128 and 1536"),
+        (("--inpainter", "nobody"), "--inpainter nobody"),
+        (("--inpainter", "propainter"), "inpainter propainter"),
+        (
+            ("--inpainter", "geometry", "--inpainter-weights", "w"),
+            "geometry takes neither --inpainter-weights",
+        ),
+        (
+            ("--inpainter", "opencv", "--inpainter-side", 320),
+            "opencv takes neither --inpainter-weights",
+        ),
+        (
+            ("--inpainter", "propainter", "--inpainter-side", 64),
+            "--inpainter-side must be between 128 and 1536",
+        ),
     ],
-)  # fmt: skip
+)
 def test_bad_options_leave_nothing(
     place: Path, tmp_path: Path, options: tuple[object, ...], said: str
 ) -> None:
@@ -288,7 +305,8 @@ def test_training_takes_each_view_once_and_judges_by_others(whole: Path, copy: P
 
 
 def test_the_papers_recipe_learns_from_a_dataset(whole: Path, tmp_path: Path) -> None:
-    options = f"data.pseudo={whole} data.cells=16 data.validation_views=8 loss.features=none optim.batch=2"
+    options = f"data.pseudo={whole} data.cells=16 data.validation_views=8"
+    options += " loss.features=none optim.batch=2"
     done = run(
         "train", "--recipe", "paper", "-o", tmp_path / "out", *options.split(), "optim.steps=1"
     )

@@ -20,13 +20,13 @@ from PIL import Image
 from torch.utils.data import DataLoader
 
 from spackle.paper.dataset import DatasetFiles
-from spackle.paper.dataset.sample import (
-    END_OF_ARCHIVE,
+from spackle.paper.dataset.encoding import (
     decode_alpha,
     decode_depth,
     encode_alpha,
     encode_depth,
 )
+from spackle.paper.dataset.sample import END_OF_ARCHIVE
 from spackle.paper.dataset.shards import load_manifest
 from spackle.render import get_renderer
 from spackle.residual import hole_mask

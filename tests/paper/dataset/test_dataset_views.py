@@ -87,7 +87,8 @@ class Numbering:
 def test_an_inpainter_gets_the_views_in_the_order_of_the_path() -> None:
     stack = stack_of(0.3, -0.3, -0.4)
     inpainter, order = Numbering(), [1, 0, 2, 3]
-    targets = paint_video(inpainter, stack)  # type: ignore[arg-type]  # no inpainter in all respects
+    # It is no inpainter in all respects.
+    targets = paint_video(inpainter, stack)  # type: ignore[arg-type]
     rgb, hole, inverse_depth = inpainter.inputs
     assert torch.equal(rgb, stack.rgb[order])
     assert torch.equal(hole, stack.mask[order])

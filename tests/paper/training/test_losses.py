@@ -201,7 +201,8 @@ def test_distance_weighs_cells_by_their_share_of_the_hole() -> None:
         def __call__(self, images: Tensor) -> list[Tensor]:
             return [F.max_pool2d(images, 2)]
 
-    # The hole covers 3/4 of the left cell, which is wrong, and 1/4 of the right cell, which is right.
+    # The hole covers 3/4 of the left cell, which is wrong, and 1/4 of the right cell, which is
+    # right.
     assert hole_distance(Halved(), rgb, target, hole) == pytest.approx(0.75 * (2 - math.sqrt(2)))
 
 

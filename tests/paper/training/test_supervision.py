@@ -76,14 +76,18 @@ def surface(scene: Scene) -> Tensor:
 
 
 def outside(scene: Scene, viewer: Camera, margin: float = 0.0) -> Tensor:
-    """[H, W] bool: pixels whose points lie more than `margin` pixels outside of another camera's frame."""
+    """[H, W] bool: pixels whose points lie more than `margin` pixels outside of another camera's
+    frame.
+    """
     uv, z = viewer.project(surface(scene))
     size = torch.tensor([viewer.width, viewer.height])
     return ((uv < -margin) | (uv > size + margin)).any(-1) | (z <= 0)
 
 
 def hidden(scene: Scene, viewer: Camera) -> Tensor:
-    """[H, W] bool: pixels of frontal surfaces whose line to another camera meets another surface of the photo."""
+    """[H, W] bool: pixels of frontal surfaces whose line to another camera meets another surface
+    of the photo.
+    """
     points, eye, (height, width) = surface(scene), viewer.position, scene.depth.shape
     covered = torch.zeros(height, width, dtype=torch.bool)
     for z in scene.depth.unique():
@@ -229,7 +233,9 @@ def test_a_cut_out_is_nearer_than_its_background(
     seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def composite(objects: int) -> tuple[Tensor, Tensor]:
-        """A composite of photos with one colour each; more objects do not change earlier objects."""
+        """A composite of photos with one colour each; more objects do not change earlier
+        objects.
+        """
         monkeypatch.setattr(composites, "CUTOUT_COUNT", (objects, objects))
         colors = iter(PALETTE)
         return composites.compose_cutouts(
@@ -296,7 +302,9 @@ def test_a_sample_file_is_small_and_renders_the_same(tmp_path: Path) -> None:
 
 
 def fill(folder: Path, killed_at: int | None = None) -> tuple[list[str], list[float]]:
-    """Files of the samples of five views, and the camera positions of the views made in this call."""
+    """Files of the samples of five views, and the camera positions of the views made in this
+    call.
+    """
     asked: list[float] = []
 
     def view(rng: np.random.Generator, number: int) -> Sample:

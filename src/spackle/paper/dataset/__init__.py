@@ -1,4 +1,9 @@
-"""The pseudo-supervised dataset (paper, appendix): photos' views with holes, and completed targets, in shards."""
+"""The pseudo-supervised dataset (paper, appendix): views with holes and completed targets, in
+shards.
+
+Read `build_dataset` in build.py for the way from photos to files, and `DatasetFiles` in shards.py
+for the way back.
+"""
 
 from spackle.paper.dataset.sample import DatasetView, PhotoGroup
 from spackle.paper.dataset.shards import DatasetFiles

@@ -1,4 +1,6 @@
-"""`spackle dataset info`, `verify` and `preview`: a dataset's contents, its integrity, and its images."""
+"""`spackle dataset info`, `verify` and `preview`: a dataset's contents, its integrity, and its
+images.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,7 @@ from torch import Tensor
 
 from spackle.formats import save_png
 from spackle.formats.png import contact_sheet
-from spackle.paper.dataset.sample import END_OF_ARCHIVE
+from spackle.paper.dataset.sample import END_OF_ARCHIVE, PhotoGroup
 from spackle.paper.dataset.shards import (
     DatasetFiles,
     Manifest,
@@ -31,62 +33,81 @@ from spackle.video.encoding import save_video
 
 SHEET_FILE = "sheet.png"
 VIDEO_FILE = "trajectory.mp4"
-THUMBNAIL_SIDE_PX = 192  # pixels of a thumbnail's longer side
-PREVIEW_FPS = 8
+THUMBNAIL_SIDE_PX = 192  # the longer side
+PREVIEW_FPS = 8  # slow enough to compare the two halves of a frame
 
 
 def show_info(location: str, console: Console) -> None:
-    """Print a dataset's counts, sizes, holes and configuration."""
+    """Print a dataset's counts, sizes, holes and configuration; InputError without a manifest."""
     manifest = load_manifest(location)
-    samples = manifest.samples
+    sample_count = len(manifest.samples)
+    state = "complete" if manifest.complete else "not finished"
+    photos = pluralized(sample_count, "photo")
+    shards = pluralized(len(manifest.shards), "shard")
+    bytes_per_photo = manifest.size // max(1, sample_count)
     lines = [
-        printable_line(f"{location}: {'complete' if manifest.complete else 'not finished'}"),
-        f"{pluralized(len(samples), 'photo')}, {manifest.views} views, {pluralized(len(manifest.shards), 'shard')}",
-        f"{decimal(manifest.size)}, {decimal(manifest.size // max(1, len(samples)))} a photo",
+        printable_line(f"{location}: {state}"),
+        f"{photos}, {manifest.views} views, {shards}",
+        f"{decimal(manifest.size)}, {decimal(bytes_per_photo)} a photo",
     ]
-    if skipped := sum(len(shard.passed_over) for shard in manifest.shards):
-        lines.append(f"{skipped} photos gave no sample: manifest.json says why")
-    if samples:
-        holes = np.mean([sample.holes for _, sample in samples], axis=0)
-        lines.append("holes of each view: " + " ".join(f"{share:.1%}" for share in holes))
+
+    skipped_count = sum(len(shard.passed_over) for shard in manifest.shards)
+    if skipped_count:
+        lines.append(f"{skipped_count} photos gave no sample: manifest.json says why")
+    if sample_count:
+        hole_ratios = np.mean([sample.holes for _, sample in manifest.samples], axis=0)  # [views]
+        lines.append("holes of each view: " + " ".join(f"{ratio:.1%}" for ratio in hole_ratios))
     lines.append("configuration: " + json.dumps(manifest.config, indent=1, sort_keys=True))
     for line in lines:
         console.print(line, markup=False, soft_wrap=True)
 
 
 def verify_dataset(location: str, reporter: Reporter) -> int:
-    """Read every byte and log each problem; returns the number of problems. InputError without a manifest."""
+    """Read every byte of a dataset and log each problem; returns the number of problems.
+
+    InputError if the dataset has no readable manifest, which lists what should be there.
+    """
     manifest = load_manifest(location)
-    count = 0
-    with reporter.stage("verify") as step:
-        for line in find_problems(location, manifest, step):
-            reporter.log(f"{location}: {line}")
-            count += 1
-    if not count:
-        reporter.log(
-            f"{location}: {len(manifest.samples)} photos, {decimal(manifest.size)}, undamaged"
-        )
-    return count
+    problem_count = 0
+    with reporter.stage("verify") as progress:
+        for problem in find_problems(location, manifest, progress):
+            reporter.log(f"{location}: {problem}")
+            problem_count += 1
+    if problem_count == 0:
+        size = decimal(manifest.size)
+        reporter.log(f"{location}: {len(manifest.samples)} photos, {size}, undamaged")
+    return problem_count
 
 
 def find_problems(
     location: str | os.PathLike[str], manifest: Manifest, progress: Progress
 ) -> Iterator[str]:
-    """Read every byte of a dataset and yield a line for each problem. `progress` counts bytes."""
-    done = 0
+    """Read every byte of a dataset and yield a line for each problem.
+
+    Args:
+        location: the dataset: a folder, or a URL for fsspec.
+        manifest: of the dataset.
+        progress: receives (bytes read, bytes in all).
+    """
     if not manifest.complete:
         yield "the dataset is not finished: run the same `spackle dataset build` again"
+    checked_bytes = 0
     for shard in manifest.shards:
         try:
-            yield from (f"{shard.file}: {line}" for line in find_shard_problems(location, shard))
+            for problem in find_shard_problems(location, shard):
+                yield f"{shard.file}: {problem}"
         except InputError as error:
             yield str(error)
-        done += shard.size
-        progress(done, manifest.size)
+        checked_bytes += shard.size
+        progress(checked_bytes, manifest.size)
 
 
 def find_shard_problems(location: str | os.PathLike[str], shard: ShardEntry) -> Iterator[str]:
-    """Check a shard's size, the digest of each sample, and the end of the archive; InputError if reading fails."""
+    """Yield a line for each problem of a shard, one tar file of a dataset.
+
+    Its size, the digest of each sample and the end of the archive are checked. InputError if
+    reading fails.
+    """
     with (
         open_dataset_file(location, shard.file) as file,
         as_input_error(shard.file, "cannot be read: {reason}", OSError),
@@ -94,45 +115,65 @@ def find_shard_problems(location: str | os.PathLike[str], shard: ShardEntry) -> 
         size = file.seek(0, os.SEEK_END)
         if size != shard.size:
             yield f"{size:,} bytes instead of {shard.size:,}"
+
         file.seek(0)
-        damaged = False
+        is_damaged = False
         for sample in shard.samples:
             if hashlib.sha256(file.read(sample.size)).hexdigest() != sample.sha256:
-                damaged = True
+                is_damaged = True
                 yield f"sample {sample.key} ({sample.photo}) is damaged"
-        if not damaged and file.read(len(END_OF_ARCHIVE)) != END_OF_ARCHIVE:
+        # After a damaged sample, a wrong end would only be the same problem once more.
+        if not is_damaged and file.read(len(END_OF_ARCHIVE)) != END_OF_ARCHIVE:
             yield "damaged after its last sample"
 
 
 def preview_dataset(
     location: str, output: Path, photos: int, views: int, reporter: Reporter
 ) -> None:
-    """Write a sheet of base, mask and target for some views of some photos, and a video that shows base beside target.
+    """Write pictures of a dataset into a folder: sheet.png and trajectory.mp4.
 
-    InputError if the dataset is unfinished or damaged, or the folder cannot be written to.
+    The sheet has three rows for each photo: what the photo's Gaussians show, the mask of the
+    holes, and the target. The video shows the views of the first photo beside their targets.
+
+    Args:
+        location: the dataset: a folder, or a URL for fsspec.
+        output: the folder.
+        photos: number of photos on the sheet.
+        views: number of views of each photo on the sheet.
+        reporter: says where the files are.
+
+    Raises:
+        InputError: the dataset is unfinished or damaged, or the folder cannot be written to.
     """
     files = DatasetFiles(location)
     with results_folder(output, (SHEET_FILE, VIDEO_FILE), locked=True):
         groups = [files[index] for index in spread_indices(len(files), photos)]
         rows: list[list[Tensor]] = []
         for group in groups:
-            chosen = [group.view(index) for index in spread_indices(group.views, views)]
-            masks = [view.mask[..., None].expand(-1, -1, 3).float() for view in chosen]
-            rows += [
-                [view.rendering.rgb for view in chosen],
-                masks,
-                [view.target for view in chosen],
-            ]
+            rows += sheet_rows(group, views)
         save_png(contact_sheet(rows, THUMBNAIL_SIDE_PX, fill=1.0), output / SHEET_FILE)
-        # View 0 is the photo's view, which is not on the path.
-        path = (groups[0].view(index) for index in range(1, groups[0].views))
-        save_video(
-            (torch.cat([view.rendering.rgb, view.target], dim=1) for view in path),
-            output / VIDEO_FILE,
-            fps=PREVIEW_FPS,
-        )
+        save_video(frames_beside_targets(groups[0]), output / VIDEO_FILE, fps=PREVIEW_FPS)
     reporter.log(f"{SHEET_FILE} and {VIDEO_FILE} -> {output}")
 
 
+def sheet_rows(group: PhotoGroup, view_count: int) -> list[list[Tensor]]:
+    """Three rows of pictures [H, W, 3] of some of a photo's views: rendering, mask, target."""
+    views = [group.view(index) for index in spread_indices(group.views, view_count)]
+    renderings = [view.rendering.rgb for view in views]
+    masks = [view.mask[..., None].expand(-1, -1, 3).float() for view in views]
+    targets = [view.target for view in views]
+    return [renderings, masks, targets]
+
+
+def frames_beside_targets(group: PhotoGroup) -> Iterator[Tensor]:
+    """Yield a photo's views along the path, each beside its target, as [H, 2 W, 3] sRGB."""
+    # View 0 is the photo's view, which is not on the path.
+    for index in range(1, group.views):
+        view = group.view(index)
+        yield torch.cat([view.rendering.rgb, view.target], dim=1)
+
+
 def spread_indices(total: int, count: int) -> list[int]:
-    return sorted({round(place) for place in np.linspace(0, total - 1, min(count, total))})
+    """Up to `count` different indices below `total`, evenly spread, the first and last included."""
+    positions = np.linspace(0, total - 1, min(count, total))
+    return sorted({round(position) for position in positions})

@@ -17,7 +17,8 @@ from spackle.runtime.files import list_files
 from spackle.runtime.progress import Progress
 
 DATASET_PHOTO_SUFFIXES = (*PHOTO_SUFFIXES, ".gif", ".bmp")
-MIN_SIDE_PX = 32  # pixels: no depth can be recognised in smaller images
+MIN_SIDE_PX = 32  # no depth can be recognised in smaller images
+MAX_SHOWN_CHARACTERS = 60  # of a bad name, in a message
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,39 +32,66 @@ class PhotoFile:
 
     @property
     def key(self) -> str:
-        """The photo's number as text; the names of the photo's files in the dataset begin with this key."""
+        """The photo's number as text, with which the names of its files in the dataset begin."""
         return f"{self.index:06d}"
 
 
 def find_photos(
     source: Path, folder: Path | None, log: Callable[[str], None]
 ) -> tuple[Path, list[str]]:
-    """Find a dataset's photos; returns the folder, and the photos' sorted names relative to the folder.
+    """Find a dataset's photos.
 
     Args:
-        source: a folder, whose subfolders are included, or a COCO file `{"images": [{"file_name": …}, …]}`.
+        source: a folder, whose subfolders are included, or a COCO file, a list of photos as
+            `{"images": [{"file_name": …}, …]}`.
         folder: the folder of the COCO file's photos; None: the file's own folder.
         log: receives a line if photos that the COCO file names are missing.
+
+    Returns:
+        The folder, and the photos' sorted names relative to the folder.
 
     Raises:
         InputError: there is no photo, or no such file.
     """
     if not os.path.isdir(source):
-        return _named_by_coco(source, folder, log)
-    names = [
-        file.relative_to(source).as_posix()
-        for file in list_files(source, DATASET_PHOTO_SUFFIXES, below=True)
-    ]
-    if not names:
+        return find_coco_photos(source, folder, log)
+    files = list_files(source, DATASET_PHOTO_SUFFIXES, below=True)
+    if not files:
         raise InputError(
             f"{source}: no photos in this folder (looked for {', '.join(DATASET_PHOTO_SUFFIXES)})"
         )
-    return source, sorted(names)
+    return source, sorted(file.relative_to(source).as_posix() for file in files)
 
 
-def _named_by_coco(
+def find_coco_photos(
     source: Path, folder: Path | None, log: Callable[[str], None]
 ) -> tuple[Path, list[str]]:
+    """Find the photos that a COCO file names; arguments and result as of `find_photos`.
+
+    InputError if the file is no COCO file, names no photos, or none of them is there.
+    """
+    names = read_coco_names(source)
+    root = source.parent if folder is None else folder
+    unique_names = sorted({Path(name).as_posix() for name in names})
+    present = [name for name in unique_names if os.path.isfile(root / name)]
+    if not present:
+        raise InputError(
+            f"{source}: none of the {len(unique_names)} images is in {root}: give their folder "
+            "with `images`"
+        )
+
+    missing = sorted(set(unique_names) - set(present))
+    if missing:
+        log(f"{len(missing)} images that {source} names are not in {root}, such as {missing[0]}")
+    return root, present
+
+
+def read_coco_names(source: Path) -> list[str]:
+    """The names of the photos in a COCO file; InputError if it is none, names none or a bad one.
+
+    A name that is absolute or leads out of the folder of photos is bad: the file may be a
+    stranger's.
+    """
     with as_input_error(
         source, 'neither a folder nor COCO annotations {"images": [{"file_name": …}, …]}: {reason}'
     ):
@@ -71,25 +99,13 @@ def _named_by_coco(
         names = [image["file_name"] for image in content["images"]]
     if not names:
         raise InputError(f"{source}: names no images")
-    root = source.parent if folder is None else folder
-    for name in names:  # names must not lead out of the folder
-        if (
-            not isinstance(name, str)
-            or not name
-            or "\0" in name
-            or name.startswith("/")
-            or ".." in Path(name).parts
-        ):
-            raise InputError(f"{source}: {str(name)[:60]!r} is not the file name of an image")
-    unique = sorted({Path(name).as_posix() for name in names})
-    present = [name for name in unique if os.path.isfile(root / name)]
-    if not present:
-        raise InputError(
-            f"{source}: none of the {len(unique)} images is in {root}: give their folder with --images"
-        )
-    if missing := sorted(set(unique) - set(present)):
-        log(f"{len(missing)} images that {source} names are not in {root}, such as {missing[0]}")
-    return root, present
+
+    for name in names:
+        is_name = isinstance(name, str) and name != "" and "\0" not in name
+        if not is_name or name.startswith("/") or ".." in Path(name).parts:
+            shown = repr(str(name)[:MAX_SHOWN_CHARACTERS])
+            raise InputError(f"{source}: {shown} is not the file name of an image")
+    return names
 
 
 def choose_photos(
@@ -100,43 +116,59 @@ def choose_photos(
     warn: Callable[[str], None],
     progress: Progress,
 ) -> list[PhotoFile]:
-    """Choose a dataset's photos, sorted by name: all, or a random subset of `count`.
+    """Choose a dataset's photos, sorted by name: all, or a random subset.
 
-    The subset depends on names, contents and seed alone. Unreadable photos, small photos and copies are reported to
-    `warn` and replaced by other photos. InputError if fewer than `count` photos are usable.
+    The subset depends on names, contents and seed alone, not on the order of the names. Unreadable
+    photos, small photos and copies are replaced by other photos.
+
+    Args:
+        root: the folder of the photos.
+        names: their names, relative to the folder.
+        count: number of photos; None: all.
+        seed: determines the subset.
+        warn: receives a line for each photo that cannot be used.
+        progress: receives (photos chosen, photos wanted).
+
+    Raises:
+        InputError: no photo is usable, or fewer than `count` are.
     """
-    wanted = len(names) if count is None else count
-    order = (
-        names
-        if count is None
-        else sorted(names, key=lambda n: hashlib.sha256(f"{seed}:{n}".encode()).digest())
-    )
+    wanted_count = len(names) if count is None else count
+    order = list(names)
+    if count is not None:
+        # A random order that each name determines for itself: new photos do not change the others'.
+        order.sort(key=lambda name: hashlib.sha256(f"{seed}:{name}".encode()).digest())
+
     chosen: dict[str, str] = {}  # names by SHA-256 of the files
     for name in order:
-        if len(chosen) == wanted:
+        if len(chosen) == wanted_count:
             break
-        path = root / name
         try:
-            photo = load_photo(path)  # decodes all pixels, to find damage
-            if min(photo.width, photo.height) < MIN_SIDE_PX:
-                size = f"{photo.width}×{photo.height}"
-                raise InputError(
-                    f"{path}: {size} pixels are too few (at least {MIN_SIDE_PX} each way)"
-                )
-            with open(path, "rb") as file:
-                sha256 = sha256_of(file)
-            if chosen.setdefault(sha256, name) != name:
-                raise InputError(f"{path}: the same photo as {chosen[sha256]}")
+            sha256 = check_photo_file(root / name)
+            if sha256 in chosen:
+                raise InputError(f"{root / name}: the same photo as {chosen[sha256]}")
+            chosen[sha256] = name
         except InputError as error:
             warn(f"passed over: {error}")
-        progress(len(chosen), wanted)
+        progress(len(chosen), wanted_count)
+
     if not chosen:
         raise InputError(
             f"{root}: none of {len(names)} photos can be used (the lines above say why)"
         )
     if count is not None and len(chosen) < count:
-        raise InputError(f"{root}: {len(chosen)} photos can be used, and --sample asks for {count}")
-    by_name = sorted((name, sha256) for sha256, name in chosen.items())
+        raise InputError(f"{root}: {len(chosen)} photos can be used, and `sample` asks for {count}")
+    names_and_digests = sorted((name, sha256) for sha256, name in chosen.items())
     return [
-        PhotoFile(index, root / name, name, sha256) for index, (name, sha256) in enumerate(by_name)
+        PhotoFile(index, root / name, name, sha256)
+        for index, (name, sha256) in enumerate(names_and_digests)
     ]
+
+
+def check_photo_file(path: Path) -> str:
+    """Read a photo; returns the SHA-256 of its file. InputError if it is damaged or too small."""
+    photo = load_photo(path)  # decodes all pixels, to find damage
+    if min(photo.width, photo.height) < MIN_SIDE_PX:
+        size = f"{photo.width}×{photo.height}"
+        raise InputError(f"{path}: {size} pixels are too few (at least {MIN_SIDE_PX} each way)")
+    with open(path, "rb") as file:
+        return sha256_of(file)

@@ -1,43 +1,41 @@
-"""Encode and decode a photo with its views as part of a tar archive; see docs/dataset.md.
+"""A photo with its views as a part of a tar archive: `pack_sample` writes it, `PhotoGroup` reads
+it.
 
-The same sample always has the same bytes. The loss in colours, opacity and depth is invisible; the loss in Gaussians is
-less than 1e-3 of a pixel; masks and cameras are exact.
+The same sample always has the same bytes. docs/dataset.md describes the files; encoding.py has the
+formats of pictures and Gaussians. Cameras are exact.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-import io
 import json
-import math
 import tarfile
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-import torch
-from numpy.typing import NDArray
-from PIL import Image
-from safetensors.numpy import load, save
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from spackle.core.camera import Camera
-from spackle.core.color import to_uint8
 from spackle.core.gaussians import Gaussians
-from spackle.core.image_files import check_pixel_count
 from spackle.formats.camera_files import camera_from_json
+from spackle.paper.dataset.encoding import (
+    decode_alpha,
+    decode_depth,
+    decode_gaussians,
+    decode_mask,
+    decode_rgb,
+    encode_alpha,
+    encode_depth,
+    encode_gaussians,
+    encode_mask,
+    encode_rgb,
+)
 from spackle.paper.dataset.views import ViewStack
 from spackle.render.protocol import Rendering
 from spackle.runtime.errors import as_input_error
 
-PNG_COMPRESSION_LEVEL = (
-    1  # zlib's level: level 6 takes three times as long and saves a tenth of the bytes
-)
-MAX_CODE = 65535
-MIN_SCALE = 1e-30
-END_OF_ARCHIVE = bytes(2 * tarfile.BLOCKSIZE)  # the end-of-archive mark
+END_OF_ARCHIVE = bytes(2 * tarfile.BLOCKSIZE)  # two empty blocks end a tar archive
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,55 +44,73 @@ class DatasetView:
 
     key: str  # the photo's key in its dataset
     index: int  # the view's number; 0 is the photo's camera
-    photo: Tensor  # [h, w, 3] sRGB at its working size
+    photo: Tensor  # [h, w, 3] sRGB, reduced to at most 1536 pixels on the longer side
     photo_camera: Camera
     camera: Camera  # the view's
-    rendering: Rendering  # of the base: rgb [H, W, 3], depth [H, W], alpha [H, W]
-    mask: Tensor  # [H, W] bool: uncovered
+    rendering: Rendering  # of the photo's Gaussians: rgb [H, W, 3], depth [H, W], alpha [H, W]
+    mask: Tensor  # [H, W] bool: uncovered by these Gaussians
     target: Tensor  # [H, W, 3] sRGB, completed
 
 
 def pack_sample(
     key: str, photo: Tensor, stack: ViewStack, targets: Tensor, facts: Mapping[str, Any]
 ) -> bytes:
-    """Pack a photo for a tar archive: KEY.json, KEY.photo.png, KEY.base.safetensors, then five files per view.
+    """Pack a photo with its views for a tar archive.
 
-    The bytes have no end-of-archive mark and record no time, owner or machine. `photo` [h, w, 3] (at its working size)
-    and `targets` [V, H, W, 3] are sRGB; `facts` become part of the JSON, and must hold "threshold" (of the mask) and
-    "trajectory".
+    The archive's files are KEY.json, KEY.photo.png, KEY.base.safetensors (the photo's Gaussians),
+    then five pictures for each view: rgb, target, mask, alpha, depth. The bytes have no
+    end-of-archive mark and record no time, owner or machine.
+
+    Args:
+        key: begins the names of the files.
+        photo: [h, w, 3] sRGB.
+        stack: V views of the photo's Gaussians.
+        targets: [V, H, W, 3] sRGB, the completed views.
+        facts: become part of the JSON; they must hold "threshold" (the opacity below which a pixel
+            is masked) and "trajectory".
     """
-    files: list[tuple[str, bytes]] = []
-    views: list[dict[str, Any]] = []
+    view_files: list[tuple[str, bytes]] = []  # names and contents
+    view_facts: list[dict[str, Any]] = []
     for index, camera in enumerate(stack.cameras):
-        rgb, depth, alpha, mask = (
-            field[index] for field in (stack.rgb, stack.depth, stack.alpha, stack.mask)
-        )
-        depth_png, depth_range = encode_depth(depth, alpha)
-        kinds = {
-            "rgb": encode_rgb(rgb),
+        alpha = stack.alpha[index]
+        mask = stack.mask[index]
+        depth_png, depth_range = encode_depth(stack.depth[index], alpha)
+        pictures = {
+            "rgb": encode_rgb(stack.rgb[index]),
             "target": encode_rgb(targets[index]),
-            "mask": _png(mask.cpu().numpy().astype(np.uint8) * np.uint8(255)),
+            "mask": encode_mask(mask),
             "alpha": encode_alpha(alpha, mask, facts["threshold"]),
             "depth": depth_png,
         }
-        files += [(f"{key}.{index:02d}.{kind}.png", data) for kind, data in kinds.items()]
-        views.append(
-            _camera_facts(camera)
-            | {"depth_range": list(depth_range), "hole": float(mask.double().mean())}
+        for kind, content in pictures.items():
+            view_files.append((f"{key}.{index:02d}.{kind}.png", content))
+        hole_ratio = float(mask.double().mean())
+        view_facts.append(
+            camera_facts(camera) | {"depth_range": list(depth_range), "hole": hole_ratio}
         )
-    common = {"key": key, "photo_camera": _camera_facts(stack.prediction.camera), "views": views}
-    text = json.dumps({**facts, **common}, indent=1, sort_keys=True, allow_nan=False) + "\n"
-    first = [(f"{key}.json", text.encode()), (f"{key}.photo.png", encode_rgb(photo))]
-    parts: list[bytes] = []
-    for name, data in [
-        *first,
+
+    photo_facts = {
+        **facts,
+        "key": key,
+        "photo_camera": camera_facts(stack.prediction.camera),
+        "views": view_facts,
+    }
+    text = json.dumps(photo_facts, indent=1, sort_keys=True, allow_nan=False) + "\n"
+    files = [
+        (f"{key}.json", text.encode()),
+        (f"{key}.photo.png", encode_rgb(photo)),
         (f"{key}.base.safetensors", encode_gaussians(stack.prediction.gaussians)),
-        *files,
-    ]:
-        header = tarfile.TarInfo(name)  # mtime 0, uid 0, gid 0, mode 644
-        header.size = len(data)
-        parts += [header.tobuf(tarfile.USTAR_FORMAT), data, bytes(-len(data) % tarfile.BLOCKSIZE)]
-    return b"".join(parts)
+        *view_files,
+    ]
+    return b"".join(tar_member(name, content) for name, content in files)
+
+
+def tar_member(name: str, content: bytes) -> bytes:
+    """A file as a member of a tar archive: header, content, and zeros up to a full block."""
+    header = tarfile.TarInfo(name)  # mtime 0, uid 0, gid 0, mode 644
+    header.size = len(content)
+    padding = bytes(-len(content) % tarfile.BLOCKSIZE)  # zeros up to the next block
+    return header.tobuf(tarfile.USTAR_FORMAT) + content + padding
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,69 +118,107 @@ class PhotoGroup:
     """The encoded files of a photo."""
 
     key: str
-    files: Mapping[str, bytes]
+    files: Mapping[str, bytes]  # contents by name
     facts: Mapping[str, Any]  # the contents of KEY.json
-    holes: tuple[float, ...]  # HAR of each view (paper, eq. 11)
+    holes: tuple[float, ...]  # share of uncovered pixels of each view (HAR, eq. 11 of the paper)
     where: str  # the source, for messages
 
     @staticmethod
     def from_tar(key: str, data: bytes, where: str) -> PhotoGroup:
-        """Split a photo's part of a shard into files; InputError for damaged bytes."""
-        files: dict[str, bytes] = {}
+        """Split a photo's part of a tar archive into files.
+
+        Args:
+            key: begins the names of the photo's files.
+            data: the bytes that `pack_sample` has made.
+            where: what messages call the data.
+
+        Raises:
+            InputError: the bytes are damaged.
+        """
         with as_input_error(where, "not a photo of a dataset, or damaged: {reason}"):
-            at = 0
-            while at < len(data):  # `pack_sample` writes plain files only: no links or sparse files
-                member = tarfile.TarInfo.frombuf(
-                    data[at : at + tarfile.BLOCKSIZE], "utf-8", "strict"
-                )
-                begin = at + tarfile.BLOCKSIZE
-                if member.type != tarfile.REGTYPE or not 0 <= member.size <= len(data) - begin:
-                    raise ValueError(f"{member.name} is no plain file")
-                files[member.name] = data[begin : begin + member.size]
-                at = begin + member.size + -member.size % tarfile.BLOCKSIZE
+            files = split_tar(data)
             facts = json.loads(files[f"{key}.json"])
             holes = tuple(float(view["hole"]) for view in facts["views"])
         return PhotoGroup(key, files, facts, holes, where)
 
     @property
     def views(self) -> int:
+        """The number of views."""
         return len(self.holes)
 
     def view(self, index: int) -> DatasetView:
-        """Decode one view; InputError if a file is missing or damaged."""
+        """Decode one view, by its number; InputError if a file is missing or damaged."""
         with as_input_error(f"{self.where}: view {index}", "cannot be read: {reason}"):
             facts = self.facts["views"][index]
-            rgb, target = (decode_rgb(self._file(index, kind)) for kind in ("rgb", "target"))
-            depth = decode_depth(self._file(index, "depth"), *facts["depth_range"])
+            near, far = facts["depth_range"]
+            rendering = Rendering(
+                decode_rgb(self._picture(index, "rgb")),
+                decode_depth(self._picture(index, "depth"), near, far),
+                decode_alpha(self._picture(index, "alpha")),
+            )
             view = DatasetView(
                 key=self.key,
                 index=index,
                 photo=decode_rgb(self.files[f"{self.key}.photo.png"]),
                 photo_camera=camera_from_json(self.facts["photo_camera"], self.where),
                 camera=camera_from_json(facts, self.where),
-                rendering=Rendering(rgb, depth, decode_alpha(self._file(index, "alpha"))),
-                mask=torch.from_numpy(_pixels(self._file(index, "mask"), 2)) > 127,
-                target=target,
+                rendering=rendering,
+                mask=decode_mask(self._picture(index, "mask")),
+                target=decode_rgb(self._picture(index, "target")),
             )
-            for camera, pictures in (
-                (view.camera, (rgb, depth, view.rendering.alpha, view.mask, target)),
-                (view.photo_camera, (view.photo,)),
-            ):
-                if any(picture.shape[:2] != (camera.height, camera.width) for picture in pictures):
-                    raise ValueError("a picture has another size than its camera")
+            check_sizes(view)
             return view
 
     @functools.cached_property
     def base(self) -> Gaussians:
-        """Decode the photo's Gaussians; InputError if the file is missing or damaged."""
+        """The photo's Gaussians, decoded when first asked for; InputError for a damaged file."""
         with as_input_error(f"{self.where}: Gaussians", "cannot be read: {reason}"):
             return decode_gaussians(self.files[f"{self.key}.base.safetensors"])
 
-    def _file(self, index: int, kind: str) -> bytes:
+    def _picture(self, index: int, kind: str) -> bytes:
+        """The PNG of a view: "rgb", "target", "mask", "alpha" or "depth"; KeyError if it is
+        missing.
+        """
         return self.files[f"{self.key}.{index:02d}.{kind}.png"]
 
 
-def _camera_facts(camera: Camera) -> dict[str, Any]:
+def split_tar(data: bytes) -> dict[str, bytes]:
+    """The contents of an archive's files by name; `data` has no end-of-archive mark.
+
+    Only plain files are accepted, as `pack_sample` writes no other: a stranger's links and sparse
+    files would need care. ValueError, or an exception of tarfile, if the data are damaged.
+    """
+    files: dict[str, bytes] = {}
+    position = 0
+    while position < len(data):
+        header = data[position : position + tarfile.BLOCKSIZE]
+        member = tarfile.TarInfo.frombuf(header, "utf-8", "strict")
+        start = position + tarfile.BLOCKSIZE
+        if member.type != tarfile.REGTYPE or not 0 <= member.size <= len(data) - start:
+            raise ValueError(f"{member.name} is no plain file")
+        files[member.name] = data[start : start + member.size]
+        padding = -member.size % tarfile.BLOCKSIZE  # zeros up to the next block
+        position = start + member.size + padding
+    return files
+
+
+def check_sizes(view: DatasetView) -> None:
+    """ValueError if a picture of a view does not have the size of its camera."""
+    pictures = [
+        (view.photo, view.photo_camera),
+        (view.rendering.rgb, view.camera),
+        (view.rendering.depth, view.camera),
+        (view.rendering.alpha, view.camera),
+        (view.mask, view.camera),
+        (view.target, view.camera),
+    ]
+    for picture, camera in pictures:
+        if picture.shape[:2] != (camera.height, camera.width):
+            raise ValueError("a picture has another size than its camera")
+
+
+def camera_facts(camera: Camera) -> dict[str, Any]:
+    """A camera as JSON: intrinsics K [3, 3], world_to_camera [4, 4], position [3] and size."""
     return {
         "K": camera.K.tolist(),
         "world_to_camera": camera.world_to_camera.tolist(),
@@ -172,95 +226,3 @@ def _camera_facts(camera: Camera) -> dict[str, Any]:
         "width": camera.width,
         "height": camera.height,
     }
-
-
-def encode_rgb(rgb: Tensor) -> bytes:
-    """Encode sRGB [H, W, 3] in 0..1 as PNG."""
-    return _png(to_uint8(rgb).numpy())
-
-
-def decode_rgb(data: bytes) -> Tensor:
-    """Decode a PNG to sRGB [H, W, 3] in 0..1."""
-    return torch.from_numpy(_pixels(data, 3)).float() / 255
-
-
-def encode_alpha(alpha: Tensor, mask: Tensor, threshold: float) -> bytes:
-    """Encode opacity [H, W] in 0..1 as 16-bit PNG, so that exactly the pixels of `mask` stay below `threshold`."""
-    codes = (alpha.detach().cpu().double() * MAX_CODE).round().clamp(0, MAX_CODE)
-    last = math.ceil(threshold * MAX_CODE) - 1  # the greatest code below the threshold
-    codes = torch.where(mask.cpu(), codes.clamp_max(last), codes.clamp_min(last + 1))
-    return _png(codes.numpy().astype(np.uint16))
-
-
-def decode_alpha(data: bytes) -> Tensor:
-    """Decode opacity [H, W] in 0..1."""
-    return torch.from_numpy(_pixels(data, 2).astype(np.float64) / MAX_CODE).float()
-
-
-def encode_depth(depth: Tensor, alpha: Tensor) -> tuple[bytes, tuple[float, float]]:
-    """Encode expected z [H, W] as PNG, in logarithmic steps; also returns (near, far) for `decode_depth`."""
-    z = depth.detach().cpu().double().numpy()
-    known = (alpha.detach().cpu().numpy() > 0) & np.isfinite(z) & (z > 0)
-    near, far = (float(z[known].min()), float(z[known].max())) if known.any() else (1.0, 1.0)
-    codes = np.zeros(z.shape, np.uint16)
-    span = max(math.log(far / near), 1e-12)
-    codes[known] = 1 + np.round((MAX_CODE - 1) * np.log(z[known] / near) / span)
-    return _png(codes), (near, far)
-
-
-def decode_depth(data: bytes, near: float, far: float) -> Tensor:
-    """Decode expected z [H, W]; 0 means unknown."""
-    codes = _pixels(data, 2).astype(np.float64)
-    z = near * np.exp((codes - 1) / (MAX_CODE - 1) * math.log(far / near))
-    return torch.from_numpy(np.where(codes > 0, z, 0.0)).float()
-
-
-def encode_gaussians(gaussians: Gaussians) -> bytes:
-    """Encode Gaussians as safetensors, 34 bytes each."""
-    means, quats, scales, opacities, colors = (t.detach().cpu().float() for t in gaussians.tensors)
-    logs = scales.double().clamp_min(MIN_SCALE).log()
-    low, high = (float(logs.min()), float(logs.max())) if len(means) else (0.0, 0.0)
-    steps = ((logs - low) / max(high - low, 1e-12) * MAX_CODE).round()
-    arrays: dict[str, NDArray[Any]] = {
-        "means": means.numpy(),
-        "quats": normalize(quats, dim=-1).half().numpy(),
-        "scales": steps.numpy().astype(np.uint16),
-        "scale_logs": np.array([low, high]),
-        "opacities": (opacities.double() * MAX_CODE)
-        .round()
-        .clamp(0, MAX_CODE)
-        .numpy()
-        .astype(np.uint16),
-        "colors": colors.half().numpy(),
-    }
-    return save(arrays)
-
-
-def decode_gaussians(data: bytes) -> Gaussians:
-    """Decode bytes of `encode_gaussians` to float32; other bytes may raise any exception."""
-    arrays = load(data)
-    low, high = arrays["scale_logs"].tolist()
-    scales = np.exp(low + arrays["scales"].astype(np.float64) / MAX_CODE * max(high - low, 1e-12))
-    opacities = arrays["opacities"].astype(np.float64) / MAX_CODE
-    columns = (arrays["means"], arrays["quats"], scales, opacities, arrays["colors"])
-    gaussians = Gaussians(
-        *(torch.from_numpy(np.ascontiguousarray(column)).float() for column in columns)
-    )
-    if not gaussians.finite:
-        raise ValueError("Gaussians that are not finite")
-    return gaussians
-
-
-def _png(pixels: NDArray[Any]) -> bytes:
-    file = io.BytesIO()
-    Image.fromarray(pixels).save(file, format="PNG", compress_level=PNG_COMPRESSION_LEVEL)
-    return file.getvalue()
-
-
-def _pixels(data: bytes, axes: int) -> NDArray[Any]:
-    with Image.open(io.BytesIO(data), formats=["PNG"]) as image:
-        check_pixel_count(*image.size, len(data), "a picture")
-        pixels = np.array(image)
-    if pixels.ndim != axes:
-        raise ValueError(f"a picture with {pixels.ndim} axes instead of {axes}")
-    return pixels

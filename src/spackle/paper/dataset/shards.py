@@ -1,4 +1,8 @@
-"""Write and read a dataset's shards and manifest, in a folder or at a URL (optional: pip install fsspec)."""
+"""Write and read a dataset: tar files of some photos each, the shards, and a manifest that lists
+them.
+
+A dataset lies in a folder or at a URL (optional: pip install fsspec). Read `DatasetFiles` first.
+"""
 
 from __future__ import annotations
 
@@ -14,12 +18,12 @@ from torch.utils.data import Dataset
 
 from spackle.paper.dataset.sample import END_OF_ARCHIVE, PhotoGroup
 from spackle.runtime.digests import json_digest
-from spackle.runtime.errors import InputError, as_input_error
+from spackle.runtime.errors import InputError, as_input_error, reason_in_a_line
 from spackle.runtime.files import atomic_path
 
 MANIFEST_NAME = "manifest.json"
 FORMAT_VERSION = 1  # version of shards and manifest; other versions are refused
-ByteCount = Annotated[int, Field(ge=0, le=1 << 40)]
+ByteCount = Annotated[int, Field(ge=0, le=1 << 40)]  # at most a terabyte
 Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
@@ -31,7 +35,7 @@ class SampleEntry(BaseModel, frozen=True, extra="forbid", strict=True):
     offset: ByteCount  # position of the sample's first byte in the shard
     size: ByteCount
     sha256: str  # of the sample's bytes
-    holes: tuple[Fraction, ...]  # HAR of each view
+    holes: tuple[Fraction, ...]  # share of uncovered pixels of each view (HAR)
 
 
 class ShardEntry(BaseModel, frozen=True, extra="forbid", strict=True):
@@ -52,7 +56,8 @@ class Manifest(BaseModel, frozen=True, extra="ignore", strict=True):
     complete: bool
 
     @model_validator(mode="after")
-    def _even(self) -> Manifest:
+    def _check_equal_view_counts(self) -> Manifest:
+        """ValueError if photos have different numbers of views."""
         if len({len(sample.holes) for _, sample in self.samples}) > 1:
             raise ValueError("photos with different numbers of views")
         return self
@@ -64,10 +69,12 @@ class Manifest(BaseModel, frozen=True, extra="ignore", strict=True):
 
     @property
     def views(self) -> int:
+        """The number of views of all photos together."""
         return sum(len(sample.holes) for _, sample in self.samples)
 
     @property
     def size(self) -> int:
+        """The size of all shards in bytes."""
         return sum(shard.size for shard in self.shards)
 
     @property
@@ -76,55 +83,75 @@ class Manifest(BaseModel, frozen=True, extra="ignore", strict=True):
         return json_digest(self._content())
 
     def save(self, folder: Path) -> None:
+        """Write manifest.json into a folder, whole or not at all, with the digest of its
+        content.
+        """
         content = self._content()
-        text = json.dumps(
-            content | {"sha256": json_digest(content)}, indent=1, sort_keys=True, allow_nan=False
-        )
+        signed_content = {**content, "sha256": json_digest(content)}
+        text = json.dumps(signed_content, indent=1, sort_keys=True, allow_nan=False)
         with atomic_path(folder / MANIFEST_NAME) as temporary:
             temporary.write_text(text + "\n", encoding="utf-8")
 
     def _content(self) -> dict[str, Any]:
+        """The manifest as JSON, without its digest; the counts are for people who read the file."""
         counts = {"photos": len(self.samples), "views": self.views, "bytes": self.size}
         return self.model_dump(mode="json") | {"format": FORMAT_VERSION, "counts": counts}
 
 
 def open_dataset_file(location: str | os.PathLike[str], name: str) -> IO[bytes]:
-    """Open a seekable file in a folder or at an fsspec address (s3://bucket/dataset); InputError if opening fails."""
-    place = f"{str(location).rstrip('/')}/{name}"
-    package = "an address needs fsspec (pip install fsspec), and perhaps a package for its protocol"
-    with (
-        as_input_error(place, f"cannot be opened ({{reason}}): {package}", ImportError, ValueError),
-        as_input_error(place, "cannot be read: {reason}", OSError),
-        as_input_error(
-            place,
-            f"no such file: is {location} a dataset of `spackle dataset build`?",
-            FileNotFoundError,
-        ),
-    ):
-        if "://" not in place:
+    """Open a file of a dataset, with random access.
+
+    Args:
+        location: the dataset: a folder, or an address for fsspec, such as s3://bucket/dataset.
+        name: the file in it.
+
+    Raises:
+        InputError: there is no such file, it cannot be read, or a package for the address is
+            missing.
+    """
+    address = f"{str(location).rstrip('/')}/{name}"
+    try:
+        if "://" not in address:
             return open(os.path.join(location, name), "rb")
         import fsspec
 
-        file: IO[bytes] = fsspec.open(place, "rb").open()
+        file: IO[bytes] = fsspec.open(address, "rb").open()
         return file
+    except FileNotFoundError as error:
+        raise InputError(
+            f"{address}: no such file: is {location} a dataset of `spackle dataset build`?"
+        ) from error
+    except OSError as error:
+        raise InputError(f"{address}: cannot be read: {reason_in_a_line(error)}") from error
+    except (ImportError, ValueError) as error:
+        raise InputError(
+            f"{address}: cannot be opened ({reason_in_a_line(error)}): an address needs fsspec "
+            "(pip install fsspec), and perhaps a package for its protocol"
+        ) from error
 
 
 def load_manifest(location: str | os.PathLike[str]) -> Manifest:
-    """Read the manifest of a dataset; InputError for a missing or damaged file, or another format."""
-    where = f"{str(location).rstrip('/')}/{MANIFEST_NAME}"
+    """Read the manifest of a dataset; InputError for a missing or damaged file, or another format.
+
+    `location` is a folder, or an address for fsspec.
+    """
+    address = f"{str(location).rstrip('/')}/{MANIFEST_NAME}"
     with (
         open_dataset_file(location, MANIFEST_NAME) as file,
-        as_input_error(where, "damaged, or no manifest of a dataset: {reason}"),
+        as_input_error(address, "damaged, or no manifest of a dataset: {reason}"),
     ):
         text = file.read()
         content = json.loads(text)
         if content["format"] != FORMAT_VERSION:
             raise InputError(
-                f"{where}: format {content['format']!r} is unknown: this Spackle reads format {FORMAT_VERSION}"
+                f"{address}: format {content['format']!r} is unknown: this Spackle reads format "
+                f"{FORMAT_VERSION}"
             )
-        recorded = content.pop("sha256")
+
+        # The digest must fit the file, and what was understood of the file.
+        recorded_digest = content.pop("sha256")
         manifest = Manifest.model_validate_json(text)
-        if not json_digest(content) == manifest.digest == recorded:
+        if not json_digest(content) == manifest.digest == recorded_digest:
             raise ValueError("the digest is wrong")
         return manifest
 
@@ -132,12 +159,19 @@ def load_manifest(location: str | os.PathLike[str]) -> Manifest:
 def write_shard(
     parts: Sequence[tuple[str, Path]], target: Path, passed_over: Sequence[str] = ()
 ) -> ShardEntry:
-    """Write samples, given as (key, file), to a tar file, atomically.
+    """Write samples to a tar file, whole or not at all; returns its entry in the manifest.
 
-    InputError if a part is damaged or the disk is full.
+    Args:
+        parts: key and file of each sample; the files hold the bytes of `pack_sample`.
+        target: the tar file.
+        passed_over: messages about photos without a sample, for the manifest.
+
+    Raises:
+        InputError: a part is damaged, or the disk is full.
     """
     samples: list[SampleEntry] = []
-    whole, offset = hashlib.sha256(), 0
+    shard_sha256 = hashlib.sha256()
+    size = 0
     with atomic_path(target) as temporary, open(temporary, "wb") as file:
         for key, path in parts:
             data = path.read_bytes()
@@ -147,25 +181,25 @@ def write_shard(
                 raise InputError(
                     f"{error}: delete this file, and the same command makes it again"
                 ) from error
-            entry = {
-                "key": key,
-                "photo": group.facts["photo"]["name"],
-                "offset": offset,
-                "size": len(data),
-            }
-            samples.append(
-                SampleEntry(**entry, sha256=hashlib.sha256(data).hexdigest(), holes=group.holes)
+            sample = SampleEntry(
+                key=key,
+                photo=group.facts["photo"]["name"],
+                offset=size,
+                size=len(data),
+                sha256=hashlib.sha256(data).hexdigest(),
+                holes=group.holes,
             )
+            samples.append(sample)
             file.write(data)
-            whole.update(data)
-            offset += len(data)
+            shard_sha256.update(data)
+            size += len(data)
         file.write(END_OF_ARCHIVE)
-        whole.update(END_OF_ARCHIVE)
-    size, sha256 = offset + len(END_OF_ARCHIVE), whole.hexdigest()
+        shard_sha256.update(END_OF_ARCHIVE)
+        size += len(END_OF_ARCHIVE)
     return ShardEntry(
         file=target.name,
         size=size,
-        sha256=sha256,
+        sha256=shard_sha256.hexdigest(),
         samples=tuple(samples),
         passed_over=tuple(passed_over),
     )
@@ -174,12 +208,14 @@ def write_shard(
 class DatasetFiles(Dataset[PhotoGroup]):
     """The encoded photos of a dataset as a torch `Dataset` with random access.
 
-    A DataLoader with `batch_size=None` can shuffle and prefetch photos; a DistributedSampler can divide photos between
-    ranks.
+    A DataLoader with `batch_size=None` can shuffle and prefetch photos; a DistributedSampler can
+    divide photos between ranks.
     """
 
     def __init__(self, location: str | os.PathLike[str]) -> None:
-        """Open a dataset in a folder or at a URL for fsspec; InputError for an unfinished dataset."""
+        """Open a dataset in a folder or at a URL for fsspec; InputError for an unfinished
+        dataset.
+        """
         self.location = location
         self.manifest = load_manifest(location)
         if not self.manifest.complete:
@@ -189,20 +225,22 @@ class DatasetFiles(Dataset[PhotoGroup]):
         self.samples = self.manifest.samples
 
     def __len__(self) -> int:
+        """The number of photos."""
         return len(self.samples)
 
     def __getitem__(self, index: int) -> PhotoGroup:
         """The files of a photo, checked by their digest; InputError for damaged files."""
         shard, sample = self.samples[index]
-        where = f"{self.location}/{shard.file}"
+        address = f"{self.location}/{shard.file}"
         with (
             open_dataset_file(self.location, shard.file) as file,
-            as_input_error(where, "cannot be read: {reason}", OSError),
+            as_input_error(address, "cannot be read: {reason}", OSError),
         ):
             file.seek(sample.offset)
             data = file.read(sample.size)
         if hashlib.sha256(data).hexdigest() != sample.sha256:
             raise InputError(
-                f"{where}: sample {sample.key} ({sample.photo}) is damaged: see `spackle dataset verify`"
+                f"{address}: sample {sample.key} ({sample.photo}) is damaged: see `spackle "
+                "dataset verify`"
             )
-        return PhotoGroup.from_tar(sample.key, data, f"{where}: sample {sample.key}")
+        return PhotoGroup.from_tar(sample.key, data, f"{address}: sample {sample.key}")

@@ -1,6 +1,8 @@
-"""The views of a photo along a controlled camera path, and their completed targets (paper, appendix).
+"""The views of a photo along a camera path, and their completed targets (paper, appendix).
 
-An inpainter paints the holes so that all views agree, or one completed scene fills the holes, or they stay black.
+`draw_random_path` and `cameras_along_path` choose the cameras, `render_views` renders the photo's
+Gaussians, and `complete_views` fills the holes: what the photo does not show. An inpainter paints
+the holes so that all views agree, or one completed scene fills the holes, or they stay black.
 """
 
 from __future__ import annotations
@@ -30,58 +32,103 @@ from spackle.render import Renderer
 from spackle.residual import hole_mask
 from spackle.scene_fill.fill import farthest_first
 
-SAME_VIEW_DISTANCE = (
-    1e-3  # two views are the same if their cameras are closer than this times the maximum offset
-)
-MAX_EXTRA_FRAMES = 6  # the most extra frames of a path, tried because frames may coincide
-SAME_SURFACE_TOLERANCE = 0.03  # relative difference below which two depths belong to one surface
+# Two views are the same if their cameras are closer than this times the path's greatest offset.
+SAME_VIEW_DISTANCE = 1e-3
+MAX_EXTRA_FRAMES = 6  # of a path, tried because frames may coincide
+SAME_SURFACE_TOLERANCE = 0.03  # two depths with less relative difference belong to one surface
 MIN_INVERSE_DEPTH = 1e-6  # the smallest inverse depth to divide by
-COMPLETIONS = (*INPAINTERS, "geometry", "none")  # values of --inpainter
+# How holes may be completed, the values of the option `inpainter`: painted by an inpainter, filled
+# from one completed scene ("geometry"), or left black ("none").
+COMPLETIONS = (*INPAINTERS, "geometry", "none")
 
 
 def draw_random_path(
-    kind: SharpTrajectory | None, disparity: tuple[float, float], seed: int, photo_sha256: str
+    kind: SharpTrajectory | None,
+    disparity_range: tuple[float, float],
+    seed: int,
+    photo_sha256: str,
 ) -> tuple[SharpTrajectory, float]:
-    """Draw a photo's path and disparity at random, by seed and file content; `kind` fixes the kind of path."""
-    rng = np.random.default_rng(list(hashlib.sha256(f"{seed}:{photo_sha256}".encode()).digest()))
-    drawn = SHARP_TRAJECTORIES[rng.integers(len(SHARP_TRAJECTORIES))]
-    return kind or drawn, float(rng.uniform(*disparity))
+    """Draw the path of a photo's views at random; returns its kind, and how far the camera moves.
+
+    The draw depends on `seed` and the photo's content alone, not on its name or on other photos.
+
+    Args:
+        kind: fixes the kind of path; None: one of SHARP's paths at random.
+        disparity_range: least and greatest disparity, which says how far the camera moves.
+        seed: another seed gives another path.
+        photo_sha256: digest of the photo's file.
+    """
+    digest = hashlib.sha256(f"{seed}:{photo_sha256}".encode()).digest()
+    rng = np.random.default_rng(list(digest))
+    # Drawn also if the kind is fixed, so that the disparity is the same in both cases.
+    random_kind = SHARP_TRAJECTORIES[rng.integers(len(SHARP_TRAJECTORIES))]
+    disparity = float(rng.uniform(*disparity_range))
+    return kind or random_kind, disparity
 
 
 def cameras_along_path(
-    kind: SharpTrajectory, disparity: float, camera: Camera, depth_range: DepthRange, views: int
+    kind: SharpTrajectory,
+    disparity: float,
+    camera: Camera,
+    depth_range: DepthRange,
+    view_count: int,
 ) -> list[Camera]:
-    """Choose `views` different cameras: first the photo's `camera` (of the views' size), then cameras along the path.
+    """Choose different cameras for a photo's views: first the photo's, then cameras along a path.
 
-    A path may pass through the photo's camera position, and a closed path ends where it begins. So the path is sampled
-    with extra frames, and repeated views are dropped. ValueError if the path is impossible, or the camera does not
-    move.
+    A path may pass through the photo's camera position, and a closed path ends where it begins. So
+    the path is sampled with extra frames, and repeated views are dropped.
+
+    Args:
+        kind: the kind of path, such as "swipe".
+        disparity: how far the camera moves; 0.3 is large.
+        camera: the photo's camera, of the views' size.
+        depth_range: near and far depth of the scene, to which the movement is relative.
+        view_count: number of cameras.
+
+    Raises:
+        ValueError: the path is impossible, or the camera does not move.
     """
-
-    def distance(one: Camera, other: Camera) -> float:
-        return float((one.position.double() - other.position.double()).norm())
-
     cameras = [camera]
-    least = SAME_VIEW_DISTANCE * disparity_to_offset(camera, disparity, depth_range)
-    for frames in range(views - 1, views + MAX_EXTRA_FRAMES) if least > 0 else ():
-        cameras = [camera]
-        for view in trajectory_cameras(kind, camera, disparity, depth_range, frames):
-            if all(distance(view, other) > least for other in cameras):
-                cameras.append(view)
-        if len(cameras) >= views:
-            break
-    if len(cameras) < views:
-        raise ValueError(f"{kind} at a disparity of {disparity:g} has no {views} different views")
-    while len(cameras) > views:  # drop the view nearest to the photo's
-        del cameras[1 + int(np.argmin([distance(view, camera) for view in cameras[1:]]))]
+    min_distance = SAME_VIEW_DISTANCE * disparity_to_offset(camera, disparity, depth_range)
+    if min_distance > 0:
+        for frame_count in range(view_count - 1, view_count + MAX_EXTRA_FRAMES):
+            path = trajectory_cameras(kind, camera, disparity, depth_range, frame_count)
+            cameras = different_cameras([camera, *path], min_distance)
+            if len(cameras) >= view_count:
+                break
+    if len(cameras) < view_count:
+        raise ValueError(
+            f"{kind} at a disparity of {disparity:g} has no {view_count} different views"
+        )
+
+    # Of too many views, those nearest to the photo's show the smallest holes.
+    while len(cameras) > view_count:
+        distances = [eye_distance(other, camera) for other in cameras[1:]]
+        del cameras[1 + int(np.argmin(distances))]
     return cameras
+
+
+def different_cameras(cameras: Sequence[Camera], min_distance: float) -> list[Camera]:
+    """The cameras, in order, without those that are closer than `min_distance` to an earlier
+    one.
+    """
+    different: list[Camera] = []
+    for camera in cameras:
+        if all(eye_distance(camera, other) > min_distance for other in different):
+            different.append(camera)
+    return different
+
+
+def eye_distance(one: Camera, other: Camera) -> float:
+    """The distance between the positions of two cameras."""
+    return float((one.position.double() - other.position.double()).norm())
 
 
 @dataclasses.dataclass(frozen=True)
 class ViewStack:
     """A photo's Gaussians, rendered from V cameras."""
 
-    prediction: BasePrediction
+    prediction: BasePrediction  # the Gaussians, and the photo's camera
     cameras: Sequence[Camera]  # the first camera is the photo's
     rgb: Tensor  # [V, H, W, 3] sRGB in 0..1, over black
     depth: Tensor  # [V, H, W] expected z; 0 where alpha is 0
@@ -93,79 +140,107 @@ class ViewStack:
 def render_views(
     prediction: BasePrediction, cameras: Sequence[Camera], renderer: Renderer
 ) -> ViewStack:
-    """Render the base from each camera."""
-    drawn = [renderer.render(prediction.gaussians, camera).tensors for camera in cameras]
-    rgb, depth, alpha = (torch.stack(images) for images in zip(*drawn, strict=True))
+    """Render a photo's Gaussians from each camera; the first camera is the photo's.
+
+    The mask of a view marks the pixels that the Gaussians leave uncovered (eq. 4 of the paper).
+    """
+    renderings = [renderer.render(prediction.gaussians, camera) for camera in cameras]
+    rgb = torch.stack([rendering.rgb for rendering in renderings])
+    depth = torch.stack([rendering.depth for rendering in renderings])
+    alpha = torch.stack([rendering.alpha for rendering in renderings])
     return ViewStack(prediction, cameras, rgb, depth, alpha, hole_mask(alpha))
 
 
 def complete_views(
     views: ViewStack, completion: str, inpainter: Inpainter | None, renderer: Renderer
 ) -> Tensor:
-    """Targets [V, H, W, 3] sRGB: new colours in the holes; elsewhere the views, bit for bit.
+    """The targets of views, [V, H, W, 3] sRGB: new colours in the holes, elsewhere the views.
 
-    `completion` is one of `COMPLETIONS`; "none" returns the views unchanged.
+    Args:
+        views: the rendered views, which do not change outside of the holes, bit for bit.
+        completion: one of `COMPLETIONS`; "none" returns the views unchanged.
+        inpainter: paints the holes; None: one completed scene fills them.
+        renderer: renders that scene.
     """
     if completion == "none":
         return views.rgb
     if inpainter is None:
-        return torch.where(views.mask[..., None], render_completed(views, renderer)[0], views.rgb)
-    return (
-        paint_video(inpainter, views)
-        if inpainter.paints_views_together
-        else paint_view_by_view(inpainter, views, renderer)
-    )
+        completed, _ = render_completed(views, renderer)
+        return torch.where(views.mask[..., None], completed, views.rgb)
+    if inpainter.paints_views_together:
+        return paint_video(inpainter, views)
+    return paint_view_by_view(inpainter, views, renderer)
 
 
 @torch.no_grad()
 def render_completed(views: ViewStack, renderer: Renderer) -> tuple[Tensor, Tensor]:
-    """Colours [V, H, W, 3] and inverse depth [V, H, W] of one scene completed by initial Gaussians, so that all views agree.
+    """Render one completed scene in all views, so that the views agree.
 
+    The scene is completed without a network: Gaussians in the holes continue what surrounds them.
     Pixels that stay uncovered take the colour and depth of their neighbours.
+
+    Returns:
+        Colours [V, H, W, 3] sRGB and inverse depth [V, H, W]. Views without holes stay as they are.
     """
     prediction = views.prediction
-    aux = complete(
+    added = complete(
         prediction, views.cameras, exact=True, network=None, fill="network", renderer=renderer
     ).aux
-    colors, inverse_depths = views.rgb.clone(), known_inverse_depth(views.depth, views.mask)
+    colors = views.rgb.clone()
+    inverse_depths = known_inverse_depth(views.depth, views.mask)
     for index, camera in enumerate(views.cameras):
-        if bool(views.mask[index].any()):
-            drawn = renderer.render([prediction.gaussians, aux], camera)
-            rgb, inverse_depth = drawn.rgb, known_inverse_depth(drawn.depth, hole_mask(drawn.alpha))
-            if 0 < int(inverse_depth.count_nonzero()) < inverse_depth.numel():
-                inverse_depth, mixed = fill_from_far_side(
-                    inverse_depth, rgb.permute(2, 0, 1), inverse_depth > 0
-                )
-                rgb = mixed.permute(1, 2, 0)
-            colors[index], inverse_depths[index] = rgb, inverse_depth
+        if not bool(views.mask[index].any()):
+            continue
+        rendering = renderer.render([prediction.gaussians, added], camera)
+        rgb = rendering.rgb
+        inverse_depth = known_inverse_depth(rendering.depth, hole_mask(rendering.alpha))
+
+        # Pixels can be filled from their neighbours only if some are known, and some are not.
+        known_count = int(inverse_depth.count_nonzero())
+        if 0 < known_count < inverse_depth.numel():
+            inverse_depth, filled_rgb = fill_from_far_side(
+                inverse_depth, rgb.permute(2, 0, 1), inverse_depth > 0
+            )
+            rgb = filled_rgb.permute(1, 2, 0)
+        colors[index] = rgb
+        inverse_depths[index] = inverse_depth
     return colors, inverse_depths
 
 
 @torch.no_grad()
 def paint_view_by_view(inpainter: Inpainter, views: ViewStack, renderer: Renderer) -> Tensor:
-    """Paint the views' holes one view after the other, the farthest from the photo first, so that all views agree.
+    """Paint the views' holes with an inpainter of single pictures, so that all views agree.
 
-    Painted views are reprojected into the next view's holes, and the inpainter paints the rest. The depth in the holes
-    comes from one completed scene.
+    The view farthest from the photo comes first, because it has the largest holes. Painted views
+    are reprojected into the next view's holes, and the inpainter paints the rest. The depth in the
+    holes comes from one completed scene.
+
+    Returns:
+        The completed views [V, H, W, 3] sRGB.
     """
-    inverse_depths, targets = render_completed(views, renderer)[1], views.rgb.clone()
-    painted: list[int] = []
+    _, inverse_depths = render_completed(views, renderer)
+    targets = views.rgb.clone()
+    painted: list[int] = []  # views whose holes are filled
     for index in farthest_first(views.cameras, views.prediction.camera):
-        camera, hole, target = views.cameras[index], views.mask[index].clone(), targets[index]
+        camera = views.cameras[index]
+        target = targets[index]
+        hole = views.mask[index].clone()
+
+        # What an earlier view shows at a hole's points is taken over.
         for other in painted:
             row, column = hole.nonzero(as_tuple=True)
             pixels = camera.pixel_centers().to(target)[row, column]
-            points = camera.unproject(
-                pixels, 1 / inverse_depths[index][row, column].clamp_min(MIN_INVERSE_DEPTH)
-            )
-            colors, seen = look_up_points(
+            depth = 1 / inverse_depths[index][row, column].clamp_min(MIN_INVERSE_DEPTH)
+            points = camera.unproject(pixels, depth)
+            colors, is_seen = look_up_points(
                 points, views.cameras[other], targets[other], inverse_depths[other]
             )
-            target[row[seen], column[seen]] = colors[seen]
-            hole[row[seen], column[seen]] = False
+            target[row[is_seen], column[is_seen]] = colors[is_seen]
+            hole[row[is_seen], column[is_seen]] = False
+
         if bool(hole.any()):
-            known = torch.where(hole, 0, inverse_depths[index])
-            targets[index] = inpainter.paint(target[None], hole[None], known[None])[0]
+            outside_depth = torch.where(hole, 0, inverse_depths[index])
+            targets[index] = inpainter.paint(target[None], hole[None], outside_depth[None])[0]
         if bool(views.mask[index].any()):
             painted.append(index)
     return targets
@@ -174,26 +249,51 @@ def paint_view_by_view(inpainter: Inpainter, views: ViewStack, renderer: Rendere
 def look_up_points(
     points: Tensor, camera: Camera, rgb: Tensor, inverse_depth: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Colours [n, 3] of points [n, 3] in a view [H, W, 3] with inverse depth [H, W], and whether each is seen [n]."""
-    uv, z = camera.project(points)
-    place = 2 * uv / uv.new_tensor([camera.width, camera.height]) - 1
-    images = torch.cat([rgb, inverse_depth[..., None]], -1).permute(2, 0, 1)
-    values = grid_sample(
-        images[None], place[None, None], align_corners=False, padding_mode="border"
-    )[0, :, 0].T
-    same = (values[:, 3] * z - 1).abs() < SAME_SURFACE_TOLERANCE
-    return values[:, :3], same & (z > 0) & (place.abs() <= 1).all(-1)
+    """Look up what a view shows at points of the scene.
+
+    Args:
+        points: [n, 3] in world coordinates.
+        camera: of the view.
+        rgb: the view [H, W, 3].
+        inverse_depth: the view's inverse depth [H, W].
+
+    Returns:
+        Colours [n, 3], and whether each point is seen, [n] bool: inside of the frame, and not
+        behind another surface.
+    """
+    uv, z = camera.project(points)  # [n, 2] pixels, [n] depth
+    size = uv.new_tensor([camera.width, camera.height])
+    position = 2 * uv / size - 1  # -1..1 across the picture, as `grid_sample` wants it
+    channels = torch.cat([rgb, inverse_depth[..., None]], -1).permute(2, 0, 1)  # [4, H, W]
+    sampled = grid_sample(
+        channels[None], position[None, None], align_corners=False, padding_mode="border"
+    )[0, :, 0].T  # [n, 4]
+
+    # The view shows the point itself if its depth there is the point's depth.
+    is_same_surface = (sampled[:, 3] * z - 1).abs() < SAME_SURFACE_TOLERANCE
+    is_in_frame = (position.abs() <= 1).all(-1)
+    return sampled[:, :3], is_same_surface & (z > 0) & is_in_frame
 
 
 def paint_video(inpainter: Inpainter, views: ViewStack) -> Tensor:
     """Paint the views' holes as one video, whose frames are ordered along the path.
 
-    The photo's view is inserted at the position that lengthens the path least.
+    The photo's view is the first of the stack, but lies anywhere on the path: it is inserted where
+    it lengthens the path least.
+
+    Returns:
+        The completed views [V, H, W, 3] sRGB, in the order of the stack.
     """
-    eyes = torch.stack([camera.position.double() for camera in views.cameras])
+    eyes = torch.stack([camera.position.double() for camera in views.cameras])  # [V, 3]
+
+    def path_length(order: list[int]) -> float:
+        """The way from eye to eye in this order."""
+        return float(eyes[order].diff(dim=0).norm(dim=-1).sum())
+
+    # View 0, the photo's, is tried at every place between the others.
     others = list(range(1, len(eyes)))
     orders = [[*others[:place], 0, *others[place:]] for place in range(len(eyes))]
-    order = min(orders, key=lambda order: float(eyes[order].diff(dim=0).norm(dim=-1).sum()))
+    order = min(orders, key=path_length)
     inverse_depth = known_inverse_depth(views.depth, views.mask)
     targets = torch.empty_like(views.rgb)
     targets[order] = inpainter.paint(views.rgb[order], views.mask[order], inverse_depth[order])

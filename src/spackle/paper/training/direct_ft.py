@@ -1,7 +1,9 @@
-"""The paper's naive decoupled baseline ("Direct FT"): SHARP's own decoder is trained in place of the residual.
+"""The paper's naive decoupled baseline ("Direct FT"): SHARP's own decoder learns to fill holes.
 
-Targets and losses are those of the residual. Each step includes the photo's own view, because the paper has losses at
-the input view only in "the non-Spackle training path" ("Training Details and Loss Weights").
+SHARP is a network that turns a photo into Gaussians. Its encoder stays as it is, its decoder is
+trained in place of the residual network. Targets and losses are those of the residual. Each step
+includes the photo's own view, because the paper has losses at the input view only in "the
+non-Spackle training path" ("Training Details and Loss Weights").
 """
 
 from __future__ import annotations
@@ -43,12 +45,15 @@ from spackle.runtime.progress import Reporter
 from spackle.weights import installed_weights, weights_digest
 from spackle.weights.checkpoints import read_tensors
 
-VIEWS_PER_PHOTO = 4  # views of a photo in a step; they share one pass through the encoder, the most expensive part
+# Views of a photo in a step. They share one pass through the encoder, the most expensive part.
+VIEWS_PER_PHOTO = 4
 
 
 @dataclasses.dataclass(frozen=True)
 class TunableSharp:
-    """SHARP with frozen weights, and a trainable decoder `network.gaussian_decoder()` in float32."""
+    """SHARP with frozen weights, and a trainable decoder `network.gaussian_decoder()` in
+    float32.
+    """
 
     network: SharpNetwork
     precision: torch.dtype  # of frozen weights, and of the decoder under autocast
@@ -57,73 +62,98 @@ class TunableSharp:
     def load(
         path: str | os.PathLike[str], precision: torch.dtype, device: torch.device
     ) -> TunableSharp:
-        """Read a checkpoint, see `load_network`, and freeze it; `precision` is float32 or bfloat16."""
+        """Read a checkpoint of SHARP and freeze it; InputError if the file is unusable.
+
+        `precision`, float32 or bfloat16, is that of the encoder and of the decoder's arithmetic.
+        """
         network = load_network(path, torch.float32)
         set_precision(network.monodepth_model, precision)
         return TunableSharp(network.to(device), precision)
 
     @torch.no_grad()
     def encode(self, rgb: Tensor, photo_camera: Camera) -> DecoderInput:
-        """Run the frozen encoder on a photo [H, W, 3], sRGB in 0..1, with a camera of the same size."""
+        """Run the frozen encoder on a photo [H, W, 3], sRGB in 0..1, with a camera of the same
+        size.
+
+        Returns what the decoder needs: image, disparity, feature maps and initial Gaussians.
+        """
         device = next(self.network.parameters()).device
-        image = resize_to_square(rgb.to(device), self.network.config.side)
+        square_image = resize_to_square(rgb.to(device), self.network.config.side)
+        focal_per_width = photo_camera.focal[0] / photo_camera.width
         with without_autocast_or_tf32(device):
-            return self.network.encode(
-                image, photo_camera.focal[0] / photo_camera.width, default_window_batch(device)
-            )
+            return self.network.encode(square_image, focal_per_width, default_window_batch(device))
 
     def gaussians(
-        self, decoder: nn.Module, encoded: DecoderInput, place: torch.device | str = "cpu"
+        self, decoder: nn.Module, encoded: DecoderInput, target_device: torch.device | str = "cpu"
     ) -> Gaussians:
-        """Gaussians in SHARP's normalised space, on the device `place`; gradients reach `decoder`."""
+        """Gaussians in SHARP's normalised space, on `target_device`; gradients reach `decoder`.
+
+        The normalised space is stretched, so that every photo has the same field of view; see
+        `normalised_camera`. `encoded` comes from `encode`.
+        """
         device = encoded.image_and_disparity.device
         autocast = torch.autocast(
             device.type, self.precision, enabled=self.precision != torch.float32
         )
         with without_autocast_or_tf32(device):
+            # Low precision is enough for the decoder's deltas, but would shift the Gaussians.
             with autocast:
                 deltas = decoder(encoded.image_and_disparity, encoded.encoder_maps)
-            return apply_deltas(encoded.initial, deltas).to(place)
+            return apply_deltas(encoded.initial, deltas).to(target_device)
 
 
 def normalised_camera(camera: Camera, photo_camera: Camera) -> Camera:
-    """A camera that sees Gaussians in SHARP's normalised space as `camera` sees the same Gaussians in metres.
+    """A camera that sees Gaussians in SHARP's normalised space as `camera` sees them in metres.
 
-    D = diag(W / 2fx, H / 2fy, 1) maps normalised space to metres. Stretching Gaussians by D takes an eigendecomposition
-    (`stretch_gaussians`), whose gradient is undefined for round Gaussians. A renderer uses the camera's matrix P only
-    as P x for centres and P Σ Pᵀ for covariances. The matrix P D thus renders the same image, with all gradients.
+    D = diag(W / 2fx, H / 2fy, 1) maps normalised space to metres, with W, H, fx and fy of
+    `photo_camera`, the camera of the photo. Stretching Gaussians by D takes an eigendecomposition,
+    whose gradient is undefined for round Gaussians. A renderer uses the camera's matrix P only as
+    P x for centres and P Σ Pᵀ for covariances. The matrix P D thus renders the same image, with all
+    gradients.
     """
     fx, fy = photo_camera.focal
-    matrix = camera.world_to_camera.double()  # float32 would shift the image
-    stretch = matrix.new_tensor(
-        [photo_camera.width / (2 * fx), photo_camera.height / (2 * fy), 1.0, 1.0]
-    )
-    return dataclasses.replace(camera, world_to_camera=matrix * stretch)
+    x_stretch = photo_camera.width / (2 * fx)
+    y_stretch = photo_camera.height / (2 * fy)
+    world_to_camera = camera.world_to_camera.double()  # float32 would shift the image
+    # The columns of P are stretched; the fourth one is the translation.
+    stretch = world_to_camera.new_tensor([x_stretch, y_stretch, 1.0, 1.0])
+    return dataclasses.replace(camera, world_to_camera=world_to_camera * stretch)
 
 
 def render_views_of_photo(
     decoder: nn.Module, base: TunableSharp, views: Sequence[DatasetView], renderer: Renderer
 ) -> ViewBatch:
-    """Predict a photo's Gaussians and render them in the given views; only `decoder` gets gradients.
+    """Predict a photo's Gaussians and render them in the given views.
 
-    InputError if memory runs out.
+    Args:
+        decoder: SHARP's decoder; only this network gets gradients.
+        base: the rest of SHARP.
+        views: views of one photo, with their targets.
+        renderer: renders the Gaussians.
+
+    Returns:
+        The rendered views, beside those of the dataset, their targets and holes. InputError if
+        memory runs out.
     """
     photo_camera = views[0].photo_camera
     with report_memory_shortage("try optim.precision=bf16"):
-        gaussians = base.gaussians(
-            decoder, base.encode(views[0].photo, photo_camera), renderer.device
-        )
-        drawn = [
+        encoded = base.encode(views[0].photo, photo_camera)
+        gaussians = base.gaussians(decoder, encoded, renderer.device)
+        renderings = [
             renderer.render(gaussians, normalised_camera(view.camera, photo_camera))
             for view in views
         ]
     return ViewBatch.of(
-        (one, v.rendering.rgb, v.target, v.mask) for one, v in zip(drawn, views, strict=True)
+        (rendering, view.rendering.rgb, view.target, view.mask)
+        for rendering, view in zip(renderings, views, strict=True)
     )
 
 
 class DirectFt(ViewTask):
-    """Trains SHARP's decoder; its items are photos, run one at a time, because one gradient takes gigabytes."""
+    """Trains SHARP's decoder; its items are photos, run one at a time.
+
+    One at a time, because the gradient of one photo takes gigabytes.
+    """
 
     name: ClassVar[str] = "direct-ft"
     micro_batch = 1
@@ -131,72 +161,129 @@ class DirectFt(ViewTask):
     def __init__(
         self, recipe: Recipe, device: torch.device, checkpoint: Path | None = None
     ) -> None:
-        """Check that the dataset matches the checkpoint (None: the downloaded one), without loading the network.
+        """Check that the dataset was built with the checkpoint, without loading the network.
 
-        InputError if the recipe, the checkpoint or the dataset cannot be used.
+        Args:
+            recipe: the settings of the run.
+            device: where the networks compute.
+            checkpoint: SHARP's weights; None: the downloaded file.
+
+        Raises:
+            InputError: the recipe, the checkpoint or the dataset cannot be used.
         """
         super().__init__(recipe, device)
+        dataset_location = self._check_recipe(recipe)
+        self.sharp_checkpoint = self._find_checkpoint(checkpoint)
+        self.files = open_pseudo_dataset(dataset_location)
+        self._check_base_of_dataset(dataset_location)
+
+        self.training_photos, self.validation_photos = split_photos(self.files, recipe.data)
+        self.digest = short_digest(
+            (self.files.manifest.digest, self.training_photos, self.validation_photos)
+        )
+        self.items = len(self.training_photos)
+        self.validation_items = len(self.validation_photos)
+        self.items_per_step = recipe.optim.batch // VIEWS_PER_PHOTO
+
+    @staticmethod
+    def _check_recipe(recipe: Recipe) -> Path:
+        """Check that a recipe names a dataset as its only data; returns where the dataset lies.
+
+        InputError if there are other data or initial weights, or the batch cannot be divided into
+        photos.
+        """
         data = recipe.data
         if recipe.optim.batch % VIEWS_PER_PHOTO:
             raise InputError(
                 f"optim.batch={recipe.optim.batch}: give a multiple of {VIEWS_PER_PHOTO} views"
             )
-        if data.pseudo is None or recipe.init or data.photos or data.rgbd or data.stereo:
+        has_other_data = recipe.init or data.photos or data.rgbd or data.stereo
+        if data.pseudo is None or has_other_data:
             raise InputError(
-                "--method direct-ft learns only from data.pseudo, a dataset of `spackle dataset build --base sharp`: "
-                "leave out init and other data"
+                "`method` direct-ft learns only from data.pseudo, a dataset of `spackle dataset "
+                "build` with `base` sharp: leave out init and other data"
             )
+        return data.pseudo
+
+    @staticmethod
+    def _find_checkpoint(checkpoint: Path | None) -> SourceCheckpoint:
+        """SHARP's original checkpoint, given or downloaded; InputError if it is unusable."""
         path = checkpoint or installed_weights("sharp")
         if path is None:
-            raise InputError(f"--method direct-ft: {MISSING_WEIGHTS_ADVICE['sharp']}")
-        read_tensors(path, "give SHARP's checkpoint")  # without the numbers; refuses other files
+            raise InputError(f"`method` direct-ft: {MISSING_WEIGHTS_ADVICE['sharp']}")
+        # Refuses files of other kinds; the numbers themselves are not read yet.
+        read_tensors(path, "give SHARP's checkpoint")
         if source_checkpoint_of(path) is not None:
             raise InputError(
-                f"-c {path}: holds an already trained decoder: give the original checkpoint of SHARP"
+                f"`checkpoint` {path}: holds an already trained decoder: give the original "
+                "checkpoint of SHARP"
             )
-        self.owner = SourceCheckpoint(path, weights_digest(path))
-        self.files = open_pseudo_dataset(data.pseudo)
+        return SourceCheckpoint(path, weights_digest(path))
+
+    def _check_base_of_dataset(self, location: Path) -> None:
+        """InputError if the dataset was not built with the weights of SHARP that are trained here.
+
+        The dataset's manifest records its base: the network that turned photos into Gaussians.
+        """
         base = self.files.manifest.config.get("base", {})
-        if (base.get("name"), base.get("weights")) != ("sharp", self.owner.sha256):
+        name = base.get("name")
+        weights = base.get("weights")  # their SHA-256
+        if name != "sharp" or weights != self.sharp_checkpoint.sha256:
             raise InputError(
-                f"{data.pseudo}: built with the base {base.get('name')}, weights {base.get('weights')}: build a "
-                f"dataset with --base sharp and the weights {path}"
+                f"{location}: built with the base {name}, weights {weights}: build a dataset with "
+                f"`base` sharp and the weights {self.sharp_checkpoint.path}"
             )
-        self.training_photos, self.validation_photos = split_photos(self.files, data)
-        self.digest = short_digest(
-            (self.files.manifest.digest, self.training_photos, self.validation_photos)
-        )
-        self.items, self.validation_items = len(self.training_photos), len(self.validation_photos)
-        self.items_per_step = recipe.optim.batch // VIEWS_PER_PHOTO
 
     def prepare(self, output: Path, reporter: Reporter) -> dict[str, Any]:
-        """Load SHARP."""
-        self.base = TunableSharp.load(self.owner.path, self.precision, self.device)
+        """Load SHARP; returns the file and digest of its weights for run.json."""
+        self.base = TunableSharp.load(self.sharp_checkpoint.path, self.precision, self.device)
         self.network = self.base.network.gaussian_decoder().enable_training()
         reporter.log(f"{self.items} training photos, {self.validation_items} validation photos")
-        return {"checkpoint": {"file": self.owner.path.name, "sha256": self.owner.sha256}}
+        return {
+            "checkpoint": {
+                "file": self.sharp_checkpoint.path.name,
+                "sha256": self.sharp_checkpoint.sha256,
+            }
+        }
 
     def load_batch(self, step: int | None, items: Sequence[int]) -> list[DatasetView]:
-        """Views of a photo, see `draw_view_numbers`; for validation (step None) all views."""
-        (item,) = items
-        group = self.files[(self.validation_photos if step is None else self.training_photos)[item]]
-        drawn = (
-            range(group.views)
-            if step is None
-            else draw_view_numbers([self.recipe.run.seed, step, item], group.views)
-        )
-        return [group.view(index) for index in drawn]
+        """Views of one photo: a random choice of `VIEWS_PER_PHOTO` views, or all for validation.
+
+        Args:
+            step: the number of the training step; None: the photo is for validation.
+            items: the number of the photo, as a list.
+        """
+        (item,) = items  # `micro_batch` is 1
+        if step is None:
+            photo = self.files[self.validation_photos[item]]
+            view_numbers = list(range(photo.views))
+        else:
+            photo = self.files[self.training_photos[item]]
+            # The choice depends on these numbers alone: a resumed run makes the same choice.
+            view_numbers = draw_view_numbers([self.recipe.run.seed, step, item], photo.views)
+        return [photo.view(number) for number in view_numbers]
 
     def complete(self, network: nn.Module, batch: Sequence[DatasetView]) -> ViewBatch:
         return render_views_of_photo(network, self.base, batch, self.renderer)
 
     def export(self, network: nn.Module, path: Path) -> None:
-        """Write the decoder in float32, for `spackle predict --base sharp -c`, and a link to SHARP's checkpoint."""
-        write_atomic(path, encode_decoder(network, self.owner))
-        link_source_checkpoint(self.owner, path.parent)
+        """Write the decoder in float32, for `spackle predict`, and a link to SHARP's checkpoint.
+
+        The file holds only what was trained; the link finds the rest of SHARP.
+        """
+        write_atomic(path, encode_decoder(network, self.sharp_checkpoint))
+        link_source_checkpoint(self.sharp_checkpoint, path.parent)
 
 
-def draw_view_numbers(seed: Sequence[int], views: int) -> list[int]:
-    """Numbers of up to `VIEWS_PER_PHOTO` views of a photo: 0 for the photo's own view, then random other views."""
-    others = 1 + np.random.default_rng(seed).permutation(views - 1)[: VIEWS_PER_PHOTO - 1]
-    return [0, *sorted(others.tolist())]
+def draw_view_numbers(seed: Sequence[int], view_count: int) -> list[int]:
+    """Numbers of up to `VIEWS_PER_PHOTO` views of a photo, in ascending order.
+
+    The first one is 0, the photo's own view; the others are a random choice of the other views.
+
+    Args:
+        seed: numbers that determine the choice.
+        view_count: number of views that the photo has.
+    """
+    shuffled = 1 + np.random.default_rng(seed).permutation(view_count - 1)
+    chosen = shuffled[: VIEWS_PER_PHOTO - 1]
+    return [0, *sorted(chosen.tolist())]

@@ -217,14 +217,15 @@ def read_caffe_arrays(path: Path, advice: str) -> dict[str, Tensor]:
         np.load(file, allow_pickle=False) as arrays,
     ):
         for caffe_name in arrays.files:
-            layer, kind = caffe_name[:-1], caffe_name[-1]
-            tensors[layer.replace("/", ".") + suffixes[kind]] = torch.from_numpy(arrays[caffe_name])
+            layer = caffe_name[:-1].replace("/", ".")  # with the dot before the suffix
+            torch_name = layer + suffixes[caffe_name[-1]]
+            tensors[torch_name] = torch.from_numpy(arrays[caffe_name])
     return tensors
 
 
 def channel_constants(numbers: tuple[float, ...], images: Tensor) -> Tensor:
-    """Numbers [C], one a channel, as [C, 1, 1] of the dtype and on the device of images [B, C, H,
-    W].
+    """Numbers [C], one a channel, as [C, 1, 1] of the dtype and on the device of images
+    [B, C, H, W].
     """
     # Made on the CPU and sent without waiting: making them on a GPU would wait for the GPU.
     constants = torch.tensor(numbers, dtype=images.dtype)

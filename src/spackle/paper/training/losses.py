@@ -69,17 +69,20 @@ def perceptual_loss(
     """[] differences of features and of Gram matrices near the hole, summed over layers.
 
     F and T are a layer's features [C, h, w] of prediction and target, divided by the root mean
-    square of T. The weight w [h, w] is the fraction of each cell that the dilated hole covers. A
-    layer adds
+    square of T. The weight w [h, w] is the fraction of each cell of the feature map that the
+    dilated hole covers. A layer adds
 
-        sum(w |F - T|) / (C sum(w))  +  gram · mean |G(F) - G(T)|,    G(F) = (F w) F^T / sum(w),
-        [C, C].
+        sum(w |F - T|) / (C sum(w))  +  gram · mean |G(F) - G(T)|,
+
+    with the Gram matrix G(F) = (F w) F^T / sum(w), [C, C], which describes texture.
 
     Args:
         features: the network.
-        rgb, target, hole: as in the other terms. Outside of the dilated hole, the target replaces
-            the prediction.
-        dilation: side in pixels of the max-pool that dilates the hole.
+        rgb: completed views [B, H, W, 3], sRGB 0..1. Outside of the dilated hole they count as
+            equal to the target.
+        target: what they should look like [B, H, W, 3].
+        hole: [B, H, W] bool.
+        dilation: side in pixels of the square by which the hole is extended.
         size: longer side in pixels to which images are resized for the network; None: not resized.
         gram: weight of the Gram matrices.
     """
@@ -218,9 +221,9 @@ def layer_terms(prediction: Tensor, target: Tensor, weight: Tensor) -> tuple[Ten
     """The feature term [] and the Gram term [] of the perceptual loss for one layer of the feature
     network.
 
-    Both compare features of prediction and target [B, C, h, w], weighted by cell, with weights [B,
-    1, h, w]. The feature term is the mean difference; the Gram term is the mean difference of the
-    Gram matrices, which describe textures.
+    Both compare features of prediction and target [B, C, h, w], weighted by cell, with weights
+    [B, 1, h, w]. The feature term is the mean difference; the Gram term is the mean difference of
+    the Gram matrices, which describe textures.
     """
     # Layers have features of different sizes; divided by the target's root mean square, all layers
     # count alike.

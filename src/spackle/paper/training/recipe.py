@@ -130,8 +130,9 @@ class LossRecipe(RecipePart):
 
     @property
     def features_file(self) -> Path | None:
-        """Weights of the feature network: `features_path`, else the file of `spackle weights get
-        features`.
+        """The file of the feature network's weights: `features_path`, if it is given.
+
+        Else, for ResNet-50, the downloaded file; None if nothing was downloaded.
         """
         if self.features_path is not None or self.features != "resnet50":
             return self.features_path

@@ -51,7 +51,10 @@ DrawPhotoWithDepth = Callable[[np.random.Generator], tuple[Tensor, DepthMap, Cam
 
 
 def find_sources(data: DataRecipe, renderer: Renderer, *, validation: bool) -> list[Source]:
-    """Find the files of a recipe; returns the sources of views that have a share above 0.
+    """Find the files of a recipe; returns the sources of training views that are to be used.
+
+    A source makes views with holes, and knows what the holes should show. Its share is the part of
+    all views that it gives; sources whose share is 0 are left out.
 
     Args:
         data: names the folders, and the share of each source.
@@ -82,8 +85,10 @@ def find_sources(data: DataRecipe, renderer: Renderer, *, validation: bool) -> l
 
 
 def composite_source(data: DataRecipe, folder: Path, renderer: Renderer) -> Source:
-    """Reverse views of composites: cut-outs of photos in front of other photos, at chosen
-    depths.
+    """A source of training views from photos without depth, in the folder `data.photos`.
+
+    Cut-outs of photos stand in front of other photos, at random depths. Of such a composite, the
+    holes are what a virtual camera does not see, and the composite itself is the target.
     """
     photos = find_files(folder, "data.photos", PHOTO_SUFFIXES, "photos")
     draw = partial(draw_composite, photos=photos)
@@ -95,12 +100,15 @@ def composite_source(data: DataRecipe, folder: Path, renderer: Renderer) -> Sour
 
 
 def rgbd_sources(data: DataRecipe, renderer: Renderer) -> list[Source]:
-    """Reverse views of the frames of each depth camera in `data.rgbd`."""
+    """A source of training views for each depth camera in `data.rgbd`, which gives photo and depth.
+
+    The holes are what a virtual camera does not see of a photo, and the photo is the target.
+    """
     frames_of_cameras = []
     for camera in data.rgbd:
         frames = find_files(camera.folder, "data.rgbd", (".color.jpg",), "NAME.color.jpg")
         frames_of_cameras.append(frames)
-    frame_count = sum(map(len, frames_of_cameras))
+    frame_count = sum(len(frames) for frames in frames_of_cameras)
 
     sources = []
     for camera, frames in zip(data.rgbd, frames_of_cameras, strict=True):
@@ -118,7 +126,12 @@ def rgbd_sources(data: DataRecipe, renderer: Renderer) -> list[Source]:
 
 
 def stereo_sources(data: DataRecipe, folder: Path, renderer: Renderer) -> list[Source]:
-    """Two sources of stereo pairs: reverse views of left photos, and views at the right camera."""
+    """Two sources of training views from stereo pairs, in the folder `data.stereo`.
+
+    In the first, the holes are what a virtual camera does not see of a left photo, and this photo
+    is the target. In the second, the left photo is rendered at the right camera; its holes are
+    real, and the right photo is the target.
+    """
     scene_files = find_files(folder, "data.stereo", ("scene.json",), "scene.json")
     scene_folders = [file.parent for file in scene_files]
     scene_names = relative_names(scene_folders, folder)
@@ -160,7 +173,8 @@ def dataset_source(data: DataRecipe, location: Path, *, validation: bool) -> Sou
             photo.base, view.rendering, view.camera, view.photo_camera, view.photo, view.target
         )
 
-    # With the validation photos, the names also tell apart datasets that are divided differently.
+    # The names identify the training samples. The validation photos are among them, because a
+    # dataset that is divided differently gives other samples.
     names = ["pseudo", dataset.manifest.digest, *map(str, validation_photos)]
     return Source(data.shares.pseudo, stored_view, names, views=len(views))
 
@@ -215,8 +229,10 @@ def visible_from(gaussians: Gaussians, viewer: Camera, depth: Tensor) -> Tensor:
 
     # Centres outside of the frame read some pixel at its edge, but do not count.
     pixel = (row.clamp(0, viewer.height - 1), column.clamp(0, viewer.width - 1))
-    is_unhidden = z <= greatest_depth[pixel] * (1 + VISIBLE_DEPTH_TOLERANCE)
-    return is_in_frame & (z > 0) & ((depth[pixel] == 0) | is_unhidden)
+    is_near_enough = z <= greatest_depth[pixel] * (1 + VISIBLE_DEPTH_TOLERANCE)
+    # Where nothing is drawn, nothing can hide the Gaussian.
+    is_unhidden = is_near_enough | (depth[pixel] == 0)
+    return is_in_frame & (z > 0) & is_unhidden
 
 
 def add_visible_backing(is_visible: Tensor, gaussians: Gaussians, camera: Camera) -> Tensor:

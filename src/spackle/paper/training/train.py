@@ -134,7 +134,7 @@ def train(
 
     Args:
         recipe: the settings of the run.
-        open_task: creates the task on a device.
+        open_task: creates the task (the network, its data and its loss) on a device.
         output: a folder for all results.
         reporter: shows progress; used by the first process.
         overwrite: delete an older run in `output`, but keep its samples.
@@ -168,6 +168,7 @@ def train(
 
         # All processes have looked for a checkpoint, so an older run may be deleted.
         wait_for_ranks()
+        # From here on, a full disk or a missing permission ends the run with one line.
         stack.enter_context(as_input_error(output, "cannot write: {reason}", OSError))
         if overwrite and rank() == 0:
             remove_run(output)
@@ -230,7 +231,9 @@ def run_steps(run: TrainingRun) -> str:
 
     The reason is "steps", "patience" or "stopped", see `train`.
     """
-    progress, optim, settings = run.progress, run.recipe.optim, run.recipe.run
+    progress = run.progress
+    optim = run.recipe.optim
+    settings = run.recipe.run
     passes = (
         (step, items)
         for step in range(progress.step, optim.steps)
@@ -388,7 +391,8 @@ def validate_and_save(run: TrainingRun, is_last_step: bool) -> None:
     validated, and the state at the end of a run is always saved. All processes validate; process 0
     writes.
     """
-    settings, progress = run.recipe.run, run.progress
+    settings = run.recipe.run
+    progress = run.progress
     if progress.step % settings.validate_every == 0 or is_last_step:
         measures = validate(run.task, run.average, run.device)
         is_best = progress.record_validation(

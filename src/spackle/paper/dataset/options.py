@@ -1,0 +1,169 @@
+"""The options of `spackle dataset build`, and the record of all that determines a dataset."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import spackle
+from spackle.bases.settings import NETWORK_BASES, BaseSettings
+from spackle.core.trajectories import MAX_DISPARITY, SharpTrajectory
+from spackle.depth.readers import find_depth_file
+from spackle.inpaint import (
+    Inpainter,
+    InpainterOptions,
+    get_inpainter,
+    inpainter_class,
+    is_inpainter,
+)
+from spackle.paper.dataset.photos import PhotoFile
+from spackle.paper.dataset.views import COMPLETIONS
+from spackle.residual import MASK_THRESHOLD
+from spackle.runtime.digests import file_fingerprint, json_digest
+from spackle.runtime.errors import InputError, check_name
+from spackle.weights import weights_digest, weights_digests
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DatasetOptions:
+    """The options of `spackle dataset build`; the command line checks the bounds of its numbers."""
+
+    base: BaseSettings  # turns a photo into Gaussians: a network, or depth maps
+    images: Path | None = None  # folder of a COCO JSON's photos
+    sample: int | None = None  # number of photos; None: all
+    seed: int = 0  # for the choice of photos and paths
+    views: int = 20  # per photo, including the photo's camera, as in the paper
+    trajectory: SharpTrajectory | None = None  # the camera path; None: drawn for each photo
+    # Range of the random disparity, which says how far the camera moves.
+    disparity: tuple[float, float] = (0.1, 0.6)
+    inpainter: str = "exemplar"  # how holes are completed, one of `COMPLETIONS`
+    inpainter_weights: Path | None = None  # a file or folder, if the inpainter has a network
+    # Long side in pixels of the images that the inpainter's network gets; None: its own default.
+    inpainter_side: int | None = None
+    workers: int = 1  # processes
+    threads: int = 2  # threads per process
+    shard_size: int = 50  # photos per shard, that is, per tar file
+
+    def open_inpainter(self) -> Inpainter | None:
+        """Open the inpainter, which paints holes; None if holes are completed in another way.
+
+        InputError if a package or weights are missing.
+        """
+        if not is_inpainter(self.inpainter):
+            return None
+        device = None if self.base.device == "auto" else self.base.device
+        options = InpainterOptions(
+            weights=self.inpainter_weights, side=self.inpainter_side, device=device
+        )
+        return get_inpainter(self.inpainter, options)
+
+    def check(self) -> None:
+        """InputError if options contradict each other; inpainters check their options
+        themselves.
+        """
+        self.base.check(allow_auto=False)
+        self._check_depth()
+        self._check_completion()
+        low, high = self.disparity
+        if not 0 < low <= high <= MAX_DISPARITY:
+            raise InputError(
+                f"`disparity` {low:g} {high:g}: give two numbers above 0 and up to "
+                f"{MAX_DISPARITY:g}, the smaller first"
+            )
+
+    def _check_depth(self) -> None:
+        """InputError if the base needs depth and gets none, or depth is not a folder."""
+        depth = self.base.depth
+        if depth is None and not self.base.uses_network:
+            raise InputError(
+                f"`base` {self.base.name} needs depth: give `depth` FOLDER; "
+                f"{', '.join(NETWORK_BASES)} need no depth"
+            )
+        # A single map would fit one photo only.
+        if isinstance(depth, Path) and not depth.is_dir():
+            raise InputError(
+                f"`depth` {depth}: no such folder: give a folder with a depth map for each photo"
+            )
+
+    def _check_completion(self) -> None:
+        """InputError for an unknown way of completion, or options that its inpainter does not
+        take.
+        """
+        takes_options = False
+        if is_inpainter(self.inpainter):
+            takes_options = inpainter_class(self.inpainter).uses_network
+        else:
+            check_name("inpainter", self.inpainter, COMPLETIONS)
+        has_options = self.inpainter_weights is not None or self.inpainter_side is not None
+        if has_options and not takes_options:
+            raise InputError(
+                f"`inpainter` {self.inpainter} takes neither `inpainter_weights` nor "
+                "`inpainter_side`"
+            )
+
+    def find_depth(self, photo: PhotoFile) -> Path | None:
+        """A photo's depth map: in the photo's subfolder of `base.depth`, or else in that folder.
+
+        None if the base takes no depth. InputError if there is no map for the photo.
+        """
+        folder = self.base.depth
+        if not isinstance(folder, Path):
+            return None
+        subfolder = folder / Path(photo.name).parent
+        return find_depth_file(subfolder if subfolder.is_dir() else folder, photo.path)
+
+    def input_digests(self, photo: PhotoFile) -> list[str]:
+        """Name and digest of a photo, and the digest of its depth map, if it has one."""
+        digests = [photo.name, photo.sha256]
+        # A missing depth map is no error yet: the build reports it, and goes on.
+        with contextlib.suppress(InputError):
+            depth_file = self.find_depth(photo)
+            if depth_file is not None:
+                digests.append(file_fingerprint(depth_file, "depth map"))
+        return digests
+
+
+def dataset_configuration(
+    options: DatasetOptions, photos: Sequence[PhotoFile], inpainter: Inpainter | None
+) -> dict[str, Any]:
+    """Everything that determines the shards' bytes, ready for JSON, without paths of this machine.
+
+    The number of threads is included, because SHARP's last bits depend on it; the number of workers
+    is not. `inpainter` is what `options.open_inpainter` has opened.
+    """
+    base = options.base
+    completion: dict[str, Any] = completion_facts(options, inpainter)
+    if inpainter is not None and inpainter.weight_files:
+        completion["weights"] = {
+            name: weights_digest(file) for name, file in inpainter.weight_files.items()
+        }
+    inputs_digest = json_digest([options.input_digests(photo) for photo in photos])
+    return {
+        "spackle": spackle.__version__,
+        "photos": {"count": len(photos), "sample": options.sample, "sha256": inputs_digest},
+        "base": {
+            "name": base.public_name,
+            "weights": weights_digests(base.model_files),
+            "precision": base.precision,
+            "device": base.device,
+        },
+        "views": {
+            "seed": options.seed,
+            "views": options.views,
+            "trajectory": options.trajectory,
+            "disparity": list(options.disparity),
+            "threshold": MASK_THRESHOLD,
+        },
+        "inpainter": completion,
+        "shard_size": options.shard_size,
+        "threads": options.threads,
+    }
+
+
+def completion_facts(options: DatasetOptions, inpainter: Inpainter | None) -> dict[str, str]:
+    """How holes are completed: the name and version of the inpainter, or of another way."""
+    version = "1" if inpainter is None else inpainter.version
+    return {"name": options.inpainter, "version": version}
