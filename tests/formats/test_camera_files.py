@@ -20,10 +20,8 @@ FRAME = {
     "world_to_camera": [[1, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, -2], [0, 0, 0, 1]],
 }
 CAMERAS: dict[str, Any] = {"width": 640, "height": 480, "frames": [FRAME]}
-FIRST, SECOND = (
-    {"time": 0, "eye": [0, 0, 0], "target": [0, 0, 3]},
-    {"time": 1.5, "eye": [0.2, 0, 0], "target": [0, 0, 3]},
-)
+FIRST = {"time": 0, "eye": [0, 0, 0], "target": [0, 0, 3]}
+SECOND = {"time": 1.5, "eye": [0.2, 0, 0], "target": [0, 0, 3]}
 PATH: dict[str, Any] = {"keyframes": [FIRST, SECOND]}
 
 

@@ -78,7 +78,8 @@ def looks(found: Gaussians, gaussians: Gaussians, *cameras: Camera) -> float:
 def test_a_scene_read_back_is_the_scene(kind: str) -> None:
     decibels, place, size, turn, color, opacity = BOUNDS[kind]
     gaussians = random_gaussians()
-    found, expected = read(kind, encode(kind, gaussians)), in_file_order(kind, gaussians)
+    found = read(kind, encode(kind, gaussians))
+    expected = in_file_order(kind, gaussians)
     middle = expected.scales.median(dim=1).values[:, None]
     assert float(((found.means - expected.means).abs() / middle).max()) <= place
     assert float((found.scales.log() - expected.scales.log()).abs().max()) <= size
@@ -120,10 +121,12 @@ EXTREMES = {
 def test_extremes_come_back_as_well_as_the_format_can(kind: str, extreme: str) -> None:
     given = {name: torch.tensor(values) for name, values in EXTREMES[extreme].items()}
     gaussians = dataclasses.replace(random_gaussians(4), **given)
-    found, expected = read(kind, encode(kind, gaussians)), in_file_order(kind, gaussians)
+    found = read(kind, encode(kind, gaussians))
+    expected = in_file_order(kind, gaussians)
     assert all(bool(torch.isfinite(t).all()) for t in found.tensors)
     torch.testing.assert_close(found.opacities, expected.opacities, rtol=0, atol=0.003)
-    colors, expected_colors = linear_to_srgb(found.colors), linear_to_srgb(expected.colors)
+    colors = linear_to_srgb(found.colors)
+    expected_colors = linear_to_srgb(expected.colors)
     torch.testing.assert_close(colors, expected_colors, rtol=0, atol=BOUNDS[kind][4])
     if extreme != "far":
         ends = {"spz": (-10, 5.94), "compressed.ply": (-20, 20)}.get(kind, (-85, 85))
@@ -143,12 +146,14 @@ def test_extremes_come_back_as_well_as_the_format_can(kind: str, extreme: str) -
 def test_scenes_are_read_as_the_plainest_reader_does(
     tmp_path: Path, kind: str, extreme: str | None
 ) -> None:
-    gaussians, path = random_gaussians(4 if extreme else 700), tmp_path / f"a.{kind}"
+    gaussians = random_gaussians(4 if extreme else 700)
+    path = tmp_path / f"a.{kind}"
     given = {name: torch.tensor(values) for name, values in EXTREMES.get(extreme or "", {}).items()}
     path.write_bytes(
         encode(kind, dataclasses.replace(gaussians, **given), Camera.from_focal(50, 64, 48), 3)
     )
-    found, expected = load_scene(path), read(kind, path.read_bytes())
+    found = load_scene(path)
+    expected = read(kind, path.read_bytes())
     for mine, plain in zip(found.gaussians.tensors, expected.tensors, strict=True):
         torch.testing.assert_close(
             mine, plain, rtol=1e-4, atol=2e-5 + 1e-7 * float(plain.abs().max())
@@ -187,7 +192,8 @@ def test_glb_keeps_the_photos_camera_and_the_border() -> None:
     lens = Camera.from_focal(50, 64, 48)
     camera = lens.looking(torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 0.5, 4.0]))
     gltf, _ = glb_parts(encode("glb", random_gaussians(1), camera, 1))
-    (scene, photo), (found,) = gltf["nodes"], gltf["cameras"]
+    scene, photo = gltf["nodes"]
+    (found,) = gltf["cameras"]
     assert scene["extras"] == {"spackle_base": 1}
     assert gltf["scenes"][0]["nodes"] == [0, 1]
     assert found["extras"] == {"K": camera.K.tolist(), "width": 64, "height": 48}
@@ -235,8 +241,10 @@ def spz_scene(near: float, far: float) -> Gaussians:
             torch.linspace(-0.5, 0.5, 40), torch.linspace(-0.4, 0.4, 32), indexing="xy"
         )
     )
-    depth, ones = torch.where(y < 0, far, near)[:, None], torch.ones_like(x)
-    scales, quats = depth / 60 * torch.tensor([1.0, 1.0, 0.1]), torch.eye(4)[:1].expand(len(x), 4)
+    depth = torch.where(y < 0, far, near)[:, None]
+    ones = torch.ones_like(x)
+    scales = depth / 60 * torch.tensor([1.0, 1.0, 0.1])
+    quats = torch.eye(4)[:1].expand(len(x), 4)
     colors = 0.5 + 0.4 * torch.stack(
         [torch.sin(20 * x), torch.sin(15 * y), torch.cos(12 * x + 9 * y)], dim=1
     )
@@ -245,7 +253,8 @@ def spz_scene(near: float, far: float) -> Gaussians:
 
 @pytest.mark.parametrize("far", [30.0, 5000.0])
 def test_spz_shows_what_is_near_and_a_far_sky(far: float) -> None:
-    gaussians, camera = spz_scene(0.3, far), Camera.from_focal(60, 64, 48)
+    gaussians = spz_scene(0.3, far)
+    camera = Camera.from_focal(60, 64, 48)
     found = read("spz", encode("spz", gaussians))
     assert looks(found, gaussians, camera) >= 43
     assert looks(found, gaussians, shifted(camera, 0.02, 0.3)) >= 41
@@ -301,7 +310,8 @@ def test_all_formats_at_once(scene: Path, tmp_path: Path) -> None:
 
 
 def test_what_a_format_cannot_hold_is_said(scene: Path, tmp_path: Path) -> None:
-    foreign, far = tmp_path / "inria.ply", tmp_path / "far.ply"
+    foreign = tmp_path / "inria.ply"
+    far = tmp_path / "far.ply"
     shutil.copy(DATA / "ply" / "little float, cameras before.ply", foreign)
     save_ply(spz_scene(0.3, 5000.0), far)
     for path, says in (
@@ -364,17 +374,20 @@ def agree(found: Gaussians, expected: Gaussians, turn: float) -> None:
     "kind", [kind for kind in FORMATS if kind != "glb"]
 )  # which it writes but does not read
 def test_splat_transform_reads_the_scene(kind: str, tmp_path: Path) -> None:
-    given, found = os.environ.get("SPLAT_TRANSFORM"), shutil.which("splat-transform")
+    given = os.environ.get("SPLAT_TRANSFORM")
+    found = shutil.which("splat-transform")
     if not (given or found):
         pytest.skip("splat-transform is not installed: npm install -g @playcanvas/splat-transform")
-    data, path = encode(kind, random_gaussians(50)), tmp_path / f"a.{kind}"
+    data = encode(kind, random_gaussians(50))
+    path = tmp_path / f"a.{kind}"
     path.write_bytes(data)
     command = ["node", given] if given else [str(found)]
     done = subprocess.run(
         [*command, "-q", path, tmp_path / "b.ply"], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
-    copy, expected = load_ply(tmp_path / "b.ply"), read(kind, data)
+    copy = load_ply(tmp_path / "b.ply")
+    expected = read(kind, data)
     agree(
         copy, expected, 0.02 if kind == "splat" else 0.001
     )  # of .splat's bytes it takes 127.5 for 0, others 128
@@ -387,10 +400,8 @@ def test_gsply_reads_the_scene_and_we_what_it_writes(kind: str, tmp_path: Path) 
     gsply = pytest.importorskip("gsply")
     path = tmp_path / f"a.{kind}"
     path.write_bytes(encode(kind, random_gaussians(50)))
-    raw, expected = (
-        gsply.read_spz(path) if kind == "spz" else gsply.plyread(path),
-        read(kind, path.read_bytes()),
-    )
+    raw = gsply.read_spz(path) if kind == "spz" else gsply.plyread(path)
+    expected = read(kind, path.read_bytes())
     means, quats, scales, opacities = map(
         torch.as_tensor, (raw.means, raw.quats, raw.scales, raw.opacities)
     )

@@ -59,7 +59,8 @@ def written(path: Path) -> np.ndarray[Any, np.dtype[np.float32]]:
 def test_independent_reader_finds_what_was_meant(tmp_path: Path) -> None:
     gaussians = random_gaussians(300)
     save_ply(gaussians, tmp_path / "a.ply")
-    found, expected = written(tmp_path / "a.ply"), raw(gaussians)
+    found = written(tmp_path / "a.ply")
+    expected = raw(gaussians)
     expected[:, 10:] /= np.linalg.norm(expected[:, 10:], axis=1, keepdims=True)
     np.testing.assert_allclose(np.delete(found, [3, 4, 5], axis=1), expected, rtol=1e-5, atol=2e-5)
     assert not found[:, 3:6].any()
@@ -90,7 +91,8 @@ def test_extremes_stay_finite(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("count", [1, ROWS_PER_BLOCK, ROWS_PER_BLOCK + 777])
 def test_first_rows_depend_on_the_first_gaussians_alone(tmp_path: Path, count: int) -> None:
-    base, more = random_gaussians(count), random_gaussians(3 * ROWS_PER_BLOCK + 1, seed=1)
+    base = random_gaussians(count)
+    more = random_gaussians(3 * ROWS_PER_BLOCK + 1, seed=1)
     save_ply(base, tmp_path / "base.ply")
     threads = torch.get_num_threads()
     try:
@@ -103,7 +105,8 @@ def test_first_rows_depend_on_the_first_gaussians_alone(tmp_path: Path, count: i
         for name in ("base.ply", "both.ply")
     ]
     assert rows[1].startswith(rows[0])
-    loaded, both = load_ply(tmp_path / "base.ply"), load_ply(tmp_path / "both.ply")
+    loaded = load_ply(tmp_path / "base.ply")
+    both = load_ply(tmp_path / "both.ply")
     close(
         loaded, dataclasses.replace(base, quats=torch.nn.functional.normalize(base.quats, dim=-1))
     )
@@ -132,12 +135,14 @@ def test_sharp_file(name: str) -> None:
 
 
 def test_what_a_comment_keeps(tmp_path: Path) -> None:
-    path, camera = tmp_path / "a.ply", Camera.from_focal(50.25, 64, 48)
+    path = tmp_path / "a.ply"
+    camera = Camera.from_focal(50.25, 64, 48)
     save_ply(random_gaussians(9), path)
     plain = PlyFile(path)
     assert plain.camera() is plain.base_count() is plain.disparity() is None
     save_ply(random_gaussians(9), path, camera=camera, base_count=7, disparity=0.3)
-    file, found = PlyFile(path), camera_of(path)
+    file = PlyFile(path)
+    found = camera_of(path)
     assert torch.equal(found.K, camera.K)
     assert (found.width, found.height, file.base_count(), file.disparity()) == (64, 48, 7, 0.3)
     content = path.read_bytes()
@@ -192,7 +197,8 @@ def test_a_bad_file_is_refused_with_the_reason(tmp_path: Path, content: bytes, s
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
-    path, broken = tmp_path / "a.ply", random_gaussians(2 * ROWS_PER_BLOCK)
+    path = tmp_path / "a.ply"
+    broken = random_gaussians(2 * ROWS_PER_BLOCK)
     broken.means[-1, 0] = math.nan
     save_ply(random_gaussians(3), path)
     before = path.read_bytes()

@@ -31,17 +31,14 @@ def test_only_holes_change_and_results_repeat(name: str) -> None:
 def test_exemplar_extends_a_pattern_also_without_depth() -> None:
     y, x = torch.meshgrid(torch.arange(100), torch.arange(117), indexing="ij")
     bricks = torch.where((y % 8 < 2) | ((x + 7 * (y // 8 % 2)) % 14 < 2), 0.8, 0.3)
-    truth, hole = (
-        bricks[..., None] * torch.tensor([1, 0.8, 0.6]),
-        torch.zeros(100, 117, dtype=torch.bool),
-    )
+    truth = bricks[..., None] * torch.tensor([1, 0.8, 0.6])
+    hole = torch.zeros(100, 117, dtype=torch.bool)
     hole[40:66, 45:71] = True
-    holes, depths = torch.stack([hole, hole | True, hole & False]), torch.ones(3, 100, 117)
+    holes = torch.stack([hole, hole | True, hole & False])
+    depths = torch.ones(3, 100, 117)
     depths[0, :, :9] = 0
-    rgb, painter = (
-        torch.where(holes[..., None], 0.0, truth),
-        get_inpainter("exemplar", InpainterOptions()),
-    )
+    rgb = torch.where(holes[..., None], 0.0, truth)
+    painter = get_inpainter("exemplar", InpainterOptions())
     painted = painter.paint(rgb, holes, depths)
     assert psnr(painted[0][hole], truth[hole]) > 40
     assert torch.equal(painted[0][~hole], truth[~hole])

@@ -63,11 +63,9 @@ def file(weights: Weights, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_network_matches_the_original(
     name: str, size: tuple[int, ...], height: int, width: int, step: int
 ) -> None:
-    golden, network, x = (
-        torch.from_numpy(GOLDEN[name]),
-        LamaNetwork(lama_weights(*size)),
-        made_input(height, width),
-    )
+    golden = torch.from_numpy(GOLDEN[name])
+    network = LamaNetwork(lama_weights(*size))
+    x = made_input(height, width)
     logits = network.logits(x)
     torch.testing.assert_close(
         logits[0, :, ::step, ::step], golden, rtol=0, atol=1e-5 * float(golden.abs().max())
@@ -90,10 +88,8 @@ def named(prefix: str, weights: Weights) -> Weights:
 
 @pytest.mark.parametrize("prefix", ["model.generator.", "generator.", ""])
 def test_published_files_are_read(weights: Weights, tmp_path: Path, prefix: str) -> None:
-    path, others = (
-        tmp_path / "big-lama.pt",
-        {f"{prefix}model.1.bn_l.num_batches_tracked": torch.tensor(7)},
-    )
+    path = tmp_path / "big-lama.pt"
+    others = {f"{prefix}model.1.bn_l.num_batches_tracked": torch.tensor(7)}
     if prefix == "model.generator.":
         others |= {
             "discriminator.model0.0.weight": torch.ones(3, 3),
@@ -131,10 +127,8 @@ def test_other_networks_are_refused(
 def views(
     height: int, width: int, *holes: tuple[int, int, int, int]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    rgb, hole = (
-        made_input(height, width)[:, :3].permute(0, 2, 3, 1),
-        torch.zeros(1, height, width, dtype=torch.bool),
-    )
+    rgb = made_input(height, width)[:, :3].permute(0, 2, 3, 1)
+    hole = torch.zeros(1, height, width, dtype=torch.bool)
     for top, left, bottom, right in holes:
         hole[:, top:bottom, left:right] = True
     return torch.where(hole[..., None], 0.0, rgb), hole, torch.zeros(1, height, width)

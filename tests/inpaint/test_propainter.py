@@ -95,7 +95,8 @@ class Video:
     def __init__(
         self, frames: Any, masks: Any, *networks: nn.Module, use_cuda: bool, step: int
     ) -> None:
-        self.frames, self.masks = frames[0:step], masks[0:step]
+        self.frames = frames[0:step]
+        self.masks = masks[0:step]
         Video.given.append((self.frames, self.masks))
 
     def __iter__(self) -> Iterator[Tensor]:

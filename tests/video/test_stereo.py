@@ -78,7 +78,8 @@ def test_frame_size_and_layout(layout: str, height: int, width: int) -> None:
 def test_an_anaglyph_of_grey_is_grey_and_each_eye_has_its_filter() -> None:
     grey = torch.linspace(0, 1, 64).repeat(3, 1).T
     torch.testing.assert_close(anaglyph(grey, grey), grey, atol=0.004, rtol=0)
-    white, black = torch.ones(1, 3), torch.zeros(1, 3)
+    white = torch.ones(1, 3)
+    black = torch.zeros(1, 3)
     assert anaglyph(white, black)[0].tolist() == pytest.approx([1, 0, 0], abs=1e-6)
     cyan = anaglyph(black, white)[0]
     assert (float(cyan[0]), float(cyan[1:].min()) > 0.99) == (0, True)

@@ -45,7 +45,8 @@ def decoded(path: Path) -> tuple[str, list[av.VideoFrame], list[Tensor]]:
     )
 
 
-CUES, CLUSTER = b"\x1c\x53\xbb\x6b", b"\x1f\x43\xb6\x75"
+CUES = b"\x1c\x53\xbb\x6b"
+CLUSTER = b"\x1f\x43\xb6\x75"
 SIZES = [(48, 64), (47, 65)]
 
 
@@ -56,11 +57,9 @@ SIZES = [(48, 64), (47, 65)]
 def test_a_video_decodes_to_what_went_in_and_plays_while_it_loads(
     tmp_path: Path, name: str, codec: str, index: bytes, height: int, width: int
 ) -> None:
-    given, path, reused = (
-        frames(7, height, width),
-        tmp_path / name,
-        torch.empty(height, width, 3, dtype=torch.uint8),
-    )
+    given = frames(7, height, width)
+    path = tmp_path / name
+    reused = torch.empty(height, width, 3, dtype=torch.uint8)
     save_video((reused.copy_(255 * frame) for frame in given), path, fps=25, loop=2)
     kind, shown, colors = decoded(path)
     assert kind == codec
@@ -87,7 +86,9 @@ def test_a_video_decodes_to_what_went_in_and_plays_while_it_loads(
 def test_the_same_frames_give_the_same_bytes_whatever_memory_held(
     tmp_path: Path, name: str
 ) -> None:
-    perturb, found, mallopt = -6, set(), ctypes.CDLL(None).mallopt
+    perturb = -6
+    found = set()
+    mallopt = ctypes.CDLL(None).mallopt
     for byte in (1, 85, 254):
         mallopt(perturb, byte)
         try:
@@ -115,7 +116,8 @@ def test_colours_are_bt709(tmp_path: Path, color: tuple[float, float, float]) ->
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.gif", "a.webp", "a.webm"])
 def test_a_failed_video_leaves_the_old_file(tmp_path: Path, name: str) -> None:
-    path, one = tmp_path / name, torch.zeros(16, 16, 3)
+    path = tmp_path / name
+    one = torch.zeros(16, 16, 3)
     path.write_bytes(b"old")
     for wrong, says in (
         ([], "at least one"),
@@ -130,7 +132,8 @@ def test_a_failed_video_leaves_the_old_file(tmp_path: Path, name: str) -> None:
 
 def animation(path: Path) -> tuple[list[Tensor], list[int], int | None]:
     """Frames, their milliseconds and the loop count of a GIF or WebP, by Pillow."""
-    shown, times = [], []
+    shown = []
+    times = []
     with Image.open(path) as image:
         loop = image.info.get("loop")
         for index in range(getattr(image, "n_frames", 1)):
@@ -180,7 +183,8 @@ def test_an_animation_says_how_often_it_plays(tmp_path: Path, name: str) -> None
 
 
 def test_a_gif_keeps_rare_colours_and_spreads_a_gradient(tmp_path: Path) -> None:
-    ramp, orange = torch.linspace(0.1, 0.6, 160), torch.tensor([1.0, 0.5, 0.1])
+    ramp = torch.linspace(0.1, 0.6, 160)
+    orange = torch.tensor([1.0, 0.5, 0.1])
     pictures = [ramp[:, None].repeat(90, 1, 3) for _ in range(3)]
     for k, picture in enumerate(pictures):
         picture[40:46, 20 * k : 20 * k + 6] = orange

@@ -107,7 +107,8 @@ def records_of(path: Path) -> dict[str, bytes]:
 
 
 def test_code_in_a_file_is_not_run(tmp_path: Path) -> None:
-    path, mark = tmp_path / "weights.pt", tmp_path / "mark"
+    path = tmp_path / "weights.pt"
+    mark = tmp_path / "mark"
     write_script(WHOLE, path)
     records = records_of(path)
     code = next(name for name in records if name.startswith("code/") and name.endswith(".py"))

@@ -75,14 +75,16 @@ def test_an_older_file_or_a_link_stays_until_the_new_one_is_whole(
     site: Site, tmp_path: Path
 ) -> None:
     (tmp_path / "real").mkdir()
-    link, real = tmp_path / "link.pt", tmp_path / "real" / "weights.pt"
+    link = tmp_path / "link.pt"
+    real = tmp_path / "real" / "weights.pt"
     link.symlink_to(real)
     real.write_bytes(b"old")
     site.status = 404
     with pytest.raises(InputError):
         fetch(site.url, link)
     assert real.read_bytes() == b"old"
-    site.status, site.headers = 200, {"Content-Length": None}
+    site.status = 200
+    site.headers = {"Content-Length": None}
     fetch(site.url, link)
     assert link.is_symlink()
     assert real.read_bytes() == CONTENT
@@ -90,7 +92,8 @@ def test_an_older_file_or_a_link_stays_until_the_new_one_is_whole(
 
 @pytest.mark.parametrize("knows_ranges", [True, False])
 def test_a_later_call_requests_only_the_rest(site: Site, target: Path, knows_ranges: bool) -> None:
-    site.drops, site.ranges = [BREAK], knows_ranges
+    site.drops = [BREAK]
+    site.ranges = knows_ranges
     refused(site.url, target, f"{len(CONTENT) - BREAK:,} bytes early")
     assert os.listdir(target.parent) == ["weights.pt.part"]
     steps: list[tuple[int, int]] = []
@@ -255,9 +258,7 @@ def test_list_tells_which_weights_are_on_this_machine(weights: Path) -> None:
     for content, said in ((None, "not here"), (CONTENT, "whole 1.0 MB"), (CONTENT[:-1], "damaged")):
         if content is not None:
             (weights / SHARP_FILE).write_bytes(content)
-        result, words = (
-            run("weights", "list"),
-            ("research only", "photo to Gaussians", str(weights)),
-        )
+        result = run("weights", "list")
+        words = ("research only", "photo to Gaussians", str(weights))
         assert (result.code, result.err) == (0, "")
         assert all(part in " ".join(result.out.split()) for part in (said, *words))
