@@ -1,4 +1,4 @@
-"""Depth maps are resampled, sharpened along the photo's outlines, and smoothed if they are noisy."""
+"""Depth maps are resampled, sharpened along the photo's outlines, and smoothed if noisy."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def front(scene: Scene, depth: DepthMap) -> Tensor:
 def settled(
     inverse: Tensor, known: Tensor, rgb: Tensor, focal: tuple[float, float] = FOCAL
 ) -> tuple[Tensor, Tensor]:
-    """Resampled and sharpened inverse depth at the photo's size, and a mask of the pixels that are no holes."""
+    """Sharpened inverse depth at the photo's size, and a mask of the pixels that are no holes."""
     depths, mask = inverse.numpy(), known.numpy()
     sampled = resample_map(depths, mask, find_edges(depths, mask, focal), *rgb.shape[:2])
     return torch.from_numpy(
@@ -116,7 +116,10 @@ def test_compiled_kernels_agree_with_plain_python(seed: int, size: tuple[int, in
 
 
 def sphere(radius_px: float, behind: float, size: int = 120) -> Tensor:
-    """Exact inverse depth of a ball at 3 m, `behind` radii in front of a wall, at a focal length of 200 pixels."""
+    """Exact inverse depth of a ball at 3 m, `behind` radii in front of a wall.
+
+    The focal length is 200 pixels.
+    """
     ray = Camera.from_focal(200, size, size).pixel_centers().sub(size / 2).div(200)
     radius = 3 * radius_px / 200
     a, c = ray.square().sum(-1) + 1, 9 - radius**2

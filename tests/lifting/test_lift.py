@@ -1,4 +1,4 @@
-"""The rgbd base: sharp and without holes at the photo's camera, and with open disocclusions from the side."""
+"""The rgbd base: no holes at the photo's camera, and open disocclusions from the side."""
 
 from __future__ import annotations
 
@@ -43,14 +43,14 @@ def eroded(mask: Tensor, pixels: int) -> Tensor:
 
 
 def in_frame(camera: Camera, points: Tensor, margin: float = 0.0) -> Tensor:
-    """A mask of the world points that lie in a camera's frame, at least `margin` pixels from the border."""
+    """A mask of the world points in a camera's frame, at least `margin` pixels from the border."""
     uv, z = camera.project(points)
     size = torch.tensor([camera.width, camera.height]).to(uv)
     return ((uv > margin) & (uv < size - margin)).all(-1) & (z > 0)
 
 
 def shows_plane(scene: Scene, camera: Camera) -> Tensor:
-    """[H, W] mask of a view's pixels that show the plane of `slanted_plane` well inside the photo."""
+    """[H, W] mask of a view's pixels that show the plane of `slanted_plane` inside the photo."""
     inverse = 1 / scene.depth.double()
     slope = torch.stack([inverse[0, -1] - inverse[0, 0], inverse[-1, 0] - inverse[0, 0]])
     slope = slope / torch.tensor([scene.camera.width - 1, scene.camera.height - 1])

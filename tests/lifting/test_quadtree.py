@@ -37,7 +37,7 @@ def ground(height: int = 27, width: int = 38) -> tuple[Tensor, Tensor, Tensor, T
 
 
 def losses(picture: Tensor, height: int, width: int) -> Tensor:
-    """[H/height, W/width] losses of tiles of one size, by PyTorch's bilinear interpolation of their means."""
+    """[H/height, W/width] losses of tiles, by PyTorch's bilinear interpolation of their means."""
     rows, columns = picture.shape[0] // height * height, picture.shape[1] // width * width
     inside = picture[:rows, :columns].permute(2, 0, 1)[None].double()
     smooth = interpolate(avg_pool2d(inside, (height, width)), size=(rows, columns), mode="bilinear")

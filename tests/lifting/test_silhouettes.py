@@ -29,7 +29,10 @@ CPU = CpuRenderer()
 
 
 def steps(seed: int, height: int = 15, width: int = 17) -> tuple[Image, Image, Image]:
-    """Inverse depth with steps along random lines, its slopes, and blurred noisy colours that follow the depth."""
+    """Inverse depth with steps along random lines, its slopes, and colours.
+
+    The colours are blurred and noisy, and follow the depth.
+    """
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[:height, :width]
     inverse = 0.2 + 0.002 * x + 0.001 * rng.random((height, width))
@@ -65,7 +68,10 @@ def test_compiled_kernels_agree_with_plain_python(seed: int) -> None:
 
 
 def blended() -> Scene:
-    """A dark box in front of a bright wall, rendered at four times the resolution; its left border halves pixels."""
+    """A dark box in front of a bright wall, rendered at four times the resolution.
+
+    The box's left border halves pixels.
+    """
     fine = box_before_wall(width=384, height=288, focal=320)
     near = fine.depth < 3
     near[:, 128:130] = False  # the left border lies half a pixel further in

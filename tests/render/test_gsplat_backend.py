@@ -45,7 +45,10 @@ def gpu(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Gspl
 
 
 def agree(one: Rendering, other: Rendering) -> None:
-    """Equal except for pixels at a threshold, where the last digit decides whether a Gaussian is drawn."""
+    """Equal except for pixels at a threshold.
+
+    There, the last digit decides whether a Gaussian is drawn.
+    """
     same = ((one.rgb - other.rgb).abs().amax(-1) < 2e-4) & ((one.alpha - other.alpha).abs() < 1e-4)
     assert float(same.float().mean()) > 0.97
     torch.testing.assert_close(one.rgb, other.rgb, atol=2e-2, rtol=0)

@@ -226,7 +226,7 @@ def test_needles_and_edge_on_discs_match_the_reference(stretch):
 def test_gradients_match_the_reference(scene):
     gaussians, camera, eps2d, _ = scene
     sturdy = sturdy_pixels(gaussians, camera, eps2d)
-    # With one weighting, contributions of pixels may cancel; with several weightings, this is unlikely.
+    # With one weighting, contributions of pixels may cancel; with several, this is unlikely.
     weights = torch.randn(
         4, *sturdy.shape, 5, generator=torch.Generator().manual_seed(len(gaussians))
     )

@@ -94,6 +94,7 @@ class ClipCompleter:
         frame = self._align(rgb, prediction)
         camera = self._camera(prediction, frame.state.depth_range)
         base_rendering = self.renderer.render(frame.base, camera)
+        # After a cut, alignment leaves out the previous frame.
         starts_shot = frame.previous is not self._previous
 
         if self.fill:
@@ -101,12 +102,12 @@ class ClipCompleter:
         else:
             memory = None
             view = CompletedView(
-                camera,
-                frame.base,
-                Gaussians.empty(),
-                base_rendering,
-                base_rendering,
-                base_rendering,
+                camera=camera,
+                base=frame.base,
+                aux=Gaussians.empty(),
+                rendering=base_rendering,
+                base_rendering=base_rendering,
+                independent_rendering=base_rendering,
             )
         self._previous = dataclasses.replace(frame.state, memory=memory)
         self._completed_frames += 1
@@ -139,6 +140,9 @@ class ClipCompleter:
             photo_camera: that took the frame.
             camera: the view.
             base_rendering: the view of the frame's own Gaussians.
+
+        Returns:
+            The completed view, and what the next frame has to know of it.
         """
         # Without texture, which would flicker: each frame would find other patches.
         context = FillContext(
@@ -150,6 +154,8 @@ class ClipCompleter:
             precision=self.precision,
         )
         filled = fill_view(context, camera, [frame.guard], base_rendering)
+
+        # The Gaussians that fill holes ("aux") take colours of the previous frame.
         aux, memory = propagate_colors(
             frame.base,
             filled.aux,
@@ -160,7 +166,12 @@ class ClipCompleter:
             self.flow,
         )
         view = CompletedView(
-            camera, frame.base, aux, memory.rendering, base_rendering, filled.rendering
+            camera=camera,
+            base=frame.base,
+            aux=aux,
+            rendering=memory.rendering,
+            base_rendering=base_rendering,
+            independent_rendering=filled.rendering,
         )
         return view, memory
 

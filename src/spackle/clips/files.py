@@ -18,7 +18,7 @@ from av.video.reformatter import VideoReformatter
 from av.video.stream import VideoStream
 from torch import Tensor
 
-from spackle.core.photo import check_pixel_count
+from spackle.core.image_files import check_pixel_count
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import check_file
 from spackle.runtime.progress import Progress
@@ -147,6 +147,7 @@ def _read_clip(path: str | os.PathLike[str], first: int | None, progress: Progre
     if frame is None:
         raise InputError(f"{path}: has no frames: give another clip")
 
+    # All frames have the size and the rotation of the last one.
     width, height = _square_pixel_size(frame, pixel_aspect)
     if _quarter_turns(frame) % 2 == 1:
         width, height = height, width

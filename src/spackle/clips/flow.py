@@ -99,7 +99,8 @@ def sample(image: Tensor, uv: Tensor) -> Tensor:
 def extend_flow(tracked: Track, inverse_depth: Tensor, known: Tensor, camera: Camera) -> Tensor:
     """Extend the flow into holes: [H, W, 2] pixels (x, y) at every pixel.
 
-    In a hole it is the camera's motion, plus the deviation from that motion at the hole's far rim.
+    A hole is what the frame does not show of this view. Its flow is the camera's motion, plus the
+    deviation from that motion at the hole's far rim, because a hole uncovers the surface behind.
 
     Args:
         tracked: the flow; where it is reliable and `known` is true, it is kept.

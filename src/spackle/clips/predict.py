@@ -51,17 +51,24 @@ def clip_options(scene: PipelineOptions, photo: PhotoOptions, workers: int) -> P
     """
     _check_options_suit_clips(scene, photo, workers)
     OpenCV("a clip, whose motion has to be followed,")  # fails if it is not installed
-    if scene.fill.fill == "auto":  # this fill opens no inpainter
-        return dataclasses.replace(scene, fill=dataclasses.replace(scene.fill, fill="network"))
-    return scene
+    if scene.fill.fill != "auto":
+        return scene
+
+    # For photos, "auto" may choose an inpainter, whose texture would flicker.
+    network_fill = dataclasses.replace(scene.fill, fill="network")
+    return dataclasses.replace(scene, fill=network_fill)
 
 
 def _check_options_suit_clips(scene: PipelineOptions, photo: PhotoOptions, workers: int) -> None:
-    """Raise an InputError for an option that does not apply to a clip."""
+    """Raise an InputError for an option that does not apply to a clip.
+
+    `scene` and `photo` are the user's options; `workers` is the number of processes.
+    """
     path = scene.path
     unsuitable: list[str] = []  # names of options, in the order of messages
     if path.video.suffix != ".mp4":
         unsuitable.append("format")
+    # No option of a video applies but its format, if that is mp4.
     default_video = VideoOptions()
     for field in dataclasses.fields(VideoOptions):
         is_given = getattr(path.video, field.name) != getattr(default_video, field.name)
@@ -261,7 +268,15 @@ class FramePredictor:
             yield self._complete_frame(index, rgb)
 
     def _complete_frame(self, index: int, rgb: Tensor) -> CompletedView:
-        """Predict frame number `index`, [H, W, 3] sRGB in 0..1, and complete its view."""
+        """Predict the Gaussians of a frame, and complete its view.
+
+        Args:
+            index: the frame's number, from 0.
+            rgb: [H, W, 3] sRGB in 0..1.
+
+        Raises:
+            InputError: it names the frame, which cannot be predicted or completed.
+        """
         focal_px, focal_source = self._focal
         photo = Photo(rgb, focal_px, focal_source, self._clip.path / FRAME_NAME.format(index))
         check_photo_size(photo.width, photo.height, photo.path)

@@ -115,10 +115,11 @@ def _trust(hole: Tensor, aux_share: Tensor, weight: Tensor) -> Tensor:
     """[H, W] in 0..1: how much the next frame may trust the colour of each pixel.
 
     Args:
-        hole: [H, W] bool: pixels that the base does not cover; all others have trust 1.
-        aux_share: [H, W] share of a pixel's light that comes from aux Gaussians.
+        hole: [H, W] bool: pixels that the frame does not show; all others have trust 1.
+        aux_share: [H, W] share of a pixel's light that comes from the Gaussians that fill holes.
         weight: [H, W] share of a pixel's colour that comes from the previous frame, with its trust.
     """
+    # A colour is either recalled or made up; of a faint one, nothing is known.
     trust_in_hole = weight.clamp_min(COMPLETED_TRUST)
     trust_in_hole = torch.where(aux_share < MIN_REMEMBERED_SHARE, 0.0, trust_in_hole)
     return torch.where(hole, trust_in_hole, 1.0)
@@ -127,7 +128,9 @@ def _trust(hole: Tensor, aux_share: Tensor, weight: Tensor) -> Tensor:
 def surfaces_behind_base(
     base_rendering: Rendering, rendering: Rendering, hole: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Light and depth of a view; in holes, only those of the aux Gaussians.
+    """Light and depth of a view; in holes, only those of the Gaussians that fill them.
+
+    "Base" Gaussians are what the frame shows, "aux" Gaussians fill the holes that it leaves.
 
     Args:
         base_rendering: of the base Gaussians alone.
@@ -144,11 +147,13 @@ def surfaces_behind_base(
     light = srgb_to_linear(rendering.rgb)
     aux_light = ((light - base_light) / aux_share[..., None]).clamp(0, 1)
 
+    # The same for depth, which a rendering divides by alpha.
     depth_sum = rendering.depth * rendering.alpha
     base_depth_sum = base_rendering.depth * base_rendering.alpha
     aux_depth = (depth_sum - base_depth_sum) / aux_share
     depth = torch.where(hole & (aux_depth > 0), aux_depth, rendering.depth)
 
+    # Where nothing was drawn, the inverse depth must still be positive.
     inverse_depth = torch.where(depth > 0, 1 / depth.clamp_min(1e-6), 0.0)
     is_drawn = inverse_depth > 0
     farthest = inverse_depth.new_tensor(1.0)
@@ -236,7 +241,9 @@ def _change_of_new_pixels(
 
 
 def _recolored(aux: Gaussians, camera: Camera, change: Tensor, weight: Tensor) -> Gaussians:
-    """Aux Gaussians with the mean change of colour in their cell of 2×2 pixels added.
+    """The Gaussians that fill holes, with the mean change of colour in their cell added.
+
+    A cell has 2×2 pixels.
 
     Args:
         aux: the Gaussians.

@@ -29,7 +29,8 @@ RIM_SIGMA_SIDES = 0.42
 RECEDING_SIDES = 2
 VISIBLE_BACKING_SHARE = 0.02  # share of the backing's colour that is visible through the front
 SAME_SURFACE_RATIO = 0.02  # pixels that differ by less than this share are on one surface
-MIN_CENTER_RATIO = 0.5  # a cell's centre is never farther than this share of the least depth
+# A cell's centre has at least this share of the photo's smallest inverse depth.
+MIN_CENTER_RATIO = 0.5
 
 
 def backing_surfels(
@@ -48,7 +49,8 @@ def backing_surfels(
     Returns:
         One part for each size and place, none if the photo is one pixel high or wide.
     """
-    hidden_far = pixels.mixed & pixels.near_is_main  # the far surface is the lesser one
+    # The farthest surface that a pixel shows, also where that is the lesser of two.
+    hidden_far = pixels.mixed & pixels.near_is_main
     deepest = pixels.main.replaced(hidden_far, pixels.other)
     cell_depths = _cells(deepest.inverse_depth)  # [h, w, 4]
     if cell_depths.numel() == 0:
@@ -68,9 +70,10 @@ def backing_surfels(
     tree = Quadtree(picture, surface.inverse_depth, slope_by_cell, may_share, levels, CREASE_RATIO)
     single, tiles = tree.cut(gaussian_cost / VISIBLE_BACKING_SHARE)
 
+    # The larger a backing Gaussian and the farther from a near surface's rim, the wider it may be.
     inner_cells = Tiles(1, 1, *(single & backed & ~has_near).nonzero(as_tuple=True))
     rim_cells = Tiles(1, 1, *(single & backed & has_near).nonzero(as_tuple=True))
-    parts = [(same_size, LARGE_SIGMA_SIDES) for same_size in tiles]
+    parts = [(of_one_size, LARGE_SIGMA_SIDES) for of_one_size in tiles]
     parts += [(inner_cells, TILE_SIGMA_SIDES), (rim_cells, RIM_SIGMA_SIDES)]
     return [
         _receded(surface.tile_samples(part, sigma_sides, cell_px=CELL_PX), part)
@@ -81,16 +84,22 @@ def backing_surfels(
 def _cell_surface(deepest: Surface, cell_depths: Tensor) -> Surface:
     """The surface of each cell's farthest pixel, at the cell's centre: a surface of [h, w] cells.
 
+    A cell has 2×2 pixels, numbered 0 to 3 row by row.
+
     Args:
         deepest: the farthest surface of each pixel, [H, W].
         cell_depths: [h, w, 4] inverse depths of each cell's pixels on this surface.
     """
-    far, pick = cell_depths.min(dim=-1)  # [h, w]: inverse depth and number of the farthest pixel
-    pick_index = pick[..., None, None].expand(*pick.shape, 1, 2)
-    slope = _cells(deepest.slope).gather(2, pick_index).squeeze(2)  # [h, w, 2]
+    # The farthest pixel has the smallest inverse depth.
+    far, number = cell_depths.min(dim=-1)  # [h, w] each
+    slope_index = number[..., None, None].expand(*number.shape, 1, 2)
+    slope = _cells(deepest.slope).gather(2, slope_index).squeeze(2)  # [h, w, 2]
 
-    # The cell's centre lies half a pixel from the farthest pixel's centre, along x and along y.
-    offset = torch.stack([0.5 - pick % 2, 0.5 - pick // 2], dim=-1)
+    # The cell's centre lies half a pixel from that pixel's centre, along x and along y. A surface
+    # is extended at most to half the smallest inverse depth.
+    x_in_cell = number % 2
+    y_in_cell = number // 2
+    offset = torch.stack([0.5 - x_in_cell, 0.5 - y_in_cell], dim=-1)  # [h, w, 2]
     at_center = (far + (slope * offset).sum(-1)).clamp_min(MIN_CENTER_RATIO * far.min())
 
     # The colour is the mean of the cell's pixels on the same surface.
@@ -104,6 +113,7 @@ def _cell_surface(deepest: Surface, cell_depths: Tensor) -> Surface:
 def _receded(samples: SurfelSamples, tiles: Tiles) -> SurfelSamples:
     """The backing moved behind the front Gaussians, further where the surface is steep.
 
+    The backing are wide Gaussians that close the gaps between those of the pixels from behind.
     `samples` has one Gaussian for each of `tiles`, which are rectangles of cells.
     """
     reach_px = CELL_PX * RECEDING_SIDES * torch.tensor([tiles.width, tiles.height])

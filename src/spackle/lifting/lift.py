@@ -55,13 +55,17 @@ def lift_depth_map(
     inverse_depth = np.zeros(known.shape, np.float32)
     np.divide(1, z.numpy(), out=inverse_depth, where=known)
 
-    # The step between two values that the map can store, as a step of the inverse depth.
-    quantization = np.float32(depth.quantum or 0) * (
-        # |d(1/z)| = dz/z² for a map that stores depth.
-        inverse_depth**2 if depth.quantity == "depth" else np.ones_like(inverse_depth)
-    )
+    # The step between two values that the map can store, as a step of the inverse depth: for a map
+    # that stores depth, |d(1/z)| = dz/z².
+    stored_step = np.float32(depth.quantum or 0)
+    step_ratio = np.ones_like(inverse_depth)
+    if depth.quantity == "depth":
+        step_ratio = inverse_depth**2
+    quantization = stored_step * step_ratio
     inverse_depth = smooth_inverse_depth(inverse_depth, known, quantization)
 
+    # Bring the map to the photo's size. There, each pixel is settled (has a depth), open (lies in a
+    # depth edge, so that its side must be found), or a hole.
     rows, columns = known.shape
     fx, fy = camera.focal
     map_focal = (fx * columns / camera.width, fy * rows / camera.height)  # pixels of the map
@@ -74,9 +78,8 @@ def lift_depth_map(
     photo_inverse_depth = torch.from_numpy(assign_open_pixels(resampled, rgb.numpy()))  # [H, W]
     gaussians = layered_gaussians(photo_inverse_depth, srgb_to_linear(rgb), camera, levels)
 
-    notes: dict[str, float | int | str] = {
-        "depth_filled": round(float((resampled.state == HOLE).mean()), 4)
-    }
+    hole_share = float((resampled.state == HOLE).mean())
+    notes: dict[str, float | int | str] = {"depth_filled": round(hole_share, 4)}
     if depth.depth.shape != photo_inverse_depth.shape:
         notes["depth_resampled_from"] = f"{columns}×{rows}"
     return LiftedPhoto(gaussians, camera, notes)

@@ -77,7 +77,7 @@ def assign_open_pixels(resampled: ResampledMap, rgb: Floats) -> Floats:
 
 @inlined_kernel
 def _color_change(rgb: Any, y: int, x: int, v: int, u: int) -> Any:
-    """Sum of the channels' differences between the pixels (y, x) and (v, u) of a photo [H, W, 3]."""
+    """Sum of the channels' differences between two pixels (y, x), (v, u) of a photo [H, W, 3]."""
     change = abs(rgb[y, x, 0] - rgb[v, u, 0]) + abs(rgb[y, x, 1] - rgb[v, u, 1])
     return change + abs(rgb[y, x, 2] - rgb[v, u, 2])
 

@@ -38,6 +38,10 @@ def resample_map(
 ) -> ResampledMap:
     """Resample a map's inverse depth to the size of the photo.
 
+    A smeared edge is a depth edge that the map blurs over several pixels. Each pixel of the photo
+    becomes settled (its depth is known), open (it lies in an edge, and its side is undecided) or a
+    hole (its depth is unknown).
+
     Between four map pixels of one surface the inverse depth is interpolated bilinearly, so a plane
     stays a plane. If an edge runs between these four, or one of them lies in a smeared edge, the
     photo's pixel stays open. If unknown map pixels have more than half of the weight, the photo's
@@ -47,9 +51,10 @@ def resample_map(
     Args:
         inverse_depth: [h, w] 1/z.
         known: [h, w] bool: pixels of the map with a depth.
-        edges: of the map.
+        edges: the depth edges of the map.
         height, width: of the photo.
     """
+    # The depth of a pixel in a smeared edge belongs to no surface.
     sound = known & (edges.smear_height == 0)
     slope_x = _flattest_slopes(inverse_depth, sound, edges.right)
     slope_y = _flattest_slopes(
@@ -162,9 +167,17 @@ def _resample(
 
             covered_depth = np.float32(0)  # of the closest sound map pixel, extended to this one
             covered_distance = np.inf  # of that map pixel, in pixels of the photo
-            smear, low, high = np.float32(0), np.float32(np.inf), np.float32(0)
+            # Of the known ones among the four map pixels around: height of the highest smeared
+            # edge, lowest and highest inverse depth, number, and sums.
+            smear = np.float32(0)
+            low = np.float32(np.inf)
+            high = np.float32(0)
             known_count = 0
-            bilinear_sum, weight_sum, known_weight, mixed_sum, plane_sum = 0.0, 0.0, 0.0, 0.0, 0.0
+            known_weight = 0.0
+            bilinear_sum = 0.0
+            mixed_sum = 0.0
+            plane_sum = 0.0
+            weight_sum = 0.0  # of all four
             for k in range(4):  # the four map pixels around
                 r = y1 if k >= 2 else y0
                 c = x1 if k % 2 else x0
@@ -196,11 +209,13 @@ def _resample(
                     covered_distance = distance
 
             covers_map_pixel = covered_distance < COVERED_PX
+            # Mostly unknown: a hole, unless a known map pixel lies here.
             if known_weight < 0.5 * weight_sum:
                 if covers_map_pixel:
                     values[y, x] = covered_depth
                     state[y, x] = SETTLED
                 continue
+            # On one surface: interpolate it. In an edge: the map pixel that lies here, or open.
             state[y, x] = SETTLED
             if not edge_between and smear == 0:
                 if known_count == 4:

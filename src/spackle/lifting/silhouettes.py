@@ -96,7 +96,10 @@ def _closest_mixture(colors: Any, color: Any, y: int, x: int) -> Any:
         The near colour's share in the mixture (of any sign and size), the squared distance of the
         pixel's colour from it, and the squared distance between both colours.
     """
-    contrast, along, from_far = np.float32(0), np.float32(0), np.float32(0)
+    contrast = np.float32(0)
+    along = np.float32(0)
+    from_far = np.float32(0)
+    # Project the pixel's colour on the line through both colours.
     for c in range(3):
         difference = color[0, y, x, c] - color[1, y, x, c]
         own = colors[y, x, c] - color[1, y, x, c]

@@ -77,7 +77,8 @@ def layered_gaussians(
     )
     ring = torch.from_numpy(layers.ring)  # [H, W] distance to the nearest depth step, or 0
 
-    # Pixels away from depth steps may share Gaussians where the photo has little detail.
+    # Pixels away from depth steps may share Gaussians where the photo has little detail. The
+    # quadtree weighs the lost detail against the number of Gaussians.
     may_share = without_border(ring == 0)
     tree = Quadtree(
         linear_to_srgb(colors), inverse_depth, slope, may_share, levels, DEPTH_EDGE_RATIO
@@ -86,13 +87,15 @@ def layered_gaussians(
     gaussian_cost = min(max(gaussian_cost, MIN_GAUSSIAN_COST), MAX_GAUSSIAN_COST)
     single, tiles = tree.cut(gaussian_cost)
 
+    # A pixel beside a step may show two surfaces, and then has two Gaussians. The backing closes
+    # the gaps between the Gaussians from behind.
     opaque = torch.full_like(inverse_depth, float(SURFEL_OPACITY))
     surface = Surface(inverse_depth, slope, colors, opaque)
     pixels = _split_mixed_pixels(layers, colors)
     samples = SurfelSamples.cat(
         [
             pixels.main.pixel_samples(single, camera),
-            *(surface.tile_samples(same_size, TILE_SIGMA_SIDES) for same_size in tiles),
+            *(surface.tile_samples(of_one_size, TILE_SIGMA_SIDES) for of_one_size in tiles),
             pixels.other.pixel_samples(pixels.mixed, camera),
             *backing_surfels(pixels, gaussian_cost, levels),
         ]
@@ -146,12 +149,14 @@ def _correct_colors(
 ) -> SurfelSamples:
     """Correct the colours of single pixels and tiles until all samples blend to the photo.
 
+    A sample is a Gaussian, given in the photo. A tile is a rectangle of pixels that share one.
+
     Args:
         samples: first those of single pixels, then those of tiles, then all others.
         colors: [H, W, 3] the photo in linear RGB.
         single: [H, W] bool: the single pixels.
         correctable: [number of single pixels] bool: those whose colour may change.
-        tiles: in the order of their samples.
+        tiles: in the order of their samples, those of one size together.
     """
     height, width = single.shape
     nearest_first = samples.inverse_depth.argsort(descending=True, stable=True)
@@ -160,11 +165,12 @@ def _correct_colors(
     )  # [N, 5]
     spots = screen_gaussians[nearest_first].numpy()
     corrected = samples.color.clone()
+    # Each sweep adds what the blended picture lacks. Neighbours overlap, so that one is not enough.
     for _ in range(CORRECTION_SWEEPS):
         blended = blend_screen_gaussians(spots, corrected[nearest_first], height, width)
         missing = colors - blended
         missing_in_pixels = missing[single] * correctable[:, None]
-        missing_in_tiles = [same_size.means(missing) for same_size in tiles]
+        missing_in_tiles = [tiles_of_one_size.means(missing) for tiles_of_one_size in tiles]
         change = torch.cat([missing_in_pixels, *missing_in_tiles])
         corrected[: len(change)] = (corrected[: len(change)] + change).clamp(0, 1)
     return samples._replace(color=corrected)

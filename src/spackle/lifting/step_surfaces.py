@@ -42,6 +42,9 @@ PLANE_REGULARIZATION = 0.3
 def find_step_rings(image: Any) -> Any:
     """Find the depth steps of an image [H, W] of inverse depth, and the rings around them.
 
+    A step lies between two neighbouring pixels whose inverse depths differ by more than 3 % and by
+    more than on a plane. A ring are the pixels at the same distance from the nearest step.
+
     Returns:
         [H, W] uint8: the distance to the nearest step in pixels, from 1 to 3; 0 beyond; and
         [H, W, 2] float32: for pixels of the first ring the inverse depths on the near and the far
@@ -52,9 +55,9 @@ def find_step_rings(image: Any) -> Any:
     side_depths = np.zeros((height, width, 2), np.float32)
     for y in range(height):
         for x in range(width):
-            for k in range(2):  # the neighbour to the right, then the one below
-                v = y + k
-                u = x + 1 - k
+            for dy, dx in ((0, 1), (1, 0)):  # the neighbour to the right, then the one below
+                v = y + dy
+                u = x + dx
                 if v >= height or u >= width:
                     continue
                 high = max(image[y, x], image[v, u])
@@ -65,10 +68,12 @@ def find_step_rings(image: Any) -> Any:
                 # On a steep plane, such as ground near the horizon, the change continues on both
                 # sides. At the image's border, it is assumed to continue.
                 jump = image[v, u] - image[y, x]
-                has_pixel_before = y > 0 if k == 1 else x > 0
-                has_pixel_after = v + 1 < height if k == 1 else u + 1 < width
-                change_before = image[y, x] - image[y - k, x - 1 + k] if has_pixel_before else jump
-                change_after = image[v + k, u + 1 - k] - image[v, u] if has_pixel_after else jump
+                change_before = jump
+                if y - dy >= 0 and x - dx >= 0:
+                    change_before = image[y, x] - image[y - dy, x - dx]
+                change_after = jump
+                if v + dy < height and u + dx < width:
+                    change_after = image[v + dy, u + dx] - image[v, u]
                 steady = min(change_before * jump, change_after * jump)
                 if steady > STEADY_DIFFERENCE_RATIO * jump * jump:
                     continue
@@ -80,7 +85,7 @@ def find_step_rings(image: Any) -> Any:
                         side_depths[row, column, 0] = high
                         side_depths[row, column, 1] = low
 
-    # Each further ring are the free pixels around the one before.
+    # A ring of pixels lies around the one before.
     for ring in range(1, MAX_RING):
         for y in range(height):
             for x in range(width):
@@ -107,7 +112,9 @@ def estimate_surfaces(
     Args:
         inverse_depth: [H, W].
         colors: [H, W, 3] the photo in linear RGB.
-        rings, side_depths: as `find_step_rings` returns them.
+        rings: [H, W] distance to the nearest step in pixels, 1 to 3; 0 beyond.
+        side_depths: [H, W, 2] inverse depths on the near and the far side of a step, for pixels
+            that touch it.
         depth, slope, color: [2, H, W], [2, H, W, 2] and [2, H, W, 3]: inverse depth, its derivative
             by pixel x and y, and mean colour of both surfaces. Pixels in a ring are written here.
 
@@ -204,7 +211,9 @@ def _closest_step(y: int, x: int, rings: Any, side_depths: Any) -> Any:
     inverse depths in the first ring.
     """
     height, width = rings.shape
-    high, low, closest = np.float32(0), np.float32(0), NO_STEP
+    high = np.float32(0)
+    low = np.float32(0)
+    closest = NO_STEP  # squared distance
     for v in range(max(y - MAX_RING, 0), min(y + MAX_RING + 1, height)):
         for u in range(max(x - MAX_RING, 0), min(x + MAX_RING + 1, width)):
             squared_distance = (v - y) ** 2 + (u - x) ** 2
@@ -222,6 +231,8 @@ def _sum_window(
 ) -> Any:  # fmt: skip
     """Sum depths and colours of both surfaces over the 11×11 pixels around a pixel.
 
+    Pixels next to a step count little, because their colours mix both surfaces.
+
     Args:
         y, x: the pixel.
         image: [H, W] inverse depth.
@@ -236,13 +247,14 @@ def _sum_window(
     """
     height, width = image.shape
     middle = np.float32(0.5) * (high + low)
-    near_weight, total_weight = 0.0, 0.0
+    near_weight = 0.0
+    total_weight = 0.0
     for v in range(max(y - WINDOW_PX, 0), min(y + WINDOW_PX + 1, height)):
         for u in range(max(x - WINDOW_PX, 0), min(x + WINDOW_PX + 1, width)):
             d = image[v, u]
             dx = u - x
             dy = v - y
-            side = 0 if d > middle else 1
+            side = 0 if d > middle else 1  # near or far
             if abs(dx) <= MAX_RING and abs(dy) <= MAX_RING:
                 weight = np.exp(
                     -np.float32(dx * dx + dy * dy) / (2 * OUTLINE_BLUR_PX * OUTLINE_BLUR_PX)
@@ -255,6 +267,7 @@ def _sum_window(
                 continue
             weight = np.exp(-np.float32(dx * dx + dy * dy) / np.float32(MAX_RING * MAX_RING))
             ring = rings[v, u]
+            # Only depths that continue this pixel's surface.
             if abs(d - surface_depths[side]) < np.float32(DEPTH_EDGE_RATIO) * 2 * d:
                 depth_weight = weight * DEPTH_WEIGHT_OF_RING[ring]
                 depth_moments[side, 0] += depth_weight
@@ -291,6 +304,7 @@ def _fit_plane(moments: Any, default: Any) -> Any:
     mean_x = moments[1] / total
     mean_y = moments[2] / total
     mean_d = moments[3] / total
+    # The regularisation makes a plane through few pixels nearly flat.
     var_x = moments[4] / total - mean_x * mean_x + PLANE_REGULARIZATION
     var_y = moments[5] / total - mean_y * mean_y + PLANE_REGULARIZATION
     cov_xy = moments[6] / total - mean_x * mean_y
@@ -304,5 +318,6 @@ def _fit_plane(moments: Any, default: Any) -> Any:
     limit = np.float32(CREASE_RATIO) * mean_d
     slope_x = min(max(slope_x, -limit), limit)
     slope_y = min(max(slope_y, -limit), limit)
+    # A surface is never extended to less than half its inverse depth.
     at_center = max(mean_d - slope_x * mean_x - slope_y * mean_y, 0.5 * mean_d)
     return np.float32(at_center), np.float32(slope_x), np.float32(slope_y)

@@ -60,7 +60,7 @@ def backward_tiles(
         tiles: [K] numbers of tiles, row by row.
         lists: the E Gaussians of all tiles ("entries"), sorted front to back.
         entry_needs: [E] bool: the entries whose sums are wanted.
-        records: [N, 12] float32 numbers of each Gaussian, see `spackle.render.project`.
+        records: [N, 12] float32: centre, ellipse, opacity, depth and colour of each Gaussian.
         images: the forward pass's rgb, depth, alpha and linear colour.
         gradients: of rgb [H, W, 3], depth [H, W] and alpha [H, W].
         rows_before: [T + 1] int64: where each tile's rows start in `sums`.
@@ -69,12 +69,14 @@ def backward_tiles(
     work = np.empty(WORKSPACE_FLOATS, np.float32)
     notes = np.empty(NOTES_FLOATS, np.float32)
     first_notes = np.empty(CHUNK_GAUSSIANS, np.uint64)
-    room = work, notes, first_notes
+    room = (work, notes, first_notes)
     columns = (images[1].shape[1] + TILE_PX - 1) // TILE_PX
     for k in range(first, last):
         tile = tiles[k]
         left = (tile % columns) * TILE_PX
         top = (tile // columns) * TILE_PX
+
+        # First the gradients of the tile's pixels, then those of its Gaussians.
         load_gradients(work, left, top, images, gradients)
         entries = slice(lists.starts[tile], lists.starts[tile + 1])
         tile_sums = sums[rows_before[tile] : rows_before[tile + 1]]
@@ -121,10 +123,14 @@ def backward_tile(
 ) -> None:
     """Sum gradients over the pixels of one tile, for the Gaussians in its list that need them.
 
+    The forward pass keeps no alphas. So the tile is drawn again in chunks of 128 Gaussians, with
+    notes of all alphas, and the Gaussians of each chunk are then visited back to front.
+
     Args:
-        room: buffers for one tile: its workspace, with gradients filled in; the notes; and
-            [128] for the start of each Gaussian's notes.
-        records: [N, 12] float32 numbers of each Gaussian.
+        room: buffers for one tile. First its workspace, seven planes of 256 floats: transmittance,
+            contribution of what lies behind, gradients of red, green, blue, depth and alpha, which
+            are filled in. Then room for the notes, and [128] for the start of each Gaussian's.
+        records: [N, 12] float32: centre, ellipse, opacity, depth and colour of each Gaussian.
         ids: [n] indices of the tile's Gaussians, front to back.
         entry_needs: [n] bool: those whose sums are wanted.
         left, top: the tile's first pixel in the image.
@@ -203,7 +209,9 @@ def redraw_chunk(
 def redraw_row(
     work: Array, offset: np.uint64, notes: Array, note: np.uint64, peak: np.float32, bell: Numbers
 ) -> None:
-    """Draw a row of 16 pixels of a Gaussian, and note each pixel's alpha and transmittance.
+    """Draw a row of 16 pixels of a Gaussian again, and note alphas and transmittances.
+
+    The forward pass keeps neither; the backward pass needs them in reverse order.
 
     Args:
         work: the tile's workspace; its first plane, the transmittance, is changed.
@@ -213,12 +221,12 @@ def redraw_row(
         peak: largest log2 of alpha in the row.
         bell: (rate, centre): log2 of alpha is peak - rate·(x - centre)².
     """
-    across, center = bell
+    rate, center = bell
     for x in range(TILE_PX):
         i = offset + np.uint64(x)
         n = note + np.uint64(x)
-        u = np.float32(x) - center
-        alpha = alpha_from_log2(peak - across * u * u)
+        distance = np.float32(x) - center
+        alpha = alpha_from_log2(peak - rate * distance * distance)
         transmittance = work[i]
         after = transmittance * (ONE - alpha)
         full = after <= TRANSMITTANCE_STOP_F32
@@ -326,8 +334,13 @@ def step_back_and_sum_row(
         of red, green, blue and depth.
     """
     red, green, blue, depth = look
-    sum_v, sum_vu, sum_vuu = ZERO, ZERO, ZERO
-    sum_red, sum_green, sum_blue, sum_depth = ZERO, ZERO, ZERO, ZERO
+    sum_v = ZERO
+    sum_vu = ZERO
+    sum_vuu = ZERO
+    sum_red = ZERO
+    sum_green = ZERO
+    sum_blue = ZERO
+    sum_depth = ZERO
     for x in range(TILE_PX):
         i = offset + np.uint64(x)
         n = note + np.uint64(x)

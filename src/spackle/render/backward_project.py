@@ -105,7 +105,8 @@ def ellipse_backward(
     slope k = Σxy/Σyy, and u the pixel's distance from the middle of its row.
 
     Args:
-        sums: [10] of the Gaussian, see `project_backward`.
+        sums: [10] over pixels, with v = ∂L/∂ln(alpha): of v, v·u, v·u², v·dy, v·dy², v·u·dy; then
+            four that are not used here.
         factor: M row by row, with Σ = M Mᵀ + eps2d·I.
         eps2d: pixels².
         factor_grad: [2, 3]: the gradient of M is written here.
@@ -173,6 +174,12 @@ def factor_backward(
 def quat_backward(quat: Array, rotation_grad: Array, quat_grad: Array) -> None:
     """Turn the gradient of a rotation matrix into that of its quaternion before normalisation.
 
+    The matrix of a unit quaternion (w, x, y, z) is
+
+        1 - 2(yy + zz)    2(xy - wz)    2(xz + wy)
+          2(xy + wz)    1 - 2(xx + zz)  2(yz - wx)
+          2(xz - wy)      2(yz + wx)  1 - 2(xx + yy)
+
     Args:
         quat: [4] wxyz, of any length.
         rotation_grad: [3, 3].
@@ -188,7 +195,7 @@ def quat_backward(quat: Array, rotation_grad: Array, quat_grad: Array) -> None:
     y = y * inverse_norm
     z = z * inverse_norm
 
-    # The derivative of the rotation matrix by each component of the unit quaternion.
+    # The derivative of this matrix by each component, times the gradient r of the matrix.
     r = rotation_grad
     w_grad = 2 * (x * (r[2, 1] - r[1, 2]) + y * (r[0, 2] - r[2, 0]) + z * (r[1, 0] - r[0, 1]))
     x_grad = 2 * (
@@ -222,7 +229,8 @@ def center_backward(
 
     Args:
         center: [3] in the camera's frame.
-        lens: [8] focal lengths, principal point and bounds of x/z and y/z, see `KernelCamera`.
+        lens: [8] fx, fy, cx, cy in pixels, and the bounds (left, right, top, bottom) of the slopes
+            x/z and y/z for which the Jacobian is exact.
         jacobian_grad: [2, 3] of the projection's Jacobian, which depends on the centre, too.
         u_grad, v_grad: of the centre's pixel position.
         depth_grad: of its depth z.
@@ -239,7 +247,8 @@ def center_backward(
     y_grad = fy * v_grad
     z_grad = depth_grad - (x_grad * x + y_grad * y) / z
 
-    # By way of the Jacobian [[fx/z, 0, -fx·slope/z], [0, fy/z, -fy·slope/z]].
+    # By way of the Jacobian [[fx/z, 0, -fx·slope/z], [0, fy/z, -fy·slope/z]]: first by its factor
+    # 1/z, then by the slopes, where they move.
     z_grad -= (fx * jacobian_grad[0, 0] + fy * jacobian_grad[1, 1]) / z
     z_grad += (fx * x_slope * jacobian_grad[0, 2] + fy * y_slope * jacobian_grad[1, 2]) / z
     if lens[MIN_X_SLOPE] <= x / z <= lens[MAX_X_SLOPE]:

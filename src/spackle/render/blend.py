@@ -73,7 +73,7 @@ def blend_tiles(
         first, last: the tiles `tiles[first]` to `tiles[last - 1]` are drawn.
         tiles: [K] numbers of tiles, row by row.
         lists: the Gaussians of each tile, sorted front to back.
-        records: [N, 12] float32 numbers of each Gaussian, see `spackle.render.project`.
+        records: [N, 12] float32: centre, ellipse, opacity, depth and colour of each Gaussian.
         images: rgb [H, W, 3] sRGB, depth [H, W], alpha [H, W] and linear colour [H, W, 3], whose
             pixels in these tiles are written. An empty linear colour is not written.
     """
@@ -86,7 +86,7 @@ def blend_tiles(
         left = (tile % columns) * TILE_PX
         top = (tile // columns) * TILE_PX
 
-        # Full transmittance, and nothing blended.
+        # The first plane is the transmittance, which starts at 1; sums start at 0.
         for i in range(TILE_STATE_FLOATS):
             state[i] = ONE if i < PLANE_FLOATS else ZERO
 
@@ -115,10 +115,11 @@ def fetch_records(records: Array, ids: Array, begin: int, count: int, next_recor
 
 @kernel
 def blend_splats(state: Array, records: Array, count: int, left: int, top: int) -> None:
-    """Draw the first `count` of `records` [16, 12] into a tile.
+    """Draw the Gaussians with the first `count` of `records` [16, 12] into a tile.
 
-    `state` is the tile's buffer, (left, top) its first pixel in the image. This is a function of its
-    own so that constants stay in registers.
+    `state` is the tile's buffer of colours and transmittances, changed in place, and (left, top) is
+    the tile's first pixel in the image. This is a function of its own so that constants stay in
+    registers.
     """
     for index in range(count):
         blend_splat(state, records[index], left, top)
@@ -128,8 +129,14 @@ def blend_splats(state: Array, records: Array, count: int, left: int, top: int) 
 def blend_splat(state: Array, record: Array, left: int, top: int) -> None:
     """Draw a Gaussian into the patches of a tile that it may touch.
 
-    `state` is the tile's buffer of six planes, `record` [12] describes the Gaussian, and (left,
-    top) is the tile's first pixel in the image.
+    A patch has 4×4 pixels; a tile has 4×4 patches.
+
+    Args:
+        state: the tile's flat buffer, six planes of 256 floats: transmittance, red, green, blue,
+            depth, alpha. It is changed in place.
+        record: [12] the Gaussian's centre (x, y), the shape of its ellipse (slope, across, fall),
+            log2 of its opacity (peak), half sizes in pixels, depth and colour.
+        left, top: the tile's first pixel in the image.
     """
     x, y, slope, across, fall, peak, half_width, half_height, depth, red, green, blue = in_tile(
         record, left, top
@@ -152,7 +159,8 @@ def blend_patch(
     """Draw a Gaussian into a patch of 4×4 pixels.
 
     Args:
-        state: the tile's buffer of six planes, changed in place.
+        state: the tile's flat buffer, changed in place: planes of transmittance, red, green, blue,
+            depth and alpha, 256 floats each.
         offset: where the patch begins in each plane.
         left, top: the patch's first pixel, relative to the tile's.
         splat: the Gaussian's record, with the centre relative to the tile and without half sizes.
@@ -178,7 +186,8 @@ def blend_patch(
 def touched_pixels(center: np.float32, half_size: np.float32) -> tuple[int, int]:
     """The range first..last (exclusive) of a tile's rows or columns that a Gaussian may touch.
 
-    `center` and `half_size` are in pixels along this axis, from the centre of the tile's first.
+    `center` and `half_size` are in pixels along this axis; 0 is the centre of the tile's first
+    pixel.
     """
     # One is added before or after truncation to round up: ceil or floor would cost more than
     # drawing a patch.
@@ -191,10 +200,12 @@ def touched_pixels(center: np.float32, half_size: np.float32) -> tuple[int, int]
 def touched_patches(center: np.float32, half_size: np.float32) -> tuple[int, int]:
     """The range first..last (exclusive) of a tile's patches that a Gaussian may touch on one axis.
 
-    `center` and `half_size` are in pixels along this axis, from the centre of the tile's first.
+    A patch has 4×4 pixels. `center` and `half_size` are in pixels along this axis; 0 is the centre
+    of the tile's first pixel.
     """
     first, last = touched_pixels(center, half_size)
-    return first // PATCH_PX, (last + PATCH_PX - 1) // PATCH_PX
+    last_rounded_up = (last + PATCH_PX - 1) // PATCH_PX
+    return first // PATCH_PX, last_rounded_up
 
 
 @kernel
@@ -211,7 +222,8 @@ def store_tile(state: Array, left: int, top: int, images: Arrays) -> None:
     """Write a tile's colours, depth and alpha to its pixels inside the image.
 
     Args:
-        state: the tile's buffer of six planes; its colours are converted to sRGB in place.
+        state: the tile's flat buffer, six planes of 256 floats: transmittance, red, green, blue,
+            depth, alpha. Its colours are converted from linear light to sRGB in place.
         left, top: the tile's first pixel in the image.
         images: rgb [H, W, 3], depth [H, W], alpha [H, W] and linear colour [H, W, 3], which are
             written. An empty linear colour is not written.
@@ -237,9 +249,14 @@ def store_tile(state: Array, left: int, top: int, images: Arrays) -> None:
 
 @kernel
 def store_color(state: Array, left: int, top: int, rows: int, columns: int, image: Array) -> None:
-    """Write the first rows and columns of a tile's red, green and blue planes to an image [H, W, 3].
+    """Write a tile's colours to its pixels in an image [H, W, 3].
 
-    (left, top) is the tile's first pixel in the image.
+    Args:
+        state: the tile's flat buffer, six planes of 256 floats: transmittance, red, green, blue,
+            depth, alpha.
+        left, top: the tile's first pixel in the image.
+        rows, columns: of the tile, as far as they lie in the image.
+        image: [H, W, 3], written here.
     """
     for row in range(rows):
         for column in range(columns):

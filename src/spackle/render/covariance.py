@@ -38,7 +38,9 @@ def projected_covariance(
         x, y, nearness: the centre in the camera's frame is (x, y, 1) / nearness.
         quat: [4] wxyz, of any length.
         scale: [3] standard deviations along the Gaussian's axes.
-        lens, pose: as in `KernelCamera`: focal lengths with bounds [8], and world to camera [3, 4].
+        lens: [8] fx, fy, cx, cy in pixels, and the bounds (left, right, top, bottom) of the slopes
+            x and y, beyond which the Jacobian stays the same.
+        pose: [3, 4] world to camera.
         eps2d: added to xx and yy, in pixels².
     """
     jacobian = projection_jacobian(x, y, nearness, lens)
@@ -50,8 +52,9 @@ def projected_covariance(
 def projection_jacobian(x: float, y: float, nearness: float, lens: Array) -> Numbers:
     """The Jacobian [[a, 0, b], [0, c, d]] of the projection to pixels, as (a, b, c, d).
 
-    It is taken at the point (x, y, 1) / nearness in the camera's frame. Where the slopes x and y
-    leave the bounds in `lens` [8], they are moved to the bounds.
+    It is taken at the point (x, y, 1) / nearness in the camera's frame. `lens` [8] has fx, fy, cx,
+    cy in pixels, and bounds (left, right, top, bottom); slopes x and y beyond them are moved to
+    them.
     """
     a = lens[FX] * nearness
     c = lens[FY] * nearness

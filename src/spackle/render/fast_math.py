@@ -18,7 +18,10 @@ from spackle.runtime.kernels import MANTISSA_BITS, ONE, ZERO, inlined_kernel, ke
 def power_series(
     function: Callable[[Any], Any], low: float, high: float, degree: int
 ) -> list[np.float32]:
-    """Coefficients, lowest power first, of a near-minimax polynomial for a function on low..high."""
+    """Coefficients of a polynomial that approximates a function on low..high, lowest power first.
+
+    It interpolates at Chebyshev's nodes, so that its largest error is nearly the least possible.
+    """
     fit = Chebyshev.interpolate(function, degree, [low, high])
     return [np.float32(coefficient) for coefficient in fit.convert(kind=Polynomial).coef]
 
@@ -55,9 +58,11 @@ ROOT_HALF_BITS = np.int32(0x3F3504F3)  # of the square root of a half, as float3
 @kernel
 def exp2(x: np.float32) -> np.float32:
     """2^x for x in -60..60, with a relative error below 5e-7."""
-    # x = n + f with an integer n and f in -½..½.
+    # x = n + f with an integer n and f in -½..½. Adding 1.5·2²³ pushes all digits after the point
+    # out of a float32, so that n is left, in the low bits.
     shifted = x + ROUNDING_SHIFT
     f = x - (shifted - ROUNDING_SHIFT)
+    # 2^f by a polynomial.
     series = E0 + f * (E1 + f * (E2 + f * (E3 + f * (E4 + f * E5))))
 
     # 2^n · 2^f: n is added to the exponent bits of the float 2^f.
@@ -68,12 +73,13 @@ def exp2(x: np.float32) -> np.float32:
 @inlined_kernel
 def natural_log(x: np.float32) -> float:
     """The logarithm of a positive float32, accurate to the last digits of float64."""
-    # x = 2^exponent · m with m from sqrt(1/2) to sqrt(2): split the float's bits.
+    # x = 2^exponent · m with m from sqrt(1/2) to sqrt(2): split the float's bits, which are the
+    # exponent followed by the mantissa.
     bits = np.float32(x).view(np.int32)
     exponent = (bits - ROOT_HALF_BITS) >> MANTISSA_BITS
     m = np.float64(np.int32(bits - (exponent << MANTISSA_BITS)).view(np.float32))
 
-    # ln m as a series in t, because m = (1 + t) / (1 - t).
+    # m = (1 + t) / (1 - t), so that ln m = 2t + 2t³/3 + 2t⁵/5 + …, with Ln = 2/n.
     t = (m - 1.0) / (m + 1.0)
     s = t * t
     series = L3 + s * (

@@ -104,12 +104,15 @@ class DrawFunction(torch.autograd.Function):
     def backward(ctx: Any, *image_gradients: Tensor) -> tuple[Tensor | None, ...]:
         """Turn gradients of the three images into gradients of all arguments of `forward`.
 
-        `image_gradients` are those of rgb [H, W, 3], depth [H, W] and alpha [H, W]. A gradient that
-        nobody asked for is None.
+        These are the camera and the tiles, which are no tensors; three images that lie under the
+        drawing; and for each set of Gaussians its five fields (means, quats, scales, opacities,
+        colors). A gradient that nobody asked for is None.
+
+        `ctx` has what `forward` kept, and `image_gradients` are those of rgb [H, W, 3],
+        depth [H, W] and alpha [H, W].
         """
         drawing: Drawing = ctx.drawing
-        fields = ctx.saved_tensors[IMAGES:]
-        # The first two arguments, view and tiles, are no tensors.
+        fields = ctx.saved_tensors[IMAGES:]  # the first ones are the images of the result
         background_needs = ctx.needs_input_grad[2 : 2 + IMAGES]
         field_needs = ctx.needs_input_grad[2 + IMAGES :]
         background_gradients = gradients_of_background(drawing, image_gradients, background_needs)
@@ -118,7 +121,7 @@ class DrawFunction(torch.autograd.Function):
         set_slices = [
             slice(first, first + FIELDS_PER_SET) for first in range(0, len(fields), FIELDS_PER_SET)
         ]
-        set_needs = np.array([any(field_needs[fields_of]) for fields_of in set_slices], np.bool_)
+        set_needs = np.array([any(field_needs[set_slice]) for set_slice in set_slices], np.bool_)
         needs = np.repeat(set_needs, ctx.set_sizes)  # [N], of each Gaussian
         table_rows = np.where(needs, np.cumsum(needs) - 1, -1).astype(np.int32)
         gradient_arrays = tuple(as_array(gradient) for gradient in image_gradients)
@@ -126,16 +129,16 @@ class DrawFunction(torch.autograd.Function):
 
         field_gradients: list[Tensor | None] = []
         first_row = 0  # of the set in the table
-        for fields_of, size, set_need in zip(set_slices, ctx.set_sizes, set_needs, strict=True):
+        for set_slice, size, set_need in zip(set_slices, ctx.set_sizes, set_needs, strict=True):
             if not set_need:
                 field_gradients += [None] * FIELDS_PER_SET
                 continue
             set_table = table[first_row : first_row + size]
             first_row += size
-            gradients = gradients_of_set(fields[fields_of], drawing.view, set_table)
+            gradients = gradients_of_set(fields[set_slice], drawing.view, set_table)
             field_gradients += [
                 gradient if need else None
-                for gradient, need in zip(gradients, field_needs[fields_of], strict=True)
+                for gradient, need in zip(gradients, field_needs[set_slice], strict=True)
             ]
         return None, None, *background_gradients, *field_gradients
 
@@ -160,8 +163,10 @@ def gradients_of_background(
 def pixel_sums(drawing: Drawing, gradients: Arrays, table_rows: Array, count: int) -> Array:
     """Sums over pixels for each Gaussian that needs gradients: a table [count, 10] float32.
 
-    The columns are listed at `SUMS`. Each tile sums on its own, and the sums of tiles are added in
-    the order of tiles, so that the result does not depend on the number of threads.
+    With u = x - centre, dy = y - centre and v = ∂L/∂ln(alpha), the columns are the sums of v, v·u,
+    v·u², v·dy, v·dy², v·u·dy; then the gradients of red, green, blue and depth. Each tile sums on
+    its own, and the sums of tiles are added in the order of tiles, so that the result does not
+    depend on the number of threads.
 
     Args:
         drawing: the result of the forward pass.
@@ -171,8 +176,8 @@ def pixel_sums(drawing: Drawing, gradients: Arrays, table_rows: Array, count: in
     """
     lists = drawing.lists
     # An entry is a Gaussian in a tile's list. Each that needs gradients has a row in `sums`.
-    entry_rows = table_rows[lists.ids]  # [E]
-    entry_needs = entry_rows >= 0
+    entry_rows = table_rows[lists.ids]  # [E] int32
+    entry_needs = entry_rows >= 0  # [E] bool
     rows_before = np.concatenate([[0], np.cumsum(entry_needs)])[lists.starts]  # [T + 1]
     tiles = np.flatnonzero(np.diff(rows_before))  # those with such entries
     sums = np.zeros((rows_before[-1], SUMS), np.float32)

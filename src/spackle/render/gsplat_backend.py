@@ -115,7 +115,7 @@ class UploadCache:
 
 @dataclasses.dataclass(frozen=True)
 class ProjectedBatch:
-    """The n Gaussians of all views of a batch, one view after the other, as gsplat projects them."""
+    """The n Gaussians of a batch of views, one view after the other, as gsplat projects them."""
 
     view_index: Tensor  # [n] int64: the view that shows the Gaussian
     radii: Tensor  # [n, 2] int32: half sizes in pixels; 0 for an invisible Gaussian

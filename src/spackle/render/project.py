@@ -115,6 +115,7 @@ def count_drawn_tiles(drawn_tiles: Array) -> Array:
     An element is the number of drawn tiles above and to the left of a tile's corner. Four of them
     tell how many tiles of a box are drawn.
     """
+    # Above and to the left of the first row and column, there is no tile.
     sums = drawn_tiles.astype(np.int32).cumsum(axis=0).cumsum(axis=1)
     return np.pad(sums, ((1, 0), (1, 0))).astype(np.int32)
 
@@ -239,12 +240,15 @@ def pixel_range(center: float, extent: float, size: int) -> tuple[np.int32, np.i
     "Near" means within `extent`; all three are in pixels, and `size` is the image's width or
     height. The range is empty if the position is NaN.
     """
-    # In this order of min and max, NaN becomes 0, and all results fit into integers.
+    # The slack is half a pixel, from a pixel's border to its centre, and room for rounding. In this
+    # order of min and max, NaN becomes 0, and all results fit into integers.
     low = min(np.float64(size), max(0.0, center - extent - PIXEL_SLACK))
     high = min(np.float64(size), max(0.0, center + extent + PIXEL_SLACK))
-    first = np.int32(low)
-    rounded_up = np.int32(first + np.int32(first < low))
-    return rounded_up, np.int32(high)
+
+    # Round `low` up without a call of ceil, which would keep the loop out of vector registers.
+    truncated = np.int32(low)
+    first = np.int32(truncated + np.int32(truncated < low))
+    return first, np.int32(high)
 
 
 @kernel
@@ -254,7 +258,8 @@ def write_records(
     """Write the boxes of a block of n projected Gaussians, and records of those that are drawn.
 
     Args:
-        block: [13·256] float32, as `project_block` has filled it.
+        block: [13·256] float32: 13 planes of 256 numbers, as `project_block` has filled them. The
+            first nine are fields of a record, the last four a box: left, right, top and bottom.
         colors: flat [3·n] linear RGB. A Gaussian whose colour is not finite becomes invisible.
         first_index: the index of the block's first Gaussian in `splats`.
         drawn_before: [rows + 1, columns + 1] int32 counts of drawn tiles above and to the left.
@@ -263,7 +268,8 @@ def write_records(
     """
     records, boxes = splats
     for k in range(len(colors) // 3):
-        # Unsigned indices, so that no check for negative ones is compiled.
+        # Until something else is written, the Gaussian is invisible. Indices are unsigned, so that
+        # no check for negative ones is compiled.
         i = np.uint64(k)
         i3 = np.uint64(3 * k)
         out = np.uint64(first_index + k)
@@ -272,6 +278,7 @@ def write_records(
         boxes[out, 2] = 0
         boxes[out, 3] = 0
 
+        # A plane's numbers follow one another, so that plane p starts at p·256.
         right = np.uint32(block[i + np.uint64(RIGHT * BLOCK_GAUSSIANS)])
         red = colors[i3]
         green = colors[i3 + ONE_ON]
@@ -303,8 +310,9 @@ def has_drawn_tile(
 ) -> bool:
     """Whether any tile of a box (columns left..right, rows top..bottom, exclusive) is drawn.
 
-    `drawn_before` [rows + 1, columns + 1] counts the drawn tiles above and to the left of each
-    corner. The box has none if its columns have as many above its bottom as above its top.
+    `drawn_before` [rows + 1, columns + 1] has the number of drawn tiles above and to the left of
+    each tile's corner. A box has no drawn tile if its columns have as many of them above the box's
+    bottom as above its top.
     """
     above_bottom = drawn_before[bottom, right] - drawn_before[bottom, left]
     above_top = drawn_before[top, right] - drawn_before[top, left]

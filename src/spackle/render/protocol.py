@@ -119,7 +119,7 @@ def as_sets(gaussians: Gaussians | Sequence[Gaussians]) -> list[Gaussians]:
 
 
 def common_size(cameras: Sequence[Camera]) -> tuple[int, int]:
-    """The width and height in pixels that all cameras of a batch share; ValueError if they differ."""
+    """Width and height in pixels that all cameras of a batch share; ValueError if they differ."""
     width, height = cameras[0].width, cameras[0].height
     if any((camera.width, camera.height) != (width, height) for camera in cameras):
         raise ValueError("views that are drawn together must be of one size")
@@ -127,7 +127,7 @@ def common_size(cameras: Sequence[Camera]) -> tuple[int, int]:
 
 
 def tile_grid(height: int, width: int) -> tuple[int, int]:
-    """Rows and columns of tiles that cover an image; tiles at the right and bottom may stick out."""
+    """Rows and columns of tiles that cover an image; the last ones may reach beyond it."""
     return math.ceil(height / TILE_PX), math.ceil(width / TILE_PX)
 
 

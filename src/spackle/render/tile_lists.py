@@ -27,6 +27,8 @@ class TileLists(NamedTuple):
 def list_tiles(boxes: Array, drawn_tiles: Array, part_size: int) -> TileLists:
     """List the Gaussians of each tile, in their own order.
 
+    An *entry* is a Gaussian in the list of a tile. A Gaussian that touches three tiles has three.
+
     Args:
         boxes: [N, 4] uint16: the tiles that each Gaussian may touch, as first column, last column,
             first row, last row (last exclusive).
@@ -61,10 +63,11 @@ def list_tiles(boxes: Array, drawn_tiles: Array, part_size: int) -> TileLists:
 def count_entries(
     first: int, last: int, part_size: int, boxes: Array, drawn_tiles: Array, counts: Array
 ) -> None:
-    """Count how many Gaussians each part of them adds to each tile's list, for the parts first..last.
+    """Count how many Gaussians of each part are in each tile's list.
 
     Args:
-        first, last: the parts to count; part k has the Gaussians from k·part_size on.
+        first, last: the parts first..last (exclusive) are counted; part k has the Gaussians from
+            k·part_size on.
         part_size: Gaussians in a part.
         boxes: [N, 4] uint16: each Gaussian's first and last tile column, first and last row.
         drawn_tiles: [rows, columns] bool; other tiles are not counted.
@@ -147,6 +150,8 @@ def sort_tiles(first: int, last: int, tiles: Array, lists: TileLists, records: A
     for k in range(first, last):
         tile_list = ids[starts[tiles[k]] : starts[tiles[k] + 1]]
         count = len(tile_list)
+
+        # Read the keys once, and count the values of all digits.
         places[:] = 0
         for n in range(count):
             items[n] = tile_list[n]
@@ -159,17 +164,19 @@ def sort_tiles(first: int, last: int, tiles: Array, lists: TileLists, records: A
             # Most tiles show a small range of depths, whose highest digit is the same.
             if count == 0 or digit_places[digit_of(keys[0], digit)] == count:
                 continue
+            # Keys with a lower value of this digit come first: counts become places.
             next_place = np.uint32(0)
-            for value in range(DIGIT_VALUES):
-                keys_with_value = digit_places[value]
-                digit_places[value] = next_place
+            for digit_value in range(DIGIT_VALUES):
+                keys_with_value = digit_places[digit_value]
+                digit_places[digit_value] = next_place
                 next_place += keys_with_value
             for n in range(count):
-                key_value = digit_of(keys[n], digit)
-                place = digit_places[key_value]
+                value = digit_of(keys[n], digit)
+                place = digit_places[value]
                 sorted_keys[place] = keys[n]
                 sorted_items[place] = items[n]
-                digit_places[key_value] = place + np.uint32(1)
+                digit_places[value] = place + np.uint32(1)
+            # The result is the input for the next digit.
             keys, sorted_keys = sorted_keys, keys
             items, sorted_items = sorted_items, items
         tile_list[:] = items[:count]
@@ -177,6 +184,6 @@ def sort_tiles(first: int, last: int, tiles: Array, lists: TileLists, records: A
 
 @inlined_kernel
 def digit_of(key: np.uint32, digit: int) -> np.uint32:
-    """The 8 bits of a 32-bit sort key that form its digit number `digit`, counted from the lowest."""
+    """The 8 bits of a 32-bit sort key that are its digit number `digit`, from the lowest on."""
     shifted = key >> np.uint32(BITS_PER_DIGIT * digit)
     return np.uint32(shifted & np.uint32(DIGIT_VALUES - 1))
