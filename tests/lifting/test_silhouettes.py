@@ -15,14 +15,13 @@ from torch.nn.functional import avg_pool2d, max_pool2d
 
 from spackle.core.camera import Camera
 from spackle.core.color import linear_to_srgb, srgb_to_linear
-from spackle.core.surfels import SURFEL_OPACITY, make_surfels
+from spackle.core.surfels import SURFEL_OPACITY
 from spackle.core.trajectories import DepthRange, leftmost_and_rightmost
 from spackle.lifting import silhouettes, splats, step_surfaces
 from spackle.lifting.quadtree import TILE_LEVELS
 from spackle.lifting.silhouettes import find_layers
 from spackle.lifting.splats import NEIGHBOR_FALLOFF, blended_opacities, layered_gaussians
-from spackle.render import CpuRenderer, screen_blend
-from spackle.render.screen_blend import blend_screen_gaussians
+from spackle.render import CpuRenderer
 
 Image = np.ndarray
 CPU = CpuRenderer()
@@ -51,17 +50,15 @@ def steps(seed: int, height: int = 15, width: int = 17) -> tuple[Image, Image, I
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_compiled_kernels_agree_with_plain_python(seed: int) -> None:
-    made, rng = steps(seed), np.random.default_rng(seed)
-    spots = (rng.random((40, 5)) * [17, 15, 2, 2, 0.5] + [0, 0, 0.4, 0.4, 0.4]).astype(np.float32)
+    made = steps(seed)
 
     def arrays() -> list[Image]:
         found = find_layers(*made)
-        picture = blend_screen_gaussians(spots, torch.from_numpy(spots[:, 2:] / 3), 15, 17).numpy()
-        return [*dataclasses.astuple(found), blended_opacities(found.alpha, found.ring), picture]
+        return [*dataclasses.astuple(found), blended_opacities(found.alpha, found.ring)]
 
     compiled = arrays()
     assert 0 < np.count_nonzero(compiled[0]) < compiled[0].size
-    with uncompiled(silhouettes, splats, step_surfaces, screen_blend):
+    with uncompiled(silhouettes, splats, step_surfaces):
         plain = arrays()
     for one, other in zip(compiled, plain, strict=True):
         np.testing.assert_allclose(one, other, rtol=2e-3, atol=2e-4)
@@ -115,19 +112,6 @@ def test_a_sharpened_fringe_belongs_to_the_near_surface() -> None:
     scene.rgb[:, 31][scene.depth[:, 32] < 3] = torch.tensor([1.0, 1.0, 0.9])
     for wall in wall_beside(scene):
         assert float(wall[:, 2].amax()) < 0.6
-
-
-def test_a_mixture_is_the_renderers_picture() -> None:
-    torch.manual_seed(0)
-    n, camera = 300, Camera.from_focal(40, 40, 300)  # more rows than one thread takes
-    uv, spread = torch.rand(n, 2) * torch.tensor([44, 308]) - 4, 0.4 + 3 * torch.rand(n, 2)
-    depth = (0.2 + torch.rand(n)).sort(descending=True).values
-    opacity, colors = 0.2 + 0.79 * torch.rand(n), torch.rand(n, 3)
-    mixed = blend_screen_gaussians(
-        torch.cat([uv, spread, opacity[:, None]], 1).numpy(), colors, 300, 40
-    )
-    gaussians = make_surfels(camera, uv, depth, torch.zeros(n, 2), spread, colors, opacity)
-    assert psnr(linear_to_srgb(mixed), CPU.render(gaussians, camera).rgb) > 50
 
 
 @pytest.mark.parametrize("cells", [2, 3, 7])

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spackle.lifting.edges import Bools, Edges, Floats
-from spackle.runtime.kernels import kernel
+from spackle.runtime.kernels import inlined_kernel, kernel
 
 # States of a pixel of the photo.
 HOLE = 0  # its depth is unknown
@@ -150,82 +150,120 @@ def _resample(
     """
     rows, columns = inverse_depth.shape
     values: Any = np.zeros((height, width), np.float32)
-    state = np.zeros((height, width), np.uint8)  # HOLE
+    state = np.zeros((height, width), np.uint8)
     edge_height = np.zeros((height, width), np.float32)
     for y in range(height):
         # The pixel's centre lies at (u, v), in pixels of the map from the first one's centre.
         v = (y + 0.5) * rows / height - 0.5
-        y0 = min(max(int(np.floor(v)), 0), max(rows - 2, 0))
-        y1 = min(y0 + 1, rows - 1)
         for x in range(width):
             u = (x + 0.5) * columns / width - 0.5
-            x0 = min(max(int(np.floor(u)), 0), max(columns - 2, 0))
-            x1 = min(x0 + 1, columns - 1)
-            edge_between = (x1 > x0 and (edge_right[y0, x0] or edge_right[y1, x0])) or (
-                y1 > y0 and (edge_below[y0, x0] or edge_below[y0, x1])
+            values[y, x], state[y, x], edge_height[y, x] = _resample_pixel(
+                u,
+                v,
+                inverse_depth,
+                known,
+                smear_height,
+                edge_right,
+                edge_below,
+                slope_x,
+                slope_y,
+                height,
+                width,
             )
-
-            covered_depth = np.float32(0)  # of the closest sound map pixel, extended to this one
-            covered_distance = np.inf  # of that map pixel, in pixels of the photo
-            # Of the known ones among the four map pixels around: height of the highest smeared
-            # edge, lowest and highest inverse depth, number, and sums.
-            smear = np.float32(0)
-            low = np.float32(np.inf)
-            high = np.float32(0)
-            known_count = 0
-            known_weight = 0.0
-            bilinear_sum = 0.0
-            mixed_sum = 0.0
-            plane_sum = 0.0
-            weight_sum = 0.0  # of all four
-            for k in range(4):  # the four map pixels around
-                r = y1 if k >= 2 else y0
-                c = x1 if k % 2 else x0
-                # Beyond the outermost pixels' centres `linear` extrapolates and `weight` does not.
-                linear_y = v - y0 if k >= 2 else y0 + 1 - v
-                linear_x = u - x0 if k % 2 else x0 + 1 - u
-                linear = linear_y * linear_x
-                weight = max(1 - abs(v - r), 0.0) * max(1 - abs(u - c), 0.0)
-                weight_sum += weight
-                if not known[r, c]:
-                    continue
-                value = inverse_depth[r, c]
-                low = min(low, value)
-                high = max(high, value)
-                smear = max(smear, smear_height[r, c])
-                # The map pixel's surface, extended to the photo's pixel.
-                plane = max(
-                    value + slope_x[r, c] * (u - c) + slope_y[r, c] * (v - r),
-                    MIN_PLANE_RATIO * value,
-                )
-                known_count += 1
-                bilinear_sum += linear * value
-                known_weight += weight
-                mixed_sum += weight * value
-                plane_sum += weight * plane
-                distance = max(abs(u - c) * width / columns, abs(v - r) * height / rows)
-                if smear_height[r, c] == 0 and distance < covered_distance:
-                    covered_depth = np.float32(plane)
-                    covered_distance = distance
-
-            covers_map_pixel = covered_distance < COVERED_PX
-            # Mostly unknown: a hole, unless a known map pixel lies here.
-            if known_weight < 0.5 * weight_sum:
-                if covers_map_pixel:
-                    values[y, x] = covered_depth
-                    state[y, x] = SETTLED
-                continue
-            # On one surface: interpolate it. In an edge: the map pixel that lies here, or open.
-            state[y, x] = SETTLED
-            if not edge_between and smear == 0:
-                if known_count == 4:
-                    values[y, x] = max(bilinear_sum, MIN_PLANE_RATIO * low)
-                else:
-                    values[y, x] = plane_sum / known_weight
-            elif covers_map_pixel:  # no other pixel of the photo is closer to this map pixel
-                values[y, x] = covered_depth
-            else:
-                values[y, x] = mixed_sum / known_weight
-                state[y, x] = OPEN
-                edge_height[y, x] = max(smear, high - low)
     return values, state, edge_height
+
+
+@inlined_kernel
+def _resample_pixel(
+    u: float,
+    v: float,
+    inverse_depth: Any,
+    known: Any,
+    smear_height: Any,
+    edge_right: Any,
+    edge_below: Any,
+    slope_x: Any,
+    slope_y: Any,
+    height: int,
+    width: int,
+) -> Any:
+    """Resample a map [h, w] at the centre (u, v) of one pixel of the photo.
+
+    (u, v) is in pixels of the map, from the first one's centre. All other arguments are those of
+    `_resample`: images of the map, and the photo's size.
+
+    Returns:
+        The pixel's inverse depth, its state HOLE, OPEN or SETTLED, and the height of the edge if it
+        is open.
+    """
+    rows, columns = inverse_depth.shape
+    y0 = min(max(int(np.floor(v)), 0), max(rows - 2, 0))
+    y1 = min(y0 + 1, rows - 1)
+    x0 = min(max(int(np.floor(u)), 0), max(columns - 2, 0))
+    x1 = min(x0 + 1, columns - 1)
+    edge_between = (x1 > x0 and (edge_right[y0, x0] or edge_right[y1, x0])) or (
+        y1 > y0 and (edge_below[y0, x0] or edge_below[y0, x1])
+    )
+
+    # Of the known ones among the four map pixels around: height of the highest smeared edge, lowest
+    # and highest inverse depth, number, and sums.
+    smear = np.float32(0)
+    low: Any = np.float32(np.inf)
+    high = np.float32(0)
+    known_count = 0
+    known_weight = 0.0
+    bilinear_sum = 0.0
+    mixed_sum = 0.0
+    plane_sum = 0.0
+    weight_sum = 0.0  # of all four
+    covered_depth = np.float32(0)  # of the closest sound map pixel, extended to this one
+    covered_distance = np.inf  # of that map pixel, in pixels of the photo
+    for k in range(4):
+        r = y1 if k >= 2 else y0
+        c = x1 if k % 2 else x0
+        # Beyond the outermost pixels' centres `linear` extrapolates and `weight` does not.
+        linear_y = v - y0 if k >= 2 else y0 + 1 - v
+        linear_x = u - x0 if k % 2 else x0 + 1 - u
+        linear = linear_y * linear_x
+        weight = max(1 - abs(v - r), 0.0) * max(1 - abs(u - c), 0.0)
+        weight_sum += weight
+        if not known[r, c]:
+            continue
+        value = inverse_depth[r, c]
+        low = min(low, value)
+        high = max(high, value)
+        smear = max(smear, smear_height[r, c])
+        # The map pixel's surface, extended to the photo's pixel.
+        plane = max(
+            value + slope_x[r, c] * (u - c) + slope_y[r, c] * (v - r),
+            MIN_PLANE_RATIO * value,
+        )
+        known_count += 1
+        bilinear_sum += linear * value
+        known_weight += weight
+        mixed_sum += weight * value
+        plane_sum += weight * plane
+        distance = max(abs(u - c) * width / columns, abs(v - r) * height / rows)
+        if smear_height[r, c] == 0 and distance < covered_distance:
+            covered_depth = np.float32(plane)
+            covered_distance = distance
+
+    # Mostly unknown: a hole, unless a known map pixel lies here.
+    no_edge = np.float32(0)
+    covers_map_pixel = covered_distance < COVERED_PX
+    if known_weight < 0.5 * weight_sum:
+        if covers_map_pixel:
+            return covered_depth, SETTLED, no_edge
+        return np.float32(0), HOLE, no_edge
+
+    # On one surface: interpolate it.
+    if not edge_between and smear == 0:
+        if known_count == 4:
+            return np.float32(max(bilinear_sum, MIN_PLANE_RATIO * low)), SETTLED, no_edge
+        return np.float32(plane_sum / known_weight), SETTLED, no_edge
+
+    # In an edge: the map pixel that lies here, as no other pixel of the photo is closer to it. Else
+    # the pixel stays open.
+    if covers_map_pixel:
+        return covered_depth, SETTLED, no_edge
+    return np.float32(mixed_sum / known_weight), OPEN, max(smear, high - low)

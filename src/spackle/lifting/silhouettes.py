@@ -173,6 +173,38 @@ def _fit_coverage(
             alpha[y, x] = min(max(coverage, 0.0), 1.0)
 
 
+@inlined_kernel
+def _move_colors(y: int, x: int, a: Any, residual: Any, color: Any, variance: Any) -> Any:
+    """Move the near and the far colour of a pixel so that their mixture changes by `residual`.
+
+    A colour that covers the part p of the pixel moves by residual·p²/(a³ + (1 - a)³), so that both
+    movements together give the residual; but by at most 1.5 standard deviations.
+
+    Args:
+        y, x: the pixel.
+        a: the part that the near surface covers; the far one covers 1 - a.
+        residual: [3] change of the mixture.
+        color: [2, H, W, 3] near and far colour, changed in place.
+        variance: [2, H, W] of each surface's colours.
+
+    Returns:
+        The squared length of the part of the residual that is left.
+    """
+    cubes = a * a * a + (1 - a) * (1 - a) * (1 - a)
+    unexplained = np.float32(0)
+    for c in range(3):
+        missing = residual[c]
+        for side in range(2):
+            part = a if side == 0 else 1 - a
+            limit = MAX_COLOR_DEVIATIONS * np.sqrt(variance[side, y, x])
+            change = min(max(residual[c] * part * part / cubes, -limit), limit)
+            moved = min(max(color[side, y, x, c] + change, np.float32(0)), np.float32(1))
+            missing -= part * (moved - color[side, y, x, c])
+            color[side, y, x, c] = moved
+        unexplained += missing * missing
+    return unexplained
+
+
 @kernel
 def _unmix(colors: Any, ring: Any, inside: Any, alpha: Any, color: Any, variance: Any) -> None:
     """Change both colours so that they mix to the photo's colour, as far as they may.
@@ -210,21 +242,7 @@ def _unmix(colors: Any, ring: Any, inside: Any, alpha: Any, color: Any, variance
                 unchanged[1, c] = color[1, y, x, c]
                 residual[c] = colors[y, x, c] - (a * unchanged[0, c] + (1 - a) * unchanged[1, c])
 
-            # Divide the residual: a colour with the part p of the pixel moves by
-            # residual·p²/(a³ + (1 - a)³), so that both movements together give the residual.
-            cubes = a * a * a + (1 - a) * (1 - a) * (1 - a)
-            unexplained = np.float32(0)
-            for c in range(3):
-                missing = residual[c]
-                for side in range(2):
-                    part = a if side == 0 else 1 - a
-                    limit = MAX_COLOR_DEVIATIONS * np.sqrt(variance[side, y, x])
-                    change = min(max(residual[c] * part * part / cubes, -limit), limit)
-                    moved = min(max(color[side, y, x, c] + change, np.float32(0)), np.float32(1))
-                    missing -= part * (moved - color[side, y, x, c])
-                    color[side, y, x, c] = moved
-                unexplained += missing * missing
-
+            unexplained = _move_colors(y, x, a, residual, color, variance)
             if inside[y, x] <= 0 and is_fringe:
                 alpha[y, x] = 1
                 continue

@@ -191,16 +191,7 @@ def _estimate_surfaces(
                     depth[side, y, x] = at_center
                     slope[side, y, x, 0] = slope_x
                     slope[side, y, x, 1] = slope_y
-                total_variance = 0.0
-                weight = color_moments[side, 0]
-                if weight > 0:
-                    for c in range(3):
-                        mean = color_moments[side, 1 + c] / weight
-                        color[side, y, x, c] = mean
-                        total_variance += max(
-                            color_moments[side, 4 + c] / weight - mean * mean, 0.0
-                        )
-                variance[side, y, x] = total_variance
+                variance[side, y, x] = _mean_color(color_moments[side], color[side, y, x])
 
 
 @kernel
@@ -285,6 +276,23 @@ def _sum_window(
                 color_moments[side, 1 + c] += color_weight * colors[v, u, c]
                 color_moments[side, 4 + c] += color_weight * colors[v, u, c] * colors[v, u, c]
     return near_weight / total_weight
+
+
+@kernel
+def _mean_color(moments: Any, color: Any) -> Any:
+    """Write the mean of weighted colours to `color` [3]; return the sum of the channels' variances.
+
+    `moments` [7] has the sums of the weights, of the three channels and of their squares. If all
+    weights are 0, the colour stays as it is, and the variance is 0.
+    """
+    total_variance = 0.0
+    weight = moments[0]
+    if weight > 0:
+        for c in range(3):
+            mean = moments[1 + c] / weight
+            color[c] = mean
+            total_variance += max(moments[4 + c] / weight - mean * mean, 0.0)
+    return total_variance
 
 
 @kernel

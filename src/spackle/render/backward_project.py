@@ -20,7 +20,7 @@ from spackle.render.covariance import (
     widened_covariance,
 )
 from spackle.render.project import Arrays, KernelCamera
-from spackle.runtime.kernels import Array, kernel
+from spackle.runtime.kernels import Array, inlined_kernel, kernel
 
 MIN_NORM = 1e-12  # of a quaternion, for a safe division
 
@@ -61,13 +61,7 @@ def project_backward(
         opacities_grad[i] = sums[0] / opacities[i]
 
         # The forward pass once more, as in `project_block`.
-        for a in range(3):
-            center[a] = (
-                pose[a, 0] * means[i, 0]
-                + pose[a, 1] * means[i, 1]
-                + pose[a, 2] * means[i, 2]
-                + pose[a, 3]
-            )
+        transform_point(pose, means[i], center)
         nearness = 1.0 / center[2]
         jacobian = projection_jacobian(center[0] * nearness, center[1] * nearness, nearness, lens)
         rotation = rotation_matrix(quats[i])
@@ -92,6 +86,15 @@ def project_backward(
                 + pose[1, b] * center_grad[1]
                 + pose[2, b] * center_grad[2]
             )
+
+
+@inlined_kernel
+def transform_point(pose: Array, point: Array, result: Array) -> None:
+    """Write a world point [3] to `result` [3], in the frame of a camera with `pose` [3, 4]."""
+    for a in range(3):
+        result[a] = (
+            pose[a, 0] * point[0] + pose[a, 1] * point[1] + pose[a, 2] * point[2] + pose[a, 3]
+        )
 
 
 @kernel

@@ -183,6 +183,7 @@ def pixel_sums(drawing: Drawing, gradients: Arrays, table_rows: Array, count: in
     sums = np.zeros((rows_before[-1], SUMS), np.float32)
 
     def sum_tiles(start: int, stop: int) -> None:
+        """Fill the rows of `sums` that belong to the tiles `tiles[start]` to `tiles[stop - 1]`."""
         backward_tiles(
             start,
             stop,

@@ -209,12 +209,12 @@ def project_block(
         left, right = pixel_range(u, half_width, camera.width)
         top, bottom = pixel_range(v, half_height, camera.height)
 
-        # All comparisons are false for NaN.
-        sound = (z >= NEAR_PLANE) & (z < MAX_FINITE)
-        sound &= (opacity >= ALPHA_MIN) & (opacity < MAX_FINITE)
-        sound &= (det > 0.0) & (det < MAX_FINITE) & (cxx < MAX_FINITE) & (cyy < MAX_FINITE)
-        sound &= (across < MAX_FINITE) & (fall < MAX_FINITE)
-        visible = sound & (left < right) & (top < bottom)
+        # An ellipse without area is invisible. All comparisons are false for NaN.
+        drawable = (z >= NEAR_PLANE) & (z < MAX_FINITE)
+        drawable &= (opacity >= ALPHA_MIN) & (opacity < MAX_FINITE)
+        drawable &= (det > 0.0) & (det < MAX_FINITE) & (cxx < MAX_FINITE) & (cyy < MAX_FINITE)
+        drawable &= (across < MAX_FINITE) & (fall < MAX_FINITE)
+        visible = drawable & (left < right) & (top < bottom)
 
         block[i + np.uint64(X * BLOCK_GAUSSIANS)] = u
         block[i + np.uint64(Y * BLOCK_GAUSSIANS)] = v
