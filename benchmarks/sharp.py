@@ -216,7 +216,7 @@ def main() -> None:
         contenders: dict[str, dict[str, Any]] = (
             {"original": {"checkout": chosen.original}} if chosen.original else {}
         )
-        contenders |= {"Spackle": {}, "Spackle, --sharp windows=1": {"windows_per_batch": 1}}
+        contenders |= {"Spackle": {}, "Spackle, --sharp-windows 1": {"windows_per_batch": 1}}
         contenders |= {"Spackle, fp32": {"precision": "fp32"}}
         outputs = {label: folder / f"{index}.ply" for index, label in enumerate(contenders)}
         results = []

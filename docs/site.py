@@ -26,7 +26,7 @@ ELSEWHERE = {
 }
 CODE = {
     "python.md": "src/spackle/__init__.py",
-    "commands.md": "src/spackle/cli/commands.py",
+    "commands.md": "src/spackle/cli/__init__.py",
 }  # what a page is made of
 COMMANDS = ("predict", "view", "render", "export", "info", "demo", "weights get", "weights list")
 COMMANDS += (

@@ -118,7 +118,7 @@ def test_every_command_has_a_help() -> None:
     for command in COMMANDS:
         result = run(command, "--help")
         assert (result.code, f"spackle {command}" in result.out.splitlines()[0]) == (0, True)
-    assert "--sharp" in run("predict", "--help-all").out
+    assert "--sharp-windows" in run("predict", "--help-all").out
 
 
 def test_info_says_what_a_file_is(tmp_path: Path, scene: Path, pair: tuple[Path, Path]) -> None:

@@ -41,10 +41,7 @@ PREDICT = [
     ("--fov 180", "--fov"),
     *((f"--frames {value}", "--frames") for value in ("0", "1000000", "many")),
     *((f"--seconds {value}", "--seconds") for value in ("0", "2 --frames 9")),
-    *(
-        (f"--sharp {value}", "--sharp")
-        for value in ("windows=1", "windws=1", "windows=many", "compile")
-    ),
+    *((f"--sharp-windows {value}", "--sharp-windows") for value in ("1", "many", "36")),
     *((f"--residual {file}.safetensors", f"{file}.safetensors") for file in ("nowhere", "bad")),
     *((f"{option} 0", option) for option in ("--workers", "--threads")),
     ("--depth-out depth.tiff", "depth.tiff"),

@@ -50,11 +50,11 @@ def test_a_photo_becomes_a_scene_and_is_done_again_for_other_weights_but_not_for
     assert all(row["after"] < 0.01 < row["before"] for row in report["hole_area_ratio"])
     with monkeypatch.context() as patch:
         patch.setattr(SharpBase, "load", lambda *args, **options: pytest.fail("loaded"))
-        assert run(*arguments, "--sharp", "windows=9").err.count("done already") == 1
+        assert run(*arguments, "--sharp-windows", 9).err.count("done already") == 1
     changed = tiny_weights(MICRO_SIZE)
     changed["prediction_head.texture_prediction_head.bias"] += 0.1
     torch.save(changed, weights)
-    result = run(*arguments, "--precision", "fp32", "--sharp", "windows=1")
+    result = run(*arguments, "--precision", "fp32", "--sharp-windows", 1)
     assert (result.code, "done already" in result.err) == (0, False)
     assert report_of(folder)["base"]["precision"] == "fp32"
 

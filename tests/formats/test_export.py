@@ -18,7 +18,6 @@ from helpers.plain_scenes import FORMATS, gaussians_of, glb_parts
 from helpers.scenes import box_before_wall, psnr, random_gaussians, shifted, slanted_plane
 from rich.console import Console
 
-from spackle.cli.saved_scene import PAGE, export_scene
 from spackle.core.camera import Camera
 from spackle.core.color import linear_to_srgb
 from spackle.core.gaussians import Gaussians, quat_to_matrix
@@ -28,6 +27,7 @@ from spackle.formats.scene_content import SceneFile
 from spackle.formats.scene_files import SCENE_ENCODERS, encoder_for, load_scene
 from spackle.formats.spz import MAX_BYTES_PER_GAUSSIAN
 from spackle.render import CpuRenderer
+from spackle.results.saved_scene import PAGE_ENCODERS, export_scene
 from spackle.runtime.errors import InputError
 from spackle.runtime.progress import Reporter
 from spackle.scene import Scene
@@ -290,7 +290,7 @@ def test_a_scene_never_overwrites_itself(scene: Path) -> None:
 
 
 def test_all_formats_at_once(scene: Path, tmp_path: Path) -> None:
-    names = [*(f"out{suffix}" for suffix in (*SCENE_ENCODERS, *PAGE)), "A.SPLAT"]
+    names = [*(f"out{suffix}" for suffix in (*SCENE_ENCODERS, *PAGE_ENCODERS)), "A.SPLAT"]
     export(scene, *names)
     base = load_ply(scene)
     for a, b in zip(load_ply(tmp_path / "out.ply").tensors, base.tensors, strict=True):

@@ -154,7 +154,9 @@ def test_an_empty_page_offers_photos(visit: Callable[..., Run]) -> None:
 
 
 def test_bad_files_and_options(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("spackle.cli.serve.announce", lambda *_: pytest.fail("there is a page"))
+    monkeypatch.setattr(
+        "spackle.web.local_server.announce", lambda *_: pytest.fail("there is a page")
+    )
     (tmp_path / "written.glb").write_bytes(b"anything")  # a format that cannot be read
     (tmp_path / "scene.jpg").write_bytes(b"ply\nformat binary_little_endian 1.0\nend_header\n")
     behind = dataclasses.replace(base := box_before_wall().base(), means=-base.means)

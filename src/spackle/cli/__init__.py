@@ -1,4 +1,8 @@
-"""The command line. Functions declare the options of commands; they import the code of a command only when it runs."""
+"""The command line.
+
+One file declares the options of one command and calls the library; it imports the command's work
+only when the command runs, so that help does not wait for torch. `main` is the entry.
+"""
 
 from __future__ import annotations
 
@@ -10,18 +14,56 @@ import os
 import signal
 import sys
 import threading
-from typing import Annotated, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import typer
+from typer.core import TyperGroup
 from typer.exceptions import TyperException
 
-from spackle.cli import commands, dataset, evaluate, train, weights
+from spackle.cli.bench import bench
+from spackle.cli.dataset import dataset
+from spackle.cli.demo import demo
+from spackle.cli.evaluate import evaluate
+from spackle.cli.export import export
+from spackle.cli.figures import figures
+from spackle.cli.info import info
 from spackle.cli.messages import applications, with_flags
-from spackle.cli.options import INTERRUPTED
+from spackle.cli.options import INTERRUPTED, PAPER_PANEL
+from spackle.cli.predict import predict
+from spackle.cli.render import render
+from spackle.cli.serve import serve
+from spackle.cli.tables import tables
+from spackle.cli.train import train
+from spackle.cli.view import view
+from spackle.cli.weights import weights
 from spackle.runtime.errors import InputError, printable_line
+
+BAD_INPUT = 2  # exit code after a message about the input
+# The garbage collector runs after so many new objects, not after 2,000, because each time it scans
+# the 200,000 objects of torch and numba.
+OBJECTS_BETWEEN_COLLECTIONS = 50_000
+
+
+class GroupedCommands(TyperGroup):
+    """Commands whose help lists those of the paper's experiments apart from all others."""
+
+    def format_commands(self, context: Any, formatter: Any) -> None:
+        """Write one section of the help for each panel, in the order of the first commands."""
+        sections: dict[str, list[tuple[str, str]]] = {}
+        for name in self.list_commands(context):
+            command: Any = self.get_command(context, name)
+            panel = getattr(command, "rich_help_panel", None)
+            title = panel if isinstance(panel, str) else "Commands"
+            help_text = command.get_short_help_str(limit=formatter.width)
+            sections.setdefault(title, []).append((name, help_text))
+        for title, rows in sections.items():
+            with formatter.section(title):
+                formatter.write_dl(rows)
+
 
 app = typer.Typer(
     name="spackle",
+    cls=GroupedCommands,
     help="""One photo in, a 3D Gaussian scene out that survives a large camera move.
 
     \b
@@ -39,30 +81,41 @@ app = typer.Typer(
     },
 )
 
-app.command(short_help="Turn photos, or a clip, into completed scenes and videos")(commands.predict)
-app.command(short_help="View a scene, or a photo that becomes one, in the browser")(commands.view)
-app.command(short_help="Complete photos for programs, over HTTP")(commands.serve)
-app.command(short_help="Render a saved scene as a video")(commands.render)
-app.command(short_help="Write a scene for other viewers, or as one page to send")(commands.export)
-app.command(short_help="Describe a scene, photo, depth map or clip")(commands.info)
-app.command(short_help="Complete one photo and compare with its true second view")(commands.demo)
+app.command(short_help="Turn photos, or a clip, into completed scenes and videos")(predict)
+app.command(short_help="View a scene, or a photo that becomes one, in the browser")(view)
+app.command(short_help="Complete photos for programs, over HTTP")(serve)
+app.command(short_help="Render a saved scene as a video")(render)
+app.command(short_help="Write a scene for other viewers, or as one page to send")(export)
+app.command(short_help="Describe a scene, photo, depth map or clip")(info)
+app.command(short_help="Complete one photo and compare with its true second view")(demo)
+app.add_typer(weights, name="weights", short_help="Download or list weights that others publish")
+
+app.command(
+    short_help="Train the residual network or SHARP's decoder", rich_help_panel=PAPER_PANEL
+)(train)
+app.command(
+    short_help="Evaluate on a dataset by the paper's protocols", rich_help_panel=PAPER_PANEL
+)(evaluate)
+app.command(
+    short_help="Merge several evaluations into the same tables", rich_help_panel=PAPER_PANEL
+)(tables)
+app.command(
+    short_help="Draw the paper's figures from several evaluations", rich_help_panel=PAPER_PANEL
+)(figures)
+app.command(
+    short_help="Measure what Spackle costs, in Gaussians and in time", rich_help_panel=PAPER_PANEL
+)(bench)
 app.add_typer(
-    weights.weights, name="weights", short_help="Download or list weights that others publish"
-)
-app.command(short_help="Train the residual network or SHARP's decoder")(train.train)
-app.command(short_help="Evaluate on a dataset by the paper's protocols")(evaluate.evaluate)
-app.command(short_help="Merge several evaluations into the same tables")(evaluate.tables)
-app.command(short_help="Draw the paper's figures from several evaluations")(evaluate.figures)
-app.command(short_help="Measure what Spackle costs, in Gaussians and in time")(evaluate.bench)
-app.add_typer(
-    dataset.dataset,
+    dataset,
     name="dataset",
     short_help="Build training data: views with holes and completed targets",
+    rich_help_panel=PAPER_PANEL,
 )
 applications.append(app)
 
 
-def _version(asked: bool) -> None:
+def _print_version(asked: bool) -> None:
+    """Print the version and end the command, if `--version` is given."""
     if asked:
         from spackle import __version__
 
@@ -71,44 +124,47 @@ def _version(asked: bool) -> None:
 
 
 @app.callback()
-def everywhere(
+def options_before_any_command(
     version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Print the version."
+        ),
     ] = False,
 ) -> None:
     """Options that come before any command."""
 
 
 def main() -> None:
-    """Entry point; bad input prints one line and ends with exit code 2."""
-    # Otherwise idle threads of torch spin, which slows completion down by a factor of three to five on busy cores.
+    """Run the command; bad input prints one line and ends with exit code 2."""
+    # Otherwise idle threads of torch spin, which makes completion three to five times slower on
+    # busy cores.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    # Otherwise the garbage collector scans the 200,000 objects of torch and numba too often.
-    gc.set_threshold(50_000)
-    if (
-        threading.current_thread() is threading.main_thread()
-    ):  # let SIGTERM run every `finally`, too
-        signal.signal(signal.SIGTERM, _end)
+    gc.set_threshold(OBJECTS_BETWEEN_COLLECTIONS)
+    # SIGTERM then ends the process by an exception, so that every `finally` runs. Only the main
+    # thread may set this.
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, _exit_at_signal)
+
     try:
         code = app(standalone_mode=False)
         sys.stdout.flush()
     except InputError as error:
-        _fail(str(error))
+        _exit_with_error(str(error))
     except TyperException as error:  # an unknown option, or text in place of a number
-        if type(error).__name__ == "NoArgsIsHelpError":  # no arguments: print the help
+        if type(error).__name__ == "NoArgsIsHelpError":  # without arguments the help is printed
             print(error.format_message(), file=sys.stderr)
-            sys.exit(2)
-        _fail(
-            error.format_message().replace("Value error, ", "")
-        )  # pydantic's words, which typer keeps
+            sys.exit(BAD_INPUT)
+        # pydantic's first words, which typer keeps, say nothing to a user.
+        _exit_with_error(error.format_message().replace("Value error, ", ""))
     except OSError as error:
+        # Without a file name it is the standard output that fails, such as a pipe to a full disk.
         if error.filename is not None:
             raise
-        print(
-            f"error: cannot write to the standard output: {error.strerror or error}",
-            file=sys.stderr,
-        )
-        sys.exit(2)
+        reason = error.strerror or error
+        print(f"error: cannot write to the standard output: {reason}", file=sys.stderr)
+        sys.exit(BAD_INPUT)
+
     if code == INTERRUPTED:
         print("interrupted", file=sys.stderr)
     sys.exit(code)
@@ -128,13 +184,15 @@ def run() -> NoReturn:
     os._exit(code if isinstance(code, int) else 1)
 
 
-def _end(number: int, frame: object) -> NoReturn:
+def _exit_at_signal(number: int, frame: object) -> NoReturn:
+    """End the process with the exit code that shells give a process ended by this signal."""
     sys.exit(128 + number)
 
 
-def _fail(message: str) -> NoReturn:
+def _exit_with_error(message: str) -> NoReturn:
+    """Print an error in one line, and as JSON if the user asked for JSON; exit code 2."""
     line = with_flags(printable_line(message))
     print(f"error: {line}", file=sys.stderr)
     if "--json" in sys.argv:
         print(json.dumps({"error": line}))
-    sys.exit(2)
+    sys.exit(BAD_INPUT)

@@ -19,6 +19,9 @@ from spackle.runtime.progress import Reporter
 # The application whose commands' options are known; `spackle.cli` adds it once all commands exist.
 applications: list[typer.Typer] = []
 
+# Options whose flag is not made of their Python name.
+FLAGS_OF_OTHER_NAMES = {"windows_per_batch": "--sharp-windows"}
+
 
 def with_flags(message: str) -> str:
     """The message, with every option in backticks replaced by its flag: `fov` becomes --fov.
@@ -27,7 +30,8 @@ def with_flags(message: str) -> str:
     """
 
     def flag_of(match: re.Match[str]) -> str:
-        flag = "--" + match[1].replace("_", "-")
+        name = match[1]
+        flag = FLAGS_OF_OTHER_NAMES.get(name, "--" + name.replace("_", "-"))
         return flag if flag in _known_flags() else match[0]
 
     return re.sub(r"`([a-z][a-z0-9_]*)`", flag_of, message)
@@ -49,14 +53,14 @@ def _known_flags() -> set[str]:
 
 
 class CommandReporter(Reporter):
-    """Reports progress, messages and results of a command; options in messages are named as flags."""
+    """Reports progress, messages and results of a command; messages name options as flags."""
 
     def log(self, line: str) -> None:
         """Print a line."""
         super().log(with_flags(line))
 
     def result(self, values: Mapping[str, object]) -> None:
-        """Print a result as a line of JSON if the user asked for JSON; an error in it names flags."""
+        """Print a result as a line of JSON if the user asked for JSON; an error names flags."""
         error = values.get("error")
         if isinstance(error, str):
             values = {**values, "error": with_flags(error)}

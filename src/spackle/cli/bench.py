@@ -1,0 +1,87 @@
+"""`spackle bench`: measure what Spackle costs, in Gaussians and in time."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from spackle.cli.evaluation_options import (
+    BaseNameOption,
+    BaseWeightsOption,
+    DatasetNameOption,
+    DisparitiesOption,
+    FolderArgument,
+    LimitOption,
+    ResidualOption,
+    ResultsOption,
+    SideOption,
+)
+from spackle.cli.options import (
+    INTERRUPTED,
+    DeviceOption,
+    JsonOption,
+    PrecisionOption,
+    SharpWindowsOption,
+    VerboseOption,
+)
+
+# A base such as hf:OWNER/NAME is part of the name of the folder with results.
+UNSAFE_IN_FOLDER_NAMES = re.compile(r"[^\w.-]+")
+
+
+def bench(
+    folder: FolderArgument,
+    dataset: DatasetNameOption,
+    disparity: DisparitiesOption = "0.3,0.4,0.5",
+    side: SideOption = None,
+    base: BaseNameOption = "sharp",
+    checkpoint: BaseWeightsOption = None,
+    precision: PrecisionOption = "auto",
+    sharp_windows: SharpWindowsOption = None,
+    residual: ResidualOption = None,
+    limit: LimitOption = None,
+    runs: Annotated[
+        int, typer.Option(min=1, max=1000, help="Number of timed runs of all steps after the base.")
+    ] = 5,
+    base_runs: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            max=1000,
+            help="Number of timed runs of the base. [default: 1 for sharp, else as --runs]",
+        ),
+    ] = None,
+    device: DeviceOption = "auto",
+    output: ResultsOption = None,
+    as_json: JsonOption = False,
+    verbose: VerboseOption = False,
+) -> None:
+    """Count the Gaussians and measure the time that Spackle adds to a base: rows.jsonl, bench.md, bench.tex."""
+    from spackle.bases.settings import BaseSettings
+    from spackle.cli.messages import CommandReporter
+    from spackle.paper.evaluation.bench import bench as run
+    from spackle.paper.evaluation.options import BenchOptions, parse_disparities
+
+    options = BenchOptions(
+        dataset=dataset,
+        root=folder,
+        disparities=parse_disparities(disparity),
+        side=side,
+        base=BaseSettings(
+            name=base,
+            checkpoint=checkpoint,
+            precision=precision,
+            device=device,
+            windows_per_batch=sharp_windows,
+        ),
+        residual=residual,
+        limit=limit,
+        runs=runs,
+        base_runs=base_runs,
+    )
+    results = output or Path(f"bench-{dataset}-{UNSAFE_IN_FOLDER_NAMES.sub('-', base)}")
+    if run(options, results, CommandReporter(verbose, as_json=as_json)) is None:
+        raise typer.Exit(INTERRUPTED)

@@ -1,0 +1,31 @@
+"""`spackle export`: a scene in the formats that other viewers read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from spackle.cli.options import JsonOption
+
+
+def export(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="A 3D Gaussian scene.")],
+    output: Annotated[
+        list[Path],
+        typer.Option(
+            "-o",
+            "--output",
+            metavar="FILE",
+            help="Output file; the suffix sets the format: .ply, .compressed.ply, .spz, .splat, "
+            ".sog, .glb, or .html (a page with the scene). The option may be repeated.",
+        ),
+    ],
+    as_json: JsonOption = False,
+) -> None:
+    """Write a scene in the formats that other viewers read."""
+    from spackle.cli.messages import CommandReporter
+    from spackle.results.saved_scene import export_scene
+
+    export_scene(scene, output, CommandReporter(as_json=as_json))

@@ -1,0 +1,293 @@
+"""`spackle predict`: turn photos, folders of photos or a clip into completed scenes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from spackle.cli.options import (
+    CamerasOption,
+    CheckpointOption,
+    ConvergenceOption,
+    DepthKindOption,
+    DeviceOption,
+    DisparityOption,
+    FitOption,
+    FovOption,
+    FpsOption,
+    FramesOption,
+    HelpAllOption,
+    IpdOption,
+    JsonOption,
+    KeepFrameOption,
+    LoopOption,
+    OverscanOption,
+    PathFileOption,
+    PrecisionName,
+    SecondsOption,
+    SharpWindowsOption,
+    ShowOption,
+    SizeOption,
+    StereoOption,
+    TrajectoryOption,
+    VerboseOption,
+    VideoFormatOption,
+    path_options,
+)
+from spackle.runtime.errors import InputError
+
+if TYPE_CHECKING:  # torch takes seconds to load
+    from spackle.results.many_photos import PredictOptions
+    from spackle.runtime.progress import Reporter
+
+
+def predict(
+    *,
+    photos: Annotated[
+        list[Path],
+        typer.Argument(metavar="PHOTO...", help="Photos, folders of photos, or one clip."),
+    ],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="OUT", help="Results go to OUT/PHOTO_NAME/.")
+    ] = Path("out"),
+    base: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="Base, which turns the photo into Gaussians. rgbd: a depth map; sharp: Apple's "
+            "network; moge: MoGe-2, with metric depth and focal length; lite: small networks "
+            "inside Spackle, with rough depth; hf:OWNER/NAME or hf:FOLDER: a depth model of "
+            "transformers; package.module:Class: a base of another package. auto: the given depth "
+            "map, or the one in the photo's file, else sharp or moge if their weights are "
+            "downloaded, else lite.",
+        ),
+    ] = "auto",
+    depth: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="PATH_OR_FOLDER",
+            help="Depth of the photo: .npy, .npz, .pfm, .exr (metres), 16-bit .png (mm), a "
+            "Middlebury disparity map, or a grey picture with --depth-kind.",
+        ),
+    ] = None,
+    depth_kind: DepthKindOption = "auto",
+    near: Annotated[
+        float | None,
+        typer.Option(
+            hidden=True,
+            metavar="METRES",
+            help="Distance in metres of the nearest part of a relative --depth.",
+            show_default="1.5",
+        ),
+    ] = None,
+    far: Annotated[
+        float | None,
+        typer.Option(
+            hidden=True,
+            metavar="METRES",
+            help="Distance in metres of the farthest part of a relative --depth.",
+            show_default="15",
+        ),
+    ] = None,
+    calib: Annotated[
+        Path | None,
+        typer.Option(
+            hidden=True, metavar="FILE", help="calib.txt, if it is not in the map's folder."
+        ),
+    ] = None,
+    checkpoint: CheckpointOption = None,
+    precision: Annotated[
+        PrecisionName,
+        typer.Option(
+            hidden=True,
+            help="Precision of the base's network; auto: bf16 if the hardware supports it.",
+        ),
+    ] = "auto",
+    sharp_windows: SharpWindowsOption = None,
+    residual: Annotated[
+        str | None,
+        typer.Option(
+            metavar="PATH|initial|none",
+            hidden=True,
+            help="Weights of the residual. initial: no network; none: no fill. Default: the weights "
+            "in the package.",
+        ),
+    ] = None,
+    fill: Annotated[
+        Literal["auto", "network", "exemplar", "lama", "none"],
+        typer.Option(
+            help="Texture in the holes. lama: LaMa (`spackle weights get lama`); exemplar: patches "
+            "of the photo; network: no texture; none: no fill; auto: lama if its weights are "
+            "downloaded, else exemplar."
+        ),
+    ] = "auto",
+    render: Annotated[bool, typer.Option(help="Write a video.")] = True,
+    keep_base: Annotated[
+        bool,
+        typer.Option(
+            "--keep-base", hidden=True, help="Also write base.ply, the Gaussians of the base."
+        ),
+    ] = False,
+    depth_out: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            hidden=True,
+            help="Also write the depth: depth.png (mm), .npy or .exr (m).",
+        ),
+    ] = None,
+    trajectory: TrajectoryOption = None,
+    disparity: DisparityOption = None,
+    path: PathFileOption = None,
+    cameras: CamerasOption = None,
+    frames: FramesOption = None,
+    seconds: SecondsOption = None,
+    video_format: VideoFormatOption = None,
+    fps: FpsOption = None,
+    loop: LoopOption = None,
+    overscan: OverscanOption = None,
+    size: SizeOption = None,
+    fit: FitOption = "pad",
+    show: ShowOption = "color",
+    stereo: StereoOption = None,
+    ipd: IpdOption = None,
+    convergence: ConvergenceOption = None,
+    mode: Annotated[
+        Literal["scene", "view"],
+        typer.Option(
+            hidden=True,
+            help="scene: one set of aux Gaussians for all views; view: a set for each view.",
+        ),
+    ] = "scene",
+    device: DeviceOption = "auto",
+    focal_px: Annotated[
+        float | None, typer.Option(hidden=True, help="Focal length in pixels of the photo.")
+    ] = None,
+    focal_mm: Annotated[
+        float | None, typer.Option(help="Focal length in mm, 35 mm equivalent.")
+    ] = None,
+    fov: FovOption = None,
+    keep_frame: KeepFrameOption = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Predict again even if results exist.")
+    ] = False,
+    workers: Annotated[
+        int,
+        typer.Option(
+            hidden=True,
+            min=1,
+            max=1024,
+            help="Number of processes that share the photos, each with its own copy of the base's "
+            "network.",
+        ),
+    ] = 1,
+    threads: Annotated[
+        int | None,
+        typer.Option(
+            hidden=True,
+            min=1,
+            max=1024,
+            help="Threads of each worker; the last bits of a network's output depend on their "
+            "number.",
+            show_default="the cores, shared evenly",
+        ),
+    ] = None,
+    as_json: JsonOption = False,
+    verbose: VerboseOption = False,
+    help_all: HelpAllOption = False,
+) -> None:
+    """Turn photos into completed 3D scenes: scene.ply, video.mp4 and report.json for each.
+
+    A depth map, or weights from `spackle weights get depth` or `sharp`, improve the geometry.
+    """
+    from spackle.bases.settings import BaseSettings
+    from spackle.cli.messages import CommandReporter
+    from spackle.pipeline import FillOptions, PipelineOptions
+    from spackle.results.many_photos import PredictOptions
+    from spackle.results.photo_folder import PhotoOptions
+
+    base_settings = BaseSettings(
+        name=base,
+        depth=depth,
+        calib=calib,
+        depth_kind=depth_kind,
+        near=near,
+        far=far,
+        checkpoint=checkpoint,
+        precision=precision,
+        windows_per_batch=sharp_windows,
+        device=device,
+    )
+    path_and_video = path_options(
+        trajectory=trajectory,
+        disparity=disparity,
+        path=path,
+        cameras=cameras,
+        frames=frames,
+        seconds=seconds,
+        video_format=video_format,
+        fps=fps,
+        loop=loop,
+        overscan=overscan,
+        size=size,
+        fit=fit,
+        show=show,
+        stereo=stereo,
+        ipd=ipd,
+        convergence=convergence,
+    )
+    options = PredictOptions(
+        scene=PipelineOptions(
+            base=base_settings,
+            path=path_and_video,
+            fill=FillOptions(residual=residual, fill=fill, mode=mode),
+        ),
+        photo=PhotoOptions(
+            lens={"focal_px": focal_px, "focal_mm": focal_mm, "fov": fov},
+            render=render,
+            keep_base=keep_base,
+            depth_out=depth_out,
+            keep_frame=keep_frame,
+        ),
+        overwrite=overwrite,
+        workers=workers,
+        threads=threads,
+    )
+    failure_count = _predict_all(photos, output, options, CommandReporter(verbose, as_json=as_json))
+    if failure_count:
+        raise typer.Exit(1)
+
+
+def _predict_all(
+    sources: list[Path], output: Path, options: PredictOptions, reporter: Reporter
+) -> int:
+    """Predict a clip, or photos and folders of photos; returns how many photos failed.
+
+    InputError if an option, a clip or a single photo cannot be used.
+    """
+    from spackle.clips.files import is_clip
+    from spackle.clips.predict import VIDEO_FILE, clip_options, predict_clip
+    from spackle.pipeline import Pipeline
+    from spackle.results.many_photos import find_photos, predict_photos, say_if_kernels_compile
+    from spackle.runtime.files import check_file
+    from spackle.runtime.folders import results_folder
+
+    photos = find_photos(sources)
+    clips = [photo for photo in photos if is_clip(photo.path)]
+    if not clips:
+        is_single_photo = len(sources) == len(photos) == 1 and not sources[0].is_dir()
+        return predict_photos(photos, output, options, reporter, is_single=is_single_photo)
+
+    clip = clips[0]
+    if len(sources) > 1 or len(photos) > 1 or sources[0].is_dir():
+        raise InputError(f"{clip.path}: is a clip: give it alone, without other photos or clips")
+    pipeline = Pipeline.open(clip_options(options.scene, options.photo, options.workers))
+    say_if_kernels_compile(pipeline, reporter)
+    check_file(clip.path, "clip")
+    folder = output / clip.name
+    with results_folder(output):
+        predict_clip(clip.path, folder, pipeline, options.photo.lens, reporter)
+    reporter.log(f"Look at {folder / VIDEO_FILE}")
+    return 0

@@ -1,0 +1,429 @@
+"""Predict many photos, by this process or by several, and go on where an earlier run stopped.
+
+Read `predict_photos` first; `find_photos` names the photos, and `Predictor` predicts one after the
+other.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import glob
+import os
+import shlex
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import spackle
+from spackle.bases.open import BaseError
+from spackle.core.photo import PHOTO_SUFFIXES
+from spackle.depth.calibration import calibration_candidates
+from spackle.depth.readers import find_depth_file
+from spackle.depth.writers import check_depth_name
+from spackle.pipeline import Pipeline, PipelineOptions
+from spackle.render.blend import blend_tiles
+from spackle.results.photo_folder import (
+    REPORT_NAME,
+    PhotoOptions,
+    predict_photo,
+    read_earlier_report,
+)
+from spackle.runtime.device import thread_count
+from spackle.runtime.digests import file_fingerprint, json_digest, matches_records
+from spackle.runtime.errors import InputError
+from spackle.runtime.files import check_file, list_files
+from spackle.runtime.folders import results_folder
+from spackle.runtime.kernels import is_compiled
+from spackle.runtime.progress import BufferedReporter, Reporter, catch_stop_signals
+from spackle.runtime.workers import parallel_map, torch_threads
+from spackle.video.frames import video_problem
+from spackle.weights import installed_weights
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PredictOptions:
+    """Options for predicting photos: those of a scene, of its files, and of the run."""
+
+    scene: PipelineOptions
+    photo: PhotoOptions
+    overwrite: bool = False  # redo photos whose results exist
+    workers: int = 1  # processes that share the photos
+    threads: int | None = None  # of each worker; None: the cores, shared evenly
+
+    def open_pipeline(self) -> Pipeline:
+        """Open the pipeline for all photos; InputError for an option that no photo can use."""
+        self._check_depth_out()
+        pipeline = Pipeline.open(self.scene)
+        path = self.scene.path
+        if not self.photo.render:
+            for option in ("format", "fps", "loop"):
+                if getattr(path.video, option) is not None:
+                    raise InputError(
+                        f"`{option}`: `no_render` writes no video: leave one of them out"
+                    )
+        elif pipeline.given_views:
+            problem = video_problem(pipeline.given_views)
+            if problem:
+                raise InputError(
+                    f"{path.cameras}: {problem}, so no video can be made: "
+                    "add `no_render` for pictures only"
+                )
+        return pipeline
+
+    def _check_depth_out(self) -> None:
+        """InputError if the name for the photo's depth is no file name of a known format."""
+        name = self.photo.depth_out
+        if name is None:
+            return
+        check_depth_name(name)
+        if Path(name).name != name:
+            raise InputError(
+                f"`depth_out` {name}: give a name without a folder: the file lies beside scene.ply"
+            )
+
+
+class NamedPhoto(NamedTuple):
+    """A photo, and the name of the folder with its results."""
+
+    path: Path
+    name: str
+
+
+class PhotoResult(NamedTuple):
+    """What a worker says about a photo."""
+
+    file_name: str
+    failed: bool
+    messages: Sequence[str | Mapping[str, object]]  # log lines, and results for JSON, in order
+
+
+def say_if_kernels_compile(pipeline: Pipeline, reporter: Reporter) -> None:
+    """Tell why the first run takes longer, if it does."""
+    if pipeline.renderer.device.type == "cpu" and not is_compiled(blend_tiles):
+        reporter.log(
+            "first use: kernels are compiled for this processor, "
+            "which takes about half a minute, once"
+        )
+
+
+def find_photos(sources: Sequence[Path]) -> list[NamedPhoto]:
+    """The photos that are given by name, by a pattern such as "*.png", or by folder.
+
+    A photo's results are named by its file, without the suffix where this is unique.
+
+    Raises:
+        InputError: a folder without photos, or two photos whose results would have the same name.
+    """
+    photos: list[Path] = []
+    for source in sources:
+        photos += _photos_of(source)
+
+    # File systems of Windows and macOS do not distinguish upper and lower case.
+    stem_counts = Counter(photo.stem.casefold() for photo in photos)
+    named: dict[str, NamedPhoto] = {}
+    for photo in photos:
+        is_unique = stem_counts[photo.stem.casefold()] == 1
+        is_dots = not photo.stem.strip(".")  # "...png" has the stem "..", the folder above
+        name = photo.stem if is_unique and not is_dots else photo.name
+        other = named.get(name.casefold())
+        if other is not None:
+            raise InputError(
+                f"{photo}: {other.path} has the same name: "
+                "predict them in two runs, each with its own `output`"
+            )
+        named[name.casefold()] = NamedPhoto(photo, name)
+    return list(named.values())
+
+
+def _photos_of(source: Path) -> list[Path]:
+    """The photos in a folder, or those that match a pattern, or the file itself.
+
+    InputError for a folder without photos.
+    """
+    if os.path.isdir(source):
+        photos = list_files(source, PHOTO_SUFFIXES)
+        if not photos:
+            raise InputError(
+                f"{source}: no photos in this folder (looked for {', '.join(PHOTO_SUFFIXES)})"
+            )
+        return photos
+
+    # A file whose name looks like a pattern is meant literally.
+    if not os.path.lexists(source):
+        matches = sorted(glob.glob(str(source)))
+        if matches:
+            return [Path(match) for match in matches]
+    return [source]
+
+
+def predict_photos(
+    photos: Sequence[NamedPhoto],
+    output: Path,
+    options: PredictOptions,
+    reporter: Reporter,
+    *,
+    is_single: bool,
+) -> int:
+    """Predict photos into the folder `output`, each into a folder of its name.
+
+    Args:
+        photos: the photos.
+        output: the folder of all results.
+        options: of scenes, files and run.
+        reporter: gets messages, progress and results.
+        is_single: whether one photo was named, not a folder; it is predicted even if its results
+            exist, and its error ends the run.
+
+    Returns:
+        The number of photos that failed.
+
+    Raises:
+        InputError: an option, or a single photo, cannot be used.
+    """
+    worker_count = min(options.workers, len(photos))
+    threads = options.threads or max(1, thread_count() // worker_count)
+    pipeline = options.open_pipeline()
+    say_if_kernels_compile(pipeline, reporter)
+    if is_single:
+        check_file(photos[0].path, "photo")
+
+    shared_digest = _shared_digest(options)
+    with results_folder(output, locked=not is_single):
+        predictor = Predictor(
+            output=output,
+            options=options,
+            shared_digest=shared_digest,
+            is_single=is_single,
+            pipeline=pipeline,
+            verbose=reporter.verbose,
+        )
+        unfinished = predictor.unfinished(photos, reporter)
+        failure_count = 0
+        if worker_count == 1:
+            with torch_threads(threads):
+                for photo in unfinished:
+                    if not predictor.predict(photo, reporter):
+                        failure_count += 1
+        else:
+            failure_count = _predict_by_workers(
+                functools.partial(Predictor.open, output, options, shared_digest, reporter.verbose),
+                list(unfinished),
+                len(photos),
+                worker_count,
+                threads,
+                reporter,
+                uses_gpu=options.scene.base.device != "cpu",
+            )
+
+    if failure_count:
+        reporter.log(f"{failure_count} of {len(photos)} photos failed")
+    else:
+        folder = output / (photos[0].name if is_single else "NAME")
+        _say_where_to_look(folder, options, reporter)
+    return failure_count
+
+
+def _say_where_to_look(folder: Path, options: PredictOptions, reporter: Reporter) -> None:
+    """Log a line that names the video and the command that shows the scene."""
+    view_command = f"spackle view {shlex.quote(str(folder / 'scene.ply'))}"
+    if options.photo.render:
+        video = folder / f"video{options.scene.path.video.suffix}"
+        reporter.log(f"Look at {video}, or into the scene: {view_command}")
+    else:
+        reporter.log(f"Look into the scene: {view_command}")
+
+
+def _predict_by_workers(
+    open_predictor: Callable[[], Predictor],
+    unfinished: Sequence[NamedPhoto],
+    photo_count: int,
+    worker_count: int,
+    threads: int,
+    reporter: Reporter,
+    *,
+    uses_gpu: bool,
+) -> int:
+    """Predict photos by several processes, and print the messages about each finished photo.
+
+    Args:
+        open_predictor: opens a predictor in a process.
+        unfinished: the photos that have no results yet.
+        photo_count: the number of all photos, for the progress.
+        worker_count: the number of processes.
+        threads: of each process.
+        reporter: gets messages and progress.
+        uses_gpu: whether each process uses one GPU.
+
+    Returns:
+        The number of photos that failed.
+
+    Raises:
+        KeyboardInterrupt: after Ctrl-C or SIGTERM, once the photos in progress are done.
+    """
+    if not unfinished:
+        return 0
+    failure_count = 0
+    finished_before = photo_count - len(unfinished)
+    finished_count = finished_before
+    with (
+        catch_stop_signals(single_process=True) as is_stopping,
+        reporter.steps("photos", finished_before, photo_count) as report_step,
+        parallel_map(
+            open_predictor,
+            unfinished,
+            is_stopping,
+            count=worker_count,
+            threads=threads,
+            gpu=uses_gpu,
+        ) as results,
+    ):
+        for result in results:
+            finished_count += 1
+            for message in result.messages:
+                if isinstance(message, str):
+                    reporter.log(message)
+                else:
+                    reporter.result(message)
+            if result.failed:
+                failure_count += 1
+            report_step(finished_count, result.file_name)
+            if is_stopping():
+                break
+
+    if finished_count < photo_count:
+        reporter.log("stopped; the same command resumes from here")
+        raise KeyboardInterrupt
+    return failure_count
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Predictor:
+    """Predicts one photo after the other."""
+
+    output: Path
+    options: PredictOptions
+    shared_digest: str  # of what the results of all photos depend on
+    is_single: bool  # one photo was named: it is always predicted, and an error ends the run
+    pipeline: Pipeline
+    verbose: bool
+
+    @staticmethod
+    def open(output: Path, options: PredictOptions, shared_digest: str, verbose: bool) -> Predictor:
+        """Open the predictor of a worker process."""
+        return Predictor(
+            output=output,
+            options=options,
+            shared_digest=shared_digest,
+            is_single=False,
+            pipeline=options.open_pipeline(),
+            verbose=verbose,
+        )
+
+    def make(self, photo: NamedPhoto) -> PhotoResult:
+        """Predict a photo in a worker process, and keep the messages for the main process."""
+        reporter = BufferedReporter(self.verbose)
+        succeeded = self.predict(photo, reporter)
+        return PhotoResult(photo.path.name, not succeeded, reporter.said)
+
+    def predict(self, photo: NamedPhoto, reporter: Reporter) -> bool:
+        """Predict a photo; returns whether this succeeded, and logs an error.
+
+        InputError for a single photo, or if no photo can succeed.
+        """
+        folder = self.output / photo.name
+        try:
+            request = self.request_digest(photo)
+            predict_photo(photo.path, folder, self.pipeline, reporter, self.options.photo, request)
+        except InputError as error:
+            if self.is_single or isinstance(error, BaseError):
+                raise
+            reporter.log(f"error: {error}")
+            reporter.result({"folder": folder, "error": str(error)})
+            return False
+        return True
+
+    def unfinished(self, photos: Iterable[NamedPhoto], reporter: Reporter) -> Iterator[NamedPhoto]:
+        """The photos without complete results; logs each photo that is skipped."""
+        for photo in photos:
+            if self.is_done(photo):
+                reporter.log(f"{photo.path.name}: done already (`overwrite` does it again)")
+                reporter.result({"folder": self.output / photo.name, "done_already": True})
+            else:
+                yield photo
+
+    def is_done(self, photo: NamedPhoto) -> bool:
+        """Whether an earlier run with the same input and options has left complete results."""
+        if self.is_single or self.options.overwrite:
+            return False
+        folder = self.output / photo.name
+        earlier_report = read_earlier_report(folder)
+        if not earlier_report:
+            return False
+        try:
+            request = self.request_digest(photo)
+        except InputError:
+            return False  # a file is missing, which `predict` will report
+        has_same_request = earlier_report.get("request") == request
+        return has_same_request and matches_records(
+            folder, REPORT_NAME, earlier_report.get("files")
+        )
+
+    def request_digest(self, photo: NamedPhoto) -> str:
+        """A digest of all that a photo's results depend on.
+
+        InputError if the photo or its depth map is missing.
+        """
+        fingerprints = [file_fingerprint(photo.path, "photo")]
+        depth = self.options.scene.base.depth
+        if isinstance(depth, Path):
+            depth_file = find_depth_file(depth, photo.path)
+            fingerprints.append(file_fingerprint(depth_file, "depth map"))
+            for calibration in calibration_candidates(depth_file):
+                if calibration.is_file():
+                    fingerprints.append(file_fingerprint(calibration, "calibration"))
+        return json_digest([self.shared_digest, *fingerprints])
+
+
+def _shared_digest(options: PredictOptions) -> str:
+    """A digest of version, options and files that all photos share.
+
+    InputError for a missing file.
+    """
+    base, path, fill = options.scene.base, options.scene.path, options.scene.fill
+    files: dict[str, Path | None] = {
+        "calibration": base.calib,
+        "camera file": path.cameras,
+        "path file": path.path,
+        "weights": fill.weights_file,
+        "LaMa": installed_weights("lama") if fill.texture == "lama" else None,
+        **base.model_files,
+    }
+    fingerprints = {
+        kind: file_fingerprint(file, kind) for kind, file in files.items() if file is not None
+    }
+
+    # Files are identified by their content, wherever they lie. The number of SHARP's windows in a
+    # batch changes only the last bits of results.
+    base = dataclasses.replace(
+        base,
+        name=base.resolved_name if base.model_folder is None else "hf",
+        depth=None,
+        calib=None,
+        checkpoint=None,
+        windows_per_batch=None,
+    )
+    path = dataclasses.replace(path, cameras=None, path=None)
+    return json_digest(
+        [
+            spackle.__version__,
+            dataclasses.asdict(base),
+            dataclasses.asdict(path),
+            dataclasses.asdict(options.photo),
+            fill.weights_name,
+            fill.texture,
+            fill.mode,
+            fingerprints,
+        ]
+    )

@@ -1,0 +1,295 @@
+"""A saved scene as a video (`render_scene`), and in the formats of other viewers (`export_scene`)."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import mimetypes
+import os
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from rich.filesize import decimal
+from torch import Tensor
+
+from spackle.core.camera import Camera
+from spackle.core.focal_length import ASSUMED_FOCAL_MM
+from spackle.core.gaussians import Gaussians
+from spackle.core.keyframes import PathError
+from spackle.formats import save_png
+from spackle.formats.html import single_html
+from spackle.formats.scene_content import SceneFile
+from spackle.formats.scene_files import Encoder, encoder_for, load_scene
+from spackle.formats.spz import MAX_GRID_COORDINATE, spz_grid
+from spackle.render import Renderer, get_renderer
+from spackle.residual import hole_area_ratio
+from spackle.runtime.errors import InputError, as_input_error
+from spackle.runtime.files import write_atomic
+from spackle.runtime.folders import results_folder
+from spackle.runtime.progress import Progress, Reporter
+from spackle.scene import Scene
+from spackle.video.encoding import save_video
+from spackle.video.frames import FrameMaker, video_problem
+from spackle.video.video_formats import VIDEO_FORMATS
+from spackle.views import PathOptions
+
+MAX_UNMENTIONED_HOLES = 0.01  # the log mentions holes that take a larger share of a frame
+NO_PATH_MESSAGE = "no camera path: {reason}: give views with `cameras`"
+
+
+def encode_page(file: SceneFile) -> bytes:
+    """The bytes of an HTML file with the scene and its viewer."""
+    return single_html(Scene.of_file(file).page(page_name(file.path)))
+
+
+PAGE_ENCODERS: dict[str, Encoder] = {".html": encode_page}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SceneVideo:
+    """What the frames of a video of a scene are made of."""
+
+    cameras: list[Camera]
+    frame_maker: FrameMaker
+    # The scene as one list of sets of Gaussians; for a comparison two: the base, and the scene.
+    gaussian_sets: list[list[Gaussians]]
+    renderer: Renderer
+    hole_ratios: list[float] = dataclasses.field(default_factory=list)  # of the frames so far
+
+    def frames(self, picture_files: Sequence[Path], progress: Progress) -> Iterator[Tensor]:
+        """Render each frame [H, W, 3] sRGB, and note its holes.
+
+        `picture_files` has a file for each frame that is also saved as a picture, or is empty.
+        """
+        for index, camera in enumerate(self.cameras):
+            frame, renderings = self.frame_maker.render(self.gaussian_sets, camera, self.renderer)
+            # The base alone has holes in any case.
+            completed = renderings[1:] if self.frame_maker.options.compare else renderings
+            self.hole_ratios.append(max(hole_area_ratio(view.alpha) for view in completed))
+            if picture_files:
+                save_png(frame, picture_files[index])
+            yield frame
+            progress(index + 1, len(self.cameras))
+
+
+def render_scene(
+    scene_file: Path,
+    output: Path,
+    path: PathOptions,
+    reporter: Reporter,
+    *,
+    focal_px: float | None = None,
+    fov: float | None = None,
+    device: str = "auto",
+) -> None:
+    """Render a scene along a path to a video; given views also become pictures in a folder.
+
+    Args:
+        scene_file: the scene.
+        output: a video file, or a folder, in which the video gets the scene's name.
+        path: the options of camera path and video.
+        reporter: gets messages, progress and the result.
+        focal_px: a focal length in pixels of the video, instead of the stored one.
+        fov: a horizontal field of view in degrees, instead of the stored focal length.
+        device: "auto", "cpu" or "cuda".
+
+    Raises:
+        InputError: a file or option cannot be used.
+    """
+    is_single_file = output.suffix.lower() in VIDEO_FORMATS
+    if is_single_file:
+        path = dataclasses.replace(path, video=path.video.for_file(output))
+    else:
+        _check_is_folder_name(output)
+    path.check()
+    has_new_lens = focal_px is not None or fov is not None
+    if path.cameras is not None and has_new_lens:
+        raise InputError(
+            f"`cameras` {path.cameras}: its views have their own lenses: "
+            "leave `fov` and `focal_px` out"
+        )
+    renderer = get_renderer(device)
+
+    with reporter.stage("load"):
+        given_views, keyframes = path.load()
+        loaded = load_scene(scene_file)
+        scene = Scene.of_file(loaded, path.video.size, focal_px=focal_px, fov=fov)
+        gaussian_sets = _sets_to_render(scene, scene_file, compare=path.video.compare)
+
+        # Overscan hides the border of the fill; another lens, or a scene that was not completed
+        # for a path, has no such border.
+        if has_new_lens or scene.disparity is None:
+            path = dataclasses.replace(path, overscan=0)
+        with (
+            as_input_error(scene_file, NO_PATH_MESSAGE, ValueError),
+            as_input_error(path.path, "{reason}", PathError),
+        ):
+            cameras = given_views or path.video_cameras(
+                scene.base, scene.camera, keyframes, scene.disparity
+            )
+        _say_if_beyond_completion(scene, scene_file, path, reporter)
+        if not given_views and loaded.camera is None and not has_new_lens:
+            reporter.log(
+                f"{scene_file.name}: no camera stored: {ASSUMED_FOCAL_MM:g} mm assumed, "
+                "`fov` gives another lens"
+            )
+        video = SceneVideo(
+            cameras=cameras,
+            frame_maker=FrameMaker.of(path.video, scene.base, cameras, scene_file),
+            gaussian_sets=gaussian_sets,
+            renderer=renderer,
+        )
+
+    # Given views may differ in size, which no video can show; pictures can.
+    problem = video_problem([video.frame_maker.resized_camera(camera) for camera in cameras])
+    makes_pictures = bool(given_views) and not is_single_file
+    if problem and not makes_pictures:
+        hint = "give a folder with `output` for pictures only" if given_views else "give `size`"
+        raise InputError(
+            f"{path.cameras or scene_file}: {problem}, so no video can be made: {hint}"
+        )
+
+    video_file = output if is_single_file else output / f"{scene_file.stem}{path.video.suffix}"
+    picture_names: list[str] = []
+    if makes_pictures:
+        picture_names = [f"{index:04d}.png" for index in range(len(cameras))]
+    names = [*picture_names, video_file.name]
+    with results_folder(video_file.parent, names), reporter.stage("video") as progress:
+        picture_files = [video_file.parent / name for name in picture_names]
+        frames = video.frames(picture_files, progress)
+        if problem is None:
+            save_video(frames, video_file, path.video.frames_per_second, path.video.loop)
+        else:
+            for _ in frames:  # only the pictures are written
+                pass
+
+    gaussian_count = len(loaded.gaussians)
+    most_holes = max(video.hole_ratios)
+    if most_holes > MAX_UNMENTIONED_HOLES:
+        reporter.log(f"{scene_file.name}: holes take up to {most_holes:.1%} of a frame")
+    result = {
+        "gaussians": gaussian_count,
+        "frames": len(cameras),
+        "seconds": reporter.seconds["video"],
+        "open": round(most_holes, 5),
+    }
+    if problem is not None:
+        reporter.log(f"{path.cameras}: {problem}: pictures only, no video")
+        reporter.result({"folder": output, **result})
+        return
+    reporter.log(
+        f"{scene_file.name}: {gaussian_count:,} Gaussians, {len(cameras)} frames "
+        f"in {reporter.seconds['video']:.1f} s -> {video_file}"
+    )
+    reporter.result({"file": video_file, **result})
+
+
+def _check_is_folder_name(output: Path) -> None:
+    """InputError if a name is that of a video or picture which cannot be written."""
+    kind = mimetypes.guess_type(output.name)[0] or ""
+    if kind.startswith(("video/", "image/")):
+        raise InputError(
+            f"{output}: not a kind of video that can be written: "
+            f"end the name with {', '.join(VIDEO_FORMATS)}"
+        )
+
+
+def _sets_to_render(scene: Scene, scene_file: Path, *, compare: bool) -> list[list[Gaussians]]:
+    """The whole scene; for a comparison the base before it.
+
+    InputError if there is nothing to compare, because the scene was never completed.
+    """
+    if not compare:
+        return [[scene.base, scene.aux]]
+    if not len(scene.aux):
+        raise InputError(
+            f"{scene_file}: `compare` needs a completed scene, "
+            "such as the scene.ply of `spackle predict`"
+        )
+    return [[scene.base], [scene.base, scene.aux]]
+
+
+def _say_if_beyond_completion(
+    scene: Scene, scene_file: Path, path: PathOptions, reporter: Reporter
+) -> None:
+    """Log a line if the camera moves farther than the scene was completed for."""
+    if scene.disparity is None or path.disparity is None or path.disparity <= scene.disparity:
+        return
+    option = f"`disparity` {path.disparity:g}"
+    reporter.log(
+        f"{scene_file.name}: {option} goes beyond the {scene.disparity:g} for which the scene was "
+        f"completed: `spackle predict --disparity {path.disparity:g}` completes a photo that far"
+    )
+
+
+def export_scene(scene_file: Path, outputs: Sequence[Path], reporter: Reporter) -> None:
+    """Write a scene to each output in the format of its suffix; each file whole or not at all.
+
+    Raises:
+        InputError: a scene or name cannot be used, or the scene is too large for a format.
+    """
+    encoders = [encoder_for(output, PAGE_ENCODERS) for output in outputs]
+    with contextlib.ExitStack() as folders:
+        # All names have to be known as good before the first file is written.
+        for output in outputs:
+            folders.enter_context(results_folder(output.parent, [output.name]))
+            if os.path.realpath(output) == os.path.realpath(scene_file):
+                raise InputError(
+                    f"{output}: this is the scene itself: give the output another name"
+                )
+
+        loaded = load_scene(scene_file)
+        if loaded.unread_harmonics:
+            reporter.log(
+                f"{scene_file}: {loaded.unread_harmonics} spherical harmonics of each Gaussian, "
+                "above degree 0, are left out"
+            )
+        for output, encode in zip(outputs, encoders, strict=True):
+            start = time.perf_counter()
+            try:
+                content = encode(loaded)
+            except InputError as error:  # the encoder does not know the file's name
+                raise InputError(f"{output}: {error}") from error
+            write_atomic(output, content)
+            _report_file(loaded, output, time.perf_counter() - start, reporter)
+
+
+def _report_file(scene: SceneFile, output: Path, seconds: float, reporter: Reporter) -> None:
+    """Log one line about a written file, and one about what its format cannot store."""
+    size = os.path.getsize(output)
+    size_ratio = size / os.path.getsize(scene.path)
+    count = len(scene.gaussians)
+    reporter.log(
+        f"{output}: {count:,} Gaussians, {decimal(size)}, "
+        f"{size_ratio:.0%} of the size of {scene.path.name}, {seconds:.1f} s"
+    )
+
+    moved_count = 0
+    if output.name.lower().endswith(".spz"):
+        grid = spz_grid(scene.gaussians)
+        moved_count = grid.outside_count
+        if moved_count:
+            largest_coordinate = MAX_GRID_COORDINATE / 2**grid.fraction_bits
+            reporter.log(
+                f"{output}: {moved_count:,} Gaussians beyond {largest_coordinate:,.0f} m were moved "
+                "nearer, which does not change the photo's view"
+            )
+    reporter.result(
+        {
+            "file": output,
+            "gaussians": count,
+            "bytes": size,
+            "seconds": round(seconds, 3),
+            "drawn_nearer": moved_count,
+        }
+    )
+
+
+def page_name(path: Path) -> str:
+    """A scene's name on the page: its file's name, or its folder's for scene.ply and base.ply."""
+    absolute_path = path.absolute()
+    folder_name = absolute_path.parent.name
+    if absolute_path.name in ("scene.ply", "base.ply") and folder_name:
+        return folder_name
+    return absolute_path.stem
