@@ -48,6 +48,7 @@ def align(case: Case, base_depth: Tensor, is_covered: Tensor) -> float:
         points = case.read_points()
         candidates.append(_ratios_of_points(points, case.camera, base_depth, is_covered))
 
+    # The first source with enough pixels decides. The median stands firm against wrong depths.
     for ratios in candidates:
         ratios = ratios[torch.isfinite(ratios) & (ratios > 0)].double()
         if len(ratios) >= MIN_ALIGNED_PIXELS:
@@ -72,8 +73,8 @@ def _ratio_of_bounds(depth_bounds: tuple[float, float], base_depth: Tensor) -> f
     Returns:
         The geometric mean of the ratio at the nearest and the ratio at the farthest depth.
     """
-    # The bounds are quantiles of the depth of a scene's points, near 0 and near 1. They are compared
-    # with the same quantiles of the base's depth.
+    # The bounds are quantiles of the depth of a scene's points, near 0 and near 1. They are
+    # compared with the same quantiles of the base's depth.
     ascending = base_depth.double().sort().values
     ratios = []
     for bound, quantile in zip(depth_bounds, DEPTH_BOUND_QUANTILES, strict=True):
@@ -157,6 +158,7 @@ def camera_in_base_scene(
     shear = torch.linalg.solve(photo_camera.K.double(), base_K)  # K0⁻¹ Kb
     new_K, new_rotation = _intrinsics_times_rotation(K @ rotation @ shear)
 
+    # In homogeneous coordinates K' has any scale; the translation is found before it is normalised.
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, :3] = new_rotation
     pose[:3, 3] = torch.linalg.solve(new_K, K @ translation) / scale

@@ -102,6 +102,7 @@ def bench(options: BenchOptions, output: Path, reporter: Reporter) -> Run | None
         InputError: options, dataset or folder cannot be used, `output` holds another benchmark, or
             memory is too small for the base.
     """
+    # The networks are opened as for an evaluation, so that both measure the same.
     evaluation = open_evaluation(options.as_evaluation)
     config = _configuration(options, evaluation)
     plan = RunPlan(
@@ -146,6 +147,7 @@ def _configuration(options: BenchOptions, evaluation: Evaluation) -> dict[str, A
 
     A later run in the same folder must have the same configuration; tables show it.
     """
+    # A base without a network lifts a depth map, which needs no GPU.
     device = evaluation.options.device
     base_device = device.type if options.base.uses_network else "cpu"
 
@@ -200,6 +202,7 @@ def time_case(
     measurements = [
         image_measurement(title, case.name, name, value) for name, value in facts.items()
     ]
+    # A view costs what the base costs, and what the method adds.
     for view in large_views(prediction, options.disparities, options.max_side):
         for method in _time_view(view, context, evaluation.renderer.device, runs):
             numbers = view_numbers(
@@ -283,6 +286,7 @@ def _time_view(
         aux = complete_view_in_stages(context, view.camera, end_stage, method)
         added_counts[method] = len(aux)
 
+    # The methods take turns, so that a busy machine slows both alike.
     tasks = {method: functools.partial(complete, method) for method in TIMED_METHODS}
     times = time_tasks(runs, tasks, device)
 
@@ -311,6 +315,7 @@ def view_numbers(
         Counts; times in milliseconds (sums of the stages' medians over runs); "aux_share" and
         "overhead" as shares (not percent); "fps" in views per second.
     """
+    # Medians, because a busy machine makes some runs far too long.
     base_ms = sum(_median_ms(seconds[stage]) for stage in BASE_STAGES)
     completion_ms = sum(_median_ms(seconds[stage]) for stage in COMPLETION_STAGES)
     return {
@@ -384,6 +389,7 @@ def time_tasks(
     for run in range(untimed_runs + runs):
         for name, task in tasks.items():
             stage_times = _time_stages(task, device)
+            # The first run compiles kernels, and its times would say nothing about later ones.
             if run < untimed_runs:
                 continue
             for stage, milliseconds in stage_times.items():
@@ -411,6 +417,7 @@ def _time_stages(task: TimedTask, device: torch.device) -> dict[str, float]:
 
 def _now_ms(device: torch.device) -> float:
     """The time in milliseconds, once the device has done the work that it was given."""
+    # A GPU works on while Python goes on.
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return MS_PER_S * time.perf_counter()
@@ -434,7 +441,8 @@ def complete_view_in_stages(
     Returns:
         The Gaussians that the method adds for the view.
     """
-    # On the renderer's device, and without the rendering of the photo that earlier repetitions left.
+    # On the renderer's device, and without the rendering of the photo that earlier repetitions
+    # left.
     context = dataclasses.replace(context.placed, photo_cache=PhotoRendering())
     base_rendering = context.renderer.render(context.base, camera)
     end_stage("view")

@@ -137,6 +137,7 @@ def _load_second_view(view: SecondView, max_side: int) -> Viewpoint:
         InputError: the photo is missing or is no image, or its aspect ratio differs from its
             camera's.
     """
+    # Read now, so that a damaged photo is found before long work.
     stored_photo = load_photo(view.photo)
     _check_aspect_ratio(view.photo, stored_photo, view.camera)
     working_width, working_height = working_size(stored_photo.width, stored_photo.height, max_side)

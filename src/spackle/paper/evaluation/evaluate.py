@@ -84,6 +84,7 @@ def evaluate(
     """
     if html:
         check_matplotlib("`html`")
+    # A resumed run measures the metrics of the earlier run, too, so that none is lost.
     earlier_metrics = metrics_of_earlier_run(output)
     evaluation = open_evaluation(options, earlier_metrics)
     _report_missing_metrics(evaluation, earlier_metrics, output, reporter)
@@ -146,6 +147,7 @@ def _report_missing_metrics(
 
 def _report_results(run: Run, output: Path, reporter: Reporter) -> None:
     """Log a table of means, and how many images were measured."""
+    # The means answer the first question; the files have the details.
     for line in to_plain_lines(means_table(run, run.measurements)):
         reporter.log(line)
 
@@ -175,6 +177,7 @@ def _measure_and_save_pictures(
     """
     measurements, pictures = measure_case(case, evaluation)
 
+    # A metric that fails leaves the same remark for each view.
     remarks = [one.value for one in measurements if one.metric == REMARK_METRIC]
     for remark in dict.fromkeys(remarks):
         reporter.log(f"{case.name}: {remark}")
@@ -217,6 +220,7 @@ def measure_case(case: Case, evaluation: Evaluation) -> tuple[list[Measurement],
     else:
         viewpoints = large_views(prediction, options.disparities, options.max_side)
 
+    # All methods start from the same Gaussians.
     context = evaluation.fill_context(prediction)
     methods = _methods(evaluation, loaded, context, scale)
     title = str(evaluation.config["title"])
@@ -225,6 +229,7 @@ def measure_case(case: Case, evaluation: Evaluation) -> tuple[list[Measurement],
     )
     pictures[INPUT_PICTURE] = loaded.photo.rgb
 
+    # Numbers of the whole image; a base may add notes of its own.
     facts: dict[str, Value] = {
         "width": loaded.photo.width,
         "height": loaded.photo.height,
@@ -266,6 +271,7 @@ def _scale_of_base(loaded: LoadedCase, prediction: BasePrediction, evaluation: E
     """
     if not evaluation.options.base.uses_network:  # the base is the dataset's depth
         return 1.0
+    # The depth of Gaussians is that of their rendering; in holes it is unknown.
     rendering = evaluation.renderer.render(prediction.gaussians, prediction.camera)
     return align(loaded.case, rendering.depth, ~hole_mask(rendering.alpha))
 
@@ -316,6 +322,7 @@ def _predict_by_tuned_base(
         gaussians: in the fine-tuned base's own unit of length.
         unit: the factor that converts camera positions to this unit.
     """
+    # Fine-tuning may have changed the base's unit of length, so its scale is found anew.
     assert evaluation.tuned_base is not None
     prediction, _ = evaluation.tuned_base.predict(loaded.full_photo)
     if scale is None:  # large views are cameras of the base's scene, whatever its unit

@@ -82,6 +82,7 @@ def open_evaluation(options: EvaluateOptions, earlier_metrics: Sequence[str] = (
     Raises:
         InputError: an option, the dataset, weights or a package cannot be used.
     """
+    # What fails fast comes first: options, files of the dataset, weights, packages.
     options.check()
     cases = _cases_to_evaluate(options)
     network = FillOptions(residual=options.residual).load_network()
@@ -91,6 +92,7 @@ def open_evaluation(options: EvaluateOptions, earlier_metrics: Sequence[str] = (
         inpainter_options = InpainterOptions(device=options.device.type)
         inpainter = get_inpainter(options.inpainter, inpainter_options)
 
+    # The method direct-ft is the same base with other weights.
     tuned_base = None
     if options.direct_ft is not None:
         tuned_base = open_base(dataclasses.replace(options.base, checkpoint=options.direct_ft))
@@ -120,6 +122,7 @@ def _cases_to_evaluate(options: EvaluateOptions) -> list[Case]:
     if options.limit is not None and options.limit < len(cases):
         cases = evenly_spaced_items(cases, options.limit)
 
+    # Second photos that are not used are not read either.
     chosen_cases = []
     for case in cases:
         if not options.is_near_view:  # large views are not compared with photos
@@ -145,6 +148,7 @@ def _open_metrics(
         suite: the metrics, ready to use.
         states: for each metric what measures it, or "not run" and the reason.
     """
+    # None means all metrics that the protocol allows; an empty list means none.
     chosen = DEFAULT_METRICS[options.protocol] if options.metrics is None else options.metrics
     chosen = [*chosen, *earlier_metrics]
     names = tuple(name for name in METRICS if name in chosen)  # in the order of the tables
@@ -158,6 +162,7 @@ def _open_metrics(
         published_names, options.device.type, options.download_metrics
     )
     states = dict.fromkeys(names, OWN_METRIC) | published_states
+    # The distance compares features of a network, whose weights have to be given.
     if "distance" in names:
         if options.features is None:
             states["distance"] = f"{NOT_RUN}: weights: give SqueezeNet's with `features` FILE"
@@ -186,6 +191,7 @@ def _configuration(
     dataset = DATASETS[options.dataset]
     names_digest = json_digest([case.name for case in cases])
 
+    # Weights are recorded by digest, because paths differ between machines.
     direct_ft = None
     if options.direct_ft is not None:
         direct_ft = weights_digest(options.direct_ft)
@@ -235,6 +241,7 @@ def _residual_configuration(options: EvaluateOptions, renderer: Renderer) -> dic
     if weights_file is None:  # the initial Gaussians fill holes as they are
         return {"weights": "initial", "sha256": None, "precision": None}
 
+    # "auto" becomes the number format that the hardware multiplies fastest.
     dtype = pick_dtype(options.base.precision, renderer.device)
     return {
         "weights": "shipped" if options.residual is None else "given",

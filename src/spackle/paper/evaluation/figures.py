@@ -121,6 +121,7 @@ def make_figures(folders: Sequence[Path], max_rows: int, output: Path, reporter:
     all_runs = [RunWithFolder(load_run(folder), folder) for folder in folders]
     large_runs = [one for one in all_runs if not one.run.is_benchmark and not one.run.is_near_view]
 
+    # A figure that needs a method which no evaluation has is left out.
     drawn_figures = {}
     for figure in FIGURES:
         shown_runs = [one for one in large_runs if figure.needed_method in one.run.methods]
@@ -186,6 +187,7 @@ def _draw_figure(
     if not rows:
         return None
 
+    # Usually all evaluations have one base.
     bases = ", ".join(dict.fromkeys(run.base_title for run, _ in runs))
     titles = [_column_title(column, bases) for column in columns]
     picture = draw_grid(
@@ -261,6 +263,7 @@ def _added_share_tag(run: Run, image: str, method: str) -> str:
 
     Empty if the method adds none, as for the input photo.
     """
+    # The tag is about the view that the picture shows.
     setting, view = run.view_with_largest_hole(image)
     for measurement in run.measurements:
         is_shown = (
@@ -309,6 +312,7 @@ def _figure_latex(figure: PaperFigure, runs: Sequence[Run], bases: str, methods:
         bases: the names of the bases, joined.
         methods: the names of the paper's methods in it, joined.
     """
+    # The largest hole, which the figure shows, is at the largest disparity.
     largest_disparities = dict.fromkeys(max(run.settings, key=float) for run in runs)
     weights = dict.fromkeys(run.config["residual"]["weights"] for run in runs)
     weights_sentences = [WEIGHTS_SENTENCES[name] for name in weights if name in WEIGHTS_SENTENCES]

@@ -193,6 +193,7 @@ def measure_images(plan: RunPlan, measure: MeasureImage, reporter: Reporter) -> 
 
 def _inputs_digest(case: Case, plan: RunPlan, digest_of_photo: Callable[[Path], str]) -> str:
     """A digest of what may change between runs: the case's photos, and how metrics are measured."""
+    # A metric that can be measured now may not have been in an earlier run.
     photos = [case.photo, *(view.photo for view in case.second_views)]
     photo_digests = [digest_of_photo(photo) for photo in photos]
     return json_digest([photo_digests, plan.about.get("metrics")])

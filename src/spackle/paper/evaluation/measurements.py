@@ -153,6 +153,7 @@ class Run:
 
         Images without a finite value are left out.
         """
+        # Views without the metric have no measurement, so they do not count.
         of_method = (
             measurement
             for measurement in self.measurements
@@ -187,6 +188,7 @@ def paper_measurements(label: str) -> tuple[Measurement, ...]:
     `label` is the table's label in the paper's LaTeX source.
     """
     measurements = []
+    # Rows of a table with other metrics than its neighbours are a part of their own.
     tables = [table for table in PAPER_TABLES if table.label == label]
     for table in tables:
         for row in table.rows:

@@ -65,6 +65,7 @@ class MetricSuite:
 
         `rgb` and `true_picture` are [H, W, 3] sRGB 0..1.
         """
+        # Metrics without a reference take one picture only.
         compared_picture = true_picture if METRICS[name].needs_true_picture else None
         try:
             yield name, self.published[name](rgb, compared_picture)

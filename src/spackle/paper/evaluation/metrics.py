@@ -169,6 +169,7 @@ def sharpness(image: Tensor, true_picture: Tensor, mask: Tensor) -> float:
     Returns:
         The ratio; NaN if no pixel counts.
     """
+    # A pixel is inside if no pixel around it is outside of the mask.
     is_inside = ~maximum_filter(~mask, SHARPNESS_SQUARE_PX // 2)
     return float(_mean_gradient(image, is_inside) / _mean_gradient(true_picture, is_inside))
 
@@ -215,6 +216,7 @@ def ssim_map(image: Tensor, true_picture: Tensor) -> Tensor:
     Returns:
         [H, W, 3] float64, 1 where the images are equal.
     """
+    # Float64, because variances are small differences of large numbers.
     x = image.double()
     y = true_picture.double()
 
@@ -233,5 +235,6 @@ def _windowed_mean(image: Tensor) -> Tensor:
     """The mean of [H, W, C] around each pixel under a Gaussian window; borders are mirrored."""
     margin = SSIM_WINDOW_PX // 2
     widths = ((margin, margin), (margin, margin), (0, 0))
+    # By NumPy, because torch's mirror would leave the outermost pixel out.
     mirrored = torch.from_numpy(np.pad(image.numpy(), widths, "symmetric"))
     return gaussian_blur(mirrored, SSIM_SIGMA_PX)[margin:-margin, margin:-margin]

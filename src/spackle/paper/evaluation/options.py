@@ -51,7 +51,9 @@ class EvaluateOptions:
     disparities: Sequence[float] = PAPER_DISPARITIES  # sizes of the camera moves of large views
     metrics: Sequence[str] | None = None  # keys of `METRICS`; None: all of the protocol
     base: BaseSettings = PAPER_BASE  # precision and device also apply to the residual network
-    residual: str | None = None  # a file of weights, or "initial"; None: the shipped weights, if any
+    residual: str | None = (
+        None  # a file of weights, or "initial"; None: the shipped weights, if any
+    )
     direct_ft: Path | None = None  # weights of the method direct-ft
     inpainter: str = "opencv"  # of the method inpaint2d
     features: Path | None = None  # SqueezeNet's weights, for the metric distance
@@ -112,6 +114,7 @@ class EvaluateOptions:
             else:
                 check_name("methods", method, METHODS)
 
+        # Direct FT trains SHARP's own weights, so no other base has such a file.
         has_tuned_base = self.base.name == "sharp" and self.direct_ft is not None
         if "direct-ft" in self.methods and not has_tuned_base:
             raise InputError(
@@ -148,7 +151,9 @@ class BenchOptions:
     root: Path  # the folder of the unpacked dataset
     disparities: Sequence[float] = PAPER_DISPARITIES  # sizes of the camera moves
     base: BaseSettings = PAPER_BASE  # turns photos into Gaussians
-    residual: str | None = None  # a file of weights, or "initial"; None: the shipped weights, if any
+    residual: str | None = (
+        None  # a file of weights, or "initial"; None: the shipped weights, if any
+    )
     side: int | None = None  # long side of the views, in pixels; None: 1280, as in the paper
     limit: int | None = None  # the number of images, spread over the dataset; None: all
     runs: int = 5  # how often each stage after the base is timed

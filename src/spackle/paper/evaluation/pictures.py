@@ -84,6 +84,7 @@ def draw_grid(
     gap = max(4, font_size // 3)  # between pictures, in pixels
     line_height = round(1.5 * font_size)
 
+    # All pictures have one width. A row is as high as its highest picture.
     resized_rows = [
         [_resized_to_width(one.picture, picture_width) for one in row.pictures] for row in rows
     ]
@@ -211,6 +212,7 @@ def stored_pictures(run: Run, folder: Path, image: str) -> dict[str, Path]:
         folder: their folder.
         image: the image's name.
     """
+    # Files are numbered by the image's place in the dataset.
     index = run.images.index(image)
     paths = {
         name: picture_file(folder, index, image, name) for name in (*run.methods, *OTHER_PICTURES)
@@ -242,6 +244,7 @@ def ranking_of_run(run: Run) -> Ranking | None:
     is one way to render new views of a photo.) The first metric counts that was measured.
     """
     method = "spackle" if "spackle" in run.methods else run.methods[-1]
+    # Which metrics there are depends on the options and on the packages that are installed.
     for metric in RANKING_METRICS[str(run.config["protocol"])]:
         values = run.mean_by_image(metric, method)
         if values:
@@ -275,6 +278,7 @@ def write_contact_sheets(run: Run, folder: Path) -> None:
     if ranking is None:
         return
 
+    # Large camera moves have no true picture.
     names = [*run.methods, TRUE_PICTURE] if run.is_near_view else run.methods
     titles = [picture_title(run, name) for name in names]
     heading = f"{run.title}, {run.config['protocol']}, by {ranking.criterion}"
@@ -306,6 +310,7 @@ def _contact_sheet_row(
         names: which pictures: names of methods, or "truth".
         value: the image's value of the metric that ranks images, for the caption.
     """
+    # The stored pictures are those of this view.
     setting, view = run.view_with_largest_hole(image)
     files = stored_pictures(run, folder, image)
     pictures = [GridPicture(Image.open(files[name]).convert("RGB")) for name in names]

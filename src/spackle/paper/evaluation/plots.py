@@ -142,6 +142,7 @@ def _draw_plot(
         file = io.BytesIO()
         figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None})
 
+    # The image becomes a part of the page, which is one file.
     svg = base64.b64encode(file.getvalue()).decode()
     alt_text = f"{title}. {', '.join(one.title for one in series)}"
     return Plot(title, alt_text, f"data:image/svg+xml;base64,{svg}", note)
@@ -192,6 +193,7 @@ def _hole_area_series(run: Run) -> list[Series]:
             title = f"after: {method_row_name(run, method)}"
             series.append(Series(title, method, after, line_style="-"))
 
+    # The paper's numbers, for the eye's comparison.
     published = paper_measurements(HOLE_AREA.label)
     before = _mean_by_disparity(published, run.title, "har_before", PAPER_METHOD)
     after = _mean_by_disparity(published, run.title, "har", PAPER_METHOD)
@@ -227,6 +229,7 @@ def _set_logarithmic_scale(axes: Axes, values: Sequence[float]) -> None:
 
     If all values are 0, the axis stays linear.
     """
+    # A logarithm has no place for 0, which a method reaches if it fills every hole.
     positive_values = [value for value in values if value > 0]
     if len(positive_values) == len(values):
         axes.set_yscale("log")
@@ -246,6 +249,7 @@ def scenes_plot(run: Run, metric: str) -> Plot | None:
         run: an evaluation against second photos.
         metric: a key of `SCENE_PLOTS`.
     """
+    # A method may lack the metric, if it failed on all images.
     values_by_method = {}
     for method in run.methods:
         values = run.mean_by_image(metric, method)

@@ -100,6 +100,7 @@ def measure_views(
     pictures: dict[str, Tensor] = {}
     largest_hole_ratio = -1.0
 
+    # A method may complete all views of a setting together, so settings are taken one by one.
     for setting in dict.fromkeys(view.setting for view in viewpoints):
         setting_views = [view for view in viewpoints if view.setting == setting]
         cameras = [view.camera for view in setting_views]
@@ -140,6 +141,7 @@ def _measure_view(
         fills: for each method's name the function that fills a view.
         suite: the metrics.
     """
+    # What the base alone shows; the hole is where its Gaussians cover too little.
     before = context.renderer.render(context.base, view.camera)
     hole = hole_mask(before.alpha)  # [H, W]
     hole_ratio = hole_area_ratio(before.alpha)
@@ -154,6 +156,7 @@ def _measure_view(
         picture = filled.rgb.cpu()  # true pictures are on the CPU, too
         pictures[method] = picture
 
+        # Pictures are compared as they are, in full size; only stored pictures are made smaller.
         numbers = _hole_numbers(filled, hole_ratio, hole.numel(), len(context.base))
         numbers += suite.measure(picture, true_picture, hole)
         for metric, value in numbers:
@@ -196,11 +199,13 @@ def _hole_numbers(
     """
     numbers: list[tuple[str, float | str]] = [("har_before", hole_ratio)]
 
+    # A flat inpainted picture has no opacity, and so no hole.
     if filled.alpha is not None:
         remaining_hole_ratio = hole_area_ratio(filled.alpha)
         numbers.append(("har", remaining_hole_ratio))
         numbers.append(("coverage", 1 - remaining_hole_ratio))
 
+    # A base that was fine-tuned has other Gaussians, and none is added.
     if filled.aux is not None:
         added_count = len(filled.aux)
         numbers.append(("aux", added_count))

@@ -55,6 +55,7 @@ def open_published_metrics(
     try:
         pyiqa = _import_pyiqa()
     except Exception as error:  # pyiqa needs torchvision, which may not match the installed torch
+        # A missing package is usual, a broken one is not: the two need different advice.
         is_absent = isinstance(error, ModuleNotFoundError) and error.name == "pyiqa"
         if is_absent:
             reason = NOT_INSTALLED
@@ -92,6 +93,7 @@ def _load_metric(pyiqa: ModuleType, name: str, device: str, download: bool) -> M
         download: whether missing weights may be fetched; if not, looking up a host name raises
             OSError.
     """
+    # The network is blocked while the metric loads, which is when it fetches weights.
     with contextlib.ExitStack() as stack:
         stack.enter_context(_silenced())
         if not download:
@@ -107,6 +109,7 @@ def _metric_of_network(network: Callable[..., Any]) -> Metric:
     def measure(picture: Tensor, true_picture: Tensor | None = None) -> float:
         """The network's score for a picture, compared with the true one if given; it may be NaN."""
         pictures = [picture] if true_picture is None else [picture, true_picture]
+        # Published metrics expect 0..1.
         batches = [one.clamp(0, 1).permute(2, 0, 1)[None].float() for one in pictures]
 
         with torch.no_grad(), warnings.catch_warnings():

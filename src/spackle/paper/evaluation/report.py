@@ -131,6 +131,7 @@ def make_report(sources: Sequence[tuple[Run, Path]], *, with_unmeasured: bool = 
     images_each = max(MIN_IMAGES_EACH, MAX_IMAGES // max(1, len(evaluations)))
     datasets = ", ".join(dict.fromkeys(run.title for run in runs))
 
+    # Names of images come from files; the template escapes them.
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     environment.filters["group_widths"] = group_widths
     environment.filters["bold"] = _bold_markup
@@ -171,12 +172,13 @@ def _part_of_run(run: Run, folder: Path, max_images: int) -> ReportPart:
     for index in evenly_spaced_indices(len(names), max_images):
         files = stored_pictures(run, folder, names[index])
         slider_names = [name for name in SLIDER_PICTURES if name in files][:MAX_SLIDER_PICTURES]
-        if not slider_names:
+        if not slider_names:  # the folder's pictures were deleted
             continue
         slider_files = {name: files[name] for name in slider_names}
         position = "" if ranking is None else _position_text(index, len(names))
         images.append(_report_image(run, names[index], position, slider_files))
 
+    # A metric that fails leaves the same remark for each view.
     remarks = [(one.image, one.value) for one in run.measurements if one.metric == REMARK_METRIC]
     return ReportPart(
         run=run,
@@ -211,6 +213,7 @@ def means_table(run: Run, measurements: Iterable[Measurement]) -> Table:
         run: the evaluation, which names methods and base.
         measurements: the numbers to average: all, or those of one view.
     """
+    # Only methods' numbers that people compare are shown; tables.md has the rest.
     shown = [one for one in measurements if one.metric in MEANS_COLUMNS]
     values = group_values(shown, "setting", "method", "metric")
     settings = list(dict.fromkeys(setting for setting, _, _ in values))
@@ -261,6 +264,7 @@ def _report_image(run: Run, name: str, position: str, files: Mapping[str, Path])
         for one in run.measurements
         if one.image == name and one.setting == setting and one.view == view
     ]
+    # All pictures of a slider have the same size, because they show one view.
     names = list(files)
     left, right = _first_slider_pictures(names)
     with Image.open(files[left]) as image:

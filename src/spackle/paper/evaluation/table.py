@@ -78,6 +78,7 @@ def mark_best(
         texts: the number's texts.
         lower_is_better: whether the smallest number is the best.
     """
+    # Readers compare texts, so the best is one that they can tell from the others.
     text_of_value = {
         value: text for value, text in zip(values, texts, strict=True) if value is not None
     }
@@ -94,12 +95,14 @@ def group_widths(heads: Sequence[tuple[str, str]]) -> list[tuple[str, int]]:
 
     `heads` has for each column the head of its group ("" without a group), and its own head.
     """
+    # A group's columns stand side by side, and "" stands for columns without a group.
     neighbours = itertools.groupby(heads, key=lambda head: head[0])
     return [(group, len(list(columns))) for group, columns in neighbours]
 
 
 def to_markdown(table: Table) -> str:
     """A table in Markdown, with title, caption and notes."""
+    # Markdown tables have one line of heads, so a group's head is repeated in each of its columns.
     heads = [f"{group}: {head}" if group else head for group, head in table.heads]
     lines = [
         f"**{table.title}** (`{table.label}`). {table.caption}",
@@ -123,6 +126,7 @@ def _markdown_row(texts: RowTexts) -> str:
 
 def to_plain_lines(table: Table) -> list[str]:
     """A table as lines for a terminal, without title and notes; numbers are right-aligned."""
+    # Heads keep words together for web pages; a terminal needs no such care.
     heads = [head.replace("\N{NO-BREAK SPACE}", " ") for _, head in table.heads]
     rows = [heads, *(texts for body in table.bodies for texts in body)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
@@ -186,6 +190,7 @@ def to_latex(table: Table, label_suffix: str = "") -> str:
         rf"\begin{{tabular}}{{{shape}}}",
         r"\toprule",
     ]
+    # Group heads, if any, are a line above the columns' own heads.
     lines += _latex_group_heads(table.heads)
     lines.append(_latex_row([head for _, head in table.heads]))
 
@@ -211,6 +216,7 @@ def _latex_group_heads(heads: Sequence[tuple[str, str]]) -> list[str]:
 
     `heads` has for each column the head of its group ("" without a group), and its own head.
     """
+    # A rule below a group's head shows which columns belong to it.
     group_heads = []
     rules = []
     first_column = 1  # LaTeX counts columns from 1

@@ -32,6 +32,7 @@ def method_row_name(run: Run, method: str, title: str = "") -> str:
         For instance "Spackle‡ (SHARP)". The mark ‡ says that the weights of the residual network
         do not come from the paper's recipe, because no other weights were given.
     """
+    # The base is not a method on top of itself.
     if method == "base":
         return f"{run.base_title} alone"
     description = describe_method(method)
@@ -54,6 +55,7 @@ def shown_methods(layout: TableLayout, run: Run) -> dict[str, str]:
         }
 
     methods = run.methods
+    # For instance, a flat inpainted picture has no opacity, and so no area of holes.
     if layout.needed_metric is not None:
         methods_with_metric = {
             measurement.method
@@ -68,6 +70,7 @@ def shown_methods(layout: TableLayout, run: Run) -> dict[str, str]:
 
 def notes_of_table(layout: TableLayout, runs: Sequence[Run]) -> list[str]:
     """The notes below a table that shows these runs, without repetitions."""
+    # Several columns may show one metric, such as PSNR in the hole and outside.
     metrics = [metric_of_column(column.metric) for column in layout.columns]
     image_metrics = list(dict.fromkeys(metric for metric in metrics if metric is not None))
 
@@ -105,6 +108,7 @@ def _views_note(run: Run) -> str:
 
 def _methods_notes(layout: TableLayout, runs: Sequence[Run]) -> list[str]:
     """A note that explains the methods in a table's rows; empty if the table shows no run."""
+    # A table may have titles of its own for methods, as in the paper.
     row_titles = layout.row_titles or {}
     explanations = {}
     for run in runs:
@@ -125,6 +129,7 @@ def _residual_note(run: Run) -> str:
     if residual["weights"] == "given":
         return f"Residual: given weights ({digest_start})."
 
+    # Neither is what the paper's recipe would train.
     if residual["sha256"]:
         weights = f"the residual has the weights that ship with Spackle ({digest_start})"
     else:
@@ -134,6 +139,7 @@ def _residual_note(run: Run) -> str:
 
 def _missing_metrics_notes(run: Run, image_metrics: Sequence[str]) -> list[str]:
     """Notes on the image metrics that a run did not measure, one for each reason."""
+    # Benchmarks have no metrics. Metrics with the same reason share a note.
     states = run.about.get("metrics", {})
     names_by_reason: dict[str, list[str]] = {}
     for metric in image_metrics:
@@ -148,6 +154,7 @@ def _missing_images_notes(run: Run) -> list[str]:
     missing_images = list(run.problems)
     if not missing_images:
         return []
+    # A few names are enough to find the cause; rows.jsonl has them all.
     listed_images = missing_images[:MAX_LISTED_IMAGES]
     if len(missing_images) > MAX_LISTED_IMAGES:
         listed_images.append("…")
@@ -170,6 +177,7 @@ def _machine_note(run: Run) -> str:
             base_precision = measurement.value
             break
 
+    # Which number format a network computes in, and where it runs, decides about its speed.
     places = []
     if base_precision:
         base_device = run.config["base"]["device"]

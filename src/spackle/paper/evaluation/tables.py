@@ -6,33 +6,24 @@ and writes notes, table.py writes the finished tables as Markdown and LaTeX.
 
 from __future__ import annotations
 
-import dataclasses
-import statistics
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from spackle.paper.evaluation.measurements import (
     NEAR_SETTING,
-    Mean,
     Measurement,
     Run,
-    Value,
     group_values,
-    mean_of_known,
     paper_measurements,
     setting_title,
 )
-from spackle.paper.evaluation.metrics import METRICS, metric_of_column
 from spackle.paper.evaluation.paper_numbers import PAPER_IMAGE_COUNTS, PAPER_SETTINGS
 from spackle.paper.evaluation.table import (
     NO_NUMBER,
     NOT_RUN,
-    NUMBER_FORMATS,
-    NumberFormat,
     RowTexts,
     Table,
-    mark_best,
     to_latex,
     to_markdown,
 )
@@ -41,9 +32,15 @@ from spackle.paper.evaluation.table_layouts import (
     NEAR_VIEW_QUALITY,
     OVERHEAD,
     TABLE_LAYOUTS,
-    ColumnLayout,
     Source,
     TableLayout,
+)
+from spackle.paper.evaluation.table_numbers import (
+    PAPER_SUFFIX,
+    Column,
+    columns_of_layout,
+    mean_of_metric,
+    texts_of_methods,
 )
 from spackle.paper.evaluation.table_texts import notes_of_table, shown_methods
 from spackle.runtime.errors import InputError
@@ -52,42 +49,7 @@ from spackle.runtime.files import write_atomic
 MARKDOWN_FILE = "tables.md"
 LATEX_FILE = "tables.tex"
 
-PAPER_SUFFIX = " (paper)"  # the end of the method's name in the paper's rows
 DISPARITY_PATTERN = "{}: disparity {}"  # a head above columns, such as "S1: disparity 0.3"
-
-# Of these metrics tables show medians, because a busy machine makes some times far too long.
-TIME_METRICS = ("base_ms", "spackle_ms", "overhead", "base_fps", "spackle_fps")
-
-
-class Ratio(NamedTuple):
-    """A metric that is computed from the means of two others."""
-
-    numerator: str
-    denominator: str
-    denominator_method: str | None = None  # whose denominator; None: that of the row's own method
-    is_reduction: bool = False  # whether the metric is 1 minus the ratio
-
-
-RATIOS = {
-    # Added Gaussians over masked cells of 2×2 pixels.
-    "aux_per_cell": Ratio("aux", "hole_cells"),
-    # By how much completion reduces the hole area ratio (paper, eq. 11).
-    "reduction": Ratio("har", "har_before", is_reduction=True),
-    # How many Gaussians fewer than with a Gaussian for every cell.
-    "aux_reduction": Ratio("aux", "aux", denominator_method="dense", is_reduction=True),
-}
-
-
-@dataclasses.dataclass(frozen=True)
-class Column:
-    """A column of a finished table: a metric at a setting (a camera move, or near views)."""
-
-    group: str  # the head above this and neighbouring columns; "" without a group
-    title: str
-    setting: str
-    metric: str
-    format: NumberFormat
-    lower_is_better: bool | None = None  # None: the best number is not marked
 
 
 class DatasetRow(NamedTuple):
@@ -103,10 +65,6 @@ class TableContent(NamedTuple):
 
     heads: list[tuple[str, str]]
     bodies: list[list[RowTexts]]
-
-
-# The values of measurements by (method, setting, metric).
-GroupedValues = Mapping[tuple[str, ...], Sequence[Value]]
 
 
 def make_tables(runs: Sequence[Run], *, with_unmeasured: bool = False) -> list[Table]:
@@ -125,6 +83,7 @@ def make_tables(runs: Sequence[Run], *, with_unmeasured: bool = False) -> list[T
         InputError: two runs have the same dataset, protocol and base, or runs differ in their
             disparities (sizes of camera moves).
     """
+    # Before a table is made, because all tables share datasets and settings.
     _check_distinct(runs)
     runs_by_source = _runs_by_source(runs)
     large_settings = _settings_of_large_views(runs)
@@ -137,6 +96,7 @@ def make_tables(runs: Sequence[Run], *, with_unmeasured: bool = False) -> list[T
             continue
         settings = [NEAR_SETTING] if layout.source == "near" else large_settings
 
+        # Three tables of the paper have a layout of their own.
         if layout is NEAR_VIEW_QUALITY:
             content = _near_view_content(layout, shown_runs, settings)
         elif layout is OVERHEAD:
@@ -183,6 +143,7 @@ def _runs_by_source(runs: Sequence[Run]) -> dict[Source, list[Run]]:
     large_runs = [run for run in runs if not run.is_near_view and not run.is_benchmark]
     benchmarks = [run for run in runs if run.is_benchmark]
 
+    # A benchmark times the same views, so its counts are preferred.
     benchmarked = {(run.title, run.base_title) for run in benchmarks}
     stand_ins = [run for run in large_runs if (run.title, run.base_title) not in benchmarked]
     return {"near": near_runs, "large": large_runs, "cost": benchmarks + stand_ins}
@@ -196,6 +157,7 @@ def _settings_of_large_views(runs: Sequence[Run]) -> list[str]:
     Raises:
         InputError: the runs have different disparities.
     """
+    # Tables have columns for each disparity, so all runs must have the same.
     settings = {tuple(run.settings) for run in runs if not run.is_near_view}
     if len(settings) > 1:
         raise InputError("the results have different disparities: make a separate table for each")
@@ -225,145 +187,10 @@ def write_tables(
     markdown = "\n".join(to_markdown(table) for table in tables)
     write_atomic(folder / markdown_file, markdown.encode())
 
+    # A comment for whoever includes the file in a document.
     head = "% needs \\usepackage{booktabs,graphicx}\n"
     latex = head + "\n".join(to_latex(table, label_suffix) for table in tables)
     write_atomic(folder / latex_file, latex.encode())
-
-
-# --- columns and numbers
-
-
-def _columns(
-    column_layouts: Sequence[ColumnLayout],
-    settings: Iterable[str],
-    *,
-    group_pattern: str = "",
-    marks_best: bool = False,
-) -> list[Column]:
-    """A table's columns, repeated for each setting.
-
-    Args:
-        column_layouts: the columns of one setting.
-        settings: disparities (sizes of camera moves) as text, or "near".
-        group_pattern: the head above the columns of a setting, a format string that gets "S1" and
-            "0.3"; if empty, each column has the head of its layout.
-        marks_best: whether the best number of a column with image metrics is bold.
-    """
-    columns = []
-    for setting in settings:
-        for layout in column_layouts:
-            image_metric = metric_of_column(layout.metric)
-
-            if layout.number_format is not None:
-                number_format = NUMBER_FORMATS[layout.number_format]
-            else:
-                assert image_metric is not None
-                number_format = METRICS[image_metric].format
-
-            lower_is_better = None
-            if marks_best and image_metric is not None:
-                lower_is_better = METRICS[image_metric].lower_is_better
-
-            column = Column(
-                group=setting_title(setting, group_pattern) if group_pattern else layout.group,
-                title=layout.title,
-                setting=setting,
-                metric=layout.metric,
-                format=number_format,
-                lower_is_better=lower_is_better,
-            )
-            columns.append(column)
-    return columns
-
-
-def _mean_of_metric(values: GroupedValues, method: str, setting: str, metric: str) -> Mean | None:
-    """The mean of a method's metric over the views of a setting, for an entry of a table.
-
-    Times give the median. A metric of `RATIOS` that was not measured itself gives the ratio of two
-    means. Numbers of whole images are valid for all methods and settings.
-
-    Args:
-        values: measured numbers by (method, setting, metric).
-        method: the method's name.
-        setting: a disparity as text, or "near".
-        metric: the metric's name.
-
-    Returns:
-        The mean; None if nothing was measured.
-    """
-    measured = values.get((method, setting, metric))
-    if not measured:
-        measured = values.get(("", "", metric))  # of whole images
-    if measured:
-        statistic = statistics.median if metric in TIME_METRICS else statistics.fmean
-        return mean_of_known(measured, statistic)
-    if metric in RATIOS:
-        return _ratio_of_means(values, method, setting, RATIOS[metric])
-    return None
-
-
-def _ratio_of_means(values: GroupedValues, method: str, setting: str, ratio: Ratio) -> Mean | None:
-    """A metric that is the ratio of two means, or 1 minus the ratio.
-
-    Args:
-        values: measured numbers by (method, setting, metric).
-        method: the name of the numerator's method.
-        setting: a disparity as text, or "near".
-        ratio: which two metrics.
-
-    Returns:
-        The ratio; None if a mean is unknown, if the denominator is 0, or if the method would be
-        compared with itself.
-    """
-    if method == ratio.denominator_method:
-        return None
-    denominator_method = ratio.denominator_method or method
-    numerator = _mean_of_metric(values, method, setting, ratio.numerator)
-    denominator = _mean_of_metric(values, denominator_method, setting, ratio.denominator)
-
-    if numerator is None or numerator.value is None:
-        return None
-    if denominator is None or not denominator.value:
-        return None
-    quotient = numerator.value / denominator.value
-    return Mean(1 - quotient if ratio.is_reduction else quotient, 0)
-
-
-def _entry_text(mean: Mean | None, column: Column, method: str) -> str:
-    """The text of a table's entry: the number, and in brackets the count of views without one."""
-    if mean is None:
-        return NO_NUMBER
-
-    # The paper's overheads keep their one decimal.
-    is_paper_overhead = method.endswith(PAPER_SUFFIX) and column.metric == "overhead"
-    number_format = NUMBER_FORMATS["tenths %"] if is_paper_overhead else column.format
-
-    number = NO_NUMBER if mean.value is None else number_format(mean.value)
-    missing = f"({mean.missing} NaN)" if mean.missing else ""
-    return f"{number} {missing}".strip()
-
-
-def _texts_of_methods(
-    measurements: Iterable[Measurement], columns: Sequence[Column], methods: Sequence[str]
-) -> list[list[str]]:
-    """For each method a list of texts, one for each column; the best of a column is marked bold."""
-    values = group_values(measurements, "method", "setting", "metric")
-
-    texts_by_column = []
-    for column in columns:
-        means = [
-            _mean_of_metric(values, method, column.setting, column.metric) for method in methods
-        ]
-        texts = [
-            _entry_text(mean, column, method) for mean, method in zip(means, methods, strict=True)
-        ]
-        if column.lower_is_better is not None:
-            numbers = [None if mean is None else mean.value for mean in means]
-            texts = mark_best(numbers, texts, column.lower_is_better)
-        texts_by_column.append(texts)
-
-    # From one list for each column to one for each method.
-    return [list(texts) for texts in zip(*texts_by_column, strict=True)]
 
 
 # --- rows
@@ -411,15 +238,19 @@ def _rows_of_dataset(
         if dataset in PAPER_IMAGE_COUNTS:
             image_count += f"/{PAPER_IMAGE_COUNTS[dataset]}"
 
-        texts_of_methods = _texts_of_methods(run.measurements, columns, list(names))
-        for name, texts in zip(names.values(), texts_of_methods, strict=True):
+        # One list of texts for each method, in the same order.
+        rows_of_run = texts_of_methods(run.measurements, columns, list(names))
+        for name, texts in zip(names.values(), rows_of_run, strict=True):
             rows.append(DatasetRow(name, image_count, texts))
+
+    # A dataset that was not measured stands in the table, too, so that nobody overlooks the gap.
     if not rows:
         rows.append(DatasetRow(NOT_RUN, NO_NUMBER, [NO_NUMBER] * len(columns)))
 
     published = [one for one in paper_measurements(paper_label) if one.dataset == dataset]
     for method in dict.fromkeys(one.method for one in published):
-        (texts,) = _texts_of_methods(published, columns, [method])
+        (texts,) = texts_of_methods(published, columns, [method])
+        # The paper may have other settings than the runs; then its row would be empty.
         has_numbers = any(texts)
         if has_numbers:
             rows.append(DatasetRow(method, str(PAPER_IMAGE_COUNTS[dataset]), texts))
@@ -436,8 +267,9 @@ def _content_by_dataset(
 
     The columns are repeated for each setting, that is, for each size of the camera move.
     """
+    # Near views have one setting, which needs no head above its columns.
     is_near_view = list(settings) == [NEAR_SETTING]
-    columns = _columns(
+    columns = columns_of_layout(
         layout.columns,
         settings,
         group_pattern="" if is_near_view else DISPARITY_PATTERN,
@@ -461,7 +293,7 @@ def _near_view_content(
 
     Our methods stand in a group above the paper's.
     """
-    columns = _columns(layout.columns, settings, marks_best=layout.marks_best)
+    columns = columns_of_layout(layout.columns, settings, marks_best=layout.marks_best)
     datasets = _datasets(runs)
     heads = [("", "Method")]
     heads += [(dataset, column.title) for dataset in datasets for column in columns]
@@ -475,6 +307,7 @@ def _near_view_content(
                 continue
             rows = paper_rows if row.name.endswith(PAPER_SUFFIX) else measured_rows
             rows.setdefault(row.name, {})[dataset] = row.texts
+    # Without results one row says so, above the paper's.
     if not measured_rows:
         measured_rows[NOT_RUN] = {}
 
@@ -499,7 +332,7 @@ def _overhead_content(
     Each setting (size of the camera move) has the same columns. Times are medians of the datasets'
     medians; each stands in the first column of its setting.
     """
-    columns = _columns(layout.columns, settings, group_pattern=DISPARITY_PATTERN)
+    columns = columns_of_layout(layout.columns, settings, group_pattern=DISPARITY_PATTERN)
     heads = [("", "Dataset"), ("", "From")]
     heads += [(column.group, column.title) for column in columns]
 
@@ -509,10 +342,11 @@ def _overhead_content(
         rows = _rows_of_dataset(dataset, layout, runs, columns, paper_label=EXPANDED_OVERHEAD.label)
         bodies.append(prepend_group_name(dataset, [(row.name, *row.texts) for row in rows]))
 
+    # Each dataset counts once, whatever its number of images.
     means = _means_of_datasets(layout, runs)
     average_rows = []
     for name, measurements in means.items():
-        (texts,) = _texts_of_methods(measurements, columns, [name])
+        (texts,) = texts_of_methods(measurements, columns, [name])
         average_rows.append((name, *texts))
     bodies.append(prepend_group_name("Average", average_rows))
 
@@ -533,8 +367,9 @@ def _means_of_datasets(layout: TableLayout, runs: Sequence[Run]) -> dict[str, li
         for method, setting, metric in values:
             if method not in names:
                 continue
-            mean = _mean_of_metric(values, method, setting, metric)
+            mean = mean_of_metric(values, method, setting, metric)
             if mean is not None:
+                # The dataset takes the place of an image: the next mean is one over datasets.
                 name = names[method]
                 measurement = Measurement(
                     dataset="",
@@ -547,6 +382,7 @@ def _means_of_datasets(layout: TableLayout, runs: Sequence[Run]) -> dict[str, li
                 )
                 means.setdefault(name, []).append(measurement)
 
+    # The paper's numbers in this table are averages already.
     for measurement in paper_measurements(layout.label):
         means.setdefault(measurement.method, []).append(measurement)
     return means
@@ -562,14 +398,15 @@ def _time_rows(
         settings: disparities (sizes of camera moves), as text.
         means: for each row's name the numbers of all datasets.
     """
+    # Times stand below the columns of counts, under a heading of their own.
     count_columns = len(layout.columns) * len(settings)
     rows: list[RowTexts] = [("Runtime efficiency", *[NO_NUMBER] * (1 + count_columns))]
 
     for time_column in layout.time_columns:
-        columns = _columns([time_column], settings)  # one for each setting
+        columns = columns_of_layout([time_column], settings)  # one for each setting
         rows_of_methods = []
         for name, measurements in means.items():
-            (texts,) = _texts_of_methods(measurements, columns, [name])
+            (texts,) = texts_of_methods(measurements, columns, [name])
 
             # A setting has several columns of counts; the time stands in the first.
             row_texts = [name]
@@ -596,7 +433,8 @@ def _expanded_overhead_content(
     for dataset in _datasets(runs):
         group: list[RowTexts] = []
         for setting in settings:
-            columns = _columns(layout.columns, [setting])
+            # Settings are rows here, so the columns are those of one setting.
+            columns = columns_of_layout(layout.columns, [setting])
             rows = _rows_of_dataset(dataset, layout, runs, columns, paper_label=layout.label)
             for row in rows:
                 group.append((setting_title(setting), row.name, *row.texts, row.image_count))

@@ -59,6 +59,7 @@ def read_cases(name: str, root: Path) -> list[Case]:
     if root.name in ("", ".."):  # scenes are named after folders, so the path must end with a name
         root = root.resolve()
 
+    # Sorted, because the order in which a system lists folders is arbitrary.
     folders = sorted(
         _scene_folders(root, dataset), key=lambda folder: (folder.name, folder.as_posix())
     )
@@ -67,6 +68,7 @@ def read_cases(name: str, root: Path) -> list[Case]:
             f"{root}: no scene of {name} in this folder or below: expected {dataset.expected}"
         )
 
+    # Two folders with one name are the same scene in two sizes, or a mistake.
     scenes: dict[str, Path] = {}
     for folder in folders:
         scene = dataset.scene_name(folder)

@@ -52,6 +52,7 @@ def _cases_of_scene(folder: Path) -> list[Case]:
     Raises:
         InputError: the calibration or the disparity map is missing or damaged.
     """
+    # One of the photos may be damaged, so the size is that of any readable one.
     left_photos = list_files(folder / "camera_00", PHOTO_SUFFIXES)
     size = size_of_photos(left_photos)
     calibration = _read_opencv_calibration(folder / "calib_00-02.xml")
@@ -92,6 +93,7 @@ def _read_opencv_calibration(path: Path) -> Calibration:
         right = _matrix_of_entry(entries["proj_matR"])
         baseline_mm = float(entries["baselineLR"].text or "")
 
+        # The principal points of the two cameras differ along x, which offsets the disparities.
         left_cx = float(left[0, 2])
         right_cx = float(right[0, 2])
         calibration = Calibration(

@@ -145,6 +145,7 @@ def read_model(folder: Path) -> Model:
     is_binary = (folder / "cameras.bin").is_file()
     suffix = ".bin" if is_binary else ".txt"
 
+    # Each file has its own block, so that a message names the damaged file.
     points_path = folder / f"points3D{suffix}"
     with as_input_error(points_path, DAMAGED):
         point_records = _points_bin(points_path) if is_binary else _points_txt(points_path)
@@ -202,6 +203,7 @@ def _lens_of_record(path: Path, record: CameraRecord) -> Camera:
             "COLMAP first"
         )
 
+    # Bring both kinds of parameters to the order fx, fy, cx, cy, distortion.
     parameters = record.parameters
     if model.name in SINGLE_FOCAL_MODELS:
         parameters = [parameters[0], *parameters]  # fx and fy are the same
@@ -279,6 +281,7 @@ def _view_of_record(path: Path, lens: Camera, record: ImageRecord) -> ColmapView
         lens.K, world_to_camera, lens.width, lens.height, where, dtype=torch.float64
     )
 
+    # Positions without a point are of no use here.
     observations = record.observations[record.observations["id"] >= 0]
     _, first = np.unique(observations["id"], return_index=True)  # a photo may see a point twice
     observations = observations[first]

@@ -31,6 +31,7 @@ def eth3d_cases(scenes: Mapping[str, Path]) -> list[Case]:
     """
     cases = []
     for folder in scenes.values():
+        # The model's names of photos contain their folder.
         model = read_model(folder / MODEL_FOLDER)
         photos = [folder / "images" / view.name for view in model.views]
         cases += make_cases(posed_photos_of_model(folder, model, photos))

@@ -36,6 +36,7 @@ def middlebury_cases(scenes: Mapping[str, Path]) -> list[Case]:
     """
     cases = []
     for name, folder in scenes.items():
+        # Names without "-imperfect" stay as they are.
         perfect_name = name.replace("-imperfect", "-perfect")
         has_perfect_twin = perfect_name != name and perfect_name in scenes
         if not has_perfect_twin:
@@ -63,6 +64,7 @@ def _middlebury_case(folder: Path) -> Case:
         right = folder / str(facts["right"])
         disparity = folder / str(facts["disparity"])
 
+    # Disparities become depth by the same calibration.
     read_depth = partial(load_depth, disparity, calib=path)
     size = size_of_photos([left])
     return rectified_pair(folder.name, left, right, calibration, size, read_depth)

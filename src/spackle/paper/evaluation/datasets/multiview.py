@@ -91,6 +91,7 @@ def posed_photos_of_model(scene: Path, model: Model, photos: Sequence[Path]) -> 
     """
     posed_photos = []
     for view, photo in zip(model.views, photos, strict=True):
+        # Without points the depth is unknown, and no other photo counts as near.
         depths = model.points(view).z
         middle_depth = float(depths.median()) if len(depths) else math.nan
         posed_photo = PosedPhoto(
@@ -197,6 +198,7 @@ def _near_indices(
     max_distance = MAX_BASELINE_OVER_DEPTH * photo.middle_depth
     has_good_distance = (distances >= min_distance) & (distances <= max_distance)
 
+    # Axes are unit vectors, so their product is the cosine of the angle between them.
     cosines = scene.axes @ scene.axes[index]
     looks_alike = cosines >= math.cos(math.radians(MAX_TURN_DEGREES))
 
@@ -250,6 +252,7 @@ def spread_over_scenes(
     Returns:
         The scenes that are used, in order, each with the indices of its chosen photos, in order.
     """
+    # Names without a slash are categories of their own, so all scenes are used.
     by_category = itertools.groupby(scenes, key=lambda scene: scene.partition("/")[0])
     scenes_of_categories = [list(names) for _, names in by_category]
     used_scenes = _in_turn(scenes_of_categories)[:count]

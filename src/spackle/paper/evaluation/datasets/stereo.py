@@ -93,6 +93,7 @@ def pair_of_2014(folder: Path) -> Case:
             f"{calibration_path}: needs a width and a height above 0: the file is damaged"
         )
 
+    # Test scenes have none.
     disparity_paths = [folder / name for name in DISPARITY_FILES if (folder / name).is_file()]
     if not disparity_paths:
         raise InputError(

@@ -116,6 +116,7 @@ def _frames_of_scene(name: str, folder: Path) -> list[PosedPhoto]:
     poses_path = folder / "cam_poses.txt"
     poses = _read_poses(poses_path)
 
+    # A pose without a frame, or a frame without a pose, is left out.
     files_by_stem = {file.stem: file for file in (folder / "rgb").glob("*.png")}
     frames = []
     for number, camera_to_world in poses:
