@@ -35,7 +35,7 @@ def test_the_architecture_names_existing_files_and_functions() -> None:
     for file, name in found:
         path = (
             ROOT / file
-            if file.startswith(("tests/", "research/"))
+            if file.startswith(("tests/", "research/", "examples/"))
             else ROOT / "src" / "spackle" / file
         )
         assert path.is_file(), file
