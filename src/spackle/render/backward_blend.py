@@ -91,7 +91,8 @@ def load_gradients(work: Array, left: int, top: int, images: Arrays, gradients: 
     divided by alpha. Pixels outside of the image get zeros.
 
     Args:
-        work: the tile's workspace of seven planes; the last five are written.
+        work: the tile's workspace, seven planes of 256 floats. The last five are written: the
+            gradients of red, green, blue, depth and alpha.
         left, top: the tile's first pixel in the image.
         images: rgb [H, W, 3], depth [H, W], alpha [H, W], linear colour [H, W, 3].
         gradients: of rgb, depth and alpha.
@@ -174,10 +175,13 @@ def redraw_chunk(
 ) -> int:
     """Draw up to 128 Gaussians of a tile again, noting alpha and transmittance of each pixel.
 
+    The backward pass needs both in reverse order. A row of pixels in which a Gaussian is too faint
+    to be drawn gets no note.
+
     Args:
         work: the tile's workspace; its first plane, the transmittance, is changed.
         notes: written here: for each row of each Gaussian 16 alphas, then 16 transmittances.
-        records: [N, 12] float32 numbers of each Gaussian.
+        records: [N, 12] float32: centre, ellipse, opacity, depth and colour of each Gaussian.
         ids: [n] indices of the Gaussians to draw, front to back.
         left, top: the tile's first pixel in the image.
         first_notes: [128]: where each Gaussian's notes start, written here.
@@ -249,13 +253,16 @@ def step_back(
     """Step back over a Gaussian: add its light to that behind the next one, and sum its gradients.
 
     Args:
-        work: the tile's workspace of seven planes; the light behind is changed.
+        work: the tile's workspace, seven planes of 256 floats: transmittance, contribution of what
+            lies behind (changed here), gradients of red, green, blue, depth and alpha.
         notes: of the chunk, as `redraw_chunk` writes them.
         note: where this Gaussian's notes start.
-        record: [12] the Gaussian's numbers.
+        record: [12] the Gaussian's centre, ellipse, opacity, depth and colour.
         left, top: the tile's first pixel in the image.
         need: whether the sums are wanted.
-        sums: [10]: the Gaussian's sums, to which those of this tile are added if `need`.
+        sums: [10]: the Gaussian's sums, to which those of this tile are added if `need`. With
+            u = x - centre, dy = y - centre and v = ∂L/∂ln(alpha): of v, v·u, v·u², v·dy, v·dy²,
+            v·u·dy; then the gradients of red, green, blue and depth.
     """
     x, y, slope, _, fall, peak, _, half_height, depth, red, green, blue = in_tile(record, left, top)
     look = (red, green, blue, depth)
@@ -290,10 +297,12 @@ def step_back_row(
 ) -> None:
     """Step back over a row of a Gaussian whose own gradient nobody needs.
 
-    The plane of contributions behind grows by weight·(look · gradients) in each pixel.
+    In each pixel, what lies behind the next Gaussian contributes more to the loss: by this
+    Gaussian's weight times its colour, depth and 1, each times its gradient.
 
     Args:
-        work: the tile's workspace of seven planes.
+        work: the tile's workspace, seven planes of 256 floats: transmittance, contribution of what
+            lies behind (changed here), gradients of red, green, blue, depth and alpha.
         offset: where the row starts in a plane.
         notes: alphas and transmittances of the row, from `note` on.
         note: where the row's note starts.
@@ -322,7 +331,8 @@ def step_back_and_sum_row(
     """Step back over a row of 16 pixels of a Gaussian, and sum its gradients over them.
 
     Args:
-        work: the tile's workspace of seven planes; that of contributions behind is changed.
+        work: the tile's workspace, seven planes of 256 floats: transmittance, contribution of what
+            lies behind (changed here), gradients of red, green, blue, depth and alpha.
         offset: where the row starts in a plane.
         notes: alphas and transmittances of the row, from `note` on.
         note: where the row's note starts.

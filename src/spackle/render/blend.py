@@ -168,7 +168,7 @@ def blend_patch(
             peak - fall·dy² - across·(x of the pixel - x - slope·dy)².
     """
     x, y, slope, across, fall, peak, depth, red, green, blue = splat
-    for lane in range(PATCH_PIXELS):
+    for lane in range(PATCH_PIXELS):  # pixels row by row
         i = offset + np.uint64(lane)
         dy = np.float32(lane // PATCH_PX) + top - y
         u = np.float32(lane % PATCH_PX) + left - (x + slope * dy)

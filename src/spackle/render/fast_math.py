@@ -62,7 +62,7 @@ def exp2(x: np.float32) -> np.float32:
     # out of a float32, so that n is left, in the low bits.
     shifted = x + ROUNDING_SHIFT
     f = x - (shifted - ROUNDING_SHIFT)
-    # 2^f by a polynomial.
+    # 2^f, by a polynomial with the coefficients E0 to E5.
     series = E0 + f * (E1 + f * (E2 + f * (E3 + f * (E4 + f * E5))))
 
     # 2^n · 2^f: n is added to the exponent bits of the float 2^f.
@@ -92,6 +92,9 @@ def natural_log(x: np.float32) -> float:
 def encode_srgb(linear: np.float32) -> np.float32:
     """Convert linear light to sRGB, both clamped to 0..1; error 1e-6."""
     value = min(max(linear, ZERO), ONE)
+
+    # sRGB's power, by a polynomial with the coefficients S0 to S8 in t. This is the fourth root of
+    # the linear value, moved to -1..1, in which the curve is nearly straight.
     t = (np.sqrt(np.sqrt(value)) - ROOT_MIDDLE) / ROOT_SPREAD
     curve = S0 + t * (S1 + t * (S2 + t * (S3 + t * (S4 + t * (S5 + t * (S6 + t * (S7 + t * S8)))))))
     return SRGB_LINE * value if value <= SRGB_KNEE else min(curve, ONE)
@@ -101,6 +104,9 @@ def encode_srgb(linear: np.float32) -> np.float32:
 def decode_srgb(encoded: np.float32) -> np.float32:
     """Convert sRGB to linear light, both clamped to 0..1; relative error 2e-6."""
     value = min(max(encoded, ZERO), ONE)
+
+    # The power y^2.4 = y²·q^1.6, with q = y^¼: q^1.6 by a polynomial with the
+    # coefficients D0 to D5, which has little left to approximate.
     y = (value + np.float32(0.055)) / np.float32(1.055)
     q = np.sqrt(np.sqrt(y))
     curve = y * y * (D0 + q * (D1 + q * (D2 + q * (D3 + q * (D4 + q * D5)))))

@@ -182,22 +182,14 @@ def pixel_sums(drawing: Drawing, gradients: Arrays, table_rows: Array, count: in
     tiles = np.flatnonzero(np.diff(rows_before))  # those with such entries
     sums = np.zeros((rows_before[-1], SUMS), np.float32)
 
-    def sum_tiles(start: int, stop: int) -> None:
-        """Fill the rows of `sums` that belong to the tiles `tiles[start]` to `tiles[stop - 1]`."""
-        backward_tiles(
-            start,
-            stop,
-            tiles,
-            lists,
-            entry_needs,
-            drawing.splats.records,
-            drawing.images,
-            gradients,
-            rows_before,
-            sums,
-        )
-
-    parallel_for_chunks(sum_tiles, len(tiles), TILES_PER_CHUNK)
+    parallel_for_chunks(
+        lambda start, stop: backward_tiles(
+            start, stop, tiles, lists, entry_needs, drawing.splats.records, drawing.images,
+            gradients, rows_before, sums,
+        ),
+        len(tiles),
+        TILES_PER_CHUNK,
+    )  # fmt: skip
 
     # Each thread adds up one share of the table's rows, so that no two write to one row.
     table = np.zeros((count, SUMS), np.float32)
@@ -205,10 +197,13 @@ def pixel_sums(drawing: Drawing, gradients: Arrays, table_rows: Array, count: in
     shares = thread_count()
     share_size = math.ceil(count / shares)
 
-    def collect_shares(start: int, stop: int) -> None:
-        collect_sums(start * share_size, stop * share_size, sum_rows, sums, table)
-
-    parallel_for_chunks(collect_shares, shares, chunk_length=1)
+    parallel_for_chunks(
+        lambda start, stop: collect_sums(
+            start * share_size, stop * share_size, sum_rows, sums, table
+        ),
+        shares,
+        chunk_length=1,
+    )
     return table
 
 
@@ -220,8 +215,9 @@ def gradients_of_set(fields: Sequence[Tensor], view: KernelCamera, table: Array)
     scene = tuple(as_array(field) for field in fields)
     gradients = tuple(np.zeros(field.shape, np.float32) for field in fields)
 
-    def project_some(start: int, stop: int) -> None:
-        project_backward(start, stop, scene, view, table, gradients)
-
-    parallel_for_chunks(project_some, len(table), GAUSSIANS_PER_CHUNK)
+    parallel_for_chunks(
+        lambda start, stop: project_backward(start, stop, scene, view, table, gradients),
+        len(table),
+        GAUSSIANS_PER_CHUNK,
+    )
     return [torch.from_numpy(gradient) for gradient in gradients]

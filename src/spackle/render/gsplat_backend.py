@@ -328,6 +328,7 @@ class GsplatRenderer(Renderer):
 
     def _upload_cameras(self, cameras: Sequence[Camera]) -> tuple[Tensor, Tensor]:
         """World to camera [V, 1, 4, 4] and intrinsics [V, 1, 3, 3] of V cameras, in one upload."""
+        # The 16 numbers of the first matrix, then the nine of the second.
         numbers = [
             [*camera.world_to_camera.flatten().tolist(), *camera.K.flatten().tolist()]
             for camera in cameras
