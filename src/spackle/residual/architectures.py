@@ -55,10 +55,14 @@ def load_residual(path: str | os.PathLike[str]) -> ResidualNet:
     advice = "give the residual's weights, 'initial' or 'none'"
     tensors = read_tensors(path, advice)
     name = read_metadata(path, NOTE) or NAME_WITHOUT_NOTE
+
+    # "package.module:Class", for a network of another package.
     module, _, class_name = name.partition(":")
     is_imported = module in sys.modules and class_name.isidentifier()
     if name not in ARCHITECTURES and not is_imported:
         shown = printable_line(name)[:MAX_NAME_IN_MESSAGE]
         raise InputError(f"{path}: unknown architecture {shown}: {advice}")
     network = network_class(name).untrained_for(tensors)
+
+    # Convolutions are faster on a CPU if the channels of a pixel are neighbours in memory.
     return load_strict(network, tensors, path, advice, prepare=to_channels_last)

@@ -88,12 +88,12 @@ class ViewCompletion:
         return self.features.mask
 
     def cells(self, at_least: int = 0) -> Tensor:
-        """[h, w] bool: the cells that get an aux Gaussian, those whose first pixel is a hole (eqs.
-        4 and 7).
+        """[h, w] bool: the cells of 2×2 pixels that get a new Gaussian (eqs. 4 and 7).
 
-        About HAR · h · w cells are thus chosen, as in the paper's tables (HAR: the fraction of hole
-        pixels). If these are fewer than `at_least`, the `at_least` least opaque cells are chosen
-        instead.
+        These are the cells whose first pixel is a hole: the upper left one of the four.
+        About HAR · h · w cells are thus chosen, as in the paper's tables, where HAR is the fraction
+        of hole pixels. If these are fewer than `at_least`, the `at_least` least opaque cells are
+        chosen instead.
         """
         hole = hole_mask(self.rendering.alpha, self.threshold)
         cells = hole[::CELL, ::CELL].cpu()
@@ -113,8 +113,10 @@ class ViewCompletion:
 
     @functools.cached_property
     def photo_colors(self) -> Tensor:
-        """[h, w, 3] sRGB of the photo at the initial Gaussians; outside of the photo, their own
-        colour.
+        """[h, w, 3] sRGB: for each cell, the photo's colour at the cell's initial Gaussian.
+
+        The initial Gaussian is the first guess of what fills the cell. If it lies outside of what
+        the photo shows, its own colour is taken.
         """
         if self._render_photo is None:
             raise ValueError('a network names the input "photo", but no photo was given')
@@ -191,8 +193,9 @@ class ViewCompletion:
 def view_type_of(
     network: ResidualNet | None, default: type[ViewCompletion]
 ) -> type[ViewCompletion]:
-    """The class that computes the inputs of a network; `default` without a network, or if it states
-    none.
+    """The class that computes the inputs which a network names.
+
+    Most networks state no such class (`view_type`), and get `default`.
     """
     if network is None or network.view_type is None:
         return default
@@ -213,27 +216,32 @@ def complete_view(
     photo: Tensor | None = None,
     precision: Precision = "auto",
 ) -> Gaussians:
-    """𝒢̃_aug of a view (eq. 7): one Gaussian for each cell of 2×2 pixels whose first pixel is a
-    hole.
+    """Gaussians that fill the holes of one view, as in the paper (𝒢̃_aug of eq. 7).
+
+    The holes are where the base does not cover the view. There is one Gaussian for each cell of 2×2
+    pixels whose first pixel is a hole.
 
     Args:
-        base: 𝒢_base, N Gaussians in the world's frame.
-        camera: the view v.
-        photo_camera: the camera of the photo from which the base was predicted.
-        renderer: ℛ.
-        network: f_res, on any device; None: all deltas are 0.
-        threshold: τ_α.
-        least: if fewer cells have a hole, so many of the least opaque cells are filled (paper,
+        base: the Gaussians predicted from a photo (𝒢_base), in the world's frame.
+        camera: the view (v).
+        photo_camera: the camera of the photo.
+        renderer: draws Gaussians (ℛ).
+        network: the residual network (f_res), on any device; None: holes are filled by the initial
+            Gaussians, the first guess that a network would change.
+        threshold: a pixel with a lower opacity is a hole (τ_α).
+        least: if fewer cells are holes, so many of the least opaque cells are filled (paper,
             training details: 64).
-        rendering: ℛ(𝒢_base, v), if already available.
-        photo: I as [H, W, 3] sRGB, for a network that names the input "photo"; None: the rendering
-            of the base.
+        rendering: the base as the view shows it, if already available.
+        photo: [H, W, 3] sRGB, for a network that names the input "photo"; None: the base rendered
+            from the photo's camera.
         precision: of the network; auto is bfloat16 if the hardware multiplies it natively.
     """
 
     def render_photo() -> Tensor:
-        """The photo [H, W, 3], sRGB."""
-        return renderer.render(base, photo_camera).rgb if photo is None else photo
+        """The photo [H, W, 3], sRGB; called only if the network asks for it."""
+        if photo is not None:
+            return photo
+        return renderer.render(base, photo_camera).rgb
 
     if rendering is None:
         rendering = renderer.render(base, camera)  # eqs. 2 and 3

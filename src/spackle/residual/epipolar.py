@@ -28,7 +28,7 @@ def trace_epipolar_lines(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Values at the rim of a hole, for each cell of the hole, found along the cell's epipolar line.
 
-    From each masked cell, the line is followed in both directions to the first unmasked cells. Of
+    From each hole cell, the line is followed in both directions to the first visible cells. Of
     these two cells at the rim of the hole, the farther one counts, because a hole uncovers what
     lies behind.
 
@@ -44,8 +44,8 @@ def trace_epipolar_lines(
     Returns:
         Values [h, w, c] at the rim; values [h, w, c] at the cell's mirror image beyond the rim, or
         those at the rim if the mirror image lies on another surface; distance [h, w] to the rim in
-        cells. Unmasked cells, and cells whose line leaves the view before it meets an unmasked
-        cell, have their own values and the distance 0.
+        cells. Visible cells, and cells whose line leaves the view before it meets a visible one,
+        have their own values and the distance 0.
     """
     eye = eye.double()
     # Homogeneous coordinates, because the epipole may lie at infinity.

@@ -37,8 +37,9 @@ def hole_mask(alpha: Tensor, threshold: float = MASK_THRESHOLD) -> Tensor:
 
 
 def hole_area_ratio(alpha: Tensor, threshold: float = MASK_THRESHOLD) -> float:
-    """HAR = 1 − coverage (eqs. 10 and 11): the fraction of pixels with opacity `alpha` [H, W] below
-    the threshold.
+    """The hole-area ratio (HAR = 1 − coverage, eqs. 10 and 11): the fraction of hole pixels.
+
+    `alpha` [H, W] is the opacity of the pixels; a hole pixel's is below the threshold.
     """
     hole = hole_mask(alpha, threshold)
 
@@ -63,8 +64,9 @@ class ViewFeatures:
 
     @staticmethod
     def of(rendering: Rendering, threshold: float = MASK_THRESHOLD) -> ViewFeatures:
-        """Reduce a rendering [H, W] to cells [h, w]; a pixel with an opacity below `threshold` is a
-        hole.
+        """Average the pixels [H, W] of a rendering in cells [h, w] of 2×2 pixels.
+
+        A pixel with an opacity below `threshold` is a hole.
         """
         rendering = rendering.to(torch.device("cpu")).detach()
         # The kernel runs along whole rows, so colours become [H, 3W].

@@ -209,7 +209,8 @@ def place_behind_surfaces(filled: Tensor, cells: Tensor, visible: Tensor, radius
         visible: [h, w] inverse depth of visible surfaces; 0: none.
         radius: surfaces within so many rows and columns of a cell count.
     """
-    # The least inverse depth nearby, as a maximum of the negative.
+    # The least inverse depth nearby, as a maximum of the negative. A little behind it, a Gaussian
+    # does not show through the surface.
     farthest_nearby = -maximum_filter(-torch.where(visible > 0, visible, torch.inf), radius)
     behind = torch.minimum(filled, farthest_nearby) * (1 - BEHIND_SURFACE_RATIO)
     return torch.where(cells, behind, filled)
@@ -224,8 +225,7 @@ def fill_around(
     camera: Camera,
     photo_camera: Camera,
 ) -> tuple[Tensor, Tensor]:
-    """Inverse depth [h, w] and sRGB [3, h, w] of all cells, with holes filled, also beyond the
-    photo's border.
+    """Inverse depth [h, w] and sRGB [3, h, w] of all cells, with the holes filled.
 
     Holes inside the photo are filled from the far side of their rim. Beyond the border, the surface
     that ends at the border is extended; a hole there that lies behind a nearer surface is filled
@@ -241,10 +241,12 @@ def fill_around(
         photo_camera: of the photo.
     """
     colors = features.rgb.movedim(-1, 0)  # [3, h, w]
-    bias = FAR_SIDE_BIAS * inside
+
+    # Inside the photo, the far side of a rim decides; beyond the border (bias 0), all sides do.
+    far_bias = FAR_SIDE_BIAS * inside
     beyond = features.mask & ~inside
     if not bool(beyond.any()):
-        return fill_from_far_side(features.inverse_depth, colors, known, far_bias=bias)
+        return fill_from_far_side(features.inverse_depth, colors, known, far_bias=far_bias)
 
     hidden, extended, extended_inverse_depth = _extend_border_surfaces(
         features, even_inverse_depth, uv, beyond, known, camera, photo_camera
@@ -252,14 +254,16 @@ def fill_around(
 
     # Cells behind a nearer surface belong to the far side of their hole, although they lie beyond
     # the border.
-    bias = torch.where(hidden, FAR_SIDE_BIAS, bias)
-    filled, filled_colors = fill_from_far_side(features.inverse_depth, colors, known, far_bias=bias)
+    far_bias = torch.where(hidden, FAR_SIDE_BIAS, far_bias)
+    filled, filled_colors = fill_from_far_side(
+        features.inverse_depth, colors, known, far_bias=far_bias
+    )
     filled = torch.where(extended, extended_inverse_depth, filled)
 
     # The other cells beyond the border continue the extended surfaces, which are known only now.
     others = beyond & ~extended
     if bool(others.any()):
-        refilled, _ = fill_from_far_side(filled, colors[:0], extended | known, far_bias=bias)
+        refilled, _ = fill_from_far_side(filled, colors[:0], extended | known, far_bias=far_bias)
         filled = torch.where(others, refilled, filled)
     return filled, filled_colors
 

@@ -95,9 +95,13 @@ class FillContext:
         return OcclusionGuard.of(self.photo_rendering, self.photo_camera, self.threshold)
 
     def view(self, rendering: Rendering, camera: Camera) -> SceneViewCompletion:
-        """The completion of one view, from the rendering of the base (and of earlier aux Gaussians)
-        at its camera.
+        """The completion of one view; its parts are computed when they are asked for.
+
+        Args:
+            rendering: the base, and what was added to it before, as the view's camera sees them.
+            camera: of the view.
         """
+        # A network with inputs of its own brings the class that computes them.
         view_type = view_type_of(self.network, SceneViewCompletion)
         if not issubclass(view_type, SceneViewCompletion):
             raise TypeError(f"{view_type.__name__} must be a subclass of SceneViewCompletion")

@@ -95,10 +95,10 @@ def fill_scene(
 ) -> FilledScene:
     """Complete all views of a path with one set of Gaussians.
 
-    Views are visited in the order of `farthest_first`. Each view is rendered with base Gaussians
-    and all Gaussians added before, and then gets new Gaussians in its holes and beneath the rims of
-    its holes (underlays). New Gaussians lie behind all surfaces that the photo, the widest views
-    and earlier views show.
+    The widest views come first, then always the view farthest from all earlier ones. Each view is
+    rendered with the base (the Gaussians predicted from the photo) and all Gaussians added before,
+    and then gets new Gaussians in its holes and beneath the rims of its holes. New Gaussians lie
+    behind all surfaces that the photo, the widest views and earlier views show.
 
     Args:
         context: the photo's base and the settings of the fill.
@@ -113,6 +113,8 @@ def fill_scene(
     device = context.base.means.device
     if not cameras:
         return FilledScene(Gaussians.empty(device), {})
+
+    # Everything is done on the renderer's device; the result returns to the base's device.
     filling = _SceneFilling(context.placed, cameras, exact, always_filled)
     for count, index in enumerate(filling.views_to_fill, start=1):
         filling.visit(index)
@@ -123,7 +125,7 @@ def fill_scene(
 
 
 class _SceneFilling:
-    """The state of `fill_scene` between two views."""
+    """The state of `fill_scene` between two views: what was added, which surfaces are guarded."""
 
     def __init__(
         self,
@@ -201,11 +203,16 @@ class _SceneFilling:
         return FilledScene(aux, self.pictures)
 
     def _view_context(self, hole_ratio: float) -> FillContext:
-        """The context with network and texture for the next view, of whose pixels the fraction
-        `hole_ratio` is holes.
+        """The context with network and texture for the next view.
+
+        `hole_ratio` is the fraction of the view's pixels that are holes.
         """
+        # In small holes, the effect of the network would be invisible.
         if hole_ratio < MIN_HOLE_RATIO_FOR_NETWORK and not self.exact:
             return self.context.without_network
+
+        # The chosen texture may take seconds (an inpainter); the two widest views, which come
+        # first, show nearly all holes, so later views copy texture from the view itself.
         if self.filled_views >= OPPOSITE_VIEWS and self.context.texture is not None:
             return dataclasses.replace(self.context, texture=exemplar_texture)
         return self.context

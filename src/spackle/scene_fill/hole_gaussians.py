@@ -37,8 +37,8 @@ class HoleFilling:
     """The new Gaussians in the holes of a view, and the surfaces that they continue."""
 
     gaussians: Gaussians
-    # The first guess for all cells of the view, from which the surfaces beneath the rims of holes
-    # are continued.
+    # A surface point with its colour for each cell of the view, in holes and elsewhere. These
+    # surfaces are continued beneath the rims of the holes.
     surfaces: InitialGaussians
 
 
@@ -117,19 +117,21 @@ def _textured_pixels(
 def _follow_beyond_photo(
     view: SceneViewCompletion, depths: Tensor, is_kept: Tensor
 ) -> InitialGaussians:
-    """The view's initial Gaussians, with those beyond the photo's border moved to the depths of the
-    new Gaussians.
+    """The surface points of all cells of a view, at the new Gaussians' depths beyond the photo.
 
-    There, the surfaces beneath the rims of holes must follow the Gaussians that were moved away.
+    The initial Gaussians are the first guess of such a point for each cell of 2×2 pixels. In hole
+    cells, new Gaussians may since have moved away from the camera. What is later placed beneath the
+    rims of holes continues these points, so beyond the photo's border they follow the Gaussians.
 
     Args:
         view: the view.
         depths: [n] z of the new Gaussians of the n hole cells.
         is_kept: [n] bool, false for Gaussians that were removed.
     """
+    hole_inverse_depth = view.initial.inverse_depth[view.mask]  # [n]
+    follows = view.beyond_photo[view.mask] & is_kept
     inverse_depth = view.initial.inverse_depth.clone()
-    moved = view.beyond_photo[view.mask] & is_kept
-    inverse_depth[view.mask] = torch.where(moved, 1 / depths, inverse_depth[view.mask])
+    inverse_depth[view.mask] = torch.where(follows, 1 / depths, hole_inverse_depth)
     return dataclasses.replace(view.initial, inverse_depth=inverse_depth)
 
 

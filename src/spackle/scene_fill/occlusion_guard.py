@@ -46,9 +46,19 @@ class OcclusionGuard:
     def of(
         rendering: Rendering, camera: Camera, threshold: float = MASK_THRESHOLD
     ) -> OcclusionGuard:
-        """The guard of a rendered view; pixels with an opacity below the threshold are holes."""
+        """The farthest surface around each pixel of a rendered view, which new Gaussians must not
+        hide.
+
+        Args:
+            rendering: the view [H, W], on any device.
+            camera: of the view.
+            threshold: pixels with a lower opacity are holes, and show no surface.
+        """
         view = rendering.to(torch.device("cpu")).detach()
-        surface_depth = torch.where(view.alpha < threshold, 0, view.depth).float()
+        is_hole = view.alpha < threshold
+        surface_depth = torch.where(is_hole, 0, view.depth).float()
+
+        # A Gaussian is tested at its centre, but it reaches some pixels around the centre.
         return OcclusionGuard(camera, maximum_filter(surface_depth, WINDOW_PX))
 
 

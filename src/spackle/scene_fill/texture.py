@@ -133,6 +133,8 @@ def copy_patch_blocks(patches: Patches, blocks: Tensor) -> Tensor:
 def _gain_to_surroundings(texture: Tensor, view: SceneViewCompletion) -> Tensor:
     """Factors [h, w] ≤ 1 that make a hole's texture no stronger than the texture around the hole.
 
+    The strength is the energy: the local mean of the squared high frequencies.
+
     Args:
         texture: [2h, 2w, 3] the high frequencies of the view, filled in holes.
         view: the view, whose cells are 2×2 pixels.
@@ -171,16 +173,19 @@ def _interpolate_cells(colors: Tensor, mask: Tensor) -> Tensor:
 
 
 def continue_border(view: SceneViewCompletion, structure: Tensor) -> Tensor:
-    """`structure` [h, w, 3] sRGB; just beyond the photo's border, it continues the nearest visible
-    cell's colour.
+    """Colours [h, w, 3] that continue the nearest visible colour just beyond the photo's border.
 
-    That colour fades to `structure` with the distance to the visible cell, and with the difference
-    in depth. Holes behind an object keep `structure`, because their nearest visible cell may belong
-    to the object.
+    With the distance to the nearest visible cell, and with the difference in depth, that colour
+    fades to the given colour of the cell. Holes behind an object keep their given colour, because
+    their nearest visible cell may belong to the object.
+
+    Args:
+        view: a view with holes, in cells of 2×2 pixels.
+        structure: [h, w, 3] sRGB, the given smooth colours of all cells.
     """
     features = view.features
     nearest = nearest_known_pixels(view.mask.numpy())  # [2, h, w] row and column
-    row, column = torch.from_numpy(nearest).long().clamp_min(0)
+    row, column = torch.from_numpy(nearest).long().clamp_min(0)  # negative if nothing is visible
     nearest_inverse_depth = features.inverse_depth[row, column].clamp_min(MIN_INVERSE_DEPTH)
     log_depth_ratio = (view.initial.inverse_depth / nearest_inverse_depth).log()
 

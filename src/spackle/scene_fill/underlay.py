@@ -40,18 +40,20 @@ def rim_underlay(mask: Tensor, surfaces: InitialGaussians, camera: Camera) -> Ga
             elsewhere.
         camera: of the view.
     """
+    # An underlay is smooth: one large Gaussian for every third row and column of cells is enough.
     coarse = (slice(None, None, UNDERLAY_STRIDE), slice(None, None, UNDERLAY_STRIDE))
     around_holes = maximum_filter(mask, UNDERLAY_REACH_CELLS) & ~mask
     rim = around_holes[coarse]
     if not bool(rim.any()) or bool(rim.all()):
-        return Gaussians.empty()
+        return Gaussians.empty()  # no rim, or nothing that could be continued beneath it
 
     # All cells that are not at a rim are known: the filling of the holes, and visible surfaces.
     coarse_inverse_depth, coarse_rgb = fill_from_far_side(
         surfaces.inverse_depth[coarse], surfaces.rgb[coarse].permute(2, 0, 1), ~rim
     )
 
-    # The underlay lies behind every cell of the fine grid that it can reach.
+    # The underlay must lie behind all fine cells that its Gaussians reach, so it is placed on the
+    # fine grid, and then read every third cell again.
     inverse_depth = surfaces.inverse_depth.clone()
     inverse_depth[coarse] = coarse_inverse_depth
     is_underlay = mask.new_zeros(mask.shape)
@@ -60,11 +62,11 @@ def rim_underlay(mask: Tensor, surfaces: InitialGaussians, camera: Camera) -> Ga
         inverse_depth, is_underlay, surfaces.inverse_depth, UNDERLAY_REACH_CELLS
     )[coarse]
 
+    inverse_depth_slopes = inverse_depth_slope(behind)  # per coarse cell
     cells = InitialGaussians(
         uv=surfaces.uv[coarse],
         inverse_depth=behind,
-        slope=inverse_depth_slope(behind)
-        / (UNDERLAY_STRIDE * CELL),  # from a coarse cell to a pixel
+        slope=inverse_depth_slopes / (UNDERLAY_STRIDE * CELL),  # per pixel
         rgb=coarse_rgb.permute(1, 2, 0),
         unit=surfaces.unit,
     )

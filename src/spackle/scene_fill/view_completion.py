@@ -60,14 +60,17 @@ class SceneViewCompletion(ViewCompletion):
 
     @functools.cached_property
     def far_rim(self) -> FarRim:
-        """Colours at the far rims of holes. Without a rim, or at a much nearer surface, the initial
-        colour is kept.
+        """For each hole cell, the colours that lie at the far rim of its hole, along an epipolar
+        line.
+
+        Where there is no rim, or only that of a much nearer surface, which does not continue into
+        the hole, the cell keeps its initial colour.
         """
         rgb = self.initial.rgb.detach()
         inverse_depth = self.initial.inverse_depth.detach()
         rim_values, mirrored_values, distance = trace_epipolar_lines(
             self.initial.uv.detach(),
-            torch.cat([rgb, inverse_depth[..., None]], dim=-1),
+            torch.cat([rgb, inverse_depth[..., None]], dim=-1),  # [h, w, 4]
             inverse_depth,
             self.mask,
             self.camera,
