@@ -70,7 +70,9 @@ CLIPS: dict[
 
 
 def load_world(side: int) -> World:
-    """Motorcycle's left photo, `side` pixels wide, completed for cameras all around; and the board."""
+    """Motorcycle's left photo, `side` pixels wide, completed for cameras all around; and the
+    board.
+    """
     from skimage.transform import resize
 
     pair = load_motorcycle()
@@ -118,7 +120,9 @@ def moved(camera: Camera, eye: Eye) -> Camera:
 
 
 def said_depth(depth: Tensor, dice: torch.Generator) -> Tensor:
-    """True depth [H, W] with errors like a network's: another scale, shift and dents in each frame."""
+    """True depth [H, W] with errors like a network's: another scale, shift and dents in each
+    frame.
+    """
     rolls = torch.randn(2, generator=dice)
     waves = torch.randn(1, 1, 4, 6, generator=dice)
     waves = torch.nn.functional.interpolate(waves, size=depth.shape, mode="bicubic")[0, 0]

@@ -78,7 +78,8 @@ def run(*command: str) -> Iterator[str]:
     done = subprocess.run(command, capture_output=True, text=True, cwd=REPOSITORY)
     if done.returncode:
         raise SystemExit(
-            f"{' '.join(command)} ended with {done.returncode}:\n{(done.stdout + done.stderr)[-2000:]}"
+            f"{' '.join(command)} ended with "
+            f"{done.returncode}:\n{(done.stdout + done.stderr)[-2000:]}"
         )
     yield from done.stdout.splitlines()
 
@@ -118,7 +119,8 @@ def rows(tasks: dict[str, TimedTask], runs: int = RUNS) -> Iterator[str]:
 
 def machine(options: argparse.Namespace) -> Iterator[str]:
     """names driver, GPU, torch and the compiler"""
-    yield f"torch {torch.__version__}, CUDA {torch.version.cuda}, sees a GPU: {torch.cuda.is_available()}"
+    sees_gpu = torch.cuda.is_available()
+    yield f"torch {torch.__version__}, CUDA {torch.version.cuda}, sees a GPU: {sees_gpu}"
     yield from run(
         "nvidia-smi", "--query-gpu=name,driver_version,memory.total,compute_cap", "--format=csv"
     )
@@ -164,17 +166,28 @@ def against_cpu(options: argparse.Namespace) -> Iterator[str]:
         apart = (one.rgb - other.rgb).abs().amax(-1)
         material, view = DeviceGaussians.of(scene, CUDA), camera.to(CUDA)
         radii = gpu._gsplat.fully_fused_projection(
-            material.means, material.covariances, None, None, view.world_to_camera[None], view.K[None],
-            camera.width, camera.height, eps2d=0.0, near_plane=NEAR_PLANE, opacities=material.opacities,
-        )[0][0]  # fmt: skip
+            material.means,
+            material.covariances,
+            None,
+            None,
+            view.world_to_camera[None],
+            view.K[None],
+            camera.width,
+            camera.height,
+            eps2d=0.0,
+            near_plane=NEAR_PLANE,
+            opacities=material.opacities,
+        )[0][0]
         here = (radii > 0).all(-1).cpu()
         lens = KernelCamera.of(camera, 0.0)
         there = torch.from_numpy(
             project([scene], lens, tiles_to_draw(lens, None))[0].boxes[: len(scene), 1] > 0
         )
         yield (
-            f"{len(scene):,} Gaussians: {float((apart < CLOSE).float().mean()):.4%} of pixels within {CLOSE:g}, worst "
-            f"{float(apart.max()):.1e}; drawn by the GPU alone {int((here & ~there).sum()):,}, by the processor alone "
+            f"{len(scene):,} Gaussians: {float((apart < CLOSE).float().mean()):.4%} of pixels "
+            f"within {CLOSE:g}, worst "
+            f"{float(apart.max()):.1e}; drawn by the GPU alone {int((here & ~there).sum()):,}, by "
+            f"the processor alone "
             f"{int((there & ~here).sum()):,}"
         )
 

@@ -1,4 +1,6 @@
-"""A naive renderer, as the baseline for ours: tile by tile, Gaussian by Gaussian, pixel by pixel."""
+"""A naive renderer, as the baseline for ours: tile by tile, Gaussian by Gaussian, pixel by
+pixel.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Make random weights in SHARP's or LaMa's shapes, the same each time, to try all commands without
 a download:
 
-    python benchmarks/random_weights.py sharp.pt                          # 702 M numbers, as published
+    python benchmarks/random_weights.py sharp.pt     # 702 M numbers, as published
     python benchmarks/random_weights.py tiny.safetensors --size tiny      # or micro, or lama
 
 Scenes that these weights make are meaningless.

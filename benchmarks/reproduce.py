@@ -282,17 +282,22 @@ def commands() -> list[str]:
         "--base sharp -c sharp.safetensors",
         "--residual sharp-decoder/best.safetensors",
     )
-    few = f"data.pseudo=pseudo data.validation_views={VIEWS} loss.features=none run.validate_every=10 optim.warmup=4"
+    few = (
+        f"data.pseudo=pseudo data.validation_views={VIEWS} loss.features=none "
+        "run.validate_every=10 optim.warmup=4"
+    )
     train = f"torchrun --nproc-per-node {RANKS} --no-python spackle train --recipe"
     crops = f"optim.steps={STEPS} optim.batch=4 data.views=30 data.crops=2 data.cells=32"
     # high rates for few steps
     fast = f"optim.steps={STEPS // 2} optim.batch=8 optim.lr=4e-3 optim.min_lr=4e-4"
     methods = "--methods base,paper,spackle,direct-ft,dense --direct-ft direct-ft/best.safetensors"
     lines = [
-        f"spackle dataset build photos -o pseudo {sharp} --views {VIEWS} --inpainter exemplar --disparity 0.3 0.6",
+        f"spackle dataset build photos -o pseudo {sharp} --views {VIEWS} --inpainter exemplar "
+        f"--disparity 0.3 0.6",
         "spackle dataset verify pseudo",
         f"{train} paper -o unet network=unet {few} {crops}",
-        f"{train} paper -o sharp-decoder network=sharp-decoder init=sharp.safetensors {few} {crops}",
+        f"{train} paper -o sharp-decoder network=sharp-decoder init=sharp.safetensors {few} "
+        f"{crops}",
         f"{train} direct_ft --method direct-ft -o direct-ft -c sharp.safetensors {few} {fast}",
     ]
     measured, pictured = [], []
@@ -314,7 +319,9 @@ def commands() -> list[str]:
 
 
 def run(out: Path, line: str) -> None:
-    """Print a command line and run it in the folder of results; its output goes to log.txt there."""
+    """Print a command line and run it in the folder of results; its output goes to log.txt
+    there.
+    """
     print(f"$ {line}", flush=True)
     began, words = time.monotonic(), shlex.split(line)
     with (out / "log.txt").open("a") as log:
@@ -344,7 +351,8 @@ def main() -> None:
     for line in commands():
         run(out, line)
     print(
-        f"{time.monotonic() - began:.0f} s: tables and report.html in {out / 'tables'}, figures in {out / 'figures'}"
+        f"{time.monotonic() - began:.0f} s: tables and report.html in {out / 'tables'}, figures in "
+        f"{out / 'figures'}"
     )
 
 

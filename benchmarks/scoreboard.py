@@ -6,21 +6,25 @@
     benchmarks/scoreboard.py --photos FOLDER [--without NAME] -o sheet.jpg
 
 PAIRS has one folder per scene: two photos, a disparity map and a `scene.json`
-(`spackle.paper.training.measured_photos.load_pair`). The left photo is lifted by its true depth, and the
-right camera's view is completed and compared with the right photo. PAIRS may also be a folder of
-photos. A fifth of the width is then cut off at each side of a photo, its middle is lifted by lite's
-depth for the whole photo, and the view to complete is the whole photo.
+(`spackle.paper.training.measured_photos.load_pair`). The left photo is lifted by its true depth,
+and the right camera's view is completed and compared with the right photo. PAIRS may also be a
+folder of photos. A fifth of the width is then cut off at each side of a photo, its middle is lifted
+by lite's depth for the whole photo, and the view to complete is the whole photo.
 
 The hole is where the lifted photo's opacity in the view is below 0.95; the band is within 8 pixels
 of the hole.
 
-distance ↓    SqueezeNet 1.0 at conv1, fire3, fire5 and fire9: mean squared difference of unit feature vectors over the
+distance ↓    SqueezeNet 1.0 at conv1, fire3, fire5 and fire9: mean squared difference of unit
+              feature vectors over the
               cells, weighted by the fraction that is hole; outside the hole the view is replaced by
               the truth. 0 to 2
-texture ↓     Frobenius norm of the difference of the vectors' Gram matrices, over that of the truth's matrices
-sharpness     mean gradient magnitude in grey over the truth's, at least 3 pixels inside the hole; 1 is best
+texture ↓     Frobenius norm of the difference of the vectors' Gram matrices, over that of the
+              truth's matrices
+sharpness     mean gradient magnitude in grey over the truth's, at least 3 pixels inside the hole;
+              1 is best
 PSNR ↑        in the hole; band ↑: in the band; elsewhere ↑: outside both; in dB
-seam ↓        mean grey difference within 2 pixels of the photo's former border, over that at 3 to 20 pixels from it
+seam ↓        mean grey difference within 2 pixels of the photo's former border, over that at
+              3 to 20 pixels from it
 photo ↑       PSNR of the completed scene at the photo's own camera against the photo, in dB
 agreement ↑   the same against the lifted photo, at most 100 dB
 HAR ↓         the hole that is left, in percent of the view
@@ -168,7 +172,8 @@ def holders(target: str) -> list[ModuleType]:
     things = {id(vars(m)[name]) for m in modules if home in ("", m.__name__.rpartition(".")[2])}
     if len(things) != 1:
         raise LookupError(
-            f"{target}: the package has {len(things)} things of that name: mend benchmarks/scoreboard.py"
+            f"{target}: the package has {len(things)} things of that name: mend "
+            f"benchmarks/scoreboard.py"
         )
     return [m for m in modules if id(vars(m)[name]) in things]
 
@@ -372,7 +377,9 @@ def comparison(before: Rows, now: Rows) -> str:
         for m, (old, new, up, down) in changes.items()
     ]
     moved = [m for m, (*_, up, down) in changes.items() if m not in SECONDS and up + down]
-    note = f"{len(set(before) & set(now))} scenes; but for the seconds {', '.join(moved) or 'nothing'} changed."
+    shared_scenes = set(before) & set(now)
+    changed_metrics = ", ".join(moved) or "nothing"
+    note = f"{len(shared_scenes)} scenes; but for the seconds {changed_metrics} changed."
     return f"{markdown(['', 'before', 'now', 'change', 'up : down', 'p'], rows)}\n\n{note}"
 
 
@@ -488,7 +495,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     before = json.loads(chosen.against.read_text()) if chosen.against else None
     if before and before["small"] != chosen.small:
         parser.error(
-            f"{chosen.against}: its depth maps are {before['small']} times smaller, not {chosen.small}"
+            f"{chosen.against}: its depth maps are {before['small']} times smaller, not "
+            f"{chosen.small}"
         )
     network = load_features("squeezenet", chosen.features) if chosen.features else None
     perception = Perception(network) if network else None

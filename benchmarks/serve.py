@@ -47,7 +47,8 @@ def upload(content: bytes) -> bytes:
     """The HTTP request that uploads a photo."""
     options = json.dumps({"files": ["scene.spz"]})
     body = (
-        f'--{BOUNDARY}\r\nContent-Disposition: form-data; name="options"\r\n\r\n{options}\r\n--{BOUNDARY}\r\n'
+        f'--{BOUNDARY}\r\nContent-Disposition: form-data; name="options"\r\n\r\n'
+        f"{options}\r\n--{BOUNDARY}\r\n"
         'Content-Disposition: form-data; name="photo"; filename="photo.jpg"\r\n\r\n'
     ).encode()
     body += content + f"\r\n--{BOUNDARY}--\r\n".encode()

@@ -160,7 +160,8 @@ def compare(ply: Path, reference: Path) -> str:
 def print_table(results: list[dict[str, Any]]) -> None:
     """Print a Markdown table with a row for each contender; ratios are relative to the first."""
     print(
-        f"\n| | {' | '.join(STAGES)} | whole process | peak memory | whole | post-processing + save |"
+        f"\n| | {' | '.join(STAGES)} | whole process | peak memory | whole | post-processing + "
+        f"save |"
     )
     print(f"|---|{'---|' * (len(STAGES) + 4)}")
     post = [r["post-processing"] + r["save"] for r in results]

@@ -406,7 +406,8 @@ def main(arguments: list[str]) -> None:
         "sections": {},
     }
     lines = [
-        f"# Speed\n\n{', '.join(f'{k} {v}' for k, v in about.items())}; commit {commit()}; {options.runs} runs."
+        f"# Speed\n\n{', '.join(f'{k} {v}' for k, v in about.items())}; commit {commit()}; "
+        f"{options.runs} runs."
     ]
     peaks: dict[str, float] = {}
     for name in chosen:

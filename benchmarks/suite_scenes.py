@@ -66,7 +66,9 @@ def photo_scene(side: int = SIDE) -> tuple[Gaussians, Camera]:
 
 
 def holed_scene(side: int = SIDE) -> tuple[Gaussians, Camera]:
-    """A scene of the same size, with holes only in views from the side: boxes in front of a wall."""
+    """A scene of the same size, with holes only in views from the side: boxes in front of a
+    wall.
+    """
     camera, uv, xs, ys, grid = _pixels(side)
     n, depth = grid * grid, torch.full((grid, grid), WALL_M)
     for left, top, right, bottom, metres in BOXES:

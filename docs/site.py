@@ -1,4 +1,6 @@
-"""What the site has besides docs/: pages from elsewhere in the repository, and the reference made of the code."""
+"""What the site has besides docs/: pages from elsewhere in the repository, and the reference.
+
+The reference is made of the code."""
 
 from __future__ import annotations
 
@@ -88,7 +90,8 @@ def _code(found: re.Match[str]) -> str:
 def _commands() -> str:
     """The help of every command, with all options."""
     parts = [
-        "# Commands\n\nAll options, as `--help` prints them, and `--help-all` of `predict` and `render`.\n"
+        "# Commands\n\nAll options, as `--help` prints them, and `--help-all` of `predict` "
+        "and `render`.\n"
     ]
     for name in COMMANDS:
         whole = "--help-all" if name in ("predict", "render") else "--help"
@@ -97,9 +100,8 @@ def _commands() -> str:
         text = subprocess.run(
             command, capture_output=True, text=True, check=True, env=environment
         ).stdout
-        parts.append(
-            f"## spackle {name}\n\n```text\n{text.replace('python -m spackle', 'spackle').strip()}\n```\n"
-        )
+        help_text = text.replace("python -m spackle", "spackle").strip()
+        parts.append(f"## spackle {name}\n\n```text\n{help_text}\n```\n")
     return "\n".join(parts)
 
 

@@ -20,7 +20,8 @@ def main(photo: Path, depth: Path, out: Path) -> None:
     metres = scene.depth_map().numpy()
     again = spackle.predict(photo, np.where(metres > 0, metres, np.nan), fov=60, disparity=0.2)
     print(
-        f"{len(scene.base):,} Gaussians from the file, {len(again.base):,} from the scene's own depth"
+        f"{len(scene.base):,} Gaussians from the file, {len(again.base):,} from the scene's own "
+        f"depth"
     )
 
 

@@ -25,7 +25,8 @@ def main(out: Path) -> None:
     after = scene.render(pair.right_camera)
     hole = spackle.hole_mask(before.alpha)
     print(
-        f"holes: {spackle.hole_area_ratio(before.alpha):.1%} -> {spackle.hole_area_ratio(after.alpha):.2%}"
+        f"holes: {spackle.hole_area_ratio(before.alpha):.1%} -> "
+        f"{spackle.hole_area_ratio(after.alpha):.2%}"
     )
     for name, view in (("base", before.rgb), ("completed", after.rgb)):
         inside, outside = psnr(view, pair.right, hole), psnr(view, pair.right, ~hole)

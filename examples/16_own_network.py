@@ -16,7 +16,9 @@ from spackle.residual import ResidualNet
 
 
 class SmallNet(ResidualNet):
-    """Two convolutions: from a view's inputs [B, 9, h, w] to 14 deltas for each cell of 2×2 pixels."""
+    """Two convolutions: from a view's inputs [B, 9, h, w] to 14 deltas for each cell of 2×2
+    pixels.
+    """
 
     name = "my_package.my_module:SmallNet"
     inputs = ("rgb", "alpha", "mask", "initial")  # 3 + 1 + 1 + 4 channels

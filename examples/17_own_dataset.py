@@ -25,7 +25,9 @@ from spackle.runtime.progress import Reporter
 
 
 def read_cases(scenes: Mapping[str, Path]) -> list[Case]:
-    """One case for each folder: the first photo, its depth, and the second photo to compare with."""
+    """One case for each folder: the first photo, its depth, and the second photo to compare
+    with.
+    """
     cases = []
     for name, folder in scenes.items():
         numbers = json.loads((folder / "camera.json").read_text())

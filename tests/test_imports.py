@@ -61,7 +61,8 @@ WITHOUT_OPTIONAL = """
 import importlib, pkgutil, sys
 sys.modules.update(dict.fromkeys(sys.argv[1:]))  # None lets the import of such a module fail
 import spackle
-names = [m.name for m in pkgutil.walk_packages(spackle.__path__, "spackle.") if not m.name.endswith("__main__")]
+modules = pkgutil.walk_packages(spackle.__path__, "spackle.")
+names = [m.name for m in modules if not m.name.endswith("__main__")]
 for name in names:
     importlib.import_module(name)
 print(len(names))

@@ -126,7 +126,8 @@ def main() -> None:
     base = LiteBase.load(arguments.weights)
 
     print(
-        "| set | frames | constant | ramp | lite | against the better | δ < 1.25: constant | ramp | lite |"
+        "| set | frames | constant | ramp | lite | against the better | δ < 1.25: constant | ramp "
+        "| lite |"
     )
     print("|---|---" + "|---:" * 7 + "|")
     rows = []

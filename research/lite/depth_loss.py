@@ -177,7 +177,9 @@ class DepthJudge:
 
     @torch.no_grad()
     def measure(self, network: nn.Module, frame: Frame) -> dict[str, float]:
-        """`MEASURES` of a frame: scores at the frame's size, the loss at the network's output size."""
+        """`MEASURES` of a frame: scores at the frame's size, the loss at the network's output
+        size.
+        """
         batch = self._batch(frame)
         predicted = self._run(network, batch.rgb)
         truth, valid = batch.inverse_depth.to(self.device), batch.valid.to(self.device)

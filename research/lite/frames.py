@@ -188,7 +188,9 @@ class Measured:
         return f"{self.path} (right)" if self.right else str(self.path)
 
     def read(self, side: int) -> Frame:
-        """Read the frame, with at most `side` pixels on the longer side; InputError if that fails."""
+        """Read the frame, with at most `side` pixels on the longer side; InputError if that
+        fails.
+        """
         if self.unit_m is not None:
             rgb, stored = load_frame(self.path, self.unit_m)
             return reduced(rgb, stored.depth, stored.valid, side)

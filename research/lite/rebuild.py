@@ -22,14 +22,18 @@ from spackle.bases.lite import LiteNet, load_networks
 
 SMALL = "network=lite0 data.scales=[1] optim.warmup=60"
 RUNS = {  # name: initial weights, teacher, and values that override lite.yaml
-    "one": ("", "", f"{SMALL} data.made=2000 data.shares.made=0.45 data.shares.stereo=0.33 data.shares.rgbd=0.22"),
-    "two": ("one", "", f"{SMALL} data.made=4000 data.shares.made=0.45 data.shares.stereo=0.35 data.shares.rgbd=0.2"
+    "one": ("", "", f"{SMALL} data.made=2000 "
+            "data.shares.made=0.45 data.shares.stereo=0.33 data.shares.rgbd=0.22"),
+    "two": ("one", "", f"{SMALL} data.made=4000 "
+            "data.shares.made=0.45 data.shares.stereo=0.35 data.shares.rgbd=0.2"
             " optim.steps=1356 optim.min_lr=3e-4"),
     "three": ("one+two", "one+two", f"{SMALL} optim.steps=400 optim.lr=7e-4 optim.min_lr=7e-4"),
-    "four": ("one+three", "one+three", f"{SMALL} data.seed=7 optim.steps=1350 optim.lr=4e-4 optim.min_lr=1e-5"),
+    "four": ("one+three", "one+three", f"{SMALL} data.seed=7 "
+             "optim.steps=1350 optim.lr=4e-4 optim.min_lr=1e-5"),
     # Its schedule was planned for 5,800 steps; the shipped weights are from step 3,500, at a rate
     # of 3.7e-4.
-    "larger": ("", "smaller", "data.seed=11 data.made=4500 data.guesses=1525 optim.steps=3500 optim.min_lr=3.7e-4"),
+    "larger": ("", "smaller", "data.seed=11 data.made=4500 data.guesses=1525 "
+               "optim.steps=3500 optim.min_lr=3.7e-4"),
 }  # fmt: skip
 MEANS = {
     "one+two": {"one": 0.5, "two": 0.5},
@@ -40,7 +44,9 @@ RECIPE = Path(__file__).with_name("lite.yaml")
 
 
 def mean(files: Mapping[Path, float]) -> LiteNet:
-    """Average the networks of several files, weighted by their shares; each file holds one network."""
+    """Average the networks of several files, weighted by their shares; each file holds one
+    network.
+    """
     networks = [load_networks(file)[0] for file in files]
     states = [network.state_dict() for network in networks]
     shares = list(files.values())

@@ -152,11 +152,13 @@ class LiteFiles:
         )
         if not (files.photos or files.stereo or files.rgbd or files.guessed):
             raise InputError(
-                "the recipe has no data: give data.photos=FOLDER, data.rgbd or data.stereo, and a share above 0"
+                "the recipe has no data: give data.photos=FOLDER, data.rgbd or data.stereo, and a "
+                "share above 0"
             )
         if not files.groups:
             raise InputError(
-                "the recipe has nothing to judge the network by: give data.rgbd with a share in data.validation, "
+                "the recipe has nothing to judge the network by: give data.rgbd with a share in "
+                "data.validation, "
                 "or scenes as data.validation_stereo=FOLDER"
             )
         return files
@@ -172,7 +174,9 @@ class LiteFiles:
 
     @property
     def guesses_digest(self) -> str:
-        """Twelve digits that identify the photos and the teacher (or none), wherever the files are."""
+        """Twelve digits that identify the photos and the teacher (or none), wherever the files
+        are.
+        """
         teacher = self.data.teacher
         weights = (
             hashlib.sha256(teacher.read_bytes()).hexdigest()

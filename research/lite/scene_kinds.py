@@ -215,7 +215,9 @@ def _tree(rng: Rng, foot: Array, tall: float) -> list[Solid]:
 
 
 def _canopy(rng: Rng, eye: float) -> list[Solid]:
-    """A pillar that spreads into a mushroom-like roof with ribs; its edge may be above the camera."""
+    """A pillar that spreads into a mushroom-like roof with ribs; its edge may be above the
+    camera.
+    """
     z = rng.uniform(2.5, 9)
     x, rise = rng.uniform(-0.5, 0.5) * z, rng.uniform(0.9, 2.6)
     wide, skin = z * rng.uniform(0.4, 1.1), int(rng.integers(WHOLE))

@@ -132,7 +132,8 @@ class PhotoDraw:
                 self.bad.add(file)
                 self.warn(f"passed over: {error}")
         raise InputError(
-            f"{self.files[0].parent}: {TRIES} photos in a row cannot be read: give others as data.photos"
+            f"{self.files[0].parent}: {TRIES} photos in a row cannot be read: give others as "
+            f"data.photos"
         )
 
 

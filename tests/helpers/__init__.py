@@ -1,4 +1,6 @@
-"""What several tests need: scenes, photos, weights and clients made on the spot, and plain oracles."""
+"""What several tests need: scenes, photos, weights and clients made on the spot, and plain
+oracles.
+"""
 
 from pathlib import Path
 

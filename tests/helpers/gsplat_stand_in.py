@@ -13,10 +13,20 @@ __version__ = "1.5.3"
 
 
 def fully_fused_projection(
-    means: Tensor, covars: Tensor | None, quats: Tensor | None, scales: Tensor | None, viewmats: Tensor, Ks: Tensor,
-    width: int, height: int, eps2d: float = 0.3, near_plane: float = 0.01, far_plane: float = 1e10, *,
+    means: Tensor,
+    covars: Tensor | None,
+    quats: Tensor | None,
+    scales: Tensor | None,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    eps2d: float = 0.3,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    *,
     opacities: Tensor | None = None,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, None]:  # fmt: skip
+) -> tuple[Tensor, Tensor, Tensor, Tensor, None]:
     """Radii [C, N, 2] int, means [C, N, 2], depths [C, N], conics [C, N, 3]; radii are 0 for
     invisible Gaussians.
     """
@@ -58,10 +68,18 @@ def fully_fused_projection(
 
 
 def isect_tiles(
-    means2d: Tensor, radii: Tensor, depths: Tensor, tile_size: int, tile_width: int, tile_height: int, *,
-    packed: bool = False, n_images: int | None = None, image_ids: Tensor | None = None,
+    means2d: Tensor,
+    radii: Tensor,
+    depths: Tensor,
+    tile_size: int,
+    tile_width: int,
+    tile_height: int,
+    *,
+    packed: bool = False,
+    n_images: int | None = None,
+    image_ids: Tensor | None = None,
     gaussian_ids: Tensor | None = None,
-) -> tuple[None, Tensor, Tensor]:  # fmt: skip
+) -> tuple[None, Tensor, Tensor]:
     """Keys [M] (image and tile) and ids [M] of packed Gaussians, sorted by key and depth."""
     assert packed
     assert n_images is not None
@@ -105,9 +123,19 @@ def isect_offset_encode(
 
 
 def rasterize_to_pixels(
-    means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, image_width: int, image_height: int,
-    tile_size: int, isect_offsets: Tensor, flatten_ids: Tensor, *, masks: Tensor | None = None, packed: bool = False,
-) -> tuple[Tensor, Tensor]:  # fmt: skip
+    means2d: Tensor,
+    conics: Tensor,
+    colors: Tensor,
+    opacities: Tensor,
+    image_width: int,
+    image_height: int,
+    tile_size: int,
+    isect_offsets: Tensor,
+    flatten_ids: Tensor,
+    *,
+    masks: Tensor | None = None,
+    packed: bool = False,
+) -> tuple[Tensor, Tensor]:
     """Colours [I, H, W, D] and alphas [I, H, W, 1]; NaN in tiles that are not in the mask."""
     assert packed
     n, (images, rows, columns) = len(means2d), isect_offsets.shape

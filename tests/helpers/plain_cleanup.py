@@ -38,7 +38,9 @@ def around(shape: tuple[int, ...], pixel: Pixel, reach: int = 1) -> list[Pixel]:
 def cheapest(
     sources: Bools, targets: Bools, cost: Callable[[Pixel, Pixel], float]
 ) -> dict[Pixel, Pixel]:
-    """For each target the source of its cheapest path; `cost` is added to the length of each step."""
+    """For each target the source of its cheapest path; `cost` is added to the length of each
+    step.
+    """
     csgraph = pytest.importorskip("scipy.sparse.csgraph")
     pixels = list(np.ndindex(*targets.shape))
     number, steps = (

@@ -100,7 +100,9 @@ def box_before_wall(
 
 
 def cast(camera: Camera, z: float) -> Tensor:
-    """The points [H, W, 3] at which rays through a view's pixels meet the world's plane at depth z."""
+    """The points [H, W, 3] at which rays through a view's pixels meet the world's plane at depth
+    z.
+    """
     centers = camera.pixel_centers()
     ray = camera.unproject(centers, torch.ones(centers.shape[:-1])) - camera.position
     return camera.position + ray * ((z - camera.position[2]) / ray[..., 2])[..., None]

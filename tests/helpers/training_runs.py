@@ -48,7 +48,8 @@ def assert_same_weights(one: Path, other: Path, tolerance: float = 0.0) -> None:
 
 def started(arguments: Sequence[str], code: str, **environment: str) -> subprocess.Popen[str]:
     """Start a command in a new process that first runs `code`."""
-    code = f"import sys\nsys.argv = {['spackle', *arguments]!r}\n{code}\nfrom spackle.cli import main\nmain()"
+    words = ["spackle", *arguments]
+    code = f"import sys\nsys.argv = {words!r}\n{code}\nfrom spackle.cli import main\nmain()"
     return subprocess.Popen(
         [sys.executable, "-c", code],
         env={**os.environ, "OMP_NUM_THREADS": "1", **environment},
@@ -58,12 +59,16 @@ def started(arguments: Sequence[str], code: str, **environment: str) -> subproce
 
 
 def killed_at(number: int) -> str:
-    """Code for `started` that kills a run in this step, counted from 0, before its weights change."""
+    """Code for `started` that kills a run in this step, counted from 0, before its weights
+    change.
+    """
     return f"""
 import os
 from spackle.paper.training import train
 rate = train.learning_rate
-train.learning_rate = lambda step, optim: os.kill(os.getpid(), 9) if step == {number} else rate(step, optim)
+def kill_or_rate(step, optim):
+    return os.kill(os.getpid(), 9) if step == {number} else rate(step, optim)
+train.learning_rate = kill_or_rate
 """
 
 

@@ -1,4 +1,6 @@
-"""Training of the lite base: the ray tracer, turned cameras, the loss, the score and the encoder."""
+"""Training of the lite base: the ray tracer, turned cameras, the loss, the score and the
+encoder.
+"""
 
 from __future__ import annotations
 

@@ -57,7 +57,9 @@ encoder: random
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a recipe, all files that it names and, after the first run, synthetic scenes."""
+    """A folder with a recipe, all files that it names and, after the first run, synthetic
+    scenes.
+    """
     place = tmp_path_factory.mktemp("lite")
     write_data(place)
     (place / "recipe.yaml").write_text(RECIPE % {"place": place})
