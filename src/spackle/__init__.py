@@ -1,7 +1,7 @@
 """Spackle: one photo in, a 3D Gaussian scene out that survives a large camera move.
 
 import spackle
-scene = spackle.predict("photo.jpg")  # or depth="depth.png", or base=spackle.SharpBase.load("sharp.pt")
+scene = spackle.predict("photo.jpg")  # or depth="depth.png", or base=SharpBase.load("sharp.pt")
 scene.save_video("video.mp4")
 """
 
@@ -44,7 +44,7 @@ if TYPE_CHECKING:  # for editors and type checkers
 __version__ = "0.1.0"  # pyproject.toml reads this line
 
 # A name is imported at its first use, so that `spackle --help` does not wait for torch.
-_NAMES = {
+_NAMES_BY_MODULE = {
     "spackle.bases": ("Base", "BasePrediction"),
     "spackle.depth.depth_map": ("DepthMap",),
     "spackle.depth.readers": ("load_depth",),
@@ -65,17 +65,19 @@ _NAMES = {
     "spackle.scene_fill": ("FillContext", "fill_scene", "fill_view"),
     "spackle.api": ("Spackle", "predict"),
 }
-_HOMES = {name: module for module, names in _NAMES.items() for name in names}
-__all__ = sorted(_HOMES)
+_MODULE_OF_NAME = {name: module for module, names in _NAMES_BY_MODULE.items() for name in names}
+__all__ = sorted(_MODULE_OF_NAME)
 
 
 def __dir__() -> list[str]:
+    """The public names, for completion in editors and notebooks."""
     return [*__all__, "__version__"]
 
 
 if not TYPE_CHECKING:  # so that type checkers report misspelled names
 
     def __getattr__(name: str) -> object:
-        if name not in _HOMES:
+        """Import a public name at its first use; AttributeError for any other name."""
+        if name not in _MODULE_OF_NAME:
             raise AttributeError(f"module 'spackle' has no attribute {name!r}")
-        return getattr(importlib.import_module(_HOMES[name]), name)
+        return getattr(importlib.import_module(_MODULE_OF_NAME[name]), name)

@@ -196,8 +196,8 @@ def choose_disparity(
 ) -> BasePrediction:
     """Replace the prediction's disparity by the largest one that uncovers few enough holes.
 
-    The limit is `prediction.max_hole_ratio`, the upper bound is the base's usual disparity. Holes are
-    measured as the mean hole-area ratio (eq. 11) of the leftmost and rightmost view, in coarse
+    The limit is `prediction.max_hole_ratio`, the upper bound is the base's usual disparity. Holes
+    are measured as the mean hole-area ratio (eq. 11) of the leftmost and rightmost view, in coarse
     renderings. This ratio and the usual disparity are added to the prediction's notes.
 
     Raises:

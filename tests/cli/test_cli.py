@@ -14,10 +14,19 @@ import numpy as np
 import pytest
 from helpers.command import FILES, SHORT, Run, names_in, refuses, report_of, run
 from helpers.photos import CLIPS, metres, write_depth, write_photo
+from helpers.systems import needs_full_device, needs_posix_signals
 from PIL import Image
 
 import spackle
 from spackle import cli
+from spackle.bases.settings import AUTO_NETWORKS, RGBD
+from spackle.core.trajectories import TRAJECTORIES
+from spackle.depth.units import DEPTH_KINDS
+from spackle.inpaint.registry import INPAINTERS
+from spackle.paper.evaluation.method_descriptions import METHODS
+from spackle.paper.evaluation.metrics import METRICS
+from spackle.runtime.device import PRECISIONS
+from spackle.weights import PUBLISHED_WEIGHTS
 
 COMMAND = [sys.executable, "-m", "spackle"]
 COMMANDS = ["predict", "render", "view", "export", "info", "demo"]
@@ -43,10 +52,17 @@ def test_the_installed_command_and_python_m_spackle_are_this_one(tmp_path: Path)
     ("words", "shown"), [("--help", "predict"), ("predict --help", "--trajectory")]
 )
 def test_help_does_not_wait(words: str, shown: str) -> None:
-    code = f"import sys; sys.argv = ['spackle', *{words.split()}]\nfrom spackle.cli import main\ntry: main()\n"
-    code += "finally: assert not {'torch', 'numba', 'av', 'fastapi'} & set(sys.modules)"
+    code = f"""
+import sys
+sys.argv = ['spackle', *{words.split()}]
+from spackle.cli import main
+try:
+    main()
+finally:
+    assert not {{'torch', 'numba', 'av', 'fastapi'}} & set(sys.modules)
+"""
     result = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False
     )
     assert (result.returncode, shown in result.stdout) == (0, True), result.stderr
 
@@ -78,6 +94,7 @@ def test_ctrl_c_is_one_line_and_leaves_an_old_set_whole(
     }
 
 
+@needs_posix_signals
 def test_a_terminated_run_leaves_nothing(tmp_path: Path, pair: tuple[Path, Path]) -> None:
     words = ["predict", pair[0], "--depth", pair[1], "-o", tmp_path / "out", "--frames", "1500"]
     with subprocess.Popen([*COMMAND, *map(str, words)], stderr=subprocess.DEVNULL) as process:
@@ -103,6 +120,7 @@ def test_no_control_character_of_a_name_reaches_the_terminal(tmp_path: Path) -> 
     assert r"a\x1b]0;owned\x07\x9b2J  \u202e\udcff.png" in result.err
 
 
+@needs_full_device
 def test_a_full_standard_output_is_reported_in_one_line(scene: Path, tmp_path: Path) -> None:
     words = [*COMMAND, "export", str(scene), "-o", str(tmp_path / "a.splat"), "--json"]
     with open("/dev/full", "w") as full:
@@ -119,6 +137,30 @@ def test_every_command_has_a_help() -> None:
         result = run(command, "--help")
         assert (result.code, f"spackle {command}" in result.out.splitlines()[0]) == (0, True)
     assert "--sharp-windows" in run("predict", "--help-all").out
+
+
+def test_help_names_everything_that_is_registered() -> None:
+    bases = [*AUTO_NETWORKS, RGBD, "hf:", "package.module:Class"]
+    predict, build = run("predict", "--help-all").out, run("dataset", "build", "--help").out
+    evaluate, bench = run("evaluate", "--help").out, run("bench", "--help").out
+    for text in (predict, build, evaluate, bench):
+        assert [name for name in bases if name not in text] == []
+    for name in (*TRAJECTORIES, *PRECISIONS, *DEPTH_KINDS):
+        assert name in predict
+    for text in (build, evaluate):
+        assert [name for name in INPAINTERS if name not in text] == []
+    assert [name for name in (*METHODS, *METRICS) if name not in evaluate] == []
+    weights = run("weights", "get", "--help").out
+    assert [name for name in PUBLISHED_WEIGHTS if name not in weights] == []
+
+
+def test_help_lists_the_papers_experiments_apart() -> None:
+    people, experiments = run("--help").out.split("The paper's experiments:")
+    for name in ("predict", "view", "serve", "render", "export", "info", "demo", "weights"):
+        assert f"\n  {name} " in people
+    for name in ("train", "evaluate", "tables", "figures", "bench", "dataset"):
+        assert f"\n  {name} " in experiments
+        assert f"\n  {name} " not in people
 
 
 def test_info_says_what_a_file_is(tmp_path: Path, scene: Path, pair: tuple[Path, Path]) -> None:

@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 from helpers.command import SHORT, Run, names_in, report_of, run
 from helpers.photos import HEIGHT, WIDTH, metres, write_depth, write_photo
+from helpers.systems import needs_posix_signals
 
 FILES = {"scene.ply", "report.json", "video.gif"}  # x264 may encode otherwise each time
 
@@ -87,6 +88,7 @@ def test_two_workers_give_the_same_files_as_one_by_one_and_go_on(
     assert list(content(out)) == list(content(place / "alone"))
 
 
+@needs_posix_signals
 @pytest.mark.parametrize(
     ("everybody", "code", "says"),
     [

@@ -10,6 +10,7 @@ import pytest
 from helpers import DATA
 from helpers.command import FILES, SHORT, names_in, refuses, run
 from helpers.photos import write_photo
+from helpers.systems import needs_named_pipes
 
 INPUTS = {"predict": ("photo.png", "--depth", "depth.npy"), "render": ("scene.ply",)}
 # Options of both commands, and a part of the error message.
@@ -113,7 +114,10 @@ def test_an_input_has_to_be_named(tmp_path: Path) -> None:
     )
 
 
-@pytest.mark.parametrize("kind", ["missing", "text", "an empty folder", "a pipe"])
+@pytest.mark.parametrize(
+    "kind",
+    ["missing", "text", "an empty folder", pytest.param("a pipe", marks=needs_named_pipes)],
+)
 def test_files_that_are_no_photo_and_no_depth_map(
     tmp_path: Path, pair: tuple[Path, Path], kind: str
 ) -> None:

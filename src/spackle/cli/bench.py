@@ -59,7 +59,10 @@ def bench(
     as_json: JsonOption = False,
     verbose: VerboseOption = False,
 ) -> None:
-    """Count the Gaussians and measure the time that Spackle adds to a base: rows.jsonl, bench.md, bench.tex."""
+    """Count the Gaussians and measure the time that Spackle adds to a base.
+
+    Writes rows.jsonl, bench.md and bench.tex.
+    """
     from spackle.bases.settings import BaseSettings
     from spackle.cli.messages import CommandReporter
     from spackle.paper.evaluation.bench import bench as run

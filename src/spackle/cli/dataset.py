@@ -8,6 +8,8 @@ from typing import Annotated
 import typer
 
 from spackle.cli.options import (
+    DATASET_BASES,
+    INPAINTERS,
     INTERRUPTED,
     DeviceOption,
     PrecisionOption,
@@ -63,9 +65,7 @@ def dataset_build(
     ] = 0,
     base: Annotated[
         str,
-        typer.Option(
-            help="What turns a photo into Gaussians: sharp, rgbd, depth, lite or hf:NAME."
-        ),
+        typer.Option(metavar="NAME", help=f"What turns a photo into Gaussians: {DATASET_BASES}."),
     ] = "sharp",
     depth: Annotated[
         Path | None,
@@ -94,7 +94,8 @@ def dataset_build(
     inpainter: Annotated[
         str,
         typer.Option(
-            help="What completes the views: exemplar, lama, opencv, propainter; geometry; or none."
+            metavar="NAME",
+            help=f"What completes the views: {INPAINTERS}; geometry; or none.",
         ),
     ] = "exemplar",
     inpainter_weights: Annotated[
@@ -106,7 +107,8 @@ def dataset_build(
     inpainter_side: Annotated[
         int | None,
         typer.Option(
-            help="Long side in pixels at which the inpainter works; default: propainter 640, lama 1024."
+            help="Long side in pixels at which the inpainter works; default: propainter 640, "
+            "lama 1024."
         ),
     ] = None,
     workers: Annotated[
@@ -127,7 +129,10 @@ def dataset_build(
     device: DeviceOption = "auto",
     verbose: VerboseOption = False,
 ) -> None:
-    """Build a pseudo-supervised dataset: manifest.json and shard-000000.tar, … (the paper's appendix)."""
+    """Build a pseudo-supervised dataset: manifest.json and shard-000000.tar, ….
+
+    The paper's appendix describes it.
+    """
     from spackle.bases.settings import BaseSettings
     from spackle.cli.messages import CommandReporter
     from spackle.paper.dataset.build import build_dataset

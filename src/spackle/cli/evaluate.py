@@ -20,7 +20,10 @@ from spackle.cli.evaluation_options import (
     SideOption,
 )
 from spackle.cli.options import (
+    INPAINTERS,
     INTERRUPTED,
+    METHODS,
+    METRICS,
     DeviceOption,
     JsonOption,
     PrecisionOption,
@@ -40,7 +43,7 @@ def evaluate(
         str,
         typer.Option(
             metavar="A,B,…",
-            help="Methods, with commas: base, paper, spackle, spackle-scene, initial, dense, inpaint2d, direct-ft.",
+            help=f"Methods, with commas: {METHODS}, or package.module:Class.",
         ),
     ] = "base,paper,spackle",
     disparity: DisparitiesOption = "0.3,0.4,0.5",
@@ -53,7 +56,7 @@ def evaluate(
         str | None,
         typer.Option(
             metavar="A,B,…",
-            help="Metrics, with commas: clipiqa, niqe, musiq, psnr, ssim, distance, dists, lpips; or none.",
+            help=f"Metrics, with commas: {METRICS}; or none.",
         ),
     ] = None,
     base: BaseNameOption = "sharp",
@@ -66,9 +69,7 @@ def evaluate(
     ] = None,
     inpainter: Annotated[
         str,
-        typer.Option(
-            metavar="NAME", help="Inpainter of the method inpaint2d: exemplar, lama, opencv, …"
-        ),
+        typer.Option(metavar="NAME", help=f"Inpainter of the method inpaint2d: {INPAINTERS}."),
     ] = "opencv",
     features: Annotated[
         Path | None,
@@ -87,7 +88,10 @@ def evaluate(
     as_json: JsonOption = False,
     verbose: VerboseOption = False,
 ) -> None:
-    """Evaluate on a dataset by the paper's protocols: rows.jsonl, tables.md, tables.tex, worst.png, best.png."""
+    """Evaluate on a dataset by the paper's protocols.
+
+    Writes rows.jsonl, tables.md, tables.tex, worst.png and best.png.
+    """
     from spackle.bases.settings import BaseSettings
     from spackle.cli.messages import CommandReporter
     from spackle.paper.evaluation.evaluate import evaluate as run

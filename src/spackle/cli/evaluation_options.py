@@ -23,7 +23,7 @@ FolderArgument = Annotated[
     Path, typer.Argument(metavar="FOLDER", help="Folder of the unpacked dataset.")
 ]
 BaseNameOption = Annotated[
-    str, typer.Option(help=f"Base: {DATASET_BASES}, here the dataset's own.")
+    str, typer.Option(metavar="NAME", help=f"Base: {DATASET_BASES}, here the dataset's own.")
 ]
 BaseWeightsOption = Annotated[
     Path | None, typer.Option("-c", "--checkpoint", help="Weights of the base.")
@@ -57,7 +57,8 @@ ResultsOption = Annotated[
         "-o",
         "--output",
         metavar="OUT",
-        help="Folder for the results; an unfinished run resumes. [default: named by dataset and protocol]",
+        help="Folder for the results; an unfinished run resumes. "
+        "[default: named by dataset and protocol]",
     ),
 ]
 HtmlOption = Annotated[

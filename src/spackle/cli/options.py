@@ -25,7 +25,11 @@ SharpTrajectoryName = Literal["swipe", "shake", "rotate", "rotate-forward"]
 TrajectoryName = Literal[SharpTrajectoryName, "vertical", "orbit", "dolly-zoom"]
 PrecisionName = Literal["auto", "fp32", "bf16"]
 DepthKindName = Literal["auto", "metric", "disparity", "near-white", "near-black"]
-DATASET_BASES = "sharp, moge, lite, hf:NAME, or rgbd with depth maps"
+DATASET_BASES = "sharp, moge, lite, hf:NAME, package.module:Class, or rgbd with depth maps"
+INPAINTERS = "exemplar, lama, opencv, propainter"
+METHODS = "base, paper, spackle, spackle-scene, initial, dense, inpaint2d, direct-ft"
+METRICS = "clipiqa, niqe, musiq, psnr, ssim, distance, dists, lpips"
+WEIGHTS = "depth (MoGe-2), sharp, lama or features"
 
 # The machine.
 PrecisionOption = Annotated[PrecisionName, typer.Option(help="Precision of the base's network.")]

@@ -111,8 +111,8 @@ def predict(
         typer.Option(
             metavar="PATH|initial|none",
             hidden=True,
-            help="Weights of the residual. initial: no network; none: no fill. Default: the weights "
-            "in the package.",
+            help="Weights of the residual. initial: no network; none: no fill. Default: the "
+            "weights in the package.",
         ),
     ] = None,
     fill: Annotated[

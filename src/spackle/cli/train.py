@@ -1,4 +1,4 @@
-"""`spackle train`."""
+"""`spackle train`: train the residual network or SHARP's decoder."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ def train(
         typer.Option(
             "--recipe",
             metavar="RECIPE",
-            help="Training data and settings: quick, cpu, paper, reverse_view, direct_ft, or a YAML file.",
+            help="Training data and settings: quick, cpu, paper, reverse_view, direct_ft, or a "
+            "YAML file.",
         ),
     ],
     output: Annotated[
@@ -39,7 +40,8 @@ def train(
     method: Annotated[
         Literal["residual", "direct-ft"],
         typer.Option(
-            help="What to train: the residual network, or (direct-ft) SHARP's decoder, for comparison."
+            help="What to train: the residual network, or (direct-ft) SHARP's decoder, for "
+            "comparison."
         ),
     ] = "residual",
     checkpoint: Annotated[
@@ -51,7 +53,10 @@ def train(
     ] = False,
     verbose: VerboseOption = False,
 ) -> None:
-    """Train the residual network or SHARP's decoder: best.safetensors, last.safetensors, run.json, pictures, logs."""
+    """Train the residual network or SHARP's decoder.
+
+    Writes best.safetensors, last.safetensors, run.json, pictures and logs.
+    """
     from spackle.cli.messages import CommandReporter
     from spackle.paper.training.direct_ft import DirectFt
     from spackle.paper.training.recipe import Recipe, load_recipe
@@ -61,7 +66,8 @@ def train(
 
     if method == "residual" and checkpoint is not None:
         raise InputError(
-            f"-c {checkpoint}: --method residual learns without a base: leave the option out"
+            f"`checkpoint` {checkpoint}: `method` residual learns without a base: "
+            "leave the option out"
         )
     task = ResidualTask if method == "residual" else partial(DirectFt, checkpoint=checkpoint)
     ended = train(

@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from spackle.cli.options import JsonOption
+from spackle.cli.options import WEIGHTS, JsonOption
 from spackle.runtime.errors import InputError
+
+if TYPE_CHECKING:  # help must not wait for the library
+    from spackle.weights import PublishedWeights
 
 weights = typer.Typer(help="Download or list weights that others publish.", no_args_is_help=True)
 
 
 @weights.command("get")
 def weights_get(
-    name: Annotated[
-        str, typer.Argument(help="Which weights: depth (MoGe-2), sharp, lama or features.")
-    ],
+    name: Annotated[str, typer.Argument(help=f"Which weights: {WEIGHTS}.")],
     output: Annotated[
         Path | None,
         typer.Option(
@@ -39,26 +40,30 @@ def weights_get(
 
     from spackle.cli.messages import CommandReporter
     from spackle.runtime.folders import results_folder
-    from spackle.weights import published_weights, weights_digest, weights_folder
+    from spackle.weights import published_weights, weights_digest
     from spackle.weights.download import download
 
-    reporter, entry = CommandReporter(as_json=as_json), published_weights(name)
-    path = (output or weights_folder()) / entry.file
-    if output is not None and output.suffix.lower() == path.suffix and not os.path.isdir(output):
-        path = output
+    reporter = CommandReporter(as_json=as_json)
+    entry = published_weights(name)
+    path = _target_file(entry, output)
     summary = f"{name}: {decimal(entry.bytes)}, SHA-256 {entry.sha256}"
-    new = force or not os.path.isfile(path)
-    if new:
-        with results_folder(path.parent, [path.name], locked=True), reporter.transfer(name) as step:
-            download(url or entry.address, path, entry.bytes, entry.sha256, step)
+    is_download_needed = force or not os.path.isfile(path)
+    if is_download_needed:
+        with (
+            results_folder(path.parent, [path.name], locked=True),
+            reporter.transfer(name) as progress,
+        ):
+            download(url or entry.address, path, entry.bytes, entry.sha256, progress)
         for line in entry.notice:  # without a download no licence applies
             reporter.log(line)
-        reporter.log(f"{summary} -> {path}" + ("" if output is None else f"; {entry.option}"))
+        advice = "" if output is None else f"; {entry.option}"
+        reporter.log(f"{summary} -> {path}{advice}")
     else:
         with reporter.stage("check"):
             if weights_digest(path) != entry.sha256:
                 raise InputError(
-                    f"{path}: damaged, or a file of yours: SHA-256 is not {entry.sha256}: use --force"
+                    f"{path}: damaged, or a file of yours: SHA-256 is not {entry.sha256}: "
+                    "use `force`"
                 )
         reporter.log(f"{summary}, already downloaded and intact: {path}")
     reporter.result(
@@ -67,9 +72,21 @@ def weights_get(
             "file": path,
             "bytes": entry.bytes,
             "sha256": entry.sha256,
-            "downloaded": new,
+            "downloaded": is_download_needed,
         }
     )
+
+
+def _target_file(entry: PublishedWeights, output: Path | None) -> Path:
+    """The file to which weights are downloaded: in the weights' folder, a folder, or a file."""
+    from spackle.weights import weights_folder
+
+    if output is None:
+        return weights_folder() / entry.file
+    has_suffix_of_weights = output.suffix.lower() == Path(entry.file).suffix
+    if has_suffix_of_weights and not os.path.isdir(output):
+        return output
+    return output / entry.file
 
 
 @weights.command("list")
@@ -80,25 +97,33 @@ def weights_list(as_json: JsonOption = False) -> None:
     from spackle.cli.messages import CommandReporter
     from spackle.weights import PUBLISHED_WEIGHTS, weights_folder
 
-    reporter, folder = CommandReporter(as_json=as_json), weights_folder()
+    reporter = CommandReporter(as_json=as_json)
+    folder = weights_folder()
     for entry in PUBLISHED_WEIGHTS.values():
-        file, state = folder / entry.file, "not here"
-        if os.path.isfile(file):
-            size = os.path.getsize(file)
-            state = (
-                "whole" if size == entry.bytes else f"damaged, or a file of yours: {size:,} bytes"
-            )
-        facts = {
-            "name": entry.name,
-            "state": state,
-            "file": file,
-            "bytes": entry.bytes,
-            "licence": entry.licence,
-        }
-        reporter.result({**facts, "purpose": entry.purpose})
+        file = folder / entry.file
+        state = _state_of(file, entry)
+        reporter.result(
+            {
+                "name": entry.name,
+                "state": state,
+                "file": file,
+                "bytes": entry.bytes,
+                "licence": entry.licence,
+                "purpose": entry.purpose,
+            }
+        )
         if not as_json:
-            print(
-                f"{entry.name:9} {state:9} {decimal(entry.bytes):>8}  {entry.licence:20} {entry.purpose}"
-            )
+            size = decimal(entry.bytes)
+            print(f"{entry.name:9} {state:9} {size:>8}  {entry.licence:20} {entry.purpose}")
     if not as_json:
         print(f"in {folder} (SPACKLE_WEIGHTS names another)")
+
+
+def _state_of(file: Path, entry: PublishedWeights) -> str:
+    """Whether weights are on this machine, by the size of their file."""
+    if not os.path.isfile(file):
+        return "not here"
+    size = os.path.getsize(file)
+    if size == entry.bytes:
+        return "whole"
+    return f"damaged, or a file of yours: {size:,} bytes"

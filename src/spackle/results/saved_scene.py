@@ -1,4 +1,7 @@
-"""A saved scene as a video (`render_scene`), and in the formats of other viewers (`export_scene`)."""
+"""A saved scene as a video, and in the formats of other viewers.
+
+Read `render_scene` or `export_scene`.
+"""
 
 from __future__ import annotations
 
@@ -272,8 +275,8 @@ def _report_file(scene: SceneFile, output: Path, seconds: float, reporter: Repor
         if moved_count:
             largest_coordinate = MAX_GRID_COORDINATE / 2**grid.fraction_bits
             reporter.log(
-                f"{output}: {moved_count:,} Gaussians beyond {largest_coordinate:,.0f} m were moved "
-                "nearer, which does not change the photo's view"
+                f"{output}: {moved_count:,} Gaussians beyond {largest_coordinate:,.0f} m were "
+                "moved nearer, which does not change the photo's view"
             )
     reporter.result(
         {
