@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import tracemalloc
 import warnings
 import zipfile
 from collections import OrderedDict
@@ -162,6 +163,23 @@ NAME = b"X\x01\x00\x00\x00a"
 def test_malicious_pickles_are_refused(tmp_path: Path, data: bytes, says: str) -> None:
     write_archive(tmp_path / "a.pt", {"data.pkl": data, "data/0": bytes(16)})
     assert says in refusal(tmp_path / "a.pt")
+
+
+def test_a_length_beyond_the_end_of_an_old_file_takes_no_memory(tmp_path: Path) -> None:
+    path = tmp_path / "a.pt"
+    write_old(GOOD, path)
+    name = b"protocol_version"
+    content = path.read_bytes()
+    length = len(name).to_bytes(4, "little")
+    assert length + name in content
+    path.write_bytes(content.replace(length + name, b"\xff\xff\xff\x7f" + name))
+    tracemalloc.start()
+    try:
+        assert "not a file of weights" in refusal(path)
+        _, peak_bytes = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak_bytes < 100_000_000
 
 
 def test_unusual_archives_are_refused(tmp_path: Path) -> None:

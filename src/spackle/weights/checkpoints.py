@@ -7,12 +7,13 @@ The formats are safetensors and those of PyTorch.
 
 from __future__ import annotations
 
+import mmap
 import os
 import pickle
 import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
-from typing import TypeVar
+from typing import BinaryIO, TypeVar, cast
 
 import torch
 from safetensors import safe_open
@@ -262,10 +263,14 @@ def _read_old_pickle(path: StrPath) -> dict[str, Tensor]:
         ValueError: the pickle holds more than tensors and plain values.
     """
     try:
-        with warnings.catch_warnings():
+        # From memory, because a damaged length lets PyTorch ask for far more bytes than the file
+        # has, and a file would allocate as many before it reads.
+        with open(path, "rb") as file, warnings.catch_warnings():
             # About the old format.
             warnings.simplefilter("ignore")
-            content = torch.load(path, map_location="cpu", weights_only=True)
+            with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapped:
+                readable = cast(BinaryIO, mapped)
+                content = torch.load(readable, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
         problem = "a bare pickle with more than tensors; nothing in the pickle was run"
         raise ValueError(problem) from error
