@@ -40,6 +40,7 @@ POLL_S = 0.1  # seconds between two checks whether a state has changed
 MAX_UPLOAD_S = 300.0  # seconds that an upload may take, because it holds a place in the queue
 MAX_CONNECTIONS = 512  # open at a time; further ones are refused
 MAX_HEAD_S = 10.0  # seconds that a client may take to send the head of a request
+BUSY = object()  # marks a connection that is not idle
 DEFAULT_WORK = SceneWork()
 DEFAULT_LIMITS = RetentionLimits()
 
@@ -223,8 +224,7 @@ class SceneHandlers:
         return FileResponse(path, filename=PurePosixPath(job.name).stem + path.suffix)
 
     async def get_page_state(self) -> dict[str, object]:
-        """What the page may send: kinds of files, size limit, and bases, the networks to choose
-        from.
+        """What the page may send: kinds of files, size limit, and networks to choose from.
 
         {"upload": null} if it may send nothing.
         """
@@ -294,8 +294,7 @@ def make_server(app: FastAPI) -> uvicorn.Server:
 
 
 class PatientProtocol(H11Protocol):
-    """uvicorn's connection to one client, which ends if the client sends no complete head of a
-    request.
+    """uvicorn's connection to one client, which ends if the client stays silent.
 
     A client may take `MAX_HEAD_S` seconds for it. Otherwise silent clients could take up all
     connections.
@@ -304,23 +303,21 @@ class PatientProtocol(H11Protocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Note a new connection, and begin to watch it."""
         super().connection_made(transport)
-        self._end_if_silent(self)
+        self._end_if_silent(BUSY)
 
-    def _end_if_silent(self, earlier_request: object) -> None:
-        """Close the connection if the client has waited for long; otherwise look again later.
-
-        uvicorn calls a request with its answer a cycle. The connection is idle before the first
-        cycle and after each complete one.
+    def _end_if_silent(self, idle_after: object) -> None:
+        """Close the connection if no request has come since the last look; else look again later.
 
         Args:
-            earlier_request: the complete cycle at the last look, None if there was none yet, or
-                this connection itself if it was not idle then.
+            idle_after: the request after whose answer the connection was idle at the last look;
+                None: it was idle before its first request; BUSY: it was not idle.
         """
-        is_idle = self.cycle is None or self.cycle.response_complete
-        is_still_idle = is_idle and self.cycle is earlier_request
-        if self.transport.is_closing() or is_still_idle:
+        latest_request = self.cycle  # uvicorn's name for a request with its answer
+        is_idle = latest_request is None or latest_request.response_complete
+        is_silent = is_idle and latest_request is idle_after
+        if self.transport.is_closing() or is_silent:
             # `close` would first send data that nobody reads.
             self.transport.abort()
         else:
-            current_request = self.cycle if is_idle else self
-            self.loop.call_later(MAX_HEAD_S, self._end_if_silent, current_request)
+            state = latest_request if is_idle else BUSY
+            self.loop.call_later(MAX_HEAD_S, self._end_if_silent, state)

@@ -120,8 +120,9 @@ class Access(NamedTuple):
             return name.rstrip(".") in self.names
 
     def _is_token(self, word: str) -> bool:
-        """Whether a word is the token, compared in a time that tells a stranger nothing about
-        it.
+        """Whether a word is the token.
+
+        The comparison takes the same time for every word: it tells a stranger nothing.
         """
         return self.token is not None and hmac.compare_digest(word.encode(), self.token.encode())
 
@@ -170,8 +171,10 @@ class Guard:
         self.max_bytes = max_bytes
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request, as ASGI asks of an app: `receive` gives its body, `send` takes the
-        answer.
+        """Answer a request, if it may be answered.
+
+        As in every ASGI app, `scope` describes the request, `receive` gives its body, and `send`
+        takes the answer.
         """
         if scope["type"] == "lifespan":  # the start and the end of the server
             await self.app(scope, receive, send)
@@ -204,8 +207,7 @@ class Guard:
             raise HTTPException(413, f"more than {limit}: send a smaller photo")
 
     def _limited(self, receive: Receive) -> Receive:
-        """A `receive` that counts the bytes of a body, and raises HTTPException 413 beyond the
-        limit.
+        """A `receive` that counts a body's bytes, and raises HTTPException 413 beyond the limit.
 
         A body need not announce its size, and may be longer than announced.
         """

@@ -190,8 +190,9 @@ class Jobs:
         return job
 
     def make_file(self, job: Job, file: str) -> Future[str | None]:
-        """Add a file to a finished scene; the future's result is None, or the reason for
-        failure.
+        """Add a file to a finished scene.
+
+        The result of the future is None, or the reason for failure.
         """
 
         def add_file() -> str | None:
@@ -224,10 +225,9 @@ class Jobs:
         """The calling thread's process; a new one if there is none, or the old one died."""
         process: TaskProcess | None = getattr(self._own_process, "process", None)
         with self._lock:
-            # A dead process is replaced, but not after `close`, which has killed it: its tasks
-            # fail.
-            is_usable = process is not None and (process.alive or self._is_closed.is_set())
-            if process is None or not is_usable:
+            # After `close`, which kills the processes, a dead one stays: its tasks fail.
+            is_dead = process is not None and not process.alive
+            if process is None or (is_dead and not self._is_closed.is_set()):
                 process = TaskProcess(self._work)
                 self._own_process.process = process
                 alive = [each for each in self._processes if each.alive]
@@ -256,8 +256,8 @@ class Jobs:
         except (OSError, InputError) as problem:
             error = f"{job.name}: cannot be stored here: {reason_in_a_line(problem)}"
 
-        # A signal to end the whole service may reach the worker process first: wait a second for
-        # it.
+        # A signal to end the whole service may reach the worker process first, and this one only
+        # a moment later.
         if error == WORKER_DIED:
             self._is_closed.wait(1)
         self._process_of_job.pop(id, None)
@@ -315,9 +315,7 @@ class Jobs:
                 self.remove_expired()
 
     def remove_expired(self) -> None:
-        """Remove jobs that ended too long ago, and the oldest jobs while the folder is too
-        large.
-        """
+        """Remove jobs that ended long ago, and the oldest ones while the folder is too large."""
         end_times: dict[str, float] = {}  # by the id of a job
         sizes: dict[str, int] = {}  # bytes
         # A copy of the list, because other threads add and remove jobs meanwhile.

@@ -1,6 +1,4 @@
-"""What a client sends: the form with a photo, its depth map and options, checked before work
-begins.
-"""
+"""What a client sends: a form with a photo, its depth map and options, which is checked here."""
 
 from __future__ import annotations
 
@@ -54,6 +52,7 @@ def accept_photo(form: FormData, upload_folder: Path, jobs: Jobs, bases: list[st
         HTTPException: 422 for a bad form or bad options, 400 for an empty file, 415 for a file that
             is no photo of an accepted kind.
     """
+    # A form may hold anything: several photos, text in place of a file, a file in place of text.
     photo = form.get("photo")
     options_text = form.get("options") or "{}"
     is_one_photo = isinstance(photo, UploadFile) and len(form.getlist("photo")) == 1
@@ -123,6 +122,7 @@ def store_upload(
     if not upload.size:
         raise HTTPException(400, f"{shown_name}: the file is empty")
 
+    # "x" refuses to overwrite: the folder is new, so nothing can have this name.
     stored_name = f"{stem}{suffix}"
     with (folder / stored_name).open("xb") as file:
         shutil.copyfileobj(upload.file, file)
@@ -130,9 +130,9 @@ def store_upload(
 
 
 def safe_display_name(file_name: str) -> str:
-    """The last part of a file's name, without characters that are unsafe in terminals, pages and
-    logs.
+    """The last part of a file's name, safe to show in terminals, pages and logs.
 
+    Control characters, for example, are left out: a terminal would obey them.
     At most `MAX_NAME_CHARACTERS` characters are kept, those at the end, because of the suffix.
     """
     last_part = re.split(r"[/\\]", file_name)[-1]

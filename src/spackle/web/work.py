@@ -1,6 +1,4 @@
-"""The work of a worker process: turn a photo or scene into the page's data and files to
-download.
-"""
+"""The work of a worker process: a photo or scene becomes the page's data and files."""
 
 from __future__ import annotations
 
@@ -130,6 +128,7 @@ class SceneWork:
                 server.
         """
         job, file = task
+        # What the client has set goes before the server's defaults.
         options = SceneOptions.model_validate({**self.default_options, **job.options})
         reporter = JobReporter(job, send_event, self.verbose)
         try:
@@ -148,8 +147,9 @@ class SceneWork:
             raise InputError(reporter.without_paths(str(error))) from error
 
     def _make_scene(self, job: Job, options: SceneOptions, reporter: JobReporter) -> Scene:
-        """Make the scene of a job's photo, or open the job's scene, and write what the page
-        draws.
+        """Make the scene of a job's photo, and write what the page draws.
+
+        The job may hold a scene in place of a photo, which is only opened.
         """
         source = job.folder / job.source
         scene_file = job.results / SCENE_FILE
@@ -220,6 +220,7 @@ class SceneWork:
 
         InputError for the report of a scene that no photo gave.
         """
+        # Only a photo has a report, and it exists before anybody can ask for it.
         if target.name == REPORT_NAME:
             raise InputError(f"{job.name}: has no report, because it was opened as a scene")
         if target.suffix == ".mp4":
@@ -248,9 +249,7 @@ class JobReporter(Reporter):
         self._send_event = send_event
 
     def without_paths(self, line: str) -> str:
-        """A line for clients: they know the photo's name, and must not learn paths of this
-        server.
-        """
+        """A line for clients, who know the photo's name and must not learn this server's paths."""
         job = self._job
         line = line.removesuffix(f" -> {job.results}")
         line = line.replace(f"{job.folder}{os.sep}", "")

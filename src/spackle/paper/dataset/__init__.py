@@ -1,5 +1,4 @@
-"""The pseudo-supervised dataset (paper, appendix): views with holes and completed targets, in
-shards.
+"""The pseudo-supervised dataset (paper, appendix): views with holes, and completed targets.
 
 Read `build_dataset` in build.py for the way from photos to files, and `DatasetFiles` in shards.py
 for the way back.

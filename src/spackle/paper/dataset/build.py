@@ -1,5 +1,6 @@
-"""`spackle dataset build`: photos to shards; an interrupted build resumes and writes the same
-bytes.
+"""`spackle dataset build`: photos to shards.
+
+An interrupted build resumes and writes the same bytes.
 
 Read `build_dataset` first. A photo's sample (its views with holes, and their targets) is first
 written to a file of its own, the part. When all photos of a shard are done, their parts become a
@@ -59,14 +60,17 @@ def build_dataset(source: Path, output: Path, options: DatasetOptions, reporter:
     Raises:
         InputError: options, photos or folders cannot be used, or `output` holds another dataset.
     """
+    # Errors in options and weights come now, before any long work.
     options.check()
-    maker = SampleMaker(options)  # raises errors before any long work
+    maker = SampleMaker(options)
+    # Some inpainters have a licence that the user should know of.
     if maker.inpainter is not None and maker.inpainter.notice:
         reporter.log(maker.inpainter.notice)
 
     root, names = find_photos(source, options.images, reporter.log)
     with reporter.stage("photos") as progress:
         photos = choose_photos(root, names, options.sample, options.seed, reporter.log, progress)
+    # The record by which a later run of the same command knows that it is the same build.
     config = dataset_configuration(options, photos, maker.inpainter)
     with results_folder(output, (MANIFEST_NAME,), locked=True):
         return DatasetBuild(photos, output, options, reporter, config).run()
@@ -102,6 +106,7 @@ class SampleMaker:
         try:
             return PhotoResult(photo.index, sample=self._make_sample(photo))
         except BaseError:
+            # The next photo would fail in the same way, so the build ends.
             raise
         except InputError as error:
             return PhotoResult(photo.index, problem=str(error))
@@ -110,6 +115,7 @@ class SampleMaker:
         """A photo's part of a tar archive; InputError if the photo or its depth cannot be used."""
         options = self.options
         photo = load_photo(file.path)
+        # The second result says which base it was; here it is always the same.
         prediction, _ = self.base.predict(photo, options.find_depth(file))
         kind, disparity = draw_random_path(
             options.trajectory, options.disparity, options.seed, file.sha256
@@ -121,6 +127,7 @@ class SampleMaker:
         views = render_views(prediction, cameras, self.renderer)
         targets = complete_views(views, options.inpainter, self.inpainter, self.renderer)
 
+        # Where the sample comes from, for people who read the JSON.
         facts = {
             "photo": {
                 "name": file.name,
@@ -166,6 +173,7 @@ class DatasetBuild:
         self.reporter = reporter
         self.config = config
 
+        # The manifest comes first: it says what the folder holds, also if the build is killed.
         if not (output / MANIFEST_NAME).exists():
             Manifest(config=config, shards=(), complete=False).save(output)
         manifest = load_manifest(output)
@@ -186,7 +194,7 @@ class DatasetBuild:
                 number = int(shard.file.removeprefix("shard-").removesuffix(".tar"))
                 self.shards[number] = shard
 
-        # Indices of photos that have neither a place in a shard nor a part.
+        # Indices of photos whose sample is neither in a shard nor in a file of its own, a part.
         self.missing = set()
         for index in range(len(photos)):
             is_in_shard = self._shard_number(index) in self.shards
@@ -250,6 +258,7 @@ class DatasetBuild:
             threads=options.threads,
             gpu=options.base.device != "cpu",
         ) as results:
+            # Results come in any order, as soon as they are made.
             for done_count, result in enumerate(results, ready_count + 1):
                 self._store(result)
                 self._write_shard_if_ready(self._shard_number(result.index))
@@ -270,7 +279,10 @@ class DatasetBuild:
         return self.output / PARTS_FOLDER / f"{self.photos[index].key}.tar"
 
     def _store(self, result: PhotoResult) -> None:
-        """Write a photo's sample to its part, or log why the photo has no sample."""
+        """Keep a photo's sample in a file of its own until its shard is written.
+
+        If the photo has no sample, the reason is logged, and kept for the manifest.
+        """
         if result.sample is not None:
             write_atomic(self._part(result.index), result.sample)
         self.missing.discard(result.index)
@@ -279,10 +291,11 @@ class DatasetBuild:
             self.reporter.log(f"passed over: {result.problem}")
 
     def _write_shard_if_ready(self, number: int) -> None:
-        """Write a shard if all of its photos are done and it is not written yet.
+        """Write a shard, a tar file of some photos' samples, if all of these photos are done.
 
-        First the shard, then its entry in the manifest; then its parts are deleted. A build that
-        is killed between these steps repeats them.
+        Nothing happens if it is written already. First comes the shard, then its entry in the
+        manifest; then the files of its samples, the parts, are deleted. A build that is killed
+        between these steps repeats them.
         """
         first = number * self.options.shard_size
         indices = range(first, min(first + self.options.shard_size, len(self.photos)))
@@ -321,6 +334,7 @@ class DatasetBuild:
             return
 
         shutil.rmtree(self.output / PARTS_FOLDER)
+        # An empty dataset would only puzzle whoever finds it.
         shards = self.shards.values()
         for name in (MANIFEST_NAME, *(shard.file for shard in shards)):
             (self.output / name).unlink(missing_ok=True)

@@ -55,6 +55,7 @@ def encode_alpha(alpha: Tensor, mask: Tensor, threshold: float) -> bytes:
     bool stay below `threshold`.
     """
     codes = (alpha.detach().cpu().double() * MAX_CODE).round().clamp(0, MAX_CODE)
+    # Codes that rounding has moved to the other side of the threshold are moved back.
     max_masked_code = math.ceil(threshold * MAX_CODE) - 1  # the greatest code below the threshold
     masked_codes = codes.clamp_max(max_masked_code)
     other_codes = codes.clamp_min(max_masked_code + 1)
@@ -88,6 +89,7 @@ def encode_depth(depth: Tensor, alpha: Tensor) -> tuple[bytes, tuple[float, floa
         near = float(z[is_known].min())
         far = float(z[is_known].max())
 
+    # The quotient grows from 0 at `near` to 1 at `far`.
     log_range = max(math.log(far / near), MIN_RANGE)
     codes = np.zeros(z.shape, np.uint16)
     codes[is_known] = 1 + np.round((MAX_CODE - 1) * np.log(z[is_known] / near) / log_range)
@@ -110,6 +112,7 @@ def encode_gaussians(gaussians: Gaussians) -> bytes:
     means, quats, scales, opacities, colors = (
         tensor.detach().cpu().float() for tensor in gaussians.tensors
     )
+    # Scales span many orders of magnitude; in equal steps of the logarithm all lose the same share.
     log_scales = scales.double().clamp_min(MIN_SCALE).log()
     low = high = 0.0
     if len(means):
@@ -130,8 +133,9 @@ def encode_gaussians(gaussians: Gaussians) -> bytes:
 
 
 def decode_gaussians(data: bytes) -> Gaussians:
-    """The Gaussians of bytes of `encode_gaussians`, in float32; other bytes may raise any
-    exception.
+    """The Gaussians, in float32, of bytes that `encode_gaussians` has made.
+
+    Other bytes may raise any exception.
     """
     arrays = load(data)
     low, high = arrays["scale_logs"].tolist()
@@ -143,9 +147,11 @@ def decode_gaussians(data: bytes) -> Gaussians:
         arrays["opacities"].astype(np.float64) / MAX_CODE,
         arrays["colors"],
     )
+    # The fields of Gaussians in their order: centres, quaternions, scales, opacities, colours.
     gaussians = Gaussians(
         *(torch.from_numpy(np.ascontiguousarray(column)).float() for column in columns)
     )
+    # Half precision overflows to infinity, and damaged files hold anything.
     if not gaussians.finite:
         raise ValueError("Gaussians that are not finite")
     return gaussians

@@ -1,6 +1,5 @@
-"""`spackle dataset info`, `verify` and `preview`: a dataset's contents, its integrity, and its
-images.
-"""
+"""`spackle dataset info`, `verify` and `preview`: what a dataset holds, whether it is whole, how it
+looks."""
 
 from __future__ import annotations
 
@@ -51,6 +50,7 @@ def show_info(location: str, console: Console) -> None:
         f"{decimal(manifest.size)}, {decimal(bytes_per_photo)} a photo",
     ]
 
+    # What is missing, and how much there is to learn from: views without holes teach nothing.
     skipped_count = sum(len(shard.passed_over) for shard in manifest.shards)
     if skipped_count:
         lines.append(f"{skipped_count} photos gave no sample: manifest.json says why")
@@ -98,6 +98,7 @@ def find_problems(
                 yield f"{shard.file}: {problem}"
         except InputError as error:
             yield str(error)
+        # A missing shard counts, too, so that the progress ends at 100 %.
         checked_bytes += shard.size
         progress(checked_bytes, manifest.size)
 
@@ -116,6 +117,7 @@ def find_shard_problems(location: str | os.PathLike[str], shard: ShardEntry) -> 
         if size != shard.size:
             yield f"{size:,} bytes instead of {shard.size:,}"
 
+        # Samples follow each other without gaps, so the file is read from the start to the end.
         file.seek(0)
         is_damaged = False
         for sample in shard.samples:
@@ -147,6 +149,7 @@ def preview_dataset(
     """
     files = DatasetFiles(location)
     with results_folder(output, (SHEET_FILE, VIDEO_FILE), locked=True):
+        # Photos from the whole dataset, because neighbours by name are often alike.
         groups = [files[index] for index in spread_indices(len(files), photos)]
         rows: list[list[Tensor]] = []
         for group in groups:

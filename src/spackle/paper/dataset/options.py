@@ -54,6 +54,7 @@ class DatasetOptions:
         """
         if not is_inpainter(self.inpainter):
             return None
+        # None lets the inpainter choose for itself.
         device = None if self.base.device == "auto" else self.base.device
         options = InpainterOptions(
             weights=self.inpainter_weights, side=self.inpainter_side, device=device
@@ -61,8 +62,9 @@ class DatasetOptions:
         return get_inpainter(self.inpainter, options)
 
     def check(self) -> None:
-        """InputError if options contradict each other; inpainters check their options
-        themselves.
+        """InputError if options contradict each other.
+
+        Inpainters check their own options when they are opened.
         """
         self.base.check(allow_auto=False)
         self._check_depth()
@@ -89,8 +91,9 @@ class DatasetOptions:
             )
 
     def _check_completion(self) -> None:
-        """InputError for an unknown way of completion, or options that its inpainter does not
-        take.
+        """InputError for an unknown way to complete holes, or options that it does not take.
+
+        Only inpainters with a network take weights and a size.
         """
         takes_options = False
         if is_inpainter(self.inpainter):
@@ -112,6 +115,7 @@ class DatasetOptions:
         folder = self.base.depth
         if not isinstance(folder, Path):
             return None
+        # Photos of the same name may lie in several subfolders.
         subfolder = folder / Path(photo.name).parent
         return find_depth_file(subfolder if subfolder.is_dir() else folder, photo.path)
 

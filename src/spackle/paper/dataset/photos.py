@@ -53,6 +53,7 @@ def find_photos(
     Raises:
         InputError: there is no photo, or no such file.
     """
+    # Whatever is no folder must be a list of photos.
     if not os.path.isdir(source):
         return find_coco_photos(source, folder, log)
     files = list_files(source, DATASET_PHOTO_SUFFIXES, below=True)
@@ -72,6 +73,7 @@ def find_coco_photos(
     """
     names = read_coco_names(source)
     root = source.parent if folder is None else folder
+    # Lists name photos twice, or by different spellings of the same path.
     unique_names = sorted({Path(name).as_posix() for name in names})
     present = [name for name in unique_names if os.path.isfile(root / name)]
     if not present:
@@ -80,6 +82,7 @@ def find_coco_photos(
             "with `images`"
         )
 
+    # COCO's lists are longer than what people download, so a missing photo is no error.
     missing = sorted(set(unique_names) - set(present))
     if missing:
         log(f"{len(missing)} images that {source} names are not in {root}, such as {missing[0]}")
@@ -143,6 +146,7 @@ def choose_photos(
         if len(chosen) == wanted_count:
             break
         try:
+            # A copy of a photo, in training and in validation, would make validation worthless.
             sha256 = check_photo_file(root / name)
             if sha256 in chosen:
                 raise InputError(f"{root / name}: the same photo as {chosen[sha256]}")

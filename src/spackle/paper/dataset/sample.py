@@ -1,5 +1,6 @@
-"""A photo with its views as a part of a tar archive: `pack_sample` writes it, `PhotoGroup` reads
-it.
+"""A photo with its views as a part of a tar archive.
+
+`pack_sample` writes it, `PhotoGroup` reads it.
 
 The same sample always has the same bytes. docs/dataset.md describes the files; encoding.py has the
 formats of pictures and Gaussians. Cameras are exact.
@@ -72,6 +73,7 @@ def pack_sample(
     view_files: list[tuple[str, bytes]] = []  # names and contents
     view_facts: list[dict[str, Any]] = []
     for index, camera in enumerate(stack.cameras):
+        # Five pictures a view, each in the format that suits its numbers.
         alpha = stack.alpha[index]
         mask = stack.mask[index]
         depth_png, depth_range = encode_depth(stack.depth[index], alpha)
@@ -89,6 +91,7 @@ def pack_sample(
             camera_facts(camera) | {"depth_range": list(depth_range), "hole": hole_ratio}
         )
 
+    # What the pictures cannot say: cameras, ranges of depth, the size of the holes.
     photo_facts = {
         **facts,
         "key": key,
@@ -96,6 +99,7 @@ def pack_sample(
         "views": view_facts,
     }
     text = json.dumps(photo_facts, indent=1, sort_keys=True, allow_nan=False) + "\n"
+    # The JSON comes first, so that a reader of the archive knows what follows.
     files = [
         (f"{key}.json", text.encode()),
         (f"{key}.photo.png", encode_rgb(photo)),
@@ -176,8 +180,9 @@ class PhotoGroup:
             return decode_gaussians(self.files[f"{self.key}.base.safetensors"])
 
     def _picture(self, index: int, kind: str) -> bytes:
-        """The PNG of a view: "rgb", "target", "mask", "alpha" or "depth"; KeyError if it is
-        missing.
+        """The PNG of a view; KeyError if it is missing.
+
+        `kind` is "rgb", "target", "mask", "alpha" or "depth".
         """
         return self.files[f"{self.key}.{index:02d}.{kind}.png"]
 
@@ -192,6 +197,7 @@ def split_tar(data: bytes) -> dict[str, bytes]:
     position = 0
     while position < len(data):
         header = data[position : position + tarfile.BLOCKSIZE]
+        # The header names the file and its size; its checksum is verified.
         member = tarfile.TarInfo.frombuf(header, "utf-8", "strict")
         start = position + tarfile.BLOCKSIZE
         if member.type != tarfile.REGTYPE or not 0 <= member.size <= len(data) - start:

@@ -1,5 +1,4 @@
-"""Write and read a dataset: tar files of some photos each, the shards, and a manifest that lists
-them.
+"""Write and read a dataset: shards, which are tar files of some photos each, and a manifest.
 
 A dataset lies in a folder or at a URL (optional: pip install fsspec). Read `DatasetFiles` first.
 """
@@ -83,8 +82,9 @@ class Manifest(BaseModel, frozen=True, extra="ignore", strict=True):
         return json_digest(self._content())
 
     def save(self, folder: Path) -> None:
-        """Write manifest.json into a folder, whole or not at all, with the digest of its
-        content.
+        """Write manifest.json into a folder, whole or not at all.
+
+        The digest of its content is part of the file.
         """
         content = self._content()
         signed_content = {**content, "sha256": json_digest(content)}
@@ -111,6 +111,7 @@ def open_dataset_file(location: str | os.PathLike[str], name: str) -> IO[bytes]:
     """
     address = f"{str(location).rstrip('/')}/{name}"
     try:
+        # Most datasets lie in a folder, and need no further package.
         if "://" not in address:
             return open(os.path.join(location, name), "rb")
         import fsspec
@@ -175,6 +176,7 @@ def write_shard(
     with atomic_path(target) as temporary, open(temporary, "wb") as file:
         for key, path in parts:
             data = path.read_bytes()
+            # A damaged part would make the whole shard useless, so it is read once more.
             try:
                 group = PhotoGroup.from_tar(key, data, str(path))
             except InputError as error:
@@ -213,8 +215,9 @@ class DatasetFiles(Dataset[PhotoGroup]):
     """
 
     def __init__(self, location: str | os.PathLike[str]) -> None:
-        """Open a dataset in a folder or at a URL for fsspec; InputError for an unfinished
-        dataset.
+        """Open a dataset in a folder or at a URL for fsspec.
+
+        InputError if there is none, or it is not finished.
         """
         self.location = location
         self.manifest = load_manifest(location)
@@ -236,8 +239,10 @@ class DatasetFiles(Dataset[PhotoGroup]):
             open_dataset_file(self.location, shard.file) as file,
             as_input_error(address, "cannot be read: {reason}", OSError),
         ):
+            # Only the photo's part of the shard is read: shards may lie in another country.
             file.seek(sample.offset)
             data = file.read(sample.size)
+        # A training run of days should not learn from damaged pictures.
         if hashlib.sha256(data).hexdigest() != sample.sha256:
             raise InputError(
                 f"{address}: sample {sample.key} ({sample.photo}) is damaged: see `spackle "

@@ -109,9 +109,7 @@ def cameras_along_path(
 
 
 def different_cameras(cameras: Sequence[Camera], min_distance: float) -> list[Camera]:
-    """The cameras, in order, without those that are closer than `min_distance` to an earlier
-    one.
-    """
+    """The cameras without those that are closer than `min_distance` to an earlier one."""
     different: list[Camera] = []
     for camera in cameras:
         if all(eye_distance(camera, other) > min_distance for other in different):

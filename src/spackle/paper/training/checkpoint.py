@@ -70,8 +70,9 @@ class TrainingProgress:
 
 @dataclasses.dataclass(frozen=True)
 class Checkpoint:
-    """All state on which the next step depends; the number of a step determines the step's
-    samples.
+    """All state on which the next step depends.
+
+    The samples of a step need none: they follow from its number.
     """
 
     progress: TrainingProgress
@@ -84,8 +85,9 @@ class Checkpoint:
 
 
 def save_checkpoint(checkpoint: Checkpoint, folder: Path) -> None:
-    """Write checkpoint.pt; if the disk is full, raise InputError and keep the previous
-    checkpoint.
+    """Write checkpoint.pt, whole or not at all.
+
+    If the disk is full, InputError, and the previous checkpoint stays.
     """
     state = {**vars(checkpoint), "progress": dataclasses.asdict(checkpoint.progress)}
 
@@ -153,8 +155,9 @@ def remove_run(output: Path) -> None:
 
 
 def open_logs(folder: Path, first_step: int, log: Log) -> AbstractContextManager[Any]:
-    """TensorBoard's writer as a context that closes it; a context of None, and a line to `log`,
-    without TensorBoard.
+    """TensorBoard's writer, as a context that closes it.
+
+    Without TensorBoard a context of None, and a line to `log`.
 
     A resumed run repeats the steps after its checkpoint: values that the logs have for these steps,
     from `first_step` on, are hidden.

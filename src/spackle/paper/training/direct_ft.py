@@ -51,8 +51,9 @@ VIEWS_PER_PHOTO = 4
 
 @dataclasses.dataclass(frozen=True)
 class TunableSharp:
-    """SHARP with frozen weights, and a trainable decoder `network.gaussian_decoder()` in
-    float32.
+    """SHARP with frozen weights, but a trainable decoder.
+
+    The decoder, `network.gaussian_decoder()`, has weights in float32.
     """
 
     network: SharpNetwork
@@ -66,14 +67,16 @@ class TunableSharp:
 
         `precision`, float32 or bfloat16, is that of the encoder and of the decoder's arithmetic.
         """
+        # The decoder's weights stay in float32: small steps of the optimiser would vanish in bf16.
         network = load_network(path, torch.float32)
         set_precision(network.monodepth_model, precision)
         return TunableSharp(network.to(device), precision)
 
     @torch.no_grad()
     def encode(self, rgb: Tensor, photo_camera: Camera) -> DecoderInput:
-        """Run the frozen encoder on a photo [H, W, 3], sRGB in 0..1, with a camera of the same
-        size.
+        """Run the frozen encoder on a photo [H, W, 3], sRGB in 0..1.
+
+        `photo_camera` is the photo's, of the same size.
 
         Returns what the decoder needs: image, disparity, feature maps and initial Gaussians.
         """
@@ -225,6 +228,7 @@ class DirectFt(ViewTask):
 
         The dataset's manifest records its base: the network that turned photos into Gaussians.
         """
+        # Views of another network have holes elsewhere.
         base = self.files.manifest.config.get("base", {})
         name = base.get("name")
         weights = base.get("weights")  # their SHA-256

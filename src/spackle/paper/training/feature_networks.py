@@ -1,5 +1,6 @@
-"""Networks that turn images into features, by which images are compared: ResNet-50, as in the
-paper, and SqueezeNet.
+"""Networks that turn images into features, by which images are compared.
+
+ResNet-50 is the paper's; SqueezeNet is faster.
 """
 
 from __future__ import annotations
@@ -39,8 +40,9 @@ SQUEEZENET_BLOCKS = {
 
 
 class FeatureNet(nn.Module):
-    """Maps [B, 3, H, W] sRGB 0..1 to four feature maps [B, C, h, w], fine to coarse; weights get no
-    gradients.
+    """Maps [B, 3, H, W] sRGB 0..1 to four feature maps [B, C, h, w], fine to coarse.
+
+    The weights get no gradients.
     """
 
     head: str  # prefix of the names of the classifier's tensors, which are ignored
@@ -79,8 +81,9 @@ class Bottleneck(nn.Module):
 
 
 class ResNet50(FeatureNet):
-    """The paper's feature network, with torchvision's names of tensors, for images of at least 32
-    pixels a side.
+    """The paper's feature network, for images of at least 32 pixels a side.
+
+    The tensors have torchvision's names.
 
     The feature maps are the outputs of layer1 to layer4: 256, 512, 1024, 2048 channels at 1/4, 1/8,
     1/16, 1/32 of the image's size.
@@ -89,8 +92,9 @@ class ResNet50(FeatureNet):
     head = "fc."
 
     def __init__(self) -> None:
-        """Create the network with random weights, under the names of torchvision: conv1, bn1,
-        layer1 to layer4.
+        """Create the network with random weights.
+
+        The attributes have torchvision's names: conv1, bn1, layer1 to layer4.
         """
         super().__init__()
         self.conv1 = nn.Conv2d(3, 64, 7, stride=2, padding=3, bias=False)
@@ -132,8 +136,9 @@ class Fire(nn.Module):
 
 
 class SqueezeNet(FeatureNet):
-    """SqueezeNet 1.0 as in Caffe: 3 MB, much faster than ResNet-50, for images of at least 32
-    pixels a side.
+    """SqueezeNet 1.0 as in Caffe, for images of at least 32 pixels a side.
+
+    Its weights take 3 MB, and it is much faster than ResNet-50.
 
     The feature maps are the outputs of conv1, fire4, fire8, fire9: 96, 256, 512, 512 channels at
     about 1/2, 1/4, 1/8, 1/16 of the image's size.
@@ -142,8 +147,9 @@ class SqueezeNet(FeatureNet):
     head = "conv10."
 
     def __init__(self) -> None:
-        """Create the network with random weights, under the names of Caffe: conv1, fire2 to
-        fire9.
+        """Create the network with random weights.
+
+        The attributes have Caffe's names: conv1, fire2 to fire9.
         """
         super().__init__()
         self.conv1 = nn.Conv2d(3, 96, 7, stride=2)
@@ -203,8 +209,9 @@ def load_features(
 
 
 def read_caffe_arrays(path: Path, advice: str) -> dict[str, Tensor]:
-    """The arrays of an .npz with Caffe's names, under torch's names: `fire2/conv1x1_1.w` is
-    `fire2.conv1x1_1.weight`.
+    """The arrays of an .npz with Caffe's names, under torch's names.
+
+    `fire2/conv1x1_1.w`, for example, becomes `fire2.conv1x1_1.weight`.
 
     InputError if the file is missing or holds no such arrays; the message ends with `advice`.
     """
@@ -224,8 +231,9 @@ def read_caffe_arrays(path: Path, advice: str) -> dict[str, Tensor]:
 
 
 def channel_constants(numbers: tuple[float, ...], images: Tensor) -> Tensor:
-    """Numbers [C], one a channel, as [C, 1, 1] of the dtype and on the device of images
-    [B, C, H, W].
+    """One number a channel, as a tensor [C, 1, 1] that fits images [B, C, H, W].
+
+    It has the images' dtype and device.
     """
     # Made on the CPU and sent without waiting: making them on a GPU would wait for the GPU.
     constants = torch.tensor(numbers, dtype=images.dtype)

@@ -50,8 +50,10 @@ def alpha_loss(alpha: Tensor, hole: Tensor) -> Tensor:
 
 
 def preserve_loss(rgb: Tensor, base_rgb: Tensor, hole: Tensor) -> Tensor:
-    """[] mean |rgb - base_rgb| over pixels outside of the hole and channels; `base_rgb` gets no
-    gradient.
+    """[] mean |rgb - base_rgb| over the pixels outside of the hole and the channels.
+
+    Completed views [B, H, W, 3] should not change there. `base_rgb`, the views before completion,
+    gets no gradient; `hole` is [B, H, W] bool.
     """
     return color_loss(rgb, base_rgb.detach(), ~hole)
 
@@ -148,8 +150,9 @@ def total_loss(
 
 @torch.no_grad()
 def hole_distance(features: FeatureNet, rgb: Tensor, target: Tensor, hole: Tensor) -> float:
-    """Perceptual distance inside a hole, like LPIPS without learned weights; 0 if equal, NaN if the
-    hole is empty.
+    """Perceptual distance inside a hole; 0 for equal images, NaN for an empty hole.
+
+    It is LPIPS without learned weights.
 
     Feature vectors are scaled to unit length. Their squared difference is averaged over a layer's
     cells, weighted by the fraction of each cell that the hole covers, and summed over layers. Only
@@ -186,8 +189,9 @@ def hole_psnr(rgb: Tensor, target: Tensor, hole: Tensor) -> float:
 
 
 def covered_fraction(mask: Tensor, features: Tensor) -> Tensor:
-    """[B, 1, h, w]: the fraction of each cell of a feature map [B, C, h, w] that a mask [B, H, W]
-    covers.
+    """The fraction [B, 1, h, w] of each cell of a feature map that a mask covers.
+
+    `mask` is [B, H, W] bool, `features` [B, C, h, w].
     """
     height, width = features.shape[-2:]
     return F.adaptive_avg_pool2d(mask[:, None].to(features.dtype), (height, width))
@@ -203,8 +207,7 @@ def mean_of_images(values: Tensor, mask: Tensor) -> Tensor:
 
 
 def resize_for_network(images: Tensor, size: int | None) -> Tensor:
-    """Images [B, H, W, 3] as [B, 3, h, w] for a feature network, with a longer side of `size`
-    pixels.
+    """Images [B, H, W, 3] as [B, 3, h, w], with a longer side of `size` pixels.
 
     None keeps the size.
     """
@@ -218,8 +221,7 @@ def resize_for_network(images: Tensor, size: int | None) -> Tensor:
 
 
 def layer_terms(prediction: Tensor, target: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """The feature term [] and the Gram term [] of the perceptual loss for one layer of the feature
-    network.
+    """The feature term [] and the Gram term [] of the perceptual loss for one layer.
 
     Both compare features of prediction and target [B, C, h, w], weighted by cell, with weights
     [B, 1, h, w]. The feature term is the mean difference; the Gram term is the mean difference of

@@ -79,23 +79,27 @@ def draw_left_photo(
 
 
 def load_frame(color_file: Path, unit_m: float) -> tuple[Tensor, DepthMap]:
-    """Read the photo NAME.color.jpg of a depth camera, [H, W, 3] sRGB, and the depth in
-    NAME.depth.png.
+    """Read a frame of a depth camera: the photo [H, W, 3] sRGB, and its depth.
+
+    The files are NAME.color.jpg and NAME.depth.png.
 
     `unit_m` is one unit of the depth file in metres; 0 and 65535 mean unknown depth. InputError if
     a file is missing or broken, or the two differ in size.
     """
     rgb = load_photo(color_file).rgb
+    # The names of a frame's files differ by one word and the suffix.
     depth_name = color_file.name.replace(".color.", ".depth.")
     depth = load_depth(color_file.with_name(depth_name).with_suffix(".png"))
     depth.check_aspect_ratio(rgb.shape[0], rgb.shape[1], color_file)
+    # Files of other cameras have other units.
     depth_m = depth.depth * (unit_m / LOADED_UNIT_M)
     return rgb, dataclasses.replace(depth, depth=depth_m)
 
 
 def load_pair(folder: Path) -> StereoPair:
-    """Read a stereo pair from a folder, whose scene.json names the photos, disparities and
-    calibration.
+    """Read a stereo pair from a folder.
+
+    The folder's scene.json names the photos, the disparities and the calibration.
 
     InputError if a file is missing or broken, or the photos differ in size.
     """
@@ -108,6 +112,7 @@ def load_pair(folder: Path) -> StereoPair:
         disparity_file = folder / facts["disparity"]
         calibration = read_calibration(scene_file)
 
+    # A pair is rectified: both photos have the same rows, and so the same size.
     left = load_photo(left_file).rgb
     right = load_photo(right_file).rgb
     if left.shape != right.shape:

@@ -34,6 +34,7 @@ def joined_ranks(device_kind: str) -> Iterator[torch.device]:
     Raises:
         InputError: the environment variables are set, but the processes cannot join.
     """
+    # torchrun starts one process for each GPU, and sets these variables in each.
     gpu_number = 0
     if "WORLD_SIZE" in os.environ:
         with as_input_error(
@@ -52,6 +53,7 @@ def joined_ranks(device_kind: str) -> Iterator[torch.device]:
     try:
         yield device
     finally:
+        # Without this, the other processes would wait for one that has failed.
         if dist.is_initialized():
             dist.destroy_process_group()
 
@@ -77,6 +79,7 @@ def sum_of_ranks(numbers: Mapping[str, float], device: torch.device) -> dict[str
 
     Every process must call this with the same names, in the same order.
     """
+    # One message for all numbers; float64, because counts must stay exact.
     sums = torch.tensor(list(numbers.values()), dtype=torch.float64, device=device)
     if rank_count() > 1:
         dist.all_reduce(sums)

@@ -24,8 +24,9 @@ T = TypeVar("T")
 
 
 def must_hold(message: str, condition: Callable[[Any], bool]) -> AfterValidator:
-    """A validator of pydantic that refuses a value for which `condition` is false, with this
-    message.
+    """A validator of pydantic that refuses a value for which `condition` is false.
+
+    The refusal says `message`.
     """
 
     def check(value: Any) -> Any:
@@ -42,9 +43,7 @@ def empty_section_as_defaults(value: object) -> object:
 
 
 def scientific_as_number(value: object) -> object:
-    """The number for a text such as 1e3, which YAML reads as text; other values stay as they
-    are.
-    """
+    """The number for a text such as 1e3, which YAML takes for text; other values unchanged."""
     if re.fullmatch(r"\d+(\.\d*)?[eE]\+?\d+", str(value)):
         return float(str(value))
     return value
@@ -108,8 +107,9 @@ class DataRecipe(RecipePart):
 
 
 class LossRecipe(RecipePart):
-    """Weights of the terms of eq. 12, and settings of the terms (paper, "Training Details and Loss
-    Weights").
+    """Weights of the terms of eq. 12, and their settings.
+
+    The values are the paper's ("Training Details and Loss Weights").
     """
 
     color: NonNegative = 10.0
@@ -140,8 +140,9 @@ class LossRecipe(RecipePart):
 
 
 class OptimRecipe(RecipePart):
-    """AdamW with a linear warm-up, then a cosine decay (paper, "Training Details and Loss
-    Weights").
+    """AdamW with a linear warm-up, then a cosine decay.
+
+    The values are the paper's ("Training Details and Loss Weights").
     """
 
     lr: Annotated[float, Field(gt=0, le=1)] = 1.6e-4
@@ -256,8 +257,7 @@ def load_recipe(kind: type[R], path: str | os.PathLike[str], overrides: Sequence
 
 
 def find_recipe(path: str | os.PathLike[str]) -> str | os.PathLike[str]:
-    """The file of a packaged recipe, given by its name, such as "cpu"; other paths stay as they
-    are.
+    """The file of a packaged recipe, given by its name, such as "cpu"; other paths unchanged.
 
     A file in the working directory goes before a packaged recipe of the same name. InputError if a
     plain name is neither.

@@ -1,6 +1,4 @@
-"""What happens at which step: learning rate, averaging of weights, choice of samples, reading of
-samples in advance.
-"""
+"""What happens at which step: learning rate, averaging of weights, choice of samples."""
 
 from __future__ import annotations
 
@@ -24,8 +22,7 @@ V = TypeVar("V")
 
 
 def learning_rate(step: int, optim: OptimRecipe) -> float:
-    """The learning rate at a step, counted from 0: a linear warm-up, then half a cosine down to
-    `optim.min_lr`.
+    """The learning rate at a step, counted from 0: a linear warm-up, then half a cosine.
 
     This is the paper's schedule ("Training Details and Loss Weights"):
 
@@ -42,8 +39,9 @@ def learning_rate(step: int, optim: OptimRecipe) -> float:
 
 
 def ema_decay(step: int, decay: float) -> float:
-    """The share of the old average in the moving average of the weights at a step; the new weights
-    get the rest.
+    """The share of the old average in the moving average of the weights at a step.
+
+    The new weights get the rest.
 
     The share grows from 1/10 at step 0 towards `decay`.
     """
@@ -67,6 +65,7 @@ def samples_of_step(
         rank: the number of the process, whose samples are returned.
         ranks: number of processes; they divide each batch evenly.
     """
+    # The processes take neighbouring parts of the batch.
     samples_per_rank = batch // ranks
     first = step * batch + rank * samples_per_rank
 
@@ -86,8 +85,7 @@ def order_of_epoch(seed: int, epoch: int, count: int) -> NDArray[np.int64]:
 
 
 def prefetch(make: Callable[[K], V], keys: Iterable[K], threads: int) -> Generator[V, None, None]:
-    """Yield `make(key)` for each key, in the order of the keys; threads compute the next values in
-    advance.
+    """Yield `make(key)` for each key, in order; threads compute the next values in advance.
 
     At most one value for each thread waits to be used, because more values would only take memory.
     """

@@ -271,8 +271,9 @@ def reverse_view_by_number(
     data: DataRecipe,
     renderer: Renderer,
 ) -> Sample:
-    """A random reverse view, in the form that `Source` asks for; the number `index` changes
-    nothing.
+    """A random reverse view of a photo, see `random_reverse_view`.
+
+    The number `index` is not used: `Source` passes it to all of its functions.
     """
     return random_reverse_view(rng, draw, data.disparity, renderer)
 
@@ -306,8 +307,9 @@ def random_reverse_view(
 def random_right_view(
     rng: np.random.Generator, folders: Sequence[Path], renderer: Renderer
 ) -> Sample:
-    """The lifted left photo of a random stereo pair at the right camera; the target is the right
-    photo.
+    """A training view from a random stereo pair, with the right photo as the target.
+
+    The left photo becomes Gaussians by its depth, which are rendered at the right camera.
     """
     pair = load_pair(pick_random(rng, folders))
     base = lift_rgbd(pair.left, pair.depth, pair.left_camera).gaussians

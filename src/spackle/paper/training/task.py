@@ -40,13 +40,15 @@ class Task(Protocol):
     validation_items: int
 
     def prepare(self, output: Path, reporter: Reporter) -> dict[str, Any]:
-        """Do all long preparations; returns facts about the data for run.json. Every process calls
-        this.
+        """Do all long preparations; returns facts about the data for run.json.
+
+        Every process of a run calls this.
         """
 
     def parameter_groups(self) -> list[dict[str, Any]]:
-        """The groups of weights that the optimiser trains: here a single group of all weights with
-        requires_grad.
+        """The groups of weights that the optimiser trains.
+
+        Here all weights with requires_grad are one group.
 
         A group is {"params": [weights]}, and may have an "lr_scale", a factor on the learning rate.
         """
@@ -64,14 +66,10 @@ class Task(Protocol):
         """The loss [] of a batch, with gradients, and the terms [] of the loss by name."""
 
     def measure(self, network: nn.Module, batch: Any) -> dict[str, list[float]]:
-        """Measure a network on a batch of validation items; returns the values of each measure by
-        name.
-        """
+        """Measure a network on validation items; returns the values of each measure by name."""
 
     def draw_picture(self, network: nn.Module) -> Tensor:
-        """A picture [H, W, 3] sRGB that shows the results of the network for a few validation
-        items.
-        """
+        """A picture [H, W, 3] sRGB of the network's results for a few validation items."""
 
     def export(self, network: nn.Module, path: Path) -> None:
         """Write the weights in the format that the package reads; InputError if that fails."""

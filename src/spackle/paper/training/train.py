@@ -1,5 +1,6 @@
-"""The training loop: `train` prepares a run, `run_steps` is the loop, `train_step` and
-`validate_and_save` its parts.
+"""The training loop.
+
+`train` prepares a run, `run_steps` is the loop, `train_step` and `validate_and_save` are its parts.
 
 A `Task` (task.py) defines the network, the data and the loss. Several processes, started by
 torchrun, train one network together (ranks.py): each step is divided between them, and process 0
@@ -9,8 +10,6 @@ writes all files.
 from __future__ import annotations
 
 import contextlib
-import copy
-import dataclasses
 import math
 import os
 import time
@@ -21,9 +20,7 @@ from typing import Any, TypeVar
 import torch
 from rich.console import Console
 from torch import Tensor, nn
-from torch.nn.parallel import DistributedDataParallel
 from torch.nn.utils import clip_grad_norm_
-from torch.optim import AdamW
 
 from spackle.formats import save_png
 from spackle.paper.training.checkpoint import (
@@ -31,9 +28,7 @@ from spackle.paper.training.checkpoint import (
     LAST_WEIGHTS,
     PICTURES_FOLDER,
     RUN_FILES,
-    RUN_REPORT,
     Checkpoint,
-    TrainingProgress,
     find_checkpoint,
     open_logs,
     remove_run,
@@ -47,11 +42,11 @@ from spackle.paper.training.ranks import (
     wait_for_ranks,
 )
 from spackle.paper.training.recipe import AnyRecipe
+from spackle.paper.training.run import TrainingRun, open_run
 from spackle.paper.training.schedule import ema_decay, learning_rate, prefetch, samples_of_step
 from spackle.paper.training.task import Task
-from spackle.runtime.device import hardware_facts, package_versions, pick_device
+from spackle.runtime.device import pick_device
 from spackle.runtime.errors import InputError, as_input_error
-from spackle.runtime.files import write_json
 from spackle.runtime.folders import results_folder
 from spackle.runtime.progress import Reporter, catch_stop_signals
 
@@ -62,65 +57,6 @@ END_MESSAGES = {
     "stopped": "stopped; the same command resumes the run",
 }
 R = TypeVar("R", bound=AnyRecipe)
-
-
-@dataclasses.dataclass
-class TrainingRun:
-    """A run in progress: its settings, and everything that a step changes."""
-
-    recipe: AnyRecipe
-    task: Task
-    device: torch.device
-    output: Path
-    reporter: Reporter
-    facts: dict[str, Any]  # for run.json: settings, data, versions, hardware
-    network: nn.Module  # the weights that the optimiser changes
-    average: nn.Module  # moving average of these weights, which is validated and exported
-    optimizer: AdamW
-    progress: TrainingProgress = dataclasses.field(default_factory=TrainingProgress)
-    is_stopped: bool = False  # whether any process has received Ctrl-C or SIGTERM
-    logs: Any = (
-        None  # TensorBoard's writer; None without TensorBoard, and in processes other than 0
-    )
-
-    def __post_init__(self) -> None:
-        """Let several processes average their gradients, by a wrapper around the network."""
-        self.wrapped = self.network
-        if rank_count() > 1:
-            self.wrapped = DistributedDataParallel(self.network)
-
-    def resume(self, checkpoint: Checkpoint) -> None:
-        """Continue from a checkpoint of this run; InputError if its network is another one."""
-        problem = (
-            "the checkpoint has another network ({reason}): choose another `output`, or `overwrite`"
-        )
-        with as_input_error(self.output, problem):
-            self.network.load_state_dict(checkpoint.network)
-            self.average.load_state_dict(checkpoint.average)
-            self.optimizer.load_state_dict(checkpoint.optimizer)
-        self.progress = checkpoint.progress
-
-    def end_reason(self) -> str | None:
-        """Why the run ends now, as a key of `END_MESSAGES`; None if it continues."""
-        if self.progress.step >= self.recipe.optim.steps:
-            return "steps"
-        if self.progress.stale >= self.recipe.run.patience:
-            return "patience"
-        return "stopped" if self.is_stopped else None
-
-    def write_report(self, ended: str | None = None) -> None:
-        """Write run.json: the facts of the run, why it ended (None: it goes on), and its
-        progress.
-        """
-        if rank() == 0:
-            report = {**self.facts, "ended": ended, **dataclasses.asdict(self.progress)}
-            write_json(report, self.output / RUN_REPORT)
-
-    def log_curves(self, group: str, values: Mapping[str, float]) -> None:
-        """Add a point to TensorBoard's curve of each value; `group` is "train" or "validation"."""
-        if self.logs is not None:
-            for name, value in values.items():
-                self.logs.add_scalar(f"{group}/{name}", value, self.progress.step)
 
 
 def train(
@@ -182,52 +118,8 @@ def train(
         return end_reason
 
 
-def open_run(
-    recipe: AnyRecipe,
-    task: Task,
-    device: torch.device,
-    output: Path,
-    reporter: Reporter,
-    facts: Mapping[str, Any],
-) -> TrainingRun:
-    """A run at step 0: the network on its device, a copy for the average, and the optimiser.
-
-    `facts`, from the task's preparation, come first in run.json; settings, versions and hardware
-    follow.
-    """
-    # Convolutions are faster if the channels of a pixel lie beside each other in memory.
-    network: nn.Module = task.network.to(
-        device,
-        memory_format=torch.channels_last,  # type: ignore[call-overload]
-    )
-    optim = recipe.optim
-    optimizer = AdamW(
-        task.parameter_groups(), optim.lr, betas=optim.betas, weight_decay=optim.weight_decay
-    )
-    return TrainingRun(
-        recipe=recipe,
-        task=task,
-        device=device,
-        output=output,
-        reporter=reporter,
-        facts={
-            **facts,
-            "method": task.name,
-            "aim": task.selection_measure,
-            "recipe": recipe.model_dump(mode="json"),
-            "processes": rank_count(),
-            "versions": package_versions(),
-            "hardware": hardware_facts(device),
-        },
-        network=network,
-        average=copy.deepcopy(network).requires_grad_(False),
-        optimizer=optimizer,
-    )
-
-
 def run_steps(run: TrainingRun) -> str:
-    """The loop: train step by step, log, validate and save, until the run ends; returns the reason
-    of the end.
+    """The loop: train step by step, log, validate and save, until the run ends.
 
     The reason is "steps", "patience" or "stopped", see `train`.
     """
@@ -349,9 +241,7 @@ def accumulate_gradients(run: TrainingRun, batches: Iterator[Any]) -> dict[str, 
 
 
 def items_of_passes(run: TrainingRun, step: int) -> list[list[int]]:
-    """Numbers of the items that this process uses at a step, divided into passes through the
-    network.
-    """
+    """Numbers of this process's items at a step, divided into passes through the network."""
     task = run.task
     items = samples_of_step(
         step, task.items, task.items_per_step, run.recipe.run.seed, rank(), rank_count()
@@ -361,8 +251,9 @@ def items_of_passes(run: TrainingRun, step: int) -> list[list[int]]:
 
 
 def update_weights(run: TrainingRun, step: int) -> float:
-    """Let the optimiser change the weights, then update their average; returns the learning rate of
-    the step.
+    """Let the optimiser change the weights, then update their average.
+
+    Returns the learning rate of the step.
     """
     optim = run.recipe.optim
     rate = learning_rate(step, optim)
@@ -419,8 +310,9 @@ def validate_and_save(run: TrainingRun, is_last_step: bool) -> None:
 
 
 def report_validation(run: TrainingRun, measures: Mapping[str, float], is_best: bool) -> None:
-    """Write the results of a validation: a picture, curves, a log line, run.json, and the weights
-    if they are the best.
+    """Write the results of a validation: a picture, curves, a log line and run.json.
+
+    If the averaged weights are the best so far, they are exported.
 
     `measures` are the means over all validation items by name.
     """
@@ -441,8 +333,9 @@ def report_validation(run: TrainingRun, measures: Mapping[str, float], is_best: 
 
 @torch.no_grad()
 def validate(task: Task, network: nn.Module, device: torch.device) -> dict[str, float]:
-    """Means of a task's measures over all validation items, by name; values that are not finite are
-    left out.
+    """Means of a task's measures over all validation items, by name.
+
+    Values that are not finite are left out.
 
     The processes divide the items, and each process gets the same means. A measure without finite
     values is missing.
