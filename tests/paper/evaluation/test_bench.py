@@ -38,7 +38,8 @@ STAGE_MS = {"base": 1000.0, "view": 400.0, "photo": 1.0, "completion": 13.0}
 
 
 def results(title: str = "Middlebury", factor: float = 1.0) -> Results:
-    """A run of three images, the second twice as slow and the third four times as slow, and one failed image."""
+    """A run of three images, the second twice as slow and the third four times as slow, and one
+    failed image."""
     config: dict[str, Any] = {
         "kind": "bench",
         "protocol": "bench",
@@ -82,7 +83,8 @@ def results(title: str = "Middlebury", factor: float = 1.0) -> Results:
 
 @pytest.mark.parametrize(("name", "count"), [("unet", 8_023_153), ("sharp-decoder", 8_022_894)])
 def test_the_networks_have_the_papers_parameters(name: str, count: int) -> None:
-    found, paper = bench.count_parameters(open_residual(name)), PAPER_PARAMETERS
+    found = bench.count_parameters(open_residual(name))
+    paper = PAPER_PARAMETERS
     assert (found["base"], found["residual"]) == (702_305_169, count)
     assert round(found["base"] / 1e6, 2) == paper.base_m
     assert round(found["residual"] / 1e6, 2) == paper.residual_m
@@ -103,10 +105,8 @@ def test_costs_are_joined_over_datasets_and_with_large_views() -> None:
     assert [*groups] == ["", *(f"S{k}: disparity 0.{k + 2}" for k in (1, 2, 3))]
     lines = [cells for rows in overhead.bodies for cells in rows]
     at = {cells[0]: k for k, cells in enumerate(lines) if cells[0]}
-    paper, spackle = (
-        ("Spackle, eqs. 2 to 9‡ (SHARP)", "10", "1.00"),
-        ("Spackle‡ (SHARP)", "40", "4.00"),
-    )
+    paper = ("Spackle, eqs. 2 to 9‡ (SHARP)", "10", "1.00")
+    spackle = ("Spackle‡ (SHARP)", "40", "4.00")
     large = ("Spackle‡ (rgbd)", "30", "50.00")
     for name, *found in (
         ("Middlebury", paper, spackle),
@@ -133,15 +133,16 @@ def test_costs_are_joined_over_datasets_and_with_large_views() -> None:
 
 
 def test_a_view_costs_what_a_completion_adds() -> None:
-    prediction, renderer = box_before_wall().lift(), get_renderer()
-    context, laps = FillContext(prediction.gaussians, prediction.camera, renderer), list[str]()
+    prediction = box_before_wall().lift()
+    context = FillContext(prediction.gaussians, prediction.camera, get_renderer())
+    stages: list[str] = []
     camera = large_views(prediction, (0.3,), 1280)[0].camera
     paper, spackle = (
-        len(bench.complete_view_in_stages(context, camera, laps.append, name))
+        len(bench.complete_view_in_stages(context, camera, stages.append, name))
         for name in TIMED_METHODS
     )
     assert spackle == len(fill_view(context, camera).aux) > paper > 64
-    assert laps == [*bench.BASE_STAGES[1:], *bench.COMPLETION_STAGES] * 2
+    assert stages == [*bench.BASE_STAGES[1:], *bench.COMPLETION_STAGES] * 2
 
 
 def test_points_suffice_and_without_depth_a_case_is_refused(scenes: Path) -> None:

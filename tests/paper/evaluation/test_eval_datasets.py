@@ -1,8 +1,10 @@
-"""Datasets of the evaluation: small trees in the official formats, projections of known points, and scales."""
+"""Datasets of the evaluation: small trees in the official formats, projections of known points,
+and scales."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 import shutil
 import struct
 from pathlib import Path
@@ -29,7 +31,9 @@ from spackle.paper.evaluation.options import EvaluateOptions
 from spackle.runtime.errors import InputError
 
 Array = NDArray[Any]
-WIDTH, HEIGHT, FOCAL = 48, 36, 40.0
+# Of the stored photos, in pixels.
+WIDTH, HEIGHT = 48, 36
+FOCAL = 40.0
 POINTS = np.array(
     [[x, y, 4 + 0.5 * x + 0.2 * y] for x in (-1.0, -0.3, 0.4, 1.1) for y in (-0.8, 0.0, 0.7)]
 )
@@ -37,7 +41,8 @@ POINTS = np.array(
 
 @dataclasses.dataclass(frozen=True)
 class Eye:
-    """A camera that uses no code of the package: OpenCV axes, the first pixel's corner is (0, 0)."""
+    """A camera that uses no code of the package: OpenCV axes, the first pixel's corner is (0,
+    0)."""
 
     at: tuple[float, float, float]
     turn: float = 0.0  # radians to the right
@@ -45,7 +50,8 @@ class Eye:
     @property
     def to_world(self) -> Array:
         """[4, 4], columns right, down, forward, eye."""
-        c, s = np.cos(self.turn), np.sin(self.turn)
+        c = np.cos(self.turn)
+        s = np.sin(self.turn)
         return np.array(
             [[c, 0, s, self.at[0]], [0, 1, 0, self.at[1]], [-s, 0, c, self.at[2]], [0, 0, 0, 1.0]]
         )
@@ -69,8 +75,9 @@ EYES = [
 def stored(name: str, scene: Path) -> Path:
     """A stored scene with photos of `WIDTH` by `HEIGHT`.
 
-    WildRGB-D's has the cameras `EYES`, with smaller distances; LLFF's, ETH3D's and Tanks and Temples' have `EYES` and,
-    as COLMAP models, `POINTS`; LLFF's photos have a quarter of the size in the poses.
+    WildRGB-D's has the cameras `EYES`, with smaller distances; LLFF's, ETH3D's and Tanks and
+    Temples' have `EYES` and, as COLMAP models, `POINTS`; LLFF's photos have a quarter of the size
+    in the poses.
     """
     return Path(shutil.copytree(DATA / "datasets" / name, scene))
 
@@ -148,9 +155,8 @@ def test_odd_poses_and_bent_lenses_are_refused(tmp_path: Path) -> None:
     cameras = stored("tanks", tmp_path / "tanks/Truck") / "sparse/0/cameras.bin"
     cameras.write_bytes(lens(2, FOCAL, WIDTH / 2, HEIGHT / 2, 0.4))
     assert "distorts the corners of photos: undistort" in error_of("tanks", tmp_path / "tanks")
-    cameras.write_bytes(
-        lens(2, 20 * FOCAL, WIDTH / 2, HEIGHT / 2, 0.4)
-    )  # the corners of a long lens are near the axis
+    # The corners of a long lens are near the axis.
+    cameras.write_bytes(lens(2, 20 * FOCAL, WIDTH / 2, HEIGHT / 2, 0.4))
     assert read_cases("tanks", tmp_path / "tanks")
     cameras.write_bytes(lens(5, *[1.0] * 8))
     assert "camera model 5 is not a pinhole" in error_of("tanks", tmp_path / "tanks")
@@ -159,10 +165,12 @@ def test_odd_poses_and_bent_lenses_are_refused(tmp_path: Path) -> None:
 def assert_pair(
     case: Case, disparity: float, z: float, x: int = 30, y: int = 9
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Check where the right camera sees the centre of a left pixel; returns the pixels with known depth, and K."""
+    """Check where the right camera sees the centre of a left pixel; returns the pixels with known
+    depth, and K."""
     assert case.camera is not None
     assert case.read_depth is not None
-    known, K = case.read_depth(), case.camera.K
+    known = case.read_depth()
+    K = case.camera.K
     assert bool(known.valid[y, x])
     point = case.camera.unproject(torch.tensor([x + 0.5, y + 0.5]), known.depth[y, x])
     uv, depth = case.second_views[0].camera.project(point)
@@ -184,10 +192,9 @@ def test_middlebury_2014(tmp_path: Path) -> None:
     assert [case.name for case in found] == ["Art", "Piano-perfect"]
     for case in found:
         valid, K = assert_pair(case, 5.0, FOCAL * 0.193001 / (5.0 + 3.5))
-        assert (float(K[0, 2]), bool(valid[0, 0])) == (
-            20.75,
-            False,
-        )  # in the file (0, 0) is the first pixel's middle
+        # In the file (0, 0) is the first pixel's middle.
+        assert float(K[0, 2]) == 20.75
+        assert not valid[0, 0]
     stored("middlebury", tmp_path / "trainingH/Art")
     assert "give a folder with a single size" in error_of("middlebury", tmp_path)
 
@@ -248,7 +255,8 @@ def test_points_land_on_their_pixels(name: str, tree: str, scale: float, tmp_pat
 
 
 def test_second_views_are_the_nearest_but_not_the_same(tmp_path: Path) -> None:
-    # Cameras at x = 0, 0.01, 0.3, 0.35, 0.4, 0.5, 3, and at 0.25 turned by one radian; the middle depth is 4.
+    # Cameras at x = 0, 0.01, 0.3, 0.35, 0.4, 0.5, 3, and at 0.25 turned by one radian; the middle
+    # depth is 4.
     stored("llff-beside", tmp_path / "fern")
     first = read_cases("llff", tmp_path)[0]
     assert [view.name for view in first.second_views if view.is_among_nearest] == [
@@ -300,35 +308,26 @@ def test_frames_are_spread_evenly() -> None:
         for group, n in (("apple", 200), ("box", 30), ("car", 5))
         for k in range(n)
     ]
-    more = spread_over_scenes(
-        scenes, lambda scene: range(300), 45
-    )  # with more scenes than frames each category gets its share
+    # With more scenes than frames each category gets its share.
+    more = spread_over_scenes(scenes, lambda scene: range(300), 45)
     assert list(more.values()) == [[150]] * 45
     assert list(more) == [*scenes[:20], *scenes[200:220], *scenes[230:]]
 
 
 def test_working_sizes_give_the_papers_dense_counts() -> None:
-    booster, wild, upright, tanks, llff = (
-        (4112, 3008),
-        (640, 480),
-        (480, 640),
-        (1920, 1080),
-        (1008, 756),
-    )
-    found = [
-        working_size(*stored)
-        for stored in (booster, wild, upright, tanks, llff, (6048, 4032), (6208, 4135))
+    # Width, height, and the paper's number of 2×2 cells; ETH3D's mean is 393,246.72.
+    stored_sizes = [
+        (4112, 3008, 431_616),  # Booster
+        (640, 480, 76_800),  # WildRGB-D
+        (480, 640, 76_800),
+        (1920, 1080, 331_776),  # Tanks and Temples
+        (1008, 756, 190_512),  # LLFF
+        (6048, 4032, 393_216),  # ETH3D
+        (6208, 4135, 393_216),
     ]
-    cells = [(width + 1) // 2 * ((height + 1) // 2) for width, height in found]
-    assert cells == [
-        431_616,
-        76_800,
-        76_800,
-        331_776,
-        190_512,
-        393_216,
-        393_216,
-    ]  # ETH3D's mean is 393,246.72
+    for stored_width, stored_height, cells in stored_sizes:
+        width, height = working_size(stored_width, stored_height)
+        assert math.ceil(width / 2) * math.ceil(height / 2) == cells
 
 
 def test_photos_and_cameras_are_brought_to_the_working_size(tmp_path: Path) -> None:
@@ -414,7 +413,8 @@ def test_bounds_are_the_last_resort_and_nothing_is_an_error() -> None:
 def test_a_second_camera_in_the_bases_world(
     turn: float, off: tuple[float, float], tolerance: float
 ) -> None:
-    base, scale = Camera.from_focal(40.0, 48, 36), 2.5
+    base = Camera.from_focal(40.0, 48, 36)
+    scale = 2.5
     K = base.K.clone()
     K[:2, 2] += torch.tensor(off)
     given = Camera(K, torch.eye(4), 48, 36).resized(96, 72)

@@ -1,4 +1,5 @@
-"""`spackle evaluate`: metrics as in scikit-image, tables with the paper's numbers, killed runs that resume."""
+"""`spackle evaluate`: metrics as in scikit-image, tables with the paper's numbers, killed runs
+that resume."""
 
 from __future__ import annotations
 
@@ -99,7 +100,8 @@ def test_variants_are_pinned_and_no_weights_are_downloaded(monkeypatch: pytest.M
         {"net": "alex", "version": "0.1"},
         {"pretrained": "koniq10k"},
     )
-    picture, truth = torch.full((5, 7, 3), 1.5), torch.full((5, 7, 3), 0.25)
+    picture = torch.full((5, 7, 3), 1.5)
+    truth = torch.full((5, 7, 3), 0.25)
     picture[0, 1, 2] = 0.0
     assert metrics["lpips"](picture, truth) == pytest.approx(104 / 105)
     first, second = seen[0]
@@ -162,8 +164,9 @@ def test_the_near_view_tables_have_the_papers_layout_and_numbers() -> None:
     }
     near, ablation, _ = make_tables([results("Booster", True, lambda image: figures)])
     assert [tuple(row[:5]) for row in near.bodies[0]] == [
-        ("dense grid‡ (rgbd)", "", "", "0.2500", ""), ("Spackle, eqs. 2 to 9‡ (rgbd)", "", "", "0.1250", "")
-    ]  # fmt: skip
+        ("dense grid‡ (rgbd)", "", "", "0.2500", ""),
+        ("Spackle, eqs. 2 to 9‡ (rgbd)", "", "", "0.1250", ""),
+    ]
     assert [row[-1] for row in near.bodies[1]] == ["0.7154", "0.7325", "0.7180"]
     assert near.notes[0].startswith("Views: all other photos")
     dense, guided, *papers = cells(ablation, "Booster")
@@ -208,10 +211,8 @@ def test_runs_with_different_disparities_share_no_table() -> None:
 
 
 def test_a_table_as_markdown_and_latex() -> None:
-    heads, bodies = (
-        [("", "A"), ("both", "B"), ("both", "C")],
-        [[("x_1", "**1**", "a|b")], [("", "2", "±<3")]],
-    )
+    heads = [("", "A"), ("both", "B"), ("both", "C")]
+    bodies = [[("x_1", "**1**", "a|b")], [("", "2", "±<3")]]
     table = Table("tab:x", "X", "Ours & theirs, 5 %.", heads, bodies, notes=("n.",))
     assert "| A | both: B | both: C |\n|---|---|---|\n| x_1 | **1** | a\\|b |" in to_markdown(table)
     assert "\\label{tab:x:one}" in to_latex(table, ":one")
@@ -226,7 +227,8 @@ def test_a_table_as_markdown_and_latex() -> None:
 
 
 def test_each_method_starts_from_the_same_base() -> None:
-    prediction, renderer = box_before_wall().lift(), get_renderer()
+    prediction = box_before_wall().lift()
+    renderer = get_renderer()
     context = FillContext(prediction.gaussians, prediction.camera, renderer)
     cameras = [shifted(prediction.camera, side) for side in (0.4, -0.4)]
     renderings = [renderer.render(context.base, camera) for camera in cameras]
@@ -321,9 +323,8 @@ def test_large_views_from_files_to_tables(
     assert done.code == 0, done.err
     assert names_in(tmp_path) == OUTPUTS
     found = load_run(tmp_path)
-    ending = [
-        line.split() for line in done.lines[-2 - 2 * len(found.methods) :]
-    ]  # a table of means, and the folder
+    # A table of means with two settings and a line of heads, and a line with the folder.
+    ending = [line.split() for line in done.lines[-2 - 2 * len(found.methods) :]]
     assert ending[0] == ["NIQE", "↓", "MUSIQ", "↑", "HAR", "↓", "added", "GS"]
     niqe, har = (f"{mean_of(found, '0.3', 'base', metric):.4f}" for metric in ("niqe", "har"))
     assert ending[1] == ["S1", "base", "(rgbd)", niqe, har, "0"]
@@ -348,7 +349,8 @@ def test_metrics_are_added_to_a_finished_run(
     scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     words = ("--protocol", "near-view", "--methods", "base,initial", "--limit", 2)
-    once, later = tmp_path / "once", tmp_path / "later"
+    once = tmp_path / "once"
+    later = tmp_path / "later"
     monkeypatch.setitem(sys.modules, "pyiqa", None)
     assert evaluate(scenes, later, *words, "--metrics", "ssim,dists").code == 0
     assert "DISTS not run: pyiqa is not installed" in (later / "tables.md").read_text()
@@ -372,7 +374,8 @@ def test_metrics_are_added_to_a_finished_run(
 
 
 def test_a_broken_image_is_named_and_the_others_are_measured(scenes: Path, tmp_path: Path) -> None:
-    root, output = tmp_path / "data", tmp_path / "out"
+    root = tmp_path / "data"
+    output = tmp_path / "out"
     shutil.copytree(scenes, root)
     photo = root / "Chair" / "left.png"
     choices = ("--methods", "base", "--metrics", "none", "--disparity", "0.3")
@@ -401,7 +404,9 @@ def test_a_run_resumes_to_the_same_bytes_and_runs_share_tables(
     scenes: Path, tmp_path: Path
 ) -> None:
     choices = ("--methods", "base,initial", "--metrics", "none", "--disparity", "0.3,0.5")
-    one, two, both = tmp_path / "one", tmp_path / "two", tmp_path / "both"
+    one = tmp_path / "one"
+    two = tmp_path / "two"
+    both = tmp_path / "both"
     assert evaluate(scenes, one, *choices).code == 0
     stopped = shutil.copytree(one, tmp_path / "stopped")
     for name in ("rows.jsonl", "images/00002-Door.json"):

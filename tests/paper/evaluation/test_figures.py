@@ -14,7 +14,8 @@ from PIL import Image
 
 
 def check_latex(*files: Path) -> None:
-    """Braces and environments are closed, labels are unique, and all rows of a table have the same columns."""
+    """Braces and environments are closed, labels are unique, and all rows of a table have the
+    same columns."""
     text = "\n".join(file.read_text(encoding="utf-8") for file in files)
     bare = re.sub(r"\\[\\{}%]", "", text)
     depths = np.cumsum([(sign == "{") - (sign == "}") for sign in bare])
@@ -37,33 +38,17 @@ def check_latex(*files: Path) -> None:
 def test_both_figures_and_all_tables_are_latex(tmp_path: Path) -> None:
     data, large, near, bench = (tmp_path / name for name in ("data", "large", "near", "bench"))
     write_boxes(data / "Ball_1", 0)
-    tiny, words = (
-        write_tiny(tmp_path / "sharp.safetensors", MICRO_SIZE),
-        (data, "--dataset", "middlebury"),
-    )
+    tiny = write_tiny(tmp_path / "sharp.safetensors", MICRO_SIZE)
+    words = (data, "--dataset", "middlebury")
     sharp = ("--base", "sharp", "-c", tiny, "--precision", "fp32", "--metrics", "none")
     choices = ("--methods", "base,paper,direct-ft", "--direct-ft", tiny, "--disparity", "0.6")
     done = run("evaluate", *words, *sharp, *choices, "-o", large)
     assert done.code == 0, done.err
-    assert (
-        run(
-            "evaluate",
-            *words,
-            "--base",
-            "rgbd",
-            "--protocol",
-            "near-view",
-            "--metrics",
-            "psnr",
-            "-o",
-            near,
-        ).code
-        == 0
-    )
-    assert (
-        run("bench", *words, "--base", "rgbd", "--runs", 1, "--disparity", "0.6", "-o", bench).code
-        == 0
-    )
+    rgbd = ("--base", "rgbd")
+    near_choices = ("--protocol", "near-view", "--metrics", "psnr")
+    assert run("evaluate", *words, *rgbd, *near_choices, "-o", near).code == 0
+    bench_choices = ("--runs", 1, "--disparity", "0.6")
+    assert run("bench", *words, *rgbd, *bench_choices, "-o", bench).code == 0
     done = run("figures", large, near, "-o", tmp_path / "figures")
     assert done.code == 0, done.err
     kinds = {f"{name}.{end}" for name in ("comparison", "direct_ft") for end in ("pdf", "png")}
@@ -73,9 +58,8 @@ def test_both_figures_and_all_tables_are_latex(tmp_path: Path) -> None:
     for name in ("comparison", "direct_ft"):
         with Image.open(tmp_path / "figures" / f"{name}.png") as picture:
             sizes.append(picture.size)
-    assert sizes[0][0] == pytest.approx(
-        sizes[1][0], rel=0.03
-    )  # three columns and five of one width
+    # Three columns and five have the same width together.
+    assert sizes[0][0] == pytest.approx(sizes[1][0], rel=0.03)
     assert sizes[0][1] > sizes[1][1]
     done = run("tables", large, near, bench, "-o", tmp_path / "tables")
     assert done.code == 0, done.err

@@ -1,4 +1,5 @@
-"""The report is a well-formed page without addresses, escapes names, contains all cells, and has reproducible bytes."""
+"""The report is a well-formed page without addresses, escapes names, contains all cells, and has
+reproducible bytes."""
 
 from __future__ import annotations
 
@@ -55,7 +56,8 @@ class Page(HTMLParser):
 
 def results(near: bool) -> Results:
     def numbers(method: str, scene: int) -> dict[str, float | None]:
-        before, rank = 0.05 + 0.01 * scene, METHODS.index(method)
+        before = 0.05 + 0.01 * scene
+        rank = METHODS.index(method)
         found: dict[str, float | None] = {
             "har_before": before,
             "har": before if method == "base" else 0.0,
@@ -85,7 +87,8 @@ def test_a_page_is_well_formed_and_contains_everything(tmp_path: Path) -> None:
     sources = [(one, tmp_path) for one in runs]
     text = make_report(sources)
     assert text == make_report(sources)
-    page, tables = Page(text), make_tables(runs)
+    page = Page(text)
+    tables = make_tables(runs)
     plots = (str(image["src"]) for image in page.named("img") if image.get("class") == "plot")
     drawings = [ElementTree.fromstring(base64.b64decode(plot.partition(",")[2])) for plot in plots]
     assert len(drawings) == 3  # near views: PSNR, distance; large views: holes
@@ -115,22 +118,17 @@ def test_a_page_is_well_formed_and_contains_everything(tmp_path: Path) -> None:
 def test_evaluate_and_tables_write_the_report(
     scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    out, words = (
-        tmp_path / "out",
-        ("--dataset", "middlebury", "--base", "rgbd", "--protocol", "near-view"),
-    )
+    out = tmp_path / "out"
+    words = ("--dataset", "middlebury", "--base", "rgbd", "--protocol", "near-view")
     choices = (
         "evaluate",
         scenes,
         *words,
         "-o",
         out,
-        "--methods",
-        "base,initial",
-        "--metrics",
-        "psnr",
-        "--limit",
-        2,
+        *("--methods", "base,initial"),
+        *("--metrics", "psnr"),
+        *("--limit", 2),
     )
     assert run(*choices, "--html").code == 0
     text = (out / "report.html").read_text(encoding="utf-8")
@@ -139,9 +137,8 @@ def test_evaluate_and_tables_write_the_report(
     assert run("tables", out, "-o", tmp_path / "again", "--html").code == 0
     whole = (tmp_path / "again" / "report.html").read_text(encoding="utf-8")
     assert whole.partition('id="tables"')[0] == text.partition('id="tables"')[0]
-    assert "Efficiency and Gaussian overhead" in Page(whole).text(
-        "figcaption"
-    )  # a table of the paper without our rows
+    # A table of the paper without our rows.
+    assert "Efficiency and Gaussian overhead" in Page(whole).text("figcaption")
     find = importlib.util.find_spec
     monkeypatch.setattr(
         importlib.util, "find_spec", lambda name: None if name == "matplotlib" else find(name)
