@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import sys
+import types
 from pathlib import Path
 
 import pytest
@@ -24,6 +26,7 @@ from spackle.residual.initializer import sample_photo
 from spackle.residual.network import ResidualNet
 from spackle.residual.sharp_decoder import SharpDecoder
 from spackle.runtime.errors import InputError
+from spackle.scene_fill import fill_view
 from spackle.scene_fill.unet import UNet
 from spackle.scene_fill.view_completion import SceneViewCompletion
 from spackle.weights.checkpoints import read_tensors, to_channels_last
@@ -143,6 +146,48 @@ def test_a_loaded_network_equals_the_saved_one(name: str, tmp_path: Path) -> Non
         save_file(tensors, path, {NOTE: wrong})
         with pytest.raises(InputError, match=said):
             load_residual(path)
+
+
+class TwoLayers(ResidualNet):
+    """A network of another package."""
+
+    name = "tests_own_network:TwoLayers"
+    inputs = ("rgb", "initial")
+    local = False
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.first = torch.nn.Conv2d(7, 8, 3, padding=1)
+        self.last = torch.nn.Conv2d(8, DELTA_CHANNELS, 1)
+
+    def forward(self, features: torch.Tensor) -> torch.Tensor:
+        deltas: torch.Tensor = self.last(self.first(features).relu())
+        return deltas
+
+
+def test_a_network_of_another_package_is_trained_saved_and_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module = types.ModuleType("tests_own_network")
+    vars(module).update(TwoLayers=TwoLayers, types=types)
+    path = tmp_path / "weights.safetensors"
+    tensors = {key: value.contiguous() for key, value in TwoLayers().state_dict().items()}
+    save_file(tensors, path, {NOTE: TwoLayers.name})
+    with pytest.raises(InputError, match="unknown architecture tests_own_network:TwoLayers"):
+        load_residual(path)  # a file must not import modules
+
+    monkeypatch.setitem(sys.modules, "tests_own_network", module)
+    assert isinstance(first_network(TwoLayers.name), TwoLayers)
+    assert isinstance(first_network(TwoLayers.name, path), TwoLayers)
+    loaded = load_residual(path)
+    context, camera = box_view()
+    deltas = view_of(context.base, camera, context.photo_camera).deltas(loaded)
+    assert deltas is not None
+    assert deltas.any()
+    assert len(fill_view(dataclasses.replace(context, network=loaded), camera).aux) > 100
+    for wrong in ("tests_own_network:types", "no_such_module:Net", "nonsense"):
+        with pytest.raises(InputError, match="`network`"):
+            open_residual(wrong)
 
 
 def test_colours_of_the_photo_at_projected_points() -> None:

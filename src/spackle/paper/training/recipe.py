@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from spackle.core.trajectories import MAX_DISPARITY
+from spackle.residual.architectures import ARCHITECTURES
 from spackle.runtime.device import Precision
 from spackle.runtime.errors import InputError, as_input_error
 from spackle.runtime.files import check_file
@@ -187,8 +188,15 @@ class Recipe(AnyRecipe):
 
     data: Section[DataRecipe] = DataRecipe()
     loss: Section[LossRecipe] = LossRecipe()
-    # Architecture of the residual.
-    network: Annotated[Literal["unet", "sharp-decoder"], MAY_CHANGE_ON_RESUME] = "unet"
+    # Architecture of the residual: a built-in name, or a class of another package.
+    network: Annotated[
+        str,
+        must_hold(
+            f"must be {', '.join(ARCHITECTURES)} or package.module:Class",
+            lambda name: name in ARCHITECTURES or ":" in name,
+        ),
+        MAY_CHANGE_ON_RESUME,
+    ] = "unet"
     init: Path | None = None  # initial weights; sharp-decoder also takes SHARP's checkpoint
 
 
