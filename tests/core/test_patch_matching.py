@@ -1,4 +1,4 @@
-"""Patch matching: its kernels against plain twins, textures that it continues, and what could break it."""
+"""Patch matching: kernels against plain twins, textures that continue, and extreme holes."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from helpers.plain_patches import Subject
 from helpers.scenes import psnr
 from torch import Tensor
 
-from spackle.core import patch_matching
 from spackle.core.patch_matching import NEIGHBOR_STEPS, match_patches
+from spackle.core.patch_search import improve_matches, patch_cost
 
 Y, X = np.indices((100, 117))
 WALL = torch.ones(Y.shape)
@@ -26,16 +26,15 @@ def test_costs_match_the_formula_and_searches_approach_the_minimum(size: tuple[i
     cells, places, costs = subject.cells, subject.places, subject.costs
     assert set(places[:, 0]) == {0, 1}
     np.testing.assert_allclose(costs, subject.expected(), rtol=1e-4)
-    ask = (*subject.target[:2], subject.level.traits, *subject.target[3:], *cells[7], *places[7])
-    assert [patch_matching._cost(*ask, costs[7] * np.float32(k)) for k in (1.01, 0.99)] == [
-        costs[7],
-        np.inf,
-    ]
+    for factor, expected in ((1.01, costs[7]), (0.99, np.inf)):
+        limit = costs[7] * np.float32(factor)
+        assert patch_cost(subject.inputs, *cells[7], *places[7], limit) == expected
     for turn in range(24):
-        jump, before = NEIGHBOR_STEPS[turn % len(NEIGHBOR_STEPS)], (places.copy(), costs.copy())
-        state = (*before, subject.valid, subject.pool, jump, np.uint32(turn * 7919))
-        patch_matching._search(
-            0, len(costs), cells, subject.numbers, *state, *subject.target, places, costs
+        step = NEIGHBOR_STEPS[turn % len(NEIGHBOR_STEPS)]
+        before = (places.copy(), costs.copy())
+        state = (*before, subject.valid, subject.pool, step, np.uint32(turn * 7919))
+        improve_matches(
+            0, len(costs), cells, subject.numbers, *state, subject.inputs, places, costs
         )
         assert (costs <= before[1]).all()
     np.testing.assert_allclose(costs, subject.expected(), rtol=1e-4)

@@ -1,4 +1,4 @@
-"""The costs of `spackle.core.patch_matching` by NumPy, for all patches of a cell at once."""
+"""The costs of `spackle.core.patch_search` by NumPy, for all patches of a cell at once."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from numpy.lib.stride_tricks import sliding_window_view as windows
 
-from spackle.core import patch_matching
 from spackle.core.filters import gaussian_blur
-from spackle.core.patch_matching import PATCH_RADIUS, PATCH_SIDE
+from spackle.core.patch_matching import _build_pyramid
+from spackle.core.patch_search import PATCH_RADIUS, PATCH_SIDE, CostInputs, score_matches
 
 INNER = slice(PATCH_RADIUS, -PATCH_RADIUS)
 
@@ -23,7 +23,7 @@ class Subject:
         hole = torch.zeros(height, width, dtype=torch.bool)
         hole[height // 3 : height // 2, width // 3 : width // 2] = hole[-height // 5 :, -3:] = True
         z = torch.linspace(-1.5, 0, width) + 0.1 * rgb[..., 0]
-        self.level = patch_matching._pyramid(rgb, hole, z.exp())[0]
+        self.level = _build_pyramid(rgb, hole, z.exp())[0]
         self.hole, self.cells = hole.numpy(), hole.nonzero().numpy().astype(np.int32)
         self.numbers = np.where(hole, hole.flatten().cumsum(0).view_as(hole) - 1, -1).astype(
             np.int32
@@ -34,11 +34,9 @@ class Subject:
         self.pool = np.argwhere(usable).astype(np.int32)
         grids = (self.level.rgb, self.level.traits, usable)
         self.sources, traits, self.valid = (np.stack([grid, grid[:, ::-1]]) for grid in grids)
-        self.padded, step = (
-            np.pad(self.level.rgb, [(PATCH_RADIUS, PATCH_RADIUS)] * 2 + [(0, 0)]),
-            0.05 / max(height, width) ** 2,
-        )
-        self.target = (
+        self.padded = np.pad(self.level.rgb, [(PATCH_RADIUS, PATCH_RADIUS)] * 2 + [(0, 0)])
+        step = 0.05 / max(height, width) ** 2
+        self.inputs = CostInputs(
             self.padded,
             self.level.weights,
             self.level.traits,
@@ -56,7 +54,7 @@ class Subject:
         every = np.argwhere(self.valid).astype(np.int32)
         self.places = every[:: len(every) // len(self.cells)][: len(self.cells)]
         self.costs = np.empty(len(self.cells), np.float32)
-        patch_matching._score(0, len(self.cells), self.cells, self.places, *self.target, self.costs)
+        score_matches(0, len(self.cells), self.cells, self.places, self.inputs, self.costs)
 
     def formula(self, y: int, x: int) -> np.ndarray:
         """Costs [2, height, width] of all patches and mirrored patches; infinite for patches that

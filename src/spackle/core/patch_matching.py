@@ -1,15 +1,18 @@
-"""PatchMatch (Barnes et al. 2009, Wexler et al. 2007): fill a hole by patches of the picture, from coarse to fine.
+"""PatchMatch (Barnes et al. 2009, Wexler et al. 2007): fill a hole by patches of the picture.
 
-The cost of the patch at q for a cell p of the hole, with colours I, log inverse depth z and blurred colours L, is
+It works from coarse to fine. The cost of the patch at q for a pixel p of the hole, with colours I,
+log inverse depth z and blurred colours L, is
 
     mean |I(p + o) - I(q + o)|²  +  (0.15 dz / σz)²  +  2 |L(p) - L(q)|²  +  0.05 (|p - q| / size)²
+
+`match_patches` is the entry; `_LevelSearch` finds the patches at one resolution, by the kernels of
+`patch_search.py`.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -24,28 +27,37 @@ from spackle.core.filters import (
     maximum_filter,
     nearest_known_pixels,
 )
+from spackle.core.patch_search import (
+    PATCH_RADIUS,
+    CostInputs,
+    improve_matches,
+    score_matches,
+    start_matches,
+    vote_colors,
+)
 from spackle.runtime.device import parallel_for_chunks
-from spackle.runtime.kernels import kernel, reordering_kernel
+from spackle.runtime.kernels import kernel
 
-PATCH_RADIUS = 3  # patches have 7×7 cells
-PATCH_SIDE = 2 * PATCH_RADIUS + 1
-COARSEST = 48  # least short side of a level, in cells
-ROUNDS = 6  # number of searches and votes at each level
-NEIGHBOR_STEPS = (4, 1)  # distances, in cells, to the neighbours whose matches a search tries
-TONE_BLUR_CELLS = 4.0  # standard deviation, in cells, of the blur that makes the tone L
-FADING = 0.8  # a cell's weight in a patch is 0.8^d at a depth of d cells in the hole
-FAINTEST_CELL = np.float32(1e-30)  # least weight of a cell
-DEPTH_WEIGHT, TONE_WEIGHT, OFFSET_WEIGHT = 0.15, math.sqrt(2), 0.05
-LEAST_SPREAD = 0.05  # least σz; the depth of a wall that faces the camera hardly varies
-SAME_SURFACE = 0.25  # greatest difference in z / σz between a cell and its mirror image
-MIN_VOTE_WEIGHT, MIN_MEAN_COST = 1e-6, 1e-8
+MIN_COARSEST_SIDE_PX = 48  # short side of the coarsest level; patches need room around the hole
+SEARCH_ROUNDS = 6  # number of searches and votes at each level
+NEIGHBOR_STEPS = (4, 1)  # distances, in pixels, to the neighbours whose matches a search tries
+SEED_STEP = 7919  # a prime, by which the random numbers of searches differ
+
+TONE_BLUR_CELLS = 4.0  # standard deviation, in pixels, of the blur that makes the tone L
+MIN_TONE_BLUR_PX = 0.5  # the same at the coarsest levels
+DEPTH_WEIGHT = 0.15
+TONE_WEIGHT = math.sqrt(2)
+DISTANCE_WEIGHT = 0.05
+MIN_DEPTH_SPREAD = 0.05  # least σz; the depth of a wall that faces the camera hardly varies
+
+FADING_PER_PX = 0.8  # a pixel's weight in a patch is 0.8^d at a depth of d pixels in the hole
+MIN_PIXEL_WEIGHT = np.float32(1e-30)  # a patch deep in a hole still has a mean
+SAME_SURFACE_DEPTH = 0.25  # greatest difference in z / σz between a pixel and its mirror image
+MIN_MEAN_COST = 1e-8  # votes divide by the mean cost
 
 Floats = NDArray[np.float32]
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int32]
-# The best patches for the n cells of a hole: numbers of the cells [h, w], -1 outside of the hole; source, row and
-# column of each patch's centre [n, 3]; costs [n].
-Matches = tuple[Ints, Ints, Floats]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,8 +65,10 @@ class Patches:
     """A picture whose hole is filled by patches of its known part."""
 
     rgb: Tensor  # [H, W, 3] sRGB; unchanged outside of the hole
-    mismatch: Tensor  # [H, W] root of the cost of each cell's patch; 0 outside of the hole
-    matches: Tensor  # [H, W, 3] picture (1: mirrored), row and column of each cell's patch; -1 outside of the hole
+    mismatch: Tensor  # [H, W] root of the cost of each pixel's patch; 0 outside of the hole
+    # [H, W, 3] source (1: the mirrored picture), row and column of the centre of each pixel's
+    # patch; −1 outside of the hole
+    matches: Tensor
 
 
 def match_patches(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> Patches:
@@ -63,294 +77,273 @@ def match_patches(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> Patches
     Args:
         guess: [H, W, 3] sRGB, with smooth colours in the hole.
         hole: [H, W] bool.
-        inverse_depth: [H, W], positive everywhere.
+        inverse_depth: [H, W], positive everywhere; patches come from a similar depth.
     """
-    levels = _pyramid(guess.detach().float(), hole, inverse_depth.detach().float())
+    levels = _build_pyramid(guess.detach().float(), hole, inverse_depth.detach().float())
     matches = None
-    for number in reversed(range(len(levels))):
-        matches = _match(levels[number], matches, number)
-    mismatch, places = np.zeros(hole.shape, np.float32), np.full((*hole.shape, 3), -1, np.int32)
+    for number in reversed(range(len(levels))):  # the coarsest level first
+        matches = _match_level(levels[number], matches, number)
+
+    finest = levels[0]
+    mismatch = np.zeros(hole.shape, np.float32)
+    positions = np.full((*hole.shape, 3), -1, np.int32)
     if matches is not None:
-        _, places[levels[0].hole], costs = matches
-        mismatch[levels[0].hole] = np.sqrt(costs)
-    return Patches(*(torch.from_numpy(grid) for grid in (levels[0].rgb, mismatch, places)))
+        positions[finest.hole] = matches.positions
+        mismatch[finest.hole] = np.sqrt(matches.costs)
+    return Patches(
+        rgb=torch.from_numpy(finest.rgb),
+        mismatch=torch.from_numpy(mismatch),
+        matches=torch.from_numpy(positions),
+    )
 
 
 @dataclasses.dataclass(frozen=True)
 class _Level:
-    """One level of the pyramid, h × w cells."""
+    """One level of the pyramid, h × w pixels."""
 
-    rgb: Floats  # [h, w, 3]; votes change the hole's cells in place
+    rgb: Floats  # [h, w, 3]; votes change the hole's pixels in place
     traits: Floats  # [h, w, 4] tone and depth, scaled so that squared differences are costs
     hole: Bools  # [h, w]
-    weights: Floats  # [h + 6, w + 6] weights of cells in a patch; 0 beyond the picture
+    weights: Floats  # [h + 6, w + 6] weights of pixels in a patch; 0 beyond the picture
 
 
-def _pyramid(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> list[_Level]:
-    """Build the pyramid, finest level first."""
-    depth = inverse_depth.clamp_min(1e-9).log()[..., None]
-    depth = depth / max(
-        float(depth[~hole].std(correction=0)) if bool((~hole).any()) else 0.0, LEAST_SPREAD
-    )
-    rgb, tone, levels = guess.clone(memory_format=torch.contiguous_format), guess, list[_Level]()
-    _mirror(rgb.numpy(), hole.numpy(), depth[..., 0].numpy(), nearest_known_pixels(hole.numpy()))
+def _build_pyramid(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> list[_Level]:
+    """Reduce the picture by half as often as patches have room; returns the finest level first.
+
+    Args:
+        guess: [H, W, 3] float32 sRGB.
+        hole: [H, W] bool.
+        inverse_depth: [H, W] float32.
+    """
+    depth = _relative_log_depth(inverse_depth, hole)  # [H, W, 1]
+    tone = guess
+    rgb = guess.clone(memory_format=torch.contiguous_format)
+    nearest = nearest_known_pixels(hole.numpy())
+    _mirror_into_hole(rgb.numpy(), hole.numpy(), depth[..., 0].numpy(), nearest)
+
+    levels: list[_Level] = []
     while True:
-        traits = [
-            TONE_WEIGHT * gaussian_blur(tone, max(TONE_BLUR_CELLS / 2 ** len(levels), 0.5)),
-            DEPTH_WEIGHT * depth,
-        ]
-        weights = np.zeros([size + 2 * PATCH_RADIUS for size in hole.shape], np.float32)
-        inside = distance_to_nearest(nearest_known_pixels(hole.numpy())).numpy()
-        weights[PATCH_RADIUS:-PATCH_RADIUS, PATCH_RADIUS:-PATCH_RADIUS] = np.maximum(
-            np.float32(FADING) ** inside, FAINTEST_CELL
+        tone_blur = max(TONE_BLUR_CELLS / 2 ** len(levels), MIN_TONE_BLUR_PX)
+        traits = [TONE_WEIGHT * gaussian_blur(tone, tone_blur), DEPTH_WEIGHT * depth]
+        level = _Level(
+            rgb=rgb.contiguous().numpy(),
+            traits=torch.cat(traits, dim=-1).contiguous().numpy(),
+            hole=hole.numpy(),
+            weights=_pixel_weights(hole.numpy()),
         )
-        picture, marks = (image.contiguous().numpy() for image in (rgb, torch.cat(traits, dim=-1)))
-        levels.append(_Level(picture, marks, hole.numpy(), weights))
+        levels.append(level)
+
+        # A reduced pixel belongs to the hole if any of its four pixels does.
         coarse_hole = avg_pool2d(hole[None].float(), 2, ceil_mode=True)[0] > 0
-        if min(hole.shape) < 2 * COARSEST or bool(coarse_hole.all()) or not bool(hole.any()):
+        is_small = min(hole.shape) < 2 * MIN_COARSEST_SIDE_PX
+        if is_small or bool(coarse_hole.all()) or not bool(hole.any()):
             return levels
-        planes = (image.permute(2, 0, 1) for image in (rgb, tone, depth))
-        means = (avg_pool2d(plane, 2, ceil_mode=True, count_include_pad=False) for plane in planes)
-        rgb, tone, depth = (mean.permute(1, 2, 0) for mean in means)
+        rgb = _reduce_by_half(rgb)
+        tone = _reduce_by_half(tone)
+        depth = _reduce_by_half(depth)
         hole = coarse_hole
 
 
+def _relative_log_depth(inverse_depth: Tensor, hole: Tensor) -> Tensor:
+    """log inverse depth [H, W, 1] in units of its standard deviation at the known pixels."""
+    log_depth = inverse_depth.clamp_min(1e-9).log()[..., None]
+    spread = 0.0
+    if bool((~hole).any()):
+        spread = float(log_depth[~hole].std(correction=0))
+    return log_depth / max(spread, MIN_DEPTH_SPREAD)
+
+
+def _pixel_weights(hole: Bools) -> Floats:
+    """Weights [h + 6, w + 6] of the pixels in a patch, with three zeros beyond each side.
+
+    Known pixels have the weight 1. The guess deep in a hole [h, w] is unreliable, and counts less.
+    """
+    distance = distance_to_nearest(nearest_known_pixels(hole)).numpy()
+    weights = np.maximum(np.float32(FADING_PER_PX) ** distance, MIN_PIXEL_WEIGHT)
+    return np.pad(weights.astype(np.float32, copy=False), PATCH_RADIUS)
+
+
+def _reduce_by_half(image: Tensor) -> Tensor:
+    """Means of 2×2 pixels of an image [h, w, C]; fewer pixels at an odd border."""
+    planes = image.permute(2, 0, 1)
+    means = avg_pool2d(planes, 2, ceil_mode=True, count_include_pad=False)
+    return means.permute(1, 2, 0)
+
+
 @kernel
-def _mirror(rgb: Any, hole: Any, depth: Any, near: Any) -> None:
-    """Fill each hole cell, in place, with its mirror image about the nearest known cell, if both depths are similar."""
+def _mirror_into_hole(rgb: Any, hole: Any, depth: Any, nearest: Any) -> None:
+    """Fill each hole pixel, in place, with its mirror image about the nearest known pixel.
+
+    A mirrored texture is a better start of the search than a smooth guess. The pixel is left alone
+    if its mirror image is unknown or lies on another surface.
+
+    Args:
+        rgb: [h, w, 3] changed in the hole.
+        hole: [h, w] bool.
+        depth: [h, w] log inverse depth in units of its standard deviation.
+        nearest: [2, h, w] row and column of the nearest known pixel.
+    """
     height, width = hole.shape
     for y in range(height):
         for x in range(width):
-            if hole[y, x]:
-                v, u = 2 * near[0, y, x] - y, 2 * near[1, y, x] - x
-                inside = 0 <= v < height and 0 <= u < width
-                if inside and not hole[v, u] and abs(depth[v, u] - depth[y, x]) < SAME_SURFACE:
-                    rgb[y, x] = rgb[v, u]
+            if not hole[y, x]:
+                continue
+            v = 2 * nearest[0, y, x] - y
+            u = 2 * nearest[1, y, x] - x
+            is_inside = 0 <= v < height and 0 <= u < width
+            if is_inside and not hole[v, u] and abs(depth[v, u] - depth[y, x]) < SAME_SURFACE_DEPTH:
+                rgb[y, x] = rgb[v, u]
 
 
-def _match(level: _Level, coarse: Matches | None, number: int) -> Matches | None:
-    """Alternate search and vote at a level; None without a hole, or without any patch."""
-    usable = ~maximum_filter(torch.from_numpy(level.hole), PATCH_RADIUS).numpy()
-    usable[:PATCH_RADIUS] = usable[-PATCH_RADIUS:] = False
-    usable[:, :PATCH_RADIUS] = usable[:, -PATCH_RADIUS:] = False
-    if not usable.any() or not level.hole.any():
+@dataclasses.dataclass(frozen=True)
+class _Matches:
+    """The best patches for the n pixels of a level's hole."""
+
+    numbers: Ints  # [h, w] the number of each hole pixel; −1 outside of the hole
+    positions: Ints  # [n, 3] source, row and column of the centre of each hole pixel's patch
+    costs: Floats  # [n]
+
+
+def _match_level(level: _Level, coarse: _Matches | None, number: int) -> _Matches | None:
+    """Alternate search and vote at a level; None without a hole, or without any usable patch.
+
+    Args:
+        level: its colours in the hole are changed in place.
+        coarse: the matches of the level of half the size; None makes a random start.
+        number: of the level, for the random numbers.
+    """
+    is_usable = _usable_patches(level.hole)
+    if not is_usable.any() or not level.hole.any():
         return None
-    height, width = level.hole.shape
-    cells, pool = (np.argwhere(mask).astype(np.int32) for mask in (level.hole, usable))
-    numbers = np.full((height, width), -1, np.int32)
-    numbers[level.hole] = np.arange(len(cells))
-    grids = (level.rgb, level.traits, usable)
-    sources, traits, valid = (
-        np.ascontiguousarray(np.stack([grid, grid[:, ::-1]])) for grid in grids
-    )
-    places, costs = np.empty((len(cells), 3), np.int32), np.zeros(len(cells), np.float32)
-    parents = coarse or (numbers, places, costs)
-    _begin(cells, coarse is not None, *parents[:2], valid, pool, places)
-    padded = np.pad(level.rgb, ((PATCH_RADIUS, PATCH_RADIUS), (PATCH_RADIUS, PATCH_RADIUS), (0, 0)))
-    target = (
-        padded,
-        level.weights,
-        level.traits,
-        sources,
-        traits,
-        np.float32(OFFSET_WEIGHT / max(height, width) ** 2),
-    )
-
-    def run(function: Callable[..., None], *given: Any) -> None:
-        parallel_for_chunks(lambda start, stop: function(start, stop, cells, *given), len(cells))
-
-    def vote(mean: float) -> None:
-        run(_vote, numbers, places, costs, np.float32(max(mean, MIN_MEAN_COST)), sources, level.rgb)
-        padded[PATCH_RADIUS:-PATCH_RADIUS, PATCH_RADIUS:-PATCH_RADIUS] = level.rgb
-
+    search = _LevelSearch(level, is_usable)
+    search.start_from(coarse)
     if coarse is not None:
-        vote(1.0)  # all costs are still zero
-    for turn in range(ROUNDS):
-        run(_score, places, *target, costs)
-        for jump in NEIGHBOR_STEPS:
-            seed = np.uint32(((number * ROUNDS + turn) * len(NEIGHBOR_STEPS) + jump) * 7919)
-            run(
-                _search,
-                numbers,
-                places.copy(),
-                costs.copy(),
-                valid,
-                pool,
-                jump,
+        search.vote(mean_cost=1.0)  # all costs are still zero, so every patch has the same weight
+    for search_round in range(SEARCH_ROUNDS):
+        search.score()
+        for step in NEIGHBOR_STEPS:
+            call = (number * SEARCH_ROUNDS + search_round) * len(NEIGHBOR_STEPS) + step
+            search.improve(step, seed=np.uint32(call * SEED_STEP))
+        search.vote(mean_cost=float(search.matches.costs.mean()))
+    return search.matches
+
+
+def _usable_patches(hole: Bools) -> Bools:
+    """Whether a patch around each pixel [h, w] lies inside the picture and has no hole pixel."""
+    is_usable: Bools = ~maximum_filter(torch.from_numpy(hole), PATCH_RADIUS).numpy()
+    is_usable[:PATCH_RADIUS] = False
+    is_usable[-PATCH_RADIUS:] = False
+    is_usable[:, :PATCH_RADIUS] = False
+    is_usable[:, -PATCH_RADIUS:] = False
+    return is_usable
+
+
+class _LevelSearch:
+    """The search for patches at one level of the pyramid."""
+
+    def __init__(self, level: _Level, is_usable: Bools) -> None:
+        """Number the hole's pixels and build the images that the kernels read.
+
+        Args:
+            level: its colours in the hole are changed by votes.
+            is_usable: [h, w] whether the patch around each pixel is usable.
+        """
+        height, width = level.hole.shape
+        self._rgb = level.rgb
+        self._hole_pixels = np.argwhere(level.hole).astype(np.int32)  # [n, 2] rows, columns
+        self._usable_centers = np.argwhere(is_usable).astype(np.int32)  # [k, 2]
+        self._is_usable = _with_mirror_image(is_usable)
+        padding = (PATCH_RADIUS, PATCH_RADIUS)
+        self._inputs = CostInputs(
+            padded_rgb=np.pad(level.rgb, (padding, padding, (0, 0))),
+            weights=level.weights,
+            traits=level.traits,
+            source_rgb=_with_mirror_image(level.rgb),
+            source_traits=_with_mirror_image(level.traits),
+            distance_weight=np.float32(DISTANCE_WEIGHT / max(height, width) ** 2),
+        )
+
+        count = len(self._hole_pixels)
+        numbers = np.full((height, width), -1, np.int32)
+        numbers[level.hole] = np.arange(count)
+        self.matches = _Matches(
+            numbers, np.empty((count, 3), np.int32), np.zeros(count, np.float32)
+        )
+
+    def start_from(self, coarse: _Matches | None) -> None:
+        """Take the first matches from the coarser level, or at random."""
+        parents = self.matches if coarse is None else coarse
+        start_matches(
+            self._hole_pixels,
+            coarse is not None,
+            parents.numbers,
+            parents.positions,
+            self._is_usable,
+            self._usable_centers,
+            self.matches.positions,
+        )
+
+    def score(self) -> None:
+        """Compute the costs of the matches, which votes have changed."""
+        parallel_for_chunks(
+            lambda start, stop: score_matches(
+                start,
+                stop,
+                self._hole_pixels,
+                self.matches.positions,
+                self._inputs,
+                self.matches.costs,
+            ),
+            len(self._hole_pixels),
+        )
+
+    def improve(self, step: int, seed: np.uint32) -> None:
+        """Search better patches for all hole pixels, also from neighbours `step` pixels away."""
+        # All pixels look at the old matches, so the result does not depend on the threads' order.
+        old_positions = self.matches.positions.copy()
+        old_costs = self.matches.costs.copy()
+        parallel_for_chunks(
+            lambda start, stop: improve_matches(
+                start,
+                stop,
+                self._hole_pixels,
+                self.matches.numbers,
+                old_positions,
+                old_costs,
+                self._is_usable,
+                self._usable_centers,
+                step,
                 seed,
-                *target,
-                places,
-                costs,
-            )
-        vote(float(costs.mean()))
-    return numbers, places, costs
-
-
-@kernel
-def _begin(
-    cells: Any, refine: bool, coarse_numbers: Any, coarse: Any, valid: Any, pool: Any, places: Any
-) -> None:
-    """Initialise matches by the coarser level's matches, or at random."""
-    rows, columns = coarse_numbers.shape
-    height, width = valid.shape[1:]
-    for n in range(len(cells)):
-        y, x = cells[n]
-        pick = pool[_hash(np.uint32(n)) % np.uint32(len(pool))]
-        places[n, 0], places[n, 1], places[n, 2] = 0, pick[0], pick[1]
-        k = coarse_numbers[min(y // 2, rows - 1), min(x // 2, columns - 1)] if refine else -1
-        if k >= 0:
-            # Columns of a mirrored picture count from the right.
-            m, side = coarse[k, 0], width - 2 * columns if coarse[k, 0] else 0
-            row, column = 2 * coarse[k, 1] + y % 2, 2 * coarse[k, 2] + x % 2 + side
-            if 0 <= row < height and 0 <= column < width and valid[m, row, column]:
-                places[n, 0], places[n, 1], places[n, 2] = m, row, column
-
-
-@kernel
-def _hash(value: Any) -> Any:
-    value = np.uint32(value)
-    value ^= value >> np.uint32(16)
-    value = np.uint32(value * np.uint32(0x7FEB352D))
-    value ^= value >> np.uint32(15)
-    value = np.uint32(value * np.uint32(0x846CA68B))
-    value ^= value >> np.uint32(16)
-    return value
-
-
-@reordering_kernel
-def _patch_cost(
-    padded: Any, weights: Any, source: Any, y: int, x: int, v: int, u: int, bound: Any
-) -> Any:
-    """Weighted mean of the squared differences of two patches; infinite if the mean exceeds the bound."""
-    total, mass = np.float32(0), np.float32(0)
-    for j in range(PATCH_SIDE):
-        for i in range(PATCH_SIDE):
-            mass += weights[y + j, x + i]
-    limit = bound * mass
-    for j in range(PATCH_SIDE):
-        for i in range(PATCH_SIDE):
-            red = padded[y + j, x + i, 0] - source[v + j - PATCH_RADIUS, u + i - PATCH_RADIUS, 0]
-            green = padded[y + j, x + i, 1] - source[v + j - PATCH_RADIUS, u + i - PATCH_RADIUS, 1]
-            blue = padded[y + j, x + i, 2] - source[v + j - PATCH_RADIUS, u + i - PATCH_RADIUS, 2]
-            total += weights[y + j, x + i] * (red * red + green * green + blue * blue)
-        if total > limit:
-            return np.float32(np.inf)
-    return total / mass
-
-
-@kernel
-def _cost(
-    padded: Any, weights: Any, own: Any, sources: Any, traits: Any, offset: Any,
-    y: int, x: int, m: int, v: int, u: int, bound: Any,
-) -> Any:  # fmt: skip
-    """The cost of source m's patch at (v, u) for the cell (y, x); infinite beyond the bound."""
-    cost = np.float32(0)
-    for c in range(own.shape[2]):
-        apart = own[y, x, c] - traits[m, v, u, c]
-        cost += apart * apart
-    across = x - (own.shape[1] - 1 - u if m else u)
-    cost += offset * np.float32((y - v) * (y - v) + across * across)
-    if cost >= bound:
-        return np.float32(np.inf)
-    return cost + _patch_cost(padded, weights, sources[m], y, x, v, u, bound - cost)
-
-
-@kernel
-def _score(
-    start: int, stop: int, cells: Any, places: Any,
-    padded: Any, weights: Any, own: Any, sources: Any, traits: Any, offset: Any, costs: Any,
-) -> None:  # fmt: skip
-    for n in range(start, stop):
-        y, x = cells[n]
-        m, v, u = places[n]
-        costs[n] = _cost(
-            padded, weights, own, sources, traits, offset, y, x, m, v, u, np.float32(1e30)
+                self._inputs,
+                self.matches.positions,
+                self.matches.costs,
+            ),
+            len(self._hole_pixels),
         )
 
+    def vote(self, mean_cost: float) -> None:
+        """Give the hole's pixels the mean colours of the patches that cover them.
 
-@kernel
-def _search(
-    start: int, stop: int, cells: Any, numbers: Any, before: Any, worth: Any, valid: Any, pool: Any, jump: int,
-    seed: Any, padded: Any, weights: Any, own: Any, sources: Any, traits: Any, offset: Any, places: Any, costs: Any,
-) -> None:  # fmt: skip
-    """Improve the matches of cells start..stop: try neighbours' matches, a random patch, and patches near the best."""
-    mirrors, height, width = valid.shape
-    for n in range(start, stop):
-        y, x = cells[n]
-        best, bm, bv, bu = (
-            worth[n],
-            np.int64(before[n, 0]),
-            np.int64(before[n, 1]),
-            np.int64(before[n, 2]),
+        Patches whose cost is above `mean_cost` weigh little.
+        """
+        parallel_for_chunks(
+            lambda start, stop: vote_colors(
+                start,
+                stop,
+                self._hole_pixels,
+                self.matches.numbers,
+                self.matches.positions,
+                self.matches.costs,
+                np.float32(max(mean_cost, MIN_MEAN_COST)),
+                self._inputs.source_rgb,
+                self._rgb,
+            ),
+            len(self._hole_pixels),
         )
-        for turn in range(4):
-            dy = jump if turn == 0 else -jump if turn == 1 else 0
-            dx = jump if turn == 2 else -jump if turn == 3 else 0
-            if not (0 <= y + dy < height and 0 <= x + dx < width):
-                continue
-            k = numbers[y + dy, x + dx]
-            if k < 0:
-                continue
-            m, v, u = (
-                np.int64(before[k, 0]),
-                np.int64(before[k, 1]) - dy,
-                np.int64(before[k, 2]) - dx,
-            )
-            if 0 <= v < height and 0 <= u < width and valid[m, v, u]:
-                cost = _cost(padded, weights, own, sources, traits, offset, y, x, m, v, u, best)
-                if cost < best:
-                    best, bm, bv, bu = cost, m, v, u
-        chance = _hash(np.uint32(n) * np.uint32(9781) + seed)
-        pick = pool[chance % np.uint32(len(pool))]
-        chance = _hash(chance)
-        m = np.int64(chance % np.uint32(mirrors))
-        v, u = np.int64(pick[0]), np.int64(width - 1 - pick[1] if m else pick[1])
-        cost = _cost(padded, weights, own, sources, traits, offset, y, x, m, v, u, best)
-        if cost < best:
-            best, bm, bv, bu = cost, m, v, u
-        reach = max(height, width) // 4
-        while reach >= 1:
-            chance = _hash(chance)
-            span = np.uint32(2 * reach + 1)
-            v = bv + np.int64(chance % span) - reach
-            u = bu + np.int64((chance >> np.uint32(12)) % span) - reach
-            if 0 <= v < height and 0 <= u < width and valid[bm, v, u]:
-                cost = _cost(padded, weights, own, sources, traits, offset, y, x, bm, v, u, best)
-                if cost < best:
-                    best, bv, bu = cost, v, u
-            reach //= 4
-        costs[n] = best
-        places[n, 0], places[n, 1], places[n, 2] = bm, bv, bu
+        inner = slice(PATCH_RADIUS, -PATCH_RADIUS)
+        self._inputs.padded_rgb[inner, inner] = self._rgb
 
 
-@kernel
-def _vote(
-    start: int,
-    stop: int,
-    cells: Any,
-    numbers: Any,
-    places: Any,
-    costs: Any,
-    mean: Any,
-    sources: Any,
-    rgb: Any,
-) -> None:
-    """Set the colours of cells start..stop to weighted means of all patches that cover the cells."""
-    height, width = numbers.shape
-    for n in range(start, stop):
-        y, x = cells[n]
-        red, green, blue, mass = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
-        for dy in range(-PATCH_RADIUS, PATCH_RADIUS + 1):
-            for dx in range(-PATCH_RADIUS, PATCH_RADIUS + 1):
-                if not (0 <= y + dy < height and 0 <= x + dx < width):
-                    continue
-                k = numbers[y + dy, x + dx]
-                if k < 0:
-                    continue
-                m, v, u = places[k, 0], places[k, 1] - dy, places[k, 2] - dx
-                weight = np.float32(np.exp(-costs[k] / mean)) + np.float32(MIN_VOTE_WEIGHT)
-                red += weight * sources[m, v, u, 0]
-                green += weight * sources[m, v, u, 1]
-                blue += weight * sources[m, v, u, 2]
-                mass += weight
-        rgb[y, x, 0], rgb[y, x, 1], rgb[y, x, 2] = red / mass, green / mass, blue / mass
+def _with_mirror_image(image: NDArray[Any]) -> NDArray[Any]:
+    """A copy [2, h, w, ...] of an image [h, w, ...] and of the image mirrored left to right."""
+    return np.ascontiguousarray(np.stack([image, image[:, ::-1]]))

@@ -21,7 +21,8 @@ from spackle.core.filters import (
     nearest_known_pixels,
 )
 from spackle.core.hole_filling import FAR_SIDE_BIAS, fill_from_far_side
-from spackle.core.patch_matching import MIN_MEAN_COST, MIN_VOTE_WEIGHT, TONE_BLUR_CELLS, Patches
+from spackle.core.patch_matching import MIN_MEAN_COST, TONE_BLUR_CELLS, Patches
+from spackle.core.patch_search import MIN_VOTE_WEIGHT
 from spackle.inpaint import Inpainter, known_inverse_depth
 from spackle.residual.features import CELL, MIN_DIVISOR, hole_mask
 from spackle.scene_fill.view_completion import SceneViewCompletion

@@ -1,0 +1,296 @@
+"""Kernels of patch matching: the cost of a patch, the search for better patches, and the vote.
+
+A patch is a square of 7×7 pixels. There are two *sources* of patches: the picture (0), and the
+picture mirrored from left to right (1). The *match* of a pixel of the hole is the source, row and
+column of the centre of a patch. A patch is *usable* if all its pixels are known.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spackle.runtime.kernels import kernel, reordering_kernel
+
+PATCH_RADIUS = 3
+PATCH_SIDE = 2 * PATCH_RADIUS + 1  # patches have 7×7 pixels
+MIN_VOTE_WEIGHT = 1e-6  # of a bad match, so that the weights of a pixel never add up to 0
+LARGE_COST = np.float32(1e30)  # larger than the cost of any patch
+
+# Multipliers of a good mixer of 32 bits (lowbias32, by Chris Wellons).
+HASH_MULTIPLIER_1 = np.uint32(0x7FEB352D)
+HASH_MULTIPLIER_2 = np.uint32(0x846CA68B)
+PIXEL_SEED_STEP = np.uint32(9781)  # a prime, by which the random numbers of pixels differ
+
+# Rows and columns to the four neighbours of a pixel: below, above, right, left.
+NEIGHBOR_DIRECTIONS = ((1, 0), (-1, 0), (0, 1), (0, -1))
+
+
+class CostInputs(NamedTuple):
+    """The images on which the cost of a patch depends; [h, w] is the size of the picture."""
+
+    padded_rgb: NDArray[np.float32]  # [h + 6, w + 6, 3] the picture with three zeros at each side
+    weights: NDArray[np.float32]  # [h + 6, w + 6] of pixels in a patch; 0 beyond the picture
+    traits: NDArray[np.float32]  # [h, w, 4] tone and depth, scaled: squared differences are costs
+    source_rgb: NDArray[np.float32]  # [2, h, w, 3] the picture and its mirror image
+    source_traits: NDArray[np.float32]  # [2, h, w, 4] the traits and their mirror image
+    distance_weight: np.float32  # cost of a squared pixel between a hole pixel and its patch
+
+
+@kernel
+def hash_uint32(value: Any) -> Any:
+    """Mix the bits of a number: a random uint32 that depends on the number alone."""
+    value = np.uint32(value)
+    value ^= value >> np.uint32(16)
+    value = np.uint32(value * HASH_MULTIPLIER_1)
+    value ^= value >> np.uint32(15)
+    value = np.uint32(value * HASH_MULTIPLIER_2)
+    value ^= value >> np.uint32(16)
+    return value
+
+
+@reordering_kernel
+def _color_cost(
+    padded_rgb: Any, weights: Any, source_rgb: Any, y: int, x: int, v: int, u: int, limit: Any
+) -> Any:
+    """Weighted mean of the squared colour differences of two patches; infinity beyond `limit`.
+
+    Args:
+        padded_rgb: [h + 6, w + 6, 3] the picture with three zeros at each side.
+        weights: [h + 6, w + 6] of the pixels around (y, x).
+        source_rgb: [h, w, 3] the picture or its mirror image, for the patch around (v, u).
+        y: row of the hole's pixel in the picture without padding.
+        x: column of the hole's pixel.
+        v: row of the patch's centre.
+        u: column of the patch's centre.
+        limit: a larger mean is of no interest, and the computation stops.
+    """
+    weight_sum = np.float32(0)
+    for j in range(PATCH_SIDE):
+        for i in range(PATCH_SIDE):
+            weight_sum += weights[y + j, x + i]
+    max_total = limit * weight_sum
+
+    total = np.float32(0)
+    for j in range(PATCH_SIDE):
+        for i in range(PATCH_SIDE):
+            # With the padding, (y, x) is the first pixel of the patch around (y, x).
+            row, column = v + j - PATCH_RADIUS, u + i - PATCH_RADIUS
+            red = padded_rgb[y + j, x + i, 0] - source_rgb[row, column, 0]
+            green = padded_rgb[y + j, x + i, 1] - source_rgb[row, column, 1]
+            blue = padded_rgb[y + j, x + i, 2] - source_rgb[row, column, 2]
+            total += weights[y + j, x + i] * (red * red + green * green + blue * blue)
+        if total > max_total:
+            return np.float32(np.inf)
+    return total / weight_sum
+
+
+@kernel
+def patch_cost(inputs: Any, y: int, x: int, source: int, v: int, u: int, limit: Any) -> Any:
+    """The cost, float32, of a patch for a pixel of the hole; infinity if it exceeds `limit`.
+
+    It is the sum of the squared differences of the traits (tone and depth), of the weighted squared
+    distance in the picture, and of the mean squared difference of the colours.
+
+    Args:
+        inputs: the images, `CostInputs`.
+        y: row of the hole's pixel.
+        x: column of the hole's pixel.
+        source: 0 for the picture, 1 for its mirror image.
+        v: row of the patch's centre in the source.
+        u: column of the patch's centre in the source.
+        limit: a larger cost is of no interest, and the computation stops early.
+    """
+    cost = np.float32(0)
+    for c in range(inputs.traits.shape[2]):
+        difference = inputs.traits[y, x, c] - inputs.source_traits[source, v, u, c]
+        cost += difference * difference
+
+    # The distance counts in the picture, where a mirrored patch has another column.
+    last_column = inputs.traits.shape[1] - 1
+    rows_apart = y - v
+    columns_apart = x - (last_column - u if source else u)
+    distance2 = np.float32(rows_apart * rows_apart + columns_apart * columns_apart)
+    cost += inputs.distance_weight * distance2
+    if cost >= limit:
+        return np.float32(np.inf)
+    return cost + _color_cost(
+        inputs.padded_rgb, inputs.weights, inputs.source_rgb[source], y, x, v, u, limit - cost
+    )
+
+
+@kernel
+def score_matches(
+    start: int, stop: int, hole_pixels: Any, matches: Any, inputs: Any, costs: Any
+) -> None:
+    """Compute the costs of the matches of the hole pixels start..stop.
+
+    Args:
+        start: number of the first pixel.
+        stop: number after the last pixel.
+        hole_pixels: [n, 2] rows and columns.
+        matches: [n, 3] source, row and column of each pixel's patch.
+        inputs: the images, `CostInputs`.
+        costs: [n] written.
+    """
+    for n in range(start, stop):
+        y, x = hole_pixels[n]
+        source, v, u = matches[n]
+        costs[n] = patch_cost(inputs, y, x, source, v, u, LARGE_COST)
+
+
+@kernel
+def start_matches(
+    hole_pixels: Any, has_coarse: bool, coarse_numbers: Any, coarse_matches: Any,
+    is_usable: Any, usable_centers: Any, matches: Any,
+) -> None:  # fmt: skip
+    """Take the first match of each hole pixel from the level of half the size, or at random.
+
+    Args:
+        hole_pixels: [n, 2] rows and columns.
+        has_coarse: whether there is a coarser level; else all matches are random.
+        coarse_numbers: [⌈h/2⌉, ⌈w/2⌉] numbers of the coarser level's hole pixels; −1 elsewhere.
+        coarse_matches: [m, 3] the coarser level's matches, by these numbers.
+        is_usable: [2, h, w] whether the patch around a pixel of each source is usable.
+        usable_centers: [k, 2] rows and columns of the usable patches of the picture.
+        matches: [n, 3] written.
+    """
+    coarse_height, coarse_width = coarse_numbers.shape
+    height, width = is_usable.shape[1:]
+    for n in range(len(hole_pixels)):
+        y, x = hole_pixels[n]
+        center = usable_centers[hash_uint32(np.uint32(n)) % np.uint32(len(usable_centers))]
+        matches[n, 0], matches[n, 1], matches[n, 2] = 0, center[0], center[1]
+        if not has_coarse:
+            continue
+
+        k = coarse_numbers[min(y // 2, coarse_height - 1), min(x // 2, coarse_width - 1)]
+        if k < 0:
+            continue
+        source = coarse_matches[k, 0]
+        # Columns of the mirror image count from the right, where a last odd column is cut.
+        shift = width - 2 * coarse_width if source else 0
+        row = 2 * coarse_matches[k, 1] + y % 2
+        column = 2 * coarse_matches[k, 2] + x % 2 + shift
+        is_inside = 0 <= row < height and 0 <= column < width
+        if is_inside and is_usable[source, row, column]:
+            matches[n, 0], matches[n, 1], matches[n, 2] = source, row, column
+
+
+@kernel
+def improve_matches(
+    start: int, stop: int, hole_pixels: Any, numbers: Any, old_matches: Any, old_costs: Any,
+    is_usable: Any, usable_centers: Any, step: int, seed: Any, inputs: Any,
+    matches: Any, costs: Any,
+) -> None:  # fmt: skip
+    """Try other patches for the hole pixels start..stop, and keep the best one of each.
+
+    The candidates are the patches beside those of the neighbours' matches, a random patch, and
+    random patches closer and closer to the best one.
+
+    Args:
+        start: number of the first pixel.
+        stop: number after the last pixel.
+        hole_pixels: [n, 2] rows and columns.
+        numbers: [h, w] numbers of the hole pixels; −1 elsewhere.
+        old_matches: [n, 3] source, row and column of each pixel's patch.
+        old_costs: [n] of these matches.
+        is_usable: [2, h, w] whether the patch around a pixel of each source is usable.
+        usable_centers: [k, 2] rows and columns of the usable patches of the picture.
+        step: distance in pixels to the neighbours.
+        seed: uint32 that makes the random numbers of this call differ from those of others.
+        inputs: the images, `CostInputs`.
+        matches: [n, 3] written.
+        costs: [n] written.
+    """
+    source_count, height, width = is_usable.shape
+    for n in range(start, stop):
+        y, x = hole_pixels[n]
+        cost = old_costs[n]
+        source = np.int64(old_matches[n, 0])
+        row, column = np.int64(old_matches[n, 1]), np.int64(old_matches[n, 2])
+
+        # If a neighbour's patch fits, the patch beside it probably fits here.
+        for direction in NEIGHBOR_DIRECTIONS:
+            dy, dx = direction[0] * step, direction[1] * step
+            if not (0 <= y + dy < height and 0 <= x + dx < width):
+                continue
+            k = numbers[y + dy, x + dx]
+            if k < 0:
+                continue
+            new_source = np.int64(old_matches[k, 0])
+            v, u = np.int64(old_matches[k, 1]) - dy, np.int64(old_matches[k, 2]) - dx
+            if 0 <= v < height and 0 <= u < width and is_usable[new_source, v, u]:
+                new_cost = patch_cost(inputs, y, x, new_source, v, u, cost)
+                if new_cost < cost:
+                    cost, source, row, column = new_cost, new_source, v, u
+
+        random = hash_uint32(np.uint32(n) * PIXEL_SEED_STEP + seed)
+        center = usable_centers[random % np.uint32(len(usable_centers))]
+        random = hash_uint32(random)
+        new_source = np.int64(random % np.uint32(source_count))
+        v, u = np.int64(center[0]), np.int64(width - 1 - center[1] if new_source else center[1])
+        new_cost = patch_cost(inputs, y, x, new_source, v, u, cost)
+        if new_cost < cost:
+            cost, source, row, column = new_cost, new_source, v, u
+
+        radius = max(height, width) // 4
+        while radius >= 1:
+            random = hash_uint32(random)
+            side = np.uint32(2 * radius + 1)
+            v = row + np.int64(random % side) - radius
+            u = column + np.int64((random >> np.uint32(12)) % side) - radius  # other random bits
+            if 0 <= v < height and 0 <= u < width and is_usable[source, v, u]:
+                new_cost = patch_cost(inputs, y, x, source, v, u, cost)
+                if new_cost < cost:
+                    cost, row, column = new_cost, v, u
+            radius //= 4
+
+        costs[n] = cost
+        matches[n, 0], matches[n, 1], matches[n, 2] = source, row, column
+
+
+@kernel
+def vote_colors(
+    start: int, stop: int, hole_pixels: Any, numbers: Any, matches: Any, costs: Any,
+    mean_cost: Any, source_rgb: Any, rgb: Any,
+) -> None:  # fmt: skip
+    """Set the colours of the hole pixels start..stop to means over all patches that cover them.
+
+    A patch has the weight exp(−cost / mean_cost).
+
+    Args:
+        start: number of the first pixel.
+        stop: number after the last pixel.
+        hole_pixels: [n, 2] rows and columns.
+        numbers: [h, w] numbers of the hole pixels; −1 elsewhere.
+        matches: [n, 3] source, row and column of each pixel's patch.
+        costs: [n] of these matches.
+        mean_cost: float32, above 0.
+        source_rgb: [2, h, w, 3] the picture and its mirror image.
+        rgb: [h, w, 3] written at the hole pixels.
+    """
+    height, width = numbers.shape
+    for n in range(start, stop):
+        y, x = hole_pixels[n]
+        red, green, blue = np.float32(0), np.float32(0), np.float32(0)
+        weight_sum = np.float32(0)
+        for dy in range(-PATCH_RADIUS, PATCH_RADIUS + 1):
+            for dx in range(-PATCH_RADIUS, PATCH_RADIUS + 1):
+                if not (0 <= y + dy < height and 0 <= x + dx < width):
+                    continue
+                k = numbers[y + dy, x + dx]
+                if k < 0:
+                    continue
+                # The pixel at (−dy, −dx) from the centre of the neighbour's patch lies here.
+                source, v, u = matches[k, 0], matches[k, 1] - dy, matches[k, 2] - dx
+                weight = np.float32(np.exp(-costs[k] / mean_cost)) + np.float32(MIN_VOTE_WEIGHT)
+                red += weight * source_rgb[source, v, u, 0]
+                green += weight * source_rgb[source, v, u, 1]
+                blue += weight * source_rgb[source, v, u, 2]
+                weight_sum += weight
+        rgb[y, x, 0] = red / weight_sum
+        rgb[y, x, 1] = green / weight_sum
+        rgb[y, x, 2] = blue / weight_sum
