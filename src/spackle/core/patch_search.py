@@ -103,13 +103,14 @@ def patch_cost(inputs: Any, y: int, x: int, source: int, v: int, u: int, limit: 
         u: column of the patch's centre in the source.
         limit: a larger cost is of no interest, and the computation stops early.
     """
+    traits, source_traits = inputs.traits, inputs.source_traits
     cost = np.float32(0)
-    for c in range(inputs.traits.shape[2]):
-        difference = inputs.traits[y, x, c] - inputs.source_traits[source, v, u, c]
+    for c in range(traits.shape[2]):
+        difference = traits[y, x, c] - source_traits[source, v, u, c]
         cost += difference * difference
 
     # The distance counts in the picture, where a mirrored patch has another column.
-    last_column = inputs.traits.shape[1] - 1
+    last_column = traits.shape[1] - 1
     rows_apart = y - v
     columns_apart = x - (last_column - u if source else u)
     distance2 = np.float32(rows_apart * rows_apart + columns_apart * columns_apart)
