@@ -403,9 +403,11 @@ class LiteBase:
 
 
 def merge_outputs(outputs: Tensor, tilt: Sequence[bool]) -> Tensor:
-    """Mean [h, w] of outputs [n, h, w].
+    """Mean [h, w] of n networks' outputs [n, h, w] for the same photo.
 
-    Its low frequencies come only from the outputs for which `tilt` is true.
+    An output is the sum of its low frequencies (its means in 3×4 cells, interpolated) and its
+    outlines. Outlines are averaged over all outputs, low frequencies only over those for which
+    `tilt` is true.
     """
     height, width = outputs.shape[1:]
     cells = COARSE_CELLS if height <= width else COARSE_CELLS[::-1]

@@ -229,6 +229,8 @@ class OpenedBase:
     ) -> tuple[BasePrediction, ResolvedBase]:
         """A photo's Gaussians by the first candidate that works, and which one it was.
 
+        The candidates are the bases that may be used, the best first.
+
         Args:
             photo: at its full size.
             depth: this photo's depth, used instead of the settings' depth; for rgbd only.
@@ -273,8 +275,9 @@ class OpenedBase:
         It does if loading fails (then `base` is None) or memory is short. But a depth map belongs
         to one photo: if it cannot be used, the next photo's may be usable.
         """
-        is_network = name != RGBD or name in self._loaded
-        return is_network and (base is None or isinstance(error, NotEnoughMemory))
+        # A base named rgbd that the program loaded has one depth map for all photos.
+        serves_all_photos = name != RGBD or name in self._loaded
+        return serves_all_photos and (base is None or isinstance(error, NotEnoughMemory))
 
     def _skip(self, name: str, error: InputError, is_unusable: bool) -> SkippedCandidate:
         """Describe a candidate that failed; if it `is_unusable`, remember that and free its memory."""

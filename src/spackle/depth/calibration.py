@@ -72,8 +72,8 @@ class Calibration:
             depth = self.baseline_m * self.focal_px / disparity_px
         return build_depth_map(
             stored,
-            depth,
-            valid & np.isfinite(depth),
+            depth=depth,
+            valid=valid & np.isfinite(depth),
             quantity="disparity",
             stored_unit=self.scale / (self.baseline_m * self.focal_px),
             K=self.K,
@@ -111,6 +111,7 @@ class Calibration:
 
     def checked(self, path: StrPath) -> Calibration:
         """This calibration; InputError, naming the file, if its numbers are impossible."""
+        # Larger numbers are damage; their squares would leave the range of float32.
         must_be_positive = (self.focal_px, self.baseline_m, self.scale)
         may_be_negative = (self.cx, self.cy, self.doffs_px)
         are_positive = all(1 / LARGEST_NUMBER <= n <= LARGEST_NUMBER for n in must_be_positive)

@@ -106,9 +106,9 @@ def check_not_negative(stored: Array, path: StrPath) -> None:
 
 def build_depth_map(
     stored: Array,
+    *,
     depth: Array,
     valid: Array,
-    *,
     quantity: Quantity,
     stored_unit: float | None,
     K: Tensor | None,

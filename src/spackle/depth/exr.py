@@ -29,33 +29,23 @@ MAX_NUMBERS = 400_000_000  # in all channels of a file, which the library reads 
 def read_exr_depth(file: IO[bytes], path: StrPath) -> Array:
     """The depth channel [H, W] of an open EXR file, as half or float; `path` is for messages.
 
-    The picture has the size of the display window; pixels for which the file has no data are 0.
-    InputError for a file with several parts, lossy compression or integers, a damaged or too large
-    file, and if the package OpenEXR is missing.
+    A file states the frame of the whole picture (display window) and the part of which it has
+    pixels (data window). The result is the whole picture, with 0 where there are none. InputError
+    for a file with several parts, lossy compression or integers, a damaged or too large file, and
+    if the package OpenEXR is missing.
     """
     OpenEXR = _import_openexr(path)
     # The header comes first, because a damaged header may announce gigabytes.
     described = OpenEXR.File(file, separate_channels=True, header_only=True, num_threads=0)
     header = described.header()
     _check_kind(OpenEXR, described, path)
-    height, width = _window_size(header["displayWindow"])
-    data_height, data_width = _window_size(header["dataWindow"])
-    if min(height, width, data_height, data_width) < 1:
-        raise InputError(f"{path}: an EXR without pixels: give another file")
-    file_bytes = file.seek(0, io.SEEK_END)
-    check_pixel_count(width, height, file_bytes, path)
-    check_pixel_count(data_width, data_height, file_bytes, path)
-    names = [channel.name for channel in header["channels"]]
-    if data_width * data_height * len(names) > MAX_NUMBERS:
-        raise InputError(
-            f"{path}: {data_width}×{data_height} pixels in {len(names)} channels are too many: "
-            "save the depth alone"
-        )
+    _check_size(header, file.seek(0, io.SEEK_END), path)
 
-    pixels = _read_channel(OpenEXR, file, depth_channel(names))
+    names = [channel.name for channel in header["channels"]]
+    pixels = _read_channel(OpenEXR, file, _depth_channel(names))
     if pixels.dtype.kind != "f":
         raise InputError(f"{path}: an EXR of integers: give metres as half or float")
-    if pixels.shape != (data_height, data_width):
+    if pixels.shape != _window_size(header["dataWindow"]):
         raise InputError(f"{path}: a depth channel at another resolution: save it at full size")
     return _in_display_window(pixels, header["dataWindow"], header["displayWindow"])
 
@@ -82,7 +72,23 @@ def _check_kind(OpenEXR: Any, described: Any, path: StrPath) -> None:
         )
 
 
-def depth_channel(names: list[str]) -> str:
+def _check_size(header: dict[str, Any], file_bytes: int, path: StrPath) -> None:
+    """InputError if a picture has no pixels, or would take too much memory for its file's size."""
+    height, width = _window_size(header["displayWindow"])
+    data_height, data_width = _window_size(header["dataWindow"])
+    if min(height, width, data_height, data_width) < 1:
+        raise InputError(f"{path}: an EXR without pixels: give another file")
+    check_pixel_count(width, height, file_bytes, path)
+    check_pixel_count(data_width, data_height, file_bytes, path)
+    channel_count = len(header["channels"])
+    if data_width * data_height * channel_count > MAX_NUMBERS:
+        raise InputError(
+            f"{path}: {data_width}×{data_height} pixels in {channel_count} channels are too many: "
+            "save the depth alone"
+        )
+
+
+def _depth_channel(names: list[str]) -> str:
     """The channel that holds depth: one that is called depth, else one that ends in Z, V, Y or R.
 
     The shortest of several such names wins: Z, not Normal.Z, which is part of a direction.

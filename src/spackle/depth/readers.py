@@ -62,7 +62,8 @@ def find_depth_file(depth: Path, photo: Path) -> Path:
     for name in (photo.name, photo.stem):
         for suffix in DEPTH_SUFFIXES:
             candidate = depth / f"{name}{suffix}"
-            if os.path.isfile(candidate) and candidate.resolve() != photo.resolve():
+            is_photo_itself = candidate.resolve() == photo.resolve()  # a PNG in the same folder
+            if os.path.isfile(candidate) and not is_photo_itself:
                 return candidate
     names = ", ".join(f"{photo.stem}{suffix}" for suffix in DEPTH_SUFFIXES)
     raise InputError(f"{photo}: no depth map in {depth}: looked for {names}")
@@ -88,7 +89,8 @@ def load_depth(
     as its `disparity`, or if the file's name starts with "disp" and the same folder has a
     Middlebury `calib.txt`.
 
-    Besides these formats, a relative map may be any grey picture; see `relative_depth`.
+    Besides these formats, a relative map may be any grey picture: bright is near (near-white), or
+    far (near-black), and the range of its numbers becomes `near` to `far`.
 
     Args:
         path: the file.

@@ -74,8 +74,8 @@ def metric_depth(stored: Array, path: StrPath) -> DepthMap:
         )
     return build_depth_map(
         stored,
-        stored,
-        np.isfinite(stored),
+        depth=stored,
+        valid=np.isfinite(stored),
         quantity="depth",
         stored_unit=1.0 if are_integers else None,
         K=None,
@@ -95,8 +95,8 @@ def millimetre_depth(stored: Array, path: StrPath) -> DepthMap:
         )
     return build_depth_map(
         stored,
-        stored * MILLIMETRE_M,
-        stored != UNKNOWN_MILLIMETRES,
+        depth=stored * MILLIMETRE_M,
+        valid=stored != UNKNOWN_MILLIMETRES,
         quantity="depth",
         stored_unit=MILLIMETRE_M,
         K=None,

@@ -111,7 +111,8 @@ class MogeBase:
         photo = resize_photo(photo)
         tokens = min(max(USUAL_TOKENS, self.network.least_tokens), self.network.most_tokens)
         rows, columns = token_grid(photo.height, photo.width, tokens)
-        # The maps need not be finer than the network's finest level: lifting enlarges them.
+        # The maps need not be finer than the network's finest level: lifting enlarges them. Both
+        # sizes have the photo's aspect ratio, so that the smaller height is the smaller size.
         finest_size = (PIXELS_PER_TOKEN * rows, PIXELS_PER_TOKEN * columns)
         size = min(finest_size, (photo.height, photo.width))
         with report_memory_shortage():

@@ -281,6 +281,7 @@ class FeatureNetwork(nn.Module):
         width = config.gaussian_width
         self.decoder = Decoder((config.depth_width, *config.pyramid_channels), width)
         self.image_encoder = nn.Module()  # the checkpoint's names have this level
+        # From the pixels' sRGB and the disparity of both layers to one value for each cell.
         self.image_encoder.conv = Float32Conv(
             3 + LAYER_COUNT, width, CELL_STRIDE, stride=CELL_STRIDE
         )

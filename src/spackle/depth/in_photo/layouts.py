@@ -172,7 +172,7 @@ def _to_depth_map(coded: CodedDepth, path: Path) -> DepthMap:
 
 
 def _factor_to_plausible(depth: Tensor) -> float:
-    """What brings the median of depths [H, W] to 3 m; 1 if it lies between 0.3 and 30 m."""
+    """The factor that brings the median of depths [H, W] to 3 m; 1 if it is in 0.3 to 30 m."""
     known = depth[is_valid_depth(depth)]
     if not len(known):
         return 1.0
@@ -194,7 +194,8 @@ def _read_codes(picture: bytes) -> tuple[Array, int]:
 def _find_in_jpeg(data: bytes) -> CodedDepth | None:
     """Apple's depth map in a JPEG, or else Android's; None without either.
 
-    Apple's is one of the further pictures behind the main one, and recognised by its XMP.
+    Apple's is one of the further pictures behind the main one, and is recognised by its XMP, which
+    states the scale: what depth or disparity a stored number means.
     """
     image = open_jpeg(data)
     if image is None:  # whoever decodes the photo will say what is wrong
@@ -262,14 +263,16 @@ def apple_scale(packet: bytes) -> CodeScale | None:
 def _apple_quantity(tree: Element) -> Quantity | None:
     """Whether Apple's XMP is about a map of depth or of disparity; None if about another picture.
 
-    The pixel format decides. Without one the type of the picture does, unless there is a subtype,
-    which only mattes have, although they, too, are of type "depth".
+    The pixel format decides. Without one the type of the picture does, unless there is a subtype:
+    only mattes (masks of hair or skin) have one, and their type is "depth", too.
     """
     pixel_format = find_property(tree, f"{PIXEL_DATA}NativeFormat")
     if pixel_format is not None:
         if pixel_format.isdecimal() and len(pixel_format) <= 10:
-            # Four characters, written as one number. Ten digits may need a fifth byte.
-            pixel_format = int(pixel_format).to_bytes(5, "big")[1:].decode("latin-1")
+            # Its four characters, such as "hdis", are written as one number of 4 bytes. But a
+            # damaged number of ten digits may need a fifth byte, which is dropped.
+            four_bytes = int(pixel_format).to_bytes(5, "big")[1:]
+            pixel_format = four_bytes.decode("latin-1")
         return _QUANTITY_OF_PIXEL_FORMAT.get(pixel_format)
 
     if find_property(tree, f"{PIXEL_DATA}AuxiliaryImageSubType") is not None:
@@ -284,6 +287,7 @@ GDEPTH = "{http://ns.google.com/photos/1.0/depthmap/}"
 DYNAMIC_DEPTH_MAP = "{http://ns.google.com/photos/dd/1.0/depthmap/}"
 DYNAMIC_DEPTH_ITEM = "{http://ns.google.com/photos/dd/1.0/item/}"
 _METRES_PER_UNIT = {"m": 1.0, "meter": 1.0, "meters": 1.0, "mm": 0.001, "millimeters": 0.001}
+NO_PICTURE_IN_DIRECTORY = "the photo's directory of items does not lead to a picture"
 _PICTURE_BEGIN = re.compile(rb"\xff\xd8\xff|\x89PNG")  # of a JPEG or a PNG
 _PICTURE_ENDS = (b"\xff\xd9", b"IEND\xaeB`\x82")  # of a JPEG, and of a PNG
 
@@ -356,31 +360,33 @@ def android_scale(node: Element, namespace: str, layout: str) -> CodeScale:
 def _appended_picture(data: bytes, tree: Element, address: str) -> bytes:
     """The picture of the item `address` in the directory of the photo `data`.
 
-    The items lie at the file's end, in the order of the directory, which states their lengths. But
-    phones disagree: the item's own length may be missing, and other bytes may follow the items.
-    ValueError if no picture is found.
+    The directory is XMP; the items lie at the file's end, in its order, and it states their lengths
+    in bytes. But phones disagree: the item's own length may be missing, and other bytes may follow
+    the items. ValueError if no picture is found.
     """
     entries = [node for node in tree.iter() if _is_directory_entry(node)]
     addresses = [own_property(node, f"{DYNAMIC_DEPTH_ITEM}DataURI") for node in entries]
-    if address in addresses:
-        lengths = [
-            int(find_number(node, f"{DYNAMIC_DEPTH_ITEM}Length") or 0)
-            for node in entries[addresses.index(address) :]
-        ]
-        length = lengths[0]
-        # The item begins here, or earlier if other bytes follow the items.
-        latest_begin = len(data) - sum(lengths)
-        begins = [match.start() for match in _PICTURE_BEGIN.finditer(data, 1)]
-        for begin in reversed(begins):
-            if begin > latest_begin:
-                continue
+    if address not in addresses:
+        raise ValueError(NO_PICTURE_IN_DIRECTORY)
+    index = addresses.index(address)
+    lengths = [
+        int(find_number(node, f"{DYNAMIC_DEPTH_ITEM}Length") or 0) for node in entries[index:]
+    ]
+    length = lengths[0]
+
+    # The item begins here, or earlier if other bytes follow the items.
+    latest_begin = len(data) - sum(lengths)
+    picture_begins = [match.start() for match in _PICTURE_BEGIN.finditer(data, 1)]
+    for begin in reversed([begin for begin in picture_begins if begin <= latest_begin]):
+        if length > 0:
             end = begin + length
-            if length and (begin == latest_begin or data.endswith(_PICTURE_ENDS, begin, end)):
+            if begin == latest_begin or data.endswith(_PICTURE_ENDS, begin, end):
                 return data[begin:end]
-            # Without a length, the item ends with the file, and the picture before it ends here.
-            if not length and data.endswith((*_PICTURE_ENDS, b"\0"), 0, begin):
-                return data[begin:]
-    raise ValueError("the photo's directory of items does not lead to a picture")
+        # Without a length the item reaches to the file's end. It is a picture of its own, and no
+        # thumbnail within one, if the picture before it, or its padding, ends where it begins.
+        elif data.endswith((*_PICTURE_ENDS, b"\0"), 0, begin):
+            return data[begin:]
+    raise ValueError(NO_PICTURE_IN_DIRECTORY)
 
 
 def _is_directory_entry(node: Element) -> bool:
@@ -430,9 +436,10 @@ HEVC_UNEVEN_DISPARITY = 3
 
 
 def hevc_scale(stated: dict[str, Any]) -> CodeScale:
-    """The scale that HEVC's depth representation information states, else 1 to 10 m.
+    """What the codes of a HEIF's depth map mean, by HEVC's "depth representation information".
 
-    ValueError for a range that is impossible, or steps of uneven size.
+    `stated` is that information; without it, the usual range of 1 to 10 m is assumed. ValueError
+    for a range that is impossible, or disparities that are not linear in the codes.
     """
     representation = stated.get("representation_type")
     if representation == HEVC_UNEVEN_DISPARITY:
