@@ -1,8 +1,9 @@
 """A base turns one photo into the 3D Gaussians of the surfaces that the photo shows.
 
-Here stand the interface `Base` and its result. `settings` lists the bases and their options, `open`
-opens and chooses them. The bases are SHARP and MoGe-2 (published networks), lite (two small networks
-in the package), transformers (any depth model of that library) and depth (a measured depth map).
+Here stand the interface `Base` and its result. `settings` lists the bases and their options,
+`open` opens and chooses them. The bases are SHARP and MoGe-2 (published networks), lite (two small
+networks in the package), transformers (any depth model of that library) and depth (a measured depth
+map).
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ from spackle.runtime.progress import Progress
 DEFAULT_MAX_DISPARITY = 0.3
 # Share of the widest views that may be holes if the user sets no disparity; more is conspicuous.
 DEFAULT_MAX_HOLE_RATIO = 0.125
-# A network's estimate of the focal length is plausible in this range of 35 mm equivalents, which are
-# fields of view from 130° to 4°.
+# A network's estimate of the focal length is plausible in this range of 35 mm equivalents, which
+# are fields of view from 130° to 4°.
 PLAUSIBLE_FOCALS_MM = (10.0, 600.0)
 
 
@@ -56,6 +57,7 @@ class Base(Protocol):
 
 def is_plausible_focal(focal_px: float, width: int, height: int) -> bool:
     """Whether a focal length that a network estimates is plausible for a photo of this size."""
+    # A network may see a painting or a close-up as a view through an impossible lens.
     shortest_mm, longest_mm = PLAUSIBLE_FOCALS_MM
     shortest_px = focal_mm_to_px(shortest_mm, width, height)
     longest_px = focal_mm_to_px(longest_mm, width, height)

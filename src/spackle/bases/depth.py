@@ -31,6 +31,7 @@ class RgbdBase:
 
         The focal length and principal point are the map's, if it has them, else the photo's.
         """
+        # A measured map knows its lens better than the photo's file does.
         depth, camera = self._cropped_to(photo)
         resized = resize_photo(photo)
         if camera is None:
@@ -40,6 +41,7 @@ class RgbdBase:
             camera = camera.resized(resized.width, resized.height)
             lens_source = self.lens_source
 
+        # The depth is lifted as it is: lifting resamples a map of any size to the photo's pixels.
         prediction = lift_rgbd(resized.rgb, depth, camera)
         notes = prediction.notes | {"depth_range": self.depth.range_in_words}
         if depth.note:
@@ -53,6 +55,7 @@ class RgbdBase:
         ratio of the photo with its border.
         """
         depth = self.depth
+        # The map was made for the photo as it was before a uniform border was cropped.
         framed_width, framed_height = photo.framed_size
         depth.check_aspect_ratio(framed_height, framed_width, photo.path)
         rows, columns = depth.depth.shape
@@ -66,6 +69,7 @@ class RgbdBase:
             depth=frame.inside(depth.depth, framed_width, framed_height),
             valid=frame.inside(depth.valid, framed_width, framed_height),
         )
+        # Cropping moves the principal point.
         if camera is not None:
             camera = camera.resized(framed_width, framed_height)
             camera = camera.cropped(frame.left, frame.top, photo.width, photo.height)

@@ -84,6 +84,7 @@ class SameConv(nn.Conv2d):
     ) -> None:
         """Build a convolution from `inputs` to `outputs` channels."""
         super().__init__(inputs, outputs, kernel, stride, groups=groups)
+        # nn.Conv2d pads both sides alike, the pretrained network does not.
         total_margin = kernel - stride
         before = total_margin // 2
         after = total_margin - before  # TensorFlow puts the odd pixel behind
@@ -150,7 +151,7 @@ class EfficientNetEncoder(nn.Module):
 
 
 class UpsampleAndAdd(nn.Module):
-    """Upsamples the features of the coarser scale, and adds the encoder's features of this scale."""
+    """Upsamples features of the coarser scale, and adds the encoder's features of this scale."""
 
     def __init__(self, coarse_channels: int, fine_channels: int, outputs: int) -> None:
         """Build the layers; both inputs are projected to `outputs` channels."""
@@ -203,6 +204,7 @@ class LiteNet(nn.Module):
         *finer, coarsest = self.encoder(rgb)
         # The position of an object in the picture tells much about the object's distance.
         x = self.top(torch.cat([coarsest, _cell_positions(coarsest)], dim=1))
+        # What the whole picture shows tells whether it is a room or a landscape.
         x = x + self.context(coarsest.mean(dim=(2, 3), keepdim=True))
         x = x + self.spread(relu(x))
         for fuse, fine in zip(self.fuse, reversed(finer), strict=True):
@@ -238,6 +240,7 @@ def load_networks(path: str | os.PathLike[str]) -> list[LiteNet]:
     InputError for a missing or broken file, or for weights of another architecture.
     """
     tensors = _dequantised(read_tensors(path, ADVICE))
+    # A file with one network has no numbers before the names.
     if _SIZE_TENSOR in tensors:
         return [_load_network(tensors, path)]
 
@@ -272,6 +275,7 @@ def _dequantised(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     values: dict[str, Tensor] = {}
     for name, tensor in tensors.items():
         steps = tensors.get(name + SCALE_SUFFIX)
+        # Biases and small layers are stored as floats.
         if tensor.is_floating_point() and not name.endswith(SCALE_SUFFIX):
             values[name] = tensor
         elif steps is not None and tensor.dim() == 4 and steps.shape == tensor.shape[:1]:
@@ -380,6 +384,7 @@ class LiteBase:
 
         All have the resolution of the last scale, and lie on the CPU.
         """
+        # The logarithms of the outputs have unknown constants, which the mean removes.
         picture = rgb.float().permute(2, 0, 1)[None].to(self.device)  # [1, 3, H, W]
         outputs = [self._run_network(picture, scale)[None, None] for scale in scales]
         finest_size = outputs[-1].shape[2:]
@@ -409,6 +414,7 @@ def merge_outputs(outputs: Tensor, tilt: Sequence[bool]) -> Tensor:
     outlines. Outlines are averaged over all outputs, low frequencies only over those for which
     `tilt` is true.
     """
+    # Large inputs give sharp outlines, but their slopes over the whole picture are worse.
     height, width = outputs.shape[1:]
     cells = COARSE_CELLS if height <= width else COARSE_CELLS[::-1]
     cell_means = interpolate(outputs[None], size=cells, mode="area")
@@ -425,6 +431,7 @@ def network_size(height: int, width: int, pixels: int) -> tuple[int, int]:
 
 def scaled_size(height: int, width: int, scale: float) -> tuple[int, int]:
     """The size closest to `scale` times (height, width) that a network accepts."""
+    # The encoder halves the resolution five times.
     rows = max(SIDE_MULTIPLE, round(height * scale / SIDE_MULTIPLE) * SIDE_MULTIPLE)
     columns = max(SIDE_MULTIPLE, round(width * scale / SIDE_MULTIPLE) * SIDE_MULTIPLE)
     return rows, columns

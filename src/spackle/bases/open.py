@@ -71,6 +71,7 @@ class BaseError(InputError):
 def open_base(settings: BaseSettings) -> OpenedBase:
     """A base whose network is loaded for the first photo; InputError for unsuitable settings."""
     settings.check()
+    # The network is loaded by the first photo that needs it.
     if settings.resolved_name == AUTO:
         return OpenedBase(AUTO_CANDIDATES, settings)
 
@@ -99,6 +100,7 @@ def _untimed_stage(name: str) -> Iterator[Progress]:
 def _load_network(name: str, settings: BaseSettings) -> Base | None:
     """Load the network of a base; None if its weights are not on this machine."""
     device = None if settings.device == "auto" else settings.device
+    # Code of another package runs here, and only for a name that the user gave.
     if settings.kind == PLUGIN_KIND:
         plugin = load_plugin(name, "base")
         with as_input_error(f"`base` {name}", "cannot be opened: {reason}"):
@@ -110,6 +112,7 @@ def _load_network(name: str, settings: BaseSettings) -> Base | None:
     if name == "lite":
         return LiteBase.load(settings.checkpoint, device=device)
 
+    # Weights of SHARP and MoGe are downloads, and may be missing.
     weights = settings.model_files.get(name)
     if weights is None:
         return None
@@ -129,6 +132,7 @@ def _open_rgbd(settings: BaseSettings, photo: Photo, depth: Depth) -> Base | Non
     The depth is `depth`, else the settings' map, else the map in the photo's file. A focal length
     that the user gives replaces the map's.
     """
+    # Depth of this call, then of all calls, then of the file.
     source = settings.depth if depth is None else depth
     if source is None and photo.path.is_file():  # a photo that a program made has no file
         source = load_photo_depth(photo.path)
@@ -244,6 +248,7 @@ class OpenedBase:
         """
         skipped: list[SkippedCandidate] = []
         for name, candidate in self.candidates.items():
+            # It failed before in a way that this photo does not change.
             if name in self._unusable:
                 skipped.append(self._unusable[name])
                 continue
@@ -257,10 +262,12 @@ class OpenedBase:
                     continue
                 with stage("base") as progress:
                     prediction = _predict_finite(base, photo, progress)
+            # A problem of the code is no InputError, and ends the run.
             except InputError as error:
                 is_unusable = self._fails_for_every_photo(name, base, error)
                 if is_unusable and len(self.candidates) == 1:
                     raise BaseError(str(error)) from error
+                # After the last candidate nothing is left to try.
                 if name == list(self.candidates)[-1] or isinstance(error, BaseError):
                     raise
                 skipped.append(self._skip(name, error, is_unusable))
@@ -280,7 +287,7 @@ class OpenedBase:
         return serves_all_photos and (base is None or isinstance(error, NotEnoughMemory))
 
     def _skip(self, name: str, error: InputError, is_unusable: bool) -> SkippedCandidate:
-        """Describe a candidate that failed; if it `is_unusable`, remember that and free its memory."""
+        """Describe a candidate that failed; if it `is_unusable`, remember it and drop its network."""
         title = self.candidates[name].title
         skipped = SkippedCandidate(
             reason=f"{title} cannot be used",
@@ -317,6 +324,7 @@ class OpenedBase:
         InputError if loading fails; BaseError if a file of weights has changed since the start.
         """
         name = name or next(iter(self.candidates))
+        # Each photo has its own depth, which is not kept.
         if name == RGBD and name not in self._loaded:
             return _open_rgbd(self._settings, photo, depth)
         if name not in self._loaded:
@@ -338,6 +346,7 @@ class OpenedBase:
 
 def _predict_finite(base: Base, photo: Photo, progress: Progress) -> BasePrediction:
     """The base's prediction; InputError if one of its Gaussians is infinite or not a number."""
+    # A corrupt depth map or focal length shows only here, and would make an unreadable scene.
     prediction = base.predict(photo, progress)
     if not prediction.gaussians.finite:
         raise InputError(

@@ -128,6 +128,7 @@ class BaseSettings:
 
         It becomes `rgbd` if a depth map is given, else `sharp` if a checkpoint is given.
         """
+        # A name that the user gives is never changed.
         if self.name != AUTO:
             return self.name
         if self.depth is not None:
@@ -171,6 +172,7 @@ class BaseSettings:
         Files of weights have their base's name as the key; files of a model's folder have their
         own names.
         """
+        # A folder's files are what transformers reads.
         if self.model_folder is not None:
             matches = [
                 file
@@ -179,6 +181,7 @@ class BaseSettings:
             ]
             return {file.name: file for file in matches if file.is_file()}
 
+        # Of `auto`, any of the networks may be used for the next photo.
         files: dict[str, Path] = {}
         for name in AUTO_NETWORKS if self.resolved_name == AUTO else (self.resolved_name,):
             file = self.checkpoint or _installed_weights(name)
@@ -197,12 +200,13 @@ class BaseSettings:
         check_window_batch(self.windows_per_batch)
         check_name("depth_kind", self.depth_kind, DEPTH_KINDS)
         self._check_depth_options()
+        # To find weights missing only at the first photo would waste the time until then.
         if self.resolved_name in MISSING_WEIGHTS_ADVICE and not self.model_files:
             advice = MISSING_WEIGHTS_ADVICE[self.resolved_name]
             raise InputError(f"`base` {self.resolved_name}: {advice}")
 
     def _check_base_name(self, allow_auto: bool) -> None:
-        """InputError unless the name is a known one, `hf:` with a model, or package.module:Class."""
+        """InputError unless the name is known, `hf:` with a model, or package.module:Class."""
         if self.name == AUTO and not allow_auto:
             raise InputError(
                 f"`base` {AUTO} is not allowed here, because the results name their base: "
@@ -213,11 +217,13 @@ class BaseSettings:
                 f"`base` {HF_PREFIX} names no model: "
                 "give a Hugging Face model as owner/name, or a folder"
             )
+        # A plug-in's module is imported, and refused, only when it is opened.
         if ":" not in self.name:
             check_name("base", self.name, (AUTO, RGBD, *NETWORK_BASES))
 
     def _given_options(self) -> dict[str, object]:
         """The options that only some bases take and that the user has set, with their values."""
+        # A value that is the default counts as not given.
         options = {
             "depth": self.depth.path if isinstance(self.depth, DepthMap) else self.depth,
             "calib": self.calib,
@@ -232,6 +238,7 @@ class BaseSettings:
 
     def _check_option_of_other_bases(self) -> None:
         """InputError if an option is set that this base does not take."""
+        # An option without effect would make the user believe in it.
         for option, value in self._given_options().items():
             if option not in BASE_KINDS[self.kind].options:
                 raise InputError(

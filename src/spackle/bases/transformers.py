@@ -144,6 +144,7 @@ class HfBase:
                 camera = predicted_camera
                 lens_source = "Depth Pro"  # the only model that predicts a field of view
         focal_per_width = camera.focal[0] / photo.width
+        # Canonical disparity needs the focal length: a true one makes the metres true.
         depth = to_depth_map(output, self.meaning, focal_per_width, self.name, photo.path)
         prediction = lift_predicted_depth(photo, depth, camera)
 
@@ -165,6 +166,7 @@ class HfBase:
         with without_autocast_or_tf32(device):
             output = self.network(pixel_values=pixels.to(device))
 
+        # Only the photo's part of a padded picture is wanted.
         depth = output.predicted_depth.float().cpu()  # [1, h, w]
         height, width = depth.shape[1:]
         rows = slice(round(window.top * height), round(window.bottom * height))
@@ -177,6 +179,7 @@ def _camera_of_fov(fov_degrees: float, photo: Photo) -> Camera | None:
     """The camera with a horizontal field of view; None if that is no plausible one."""
     if not 0 < fov_degrees < 180:
         return None
+    # tan(fov / 2) = (width / 2) / focal length
     focal_px = 0.5 * photo.width / math.tan(math.radians(fov_degrees) / 2)
     if not is_plausible_focal(focal_px, photo.width, photo.height):
         return None
@@ -188,6 +191,7 @@ def meaning_of(settings: Mapping[str, Any], name: str) -> Meaning:
 
     InputError, which names the model, if it is unknown: a guess may be wrong.
     """
+    # The file is untrusted: its values may have any type.
     kind = str(settings.get("model_type"))
     stated = str(settings.get("depth_estimation_type", "relative"))
     backbone = settings.get("backbone_config")
@@ -229,6 +233,7 @@ def to_depth_map(
         disparity_per_m = output / focal_per_width
         depth = 1 / disparity_per_m.clamp(MIN_DISPARITY_PER_M, MAX_DISPARITY_PER_M)
 
+    # A metric model may predict 0 or less for the sky.
     valid = known & is_valid_depth(depth)
     return DepthMap(
         depth.where(valid, 0.0),
@@ -294,6 +299,7 @@ def _load_model(
     `source` is a folder or owner/name; only `from_hub` may use the internet. OSError for a missing
     file; InputError, which calls the model `name`, for weights that do not fit.
     """
+    # A model's folder may hold Python code, which must not run.
     files = {"local_files_only": not from_hub, "trust_remote_code": False}
     settings, _ = transformers.PretrainedConfig.get_config_dict(source, **files)
     meaning = meaning_of(settings, name)  # before gigabytes of weights are loaded
@@ -326,6 +332,7 @@ def _check_loading_info(info: Mapping[str, Any], name: str) -> None:
 
     `info` is what transformers says about it.
     """
+    # transformers fills what is missing with random numbers, and goes on.
     problems = [f"have another shape for {key}" for key, *_ in sorted(info["mismatched_keys"])]
     problems += [
         f"lack {key}"
@@ -401,6 +408,7 @@ def _stretch_to_input(settings: Mapping[str, Any]) -> Preprocessing:
     """
     height = int(settings["size"]["height"])
     width = int(settings["size"]["width"])
+    # What Depth Pro's own processor does, and nothing else, is done here without torchvision.
     filter_number = settings.get("resample", Image.Resampling.BILINEAR)
     is_possible = 1 <= min(height, width) <= max(height, width) <= MAX_INPUT_SIDE
     if filter_number != Image.Resampling.BILINEAR or not is_possible:

@@ -61,9 +61,11 @@ class Calibration:
         only if `zero_is_unknown`. InputError, naming `path`, for negative numbers, for a map of
         another size than the calibrated one, and if no pixel is known.
         """
+        # A wrong file is refused before its numbers are used.
         check_not_negative(stored, path)
         self._check_map_size(stored, path)
 
+        # Datasets mark unknown pixels in different ways.
         valid = np.isfinite(stored) & (stored != self.invalid)
         if zero_is_unknown:
             valid &= stored > 0
@@ -101,8 +103,10 @@ class Calibration:
 
     def cameras(self, width: int, height: int) -> tuple[Camera, Camera]:
         """The cameras of the left and the right photo, in the left camera's frame."""
+        # The world's origin is the left camera.
         left = Camera(self.K, torch.eye(4), width, height)
 
+        # Rectified photos differ in the principal point's x and in the position along x alone.
         right_K = self.K
         right_K[0, 2] += self.doffs_px
         left_to_right = torch.eye(4)
@@ -143,9 +147,11 @@ def find_calibration(depth_file: Path) -> Calibration | None:
     if scene_json.is_file() and _is_disparity_of_scene(depth_file, scene_json):
         return _read_scene_json(scene_json)
 
+    # Middlebury's own names are disp0.pfm and disp0GT.pfm.
     stem = depth_file.stem.lower()
     if stem.startswith("disp") and calib_txt.is_file():
         return _read_middlebury(calib_txt)
+    # To take disparity for metres would give a scene turned inside out.
     if stem.startswith("disp") or stem.endswith(("disp", "disparity")):
         raise InputError(
             f"{depth_file}: the name announces a disparity map: give `calib`, or rename the map"
@@ -158,6 +164,7 @@ def _read_middlebury(path: StrPath) -> Calibration:
 
     Optional width and height say to which image the numbers belong. InputError for another text.
     """
+    # The lines are NAME=VALUE, in any order.
     entries: dict[str, str] = {}
     for line in read_short_text(path).splitlines():
         name, _, value = line.partition("=")
@@ -166,6 +173,7 @@ def _read_middlebury(path: StrPath) -> Calibration:
     problem = "not a Middlebury calibration: needs cam0=[f 0 cx; 0 f cy; 0 0 1], doffs and baseline"
     with as_input_error(path, problem):
         number = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+        # The matrix in row-major order: f 0 cx, 0 f cy, 0 0 1.
         cam0 = [float(text) for text in re.findall(number, entries["cam0"])]
         size = None
         if "width" in entries and "height" in entries:
@@ -213,6 +221,7 @@ def read_short_text(
     path: StrPath, kind: str = "calibration", max_bytes: int = MAX_TEXT_BYTES
 ) -> str:
     """The text of a short file; InputError, calling it a `kind`, if it is missing or too long."""
+    # The wrong file may have gigabytes, and messages need none of them.
     if check_file(path, kind) > max_bytes:
         raise InputError(f"{path}: too long for a {kind}: give another file")
     return Path(path).read_text(encoding="utf-8", errors="replace")

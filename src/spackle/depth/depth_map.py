@@ -50,6 +50,7 @@ class DepthMap:
 
     def check_aspect_ratio(self, height: int, width: int, photo: StrPath) -> None:
         """InputError unless a height×width photo has this map's aspect ratio within 1 %."""
+        # A map may be smaller or larger than its photo: only the shape must fit.
         rows, columns = self.depth.shape
         ratio_of_aspects = columns * height / (rows * width)
         if abs(ratio_of_aspects - 1) > ASPECT_TOLERANCE:
@@ -64,6 +65,7 @@ class DepthMap:
         Metres that were computed from disparity scale with the focal length, because
         depth = baseline · focal / disparity. Measured metres stay, and lose the intrinsics.
         """
+        # Measured metres do not depend on a lens.
         if self.K is None or self.quantity == "depth":
             return dataclasses.replace(self, K=None)
 
@@ -83,11 +85,13 @@ def is_valid_depth(metres: Tensor) -> Tensor:
 
 def quantisation_step(values: Array) -> float | None:
     """The step of the integer grid on which all `values` [N] lie; None if one is not an integer."""
+    # Formats without a header for the step store it in the numbers themselves.
     are_integers = np.array_equal(values, np.round(values))
     if float(values.max()) > MAX_EXACT_INTEGER or not are_integers:
         return None
 
     distinct = np.unique(values.astype(np.int64))
+    # A map of two walls at 2000 and 3000 mm is no map in steps of a metre.
     if len(distinct) < MIN_DISTINCT_VALUES:
         return 1.0
     # A camera with 10 bits in a file of 16 bits stores multiples of 64.
@@ -96,6 +100,7 @@ def quantisation_step(values: Array) -> float | None:
 
 def check_not_negative(stored: Array, path: StrPath) -> None:
     """InputError, naming the file, if a number of `stored` [H, W] is negative; NaN, inf may be."""
+    # Negative depth means another convention, such as z that points backwards: no guess is safe.
     negative_count = int((np.isfinite(stored) & (stored < 0)).sum())
     if negative_count:
         raise InputError(
@@ -137,6 +142,7 @@ def build_depth_map(
     if not known.any():
         raise InputError(f"{path}: all-invalid: not one of {stored.size} pixels has a {quantity}")
 
+    # Lifting smooths within one step, because a step is no edge of a surface.
     quantum = None
     if stored_unit is not None:
         step = quantisation_step(stored[known.numpy()])

@@ -63,6 +63,7 @@ def _import_openexr(path: StrPath) -> Any:
 
 def _check_kind(OpenEXR: Any, described: Any, path: StrPath) -> None:
     """InputError unless a file, of which the header was read, is one lossless flat picture."""
+    # A deep picture has a list of depths for each pixel.
     flat_kinds = (OpenEXR.scanlineimage, OpenEXR.tiledimage)
     if len(described.parts) != 1 or described.parts[0].type() not in flat_kinds:
         raise InputError(f"{path}: a deep EXR, or one with several parts: give one plain picture")
@@ -97,6 +98,7 @@ def _depth_channel(names: list[str]) -> str:
     def preference(name: str) -> tuple[bool, int, int]:
         return "depth" in name.lower(), CHANNEL_LETTERS.find(name[-1]), -len(name)
 
+    # Renderers add layers in front: ViewLayer.Depth.Z.
     return max(names, key=preference)
 
 
@@ -115,6 +117,7 @@ def _read_channel(OpenEXR: Any, file: IO[bytes], name: str) -> Array:
 
 def _window_size(window: tuple[Array, Array]) -> tuple[int, int]:
     """(height, width) of a window, which EXR states as the first and the last pixel (x, y)."""
+    # Both corners belong to the window.
     first, last = window
     return int(last[1]) - int(first[1]) + 1, int(last[0]) - int(first[0]) + 1
 
@@ -127,6 +130,7 @@ def _in_display_window(
     A renderer may store only the part of a picture that is not empty, or more than the picture.
     """
     height, width = _window_size(display_window)
+    # Where the stored part begins in the picture; negative if it begins outside.
     top = int(data_window[0][1]) - int(display_window[0][1])
     left = int(data_window[0][0]) - int(display_window[0][0])
     if (top, left) == (0, 0) and pixels.shape == (height, width):
@@ -134,6 +138,7 @@ def _in_display_window(
 
     data_height, data_width = pixels.shape
     picture = np.zeros((height, width), pixels.dtype)
+    # What of the stored part lies in the picture.
     rows = slice(max(top, 0), min(top + data_height, height))
     columns = slice(max(left, 0), min(left + data_width, width))
     if rows.start < rows.stop and columns.start < columns.stop:

@@ -108,6 +108,7 @@ def load_depth(
     check_file(path, "depth map")
     if focal_px is not None and not 1 / LARGEST_NUMBER <= focal_px <= LARGEST_NUMBER:
         raise InputError(f"`focal_px` {focal_px:g}: give a focal length above 0, in pixels")
+    # What the user says about the numbers counts more than what the folder suggests.
     if kind in RELATIVE_KINDS:
         stored, _ = read_array(path, grey=True)
         return relative_depth(stored, kind, path, near, far)
@@ -125,6 +126,7 @@ def load_depth(
 
     if not is_png:
         return metric_depth(stored, path)
+    # Relative depth in 16 bits looks like millimetres up to 65 m: better ask than be wrong.
     if kind == "auto" and fills_16_bits(stored):
         raise InputError(
             f"{path}: its values fill the range of 16 bits, as relative depth does: {KIND_ADVICE}"
@@ -145,6 +147,7 @@ def read_array(path: StrPath, *, grey: bool = False) -> tuple[Array, bool]:
     """
     damaged = "cannot be decoded ({reason}): the file is damaged or cut off"
     with as_input_error(path, damaged), open(path, "rb") as file:
+        # The first bytes, not the name: depth maps often have made-up suffixes.
         magic = file.read(4)
         file.seek(0)
         if magic == PNG_MAGIC:
@@ -162,6 +165,7 @@ def read_array(path: StrPath, *, grey: bool = False) -> tuple[Array, bool]:
                 f"{path}: a PFM with three channels is not a depth map: give one channel (Pf)"
             )
 
+    # Relative maps also come as JPEG or WebP.
     if grey:
         return read_image(path, lambda image: _grey_values(image, path, grey)), False
     raise InputError(
@@ -172,6 +176,7 @@ def read_array(path: StrPath, *, grey: bool = False) -> tuple[Array, bool]:
 
 def _check_shape(shape: tuple[int, ...], path: StrPath) -> None:
     """InputError unless an array's shape is [height, width], and of a size that memory holds."""
+    # A third axis may be colours or several maps: there is no telling which one is meant.
     if len(shape) != 2 or min(shape) < 1:
         raise InputError(
             f"{path}: an array of shape {shape} is not a depth map: give [height, width]"
@@ -196,6 +201,7 @@ def _grey_values(image: Image.Image, path: StrPath, grey: bool) -> Array:
             f"{path}: a PNG with mode {image.mode} holds no millimetres: {KIND_ADVICE}"
         )
 
+    # A colour map (such as viridis) has no order of brightness from near to far.
     channels = np.asarray(image.convert("RGB")).astype(np.int16)  # [H, W, 3]
     if np.ptp(channels, axis=-1).max() >= MAX_CHANNEL_DIFFERENCE:
         raise InputError(f"{path}: a colour picture does not tell near from far: give a grey one")
@@ -207,6 +213,7 @@ def _read_npy(file: IO[bytes], path: StrPath) -> Array:
 
     InputError for objects, and if the shape that the header states is not that of a depth map.
     """
+    # The header is read from a bounded copy, because NumPy trusts the length that it states.
     start = io.BytesIO(file.read(MAX_NPY_HEADER_BYTES))
     if np.lib.format.read_magic(start) == (1, 0):
         shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(start)

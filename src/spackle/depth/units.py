@@ -49,6 +49,7 @@ def depth_from_array(stored: Array, path: Path, kind: DepthKind = "auto") -> Dep
     Of metres, 0, NaN and inf mean unknown. `path` is the name of the array in messages. InputError
     for an array of another shape or type, or one that cannot be depth.
     """
+    # A caller's array may be anything: objects, texts, or a picture with channels.
     if stored.ndim != 2 or not stored.size or stored.dtype.kind not in "fiu":
         raise InputError(
             f"{path}: an array of {stored.dtype} {short_repr(stored.shape)}: "
@@ -66,6 +67,7 @@ def metric_depth(stored: Array, path: StrPath) -> DepthMap:
     millimetres, and if no pixel is known.
     """
     check_not_negative(stored, path)
+    # Floats may happen to be whole metres: only integers have a step.
     are_integers = stored.dtype.kind in "iu"
     if are_integers and np.median(stored) > IMPLAUSIBLE_MEDIAN_M:
         raise InputError(
@@ -88,6 +90,7 @@ def millimetre_depth(stored: Array, path: StrPath) -> DepthMap:
 
     InputError, naming `path`, if the PNG has 8 bits, or no pixel is known.
     """
+    # 255 millimetres reach nowhere: 8 bits are relative depth, of which the kind is not known.
     if stored.dtype == np.uint8:
         raise InputError(
             f"{path}: an 8-bit PNG holds no metres: "
@@ -106,6 +109,7 @@ def millimetre_depth(stored: Array, path: StrPath) -> DepthMap:
 
 def fills_16_bits(stored: Array) -> bool:
     """Whether a PNG's numbers reach from nearly 0 to nearly 65535, as relative depth does."""
+    # The two numbers for unknown pixels say nothing about the range.
     known = stored[(stored > 0) & (stored < UNKNOWN_MILLIMETRES)]
     if not known.size:
         return False
@@ -141,6 +145,7 @@ def relative_depth(
         raise InputError(
             f"`near` {near:g}, `far` {far:g}: give two distances in metres, the nearer one first"
         )
+    # Quantiles instead of the extremes, because a few pixels may be noise.
     known = np.isfinite(stored)
     values = stored.astype(np.float64)
     extremes = np.quantile(values[known], NEAR_AND_FAR_QUANTILES) if known.any() else np.zeros(2)
@@ -153,15 +158,18 @@ def relative_depth(
     quantity: Quantity
     if kind == "near-white":
         quantity = "disparity"
+        # Inverse depth is linear in these numbers, from 1/far to 1/near.
         inverse_span = 1 / near - 1 / far  # 1/m
         inverse_depth = 1 / far + share * inverse_span
         depth = 1 / np.clip(inverse_depth, 1 / (MAX_STRETCH * far), MAX_STRETCH / near)
         stored_unit = inverse_span / (high - low)
     else:
         quantity = "depth"
+        # Depth itself is linear in these numbers.
         depth = np.clip(near + share * (far - near), near / MAX_STRETCH, MAX_STRETCH * far)
         stored_unit = (far - near) / (high - low)
 
+    # Integers come from a picture of 8 or 16 bits, whose steps must not become edges.
     if step is None and stored.dtype.kind in "iu":
         step = quantisation_step(values[known])
     quantum = None if step is None else step * stored_unit

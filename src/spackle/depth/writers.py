@@ -41,6 +41,7 @@ def save_depth(depth: Tensor, path: str | os.PathLike[str]) -> None:
     The suffix decides the format: .npy and .exr hold metres as float32, .png holds millimetres in
     16 bits. InputError for another suffix, and if the file cannot be written.
     """
+    # The name is checked first: a map may have taken minutes.
     encode = check_depth_name(path)
     write_atomic(path, encode(depth.cpu().numpy().astype(np.float32)))
 
@@ -54,6 +55,7 @@ def _encode_npy(depth: Metres) -> bytes:
 
 def _encode_png(depth: Metres) -> bytes:
     """The bytes of a 16-bit PNG in millimetres; depths beyond 65.5 m become 65.5 m."""
+    # Readers take 65535 for unknown, which suits depths that do not fit into 16 bits.
     millimetres = np.clip(np.round(depth * MILLIMETRES_PER_METRE), 0, MAX_MILLIMETRES)
     file = io.BytesIO()
     Image.fromarray(millimetres.astype(np.uint16)).save(file, format="PNG")

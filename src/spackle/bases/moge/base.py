@@ -1,4 +1,4 @@
-"""The moge base: lift the depth of MoGe-2, and take MoGe-2's focal length if the photo's is unknown.
+"""The moge base: lift the depth of MoGe-2, with MoGe-2's focal length if the photo's is unknown.
 
 The network predicts points up to a shift along z. `to_view` finds the shift and the focal length
 with which the points project to their pixels, and turns the points into depth in metres.
@@ -65,6 +65,7 @@ class MogeView:
         known = self.surface & (self.depth > 0) & self.depth.isfinite()
         if not known.any():
             raise InputError(f"{path}: MoGe finds no surface: give another photo, or `base` lite")
+        # The sky has no depth, but must not leave a hole.
         sky_depth = SKY_DISTANCE_FACTOR * self.depth[known].max()
         depth = torch.where(self.surface, self.depth.where(known, 0.0), sky_depth)
         return DepthMap(
@@ -133,6 +134,7 @@ class MogeBase:
 
         The source is "MoGe", or "" if the photo's focal length is taken.
         """
+        # An assumed focal length is worth less than the network's.
         if photo.focal_source.is_assumed:
             view = to_view(output, photo.width, photo.height)
             if is_plausible_focal(view.focal_px, photo.width, photo.height):
@@ -160,17 +162,20 @@ def to_view(output: MogeOutput, width: int, height: int, focal_px: float | None 
     points to their pixels best. A given `focal_px`, in pixels of the photo, is kept.
     """
     rows, columns = output.mask_logits.shape
+    # Two unknowns need few points: 64 × 64 of them, evenly spread.
     sampled_rows = (torch.arange(SAMPLES_PER_SIDE) * rows // SAMPLES_PER_SIDE)[:, None]
     sampled_columns = torch.arange(SAMPLES_PER_SIDE) * columns // SAMPLES_PER_SIDE
     points = output.points[sampled_rows, sampled_columns].double()  # [64, 64, 3]
     plane = view_plane(rows, columns, width / height)[0].permute(1, 2, 0)  # [h, w, 2]
     places = plane[sampled_rows, sampled_columns].double()  # [64, 64, 2]
+    # The sky's points are far away and arbitrary.
     is_surface = output.mask_logits[sampled_rows, sampled_columns] > 0
     usable = is_surface & points.isfinite().all(-1)
 
     half_diagonal = math.hypot(width, height) / 2  # the unit of places and of the focal length
     known_focal = None if focal_px is None else focal_px / half_diagonal
     focal, shift = focal_and_shift(points[usable].numpy(), places[usable].numpy(), known_focal)
+    # The shift is in the network's units, hence before the metric scale.
     depth = (output.points[..., 2] + shift) * output.metric_scale
     return MogeView(depth, output.mask_logits > 0, focal * half_diagonal, shift)
 
@@ -219,6 +224,7 @@ def focal_and_shift(
     if len(points) < 2:
         return known_focal or 1.0, 0.0
 
+    # The iteration needs a start; most photos need but a small shift.
     shift = 0.0
     fit = _fit_at(shift, points, places, known_focal)
     for _ in range(MAX_SHIFT_STEPS):
@@ -252,5 +258,6 @@ def _gauss_newton_step(
             / (fit.projected * fit.projected).sum()
         )
         residual_slope += focal_slope * fit.projected
+    # All points on one line through the camera have slope 0: then the step is 0.
     squared_slope = (residual_slope * residual_slope).sum()
     return -float((residual_slope * fit.residual).sum() / (squared_slope or 1.0))

@@ -76,6 +76,7 @@ class DinoBackbone(nn.Module):
         tokens = patches.flatten(2).transpose(1, 2)  # [1, h·w, C]
         tokens = torch.cat([self.cls_token, tokens], dim=1) + self._positions(rows, columns)
 
+        # The encoder uses tokens of several depths.
         tokens_after_block = []
         for block in self.blocks:
             tokens = block(tokens)
@@ -122,6 +123,7 @@ class DinoEncoder(nn.Module):
 
         The image is sRGB in 0..1.
         """
+        # The photo gets the size of a whole number of tokens.
         resized = interpolate(
             image,
             size=(TOKEN_PX * rows, TOKEN_PX * columns),
@@ -237,6 +239,7 @@ class Pyramid(nn.Module):
 
 def _check_pyramid_options(config: Mapping[str, Any]) -> None:
     """ValueError unless a pyramid has five levels, few blocks, and the published options."""
+    # Older configurations leave these two out.
     defaults = {"dim_times_res_block_hidden": 1, "activation": "relu"}
     options = {**defaults, **config}
     for key, value in PUBLISHED_PYRAMID_OPTIONS.items():
@@ -267,6 +270,7 @@ class MogeNetwork(nn.Module):
         self.points_head = Pyramid(config["points_head"])
         self.mask_head = Pyramid(config["mask_head"])
 
+        # All published checkpoints have three layers here.
         inputs, hidden_1, hidden_2, outputs = config["scale_head"]["dims"]
         self.scale_head = nn.Sequential(
             nn.Linear(inputs, hidden_1),
@@ -284,6 +288,7 @@ class MogeNetwork(nn.Module):
         levels, metric_scale = self.features(image, tokens)
         x, y, log_z = self.decode(self.points_head, levels, size).unbind(-1)  # each [h, w]
         z = log_z.exp()
+        # Exponentials give near and far surfaces the same relative accuracy.
         if self.remap_output == "exp":  # the network predicts x / z, y / z and log z
             x = x * z
             y = y * z
@@ -319,6 +324,7 @@ class MogeNetwork(nn.Module):
 
 def token_grid(height: int, width: int, tokens: int) -> tuple[int, int]:
     """(rows, columns) of a grid of about `tokens` tokens over a photo of this size in pixels."""
+    # rows · columns = tokens and columns / rows = aspect
     aspect = width / height
     rows = max(1, round(math.sqrt(tokens / aspect)))
     columns = max(1, round(math.sqrt(tokens * aspect)))
@@ -334,6 +340,7 @@ def view_plane(rows: int, columns: int, aspect: float) -> Tensor:
     # From -1 to 1 across the photo.
     x = (2 * torch.arange(columns, dtype=torch.float64) + 1) / columns - 1
     y = (2 * torch.arange(rows, dtype=torch.float64) + 1) / rows - 1
+    # Half the diagonal as the unit makes focal lengths of all aspect ratios alike.
     diagonal = math.hypot(1, aspect)
     grid = torch.meshgrid(x * (aspect / diagonal), y / diagonal, indexing="xy")
     return torch.stack(grid)[None].float()

@@ -1,4 +1,7 @@
-"""SHARP, Apple's network that predicts Gaussians from one photo, reimplemented for speed, and for CPUs."""
+"""SHARP, Apple's network that predicts Gaussians from one photo, reimplemented for speed.
+
+Read `network` first, then `encoder`; `base` loads and runs them, `stretch` converts to metres.
+"""
 
 from spackle.bases.sharp.base import SharpBase
 

@@ -1,7 +1,8 @@
 """The SHARP base: predict 1,179,648 Gaussians in metres from one photo.
 
 The weights are Apple's, or Apple's with a retrained Gaussian decoder. `SharpBase` is the base,
-`load_network` reads its weights, and `SourceCheckpoint` says on which weights a decoder was trained.
+`load_network` reads its weights, and `SourceCheckpoint` says on which weights a decoder was
+trained.
 """
 
 from __future__ import annotations
@@ -120,6 +121,7 @@ class SharpBase:
         """
         with report_memory_shortage(MEMORY_ADVICE):
             gaussians = to_metric(self.infer(photo, progress), photo)
+        # SHARP has a resolution of its own; the scene's camera has the size at which it is shown.
         camera = Camera.from_focal(photo.focal_px, photo.width, photo.height)
         width, height = working_size(photo.width, photo.height)
         notes: dict[str, float | int | str] = {"precision": self.precision, "weights": self.weights}
@@ -187,6 +189,7 @@ def load_network(
     or foreign file, or too little memory.
     """
     tensors: Mapping[str, Tensor] = read_tensors(path, ADVICE)
+    # A decoder is 1 % of the weights; copies of the rest would fill a disk.
     source = source_checkpoint_of(path)
     if source is not None:
         tensors = _completed_by_source(tensors, path, source)
@@ -205,6 +208,7 @@ def load_network(
 def _size_of(tensors: Mapping[str, Tensor]) -> SharpConfig:
     """The size of SHARP that a checkpoint's learned positions of tokens fit; else the published."""
     positions = tensors.get(f"{_ENCODER_PREFIX}patch_encoder.pos_embed", torch.empty(0))
+    # The tests' tiny sizes are read by the same function as the published one.
     for config in SIZES.values():
         if positions.shape == (1, 1 + config.tokens_per_side**2, config.embed_width):
             return config
@@ -263,6 +267,7 @@ def source_checkpoint_of(path: str | os.PathLike[str]) -> SourceCheckpoint | Non
 
     InputError if it is a decoder's file without the name.
     """
+    # Only files that `encode_decoder` wrote have this key.
     note = read_metadata(path, SOURCE_KEY)
     if note is None:
         return None
@@ -282,6 +287,7 @@ def _completed_by_source(
     """
     checkpoint = _find_source(path, source)
     tensors = read_tensors(checkpoint, ADVICE)
+    # The decoder's names must be exactly the checkpoint's.
     trained_names = {name for name in tensors if name.startswith(DECODER_PREFIXES)}
     wrong_names = sorted(trained_names ^ decoder.keys())  # in one of the two files only
     if wrong_names:
@@ -299,6 +305,7 @@ def _find_source(path: str | os.PathLike[str], source: SourceCheckpoint) -> Path
     It has the link's name, or its own. InputError if it is missing, unreadable or changed.
     """
     folder = Path(path).absolute().parent
+    # The name comes from an untrusted file, and goes to a terminal.
     shown_name = printable_line(source.path.name)
     candidates = [folder / source.link_name, folder / source.path.name]
     checkpoint = next((file for file in candidates if os.path.isfile(file)), None)
@@ -311,6 +318,7 @@ def _find_source(path: str | os.PathLike[str], source: SourceCheckpoint) -> Path
     unreadable = as_input_error(checkpoint, "cannot be read: {reason}", OSError)
     with unreadable, open(checkpoint, "rb") as file:
         sha256 = sha256_of(file)
+    # Another checkpoint would load without an error and give a wrong scene.
     if sha256 != source.sha256:
         shown_digest = printable_line(source.sha256)[:64]
         raise InputError(

@@ -19,8 +19,8 @@ from spackle.weights.checkpoints import to_channels_last
 LAYER_COUNT = 2  # of Gaussians: the visible surface, and what may be behind it
 CELL_STRIDE = 2  # pixels of the network's picture for each cell of Gaussians
 
-# Number of windows along a side of the picture: at full size they overlap by a quarter, at half size
-# by a half. At a quarter of its size, the picture is one window.
+# Number of windows along a side of the picture: at full size they overlap by a quarter, at half
+# size by a half. At a quarter of its size, the picture is one window.
 FULL_SIZE_WINDOWS = 5
 HALF_SIZE_WINDOWS = 3
 WINDOW_COUNT = FULL_SIZE_WINDOWS**2 + HALF_SIZE_WINDOWS**2 + 1
@@ -176,13 +176,14 @@ class TransformerBlock(nn.Module):
 
     def forward(self, tokens: Tensor) -> Tensor:
         """Tokens [B, T, C] in float32 to tokens of the same shape and type."""
+        # The sums stay float32; only what is added is computed in lower precision.
         tokens = tokens + self._attention(self.norm1(tokens)) * self.ls1["gamma"]
         hidden = gelu(self.mlp["fc1"](to_precision_of(self.norm2(tokens), self.mlp["fc1"])))
         out: Tensor = tokens + self.mlp["fc2"](hidden) * self.ls2["gamma"]
         return out
 
     def _attention(self, tokens: Tensor) -> Tensor:
-        """Multi-head self-attention of tokens [B, T, C]; the result has the precision of weights."""
+        """Multi-head self-attention of tokens [B, T, C], in the precision of the weights."""
         batch, token_count, width = tokens.shape
         qkv = self.attn["qkv"](to_precision_of(tokens, self.attn["qkv"]))  # [B, T, 3·C]
         qkv = qkv.view(batch, token_count, 3, self.heads, width // self.heads)
@@ -233,6 +234,7 @@ class SlidingPyramid(nn.Module):
             Five feature maps, fine to coarse; as published [1, 256, 768, 768], [1, 256, 384, 384],
             [1, 512, 192, 192], [1, 1024, 96, 96] and [1, 1024, 48, 48].
         """
+        # Large objects fill several windows at full size, and are seen whole at a smaller one.
         half = interpolate(image, scale_factor=0.5, mode="bilinear")
         quarter = interpolate(image, scale_factor=0.25, mode="bilinear")
         windows = torch.cat(
@@ -288,6 +290,7 @@ def cut_windows(image: Tensor, window: int, count: int) -> Tensor:
 
     They come in row-major order: [count², C, window, window].
     """
+    # The first window begins at 0, and the last one ends with the picture.
     stride = (image.shape[-1] - window) // (count - 1)
     rows = image.unfold(2, window, stride)  # [1, C, count, S, window]
     windows = rows.unfold(3, window, stride)  # [1, C, count, count, window, window]
@@ -307,6 +310,7 @@ def merge_windows(maps: Tensor, trim: int) -> Tensor:
         end = size - trim if i < count - 1 else size
         spans.append(slice(begin, end))
 
+    # Windows lie in row-major order.
     rows = []
     for i, vertical in enumerate(spans):
         tiles = [maps[i * count + j, :, vertical, horizontal] for j, horizontal in enumerate(spans)]

@@ -52,6 +52,7 @@ class GroupNorm(nn.GroupNorm):
 
     def forward(self, x: Tensor) -> Tensor:
         """Normalise [1, C, H, W] by the mean and variance of each group of channels."""
+        # GPUs sum in a tree, which is exact enough; bfloat16 is rough anyway.
         if x.device.type != "cpu" or x.dtype != torch.float32 or len(x) != 1:
             return super().forward(x)
         rows = x[0].permute(1, 2, 0)  # [H, W, C]
@@ -147,6 +148,7 @@ class Decoder(nn.Module):
 
         Map i is [1, C, H/2^i, W/2^i]. `coarser` are features that are added to the coarsest map.
         """
+        # From the coarsest map to the finest.
         features = coarser
         for level in reversed(range(len(maps))):
             projected = self.convs[level](maps[level])
@@ -407,6 +409,7 @@ def make_initial_gaussians(image: Tensor, depth: Tensor) -> InitialGaussians:
 
     Depths are scaled so that the nearest is 1, because the network was trained so.
     """
+    # In float64, because the factor is undone later.
     factor = NEAREST_DEPTH / (depth.min().double() + SMALLEST_INVERSE)
     disparity = 1.0 / (depth * factor).clamp_max(FARTHEST_DEPTH)
     return InitialGaussians(
@@ -446,6 +449,7 @@ def apply_deltas(initial: InitialGaussians, deltas: Tensor) -> Gaussians:
 
     # Without a change the quaternion is (1, 0, 0, 0): no rotation.
     quats = torch.cat([deltas[6:7] + 1, deltas[7:10]])
+    # Colours change before a sigmoid, so that they stay in 0..1.
     color = initial.color.clamp(COLOR_MARGIN, 1 - COLOR_MARGIN)
     colors = srgb_to_linear(torch.sigmoid(torch.logit(color)[:, None] + COLOR_GAIN * deltas[10:13]))
     opacities = torch.sigmoid(deltas[13])

@@ -46,6 +46,7 @@ def stretch_gaussians(gaussians: Gaussians, stretch: tuple[float, float, float])
     new_quats = np.empty((len(quats), 4), np.float32)
     new_scales = np.empty((len(quats), 3), np.float32)
 
+    # The kernel frees the GIL, so that threads compute at the same time.
     def stretch_range(start: int, stop: int) -> None:
         stretch_chunk(start, stop, quats, scales, factors, new_quats, new_scales)
 
@@ -142,6 +143,7 @@ def _rotate_to_orthogonal(p: Any, q: Any) -> Any:
     twice_dot = 2.0 * _dot(p, q)
     difference = _dot(q, q) - _dot(p, p)
     hypotenuse = math.sqrt(difference * difference + twice_dot * twice_dot)
+    # This form of the tangent loses no digits if the angle is small.
     tangent = twice_dot / (abs(difference) + hypotenuse + TINY)
     tangent = -tangent if difference < 0.0 else tangent
     cosine = 1.0 / math.sqrt(1.0 + tangent * tangent)
@@ -205,6 +207,7 @@ def _other_axes(a: Any, b: Any) -> Any:
     The second axis is the unit vector `b`, made orthogonal to `a`. If b is nearly parallel to a, or
     zero, any orthogonal axis is taken.
     """
+    # For unit vectors the squared length is the squared sine of their angle.
     c = _cross(a, b)
     if not _dot(c, c) > MIN_SQUARED_SINE:
         # The world's axis that is most different from a.
@@ -247,6 +250,7 @@ def _quat_of_axes(a: Any, b: Any, c: Any) -> Any:
     else:
         w, x, y, z = wz, xz, yz, zz
 
+    # q and -q are the same rotation: w ≥ 0 makes it unique.
     factor = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
     factor = -factor if w < 0.0 else factor
     return w * factor, x * factor, y * factor, z * factor

@@ -47,6 +47,7 @@ def extended_xmp_of(image: JpegImageFile) -> bytes:
     the main packet names (32 characters), the length of all parts together and the part's position
     (4 bytes each).
     """
+    # Parts of another photo's XMP may lie beside this one's, left by an editor.
     guid = _EXTENDED_XMP_GUID.search(xmp_of(image))
     if guid is None:
         return b""
@@ -60,6 +61,7 @@ def extended_xmp_of(image: JpegImageFile) -> bytes:
     if not parts:
         return b""
 
+    # Segments may come in any order.
     parts_in_order = sorted(parts, key=lambda part: part[36:40])
     joined = b"".join(part[40:] for part in parts_in_order)
     stated_length = parts[0][32:36]
@@ -144,6 +146,7 @@ def _boxes(body: memoryview) -> Iterator[Box]:
     position = 0
     while position + 8 <= len(body):
         size, kind = struct.unpack_from(">I4s", body, position)
+        # Sizes include the header.
         header_size = 8
         if size == 1:
             (size,) = struct.unpack_from(">Q", body, position + 8)
@@ -175,6 +178,7 @@ def _properties_of_items(iprp: memoryview) -> dict[int, list[Box]]:
     for kind, table in parts:
         if kind != b"ipma":
             continue
+        # Larger files have wider numbers.
         version = table[0]
         has_wide_numbers = table[3] & 1  # the last flag
         item_format = struct.Struct(">IB" if version else ">HB")  # item, count of its properties
@@ -207,6 +211,7 @@ def _item_types(properties: list[Box]) -> set[bytes]:
 
 def _orientation_steps(properties: list[Box]) -> str | None:
     """The steps of an item's rotations and mirrorings, in their order; None if there are none."""
+    # Other properties, such as the size or the colour space, turn nothing.
     steps = [
         _STEPS_OF_HEIF_BOX[kind][body[0] % len(_STEPS_OF_HEIF_BOX[kind])]
         for kind, body in properties
@@ -228,6 +233,7 @@ def own_property(node: Element, name: str) -> str | None:
 
     XMP stores a property as an attribute or as a child element.
     """
+    # Writers of XMP choose freely between the two forms.
     text = node.get(name)
     if text is None:
         text = node.findtext(name)

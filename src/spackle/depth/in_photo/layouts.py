@@ -96,6 +96,7 @@ class CodedDepth:
         if int(self.codes.min()) == int(self.codes.max()):
             raise ValueError("it has the same value everywhere")
 
+        # A map in 16 bits may hold the codes of 8: its step is then larger than one code.
         slope = (self.scale.last - self.scale.first) / self.max_code
         code_step = quantisation_step(self.codes) or 1
         step = abs(slope) * code_step
@@ -126,6 +127,7 @@ def load_photo_depth(path: StrPath) -> DepthMap | None:
     try:
         with open(path, "rb") as file:
             start = file.read(8)
+            # No other format of photos holds depth; they are not read to the end.
             is_jpeg = start.startswith(JPEG_MAGIC)
             is_heif = start.endswith(HEIF_BRAND_BOX)
             if not (is_jpeg or is_heif):
@@ -150,6 +152,7 @@ def _to_depth_map(coded: CodedDepth, path: Path) -> DepthMap:
     stored, quantum = coded.decode()
     depth = coded.upright(torch.from_numpy(stored))
     note = f"portrait depth of the photo ({coded.scale.source}"
+    # A stated unit is trusted, even if the photo shows a mountain.
     factor = 1.0 if coded.scale.unit_known else _factor_to_plausible(depth)
     if factor != 1:
         depth = depth * factor
@@ -176,6 +179,7 @@ def _factor_to_plausible(depth: Tensor) -> float:
     known = depth[is_valid_depth(depth)]
     if not len(known):
         return 1.0
+    # Portraits and still lifes are a few metres away: a far smaller or larger median is a unit.
     median = float(known.median())
     is_plausible = MIN_PLAUSIBLE_MEDIAN_M <= median <= MAX_PLAUSIBLE_MEDIAN_M
     return 1.0 if is_plausible else USUAL_MEDIAN_M / median
@@ -205,6 +209,7 @@ def _find_in_jpeg(data: bytes) -> CodedDepth | None:
         orientation = image.getexif().get(EXIF_TAG_ORIENTATION, 1)
         upright_steps = STEPS_OF_EXIF_ORIENTATION.get(orientation, "")
 
+    # A gain map or a matte may come first.
     for begin, end in further_pictures(image):
         further = open_jpeg(data[begin:end])
         scale = None if further is None else apple_scale(xmp_of(further))
@@ -248,6 +253,7 @@ def apple_scale(packet: bytes) -> CodeScale | None:
     """
     if not _mentions(packet, PIXEL_DATA):
         return None
+    # Only now is the packet parsed: most photos have XMP about other things.
     tree = parse_xmp(packet)
     quantity = _apple_quantity(tree)
     first = find_number(tree, f"{PIXEL_DATA}FloatMinValue")
@@ -306,6 +312,7 @@ def _find_android(data: bytes, image: JpegImageFile) -> tuple[bytes, CodeScale] 
     if extended:
         tree.append(parse_xmp(extended))
 
+    # Dynamic Depth is the newer format; a photo may have both.
     for node in tree.iter():
         address = own_property(node, f"{DYNAMIC_DEPTH_MAP}DepthURI")
         content = own_property(node, f"{DYNAMIC_DEPTH_MAP}ItemSemantic") or "Depth"
@@ -326,6 +333,7 @@ def android_scale(node: Element, namespace: str, layout: str) -> CodeScale:
     ValueError if it is missing, impossible, or of a kind that is not read. `layout` is its name in
     the report.
     """
+    # Near and Far are what the lowest and the highest code mean.
     near = find_number(node, f"{namespace}Near")
     far = find_number(node, f"{namespace}Far")
     if near is None or far is None:
@@ -414,6 +422,7 @@ def _find_in_heif(data: bytes) -> CodedDepth | None:
     upright_steps = steps_of_depth_item(data)
     if upright_steps is None:
         return None
+    # 10 and 12 bits are kept, so that the codes are those of the file.
     heif = pillow_heif.open_heif(io.BytesIO(data), hdr_to_16bit=False)
     image = heif.info["depth_images"][0]
     width, height = image.size
