@@ -51,8 +51,8 @@ class RgbdBase:
     def _cropped_to(self, photo: Photo) -> tuple[DepthMap, Camera | None]:
         """The map and its camera, without the border that was cropped from the photo.
 
-        The camera is None if the map has no intrinsics. InputError if the map has not the aspect
-        ratio of the photo with its border.
+        The camera is None if the map has no intrinsics. InputError if the map's aspect ratio is not
+        that of the photo with its border.
         """
         depth = self.depth
         # The map was made for the photo as it was before a uniform border was cropped.

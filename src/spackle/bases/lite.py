@@ -182,7 +182,9 @@ class LiteNet(nn.Module):
         *fine_channels, coarsest_channels = encoder_channels
         *fine_outputs, top = DECODER_CHANNELS
         self.top = nn.Conv2d(coarsest_channels + 2, top, 1)  # with x and y of each cell
+        # For the mean of the features over the whole picture.
         self.context = nn.Conv2d(coarsest_channels, top, 1)
+        # Each cell learns about cells two steps away.
         self.spread = nn.Sequential(
             nn.Conv2d(top, top, 3, padding=2, dilation=2, groups=top),
             nn.ReLU(),
@@ -192,6 +194,7 @@ class LiteNet(nn.Module):
             UpsampleAndAdd(DECODER_CHANNELS[level + 1], fine_channels[level], fine_outputs[level])
             for level in reversed(range(len(fine_outputs)))  # from coarse to fine
         )
+        # From the finest features to one number for each cell.
         self.head = nn.Sequential(
             nn.Conv2d(DECODER_CHANNELS[0], 16, 3, padding=1), nn.ReLU(), nn.Conv2d(16, 1, 1)
         )
@@ -257,6 +260,7 @@ def load_networks(path: str | os.PathLike[str]) -> list[LiteNet]:
 
 def _load_network(tensors: dict[str, Tensor], path: str | os.PathLike[str]) -> LiteNet:
     """A frozen network with these tensors; InputError, naming the file, if they do not fit."""
+    # A bias of the last stage, as long as that stage has channels, which tells the size.
     size_tensor = tensors.get(_SIZE_TENSOR)
     for size, stages in STAGES.items():
         if size_tensor is not None and size_tensor.shape == (stages[-1].channels,):

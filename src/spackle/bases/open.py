@@ -287,7 +287,10 @@ class OpenedBase:
         return serves_all_photos and (base is None or isinstance(error, NotEnoughMemory))
 
     def _skip(self, name: str, error: InputError, is_unusable: bool) -> SkippedCandidate:
-        """Describe a candidate that failed; if it `is_unusable`, remember it and drop its network."""
+        """Describe a candidate that failed; if it `is_unusable`, remember it and free its memory.
+
+        `error` is why it failed.
+        """
         title = self.candidates[name].title
         skipped = SkippedCandidate(
             reason=f"{title} cannot be used",

@@ -182,8 +182,9 @@ class BaseSettings:
             return {file.name: file for file in matches if file.is_file()}
 
         # Of `auto`, any of the networks may be used for the next photo.
+        names = AUTO_NETWORKS if self.resolved_name == AUTO else (self.resolved_name,)
         files: dict[str, Path] = {}
-        for name in AUTO_NETWORKS if self.resolved_name == AUTO else (self.resolved_name,):
+        for name in names:
             file = self.checkpoint or _installed_weights(name)
             if file is not None:
                 files[name] = file

@@ -206,7 +206,10 @@ def load_network(
 
 
 def _size_of(tensors: Mapping[str, Tensor]) -> SharpConfig:
-    """The size of SHARP that a checkpoint's learned positions of tokens fit; else the published."""
+    """The size of SHARP that a checkpoint belongs to, by the shape of its learned positions.
+
+    If none fits, it is the published size: loading then says what is wrong.
+    """
     positions = tensors.get(f"{_ENCODER_PREFIX}patch_encoder.pos_embed", torch.empty(0))
     # The tests' tiny sizes are read by the same function as the published one.
     for config in SIZES.values():

@@ -163,6 +163,7 @@ class TransformerBlock(nn.Module):
         """Build a block for tokens with `width` channels, which `head_count` must divide."""
         super().__init__()
         self.heads = head_count
+        # The names are those of DINOv2's checkpoints: `ls` is layer scale, a factor by channel.
         self.norm1 = nn.LayerNorm(width, eps=NORM_EPS)
         self.norm2 = nn.LayerNorm(width, eps=NORM_EPS)
         self.attn = nn.ModuleDict(

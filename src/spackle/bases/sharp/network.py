@@ -328,10 +328,10 @@ class PredictionHead(nn.Module):
         self.texture_prediction_head = Float32Conv(width, TEXTURE_CHANNELS * LAYER_COUNT, 1)
 
     def forward(self, texture: Tensor, geometry: Tensor) -> Tensor:
-        """Deltas [14, 2, H, W] float32 from texture and geometry features [1, F, H, W].
+        """Deltas (changes of the initial Gaussians) from features [1, F, H, W].
 
-        The 14 channels are offset 3, scale 3, quaternion 4, colour 3 and opacity 1; the second axis
-        counts the layers of Gaussians.
+        They are [14, 2, H, W] float32. The 14 channels are offset 3, scale 3, quaternion 4,
+        colour 3 and opacity 1; the second axis counts the layers of Gaussians.
         """
         geometry_deltas = self.geometry_prediction_head(geometry)[0]  # [3 · 2, H, W]
         texture_deltas = self.texture_prediction_head(texture)[0]  # [11 · 2, H, W]
@@ -364,7 +364,7 @@ class GaussianDecoder(nn.Module):
         return self
 
     def forward(self, image_and_disparity: Tensor, encoder_maps: list[Tensor]) -> Tensor:
-        """Deltas [14, 2, side/2, side/2] float32 of the initial Gaussians.
+        """Deltas (changes) of the initial Gaussians, [14, 2, side/2, side/2] float32.
 
         Args:
             image_and_disparity: [1, 5, side, side] in -1..1: sRGB, the disparity of both layers.
@@ -421,44 +421,48 @@ def make_initial_gaussians(image: Tensor, depth: Tensor) -> InitialGaussians:
 
 
 def apply_deltas(initial: InitialGaussians, deltas: Tensor) -> Gaussians:
-    """Gaussians from initial Gaussians and their changes.
+    """Gaussians from initial Gaussians and their predicted changes (deltas).
 
     Args:
-        initial: Gaussians on the two surfaces, one for each layer and cell.
-        deltas: [14, 2, H, W]: offset 3, scale 3, quaternion 4, colour 3 and opacity 1, for both
-            layers.
+        initial: Gaussians on the two surfaces, one for each layer and each cell of 2×2 pixels.
+        deltas: [14, 2, H, W] for both layers and H × W cells; the 14 channels are offset 3,
+            scale 3, quaternion 4, colour 3 and opacity 1.
 
     Returns:
         The Gaussians layer by layer, each in row-major order. Means are (x·z, y·z, z), where x and
         y run from -1 to 1 over the picture.
     """
+    offset, scale, quat, color, opacity = deltas.split([3, 3, 4, 3, 1])  # each [C, 2, H, W]
     height, width = deltas.shape[-2:]
     x = (2 * torch.arange(width, device=deltas.device) + 1) / width - 1  # of the cells' centres
     y = (2 * torch.arange(height, device=deltas.device) + 1) / height - 1
 
     # The offset changes inverse depth before a softplus, so that it stays positive.
-    inverse = softplus(_inverse_softplus(initial.disparity) + Z_GAIN * deltas[2])
+    inverse = softplus(_inverse_softplus(initial.disparity) + Z_GAIN * offset[2])
     z = 1.0 / (inverse + FARTHEST_INVERSE)  # [2, H, W]
-    means = torch.stack([z * (x + XY_GAIN * deltas[0]), z * (y[:, None] + XY_GAIN * deltas[1]), z])
+    moved_x = x + XY_GAIN * offset[0]
+    moved_y = y[:, None] + XY_GAIN * offset[1]
+    means = torch.stack([z * moved_x, z * moved_y, z])  # [3, 2, H, W]
 
     # A cell's width at that depth, times a factor between 0 and MAX_SCALE, which has value 1 and
     # slope 1 at zero.
     slope = MAX_SCALE / (MAX_SCALE - 1)
     shift = -math.log(MAX_SCALE - 1)
-    scales = (2.0 / width) * z * (MAX_SCALE * torch.sigmoid(slope * deltas[3:6] + shift))
+    scales = (2.0 / width) * z * (MAX_SCALE * torch.sigmoid(slope * scale + shift))
 
     # Without a change the quaternion is (1, 0, 0, 0): no rotation.
-    quats = torch.cat([deltas[6:7] + 1, deltas[7:10]])
+    quats = torch.cat([quat[:1] + 1, quat[1:]])
     # Colours change before a sigmoid, so that they stay in 0..1.
-    color = initial.color.clamp(COLOR_MARGIN, 1 - COLOR_MARGIN)
-    colors = srgb_to_linear(torch.sigmoid(torch.logit(color)[:, None] + COLOR_GAIN * deltas[10:13]))
-    opacities = torch.sigmoid(deltas[13])
+    clamped = initial.color.clamp(COLOR_MARGIN, 1 - COLOR_MARGIN)  # [3, H, W]
+    initial_color = torch.logit(clamped)
+    srgb = torch.sigmoid(initial_color[:, None] + COLOR_GAIN * color)
+    opacities = torch.sigmoid(opacity)
     return Gaussians(
         _as_rows(means * initial.unscale),
         _as_rows(quats),
         _as_rows(scales * initial.unscale),
         opacities.flatten(),
-        _as_rows(colors),
+        _as_rows(srgb_to_linear(srgb)),
     )
 
 

@@ -94,6 +94,7 @@ def _load_block(first: int, count: int, quats: Any, scales: Any, stretch: Any, b
         z = np.float64(quats[n, 3])
         # 2/‖q‖² instead of 2 makes R the rotation of the unit quaternion.
         two = 2.0 / max(w * w + x * x + y * y + z * z, MIN_SQUARED_QUAT)
+        # The scales along the Gaussian's three axes.
         a = np.float64(scales[n, 0])
         b = np.float64(scales[n, 1])
         c = np.float64(scales[n, 2])
