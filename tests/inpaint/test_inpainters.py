@@ -5,9 +5,10 @@ from __future__ import annotations
 import pytest
 import torch
 from helpers.scenes import psnr
+from torch import Tensor
 
 from spackle.inpaint import INPAINTERS, InpainterOptions, get_inpainter, inpainter_class
-from spackle.inpaint.plain import ExemplarInpainter
+from spackle.inpaint.plain import PlainInpainter
 from spackle.runtime.errors import InputError
 
 
@@ -46,9 +47,21 @@ def test_exemplar_extends_a_pattern_also_without_depth() -> None:
     assert torch.equal(painter.paint(rgb[:1], holes[:1], 0 * depths[:1]), painted[:1])
 
 
+class BlackInpainter(PlainInpainter):
+    """The shortest inpainter: leaves the holes black."""
+
+    name = "black"
+    version = "1"
+
+    def paint(self, rgb: Tensor, hole: Tensor, inverse_depth: Tensor) -> Tensor:
+        return torch.where(hole[..., None], 0.0, rgb)
+
+
 def test_an_inpainter_of_another_package_is_named_by_its_module() -> None:
-    plugin = get_inpainter("spackle.inpaint.plain:ExemplarInpainter", InpainterOptions())
-    assert isinstance(plugin, ExemplarInpainter)
+    plugin = get_inpainter(f"{__name__}:BlackInpainter", InpainterOptions())
+    assert isinstance(plugin, BlackInpainter)
+    assert not plugin.uses_network
+    assert plugin.weight_files == {}
 
 
 @pytest.mark.parametrize(

@@ -32,15 +32,15 @@ class PlainInpainter:
     notice: ClassVar[str] = ""
     weight_files: Mapping[str, Path] = {}
 
+    def __init__(self, options: InpainterOptions | None = None) -> None:
+        """Take the options that every inpainter takes; none of them is for these inpainters."""
+
 
 class ExemplarInpainter(PlainInpainter):
     """Fills each view with patches of this view, found by PatchMatch."""
 
     name = "exemplar"
     version = "1"
-
-    def __init__(self, options: InpainterOptions) -> None:
-        """There are no options."""
 
     def paint(self, rgb: Tensor, hole: Tensor, inverse_depth: Tensor) -> Tensor:
         """Paint the holes of V views, each by itself.
@@ -157,7 +157,7 @@ class OpencvInpainter(PlainInpainter):
 
     name = "opencv"
 
-    def __init__(self, options: InpainterOptions) -> None:
+    def __init__(self, options: InpainterOptions | None = None) -> None:
         """Import OpenCV; InputError if it is not installed."""
         self._opencv = OpenCV("inpainter opencv:")
         self.version = f"telea {TELEA_RADIUS_PX:g}, cv2 {self._opencv.version}"
