@@ -125,6 +125,8 @@ class Spackle:
                 "a loaded photo has a focal length already: "
                 "give focal_px, focal_mm or fov to load_photo"
             )
+
+        # The session's base, network and renderer, with the path of this call.
         path = PathOptions(trajectory=trajectory, disparity=disparity)
         path.check()
         options = dataclasses.replace(self._pipeline.options, path=path)
@@ -276,12 +278,15 @@ def _as_file(source: str | os.PathLike[str] | bytes | BinaryIO, name: str) -> It
         yield Path(source)
         return
 
+    # An open file is read from its current position.
     content = source.read() if hasattr(source, "read") else source
     if not isinstance(content, bytes):
         raise InputError(
             f"{name}: {type(source).__name__} {short_repr(source)} is not accepted: "
             "give a path, bytes, a file opened in binary mode, or an array"
         )
+
+    # The readers of photos and depth maps take files, because some formats need to seek in them.
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / name
         path.write_bytes(content)

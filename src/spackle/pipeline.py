@@ -226,9 +226,10 @@ class Pipeline:
         )
 
     def predict(self, photo: Photo, reporter: Reporter) -> PredictedPhoto:
-        """Turn a photo into Gaussians, and choose how far the camera moves.
+        """Turn a photo into Gaussians by the base, and choose how far the camera moves.
 
-        InputError if the photo or its depth map cannot be used.
+        The base is a network or the photo's depth map. What the user should know is logged, and
+        returned as warnings. InputError if the photo or its depth map cannot be used.
         """
         check_photo_size(photo.width, photo.height, photo.path)
         name = photo.path.name
@@ -310,7 +311,14 @@ class Pipeline:
     def _fill_together(
         self, context: FillContext, views: PlannedViews, progress: Progress
     ) -> FilledHoles:
-        """Fill the holes of all views by one set of Gaussians."""
+        """Fill the holes of all views by one set of Gaussians.
+
+        Args:
+            context: the photo's Gaussians, and the settings of the fill.
+            views: the planned views; of these the fill gets `views_to_fill`.
+            progress: called with (views done, all views).
+        """
+        # The fill numbers the views that it gets from 0.
         cameras = [views.cameras[index] for index in views.views_to_fill]
         always_filled = [
             position
@@ -335,7 +343,13 @@ class Pipeline:
 
 
 def _fill_each_view(context: FillContext, views: PlannedViews, progress: Progress) -> FilledHoles:
-    """Fill the holes of each view by Gaussians of its own, as the paper does."""
+    """Fill the holes of each view by Gaussians of its own, as the paper does.
+
+    Args:
+        context: the photo's Gaussians, and the settings of the fill.
+        views: the planned views, all of which are filled.
+        progress: called with (views done, all views).
+    """
     # Added Gaussians must not hide what the photo shows.
     guards = [context.photo_guard()]
     by_view: list[Gaussians] = []

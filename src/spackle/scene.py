@@ -143,6 +143,7 @@ class Scene:
             gaussians = gaussians.transform(camera.world_to_camera)
             camera = dataclasses.replace(camera, world_to_camera=torch.eye(4))
 
+        # The file of another program does not say which Gaussians were added; all count as base.
         base_count = len(gaussians) if file.base_count is None else file.base_count
         base = gaussians.select(slice(0, base_count))
         aux = gaussians.select(slice(base_count, None))
@@ -177,6 +178,7 @@ class Scene:
         """
         if disparity is None:
             disparity = self.disparity
+        # A scene of another program does not say how far the camera may move.
         if disparity is None:
             disparity = DEFAULT_MAX_DISPARITY
         depth_range = DepthRange.of(self.base)
@@ -379,16 +381,20 @@ def _camera_with_lens(
 
     InputError if both `focal_px` and `fov` are given, or one is impossible.
     """
+    # The focal length is in pixels of the views that will be rendered.
     if size is not None:
         width, height = size
     elif file.camera is not None:
-        width, height = file.camera.width, file.camera.height
+        width = file.camera.width
+        height = file.camera.height
     else:
         width, height = DEFAULT_SIZE_PX
     focal, _ = resolve_focal_length(file.path, width, height, {}, focal_px=focal_px, fov=fov)
     camera = Camera.from_focal(focal, width, height)
     if file.camera is None:
         return camera
+
+    # Another lens does not move the camera.
     return dataclasses.replace(camera, world_to_camera=file.camera.world_to_camera)
 
 

@@ -166,6 +166,7 @@ class PathOptions:
             frame_count,
             looped=True,  # most players repeat a video
         )
+        # A little zoom hides most of what the fill has made up beyond the photo's border.
         return [view.zoomed(1 + self.overscan) for view in cameras]
 
     def _keyframe_cameras(
@@ -194,11 +195,14 @@ class DisparityTrial(NamedTuple):
 def choose_disparity(
     prediction: BasePrediction, renderer: Renderer, source: Path
 ) -> BasePrediction:
-    """Replace the prediction's disparity by the largest one that uncovers few enough holes.
+    """Choose how far the camera moves: as far as the photo allows without too many holes.
 
-    The limit is `prediction.max_hole_ratio`, the upper bound is the base's usual disparity. Holes
-    are measured as the mean hole-area ratio (eq. 11) of the leftmost and rightmost view, in coarse
-    renderings. This ratio and the usual disparity are added to the prediction's notes.
+    The size of the movement is a "disparity": 0 stays, 0.3 is large. It replaces the prediction's
+    disparity, which is the base's usual one, whatever the photo shows.
+
+    The limit of the holes is `prediction.max_hole_ratio`. They are measured as the mean share of
+    the leftmost and rightmost view (hole-area ratio, eq. 11 of the paper), in coarse renderings.
+    This ratio and the usual disparity are added to the prediction's notes.
 
     Raises:
         InputError: the depths and the focal length of the photo `source` allow no camera path.
@@ -297,10 +301,11 @@ def plan_views(
     given_views: list[Camera] | None = None,
     keyframes: KeyframePath | None = None,
 ) -> PlannedViews:
-    """Plan the given views, or the views of a path.
+    """Plan which views of a photo are filled, reported and shown in the video.
 
-    The report measures the holes of all given views, of a trajectory's leftmost and rightmost
-    view, or of a path's keyframes. What it measures is always filled.
+    They are the given views, or those of a camera path. The report measures the holes of all given
+    views, of a trajectory's leftmost and rightmost view, or of a path's keyframes. What it measures
+    is always filled.
 
     Args:
         prediction: the photo's Gaussians and camera.
@@ -384,7 +389,13 @@ def _keyframe_views(
 def _index_views(
     path_views: _PathViews, frame_maker: FrameMaker, given_views: list[Camera]
 ) -> PlannedViews:
-    """Put all views of a path into one list, and name each view's purpose by its index."""
+    """Put all views of a path into one list, and name each view's purpose by its index.
+
+    Args:
+        path_views: the cameras of the video's frames, and those that are filled besides.
+        frame_maker: knows whether a frame is one view or the two views of a stereo video's eyes.
+        given_views: the views that the user gave, or an empty list.
+    """
     cameras: list[Camera] = []
 
     # The pictures of given views are taken midway between the eyes of a stereo video.

@@ -1,4 +1,4 @@
-"""Bases on the command line: `auto` for a folder, and names of bases in datasets and evaluations."""
+"""Bases on the command line: `auto` for a folder, and names in datasets and evaluations."""
 
 from __future__ import annotations
 
@@ -133,7 +133,8 @@ def test_disparity_of_the_person_else_of_the_photo(tmp_path: Path) -> None:
         (
             depth,
             0.07,
-            "disparity 0.07 of 0.3: 11.9% of the widest view is invented; --disparity 0.3 moves farther",
+            "disparity 0.07 of 0.3: 11.9% of the widest view is invented; "
+            "--disparity 0.3 moves farther",
         ),
         ((), 0.14, "moves by disparity 0.14 of 0.15: "),
     ):

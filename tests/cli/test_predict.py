@@ -159,7 +159,8 @@ def test_view_mode_completes_each_view_on_its_own(tmp_path: Path, pair: tuple[Pa
     assert all(view["after"] == 0 for view in report["hole_area_ratio"])
     base, merged = (read_ply(folder / name) for name in ("base.ply", "scene.ply"))
     assert merged.body[: len(base.body)] == base.body
-    # One Gaussian for each 2×2 cell of the view with a hole in it, one for each of its pixels, and one more at most.
+    # One Gaussian for each 2×2 cell of the view with a hole in it, one for each of its pixels, and
+    # one more at most.
     mask = pixels(folder / "views" / "0001_mask.png") > 0
     cells = mask.reshape(HEIGHT // 2, 2, WIDTH // 2, 2).any(axis=(1, 3)).sum()
     assert 0 < report["aux"]["gaussians"] == merged.count - base.count <= 6 * cells
@@ -267,8 +268,8 @@ def test_several_photos_a_folder_and_a_pattern_share_a_run(tmp_path: Path) -> No
     )
     result = run("predict", *given, "-o", out, *SHORT)
     assert (result.code, names_in(out)) == (0, {"a", "b", "wild1", "wild2"}), result.err
-    scene = f"Look at {out / 'NAME' / 'video.mp4'}, or into the scene: spackle view {out / 'NAME' / 'scene.ply'}"
-    assert result.lines[-1] == scene
+    video, scene = (out / "NAME" / name for name in ("video.mp4", "scene.ply"))
+    assert result.lines[-1] == f"Look at {video}, or into the scene: spackle view {scene}"
     refuses(
         run("predict", photos[1], write_photo(tmp_path / "other" / "b.jpg"), "-o", out),
         "has the same name",
@@ -343,10 +344,8 @@ def test_a_frame_is_cut_off_unless_geometry_is_given(tmp_path: Path) -> None:
     Image.fromarray(np.pad(picture(), ((6, 7), (3, 4), (0, 0)))).save(photo)
     lite = ("predict", photo, "-o", out, "--base", "lite", "--no-render", *SHORT)
     cut = run(*lite)
-    assert (
-        "a.png: a frame (4, 7, 5, 8 pixels: left, top, right, bottom) is cut off; --keep-frame keeps it"
-        in cut.err
-    )
+    frame = "a frame (4, 7, 5, 8 pixels: left, top, right, bottom)"
+    assert f"a.png: {frame} is cut off; --keep-frame keeps it" in cut.err
     cut_off = {"left": 4, "top": 7, "right": 5, "bottom": 8}  # the outermost pixels are mixed
     inner, whole = (
         {"file": "a.png", "width": WIDTH + w, "height": HEIGHT + h} for w, h in ((-2, -2), (7, 13))

@@ -1,4 +1,4 @@
-"""`spackle render`, and the videos of both commands: paths, stereo, sizes, formats and repetitions."""
+"""`spackle render`, and videos of both commands: paths, stereo, sizes, formats, repetitions."""
 
 from __future__ import annotations
 

@@ -104,9 +104,10 @@ def run_demo(output: Path, reporter: Reporter) -> None:
 @torch.no_grad()
 def _save_comparison(completed: CompletedPhoto, renderer: Renderer, path: Path) -> None:
     """Write a picture of the leftmost and rightmost view: above the base, below the scene."""
-    scene, views = completed.scene, completed.views
+    scene = completed.scene
+    views = completed.views
     widest_views = [views.cameras[index] for index in views.measured.values()]
-    rows: list[list[Tensor]] = []
+    rows: list[list[Tensor]] = []  # of pictures [H, W, 3] sRGB
     for gaussians in ([scene.base], scene.of_view(0)):
         rows.append([renderer.render(gaussians, view).rgb for view in widest_views])
     long_side = max(widest_views[0].width, widest_views[0].height)

@@ -201,6 +201,7 @@ def predict_photos(
         )
         unfinished = predictor.unfinished(photos, reporter)
         failure_count = 0
+        # One photo after the other is predicted in this process, which needs less memory.
         if worker_count == 1:
             with torch_threads(threads):
                 for photo in unfinished:
@@ -292,6 +293,7 @@ def _predict_by_workers(
             if is_stopping():
                 break
 
+    # After a stop some photos have no results; the exit code must say so.
     if finished_count < photo_count:
         reporter.log("stopped; the same command resumes from here")
         raise KeyboardInterrupt
@@ -337,6 +339,7 @@ class Predictor:
             request = self.request_digest(photo)
             predict_photo(photo.path, folder, self.pipeline, reporter, self.options.photo, request)
         except InputError as error:
+            # A BaseError means that the base fails for every photo.
             if self.is_single or isinstance(error, BaseError):
                 raise
             reporter.log(f"error: {error}")
@@ -375,9 +378,10 @@ class Predictor:
 
         InputError if the photo or its depth map is missing.
         """
+        # A fingerprint changes with the content of a file.
         fingerprints = [file_fingerprint(photo.path, "photo")]
         depth = self.options.scene.base.depth
-        if isinstance(depth, Path):
+        if isinstance(depth, Path):  # a depth map, or a folder with a map for each photo
             depth_file = find_depth_file(depth, photo.path)
             fingerprints.append(file_fingerprint(depth_file, "depth map"))
             for calibration in calibration_candidates(depth_file):
@@ -391,7 +395,9 @@ def _shared_digest(options: PredictOptions) -> str:
 
     InputError for a missing file.
     """
-    base, path, fill = options.scene.base, options.scene.path, options.scene.fill
+    base = options.scene.base
+    path = options.scene.path
+    fill = options.scene.fill
     files: dict[str, Path | None] = {
         "calibration": base.calib,
         "camera file": path.cameras,
@@ -404,6 +410,7 @@ def _shared_digest(options: PredictOptions) -> str:
         kind: file_fingerprint(file, kind) for kind, file in files.items() if file is not None
     }
 
+    # Workers, threads and `overwrite` do not change results, so they are not part of the digest.
     # Files are identified by their content, wherever they lie. The number of SHARP's windows in a
     # batch changes only the last bits of results.
     base = dataclasses.replace(

@@ -231,12 +231,17 @@ def _write_files(
     reporter: Reporter,
     options: PhotoOptions,
 ) -> dict[str, object] | None:
-    """Write all files of a photo but its report; returns the report's entry for the video."""
-    scene, views = completed.scene, completed.views
+    """Write all files of a photo but its report.
+
+    Returns the report's entry for the video, or None if no video is written.
+    """
+    scene = completed.scene
+    views = completed.views
     with reporter.stage("write"):
         parts = {"scene.ply": scene.gaussians}
         if options.keep_base:
             parts["base.ply"] = scene.base
+        # The number of base Gaussians tells other programs which ones completion has added.
         for name, gaussians in parts.items():
             save_ply(
                 gaussians,
@@ -270,12 +275,14 @@ def save_planned_video(
 
     InputError if the file cannot be written.
     """
-    views, scene = completed.views, completed.scene
+    views = completed.views
+    scene = completed.scene
     frame_maker = views.frame_maker
 
     def render_frames() -> Iterator[Tensor]:
         """Each frame as uint8 if the fill has rendered it already, else as floats in 0..1."""
         for frame_index, eye_views in enumerate(views.frames):
+            # Completion has rendered some views in their final state.
             picture = completed.filled.pictures.get(eye_views[0])
             if picture is not None:
                 yield picture
@@ -302,7 +309,8 @@ def _save_pictures(
 
     0000.png is the completed view, 0000_base.png the view before, 0000_mask.png its holes in white.
     """
-    views, scene = completed.views, completed.scene
+    views = completed.views
+    scene = completed.scene
     for index in range(views.still_count):
         camera = views.cameras[index]
         before = renderer.render(scene.base, camera)
@@ -323,7 +331,9 @@ def _report_of(
     request: str | None,
 ) -> PhotoReport:
     """The report of a completed photo, whose other files lie in `folder`."""
-    photo, predicted, scene = completed.photo, completed.predicted, completed.scene
+    photo = completed.photo
+    predicted = completed.predicted
+    scene = completed.scene
     assert scene.report is not None
     files = sorted(file for file in folder.rglob("*") if file.is_file())
     return PhotoReport(
@@ -363,6 +373,9 @@ def report_run(
     """
     path = pipeline.options.path
     given_file = path.cameras or path.path
+
+    # Who decided how far the camera moves: nobody, because a file gives the views; the photo's
+    # content; or the option `disparity`.
     if given_file is not None:
         disparity_source = None
     elif path.disparity is None:

@@ -53,10 +53,12 @@ PAGE_ENCODERS: dict[str, Encoder] = {".html": encode_page}
 class SceneVideo:
     """What the frames of a video of a scene are made of."""
 
-    cameras: list[Camera]
+    cameras: list[Camera]  # of the frames; in a stereo video, midway between the eyes
+    has_given_views: bool  # the cameras come from a file of views, not from a path
     frame_maker: FrameMaker
     # The scene as one list of sets of Gaussians; for a comparison two: the base, and the scene.
     gaussian_sets: list[list[Gaussians]]
+    gaussian_count: int  # of the whole scene
     renderer: Renderer
     hole_ratios: list[float] = dataclasses.field(default_factory=list)  # of the frames so far
 
@@ -67,7 +69,7 @@ class SceneVideo:
         """
         for index, camera in enumerate(self.cameras):
             frame, renderings = self.frame_maker.render(self.gaussian_sets, camera, self.renderer)
-            # The base alone has holes in any case.
+            # In a comparison the first rendering is the base alone, whose holes are no news.
             completed = renderings[1:] if self.frame_maker.options.compare else renderings
             self.hole_ratios.append(max(hole_area_ratio(view.alpha) for view in completed))
             if picture_files:
@@ -106,49 +108,23 @@ def render_scene(
     else:
         _check_is_folder_name(output)
     path.check()
-    has_new_lens = focal_px is not None or fov is not None
-    if path.cameras is not None and has_new_lens:
+    if path.cameras is not None and (focal_px is not None or fov is not None):
         raise InputError(
             f"`cameras` {path.cameras}: its views have their own lenses: "
             "leave `fov` and `focal_px` out"
         )
     renderer = get_renderer(device)
-
     with reporter.stage("load"):
-        given_views, keyframes = path.load()
-        loaded = load_scene(scene_file)
-        scene = Scene.of_file(loaded, path.video.size, focal_px=focal_px, fov=fov)
-        gaussian_sets = _sets_to_render(scene, scene_file, compare=path.video.compare)
-
-        # Overscan hides the border of the fill; another lens, or a scene that was not completed
-        # for a path, has no such border.
-        if has_new_lens or scene.disparity is None:
-            path = dataclasses.replace(path, overscan=0)
-        with (
-            as_input_error(scene_file, NO_PATH_MESSAGE, ValueError),
-            as_input_error(path.path, "{reason}", PathError),
-        ):
-            cameras = given_views or path.video_cameras(
-                scene.base, scene.camera, keyframes, scene.disparity
-            )
-        _say_if_beyond_completion(scene, scene_file, path, reporter)
-        if not given_views and loaded.camera is None and not has_new_lens:
-            reporter.log(
-                f"{scene_file.name}: no camera stored: {ASSUMED_FOCAL_MM:g} mm assumed, "
-                "`fov` gives another lens"
-            )
-        video = SceneVideo(
-            cameras=cameras,
-            frame_maker=FrameMaker.of(path.video, scene.base, cameras, scene_file),
-            gaussian_sets=gaussian_sets,
-            renderer=renderer,
-        )
+        video = _open_scene_video(scene_file, path, renderer, reporter, focal_px=focal_px, fov=fov)
 
     # Given views may differ in size, which no video can show; pictures can.
-    problem = video_problem([video.frame_maker.resized_camera(camera) for camera in cameras])
-    makes_pictures = bool(given_views) and not is_single_file
+    sizes = [video.frame_maker.resized_camera(camera) for camera in video.cameras]
+    problem = video_problem(sizes)
+    makes_pictures = video.has_given_views and not is_single_file
     if problem and not makes_pictures:
-        hint = "give a folder with `output` for pictures only" if given_views else "give `size`"
+        hint = "give `size`"
+        if video.has_given_views:
+            hint = "give a folder with `output` for pictures only"
         raise InputError(
             f"{path.cameras or scene_file}: {problem}, so no video can be made: {hint}"
         )
@@ -156,9 +132,9 @@ def render_scene(
     video_file = output if is_single_file else output / f"{scene_file.stem}{path.video.suffix}"
     picture_names: list[str] = []
     if makes_pictures:
-        picture_names = [f"{index:04d}.png" for index in range(len(cameras))]
-    names = [*picture_names, video_file.name]
-    with results_folder(video_file.parent, names), reporter.stage("video") as progress:
+        picture_names = [f"{index:04d}.png" for index in range(len(video.cameras))]
+    file_names = [*picture_names, video_file.name]
+    with results_folder(video_file.parent, file_names), reporter.stage("video") as progress:
         picture_files = [video_file.parent / name for name in picture_names]
         frames = video.frames(picture_files, progress)
         if problem is None:
@@ -167,13 +143,12 @@ def render_scene(
             for _ in frames:  # only the pictures are written
                 pass
 
-    gaussian_count = len(loaded.gaussians)
     most_holes = max(video.hole_ratios)
     if most_holes > MAX_UNMENTIONED_HOLES:
         reporter.log(f"{scene_file.name}: holes take up to {most_holes:.1%} of a frame")
     result = {
-        "gaussians": gaussian_count,
-        "frames": len(cameras),
+        "gaussians": video.gaussian_count,
+        "frames": len(video.cameras),
         "seconds": reporter.seconds["video"],
         "open": round(most_holes, 5),
     }
@@ -182,10 +157,57 @@ def render_scene(
         reporter.result({"folder": output, **result})
         return
     reporter.log(
-        f"{scene_file.name}: {gaussian_count:,} Gaussians, {len(cameras)} frames "
+        f"{scene_file.name}: {video.gaussian_count:,} Gaussians, {len(video.cameras)} frames "
         f"in {reporter.seconds['video']:.1f} s -> {video_file}"
     )
     reporter.result({"file": video_file, **result})
+
+
+def _open_scene_video(
+    scene_file: Path,
+    path: PathOptions,
+    renderer: Renderer,
+    reporter: Reporter,
+    *,
+    focal_px: float | None,
+    fov: float | None,
+) -> SceneVideo:
+    """Load a scene, and choose the cameras of its video; arguments as for `render_scene`.
+
+    InputError if the scene or a file of cameras cannot be used, or the scene allows no path.
+    """
+    given_views, keyframes = path.load()
+    loaded = load_scene(scene_file)
+    scene = Scene.of_file(loaded, path.video.size, focal_px=focal_px, fov=fov)
+    gaussian_sets = _sets_to_render(scene, scene_file, compare=path.video.compare)
+
+    # Overscan crops the border of the fill. With another lens, or in a scene that was not completed
+    # for a path, there is no such border.
+    has_new_lens = focal_px is not None or fov is not None
+    if has_new_lens or scene.disparity is None:
+        path = dataclasses.replace(path, overscan=0)
+    with (
+        as_input_error(scene_file, NO_PATH_MESSAGE, ValueError),
+        as_input_error(path.path, "{reason}", PathError),
+    ):
+        cameras = given_views or path.video_cameras(
+            scene.base, scene.camera, keyframes, scene.disparity
+        )
+
+    _say_if_beyond_completion(scene, scene_file, path, reporter)
+    if not given_views and loaded.camera is None and not has_new_lens:
+        reporter.log(
+            f"{scene_file.name}: no camera stored: {ASSUMED_FOCAL_MM:g} mm assumed, "
+            "`fov` gives another lens"
+        )
+    return SceneVideo(
+        cameras=cameras,
+        has_given_views=bool(given_views),
+        frame_maker=FrameMaker.of(path.video, scene.base, cameras, scene_file),
+        gaussian_sets=gaussian_sets,
+        gaussian_count=len(loaded.gaussians),
+        renderer=renderer,
+    )
 
 
 def _check_is_folder_name(output: Path) -> None:
@@ -268,6 +290,7 @@ def _report_file(scene: SceneFile, output: Path, seconds: float, reporter: Repor
         f"{size_ratio:.0%} of the size of {scene.path.name}, {seconds:.1f} s"
     )
 
+    # SPZ rounds positions to a grid, which does not reach as far as some Gaussians of a sky lie.
     moved_count = 0
     if output.name.lower().endswith(".spz"):
         grid = spz_grid(scene.gaussians)

@@ -87,7 +87,8 @@ def show_page(
         with reporter.stage("load"):
             title = _check_target(target, options)
 
-    # Photos that the page sends have no depth of the first photo.
+    # The depth map, and the base "rgbd" that needs one, are for the first photo alone, not for
+    # those that the page sends later.
     base_name = AUTO if options.base.name == RGBD else options.base.name
     base_of_sent_photos = dataclasses.replace(
         options.base, name=base_name, depth=None, depth_kind="auto"
@@ -104,6 +105,7 @@ def show_page(
         tempfile.TemporaryDirectory(prefix="spackle-view-", ignore_cleanup_errors=True) as folder,
         run_server(Path(folder), work, 1, RetentionLimits(), address, reporter) as (jobs, urls),
     ):
+        # The page shows the scene whose id follows the # in its address.
         if target is not None:
             job_id = _add_target(jobs, target, title, options)
             urls = [f"{url}#{job_id}" for url in urls]
@@ -220,6 +222,7 @@ def run_server(
 
         app = create_app(folder, work, workers=workers, keep=limits, access=access)
         with contextlib.closing(app.state.jobs) as jobs:
+            # The socket accepts connections already, so the caller may announce the page now.
             yield jobs, urls
             if not is_stopping():
                 make_server(app).run(sockets=[listener])
