@@ -99,7 +99,7 @@ def test_a_scene_says_how_it_was_made(scene: spackle.Scene, pair: tuple[Path, Pa
 
     # What is missing, guessed or replaced is a warning.
     depth = np.where(box(640, 480), np.nan, 3).astype(np.float32)
-    mended = spackle.predict(pair[0], depth, fov=60, residual="seeds").report
+    mended = spackle.predict(pair[0], depth, fov=60, residual="initial").report
     assert mended is not None
     assert mended.focal_source == "fov"
     missing, resampled = mended.warnings
