@@ -281,6 +281,9 @@ def _methods(
 ) -> dict[str, Method]:
     """The compared methods by name, for the views of one photo.
 
+    A method is one way to render new views of the photo. It gets the cameras of all views of a
+    setting (a size of the camera move), and returns a function that fills one of these views.
+
     Args:
         evaluation: the options name the methods.
         loaded: the photo.
@@ -302,10 +305,11 @@ def _methods(
         fill: Fill = load_plugin(name, "methods")(cameras, context)
         return fill
 
-    return {
-        name: functools.partial(plugin_method if ":" in name else built_in_method, name)
-        for name in evaluation.options.methods
-    }
+    methods: dict[str, Method] = {}
+    for name in evaluation.options.methods:
+        make_fill = plugin_method if ":" in name else built_in_method
+        methods[name] = functools.partial(make_fill, name)
+    return methods
 
 
 def _predict_by_tuned_base(

@@ -82,7 +82,9 @@ def describe_method(name: str) -> MethodDescription:
     """How tables and plots present one of `METHODS`, or a plug-in `package.module:Name`."""
     if name in METHODS:
         return METHODS[name]
-    _, _, plugin_name = name.partition(":")
+
+    # Without its module; a method of another version of Spackle has none.
+    _, _, plugin_name = name.rpartition(":")
     return MethodDescription(
         title=plugin_name,
         summary=f"the function {plugin_name} of another package",
