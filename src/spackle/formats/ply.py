@@ -132,12 +132,12 @@ def _fill_table(table: Floats, columns: GaussianColumns) -> None:
     The columns 3 to 5, the normals, are left as they are.
     """
     opacities = np.clip(columns.opacities, MIN_OPACITY, MAX_OPACITY)
-    table[:, 0:3] = columns.means
-    table[:, 6:9] = columns.harmonics
+    table[:, 0:3] = columns.means  # x y z
+    table[:, 6:9] = columns.harmonics  # f_dc_0 f_dc_1 f_dc_2
     # The logit. Above one half, 1 - opacity is exact in floating point.
     table[:, 9] = np.log(opacities / (1 - opacities))
-    table[:, 10:13] = columns.log_scales
-    table[:, 13:17] = columns.quats
+    table[:, 10:13] = columns.log_scales  # scale_0 scale_1 scale_2
+    table[:, 13:17] = columns.quats  # rot_0 rot_1 rot_2 rot_3
 
 
 def load_ply(path: StrPath) -> Gaussians:
@@ -243,7 +243,7 @@ class PlyFile:
         Raises:
             InputError: the stored camera is impossible.
         """
-        # A cropped photo's principal point may be negative.
+        # The principal point of a cropped photo may be negative.
         numbers = self._tables.numbers_in_comment("spackle_camera", 6, lowest=-math.inf)
         if numbers is not None:
             fx, fy, cx, cy, width, height = numbers

@@ -45,6 +45,7 @@ def decode_splat(data: bytes) -> GaussianColumns:
     # NaN scales stay NaN, and `to_gaussians` refuses them.
     with np.errstate(divide="ignore", invalid="ignore"):
         log_scales = np.log(np.clip(rows["scales"], MIN_SCALE, MAX_SCALE))
+    # A byte b of a rotation stands for the component (b - 128) / 128.
     return GaussianColumns(
         means=rows["means"],
         quats=codes_to_fractions(rows["quats"], 128) - 1,

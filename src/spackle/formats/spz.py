@@ -303,50 +303,75 @@ def _deflate(data: bytes) -> bytes:
 def decode_spz(data: bytes) -> GaussianColumns:
     """Decode an SPZ file, with y down and z forward, and colours of degree 0.
 
+    Raises:
+        ValueError: the file has another version, or is too short.
+        zlib.error: the file is damaged.
+    """
+    header, (positions, opacities, colors, scales, rotations) = _inflate_sections(data)
+    # A byte stands for 0.5 + COLOR_SCALE · f_dc, and srgb = 0.5 + SH_C0 · f_dc.
+    srgb_per_color = np.float32(SH_C0 / COLOR_SCALE)
+    centered_colors = codes_to_fractions(colors, 255) - np.float32(0.5)
+    srgb = centered_colors * srgb_per_color + np.float32(0.5)
+    if header.version == 3:
+        quats = _decode_rotations(rotations)
+    else:
+        quats = _decode_rotations_of_version_2(rotations)
+    columns = GaussianColumns(
+        means=_decode_positions(positions, header.fraction_bits),
+        quats=quats,
+        log_scales=codes_to_fractions(scales, SCALE_STEPS) + MIN_LOG_SCALE,
+        opacities=codes_to_fractions(opacities[:, 0], 255),
+        srgb=np.clip(srgb, 0, 1),
+    )
+    # The format has y up and z backward.
+    return columns.flip_y_and_z()
+
+
+class SpzHeader(NamedTuple):
+    """What the header of a file says, in the order of HEADER."""
+
+    magic: int
+    version: int
+    count: int
+    harmonics_degree: int
+    fraction_bits: int
+    flags: int
+    reserved: int
+
+
+def _inflate_sections(data: bytes) -> tuple[SpzHeader, list[NDArray[np.uint8]]]:
+    """Return the header of an SPZ file, and its decompressed sections.
+
     A file is never inflated beyond the size that its header announces.
+
+    Returns:
+        The header; and for N Gaussians the bytes [N, k] of positions (k = 9), opacities (1),
+        colours (3), scales (3), and rotations (4, in version 2: 3).
 
     Raises:
         ValueError: the file has another version, or is too short.
         zlib.error: the file is damaged.
     """
     inflater = zlib.decompressobj(GZIP_WINDOW)
-    head = inflater.decompress(data, HEADER.size)
-    magic, version, count, degree, fraction_bits, _, _ = HEADER.unpack(head)
-    is_known = magic == MAGIC and version in (2, 3)
-    if not is_known or degree > MAX_HARMONICS_DEGREE or count > MAX_COUNT:
-        harmonics = f"harmonics of degree {degree}"
-        raise ValueError(f"version {version} with {count:,} Gaussians and {harmonics}")
+    header = SpzHeader(*HEADER.unpack(inflater.decompress(data, HEADER.size)))
+    count = header.count
+    is_known = header.magic == MAGIC and header.version in (2, 3)
+    if not is_known or header.harmonics_degree > MAX_HARMONICS_DEGREE or count > MAX_COUNT:
+        harmonics = f"harmonics of degree {header.harmonics_degree}"
+        raise ValueError(f"version {header.version} with {count:,} Gaussians and {harmonics}")
 
-    # Bytes of a Gaussian's position, opacity, colour, scales and rotation. Harmonics of higher
-    # degrees come after all of these, and are not inflated.
-    widths = (9, 1, 3, 3, 4 if version == 3 else 3)
-    body_bytes = count * sum(widths)
-    # The limit 0 would mean no limit.
+    # Harmonics of higher degrees come after these sections, and are not inflated.
+    rotation_bytes = 4 if header.version == 3 else 3
+    section_widths = (9, 1, 3, 3, rotation_bytes)
+    body_bytes = count * sum(section_widths)
+    # For zlib, the limit 0 would mean no limit.
     body = inflater.decompress(inflater.unconsumed_tail, max(1, body_bytes))
     if len(body) != body_bytes:
         raise ValueError(f"it ends after {len(body):,} bytes of {count:,} Gaussians")
 
-    section_ends = np.cumsum(widths)[:-1] * count
+    section_ends = np.cumsum(section_widths)[:-1] * count
     sections = np.split(np.frombuffer(body, np.uint8), section_ends)
-    positions, opacities, colors, scales, rotations = (
-        section.reshape(count, -1) for section in sections
-    )
-    # A byte stands for 0.5 + COLOR_SCALE · f_dc, and srgb = 0.5 + SH_C0 · f_dc.
-    srgb_per_color = np.float32(SH_C0 / COLOR_SCALE)
-    centered_colors = codes_to_fractions(colors, 255) - np.float32(0.5)
-    srgb = centered_colors * srgb_per_color + np.float32(0.5)
-    if version == 3:
-        quats = _decode_rotations(rotations)
-    else:
-        quats = _decode_rotations_of_version_2(rotations)
-    columns = GaussianColumns(
-        means=_decode_positions(positions, fraction_bits),
-        quats=quats,
-        log_scales=codes_to_fractions(scales, SCALE_STEPS) + MIN_LOG_SCALE,
-        opacities=codes_to_fractions(opacities[:, 0], 255),
-        srgb=np.clip(srgb, 0, 1),
-    )
-    return columns.flip_y_and_z()
+    return header, [section.reshape(count, -1) for section in sections]
 
 
 def _decode_positions(positions: NDArray[np.uint8], fraction_bits: int) -> Floats:
