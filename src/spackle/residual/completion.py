@@ -129,10 +129,16 @@ class ViewCompletion:
         )
 
     def input(self, name: str) -> Tensor:
-        """[h, w, c] float32: the channels of one input, by its name in `INPUT_CHANNELS`.
+        """[h, w, c] float32: the channels of one of the network's inputs, for each cell (2×2
+        pixels).
 
         Colours are moved to -0.5..0.5. Depths are log(inverse depth / median), so their unit does
         not matter.
+
+        Args:
+            name: "rgb", "depth", "alpha": what was rendered; "mask": where holes are; "initial":
+                depth and colour of the initial Gaussians, the first guess of what fills a cell;
+                "photo": the photo's colour there.
         """
         if name == "rgb":
             return self.features.rgb - 0.5
@@ -163,8 +169,10 @@ class ViewCompletion:
     def deltas(
         self, network: ResidualNet | None, precision: Precision = "auto", *, dense: bool = False
     ) -> Tensor | None:
-        """The network's changes [h, w, 14] of the initial Gaussians (eq. 5), float32 on the CPU;
-        None without a network.
+        """The network's changes [h, w, 14] of the initial Gaussians (eq. 5), float32 on the CPU.
+
+        The initial Gaussians are the first guess of what fills each cell of 2×2 pixels. Without a
+        network the result is None.
 
         Args:
             network: f_res, on any device.
@@ -177,16 +185,20 @@ class ViewCompletion:
         return predict_deltas(network, self.network_input(network.inputs), cells, precision)
 
     def gaussians(self, cells: Tensor, deltas: Tensor | None) -> Gaussians:
-        """Aux Gaussians [n] of n cells (eq. 7); gradients reach the deltas.
+        """One Gaussian for each of n cells of 2×2 pixels (eq. 7); gradients reach the deltas.
 
         Args:
             cells: which cells, as a boolean grid [h, w] or row-major indices [n].
-            deltas: [h, w, 14] of all cells; None: zero.
+            deltas: [h, w, 14] the network's changes of the initial Gaussians (the first guess) of
+                all cells; None: no changes.
         """
         chosen = self.initial.select(cells)
         if deltas is None:
             return compose(chosen, None, self.camera)
-        index = cells.flatten().nonzero()[:, 0] if cells.dtype == torch.bool else cells
+
+        index = cells
+        if cells.dtype == torch.bool:
+            index = cells.flatten().nonzero()[:, 0]
         return compose(chosen, deltas.flatten(0, 1)[index], self.camera)
 
 

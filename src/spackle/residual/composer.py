@@ -43,15 +43,14 @@ COLOR_MARGIN = 1.0 / 512  # keeps the inverse sigmoid finite; less than one step
 def compose(
     initial: InitialGaussians, deltas: Tensor | None, camera: Camera, spread_px: float = SPREAD_PX
 ) -> Gaussians:
-    """Aux Gaussians [n], which fill holes, from n initial Gaussians and their deltas; gradients
-    reach the deltas.
+    """Gaussians [n] that fill holes, composed of n initial Gaussians and their deltas.
 
-    Position, inverse depth, scale, rotation, colour and opacity change by the deltas, each in a
-    domain in which every number is valid (SHARP's composition).
+    An initial Gaussian is the first guess for a cell of 2×2 pixels; the deltas are changes that a
+    network predicts. As in SHARP, position, inverse depth, scale, rotation, colour and opacity each
+    change in a domain in which every number is valid. Gradients reach the deltas.
 
     Args:
-        initial: the first guess, with flat fields [n, ...], as `InitialGaussians.select` returns
-            them.
+        initial: the first guess, with flat fields [n, ...].
         deltas: [n, 14] changes that the network predicts; None: zero.
         camera: the view for which the Gaussians are made.
         spread_px: standard deviation of an initial Gaussian in pixels of the view.
@@ -68,6 +67,7 @@ def compose(
             initial_opacities,
         )
 
+    # Colours and opacities change in the sigmoid's domain, so that they stay within 0..1.
     shift_px, nearer, scale, turn, color, opacity = torch.split(deltas, DELTA_SIZES, dim=1)
     inverse_depth = _add_to_positive(
         initial.inverse_depth, SMALL_STEP * nearer.squeeze(1), initial.unit
@@ -83,6 +83,8 @@ def compose(
         colors,
         opacities,
     )
+
+    # A surfel is flat and lies in the surface; the network may turn it and change its size.
     return dataclasses.replace(
         surfels,
         quats=surfels.quats + SMALL_STEP * turn,
@@ -98,12 +100,13 @@ def color_logit(value: Tensor) -> Tensor:
 
 
 def _add_to_positive(value: Tensor, delta: Tensor, unit: float) -> Tensor:
-    """unit · softplus(softplus⁻¹(value / unit) + delta): add to a positive number so that it stays
-    positive.
+    """Add to positive numbers in such a way that they stay positive.
 
-    Large values change by delta · unit, small values by a factor exp(delta).
+    The result is unit · softplus(softplus⁻¹(value / unit) + delta). Large values change by
+    delta · unit, small values by a factor exp(delta).
     """
     relative = (value / unit).clamp_min(MIN_RELATIVE_INVERSE_DEPTH)
+
     # softplus⁻¹(x) = log(exp(x) − 1) = x + log(1 − exp(−x)); the second form does not overflow.
     inverse_softplus = relative + torch.log(-torch.expm1(-relative))
     changed = softplus(inverse_softplus + delta)

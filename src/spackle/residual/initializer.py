@@ -48,12 +48,15 @@ class InitialGaussians:
 
         `cells` is a boolean grid [h, w], or holds row-major indices [n].
         """
-        index = cells.flatten().nonzero()[:, 0] if cells.dtype == torch.bool else cells
+        index = cells
+        if cells.dtype == torch.bool:
+            index = cells.flatten().nonzero()[:, 0]
 
-        # Fields that are already flat can be selected again.
+        # The grid's axes are the first two; fields that are already flat have only one.
         last_cell_axis = self.inverse_depth.ndim - 1
 
         def pick(field: Tensor) -> Tensor:
+            """The values [n, ...] of the chosen cells."""
             return field.flatten(0, last_cell_axis)[index.to(field.device)]
 
         return InitialGaussians(
@@ -66,8 +69,11 @@ class InitialGaussians:
 
 
 def initialize(features: ViewFeatures, camera: Camera, photo_camera: Camera) -> InitialGaussians:
-    """Initial Gaussians for all cells [h, w] of a view; cells outside of holes keep their rendered
-    colour and depth.
+    """The first guess of one Gaussian for every cell [h, w] of a view, which a network then
+    changes.
+
+    In holes, colour and depth are continued from the surfaces around; other cells keep what was
+    rendered.
 
     Args:
         features: the rendered view, in cells of 2×2 pixels.
@@ -97,7 +103,7 @@ def initialize(features: ViewFeatures, camera: Camera, photo_camera: Camera) -> 
     return InitialGaussians(
         uv=uv,
         inverse_depth=inverse_depth,
-        slope=inverse_depth_slope(inverse_depth) / CELL,  # from a cell to a pixel
+        slope=inverse_depth_slope(inverse_depth) / CELL,  # per pixel, not per cell
         rgb=rgb.permute(1, 2, 0),  # [h, w, 3]
         unit=float(inverse_depth.median()),
     )
@@ -167,11 +173,19 @@ def _is_inside(place: Tensor, z: Tensor) -> Tensor:
 def _project_into_photo(
     inverse_depth: Tensor, camera: Camera, photo_camera: Camera
 ) -> tuple[Tensor, Tensor]:
-    """Project the points of a view's cells into the photo: (x·z, y·z) [h, w, 2] and z [h, w, 1].
+    """Project the points of a view's cells (2×2 pixels) into the photo, homogeneously.
 
-    x and y run from 0 to 1 across the photo. They are not divided by z, so points at the camera's
-    plane are harmless. Each point is scaled by its inverse depth [h, w] in the view, which leaves x
-    and y and the sign of z unchanged.
+    A point's place in the photo is (x, y), from 0 to 1 across the photo; its depth there is z. The
+    place is not divided by z, so points in the plane of the photo's camera do no harm.
+
+    Args:
+        inverse_depth: [h, w] 1/z of the cells as `camera` sees them. Points are multiplied by it,
+            which changes neither x nor y nor the sign of z.
+        camera: of the view.
+        photo_camera: of the photo.
+
+    Returns:
+        (x·z, y·z) as [h, w, 2], and z as [h, w, 1], float64.
     """
     rays, motion = _rays_in_photo(cell_centers(camera).double(), camera, photo_camera)
     points = rays + inverse_depth[..., None] * motion[:3, 3]  # [h, w, 3]
@@ -200,8 +214,7 @@ def _rays_in_photo(uv: Tensor, camera: Camera, photo_camera: Camera) -> tuple[Te
 
 
 def place_behind_surfaces(filled: Tensor, cells: Tensor, visible: Tensor, radius: int) -> Tensor:
-    """Move the inverse depth of some cells behind all visible surfaces nearby; others keep theirs.
-    Returns [h, w].
+    """Inverse depth [h, w] of a view's cells, with some cells moved behind all surfaces nearby.
 
     Args:
         filled: [h, w] inverse depth of all cells.

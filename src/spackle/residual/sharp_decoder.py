@@ -78,7 +78,10 @@ class SharpDecoder(ResidualNet):
         return cls(decoder_size(tensors))
 
     def forward(self, features: Tensor) -> Tensor:
-        """Deltas [B, 14, h, w] of the cells, from the features [B, 13, h, w] named in `inputs`."""
+        """Deltas [B, 14, h, w]: changes of the Gaussian of each cell of 2×2 pixels.
+
+        `features` [B, 13, h, w] are the channels that `inputs` names.
+        """
         height, width = features.shape[-2:]
         features = pad_to_stride(features)
 
@@ -91,8 +94,8 @@ class SharpDecoder(ResidualNet):
             if down is not None:  # after the coarsest map
                 x = torch.relu(down(x))
 
-        # Log depths d' = log(d) become numbers in -1..1 like SHARP's disparities: tanh(d' / 2) = (d
-        # - 1) / (d + 1).
+        # SHARP's decoder reads a picture of colours and disparities in -1..1. Here depths come as
+        # log(d), and tanh(log(d) / 2) = (d - 1) / (d + 1) lies in -1..1.
         view_depth = self.slices["depth"].start
         initial_depth = self.slices["initial"].start
         depths = torch.tanh(features[:, [view_depth, initial_depth]] / 2)
@@ -101,7 +104,7 @@ class SharpDecoder(ResidualNet):
 
         # SHARP's picture has four pixels for each Gaussian.
         pixels = interpolate(picture, scale_factor=2, mode="nearest")
-        no_coarser_features = x.new_zeros(())
+        no_coarser_features = x.new_zeros(())  # is added to the coarsest map
         texture, geometry = self.feature_model(pixels, maps, no_coarser_features)
         deltas = torch.cat([self.geometry(geometry), self.texture(texture)], dim=1)
         return deltas[..., :height, :width]

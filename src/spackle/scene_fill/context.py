@@ -33,18 +33,17 @@ class PhotoRendering:
         self._rendering: Rendering | None = None
 
     def render(self, renderer: Renderer, base: Gaussians, photo_camera: Camera) -> Rendering:
-        """The rendering of these very objects; rendered anew only if one of them is another object
-        than before.
+        """The base rendered from the photo's camera, or the same rendering as last time.
+
+        It is rendered anew only if one of the three is another object than last time.
         """
         inputs = (renderer, base, photo_camera)
-        if self._rendering is None or self._inputs is None:
-            is_current = False
-        else:
-            is_current = all(a is b for a, b in zip(inputs, self._inputs, strict=True))
-        if not is_current:
+        is_same = self._inputs is not None and all(
+            new is last for new, last in zip(inputs, self._inputs, strict=True)
+        )
+        if self._rendering is None or not is_same:
             self._rendering = renderer.render(base, photo_camera)
             self._inputs = inputs
-        assert self._rendering is not None
         return self._rendering
 
 
@@ -75,6 +74,8 @@ class FillContext:
         device = self.renderer.device
         if self.base.means.device.type == device.type:
             return self
+
+        # A copy, because a torch module is moved in place, and the given one belongs to the caller.
         network = None if self.network is None else copy.deepcopy(self.network).to(device)
         return dataclasses.replace(self, base=self.base.to(device), network=network)
 

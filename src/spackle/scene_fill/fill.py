@@ -134,9 +134,14 @@ class _SceneFilling:
         exact: bool,
         always_filled: Collection[int],
     ) -> None:
-        """Render the widest views, and guard their surfaces and the photo's.
+        """Choose the views to fill, render the widest ones, and guard the surfaces they show.
 
-        Args: as for `fill_scene`; the context lies on the renderer's device.
+        Args:
+            context: the photo's base and the settings of the fill, on the renderer's device.
+            cameras: the views.
+            exact: visit every view, and leave no hole; otherwise half of the views, and holes that
+                are invisibly small stay open.
+            always_filled: indices of views that are visited in any case.
         """
         self.context = context
         self.cameras = cameras
@@ -146,11 +151,13 @@ class _SceneFilling:
             self.views_to_fill = order
             self.max_hole_ratio = 0.0
         else:
+            # The views in between show hardly anything that their neighbours do not show.
             checked = max(MIN_VIEWS_TO_FILL, len(order) // 2)
             others = [index for index in order[checked:] if index in always_filled]
             self.views_to_fill = [*order[:checked], *others]
             self.max_hole_ratio = INVISIBLE_HOLE_RATIO
 
+        # No new Gaussian may hide what the photo or one of the widest views shows.
         self.renderer = IncrementalRenderer(context.renderer, context.base)
         self.guards = {PHOTO: context.photo_guard()}
         self.base_renders: dict[int, Rendering] = {}  # by view, until the view is visited
@@ -161,7 +168,8 @@ class _SceneFilling:
             )
 
         self.filled_views = 0
-        self.aux = [Gaussians.empty()]
+        self.aux = [Gaussians.empty()]  # everything that was added
+
         # The views' indices, and the Gaussians beneath the rims of their holes, still at the place
         # where the view wants them: one view may show, and fill better, what the other's rims hide.
         self.pending_underlays: list[tuple[int, Gaussians]] = []
@@ -222,8 +230,10 @@ class _SceneFilling:
         return [guard for view, guard in self.guards.items() if view != index]
 
     def _place_underlays(self) -> list[Gaussians]:
-        """Move the pending underlays behind the surfaces of all other views; none is pending
-        afterwards.
+        """The pending underlays, moved behind the surfaces of all other views.
+
+        An underlay are the Gaussians that one view has added beneath the rims of its holes. None is
+        pending afterwards.
         """
         placed = [
             move_behind_surfaces(underlay, self.cameras[index].position, self._other_guards(index))

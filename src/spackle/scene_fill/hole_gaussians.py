@@ -60,7 +60,8 @@ def fill_holes(
     deltas = view.deltas(context.network, context.precision)
     cells = view.gaussians(mask, deltas)
 
-    # Gaussians that would hide a guarded surface move away along their line of sight.
+    # Gaussians that would hide a guarded surface move away along their line of sight. Single cells
+    # that stayed near, between others that moved, would look like specks: they move along.
     depths = view.camera.to_camera(cells.means)[:, 2]
     scales = unoccluding_scales(cells, eye, guards)
     smooth_scales = without_pits(depths * scales, mask) / depths
@@ -68,6 +69,7 @@ def fill_holes(
 
     pixels = Gaussians.empty()
     if context.texture is not None:
+        # The smooth colours of all cells: the new Gaussians' in holes, the rendered ones elsewhere.
         structure = view.features.rgb.clone()
         structure[mask] = linear_to_srgb(cells.colors)
         picture = context.texture(view, structure)
@@ -79,6 +81,7 @@ def fill_holes(
         linear_means = srgb_to_linear(cell_pixels.clamp(0, 1)).mean((1, 2))
         cells = dataclasses.replace(cells, colors=linear_means)
 
+    # Without network and texture, a later underlay continues the first guess as it is.
     surfaces = view.initial
     if context.network is not None or context.texture is not None:
         surfaces = _follow_beyond_photo(view, depths * scales, scales > 0)

@@ -27,6 +27,7 @@ class IncrementalRenderer:
         self._device = renderer.device
         self._base = base
         self._added: list[Gaussians] = []
+        # What was rendered last, which `render_added` updates.
         self._camera: Camera | None = None
         self._last: Rendering | None = None
 
@@ -58,6 +59,7 @@ class IncrementalRenderer:
         """
         assert self._camera is not None
         assert self._last is not None
+        # Tiles are squares of pixels that the renderer draws one by one.
         tiles = touched_tiles(changed, self._camera)
         if bool(tiles.any()):
             scene = [self._base, *self._added]

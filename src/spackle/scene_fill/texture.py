@@ -57,6 +57,8 @@ def exemplar_texture(view: SceneViewCompletion, structure: Tensor) -> Tensor:
     """
     patches = view.patches
     rendered = group_by_cell(view.rendering.rgb)  # [h, w, 2, 2, 3]
+
+    # Only the high frequencies of the patches are used; the low ones are the structure's.
     copied = ungroup_cells(copy_patch_blocks(patches, rendered))
     texture = copied - gaussian_blur(copied, TEXTURE_SIGMA_PX)
 
@@ -66,6 +68,7 @@ def exemplar_texture(view: SceneViewCompletion, structure: Tensor) -> Tensor:
     gain = trust * _gain_to_surroundings(texture, view)  # [h, w]
     pixel_gain = ungroup_cells(gain[..., None, None, None].expand(*gain.shape, CELL, CELL, 1))
 
+    # Outside of the hole, the picture is what was rendered.
     smooth = group_by_cell(_interpolate_cells(continue_border(view, structure), view.mask))
     in_hole = view.mask[..., None, None, None]
     picture = ungroup_cells(torch.where(in_hole, smooth, rendered))
@@ -162,8 +165,11 @@ def _gain_to_surroundings(texture: Tensor, view: SceneViewCompletion) -> Tensor:
 
 
 def _interpolate_cells(colors: Tensor, mask: Tensor) -> Tensor:
-    """Colours [2h, 2w, 3] of pixels, interpolated between the colours [h, w, 3] of cells in `mask`
-    ([h, w] bool).
+    """Colours [2h, 2w, 3] of pixels, interpolated between cells of 2×2 pixels.
+
+    Args:
+        colors: [h, w, 3] of the cells.
+        mask: [h, w] bool: the cells between which is interpolated; others are left out.
     """
     weight = mask[..., None]
     weighted = torch.cat([colors * weight, weight], dim=-1).permute(2, 0, 1)  # [4, h, w]

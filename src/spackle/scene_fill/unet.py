@@ -62,12 +62,16 @@ class UNet(ResidualNet):
     view_type = SceneViewCompletion
 
     def __init__(self) -> None:
-        """Random weights; the heads start at zero."""
+        """Make the layers: encoder (`encode`, `down`), decoder (`up`, `decode`) and two heads.
+
+        Weights are random; the heads start at zero, so that an untrained network changes nothing.
+        """
         super().__init__()
         slices = channel_slices(self.inputs, SceneViewCompletion.INPUT_CHANNELS)
         channels = slices[self.inputs[-1]].stop
         rim = slices["rim"].start
         patches = slices["patches"].start
+
         # Channels of the colours that can be copied, as differences from the initial colour: at the
         # rim, mirrored at the rim, and of patches.
         self.copied_colors = (
@@ -76,6 +80,7 @@ class UNet(ResidualNet):
             slice(patches, patches + 3),
         )
 
+        # Channels of neighbouring levels, from the finest level to the coarsest.
         fine_and_coarse = list(itertools.pairwise(WIDTHS))
         self.stem = nn.Conv2d(channels, WIDTHS[0], 3, padding=1)
         self.down = nn.ModuleList(
@@ -85,6 +90,9 @@ class UNet(ResidualNet):
         self.coarse = nn.Sequential(*(ResidualBlock(WIDTHS[-1]) for _ in range(COARSEST_BLOCKS)))
         self.up = nn.ModuleList(nn.Conv2d(coarse, fine, 1) for fine, coarse in fine_and_coarse)
         self.decode = nn.ModuleList(ResidualBlock(width) for width in WIDTHS[:-1])
+
+        # As in SHARP, one head predicts geometry, the other texture; here also the weights of the
+        # copied colours.
         self.geometry = _head(WIDTHS[0], GEOMETRY_CHANNELS)
         self.texture = _head(WIDTHS[0], TEXTURE_CHANNELS + len(self.copied_colors))
         self._initialize_weights()
@@ -113,15 +121,17 @@ class UNet(ResidualNet):
             inner = Crop(0, 0, *features.shape[-2:])
         x = self.stem(pad_to_stride(features))
 
-        # The last layers are the most expensive; they need only a few cells around `inner`.
-        near_inner = inner.grown(FINEST_CONTEXT_CELLS, 1, *x.shape[-2:])
-
+        # Encode: each level halves the grid. The decoder will need the features of each level.
         skips: list[Tensor] = []
         for encode, down in zip(self.encode, self.down, strict=True):
             x = encode(x)
             skips.append(x)
             x = down(x)
         x = self.coarse(x)
+
+        # Decode: each level doubles the grid. The layers on the finest grid (level 0) are the most
+        # expensive; they need only a few cells around `inner`.
+        near_inner = inner.grown(FINEST_CONTEXT_CELLS, 1, *skips[0].shape[-2:])
         for level in reversed(range(len(skips))):
             x = interpolate(self.up[level](x), scale_factor=2, mode="bilinear", align_corners=False)
             x = x.add_(skips[level])
@@ -130,18 +140,22 @@ class UNet(ResidualNet):
             x = self.decode[level](x)
         outputs = torch.cat([self.geometry(x), self.texture(x)], dim=1)
 
+        # The same rectangle, counted from the corner of `near_inner`.
         inner_of_crop = inner.moved(-near_inner.top, -near_inner.left)
         outputs = outputs[(..., *inner_of_crop.slices)]
         return self._add_copied_colors(outputs, features[(..., *inner.slices)])
 
     def _add_copied_colors(self, outputs: Tensor, features: Tensor) -> Tensor:
-        """Deltas [B, 14, h, w]: those in `outputs`, with the colours of rim and patches added to
-        the colour.
+        """Add weighted copies of known colours to the colour channels of the deltas.
+
+        The known colours are those at the rim of a hole, mirrored at the rim, and of patches.
 
         Args:
-            outputs: [B, 17, h, w], 14 deltas and the weights of the three colours that can be
-                copied.
-            features: [B, 21, h, w].
+            outputs: [B, 17, h, w], 14 deltas and the weights of the three known colours.
+            features: [B, 21, h, w], the network's input, which holds the known colours.
+
+        Returns:
+            Deltas [B, 14, h, w], changes of the Gaussian of each cell.
         """
         deltas, weights = torch.split(outputs, [DELTA_CHANNELS, len(self.copied_colors)], dim=1)
         copied = sum(

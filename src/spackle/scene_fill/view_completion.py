@@ -103,10 +103,10 @@ class SceneViewCompletion(ViewCompletion):
 
     @functools.cached_property
     def patch_colors(self) -> Tensor:
-        """[h, w, 3] sRGB: colours of the matching patches.
+        """[h, w, 3] sRGB: colours of patches elsewhere in the view that match its hole cells.
 
-        Beyond the photo's border their low frequencies are replaced by those of the initial
-        colours, because the patches were found by mirrored colours.
+        Beyond the photo's border, patches were found by mirrored colours. So their tone, the low
+        frequencies, may be wrong there, and is replaced by the tone of the initial colours.
         """
         colors = self.patches.rgb
         tone_difference = approximate_gaussian_blur(colors - self._smooth_colors, TONE_BLUR_CELLS)
