@@ -332,7 +332,7 @@ class SpzHeader(NamedTuple):
 
     magic: int
     version: int
-    count: int
+    gaussian_count: int
     harmonics_degree: int
     fraction_bits: int
     flags: int
@@ -354,7 +354,7 @@ def _inflate_sections(data: bytes) -> tuple[SpzHeader, list[NDArray[np.uint8]]]:
     """
     inflater = zlib.decompressobj(GZIP_WINDOW)
     header = SpzHeader(*HEADER.unpack(inflater.decompress(data, HEADER.size)))
-    count = header.count
+    count = header.gaussian_count
     is_known = header.magic == MAGIC and header.version in (2, 3)
     if not is_known or header.harmonics_degree > MAX_HARMONICS_DEGREE or count > MAX_COUNT:
         harmonics = f"harmonics of degree {header.harmonics_degree}"
