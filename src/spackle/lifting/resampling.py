@@ -134,7 +134,10 @@ def _resample(
     height: int,
     width: int,
 ) -> Any:
-    """Resample a map [h, w] to the photo's size [H, W], as `resample_map` describes.
+    """Resample a map [h, w] to the photo's size [H, W], without mixing both sides of an edge.
+
+    A pixel between map pixels of one surface is interpolated. One in a depth edge stays open: its
+    side is undecided. One between unknown map pixels is a hole.
 
     Args:
         inverse_depth: [h, w] float32.

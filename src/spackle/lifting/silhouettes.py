@@ -237,6 +237,8 @@ def _unmix(colors: Any, ring: Any, inside: Any, alpha: Any, color: Any, variance
             is_fringe = (
                 share < 0 and from_far > FRINGE_VARIANCES * variance[1, y, x] + MAX_UNEXPLAINED
             )
+
+            # Move both colours by what their mixture lacks.
             for c in range(3):
                 unchanged[0, c] = color[0, y, x, c]
                 unchanged[1, c] = color[1, y, x, c]
@@ -246,8 +248,10 @@ def _unmix(colors: Any, ring: Any, inside: Any, alpha: Any, color: Any, variance
             if inside[y, x] <= 0 and is_fringe:
                 alpha[y, x] = 1
                 continue
-            if unexplained <= MAX_UNEXPLAINED:
+            if unexplained <= MAX_UNEXPLAINED:  # the new colours explain the pixel
                 continue
+
+            # If they do not: another coverage of the old colours, or a single surface.
             if off_mixture <= MAX_UNEXPLAINED and 0 < share < 1:
                 alpha[y, x] = share
                 for c in range(3):

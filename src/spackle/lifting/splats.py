@@ -186,6 +186,7 @@ def blended_opacities(alpha: Floats, ring: NDArray[np.uint8]) -> Floats:
     Returns:
         [H, W] opacities in 0..1, as a part of a solid Gaussian's opacity.
     """
+    # Neighbours depend on each other, so that their opacities are found in sweeps.
     opacities = alpha.copy()
     for _ in range(CORRECTION_SWEEPS):
         _subtract_neighbors(alpha, ring, opacities)
