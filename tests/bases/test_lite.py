@@ -35,7 +35,7 @@ def shipped() -> LiteBase:
 
 @functools.cache
 def motorcycle() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """The left photo at half size [H, W, 3], its depth up to a factor, and a mask of the known depths."""
+    """The left photo at half size [H, W, 3], its depth up to a factor, and where it is known."""
     data = pytest.importorskip("skimage.data")
     left, _, disparity = data.stereo_motorcycle()
     rgb = torch.from_numpy(left[::2, ::2].copy()).float() / 255

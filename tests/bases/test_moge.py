@@ -1,4 +1,4 @@
-"""MoGe-2 against arrays that the original computed with deterministic weights; focal length, sky and wrong files."""
+"""MoGe-2 against arrays that the original computed; focal length, sky and wrong files."""
 
 from __future__ import annotations
 

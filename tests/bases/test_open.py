@@ -1,4 +1,4 @@
-"""`open_base`: the base of a photo and the reason for it, the source of the focal length, and errors."""
+"""`open_base`: a photo's base and the reason for it, the source of the focal length, and errors."""
 
 from __future__ import annotations
 
@@ -49,7 +49,10 @@ def sharp(tmp_path: Path, made: dict[str, Path]) -> Path:
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
-    """Stand-ins for SHARP and models of the hub, without reading files; the list holds the arguments of each load."""
+    """Stand-ins for SHARP and models of the hub, which read no files.
+
+    The list holds the arguments of each load.
+    """
     asked: list[dict[str, Any]] = []
 
     def load(path: Path | str, **options: Any) -> StandIn:

@@ -1,4 +1,4 @@
-"""Gaussians stretched along the axes, against NumPy's float64 decompositions of their covariances."""
+"""Gaussians stretched along the axes, against NumPy's decompositions of their covariances."""
 
 from __future__ import annotations
 
@@ -63,7 +63,8 @@ def check(
     square = factors(after)
     error = np.linalg.norm(square @ square.transpose(0, 2, 1) - wanted, axis=(1, 2))
     assert (error <= tolerance * np.linalg.norm(wanted, axis=(1, 2))).all()
-    # Small scales are compared with singular values of the matrix; NumPy's have eight correct digits near this limit.
+    # Small scales are compared with singular values of the matrix; NumPy's have eight correct
+    # digits near this limit.
     digits, sizes = max(tolerance, 1e-7), np.linalg.svd(matrix)[1]
     told = (sizes > 1e-8 * sizes[:, :1]) & (sizes > 0)
     np.testing.assert_allclose(after.scales.double().numpy()[told], sizes[told], rtol=digits)
@@ -91,7 +92,10 @@ def test_covariances_are_kept(
 
 
 def degenerate() -> Gaussians:
-    """Points, lines, discs, balls, threads and plates of extreme sizes, and quaternions of extreme lengths."""
+    """Points, lines, discs, balls, threads and plates, all of extreme sizes.
+
+    Their quaternions have extreme lengths.
+    """
     odd, usual = (0.3, -1.2, 0.7, 2.0), (0.1, 0.3, 0.2)
     scales = [
         (0, 0, 0),

@@ -1,4 +1,4 @@
-"""SHARP's trained decoder: exact gradients, and a file that predicts together with its checkpoint."""
+"""SHARP's trained decoder: exact gradients, and a file that predicts with its checkpoint."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The hf base: models of transformers give depth in metres at the right place, and bad models are refused."""
+"""The hf base: models of transformers give depth in metres; bad models are refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The depth map inside a photo is read upright in metres from each layout, and bad files are refused in one line."""
+"""The depth map inside a photo is read upright in metres; bad files are refused in one line."""
 
 from __future__ import annotations
 

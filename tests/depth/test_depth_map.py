@@ -1,10 +1,11 @@
-"""Depth maps: each format is read back, depth and disparity are told apart, and bad files are refused."""
+"""Depth maps: formats are read, depth and disparity are told apart, bad files are refused."""
 
 from __future__ import annotations
 
 import io
 import json
 import struct
+import sys
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -22,8 +23,14 @@ from spackle.depth.readers import load_depth
 from spackle.depth.units import RELATIVE_KINDS, DepthKind
 from spackle.runtime.errors import InputError
 
-CALIB = "cam0=[1000.5 0 30.25; 0 1000.5 20.5; 0 0 1]\ncam1=[1000.5 0 40.25; 0 1000.5 20.5; 0 0 1]\n doffs= 10.0\n"
-CALIB += "baseline=200.0\nwidth=8\nheight=6\nisint=0\n"
+CALIB = """cam0=[1000.5 0 30.25; 0 1000.5 20.5; 0 0 1]
+cam1=[1000.5 0 40.25; 0 1000.5 20.5; 0 0 1]
+ doffs= 10.0
+baseline=200.0
+width=8
+height=6
+isint=0
+"""
 EXR = DATA / "exr"
 BAD_EXR = ("lossy", "integers")
 
@@ -92,6 +99,41 @@ def test_npz_and_pfm_and_exr(tmp_path: Path) -> None:
             ramp(30, 40),
             1e-3 if "half" in path.name or "grey" in path.name else 0,
         )
+
+
+@pytest.mark.parametrize(("left", "top"), [(2, 1), (-1, -1), (5, 4), (40, 0)])
+def test_an_exr_with_pixels_for_a_part_of_the_picture(tmp_path: Path, left: int, top: int) -> None:
+    exr = pytest.importorskip("OpenEXR")
+    stored = ramp(3, 4)  # at (left, top) in a picture of 8×6, and perhaps beyond it
+    header = {
+        "type": exr.scanlineimage,
+        "dataWindow": (np.int32([left, top]), np.int32([left + 3, top + 2])),
+        "displayWindow": (np.int32([0, 0]), np.int32([7, 5])),
+    }
+    exr.File(header, {"Z": stored}).write(str(tmp_path / "part.exr"))
+    expected = np.zeros((6, 8), np.float32)
+    for y in range(6):
+        for x in range(8):
+            if 0 <= y - top < 3 and 0 <= x - left < 4:
+                expected[y, x] = stored[y - top, x - left]
+    if not expected.any():
+        with pytest.raises(InputError, match="all-invalid"):
+            load_depth(tmp_path / "part.exr")
+        return
+    same(load_depth(tmp_path / "part.exr"), expected)
+
+
+def test_an_exr_of_several_parts_and_a_missing_package_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    exr = pytest.importorskip("OpenEXR")
+    parts = [exr.Part({"type": exr.scanlineimage}, {"Z": ramp()}, name) for name in "ab"]
+    exr.File(parts).write(str(tmp_path / "parts.exr"))
+    with pytest.raises(InputError, match="several parts"):
+        load_depth(tmp_path / "parts.exr")
+    monkeypatch.setitem(sys.modules, "OpenEXR", None)
+    with pytest.raises(InputError, match=r"pip install 'spackle-nvs\[exr\]'"):
+        load_depth(EXR / "good" / "zips, depth.exr")
 
 
 def test_millimetre_png(tmp_path: Path) -> None:
@@ -165,9 +207,17 @@ def test_scene_json(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "text",
-    ["", "hello", CALIB.replace("1000.5", "0"), CALIB.replace("cam0", "cam9"), CALIB.replace("200.0", "-1"),
-     CALIB.replace("10.0", "ten"), CALIB.replace("width=8", "width=80"), "x" * 100_000],
-)  # fmt: skip
+    [
+        "",
+        "hello",
+        CALIB.replace("1000.5", "0"),
+        CALIB.replace("cam0", "cam9"),
+        CALIB.replace("200.0", "-1"),
+        CALIB.replace("10.0", "ten"),
+        CALIB.replace("width=8", "width=80"),
+        "x" * 100_000,
+    ],
+)
 def test_bad_calibrations(tmp_path: Path, text: str) -> None:
     (tmp_path / "d.pfm").write_bytes(pfm(ramp()))
     (tmp_path / "calib.txt").write_text(text)
