@@ -90,10 +90,10 @@ def _round_up(value: int, step: int) -> int:
 def crops_around_mask(
     mask: Tensor, step: int, margin: int = DEFAULT_MARGIN_CELLS
 ) -> list[tuple[Crop, Crop]]:
-    """Cover all masked cells with a few small rectangles.
+    """Cover all masked cells of a grid with a few small rectangles, on which a network then runs.
 
     Args:
-        mask: [h, w] bool.
+        mask: [h, w] bool, the cells for which the network's output is needed.
         step: the network's stride; outer rectangles begin at multiples of the stride.
         margin: number of cells that the network needs around each masked cell.
 
@@ -109,16 +109,18 @@ def crops_around_mask(
 
     # The search works with blocks of step×step cells: cuts at multiples of the stride cost nothing,
     # and blocks are fewer than cells.
-    blocks = _any_in_blocks(cells, step)
-    all_blocks = Crop(0, 0, *blocks.shape)
+    blocks = _any_in_blocks(cells, step)  # [h/step, w/step] whether any cell is masked
+    bounds = _shrink_to_mask(blocks, Crop(0, 0, *blocks.shape))
     margin_blocks = math.ceil(margin / step)
     crops = []
-    for part in _cut_in_parts(blocks, _shrink_to_mask(blocks, all_blocks), margin_blocks):
+    for part in _cut_in_parts(blocks, bounds, margin_blocks):
+        # From blocks back to cells; without the unmasked cells of the outermost blocks.
         part_cells = Crop(part.top * step, part.left * step, part.bottom * step, part.right * step)
         inner = _shrink_to_mask(cells, part_cells)
         outer = inner.grown(margin, step, height, width)
         crops.append((inner, outer))
 
+    # One call for the whole grid is faster than many that overlap.
     whole = Crop(0, 0, height, width)
     cropped_area = sum(outer.area for _, outer in crops)
     if cropped_area > MAX_CROPPED_RATIO * whole.area:
@@ -162,26 +164,33 @@ def _cut_in_parts(blocks: Mask, crop: Crop, margin: int) -> list[Crop]:
         Rectangles, each shrunk to its masked blocks, which contain each masked block exactly once.
     """
     height, width = blocks.shape
-    uncut_area = crop.grown(margin, 1, height, width).area
+    uncut_area = crop.grown(margin, step=1, height=height, width=width).area
     if uncut_area <= GOOD_ENOUGH_RATIO * _min_area(blocks, crop, margin):
         return [crop]
 
-    # Of all cuts between two rows or two columns, take the one with the least area in all.
+    # Try all cuts between two rows and between two columns. A cut makes two halves, each a
+    # rectangle (top, left, bottom, right) around its masked blocks.
     inside = blocks[crop.slices]
-    row_cuts = _halves_of_row_cuts(inside)  # [cuts, 2 halves, 4]: top, left, bottom, right
-    column_cuts = _halves_of_row_cuts(inside.T)[..., [1, 0, 3, 2]]  # transposed back
+    row_cuts = _halves_of_row_cuts(inside)  # [cuts, 2 halves, 4]
+    transposed_cuts = _halves_of_row_cuts(inside.T)  # (left, top, right, bottom)
+    column_cuts = transposed_cuts[..., [1, 0, 3, 2]]
     halves = np.concatenate([row_cuts, column_cuts])
-    halves += (crop.top, crop.left, crop.top, crop.left)
+    halves += (crop.top, crop.left, crop.top, crop.left)  # from the rectangle to the grid
+
+    # Take the cut whose halves, with their margins, have the least area.
     grown_starts = np.maximum(halves[..., :2] - margin, 0)  # [cuts, 2 halves, 2]
     grown_ends = np.minimum(halves[..., 2:] + margin, (height, width))
     areas = (grown_ends - grown_starts).prod(-1).sum(1)  # [cuts]
     best_halves = halves[areas.argmin()]  # [2, 4]
 
+    # Cut the halves again, and compare the cost of all parts with that of the uncut rectangle.
     parts = []
     for top, left, bottom, right in best_halves.tolist():
         parts += _cut_in_parts(blocks, Crop(top, left, bottom, right), margin)
-    cut_cost = sum(part.grown(margin, 1, height, width).area + CALL_COST_BLOCKS for part in parts)
-    return parts if cut_cost < uncut_area + CALL_COST_BLOCKS else [crop]
+    part_areas = [part.grown(margin, step=1, height=height, width=width).area for part in parts]
+    cut_cost = sum(part_areas) + len(parts) * CALL_COST_BLOCKS
+    uncut_cost = uncut_area + CALL_COST_BLOCKS
+    return parts if cut_cost < uncut_cost else [crop]
 
 
 def _min_area(blocks: Mask, crop: Crop, margin: int) -> int:

@@ -63,6 +63,7 @@ def _weighted_sum_of_neighbors(values: Tensor, weights: Sequence[float], dim: in
         count = size - offset  # elements that have a neighbour at this offset
         without_end = total.narrow(dim, 0, count)
         without_start = total.narrow(dim, offset, count)
+        # Each element gets the neighbour behind it, then the one before it.
         without_end.add_(values.narrow(dim, offset, count), alpha=weight)
         without_start.add_(values.narrow(dim, 0, count), alpha=weight)
     return total

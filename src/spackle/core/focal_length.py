@@ -99,6 +99,7 @@ def resolve_focal_length(
     elif focal_mm is not None:
         focal, source = focal_mm_to_px(focal_mm, width, height), FocalSource.FOCAL_MM
     elif fov is not None:
+        # Half the width is seen under half the angle.
         focal, source = width / 2 / math.tan(math.radians(fov) / 2), FocalSource.FOV
     else:
         exif_focal = focal_from_exif(exif, width, height)

@@ -331,6 +331,7 @@ def _relax(samples: Any, buffer: Any, neighbors: Any, bias: Any, sweeps: int) ->
                     new[n, channel] = neighbor_sum / NEIGHBOR_COUNT
                 continue
 
+            # Beside the rim, known samples that are nearer than the fill weigh less.
             weight_sum = np.float32(0)
             new[n] = 0
             for k in range(NEIGHBOR_COUNT):

@@ -30,6 +30,7 @@ MAX_PIXELS = 100_000_000  # a larger image would take more than a gigabyte as fl
 HARMLESS_PIXELS = 32_000_000
 MAX_PIXELS_PER_BYTE = 32
 
+MAX_UINT16 = 65535
 _EXIF_DIRECTORY = 0x8769  # the tag that points to the directory with the camera's settings
 
 
@@ -126,9 +127,10 @@ def _deep_grey_to_tensor(image: Image.Image, path: str | os.PathLike[str]) -> Te
     """Convert a grey image of 16 bits to [H, W, 3] float32 in 0..1; InputError for 32 bits."""
     values = np.asarray(image)  # [H, W]
     # Pillow opens some images of 16 bits in the mode of 32 bits, so the values decide.
-    if image.mode == "F" or values.min() < 0 or values.max() > 65535:
+    is_32_bit = image.mode == "F" or values.min() < 0 or values.max() > MAX_UINT16
+    if is_32_bit:
         raise InputError(f"{path}: pixels of 32 bits: save the photo with 8 or 16 bits per channel")
-    grey = torch.from_numpy(values.astype(np.float32)).div_(65535)
+    grey = torch.from_numpy(values.astype(np.float32)).div_(MAX_UINT16)
     return grey[..., None].expand(-1, -1, 3).contiguous()
 
 

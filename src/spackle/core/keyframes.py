@@ -219,10 +219,11 @@ def interpolate_monotone(
 
 
 def _inner_tangents(steps: Array, slopes: Array) -> Array:
-    """Tangents [K − 2, C] at the inner ones of K values, for a curve that stays in their range.
+    """Tangents [K − 2, C] of a curve through K values, at all but the first and last value.
 
-    They are weighted harmonic means of the slopes before and after a value, and 0 where the slopes'
-    signs differ, that is, at a maximum or minimum.
+    A tangent is the weighted harmonic mean of the slopes a and b before and after the value,
+    (v + w) / (v / a + w / b), and 0 where their signs differ, that is, at a maximum or minimum. So
+    the curve never leaves the range of two successive values (Fritsch and Butland).
 
     Args:
         steps: [K − 1, 1] times between the values.

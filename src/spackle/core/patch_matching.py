@@ -156,7 +156,8 @@ def _relative_log_depth(inverse_depth: Tensor, hole: Tensor) -> Tensor:
 def _pixel_weights(hole: Bools) -> Floats:
     """Weights [h + 6, w + 6] of the pixels in a patch, with three zeros beyond each side.
 
-    Known pixels have the weight 1. The guess deep in a hole [h, w] is unreliable, and counts less.
+    Known pixels have the weight 1. The guess deep in a hole [h, w] is unreliable, and counts less:
+    0.8^d for a pixel that is d pixels away from the nearest known one.
     """
     distance = distance_to_nearest(nearest_known_pixels(hole)).numpy()
     weights = np.maximum(np.float32(FADING_PER_PX) ** distance, MIN_PIXEL_WEIGHT)
@@ -188,6 +189,7 @@ def _mirror_into_hole(rgb: Any, hole: Any, depth: Any, nearest: Any) -> None:
         for x in range(width):
             if not hole[y, x]:
                 continue
+            # The point as far beyond the nearest known pixel as this pixel is before it.
             v = 2 * nearest[0, y, x] - y
             u = 2 * nearest[1, y, x] - x
             is_inside = 0 <= v < height and 0 <= u < width
@@ -284,7 +286,7 @@ class _LevelSearch:
         )
 
     def score(self) -> None:
-        """Compute the costs of the matches, which votes have changed."""
+        """Compute the cost of each hole pixel's patch anew: a vote has changed the colours."""
         parallel_for_chunks(
             lambda start, stop: score_matches(
                 start,

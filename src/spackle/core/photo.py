@@ -155,7 +155,8 @@ def _array_to_rgb(picture: NDArray[Any] | Tensor, name: Path) -> Tensor:
         values = torch.from_numpy(np.array(picture))
 
     shape = tuple(values.shape)
-    if values.ndim != 3 or 3 not in (shape[0], shape[2]) or not values.numel():
+    has_three_channels = values.ndim == 3 and 3 in (shape[0], shape[2])
+    if not has_three_channels or values.numel() == 0:
         raise InputError(
             f"{name}: a picture of shape {short_repr(shape)}: give [H, W, 3] or [3, H, W]"
         )
@@ -168,8 +169,8 @@ def _array_to_rgb(picture: NDArray[Any] | Tensor, name: Path) -> Tensor:
     if not values.is_floating_point():
         raise InputError(f"{name}: colours as {values.dtype}: give uint8, or floats from 0 to 1")
     rgb = values.float().clone()
-    # The test also refuses NaN, for which every comparison is false.
-    if not (torch.isfinite(rgb).all() and rgb.min() >= 0 and rgb.max() <= 1):
+    is_in_range = torch.isfinite(rgb).all() and rgb.min() >= 0 and rgb.max() <= 1
+    if not is_in_range:
         raise InputError(
             f"{name}: colours from {rgb.min():g} to {rgb.max():g}: "
             "give floats from 0 to 1, or uint8"

@@ -53,16 +53,21 @@ def make_surfels(
     """
     fx, fy = camera.focal
     K = to_like(camera.K, uv)
+    principal_point = K[:2, 2]
+    focal = K.diagonal()[:2]
     z = 1.0 / inverse_depth
-    ray = torch.cat([(uv - K[:2, 2]) / K.diagonal()[:2], torch.ones_like(uv[:, :1])], dim=-1)
+    ray_xy = (uv - principal_point) / focal
+    ray = torch.cat([ray_xy, torch.ones_like(uv[:, :1])], dim=-1)  # [N, 3] at depth 1
 
     # How far the point P = z·ray on the surface moves if the pixel moves by one:
     # dP/du = dz/du·ray + z·d(ray)/du, with dz/du = −z²·d(1/z)/du and d(ray)/du = (1/fx, 0, 0).
     dz = -(z**2)[:, None] * slope  # [N, 2] by pixel x and y
-    move_along_x = dz[:, :1] * ray + pad(z[:, None] * (1 / fx), (0, 2))  # [N, 3]
-    move_along_y = dz[:, 1:] * ray + pad(z[:, None] * (1 / fy), (1, 1))  # [N, 3]
+    sideways = pad(z[:, None] * (1 / fx), (0, 2))  # [N, 3]: (z/fx, 0, 0)
+    downwards = pad(z[:, None] * (1 / fy), (1, 1))  # [N, 3]: (0, z/fy, 0)
+    move_along_x = dz[:, :1] * ray + sideways  # [N, 3]
+    move_along_y = dz[:, 1:] * ray + downwards  # [N, 3]
 
-    # The Gaussian is the image of a circle, or of an ellipse, of `spread` pixels.
+    # A circle of `spread` pixels in the image is an ellipse on the surface, which is the Gaussian.
     if isinstance(spread, Tensor):
         spreads = spread.to(uv)[..., None].flatten(1)  # [N, 1], or [N, 2] along x and y
     else:
@@ -88,7 +93,9 @@ def _ellipse_axes(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
         lengths [N, 2] of both half axes.
     """
     # The axes are where the distance from the centre is extreme: tan 2t = 2 a·b / (a·a − b·b).
-    t = 0.5 * torch.atan2(2 * (a * b).sum(-1), (a * a).sum(-1) - (b * b).sum(-1))[:, None]
+    dot_ab = (a * b).sum(-1)
+    length2_difference = (a * a).sum(-1) - (b * b).sum(-1)
+    t = 0.5 * torch.atan2(2 * dot_ab, length2_difference)[:, None]  # [N, 1]
     first_axis = a * t.cos() + b * t.sin()
     second_axis = b * t.cos() - a * t.sin()
     lengths = torch.stack([first_axis.norm(dim=-1), second_axis.norm(dim=-1)], dim=-1)

@@ -166,7 +166,7 @@ def parallel_for_chunks(
     lock = threading.Lock()
 
     def work_on_chunks() -> None:
-        """Take chunks until none is left."""
+        """Take the next chunk and do its work, until no chunk is left."""
         while True:
             with lock:  # iterators are not safe to share
                 start = next(starts, None)

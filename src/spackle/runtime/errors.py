@@ -120,7 +120,9 @@ def check_name(option: str, name: str, known: Iterable[str]) -> None:
     names = list(known)
     if name in names:
         return
+    problem = f"`{option}` {name} is unknown"
     # Less than half of the letters in common is not similar.
     similar = difflib.get_close_matches(name.lower(), names, n=1, cutoff=0.5)
-    advice = f"did you mean {similar[0]}? There" if similar else "there"
-    raise InputError(f"`{option}` {name} is unknown: {advice} are {', '.join(names)}")
+    if similar:
+        raise InputError(f"{problem}: did you mean {similar[0]}? There are {', '.join(names)}")
+    raise InputError(f"{problem}: there are {', '.join(names)}")

@@ -82,11 +82,15 @@ def _compile(function: Callable[..., R], fastmath: set[str], **options: Any) -> 
 
 
 def _digest_of_globals(function: Callable[..., Any]) -> str:
-    """A hash of the numbers and kernels that the function's module knows by name."""
+    """A hash of the numbers and kernels that the function's module knows by name.
+
+    The function may use any of them. Another kernel counts by the stamp of its own sources.
+    """
     stamps = []
     for name, value in sorted(function.__globals__.items()):
-        if isinstance(value, Dispatcher):  # another kernel
-            stamps.append((name, repr(getattr(_disk_cache_of(value), "_source_stamp", None))))
+        if isinstance(value, Dispatcher):  # another kernel, compiled by numba
+            source_stamp = getattr(_disk_cache_of(value), "_source_stamp", None)
+            stamps.append((name, repr(source_stamp)))
         elif isinstance(value, (int, float, np.generic)):
             stamps.append((name, repr(value)))
     return hashlib.sha256(repr(stamps).encode()).hexdigest()
