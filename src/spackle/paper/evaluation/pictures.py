@@ -116,16 +116,38 @@ def draw_grid(
             draw.text(place, row.caption, "black", font_size=font_size, anchor="lm")
         y += caption_height
 
-        for column, one in enumerate(row.pictures):
-            resized = resized_rows[index][column]
-            x = column * (picture_width + gap)
-            canvas.paste(resized, (x, y))
-            box_line_width = max(2, font_size // 10)
-            _draw_boxes(draw, one.boxes, (x, y), resized.size, box_line_width)
-            if one.tag:
-                _draw_tag(draw, one.tag, (x + picture_width, y), gap, font_size)
+        _draw_row(canvas, row.pictures, resized_rows[index], y, gap, font_size)
         y += row_heights[index] + gap
     return canvas
+
+
+def _draw_row(
+    canvas: Image.Image,
+    pictures: Sequence[GridPicture],
+    resized_pictures: Sequence[Image.Image],
+    y: int,
+    gap: int,
+    font_size: int,
+) -> None:
+    """Draw a row of pictures side by side, with their boxes and tags.
+
+    Args:
+        canvas: the image to draw on.
+        pictures: the boxes and tags.
+        resized_pictures: the same pictures in the size in which they are drawn.
+        y: where the row begins, in pixels from the top.
+        gap: between pictures, in pixels.
+        font_size: height of a tag's letters, in pixels.
+    """
+    draw = ImageDraw.Draw(canvas)
+    box_line_width = max(2, font_size // 10)
+    x = 0
+    for one, resized in zip(pictures, resized_pictures, strict=True):
+        canvas.paste(resized, (x, y))
+        _draw_boxes(draw, one.boxes, (x, y), resized.size, box_line_width)
+        if one.tag:
+            _draw_tag(draw, one.tag, (x + resized.width, y), gap, font_size)
+        x += resized.width + gap
 
 
 def _draw_boxes(
