@@ -136,10 +136,10 @@ def test_a_photo_is_completed_as_predict_completes_it(
         [line for line in result.lines if line.startswith(f"{page['name']}: ")] for page in seen[:2]
     )
     assert any("Gaussians from rgbd" in line for line in first)
-    assert any("--fov" in line for line in first)
+    assert any("(fov)" in line for line in first)
     assert other[0].startswith("my other.jpg: base rgbd (the depth in the photo)")
     assert not any(
-        "--fov" in line or "source." in line for line in other
+        "(fov)" in line or "source." in line for line in other
     )  # what was said of the first photo
     assert not list(tmp_path.glob("spackle-view-*"))
 
