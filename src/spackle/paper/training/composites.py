@@ -122,17 +122,19 @@ def random_crop(rng: np.random.Generator, photo: Tensor, height: int, width: int
 def random_background(rng: np.random.Generator, height: int, width: int) -> Tensor:
     """Inverse depth [H, W] in 1/m of a wall, in some cases with the ground or a second wall."""
     far = 1.0 / rng.uniform(*BACKGROUND_DEPTH_M)  # 1/m
+    # The wall is turned, so that its sides differ by up to 30 % from its middle.
     plane = far * (1 + random_ramp(rng, height, width, 0.3))
 
     has_ground = rng.random() < 0.5
     if has_ground:
         # The inverse depth of the ground grows linearly below the horizon.
         rows = (torch.arange(height) + 0.5) / height  # 0 at the upper edge, 1 at the lower one
-        slope = far * rng.uniform(1.5, 4.0)
-        horizon = rng.uniform(0.2, 0.6)
+        slope = far * rng.uniform(1.5, 4.0)  # the steeper, the lower the camera
+        horizon = rng.uniform(0.2, 0.6)  # from a little below the upper edge to the middle
         ground = slope * (rows - horizon)[:, None].clamp_min(0)  # [H, 1]
         plane = torch.maximum(plane, ground.expand(height, width))
 
+    # Where the second wall is nearer, it hides the first: the two meet in a corner.
     has_second_wall = rng.random() < 0.3
     if has_second_wall:
         plane = torch.maximum(plane, far * (1 + random_ramp(rng, height, width, 1.0)))

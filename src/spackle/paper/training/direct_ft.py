@@ -180,6 +180,7 @@ class DirectFt(ViewTask):
         self.files = open_pseudo_dataset(dataset_location)
         self._check_base_of_dataset(dataset_location)
 
+        # What the training loop asks of every task: a digest of the data, and numbers of items.
         self.training_photos, self.validation_photos = split_photos(self.files, recipe.data)
         self.digest = short_digest(
             (self.files.manifest.digest, self.training_photos, self.validation_photos)

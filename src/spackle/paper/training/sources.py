@@ -203,8 +203,10 @@ def reverse_view(
     """
     camera = prediction.camera
     gaussians = prediction.gaussians
+    # What the virtual camera sees stands for its photo: the network gets it as the input.
     virtual_photo = renderer.render(gaussians, viewer)
     is_visible = visible_from(gaussians, viewer, virtual_photo.depth)
+    # Gaussians that close gaps behind a visible surface belong to it, although they are hidden.
     visible = gaussians.select(add_visible_backing(is_visible, gaussians, camera))
     rendering = renderer.render(visible, camera)
     return Sample.of(visible, rendering, camera, viewer, virtual_photo.rgb, photo)

@@ -257,6 +257,7 @@ def update_weights(run: TrainingRun, step: int) -> float:
     """
     optim = run.recipe.optim
     rate = learning_rate(step, optim)
+    # A group of weights may have a factor of its own, such as a pretrained part of the network.
     for group in run.optimizer.param_groups:
         group["lr"] = group.get("lr_scale", 1.0) * rate
     run.optimizer.step()
