@@ -118,7 +118,7 @@ class Opened:
 def opened(browser: Any, url: str) -> Opened:
     context = browser.new_context(viewport={"width": 740, "height": 490}, reduced_motion="reduce")
     page = context.new_page()
-    page.set_default_timeout(120_000)  # software draws slowly on a busy machine
+    page.set_default_timeout(300_000)  # ms; software draws slowly on a busy machine
     found = Opened(page, [], [])
     page.on("console", lambda message: found.said.append(message.text))
     page.on("pageerror", lambda error: found.said.append(str(error)))
