@@ -63,6 +63,7 @@ def bench(
 
     Writes rows.jsonl, bench.md and bench.tex.
     """
+    # Imported here, because the help must not wait for torch.
     from spackle.bases.settings import BaseSettings
     from spackle.cli.messages import CommandReporter
     from spackle.paper.evaluation.bench import bench as run

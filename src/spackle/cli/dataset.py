@@ -133,6 +133,7 @@ def dataset_build(
 
     The paper's appendix describes it.
     """
+    # Imported here, because the help must not wait for torch.
     from spackle.bases.settings import BaseSettings
     from spackle.cli.messages import CommandReporter
     from spackle.paper.dataset.build import build_dataset
@@ -163,6 +164,7 @@ def dataset_build(
 @dataset.command("info")
 def dataset_info(location: DatasetArgument) -> None:
     """Print a dataset's counts, sizes, holes of each view, and configuration."""
+    # Imported here, because the help must not wait for torch.
     from rich.console import Console
 
     from spackle.paper.dataset.inspect import show_info
@@ -173,6 +175,7 @@ def dataset_info(location: DatasetArgument) -> None:
 @dataset.command("verify")
 def dataset_verify(location: DatasetArgument) -> None:
     """Read every byte and name each damaged sample; exit code 1 if any is damaged."""
+    # Imported here, because the help must not wait for torch.
     from spackle.cli.messages import CommandReporter
     from spackle.paper.dataset.inspect import verify_dataset
 
@@ -191,6 +194,7 @@ def dataset_preview(
     views: Annotated[int, typer.Option(min=1, help="Number of views of each photo.")] = 6,
 ) -> None:
     """Write sheet.png (base, mask, target) and trajectory.mp4 (base beside target)."""
+    # Imported here, because the help must not wait for torch.
     from spackle.cli.messages import CommandReporter
     from spackle.paper.dataset.inspect import preview_dataset
 

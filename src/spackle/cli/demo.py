@@ -21,6 +21,7 @@ def demo(
 
     Needs scikit-image.
     """
+    # Imported here, because the help must not wait for torch.
     from spackle.cli.messages import CommandReporter
     from spackle.paper.demo import run_demo
 

@@ -92,6 +92,7 @@ def evaluate(
 
     Writes rows.jsonl, tables.md, tables.tex, worst.png and best.png.
     """
+    # Imported here, because the help must not wait for torch.
     from spackle.bases.settings import BaseSettings
     from spackle.cli.messages import CommandReporter
     from spackle.paper.evaluation.evaluate import evaluate as run

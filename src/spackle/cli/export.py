@@ -25,6 +25,7 @@ def export(
     as_json: JsonOption = False,
 ) -> None:
     """Write a scene in the formats that other viewers read."""
+    # Imported here, because the help must not wait for torch.
     from spackle.cli.messages import CommandReporter
     from spackle.results.saved_scene import export_scene
 

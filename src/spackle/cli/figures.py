@@ -26,6 +26,7 @@ def figures(
     ] = 6,
 ) -> None:
     """Draw the paper's figures of views: PDF, PNG, and captions in figures.tex."""
+    # Imported here, because the help must not wait for torch.
     from spackle.cli.messages import CommandReporter
     from spackle.paper.evaluation.figures import make_figures
 

@@ -17,6 +17,7 @@ def info(
     as_json: JsonOption = False,
 ) -> None:
     """Describe files: size, depth range, Gaussians and camera, and commands that take the file."""
+    # Imported here, because the help must not wait for torch.
     from spackle.cli.file_facts import print_facts
     from spackle.cli.messages import CommandReporter
 

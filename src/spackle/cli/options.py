@@ -249,6 +249,7 @@ def path_options(
     Raises:
         InputError: an option would have no effect, because --path or --cameras sets the views.
     """
+    # Imported here, because the help must not wait for torch.
     from spackle.core.trajectories import DEFAULT_OVERSCAN
     from spackle.video.options import VideoOptions, parse_size
     from spackle.views import PathOptions

@@ -202,6 +202,7 @@ def predict(
 
     A depth map, or weights from `spackle weights get depth` or `sharp`, improve the geometry.
     """
+    # Imported here, because the help must not wait for torch.
     from spackle.bases.settings import BaseSettings
     from spackle.cli.messages import CommandReporter
     from spackle.pipeline import FillOptions, PipelineOptions
@@ -267,6 +268,7 @@ def _predict_all(
 
     InputError if an option, a clip or a single photo cannot be used.
     """
+    # Imported here, because the help must not wait for torch.
     from spackle.clips.files import is_clip
     from spackle.clips.predict import VIDEO_FILE, clip_options, predict_clip
     from spackle.pipeline import Pipeline

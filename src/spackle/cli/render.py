@@ -72,6 +72,7 @@ def render(
     help_all: HelpAllOption = False,
 ) -> None:
     """Render a saved scene along a camera path."""
+    # Imported here, because the help must not wait for torch.
     from spackle.cli.messages import CommandReporter
     from spackle.results.saved_scene import render_scene
 

@@ -71,6 +71,7 @@ def serve(
 
     Ctrl-C ends the server.
     """
+    # Imported here, because the help must not wait for torch.
     from spackle.bases.settings import BaseSettings
     from spackle.cli.messages import CommandReporter
     from spackle.web.jobs import RetentionLimits

@@ -23,6 +23,7 @@ def tables(
     html: HtmlOption = False,
 ) -> None:
     """Put several evaluations and benchmarks into the same tables: tables.md and tables.tex."""
+    # Imported here, because the help must not wait for torch.
     from spackle.cli.messages import CommandReporter
     from spackle.paper.evaluation.evaluate import merge_tables
 

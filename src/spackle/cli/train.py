@@ -57,6 +57,7 @@ def train(
 
     Writes best.safetensors, last.safetensors, run.json, pictures and logs.
     """
+    # Imported here, because the help must not wait for torch.
     from spackle.cli.messages import CommandReporter
     from spackle.paper.training.direct_ft import DirectFt
     from spackle.paper.training.recipe import Recipe, load_recipe

@@ -66,6 +66,7 @@ def view(
     verbose: VerboseOption = False,
 ) -> None:
     """Open a page in the browser that shows a scene or completes photos. Ctrl-C ends the server."""
+    # Imported here, because the help must not wait for torch.
     from spackle.bases.settings import BaseSettings
     from spackle.cli.messages import CommandReporter
     from spackle.web.local_server import ServerAddress, ViewOptions, show_page

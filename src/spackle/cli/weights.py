@@ -36,6 +36,7 @@ def weights_get(
     as_json: JsonOption = False,
 ) -> None:
     """Download weights and check their SHA-256; a broken download resumes where it stopped."""
+    # Imported here, because the help must not wait for torch.
     from rich.filesize import decimal
 
     from spackle.cli.messages import CommandReporter
@@ -79,6 +80,7 @@ def weights_get(
 
 def _target_file(entry: PublishedWeights, output: Path | None) -> Path:
     """The file to which weights are downloaded: in the weights' folder, a folder, or a file."""
+    # Imported here, because the help must not wait for torch.
     from spackle.weights import weights_folder
 
     if output is None:
@@ -92,6 +94,7 @@ def _target_file(entry: PublishedWeights, output: Path | None) -> Path:
 @weights.command("list")
 def weights_list(as_json: JsonOption = False) -> None:
     """List the published weights, and say which are on this machine."""
+    # Imported here, because the help must not wait for torch.
     from rich.filesize import decimal
 
     from spackle.cli.messages import CommandReporter

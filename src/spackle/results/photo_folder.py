@@ -122,6 +122,7 @@ class PhotoReport:
 
     def to_json(self) -> dict[str, Any]:
         """The content of report.json, whose fields and order are published."""
+        # Fields that reports of clips have, too, come first.
         report = self.run.to_json()
         report["base"] |= self.base_notes
         report["residual"]["fill"] = self.texture
@@ -132,6 +133,7 @@ class PhotoReport:
         report["hole_area_ratio"] = [dataclasses.asdict(view) for view in self.holes]
         report["request"] = self.request
 
+        # The size is that at which the photo was processed, not that of its file.
         width, height = self.photo_size
         report["photo"] = {"file": self.photo_name, "width": width, "height": height}
         if self.frame_cut_off is not None:
