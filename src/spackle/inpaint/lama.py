@@ -156,12 +156,13 @@ class HoleGroup(NamedTuple):
 def group_holes(hole: Tensor) -> list[HoleGroup]:
     """Find rectangles around groups of holes [H, W].
 
-    Two rectangles are merged if they touch, or if one common input has no more pixels than the
-    two inputs.
+    The network receives a larger rectangle, with known pixels around the holes. Two rectangles
+    are merged if they touch, or if the network then receives no more pixels than for both.
     """
     height, width = hole.shape
 
     def input_crop(bounds: Crop) -> Crop:
+        # With a margin, and rounded outwards to sides that the network accepts.
         return bounds.grown(MARGIN_PX, SIDE_MULTIPLE, height, width)
 
     def belong_together(one: Crop, other: Crop) -> bool:

@@ -77,6 +77,10 @@ def expected_shapes(
 def _add_fourier_layer(shapes: TensorShapes, name: str, local: int, global_: int) -> None:
     """Add the shapes of a Fourier layer to `shapes`.
 
+    In the published names, l is local and g is global: convl2g leads from local to global
+    channels, and bn_g is the batch norm of the global outputs. Local channels are made by
+    convolutions alone; global ones pass through a Fourier transform.
+
     Args:
         shapes: shapes by the tensors' names.
         name: the layer's name.
@@ -200,6 +204,7 @@ class LamaNetwork(nn.Module):
         Args:
             x: [B, 4, H, W]: colours, 0 in the holes; and the mask, 1 in the holes.
         """
+        # From 4 to `width` channels; three layers then halve the sides.
         x = x.contiguous(memory_format=torch.channels_last)
         x = self.first(_pad_by_reflection(x, LARGE_KERNEL // 2)).relu_()
         for down in self.down:
@@ -210,6 +215,7 @@ class LamaNetwork(nn.Module):
         for up in self.up:
             x = up(x).relu_()
 
+        # The last convolution has its 7 kernel rows as 7 groups of 3 output channels.
         height = x.shape[2]
         rows = self.last_rows(_pad_by_reflection(x, LARGE_KERNEL // 2))  # [B, 21, H + 6, W]
         del x  # frees memory before the sum

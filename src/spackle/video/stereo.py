@@ -55,7 +55,7 @@ class Stereo:
         return dataclasses.replace(camera, K=K, world_to_camera=world_to_camera)
 
     def pack(self, left: Tensor, right: Tensor) -> Tensor:
-        """Combine the eyes' images in one frame.
+        """Combine the eyes' images in one frame: side by side (sbs), or one over the other (ou).
 
         Args:
             left, right: [H, W, 3] sRGB in 0..1.
@@ -92,7 +92,7 @@ class Stereo:
 
 
 def default_ipd(camera: Camera, depth_range: DepthRange) -> float:
-    """Return a distance between the eyes that is comfortable to look at.
+    """Return a distance between the eyes (ipd) that is comfortable to look at.
 
     The parallax between the scene's nearest points and infinity is then 3 % of the image's width:
     fx · ipd / z_near = 0.03 · width.
