@@ -1,4 +1,4 @@
-"""Image filters against plain loops; the fill of holes: exact at known pixels, bounded, biased to the far side."""
+"""Image filters against plain loops; filled holes: exact where known, bounded, of the far side."""
 
 from __future__ import annotations
 

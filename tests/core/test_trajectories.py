@@ -1,4 +1,4 @@
-"""Camera paths: trajectories, depth ranges, interpolation between keyframes, and the choice of the disparity."""
+"""Camera paths: trajectories, depth ranges, interpolation between keyframes."""
 
 from __future__ import annotations
 

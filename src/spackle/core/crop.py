@@ -134,7 +134,8 @@ def _any_in_blocks(cells: Mask, step: int) -> Mask:
     padded = np.pad(cells, [(0, -height % step), (0, -width % step)])  # to multiples of `step`
     rows = padded.shape[0] // step
     columns = padded.shape[1] // step
-    blocks: Mask = padded.reshape(rows, step, columns, step).any(axis=(1, 3))
+    # Axes 1 and 3 run over the rows and columns inside of a block.
+    blocks: Mask = np.any(padded.reshape(rows, step, columns, step), axis=(1, 3))
     return blocks
 
 

@@ -126,6 +126,7 @@ def _spread_nearest(hole: Any, nearest: Any) -> None:
     height, width = hole.shape
     for sweep in range(4):
         for i in range(height):
+            # Every other sweep runs backwards.
             y = i if sweep % 2 == 0 else height - 1 - i
             for j in range(width):
                 x = j if sweep % 2 == 0 else width - 1 - j

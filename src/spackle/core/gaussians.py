@@ -146,6 +146,7 @@ def quat_from_matrix(rotation: Tensor) -> Tensor:
     times_z = torch.stack([m10 - m01, m02 + m20, m12 + m21, 1 - m00 - m11 + m22], -1)
     candidates = torch.stack([times_w, times_x, times_y, times_z], dim=-2)  # [..., 4, 4]
 
+    # Of the four, take the one of the largest component.
     squares = [times_w[..., 0], times_x[..., 1], times_y[..., 2], times_z[..., 3]]  # 4w², 4x², …
     largest = torch.stack(squares, -1).argmax(-1)  # [...] 0 for w to 3 for z
     row_index = largest[..., None, None].expand(*largest.shape, 1, 4)

@@ -123,6 +123,7 @@ def _build_pyramid(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> list[_
 
     levels: list[_Level] = []
     while True:
+        # The blur is as wide in the scene at every level, so it halves with the picture.
         tone_blur = max(TONE_BLUR_CELLS / 2 ** len(levels), MIN_TONE_BLUR_PX)
         traits = [TONE_WEIGHT * gaussian_blur(tone, tone_blur), DEPTH_WEIGHT * depth]
         level = _Level(
@@ -135,7 +136,7 @@ def _build_pyramid(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> list[_
 
         # A reduced pixel belongs to the hole if any of its four pixels does.
         coarse_hole = avg_pool2d(hole[None].float(), 2, ceil_mode=True)[0] > 0
-        is_small = min(hole.shape) < 2 * MIN_COARSEST_SIDE_PX
+        is_small = min(hole.shape) < 2 * MIN_COARSEST_SIDE_PX  # half of it would be too small
         if is_small or bool(coarse_hole.all()) or not bool(hole.any()):
             return levels
         rgb = _reduce_by_half(rgb)
@@ -232,6 +233,7 @@ def _match_level(level: _Level, coarse: _Matches | None, number: int) -> _Matche
 
 def _usable_patches(hole: Bools) -> Bools:
     """Whether a patch around each pixel [h, w] lies inside the picture and has no hole pixel."""
+    # A patch has a hole pixel if there is one within its radius around the centre.
     is_usable: Bools = ~maximum_filter(torch.from_numpy(hole), PATCH_RADIUS).numpy()
     is_usable[:PATCH_RADIUS] = False
     is_usable[-PATCH_RADIUS:] = False

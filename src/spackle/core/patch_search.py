@@ -42,6 +42,7 @@ class CostInputs(NamedTuple):
 @kernel
 def hash_uint32(value: Any) -> Any:
     """Mix the bits of a number: a random uint32 that depends on the number alone."""
+    # Each shift mixes high bits into the low ones, each multiplication low bits into the high ones.
     value = np.uint32(value)
     value ^= value >> np.uint32(16)
     value = np.uint32(value * HASH_MULTIPLIER_1)

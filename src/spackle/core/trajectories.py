@@ -50,6 +50,7 @@ class DepthRange:
         z = z[z > 0]
         if z.size == 0:
             raise ValueError("no Gaussian is in front of the camera")
+        # Quantiles, because single stray Gaussians are nearer than any surface.
         # Numpy's quantile, because torch's takes at most 16 million values.
         near, focus = np.quantile(z, [NEAR_QUANTILE, FOCUS_QUANTILE])
         return DepthRange(near=float(near), focus=max(MIN_FOCUS_M, float(focus)))
