@@ -369,7 +369,7 @@ class Predictor:
         except InputError:
             return False  # a file is missing, which `predict` will report
 
-        # The report of a damaged or half copied folder may be whole; so its files are compared, too.
+        # A damaged or half copied folder may hold a whole report, so its files are compared, too.
         has_same_request = earlier_report.get("request") == request
         return has_same_request and matches_records(
             folder, REPORT_NAME, earlier_report.get("files")
