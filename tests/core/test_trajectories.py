@@ -1,4 +1,4 @@
-"""Camera paths: trajectories, depth ranges, interpolation between keyframes."""
+"""Camera paths: trajectories, depth ranges, keyframes, and the choice of the disparity."""
 
 from __future__ import annotations
 
