@@ -405,7 +405,8 @@ class LiteBase:
         inputs = torch.cat([resized, resized.flip(-1)]) if scale.mirrored else resized
         inputs = inputs.contiguous(memory_format=torch.channels_last)
         with without_autocast_or_tf32(self.device):
-            outputs = self.networks[scale.network](inputs).float()  # [1 or 2, h/2, w/2]
+            # [1 or 2, h/2, w/2], the second for the mirror image
+            outputs: Tensor = self.networks[scale.network](inputs).float()
         if not scale.mirrored:
             return outputs[0]
         return torch.stack([outputs[0], outputs[1].flip(-1)]).mean(0)

@@ -432,7 +432,7 @@ def apply_deltas(initial: InitialGaussians, deltas: Tensor) -> Gaussians:
         The Gaussians layer by layer, each in row-major order. Means are (x·z, y·z, z), where x and
         y run from -1 to 1 over the picture.
     """
-    offset, scale, quat, color, opacity = deltas.split([3, 3, 4, 3, 1])  # each [C, 2, H, W]
+    offset, scale, quat, color, opacity = torch.split(deltas, [3, 3, 4, 3, 1])  # each [C, 2, H, W]
     height, width = deltas.shape[-2:]
     x = (2 * torch.arange(width, device=deltas.device) + 1) / width - 1  # of the cells' centres
     y = (2 * torch.arange(height, device=deltas.device) + 1) / height - 1
