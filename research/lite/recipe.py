@@ -26,7 +26,7 @@ from spackle.paper.training.recipe import (
     RgbdFolder,
     Seed,
 )
-from spackle.paper.training.samples import short_digest
+from spackle.paper.training.sample_factory import short_digest
 from spackle.runtime.errors import InputError
 
 RANDOM = Path("random")  # instead of the encoder's file: random weights, for tests and experiments

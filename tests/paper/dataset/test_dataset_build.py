@@ -27,7 +27,7 @@ from spackle.paper.dataset.build import PhotoResult, SampleMaker
 from spackle.paper.dataset.photos import PhotoFile, choose_photos, find_photos
 from spackle.paper.dataset.shards import load_manifest
 from spackle.paper.training.recipe import DataRecipe
-from spackle.paper.training.samples import Source, digest_of_samples
+from spackle.paper.training.sample_factory import Source, digest_of_samples
 from spackle.paper.training.sources import find_sources
 from spackle.render import get_renderer
 from spackle.runtime.errors import InputError

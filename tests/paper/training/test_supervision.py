@@ -32,14 +32,13 @@ from spackle.core.camera import Camera
 from spackle.core.filters import maximum_filter
 from spackle.paper.training import composites, measured_photos, samples, sources
 from spackle.paper.training.recipe import DataRecipe
+from spackle.paper.training.sample_factory import Source, make_samples
 from spackle.paper.training.samples import (
     FIELDS_BY_FILE_NAME,
     FLOAT32_TENSORS,
     HOLE_RATIO_RANGE,
     Sample,
-    Source,
     load_sample,
-    make_samples,
     save_sample,
 )
 from spackle.paper.training.samples import random_crops as crops_of

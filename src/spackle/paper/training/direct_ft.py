@@ -35,7 +35,7 @@ from spackle.core.gaussians import Gaussians
 from spackle.paper.dataset.sample import DatasetView
 from spackle.paper.training.recipe import Recipe
 from spackle.paper.training.residual import ViewBatch, ViewTask
-from spackle.paper.training.samples import short_digest
+from spackle.paper.training.sample_factory import short_digest
 from spackle.paper.training.sources import open_pseudo_dataset, split_photos
 from spackle.render import Renderer
 from spackle.runtime.device import report_memory_shortage, without_autocast_or_tf32

@@ -18,7 +18,8 @@ from spackle.paper.training.feature_networks import load_features
 from spackle.paper.training.losses import hole_psnr, total_loss
 from spackle.paper.training.ranks import rank
 from spackle.paper.training.recipe import Recipe
-from spackle.paper.training.samples import Sample, digest_of_samples, load_sample, make_samples
+from spackle.paper.training.sample_factory import digest_of_samples, make_samples
+from spackle.paper.training.samples import Sample, load_sample
 from spackle.paper.training.sources import find_sources
 from spackle.paper.training.task import Task
 from spackle.render import Renderer, get_renderer

@@ -34,7 +34,8 @@ from spackle.paper.training.measured_photos import (
     pick_random,
 )
 from spackle.paper.training.recipe import DataRecipe
-from spackle.paper.training.samples import Sample, Source
+from spackle.paper.training.sample_factory import Source
+from spackle.paper.training.samples import Sample
 from spackle.render import Renderer
 from spackle.runtime.errors import InputError
 

@@ -1,0 +1,166 @@
+"""Make the training samples of a recipe that are missing, by several processes if there are."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from spackle.paper.training.ranks import rank, rank_count, wait_for_ranks
+from spackle.paper.training.recipe import DataRecipe
+from spackle.paper.training.samples import Sample, random_crops, save_sample
+from spackle.residual.features import CELL
+from spackle.runtime.errors import InputError
+from spackle.runtime.files import write_atomic
+from spackle.runtime.progress import Progress
+
+SAMPLES_VERSION = 7  # increase this whenever a recipe would give different samples
+
+
+class Source(NamedTuple):
+    """A source of views with holes and targets."""
+
+    share: float  # weight among all sources
+    # Makes a view by its number; InputError for an unusable file.
+    view: Callable[[np.random.Generator, int], Sample]
+    names: Sequence[str]  # the names of the source and of its files, relative to their folder
+    views: int | None = None  # number of views, numbered from 0; None: any number, drawn at random
+
+
+def digest_of_samples(data: DataRecipe, sources: Sequence[Source]) -> str:
+    """Twelve digits that identify the content of samples, whatever their number and paths."""
+    paths_and_numbers = ("photos", "stereo", "pseudo", "cache", "views", "validation_views")
+    excluded: dict[str, Any] = dict.fromkeys(paths_and_numbers, True)
+    excluded["rgbd"] = {"__all__": {"folder"}}
+    settings = data.model_dump(mode="json", exclude=excluded)
+    names = [name for source in sources for name in source.names]
+    shares = [source.share for source in sources]
+    return short_digest((SAMPLES_VERSION, settings, shares, names))
+
+
+def short_digest(value: Any) -> str:
+    """Twelve hexadecimal digits that identify a value by its `repr`."""
+    return hashlib.sha256(repr(value).encode()).hexdigest()[:12]
+
+
+def make_samples(
+    data: DataRecipe,
+    sources: Sequence[Source],
+    folder: Path,
+    seed: int,
+    views: int,
+    progress: Progress,
+    warn: Callable[[str], None],
+) -> list[Path]:
+    """Make the samples of the first `views` views that a folder lacks; returns all samples' files
+    in order.
+
+    The processes of a run share the work, and wait for each other.
+
+    Args:
+        data: how many crops are cut from a view, and how large.
+        sources: where views come from, each with its share.
+        folder: for the files.
+        seed: determines the views.
+        views: how many views; fewer, if the only source has fewer.
+        progress: called with (views done, all views) of this process.
+        warn: called with the reason if a view cannot be made.
+
+    Raises:
+        InputError: a file cannot be written, or no view gave a sample.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    if len(sources) == 1 and sources[0].views is not None:
+        views = min(views, sources[0].views)
+    planned_views = _plan_views(sources, seed, views)
+
+    # Each process makes a range of neighbouring views, because neighbours share a photo.
+    first = views * rank() // rank_count()
+    stop = views * (rank() + 1) // rank_count()
+    for index in range(first, stop):
+        if _crop_files(folder, index) is None:
+            crops: list[Sample] = []
+            try:
+                crops = _make_crops(data, planned_views[index], seed, index, sources)
+            except (InputError, ValueError) as error:
+                warn(str(error))
+            for number, crop in enumerate(crops):
+                save_sample(crop, _crop_file(folder, index, number))
+            # Written after all crops, so that its presence proves that they are complete.
+            write_atomic(_count_file(folder, index), f"{len(crops)}\n".encode())
+        progress(index - first + 1, stop - first)
+    wait_for_ranks()
+
+    files = [file for index in range(views) for file in _crop_files(folder, index) or ()]
+    if not files:
+        raise InputError(
+            f"{folder}: none of {views} views gave a sample: photos must be readable and larger "
+            f"than {CELL * data.cells} pixels each way, and data.disparity must be large enough "
+            "for holes"
+        )
+    return files
+
+
+class _PlannedView(NamedTuple):
+    """Which source a view comes from, and which number it has there."""
+
+    source_index: int
+    number: int
+
+
+def _plan_views(sources: Sequence[Source], seed: int, views: int) -> list[_PlannedView]:
+    """The sources of the first `views` views, drawn by their shares; each source counts its own
+    views from 0.
+    """
+    counts = [0] * len(sources)
+    planned = []
+    for index in range(views):
+        source_index, _ = _draw_source(sources, seed, index)
+        planned.append(_PlannedView(source_index, counts[source_index]))
+        counts[source_index] += 1
+    return planned
+
+
+def _draw_source(
+    sources: Sequence[Source], seed: int, index: int
+) -> tuple[int, np.random.Generator]:
+    """The index of a view's source, and the random generator for the rest of the view."""
+    shares = np.array([source.share for source in sources])
+    rng = np.random.default_rng([seed, index])
+    return int(rng.choice(len(sources), p=shares / shares.sum())), rng
+
+
+def _make_crops(
+    data: DataRecipe, planned: _PlannedView, seed: int, index: int, sources: Sequence[Source]
+) -> list[Sample]:
+    """The crops of one view; a source with a limited number of views begins again after the
+    last.
+    """
+    _, rng = _draw_source(sources, seed, index)
+    source = sources[planned.source_index]
+    number = planned.number if source.views is None else planned.number % source.views
+    view = source.view(rng, number)
+    return random_crops(view, rng, data.crops, data.cells)
+
+
+def _crop_file(folder: Path, index: int, number: int) -> Path:
+    """The file of one crop of a view."""
+    return folder / f"{index:06d}-{number}.safetensors"
+
+
+def _count_file(folder: Path, index: int) -> Path:
+    """The file that holds the number of a view's crops."""
+    return folder / f"{index:06d}.done"
+
+
+def _crop_files(folder: Path, index: int) -> list[Path] | None:
+    """The files of a view's crops; None if they are not complete."""
+    try:
+        count = int(_count_file(folder, index).read_text())
+    except (FileNotFoundError, ValueError):
+        return None
+    files = [_crop_file(folder, index, number) for number in range(count)]
+    return files if all(file.is_file() for file in files) else None
