@@ -154,7 +154,7 @@ class ViewTask(Task):
         rows = []
         for item in items:
             views = self.complete(network, self.load_batch(None, [item]))
-            # A batch may hold all views of a photo; the last is the farthest.
+            # A batch may hold all views of a photo; one of them is enough.
             rows.append((views.base_rgb[-1], views.rgb[-1], views.target[-1]))
         return contact_sheet(rows, PICTURE_SIDE_PX)
 
@@ -169,13 +169,15 @@ def complete_samples(
     """Complete samples of one size; only the network gets gradients.
 
     Args:
-        network: f_res, or a wrapper that distributes it over processes.
+        network: the residual network, or a wrapper that distributes it over processes. It predicts
+            deltas, changes of the Gaussians that fill each hole cell (2×2 pixels).
         inputs: the names of the network's inputs.
         samples: views with holes, on the CPU.
         renderer: draws the completed views; its device does the rest of the work, too.
         precision: of the network's convolutions.
     """
     device = renderer.device
+
     # Masks are read before the samples move to the renderer's device: reading them later would wait
     # for a GPU.
     cells = [
@@ -184,18 +186,21 @@ def complete_samples(
     ]
     tiles = [sample.tiles for sample in samples]
 
+    # One pass of the network for all samples.
     features = torch.cat([sample.network_input(inputs) for sample in samples])
     features = features.to(next(network.parameters()).device)
     with torch.autocast(features.device.type, precision, enabled=precision != torch.float32):
         deltas = network(features.contiguous(memory_format=torch.channels_last))  # [B, 14, h, w]
     deltas = deltas.float().to(device)
 
+    # A scene are the base's Gaussians and the new ones of a sample.
     samples = [sample.to(device) for sample in samples]
     scenes = []
     for sample, sample_deltas, index in zip(samples, deltas, cells, strict=True):
         aux = sample.view.gaussians(index, sample_deltas.permute(1, 2, 0))
         scenes.append([sample.base, aux])
 
+    # Only the tiles near holes are drawn; the rest is copied from the base's rendering.
     views = renderer.render_batch(
         scenes,
         [sample.camera for sample in samples],

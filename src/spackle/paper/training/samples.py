@@ -280,7 +280,7 @@ def save_sample(sample: Sample, path: Path) -> None:
         "seeds.unit": torch.tensor(sample.initial.unit, dtype=torch.float64),
     }
     for file_name, field in FIELDS_BY_FILE_NAME.items():
-        part, _, name = field.partition(".")
+        part, _, name = field.partition(".")  # such as "base", "means"
         tensors[file_name] = getattr(getattr(sample, part), name)
 
     # sRGB spends its 8 bits where the eye sees them.
@@ -293,6 +293,7 @@ def save_sample(sample: Sample, path: Path) -> None:
     largest = quats.abs().amax(-1, keepdim=True)
     tensors["base.quats"] = (127 * quats / largest).round().to(torch.int8)
 
+    # Half precision is enough for everything that is not a position, a camera or an opacity.
     for name, tensor in tensors.items():
         if tensor.dtype == torch.float32 and name not in FLOAT32_TENSORS:
             tensors[name] = tensor.half()
@@ -309,6 +310,8 @@ def load_sample(path: str | os.PathLike[str]) -> Sample:
         camera = Camera(
             tensors["camera.K"], tensors["camera.world_to_camera"], *tensors["camera.size"].tolist()
         )
+
+        # The tensors by the sample's parts ("base", "rendering", …) and their fields.
         fields: dict[str, dict[str, Tensor]] = {}
         for file_name, field in FIELDS_BY_FILE_NAME.items():
             part, _, name = field.partition(".")
