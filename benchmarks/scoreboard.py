@@ -1,9 +1,10 @@
 """The scoreboard: measure the quality of lifted and completed scenes on stereo pairs.
 
-    python benchmarks/scoreboard.py PAIRS --features squeezenet_v1.0.npz [--small 4] [-o NOW.json]
-    [--against OLD.json] python benchmarks/scoreboard.py PAIRS ... --without "far bias" --without
-    "network+texture" python benchmarks/scoreboard.py PAIRS ... --ledger > ledger.md python
-    benchmarks/scoreboard.py --photos FOLDER [--without NAME] -o sheet.jpg
+    python benchmarks/scoreboard.py PAIRS --features squeezenet_v1.0.npz [--small 4] \\
+        [-o NOW.json] [--against OLD.json]
+    python benchmarks/scoreboard.py PAIRS ... --without "far bias" --without "network+texture"
+    python benchmarks/scoreboard.py PAIRS ... --ledger > ledger.md
+    python benchmarks/scoreboard.py --photos FOLDER [--without NAME] -o sheet.jpg
 
 PAIRS has one folder per scene: two photos, a disparity map and a `scene.json`
 (`spackle.paper.training.measured_photos.load_pair`). The left photo is lifted by its true depth,
@@ -15,9 +16,8 @@ The hole is where the lifted photo's opacity in the view is below 0.95; the band
 of the hole.
 
 distance ↓    SqueezeNet 1.0 at conv1, fire3, fire5 and fire9: mean squared difference of unit
-              feature vectors over the
-              cells, weighted by the fraction that is hole; outside the hole the view is replaced by
-              the truth. 0 to 2
+              feature vectors over the cells, weighted by the fraction that is hole; outside the
+              hole the view is replaced by the truth. 0 to 2
 texture ↓     Frobenius norm of the difference of the vectors' Gram matrices, over that of the
               truth's matrices
 sharpness     mean gradient magnitude in grey over the truth's, at least 3 pixels inside the hole;
@@ -34,9 +34,9 @@ base, aux     thousands of Gaussians; s lift and s fill: CPU seconds of all thre
 them. --without runs once more with a mechanism of `MECHANISMS` switched off, or several joined by
 +; hole and band stay those of the default. --ledger does this with each mechanism and prints the
 changes. --against compares with another run's file: up : down counts the scenes whose figure rose
-and fell, p is the p-value of a two-sided sign test. --photos completes some
-photos with `lite` and writes a sheet with a row for each photo: at the left and the right end of
-its camera path, the lifted photo and the result of each run.
+and fell, p is the p-value of a two-sided sign test. --photos completes some photos with `lite` and
+writes a sheet with a row for each photo: at the left and the right end of its camera path, the
+lifted photo and the result of each run.
 """
 
 from __future__ import annotations

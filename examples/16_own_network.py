@@ -8,6 +8,7 @@ spackle train --recipe cpu -o run network=my_package.my_module:SmallNet
 
 import sys
 from pathlib import Path
+from typing import cast
 
 from torch import Tensor, nn
 
@@ -30,7 +31,7 @@ class SmallNet(ResidualNet):
         self.last = nn.Conv2d(32, 14, 3, padding=1)
         # Without training, the initial Gaussians stay as they are.
         nn.init.zeros_(self.last.weight)
-        nn.init.zeros_(self.last.bias)
+        nn.init.zeros_(cast(Tensor, self.last.bias))
 
     def forward(self, features: Tensor) -> Tensor:
         deltas: Tensor = self.last(self.first(features).relu())

@@ -1,9 +1,8 @@
 """Compare the lite base's depth, and two guesses that need no photo, with measured depth, as a
 Markdown table.
 
-    python research/lite/benchmark.py --stereo FOLDER --rgbd FOLDER --unit 0.001 [--last 0.2]
-    [--weights FILE] \
-        [--pictures PNG] [--standing PHOTOS]
+    python research/lite/benchmark.py --stereo FOLDER --rgbd FOLDER --unit 0.001 \
+        [--last 0.2] [--weights FILE] [--pictures PNG] [--standing PHOTOS]
 
 Each --stereo is a folder of scenes, which have a scene.json, or a calib.txt as in ETH3D and
 Middlebury 2014. Each --rgbd is a folder of NAME.color.jpg and NAME.depth.png, with its --unit in

@@ -1,8 +1,8 @@
 """Train the network of the lite base: depth from one photo, learned from synthetic scenes and
 measured frames.
 
-    python research/lite/train.py --recipe research/lite/lite.yaml -o OUT data.photos=PHOTOS
-    data.stereo=PAIRS ...
+    python research/lite/train.py --recipe research/lite/lite.yaml -o OUT \\
+        data.photos=PHOTOS data.stereo=PAIRS ...
 
 OUT gets the same files as from `spackle train`; the same command resumes a run.
 """
