@@ -40,8 +40,8 @@ class DepthAlignment:
             scale=self.scale * first.scale, shift=self.scale * first.shift + self.shift
         )
 
-    def leaked(self) -> DepthAlignment:
-        """A map a little nearer to the identity."""
+    def closer_to_identity(self) -> DepthAlignment:
+        """A map that changes depths a little less than this one."""
         return DepthAlignment(scale=self.scale**KEPT_CORRECTION, shift=KEPT_CORRECTION * self.shift)
 
     def of_depth(self, depth: Tensor) -> Tensor:
@@ -68,6 +68,8 @@ class DepthAlignment:
 def align_depth(inverse_depth: Tensor, earlier: Tensor, tracked: Track) -> DepthAlignment:
     """Fit the map from a frame's inverse depth to an earlier frame's, by robust least squares.
 
+    The map is scale · inverse depth + shift.
+
     Args:
         inverse_depth: [H, W] of the frame, 0 if unknown.
         earlier: [H, W] of the earlier frame, 0 if unknown.
@@ -84,13 +86,15 @@ def align_depth(inverse_depth: Tensor, earlier: Tensor, tracked: Track) -> Depth
     if len(now) < MIN_TRACKED_PIXELS:
         return DepthAlignment()
 
-    median = float(then.median())
+    half_weight_error = HALF_WEIGHT_RATIO * float(then.median())
     scale = float((then / now).median())
     shift = 0.0
     for _ in range(FIT_ROUNDS):
+        # Pixels that the last fit does not explain, such as moving objects, have little weight.
         error = scale * now + shift - then
-        weights = 1 / (1 + (error / (HALF_WEIGHT_RATIO * median)) ** 2)
-        # The normal equations of scale and shift.
+        weights = 1 / (1 + (error / half_weight_error) ** 2)
+        # The normal equations of scale and shift. The penalty keeps the shift small where depths
+        # are so similar that they do not tell it from a scale.
         weight_sum = weights.sum()
         now_sum = (weights * now).sum()
         then_sum = (weights * then).sum()

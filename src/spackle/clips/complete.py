@@ -94,7 +94,7 @@ class ClipCompleter:
         frame = self._align(rgb, prediction)
         camera = self._camera(prediction, frame.state.depth_range)
         base_rendering = self.renderer.render(frame.base, camera)
-        # After a cut, alignment leaves out the previous frame.
+        # If the previous frame belongs to another shot, `_align` has dropped it.
         starts_shot = frame.previous is not self._previous
 
         if self.fill:
@@ -114,17 +114,21 @@ class ClipCompleter:
         return dataclasses.replace(view, starts_shot=starts_shot)
 
     def _camera(self, prediction: BasePrediction, depth_range: DepthRange) -> Camera:
-        """The trajectory's camera for the next frame; ValueError if there is no path."""
+        """The trajectory's camera for the next frame; ValueError if there is no path.
+
+        The trajectory moves around the photo's camera, over the length of the clip.
+        """
         disparity = prediction.max_disparity if self.disparity is None else self.disparity
-        (camera,) = trajectory_cameras(
+        cameras = trajectory_cameras(
             self.trajectory,
-            prediction.camera.even(),
+            prediction.camera.even(),  # videos need even sides
             disparity,
             depth_range,
             self.frame_count,
             only=self._completed_frames,
         )
-        return camera.zoomed(1 + self.overscan)
+        # Zooming in keeps the uncovered margins of the photo out of the view.
+        return cameras[0].zoomed(1 + self.overscan)
 
     def _fill(
         self,
@@ -144,26 +148,27 @@ class ClipCompleter:
         Returns:
             The completed view, and what the next frame has to know of it.
         """
-        # Without texture, which would flicker: each frame would find other patches.
+        # No texture is added, because each frame would find other patches for it, which flickers.
         context = FillContext(
-            frame.base,
-            photo_camera,
-            self.renderer,
-            self.network,
+            base=frame.base,
+            photo_camera=photo_camera,
+            renderer=self.renderer,
+            network=self.network,
             texture=None,
             precision=self.precision,
         )
+        # The guard holds the surfaces that the added Gaussians must not hide.
         filled = fill_view(context, camera, [frame.guard], base_rendering)
 
         # The Gaussians that fill holes ("aux") take colours of the previous frame.
         aux, memory = propagate_colors(
-            frame.base,
-            filled.aux,
-            camera,
-            self.renderer,
-            (base_rendering, filled.rendering),
-            None if frame.previous is None else frame.previous.memory,
-            self.flow,
+            base=frame.base,
+            aux=filled.aux,
+            camera=camera,
+            renderer=self.renderer,
+            renderings=(base_rendering, filled.rendering),
+            previous=None if frame.previous is None else frame.previous.memory,
+            flow=self.flow,
         )
         view = CompletedView(
             camera=camera,
@@ -192,17 +197,23 @@ class ClipCompleter:
             if not tracked.same_shot():
                 previous = None
             elif self.align:
-                # From this frame's depth to the previous one's as predicted, and then as aligned.
+                # First map this frame's depth to the depth that was predicted for the previous
+                # frame, then do what aligned that depth. The result is drawn a little to the
+                # identity, so that errors do not add up from frame to frame.
                 to_previous = align_depth(inverse_depth, previous.inverse_depth, tracked)
-                alignment = previous.alignment.after(to_previous).leaked()
+                alignment = previous.alignment.after(to_previous).closer_to_identity()
 
         base = alignment.of_gaussians(prediction.gaussians)
+        # The guard keeps Gaussians that fill holes from hiding what the photo shows.
         aligned_rendering = dataclasses.replace(photo_rendering, depth=alignment.of_depth(depth))
         guard = OcclusionGuard.of(aligned_rendering, prediction.camera)
 
-        # The path's depth range follows the frames' slowly, so that the camera moves smoothly.
+        # The camera's path depends on a range of depths. It follows the range of each frame slowly,
+        # so that the camera moves smoothly.
         depth_range = DepthRange.of(base)
         if previous is not None:
             depth_range = previous.depth_range.towards(depth_range, DEPTH_RANGE_FOLLOWING)
-        state = _FrameState(rgb, inverse_depth, alignment, depth_range)
-        return _AlignedFrame(base, guard, state, previous)
+        state = _FrameState(
+            rgb=rgb, inverse_depth=inverse_depth, alignment=alignment, depth_range=depth_range
+        )
+        return _AlignedFrame(base=base, guard=guard, state=state, previous=previous)

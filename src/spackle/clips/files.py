@@ -77,7 +77,8 @@ def is_clip(path: Path) -> bool:
         return True
     try:
         with av.open(str(path), metadata_errors="replace") as container:
-            # Empty packets mark the end.
+            # Two pictures make a clip. The packets hold one picture each; an empty packet marks the
+            # end of the file.
             pictures = 0
             for packet in container.demux(video=0):
                 if packet.size > 0:
@@ -185,7 +186,8 @@ def _open_video(path: str | os.PathLike[str]) -> Iterator[tuple[InputContainer, 
     with as_input_error(
         path, "not a video, or damaged at the beginning or end ({reason})", *DECODING_ERRORS
     ):
-        # In strict mode, which replaces no metadata, the file stays open after an error.
+        # Metadata that is no valid text is replaced. Otherwise it would raise an error, after which
+        # the file stays open.
         container = av.open(str(path), metadata_errors="replace")
     with container:
         if PLAYLIST_FORMATS & set(container.format.name.split(",")):

@@ -119,14 +119,18 @@ def extend_flow(tracked: Track, inverse_depth: Tensor, known: Tensor, camera: Ca
 
 
 def camera_motion_basis(inverse_depth: Tensor, camera: Camera) -> Tensor:
-    """The flow [H, W, 2, 6] of six small camera motions, by unit (Longuet-Higgins, 1980).
+    """How far each pixel moves, in pixels (x, y), by one unit of each of six camera motions.
 
-    These are translations along x, y and z, then rotations about them. `inverse_depth` is [H, W].
+    The motions are small translations along x, y and z, then small rotations about x, y and z. With
+    the slopes (x, y) of a pixel's ray and the inverse depth d, the ray's slopes change by (d, 0),
+    (0, d), (-d·x, -d·y), (x·y, 1 + y²), (-1 - x², -x·y) and (y, -x) (Longuet-Higgins, 1980).
+
+    `inverse_depth` is [H, W]; the result is [H, W, 2, 6].
     """
     fx, fy = camera.focal
     center = camera.K[:2, 2].to(inverse_depth)
     focal = inverse_depth.new_tensor([fx, fy])
-    # Slopes of the pixels' rays.
+    # The slopes X/Z and Y/Z of the pixels' rays, [H, W] each.
     x, y = ((pixel_grid(inverse_depth) - center) / focal).unbind(-1)
     zero = torch.zeros_like(x)
     flow_x = [inverse_depth, zero, -inverse_depth * x, x * y, -(1 + x * x), y]
@@ -147,7 +151,8 @@ def fit_camera_motion(basis: Tensor, flow: Tensor, trusted: Tensor) -> Tensor:
     fitted = thinned(trusted, MIN_MOTION_PIXELS)
     equations = basis[fitted].double()  # [n, 2, 6]
     target = flow[fitted].double()  # [n, 2]
-    # With columns of length 1, one ridge suits all of them.
+    # Translations and rotations have other units and sizes. All columns are scaled to length 1, so
+    # that one ridge (a small number on the diagonal, for a stable solution) suits all of them.
     column_lengths = equations.flatten(0, 1).norm(dim=0).clamp_min(1e-12)
     equations = equations / column_lengths
 
@@ -158,6 +163,7 @@ def fit_camera_motion(basis: Tensor, flow: Tensor, trusted: Tensor) -> Tensor:
         normal = torch.einsum("nci,ncj->ij", weighted, equations)
         normal = normal + MOTION_RIDGE * torch.eye(6).to(equations)
         motion = torch.linalg.solve(normal, torch.einsum("nci,nc->i", weighted, target))
+        # Pixels that move otherwise than this solution says have less weight in the next round.
         error_px = (equations @ motion - target).norm(dim=-1)
         half_weight_px = max(HALF_WEIGHT_PX, HALF_WEIGHT_MEDIANS * float(error_px.median()))
         weights = 1 / (1 + (error_px / half_weight_px) ** 2)

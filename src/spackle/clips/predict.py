@@ -68,7 +68,8 @@ def _check_options_suit_clips(scene: PipelineOptions, photo: PhotoOptions, worke
     unsuitable: list[str] = []  # names of options, in the order of messages
     if path.video.suffix != ".mp4":
         unsuitable.append("format")
-    # No option of a video applies but its format, if that is mp4.
+    # The result is an mp4 with the clip's own size and frame rate. So of the options of a video,
+    # only the format may be given, and it must be mp4.
     default_video = VideoOptions()
     for field in dataclasses.fields(VideoOptions):
         is_given = getattr(path.video, field.name) != getattr(default_video, field.name)
@@ -175,10 +176,10 @@ class FrameMeasures:
     def of(view: CompletedView) -> FrameMeasures:
         """Measure the completed view of a frame."""
         return FrameMeasures(
-            hole_area_ratio(view.base_rendering.alpha),
-            hole_area_ratio(view.rendering.alpha),
-            len(view.aux),
-            view.starts_shot,
+            hole_ratio_before=hole_area_ratio(view.base_rendering.alpha),
+            hole_ratio_after=hole_area_ratio(view.rendering.alpha),
+            aux_count=len(view.aux),
+            starts_shot=view.starts_shot,
         )
 
 
@@ -243,19 +244,27 @@ class FramePredictor:
         `lens` has `focal_px`, `focal_mm` and `fov` as the user gave them, or None.
         """
         options = pipeline.options
+        # A base network predicts each frame anew, and relative maps have their own scale in each
+        # frame. Measured depth does not flicker, and is not changed.
         depth_may_flicker = options.base.depth is None or options.base.depth_kind in RELATIVE_KINDS
         self._clip = clip
         self._pipeline = pipeline
         self._reporter = reporter
         self._base = pipeline.base
-        self._focal = resolve_focal_length(clip.path, clip.width, clip.height, {}, **lens)
+        self._focal = resolve_focal_length(
+            clip.path,
+            clip.width,
+            clip.height,
+            exif={},  # a video has none
+            **lens,
+        )
         self._completer = ClipCompleter(
             trajectory=options.path.trajectory,
             disparity=options.path.disparity,
             frame_count=len(clip),
             renderer=pipeline.renderer,
             flow=OpenCV("a clip").flow,
-            align=depth_may_flicker,  # measured depth is not changed
+            align=depth_may_flicker,
             fill=options.fill.texture != "none",
             network=pipeline.network,
             precision=options.base.precision,
@@ -312,6 +321,8 @@ class FramePredictor:
         self._base = self._base.only_chosen(base)
 
         focal_px = prediction.camera.focal[0]  # at the working size
+        # If the base found the focal length (neither the user nor the file gave one), it stays the
+        # same for all frames, so that the view does not zoom from frame to frame.
         if prediction.lens_source:
             clip_focal_px = focal_px * self._clip.width / prediction.camera.width
             self._focal = (clip_focal_px, FocalSource.FIRST_FRAME)

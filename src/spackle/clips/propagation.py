@@ -117,9 +117,11 @@ def _trust(hole: Tensor, aux_share: Tensor, weight: Tensor) -> Tensor:
     Args:
         hole: [H, W] bool: pixels that the frame does not show; all others have trust 1.
         aux_share: [H, W] share of a pixel's light that comes from the Gaussians that fill holes.
-        weight: [H, W] share of a pixel's colour that comes from the previous frame, with its trust.
+        weight: [H, W] share of a pixel's colour that was taken from the previous frame. It is the
+            lower, the less that colour was to be trusted.
     """
-    # A colour is either recalled or made up; of a faint one, nothing is known.
+    # A colour in a hole was taken from the previous frame, or the completion made it up. Where the
+    # Gaussians are too faint, their colour cannot be measured, and has no trust.
     trust_in_hole = weight.clamp_min(COMPLETED_TRUST)
     trust_in_hole = torch.where(aux_share < MIN_REMEMBERED_SHARE, 0.0, trust_in_hole)
     return torch.where(hole, trust_in_hole, 1.0)
@@ -141,7 +143,9 @@ def surfaces_behind_base(
         Linear light [H, W, 3], and inverse depth [H, W], positive; where nothing was drawn, it is
         the smallest of all.
     """
-    # A rendering blends light·weight. What the aux Gaussians add, over their weight, is theirs.
+    # A pixel is the sum of each Gaussian's light times its weight, and alpha is the sum of weights.
+    # So the light of the aux Gaussians is what they add to the light, divided by what they add to
+    # alpha.
     aux_share = (rendering.alpha - base_rendering.alpha).clamp_min(MIN_LIGHT_SHARE)
     base_light = srgb_to_linear(base_rendering.rgb)
     light = srgb_to_linear(rendering.rgb)
@@ -175,7 +179,8 @@ def _recall(previous: FrameMemory, uv: Tensor, inverse_depth: Tensor) -> tuple[T
             is looked for.
 
     Returns:
-        Linear light [H, W, 3] and trust [H, W]; the trust is 0 outside of the previous view.
+        Linear light [H, W, 3] and trust [H, W]. The trust is 0 outside of the previous view, and
+        low where a nearer surface hides the one that is looked for.
     """
     height, width = previous.trust.shape
     corner = (uv - 0.5).floor()  # of the four pixels around, that with the lowest indices

@@ -107,7 +107,7 @@ class Calibration:
         left = Camera(self.K, torch.eye(4), width, height)
 
         # Rectified photos differ in the principal point's x and in the position along x alone.
-        right_K = self.K
+        right_K = self.K  # the property makes a new tensor, which may be changed
         right_K[0, 2] += self.doffs_px
         left_to_right = torch.eye(4)
         left_to_right[0, 3] = -self.baseline_m
@@ -172,9 +172,9 @@ def _read_middlebury(path: StrPath) -> Calibration:
 
     problem = "not a Middlebury calibration: needs cam0=[f 0 cx; 0 f cy; 0 0 1], doffs and baseline"
     with as_input_error(path, problem):
-        number = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+        number_pattern = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
         # The matrix in row-major order: f 0 cx, 0 f cy, 0 0 1.
-        cam0 = [float(text) for text in re.findall(number, entries["cam0"])]
+        cam0 = [float(text) for text in re.findall(number_pattern, entries["cam0"])]
         size = None
         if "width" in entries and "height" in entries:
             size = (int(entries["width"]), int(entries["height"]))
@@ -221,7 +221,7 @@ def read_short_text(
     path: StrPath, kind: str = "calibration", max_bytes: int = MAX_TEXT_BYTES
 ) -> str:
     """The text of a short file; InputError, calling it a `kind`, if it is missing or too long."""
-    # The wrong file may have gigabytes, and messages need none of them.
+    # The size is checked before reading, because somebody may give a wrong file of gigabytes.
     if check_file(path, kind) > max_bytes:
         raise InputError(f"{path}: too long for a {kind}: give another file")
     return Path(path).read_text(encoding="utf-8", errors="replace")

@@ -63,9 +63,9 @@ class DepthMap:
         """The map for another focal length, in pixels of the map.
 
         Metres that were computed from disparity scale with the focal length, because
-        depth = baseline · focal / disparity. Measured metres stay, and lose the intrinsics.
+        depth = baseline · focal / disparity. Measured metres do not depend on a lens and stay. Only
+        their intrinsics, which would contradict the new focal length, are removed.
         """
-        # Measured metres do not depend on a lens.
         if self.K is None or self.quantity == "depth":
             return dataclasses.replace(self, K=None)
 
@@ -84,14 +84,17 @@ def is_valid_depth(metres: Tensor) -> Tensor:
 
 
 def quantisation_step(values: Array) -> float | None:
-    """The step of the integer grid on which all `values` [N] lie; None if one is not an integer."""
-    # Formats without a header for the step store it in the numbers themselves.
+    """The greatest common step of integers: any two of `values` [N] differ by a multiple of it.
+
+    None if a value is not an integer. Then no step is known.
+    """
     are_integers = np.array_equal(values, np.round(values))
     if float(values.max()) > MAX_EXACT_INTEGER or not are_integers:
         return None
 
     distinct = np.unique(values.astype(np.int64))
-    # A map of two walls at 2000 and 3000 mm is no map in steps of a metre.
+    # Few values may share a large step by chance: a map of two walls, at 2000 and 3000 mm, does not
+    # have steps of a metre.
     if len(distinct) < MIN_DISTINCT_VALUES:
         return 1.0
     # A camera with 10 bits in a file of 16 bits stores multiples of 64.
@@ -142,9 +145,17 @@ def build_depth_map(
     if not known.any():
         raise InputError(f"{path}: all-invalid: not one of {stored.size} pixels has a {quantity}")
 
-    # Lifting smooths within one step, because a step is no edge of a surface.
+    # The step is kept, because smoothing must know it: a step of the numbers is no edge of a
+    # surface.
     quantum = None
     if stored_unit is not None:
         step = quantisation_step(stored[known.numpy()])
         quantum = None if step is None else step * stored_unit
-    return DepthMap(metres.where(known, 0.0), known, K, quantum, quantity, Path(path))
+    return DepthMap(
+        depth=metres.where(known, 0.0),
+        valid=known,
+        K=K,
+        quantum=quantum,
+        quantity=quantity,
+        path=Path(path),
+    )

@@ -35,10 +35,11 @@ def read_exr_depth(file: IO[bytes], path: StrPath) -> Array:
     if the package OpenEXR is missing.
     """
     OpenEXR = _import_openexr(path)
-    # The header comes first, because a damaged header may announce gigabytes.
-    described = OpenEXR.File(file, separate_channels=True, header_only=True, num_threads=0)
-    header = described.header()
-    _check_kind(OpenEXR, described, path)
+    # The header is read and checked first, because a damaged one may announce gigabytes. With 0
+    # threads the library works in this one.
+    header_file = OpenEXR.File(file, separate_channels=True, header_only=True, num_threads=0)
+    header = header_file.header()
+    _check_kind(OpenEXR, header_file, path)
     _check_size(header, file.seek(0, io.SEEK_END), path)
 
     names = [channel.name for channel in header["channels"]]
@@ -61,13 +62,17 @@ def _import_openexr(path: StrPath) -> Any:
     return OpenEXR
 
 
-def _check_kind(OpenEXR: Any, described: Any, path: StrPath) -> None:
-    """InputError unless a file, of which the header was read, is one lossless flat picture."""
+def _check_kind(OpenEXR: Any, header_file: Any, path: StrPath) -> None:
+    """InputError unless a file, of which the header was read, is one lossless flat picture.
+
+    `OpenEXR` is the module, and `header_file` its view of the file.
+    """
     # A deep picture has a list of depths for each pixel.
     flat_kinds = (OpenEXR.scanlineimage, OpenEXR.tiledimage)
-    if len(described.parts) != 1 or described.parts[0].type() not in flat_kinds:
+    parts = header_file.parts
+    if len(parts) != 1 or parts[0].type() not in flat_kinds:
         raise InputError(f"{path}: a deep EXR, or one with several parts: give one plain picture")
-    if described.parts[0].compression().name in LOSSY_COMPRESSIONS:
+    if parts[0].compression().name in LOSSY_COMPRESSIONS:
         raise InputError(
             f"{path}: an EXR with lossy compression: save it with ZIP or PIZ, or uncompressed"
         )
@@ -128,11 +133,14 @@ def _in_display_window(
     """Pixels [h, w] of the data window, moved into the display window [H, W]; 0 where none are.
 
     A renderer may store only the part of a picture that is not empty, or more than the picture.
+    A window is the (x, y) of its first and of its last pixel.
     """
     height, width = _window_size(display_window)
     # Where the stored part begins in the picture; negative if it begins outside.
-    top = int(data_window[0][1]) - int(display_window[0][1])
-    left = int(data_window[0][0]) - int(display_window[0][0])
+    data_first_pixel, _ = data_window
+    picture_first_pixel, _ = display_window
+    left = int(data_first_pixel[0]) - int(picture_first_pixel[0])
+    top = int(data_first_pixel[1]) - int(picture_first_pixel[1])
     if (top, left) == (0, 0) and pixels.shape == (height, width):
         return pixels
 

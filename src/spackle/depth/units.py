@@ -44,10 +44,12 @@ KIND_ADVICE = (
 
 
 def depth_from_array(stored: Array, path: Path, kind: DepthKind = "auto") -> DepthMap:
-    """A depth map from an array [H, W] of metres or of relative depth (see `DepthKind`).
+    """A depth map from an array [H, W] of metres, or of depth without a scale.
 
-    Of metres, 0, NaN and inf mean unknown. `path` is the name of the array in messages. InputError
-    for an array of another shape or type, or one that cannot be depth.
+    If `kind` is "near-white" or "near-black", the numbers are inverse depth or depth up to an
+    unknown scale and shift; else they are metres, in which 0, NaN and inf mean unknown. `path` is
+    the name of the array in messages. InputError for an array of another shape or type, or one that
+    cannot be depth.
     """
     # A caller's array may be anything: objects, texts, or a picture with channels.
     if stored.ndim != 2 or not stored.size or stored.dtype.kind not in "fiu":
@@ -67,7 +69,7 @@ def metric_depth(stored: Array, path: StrPath) -> DepthMap:
     millimetres, and if no pixel is known.
     """
     check_not_negative(stored, path)
-    # Floats may happen to be whole metres: only integers have a step.
+    # Only integers have a common step. Floats may be whole metres by chance.
     are_integers = stored.dtype.kind in "iu"
     if are_integers and np.median(stored) > IMPLAUSIBLE_MEDIAN_M:
         raise InputError(
@@ -90,7 +92,8 @@ def millimetre_depth(stored: Array, path: StrPath) -> DepthMap:
 
     InputError, naming `path`, if the PNG has 8 bits, or no pixel is known.
     """
-    # 255 millimetres reach nowhere: 8 bits are relative depth, of which the kind is not known.
+    # In 8 bits, no depth could be over 255 mm. Such a PNG holds relative depth instead, and does not
+    # say whether near surfaces are white or black in it.
     if stored.dtype == np.uint8:
         raise InputError(
             f"{path}: an 8-bit PNG holds no metres: "
@@ -99,7 +102,7 @@ def millimetre_depth(stored: Array, path: StrPath) -> DepthMap:
     return build_depth_map(
         stored,
         depth=stored * MILLIMETRE_M,
-        valid=stored != UNKNOWN_MILLIMETRES,
+        valid=stored != UNKNOWN_MILLIMETRES,  # 0, which is no depth, becomes unknown anyway
         quantity="depth",
         stored_unit=MILLIMETRE_M,
         K=None,
@@ -109,7 +112,7 @@ def millimetre_depth(stored: Array, path: StrPath) -> DepthMap:
 
 def fills_16_bits(stored: Array) -> bool:
     """Whether a PNG's numbers reach from nearly 0 to nearly 65535, as relative depth does."""
-    # The two numbers for unknown pixels say nothing about the range.
+    # 0 and 65535 may stand for unknown pixels, and therefore say nothing about the range.
     known = stored[(stored > 0) & (stored < UNKNOWN_MILLIMETRES)]
     if not known.size:
         return False
@@ -148,12 +151,15 @@ def relative_depth(
     # Quantiles instead of the extremes, because a few pixels may be noise.
     known = np.isfinite(stored)
     values = stored.astype(np.float64)
-    extremes = np.quantile(values[known], NEAR_AND_FAR_QUANTILES) if known.any() else np.zeros(2)
-    low, high = extremes
+    low = 0.0
+    high = 0.0  # not above `low`, so that a map without a known pixel is refused, too
+    if known.any():
+        low, high = np.quantile(values[known], NEAR_AND_FAR_QUANTILES)
     if not high > low:
         raise InputError(f"{path}: the depth is the same nearly everywhere: give another depth map")
 
-    # 0 at the low quantile, 1 at the high quantile; numbers beyond the quantiles are limited.
+    # 0 at the low quantile, 1 at the high quantile. Numbers beyond the quantiles are outside of
+    # 0..1, and their depths are limited below.
     share = (np.where(known, values, low) - low) / (high - low)
     quantity: Quantity
     if kind == "near-white":
@@ -175,7 +181,14 @@ def relative_depth(
     quantum = None if step is None else step * stored_unit
     metres = torch.from_numpy(depth.astype(np.float32))
     valid = torch.from_numpy(known)
-    return DepthMap(metres.where(valid, 0.0), valid, None, quantum, quantity, Path(path))
+    return DepthMap(
+        depth=metres.where(valid, 0.0),
+        valid=valid,
+        K=None,
+        quantum=quantum,
+        quantity=quantity,
+        path=Path(path),
+    )
 
 
 def near_inverse_depth(inverse_depth: Tensor) -> Tensor:

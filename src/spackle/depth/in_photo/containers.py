@@ -115,13 +115,16 @@ Box = tuple[bytes, memoryview]  # the type (four letters), and the content
 
 
 def steps_of_depth_item(data: bytes) -> str | None:
-    """The steps that make a HEIF's depth map upright after decoding, as in an orientation.
+    """The steps that make a HEIF's depth map upright after it was decoded.
 
-    None for broken boxes, and if the file has no depth map or several ones.
+    They are letters, done from left to right: "t" swaps rows and columns, "x" left and right, "y"
+    top and bottom. None for broken boxes, and if the file has no depth map or several ones.
     """
+    # A HEIF is made of boxes. The box `meta` names the primary item, which is the photo (`pitm`),
+    # and lists the properties of all items (`iprp`). In a broken file any of them may be missing.
     try:
         content = next(body for kind, body in _boxes(memoryview(data)) if kind == b"meta")
-        meta = dict(_boxes(content[4:]))  # behind version and flags
+        meta = dict(_boxes(content[4:]))  # the first 4 bytes are version and flags
         primary_item = _primary_item(meta[b"pitm"])
         properties = _properties_of_items(meta[b"iprp"])
     except (struct.error, KeyError, IndexError, ValueError, StopIteration):
@@ -130,11 +133,12 @@ def steps_of_depth_item(data: bytes) -> str | None:
     depth_items = [boxes for boxes in properties.values() if _item_types(boxes) & _DEPTH_ITEM_TYPES]
     if len(depth_items) != 1:
         return None
-    # A decoder turns the map as the map's own properties say. Apple gives turns to the photo alone,
-    # and leaves the map as the sensor saw it.
+    # If the map has turns of its own, the decoder has done them, and no step is left.
     if _orientation_steps(depth_items[0]) is not None:
         return ""
-    return _orientation_steps(properties.get(primary_item, [])) or ""
+    # Apple gives turns to the photo alone, and leaves the map as the sensor saw it.
+    photo_steps = _orientation_steps(properties.get(primary_item, []))
+    return "" if photo_steps is None else photo_steps
 
 
 def _boxes(body: memoryview) -> Iterator[Box]:
@@ -210,13 +214,19 @@ def _item_types(properties: list[Box]) -> set[bytes]:
 
 
 def _orientation_steps(properties: list[Box]) -> str | None:
-    """The steps of an item's rotations and mirrorings, in their order; None if there are none."""
-    # Other properties, such as the size or the colour space, turn nothing.
-    steps = [
-        _STEPS_OF_HEIF_BOX[kind][body[0] % len(_STEPS_OF_HEIF_BOX[kind])]
-        for kind, body in properties
-        if kind in _STEPS_OF_HEIF_BOX and body
-    ]
+    """The steps of an item's rotations and mirrorings, in their order; None if there are none.
+
+    They are letters: "t" swaps rows and columns, "x" left and right, "y" top and bottom.
+    """
+    steps: list[str] = []
+    for kind, body in properties:
+        # Other properties, such as the size or the colour space, turn nothing.
+        if kind not in _STEPS_OF_HEIF_BOX or not body:
+            continue
+        # The box has one byte. Its lowest bits say which turn it is; the remainder drops the other
+        # bits, which are reserved.
+        steps_by_value = _STEPS_OF_HEIF_BOX[kind]
+        steps.append(steps_by_value[body[0] % len(steps_by_value)])
     return "".join(steps) if steps else None
 
 

@@ -96,7 +96,8 @@ class CodedDepth:
         if int(self.codes.min()) == int(self.codes.max()):
             raise ValueError("it has the same value everywhere")
 
-        # A map in 16 bits may hold the codes of 8: its step is then larger than one code.
+        # What one code more adds to the depth or the disparity. The codes of a map in 16 bits may
+        # be multiples of 256, if it was made from 8 bits: its step is then larger than one code.
         slope = (self.scale.last - self.scale.first) / self.max_code
         code_step = quantisation_step(self.codes) or 1
         step = abs(slope) * code_step
@@ -104,8 +105,8 @@ class CodedDepth:
             values = self.scale.first + slope * self.codes.astype(np.float64)
             if self.scale.quantity == "depth":
                 return values, step
-            # Disparities that are not above zero are the horizon, or were pushed beyond it by
-            # noise: far, but known.
+            # A disparity of zero is the horizon, and noise makes some of its disparities negative.
+            # These pixels are far, but known: they get the disparity of half a code.
             return 1 / np.maximum(values, abs(slope) / 2), step
 
     def upright(self, stored: Tensor) -> Tensor:
@@ -127,7 +128,7 @@ def load_photo_depth(path: StrPath) -> DepthMap | None:
     try:
         with open(path, "rb") as file:
             start = file.read(8)
-            # No other format of photos holds depth; they are not read to the end.
+            # Photos of all other formats have no depth, and are not read to the end.
             is_jpeg = start.startswith(JPEG_MAGIC)
             is_heif = start.endswith(HEIF_BRAND_BOX)
             if not (is_jpeg or is_heif):
@@ -157,7 +158,9 @@ def _to_depth_map(coded: CodedDepth, path: Path) -> DepthMap:
     if factor != 1:
         depth = depth * factor
         note += f", scaled to a median of {USUAL_MEDIAN_M:g} m"
-        quantum *= factor if coded.scale.quantity == "depth" else 1 / factor
+        # The step of a map that stores disparity is an inverse depth.
+        quantum_factor = factor if coded.scale.quantity == "depth" else 1 / factor
+        quantum *= quantum_factor
 
     metres = depth.float().contiguous()
     valid = is_valid_depth(metres)
@@ -179,7 +182,8 @@ def _factor_to_plausible(depth: Tensor) -> float:
     known = depth[is_valid_depth(depth)]
     if not len(known):
         return 1.0
-    # Portraits and still lifes are a few metres away: a far smaller or larger median is a unit.
+    # Portraits and still lifes are a few metres away. If the median is far from that, the numbers
+    # are in another unit than metres.
     median = float(known.median())
     is_plausible = MIN_PLAUSIBLE_MEDIAN_M <= median <= MAX_PLAUSIBLE_MEDIAN_M
     return 1.0 if is_plausible else USUAL_MEDIAN_M / median
@@ -328,12 +332,17 @@ def _find_android(data: bytes, image: JpegImageFile) -> tuple[bytes, CodeScale] 
 
 
 def android_scale(node: Element, namespace: str, layout: str) -> CodeScale:
-    """The scale of codes that are linear in depth or in inverse depth, from near to far.
+    """The scale of an Android depth map: which depth or inverse depth its codes mean.
 
-    ValueError if it is missing, impossible, or of a kind that is not read. `layout` is its name in
-    the report.
+    ValueError if it is missing, impossible, or of a kind that is not read.
+
+    Args:
+        node: the XMP element with the scale.
+        namespace: of its properties.
+        layout: what the report calls this way to store depth.
     """
-    # Near and Far are what the lowest and the highest code mean.
+    # Near and Far are what the lowest and the highest code mean. Between them, either the depth
+    # ("rangelinear") or its inverse ("rangeinverse") changes by the same amount from code to code.
     near = find_number(node, f"{namespace}Near")
     far = find_number(node, f"{namespace}Far")
     if near is None or far is None:
@@ -344,8 +353,8 @@ def android_scale(node: Element, namespace: str, layout: str) -> CodeScale:
     if style not in ("rangeinverse", "rangelinear") or measure == "opticray":
         raise ValueError(f"the format {style[:40]!r} and the measure {measure[:40]!r} are not read")
 
-    # Pixel phones state diopters even for values that grow from near to far: the order counts, not
-    # the unit.
+    # Diopters, which are 1/m, fall from near to far. Pixel phones state this unit even for values
+    # that grow, which therefore are depths of unknown unit.
     in_diopters = unit == "diopters" and near > far
     unit_known = unit in _METRES_PER_UNIT or in_diopters
     near *= _METRES_PER_UNIT.get(unit, 1.0)
@@ -360,7 +369,8 @@ def android_scale(node: Element, namespace: str, layout: str) -> CodeScale:
     if is_inverse:
         near = 1 / near
         far = 1 / far
-    # Diopters are inverse metres, and the inverse of an inverse is a depth.
+    # The codes are linear in Near and Far, or in their inverses. Near and Far themselves are depths
+    # or, in diopters, inverse depths; and the inverse of an inverse depth is a depth.
     quantity: Quantity = "disparity" if is_inverse != in_diopters else "depth"
     return CodeScale(quantity, near, far, source, unit_known)
 
@@ -368,21 +378,24 @@ def android_scale(node: Element, namespace: str, layout: str) -> CodeScale:
 def _appended_picture(data: bytes, tree: Element, address: str) -> bytes:
     """The picture of the item `address` in the directory of the photo `data`.
 
-    The directory is XMP; the items lie at the file's end, in its order, and it states their lengths
-    in bytes. But phones disagree: the item's own length may be missing, and other bytes may follow
-    the items. ValueError if no picture is found.
+    The directory is a list in the XMP. The items lie at the file's end, in the order of the list,
+    which states their lengths in bytes. But some phones leave out the length of this item, and some
+    write other bytes behind the items. ValueError if no picture is found.
     """
     entries = [node for node in tree.iter() if _is_directory_entry(node)]
     addresses = [own_property(node, f"{DYNAMIC_DEPTH_ITEM}DataURI") for node in entries]
     if address not in addresses:
         raise ValueError(NO_PICTURE_IN_DIRECTORY)
     index = addresses.index(address)
+    # The lengths of this item and of all that follow it; 0 for a length that is missing.
     lengths = [
         int(find_number(node, f"{DYNAMIC_DEPTH_ITEM}Length") or 0) for node in entries[index:]
     ]
     length = lengths[0]
 
-    # The item begins here, or earlier if other bytes follow the items.
+    # If the last item ends with the file, this one begins here. If other bytes follow, it begins
+    # earlier. So the places where a picture could begin are tried from here to the front; the
+    # search leaves out byte 0, where the photo itself begins.
     latest_begin = len(data) - sum(lengths)
     picture_begins = [match.start() for match in _PICTURE_BEGIN.finditer(data, 1)]
     for begin in reversed([begin for begin in picture_begins if begin <= latest_begin]):
@@ -390,8 +403,9 @@ def _appended_picture(data: bytes, tree: Element, address: str) -> bytes:
             end = begin + length
             if begin == latest_begin or data.endswith(_PICTURE_ENDS, begin, end):
                 return data[begin:end]
-        # Without a length the item reaches to the file's end. It is a picture of its own, and no
-        # thumbnail within one, if the picture before it, or its padding, ends where it begins.
+        # Without a length, the item reaches to the file's end. A thumbnail inside of a picture
+        # begins like an item, too; but just before an item, another picture ends, or zeros do that
+        # pad it.
         elif data.endswith((*_PICTURE_ENDS, b"\0"), 0, begin):
             return data[begin:]
     raise ValueError(NO_PICTURE_IN_DIRECTORY)
