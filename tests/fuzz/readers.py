@@ -105,9 +105,9 @@ def _read_ply(folder: Path) -> None:
 def _read_tree(name: str, folder: Path) -> None:
     case = read_cases(name, folder)[0]
     load_case(case)
-    for facts in (case.depth, case.points):
-        if facts is not None:
-            facts()
+    for read in (case.read_depth, case.read_points):
+        if read is not None:
+            read()
 
 
 def _read_dataset(folder: Path) -> None:
