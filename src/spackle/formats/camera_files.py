@@ -99,18 +99,18 @@ def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
     return cameras
 
 
-def camera_from_json(facts: Mapping[str, Any], where: str) -> Camera:
+def camera_from_json(camera_entry: Mapping[str, Any], where: str) -> Camera:
     """Return a camera from its entry in a JSON file: K, world_to_camera, width and height.
 
     Args:
-        facts: the parsed entry.
+        camera_entry: the parsed entry.
         where: names the entry at the beginning of messages.
 
     Raises:
         InputError: the entry is incomplete, or the camera is impossible.
     """
     with as_input_error(where, "{reason}", ValidationError):
-        entry = _CameraEntry.model_validate(facts)
+        entry = _CameraEntry.model_validate(camera_entry)
     return _camera_from_entry(entry, entry.width, entry.height, where)
 
 
@@ -120,7 +120,7 @@ def _camera_from_entry(
     """Return a camera from a file's entry; InputError if it is impossible or has no size."""
     K = torch.tensor(entry.K, dtype=torch.float64)
     world_to_camera = torch.tensor(entry.world_to_camera, dtype=torch.float64)
-    # `checked_camera` refuses a size of 0.
+    # A missing size becomes 0, which `checked_camera` refuses.
     return checked_camera(K, world_to_camera, width or 0, height or 0, where)
 
 
@@ -164,6 +164,7 @@ def _check_intrinsics(K: Tensor, where: str) -> None:
     """Raise an InputError unless K [3, 3] has positive focal lengths and no skew."""
     fx = float(K[0, 0])
     fy = float(K[1, 1])
+    # A smaller focal length would have an inverse beyond the largest allowed number.
     if min(fx, fy) < 1 / MAX_CAMERA_NUMBER:
         raise InputError(f"{where}: K needs positive focal lengths at [0][0] and [1][1]")
     largest_skew = max(abs(float(K[0, 1])), abs(float(K[1, 0])))
@@ -193,9 +194,10 @@ def load_path(path: str | os.PathLike[str]) -> KeyframePath:
     """Read a file of keyframes.
 
     The file holds {"keyframes": [{"time": s, "eye": [x, y, z], "target": [x, y, z]}, …]}. A
-    keyframe may also have "up" [x, y, z] and "fov" in degrees; the file may have "closed" and
-    "unit", as in `KeyframePath`. The world is that of the photo's camera (OpenCV: x right, y
-    down, z forward).
+    keyframe may also have "up" [x, y, z] and "fov" in degrees. The file may have "closed" (true:
+    the path returns to its first keyframe) and "unit" of all lengths ("metres", or "disparity":
+    the distance that a disparity of 1 is). The world is that of the photo's camera (OpenCV: x
+    right, y down, z forward).
 
     Raises:
         InputError: the file has other content, an unknown name, fewer than two keyframes or

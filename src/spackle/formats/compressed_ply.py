@@ -161,14 +161,16 @@ def _to_fractions(values: Floats, chunk_starts: NDArray[np.int64]) -> tuple[Floa
 
 
 def _pack_fractions(fractions: Floats, bit_counts: tuple[int, ...]) -> NDArray[np.uint32]:
-    """Pack k fractions a row into one word a row.
+    """Round the k fractions of each row to codes, and pack these into one word a row.
+
+    A code is a whole number: 0 for the fraction 0, and the largest number of so many bits for 1.
 
     Args:
         fractions: [N, k] in 0..1.
-        bit_counts: to how many bits each of the k columns is rounded.
+        bit_counts: how many bits the code of each of the k columns has.
 
     Returns:
-        [N] words; the first column takes the highest bits.
+        [N] words of 32 bits; the code of the first column is in the highest of the bits in use.
     """
     words = np.zeros(len(fractions), np.uint32)
     for column, bit_count in zip(fractions.T, bit_counts, strict=True):
@@ -219,11 +221,14 @@ def decode_compressed_ply(chunks: NDArray[Any], vertices: NDArray[Any]) -> Gauss
 
 
 def _unpack_fractions(words: NDArray[np.uint32], bit_counts: tuple[int, ...]) -> Floats:
-    """Unpack words into fractions; the inverse of `_pack_fractions`.
+    """Return the k fractions that `_pack_fractions` packed into each word.
+
+    A word holds one code, a whole number, for each fraction; the first one is in the highest
+    bits. Code 0 stands for 0, and the largest code that a column's bits can hold stands for 1.
 
     Args:
-        words: [N]; bits above those of the first column are ignored.
-        bit_counts: how many bits each of the k columns has.
+        words: [N] of 32 bits. If the codes leave the highest bits free, these are ignored.
+        bit_counts: how many bits the code of each of the k columns has.
 
     Returns:
         [N, k] fractions in 0..1.

@@ -35,11 +35,12 @@ NEAR_PLANE = 0.01  # glTF requires a near plane; viewers may choose their own
 
 
 def encode_glb(scene: SceneFile) -> bytes:
-    """Encode a scene as binary glTF, in the scene's order, with y up and z backward.
+    """Encode a scene as binary glTF with the extension KHR_gaussian_splatting.
 
-    Scales are linear, colours are coefficients of the constant spherical harmonic. Viewers
-    without the extension show points with the linear colours of COLOR_0. The photo's camera
-    becomes a glTF camera. `extras` hold what glTF cannot express: how many Gaussians come from
+    The Gaussians keep their order; the axes become y up and z backward. Scales are linear, colours
+    are coefficients of the constant spherical harmonic. A viewer that does not know the extension
+    shows points with the linear colours of the attribute COLOR_0. The photo's camera becomes a
+    glTF camera. The fields `extras` hold what glTF cannot express: how many Gaussians come from
     the photo, and the camera's principal point and size.
 
     Raises:
@@ -106,6 +107,7 @@ def _describe_scene(
     splat_settings = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
     primitive = {
         "mode": GLTF_POINTS,
+        # An attribute names its accessor; there is one for each array, in the same order.
         "attributes": {name: index for index, name in enumerate(attributes)},
         "extensions": {EXTENSION: splat_settings},
     }

@@ -39,7 +39,7 @@ PATH_POSITIONS = 121
 # How far the page's camera may go (a disparity), where the file of a scene does not say so: in a
 # scene whose holes are filled, and in one of another program.
 DEFAULT_LIMIT_OF_FILLED_SCENE = 0.3
-DEFAULT_LIMIT_OF_OTHER_SCENE = 0.6
+DEFAULT_LIMIT_OF_UNFILLED_SCENE = 0.6
 MIN_LIMIT = 0.01
 MAX_LIMIT = 1.0
 
@@ -79,9 +79,9 @@ def page_scene(
 ) -> PageScene:
     """Prepare a scene for the page.
 
-    The description's `paths` have two lists of positions [PATH_POSITIONS, 3] in metres for each
-    kind of path. The page's camera is at still + disparity · moving, because sideways motion
-    grows with the disparity and forward motion does not.
+    The scene becomes a description, to be written as JSON, and files of packed Gaussians. For
+    each kind of path, the description's `paths` have two lists, "still" and "moving", of vectors
+    [PATH_POSITIONS, 3] in metres. The page's camera is at still + disparity · moving.
 
     Args:
         name: the scene's name on the page.
@@ -90,7 +90,8 @@ def page_scene(
         camera: the photo's camera, at the world's origin.
         disparity: the relative camera movement for which the scene was completed; the page's
             camera goes no farther.
-        note: a note for the user; the page always shows the part before the semicolon.
+        note: a text for the user; empty for none. The page shows it for some seconds, and what
+            stands before its first semicolon always.
 
     Raises:
         InputError: no Gaussian lies in front of the camera.
@@ -119,6 +120,7 @@ def page_scene(
         },
         "focus": depths.focus,
         "zNear": depths.near,
+        # The page begins with a disparity of at most `free`, and offers up to `limit`.
         "orbit": {"unit": metres_per_disparity, "free": limit, "limit": limit},
         "paths": {kind: _path_positions(kind, camera, depths) for kind in SHARP_TRAJECTORIES},
         "layers": layers,
@@ -153,32 +155,38 @@ def _encode_layers(
 
 
 def _movement_limit(disparity: float | None, is_filled: bool) -> float:
-    """Return how far the page's camera may go, as a disparity (relative to the scene's depth).
+    """Return the largest disparity to which the page's camera may go.
+
+    A disparity is the camera's movement relative to the scene's depth.
 
     Args:
-        disparity: the disparity for which the scene was completed, if it is known.
-        is_filled: whether holes of the scene are filled.
+        disparity: the disparity for which the scene was completed; None if the scene's file does
+            not say it.
+        is_filled: whether the scene has Gaussians that fill holes.
     """
-    if disparity is None and is_filled:
-        disparity = DEFAULT_LIMIT_OF_FILLED_SCENE
-    elif disparity is None:
-        disparity = DEFAULT_LIMIT_OF_OTHER_SCENE
-    return min(max(disparity, MIN_LIMIT), MAX_LIMIT)
+    limit = disparity
+    if limit is None:
+        limit = DEFAULT_LIMIT_OF_FILLED_SCENE if is_filled else DEFAULT_LIMIT_OF_UNFILLED_SCENE
+    return min(max(limit, MIN_LIMIT), MAX_LIMIT)
 
 
 def _path_positions(
     kind: TrajectoryKind, camera: Camera, depths: DepthRange
 ) -> dict[str, list[list[float]]]:
-    """Return the camera positions along a path as the page needs them, to nine digits.
+    """Return the camera positions along a path, split into two parts for the page.
+
+    For the disparity d (the camera's movement relative to the scene's depth), a position is
+    still + d · moving, because sideways motion grows with d and forward motion does not. The user
+    of the page chooses d, so the page gets both parts.
 
     Args:
         kind: the kind of path, such as "swipe".
         camera: the photo's camera, at the path's middle.
-        depths: the scene's depths; the nearest one sets how far a disparity of 1 leads.
+        depths: the scene's depths; the nearest one sets how many metres a disparity of 1 is.
 
     Returns:
-        "still": positions [PATH_POSITIONS][3] in metres for a disparity of 0; and "moving":
-        their change for a disparity of 1.
+        The lists "still" and "moving" of vectors [PATH_POSITIONS][3] in metres, whose numbers are
+        rounded to nine digits.
     """
     exact_camera = camera.to("cpu", torch.float64)
 
@@ -273,7 +281,8 @@ def html_safe_json(value: object) -> bytes:
 def single_html(scene: PageScene) -> bytes:
     """Return the page with a scene embedded; it opens from a disk or an e-mail.
 
-    The page fetches nothing, and its policy lets browsers run its own script alone.
+    The page fetches nothing. Its Content-Security-Policy forbids browsers to run any script in it
+    but its own.
     """
     page = read_page_file("index.html").decode()
     css = read_page_file("viewer.css").decode()
@@ -282,11 +291,13 @@ def single_html(scene: PageScene) -> bytes:
     embedded_files = {}
     for name, data in scene.files.items():
         # A constant time, so that the same scene gives the same bytes.
-        compressed = gzip.compress(data, 6, mtime=0)
+        compressed = gzip.compress(data, compresslevel=6, mtime=0)
         embedded_files[name] = base64.b64encode(compressed).decode()
     content = {"description": scene.description, "files": embedded_files}
     scene_json = html_safe_json(content).decode()
 
+    # The page's own script and style, which are named by their digests, are allowed. The script
+    # may compile WebAssembly, start workers, and show images and videos that it has made.
     policy = (
         f"default-src 'none'; script-src {_policy_digest(js)} 'wasm-unsafe-eval'; "
         f"style-src {_policy_digest(css)}; worker-src blob:; "

@@ -112,7 +112,8 @@ def _encode_parts(
     yield ply_header(vertex, camera=camera, base_count=base_count, disparity=disparity)
 
     gaussians = gaussians.detach().to("cpu", torch.float32)
-    # All blocks are converted at full size, so that a row's bits do not depend on those after it.
+    # All blocks are converted at full size, because the last bits of a result may depend on the
+    # size of the array; so a row's bits do not depend on how many rows come after it.
     padding = Gaussians(
         *(torch.zeros(ROWS_PER_BLOCK, *tensor.shape[1:]) for tensor in gaussians.tensors)
     )
@@ -127,14 +128,14 @@ def _encode_parts(
 
 
 def _fill_table(table: Floats, columns: GaussianColumns) -> None:
-    """Write N Gaussians into the rows of `table` [N, 17], in the order of WRITTEN_PROPERTIES.
+    """Write N Gaussians into the rows of `table` [N, 17], whose columns are WRITTEN_PROPERTIES.
 
-    The columns 3 to 5, the normals, are left as they are.
+    The columns 3 to 5 are normals. They are not written, because the caller has set them to zero.
     """
     opacities = np.clip(columns.opacities, MIN_OPACITY, MAX_OPACITY)
     table[:, 0:3] = columns.means  # x y z
     table[:, 6:9] = columns.harmonics  # f_dc_0 f_dc_1 f_dc_2
-    # The logit. Above one half, 1 - opacity is exact in floating point.
+    # The logit. It is precise for opacities near 1, too, because 1 - opacity is exact there.
     table[:, 9] = np.log(opacities / (1 - opacities))
     table[:, 10:13] = columns.log_scales  # scale_0 scale_1 scale_2
     table[:, 13:17] = columns.quats  # rot_0 rot_1 rot_2 rot_3
@@ -162,12 +163,13 @@ class PlyFile:
         self._tables = PlyTables(path)
 
     def scene(self) -> SceneFile:
-        """Read the Gaussians and all that is noted of the scene.
+        """Read the Gaussians, and what the file says about the scene's camera and completion.
 
         Raises:
-            InputError: a part of it is invalid.
+            InputError: a part of the file is invalid.
         """
-        # f_rest are the coefficients of spherical harmonics above degree 0.
+        # The properties f_rest_0, f_rest_1, … are coefficients of spherical harmonics above degree
+        # 0. They are not read but counted, so that the user can be told.
         unread_harmonics = 0
         for element in self._tables.elements:
             for name in element.property_names:
@@ -207,7 +209,7 @@ class PlyFile:
         are_linear = self._are_colors_linear()
         means = torch.empty(count, 3)
         colors = torch.empty(count, 3)
-        opacities = torch.empty(count, 1)
+        opacities = torch.empty(count, 1)  # with two axes, as the other tensors have
         scales = torch.empty(count, 3)
         quats = torch.empty(count, 4)
         # Which rows of the block below go into each tensor.
@@ -235,7 +237,10 @@ class PlyFile:
         return Gaussians(means, quats, scales, opacities[:, 0], colors)
 
     def camera(self) -> Camera | None:
-        """Read the photo's camera: `save_ply` stores it in a comment, SHARP in tables.
+        """Read the photo's camera.
+
+        `save_ply` stores it in the comment "spackle_camera". SHARP, another program that turns a
+        photo into Gaussians, stores it in the tables "intrinsic", "extrinsic" and "image_size".
 
         Returns:
             The camera; None if the file has none.
@@ -244,7 +249,7 @@ class PlyFile:
             InputError: the stored camera is impossible.
         """
         # The principal point of a cropped photo may be negative.
-        numbers = self._tables.numbers_in_comment("spackle_camera", 6, lowest=-math.inf)
+        numbers = self._tables.numbers_in_comment("spackle_camera", count=6, lowest=-math.inf)
         if numbers is not None:
             fx, fy, cx, cy, width, height = numbers
             K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
@@ -257,6 +262,7 @@ class PlyFile:
         intrinsic = extras["intrinsic"]
         extrinsic = extras.get("extrinsic", missing)
         image_size = extras.get("image_size", missing)
+        # A 3×3 matrix, a 4×4 matrix, and width and height.
         if (len(intrinsic), len(extrinsic), len(image_size)) != (9, 16, 2):
             problem = "the stored camera is not as SHARP writes it"
             raise InputError(f"{self.path}: {problem}: give the focal length")
@@ -273,7 +279,7 @@ class PlyFile:
             InputError: the stored number is negative, or larger than that of all Gaussians.
         """
         count = self._vertex_element().row_count
-        numbers = self._tables.numbers_in_comment("spackle_base", 1, highest=count)
+        numbers = self._tables.numbers_in_comment("spackle_base", count=1, highest=count)
         return None if numbers is None else int(numbers[0])
 
     def disparity(self) -> float | None:
@@ -285,7 +291,7 @@ class PlyFile:
         Raises:
             InputError: the stored value is not a number, or negative.
         """
-        numbers = self._tables.numbers_in_comment("spackle_disparity", 1)
+        numbers = self._tables.numbers_in_comment("spackle_disparity", count=1)
         return None if numbers is None else numbers[0]
 
     def _vertex_element(self) -> PlyElement:
@@ -312,7 +318,8 @@ class PlyFile:
         advice = "export it as a plain Gaussian scene"
         if vertex.row_count == 0:
             raise InputError(f"{self.path}: holds no Gaussians: {advice}")
-        # Behind a table with lists, no table has a known place.
+        # The place of a table in the file is unknown (-1) if it has lists, whose lengths vary from
+        # row to row, or comes after a table with lists.
         if vertex.start_byte < 0:
             raise InputError(f"{self.path}: holds lists in or before its vertices: {advice}")
         return vertex
@@ -375,9 +382,10 @@ def _convert_block(block: Floats, rows: NDArray[Any], are_linear: bool) -> int:
     """Convert rows of a PLY file to means, linear colours, opacities, scales and quaternions.
 
     Args:
-        block: [14, ROWS_PER_BLOCK] overwritten in its first len(rows) columns; a row holds one
-            of READ_PROPERTIES. All columns are computed, so that the bits of a Gaussian do not
-            depend on how many others are in its block.
+        block: [14, ROWS_PER_BLOCK] takes the result: one of READ_PROPERTIES a row, one Gaussian a
+            column. Only the first len(rows) columns are meaningful. The others are computed, too,
+            because the last bits of a result may depend on the size of the array; so a Gaussian
+            gets the same bits, however many others are in its block.
         rows: at most ROWS_PER_BLOCK rows of the table, with a field for each property.
         are_linear: whether the colours are linear RGB; else they are sRGB.
 
@@ -392,7 +400,7 @@ def _convert_block(block: Floats, rows: NDArray[Any], are_linear: bool) -> int:
         rgb = torch.from_numpy(harmonics_to_srgb(block[COLORS]))
     block[OPACITIES] = torch.from_numpy(block[OPACITIES]).sigmoid()
 
-    # The colours are counted as they are stored, because the conversion clamps infinite ones.
+    # The colours are checked before their conversion, which would make infinite ones finite.
     is_finite = np.isfinite(block[:, : len(rows)]).all(axis=0)  # [len(rows)]
     block[COLORS] = rgb.clamp_min(0) if are_linear else srgb_to_linear(rgb)
     return int(np.count_nonzero(~is_finite))

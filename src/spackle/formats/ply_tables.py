@@ -74,6 +74,7 @@ def ply_header(
     if camera is not None:
         principal_point = camera.K[:2, 2].tolist()
         numbers = [*camera.focal, *principal_point, camera.width, camera.height]
+        # repr() writes as many digits as the exact number needs.
         lines.append("comment spackle_camera " + " ".join(repr(number) for number in numbers))
     if base_count is not None:
         lines.append(f"comment spackle_base {base_count!r}")

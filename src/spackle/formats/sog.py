@@ -52,10 +52,11 @@ ARCHIVE_TIME = (1980, 1, 1, 0, 0, 0)
 
 
 def encode_sog(scene: SceneFile) -> bytes:
-    """Encode a scene as a bundled SOG file; the order of the Gaussians and the axes stay the same.
+    """Encode a scene as a bundled SOG file: a zip archive of images, one Gaussian a pixel.
 
-    Positions have 16 bits for each axis, spaced logarithmically from 0; scales and colours are
-    looked up in codebooks.
+    The order of the Gaussians and the axes stay the same. A coordinate has 16 bits on a
+    logarithmic scale, whose steps are small near 0. A scale or colour is a byte, the index of a
+    value in a codebook.
 
     Raises:
         InputError: there are no Gaussians, or more than the images can hold.
@@ -64,7 +65,8 @@ def encode_sog(scene: SceneFile) -> bytes:
     count = len(scene.gaussians)
     if count == 0:
         raise InputError("SOG cannot hold a scene without Gaussians: use another format")
-    # About square images, whose sides are multiples of four.
+    # The images are about square. Both sides are multiples of four, as in the files of
+    # splat-transform, the format's program.
     width = math.ceil(math.sqrt(count) / 4) * 4
     if width > MAX_IMAGE_SIDE_PX:
         raise InputError(f"{count:,} Gaussians are too many for SOG: use another format")
@@ -108,16 +110,17 @@ def encode_sog(scene: SceneFile) -> bytes:
 def codebook(values: Floats) -> tuple[Floats, NDArray[np.uint8]]:
     """Find 256 values with which given values can be stored with a small squared error.
 
-    The density of the codes follows the cube root of the values' density, which is optimal for
-    many codes. A quarter of the codes is evenly spaced, for rare values. Up to 256 different
-    values get a code each.
+    Values are counted in bins. Where many values lie, many codes lie: the density of the codes is
+    the cube root of the values' density, which gives the smallest error for many codes. A quarter
+    of the codes is evenly spaced instead, so that rare values have codes nearby. If at most 256
+    bins are in use, each gets a code of its own.
 
     Args:
         values: [N, 3].
 
     Returns:
-        The codebook [256], in which codes that no value uses hold the largest value, and the
-        code of each value [N, 3].
+        The codebook [256], and the code [N, 3] of each value: its index in the codebook. Codes
+        that no value has stand for the largest value.
     """
     low = float(values.min())
     high = float(values.max())
@@ -127,10 +130,12 @@ def codebook(values: Floats) -> tuple[Floats, NDArray[np.uint8]]:
 
     used_bin_count = np.count_nonzero(bin_counts)
     if used_bin_count <= CODEBOOK_SIZE:
-        # The n-th bin in use gets code n; empty bins before the first one get 0, too.
-        code_of_bin = np.maximum(np.cumsum(bin_counts > 0) - 1, 0).astype(np.uint8)
+        # The bins in use get the codes 0, 1, 2, …; bin 0 is in use, because it has the smallest
+        # value. The codes of empty bins do not matter.
+        code_of_bin = (np.cumsum(bin_counts > 0) - 1).astype(np.uint8)
     else:
-        # Each bin takes a share of the codes; a code's bins are those where its part begins.
+        # The codes are laid out along the bins, and each bin takes its share of them. A bin has
+        # the code at which its share begins; a code may thus have many bins with small shares.
         roots = np.cbrt(bin_counts)
         share = (1 - EVEN_CODES_SHARE) * roots / roots.sum() + EVEN_CODES_SHARE / BIN_COUNT
         share_before = np.cumsum(share) - share
@@ -146,7 +151,7 @@ def codebook(values: Floats) -> tuple[Floats, NDArray[np.uint8]]:
 
 
 def _quantize_positions(means: Floats) -> tuple[NDArray[np.uint16], Floats, Floats]:
-    """Quantise positions [N, 3] on a logarithmic scale, which is fine near the origin.
+    """Quantise positions [N, 3] on a logarithmic scale, whose steps are small near the origin.
 
     Returns:
         The codes [N, 3] in 0..65535 of sign(x) · ln(1 + |x|), and the lower and upper bound [3]
@@ -175,7 +180,8 @@ def _encode_rotations(quats: Floats) -> NDArray[np.uint8]:
 
 def _encode_webp(rgba: NDArray[np.uint8], width: int) -> bytes:
     """Encode pixels [N, 4], row by row, as an image; unused pixels at the end are black."""
-    height = math.ceil(len(rgba) / width / 4) * 4  # a multiple of four, as the width is
+    # Both sides are multiples of four, as in the files of splat-transform, the format's program.
+    height = math.ceil(len(rgba) / width / 4) * 4
     pixels = np.zeros((height * width, 4), np.uint8)
     pixels[:, 3] = 255  # opaque
     pixels[: len(rgba)] = rgba

@@ -60,7 +60,7 @@ MAX_COMPONENT_CODE = 511
 COMPONENT_SIGN_BIT = 512
 
 # Arguments of zlib: the container of gzip, the largest window, the most memory.
-GZIP_WINDOW = 16 + 15
+GZIP_WINDOW_BITS = 16 + 15
 DEFLATE_MEMORY = 9
 DEFLATE_LEVEL = 5  # level 6 takes twice the time for files 1 % smaller
 
@@ -123,12 +123,23 @@ def encode_spz(scene: SceneFile) -> bytes:
     columns = GaussianColumns.from_gaussians(scene.gaussians).flip_y_and_z()
     fraction_bits = spz_grid(scene.gaussians).fraction_bits
     columns = _shrink_into_grid(columns, fraction_bits)
-    header = HEADER.pack(MAGIC, WRITTEN_VERSION, count, 0, fraction_bits, 0, 0)
+    header_fields = SpzHeader(
+        magic=MAGIC,
+        version=WRITTEN_VERSION,
+        gaussian_count=count,
+        harmonics_degree=0,
+        fraction_bits=fraction_bits,
+        flags=0,
+        reserved=0,
+    )
+    header = HEADER.pack(*header_fields)
 
+    # ROUNDINGS go from fine to coarse. The first one with which samples of the Gaussians get small
+    # enough may be too fine for the whole file; then coarser ones follow.
     data = b""
     max_bytes = max(MAX_BYTES_PER_GAUSSIAN * count, SMALL_FILE_BYTES)
-    finest = _finest_rounding_of_samples(columns, fraction_bits)
-    for rounding in ROUNDINGS[finest:]:
+    first_index = _finest_rounding_of_samples(columns, fraction_bits)
+    for rounding in ROUNDINGS[first_index:]:
         data = _deflate(header + b"".join(_encode_sections(columns, fraction_bits, rounding)))
         if len(data) <= max_bytes:
             break
@@ -139,13 +150,13 @@ def spz_grid(gaussians: Gaussians) -> SpzGrid:
     """Choose the grid to which the positions of a scene are rounded.
 
     SPZ stores a coordinate as a fixed-point number of 24 bits. The more of these bits are
-    fractional, the finer is the grid, and the nearer is its end. The grid is as fine as the
-    farthest Gaussian allows; but if it would be too coarse for the nearest ones, it is finer, and
-    distant Gaussians lie outside.
+    fractional, the finer is the grid, but the smaller is its largest coordinate. The grid is as
+    fine as the farthest Gaussian allows. If that is too coarse for the nearest Gaussians, the grid
+    is finer, and distant Gaussians lie outside of it.
     """
     means = gaussians.means.detach().to("cpu").double().numpy()  # [N, 3]
     if len(means) == 0:
-        return SpzGrid(FRACTION_BITS_OF_EMPTY_SCENE, 0)
+        return SpzGrid(fraction_bits=FRACTION_BITS_OF_EMPTY_SCENE, outside_count=0)
     largest_coordinate = np.abs(means).max(axis=1)  # [N]
     distance = np.sqrt((means * means).sum(axis=1))  # [N]
 
@@ -161,7 +172,7 @@ def spz_grid(gaussians: Gaussians) -> SpzGrid:
     )
 
     is_outside = largest_coordinate * 2.0**fraction_bits > MAX_GRID_COORDINATE
-    return SpzGrid(fraction_bits, int(is_outside.sum()))
+    return SpzGrid(fraction_bits=fraction_bits, outside_count=int(is_outside.sum()))
 
 
 def _shrink_into_grid(columns: GaussianColumns, fraction_bits: int) -> GaussianColumns:
@@ -185,11 +196,21 @@ def _shrink_into_grid(columns: GaussianColumns, fraction_bits: int) -> GaussianC
 
 
 def _finest_rounding_of_samples(columns: GaussianColumns, fraction_bits: int) -> int:
-    """Return the index in ROUNDINGS of the finest one with which samples get small enough.
+    """Return the index of the finest of ROUNDINGS that will probably make the file small enough.
 
-    The index of the coarsest one if none does.
+    ROUNDINGS go from fine to coarse. They are tried on samples of the Gaussians, because it would
+    take long to encode the whole file with each of them.
+
+    Args:
+        columns: all Gaussians, with y up and z backward.
+        fraction_bits: the positions' grid has steps of 2 to the power of -fraction_bits.
+
+    Returns:
+        The index in ROUNDINGS; that of the coarsest one if none makes the samples small enough.
     """
     count = len(columns.means)
+    # The samples are runs of consecutive Gaussians, evenly spread. Those of a small scene start at
+    # the same places, of which one is kept.
     last_start = max(0, count - SAMPLE_GAUSSIANS)
     starts = np.unique(np.linspace(0, last_start, SAMPLE_COUNT).astype(np.int64))
     samples = [np.arange(start, min(start + SAMPLE_GAUSSIANS, count)) for start in starts]
@@ -214,7 +235,7 @@ def _encode_sections(
     Args:
         columns: N Gaussians with y up and z backward.
         fraction_bits: the positions' grid has steps of 2 to the power of -fraction_bits.
-        rounding: how coarsely values are rounded.
+        rounding: how coarsely values are rounded, because coarser values compress better.
     """
     positions = _encode_positions(columns, fraction_bits, rounding.position_step)
 
@@ -230,7 +251,7 @@ def _encode_sections(
     scale_steps = np.round((columns.log_scales - MIN_LOG_SCALE) * step_per_log)
     scales = np.clip(scale_steps * rounding.scale_step, 0, 255).astype(np.uint8)
 
-    # The rotation of a sphere is invisible, and equal rotations deflate best.
+    # The rotation of a sphere is invisible; so spheres get equal rotations, which compress best.
     is_sphere = (scales == scales[:, :1]).all(axis=1, keepdims=True)  # [N, 1]
     quats = np.where(is_sphere, np.array([1, 0, 0, 0], np.float32), columns.quats)
     rotations = _encode_rotations(quats, rounding.component_bits)
@@ -253,7 +274,8 @@ def _encode_positions(
     # relative_step · scale · 2^fraction_bits.
     log2_scale = middle_log_scale / np.float32(np.log(2))
     exponent = np.floor(log2_scale + np.float32(np.log2(relative_step) + fraction_bits))
-    # A step below 1 is finer than the grid; 2^20 leaves 3 of a number's 23 bits.
+    # A step below 1 would be finer than the grid. A step above 2^20 would leave fewer than 3 of a
+    # coordinate's 23 bits.
     step = np.exp2(np.clip(exponent, 0, 20))[:, None]  # [N, 1]
 
     grid_positions = columns.means * np.float64(2.0**fraction_bits)
@@ -296,7 +318,7 @@ def _encode_rotations(quats: Floats, component_bits: int) -> NDArray[np.uint32]:
 
 def _deflate(data: bytes) -> bytes:
     """Compress bytes as gzip does, without a time, so that equal data gives equal files."""
-    compressor = zlib.compressobj(DEFLATE_LEVEL, zlib.DEFLATED, GZIP_WINDOW, DEFLATE_MEMORY)
+    compressor = zlib.compressobj(DEFLATE_LEVEL, zlib.DEFLATED, GZIP_WINDOW_BITS, DEFLATE_MEMORY)
     return compressor.compress(data) + compressor.flush()
 
 
@@ -342,7 +364,8 @@ class SpzHeader(NamedTuple):
 def _inflate_sections(data: bytes) -> tuple[SpzHeader, list[NDArray[np.uint8]]]:
     """Return the header of an SPZ file, and its decompressed sections.
 
-    A file is never inflated beyond the size that its header announces.
+    No more bytes are decompressed than the header announces, because a small damaged or hostile
+    file could otherwise fill the memory.
 
     Returns:
         The header; and for N Gaussians the bytes [N, k] of positions (k = 9), opacities (1),
@@ -352,7 +375,8 @@ def _inflate_sections(data: bytes) -> tuple[SpzHeader, list[NDArray[np.uint8]]]:
         ValueError: the file has another version, or is too short.
         zlib.error: the file is damaged.
     """
-    inflater = zlib.decompressobj(GZIP_WINDOW)
+    # zlib takes the container's kind, which is gzip's, as a part of this number.
+    inflater = zlib.decompressobj(GZIP_WINDOW_BITS)
     header = SpzHeader(*HEADER.unpack(inflater.decompress(data, HEADER.size)))
     count = header.gaussian_count
     is_known = header.magic == MAGIC and header.version in (2, 3)
