@@ -90,8 +90,8 @@ class VideoWriter:
         self._name = path if name_in_messages is None else name_in_messages
         self._format = check_video(self._name, fps, loop)
         self._play_count = self._format.default_play_count if loop is None else loop
-        # A very low rate would be rounded to 0.
         rate = Fraction(fps).limit_denominator(MAX_RATE_DENOMINATOR)
+        # A very low rate was rounded to 0, which is no rate.
         self._rate = max(rate, Fraction(1, MAX_RATE_DENOMINATOR))
         self._waiting = deque[Future[None]]()  # the frames that are being encoded
         self._resources = contextlib.ExitStack()
@@ -122,6 +122,7 @@ class VideoWriter:
             raise ValueError(f"frame {self.frame_count} {shapes}")
         self._check_gif_size(frame)
 
+        # Frames that wait to be encoded take memory, so there must be room for one more.
         self._wait_until(MAX_WAITING_FRAMES - 1)
         # A copy, because the caller may reuse the memory of a frame of bytes.
         pixels = np.array(to_uint8(frame).numpy())
@@ -140,10 +141,11 @@ class VideoWriter:
             ValueError: there are no frames.
         """
         if error is not None:
-            # Closes the file and removes it.
+            # The resources, told of the error, close the file and remove it.
             self._resources.__exit__(error_type, error, trace)
             return
-        # Closes the file, and renames it, or removes it if one of these steps fails.
+        # At its end, the block closes the file and gives it its name. If a step in the block fails,
+        # the file is removed instead.
         with self._resources:
             if self.frame_count == 0:
                 raise ValueError(f"{self._name}: a video needs at least one frame")
@@ -236,7 +238,8 @@ class StreamEncoder:
         self._format = video_format
         self._rate = rate
         self._frame_count = 0
-        # How often the compressed packets are written; they are kept only to be repeated.
+        # A format that cannot state the play count stores the compressed packets as often as the
+        # video plays. For this, the packets are kept until the end.
         self._stored_repetitions = 1 if video_format.states_play_count else play_count
         self._kept_packets: list[av.Packet[VideoStream]] = []
 
@@ -304,6 +307,7 @@ class StreamEncoder:
         A packet is a compressed frame; it has the times of its presentation (pts) and decoding
         (dts).
         """
+        # None ends the video: the encoder gives the packets that it still holds.
         self._encode(None)
         for repetition in range(1, self._stored_repetitions):
             for packet in self._kept_packets:
@@ -392,7 +396,8 @@ class PaletteFilter:
         All frames are ready at the end; None comes after the last one.
         """
         self._source.push(frame)
-        # The first of these errors means that no frame is ready, the second that none is left.
+        # pull() raises a BlockingIOError if no frame is ready yet, and an EOFError after the last
+        # one. Either ends the loop.
         with contextlib.suppress(av.BlockingIOError, av.EOFError):
             while True:
                 ready_frame = self._sink.pull()

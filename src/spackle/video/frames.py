@@ -51,13 +51,13 @@ class FrameMaker:
     def of(
         options: VideoOptions, gaussians: Gaussians, cameras: Sequence[Camera], source: Path
     ) -> FrameMaker:
-        """Derive from the scene and the cameras what the options leave open.
+        """Make a frame maker; what the options leave open follows from the scene and the cameras.
 
         Args:
             options: what the video looks like.
             gaussians: the scene.
             cameras: the views of all frames, of one size.
-            source: the file that messages name.
+            source: the file whose name begins messages.
 
         Raises:
             InputError: the video is impossible, or its frames are too large.
@@ -70,7 +70,8 @@ class FrameMaker:
         except ValueError as error:
             raise InputError(f"{source}: this video is impossible: {error}") from error
 
-        maker = FrameMaker(options, stereo, depth_scale)
+        maker = FrameMaker(options, stereo=stereo, depth=depth_scale)
+        # All views have one size, so the first one stands for all.
         width, height = maker.frame_size(maker.resized_camera(cameras[0]))
         if max(width, height) > MAX_VIDEO_SIDE_PX:
             problem = f"frames of {width}×{height} have more than {MAX_VIDEO_SIDE_PX} pixels a side"
@@ -125,8 +126,8 @@ class FrameMaker:
         """Return one frame [H, W, 3] sRGB.
 
         Args:
-            renderings: one for each eye; for a comparison, two of one eye: of the scene without
-                and with filled holes.
+            renderings: one for each eye, the left one first. A comparison has one eye and two
+                renderings: of the scene without and with filled holes.
         """
         pictures = [self._picture(rendering) for rendering in renderings]
         if self.image_size is not None:
@@ -151,7 +152,10 @@ class FrameMaker:
         return self.depth(rendering.depth, has_depth)
 
     def resized_camera(self, camera: Camera) -> Camera:
-        """Return the camera at the size of one eye's image without margins."""
+        """Return the camera at the size at which one eye's image is rendered.
+
+        That is the size of the image without its margins, which are added after rendering.
+        """
         if self.image_size is None:
             return camera
         width, height = self.image_size
@@ -161,13 +165,19 @@ class FrameMaker:
         if self.options.fit == "crop" or is_same_aspect:
             return crop_camera_to_size(camera, width, height)
 
+        # The whole view fits into the image, and margins will fill the rest.
         scale = min(scale_across, scale_down)
         inner_width = max(1, round(scale * camera.width))
         inner_height = max(1, round(scale * camera.height))
         return camera.resized(inner_width, inner_height)
 
     def frame_size(self, camera: Camera) -> tuple[int, int]:
-        """Return width and height of a frame in pixels, for a view of the camera's size."""
+        """Return width and height of the video's frames in pixels.
+
+        Args:
+            camera: a view of the video. Unless the options give a size, one eye's image has the
+                size of this view.
+        """
         width = camera.width
         height = camera.height
         if self.image_size is not None:
@@ -183,7 +193,7 @@ class FrameMaker:
 
         Args:
             name: the video's file name.
-            camera: a view of the video.
+            camera: a view of the video; only its size matters.
             frames: how many frames the video has.
         """
         width, height = self.frame_size(self.resized_camera(camera))
@@ -234,10 +244,10 @@ def _derive_stereo(options: VideoOptions, gaussians: Gaussians, camera: Camera) 
 
 
 def crop_camera_to_size(camera: Camera, width: int, height: int) -> Camera:
-    """Return the view at another size in pixels, filled without distortion.
+    """Return a camera whose view is scaled and cropped to another size in pixels.
 
-    The view is scaled so that it covers the new size; if the aspect ratio differs, two sides are
-    cropped equally.
+    The view is scaled without distortion until it covers the new size. If the aspect ratio differs,
+    it is cropped equally on two opposite sides.
     """
     scale = max(width / camera.width, height / camera.height)
     K = camera.zoomed(scale).K
@@ -272,14 +282,14 @@ def with_margins(picture: Tensor, width: int, height: int, blurred: bool) -> Ten
 
 
 def _blurred_background(picture: Tensor, width: int, height: int) -> Tensor:
-    """Return the middle of an image [h, w, 3], enlarged to [height, width, 3], blurred and dark."""
-    inner_height, inner_width = picture.shape[:2]
-    # The part of the image that has the aspect ratio of the result.
-    scale = max(width / inner_width, height / inner_height)
-    row_count = min(inner_height, max(1, round(height / scale)))
-    column_count = min(inner_width, max(1, round(width / scale)))
-    top = (inner_height - row_count) // 2
-    left = (inner_width - column_count) // 2
+    """Return a dark, blurred background [height, width, 3] that is made from an image [h, w, 3]."""
+    picture_height, picture_width = picture.shape[:2]
+    # The largest part of the image, around its middle, that has the background's aspect ratio.
+    scale = max(width / picture_width, height / picture_height)
+    row_count = min(picture_height, max(1, round(height / scale)))
+    column_count = min(picture_width, max(1, round(width / scale)))
+    top = (picture_height - row_count) // 2
+    left = (picture_width - column_count) // 2
     middle = picture[top : top + row_count, left : left + column_count]
     middle = middle.permute(2, 0, 1)[None]  # [1, 3, row_count, column_count]
 

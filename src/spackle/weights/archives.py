@@ -69,7 +69,7 @@ def read_archive(path: str | os.PathLike[str]) -> object:
         if archive.getinfo(pickle_name).file_size > MAX_PICKLE_BYTES:
             raise ValueError("the pickle is too large for a network")
 
-        # `torch.save` can leave the checksums out.
+        # `torch.save` can leave the checksums out: all are 0 then, and cannot be checked.
         has_checksums = any(record.CRC for record in archive.infolist())
         if has_checksums:
             damaged_name = archive.testzip()
@@ -124,15 +124,14 @@ class _StandIn:
     fields: dict[object, object]
 
     def __new__(cls, *arguments: Any) -> Any:
-        """Stand for a call of the class or function.
+        """Return what a call in the pickle gives, without running the class or function called.
 
-        Two functions of PyTorch are known: the one that makes a tensor of a storage, and the one
-        that makes a parameter of a tensor. Both give a tensor here; all others give a stand-in
-        without fields.
+        Two functions of PyTorch, which make a tensor of a storage and a parameter of a tensor, are
+        replaced: both give a tensor. A call of anything else gives a stand-in without fields.
         """
         if cls.replaced_name == "torch._utils _rebuild_tensor_v2":
             storage, offset, shape, stride = arguments[:4]
-            # A storage of an unknown type is not a tensor, see `persistent_load`.
+            # `persistent_load` gives None for a storage whose type of numbers is unknown.
             if isinstance(storage, Tensor):
                 # Raises an error if the tensor would reach beyond its storage.
                 return storage.as_strided(shape, stride, offset)
@@ -163,7 +162,7 @@ class _InertUnpickler(pickle._Unpickler):
         path: str | os.PathLike[str],
         data_folder: str,
     ) -> None:
-        """Prepare to read.
+        """Prepare to read the objects of a pickle, whose tensors will be mapped from the disk.
 
         Args:
             pickled: the bytes of the pickle.

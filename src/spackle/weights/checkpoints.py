@@ -28,7 +28,10 @@ Network = TypeVar("Network", bound=nn.Module)
 StrPath = str | os.PathLike[str]
 TensorShapes = dict[str, tuple[int, ...]]  # tensors' shapes by name
 
+# How many tensors a message names, and how long a name may be before and after escaping.
 MAX_NAMES_IN_MESSAGE = 3
+MAX_NAME_CHARACTERS = 120
+MAX_ESCAPED_NAME_CHARACTERS = 200
 
 # How the files of each format begin. A safetensors file begins with a length of 8 bytes, and then
 # a JSON object.
@@ -48,18 +51,18 @@ def load_strict(
 ) -> Network:
     """Fill a network with a file's tensors, converted to float32, and freeze it.
 
-    Integer buffers keep the values that the network has.
+    Only floating-point parameters and buffers are filled. Integer buffers keep their values.
 
     Args:
         network: the network, which may be on the meta device, where tensors take no memory.
         tensors: the file's tensors, as `read_tensors` returns them.
         path: the file's name, for messages.
         advice: what to do about a wrong file, for messages.
-        prepare: changes the filled network in place. Tensors that are still mapped from the file
-            afterwards are copied.
+        prepare: a function that changes the filled network in place, for example to another data
+            type. A tensor that it replaces need not be copied from the file, which saves memory.
 
     Returns:
-        The same network.
+        The same network, which does not depend on the file any more.
 
     Raises:
         InputError: tensors are missing, unknown, of another shape, or not finite.
@@ -77,7 +80,8 @@ def load_strict(
     if prepare is not None:
         prepare(network)
 
-    # The network must not depend on the file, which may be changed or deleted.
+    # A tensor with the address of the file's tensor is still mapped from the file. It is copied,
+    # because the file may be changed or deleted.
     for name, tensor in (*network.named_parameters(), *network.named_buffers()):
         if name in float_shapes and tensor.data_ptr() == tensors[name].data_ptr():
             tensor.data = tensor.data.clone()
@@ -148,7 +152,8 @@ def check_finite(network: nn.Module, path: StrPath, advice: str) -> None:
     """
     broken_names = []
     for name, tensor in network.state_dict().items():
-        # A finite sum proves it at little cost; but the sum of finite numbers may overflow.
+        # A finite sum, which costs little, proves that all numbers are finite. An infinite sum
+        # proves nothing, because large finite numbers may add up to it.
         is_finite = bool(tensor.sum().isfinite()) or bool(tensor.isfinite().all())
         if not is_finite:
             broken_names.append(name)
@@ -163,7 +168,8 @@ def _name_some(names: list[str]) -> str:
     The names are a stranger's, so that they are shortened, and control characters are escaped.
     """
     shortened_names = [
-        printable_line(name[:120])[:200]  # escaping lengthens a name
+        # Shortened again, because escaping lengthens a name.
+        printable_line(name[:MAX_NAME_CHARACTERS])[:MAX_ESCAPED_NAME_CHARACTERS]
         for name in names[:MAX_NAMES_IN_MESSAGE]
     ]
     text = ", ".join(shortened_names)
@@ -263,10 +269,11 @@ def _read_old_pickle(path: StrPath) -> dict[str, Tensor]:
         ValueError: the pickle holds more than tensors and plain values.
     """
     try:
-        # From memory, because a damaged length lets PyTorch ask for far more bytes than the file
-        # has, and a file would allocate as many before it reads.
+        # PyTorch asks for as many bytes as a length in the pickle says, which may be far too large
+        # in a damaged file. A file object would allocate that many before it reads; a mapped file
+        # only gives what is there.
         with open(path, "rb") as file, warnings.catch_warnings():
-            # About the old format.
+            # PyTorch warns about the old format; the user of a published file cannot change it.
             warnings.simplefilter("ignore")
             with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapped:
                 readable = cast(BinaryIO, mapped)

@@ -37,7 +37,7 @@ def download(
         path: the file, in an existing folder.
         size: of the file in bytes.
         sha256: of the file, as 64 hexadecimal digits.
-        progress: called with the bytes that are there, those of earlier calls too, and `size`.
+        progress: called with how many bytes have been collected, in earlier calls too, and `size`.
 
     Raises:
         InputError: the file cannot be fetched or written, or has other content.
@@ -71,7 +71,12 @@ def download(
 def _complete_part(url: str, part: Path, size: int, sha256: str, progress: Progress | None) -> bool:
     """Fetch the bytes that are missing in the file `part`, and check its content.
 
-    The arguments are those of `download`.
+    Args:
+        url: the address of the whole file.
+        part: the file that collects the bytes; need not exist.
+        size: of the whole file in bytes.
+        sha256: of the whole file, as 64 hexadecimal digits.
+        progress: called with how many bytes `part` has, and `size`.
 
     Returns:
         Whether the content is right; if not, `part` is deleted.
@@ -113,9 +118,11 @@ def _receive_missing_bytes(url: str, part: Path, size: int, progress: Progress |
             problem = f"{size / 1e9:.1f} GB are needed"
             raise InputError(f"{part.parent}: {problem}: make room or choose another folder")
         with open(part, "ab") as file:
+            # The answer begins at `start`; older bytes from there on will come again.
             file.truncate(start)
             _copy_answer(url, response, file, start, size, progress)
-            # Before the file gets its final name.
+            # The bytes must be on the disk before the caller gives the file its final name;
+            # otherwise, a crash of the machine could leave a broken file of that name.
             os.fsync(file.fileno())
 
 
@@ -160,9 +167,9 @@ def _copy_answer(
 
 @contextlib.contextmanager
 def _network_errors(url: str) -> Iterator[None]:
-    """Turn errors in the block, which talks to a server, into an InputError.
+    """Raise an InputError in place of an error in the block, which talks to the server of `url`.
 
-    The server cannot be reached, or does not give the file.
+    One message is for an error that the server answers, another for a connection that fails.
     """
     try:
         yield
@@ -197,8 +204,8 @@ def _start_of_answer(url: str, response: HTTPResponse, present_bytes: int, size:
         problem = "the server's answer is not a file"
         raise InputError(f"{url}: {problem}: check the address in a browser")
 
-    # Without a length, the connection's end ends the file; its digest is checked later.
     start = 0
+    # An answer without a length is taken to have the right one; the file's digest is checked later.
     total_bytes = size if response.length is None else response.length
     if response.status == PARTIAL_CONTENT:
         # "bytes FIRST-LAST/TOTAL"
