@@ -51,10 +51,11 @@ CHUNK_PROPERTIES = [*POSITION_BOUNDS, *SCALE_BOUNDS, *COLOR_BOUNDS]
 
 
 def encode_compressed_ply(scene: SceneFile) -> bytes:
-    """Encode a scene as a compressed PLY; the axes and the header's comments are `save_ply`'s.
+    """Encode a scene as a compressed PLY, with axes and comments as in a file of `save_ply`.
 
-    Gaussians that come from the photo stay before those that fill holes. Within both groups,
-    neighbours in space become neighbours in the file, so that chunks are small.
+    The Gaussians are sorted, because the values of 256 consecutive ones (a chunk) are stored as
+    fractions between their bounds: neighbours in space become neighbours in the file. Gaussians
+    that come from the photo stay before those that fill holes.
 
     Raises:
         ValueError: a Gaussian is not finite.

@@ -134,8 +134,8 @@ def _encode_layers(
     """Pack layers of Gaussians by name for the page.
 
     Returns:
-        The packed bytes of each layer by file name; and the description of each layer, with the
-        logarithm of the scale for byte 0 (scaleLow) and its increase per step (scaleStep).
+        The packed bytes of each layer by file name; and the description of each layer. A byte b of
+        a scale in the file stands for the logarithm scaleLow + b · scaleStep.
     """
     files = {}
     descriptions: list[dict[str, object]] = []

@@ -302,6 +302,7 @@ def _encode_rotations(quats: Floats, component_bits: int) -> NDArray[np.uint32]:
     """
     xyzw = quats[:, [1, 2, 3, 0]]
     largest, others = encode_smallest_three(xyzw)  # [N], [N, 3]
+    # Sizes are multiples of this step, so that the lower of the nine bits are 0.
     step = 2 ** (9 - component_bits)
     code_per_component = np.float32(MAX_COMPONENT_CODE * 2**0.5 / step)
     rounded = np.round(np.abs(others) * code_per_component) * step

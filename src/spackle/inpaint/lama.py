@@ -32,6 +32,9 @@ from spackle.runtime.errors import InputError
 from spackle.weights import installed_weights
 from spackle.weights.checkpoints import check_finite, check_tensors, read_tensors
 
+# Raised whenever a change in this file makes it paint other pixels from the same input.
+PAINTING_VERSION = 1
+
 # The long side of the network's input in pixels, if none is given.
 DEFAULT_INPUT_SIDE_PX = 1024
 # Both sides of the input are multiples of this, because the network halves them three times.
@@ -74,7 +77,7 @@ class LamaInpainter:
             raise InputError(f"inpainter lama: {problem}")
         self.weight_files: Mapping[str, Path] = {"lama": path}
         self._network = load_network(path).to(self._device)
-        self.version = f"1, long side {self._input_side}"
+        self.version = f"{PAINTING_VERSION}, long side {self._input_side}"
 
     @torch.no_grad()
     def paint(self, rgb: Tensor, hole: Tensor, inverse_depth: Tensor) -> Tensor:
@@ -105,7 +108,9 @@ class LamaInpainter:
         return painted
 
     def _predict_colors(self, rgb: Tensor, hole: Tensor) -> Tensor:
-        """Return the network's colours of an image; the network gets a large image reduced.
+        """Return the colours that the network predicts for the pixels of an image.
+
+        A large image is reduced for the network, and its colours are enlarged again.
 
         Args:
             rgb: [h, w, 3] sRGB in 0..1.
@@ -126,6 +131,7 @@ class LamaInpainter:
         if is_reduced:
             small_size = (small_height, small_width)
             known_share = F.adaptive_avg_pool2d((~small_hole).to(small_rgb), small_size)
+            # A reduced pixel that contains any part of a hole is a hole, so that thin holes stay.
             small_hole = known_share < MIN_KNOWN_SHARE
             small_rgb = F.adaptive_avg_pool2d(small_rgb, small_size)
 
@@ -156,13 +162,14 @@ class HoleGroup(NamedTuple):
 def group_holes(hole: Tensor) -> list[HoleGroup]:
     """Find rectangles around groups of holes [H, W].
 
-    The network receives a larger rectangle, with known pixels around the holes. Two rectangles
-    are merged if they touch, or if the network then receives no more pixels than for both.
+    The network receives a larger rectangle, with known pixels around the holes. Two groups are
+    merged if their rectangles touch, or if the network receives no more pixels for the merged
+    group than for the two groups in turn.
     """
     height, width = hole.shape
 
     def input_crop(bounds: Crop) -> Crop:
-        # With a margin, and rounded outwards to sides that the network accepts.
+        # What the network receives: with a margin, and rounded to sides that the network accepts.
         return bounds.grown(MARGIN_PX, SIDE_MULTIPLE, height, width)
 
     def belong_together(one: Crop, other: Crop) -> bool:
@@ -174,9 +181,9 @@ def group_holes(hole: Tensor) -> list[HoleGroup]:
     block_maxima = F.max_pool2d(hole[None].float(), BLOCK_PX, ceil_mode=True)[0]
     hole_blocks = block_maxima.cpu().numpy() > 0
     groups: list[Crop] = []
-    for row, column in zip(*hole_blocks.nonzero(), strict=True):
-        top = BLOCK_PX * int(row)
-        left = BLOCK_PX * int(column)
+    for block_row, block_column in zip(*hole_blocks.nonzero(), strict=True):
+        top = BLOCK_PX * int(block_row)
+        left = BLOCK_PX * int(block_column)
         group = Crop(top, left, top + BLOCK_PX, left + BLOCK_PX)
 
         # A merged group is larger, so that it may have to be merged with a further one.
@@ -198,6 +205,7 @@ def pad_to_accepted_size(x: Tensor) -> Tensor:
         side = x.shape[axis]
         padded_side = max(MIN_SIDE_PX, math.ceil(side / SIDE_MULTIPLE) * SIDE_MULTIPLE)
         # Mirrored at its last and first pixel, the image repeats with this period: 0 1 2 1 0 1 …
+        # In the second half of a period, the pixels count backwards.
         period = max(2 * side - 2, 1)
         place_in_period = torch.arange(padded_side, device=x.device) % period
         source_index = torch.minimum(place_in_period, 2 * side - 2 - place_in_period)
@@ -206,9 +214,10 @@ def pad_to_accepted_size(x: Tensor) -> Tensor:
 
 
 def load_network(path: Path) -> LamaNetwork:
-    """Load the network, of any width and depth, without running code in the file.
+    """Load the network from a file, without running code in the file.
 
-    LaMa was trained beside a discriminator; the network that paints is called the generator.
+    The network's width and number of blocks follow from the file's tensors. LaMa was trained beside
+    a discriminator; the network that paints is called the generator.
 
     Args:
         path: a file of TorchScript, `torch.save` or safetensors. The names of its tensors may
@@ -230,7 +239,8 @@ def load_network(path: Path) -> LamaNetwork:
         if is_of_generator and not name.endswith(".num_batches_tracked"):
             tensors[name.removeprefix(prefix)] = tensor
 
-    # A weight without dimensions would be a broken one; its width 0 fits no shape.
+    # In a broken file, the weight may be a single number, which has no shape. The width 0 then
+    # makes `check_tensors` refuse the file.
     first_shape = tensors[FIRST_WEIGHT].shape
     width = first_shape[0] if first_shape else 0
     check_tensors(tensors, expected_shapes(width, count_blocks(tensors)), path, DOWNLOAD_ADVICE)

@@ -28,6 +28,8 @@ LOCAL_CHANNEL_DIVISOR = 4
 
 BATCH_NORM_EPSILON = 1e-5
 
+INPUT_CHANNELS = 4  # red, green, blue, and 1 in a hole
+
 # Side of the first and the last layer's kernel in pixels.
 LARGE_KERNEL = 7
 
@@ -37,7 +39,9 @@ FIRST_WEIGHT = "model.1.ffc.convl2l.weight"
 def expected_shapes(
     width: int = BIG_LAMA_WIDTH, block_count: int = BIG_LAMA_BLOCKS
 ) -> TensorShapes:
-    """Return the names and shapes of the published tensors, without counts of batches.
+    """Return the shapes of the published network's tensors by their names.
+
+    Counts of training batches, which a batch norm also has, are left out.
 
     Args:
         width: channels after the first layer.
@@ -50,7 +54,9 @@ def expected_shapes(
     global_ = deep - local
 
     # The names are those of the original code: l is local, g is global, l2g from local to global.
-    _add_convolution(shapes, "model.1.ffc.convl2l", (width, 4, LARGE_KERNEL, LARGE_KERNEL))
+    # A convolution's shape is (outputs, inputs, rows, columns).
+    first_shape = (width, INPUT_CHANNELS, LARGE_KERNEL, LARGE_KERNEL)
+    _add_convolution(shapes, "model.1.ffc.convl2l", first_shape)
     _add_batch_norm(shapes, "model.1.bn_l", width)
     for stage, channels in ((2, 2 * width), (3, 4 * width)):
         _add_convolution(shapes, f"model.{stage}.ffc.convl2l", (channels, channels // 2, 3, 3))
@@ -87,6 +93,7 @@ def _add_fourier_layer(shapes: TensorShapes, name: str, local: int, global_: int
         local, global_: how many channels are local and global.
     """
     spectral = f"{name}.ffc.convg2g"
+    # conv1 halves the channels before the Fourier transform, and conv2 restores them after it.
     half = global_ // 2
     _add_convolution(shapes, f"{name}.ffc.convl2l", (local, local, 3, 3))
     _add_batch_norm(shapes, f"{name}.bn_l", local)
@@ -95,7 +102,7 @@ def _add_fourier_layer(shapes: TensorShapes, name: str, local: int, global_: int
     _add_convolution(shapes, f"{name}.ffc.convg2l", (local, global_, 3, 3))
     _add_convolution(shapes, f"{spectral}.conv1.0", (half, global_, 1, 1))
     _add_batch_norm(shapes, f"{spectral}.conv1.1", half)
-    # The real and the imaginary parts of `half` channels.
+    # The spectrum of `half` channels has as many real and as many imaginary parts.
     _add_convolution(shapes, f"{spectral}.fu.conv_layer", (global_, global_, 1, 1))
     _add_batch_norm(shapes, f"{spectral}.fu.bn", global_)
     _add_convolution(shapes, f"{spectral}.conv2", (global_, half, 1, 1))
@@ -156,14 +163,18 @@ class LamaNetwork(nn.Module):
         block_count = count_blocks(tensors)
         self.first = _convolution(*_fold_batch_norm(tensors, "model.1.ffc.convl2l", "model.1.bn_l"))
 
-        # Three layers halve the sides. The last one makes the local and the global channels, which
-        # lie one behind the other.
-        local = _fold_batch_norm(tensors, "model.4.ffc.convl2l", "model.4.bn_l")
-        global_ = _fold_batch_norm(tensors, "model.4.ffc.convl2g", "model.4.bn_g")
+        # Three layers halve the sides. In the third one, one convolution makes the local channels
+        # and, after them, the global ones.
+        local_weight, local_bias = _fold_batch_norm(tensors, "model.4.ffc.convl2l", "model.4.bn_l")
+        global_weight, global_bias = _fold_batch_norm(
+            tensors, "model.4.ffc.convl2g", "model.4.bn_g"
+        )
+        third_weight = torch.cat([local_weight, global_weight])
+        third_bias = torch.cat([local_bias, global_bias])
         down = [
             _fold_batch_norm(tensors, "model.2.ffc.convl2l", "model.2.bn_l"),
             _fold_batch_norm(tensors, "model.3.ffc.convl2l", "model.3.bn_l"),
-            (torch.cat([local[0], global_[0]]), torch.cat([local[1], global_[1]])),
+            (third_weight, third_bias),
         ]
         self.down = nn.ModuleList(_convolution(weight, bias, stride=2) for weight, bias in down)
         self.layers = nn.ModuleList(
@@ -176,8 +187,9 @@ class LamaNetwork(nn.Module):
             )
             self.up.append(_transposed_convolution(weight, bias))
 
-        # Three output channels use a CPU's registers poorly: so the 7 rows of the last kernel
-        # become channels, which `logits` sums. Each of the 7 rows gets a seventh of the bias.
+        # Three output channels use a CPU's registers poorly. So the last 7×7 kernel is split into
+        # 7 rows, which make 3 channels each; `logits` shifts and sums them. Each row adds a seventh
+        # of the bias.
         last = f"model.{_last_stage(block_count)}"
         rows_first = tensors[f"{last}.weight"].permute(2, 0, 1, 3)  # [7, 3, width, 7]
         row_weight = rows_first.flatten(0, 1)[:, :, None]  # [21, width, 1, 7]
@@ -235,7 +247,8 @@ class FourierLayer(nn.Module):
         """
         super().__init__()
         spectral = f"{name}.ffc.convg2g"
-        # Both inputs of the local outputs have one batch norm, so one convolution computes them.
+        # The local outputs are batch_norm(conv(local) + conv(global)). One convolution over all
+        # channels computes the sum; the batch norm is folded into its weight and bias.
         local_scale, local_shift = _batch_norm_scale_and_shift(tensors, f"{name}.bn_l")
         from_local = tensors[f"{name}.ffc.convl2l.weight"]
         from_global = tensors[f"{name}.ffc.convg2l.weight"]
@@ -245,17 +258,19 @@ class FourierLayer(nn.Module):
             *_fold_batch_norm(tensors, f"{name}.ffc.convl2g", f"{name}.bn_g")
         )
 
-        # From the global to the global channels: linear, spectrum, linear.
+        # The global outputs are batch_norm(conv(local) + widen(x + filter(x))). Here x is
+        # relu(narrow(global)), with half the channels, and filter() acts on the spectrum of x.
         self.narrow = _linear(
             *_fold_batch_norm(tensors, f"{spectral}.conv1.0", f"{spectral}.conv1.1")
         )
         self.spectrum = _linear(
             *_fold_batch_norm(tensors, f"{spectral}.fu.conv_layer", f"{spectral}.fu.bn")
         )
-        # The shift of the batch norm is added once, by `local_to_global`.
+        # Of the batch norm, which is scale · (…) + shift, `local_to_global` adds the shift, which
+        # must be added only once.
         global_scale, _ = _batch_norm_scale_and_shift(tensors, f"{name}.bn_g")
         wide_weight = tensors[f"{spectral}.conv2.weight"]
-        self.widen = _linear(wide_weight * global_scale.view(-1, 1, 1, 1), None)
+        self.widen = _linear(wide_weight * global_scale.view(-1, 1, 1, 1), bias=None)
 
     def forward(self, x: Tensor) -> Tensor:
         """Map features [B, C, h, w] to the same shape.
@@ -269,20 +284,22 @@ class FourierLayer(nn.Module):
         padded_local = padded[:, :local_count].contiguous(memory_format=torch.channels_last)
         global_ = self.local_to_global(padded_local)
         del padded  # frees memory before the Fourier transform
-        # Views with channels last: the result is added in place to `global_`.
+        # The Fourier transform's layers take the channels last. permute() copies nothing, so the
+        # sum goes into the memory of `global_`.
         global_input = x[:, local_count:].permute(0, 2, 3, 1)
         global_.permute(0, 2, 3, 1).add_(self._filter_spectrum(global_input))
         return torch.cat([local, global_], 1).relu_()
 
     def _filter_spectrum(self, x: Tensor) -> Tensor:
-        """Map [B, h, w, D] to the same shape by a linear layer on the two-dimensional spectrum.
+        """Map features to the same shape by a linear layer on their two-dimensional spectrum.
 
-        Real and imaginary parts of the spectrum alternate in memory, in the channel order of the
-        published tensors.
+        Args:
+            x: [B, h, w, D] global features, D channels.
         """
         x = self.narrow(x).relu_()  # [B, h, w, D / 2]
         spectrum = torch.fft.rfft2(x, dim=(1, 2), norm="ortho")
-        # The real part of a channel, and then its imaginary part, become two channels.
+        # The linear layer takes the real part of the first channel, its imaginary part, the real
+        # part of the second channel, and so on.
         parts = torch.view_as_real(spectrum.contiguous()).flatten(-2)  # [B, h, w / 2 + 1, D]
         parts = self.spectrum(parts).relu_().unflatten(-1, (-1, 2))
         filtered_spectrum = torch.view_as_complex(parts)
@@ -302,6 +319,9 @@ def _fold_batch_norm(
     tensors: Tensors, convolution: str, norm: str, *, is_transposed: bool = False
 ) -> tuple[Tensor, Tensor]:
     """Return weight and bias of a convolution that also does what the batch norm after it does.
+
+    The batch norm computes scale · x + shift, so that weight and bias are multiplied by the scale,
+    and the shift is added to the bias.
 
     Args:
         tensors: the network's tensors.
@@ -332,6 +352,8 @@ def _convolution(weight: Tensor, bias: Tensor, *, stride: int = 1) -> nn.Conv2d:
 def _transposed_convolution(weight: Tensor, bias: Tensor) -> nn.ConvTranspose2d:
     """Return a convolution that doubles the sides, with weight [in, out, h, w] and bias [out]."""
     in_channels, out_channels, height, width = weight.shape
+    # With these paddings, a 3×3 kernel exactly doubles the sides. On the meta device, no memory is
+    # taken before the weight is set.
     convolution = nn.ConvTranspose2d(
         in_channels,
         out_channels,
@@ -349,7 +371,8 @@ def _transposed_convolution(weight: Tensor, bias: Tensor) -> nn.ConvTranspose2d:
 def _linear(weight: Tensor, bias: Tensor | None) -> nn.Linear:
     """Return a 1×1 convolution, with weight [out, in, 1, 1], for features with channels last."""
     out_channels, in_channels = weight.shape[:2]
-    linear = nn.Linear(in_channels, out_channels, bias is not None, device="meta")
+    # On the meta device, no memory is taken before the weight is set.
+    linear = nn.Linear(in_channels, out_channels, bias=bias is not None, device="meta")
     linear.weight = nn.Parameter(weight.flatten(1).contiguous())
     if bias is not None:
         linear.bias = nn.Parameter(bias)

@@ -117,7 +117,7 @@ class OpenCV:
             radius_px: how far the method looks for known colours.
 
         Returns:
-            [H, W, 3] sRGB in 0..1, with 8 bits a channel.
+            [H, W, 3] sRGB in 0..1, in steps of 1/255, because OpenCV takes and gives bytes.
         """
         pixels = _to_bytes_on_cpu(rgb).numpy()
         mask_pixels = mask.to(torch.uint8).numpy()
@@ -139,7 +139,8 @@ class OpenCV:
             return torch.zeros(height, width, 2, device=picture.device)
         grey_picture = self._to_grey(picture)
         grey_other = self._to_grey(other)
-        flow = self._flow.calc(grey_picture, grey_other, None)
+        no_first_guess = None
+        flow = self._flow.calc(grey_picture, grey_other, no_first_guess)
         return torch.from_numpy(flow).to(picture.device)
 
     def _to_grey(self, rgb: Tensor) -> Any:

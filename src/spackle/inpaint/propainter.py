@@ -29,6 +29,9 @@ NETWORK_NAMES = ("raft_things", "propainter_rfc", "propainter")
 WEIGHTS_URL = "https://github.com/osmr/imgclsmob/releases/tag/v0.0.570"
 INSTALL_COMMAND = "pip install 'spackle-nvs[propainter]'"
 
+# Raised whenever a change in this file makes it paint other pixels from the same input.
+PAINTING_VERSION = 1
+
 # The long side of the networks' input in pixels, if none is given; the training had 432×240.
 DEFAULT_INPUT_SIDE_PX = 640
 # Both sides of the input are multiples of this.
@@ -66,7 +69,8 @@ class PropainterInpainter:
         self.weight_files: Mapping[str, Path] = find_weight_files(options.weights)
         self._networks = [_load_network(name, file) for name, file in self.weight_files.items()]
         self._device = pick_device(options.device)
-        self.version = f"1, pytorchcv {pytorchcv.__version__}, long side {self._input_side}"
+        package = f"pytorchcv {pytorchcv.__version__}"
+        self.version = f"{PAINTING_VERSION}, {package}, long side {self._input_side}"
 
     @torch.no_grad()
     def paint(self, rgb: Tensor, hole: Tensor, inverse_depth: Tensor) -> Tensor:
@@ -117,9 +121,9 @@ class PropainterInpainter:
         from pytorchcv.models.propainter_stream import ProPainterIterator, TensorSequencer
 
         count, _, height, width = frames.shape
-        # A video needs two frames.
+        # The networks take videos of at least two frames, so a single frame is repeated.
         frame_order = [0, 0] if count == 1 else list(range(count))
-        # Left, right, top, bottom.
+        # Left, right, top, bottom: the networks accept only some sides.
         margins = (0, padded_side(width) - width, 0, padded_side(height) - height)
         frames = F.pad(frames[frame_order].to(self._device), margins, mode="replicate")
         holes = F.pad(holes[frame_order].to(self._device), margins, mode="replicate")
@@ -165,6 +169,7 @@ def _load_network(name: str, file: Path) -> nn.Module:
 
     network: nn.Module
     if name == "raft_things":
+        # The frames that the network gets are in -1..1 already, so it need not normalise them.
         network = raft_things(in_normalize=False, iters=FLOW_ITERATIONS)
     elif name == "propainter_rfc":
         network = propainter_rfc()
@@ -179,7 +184,7 @@ def _load_network(name: str, file: Path) -> nn.Module:
 
 
 def find_weight_files(folder: Path | None) -> dict[str, Path]:
-    """Find the weights of each network: NAME.pth, NAME-….pth, or .safetensors.
+    """Find each network's file of weights: NAME or NAME-…, with the suffix .pth or .safetensors.
 
     Args:
         folder: the folder that the user gave, if any.

@@ -261,13 +261,15 @@ class StreamEncoder:
             self._palette = PaletteFilter(width, height, 1 / rate)
 
     def _set_stream_size(self, width: int, height: int) -> None:
-        """Set the stream's size in pixels and its pixel format; yuv420p needs even sides."""
+        """Set the stream's pixel format, its size in pixels, and for yuv420p its kind of colours."""
         self.stream.pix_fmt = self._format.pixel_format
         self.stream.width = width
         self.stream.height = height
         if self._format.pixel_format == "yuv420p":
+            # Each 2×2 pixels share a colour, so both sides must be even.
             self.stream.width = width + width % 2
             self.stream.height = height + height % 2
+            # The file names its colours, because players would have to guess them otherwise.
             context = self.stream.codec_context
             context.color_range = LIMITED_RANGE
             context.colorspace = BT709

@@ -99,7 +99,7 @@ def default_ipd(camera: Camera, depth_range: DepthRange) -> float:
 
     Args:
         camera: the photo's camera.
-        depth_range: the scene's depths, of which `near` counts.
+        depth_range: the scene's depths, of which only the nearest one, `near`, is used.
 
     Returns:
         The distance in the scene's unit.

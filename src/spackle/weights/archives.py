@@ -189,8 +189,9 @@ class _InertUnpickler(pickle._Unpickler):
         A storage holds the numbers of one or several tensors.
 
         Args:
-            pid: five values, of which the second is the class of the storage, the third the name
-                of a file in the archive, and the fifth how many numbers there are.
+            pid: what the pickle says about the storage: five values, of which the second is the
+                storage's class, the third the name of a file in the archive, and the fifth how many
+                numbers the file has.
 
         Returns:
             A tensor mapped from the disk; None for a type that is not in STORAGE_DTYPES.
