@@ -155,12 +155,15 @@ def remove_run(output: Path) -> None:
 
 
 def open_logs(folder: Path, first_step: int, log: Log) -> AbstractContextManager[Any]:
-    """TensorBoard's writer, as a context that closes it.
+    """A context that yields TensorBoard's writer and closes it; it yields None without TensorBoard.
 
-    Without TensorBoard a context of None, and a line to `log`.
+    A resumed run repeats the steps after its checkpoint. Values that the logs already have for
+    these steps, from `first_step` on, are hidden.
 
-    A resumed run repeats the steps after its checkpoint: values that the logs have for these steps,
-    from `first_step` on, are hidden.
+    Args:
+        folder: the folder of the run.
+        first_step: the number of the first step that will be logged.
+        log: receives a line if there is no TensorBoard.
     """
     try:
         # If this package is missing, torch's import raises another error than ImportError.

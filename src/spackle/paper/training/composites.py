@@ -50,7 +50,14 @@ def draw_composite(
     rgb, inverse_depth = compose_cutouts(rng, draw_photo, height, width)
     focal_px = focal_mm_to_px(rng.uniform(*FOCAL_MM_RANGE), width, height)
     all_known = torch.ones_like(inverse_depth, dtype=torch.bool)
-    depth = DepthMap(1.0 / inverse_depth, all_known, None, None, "depth", Path("composite"))
+    depth = DepthMap(
+        depth=1.0 / inverse_depth,
+        valid=all_known,
+        K=None,
+        quantum=None,
+        quantity="depth",
+        path=Path("composite"),
+    )
     return rgb, depth, Camera.from_focal(focal_px, width, height)
 
 
@@ -134,11 +141,14 @@ def random_background(rng: np.random.Generator, height: int, width: int) -> Tens
         ground = slope * (rows - horizon)[:, None].clamp_min(0)  # [H, 1]
         plane = torch.maximum(plane, ground.expand(height, width))
 
-    # Where the second wall is nearer, it hides the first: the two meet in a corner.
+    # A second wall may be turned much more. Where it is nearer, it hides the first one, so that the
+    # two meet in a corner.
     has_second_wall = rng.random() < 0.3
     if has_second_wall:
-        plane = torch.maximum(plane, far * (1 + random_ramp(rng, height, width, 1.0)))
-    # A strong tilt must lead neither behind the camera nor to infinity.
+        second_wall = far * (1 + random_ramp(rng, height, width, 1.0))
+        plane = torch.maximum(plane, second_wall)
+    # A turned wall has inverse depths near 0, which would lie very far away: twice the depth of
+    # the first wall is the limit.
     return plane.clamp(0.5 * far, 1 / MIN_DEPTH_M)
 
 
@@ -147,6 +157,7 @@ def random_ramp(rng: np.random.Generator, height: int, width: int, max_value: fl
     y, x = torch.meshgrid(
         torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij"
     )
+    # Both slopes add up in a corner, so each gets half of the greatest value.
     x_slope = rng.uniform(-max_value, max_value) / 2
     y_slope = rng.uniform(-max_value, max_value) / 2
     return x_slope * x + y_slope * y

@@ -89,17 +89,22 @@ class TunableSharp:
     def gaussians(
         self, decoder: nn.Module, encoded: DecoderInput, target_device: torch.device | str = "cpu"
     ) -> Gaussians:
-        """Gaussians in SHARP's normalised space, on `target_device`; gradients reach `decoder`.
+        """The photo's Gaussians, in SHARP's normalised space; gradients reach `decoder`.
 
-        The normalised space is stretched, so that every photo has the same field of view; see
-        `normalised_camera`. `encoded` comes from `encode`.
+        The normalised space is stretched, so that every photo has the same field of view.
+
+        Args:
+            decoder: SHARP's decoder, or a wrapper that distributes it over processes.
+            encoded: what `encode` has returned for the photo.
+            target_device: where the Gaussians are needed.
         """
         device = encoded.image_and_disparity.device
         autocast = torch.autocast(
             device.type, self.precision, enabled=self.precision != torch.float32
         )
         with without_autocast_or_tf32(device):
-            # Low precision is enough for the decoder's deltas, but would shift the Gaussians.
+            # The decoder gives deltas, changes of the initial Gaussians. Low precision is enough
+            # for them, but would shift the Gaussians, so that only the decoder runs in it.
             with autocast:
                 deltas = decoder(encoded.image_and_disparity, encoded.encoder_maps)
             return apply_deltas(encoded.initial, deltas).to(target_device)
@@ -215,7 +220,7 @@ class DirectFt(ViewTask):
         path = checkpoint or installed_weights("sharp")
         if path is None:
             raise InputError(f"`method` direct-ft: {MISSING_WEIGHTS_ADVICE['sharp']}")
-        # Refuses files of other kinds; the numbers themselves are not read yet.
+        # This only refuses files that are no checkpoint; `prepare` loads the network.
         read_tensors(path, "give SHARP's checkpoint")
         if source_checkpoint_of(path) is not None:
             raise InputError(

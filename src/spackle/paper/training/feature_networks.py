@@ -204,7 +204,8 @@ def load_features(
     else:
         network = SqueezeNet()
         tensors = read_caffe_arrays(path, advice)
-    tensors = {key: value for key, value in tensors.items() if not key.startswith(network.head)}
+    # The classifier at the end of the network, its head, is not needed.
+    tensors = {name: value for name, value in tensors.items() if not name.startswith(network.head)}
     return load_strict(network, tensors, path, advice).to(device)
 
 
@@ -224,8 +225,9 @@ def read_caffe_arrays(path: Path, advice: str) -> dict[str, Tensor]:
         np.load(file, allow_pickle=False) as arrays,
     ):
         for caffe_name in arrays.files:
-            layer = caffe_name[:-1].replace("/", ".")  # with the dot before the suffix
-            torch_name = layer + suffixes[caffe_name[-1]]
+            # "fire2/conv1x1_1.w" is "fire2.conv1x1_1." and the suffix "w".
+            layer_and_dot = caffe_name[:-1].replace("/", ".")
+            torch_name = layer_and_dot + suffixes[caffe_name[-1]]
             tensors[torch_name] = torch.from_numpy(arrays[caffe_name])
     return tensors
 

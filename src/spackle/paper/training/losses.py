@@ -115,7 +115,9 @@ def total_loss(
     recipe: LossRecipe,
     features: FeatureNet | None = None,
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """The weighted sum [] of eq. 12, and the unweighted, detached terms [] by name.
+    """The loss, a weighted sum of terms, and the terms by name, without weights and gradients.
+
+    All of them are scalar tensors, of shape []. This is eq. 12 of the paper.
 
     Args:
         rgb: completed views [B, H, W, 3], sRGB 0..1.

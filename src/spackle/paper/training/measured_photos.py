@@ -79,19 +79,21 @@ def draw_left_photo(
 
 
 def load_frame(color_file: Path, unit_m: float) -> tuple[Tensor, DepthMap]:
-    """Read a frame of a depth camera: the photo [H, W, 3] sRGB, and its depth.
+    """Read a frame of a depth camera: the photo [H, W, 3] sRGB, and its depth in metres.
 
-    The files are NAME.color.jpg and NAME.depth.png.
+    Args:
+        color_file: the photo NAME.color.jpg; its depth is in NAME.depth.png beside it.
+        unit_m: one unit of the depth file in metres; 0 and 65535 mean unknown depth.
 
-    `unit_m` is one unit of the depth file in metres; 0 and 65535 mean unknown depth. InputError if
-    a file is missing or broken, or the two differ in size.
+    Raises:
+        InputError: a file is missing or broken, or the two differ in the ratio of their sides.
     """
     rgb = load_photo(color_file).rgb
     # The names of a frame's files differ by one word and the suffix.
     depth_name = color_file.name.replace(".color.", ".depth.")
     depth = load_depth(color_file.with_name(depth_name).with_suffix(".png"))
     depth.check_aspect_ratio(rgb.shape[0], rgb.shape[1], color_file)
-    # Files of other cameras have other units.
+    # `load_depth` has taken one unit of the file for a millimetre; this camera's unit may differ.
     depth_m = depth.depth * (unit_m / LOADED_UNIT_M)
     return rgb, dataclasses.replace(depth, depth=depth_m)
 

@@ -62,8 +62,8 @@ class ViewBatch:
     def of(images: Iterable[tuple[Rendering, Tensor, Tensor, Tensor]]) -> ViewBatch:
         """Stack images of B views, on the device of the completed views.
 
-        For each view: the completed view, sRGB [H, W, 3] of the base, target [H, W, 3], and hole
-        [H, W].
+        `images` has four things for each view, in this order: the rendering of the completed view,
+        sRGB [H, W, 3] of the base alone, the target [H, W, 3], and the hole [H, W] bool.
         """
         views = list(images)
         device = views[0][0].rgb.device
@@ -97,6 +97,7 @@ class ViewTask(Task):
         self.device = device
         self.renderer = get_renderer()
         self.precision = pick_dtype(recipe.optim.precision, device)
+        # A perceptual loss of weight 0 needs no network.
         feature_network = recipe.loss.features if recipe.loss.perceptual else "none"
         self.features = load_features(feature_network, recipe.loss.features_file, device)
 
@@ -146,14 +147,17 @@ class ViewTask(Task):
 
     @torch.no_grad()
     def draw_picture(self, network: nn.Module) -> Tensor:
-        """[H, W, 3] sRGB, one row for each of a few validation items: base, completed view,
-        target.
+        """A picture [H, W, 3] sRGB with a row for each of a few validation items.
+
+        A row shows the view of the base alone, the completed view and the target.
         """
-        step = max(1, self.validation_items // MAX_PICTURED_ITEMS)
-        items = range(0, self.validation_items, step)[:MAX_PICTURED_ITEMS]
+        # Evenly spaced items, because neighbours are often views of one photo.
+        spacing = max(1, self.validation_items // MAX_PICTURED_ITEMS)
+        items = range(0, self.validation_items, spacing)[:MAX_PICTURED_ITEMS]
         rows = []
         for item in items:
-            views = self.complete(network, self.load_batch(None, [item]))
+            batch = self.load_batch(step=None, items=[item])  # None: a validation item
+            views = self.complete(network, batch)
             # A batch may hold all views of a photo; one of them is enough.
             rows.append((views.base_rgb[-1], views.rgb[-1], views.target[-1]))
         return contact_sheet(rows, PICTURE_SIDE_PX)
@@ -178,8 +182,9 @@ def complete_samples(
     """
     device = renderer.device
 
-    # Masks are read before the samples move to the renderer's device: reading them later would wait
-    # for a GPU.
+    # The cells that get a new Gaussian, and the renderer's tiles that these can touch. They are
+    # read before the samples move to the renderer's device: reading them later would wait for a
+    # GPU.
     cells = [
         sample.view.cells(MIN_AUX_GAUSSIANS).flatten().nonzero()[:, 0].to(device, non_blocking=True)
         for sample in samples
@@ -190,10 +195,10 @@ def complete_samples(
     features = torch.cat([sample.network_input(inputs) for sample in samples])
     features = features.to(next(network.parameters()).device)
     with torch.autocast(features.device.type, precision, enabled=precision != torch.float32):
-        deltas = network(features.contiguous(memory_format=torch.channels_last))  # [B, 14, h, w]
-    deltas = deltas.float().to(device)
+        deltas = network(features.contiguous(memory_format=torch.channels_last))
+    deltas = deltas.float().to(device)  # [B, 14, h, w]: 14 parameters of each cell's Gaussian
 
-    # A scene are the base's Gaussians and the new ones of a sample.
+    # The scene of a sample is its base and the Gaussians that fill its hole.
     samples = [sample.to(device) for sample in samples]
     scenes = []
     for sample, sample_deltas, index in zip(samples, deltas, cells, strict=True):
@@ -214,17 +219,18 @@ def complete_samples(
 
 
 def first_network(name: str, init: Path | None = None) -> ResidualNet:
-    """The initial network of a run: untrained, or read from the file `init`.
+    """The network with which a run begins: untrained, or read from the file `init`.
 
-    The file holds weights of the same network. For "sharp-decoder", SHARP's checkpoint is also
-    accepted: the decoder is read, stem and heads stay untrained.
+    The file holds weights of the network `name`. For "sharp-decoder", SHARP's checkpoint is also
+    accepted: the decoder is read, while the layers before and after it stay untrained.
 
     Raises:
         InputError: the file is missing, broken or of another network.
     """
     if init is None:
         return open_residual(name)
-    network_class(name)  # imports a network of another package, so that its weights are accepted
+    # `load_residual` accepts weights of another package's network only if this is imported already.
+    network_class(name)
     if name == SharpDecoder.name:
         tensors = read_tensors(init, "give init=FILE")
         if SHARP_TENSOR in tensors:
@@ -240,9 +246,16 @@ def first_network(name: str, init: Path | None = None) -> ResidualNet:
 
 
 def _with_sharps_decoder(tensors: Mapping[str, Tensor], path: Path) -> SharpDecoder:
-    """The paper's network with the decoder of SHARP's checkpoint `tensors` and an untrained stem.
+    """The residual network "sharp-decoder", whose decoder has the weights of SHARP's decoder.
 
-    InputError, which names the file `path`, if the decoder's tensors are not as they should be.
+    The layers before and after it are untrained.
+
+    Args:
+        tensors: of SHARP's checkpoint.
+        path: the checkpoint's file, for messages.
+
+    Raises:
+        InputError: the decoder's tensors are not as they should be.
     """
     network = SharpDecoder.untrained_for(tensors)
     decoder = {
@@ -263,7 +276,8 @@ class ResidualTask(ViewTask):
     def __init__(self, recipe: Recipe, device: torch.device) -> None:
         """Find the files of a recipe, without making samples; InputError if they cannot be used."""
         super().__init__(recipe, device)
-        # The seed of the run decides about the initial weights, whatever was drawn before.
+        # The run's seed alone decides about the initial weights. Random numbers of the caller go on
+        # afterwards as if nothing had been drawn here.
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(recipe.run.seed)
             self.network = first_network(recipe.network, recipe.init).requires_grad_()
@@ -273,8 +287,9 @@ class ResidualTask(ViewTask):
         self.items_per_step = recipe.optim.batch
 
     def prepare(self, output: Path, reporter: Reporter) -> dict[str, Any]:
-        """Make the missing samples; returns their numbers and the range of reachable PSNR, for
-        run.json.
+        """Make the samples that do not exist yet; returns facts about all samples for run.json.
+
+        The facts are their numbers, and the PSNR of an untrained and of an ideal network.
         """
         data = self.recipe.data
         folder = data.cache or output / CACHE
@@ -286,25 +301,25 @@ class ResidualTask(ViewTask):
             """Report why a view is missing; the cache keeps each reason from being repeated."""
             reporter.log(f"skipped: {reason}")
 
-        # Training and validation use different seeds, and different photos of a dataset.
+        # Training has even seeds and validation odd ones, so that no view is in both.
         with reporter.stage("samples") as progress:
             self.validation_files = make_samples(
-                data,
-                self.validation_sources,
-                folder / self.digest / "validation",
-                2 * data.seed + 1,
-                data.validation_views,
-                progress,
-                log_once,
+                data=data,
+                sources=self.validation_sources,
+                folder=folder / self.digest / "validation",
+                seed=2 * data.seed + 1,
+                views=data.validation_views,
+                progress=progress,
+                warn=log_once,
             )
             self.training_files = make_samples(
-                data,
-                self.training_sources,
-                folder / self.digest / "train",
-                2 * data.seed,
-                data.views,
-                progress,
-                log_once,
+                data=data,
+                sources=self.training_sources,
+                folder=folder / self.digest / "train",
+                seed=2 * data.seed,
+                views=data.views,
+                progress=progress,
+                warn=log_once,
             )
         self.items = len(self.training_files)
         self.validation_items = len(self.validation_files)
@@ -315,24 +330,26 @@ class ResidualTask(ViewTask):
                 "validation": self.validation_items,
                 "digest": self.digest,
             },
-            # Only the process of rank 0 writes run.json.
+            # Only the process of rank 0 writes run.json, so the others need not measure.
             "hole_psnr": self.reachable_psnr() if rank() == 0 else {},
         }
 
     @torch.no_grad()
     def reachable_psnr(self) -> dict[str, float]:
-        """Mean PSNR in dB in the holes of the validation samples, untrained and at best.
+        """Mean PSNR in dB in the holes of the validation samples, before training and at best.
 
-        "untrained" is the PSNR of the initial Gaussians, the first guess that a network changes.
-        For "colours of the targets" they have the targets' colours. A run can raise PSNR only from
-        the first value towards the second.
+        "untrained": the holes show the initial Gaussians, the first guess that a network changes.
+        "colours of the targets": the initial Gaussians have the colours that the targets show. A
+        run can raise PSNR only from the first value towards the second.
         """
+        # An untrained network changes nothing. Its random weights must not use up random numbers
+        # of the run.
         with torch.random.fork_rng(devices=[]):
             network = open_residual(self.recipe.network).to(self.renderer.device)
         untrained: list[float] = []
         with_target_colors: list[float] = []
         for item in range(self.validation_items):
-            (sample,) = self.load_batch(None, [item])
+            (sample,) = self.load_batch(step=None, items=[item])  # None: a validation item
             untrained.append(self._sample_psnr(network, sample))
             with_target_colors.append(self._sample_psnr(network, _with_target_colors(sample)))
         return {
@@ -350,8 +367,8 @@ class ResidualTask(ViewTask):
         files = self.validation_files if step is None else self.training_files
         samples = [load_sample(files[item]) for item in items]
 
-        # Samples keep these. They are computed here, in the thread that reads ahead, so that the
-        # training loop does not wait for them.
+        # Each sample computes its network input and its tiles once, and keeps them. This is done
+        # here, in the thread that reads ahead, so that the training loop does not wait for it.
         for sample in samples:
             sample.network_input(self.network.inputs)
             _ = sample.tiles

@@ -26,14 +26,21 @@ class Source(NamedTuple):
     share: float  # weight among all sources
     # Makes a view by its number; InputError for an unusable file.
     view: Callable[[np.random.Generator, int], Sample]
-    names: Sequence[str]  # the names of the source and of its files, relative to their folder
+    # What identifies its views: the source's name, and its files' names relative to their folder.
+    names: Sequence[str]
     views: int | None = None  # number of views, numbered from 0; None: any number, drawn at random
 
 
 def digest_of_samples(data: DataRecipe, sources: Sequence[Source]) -> str:
-    """Twelve digits that identify the content of samples, whatever their number and paths."""
+    """Twelve digits that identify the samples that a recipe gives.
+
+    Settings that determine a sample's content count, and so do the names of the sources' files.
+    Where the files lie and how many samples there are does not count, so that a run with moved
+    files or more samples uses the samples that exist already.
+    """
     paths_and_numbers = ("photos", "stereo", "pseudo", "cache", "views", "validation_views")
     excluded: dict[str, Any] = dict.fromkeys(paths_and_numbers, True)
+    # Pydantic's way to say: of all elements of `rgbd`, the depth cameras, leave out the folder.
     excluded["rgbd"] = {"__all__": {"folder"}}
     settings = data.model_dump(mode="json", exclude=excluded)
     names = [name for source in sources for name in source.names]
@@ -73,6 +80,7 @@ def make_samples(
         InputError: a file cannot be written, or no view gave a sample.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    # A single limited source must not begin again: its views would be there twice.
     if len(sources) == 1 and sources[0].views is not None:
         views = min(views, sources[0].views)
     planned_views = _plan_views(sources, seed, views)
@@ -81,7 +89,8 @@ def make_samples(
     first = views * rank() // rank_count()
     stop = views * (rank() + 1) // rank_count()
     for index in range(first, stop):
-        if _crop_files(folder, index) is None:
+        is_complete = _crop_files(folder, index) is not None
+        if not is_complete:
             crops: list[Sample] = []
             try:
                 crops = _make_crops(data, planned_views[index], seed, index, sources)
@@ -112,8 +121,9 @@ class _PlannedView(NamedTuple):
 
 
 def _plan_views(sources: Sequence[Source], seed: int, views: int) -> list[_PlannedView]:
-    """The sources of the first `views` views, drawn by their shares; each source counts its own
-    views from 0.
+    """Draw the sources of the first `views` views; returns each view's source and number there.
+
+    A source is drawn with a probability equal to its share, and numbers its own views from 0.
     """
     counts = [0] * len(sources)
     planned = []
@@ -136,14 +146,15 @@ def _draw_source(
 def _make_crops(
     data: DataRecipe, planned: _PlannedView, seed: int, index: int, sources: Sequence[Source]
 ) -> list[Sample]:
-    """The crops of one view; a source with a limited number of views begins again after the
-    last.
-    """
+    """The crops of the view `index`, of which `planned` says the source and its number there."""
+    # The draw of the source is repeated for the random generator that comes with it.
     _, rng = _draw_source(sources, seed, index)
     source = sources[planned.source_index]
-    number = planned.number if source.views is None else planned.number % source.views
+    number = planned.number
+    if source.views is not None:
+        number %= source.views  # a limited source begins again after its last view
     view = source.view(rng, number)
-    return random_crops(view, rng, data.crops, data.cells)
+    return random_crops(view, rng, count=data.crops, cells=data.cells)
 
 
 def _crop_file(folder: Path, index: int, number: int) -> Path:

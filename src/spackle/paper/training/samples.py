@@ -122,7 +122,7 @@ class Sample:
             target: [H, W, 3] sRGB, what the completed view should look like.
         """
         rendering = rendering.detach()
-        view = SceneViewCompletion(rendering, camera, photo_camera, lambda: photo)
+        view = SceneViewCompletion(rendering, camera, photo_camera, render_photo=lambda: photo)
         surroundings = HoleSurroundings(
             rim_rgb=view.far_rim.rgb,
             mirrored_rgb=view.far_rim.mirrored,
@@ -132,14 +132,22 @@ class Sample:
             beyond_photo=view.beyond_photo,
             photo_rgb=view.photo_colors,
         )
-        return Sample(camera, base.detach(), rendering, view.initial, surroundings, target)
+        return Sample(
+            camera=camera,
+            base=base.detach(),
+            rendering=rendering,
+            initial=view.initial,
+            surroundings=surroundings,
+            target=target,
+        )
 
     @functools.cached_property
     def view(self) -> SceneViewCompletion:
         """The completion of the view from the stored parts; only the features must be computed, on
         the CPU.
         """
-        # The photo's camera is not stored: whatever depends on it is.
+        # The camera of the photo is not stored, so the view's own camera takes its place. It is
+        # never used, because every part that depends on it is stored, and set below.
         view = SceneViewCompletion(self.rendering, self.camera, photo_camera=self.camera)
         view.initial = self.initial
         view.far_rim = FarRim(
@@ -197,7 +205,10 @@ class Sample:
         )
 
     def crop(self, row: int, column: int, height: int, width: int) -> Sample:
-        """Cut out height × width cells of 2×2 pixels, from the upper left cell (row, column)."""
+        """Cut out height × width cells of 2×2 pixels, from the upper left cell (row, column).
+
+        Of the base's Gaussians only those stay that can be seen in the crop.
+        """
         top = CELL * row
         left = CELL * column
         pixels = (slice(top, top + CELL * height), slice(left, left + CELL * width))
@@ -223,11 +234,13 @@ class Sample:
         return crop._with_visible_base()
 
     def _with_visible_base(self) -> Sample:
-        """The sample with only the base Gaussians that contribute most to `tiles`: at most 1.35 for
-        each pixel.
+        """The sample with only the base Gaussians that contribute most to the picture.
+
+        At most 1.35 for each pixel are kept. Only `tiles` count, the renderer's tiles that
+        Gaussians in the hole can touch, because training renders nothing else.
         """
-        # A Gaussian's contribution to the picture is the gradient of the picture's sum by the
-        # Gaussian's colour.
+        # A Gaussian's contribution is the gradient of the picture's sum by the Gaussian's colour.
+        # It does not depend on the colours, so that all are the same grey.
         with torch.enable_grad():
             grey = torch.full_like(self.base.colors, 0.5).requires_grad_()
             scene = dataclasses.replace(self.base, colors=grey)
@@ -235,9 +248,9 @@ class Sample:
             (color_gradient,) = torch.autograd.grad(rendering.rgb.sum(), grey)
         contribution = color_gradient[:, 0]  # [N]
 
-        most = int(MAX_GAUSSIANS_PER_PIXEL * self.camera.width * self.camera.height)
+        max_count = int(MAX_GAUSSIANS_PER_PIXEL * self.camera.width * self.camera.height)
         is_kept = torch.zeros(len(grey), dtype=torch.bool)
-        is_kept[contribution.topk(min(len(grey), most)).indices] = True
+        is_kept[contribution.topk(min(len(grey), max_count)).indices] = True
         return dataclasses.replace(self, base=self.base.select(is_kept & (contribution > 0)))
 
 
@@ -277,21 +290,24 @@ def save_sample(sample: Sample, path: Path) -> None:
         "camera.world_to_camera": sample.camera.world_to_camera,
         "camera.size": torch.tensor([sample.camera.width, sample.camera.height]),
         "target": sample.target,
+        # "seeds" is the format's name for the initial Gaussians.
         "seeds.unit": torch.tensor(sample.initial.unit, dtype=torch.float64),
     }
-    for file_name, field in FIELDS_BY_FILE_NAME.items():
+    for name_in_file, field in FIELDS_BY_FILE_NAME.items():
         part, _, name = field.partition(".")  # such as "base", "means"
-        tensors[file_name] = getattr(getattr(sample, part), name)
+        tensors[name_in_file] = getattr(getattr(sample, part), name)
 
-    # sRGB spends its 8 bits where the eye sees them.
+    # Colours of Gaussians are linear. As sRGB, eight bits have the finest steps in the dark, where
+    # the eye sees small differences.
     tensors["base.colors"] = linear_to_srgb(sample.base.colors)
     for name in EIGHT_BIT_TENSORS:
         tensors[name] = to_uint8(tensors[name])
 
-    # Quaternions need no unit length: the largest component becomes 127, the greatest int8.
+    # A quaternion of any length describes the same rotation, so its largest component becomes 127,
+    # the greatest number in int8.
     quats = sample.base.quats
-    largest = quats.abs().amax(-1, keepdim=True)
-    tensors["base.quats"] = (127 * quats / largest).round().to(torch.int8)
+    largest_component = quats.abs().amax(-1, keepdim=True)
+    tensors["base.quats"] = (127 * quats / largest_component).round().to(torch.int8)
 
     # Half precision is enough for everything that is not a position, a camera or an opacity.
     for name, tensor in tensors.items():
@@ -313,15 +329,18 @@ def load_sample(path: str | os.PathLike[str]) -> Sample:
 
         # The tensors by the sample's parts ("base", "rendering", …) and their fields.
         fields: dict[str, dict[str, Tensor]] = {}
-        for file_name, field in FIELDS_BY_FILE_NAME.items():
+        for name_in_file, field in FIELDS_BY_FILE_NAME.items():
             part, _, name = field.partition(".")
-            fields.setdefault(part, {})[name] = tensors[file_name]
+            fields.setdefault(part, {})[name] = tensors[name_in_file]
         return Sample(
             camera=camera,
             base=Gaussians(**fields["base"]),
             rendering=Rendering(**fields["rendering"]),
             initial=InitialGaussians(
-                uv=cell_centers(camera), **fields["initial"], unit=float(tensors["seeds.unit"])
+                uv=cell_centers(camera),
+                **fields["initial"],
+                # "seeds" is the format's name for the initial Gaussians.
+                unit=float(tensors["seeds.unit"]),
             ),
             surroundings=HoleSurroundings(**fields["surroundings"]),
             target=tensors["target"],
@@ -329,13 +348,16 @@ def load_sample(path: str | os.PathLike[str]) -> Sample:
 
 
 def _to_float(name: str, tensor: Tensor) -> Tensor:
-    """A tensor of a sample's file in float32; integers other than colours, opacities and
-    quaternions stay.
+    """A tensor of a sample's file, from the file's compact dtype to the dtype of a sample.
+
+    Eight-bit colours and opacities become float32 in 0..1; half precision becomes float32.
     """
     if name in EIGHT_BIT_TENSORS:
         return tensor.float() / 255
+    # Quaternions are int8; their length does not matter.
     if tensor.dtype in (torch.float16, torch.int8):
         return tensor.float()
+    # The size of the camera and masks stay integers and bools.
     return tensor
 
 

@@ -39,11 +39,10 @@ def learning_rate(step: int, optim: OptimRecipe) -> float:
 
 
 def ema_decay(step: int, decay: float) -> float:
-    """The share of the old average in the moving average of the weights at a step.
+    """The share that the old average keeps when the weights of a step join their moving average.
 
-    The new weights get the rest.
-
-    The share grows from 1/10 at step 0 towards `decay`.
+    The new weights get the rest. The share grows from 1/10 at step 0 towards `decay`, so that the
+    average soon forgets the untrained weights.
     """
     return min(decay, (step + 1) / (step + EMA_WARMUP_STEPS))
 

@@ -96,7 +96,7 @@ def composite_source(data: DataRecipe, folder: Path, renderer: Renderer) -> Sour
     return Source(
         share=data.shares.composites,
         view=partial(reverse_view_by_number, draw=draw, data=data, renderer=renderer),
-        names=["composites", *relative_names(photos, folder)],
+        names=["composites", *relative_names(photos, folder)],  # identify the samples
     )
 
 
@@ -120,7 +120,7 @@ def rgbd_sources(data: DataRecipe, renderer: Renderer) -> list[Source]:
             # All frames are equally likely, so a camera's share grows with its frames.
             share=data.shares.rgbd * len(frames) / frame_count,
             view=partial(reverse_view_by_number, draw=draw, data=data, renderer=renderer),
-            names=["rgbd", *relative_names(frames, camera.folder)],
+            names=["rgbd", *relative_names(frames, camera.folder)],  # identify the samples
         )
         sources.append(source)
     return sources
@@ -135,7 +135,7 @@ def stereo_sources(data: DataRecipe, folder: Path, renderer: Renderer) -> list[S
     """
     scene_files = find_files(folder, "data.stereo", ("scene.json",), "scene.json")
     scene_folders = [file.parent for file in scene_files]
-    scene_names = relative_names(scene_folders, folder)
+    scene_names = relative_names(scene_folders, folder)  # identify the samples
 
     def right_view_by_number(rng: np.random.Generator, index: int) -> Sample:
         return random_right_view(rng, scene_folders, renderer)
@@ -153,10 +153,10 @@ def stereo_sources(data: DataRecipe, folder: Path, renderer: Renderer) -> list[S
 
 
 def dataset_source(data: DataRecipe, location: Path, *, validation: bool) -> Source:
-    """The views with holes of a dataset's photos, either of those for training or of the others.
+    """A source of the views with holes of a dataset: of its training or of its validation photos.
 
-    The targets are the pictures of the inpainter with which the dataset was built. InputError if
-    the dataset cannot be used.
+    The dataset was built with an inpainter, whose pictures are the targets. InputError if the
+    dataset cannot be used.
     """
     dataset = open_pseudo_dataset(location)
     training_photos, validation_photos = split_photos(dataset, data)
@@ -171,13 +171,18 @@ def dataset_source(data: DataRecipe, location: Path, *, validation: bool) -> Sou
         photo = read_photo(photo_number)
         view = photo.view(view_number)
         return Sample.of(
-            photo.base, view.rendering, view.camera, view.photo_camera, view.photo, view.target
+            base=photo.base,
+            rendering=view.rendering,
+            camera=view.camera,
+            photo_camera=view.photo_camera,
+            photo=view.photo,
+            target=view.target,
         )
 
-    # The names identify the training samples. The validation photos are among them, because a
-    # dataset that is divided differently gives other samples.
+    # These texts identify the training samples. The numbers of the validation photos are among
+    # them, because a dataset that is divided differently gives other samples.
     names = ["pseudo", dataset.manifest.digest, *map(str, validation_photos)]
-    return Source(data.shares.pseudo, stored_view, names, views=len(views))
+    return Source(share=data.shares.pseudo, view=stored_view, names=names, views=len(views))
 
 
 def relative_names(files: Sequence[Path], folder: Path) -> list[str]:
@@ -199,18 +204,27 @@ def reverse_view(
         prediction: the Gaussians of the photo and its camera, from `lift_rgbd` with levels=0, that
             is, with one Gaussian for each pixel.
         photo: [H, W, 3] sRGB at the camera's size.
-        viewer: the virtual camera, which is the input camera of the sample.
+        viewer: the virtual camera.
         renderer: renders the views.
     """
     camera = prediction.camera
     gaussians = prediction.gaussians
-    # What the virtual camera sees stands for its photo: the network gets it as the input.
     virtual_photo = renderer.render(gaussians, viewer)
     is_visible = visible_from(gaussians, viewer, virtual_photo.depth)
     # Gaussians that close gaps behind a visible surface belong to it, although they are hidden.
     visible = gaussians.select(add_visible_backing(is_visible, gaussians, camera))
     rendering = renderer.render(visible, camera)
-    return Sample.of(visible, rendering, camera, viewer, virtual_photo.rgb, photo)
+
+    # The roles are exchanged: the virtual camera's picture is the sample's photo, and the real
+    # photo is the target.
+    return Sample.of(
+        base=visible,
+        rendering=rendering,
+        camera=camera,
+        photo_camera=viewer,
+        photo=virtual_photo.rgb,
+        target=photo,
+    )
 
 
 def visible_from(gaussians: Gaussians, viewer: Camera, depth: Tensor) -> Tensor:
@@ -274,9 +288,9 @@ def reverse_view_by_number(
     data: DataRecipe,
     renderer: Renderer,
 ) -> Sample:
-    """A random reverse view of a photo, see `random_reverse_view`.
+    """`random_reverse_view` with the arguments of a `Source`, which passes a view's number.
 
-    The number `index` is not used: `Source` passes it to all of its functions.
+    The number `index` is not used, because `rng` alone determines the view.
     """
     return random_reverse_view(rng, draw, data.disparity, renderer)
 
@@ -287,7 +301,9 @@ def random_reverse_view(
     disparity_range: tuple[float, float],
     renderer: Renderer,
 ) -> Sample:
-    """`reverse_view` of a random photo, with a random frame of a random path as the virtual camera.
+    """A training view whose holes are what a virtual camera does not see of a random photo.
+
+    The photo is the target. The virtual camera is a random frame of a random camera path.
 
     Args:
         rng: source of all random choices.
@@ -297,7 +313,8 @@ def random_reverse_view(
         renderer: renders the views.
     """
     rgb, depth, camera = draw(rng)
-    # Without levels, as larger Gaussians on flat parts would be visible or hidden as a whole.
+    # levels=0 gives one Gaussian for each pixel. Larger Gaussians, which join pixels of flat parts,
+    # could not be visible in one part and hidden in another.
     prediction = lift_rgbd(rgb, depth, camera, levels=0)
     depth_range = DepthRange.of(prediction.gaussians)
     kind = SHARP_TRAJECTORIES[rng.integers(len(SHARP_TRAJECTORIES))]
@@ -312,24 +329,32 @@ def random_right_view(
 ) -> Sample:
     """A training view from a random stereo pair, with the right photo as the target.
 
-    The left photo becomes Gaussians by its depth, which are rendered at the right camera.
+    The left photo and its depth become Gaussians, which are rendered at the right camera.
     """
     pair = load_pair(pick_random(rng, folders))
     base = lift_rgbd(pair.left, pair.depth, pair.left_camera).gaussians
     rendering = renderer.render(base, pair.right_camera)
-    return Sample.of(base, rendering, pair.right_camera, pair.left_camera, pair.left, pair.right)
+    return Sample.of(
+        base=base,
+        rendering=rendering,
+        camera=pair.right_camera,
+        photo_camera=pair.left_camera,
+        photo=pair.left,
+        target=pair.right,
+    )
 
 
 # Datasets -----------------------------------------------------------------------------------------
 
 
 def open_pseudo_dataset(location: str | os.PathLike[str]) -> DatasetFiles:
-    """Open a pseudo-supervised dataset: views whose targets an inpainter has painted (appendix).
+    """Open a pseudo-supervised dataset: views whose targets an inpainter has painted.
 
     InputError if it is no finished dataset, was built without an inpainter, or no view has a hole.
     """
     files = DatasetFiles(location)
     inpainter = files.manifest.config.get("inpainter", {}).get("name")
+    # Holes that were left empty, or completed without an inpainter, hold nothing new to learn.
     if inpainter in INPAINTERS_WITHOUT_TARGETS:
         raise InputError(
             f"{location}: built with `inpainter` {inpainter}, whose targets teach nothing: build "
@@ -345,24 +370,28 @@ def open_pseudo_dataset(location: str | os.PathLike[str]) -> DatasetFiles:
 def split_photos(files: DatasetFiles, data: DataRecipe) -> tuple[list[int], list[int]]:
     """Divide a dataset's photos; returns the indices of those for training, then for validation.
 
-    The photos are shuffled by `data.seed`. Validation gets as many as have `data.validation_views`
-    views, at most half; training gets as many of the others as have `data.views` views.
-    InputError if the dataset has a single photo.
+    The recipe `data` says how many views each of the two needs: `views` and `validation_views`.
+    Validation gets at most half of the photos. InputError if the dataset has a single photo.
     """
     photo_count = len(files)
     _, first_sample = files.samples[0]
-    views_per_photo = len(first_sample.holes)
+    views_per_photo = len(first_sample.holes)  # the same number for all photos
     if photo_count < 2:
+        # `data.pseudo` is where the dataset lies.
         raise InputError(
             f"{data.pseudo}: has one photo, but training and validation need two: build a larger "
             "one"
         )
 
     order = [int(index) for index in np.random.default_rng(data.seed).permutation(photo_count)]
-    wanted_for_validation = max(1, data.validation_views // views_per_photo)
-    validation_count = min(wanted_for_validation, photo_count // 2)
+    needed_for_validation = max(1, data.validation_views // views_per_photo)
+    validation_count = min(needed_for_validation, photo_count // 2)
     training_count = max(1, data.views // views_per_photo)
-    return order[validation_count:][:training_count], order[:validation_count]
+
+    # Validation photos come first in the random order, training photos directly after them.
+    validation_photos = order[:validation_count]
+    training_photos = order[validation_count : validation_count + training_count]
+    return training_photos, validation_photos
 
 
 def views_with_holes(files: DatasetFiles, photo: int) -> list[int]:

@@ -46,9 +46,7 @@ class Task(Protocol):
         """
 
     def parameter_groups(self) -> list[dict[str, Any]]:
-        """The groups of weights that the optimiser trains.
-
-        Here all weights with requires_grad are one group.
+        """The groups of weights that the optimiser trains: here one, all weights with requires_grad.
 
         A group is {"params": [weights]}, and may have an "lr_scale", a factor on the learning rate.
         """

@@ -121,25 +121,29 @@ def train(
 def run_steps(run: TrainingRun) -> str:
     """The loop: train step by step, log, validate and save, until the run ends.
 
-    The reason is "steps", "patience" or "stopped", see `train`.
+    Returns:
+        Why it ended: "steps" (all steps are done), "patience" (no improvement) or "stopped" (by a
+            signal).
     """
     progress = run.progress
     optim = run.recipe.optim
     settings = run.recipe.run
+    # All passes through the network that are left, in order: each one's step and numbers of items.
     passes = (
         (step, items)
         for step in range(progress.step, optim.steps)
         for items in items_of_passes(run, step)
     )
-    # On a CPU the network itself needs the cores, so one thread reads; beside a GPU half of them
-    # read.
-    reader_threads = 1
-    if run.device.type != "cpu":
-        reader_threads = max(1, (os.cpu_count() or 1) // (2 * rank_count()))
 
     def load_pass(step_and_items: tuple[int, list[int]]) -> Any:
         step, items = step_and_items
         return run.task.load_batch(step, items)
+
+    # On a CPU the network itself needs the cores, so one thread reads batches. Beside GPUs the
+    # processes divide half of the cores among them for reading.
+    reader_threads = 1
+    if run.device.type != "cpu":
+        reader_threads = max(1, (os.cpu_count() or 1) // (2 * rank_count()))
 
     with contextlib.ExitStack() as stack:
         if rank() == 0:
@@ -152,9 +156,8 @@ def run_steps(run: TrainingRun) -> str:
 
         start_time = time.perf_counter()
         earlier_seconds = progress.seconds  # of the runs that this one resumes
-        recent_steps: list[
-            dict[str, float]
-        ] = []  # the numbers of each step since the last log line
+        # Loss and other numbers of each step since the last log line.
+        recent_steps: list[dict[str, float]] = []
         while run.end_reason() is None:
             recent_steps.append(train_step(run, batches, stop_requested))
             progress.seconds = earlier_seconds + time.perf_counter() - start_time
@@ -246,7 +249,7 @@ def items_of_passes(run: TrainingRun, step: int) -> list[list[int]]:
     items = samples_of_step(
         step, task.items, task.items_per_step, run.recipe.run.seed, rank(), rank_count()
     )
-    pass_size = task.micro_batch or len(items)
+    pass_size = task.micro_batch or len(items)  # None: all items in one pass
     return [items[start : start + pass_size] for start in range(0, len(items), pass_size)]
 
 
@@ -279,9 +282,9 @@ def mean_of_steps(steps: list[dict[str, float]]) -> dict[str, float]:
 def validate_and_save(run: TrainingRun, is_last_step: bool) -> None:
     """After a step: validate if it is time, and write the weights and a checkpoint if it is time.
 
-    The recipe's run.validate_every and run.save_every say how often. The last step is always
-    validated, and the state at the end of a run is always saved. All processes validate; process 0
-    writes.
+    The recipe's run.validate_every and run.save_every say after how many steps it is time. The last
+    step of the recipe is always validated, and a run that ends is always saved. All processes
+    validate; process 0 writes.
     """
     settings = run.recipe.run
     progress = run.progress
@@ -293,7 +296,7 @@ def validate_and_save(run: TrainingRun, is_last_step: bool) -> None:
         if rank() == 0:
             report_validation(run, measures, is_best)
 
-    # A validation may have ended the run, so this comes second.
+    # A validation without improvement may have ended the run, so saving comes after it.
     is_time_to_save = progress.step % settings.save_every == 0 or run.end_reason() is not None
     if rank() == 0 and is_time_to_save:
         run.task.export(run.average, run.output / LAST_WEIGHTS)
@@ -336,18 +339,17 @@ def report_validation(run: TrainingRun, measures: Mapping[str, float], is_best: 
 def validate(task: Task, network: nn.Module, device: torch.device) -> dict[str, float]:
     """Means of a task's measures over all validation items, by name.
 
-    Values that are not finite are left out.
-
-    The processes divide the items, and each process gets the same means. A measure without finite
-    values is missing.
+    Values that are not finite do not count, and a measure without any finite value is left out. The
+    processes divide the items, and each process gets the same means.
     """
     own_items = range(rank(), task.validation_items, rank_count())
+    # As many items at a time as in training; without `micro_batch`, all of a step in one pass.
     pass_size = task.micro_batch or task.items_per_step // rank_count()
-
     totals = dict.fromkeys(task.measures, 0.0)
     counts = dict.fromkeys(task.measures, 0.0)
     for start in range(0, len(own_items), pass_size):
-        batch = task.load_batch(None, own_items[start : start + pass_size])
+        items = own_items[start : start + pass_size]
+        batch = task.load_batch(step=None, items=items)  # None: validation items
         for name, values in task.measure(network, batch).items():
             # PSNR, for example, is NaN for a view without a hole, and infinite for equal images.
             finite = [value for value in values if math.isfinite(value)]
