@@ -194,10 +194,10 @@ def load_path(path: str | os.PathLike[str]) -> KeyframePath:
     """Read a file of keyframes.
 
     The file holds {"keyframes": [{"time": s, "eye": [x, y, z], "target": [x, y, z]}, …]}. A
-    keyframe may also have "up" [x, y, z] and "fov" in degrees. The file may have "closed" (true:
-    the path returns to its first keyframe) and "unit" of all lengths ("metres", or "disparity":
-    the distance that a disparity of 1 is). The world is that of the photo's camera (OpenCV: x
-    right, y down, z forward).
+    keyframe may also have "up" [x, y, z] and "fov" in degrees. The file may also have "closed",
+    true if the path returns to its first keyframe; and "unit", the unit of all lengths: "metres",
+    or "disparity" for the distance by which a disparity of 1 moves the camera. The world is that
+    of the photo's camera (OpenCV: x right, y down, z forward).
 
     Raises:
         InputError: the file has other content, an unknown name, fewer than two keyframes or

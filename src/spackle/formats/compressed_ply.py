@@ -164,7 +164,7 @@ def _to_fractions(values: Floats, chunk_starts: NDArray[np.int64]) -> tuple[Floa
 def _pack_fractions(fractions: Floats, bit_counts: tuple[int, ...]) -> NDArray[np.uint32]:
     """Round the k fractions of each row to codes, and pack these into one word a row.
 
-    A code is a whole number: 0 for the fraction 0, and the largest number of so many bits for 1.
+    A code is a whole number: 0 for the fraction 0, and the largest that its bits can hold for 1.
 
     Args:
         fractions: [N, k] in 0..1.

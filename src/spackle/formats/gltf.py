@@ -62,7 +62,8 @@ def encode_glb(scene: SceneFile) -> bytes:
     json_part = json_part.ljust(math.ceil(len(json_part) / 4) * 4)
     binary_part = b"".join(array.tobytes() for array in attributes.values())
 
-    # 12 bytes of the file's header, and 8 of each part's.
+    # The file's header has 12 bytes: a signature, the version 2 of glTF, and the file's length. The
+    # header of each part has 8 bytes: the part's length and kind.
     file_bytes = 12 + 8 + len(json_part) + 8 + len(binary_part)
     return b"".join(
         [

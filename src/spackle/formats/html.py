@@ -88,8 +88,8 @@ def page_scene(
         base: the Gaussians that come from the photo.
         aux: the Gaussians that fill holes; may be empty.
         camera: the photo's camera, at the world's origin.
-        disparity: the relative camera movement for which the scene was completed; the page's
-            camera goes no farther.
+        disparity: the camera movement, relative to the scene's depth, for which the scene was
+            completed; the page's camera goes no farther. None if it is not known.
         note: a text for the user; empty for none. The page shows it for some seconds, and what
             stands before its first semicolon always.
 

@@ -73,7 +73,8 @@ def save_ply(
         path: the file to write, whole or not at all.
         camera: the photo's camera, at the world's origin.
         base_count: how many Gaussians come from the photo; those that fill holes come after.
-        disparity: the relative camera movement for which the scene was completed.
+        disparity: the camera movement, relative to the scene's depth, for which the scene was
+            completed.
 
     Raises:
         InputError: `path` cannot be written.
@@ -104,7 +105,8 @@ def _encode_parts(
         gaussians: the scene.
         camera: the photo's camera, if it is known.
         base_count: how many Gaussians come from the photo, if it is known.
-        disparity: the relative camera movement for which the scene was completed, if known.
+        disparity: the camera movement, relative to the scene's depth, for which the scene was
+            completed, if it is known.
     """
     vertex = NewTable(
         name="vertex", row_count=len(gaussians), type="float", properties=WRITTEN_PROPERTIES
@@ -283,7 +285,7 @@ class PlyFile:
         return None if numbers is None else int(numbers[0])
 
     def disparity(self) -> float | None:
-        """Read the relative camera movement for which the scene was completed.
+        """Read the camera movement (relative to the scene's depth) that the scene was completed for.
 
         Returns:
             The disparity; None for files of other programs.

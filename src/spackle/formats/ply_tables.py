@@ -68,7 +68,8 @@ def ply_header(
         tables: the file's tables, in their order.
         camera: the photo's camera, at the world's origin.
         base_count: how many Gaussians come from the photo; those that fill holes come after.
-        disparity: the relative camera movement for which the scene was completed.
+        disparity: the camera movement, relative to the scene's depth, for which the scene was
+            completed.
     """
     lines = ["ply", "format binary_little_endian 1.0"]
     if camera is not None:

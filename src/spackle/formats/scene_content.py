@@ -21,7 +21,7 @@ class SceneFile:
     camera: Camera | None = None
     # How many Gaussians come from the photo; the Gaussians that fill holes come after them.
     base_count: int | None = None
-    # The relative camera movement for which the scene was completed.
+    # The camera movement, relative to the scene's depth, for which the scene was completed.
     disparity: float | None = None
     # The coefficients of spherical harmonics above degree 0 that each Gaussian of the file has.
     # They are not read.

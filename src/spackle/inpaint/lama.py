@@ -77,6 +77,7 @@ class LamaInpainter:
             raise InputError(f"inpainter lama: {problem}")
         self.weight_files: Mapping[str, Path] = {"lama": path}
         self._network = load_network(path).to(self._device)
+        # All that decides, beside the weights, which pixels are painted.
         self.version = f"{PAINTING_VERSION}, long side {self._input_side}"
 
     @torch.no_grad()

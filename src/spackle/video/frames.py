@@ -64,6 +64,7 @@ class FrameMaker:
         """
         depth_scale = None
         try:
+            # The eyes' distance follows from the first view, and stays the same in all others.
             stereo = _derive_stereo(options, gaussians, cameras[0])
             if options.show == "depth":
                 depth_scale = DepthColorScale.over(gaussians, cameras)
