@@ -47,7 +47,10 @@ class Camera:
 
     @property
     def position(self) -> Tensor:
-        """The camera's centre in world coordinates, [3]: −Rᵀ t."""
+        """The camera's centre in world coordinates, [3]: −Rᵀ t.
+
+        It is the point that R and t, the rotation and translation to the camera, move to 0.
+        """
         rotation = self.world_to_camera[:3, :3]
         translation = self.world_to_camera[:3, 3]
         return -rotation.T @ translation
@@ -69,6 +72,7 @@ class Camera:
 
     def cropped(self, left: float, top: float, width: int, height: int) -> Camera:
         """The width×height pixels of this view that begin at (left, top)."""
+        # The rays of the pixels stay, but their positions now count from another corner.
         K = self.K.clone()
         K[0, 2] -= left
         K[1, 2] -= top
@@ -142,7 +146,8 @@ def look_at(eye: Tensor, target: Tensor, up: Tensor | None = None) -> Tensor:
     forward = target - eye
     distance = float(forward.norm())
     largest_coordinate = float(torch.cat([eye, target]).abs().max())
-    # Around the origin, rounding errors are measured against a millimetre.
+    # Rounding errors grow with the coordinates. With all coordinates near 0, they would be zero, so
+    # at least a millimetre is taken.
     if distance <= MIN_EYE_TO_TARGET_RATIO * max(1e-3, largest_coordinate):
         raise ValueError("eye and target coincide: move one of them")
 
@@ -153,7 +158,8 @@ def look_at(eye: Tensor, target: Tensor, up: Tensor | None = None) -> Tensor:
             raise ValueError("up has no length")
         down = -up.double() / up.double().norm()
 
-    # The cross product's length is the distance times the sine of the angle to `up`.
+    # The length of this cross product is `distance` times the sine of the angle between `up` and
+    # the viewing direction.
     right = torch.linalg.cross(down, forward)
     if float(right.norm()) < MIN_ANGLE_TO_UP_RAD * distance:
         raise ValueError("up is parallel to the viewing direction: give another up")

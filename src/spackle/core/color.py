@@ -59,11 +59,12 @@ class DepthColorScale:
     def over(gaussians: Gaussians, cameras: Sequence[Camera]) -> DepthColorScale:
         """The scale for the depths in a set of views, without the nearest and the farthest 0.2 %.
 
-        One scale for all frames of a video keeps the colours from flickering.
+        All frames of a video share one scale, because a scale of each frame's own would flicker.
 
         Raises:
             ValueError: no Gaussian is in a view.
         """
+        # Every n-th Gaussian in every m-th view is accurate enough, and fast.
         gaussian_step = max(1, len(gaussians) // MAX_SAMPLED_GAUSSIANS)
         view_step = max(1, len(cameras) // MAX_SAMPLED_VIEWS)
         means = gaussians.means.detach()[::gaussian_step].cpu()
@@ -72,6 +73,7 @@ class DepthColorScale:
         ).double()
         if len(inverse_depths) == 0:
             raise ValueError("no Gaussian is in view")
+        # The smallest inverse depths are the farthest, so the far end is the low quantile.
         quantiles = torch.tensor([FAR_QUANTILE, NEAR_QUANTILE], dtype=torch.float64)
         far_inverse, near_inverse = torch.quantile(inverse_depths, quantiles).tolist()
         return DepthColorScale(near=1 / near_inverse, far=1 / far_inverse)
@@ -85,13 +87,14 @@ class DepthColorScale:
         """
         # 0 at the far end of the scale, 1 at its near end.
         span = max(1 / self.near - 1 / self.far, 1e-12)  # positive even for one single depth
+        # The clamp avoids a division by zero where the depth is unknown.
         brightness = ((1 / depth.clamp_min(1e-6) - 1 / self.far) / span).clamp(0, 1)
 
         # Interpolate between the two closest colours of the table.
         table = depth.new_tensor(INFERNO_COLORS)
         last = len(INFERNO_COLORS) - 1
         position = brightness * last
-        lower_index = position.floor().clamp_max(last - 1)
+        lower_index = position.floor().clamp_max(last - 1)  # there must be a colour above it
         lower_color = table[lower_index.long()]
         upper_color = table[lower_index.long() + 1]
         colors = torch.lerp(lower_color, upper_color, (position - lower_index)[..., None])

@@ -107,14 +107,15 @@ def crops_around_mask(
     if not cells.any():
         return []
 
-    # The search works with blocks of step×step cells: cuts at multiples of the stride cost nothing,
-    # and blocks are fewer than cells.
+    # The search works with blocks of step×step cells, because outer rectangles begin at multiples
+    # of the stride in any case, and blocks are fewer than cells.
     blocks = _any_in_blocks(cells, step)  # [h/step, w/step] whether any cell is masked
     bounds = _shrink_to_mask(blocks, Crop(0, 0, *blocks.shape))
     margin_blocks = math.ceil(margin / step)
     crops = []
     for part in _cut_in_parts(blocks, bounds, margin_blocks):
-        # From blocks back to cells; without the unmasked cells of the outermost blocks.
+        # From blocks back to cells. The outermost blocks may have rows or columns of cells without
+        # any masked one, which are cut off.
         part_cells = Crop(part.top * step, part.left * step, part.bottom * step, part.right * step)
         inner = _shrink_to_mask(cells, part_cells)
         outer = inner.grown(margin, step, height, width)
@@ -131,7 +132,8 @@ def crops_around_mask(
 def _any_in_blocks(cells: Mask, step: int) -> Mask:
     """Whether any cell is masked in each block of step×step cells, [h/step, w/step] rounded up."""
     height, width = cells.shape
-    padded = np.pad(cells, [(0, -height % step), (0, -width % step)])  # to multiples of `step`
+    # −n % step is what n lacks to the next multiple of `step`; the cells added are not masked.
+    padded = np.pad(cells, [(0, -height % step), (0, -width % step)])
     rows = padded.shape[0] // step
     columns = padded.shape[1] // step
     # Axes 1 and 3 run over the rows and columns inside of a block.
@@ -173,10 +175,12 @@ def _cut_in_parts(blocks: Mask, crop: Crop, margin: int) -> list[Crop]:
     # rectangle (top, left, bottom, right) around its masked blocks.
     inside = blocks[crop.slices]
     row_cuts = _halves_of_row_cuts(inside)  # [cuts, 2 halves, 4]
-    transposed_cuts = _halves_of_row_cuts(inside.T)  # (left, top, right, bottom)
+    # Transposed, columns are rows, and the order is (left, top, right, bottom); it is set right.
+    transposed_cuts = _halves_of_row_cuts(inside.T)
     column_cuts = transposed_cuts[..., [1, 0, 3, 2]]
     halves = np.concatenate([row_cuts, column_cuts])
-    halves += (crop.top, crop.left, crop.top, crop.left)  # from the rectangle to the grid
+    # The positions count from the rectangle's corner so far, from now on from the grid's.
+    halves += (crop.top, crop.left, crop.top, crop.left)
 
     # Take the cut whose halves, with their margins, have the least area.
     grown_starts = np.maximum(halves[..., :2] - margin, 0)  # [cuts, 2 halves, 2]
@@ -184,7 +188,8 @@ def _cut_in_parts(blocks: Mask, crop: Crop, margin: int) -> list[Crop]:
     areas = (grown_ends - grown_starts).prod(-1).sum(1)  # [cuts]
     best_halves = halves[areas.argmin()]  # [2, 4]
 
-    # Cut the halves again, and compare the cost of all parts with that of the uncut rectangle.
+    # Cut the halves again, and compare the cost of all parts with that of the uncut rectangle. Each
+    # call of the network has a price of its own, so many small parts can cost more.
     parts = []
     for top, left, bottom, right in best_halves.tolist():
         parts += _cut_in_parts(blocks, Crop(top, left, bottom, right), margin)
@@ -197,7 +202,8 @@ def _cut_in_parts(blocks: Mask, crop: Crop, margin: int) -> list[Crop]:
 def _min_area(blocks: Mask, crop: Crop, margin: int) -> int:
     """Least number of blocks that the network must process, however the rectangle is cut.
 
-    These are all blocks within `margin` of a masked block [h, w] of the rectangle.
+    The network needs all blocks within `margin` blocks of a masked block of the rectangle; `blocks`
+    [h, w] is the mask.
     """
     inside_crop = np.zeros_like(blocks)
     inside_crop[crop.slices] = blocks[crop.slices]
@@ -208,20 +214,23 @@ def _halves_of_row_cuts(blocks: Mask) -> NDArray[np.int64]:
     """Bounds of the masked blocks above and below each possible cut between two rows.
 
     Args:
-        blocks: [h, w]; the first and the last row must have masked blocks.
+        blocks: [h, w] mask; the first and the last row must have masked blocks.
 
     Returns:
-        [h − 1 cuts, 2 halves, 4]: top, left, bottom (exclusive), right (exclusive).
+        [h − 1 cuts, 2 halves, 4]: for the upper and the lower half of each cut, the top, left,
+        bottom (exclusive) and right (exclusive) of the rectangle around its masked blocks.
     """
     height, width = blocks.shape
     row_numbers = np.arange(height)
     has_mask = blocks.any(axis=1)  # [h]
 
-    # First and last masked column of each row; a row without any must not win below.
+    # First and last masked column of each row. A row without masked blocks gets values that never
+    # become the minimum or maximum of several rows.
     first_column = np.where(has_mask, blocks.argmax(axis=1), width)
     last_column_end = np.where(has_mask, width - blocks[:, ::-1].argmax(axis=1), 0)
 
-    # The same for all rows from the top down to each row, and from the bottom up to each row.
+    # For each row, the bounds of that row and all rows above it, and of it and all rows below it.
+    # Below, the rows are reversed, because numpy accumulates from the first element on.
     left_above = np.minimum.accumulate(first_column)
     left_below = np.minimum.accumulate(first_column[::-1])[::-1]
     right_above = np.maximum.accumulate(last_column_end)

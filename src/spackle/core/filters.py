@@ -27,7 +27,8 @@ def gaussian_blur(image: Tensor, sigma: float) -> Tensor:
     # A Gaussian is separable: blur along the rows, then along the columns.
     for dim in (-2, -3):
         side = image.shape[dim]
-        weight_sums = _weighted_sum_of_neighbors(image.new_ones(side), weights, 0)  # [side]
+        ones = image.new_ones(side)
+        weight_sums = _weighted_sum_of_neighbors(ones, weights, dim=0)  # [side]
         axes_after = -1 - dim
         weight_sums = weight_sums.view(-1, *[1] * axes_after)  # aligned with the axis `dim`
         image = _weighted_sum_of_neighbors(image, weights, dim) / weight_sums
@@ -37,7 +38,8 @@ def gaussian_blur(image: Tensor, sigma: float) -> Tensor:
 def approximate_gaussian_blur(image: Tensor, sigma: float) -> Tensor:
     """Blur a picture [H, W, C] with a Gaussian of a large `sigma` in pixels, fast but not exactly.
 
-    The picture is reduced, blurred, and enlarged again.
+    The picture is reduced, blurred, and enlarged again: a wide blur leaves no details that a
+    reduced picture could not show.
     """
     height, width, _ = image.shape
     factor = max(int(sigma / 2), 1)  # two reduced pixels for each `sigma` suffice
@@ -45,20 +47,24 @@ def approximate_gaussian_blur(image: Tensor, sigma: float) -> Tensor:
     reduced = avg_pool2d(planes, factor, ceil_mode=True, count_include_pad=False)[0]
     blurred = gaussian_blur(reduced.movedim(0, -1), sigma / factor).movedim(-1, 0)
     enlarged = interpolate(blurred[None], scale_factor=factor, mode="bilinear")
-    # The last reduced row and column may cover less than `factor` pixels.
+    # The last reduced row and column may stand for less than `factor` pixels, so the enlarged
+    # picture may be too large.
     return enlarged[0, :, :height, :width].movedim(0, -1)
 
 
 def _weighted_sum_of_neighbors(values: Tensor, weights: Sequence[float], dim: int) -> Tensor:
-    """Sum of each element and its neighbours along a dimension, many times faster than convolution.
+    """Weighted sum of each element and its neighbours along a dimension of a tensor.
+
+    Neighbours beyond the ends count as 0. On a CPU, this is many times faster than a convolution.
 
     Args:
         values: any shape.
-        weights: the weight of the element itself, of both its neighbours, of their neighbours, …
+        weights: the weight at the distance 0 (the element itself), 1 (both its neighbours), 2, …
         dim: the dimension.
     """
     size = values.shape[dim]
     total = weights[0] * values
+    # In a dimension of `size` elements, no two are `size` or more apart.
     for offset, weight in enumerate(weights[1:size], start=1):
         count = size - offset  # elements that have a neighbour at this offset
         without_end = total.narrow(dim, 0, count)
@@ -74,6 +80,7 @@ def maximum_filter(image: Tensor, radius: int) -> Tensor:
 
     For a mask, this is a dilation by a square of 2·radius + 1 pixels.
     """
+    # Padding with the smallest value never changes a maximum.
     smallest = 0 if image.dtype == torch.bool else -math.inf
     image = pad(image, (radius, radius, radius, radius), value=smallest)
     full_width = 2 * radius + 1
@@ -96,7 +103,8 @@ def nearest_known_pixels(hole: NDArray[np.bool_]) -> NDArray[np.int32]:
     from neighbour to neighbour, which is much faster than an exact search. If the whole image is a
     hole, all rows and columns are `-UNREACHABLE_PX`.
     """
-    own_positions = np.indices(hole.shape)
+    own_positions = np.indices(hole.shape)  # [2, H, W]
+    # A known pixel is its own nearest one; a hole pixel begins with one that is too far away.
     nearest = np.where(hole, -UNREACHABLE_PX, own_positions).astype(np.int32)
     _spread_nearest(hole, nearest)
     return nearest
@@ -116,8 +124,8 @@ def distance_to_nearest(nearest: NDArray[np.int32]) -> Tensor:
 def _spread_nearest(hole: Any, nearest: Any) -> None:
     """Give each pixel of a hole a neighbour's nearest known pixel if that is nearer than its own.
 
-    Four sweeps start alternately at the first and at the last pixel, so that positions spread in
-    all directions.
+    Each sweep visits all pixels. Two sweeps from the first pixel to the last, and two from the last
+    to the first, spread the positions of known pixels in all directions.
 
     Args:
         hole: [H, W] bool.
@@ -132,7 +140,7 @@ def _spread_nearest(hole: Any, nearest: Any) -> None:
                 x = j if sweep % 2 == 0 else width - 1 - j
                 if not hole[y, x]:
                     continue
-                # The 3×3 pixels around (y, x).
+                # Look at the 3×3 pixels around (y, x).
                 for v in range(max(y - 1, 0), min(y + 2, height)):
                     for u in range(max(x - 1, 0), min(x + 2, width)):
                         row, column = nearest[0, v, u], nearest[1, v, u]

@@ -82,7 +82,8 @@ def resolve_focal_length(
         height: of the photo in pixels.
         exif: EXIF tags of the photo, by number.
         focal_px: the user's focal length in pixels.
-        focal_mm: the user's focal length as a 35 mm equivalent.
+        focal_mm: the user's 35 mm equivalent of the focal length: the focal length that gives the
+            same view on film of 36 mm × 24 mm.
         fov: the user's horizontal field of view in degrees.
 
     Returns:
@@ -108,6 +109,7 @@ def resolve_focal_length(
         else:
             focal, source = focal_mm_to_px(ASSUMED_FOCAL_MM, width, height), FocalSource.ASSUMED
 
+    # Beyond these limits a number is a typing error or nonsense in EXIF, not a lens.
     shortest = MIN_FOCAL_PER_LONG_SIDE * max(width, height)
     longest = MAX_FOCAL_PER_LONG_SIDE * max(width, height)
     if not shortest <= focal <= longest:
@@ -157,13 +159,15 @@ def focal_from_exif(tags: Mapping[int, object], width: int, height: int) -> floa
         height: of the photo in pixels.
     """
     film_mm = _finite_number(tags.get(_TAG_FILM_EQUIVALENT_MM))
-    if film_mm is not None and _is_plausible_mm(film_mm):  # 0 means "unknown" in EXIF
+    # A 0, which means "unknown" in EXIF, is not plausible.
+    if film_mm is not None and _is_plausible_mm(film_mm):
         return focal_mm_to_px(film_mm, width, height)
 
     lens_mm = _finite_number(tags.get(_TAG_LENS_MM))
     if lens_mm is None or lens_mm <= 0:
         return None
 
+    # EXIF's density is often wrong, so the result must be plausible as a 35 mm equivalent.
     focal_px = _focal_from_pixel_density(tags, lens_mm, max(width, height))
     if focal_px is not None and _is_plausible_mm(focal_px / focal_mm_to_px(1.0, width, height)):
         return focal_px
@@ -183,13 +187,15 @@ def _focal_from_pixel_density(
     Args:
         tags: values of EXIF tags, by number.
         lens_mm: focal length of the lens.
-        long_side: of the photo, in pixels; EXIF's own size tells whether the photo was resized.
+        long_side: of the photo, in pixels. A resized photo has another long side than the picture
+            that the camera recorded, whose size EXIF holds.
     """
     pixels_per_unit = _finite_number(tags.get(_TAG_SENSOR_PIXELS_PER_UNIT))
     if pixels_per_unit is None or pixels_per_unit <= 0:
         return None
+    # The unit is a code; an inch (25.4 mm) is EXIF's default, and serves for unknown codes, too.
     unit = int(_finite_number(tags.get(_TAG_SENSOR_UNIT)) or _EXIF_INCH)
-    unit_mm = _MM_PER_EXIF_UNIT.get(unit, 25.4)  # an unknown unit is taken for the inch
+    unit_mm = _MM_PER_EXIF_UNIT.get(unit, 25.4)
 
     recorded_width = _finite_number(tags.get(_TAG_RECORDED_WIDTH)) or 0
     recorded_height = _finite_number(tags.get(_TAG_RECORDED_HEIGHT)) or 0

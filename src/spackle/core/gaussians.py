@@ -91,15 +91,18 @@ class Gaussians:
         matrix = matrix.to(device=self.means.device, dtype=torch.float64)
         linear = matrix[:3, :3]
         translation = matrix[:3, 3]
-        scale = torch.linalg.det(linear).abs() ** (1 / 3)  # the determinant scales as a volume
+        # The determinant is the factor of volumes, which is the cube of the scale.
+        scale = torch.linalg.det(linear).abs() ** (1 / 3)
         rotation = linear / scale
         identity = torch.eye(3).to(rotation)
         is_orthogonal = torch.allclose(rotation @ rotation.T, identity, atol=ROTATION_TOLERANCE)
-        if not is_orthogonal or torch.linalg.det(linear) <= 0:  # negative: a mirror image
+        # A negative determinant would mirror the scene, and no quaternion can do that.
+        if not is_orthogonal or torch.linalg.det(linear) <= 0:
             raise ValueError(
                 "Gaussians.transform takes a rotation, a uniform scale and a translation only"
             )
 
+        # Computed in float64, so that a scene far from the origin loses no precision.
         dtype = self.means.dtype
         means = (self.means.double() @ linear.T + translation).to(dtype)
         quats = quat_multiply(quat_from_matrix(rotation), self.quats.double()).to(dtype)
@@ -130,9 +133,9 @@ def quat_to_matrix(quats: Tensor) -> Tensor:
 def quat_from_matrix(rotation: Tensor) -> Tensor:
     """Convert rotation matrices [..., 3, 3] to unit quaternions [..., 4] (wxyz, w ≥ 0).
 
-    The elements of the matrix give the products of every two components of the quaternion, such as
-    m21 − m12 = 4wx. The four products with one component, divided by it, are the quaternion. The
-    largest component is the divisor, so the result is well conditioned for every rotation.
+    Sums of the matrix's elements are products of two components of the quaternion, such as
+    m21 − m12 = 4wx. The four products that have one component in common, such as 4w·(w, x, y, z),
+    are a multiple of the quaternion. Of the four multiples, the largest one is the most accurate.
     """
     row0, row1, row2 = rotation.unbind(-2)
     m00, m01, m02 = row0.unbind(-1)
@@ -146,7 +149,7 @@ def quat_from_matrix(rotation: Tensor) -> Tensor:
     times_z = torch.stack([m10 - m01, m02 + m20, m12 + m21, 1 - m00 - m11 + m22], -1)
     candidates = torch.stack([times_w, times_x, times_y, times_z], dim=-2)  # [..., 4, 4]
 
-    # Of the four, take the one of the largest component.
+    # Take the multiple by the largest component, which is never near zero.
     squares = [times_w[..., 0], times_x[..., 1], times_y[..., 2], times_z[..., 3]]  # 4w², 4x², …
     largest = torch.stack(squares, -1).argmax(-1)  # [...] 0 for w to 3 for z
     row_index = largest[..., None, None].expand(*largest.shape, 1, 4)
@@ -158,7 +161,7 @@ def quat_from_matrix(rotation: Tensor) -> Tensor:
 
 
 def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
-    """Hamilton product of quaternions [..., 4] (wxyz): rotate by b, then by a."""
+    """Hamilton product a·b of quaternions [..., 4] (wxyz), which rotates by b first, then by a."""
     aw, ax, ay, az = a.unbind(-1)
     bw, bx, by, bz = b.unbind(-1)
     return torch.stack(

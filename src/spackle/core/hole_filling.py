@@ -40,10 +40,11 @@ def fill_from_far_side(
     """Fill the unknown part of an inverse depth image and of further values, such as colours.
 
     A moving camera uncovers the surface behind, so a hole between a near and a far surface belongs
-    to the far surface. From coarse to fine, each level interpolates a guess, and relaxes it to a
-    membrane that the rim (the known pixels around the hole) holds. A rim sample has the weight
-    min(1, fill / sample)^far_bias, with the inverse depths `fill` in the hole and `sample` at the
-    rim.
+    to the far surface. The work goes from coarse to fine. At each resolution, the hole begins with
+    a guess, which the next coarser resolution gives; then each of its pixels is replaced, several
+    times, by the weighted mean of its four neighbours. The hole so becomes a smooth membrane that
+    hangs on its rim, the known pixels around it. A rim pixel of inverse depth r beside a hole pixel
+    of inverse depth h has the weight min(1, h / r)^far_bias, so a nearer rim hardly counts.
 
     Args:
         inverse_depth: [H, W], positive at known pixels.
@@ -60,8 +61,8 @@ def fill_from_far_side(
     """
     if not bool(known.any()):
         raise ValueError("no pixel is known")
-    # The work is done in place, so these must be copies. Channels come last, because a hole's
-    # pixels are scattered in memory.
+    # The work is done in place, so these must be copies. Channels come last, so that the values of
+    # one pixel are together in memory: a hole's pixels are scattered.
     filled_depth = _contiguous_copy(inverse_depth.detach().cpu().float())  # [H, W]
     filled_values = _contiguous_copy(values.detach().cpu().float().permute(1, 2, 0))  # [H, W, C]
     bias = torch.as_tensor(far_bias, dtype=torch.float32).cpu().expand(inverse_depth.shape)
@@ -81,7 +82,7 @@ def _contiguous_copy(tensor: Tensor) -> Tensor:
 
 
 def _fill_level(depths: Floats, values: Floats, known: Bools, bias: Floats) -> None:
-    """Fill the unknown pixels of one resolution in place, after filling the next coarser one.
+    """Fill the unknown pixels of an image in place, by first filling an image of half the size.
 
     Args:
         depths: [H, W] inverse depths, filled in place.
@@ -122,6 +123,7 @@ def _fill_level(depths: Floats, values: Floats, known: Bools, bias: Floats) -> N
     samples[hole_count:, 0] = flat_depths[rim_pixels]
     samples[hole_count:, 1:] = flat_values[rim_pixels]
 
+    # The coarser image has settled the large distances; a few sweeps settle the small ones.
     hole_bias = bias.ravel()[hole_pixels]
     samples = _relax(samples, samples.copy(), neighbors, hole_bias, RELAXATION_SWEEPS)
     flat_depths[hole_pixels] = samples[:hole_count, 0]
@@ -129,13 +131,20 @@ def _fill_level(depths: Floats, values: Floats, known: Bools, bias: Floats) -> N
 
 
 def _reference_depth(depths: Floats, known: Bools, bias: Floats) -> np.float32:
-    """The median inverse depth of the known pixels [H, W], which keeps weights in a usual range.
+    """The median inverse depth of the known pixels, by which inverse depths are divided.
 
-    Without any preference for the far side it does not matter, and is 1.
+    The weights are high powers of these ratios, which would leave the range of float32 without the
+    division. Without any preference for the far side, all weights are 1, so the result is 1, too.
+
+    Args:
+        depths: [H, W] inverse depths.
+        known: [H, W].
+        bias: [H, W] preference for the far side; 0 for none.
     """
     if not bias.any():
         return np.float32(1)
-    return np.float32(torch.from_numpy(depths[known]).median())  # the lower of two medians
+    # For an even number of pixels, torch's median is the lower one of the two in the middle.
+    return np.float32(torch.from_numpy(depths[known]).median())
 
 
 @kernel
@@ -143,7 +152,7 @@ def _reduce_by_half(
     start: int, stop: int, depths: Any, values: Any, known: Any, bias: Any, reference: Any,
     coarse_depths: Any, coarse_values: Any, coarse_known: Any, coarse_bias: Any,
 ) -> None:  # fmt: skip
-    """Reduce blocks of 2×2 pixels to weighted means; far pixels have the largest weights.
+    """Reduce blocks of 2×2 pixels to weighted means of their known pixels; far ones weigh most.
 
     Args:
         start: first row of the coarser images that is written.
@@ -151,12 +160,12 @@ def _reduce_by_half(
         depths: [H, W] inverse depths.
         values: [H, W, C] further values.
         known: [H, W]; only known pixels count.
-        bias: [H, W] preference for far pixels.
-        reference: usual inverse depth.
+        bias: [H, W] preference for far pixels; 0 makes plain means.
+        reference: the inverse depth of a pixel whose weight is 1, such as the median.
         coarse_depths: [⌈H/2⌉, ⌈W/2⌉] written; unset where no pixel of the block is known.
         coarse_values: [⌈H/2⌉, ⌈W/2⌉, C] written; unset where no pixel of the block is known.
         coarse_known: [⌈H/2⌉, ⌈W/2⌉] written: whether any pixel of the block is known.
-        coarse_bias: [⌈H/2⌉, ⌈W/2⌉] written.
+        coarse_bias: [⌈H/2⌉, ⌈W/2⌉] written: plain means of `bias`.
     """
     height, width = depths.shape
     channels = values.shape[2]
@@ -164,6 +173,7 @@ def _reduce_by_half(
     for row in range(start, stop):
         for column in range(coarse_depths.shape[1]):
             top, left = 2 * row, 2 * column
+            # An odd last row or column counts twice in the mean of the bias.
             bottom, right = min(top + 1, height - 1), min(left + 1, width - 1)
             coarse_bias[row, column] = (
                 bias[top, left] / 4
@@ -172,8 +182,10 @@ def _reduce_by_half(
                 + bias[bottom, right] / 4
             )
 
+            # The weights depend on the depth, so the mean depth is computed first; the further
+            # values then have the same weights.
             weight_sum, depth_sum = np.float32(0), np.float32(0)
-            for k in range(4):
+            for k in range(4):  # the four pixels of the block, row by row
                 y, x = top + k // 2, left + k % 2
                 weights[k] = 0
                 if y < height and x < width and known[y, x]:
@@ -181,7 +193,7 @@ def _reduce_by_half(
                     weight_sum += weights[k]
                     depth_sum += weights[k] * depths[y, x]
             coarse_known[row, column] = weight_sum > 0
-            if not weight_sum > 0:
+            if not weight_sum > 0:  # no pixel of the block is known
                 continue
 
             coarse_depths[row, column] = depth_sum / weight_sum
@@ -197,10 +209,13 @@ def _reduce_by_half(
 def _far_weight(relative_depth: Any, bias: Any) -> Any:
     """The weight relative_depth^−bias, float32, of a pixel for the mean of its block.
 
-    `relative_depth` is the inverse depth over the usual one: far pixels, below 1, weigh more.
+    `relative_depth` is the pixel's inverse depth divided by the median one. Farther pixels have a
+    smaller inverse depth, so they weigh more. The weight stays between two bounds, so that neither
+    it nor a sum of weights leaves the range of float32.
     """
     if bias == 0:
         return np.float32(1)
+    # A power by its logarithm, which shows too large a weight early; 1e-6, as log 0 is infinite.
     exponent = -bias * np.log(max(relative_depth, np.float32(1e-6)))
     if abs(exponent) < MAX_EXPONENT:
         return np.float32(np.exp(np.float64(exponent)))
@@ -216,11 +231,11 @@ def _find_holes(known: Any, hole_count: int) -> Any:
         hole_count: number n of unknown pixels.
 
     Returns:
-        hole_pixels [n]: positions y·W + x of the unknown pixels; the k-th has the number k.
-        neighbors [n, 4]: numbers of the pixels above, below, left and right of each; at the image's
-            border, a pixel is its own neighbour.
-        rim_pixels [m]: positions of the known pixels around the holes; the k-th has the number
-            n + k.
+        hole_pixels [n]: positions y·W + x of the unknown pixels; the k-th pixel has the number k.
+        neighbors [n, 4]: numbers of the pixels above, below, left and right of each hole pixel; at
+            the image's border, a pixel is its own neighbour.
+        rim_pixels [m]: positions of the known pixels around the holes; the k-th of them has the
+            number n + k.
     """
     height, width = known.shape
     hole_pixels = np.empty(hole_count, np.int32)
@@ -229,6 +244,7 @@ def _find_holes(known: Any, hole_count: int) -> Any:
     rim_pixels = np.empty(max_rim_count, np.int32)
     numbers = np.empty((height, width), np.int32)  # of all pixels; -1 as long as there is none
 
+    # First all hole pixels get their numbers, because a pixel's neighbours may come after it.
     n = 0
     for y in range(height):
         for x in range(width):
@@ -239,6 +255,7 @@ def _find_holes(known: Any, hole_count: int) -> Any:
                 hole_pixels[n] = y * width + x
                 n += 1
 
+    # Then each hole pixel learns the numbers of its neighbours; a known neighbour gets one now.
     rim_count = 0
     for n in range(hole_count):
         y, x = hole_pixels[n] // width, hole_pixels[n] % width
@@ -252,7 +269,7 @@ def _find_holes(known: Any, hole_count: int) -> Any:
                 neighbor_x = max(x - 1, 0)
             else:
                 neighbor_x = min(x + 1, width - 1)
-            if numbers[neighbor_y, neighbor_x] < 0:  # a known pixel that is met first here
+            if numbers[neighbor_y, neighbor_x] < 0:  # a known pixel without a number
                 numbers[neighbor_y, neighbor_x] = hole_count + rim_count
                 rim_pixels[rim_count] = neighbor_y * width + neighbor_x
                 rim_count += 1
@@ -276,11 +293,12 @@ def _interpolate_guess(
     rows, columns, channels = coarse_values.shape
     for n in range(len(hole_pixels)):
         y, x = hole_pixels[n] // width, hole_pixels[n] % width
-        # A fine pixel's centre lies a quarter of a coarse pixel from the centre of the coarse pixel
-        # that covers it: before it if the fine pixel's number is even, else behind it.
+        # Bilinear weights. A fine pixel's centre lies a quarter of a coarse pixel beside the centre
+        # of the coarse pixel that covers it, so that one has the weight 0.75. Of two rows it is the
+        # lower one if y is even, and of two columns the right one if x is even.
         upper_row, left_column = (y - 1) // 2, (x - 1) // 2
-        down = np.float32(0.75) if y % 2 == 0 else np.float32(0.25)
-        across = np.float32(0.75) if x % 2 == 0 else np.float32(0.25)
+        down = np.float32(0.75) if y % 2 == 0 else np.float32(0.25)  # weight of the lower row
+        across = np.float32(0.75) if x % 2 == 0 else np.float32(0.25)  # of the right column
         top, bottom = max(upper_row, 0), min(upper_row + 1, rows - 1)
         left, right = max(left_column, 0), min(left_column + 1, columns - 1)
 
@@ -301,14 +319,15 @@ def _interpolate_guess(
 
 @kernel
 def _relax(samples: Any, buffer: Any, neighbors: Any, bias: Any, sweeps: int) -> Any:
-    """Replace each hole sample by the weighted mean of its four neighbours, several times (Jacobi).
+    """Replace each hole pixel by the weighted mean of its four neighbours, several times (Jacobi).
 
     Args:
-        samples: [n + m, 1 + C] samples of n hole pixels, then of m rim pixels, which stay: inverse
-            depth, then C values. Overwritten.
-        buffer: a copy of `samples`. Overwritten.
-        neighbors: [n, 4] numbers of the rows of the neighbours.
-        bias: [n] preference for the far side; 0 makes a plain mean.
+        samples: [n + m, 1 + C] one row for each pixel, with its inverse depth and then C values:
+            first n hole pixels, then m rim pixels (known pixels beside a hole), which stay as they
+            are. Overwritten.
+        buffer: a copy of `samples`, for every other repetition. Overwritten.
+        neighbors: [n, 4] the rows in `samples` of each hole pixel's neighbours.
+        bias: [n] preference for the far side of the rim; 0 makes a plain mean.
         sweeps: number of repetitions.
 
     Returns:
@@ -319,7 +338,7 @@ def _relax(samples: Any, buffer: Any, neighbors: Any, bias: Any, sweeps: int) ->
     for _ in range(sweeps):
         for n in range(hole_count):
             up, down, left, right = neighbors[n]
-            # Inside of a hole, all neighbours have the same weight.
+            # Inside of a hole, all neighbours are hole pixels, and have the same weight.
             if bias[n] == 0 or max(up, down, left, right) < hole_count:
                 for channel in range(channels):
                     neighbor_sum = (
@@ -331,7 +350,7 @@ def _relax(samples: Any, buffer: Any, neighbors: Any, bias: Any, sweeps: int) ->
                     new[n, channel] = neighbor_sum / NEIGHBOR_COUNT
                 continue
 
-            # Beside the rim, known samples that are nearer than the fill weigh less.
+            # Beside the rim, known pixels that are nearer than the hole pixel weigh less.
             weight_sum = np.float32(0)
             new[n] = 0
             for k in range(NEIGHBOR_COUNT):
@@ -357,5 +376,6 @@ def _rim_weight(fill_depth: Any, rim_depth: Any, bias: Any) -> Any:
     """
     if rim_depth <= fill_depth:
         return np.float32(1)
+    # The small numbers keep the division and the logarithm finite.
     ratio = max(fill_depth / max(rim_depth, np.float32(1e-12)), np.float32(1e-6))
     return np.float32(max(np.exp(bias * np.log(np.float64(ratio))), MIN_RIM_WEIGHT))

@@ -62,6 +62,8 @@ def read_image(path: str | os.PathLike[str], read: Callable[[Image.Image], T]) -
     ):
         warnings.simplefilter("ignore")  # about broken EXIF
         try:
+            # A bounded file never allocates more than its size, whatever a broken image claims. It
+            # has a buffer of its own, so the file below it needs none.
             with _BoundedFile(open(path, "rb", buffering=0)) as file, Image.open(file) as image:
                 check_pixel_count(image.width, image.height, file.size, path)
                 return read(image)
@@ -73,14 +75,27 @@ def read_image(path: str | os.PathLike[str], read: Callable[[Image.Image], T]) -
             ) from None
 
 
-def check_pixel_count(width: int, height: int, size: int, path: str | os.PathLike[str]) -> None:
-    """Raise an InputError if a width×height image in a file of `size` bytes needs too much memory.
+def check_pixel_count(
+    width: int, height: int, file_bytes: int | None, path: str | os.PathLike[str]
+) -> None:
+    """Raise an InputError if an image has so many pixels that it would need too much memory.
 
-    `path` is the file's name for the message.
+    Args:
+        width: of the image in pixels.
+        height: of the image in pixels.
+        file_bytes: size of the image's file. A tiny file that claims a huge image is broken or
+            malicious, so a large image must have a large file. None: the image is in memory.
+        path: the file's name, for the message.
     """
-    max_pixels = min(MAX_PIXELS, max(HARMLESS_PIXELS, MAX_PIXELS_PER_BYTE * size))
+    if file_bytes is None:
+        max_pixels = MAX_PIXELS
+    else:
+        max_pixels = min(MAX_PIXELS, max(HARMLESS_PIXELS, MAX_PIXELS_PER_BYTE * file_bytes))
+
     if width * height > max_pixels:
-        limit = f"at most {max_pixels // 10**6} megapixels in {size:,} bytes"
+        limit = f"at most {max_pixels // 10**6} megapixels"
+        if file_bytes is not None:
+            limit += f" in {file_bytes:,} bytes"
         raise InputError(f"{path}: {width}×{height} is too large ({limit}): shrink the image first")
 
 
@@ -111,13 +126,14 @@ def to_srgb_tensor(image: Image.Image, path: str | os.PathLike[str]) -> Tensor:
     if is_deep_grey:
         return _deep_grey_to_tensor(image, path)
 
-    # Conversions of the mode lose the profile, so it is fetched first.
+    # The colour profile is fetched now, because converting the mode loses it.
     profile = image.info.get("icc_profile")
     if image.has_transparency_data:
         image = image.convert("RGBA")
         white = Image.new("RGBA", image.size, "white")
         image = Image.alpha_composite(white, image).convert("RGB")
-    elif image.mode not in ("RGB", "L", "CMYK"):  # the modes that have colour profiles
+    elif image.mode not in ("RGB", "L", "CMYK"):
+        # Those three modes stay until the profile is applied, because it describes them.
         image = image.convert("RGB")
     image = _apply_colour_profile(image, profile).convert("RGB")
     return torch.from_numpy(np.array(image)).float().div_(255)
@@ -146,6 +162,7 @@ def _apply_colour_profile(image: Image.Image, profile: bytes | None) -> Image.Im
         if "sRGB" in ImageCms.getProfileDescription(source):
             return image
         target = ImageCms.createProfile("sRGB")
-        return ImageCms.profileToProfile(image, source, target, outputMode="RGB") or image
+        converted = ImageCms.profileToProfile(image, source, target, outputMode="RGB")
+        return converted or image  # never None here, but Pillow's types allow it
     except (ImageCms.PyCMSError, OSError, ValueError, TypeError):
         return image

@@ -93,8 +93,9 @@ class KeyframePath:
         span = self.keys[-1].time - self.keys[0].time
         if not self.closed:
             return span
-        # The way back takes as long as the mean step between two keyframes.
-        return span * len(self.keys) / (len(self.keys) - 1)
+        # The way back to the first keyframe is one step more, as long as the mean of the others.
+        step_count = len(self.keys) - 1
+        return span * (step_count + 1) / step_count
 
     def frame_count(self, fps: float) -> int:
         """The path's number of frames; that of an open path includes both its ends."""
@@ -102,10 +103,17 @@ class KeyframePath:
         return max(1, steps if self.closed else steps + 1)
 
     def cameras(self, camera: Camera, frames: int, depth_range: DepthRange) -> list[Camera]:
-        """Views at equal time steps, of the size of `camera`, the photo's camera at the origin.
+        """Views at equal time steps, with the image size of the photo's camera at the origin.
 
-        An open path includes both its ends; a closed path does not end with its first frame.
-        `depth_range` determines the length of the unit "disparity".
+        The views of an open path include both its ends. Those of a closed path leave out the end,
+        because it is the first view again.
+
+        Args:
+            camera: the photo's camera.
+            frames: number of views.
+            depth_range: depths of the photo's Gaussians; if the path's unit is "disparity", lengths
+                are multiples of the camera offset that moves the nearest of these depths by the
+                image's diagonal.
 
         Raises:
             PathError: between two keyframes the eye meets the target, or the view becomes parallel
@@ -122,7 +130,8 @@ class KeyframePath:
         Args:
             times: in seconds.
             camera: the photo's camera at the origin.
-            depth_range: depths of the photo's Gaussians, for the unit "disparity".
+            depth_range: depths of the photo's Gaussians; they decide how long the unit "disparity"
+                is.
 
         Raises:
             PathError: between two keyframes the eye meets the target, or the view becomes parallel
@@ -132,7 +141,9 @@ class KeyframePath:
         if self.unit == "disparity":
             unit_length = disparity_to_offset(camera, 1.0, depth_range)
 
-        rows = []  # eye, target, up and logarithm of the focal length of each keyframe
+        # Ten numbers of each keyframe are interpolated: eye, target and up, with three coordinates
+        # each, and the logarithm of the focal length, because zooming multiplies.
+        rows = []
         for key in self.keys:
             up = np.array(key.up) / np.linalg.norm(key.up)
             rows.append((*key.eye, *key.target, *up, math.log(key.focal_px(camera))))
@@ -156,14 +167,19 @@ class KeyframePath:
                     f"at {time:.3g} s, between two keyframes, {error}: add a keyframe there"
                 ) from None
             moved = dataclasses.replace(camera, world_to_camera=pose.to(camera.world_to_camera))
-            views.append(moved.zoomed(focal_px / camera.focal[0]))
+            focal_x, _ = camera.focal
+            views.append(moved.zoomed(focal_px / focal_x))
         return views
 
 
 def _look_at(
     eye: Sequence[float] | Array, target: Sequence[float] | Array, up: Sequence[float] | Array
 ) -> Tensor:
-    """The matrix world_to_camera [4, 4] of a camera at `eye`; PathError if it sees nothing."""
+    """The matrix world_to_camera [4, 4] of a camera at `eye` that looks at `target`.
+
+    PathError if there is no such view, because eye and target coincide or `up` is parallel to the
+    viewing direction.
+    """
     try:
         return look_at(
             torch.tensor(eye, dtype=torch.float64),
@@ -189,7 +205,9 @@ def interpolate_monotone(
         [M, C].
     """
     if period is not None:
-        # One value before and two after the period give closed curves the same tangents everywhere.
+        # The tangent at a value depends on the values before and after it. A closed curve goes on
+        # beyond both its ends, so the last value is put before the first one, and the first two
+        # after the last one.
         times = np.concatenate([times[-1:] - period, times, times[:2] + period])
         values = np.concatenate([values[-1:], values, values[:2]])
     steps = np.diff(times)[:, None]  # [K − 1, 1]
@@ -203,15 +221,15 @@ def interpolate_monotone(
     u = np.clip((new_times - times[segment])[:, None] / step, 0, 1)
     before, after = values[segment], values[segment + 1]
 
-    # Hermite's cubic: a blend of both values, bent by both tangents. The blend starts at the closer
-    # value, so that rounding errors are smallest there.
+    # Hermite's cubic: a blend of the values before and after, plus a bend that gives the curve its
+    # tangents. The blend is computed from the closer value, near which rounding errors are small.
     blend = np.where(
         u < 0.5,
         before + (3 - 2 * u) * u**2 * (after - before),
         after - (1 + 2 * u) * (1 - u) ** 2 * (after - before),
     )
     bend = (1 - u) ** 2 * u * tangents[segment] - u**2 * (1 - u) * tangents[segment + 1]
-    # Rounding may exceed the bounds.
+    # Rounding errors may exceed the range of both values.
     bounded: Array = np.clip(
         blend + step * bend, np.minimum(before, after), np.maximum(before, after)
     )
@@ -233,7 +251,7 @@ def _inner_tangents(steps: Array, slopes: Array) -> Array:
     weight_before = steps[1:] * 2 + steps[:-1]
     weight_after = steps[1:] + 2 * steps[:-1]
     is_monotone = slope_before * slope_after > 0
-    # Where it is not, the mean is not used, and a 1 avoids a division by zero.
+    # At a maximum or minimum the mean is not used; slopes of 1 avoid a division by zero there.
     safe_before = np.where(is_monotone, slope_before, 1)
     safe_after = np.where(is_monotone, slope_after, 1)
     mean = (weight_before + weight_after) / (

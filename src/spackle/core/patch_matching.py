@@ -43,8 +43,9 @@ SEARCH_ROUNDS = 6  # number of searches and votes at each level
 NEIGHBOR_STEPS = (4, 1)  # distances, in pixels, to the neighbours whose matches a search tries
 SEED_STEP = 7919  # a prime, by which the random numbers of searches differ
 
-TONE_BLUR_CELLS = 4.0  # standard deviation, in pixels, of the blur that makes the tone L
-MIN_TONE_BLUR_PX = 0.5  # the same at the coarsest levels
+# The tone L of a pixel is its blurred colour.
+TONE_BLUR_CELLS = 4.0  # standard deviation, in pixels of the finest level, of that blur
+MIN_TONE_BLUR_PX = 0.5  # least standard deviation at the coarse levels
 DEPTH_WEIGHT = 0.15
 TONE_WEIGHT = math.sqrt(2)
 DISTANCE_WEIGHT = 0.05
@@ -72,19 +73,25 @@ class Patches:
 
 
 def match_patches(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> Patches:
-    """Fill a hole by patches of the known part.
+    """Fill a hole in a picture with colours of small square patches from its known part.
 
     Args:
         guess: [H, W, 3] sRGB, with smooth colours in the hole.
-        hole: [H, W] bool.
+        hole: [H, W] bool, true at the pixels to fill.
         inverse_depth: [H, W], positive everywhere; patches come from a similar depth.
+
+    Returns:
+        The filled picture, the patch that each hole pixel matches best, and how badly it matches.
     """
     levels = _build_pyramid(guess.detach().float(), hole, inverse_depth.detach().float())
     matches = None
-    for number in reversed(range(len(levels))):  # the coarsest level first
-        matches = _match_level(levels[number], matches, number)
+    # The coarsest level comes first, because each level starts from the matches of the last one.
+    for number in reversed(range(len(levels))):
+        matches = _match_level(levels[number], matches, level_number=number)
 
     finest = levels[0]
+    # Outside of the hole, a pixel has no patch: −1 marks this. There is no match at all if the
+    # picture has no hole, or no patch without a hole pixel.
     mismatch = np.zeros(hole.shape, np.float32)
     positions = np.full((*hole.shape, 3), -1, np.int32)
     if matches is not None:
@@ -108,7 +115,9 @@ class _Level:
 
 
 def _build_pyramid(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> list[_Level]:
-    """Reduce the picture by half as often as patches have room; returns the finest level first.
+    """Halve the picture again and again; returns all sizes, the finest level first.
+
+    The coarsest level is the last one on which patches still have room around the hole.
 
     Args:
         guess: [H, W, 3] float32 sRGB.
@@ -116,15 +125,17 @@ def _build_pyramid(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> list[_
         inverse_depth: [H, W] float32.
     """
     depth = _relative_log_depth(inverse_depth, hole)  # [H, W, 1]
-    tone = guess
+    tone = guess  # is blurred at each level; unlike `rgb`, it keeps the smooth colours in the hole
     rgb = guess.clone(memory_format=torch.contiguous_format)
     nearest = nearest_known_pixels(hole.numpy())
     _mirror_into_hole(rgb.numpy(), hole.numpy(), depth[..., 0].numpy(), nearest)
 
     levels: list[_Level] = []
     while True:
-        # The blur is as wide in the scene at every level, so it halves with the picture.
+        # At half the resolution, half as many pixels of blur are the same blur in the scene.
         tone_blur = max(TONE_BLUR_CELLS / 2 ** len(levels), MIN_TONE_BLUR_PX)
+        # Beside the pixels of a patch, its centre must agree in tone and depth: these traits are
+        # scaled so that their squared differences are costs.
         traits = [TONE_WEIGHT * gaussian_blur(tone, tone_blur), DEPTH_WEIGHT * depth]
         level = _Level(
             rgb=rgb.contiguous().numpy(),
@@ -137,6 +148,7 @@ def _build_pyramid(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> list[_
         # A reduced pixel belongs to the hole if any of its four pixels does.
         coarse_hole = avg_pool2d(hole[None].float(), 2, ceil_mode=True)[0] > 0
         is_small = min(hole.shape) < 2 * MIN_COARSEST_SIDE_PX  # half of it would be too small
+        # A level that is all hole would have no patches, and without a hole none are needed.
         if is_small or bool(coarse_hole.all()) or not bool(hole.any()):
             return levels
         rgb = _reduce_by_half(rgb)
@@ -147,7 +159,7 @@ def _build_pyramid(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> list[_
 
 def _relative_log_depth(inverse_depth: Tensor, hole: Tensor) -> Tensor:
     """log inverse depth [H, W, 1] in units of its standard deviation at the known pixels."""
-    log_depth = inverse_depth.clamp_min(1e-9).log()[..., None]
+    log_depth = inverse_depth.clamp_min(1e-9).log()[..., None]  # clamped: log 0 is infinite
     spread = 0.0
     if bool((~hole).any()):
         spread = float(log_depth[~hole].std(correction=0))
@@ -155,18 +167,23 @@ def _relative_log_depth(inverse_depth: Tensor, hole: Tensor) -> Tensor:
 
 
 def _pixel_weights(hole: Bools) -> Floats:
-    """Weights [h + 6, w + 6] of the pixels in a patch, with three zeros beyond each side.
+    """Weights [h + 6, w + 6] of a picture's pixels [h, w] when two patches are compared.
 
-    Known pixels have the weight 1. The guess deep in a hole [h, w] is unreliable, and counts less:
-    0.8^d for a pixel that is d pixels away from the nearest known one.
+    Known pixels have the weight 1. The guess deep in a hole is unreliable, so it counts less:
+    0.8^d for a pixel that is d pixels away from the nearest known one. The picture is padded with
+    three pixels of weight 0 at each side, because a patch of 7×7 pixels may reach beyond it.
     """
     distance = distance_to_nearest(nearest_known_pixels(hole)).numpy()
+    # Above zero, because a mean over a patch deep in the hole divides by the sum of the weights.
     weights = np.maximum(np.float32(FADING_PER_PX) ** distance, MIN_PIXEL_WEIGHT)
     return np.pad(weights.astype(np.float32, copy=False), PATCH_RADIUS)
 
 
 def _reduce_by_half(image: Tensor) -> Tensor:
-    """Means of 2×2 pixels of an image [h, w, C]; fewer pixels at an odd border."""
+    """Means of 2×2 pixels of an image [h, w, C], as [⌈h/2⌉, ⌈w/2⌉, C].
+
+    The last row or column of an odd number has means of the fewer pixels that are there.
+    """
     planes = image.permute(2, 0, 1)
     means = avg_pool2d(planes, 2, ceil_mode=True, count_include_pad=False)
     return means.permute(1, 2, 0)
@@ -176,8 +193,8 @@ def _reduce_by_half(image: Tensor) -> Tensor:
 def _mirror_into_hole(rgb: Any, hole: Any, depth: Any, nearest: Any) -> None:
     """Fill each hole pixel, in place, with its mirror image about the nearest known pixel.
 
-    A mirrored texture is a better start of the search than a smooth guess. The pixel is left alone
-    if its mirror image is unknown or lies on another surface.
+    A mirrored texture is a better start of the search than a smooth guess. A hole pixel keeps its
+    colour if its mirror image is unknown or lies on another surface.
 
     Args:
         rgb: [h, w, 3] changed in the hole.
@@ -190,7 +207,7 @@ def _mirror_into_hole(rgb: Any, hole: Any, depth: Any, nearest: Any) -> None:
         for x in range(width):
             if not hole[y, x]:
                 continue
-            # The point as far beyond the nearest known pixel as this pixel is before it.
+            # (v, u) is the mirror image: the nearest known pixel lies halfway to it.
             v = 2 * nearest[0, y, x] - y
             u = 2 * nearest[1, y, x] - x
             is_inside = 0 <= v < height and 0 <= u < width
@@ -207,13 +224,19 @@ class _Matches:
     costs: Floats  # [n]
 
 
-def _match_level(level: _Level, coarse: _Matches | None, number: int) -> _Matches | None:
-    """Alternate search and vote at a level; None without a hole, or without any usable patch.
+def _match_level(level: _Level, coarse: _Matches | None, level_number: int) -> _Matches | None:
+    """Find the patch that matches each hole pixel of a level best, and colour the hole by them.
+
+    A search for better patches alternates with a vote, which sets the hole's colours to the means
+    of the patches that cover them.
 
     Args:
         level: its colours in the hole are changed in place.
         coarse: the matches of the level of half the size; None makes a random start.
-        number: of the level, for the random numbers.
+        level_number: 0 is the finest; it makes the random numbers of the levels differ.
+
+    Returns:
+        The matches; None if the level has no hole, or no patch that is known as a whole.
     """
     is_usable = _usable_patches(level.hole)
     if not is_usable.any() or not level.hole.any():
@@ -225,8 +248,11 @@ def _match_level(level: _Level, coarse: _Matches | None, number: int) -> _Matche
     for search_round in range(SEARCH_ROUNDS):
         search.score()
         for step in NEIGHBOR_STEPS:
-            call = (number * SEARCH_ROUNDS + search_round) * len(NEIGHBOR_STEPS) + step
-            search.improve(step, seed=np.uint32(call * SEED_STEP))
+            # No other search gets the same number: from round to round it grows by two, and of the
+            # two steps, one is even and one is odd.
+            round_number = level_number * SEARCH_ROUNDS + search_round
+            search_number = round_number * len(NEIGHBOR_STEPS) + step
+            search.improve(step, seed=np.uint32(search_number * SEED_STEP))
         search.vote(mean_cost=float(search.matches.costs.mean()))
     return search.matches
 
@@ -235,6 +261,7 @@ def _usable_patches(hole: Bools) -> Bools:
     """Whether a patch around each pixel [h, w] lies inside the picture and has no hole pixel."""
     # A patch has a hole pixel if there is one within its radius around the centre.
     is_usable: Bools = ~maximum_filter(torch.from_numpy(hole), PATCH_RADIUS).numpy()
+    # Nor may a patch reach beyond the picture's border.
     is_usable[:PATCH_RADIUS] = False
     is_usable[-PATCH_RADIUS:] = False
     is_usable[:, :PATCH_RADIUS] = False
@@ -249,7 +276,7 @@ class _LevelSearch:
         """Number the hole's pixels and build the images that the kernels read.
 
         Args:
-            level: its colours in the hole are changed by votes.
+            level: the picture with its hole; `vote` changes the hole's colours in place.
             is_usable: [h, w] whether the patch around each pixel is usable.
         """
         height, width = level.hole.shape
@@ -257,6 +284,7 @@ class _LevelSearch:
         self._hole_pixels = np.argwhere(level.hole).astype(np.int32)  # [n, 2] rows, columns
         self._usable_centers = np.argwhere(is_usable).astype(np.int32)  # [k, 2]
         self._is_usable = _with_mirror_image(is_usable)
+        # Zeros around the picture let a patch at its border reach beyond it.
         padding = (PATCH_RADIUS, PATCH_RADIUS)
         self._inputs = CostInputs(
             padded_rgb=np.pad(level.rgb, (padding, padding, (0, 0))),
@@ -264,9 +292,11 @@ class _LevelSearch:
             traits=level.traits,
             source_rgb=_with_mirror_image(level.rgb),
             source_traits=_with_mirror_image(level.traits),
+            # Distances count in long sides of the picture.
             distance_weight=np.float32(DISTANCE_WEIGHT / max(height, width) ** 2),
         )
 
+        # A number for each hole pixel, so that matches and costs are short lists.
         count = len(self._hole_pixels)
         numbers = np.full((height, width), -1, np.int32)
         numbers[level.hole] = np.arange(count)
@@ -275,11 +305,13 @@ class _LevelSearch:
         )
 
     def start_from(self, coarse: _Matches | None) -> None:
-        """Take the first matches from the coarser level, or at random."""
+        """Take the first matches from the coarser level; at random if `coarse` is None."""
+        # Without a coarser level, the kernel reads nothing of one, but its arguments must be
+        # arrays; this level's own stand in.
         parents = self.matches if coarse is None else coarse
         start_matches(
             self._hole_pixels,
-            coarse is not None,
+            coarse is not None,  # has_coarse
             parents.numbers,
             parents.positions,
             self._is_usable,
@@ -288,7 +320,7 @@ class _LevelSearch:
         )
 
     def score(self) -> None:
-        """Compute the cost of each hole pixel's patch anew: a vote has changed the colours."""
+        """Compute the cost of each hole pixel's patch anew, because a vote changed the colours."""
         parallel_for_chunks(
             lambda start, stop: score_matches(
                 start,
@@ -302,8 +334,14 @@ class _LevelSearch:
         )
 
     def improve(self, step: int, seed: np.uint32) -> None:
-        """Search better patches for all hole pixels, also from neighbours `step` pixels away."""
-        # All pixels look at the old matches, so the result does not depend on the threads' order.
+        """Search better patches for all hole pixels, and keep the best one of each.
+
+        Args:
+            step: the matches of the neighbours that are this many pixels away are tried, too.
+            seed: makes the random candidates of this search differ from those of other searches.
+        """
+        # All pixels read the old matches of their neighbours, in copies that nobody changes, so the
+        # result does not depend on the order of the threads.
         old_positions = self.matches.positions.copy()
         old_costs = self.matches.costs.copy()
         parallel_for_chunks(
@@ -328,7 +366,8 @@ class _LevelSearch:
     def vote(self, mean_cost: float) -> None:
         """Give the hole's pixels the mean colours of the patches that cover them.
 
-        Patches whose cost is above `mean_cost` weigh little.
+        A patch weighs exp(−cost / mean_cost), so one that costs much more than the mean weighs
+        little.
         """
         parallel_for_chunks(
             lambda start, stop: vote_colors(
@@ -344,6 +383,7 @@ class _LevelSearch:
             ),
             len(self._hole_pixels),
         )
+        # The next search compares patches of the padded copy, which must have the new colours.
         inner = slice(PATCH_RADIUS, -PATCH_RADIUS)
         self._inputs.padded_rgb[inner, inner] = self._rgb
 

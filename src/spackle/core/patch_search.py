@@ -41,7 +41,7 @@ class CostInputs(NamedTuple):
 
 @kernel
 def hash_uint32(value: Any) -> Any:
-    """Mix the bits of a number: a random uint32 that depends on the number alone."""
+    """A uint32 that looks random, but depends on the given number alone."""
     # Each shift mixes high bits into the low ones, each multiplication low bits into the high ones.
     value = np.uint32(value)
     value ^= value >> np.uint32(16)
@@ -56,17 +56,22 @@ def hash_uint32(value: Any) -> Any:
 def _color_cost(
     padded_rgb: Any, weights: Any, source_rgb: Any, y: int, x: int, v: int, u: int, limit: Any
 ) -> Any:
-    """Weighted mean of the squared colour differences of two patches; infinity beyond `limit`.
+    """Weighted mean of the squared colour differences of two patches of 7×7 pixels.
+
+    One patch lies around (y, x) in the picture, and may have hole pixels. The other one lies around
+    (v, u) in a source of patches, and is known as a whole.
 
     Args:
-        padded_rgb: [h + 6, w + 6, 3] the picture with three zeros at each side.
-        weights: [h + 6, w + 6] of the pixels around (y, x).
-        source_rgb: [h, w, 3] the picture or its mirror image, for the patch around (v, u).
+        padded_rgb: [h + 6, w + 6, 3] the picture with three zeros at each side, because the patch
+            around (y, x) may reach beyond the picture.
+        weights: [h + 6, w + 6] weights of the pixels of `padded_rgb`; 0 beyond the picture.
+        source_rgb: [h, w, 3] the picture or its mirror image.
         y: row of the hole's pixel in the picture without padding.
-        x: column of the hole's pixel.
-        v: row of the patch's centre.
-        u: column of the patch's centre.
-        limit: a larger mean is of no interest, and the computation stops.
+        x: column of the hole's pixel in the picture without padding.
+        v: row of the other patch's centre.
+        u: column of the other patch's centre.
+        limit: a patch with a larger mean is not wanted, so the sum stops early, and the result is
+            infinity.
     """
     weight_sum = np.float32(0)
     for j in range(PATCH_SIDE):
@@ -77,12 +82,14 @@ def _color_cost(
     total = np.float32(0)
     for j in range(PATCH_SIDE):
         for i in range(PATCH_SIDE):
-            # With the padding, (y, x) is the first pixel of the patch around (y, x).
+            # The padding is as wide as the patch's radius, so the patch around (y, x) begins at
+            # (y, x) in the padded picture.
             row, column = v + j - PATCH_RADIUS, u + i - PATCH_RADIUS
             red = padded_rgb[y + j, x + i, 0] - source_rgb[row, column, 0]
             green = padded_rgb[y + j, x + i, 1] - source_rgb[row, column, 1]
             blue = padded_rgb[y + j, x + i, 2] - source_rgb[row, column, 2]
             total += weights[y + j, x + i] * (red * red + green * green + blue * blue)
+        # Once a row, because a test for each pixel would cost more than it saves.
         if total > max_total:
             return np.float32(np.inf)
     return total / weight_sum
@@ -90,10 +97,11 @@ def _color_cost(
 
 @kernel
 def patch_cost(inputs: Any, y: int, x: int, source: int, v: int, u: int, limit: Any) -> Any:
-    """The cost, float32, of a patch for a pixel of the hole; infinity if it exceeds `limit`.
+    """The cost, float32, of the patch around (v, u) for the hole pixel (y, x).
 
-    It is the sum of the squared differences of the traits (tone and depth), of the weighted squared
-    distance in the picture, and of the mean squared difference of the colours.
+    It is the sum of three terms: the squared differences of tone (blurred colour) and depth at both
+    centres, the weighted squared distance of the centres in the picture, and the mean squared
+    difference of the colours in the 7×7 pixels around them.
 
     Args:
         inputs: the images, `CostInputs`.
@@ -102,20 +110,23 @@ def patch_cost(inputs: Any, y: int, x: int, source: int, v: int, u: int, limit: 
         source: 0 for the picture, 1 for its mirror image.
         v: row of the patch's centre in the source.
         u: column of the patch's centre in the source.
-        limit: a larger cost is of no interest, and the computation stops early.
+        limit: a patch with a larger cost is not wanted, so the computation stops early, and the
+            result is infinity.
     """
+    # Traits are tone and depth, scaled so that squared differences are costs.
     traits, source_traits = inputs.traits, inputs.source_traits
     cost = np.float32(0)
     for c in range(traits.shape[2]):
         difference = traits[y, x, c] - source_traits[source, v, u, c]
         cost += difference * difference
 
-    # The distance counts in the picture, where a mirrored patch has another column.
+    # The distance is measured in the picture. A patch of the mirror image is turned back for it.
     last_column = traits.shape[1] - 1
     rows_apart = y - v
     columns_apart = x - (last_column - u if source else u)
     distance2 = np.float32(rows_apart * rows_apart + columns_apart * columns_apart)
     cost += inputs.distance_weight * distance2
+    # The colours take most of the time, and are needed only if the rest is cheap enough.
     if cost >= limit:
         return np.float32(np.inf)
     return cost + _color_cost(
@@ -140,6 +151,7 @@ def score_matches(
     for n in range(start, stop):
         y, x = hole_pixels[n]
         source, v, u = matches[n]
+        # No patch costs as much as this limit, so every cost is computed to its end.
         costs[n] = patch_cost(inputs, y, x, source, v, u, LARGE_COST)
 
 
@@ -150,19 +162,23 @@ def start_matches(
 ) -> None:  # fmt: skip
     """Take the first match of each hole pixel from the level of half the size, or at random.
 
+    A match is the source of a patch (0 for the picture, 1 for its mirror image), and the row and
+    column of the patch's centre in the source.
+
     Args:
         hole_pixels: [n, 2] rows and columns.
         has_coarse: whether there is a coarser level; else all matches are random.
         coarse_numbers: [⌈h/2⌉, ⌈w/2⌉] numbers of the coarser level's hole pixels; −1 elsewhere.
         coarse_matches: [m, 3] the coarser level's matches, by these numbers.
-        is_usable: [2, h, w] whether the patch around a pixel of each source is usable.
-        usable_centers: [k, 2] rows and columns of the usable patches of the picture.
+        is_usable: [2, h, w] whether the patch around a pixel of each source has no hole pixel.
+        usable_centers: [k, 2] rows and columns of the picture's patches without hole pixels.
         matches: [n, 3] written.
     """
     coarse_height, coarse_width = coarse_numbers.shape
     height, width = is_usable.shape[1:]
     for n in range(len(hole_pixels)):
         y, x = hole_pixels[n]
+        # A random patch of the picture stays where the coarser level has no match that fits.
         center = usable_centers[hash_uint32(np.uint32(n)) % np.uint32(len(usable_centers))]
         matches[n, 0], matches[n, 1], matches[n, 2] = 0, center[0], center[1]
         if not has_coarse:
@@ -172,7 +188,8 @@ def start_matches(
         if k < 0:
             continue
         source = coarse_matches[k, 0]
-        # Columns of the mirror image count from the right, where a last odd column is cut.
+        # Halving an odd width adds a column at the right, which is the left of the mirror image.
+        # There, all columns must move back by this one.
         shift = width - 2 * coarse_width if source else 0
         row = 2 * coarse_matches[k, 1] + y % 2
         column = 2 * coarse_matches[k, 2] + x % 2 + shift
@@ -199,8 +216,8 @@ def improve_matches(
         numbers: [h, w] numbers of the hole pixels; −1 elsewhere.
         old_matches: [n, 3] source, row and column of each pixel's patch.
         old_costs: [n] of these matches.
-        is_usable: [2, h, w] whether the patch around a pixel of each source is usable.
-        usable_centers: [k, 2] rows and columns of the usable patches of the picture.
+        is_usable: [2, h, w] whether the patch around a pixel of each source has no hole pixel.
+        usable_centers: [k, 2] rows and columns of the picture's patches without hole pixels.
         step: distance in pixels to the neighbours.
         seed: uint32 that makes the random numbers of this call differ from those of others.
         inputs: the images, `CostInputs`.
@@ -229,6 +246,7 @@ def improve_matches(
                 if new_cost < cost:
                     cost, source, row, column = new_cost, new_source, v, u
 
+        # A random patch of either source, because the good ones may lie far from all matches.
         random = hash_uint32(np.uint32(n) * PIXEL_SEED_STEP + seed)
         center = usable_centers[random % np.uint32(len(usable_centers))]
         random = hash_uint32(random)
@@ -238,6 +256,7 @@ def improve_matches(
         if new_cost < cost:
             cost, source, row, column = new_cost, new_source, v, u
 
+        # Random patches around the best one, in squares that shrink from half the picture's side.
         radius = max(height, width) // 4
         while radius >= 1:
             random = hash_uint32(random)
@@ -261,14 +280,16 @@ def vote_colors(
 ) -> None:  # fmt: skip
     """Set the colours of the hole pixels start..stop to means over all patches that cover them.
 
-    A patch has the weight exp(−cost / mean_cost).
+    Each hole pixel has a match: a patch of 7×7 pixels that is to be copied around it, so the
+    patches of all hole pixels nearby cover a pixel. A patch has the weight exp(−cost / mean_cost),
+    plus a millionth that keeps the weights from adding up to 0.
 
     Args:
         start: number of the first pixel.
         stop: number after the last pixel.
         hole_pixels: [n, 2] rows and columns.
         numbers: [h, w] numbers of the hole pixels; −1 elsewhere.
-        matches: [n, 3] source, row and column of each pixel's patch.
+        matches: [n, 3] source, row and column of the centre of each pixel's patch.
         costs: [n] of these matches.
         mean_cost: float32, above 0.
         source_rgb: [2, h, w, 3] the picture and its mirror image.
@@ -286,7 +307,8 @@ def vote_colors(
                 k = numbers[y + dy, x + dx]
                 if k < 0:
                     continue
-                # The pixel at (−dy, −dx) from the centre of the neighbour's patch lies here.
+                # This pixel lies at (−dy, −dx) from the neighbour, so its colour comes from the
+                # pixel at (−dy, −dx) from the centre of the neighbour's patch.
                 source, v, u = matches[k, 0], matches[k, 1] - dy, matches[k, 2] - dx
                 weight = np.float32(np.exp(-costs[k] / mean_cost)) + np.float32(MIN_VOTE_WEIGHT)
                 red += weight * source_rgb[source, v, u, 0]

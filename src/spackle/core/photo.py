@@ -20,7 +20,6 @@ from torch import Tensor
 from spackle.core.camera import Camera
 from spackle.core.focal_length import FocalSource, resolve_focal_length
 from spackle.core.image_files import (
-    MAX_PIXELS,
     check_pixel_count,
     exif_tags,
     read_image,
@@ -71,7 +70,9 @@ class Photo:
         The optical axis met the middle of the photo before its border was cropped, so a border that
         is wider on one side shifts the principal point away from the middle.
         """
-        left, top, right, bottom = self.frame or (0, 0, 0, 0)
+        left, top, right, bottom = self.frame or (0, 0, 0, 0)  # widths of the cropped border
+        # A border of equal width on both sides shifts nothing. Otherwise the middle is half the
+        # difference away, as if the photo had been cropped by that much at the left and the top.
         camera = Camera.from_focal(self.focal_px, self.width, self.height)
         return camera.cropped((left - right) / 2, (top - bottom) / 2, self.width, self.height)
 
@@ -94,10 +95,11 @@ def load_photo(
     Args:
         path: the file.
         focal_px: focal length in pixels of the upright photo.
-        focal_mm: 35 mm equivalent of the focal length, computed from the diagonal.
+        focal_mm: 35 mm equivalent: the focal length with the same diagonal angle of view on film of
+            36 mm × 24 mm.
         fov: horizontal field of view in degrees.
         keep_frame: keep a uniform border, such as a scan's margin. Otherwise the border is cropped,
-            unless a focal length is given.
+            unless a focal length is given, because that holds for the whole photo.
 
     Raises:
         InputError: the file is missing, broken or too large, or the focal length is invalid.
@@ -133,7 +135,7 @@ def photo_from_picture(
     """
     name = Path("photo")  # for messages, because a picture has no file
     if isinstance(picture, Image.Image):
-        check_pixel_count(picture.width, picture.height, MAX_PIXELS, name)
+        check_pixel_count(picture.width, picture.height, file_bytes=None, path=name)
         exif = exif_tags(picture)
         with as_input_error(name, "the picture cannot be used: {reason}"):
             rgb = to_srgb_tensor(upright(picture), name)
@@ -162,7 +164,8 @@ def _array_to_rgb(picture: NDArray[Any] | Tensor, name: Path) -> Tensor:
         )
     if shape[2] != 3:
         values = values.movedim(0, 2)  # [3, H, W] to [H, W, 3]
-    check_pixel_count(values.shape[1], values.shape[0], MAX_PIXELS, name)
+    height, width = values.shape[:2]
+    check_pixel_count(width, height, file_bytes=None, path=name)
 
     if values.dtype == torch.uint8:
         return values.float() / 255
@@ -197,7 +200,7 @@ def _make_photo(
     height, width = rgb.shape[:2]
     focal, source = resolve_focal_length(path, width, height, exif, **focal_options)
 
-    # A user who knows the focal length has measured with the whole image; it is not cropped.
+    # A user's focal length or field of view holds for the whole image, so it is not cropped.
     frame = None
     if not keep_frame and not source.is_from_user:
         frame = find_frame(rgb)
@@ -236,10 +239,13 @@ def resize_photo(photo: Photo, max_side: int = MAX_WORKING_SIDE_PX) -> Photo:
     rgb = photo.rgb.new_empty(height, width, 3)
 
     def resize_channel(channel: int, _: int) -> None:
-        """Resize one colour channel; Pillow resizes floats only channel by channel."""
+        """Resize one colour channel; Pillow resizes floats only channel by channel.
+
+        `_` is the end of the chunk of channels, which has only this one.
+        """
         full = Image.fromarray(photo.rgb[..., channel].contiguous().numpy())
         resized = np.array(full.resize((width, height), Image.Resampling.LANCZOS))
-        # Lanczos overshoots at edges.
+        # Lanczos overshoots at edges, so values can leave the range of colours.
         rgb[..., channel] = torch.from_numpy(resized).clamp_(0, 1)
 
     parallel_for_chunks(resize_channel, 3, 1)  # three channels, each a chunk of its own

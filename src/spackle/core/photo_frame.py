@@ -55,35 +55,44 @@ class PhotoFrame(NamedTuple):
 def find_frame(rgb: Tensor) -> PhotoFrame | None:
     """The uniform frame of an sRGB picture [H, W, 3] in 0..1, or None.
 
-    Two opposite sides must have one colour and straight inner edges, because a false frame would
-    crop the picture. A frame within the frame, such as a line inside a mount, is added to it.
+    At least two opposite sides must have the same colour and straight inner edges. The rule is
+    strict, because a false frame would crop the picture. A frame within the frame, such as a line
+    inside a mount, is added to it.
     """
     rows = rgb.numpy()  # [H, W, 3]
     columns = rows.swapaxes(0, 1)  # [W, H, 3]
-    # The picture as lines of pixels from each side inwards, in the order of PhotoFrame: from the
-    # left, the top, the right and the bottom.
+    # The four sides in the order of PhotoFrame: left, top, right and bottom. Each side sees the
+    # picture as lines of pixels, from its border inwards.
     sides = [_Side(lines) for lines in (columns, rows, columns[::-1], rows[::-1])]
 
     uniform_widths = [side.uniform_width() for side in sides]
     widths = np.zeros(4, int)
     for index, side in enumerate(sides):
-        # The sides of index 0 and 2 are adjacent to those of index 1 and 3.
-        before = uniform_widths[1 - index % 2]
-        after = uniform_widths[3 - index % 2]
-        widths[index] = side.frame_width(uniform_widths[index], before, after)
+        # Columns, which the left and the right side see, run from the top to the bottom; rows run
+        # from the left to the right.
+        is_left_or_right = index % 2 == 0
+        first_side = 1 if is_left_or_right else 0  # top or left
+        last_side = first_side + 2  # bottom or right
+        widths[index] = side.frame_width(
+            uniform_widths[index],
+            before=uniform_widths[first_side],
+            after=uniform_widths[last_side],
+        )
 
     colors = np.stack([side.color for side in sides])  # [4, 3]
-    for index in (0, 1):
-        # Only sides of the same colour are of one frame.
+    for index in (0, 1):  # left and right, then top and bottom
+        # The frame consists of the sides that have the colour of this one.
         color_difference = np.abs(colors - colors[index]).max(axis=1)
         frame_widths = np.where(color_difference <= MAX_FRAME_NOISE, widths, 0)
-        if frame_widths[index] and frame_widths[index + 2]:  # two opposite sides
+        if frame_widths[index] and frame_widths[index + 2]:  # this side and the opposite one
             height, width = rows.shape[:2]
             outer = PhotoFrame(*frame_widths.tolist())
+            # Inside of the frame there may be another one; the widths of both add up.
             inner = find_frame(outer.inside(rgb, width, height))
             if inner is None:
                 return outer
-            return PhotoFrame(*(frame_widths + inner).tolist())
+            total_widths = frame_widths + np.array(inner)  # [4]
+            return PhotoFrame(*total_widths.tolist())
     return None
 
 
@@ -95,6 +104,7 @@ class _Side:
 
         `lines` [N, M, 3] are N lines of M pixels; the first one is the border.
         """
+        # The median, because a scratch or a speck of dust must not change the colour.
         self.color: Floats = np.median(lines[0], axis=0)  # [3]
         self._max_width = int(MAX_FRAME_RATIO * len(lines))
         self._lines = lines
@@ -102,7 +112,8 @@ class _Side:
     def _differences(self, start: int, stop: int) -> Floats:
         """Differences [n, M] of the pixels of the lines start..stop from the side's colour.
 
-        Lines beyond the widest frame are left out.
+        The difference of two colours is that of the channel that differs most. Lines beyond the
+        widest possible frame are left out.
         """
         lines = self._lines[start : min(stop, self._max_width)]
         differences: Floats = np.abs(lines - self.color).max(axis=-1)
@@ -118,10 +129,14 @@ class _Side:
     def frame_width(self, uniform_width: int, before: int, after: int) -> int:
         """The width of the frame in pixels, with its blurred inner edge; 0 if there is no frame.
 
+        There is a frame if its inner edge is straight: within a few lines, most pixels change from
+        the side's colour to another one.
+
         Args:
             uniform_width: number of lines at the border that have the side's colour.
-            before: width of the frame at the beginning of each line; these pixels do not count.
-            after: the same at the end of each line.
+            before: number of pixels at the beginning of each line that belong to the adjacent side
+                of the frame, and so are not looked at.
+            after: number of such pixels at the end of each line.
         """
         edge_lines = self._differences(uniform_width, uniform_width + BLURRED_EDGE_PX)  # [n, M]
         between = edge_lines[:, before : edge_lines.shape[1] - after]
@@ -129,6 +144,7 @@ class _Side:
         is_straight = differing_ratio.max(initial=0.0) >= MIN_STRAIGHT_RATIO
         if uniform_width < MIN_FRAME_PX or not is_straight:
             return 0
-        # The edge ends at the first line that differs about as much as any.
+        # A blurred edge ends where the pixels that differ become no more: at the first line that
+        # has at least 95 % of the largest number.
         end_of_edge = int((differing_ratio >= 0.95 * differing_ratio.max()).argmax())
         return uniform_width + end_of_edge + 1

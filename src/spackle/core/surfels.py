@@ -51,6 +51,7 @@ def make_surfels(
         colors: [N, 3] linear RGB.
         opacities: [N].
     """
+    # A ray has the depth 1, so a sample's position is its depth times its ray.
     fx, fy = camera.focal
     K = to_like(camera.K, uv)
     principal_point = K[:2, 2]
@@ -82,17 +83,18 @@ def make_surfels(
 
 
 def _ellipse_axes(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-    """Axes of the ellipses a·cos t + b·sin t in space.
+    """Axes of N ellipses in space, whose points are a·cos t + b·sin t from their centres.
 
     Args:
-        a: [N, 3] a vector from the centre to the ellipse.
-        b: [N, 3] the vector for which t is a quarter turn larger.
+        a: [N, 3] the vector from the centre to the point of t = 0.
+        b: [N, 3] the vector from the centre to the point of t = 90°.
 
     Returns:
         Rotations [N, 3, 3], whose columns are the directions of both axes and the normal, and the
         lengths [N, 2] of both half axes.
     """
-    # The axes are where the distance from the centre is extreme: tan 2t = 2 a·b / (a·a − b·b).
+    # At an axis, the distance from the centre is greatest or smallest, so its derivative by t is 0:
+    # tan 2t = 2 a·b / (a·a − b·b).
     dot_ab = (a * b).sum(-1)
     length2_difference = (a * a).sum(-1) - (b * b).sum(-1)
     t = 0.5 * torch.atan2(2 * dot_ab, length2_difference)[:, None]  # [N, 1]
@@ -109,15 +111,18 @@ def _ellipse_axes(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
 def inverse_depth_slope(inverse_depth: Tensor) -> Tensor:
     """Derivative of the inverse depth by pixel x and y, [H, W, 2], never across a depth edge.
 
-    The inverse depth of a plane changes linearly across the image, so the differences to both
-    neighbours agree, and the slope is their mean. If they differ, the smaller one is used; if even
+    The inverse depth of a plane changes linearly across the image. So on a smooth surface the
+    differences to the two neighbours along an axis agree, and the slope is their mean. If they do
+    not agree, the smaller one is used, because the larger one may cross to another surface. If even
     the smaller one is large, the slope is 0.
 
     Args:
-        inverse_depth: [H, W] float32 or float64, positive everywhere; gradients do not pass.
+        inverse_depth: [H, W] float32 or float64, positive everywhere. The result is detached from
+            autograd.
     """
     image = inverse_depth.detach().cpu().contiguous().numpy()
     slopes = np.empty((*image.shape, 2), image.dtype)
+    # Limits of the image's dtype, because others would make the kernel compute in float64.
     crease_ratio = image.dtype.type(CREASE_RATIO)
     edge_ratio = image.dtype.type(DEPTH_EDGE_RATIO)
     parallel_for_chunks(
@@ -137,8 +142,10 @@ def _slopes_of_rows(
         start: the first row.
         stop: the row after the last one.
         image: [H, W] inverse depth.
-        crease_ratio: relative difference of slopes at a crease.
-        edge_ratio: relative difference of inverse depth at an edge.
+        crease_ratio: if the differences to the previous and to the next pixel differ by more than
+            this multiple of the inverse depth, the surface has a crease there.
+        edge_ratio: if neighbouring pixels differ by more than this multiple of the inverse depth,
+            there is an edge between two surfaces.
         slopes: [H, W, 2] written.
     """
     height, width = image.shape
@@ -148,7 +155,8 @@ def _slopes_of_rows(
             left, right = max(x - 1, 0), min(x + 1, width - 1)
             here = image[y, x]
 
-            # At a border of the image, the one difference serves for both sides.
+            # At the image's border, a pixel has one neighbour along an axis, and the difference to
+            # it serves for both sides.
             to_right, to_left = image[y, right] - here, here - image[y, left]
             forward = to_right if right > x else to_left
             backward = to_left if left < x else to_right
@@ -168,8 +176,9 @@ def _slope(here: Any, backward: Any, forward: Any, crease_ratio: Any, edge_ratio
         here: inverse depth at the pixel.
         backward: the pixel's value minus the previous one.
         forward: the next value minus the pixel's.
-        crease_ratio: difference of both, relative to `here`, up to which the surface is smooth.
-        edge_ratio: largest slope of a smooth surface, relative to `here`.
+        crease_ratio: the surface is smooth if `backward` and `forward` differ by at most this
+            multiple of `here`; else it has a crease or an edge.
+        edge_ratio: largest slope of a smooth surface, as a multiple of `here`.
 
     Returns:
         The mean on a smooth surface; at a crease or beside an edge the flatter difference, because
@@ -178,5 +187,6 @@ def _slope(here: Any, backward: Any, forward: Any, crease_ratio: Any, edge_ratio
     is_smooth = abs(forward - backward) <= crease_ratio * here
     flatter = backward if abs(backward) < abs(forward) else forward
     slope = (forward + backward) / 2 if is_smooth else flatter
+    # Beside an edge even the flatter difference may cross it, so less is allowed there.
     max_slope = (edge_ratio if is_smooth else crease_ratio) * here
-    return slope if abs(slope) <= max_slope else 0 * here
+    return slope if abs(slope) <= max_slope else 0 * here  # a zero of the type of `here`

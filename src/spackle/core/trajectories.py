@@ -44,7 +44,7 @@ class DepthRange:
         """Measure the depths of Gaussians in front of a camera at the world's origin.
 
         Raises:
-            ValueError: there is none.
+            ValueError: no Gaussian is in front of the camera.
         """
         z = gaussians.means[:, 2].detach().double().cpu().numpy()
         z = z[z > 0]
@@ -90,7 +90,8 @@ def trajectory_cameras(
             dolly-zoom (backward, while zooming in so that objects at the focus point keep their
             size).
         camera: the photo's camera at the world's origin.
-        disparity: the widest offset, as a multiple of the image's diagonal at the nearest depth.
+        disparity: the greatest camera offset; at 1, the nearest surface moves across the image's
+            whole diagonal.
         depth_range: depths of the photo's Gaussians.
         frames: number of cameras.
         looped: make a path that repeats without a jump. Swipe then also returns. The other paths
@@ -100,7 +101,7 @@ def trajectory_cameras(
     Raises:
         ValueError: an unknown path, a disparity outside 0..2, or less than one frame.
     """
-    name = kind.replace("_", "-")
+    name = kind.replace("_", "-")  # a name with an underscore, as Python writes, is understood
     if name not in TRAJECTORIES:
         raise ValueError(f"unknown trajectory {kind!r}: choose one of {', '.join(TRAJECTORIES)}")
     if not 0 <= disparity <= MAX_DISPARITY:
@@ -112,6 +113,7 @@ def trajectory_cameras(
     if name == "swipe":
         eyes = _swipe_eyes(offset, frames, looped)
     elif looped:
+        # The last of one frame more would be the first again.
         eyes = _closed_path_eyes(name, camera, offset, depth_range, frames + 1)[:frames]
     else:
         eyes = _closed_path_eyes(name, camera, offset, depth_range, frames)
@@ -130,9 +132,10 @@ def trajectory_cameras(
 def _swipe_eyes(offset: float, frames: int, looped: bool) -> Tensor:
     """Camera positions [frames, 3], float64, from left to right, `offset` away at both ends.
 
-    A looped path also returns, and slows down at the ends.
+    A looped path also returns to the left, and slows down at both ends.
     """
     if looped:
+        # One angle more than frames, because the last angle would repeat the first frame.
         x = -offset * _full_turn(frames + 1).cos()[:frames]
     else:
         x = torch.linspace(-offset, offset, frames, dtype=torch.float64)
@@ -165,11 +168,14 @@ def _closed_path_eyes(
         height_ratio = min(1.0, camera.height / camera.width)
         xyz = [zero, height_ratio * offset * turn.sin(), zero]
     elif name == "orbit":
-        angle = math.atan2(offset, focus) * turn.sin()  # around the focus point
+        # An arc around the focus point (0, 0, focus), whose radius is the focus depth.
+        angle = math.atan2(offset, focus) * turn.sin()
         xyz = [focus * angle.sin(), zero, focus * (1 - angle.cos())]
     elif name == "dolly-zoom":
+        # From the photo's camera straight back by `offset`, and forward again.
         xyz = [zero, zero, offset * (turn.cos() - 1) / 2]
     else:  # rotate-forward
+        # A fraction of the nearest depth, so that the camera stays in front of all surfaces.
         forward = FORWARD_MOTION_RATIO * depth_range.near
         xyz = [offset * turn.sin(), zero, forward * (1 - turn.cos()) / 2]
     return torch.stack(xyz, dim=-1)
@@ -196,8 +202,10 @@ def leftmost_and_rightmost(
 
     Args:
         camera: the photo's camera at the world's origin.
-        disparity: the offset, as a multiple of the image's diagonal at the nearest depth.
+        disparity: the camera offset; at 1, the nearest surface moves across the image's whole
+            diagonal.
         depth_range: depths of the photo's Gaussians.
     """
+    # A swipe runs from left to right; with two frames it has only its ends.
     left, right = trajectory_cameras("swipe", camera, disparity, depth_range, frames=2)
     return left, right

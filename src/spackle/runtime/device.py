@@ -56,6 +56,7 @@ def pick_device(device: torch.device | str | None) -> torch.device:
             f"{name}: torch finds no CUDA device: "
             "give cpu, or install a torch and a driver for CUDA"
         )
+    # "cuda" without a number has no index. It exists whenever device 0 does.
     if picked.type == "cuda" and (picked.index or 0) >= torch.cuda.device_count():
         last = torch.cuda.device_count() - 1
         raise InputError(f"{name}: there is no such CUDA device: give at most cuda:{last}")
@@ -127,12 +128,12 @@ def pick_dtype(precision: Precision, device: torch.device) -> torch.dtype:
 
 
 def has_native_bf16(device: torch.device) -> bool:
-    """Whether the hardware multiplies bfloat16.
+    """Whether the hardware itself multiplies bfloat16, so that it is faster than float32.
 
-    CPUs with AMX or AVX512-BF16 do, and GPUs from Ampere on.
+    CPUs with AMX or AVX512-BF16 do, and NVIDIA's GPUs from the generation Ampere on.
     """
     if device.type == "cuda":
-        ampere = (8, 0)
+        ampere = (8, 0)  # CUDA's compute capability of this generation
         return torch.cuda.get_device_capability(device) >= ampere
     if device.type == "cpu":
         capabilities = torch.cpu.get_capabilities()
@@ -174,7 +175,7 @@ def parallel_for_chunks(
                 return
             function(start, min(start + chunk_length, total))
 
-    # The calling thread works, too.
+    # The calling thread works, too, so one helper less is needed.
     helper_count = min(thread_count(), chunk_count) - 1
     pool = _thread_pool(os.getpid())
     helpers = [pool.submit(work_on_chunks) for _ in range(helper_count)]
@@ -190,7 +191,8 @@ def _thread_pool(process_id: int) -> ThreadPoolExecutor:
     """The pool of threads of a process.
 
     A forked process inherits the pool's object without its threads, so the pool is cached by the
-    process's id. Numba's own parallel loops fail after a fork, and in several Python threads.
+    process's id. The pool stands in for numba's own parallel loops, which fail after a fork, and if
+    several Python threads start them.
     """
     return ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix=f"spackle-{process_id}")
 

@@ -32,7 +32,8 @@ def json_digest(value: object) -> str:
 def file_fingerprint(file: Path, kind: str) -> str:
     """A text that changes whenever the file changes.
 
-    It is the SHA-256 of the content, but for a large file the size and the time of the last change.
+    It is the SHA-256 of the content. A large file would take too long to hash, so for it the text
+    is its size and the time of its last change.
 
     Raises:
         InputError: the file is missing or empty; the message names `kind`, such as "photo".
@@ -99,6 +100,7 @@ def _matches_record(folder: Path, name: str, record: Any, report_time: int) -> b
     facts = (folder / name).stat()
     if facts.st_size != record["bytes"]:
         return False
+    # A copied file keeps the time of its content (mtime), but not that of its entry (ctime).
     is_newer = max(facts.st_mtime_ns, facts.st_ctime_ns) > report_time
     if not is_newer:
         return True

@@ -28,6 +28,7 @@ def reason_in_a_line(error: object) -> str:
     if is_pydantic:
         return first_validation_problem(error)
     # An error of the operating system also has a text without error number and file name.
+    # The caller names the file, so that shorter text is better.
     text = str(getattr(error, "strerror", None) or error)
     without_line_breaks = " ".join(text.split())
     return printable_line(without_line_breaks)[:MAX_REASON_LENGTH] or type(error).__name__
@@ -45,6 +46,7 @@ def first_validation_problem(error: Any) -> str:
     if first["type"] == "extra_forbidden":
         problem = "there is no such key"
     else:
+        # Pydantic puts this prefix before the message of a validator of our own.
         message = first["msg"].removeprefix("Value error, ")
         problem = f"{message[0].lower()}{message[1:]}"
         # In these cases, pydantic's "input" is the whole object instead of the refused value.
@@ -88,8 +90,10 @@ def shorten_input_errors() -> Iterator[None]:
         message = str(error)
         if len(message) <= MAX_MESSAGE_LENGTH:
             raise
-        side = MAX_MESSAGE_LENGTH // 2 - 2  # " … " between both ends takes three characters
-        raise InputError(f"{message[:side]} … {message[-side:]}") from error
+        # The beginning names the value, and the end says what to do, so both are kept. The " … "
+        # between them takes three characters.
+        part_length = MAX_MESSAGE_LENGTH // 2 - 2
+        raise InputError(f"{message[:part_length]} … {message[-part_length:]}") from error
 
 
 def printable_line(text: str) -> str:
@@ -121,7 +125,7 @@ def check_name(option: str, name: str, known: Iterable[str]) -> None:
     if name in names:
         return
     problem = f"`{option}` {name} is unknown"
-    # Less than half of the letters in common is not similar.
+    # A name with less than half of the letters in common is no typing error.
     similar = difflib.get_close_matches(name.lower(), names, n=1, cutoff=0.5)
     if similar:
         raise InputError(f"{problem}: did you mean {similar[0]}? There are {', '.join(names)}")

@@ -31,7 +31,8 @@ def check_file(path: str | os.PathLike[str], kind: str) -> int:
         InputError: anything else, also an address; the message names `kind`, such as "photo".
     """
     with as_input_error(repr(str(path)), "cannot be read: {reason}", OSError, ValueError):
-        # A path of pathlib has lost the second slash of an address.
+        # An address that became a pathlib.Path has lost its second slash, so one slash is enough to
+        # know it, and the message puts the second one back.
         if re.match(r"(https?|ftp|s3|gs):/", str(path)):
             address = re.sub(":/+", "://", str(path), count=1)
             raise InputError(
@@ -80,6 +81,8 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         InputError: the file cannot be written, or the disk fills up.
     """
     target = check_writable(path)
+    # The name starts with a dot, so that lists of files leave it out. The random digits keep two
+    # writers of one file apart.
     stem = target.stem[:MAX_STEM_LENGTH]
     temporary = target.with_name(f".{stem}.{secrets.token_hex(6)}{target.suffix}")
     try:
@@ -93,6 +96,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
             raise
         raise InputError(f"{path}: cannot write: {reason_in_a_line(error)}") from error
     finally:
+        # After a success, the temporary name is gone already.
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
 
@@ -119,8 +123,10 @@ def write_json(content: Mapping[str, Any], path: Path) -> None:
 def remove_half_written(*folders: Path, files: Sequence[str] | None = None) -> None:
     """Delete temporary files that killed runs have left for `files` in some folders.
 
-    None deletes the temporary files of all names. The caller must then have locked the folders,
-    because a temporary file may belong to a run at work.
+    Args:
+        folders: where to look; subfolders are left alone.
+        files: final names of the files. None deletes the temporary files of all names; then the
+            caller must have locked the folders, because another run may be writing such a file.
     """
     for folder in folders:
         for file in folder.iterdir():
@@ -145,7 +151,8 @@ def list_files(folder: Path, endings: tuple[str, ...], *, below: bool = False) -
 
     files = []
     for place, subfolders, names in os.walk(folder):
-        # `os.walk` visits the subfolders that stay in its list.
+        # `os.walk` goes on with the subfolders that are left in its own list, so the list itself is
+        # changed.
         subfolders[:] = [name for name in subfolders if below and not name.startswith(".")]
         for name in names:
             file = Path(place) / name

@@ -66,7 +66,8 @@ def file_lock(path: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        # The file is deleted while it is locked: later, another run may have locked it.
+        # The file is deleted before it is unlocked, because afterwards another run may have locked
+        # it, and a third one would then lock a new file of the same name.
         with contextlib.suppress(OSError):
             path.unlink()
         lock.release()
@@ -86,6 +87,7 @@ def results_folder(
     Raises:
         InputError: `files` cannot be written, or another process has locked the folder.
     """
+    # The folder and its parents, as far as they do not exist yet, from the innermost outwards.
     missing_folders = [folder for folder in (path, *path.parents) if not os.path.exists(folder)]
     try:
         with contextlib.ExitStack() as stack:
@@ -94,11 +96,12 @@ def results_folder(
                 stack.enter_context(file_lock(path / LOCK_NAME))
             for name in files:
                 check_writable(path / name)
+            # A temporary file that cannot be deleted is no reason to refuse the work.
             with contextlib.suppress(OSError):
                 remove_half_written(path, files=files)
             yield
     finally:
-        # From the innermost folder outwards; a folder that is not empty raises an OSError.
+        # Remove what was created, if it is still empty: a folder with files raises an OSError.
         for folder in missing_folders:
             with contextlib.suppress(OSError):
                 folder.rmdir()
@@ -112,8 +115,8 @@ def atomic_files(folder: Path, last: str) -> Iterator[Path]:
 
     Args:
         folder: where the set belongs.
-        last: the file of the set that is deleted first and moved last, so that its presence means
-            that the set is complete.
+        last: name of one file of the set. An old one is deleted before the other files are
+            replaced, and the new one comes last, so that its presence means a complete set.
     """
     new_folder = folder / NEW_SET_NAME
     try:
@@ -126,7 +129,7 @@ def atomic_files(folder: Path, last: str) -> Iterator[Path]:
         (folder / last).unlink(missing_ok=True)
         files = [file for file in sorted(new_folder.rglob("*")) if file.is_file()]
         names = [file.relative_to(new_folder) for file in files]
-        names.sort(key=lambda name: name == Path(last))  # moves `last` to the end
+        names.sort(key=lambda name: name == Path(last))  # True sorts last, so `last` comes last
         for name in names:
             os.replace(new_folder / name, folder / name)
     finally:

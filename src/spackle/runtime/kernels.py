@@ -57,11 +57,10 @@ def is_compiled(function: Callable[..., Any]) -> bool:
 def _compile(function: Callable[..., R], fastmath: set[str], **options: Any) -> Callable[..., R]:
     """Compile a function by numba, with a disk cache that notices changes of what it uses.
 
-    Numba keys its disk cache by a stamp of the function's own source file, so it would run old
-    machine code after a change of a kernel, constant or option elsewhere. The stamp is extended by
-    these. It is a private attribute, because numba has no public way: a cache locator of one's own
-    is set by an environment variable, for the kernels of all packages in the process, and is told
-    neither the options nor the function that calls for it.
+    Numba keeps compiled functions on disk, and compiles again only if the function's own source
+    file has changed. If a kernel or constant of another file, or an option, has changed, it would
+    run the old machine code. So the stamp, by which numba knows the state of the source file, is
+    extended by all that the function may use.
 
     Args:
         function: the function in Python.
@@ -71,6 +70,8 @@ def _compile(function: Callable[..., R], fastmath: set[str], **options: Any) -> 
     compiled = numba.njit(
         cache=True, nogil=True, fastmath=fastmath, error_model="numpy", **options
     )(function)
+    # The stamp is a private attribute. Numba's public way, a cache locator, would not do: an
+    # environment variable sets it for all packages, and it knows neither function nor options.
     disk_cache = _disk_cache_of(compiled)
     if disk_cache is not None:
         disk_cache._source_stamp = (
@@ -82,9 +83,10 @@ def _compile(function: Callable[..., R], fastmath: set[str], **options: Any) -> 
 
 
 def _digest_of_globals(function: Callable[..., Any]) -> str:
-    """A hash of the numbers and kernels that the function's module knows by name.
+    """A hash of the numbers and kernels that a function's module defines or imports.
 
-    The function may use any of them. Another kernel counts by the stamp of its own sources.
+    The function may use any of them, so it must be compiled again if the hash changes. A kernel
+    enters the hash by its own source stamp, which changes with its source and all that it uses.
     """
     stamps = []
     for name, value in sorted(function.__globals__.items()):

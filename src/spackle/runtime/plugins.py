@@ -9,10 +9,10 @@ from spackle.runtime.errors import InputError, as_input_error
 
 
 def load_plugin(name: str, option: str) -> Any:
-    """Import what `package.module:Name` stands for, and return it; this runs the package's code.
+    """Import a class or function of another package, which runs the package's code.
 
     Args:
-        name: an importable module and the name of a class or function in it.
+        name: the module and the name in it, as `package.module:Name`.
         option: the Python name of the option that was given, for messages.
 
     Raises:
@@ -21,7 +21,8 @@ def load_plugin(name: str, option: str) -> Any:
     module_name, _, attribute = name.partition(":")
     if not module_name or not attribute.isidentifier():
         raise InputError(f"`{option}` {name}: give a built-in name, or package.module:Name")
-    # A module that is being imported can raise any exception.
+    # A module can raise any exception while it is imported. The double braces leave "{reason}" in
+    # the text, for which `as_input_error` puts the exception's message.
     with as_input_error(f"`{option}` {name}", f"cannot import {module_name}: {{reason}}"):
         module = importlib.import_module(module_name)
     if not hasattr(module, attribute):

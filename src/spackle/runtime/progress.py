@@ -97,6 +97,7 @@ class Reporter:
                 yield lambda done, total: bars.update(task, completed=done, total=total)
         else:
             yield lambda done, total: None
+        # A stage may run several times, such as once for each photo; its durations add up.
         elapsed = time.perf_counter() - start
         self.seconds[name] = round(self.seconds.get(name, 0.0) + elapsed, 3)
         self.detail(f"  {name}: {elapsed:.2f} s")
@@ -123,6 +124,7 @@ class Reporter:
 
         def log_step(done: int, remark: str) -> None:
             """Log the steps done, and the time left if all steps take equally long."""
+            # Steps of an earlier run took no time in this one.
             seconds_per_step = (time.monotonic() - start_time) / max(1, done - start)
             time_left = timedelta(seconds=round(seconds_per_step * (total - done)))
             self.log(f"{name}: {done} of {total}, {remark}, {time_left} left")
@@ -145,7 +147,7 @@ class Reporter:
         logged_tenth = 0
 
         def log_transfer(done: int, total: int) -> None:
-            """Log a line if another tenth of the bytes has arrived; the end needs none."""
+            """Log a line if another tenth of the bytes has arrived, but none at the end."""
             nonlocal logged_tenth
             tenth = done * 10 // total
             if tenth != logged_tenth and done < total:

@@ -57,7 +57,7 @@ class TaskProcess:
             while isinstance(message, Mapping):
                 on_event(message)
                 message = self._pipe.recv()
-        except (EOFError, OSError):
+        except (EOFError, OSError):  # the pipe broke: the process has died
             self.kill()
             return WORKER_DIED
         error: str | None = message
@@ -79,7 +79,7 @@ def _serve(pipe: connection.Connection, work: TaskFunction) -> None:
             return
         except InputError as problem:
             error = " ".join(str(problem).split())
-        except Exception as bug:  # or too little memory: the next task may succeed
+        except Exception as bug:  # the worker lives on, because the next task may succeed
             traceback.print_exc()
             error = f"internal error: {type(bug).__name__}: {reason_in_a_line(bug)}"
         pipe.send(error)

@@ -42,7 +42,7 @@ def parallel_map(
     threads: int,
     gpu: bool,
 ) -> Iterator[Iterator[Any]]:
-    """Yield the results of jobs as they arrive, in any order.
+    """Do jobs in several processes; yields an iterator of the results, as they arrive.
 
     Args:
         open_worker: makes an object whose `make(job)` returns a job's result; called once in each
@@ -59,6 +59,7 @@ def parallel_map(
     """
     process_count = min(count, len(jobs))
     if process_count < 2:
+        # One process more would only cost memory and time to start.
         with torch_threads(threads):
             yield map(open_worker().make, jobs)
         return
@@ -89,7 +90,8 @@ def _results_as_they_arrive(
     Args:
         pool: its processes were set up by `_start_process`.
         jobs: arguments of the worker's `make`.
-        max_pending: number of jobs that are in the hands of the pool at a time.
+        max_pending: number of jobs that the pool has at a time. It gets no more, because results
+            that nobody has taken yet fill the memory.
         stop: whether the user has asked the command to end.
 
     Raises:
@@ -107,7 +109,7 @@ def _results_as_they_arrive(
             for future in done:
                 yield future.result()
     except BrokenProcessPool as error:
-        # Ctrl-C ends the processes, too.
+        # If the user has stopped the command, Ctrl-C has ended the processes, too.
         if not stop():
             raise InputError(
                 "a worker process died, probably because memory ran out: give fewer `workers`; "
