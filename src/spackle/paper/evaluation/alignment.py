@@ -48,7 +48,7 @@ def align(case: Case, base_depth: Tensor, is_covered: Tensor) -> float:
         points = case.read_points()
         candidates.append(_ratios_of_points(points, case.camera, base_depth, is_covered))
 
-    # The first source with enough pixels decides. The median stands firm against wrong depths.
+    # The first source with enough pixels decides. A median, because some depths are wrong.
     for ratios in candidates:
         ratios = ratios[torch.isfinite(ratios) & (ratios > 0)].double()
         if len(ratios) >= MIN_ALIGNED_PIXELS:
@@ -129,16 +129,20 @@ def camera_in_base_scene(
 ) -> Camera:
     """The camera that sees the base's scene as a second photo's camera sees the real one.
 
-    If the base's principal point or focal length differs from the dataset's, the base's scene is
-    sheared: the same pixel at the same depth is another point. The returned camera projects the
-    base's points to the pixels where `view` projects the dataset's. The result is exact if the two
-    cameras look in the same direction, as in rectified pairs, or have the same intrinsics;
-    otherwise it is exact up to a skew of the pixel grid.
+    The base and the dataset may assume different intrinsics for the input photo. Then a pixel with
+    a depth is one point in the base's scene and another in the dataset's, and the base's scene is a
+    sheared copy of the dataset's. The returned camera makes up for this: it projects a point of the
+    base to the pixel to which `view` projects the dataset's point. This is exact if the two photos
+    look in the same direction, as in rectified pairs, or if the intrinsics agree; otherwise it is
+    exact up to a skew of the pixel grid.
 
-    With K, R, t of `view`, K0 of the dataset's and Kb of the base's input camera, a base's point
-    x at the scale s is the dataset's point s · K0⁻¹ Kb x. So `view` projects it by K (s R K0⁻¹ Kb
-    x + t), and the result has intrinsics K' and rotation R' with K' R' = K R K0⁻¹ Kb, and
-    translation K'⁻¹ K t / s.
+    Let `view` have intrinsics K, rotation R and translation t, and let the input photo have
+    intrinsics K0 in the dataset and Kb in the base. With s = `scale`:
+
+    - the base's point x is the dataset's point s · K0⁻¹ Kb x;
+    - `view` projects it by K (s · R K0⁻¹ Kb x + t);
+    - so the result has intrinsics K' and rotation R' with K' R' = K R K0⁻¹ Kb, and translation
+      K'⁻¹ K t / s.
 
     Args:
         view: the second photo's camera, in the input photo's frame and the dataset's unit.
@@ -158,7 +162,8 @@ def camera_in_base_scene(
     shear = torch.linalg.solve(photo_camera.K.double(), base_K)  # K0⁻¹ Kb
     new_K, new_rotation = _intrinsics_times_rotation(K @ rotation @ shear)
 
-    # In homogeneous coordinates K' has any scale; the translation is found before it is normalised.
+    # The translation needs K' as it is; only then K' is scaled to have 1 in its last entry, which
+    # changes no projected pixel.
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, :3] = new_rotation
     pose[:3, 3] = torch.linalg.solve(new_K, K @ translation) / scale
@@ -179,6 +184,7 @@ def _intrinsics_times_rotation(matrix: Tensor) -> tuple[Tensor, Tensor]:
     intrinsics = flip @ r.T @ flip
     rotation = flip @ q.T
 
-    # The decomposition leaves the signs of the diagonal open.
+    # QR may give negative numbers on the diagonal. If a column of the intrinsics and the same row
+    # of the rotation change their signs, the product stays the same.
     signs = torch.diag(intrinsics.diagonal().sign())
     return intrinsics @ signs, signs @ rotation

@@ -248,11 +248,11 @@ def _time_base(
     def predict(end_stage: EndStage) -> None:
         """The task, which has no stages; it keeps its latest result."""
         nonlocal prediction
-        # Beside the prediction, a base returns which candidate made it; here there is only one.
+        # `predict` also returns which base made the prediction, but a benchmark has only one.
         prediction, _ = base.predict(photo)
 
-    # SHARP on a CPU takes a minute, of which compiling kernels is a small part: already the first
-    # prediction is timed.
+    # An untimed first run keeps the compilation of kernels out of the times. SHARP on a CPU needs
+    # none: a prediction takes a minute, and compilation is a small part of it.
     is_warm = options.base.resolved_name == "sharp" and options.device.type == "cpu"
     device = evaluation.renderer.device
     times = time_tasks(base_runs, {"base": predict}, device, warm=is_warm)
@@ -346,7 +346,7 @@ def count_parameters(residual: ResidualNet | None) -> dict[str, float]:
         inference uses, without classifiers and the part that aligns depths. "residual": of the
         residual network. "share": the residual network's over SHARP's.
     """
-    # SHARP as published, but without memory for its parameters.
+    # On the device "meta" parameters have shapes but no memory, which is enough to count them.
     with torch.device("meta"):
         sharp = SharpNetwork(FULL_SIZE)
     used_count = sum(parameter.numel() for parameter in sharp.parameters())
@@ -441,13 +441,13 @@ def complete_view_in_stages(
     Returns:
         The Gaussians that the method adds for the view.
     """
-    # On the renderer's device, and without the rendering of the photo that earlier repetitions
-    # left.
+    # `placed` has the Gaussians on the renderer's device. The cache of the photo's rendering starts
+    # empty, because each timed run must render the photo's view itself.
     context = dataclasses.replace(context.placed, photo_cache=PhotoRendering())
     base_rendering = context.renderer.render(context.base, camera)
     end_stage("view")
 
-    # What a method prepares is the base rendered from the photo's camera.
+    # Making the method renders the base from the photo's camera, which is the stage "photo".
     fill = make_method(method, [camera], context)
     end_stage("photo")
 

@@ -143,7 +143,7 @@ def _load_second_view(view: SecondView, max_side: int) -> Viewpoint:
     working_width, working_height = working_size(stored_photo.width, stored_photo.height, max_side)
     camera = view.camera.resized(working_width, working_height)
 
-    # Views are completed in cells of 2×2 pixels, so their sides are even.
+    # Views are completed in cells of 2×2 pixels, so their sides are made even, but never 0.
     even_width = max(1, camera.width - camera.width % 2)
     even_height = max(1, camera.height - camera.height % 2)
     camera = dataclasses.replace(camera, width=even_width, height=even_height)

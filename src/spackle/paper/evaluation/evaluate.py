@@ -208,13 +208,14 @@ def measure_case(case: Case, evaluation: Evaluation) -> tuple[list[Measurement],
     """
     options = evaluation.options
     loaded = load_case(case, options.max_side)
-    if options.is_near_view and not case.second_views:
+    if options.compares_with_photos and not case.second_views:
         raise InputError(f"{case.name}: has no second photo")
+    # `predict` also returns which base made the prediction, but an evaluation has only one.
     prediction, _ = evaluation.base_of_case(loaded).predict(loaded.full_photo)
 
     # `scale` is dataset depth / base depth: second photos have cameras in the dataset's unit.
     scale = None
-    if options.is_near_view:
+    if options.compares_with_photos:
         scale = _scale_of_base(loaded, prediction, evaluation)
         viewpoints = _near_views(loaded, prediction, scale)
     else:
@@ -229,7 +230,7 @@ def measure_case(case: Case, evaluation: Evaluation) -> tuple[list[Measurement],
     )
     pictures[INPUT_PICTURE] = loaded.photo.rgb
 
-    # Numbers of the whole image; a base may add notes of its own.
+    # Numbers of the whole image. A base may add notes, such as its network's number format.
     facts: dict[str, Value] = {
         "width": loaded.photo.width,
         "height": loaded.photo.height,

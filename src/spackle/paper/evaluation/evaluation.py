@@ -61,10 +61,10 @@ class Evaluation:
     def fill_context(self, prediction: BasePrediction) -> FillContext:
         """What the methods need for filling the holes in views of a predicted scene."""
         return FillContext(
-            prediction.gaussians,
-            prediction.camera,
-            self.renderer,
-            self.network,
+            base=prediction.gaussians,
+            photo_camera=prediction.camera,
+            renderer=self.renderer,
+            network=self.network,
             precision=self.options.base.precision,
         )
 
@@ -125,7 +125,7 @@ def _cases_to_evaluate(options: EvaluateOptions) -> list[Case]:
     # Second photos that are not used are not read either.
     chosen_cases = []
     for case in cases:
-        if not options.is_near_view:  # large views are not compared with photos
+        if not options.compares_with_photos:  # large views are not compared with photos
             second_views: tuple[SecondView, ...] = ()
         elif options.second_views == "nearest":
             second_views = tuple(view for view in case.second_views if view.is_among_nearest)
@@ -205,10 +205,10 @@ def _configuration(
         "images": {"count": len(cases), "limit": options.limit, "names": names_digest},
         "protocol": options.protocol,
         "side": options.max_side,
-        "disparities": None if options.is_near_view else list(options.disparities),
-        "second_views": options.second_views if options.is_near_view else None,
+        "disparities": None if options.compares_with_photos else list(options.disparities),
+        "second_views": options.second_views if options.compares_with_photos else None,
         "base": _base_configuration(options),
-        "device": renderer.device.type,  # of the renderer, the residual and the base's network
+        "device": renderer.device.type,  # where renderer and networks run
         "methods": list(options.methods),
         "residual": _residual_configuration(options, renderer),
         "direct_ft": direct_ft,

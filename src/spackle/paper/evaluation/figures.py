@@ -48,9 +48,8 @@ class PaperFigure:
     """A figure of views in the paper's layout: a row for each image."""
 
     name: str
-    columns: tuple[
-        str, ...
-    ]  # pictures: "input", "hole" or a method; methods of no run are left out
+    # Names of pictures: "input", "hole" or a method; methods that no run has are left out.
+    columns: tuple[str, ...]
     needed_method: str  # the figure shows evaluations with this method
     caption: str  # with {views}, {bases}, {methods} and {weights} to be filled in
 
@@ -119,7 +118,9 @@ def make_figures(folders: Sequence[Path], max_rows: int, output: Path, reporter:
         InputError: a folder has no results, or no evaluation of large camera moves has pictures.
     """
     all_runs = [RunWithFolder(load_run(folder), folder) for folder in folders]
-    large_runs = [one for one in all_runs if not one.run.is_benchmark and not one.run.is_near_view]
+    large_runs = [
+        one for one in all_runs if not one.run.is_benchmark and not one.run.compares_with_photos
+    ]
 
     # A figure that needs a method which no evaluation has is left out.
     drawn_figures = {}
@@ -170,7 +171,7 @@ def _draw_figure(
     """
     columns = _drawn_columns(figure, runs)
 
-    # Also a figure without the hole's picture needs it, to find where to draw boxes.
+    # Boxes are drawn around holes, so the picture of the hole is needed even if it is not shown.
     needed_pictures = [*columns, HOLE_PICTURE]
     rows = []
     for run, folder in runs:
@@ -259,11 +260,16 @@ def _draw_frame(picture: Image.Image) -> None:
 
 
 def _added_share_tag(run: Run, image: str, method: str) -> str:
-    """The Gaussians that a method added in the shown view, such as "+1.25 %" of the base's.
+    """How many Gaussians a method added, in percent of the base's, such as "+1.25 %".
 
-    Empty if the method adds none, as for the input photo.
+    Empty if none were counted, as for the input photo.
+
+    Args:
+        run: the results of an evaluation.
+        image: the image's name.
+        method: the method's name, or that of another picture.
     """
-    # The tag is about the view that the picture shows.
+    # Numbers differ from view to view; pictures show the view with the largest hole.
     setting, view = run.view_with_largest_hole(image)
     for measurement in run.measurements:
         is_shown = (
@@ -309,10 +315,11 @@ def _figure_latex(figure: PaperFigure, runs: Sequence[Run], bases: str, methods:
     Args:
         figure: the figure.
         runs: the evaluations that it shows.
-        bases: the names of the bases, joined.
-        methods: the names of the paper's methods in it, joined.
+        bases: the names of the bases, such as "SHARP, MoGe", for the caption.
+        methods: the names of our methods in the figure, such as "Spackle", for the caption.
     """
-    # The largest hole, which the figure shows, is at the largest disparity.
+    # The figure shows views with the largest hole, which are those of the largest disparity (size
+    # of the camera move). Settings are disparities as text.
     largest_disparities = dict.fromkeys(max(run.settings, key=float) for run in runs)
     weights = dict.fromkeys(run.config["residual"]["weights"] for run in runs)
     weights_sentences = [WEIGHTS_SENTENCES[name] for name in weights if name in WEIGHTS_SENTENCES]

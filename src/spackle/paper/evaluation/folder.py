@@ -104,14 +104,14 @@ def load_run(folder: Path) -> Run:
     with as_input_error(config_path, DAMAGED):
         config = json.loads(config_path.read_text("utf-8"))
         if config.pop("format") != FORMAT_VERSION:
-            raise ValueError("of another version")
+            raise ValueError("of another version")  # the reason in the InputError's message
         about = config.pop("about")
         return Run(config, measurements, about)
 
 
 def metrics_of_earlier_run(folder: Path) -> list[str]:
     """The metrics that an earlier run measured in this folder; empty if there is none."""
-    # A damaged file of any content counts as no earlier run: `measure_images` refuses it later.
+    # Any damage of the file is ignored here, because `measure_images` reports it later.
     with contextlib.suppress(OSError, ValueError, LookupError, TypeError, AttributeError):
         config = json.loads((folder / CONFIG_FILE).read_text("utf-8"))
         states = config["about"]["metrics"]
@@ -152,7 +152,8 @@ def measure_images(plan: RunPlan, measure: MeasureImage, reporter: Reporter) -> 
         InputError: no image could be measured, or the folder holds results of other options.
     """
     _open_folder(plan)
-    cached_photo_digest = functools.cache(photo_digest)  # many cases may share a second photo
+    # Cached, because many cases may share a second photo.
+    cached_photo_digest = functools.cache(photo_digest)
     all_measurements: list[Measurement] = []
     has_measured = False
 
@@ -170,12 +171,13 @@ def measure_images(plan: RunPlan, measure: MeasureImage, reporter: Reporter) -> 
             measurements = _load_image_results(results_path, inputs_digest)
 
             if measurements is None:
+                # Before the first image to measure, say how far an earlier run came.
                 if index > 0 and not has_measured:
                     finished = f"{index} of {len(plan.cases)} images are done"
                     reporter.log(f"{plan.output}: going on, {finished}")
                 has_measured = True
 
-                # From now on the results are incomplete.
+                # This file says that the results are complete, but from now on they are not.
                 (plan.output / MEASUREMENTS_FILE).unlink(missing_ok=True)
                 measurements = _measure_image(index, case, measure, plan, inputs_digest, reporter)
 
@@ -227,7 +229,7 @@ def _measure_image(
     start = time.perf_counter()
     try:
         results = measure(index, case)
-    except BaseError:  # an InputError, too, but about all images
+    except BaseError:  # an InputError that concerns all images, so it ends the run
         raise
     except InputError as error:
         problem = _problem_of(case, error, plan)
@@ -250,7 +252,8 @@ def _problem_of(case: Case, error: InputError, plan: RunPlan) -> Measurement:
     # Results hold no paths of this machine.
     reason = str(error).replace(f"{plan.root}/", "")
     reason = " ".join(reason.splitlines())
-    if not reason.startswith(case.name):  # several cases may share a photo
+    # The reason may name a photo that several cases share, so the case is named, too.
+    if not reason.startswith(case.name):
         reason = f"{case.name}: {reason}"
     return image_measurement(str(plan.config["title"]), case.name, PROBLEM_METRIC, reason)
 
@@ -307,6 +310,7 @@ def _load_image_results(path: Path, inputs_digest: str) -> list[Measurement] | N
     # A file that is missing, or damaged in any way, counts as not measured.
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
         content = json.loads(path.read_text("utf-8"))
+        # A benchmark saves no pictures, so there is nothing to compare.
         pictures_match = not content["files"] or matches_records(
             path.parent, path.name, content["files"]
         )

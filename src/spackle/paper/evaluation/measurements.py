@@ -107,12 +107,17 @@ class Run:
         return str(self.config["base"]["title"])
 
     @property
+    def base_description(self) -> str:
+        """Half a sentence about the base, for the notes below tables."""
+        return str(self.config["base"]["says"])
+
+    @property
     def is_benchmark(self) -> bool:
         """Whether `spackle bench` measured times, rather than `spackle evaluate` pictures."""
         return bool(self.config["kind"] == "bench")
 
     @property
-    def is_near_view(self) -> bool:
+    def compares_with_photos(self) -> bool:
         """Whether the views are those of second photos, and were compared with these."""
         return bool(self.config["protocol"] == "near-view")
 
@@ -124,7 +129,7 @@ class Run:
     @property
     def settings(self) -> list[str]:
         """The settings: the disparities of the camera moves as text, or "near" alone."""
-        if self.is_near_view:
+        if self.compares_with_photos:
             return [NEAR_SETTING]
         return [f"{disparity:g}" for disparity in self.config["disparities"]]
 
@@ -151,15 +156,16 @@ class Run:
     def mean_by_image(self, metric: str, method: str) -> dict[str, float]:
         """The mean of a metric over each image's views, by the image's name.
 
-        Images without a finite value are left out.
+        Views that were not measured by this metric do not count. Images without a finite value are
+        left out.
         """
-        # Views without the metric have no measurement, so they do not count.
         of_method = (
             measurement
             for measurement in self.measurements
             if measurement.method == method and measurement.metric == metric
         )
 
+        # The keys of groups are tuples, here of one name.
         means = {}
         for (image,), values in group_values(of_method, "image").items():
             mean = mean_of_known(values).value
@@ -188,11 +194,11 @@ def paper_measurements(label: str) -> tuple[Measurement, ...]:
     `label` is the table's label in the paper's LaTeX source.
     """
     measurements = []
-    # Rows of a table with other metrics than its neighbours are a part of their own.
+    # A table whose rows have different metrics is listed in several parts with the same label.
     tables = [table for table in PAPER_TABLES if table.label == label]
     for table in tables:
         for row in table.rows:
-            # A row with a single setting is one of near views.
+            # A row of near views has numbers for one setting, a row of large views for three.
             settings = PAPER_SETTINGS if len(row.values_by_setting) > 1 else (NEAR_SETTING,)
 
             for setting, values in zip(settings, row.values_by_setting, strict=True):

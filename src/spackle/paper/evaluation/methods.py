@@ -1,4 +1,4 @@
-"""The compared methods : each renders new viewpoints of a photo from the same base prediction."""
+"""The compared methods: each renders new viewpoints of a photo from the same base prediction."""
 
 from __future__ import annotations
 
@@ -41,11 +41,10 @@ def make_method(
     inpainter: Inpainter | None = None,
     direct_ft: Callable[[], tuple[Gaussians, float]] | None = None,
 ) -> Fill:
-    """Make the function that fills the views of a photo's base (its predicted Gaussians) by a
-    method of `METHODS`.
+    """Make the function by which a method fills the holes in views of a photo's Gaussians.
 
     Args:
-        name: a name in `METHODS`.
+        name: the method, a key of `METHODS`.
         cameras: the cameras of all views of a setting, because a method may complete all views
             together.
         context: the base, the network and the renderer.
@@ -61,10 +60,11 @@ def make_method(
     if name == "dense":
         return _on_top_of_base(context, partial(_dense_aux, context, context.photo_guard()))
     if name == "spackle-scene":
+        # `exact`: every view is checked, and every hole is filled, however small.
         scene_aux = fill_scene(context, cameras, exact=True).aux
         return _on_top_of_base(context, lambda camera, base_rendering: scene_aux)
 
-    # Each view is completed by itself (paper, section 3.4).
+    # These two complete each view independently of other views (paper, section 3.4).
     if name == "spackle":
         return partial(_fill_each_view, context, context.photo_guard())
     if name == "initial":
@@ -79,8 +79,9 @@ def make_method(
 
 
 def _on_top_of_base(context: FillContext, added_gaussians: AddedGaussians) -> Fill:
-    """A method that renders the base together with the Gaussians that `added_gaussians` makes for
-    the view.
+    """The function that renders the base's Gaussians together with others.
+
+    `added_gaussians` makes these others, from a view's camera and the base's rendering by it.
     """
 
     def fill(camera: Camera, base_rendering: Rendering) -> MethodView:
@@ -89,15 +90,16 @@ def _on_top_of_base(context: FillContext, added_gaussians: AddedGaussians) -> Fi
         completed = base_rendering
         if len(aux):
             completed = context.renderer.render([context.base, aux], camera)
-        return MethodView(completed.rgb, completed.alpha, aux)
+        return MethodView(rgb=completed.rgb, alpha=completed.alpha, aux=aux)
 
     return fill
 
 
 @torch.no_grad()
 def _paper_aux(context: FillContext, camera: Camera, base_rendering: Rendering) -> Gaussians:
-    """The aux Gaussians of a view by the paper's eqs. 4 to 7, from the base rendered from this
-    view.
+    """The Gaussians that the paper's method (eqs. 4 to 7) adds to fill the hole in a view.
+
+    `base_rendering` is the base, rendered by `camera`; it shows where the hole is.
     """
     view = context.view(base_rendering, camera)
     deltas = view.deltas(context.network, context.precision)
@@ -108,23 +110,29 @@ def _paper_aux(context: FillContext, camera: Camera, base_rendering: Rendering) 
 def _fill_each_view(
     context: FillContext, photo_guard: OcclusionGuard, camera: Camera, base_rendering: Rendering
 ) -> MethodView:
-    """A view completed by itself in two passes, behind the surfaces that the photo shows
-    (`photo_guard`).
+    """Complete one view, independently of other views, in two passes.
+
+    Args:
+        context: the base's Gaussians, the network and the renderer.
+        photo_guard: keeps added Gaussians behind the surfaces that the photo shows.
+        camera: of the view.
+        base_rendering: the base, rendered by this camera.
     """
     filled = fill_view(context, camera, [photo_guard], base_rendering)
-    return MethodView(filled.rendering.rgb, filled.rendering.alpha, filled.aux)
+    return MethodView(rgb=filled.rendering.rgb, alpha=filled.rendering.alpha, aux=filled.aux)
 
 
 @torch.no_grad()
 def _dense_aux(
     context: FillContext, photo_guard: OcclusionGuard, camera: Camera, base_rendering: Rendering
 ) -> Gaussians:
-    """An aux Gaussian for every 2×2 pixels, hole or not: the ablation of the mask (the paper's
-    tab:mask_guided_init).
+    """Gaussians to add to a view: one for every 2×2 pixels, whether or not there is a hole.
 
-    The Gaussians are moved behind the surfaces that the photo shows (`photo_guard`).
+    The paper's table tab:mask_guided_init compares this with Gaussians in the hole alone. They are
+    moved behind the surfaces that the photo shows, of which `photo_guard` knows.
     """
     view = context.view(base_rendering, camera)
+    # A cell, 2×2 pixels, gives one Gaussian. Deltas are what the network changes in it.
     all_cells = torch.ones_like(view.mask)
     deltas = view.deltas(context.network, context.precision, dense=True)
     aux = view.gaussians(all_cells, deltas)
@@ -132,29 +140,32 @@ def _dense_aux(
 
 
 def _inpaint_2d(inpainter: Inpainter, camera: Camera, base_rendering: Rendering) -> MethodView:
-    """The base's rendering with its hole inpainted as a flat picture; an inpainter takes a batch of
-    views.
+    """The base's rendering of a view, in which an inpainter has filled the hole in the picture.
+
+    Nothing is added to the scene, so the result has neither opacity nor Gaussians.
     """
     hole = hole_mask(base_rendering.alpha)
     inverse_depth = known_inverse_depth(base_rendering.depth, hole)
+    # An inpainter takes a batch of views; this one has a single view.
     painted = inpainter.paint(base_rendering.rgb[None], hole[None], inverse_depth[None])
-    return MethodView(painted[0], None, None)
+    return MethodView(rgb=painted[0], alpha=None, aux=None)
 
 
 def _direct_ft(
     renderer: Renderer, base: Gaussians, unit: float, camera: Camera, base_rendering: Rendering
 ) -> MethodView:
-    """The paper's naive decoupled framework: render a base that was fine-tuned on completed views;
-    nothing is added.
+    """Render a view of a base that was fine-tuned on completed views; no Gaussians are added.
+
+    The paper calls this the naive decoupled framework.
 
     Args:
         renderer: draws the view.
-        base: the Gaussians of the fine-tuned base.
-        unit: the factor that converts camera positions to the unit of these Gaussians.
+        base: the Gaussians of the fine-tuned base, in that base's own unit of length.
+        unit: the factor that converts the camera's position to this unit.
         camera: of the view.
         base_rendering: not used: the fine-tuned base is rendered instead.
     """
     pose = camera.world_to_camera.clone()
     pose[:3, 3] *= unit
     rendering = renderer.render(base, dataclasses.replace(camera, world_to_camera=pose))
-    return MethodView(rendering.rgb, rendering.alpha, None)
+    return MethodView(rgb=rendering.rgb, alpha=rendering.alpha, aux=None)

@@ -55,7 +55,7 @@ class MetricSuite:
                 yield "ssim", ssim_average(similarity)
                 yield "ssim_hole", ssim_average(similarity, hole)
                 yield "ssim_outside", ssim_average(similarity, ~hole)
-            elif name == "distance" and self.features is not None:  # it compares features
+            elif name == "distance" and self.features is not None:  # needs a network's features
                 yield "distance", hole_distance(self.features, rgb, true_picture, hole)
 
     def _measure_published(

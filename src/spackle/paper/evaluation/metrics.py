@@ -169,7 +169,7 @@ def sharpness(image: Tensor, true_picture: Tensor, mask: Tensor) -> float:
     Returns:
         The ratio; NaN if no pixel counts.
     """
-    # A pixel is inside if no pixel around it is outside of the mask.
+    # A pixel counts if the square around it (of 7 pixels, so 3 to each side) lies in the mask.
     is_inside = ~maximum_filter(~mask, SHARPNESS_SQUARE_PX // 2)
     return float(_mean_gradient(image, is_inside) / _mean_gradient(true_picture, is_inside))
 

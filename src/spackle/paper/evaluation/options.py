@@ -65,7 +65,7 @@ class EvaluateOptions:
     download_metrics: bool = False  # whether pyiqa may fetch the weights of metrics
 
     @property
-    def is_near_view(self) -> bool:
+    def compares_with_photos(self) -> bool:
         """Whether the views are at the viewpoints of second photos, and are compared with these."""
         return self.protocol == "near-view"
 
@@ -74,7 +74,7 @@ class EvaluateOptions:
         """The long side of the views, in pixels."""
         if self.side is not None:
             return self.side
-        return MAX_WORKING_SIDE_PX if self.is_near_view else LARGE_VIEW_SIDE_PX
+        return MAX_WORKING_SIDE_PX if self.compares_with_photos else LARGE_VIEW_SIDE_PX
 
     @property
     def device(self) -> torch.device:
@@ -84,9 +84,10 @@ class EvaluateOptions:
 
     @property
     def settings_of_base(self) -> BaseSettings:
-        """The base's settings, without a precision if the base has no such option.
+        """The base's settings; if the base has no network, its precision is set back to "auto".
 
-        The precision then applies to the residual network alone.
+        The chosen precision then applies to the residual network alone: a base without a network
+        would refuse any other value than "auto".
         """
         lacks_precision = self.base.resolved_name in ("rgbd", "lite")
         if lacks_precision:
@@ -98,7 +99,8 @@ class EvaluateOptions:
         check_name("dataset", self.dataset, DATASETS)
         self._check_methods()
         self._check_metrics()
-        # Results name their base, so it may not be chosen by what is installed.
+        # The base "auto" is refused: it depends on what is installed, and results with different
+        # bases cannot be compared.
         self.settings_of_base.check(allow_auto=False)
         if self.residual == "none":
             raise InputError("`residual` none: leaves the holes open: give `methods` base instead")
@@ -124,9 +126,11 @@ class EvaluateOptions:
 
     def _check_metrics(self) -> None:
         """Raise an InputError if a metric is unknown, or needs true pictures of the views."""
-        for metric in self.metrics or ():
+        # None stands for the default metrics, which always fit.
+        chosen_metrics = () if self.metrics is None else self.metrics
+        for metric in chosen_metrics:
             check_name("metrics", metric, METRICS)
-            if METRICS[metric].needs_true_picture and not self.is_near_view:
+            if METRICS[metric].needs_true_picture and not self.compares_with_photos:
                 raise InputError(
                     f"`metrics` {metric}: needs a true second view: add `protocol` near-view"
                 )

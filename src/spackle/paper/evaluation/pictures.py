@@ -170,6 +170,7 @@ def _draw_boxes(
     width, height = size
     for left, top, right, bottom in boxes:
         upper_left = (x + left * width, y + top * height)
+        # The last pixels inside the box, because `rectangle` draws them, too.
         lower_right = (x + right * width - 1, y + bottom * height - 1)
         draw.rectangle((upper_left, lower_right), outline=BOX_COLOR, width=line_width)
 
@@ -225,7 +226,7 @@ def save_picture(picture: Tensor, path: Path) -> None:
 
 
 def stored_pictures(run: Run, folder: Path, image: str) -> dict[str, Path]:
-    """The files of an image's pictures: by each method, then "truth", "input" and "hole".
+    """The files of an image's pictures, by the picture's name: a method, "truth", "input", "hole".
 
     Pictures without a file are left out.
 
@@ -262,11 +263,12 @@ class Ranking(NamedTuple):
 def ranking_of_run(run: Run) -> Ranking | None:
     """The images of a run from best to worst; None if nothing was measured.
 
-    They are ranked by the results of the method "spackle", or else of the last method. (A method
-    is one way to render new views of a photo.) The first metric counts that was measured.
+    They are ranked by the results of one method (a way to render new views of a photo): "spackle",
+    or the last one if the run lacks it. The metric is the first of `RANKING_METRICS` that was
+    measured.
     """
     method = "spackle" if "spackle" in run.methods else run.methods[-1]
-    # Which metrics there are depends on the options and on the packages that are installed.
+    # A metric may be missing, because it was not chosen or its package is not installed.
     for metric in RANKING_METRICS[str(run.config["protocol"])]:
         values = run.mean_by_image(metric, method)
         if values:
@@ -301,7 +303,7 @@ def write_contact_sheets(run: Run, folder: Path) -> None:
         return
 
     # Large camera moves have no true picture.
-    names = [*run.methods, TRUE_PICTURE] if run.is_near_view else run.methods
+    names = [*run.methods, TRUE_PICTURE] if run.compares_with_photos else run.methods
     titles = [picture_title(run, name) for name in names]
     heading = f"{run.title}, {run.config['protocol']}, by {ranking.criterion}"
     # The font has no arrows.

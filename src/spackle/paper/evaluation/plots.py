@@ -87,7 +87,7 @@ def plots_of_run(run: Run) -> list[Plot]:
     Evaluations against second photos have plots scene by scene, those of large camera moves a plot
     of the area of holes.
     """
-    if run.is_near_view:
+    if run.compares_with_photos:
         plots = [scenes_plot(run, metric) for metric in SCENE_PLOTS]
     else:
         plots = [hole_area_plot(run)]
@@ -114,6 +114,7 @@ def _draw_plot(
         note: a sentence below the plot.
         height_inches: of the image.
     """
+    # Imported here, because matplotlib is optional.
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
@@ -130,15 +131,16 @@ def _draw_plot(
                 [y for _, y in one.points],
                 description.marker,
                 color=description.color,
-                ls=one.line_style,
-                mfc="white" if one.is_hollow else description.color,
-                alpha=0.8,  # markers may lie on each other
+                linestyle=one.line_style,
+                markerfacecolor="white" if one.is_hollow else description.color,
+                alpha=0.8,  # transparent, because markers may lie on each other
                 label=one.title,
             )
         axes.set(xlabel=x_title, ylabel=y_title)
         finish_axes(axes)
         figure.legend(loc="outside lower left", frameon=False, ncols=1)
 
+        # Without date and version in the file, the same series give the same bytes.
         file = io.BytesIO()
         figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None})
 
@@ -171,19 +173,20 @@ def hole_area_plot(run: Run) -> Plot | None:
     return _draw_plot(
         "Hole Area Ratio against disparity",
         series,
-        "disparity of the view",
-        "HAR, share of the pixels",
-        finish_axes,
+        x_title="disparity of the view",
+        y_title="HAR, share of the pixels",
+        finish_axes=finish_axes,
     )
 
 
 def _hole_area_series(run: Run) -> list[Series]:
     """The points (disparity, mean HAR) of a run and of the paper, before and after completion.
 
-    HAR is the hole area ratio, the fraction of pixels that are left open; "har_before" is that of
-    the base, to which methods add. Series without points are left out.
+    HAR is the hole area ratio, the fraction of pixels that are left open. The metric "har_before"
+    is the HAR of the base alone, "har" that after a method has filled holes. Series without points
+    are left out.
     """
-    # The area before completion is the same for all methods.
+    # The first method serves as well as any, because "har_before" is the same for all.
     any_method = run.methods[0]
     before = _mean_by_disparity(run.measurements, run.title, "har_before", any_method)
     series = [Series(f"before: {run.base_title} alone", "base", before, line_style="--")]
@@ -193,14 +196,15 @@ def _hole_area_series(run: Run) -> list[Series]:
             title = f"after: {method_row_name(run, method)}"
             series.append(Series(title, method, after, line_style="-"))
 
-    # The paper's numbers, for the eye's comparison.
+    # The paper's numbers are drawn beside the run's, so that a reader can compare them.
     published = paper_measurements(HOLE_AREA.label)
-    before = _mean_by_disparity(published, run.title, "har_before", PAPER_METHOD)
-    after = _mean_by_disparity(published, run.title, "har", PAPER_METHOD)
-    series.append(Series("before: SHARP (paper)", "base", before, is_hollow=True, line_style="--"))
-    series.append(
-        Series(f"after: {PAPER_METHOD}", "spackle", after, is_hollow=True, line_style="-")
-    )
+    paper_before = _mean_by_disparity(published, run.title, "har_before", PAPER_METHOD)
+    paper_after = _mean_by_disparity(published, run.title, "har", PAPER_METHOD)
+    for title, method, points, line_style in (
+        ("before: SHARP (paper)", "base", paper_before, "--"),
+        (f"after: {PAPER_METHOD}", "spackle", paper_after, "-"),
+    ):
+        series.append(Series(title, method, points, is_hollow=True, line_style=line_style))
     return [one for one in series if one.points]
 
 
@@ -242,8 +246,9 @@ def _set_logarithmic_scale(axes: Axes, values: Sequence[float]) -> None:
 def scenes_plot(run: Run, metric: str) -> Plot | None:
     """A plot of a metric with a row for each scene, best first, and a marker for each method.
 
-    Scenes are ranked by the method "spackle", or else the last method. If there are too many, a
-    selection from the best to the worst is shown. None if nothing was measured.
+    Scenes are ranked by the results of the method "spackle", or of the last method if the run lacks
+    it. If there are too many scenes, some are chosen evenly from best to worst. None if nothing was
+    measured.
 
     Args:
         run: an evaluation against second photos.
@@ -268,7 +273,7 @@ def scenes_plot(run: Run, metric: str) -> Plot | None:
         points = [
             (values[scene], float(row)) for row, scene in enumerate(scenes) if scene in values
         ]
-        series.append(Series(method_row_name(run, method), method, points))
+        series.append(Series(title=method_row_name(run, method), method=method, points=points))
 
     def finish_axes(axes: Axes) -> None:
         """Name the rows, and let the first be at the top."""
@@ -282,7 +287,15 @@ def scenes_plot(run: Run, metric: str) -> Plot | None:
     title, x_title = SCENE_PLOTS[metric]
     # Axes and legend need half of a usual plot's height.
     height_inches = PLOT_HEIGHT_INCHES / 2 + SCENE_HEIGHT_INCHES * len(scenes)
-    return _draw_plot(title, series, x_title, "", finish_axes, note, height_inches)
+    return _draw_plot(
+        title,
+        series,
+        x_title=x_title,
+        y_title="",  # the rows' names say what they are
+        finish_axes=finish_axes,
+        note=note,
+        height_inches=height_inches,
+    )
 
 
 def _shortened_name(name: str) -> str:

@@ -93,12 +93,12 @@ def measure_views(
 
     Returns:
         measurements: the numbers of all views.
-        pictures: [H, W, 3] of the view with the largest hole: the view by each method, "hole" (in
-            white), and "truth", the true picture, if known.
+        pictures: [H, W, 3] by name, all of the view with the largest hole: under a method's name
+            the view by this method; "hole", white in the hole; "truth", the true picture, if known.
     """
     measurements: list[Measurement] = []
     pictures: dict[str, Tensor] = {}
-    largest_hole_ratio = -1.0
+    largest_hole_ratio = -1.0  # below every ratio, so that the first view counts
 
     # A method may complete all views of a setting together, so settings are taken one by one.
     for setting in dict.fromkeys(view.setting for view in viewpoints):
@@ -161,6 +161,7 @@ def _measure_view(
         numbers += suite.measure(picture, true_picture, hole)
         for metric, value in numbers:
             if metric == REMARK_METRIC:
+                # Remarks are listed image by image, so they do not name view and method.
                 remark = image_measurement(dataset, image, metric, value)
                 measurements.append(remark)
             else:
@@ -171,7 +172,7 @@ def _measure_view(
                     view=view.name,
                     method=method,
                     metric=metric,
-                    value=value if math.isfinite(float(value)) else None,
+                    value=value if math.isfinite(float(value)) else None,  # JSON has no NaN
                 )
                 measurements.append(number)
 

@@ -121,12 +121,13 @@ def make_report(sources: Sequence[tuple[Run, Path]], *, with_unmeasured: bool = 
     """Make a report as a self-contained HTML page; the same results give the same bytes.
 
     Args:
-        sources: evaluations and benchmarks with joint tables, each with the folder of its pictures.
+        sources: evaluations and benchmarks, each with the folder of its pictures; the page's tables
+            show them together.
         with_unmeasured: whether to show all tables of the paper, also those without measured
             numbers.
     """
     runs = [run for run, _ in sources]
-    evaluations = [source for source in sources if not source[0].is_benchmark]
+    evaluations = [(run, folder) for run, folder in sources if not run.is_benchmark]
     # The page's images are shared out among the evaluations.
     images_each = max(MIN_IMAGES_EACH, MAX_IMAGES // max(1, len(evaluations)))
     datasets = ", ".join(dict.fromkeys(run.title for run in runs))
@@ -193,7 +194,10 @@ def _part_of_run(run: Run, folder: Path, max_images: int) -> ReportPart:
 
 
 def _position_text(index: int, count: int) -> str:
-    """An image's place among `count` images, worst first: "worst", "3 of 12" or "best"."""
+    """An image's place in a ranking from worst to best: "worst", "3 of 12" or "best".
+
+    `index` counts from 0, the worst of `count` images. A single image gets an empty text.
+    """
     if count == 1:
         return ""
     if index == 0:
@@ -213,7 +217,7 @@ def means_table(run: Run, measurements: Iterable[Measurement]) -> Table:
         run: the evaluation, which names methods and base.
         measurements: the numbers to average: all, or those of one view.
     """
-    # Only methods' numbers that people compare are shown; tables.md has the rest.
+    # An overview shows what people compare first; tables.md has the other numbers.
     shown = [one for one in measurements if one.metric in MEANS_COLUMNS]
     values = group_values(shown, "setting", "method", "metric")
     settings = list(dict.fromkeys(setting for setting, _, _ in values))
@@ -233,6 +237,7 @@ def means_table(run: Run, measurements: Iterable[Measurement]) -> Table:
             rows = prepend_group_name(setting_title(setting), rows)
         bodies.append(rows)
 
+    # The columns of words, which need no heads: the method, and before it the setting, if shown.
     word_heads = [""] if len(settings) == 1 else ["", ""]
     # An arrow stays on the line of its metric's name.
     metric_heads = [
@@ -256,7 +261,7 @@ def _report_image(run: Run, name: str, position: str, files: Mapping[str, Path])
         run: the evaluation.
         name: the image's name.
         position: the image's place in the ranking, in words.
-        files: the slider's pictures, by name: methods, or "truth".
+        files: the files of the slider's pictures, by the picture's name: a method, or "truth".
     """
     setting, view = run.view_with_largest_hole(name)
     view_measurements = [

@@ -97,7 +97,7 @@ def columns_of_layout(
                 assert image_metric is not None
                 number_format = METRICS[image_metric].format
 
-            # The best of a count or a time is no achievement by itself, so it is not marked.
+            # The lowest count or time is not marked, because a method that adds nothing has it.
             lower_is_better = None
             if marks_best and image_metric is not None:
                 lower_is_better = METRICS[image_metric].lower_is_better
@@ -117,8 +117,9 @@ def columns_of_layout(
 def mean_of_metric(values: GroupedValues, method: str, setting: str, metric: str) -> Mean | None:
     """The mean of a method's metric over the views of a setting, for an entry of a table.
 
-    Times give the median. A metric of `RATIOS` that was not measured itself gives the ratio of two
-    means. Numbers of whole images are valid for all methods and settings.
+    For times it is the median, because a busy machine makes some of them far too long. For a metric
+    of `RATIOS` that was not measured itself, it is the ratio of two means. A number of whole images
+    stands for all methods and settings.
 
     Args:
         values: measured numbers by (method, setting, metric).
@@ -131,7 +132,7 @@ def mean_of_metric(values: GroupedValues, method: str, setting: str, metric: str
     """
     measured = values.get((method, setting, metric))
     if not measured:
-        measured = values.get(("", "", metric))  # of whole images
+        measured = values.get(("", "", metric))  # whole images have no method and no setting
     if measured:
         statistic = statistics.median if metric in TIME_METRICS else statistics.fmean
         return mean_of_known(measured, statistic)
@@ -165,7 +166,9 @@ def _ratio_of_means(values: GroupedValues, method: str, setting: str, ratio: Rat
     if denominator is None or not denominator.value:
         return None
     quotient = numerator.value / denominator.value
-    return Mean(1 - quotient if ratio.is_reduction else quotient, 0)
+    value = 1 - quotient if ratio.is_reduction else quotient
+    # Views without a number are reported where the two means are shown, not again here.
+    return Mean(value=value, missing=0)
 
 
 def _entry_text(mean: Mean | None, column: Column, method: str) -> str:
@@ -173,11 +176,11 @@ def _entry_text(mean: Mean | None, column: Column, method: str) -> str:
     if mean is None:
         return NO_NUMBER
 
-    # The paper's overheads keep their one decimal.
+    # The paper prints overheads with one decimal, so its numbers have no more digits to show.
     is_paper_overhead = method.endswith(PAPER_SUFFIX) and column.metric == "overhead"
     number_format = NUMBER_FORMATS["tenths %"] if is_paper_overhead else column.format
 
-    # The reader must see if a mean is one over fewer views than that of its neighbour.
+    # If views lack the number, the mean is over fewer views than others, which the reader must see.
     number = NO_NUMBER if mean.value is None else number_format(mean.value)
     missing = f"({mean.missing} NaN)" if mean.missing else ""
     return f"{number} {missing}".strip()

@@ -29,23 +29,27 @@ def method_row_name(run: Run, method: str, title: str = "") -> str:
         title: a title instead of the method's own.
 
     Returns:
-        For instance "Spackle‡ (SHARP)". The mark ‡ says that the weights of the residual network
-        do not come from the paper's recipe, because no other weights were given.
+        For instance "Spackle‡ (SHARP)". The mark ‡ says that the residual network was not trained
+        by the paper's recipe: it had the weights that ship with Spackle, or none.
     """
     # The base is not a method on top of itself.
     if method == "base":
         return f"{run.base_title} alone"
     description = describe_method(method)
-    needs_mark = description.uses_residual and run.config["residual"]["weights"] != "given"
+    row_title = title or description.title
+
+    # Only weights that the user gave can come from the paper's recipe.
+    has_given_weights = run.config["residual"]["weights"] == "given"
+    needs_mark = description.uses_residual and not has_given_weights
     mark = RECIPE_MARK if needs_mark else ""
-    return f"{title or description.title}{mark} ({run.base_title})"
+    return f"{row_title}{mark} ({run.base_title})"
 
 
 def shown_methods(layout: TableLayout, run: Run) -> dict[str, str]:
     """The methods of a run that have a row in a table, each with the name of its row.
 
-    A table either lists its methods, or has all of the run; of these it may leave out methods that
-    lack the metric it is about.
+    A layout with `row_titles` lists its methods. Any other layout shows all methods of the run; if
+    it has a `needed_metric`, only those that were measured by this metric, without the base.
     """
     if layout.row_titles is not None:
         return {
@@ -55,13 +59,14 @@ def shown_methods(layout: TableLayout, run: Run) -> dict[str, str]:
         }
 
     methods = run.methods
-    # For instance, a flat inpainted picture has no opacity, and so no area of holes.
     if layout.needed_metric is not None:
+        # A method can lack a metric: a flat inpainted picture has no opacity, and so no holes.
         methods_with_metric = {
             measurement.method
             for measurement in run.measurements
             if measurement.metric == layout.needed_metric
         }
+        # Such a table shows what methods change about the base, so the base has no row.
         methods = [
             method for method in methods if method in methods_with_metric and method != "base"
         ]
@@ -69,13 +74,13 @@ def shown_methods(layout: TableLayout, run: Run) -> dict[str, str]:
 
 
 def notes_of_table(layout: TableLayout, runs: Sequence[Run]) -> list[str]:
-    """The notes below a table that shows these runs, without repetitions."""
+    """The notes below a table that shows these runs; a note that runs share is listed once."""
     # Several columns may show one metric, such as PSNR in the hole and outside.
     metrics = [metric_of_column(column.metric) for column in layout.columns]
     image_metrics = list(dict.fromkeys(metric for metric in metrics if metric is not None))
 
     notes = [_views_note(run) for run in runs]
-    notes += [f"Base {run.base_title}: {run.config['base']['says']}." for run in runs]
+    notes += [f"Base {run.base_title}: {run.base_description}." for run in runs]
     notes += _methods_notes(layout, runs)
     notes += [_residual_note(run) for run in runs]
     notes += [f"{METRICS[name].name}: {METRICS[name].definition}." for name in image_metrics]
@@ -86,13 +91,13 @@ def notes_of_table(layout: TableLayout, runs: Sequence[Run]) -> list[str]:
         if run.is_benchmark:
             notes += _timing_notes(run)
 
-    # Runs of several datasets share most notes.
+    # Runs of several datasets share most notes. The table's own notes come last.
     return [*dict.fromkeys(notes), *layout.notes]
 
 
 def _views_note(run: Run) -> str:
     """The note that says which views of each image were rendered."""
-    if not run.is_near_view:
+    if not run.compares_with_photos:
         return (
             "Views: both ends of a swipe at each disparity, where the camera is farthest left and "
             "farthest right and looks at the focus point; "
@@ -125,11 +130,12 @@ def _methods_notes(layout: TableLayout, runs: Sequence[Run]) -> list[str]:
 def _residual_note(run: Run) -> str:
     """The note that says which weights the residual network had."""
     residual = run.config["residual"]
+    # The digest tells files of weights apart; if there are no weights, it is None.
     digest_start = str(residual["sha256"])[:8]
     if residual["weights"] == "given":
         return f"Residual: given weights ({digest_start})."
 
-    # Neither is what the paper's recipe would train.
+    # The paper's recipe trained neither the shipped weights nor a network without weights.
     if residual["sha256"]:
         weights = f"the residual has the weights that ship with Spackle ({digest_start})"
     else:
@@ -140,7 +146,7 @@ def _residual_note(run: Run) -> str:
 def _missing_metrics_notes(run: Run, image_metrics: Sequence[str]) -> list[str]:
     """Notes on the image metrics that a run did not measure, one for each reason."""
     # Benchmarks have no metrics. Metrics with the same reason share a note.
-    states = run.about.get("metrics", {})
+    states = run.about.get("metrics", {})  # by metric, such as "not run: NIQE needs pyiqa"
     names_by_reason: dict[str, list[str]] = {}
     for metric in image_metrics:
         state = str(states.get(metric))
@@ -171,7 +177,8 @@ def _timing_notes(run: Run) -> list[str]:
 
 def _machine_note(run: Run) -> str:
     """The note on a benchmark's machine, and on the number formats of the networks."""
-    base_precision = None  # a base without a network tells none
+    # A base notes the number format of its network. None: it has no network.
+    base_precision = None
     for measurement in run.measurements:
         if measurement.metric == f"{NOTE_PREFIX}precision":
             base_precision = measurement.value

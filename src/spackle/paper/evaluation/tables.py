@@ -139,8 +139,8 @@ def _runs_by_source(runs: Sequence[Run]) -> dict[Source, list[Run]]:
     Costs come from benchmarks. An evaluation of large views has counts of Gaussians, too, and
     stands in for a benchmark of its dataset and base if there is none.
     """
-    near_runs = [run for run in runs if run.is_near_view]
-    large_runs = [run for run in runs if not run.is_near_view and not run.is_benchmark]
+    near_runs = [run for run in runs if run.compares_with_photos]
+    large_runs = [run for run in runs if not run.compares_with_photos and not run.is_benchmark]
     benchmarks = [run for run in runs if run.is_benchmark]
 
     # A benchmark times the same views, so its counts are preferred.
@@ -158,7 +158,7 @@ def _settings_of_large_views(runs: Sequence[Run]) -> list[str]:
         InputError: the runs have different disparities.
     """
     # Tables have columns for each disparity, so all runs must have the same.
-    settings = {tuple(run.settings) for run in runs if not run.is_near_view}
+    settings = {tuple(run.settings) for run in runs if not run.compares_with_photos}
     if len(settings) > 1:
         raise InputError("the results have different disparities: make a separate table for each")
     if not settings:
@@ -250,7 +250,7 @@ def _rows_of_dataset(
     published = [one for one in paper_measurements(paper_label) if one.dataset == dataset]
     for method in dict.fromkeys(one.method for one in published):
         (texts,) = texts_of_methods(published, columns, [method])
-        # The paper may have other settings than the runs; then its row would be empty.
+        # If the paper has other settings than the runs, all its texts are empty: no row.
         has_numbers = any(texts)
         if has_numbers:
             rows.append(DatasetRow(method, str(PAPER_IMAGE_COUNTS[dataset]), texts))
@@ -263,7 +263,9 @@ def _rows_of_dataset(
 def _content_by_dataset(
     layout: TableLayout, runs: Sequence[Run], settings: Sequence[str]
 ) -> TableContent:
-    """Heads and rows of a table with a group of rows for each dataset: our methods, the paper's.
+    """Heads and rows of a table with a group of rows for each dataset.
+
+    A group has the rows of our methods, then the paper's.
 
     The columns are repeated for each setting, that is, for each size of the camera move.
     """
@@ -291,14 +293,14 @@ def _near_view_content(
 ) -> TableContent:
     """Heads and rows of a table with a row for each method, and columns for each dataset.
 
-    Our methods stand in a group above the paper's.
+    The rows of our methods are a group above those of the paper's.
     """
     columns = columns_of_layout(layout.columns, settings, marks_best=layout.marks_best)
     datasets = _datasets(runs)
     heads = [("", "Method")]
     heads += [(dataset, column.title) for dataset in datasets for column in columns]
 
-    # For each method's name the texts of its columns, by dataset.
+    # By the row's name, then by dataset: the texts of the row in the dataset's columns.
     measured_rows: dict[str, dict[str, list[str]]] = {}
     paper_rows: dict[str, dict[str, list[str]]] = {}
     for dataset in datasets:
@@ -307,7 +309,7 @@ def _near_view_content(
                 continue
             rows = paper_rows if row.name.endswith(PAPER_SUFFIX) else measured_rows
             rows.setdefault(row.name, {})[dataset] = row.texts
-    # Without results one row says so, above the paper's.
+    # If nothing was measured, one row above the paper's says so.
     if not measured_rows:
         measured_rows[NOT_RUN] = {}
 
@@ -355,10 +357,10 @@ def _overhead_content(
 
 
 def _means_of_datasets(layout: TableLayout, runs: Sequence[Run]) -> dict[str, list[Measurement]]:
-    """For each row's name the means of all metrics of each dataset, as measurements.
+    """The mean of each metric over each dataset, as measurements, listed by the row's name.
 
-    Averages over datasets are computed from these, so that each dataset counts once, whatever its
-    number of images. The paper's averages are added as they are.
+    The caller averages these means, so that each dataset counts once, whatever its number of
+    images. A row of the paper has averages over datasets already; they are listed unchanged.
     """
     means: dict[str, list[Measurement]] = {}
     for run in runs:
@@ -369,7 +371,7 @@ def _means_of_datasets(layout: TableLayout, runs: Sequence[Run]) -> dict[str, li
                 continue
             mean = mean_of_metric(values, method, setting, metric)
             if mean is not None:
-                # The dataset takes the place of an image: the next mean is one over datasets.
+                # The caller averages over images, so the dataset is entered as an image.
                 name = names[method]
                 measurement = Measurement(
                     dataset="",
@@ -382,7 +384,7 @@ def _means_of_datasets(layout: TableLayout, runs: Sequence[Run]) -> dict[str, li
                 )
                 means.setdefault(name, []).append(measurement)
 
-    # The paper's numbers in this table are averages already.
+    # In this table the paper has averages over datasets, not numbers of each dataset.
     for measurement in paper_measurements(layout.label):
         means.setdefault(measurement.method, []).append(measurement)
     return means
@@ -391,14 +393,18 @@ def _means_of_datasets(layout: TableLayout, runs: Sequence[Run]) -> dict[str, li
 def _time_rows(
     layout: TableLayout, settings: Sequence[str], means: Mapping[str, Sequence[Measurement]]
 ) -> list[RowTexts]:
-    """The rows of times below a table of costs: a heading, and for each kind of time the methods.
+    """The rows of times below a table of costs.
+
+    The first row is a heading. Then each kind of time, such as the base's time, has a group of
+    rows, one for each method.
 
     Args:
-        layout: the table; each setting has a column for each of `layout.columns`.
+        layout: the table of costs; each setting has a column for each of `layout.columns`.
         settings: disparities (sizes of camera moves), as text.
         means: for each row's name the numbers of all datasets.
     """
-    # Times stand below the columns of counts, under a heading of their own.
+    # The heading stands in the first column. The second, of methods, and those of counts, below
+    # which the times will stand, are empty in its row.
     count_columns = len(layout.columns) * len(settings)
     rows: list[RowTexts] = [("Runtime efficiency", *[NO_NUMBER] * (1 + count_columns))]
 
@@ -408,7 +414,7 @@ def _time_rows(
         for name, measurements in means.items():
             (texts,) = texts_of_methods(measurements, columns, [name])
 
-            # A setting has several columns of counts; the time stands in the first.
+            # A setting has several columns of counts. Its time stands in the first of them.
             row_texts = [name]
             for text in texts:
                 row_texts.append(text)
@@ -426,6 +432,7 @@ def _expanded_overhead_content(
     A dataset's group has rows for each setting (size of the camera move), and of these one for each
     method.
     """
+    # "From" is the method that a row's numbers are from; "n" is the number of images.
     titles = ["Dataset", "Setting", "From", *(column.title for column in layout.columns), "n"]
     heads = [("", title) for title in titles]
 

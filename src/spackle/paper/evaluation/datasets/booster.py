@@ -47,7 +47,7 @@ def booster_cases(scenes: Mapping[str, Path]) -> list[Case]:
 
 
 def _cases_of_scene(folder: Path) -> list[Case]:
-    """The cases of a scene's left photos; all share calibration and depth.
+    """A case for each left photo of a scene; all photos have one calibration and one depth map.
 
     Raises:
         InputError: the calibration or the disparity map is missing or damaged.
@@ -65,6 +65,7 @@ def _cases_of_scene(folder: Path) -> list[Case]:
 
     def read_depth() -> DepthMap:
         """Depth of the left photos."""
+        # `read_array` also returns whether the file is a PNG.
         disparity, _ = read_array(disparity_path)
         return calibration.depth_from_positive(disparity, disparity_path)
 

@@ -108,6 +108,7 @@ class Model:
 
     def points(self, view: ColmapView) -> Points:
         """The reliable points in front of a view that the view sees, with their depth."""
+        # Indices of the ids that both have, in the view's and in the model's list of points.
         _, in_view, in_model = np.intersect1d(
             view.point_ids, self.point_ids, assume_unique=True, return_indices=True
         )
@@ -178,7 +179,8 @@ def _reliable_points(records: Iterator[PointRecord]) -> tuple[Array, Array]:
     rows = [record for record in records if record.error_px <= MAX_REPROJECTION_ERROR_PX]
     table = np.array(rows, np.float64).reshape(-1, 5)  # key, x, y, z, error
 
-    # Larger numbers are those of damaged files.
+    # Beyond these limits for id, x, y and z a file is damaged: float64 does not hold the id exactly,
+    # or no camera is that far away.
     limits = [MAX_EXACT_INTEGER, MAX_CAMERA_NUMBER, MAX_CAMERA_NUMBER, MAX_CAMERA_NUMBER]
     table = table[(np.abs(table[:, :4]) <= limits).all(axis=1)]
 
@@ -203,7 +205,7 @@ def _lens_of_record(path: Path, record: CameraRecord) -> Camera:
             "COLMAP first"
         )
 
-    # Bring both kinds of parameters to the order fx, fy, cx, cy, distortion.
+    # Models with one focal length have f, cx, cy; the others fx, fy, cx, cy. Then comes distortion.
     parameters = record.parameters
     if model.name in SINGLE_FOCAL_MODELS:
         parameters = [parameters[0], *parameters]  # fx and fy are the same
@@ -215,11 +217,12 @@ def _lens_of_record(path: Path, record: CameraRecord) -> Camera:
         K, at_origin, record.width, record.height, f"{path}: a lens", dtype=torch.float64
     )
 
-    # The corner that is farthest from the principal point, at focal length 1: its radius r,
-    # squared.
+    # Distortion grows outwards, so the corner that is farthest from the principal point decides.
+    # It is given at focal length 1.
     corner_x = max(cx, record.width - cx) / fx
     corner_y = max(cy, record.height - cy) / fy
-    shift = _max_distortion_shift(distortion, corner_x**2 + corner_y**2)
+    squared_radius = corner_x**2 + corner_y**2
+    shift = _max_distortion_shift(distortion, squared_radius)
     max_shift_px = MAX_DISTORTION * max(record.width, record.height)
     is_small = shift * max(fx, fy) <= max_shift_px  # false for NaN
     if not is_small:
@@ -270,6 +273,7 @@ def _view_of_record(path: Path, lens: Camera, record: ImageRecord) -> ColmapView
     quaternion = torch.tensor(record.pose[:4], dtype=torch.float64)
     translation = torch.tensor(record.pose[4:], dtype=torch.float64)
     where = f"{path}: the pose of {record.name}"
+    # A quaternion of length 0, infinity or NaN has no direction, and so gives no rotation.
     has_length = MIN_QUATERNION_NORM < float(quaternion.norm()) < MAX_CAMERA_NUMBER
     if len(translation) != 3 or not has_length:
         raise InputError(f"{where} is not a rotation: the file is damaged")
@@ -281,10 +285,11 @@ def _view_of_record(path: Path, lens: Camera, record: ImageRecord) -> ColmapView
         lens.K, world_to_camera, lens.width, lens.height, where, dtype=torch.float64
     )
 
-    # Positions without a point are of no use here.
+    # A feature of the photo that belongs to no point has the id -1.
     observations = record.observations[record.observations["id"] >= 0]
-    _, first = np.unique(observations["id"], return_index=True)  # a photo may see a point twice
-    observations = observations[first]
+    # A photo may see a point twice; the first observation is kept.
+    _, first_indices = np.unique(observations["id"], return_index=True)
+    observations = observations[first_indices]
     return ColmapView(record.name, camera, observations["uv"].copy(), observations["id"].copy())
 
 
@@ -301,11 +306,12 @@ def _cameras_bin(path: Path) -> Iterator[CameraRecord]:
     offset = 8  # bytes of the number of records
     for _ in range(count):
         key, model, width, height = struct.unpack_from("<iiQQ", data, offset)
-        # The number of parameters of other models is unknown; they are refused by the caller.
+        # The caller refuses other models, so their parameters, of unknown number, are not read.
         parameter_count = LENS_MODELS[model].parameter_count if model in LENS_MODELS else 0
-        parameters = struct.unpack_from(f"<{parameter_count}d", data, offset + 24)
+        parameters_start = offset + 24  # 4 + 4 + 8 + 8 bytes
+        parameters = struct.unpack_from(f"<{parameter_count}d", data, parameters_start)
         yield CameraRecord(key, model, width, height, list(parameters))
-        offset += 24 + 8 * parameter_count
+        offset = parameters_start + 8 * parameter_count  # a float64 has 8 bytes
 
 
 def _images_bin(path: Path) -> Iterator[ImageRecord]:
@@ -340,6 +346,7 @@ def _points_bin(path: Path) -> Iterator[PointRecord]:
     (count,) = struct.unpack_from("<Q", data)
     offset = 8  # bytes of the number of records
     for _ in range(count):
+        # "3x" skips the colour.
         key, x, y, z, error_px, photo_count = struct.unpack_from("<Q3d3xdQ", data, offset)
         yield PointRecord(key, x, y, z, error_px)
         offset += 51 + 8 * photo_count  # 8 + 3 · 8 + 3 + 8 + 8 bytes, and the photos

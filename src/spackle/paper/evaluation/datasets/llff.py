@@ -66,7 +66,7 @@ def _photos_of_scene(folder: Path) -> list[PosedPhoto]:
     table_path = folder / "poses_bounds.npy"
     rows = _read_table(table_path, len(files)) if table_path.is_file() else None
 
-    # Rows of the table are matched to photos by order.
+    # The table has no names of photos: its rows are in the order of the photos' names.
     depth_bounds = {}
     if rows is not None:
         for file, row in zip(files, rows, strict=True):
@@ -92,7 +92,7 @@ def _photos_of_scene(folder: Path) -> list[PosedPhoto]:
             name=f"{folder.name}/{file.stem}",
             photo=file,
             camera=_camera_of_row(row, f"{table_path}: {file.name}"),
-            # Half way between the bounds in inverse depth.
+            # In inverse depth, which is what parallax depends on, half way between the bounds.
             middle_depth=2 / (1 / nearest + 1 / farthest),
             depth_bounds=depth_bounds[file],
         )

@@ -47,8 +47,9 @@ def middlebury_cases(scenes: Mapping[str, Path]) -> list[Case]:
 def _middlebury_case(folder: Path) -> Case:
     """The case of a folder with scene.json, or else of a folder with the files of 2014.
 
-    scene.json has the calibration, in which pixel centres are at half-integers and lengths may be
-    nominal, and the names of the files "left", "right" (photos) and "disparity".
+    scene.json has the calibration, and the names of the files "left", "right" (photos) and
+    "disparity". Its principal point counts from the corner of the first pixel. Its baseline need
+    not be in true metres, because an evaluation compares only ratios of lengths.
 
     Raises:
         InputError: a calibration or disparity map is missing or damaged.
@@ -64,7 +65,7 @@ def _middlebury_case(folder: Path) -> Case:
         right = folder / str(facts["right"])
         disparity = folder / str(facts["disparity"])
 
-    # Disparities become depth by the same calibration.
+    # The same file has the calibration that turns disparities into depth.
     read_depth = partial(load_depth, disparity, calib=path)
     size = size_of_photos([left])
     return rectified_pair(folder.name, left, right, calibration, size, read_depth)

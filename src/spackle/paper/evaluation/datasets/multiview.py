@@ -31,7 +31,7 @@ from spackle.paper.evaluation.datasets.colmap import Model
 MIN_BASELINE_OVER_DEPTH = 0.05
 MAX_BASELINE_OVER_DEPTH = 0.25
 MAX_TURN_DEGREES = 30.0
-MIN_SHARED_POINTS = 0.3
+MIN_SHARED_POINTS_RATIO = 0.3
 MAX_NEAR_VIEWS = 3  # of a photo
 
 # How far a pose's rotation may differ from an exact rotation matrix; published poses are rounded.
@@ -111,11 +111,12 @@ def make_cases(
 ) -> list[Case]:
     """Make a case of each chosen photo, with all other photos of the scene as its second views.
 
-    Second views are in the case's frame, the nearest camera first. At most three of them are
-    marked as near: the nearest that qualify. A view qualifies if its camera is 5 % to 25 % of the
-    photo's middle depth away, is turned by at most 30°, and sees at least 30 % of the photo's
-    points. If points are unknown, each camera must instead see the middle of the other's view. A
-    photo may have no near view.
+    The cameras of second views are given in the frame of the case's photo, the nearest first.
+
+    The nearest three views that meet these conditions are marked as near; there may be fewer, or
+    none: the camera is 5 % to 25 % of the photo's middle depth away, is turned by at most 30°, and
+    sees at least 30 % of the photo's points. If points are unknown, each camera must instead see
+    the middle of the other's view.
 
     Args:
         photos: all photos of a scene.
@@ -219,7 +220,9 @@ def _sees_the_same(photo: PosedPhoto, other: PosedPhoto) -> bool:
     """
     if photo.point_ids is not None and other.point_ids is not None:
         shared_ids = np.intersect1d(photo.point_ids, other.point_ids, assume_unique=True)
-        return len(shared_ids) >= MIN_SHARED_POINTS * max(1, len(photo.point_ids))
+        # At least one point must be shared, also if the photo sees none.
+        point_count = max(1, len(photo.point_ids))
+        return len(shared_ids) >= MIN_SHARED_POINTS_RATIO * point_count
     return _sees_middle(photo.camera, other) and _sees_middle(other.camera, photo)
 
 
@@ -240,8 +243,11 @@ def spread_over_scenes(
     """Choose photos of a dataset, spread evenly over its scenes and over the photos of each scene.
 
     Scenes take turns to give one photo each, until there are `count`; scenes without further
-    photos are skipped. If there are more scenes than `count`, categories take turns to give one
-    scene each, and a scene gives one photo (names are CATEGORY/SCENE).
+    photos are skipped.
+
+    If there are more scenes than `count`, only some scenes are used, which give one photo each.
+    Then categories take turns to give one scene each. A scene's category is the first part of its
+    name, CATEGORY/SCENE.
 
     Args:
         scenes: names, in order; the scenes of a category are neighbours.
@@ -252,13 +258,14 @@ def spread_over_scenes(
     Returns:
         The scenes that are used, in order, each with the indices of its chosen photos, in order.
     """
-    # Names without a slash are categories of their own, so all scenes are used.
+    # A name without a slash is a category by itself.
     by_category = itertools.groupby(scenes, key=lambda scene: scene.partition("/")[0])
     scenes_of_categories = [list(names) for _, names in by_category]
     used_scenes = _in_turn(scenes_of_categories)[:count]
 
     photos = {scene: photos_of_scene(scene) for scene in used_scenes}
-    # Each scene's name, as often as the scene has photos.
+    # A list for each scene has its name once for each of its photos. How often a name is among the
+    # first `count` turns is how many photos the scene gives.
     turns = _in_turn([[scene] * len(photos[scene]) for scene in used_scenes])[:count]
     counts = collections.Counter(turns)
     return {

@@ -58,10 +58,16 @@ def rectified_pair(
         read_depth: reads the left photo's depth.
     """
     if size is None:
-        return Case(name, left, read_depth=read_depth)
-    left_camera, right_camera = calibration.cameras(*size)
-    second_view = SecondView("right", right, right_camera)
-    return Case(name, left, left_camera, read_depth=read_depth, second_views=(second_view,))
+        return Case(name=name, photo=left, read_depth=read_depth)
+    width, height = size
+    left_camera, right_camera = calibration.cameras(width, height)
+    return Case(
+        name=name,
+        photo=left,
+        camera=left_camera,
+        read_depth=read_depth,
+        second_views=(SecondView(name="right", photo=right, camera=right_camera),),
+    )
 
 
 def size_of_photos(photos: Sequence[Path]) -> tuple[int, int] | None:
@@ -93,7 +99,7 @@ def pair_of_2014(folder: Path) -> Case:
             f"{calibration_path}: needs a width and a height above 0: the file is damaged"
         )
 
-    # Test scenes have none.
+    # Middlebury does not publish the true disparities of its test scenes.
     disparity_paths = [folder / name for name in DISPARITY_FILES if (folder / name).is_file()]
     if not disparity_paths:
         raise InputError(
@@ -103,6 +109,7 @@ def pair_of_2014(folder: Path) -> Case:
 
     def read_depth() -> DepthMap:
         """Depth of the left photo, with the intrinsics of the calibration."""
+        # `load_depth` takes the principal point as the file has it, from the middle of a pixel.
         depth_map = load_depth(disparity_paths[0], calib=calibration_path)
         return replace(depth_map, K=calibration.K)
 
@@ -156,9 +163,10 @@ def load_motorcycle() -> StereoPair:
     )
     left_camera, right_camera = calibration.cameras(width, height)
     return StereoPair(
-        left=torch.from_numpy(left.astype(np.float32) / 255),
+        left=torch.from_numpy(left.astype(np.float32) / 255),  # 255 is the largest byte
         right=torch.from_numpy(right.astype(np.float32) / 255),
-        depth=calibration.depth_from_positive(disparity, Path("Motorcycle")),
+        # There is no file, so messages name the scene.
+        depth=calibration.depth_from_positive(disparity, path=Path("Motorcycle")),
         left_camera=left_camera,
         right_camera=right_camera,
     )

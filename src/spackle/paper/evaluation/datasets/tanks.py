@@ -59,7 +59,7 @@ def _photos_of_scene(folder: Path) -> list[PosedPhoto]:
 
     photos = []
     for photo, view in zip(posed_photos_of_model(folder, model, files), model.views, strict=True):
-        # With folders, because stems may repeat in subfolders.
+        # The name keeps the photo's subfolder, because photos in two subfolders may be named alike.
         name_in_model = Path(view.name).with_suffix("").as_posix()
         photos.append(dataclasses.replace(photo, name=f"{folder.name}/{name_in_model}"))
     return photos

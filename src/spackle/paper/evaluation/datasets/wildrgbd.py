@@ -51,7 +51,8 @@ def wildrgbd_cases(scenes: Mapping[str, Path]) -> list[Case]:
     Raises:
         InputError: a file is missing or damaged.
     """
-    # Filled by `frame_indices`, because only scenes that are used are read.
+    # For each scene its frames. Scenes are read when they are chosen (by `frame_indices`), because
+    # the dataset has many more than are used.
     frames: dict[str, list[PosedPhoto]] = {}
 
     def frame_indices(name: str) -> range:
@@ -125,7 +126,10 @@ def _frames_of_scene(name: str, folder: Path) -> list[PosedPhoto]:
             continue
         where = f"{poses_path}: {file.name}"
         camera = camera_from_pose(K, camera_to_world, width, height, where)
-        frames.append(PosedPhoto(f"{name}/{file.stem}", file, camera, MIDDLE_DEPTH_M))
+        frame = PosedPhoto(
+            name=f"{name}/{file.stem}", photo=file, camera=camera, middle_depth=MIDDLE_DEPTH_M
+        )
+        frames.append(frame)
     return frames
 
 
