@@ -178,7 +178,9 @@ def _measure_and_save_pictures(
     measurements, pictures = measure_case(case, evaluation)
 
     # A metric that fails leaves the same remark for each view.
-    remarks = [one.value for one in measurements if one.metric == REMARK_METRIC]
+    remarks = [
+        measurement.value for measurement in measurements if measurement.metric == REMARK_METRIC
+    ]
     for remark in dict.fromkeys(remarks):
         reporter.log(f"{case.name}: {remark}")
 

@@ -119,13 +119,15 @@ def make_figures(folders: Sequence[Path], max_rows: int, output: Path, reporter:
     """
     all_runs = [RunWithFolder(load_run(folder), folder) for folder in folders]
     large_runs = [
-        one for one in all_runs if not one.run.is_benchmark and not one.run.compares_with_photos
+        source
+        for source in all_runs
+        if not source.run.is_benchmark and not source.run.compares_with_photos
     ]
 
     # A figure that needs a method which no evaluation has is left out.
     drawn_figures = {}
     for figure in FIGURES:
-        shown_runs = [one for one in large_runs if figure.needed_method in one.run.methods]
+        shown_runs = [source for source in large_runs if figure.needed_method in source.run.methods]
         drawn = _draw_figure(figure, shown_runs, max_rows)
         if drawn is not None:
             drawn_figures[figure.name] = drawn

@@ -79,7 +79,9 @@ class RunPlan:
 
 def write_measurements(measurements: Iterable[Measurement], path: Path) -> None:
     """Write measurements as JSON, one a line; the file appears complete or not at all."""
-    lines = [json.dumps(one._asdict(), allow_nan=False) + "\n" for one in measurements]
+    lines = [
+        json.dumps(measurement._asdict(), allow_nan=False) + "\n" for measurement in measurements
+    ]
     write_atomic(path, "".join(lines).encode())
 
 

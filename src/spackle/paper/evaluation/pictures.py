@@ -86,7 +86,8 @@ def draw_grid(
 
     # All pictures have one width. A row is as high as its highest picture.
     resized_rows = [
-        [_resized_to_width(one.picture, picture_width) for one in row.pictures] for row in rows
+        [_resized_to_width(grid_picture.picture, picture_width) for grid_picture in row.pictures]
+        for row in rows
     ]
     row_heights = [max(picture.height for picture in pictures) for pictures in resized_rows]
     caption_heights = [line_height if row.caption else 0 for row in rows]
@@ -142,11 +143,11 @@ def _draw_row(
     draw = ImageDraw.Draw(canvas)
     box_line_width = max(2, font_size // 10)
     x = 0
-    for one, resized in zip(pictures, resized_pictures, strict=True):
+    for grid_picture, resized in zip(pictures, resized_pictures, strict=True):
         canvas.paste(resized, (x, y))
-        _draw_boxes(draw, one.boxes, (x, y), resized.size, box_line_width)
-        if one.tag:
-            _draw_tag(draw, one.tag, (x + resized.width, y), gap, font_size)
+        _draw_boxes(draw, grid_picture.boxes, (x, y), resized.size, box_line_width)
+        if grid_picture.tag:
+            _draw_tag(draw, grid_picture.tag, (x + resized.width, y), gap, font_size)
         x += resized.width + gap
 
 

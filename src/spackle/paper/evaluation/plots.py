@@ -124,17 +124,17 @@ def _draw_plot(
         figure = Figure(figsize=(PLOT_WIDTH_INCHES, height_inches), layout="constrained")
         axes = figure.subplots()
 
-        for one in series:
-            description = describe_method(one.method)
+        for method_series in series:
+            description = describe_method(method_series.method)
             axes.plot(
-                [x for x, _ in one.points],
-                [y for _, y in one.points],
+                [x for x, _ in method_series.points],
+                [y for _, y in method_series.points],
                 description.marker,
                 color=description.color,
-                linestyle=one.line_style,
-                markerfacecolor="white" if one.is_hollow else description.color,
+                linestyle=method_series.line_style,
+                markerfacecolor="white" if method_series.is_hollow else description.color,
                 alpha=0.8,  # transparent, because markers may lie on each other
-                label=one.title,
+                label=method_series.title,
             )
         axes.set(xlabel=x_title, ylabel=y_title)
         finish_axes(axes)
@@ -146,7 +146,7 @@ def _draw_plot(
 
     # The image becomes a part of the page, which is one file.
     svg = base64.b64encode(file.getvalue()).decode()
-    alt_text = f"{title}. {', '.join(one.title for one in series)}"
+    alt_text = f"{title}. {', '.join(method_series.title for method_series in series)}"
     return Plot(title, alt_text, f"data:image/svg+xml;base64,{svg}", note)
 
 
@@ -161,8 +161,10 @@ def hole_area_plot(run: Run) -> Plot | None:
     if not series:
         return None
 
-    disparities = sorted({disparity for one in series for disparity, _ in one.points})
-    hole_ratios = [hole_ratio for one in series for _, hole_ratio in one.points]
+    disparities = sorted(
+        {disparity for method_series in series for disparity, _ in method_series.points}
+    )
+    hole_ratios = [hole_ratio for method_series in series for _, hole_ratio in method_series.points]
 
     def finish_axes(axes: Axes) -> None:
         """Mark the disparities on the x axis, and show percent on the y axis."""
@@ -205,7 +207,7 @@ def _hole_area_series(run: Run) -> list[Series]:
         (f"after: {PAPER_METHOD}", "spackle", paper_after, "-"),
     ):
         series.append(Series(title, method, points, is_hollow=True, line_style=line_style))
-    return [one for one in series if one.points]
+    return [method_series for method_series in series if method_series.points]
 
 
 def _mean_by_disparity(
@@ -216,9 +218,11 @@ def _mean_by_disparity(
     Disparities, sizes of the camera move, ascend; those without a finite number are left out.
     """
     chosen = (
-        one
-        for one in measurements
-        if one.dataset == dataset and one.metric == metric and one.method == method
+        measurement
+        for measurement in measurements
+        if measurement.dataset == dataset
+        and measurement.metric == metric
+        and measurement.method == method
     )
     points = []
     for (setting,), values in group_values(chosen, "setting").items():

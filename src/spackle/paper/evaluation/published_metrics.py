@@ -110,7 +110,7 @@ def _metric_of_network(network: Callable[..., Any]) -> Metric:
         """The network's score for a picture, compared with the true one if given; it may be NaN."""
         pictures = [picture] if true_picture is None else [picture, true_picture]
         # Published metrics expect 0..1.
-        batches = [one.clamp(0, 1).permute(2, 0, 1)[None].float() for one in pictures]
+        batches = [image.clamp(0, 1).permute(2, 0, 1)[None].float() for image in pictures]
 
         with torch.no_grad(), warnings.catch_warnings():
             warnings.simplefilter("ignore")

@@ -180,7 +180,11 @@ def _part_of_run(run: Run, folder: Path, max_images: int) -> ReportPart:
         images.append(_report_image(run, names[index], position, slider_files))
 
     # A metric that fails leaves the same remark for each view.
-    remarks = [(one.image, one.value) for one in run.measurements if one.metric == REMARK_METRIC]
+    remarks = [
+        (measurement.image, measurement.value)
+        for measurement in run.measurements
+        if measurement.metric == REMARK_METRIC
+    ]
     return ReportPart(
         run=run,
         paper_images=PAPER_IMAGE_COUNTS.get(run.title),
@@ -218,7 +222,7 @@ def means_table(run: Run, measurements: Iterable[Measurement]) -> Table:
         measurements: the numbers to average: all, or those of one view.
     """
     # An overview shows what people compare first; tables.md has the other numbers.
-    shown = [one for one in measurements if one.metric in MEANS_COLUMNS]
+    shown = [measurement for measurement in measurements if measurement.metric in MEANS_COLUMNS]
     values = group_values(shown, "setting", "method", "metric")
     settings = list(dict.fromkeys(setting for setting, _, _ in values))
     measured_metrics = {metric for _, _, metric in values}
@@ -265,9 +269,9 @@ def _report_image(run: Run, name: str, position: str, files: Mapping[str, Path])
     """
     setting, view = run.view_with_largest_hole(name)
     view_measurements = [
-        one
-        for one in run.measurements
-        if one.image == name and one.setting == setting and one.view == view
+        measurement
+        for measurement in run.measurements
+        if measurement.image == name and measurement.setting == setting and measurement.view == view
     ]
     # All pictures of a slider have the same size, because they show one view.
     names = list(files)
@@ -306,9 +310,9 @@ def _first_slider_pictures(names: Sequence[str]) -> tuple[str, str]:
 
 def _hole_share_text(view_measurements: Sequence[Measurement]) -> str | None:
     """The hole's share of a view before completion, such as "4.2 %"; None if unknown."""
-    for one in view_measurements:
-        if one.metric == "har_before" and one.value is not None:
-            return f"{100 * float(one.value):.2g} %"
+    for measurement in view_measurements:
+        if measurement.metric == "har_before" and measurement.value is not None:
+            return f"{100 * float(measurement.value):.2g} %"
     return None
 
 

@@ -247,8 +247,12 @@ def _rows_of_dataset(
     if not rows:
         rows.append(DatasetRow(NOT_RUN, NO_NUMBER, [NO_NUMBER] * len(columns)))
 
-    published = [one for one in paper_measurements(paper_label) if one.dataset == dataset]
-    for method in dict.fromkeys(one.method for one in published):
+    published = [
+        measurement
+        for measurement in paper_measurements(paper_label)
+        if measurement.dataset == dataset
+    ]
+    for method in dict.fromkeys(measurement.method for measurement in published):
         (texts,) = texts_of_methods(published, columns, [method])
         # If the paper has other settings than the runs, all its texts are empty: no row.
         has_numbers = any(texts)
