@@ -46,8 +46,8 @@ class _ClipEncoder(StreamEncoder):
 
     def __init__(self, path: Path, width: int, height: int, clip: Clip) -> None:
         """Open the file at `path` for frames of this size in pixels, and the clip for its sound."""
-        # The encoder gets evenly spaced frames, at this rate. Their packets then get the times of the
-        # clip, which may be uneven.
+        # The encoder gets evenly spaced frames, at this rate. Their packets then get the times of
+        # the clip, which may be uneven.
         rate = clip.rate.limit_denominator(MAX_RATE_DENOMINATOR)
         self._even_rate = min(max(rate, MIN_FRAME_RATE), MAX_FRAME_RATE)
         super().__init__(H264, path, width, height, self._even_rate, play_count=1)

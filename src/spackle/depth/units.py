@@ -92,8 +92,8 @@ def millimetre_depth(stored: Array, path: StrPath) -> DepthMap:
 
     InputError, naming `path`, if the PNG has 8 bits, or no pixel is known.
     """
-    # In 8 bits, no depth could be over 255 mm. Such a PNG holds relative depth instead, and does not
-    # say whether near surfaces are white or black in it.
+    # In 8 bits, no depth could be over 255 mm. Such a PNG holds relative depth instead, and does
+    # not say whether near surfaces are white or black in it.
     if stored.dtype == np.uint8:
         raise InputError(
             f"{path}: an 8-bit PNG holds no metres: "

@@ -38,8 +38,8 @@ def backing_surfels(
 ) -> list[SurfelSamples]:
     """A wide Gaussian behind each cell of 2×2 pixels, on the surface of its farthest pixel.
 
-    A cell has no backing if it holds pixels of both sides of a depth step, or if its far surface is
-    visible only in pixels that mainly show the near one.
+    Two kinds of cells beside a depth step have no backing: those with pixels of both sides, and
+    those in which pixels show a little of the far surface, but none shows it mainly.
 
     Args:
         pixels: the surfaces that each pixel of the photo shows.
@@ -57,13 +57,14 @@ def backing_surfels(
         return []
     surface = _cell_surface(deepest, cell_depths)
 
-    # Which cells have a backing.
+    # Which cells have a backing. First those with pixels of the far side, then all others.
     has_near = _cells(pixels.beside_step & pixels.near_is_main).any(-1)  # [h, w]
     has_far = _cells(pixels.beside_step & ~pixels.near_is_main).any(-1)
-    only_hidden_far = _cells(hidden_far).any(-1)
-    backed = torch.where(has_far, ~has_near, ~only_hidden_far)
+    has_hidden_far = _cells(hidden_far).any(-1)
+    backed = torch.where(has_far, ~has_near, ~has_hidden_far)
 
-    # Away from steps, cells may share a Gaussian. Little of it is seen, so that it may cost much.
+    # Away from steps, cells may share a Gaussian. Only a small share of its light passes the front,
+    # so that lost detail counts less, and a Gaussian must save more of it.
     may_share = without_border(backed & ~_cells(pixels.beside_step).any(-1))
     picture = linear_to_srgb(surface.color)
     slope_by_cell = CELL_PX * surface.slope
@@ -95,8 +96,9 @@ def _cell_surface(deepest: Surface, cell_depths: Tensor) -> Surface:
     slope_index = number[..., None, None].expand(*number.shape, 1, 2)
     slope = _cells(deepest.slope).gather(2, slope_index).squeeze(2)  # [h, w, 2]
 
-    # The cell's centre lies half a pixel from that pixel's centre, along x and along y. A surface
-    # is extended at most to half the smallest inverse depth.
+    # The cell's centre lies half a pixel from that pixel's centre, along x and along y. Extended to
+    # there, the inverse depth of a steep surface could become 0 or negative. So it is limited to
+    # half of the smallest one.
     x_in_cell = number % 2
     y_in_cell = number // 2
     offset = torch.stack([0.5 - x_in_cell, 0.5 - y_in_cell], dim=-1)  # [h, w, 2]
@@ -107,7 +109,12 @@ def _cell_surface(deepest: Surface, cell_depths: Tensor) -> Surface:
     same_surface = (difference < SAME_SURFACE_RATIO * far[..., None]).to(far)  # [h, w, 4]
     color_sum = (_cells(deepest.color) * same_surface[..., None]).sum(2)
     color = color_sum / same_surface.sum(2)[..., None]
-    return Surface(at_center, slope, color, torch.full_like(far, float(SURFEL_OPACITY)))
+    return Surface(
+        inverse_depth=at_center,
+        slope=slope,
+        color=color,
+        opacity=torch.full_like(far, float(SURFEL_OPACITY)),
+    )
 
 
 def _receded(samples: SurfelSamples, tiles: Tiles) -> SurfelSamples:
@@ -116,9 +123,11 @@ def _receded(samples: SurfelSamples, tiles: Tiles) -> SurfelSamples:
     The backing are wide Gaussians that close the gaps between those of the pixels from behind.
     `samples` has one Gaussian for each of `tiles`, which are rectangles of cells.
     """
+    # On a steep surface, the parts of a wide Gaussian that are nearer than its centre must not lie
+    # in front, either. So it moves back by as much as the surface changes over two of its sides.
     reach_px = CELL_PX * RECEDING_SIDES * torch.tensor([tiles.width, tiles.height])
-    change = (reach_px * samples.slope.abs()).sum(-1) / samples.inverse_depth  # relative
-    factor = 1 - BEHIND_SURFACE_RATIO - change
+    relative_change = (reach_px * samples.slope.abs()).sum(-1) / samples.inverse_depth
+    factor = 1 - BEHIND_SURFACE_RATIO - relative_change
     return samples._replace(
         inverse_depth=samples.inverse_depth * factor, slope=samples.slope * factor[:, None]
     )

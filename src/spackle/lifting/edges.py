@@ -53,6 +53,8 @@ def find_edges(inverse_depth: Floats, known: Bools, focal: tuple[float, float]) 
         known: [h, w] bool: pixels with a depth.
         focal: horizontal and vertical focal length in pixels of the map.
     """
+    # On a surface that is inclined by an angle to the image plane, the inverse depth changes by
+    # tan(angle) / focal length from pixel to pixel, relative to itself.
     height_in_rows, right = _find_edges_in_rows(inverse_depth, known, MIN_EDGE_TANGENT / focal[0])
     # The columns are the rows of the transposed map.
     height_in_columns, below = _find_edges_in_rows(
@@ -92,14 +94,16 @@ def _find_edges_in_rows(inverse_depth: Any, known: Any, min_slope: float) -> Any
             gaps[x] = row[x] - row[x - 1] if both_known else np.nan
 
         for x in range(1, width):
-            # Only a peak of the slope that is steep enough; false for NaN.
+            # Only a peak of the slope that is steep enough is an edge. Comparisons with NaN are
+            # false.
             peak = abs(gaps[x])
             if not peak > min_slope * max(row[x], row[x - 1]):
                 continue
             if abs(gaps[x - 1]) > peak or abs(gaps[x + 1]) >= peak:
                 continue
 
-            # The slopes beside the edge explain a part of its height.
+            # The edge lies between the pixels first - 1 and last. The surfaces on both sides have
+            # slopes, too. What they would change over the edge's width is no part of its height.
             left_slope, first = _find_foot(gaps, x, -1)
             right_slope, last = _find_foot(gaps, x, 1)
             flattest = max(left_slope, right_slope, np.float32(0))
@@ -137,7 +141,8 @@ def _find_foot(gaps: Any, peak: int, direction: int) -> Any:
     sign = np.float32(1 if gaps[peak] > 0 else -1)
     steepest = sign * gaps[peak]
 
-    # Walk down from the peak to the flattest gap, until another edge or the farthest end comes.
+    # Walk down from the peak to the flattest gap. The walk ends where the slope rises again, which
+    # is where another edge begins, or after the number of steps that a smeared edge can have.
     flattest = steepest
     flattest_at = peak
     max_steps = MAX_SMEAR_PX
@@ -150,7 +155,8 @@ def _find_foot(gaps: Any, peak: int, direction: int) -> Any:
             flattest_at = k
         if flattest == 0:
             break
-        # A smeared edge is about twice as wide as its part above half the peak.
+        # A smeared edge is about twice as wide as its part that is steeper than half the peak. So
+        # once the slope is below that, the end of the walk is known.
         if 2 * sign * gaps[k] < steepest:
             max_steps = min(max_steps, 2 * n + 1)
 

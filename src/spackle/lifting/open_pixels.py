@@ -44,7 +44,9 @@ def assign_open_pixels(resampled: ResampledMap, rgb: Floats) -> Floats:
         pixels = np.flatnonzero(resampled.state == state)
         if len(pixels) == 0:
             continue
-        # All pixels that are decided by now are starts of paths, at no cost.
+        # All pixels whose depth is known by now are starts of paths, at no cost. States are numbers
+        # with HOLE < OPEN < SETTLED. So these are the settled pixels and, when holes are filled,
+        # also the open ones, which were assigned before.
         path_cost = np.where(resampled.state > state, np.float32(0), np.float32(np.inf))
         path_start = np.arange(path_cost.size)
         far_inverse_depth = inverse_depth
@@ -52,6 +54,8 @@ def assign_open_pixels(resampled: ResampledMap, rgb: Floats) -> Floats:
         if state == HOLE:
             # A hole has no smeared depths, so that only colours count.
             edge_height = np.full_like(edge_height, np.inf)
+            # The inverse depth of a hole's far side. (The second argument is for images that are
+            # filled with it, of which there are none here.)
             far_side, _ = fill_from_far_side(
                 torch.from_numpy(inverse_depth),
                 torch.from_numpy(inverse_depth[None]),
@@ -104,7 +108,9 @@ def _find_cheapest_paths(
         pixels: [n] the pixels to which paths are searched, as y·W + x, increasing.
     """
     height, width = inverse_depth.shape
-    direction = -1  # of the neighbours that are tried: this sweep has visited them already
+    # A sweep through the pixels in their order tries the neighbours above and to the left (-1), a
+    # sweep backwards those below and to the right (1). The sweep has updated them just before.
+    direction = -1
     changed = True
     changed_before = True
     while changed or changed_before:

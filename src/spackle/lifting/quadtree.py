@@ -130,7 +130,8 @@ class Quadtree:
         finite = losses[torch.isfinite(losses)]
         if finite.numel() == 0:
             return 0.0
-        return math.sqrt(float(finite.median()) / 4)  # of the 4 pixels' sum of squares
+        # A loss is a sum of squared deviations over the 4 pixels of a block.
+        return math.sqrt(float(finite.median()) / 4)
 
     def cut(self, gaussian_cost: float) -> tuple[Tensor, list[Tiles]]:
         """The cheapest division of the picture into tiles and single pixels.
@@ -152,8 +153,10 @@ class Quadtree:
             # The sum over the four quarters is four times their mean.
             quarters_cost = 4 * grid_means(cost[: 2 * rows, : 2 * columns], 2, 2)
             tiles_cost = losses + gaussian_cost * torch.tensor(TILES_OF_DIVISION)
+            # Along the last axis: WHOLE, FLAT_HALVES, TALL_HALVES, quarters. The index of the
+            # cheapest one is `division`.
             all_costs = torch.cat([tiles_cost, quarters_cost[..., None]], dim=-1)
-            cost, division = all_costs.min(dim=-1)
+            cost, division = all_costs.min(dim=-1)  # [rows, columns] each
             best_divisions.append(division)
 
         # From large blocks to small ones: take the blocks that no larger one covers. At first, all
@@ -165,10 +168,11 @@ class Quadtree:
             division = best_divisions[level - 1]
             rows = division.shape[0] * side  # pixels
             columns = division.shape[1] * side
+            # A block is covered as a whole or not at all, so that its first pixel tells which.
             uncovered = single[:rows:side, :columns:side]
             for kind, (height, width) in enumerate(_tile_sizes(side)):
                 blocks = uncovered & (division == kind)
-                # From the grid of blocks to the finer grid of their halves.
+                # Tiles are numbered in a grid of tiles. For halves it is finer than that of blocks.
                 tile_grid = blocks.repeat_interleave(side // height, 0)
                 tile_grid = tile_grid.repeat_interleave(side // width, 1)
                 tiles.append(Tiles(height, width, *tile_grid.nonzero(as_tuple=True)))

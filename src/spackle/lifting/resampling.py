@@ -199,6 +199,8 @@ def _resample_pixel(
         The pixel's inverse depth, its state HOLE, OPEN or SETTLED, and the height of the edge if it
         is open.
     """
+    # The four map pixels around have the rows y0, y1 and the columns x0, x1. At the map's border
+    # they are the outermost ones, even if the position lies beyond them.
     rows, columns = inverse_depth.shape
     y0 = min(max(int(np.floor(v)), 0), max(rows - 2, 0))
     y1 = min(y0 + 1, rows - 1)

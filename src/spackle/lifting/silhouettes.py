@@ -96,10 +96,11 @@ def _closest_mixture(colors: Any, color: Any, y: int, x: int) -> Any:
         The near colour's share in the mixture (of any sign and size), the squared distance of the
         pixel's colour from it, and the squared distance between both colours.
     """
+    # Project the pixel's colour on the line through both colours. With n the near, f the far and p
+    # the pixel's colour, these are the sums (n - f)², (n - f)·(p - f) and (p - f)² over channels.
     contrast = np.float32(0)
     along = np.float32(0)
     from_far = np.float32(0)
-    # Project the pixel's colour on the line through both colours.
     for c in range(3):
         difference = color[0, y, x, c] - color[1, y, x, c]
         own = colors[y, x, c] - color[1, y, x, c]
@@ -177,8 +178,10 @@ def _fit_coverage(
 def _move_colors(y: int, x: int, a: Any, residual: Any, color: Any, variance: Any) -> Any:
     """Move the near and the far colour of a pixel so that their mixture changes by `residual`.
 
-    A colour that covers the part p of the pixel moves by residual·p²/(a³ + (1 - a)³), so that both
-    movements together give the residual; but by at most 1.5 standard deviations.
+    A surface that covers the part p of the pixel changes its colour by residual·p²/(a³ + (1 - a)³),
+    because the one that covers more is surer to have caused the difference. In the mixture, each
+    change counts p times, so that both together give the residual. No colour moves by more than 1.5
+    standard deviations.
 
     Args:
         y, x: the pixel.
@@ -198,9 +201,9 @@ def _move_colors(y: int, x: int, a: Any, residual: Any, color: Any, variance: An
             part = a if side == 0 else 1 - a
             limit = MAX_COLOR_DEVIATIONS * np.sqrt(variance[side, y, x])
             change = min(max(residual[c] * part * part / cubes, -limit), limit)
-            moved = min(max(color[side, y, x, c] + change, np.float32(0)), np.float32(1))
-            missing -= part * (moved - color[side, y, x, c])
-            color[side, y, x, c] = moved
+            new_color = min(max(color[side, y, x, c] + change, np.float32(0)), np.float32(1))
+            missing -= part * (new_color - color[side, y, x, c])
+            color[side, y, x, c] = new_color
         unexplained += missing * missing
     return unexplained
 
@@ -232,7 +235,9 @@ def _unmix(colors: Any, ring: Any, inside: Any, alpha: Any, color: Any, variance
                 continue
             a = alpha[y, x]
             share, off_mixture, contrast = _closest_mixture(colors, color, y, x)
-            # A fringe overshoots: its colour lies beyond the far one, seen from the near one.
+            # A fringe overshoots: seen from the near colour, its colour lies clearly beyond the far
+            # one, so that the near share is negative. `from_far` is its squared distance from the
+            # far colour: along the line through both colours, plus across this line.
             from_far = share * share * contrast + off_mixture
             is_fringe = (
                 share < 0 and from_far > FRINGE_VARIANCES * variance[1, y, x] + MAX_UNEXPLAINED
@@ -251,7 +256,8 @@ def _unmix(colors: Any, ring: Any, inside: Any, alpha: Any, color: Any, variance
             if unexplained <= MAX_UNEXPLAINED:  # the new colours explain the pixel
                 continue
 
-            # If they do not: another coverage of the old colours, or a single surface.
+            # If they do not, the old colours may still mix to the pixel, with another coverage. If
+            # these do not either, the pixel shows a single surface.
             if off_mixture <= MAX_UNEXPLAINED and 0 < share < 1:
                 alpha[y, x] = share
                 for c in range(3):

@@ -28,8 +28,9 @@ def smooth_inverse_depth(
 
     Each known value is replaced by the mean of its neighbours on both sides. The change is limited
     to half a quantisation step, or to twice the noise's standard deviation if this is more. A
-    neighbour that differs by over three times the limit belongs to another surface. Noise as large
-    as depth edges is kept as content, such as leaves or meshes.
+    neighbour that differs by over three times the limit belongs to another surface. If the noise is
+    as large as the steps at depth edges, it is no noise: the map shows something fine, such as
+    leaves or a mesh, which must stay.
 
     Args:
         inverse_depth: [h, w] 1/z.
@@ -38,7 +39,7 @@ def smooth_inverse_depth(
     """
     noise = estimate_noise(inverse_depth, known)
     if noise > DEPTH_EDGE_RATIO:
-        noise = 0.0  # it is content
+        noise = 0.0  # what looked like noise is the shape of fine objects
     max_change = np.maximum(quantization / 2, NOISE_DEVIATIONS * noise * inverse_depth)
     large_enough = max_change >= MIN_SMOOTHED_CHANGE * inverse_depth
     max_change = np.where(large_enough, max_change, 0).astype(np.float32)
@@ -56,8 +57,9 @@ def smooth_inverse_depth(
 def estimate_noise(inverse_depth: Floats, known: Bools) -> float:
     """The standard deviation of most pixels' noise, relative to the inverse depth [h, w].
 
-    It follows from second differences along y and x, which are 0 on every plane; their median does
-    not see edges. It is 0 if no 3×3 pixels are `known` [h, w].
+    It is measured by second differences along y and then along x. These are 0 on every plane, so
+    that only noise and edges are left of the map. Edges are few, and hardly change the median. The
+    result is 0 if no 3×3 pixels are `known` [h, w].
     """
     if min(inverse_depth.shape) < 3:
         return 0.0
@@ -72,6 +74,8 @@ def estimate_noise(inverse_depth: Floats, known: Bools) -> float:
         return 0.0
     centers = inverse_depth[1:-1, 1:-1]
     relative = np.abs(second_difference[all_known]) / centers[all_known]
+    # From the median of absolute values to a standard deviation, and from the second differences,
+    # which enlarge the noise, back to the map.
     return float(np.median(relative)) / (MEDIAN_TO_DEVIATION * NOISE_GAIN)
 
 

@@ -101,7 +101,8 @@ def layered_gaussians(
         ]
     )
 
-    # Corrected colours beside a step or at the border would be visible ghosts.
+    # Beside a step and at the border, colours stay as they are. There, a correction would make up
+    # for the light of Gaussians around, and be a visible ghost once the camera moves.
     correctable = without_border(ring != 1)[single]
     samples = _correct_colors(samples, colors, single, correctable, tiles)
     return make_surfels(camera, *samples)
@@ -110,26 +111,36 @@ def layered_gaussians(
 def _split_mixed_pixels(layers: Layers, colors: Tensor) -> PixelSurfaces:
     """The surfaces of each pixel: two if both cover at least 5 % of it, else a single one.
 
-    `colors` [H, W, 3] are the photo's linear RGB, which a pixel with a single surface keeps.
+    Args:
+        layers: near and far surface (index 0 and 1) of the pixels beside a depth step, and the
+            share of each pixel that the near one covers.
+        colors: [H, W, 3] the photo in linear RGB.
     """
     ring = torch.from_numpy(layers.ring)
     alpha = torch.from_numpy(layers.alpha)
     near_is_main = alpha >= 0.5
     mixed = torch.minimum(alpha, 1 - alpha) >= MIN_COVERED_SHARE
 
-    # A near Gaussian lets the far one shine through by its opacity; the far one is solid.
+    # The near Gaussian of a mixed pixel is partly transparent, so that the far one behind it shows
+    # through. The far one is solid.
     near_share = torch.where(mixed, alpha, near_is_main.float())
     near_opacity = float(SURFEL_OPACITY) * blended_opacities(near_share.numpy(), layers.ring)
     far_opacity = torch.full_like(alpha, float(SURFEL_OPACITY))
 
-    near, far = (
-        Surface(
-            torch.from_numpy(layers.depth[side]),
-            torch.from_numpy(layers.slope[side]),
-            torch.where(mixed[..., None], torch.from_numpy(layers.color[side]), colors),
-            opacity,
-        )
-        for side, opacity in enumerate((torch.from_numpy(near_opacity), far_opacity))
+    # A pixel with a single surface keeps the photo's colour.
+    near_color = torch.from_numpy(layers.color[0])  # [H, W, 3]
+    far_color = torch.from_numpy(layers.color[1])
+    near = Surface(
+        inverse_depth=torch.from_numpy(layers.depth[0]),
+        slope=torch.from_numpy(layers.slope[0]),
+        color=torch.where(mixed[..., None], near_color, colors),
+        opacity=torch.from_numpy(near_opacity),
+    )
+    far = Surface(
+        inverse_depth=torch.from_numpy(layers.depth[1]),
+        slope=torch.from_numpy(layers.slope[1]),
+        color=torch.where(mixed[..., None], far_color, colors),
+        opacity=far_opacity,
     )
     return PixelSurfaces(
         main=far.replaced(near_is_main, near),
@@ -184,9 +195,10 @@ def blended_opacities(alpha: Floats, ring: NDArray[np.uint8]) -> Floats:
         ring: [H, W] distance to the nearest depth step; pixels with 0 keep their share as opacity.
 
     Returns:
-        [H, W] opacities in 0..1, as a part of a solid Gaussian's opacity.
+        [H, W] in 0..1: each Gaussian's opacity, divided by the opacity of a solid Gaussian.
     """
-    # Neighbours depend on each other, so that their opacities are found in sweeps.
+    # The opacity of a pixel depends on those of its neighbours, and theirs on it. So they are
+    # computed several times in turn.
     opacities = alpha.copy()
     for _ in range(CORRECTION_SWEEPS):
         _subtract_neighbors(alpha, ring, opacities)

@@ -42,8 +42,9 @@ PLANE_REGULARIZATION = 0.3
 def find_step_rings(image: Any) -> Any:
     """Find the depth steps of an image [H, W] of inverse depth, and the rings around them.
 
-    A step lies between two neighbouring pixels whose inverse depths differ by more than 3 % and by
-    more than on a plane. A ring are the pixels at the same distance from the nearest step.
+    A step lies between two neighbouring pixels whose inverse depths differ by more than 3 %, unless
+    the change continues on both sides, as it does on a steep plane. A ring is made of all pixels
+    with the same distance from the nearest step.
 
     Returns:
         [H, W] uint8: the distance to the nearest step in pixels, from 1 to 3; 0 beyond; and
@@ -74,6 +75,7 @@ def find_step_rings(image: Any) -> Any:
                 change_after = jump
                 if v + dy < height and u + dx < width:
                     change_after = image[v + dy, u + dx] - image[v, u]
+                # A product of two changes is positive if they have the same sign.
                 steady = min(change_before * jump, change_after * jump)
                 if steady > STEADY_DIFFERENCE_RATIO * jump * jump:
                     continue
@@ -170,20 +172,25 @@ def _estimate_surfaces(
             surface_depths[0 if is_near else 1] = image[y, x]
             depth_moments[:, :] = 0
             color_moments[:, :] = 0
-            share = _sum_window(
+            near_share = _sum_window(
                 y, x, image, colors, rings, high, low, surface_depths, depth_moments, color_moments
             )
 
-            # The share of the near surface, blurred, tells the distance from its outline.
-            share = min(max(share, MIN_SHARE), MAX_SHARE)
-            distance = np.float32(OUTLINE_BLUR_PX * np.log(share / (1 - share)) / LOGISTIC_SCALE)
+            # Blurred by a normal distribution, a straight outline gives a share of near pixels that
+            # depends on the distance from the outline alone. A logistic function, which is easy to
+            # invert, is close to this dependence.
+            near_share = min(max(near_share, MIN_SHARE), MAX_SHARE)
+            log_odds = np.log(near_share / (1 - near_share))
+            distance = np.float32(OUTLINE_BLUR_PX * log_odds / LOGISTIC_SCALE)
             if is_near:
                 inside[y, x] = max(distance, MIN_OUTLINE_DISTANCE_PX)
             else:
                 inside[y, x] = min(distance, -MIN_OUTLINE_DISTANCE_PX)
 
             for side in range(2):
-                # A pixel of the far surface keeps the map's depth there; near rims are ragged.
+                # A pixel of the near surface gets a fitted plane for both surfaces, because the map
+                # is ragged at near rims. One of the far surface keeps the map's depth as its far
+                # one.
                 if is_near or side == 0:
                     at_center, slope_x, slope_y = _fit_plane(
                         depth_moments[side], surface_depths[side]
@@ -304,7 +311,8 @@ def _fit_plane(moments: Any, default: Any) -> Any:
         default: the inverse depth to return if all weights are 0.
 
     Returns:
-        The inverse depth at (0, 0), and its slopes by x and y, which are at most 1 % of it a pixel.
+        The inverse depth at (0, 0), and its slopes by x and y. A slope is at most 1 % of the mean
+        inverse depth a pixel.
     """
     total = moments[0]
     if total < MIN_WEIGHT:

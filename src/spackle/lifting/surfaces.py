@@ -44,10 +44,10 @@ class Surface(NamedTuple):
         """This surface, replaced by `other` at the pixels `where` [H, W] bool."""
         where_channels = where[..., None]  # [H, W, 1]
         return Surface(
-            torch.where(where, other.inverse_depth, self.inverse_depth),
-            torch.where(where_channels, other.slope, self.slope),
-            torch.where(where_channels, other.color, self.color),
-            torch.where(where, other.opacity, self.opacity),
+            inverse_depth=torch.where(where, other.inverse_depth, self.inverse_depth),
+            slope=torch.where(where_channels, other.slope, self.slope),
+            color=torch.where(where_channels, other.color, self.color),
+            opacity=torch.where(where, other.opacity, self.opacity),
         )
 
     def pixel_samples(self, where: Tensor, camera: Camera) -> SurfelSamples:
@@ -55,12 +55,12 @@ class Surface(NamedTuple):
         uv = camera.pixel_centers()[where]  # [N, 2]
         sigma = torch.full_like(uv, PIXEL_SIGMA_PX)
         return SurfelSamples(
-            uv,
-            self.inverse_depth[where],
-            self.slope[where],
-            sigma,
-            self.color[where],
-            self.opacity[where],
+            uv=uv,
+            inverse_depth=self.inverse_depth[where],
+            slope=self.slope[where],
+            sigma=sigma,
+            color=self.color[where],
+            opacity=self.opacity[where],
         )
 
     def tile_samples(self, tiles: Tiles, sigma_sides: float, cell_px: int = 1) -> SurfelSamples:
@@ -77,12 +77,12 @@ class Surface(NamedTuple):
         opacity = torch.full_like(inverse_depth, float(SURFEL_OPACITY))
         sigma = torch.tensor([tiles.width, tiles.height]) * (sigma_sides * cell_px)
         return SurfelSamples(
-            tiles.centers() * cell_px,
-            inverse_depth,
-            slope,
-            sigma.expand(len(inverse_depth), 2),
-            color,
-            opacity,
+            uv=tiles.centers() * cell_px,
+            inverse_depth=inverse_depth,
+            slope=slope,
+            sigma=sigma.expand(len(inverse_depth), 2),
+            color=color,
+            opacity=opacity,
         )
 
 
@@ -97,9 +97,10 @@ class PixelSurfaces(NamedTuple):
 
 
 def without_border(mask: Tensor) -> Tensor:
-    """A mask [H, W], false on the image's border.
+    """A mask [H, W] of pixels, made false on the image's border.
 
-    A tile's Gaussian at the border would reach beyond the image.
+    For masks of pixels that may share a Gaussian: shared at the border, it would reach beyond the
+    image.
     """
     inner = torch.zeros_like(mask)
     inner[1:-1, 1:-1] = mask[1:-1, 1:-1]

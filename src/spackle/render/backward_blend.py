@@ -69,7 +69,7 @@ def backward_tiles(
     work = np.empty(WORKSPACE_FLOATS, np.float32)
     notes = np.empty(NOTES_FLOATS, np.float32)
     first_notes = np.empty(CHUNK_GAUSSIANS, np.uint64)
-    room = (work, notes, first_notes)
+    buffers = (work, notes, first_notes)
     columns = (images[1].shape[1] + TILE_PX - 1) // TILE_PX
     for k in range(first, last):
         tile = tiles[k]
@@ -80,7 +80,9 @@ def backward_tiles(
         load_gradients(work, left, top, images, gradients)
         entries = slice(lists.starts[tile], lists.starts[tile + 1])
         tile_sums = sums[rows_before[tile] : rows_before[tile + 1]]
-        backward_tile(room, records, lists.ids[entries], entry_needs[entries], left, top, tile_sums)
+        backward_tile(
+            buffers, records, lists.ids[entries], entry_needs[entries], left, top, tile_sums
+        )
 
 
 @kernel
@@ -120,7 +122,13 @@ def load_gradients(work: Array, left: int, top: int, images: Arrays, gradients: 
 
 @kernel
 def backward_tile(
-    room: Arrays, records: Array, ids: Array, entry_needs: Array, left: int, top: int, sums: Array
+    buffers: Arrays,
+    records: Array,
+    ids: Array,
+    entry_needs: Array,
+    left: int,
+    top: int,
+    sums: Array,
 ) -> None:
     """Sum gradients over the pixels of one tile, for the Gaussians in its list that need them.
 
@@ -128,16 +136,17 @@ def backward_tile(
     notes of all alphas, and the Gaussians of each chunk are then visited back to front.
 
     Args:
-        room: buffers for one tile. First its workspace, seven planes of 256 floats: transmittance,
-            contribution of what lies behind, gradients of red, green, blue, depth and alpha, which
-            are filled in. Then room for the notes, and [128] for the start of each Gaussian's.
+        buffers: (work, notes, first_notes) for one tile. Its workspace has seven planes of 256
+            floats: transmittance, contribution of what lies behind, gradients of red, green, blue,
+            depth and alpha, which are filled in. Then follow space for the notes, and [128] for the
+            place where each Gaussian's notes start.
         records: [N, 12] float32: centre, ellipse, opacity, depth and colour of each Gaussian.
         ids: [n] indices of the tile's Gaussians, front to back.
         entry_needs: [n] bool: those whose sums are wanted.
         left, top: the tile's first pixel in the image.
         sums: [m, 10] float32, zero at first: one row for each of these.
     """
-    work, notes, first_notes = room
+    work, notes, first_notes = buffers
     chunks = (len(ids) + CHUNK_GAUSSIANS - 1) // CHUNK_GAUSSIANS
 
     # Front to back: note the transmittance in front of each chunk.
@@ -164,6 +173,7 @@ def backward_tile(
                 row -= 1
             # Gaussians behind the last drawn one are hidden: their sums stay 0.
             if k < drawn:
+                # Without need, no sums are written, and any row will do.
                 own_sums = sums[row if need else 0]
                 record = records[part[k]]
                 step_back(work, notes, first_notes[k], record, left, top, need, own_sums)
@@ -189,9 +199,9 @@ def redraw_chunk(
     Returns:
         The number of Gaussians that were drawn until the tile was full.
     """
-    note = np.uint64(0)
+    note_begin = np.uint64(0)
     for k in range(len(ids)):
-        first_notes[k] = note
+        first_notes[k] = note_begin
         x, y, slope, across, fall, peak, _, half_height, _, _, _, _ = in_tile(
             records[ids[k]], left, top
         )
@@ -202,8 +212,8 @@ def redraw_chunk(
             if row_peak < INVISIBLE_LOG2_ALPHA:
                 continue
             bell = (across, x + slope * dy)
-            redraw_row(work, np.uint64(row * TILE_PX), notes, note, row_peak, bell)
-            note += np.uint64(NOTE_FLOATS)
+            redraw_row(work, np.uint64(row * TILE_PX), notes, note_begin, row_peak, bell)
+            note_begin += np.uint64(NOTE_FLOATS)
         if k % GAUSSIANS_PER_CHECK == GAUSSIANS_PER_CHECK - 1 and is_full(work):
             return k + 1
     return len(ids)
@@ -211,7 +221,12 @@ def redraw_chunk(
 
 @kernel
 def redraw_row(
-    work: Array, offset: np.uint64, notes: Array, note: np.uint64, peak: np.float32, bell: Numbers
+    work: Array,
+    offset: np.uint64,
+    notes: Array,
+    note_begin: np.uint64,
+    peak: np.float32,
+    bell: Numbers,
 ) -> None:
     """Draw a row of 16 pixels of a Gaussian again, and note alphas and transmittances.
 
@@ -220,15 +235,16 @@ def redraw_row(
     Args:
         work: the tile's workspace; its first plane, the transmittance, is changed.
         offset: where the row starts in a plane.
-        notes: at `note`, 16 alphas (0 where nothing is drawn) and 16 transmittances are written.
-        note: where the row's note starts.
+        notes: at `note_begin`, 16 alphas (0 where nothing is drawn) and 16 transmittances are
+            written.
+        note_begin: where the row's note starts.
         peak: largest log2 of alpha in the row.
         bell: (rate, centre): log2 of alpha is peak - rate·(x - centre)².
     """
     rate, center = bell
     for x in range(TILE_PX):
         i = offset + np.uint64(x)
-        n = note + np.uint64(x)
+        n = note_begin + np.uint64(x)
         distance = np.float32(x) - center
         alpha = alpha_from_log2(peak - rate * distance * distance)
         transmittance = work[i]
@@ -243,7 +259,7 @@ def redraw_row(
 def step_back(
     work: Array,
     notes: Array,
-    note: np.uint64,
+    note_begin: np.uint64,
     record: Array,
     left: int,
     top: int,
@@ -256,7 +272,7 @@ def step_back(
         work: the tile's workspace, seven planes of 256 floats: transmittance, contribution of what
             lies behind (changed here), gradients of red, green, blue, depth and alpha.
         notes: of the chunk, as `redraw_chunk` writes them.
-        note: where this Gaussian's notes start.
+        note_begin: where this Gaussian's notes start.
         record: [12] the Gaussian's centre, ellipse, opacity, depth and colour.
         left, top: the tile's first pixel in the image.
         need: whether the sums are wanted.
@@ -265,16 +281,17 @@ def step_back(
             v·u·dy; then the gradients of red, green, blue and depth.
     """
     x, y, slope, _, fall, peak, _, half_height, depth, red, green, blue = in_tile(record, left, top)
-    look = (red, green, blue, depth)
+    color_and_depth = (red, green, blue, depth)
     first, last = touched_pixels(y, half_height)
     for row in range(first, last):
         dy = np.float32(row) - y
-        if peak - fall * dy * dy < INVISIBLE_LOG2_ALPHA:  # has no note
+        # Where a row is too faint to be drawn, `redraw_chunk` has taken no note.
+        if peak - fall * dy * dy < INVISIBLE_LOG2_ALPHA:
             continue
         offset = np.uint64(row * TILE_PX)
         if need:
             v, vu, vuu, red_grad, green_grad, blue_grad, depth_grad = step_back_and_sum_row(
-                work, offset, notes, note, x + slope * dy, look
+                work, offset, notes, note_begin, x + slope * dy, color_and_depth
             )
             sums[0] += v
             sums[1] += vu
@@ -287,32 +304,34 @@ def step_back(
             sums[8] += blue_grad
             sums[9] += depth_grad
         else:
-            step_back_row(work, offset, notes, note, look)
-        note += np.uint64(NOTE_FLOATS)
+            step_back_row(work, offset, notes, note_begin, color_and_depth)
+        note_begin += np.uint64(NOTE_FLOATS)
 
 
 @kernel
 def step_back_row(
-    work: Array, offset: np.uint64, notes: Array, note: np.uint64, look: Numbers
+    work: Array, offset: np.uint64, notes: Array, note_begin: np.uint64, color_and_depth: Numbers
 ) -> None:
     """Step back over a row of a Gaussian whose own gradient nobody needs.
 
-    In each pixel, what lies behind the next Gaussian contributes more to the loss: by this
-    Gaussian's weight times its colour, depth and 1, each times its gradient.
+    This Gaussian lies behind the next one that is visited. So what it adds to the loss in each
+    pixel is added to the contribution of what lies behind: its weight times the sum of red, green,
+    blue, depth and 1 (for alpha), each multiplied by its gradient.
 
     Args:
         work: the tile's workspace, seven planes of 256 floats: transmittance, contribution of what
             lies behind (changed here), gradients of red, green, blue, depth and alpha.
         offset: where the row starts in a plane.
-        notes: alphas and transmittances of the row, from `note` on.
-        note: where the row's note starts.
-        look: the Gaussian's red, green, blue and depth.
+        notes: alphas and transmittances of the row, from `note_begin` on.
+        note_begin: where the row's note starts.
+        color_and_depth: the Gaussian's red, green, blue and depth.
     """
-    red, green, blue, depth = look
+    red, green, blue, depth = color_and_depth
     for x in range(TILE_PX):
         i = offset + np.uint64(x)
-        n = note + np.uint64(x)
+        n = note_begin + np.uint64(x)
         g = i + np.uint64(GRADIENT_PLANES)
+        # What one unit of this Gaussian's weight adds to the loss.
         value = (
             red * work[g]
             + green * work[g + np.uint64(PLANE_FLOATS)]
@@ -326,7 +345,12 @@ def step_back_row(
 
 @reordering_kernel
 def step_back_and_sum_row(
-    work: Array, offset: np.uint64, notes: Array, note: np.uint64, center: np.float32, look: Numbers
+    work: Array,
+    offset: np.uint64,
+    notes: Array,
+    note_begin: np.uint64,
+    center: np.float32,
+    color_and_depth: Numbers,
 ) -> tuple[np.float32, np.float32, np.float32, np.float32, np.float32, np.float32, np.float32]:
     """Step back over a row of 16 pixels of a Gaussian, and sum its gradients over them.
 
@@ -334,16 +358,16 @@ def step_back_and_sum_row(
         work: the tile's workspace, seven planes of 256 floats: transmittance, contribution of what
             lies behind (changed here), gradients of red, green, blue, depth and alpha.
         offset: where the row starts in a plane.
-        notes: alphas and transmittances of the row, from `note` on.
-        note: where the row's note starts.
+        notes: alphas and transmittances of the row, from `note_begin` on.
+        note_begin: where the row's note starts.
         center: the Gaussian's middle in this row, in pixels of the tile.
-        look: its red, green, blue and depth.
+        color_and_depth: its red, green, blue and depth.
 
     Returns:
         The sums of v, v·u and v·u², with v = ∂L/∂ln(alpha) and u = x - center; then the gradients
         of red, green, blue and depth.
     """
-    red, green, blue, depth = look
+    red, green, blue, depth = color_and_depth
     sum_v = ZERO
     sum_vu = ZERO
     sum_vuu = ZERO
@@ -353,7 +377,7 @@ def step_back_and_sum_row(
     sum_depth = ZERO
     for x in range(TILE_PX):
         i = offset + np.uint64(x)
-        n = note + np.uint64(x)
+        n = note_begin + np.uint64(x)
         g = i + np.uint64(GRADIENT_PLANES)
         red_grad = work[g]
         green_grad = work[g + np.uint64(PLANE_FLOATS)]

@@ -62,8 +62,10 @@ def project_backward(
 
         # The forward pass once more, as in `project_block`.
         transform_point(pose, means[i], center)
-        nearness = 1.0 / center[2]
-        jacobian = projection_jacobian(center[0] * nearness, center[1] * nearness, nearness, lens)
+        inverse_z = 1.0 / center[2]
+        jacobian = projection_jacobian(
+            center[0] * inverse_z, center[1] * inverse_z, inverse_z, lens
+        )
         rotation = rotation_matrix(quats[i])
         factor = covariance_factor(jacobian, pose, rotation, scales[i])
 
@@ -161,13 +163,14 @@ def factor_backward(
     for k in range(3):
         scale_grad[k] = 0.0
         for b in range(3):
-            # Column b of J W is multiplied by component b of the Gaussian's axis k.
+            # Column k of M is the sum over b of column b of J W, times R[b, k]·S[k]. So this is the
+            # gradient of R[b, k]·S[k].
             h0 = jacobian[0] * pose[0, b] + jacobian[1] * pose[2, b]
             h1 = jacobian[2] * pose[1, b] + jacobian[3] * pose[2, b]
-            along = h0 * factor_grad[0, k] + h1 * factor_grad[1, k]
+            scaled_axis_grad = h0 * factor_grad[0, k] + h1 * factor_grad[1, k]
             axis = rotation[3 * b + k]
-            scale_grad[k] += along * axis
-            rotation_grad[b, k] = along * scale[k]
+            scale_grad[k] += scaled_axis_grad * axis
+            rotation_grad[b, k] = scaled_axis_grad * scale[k]
             for a in range(2):
                 for c in range(3):
                     jacobian_grad[a, c] += factor_grad[a, k] * scale[k] * axis * pose[c, b]

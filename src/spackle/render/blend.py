@@ -189,8 +189,9 @@ def touched_pixels(center: np.float32, half_size: np.float32) -> tuple[int, int]
     `center` and `half_size` are in pixels along this axis; 0 is the centre of the tile's first
     pixel.
     """
-    # One is added before or after truncation to round up: ceil or floor would cost more than
-    # drawing a patch.
+    # `int` cuts off the fraction. With one added, `first` is the next pixel after the lower bound,
+    # and `last` (exclusive) is one more than the last pixel before the upper bound. Calls of ceil
+    # and floor would cost more than drawing a patch.
     first = int(max(center - half_size - ROUNDING_SLACK_PX, -ONE) + ONE)
     last = min(int(min(center + half_size + ROUNDING_SLACK_PX, TILE_PX_F32)) + 1, TILE_PX)
     return first, last

@@ -23,9 +23,9 @@ FX, FY, CX, CY, MIN_X_SLOPE, MAX_X_SLOPE, MIN_Y_SLOPE, MAX_Y_SLOPE = range(8)
 
 @inlined_kernel
 def projected_covariance(
-    x: float,
-    y: float,
-    nearness: float,
+    x_slope: float,
+    y_slope: float,
+    inverse_z: float,
     quat: Numbers,
     scale: Numbers,
     lens: Array,
@@ -35,31 +35,34 @@ def projected_covariance(
     """The projected covariance in pixels² as (xx, xy, yy, determinant), for one Gaussian.
 
     Args:
-        x, y, nearness: the centre in the camera's frame is (x, y, 1) / nearness.
+        x_slope, y_slope, inverse_z: x/z, y/z and 1/z of the centre (x, y, z) in the camera's frame.
         quat: [4] wxyz, of any length.
         scale: [3] standard deviations along the Gaussian's axes.
         lens: [8] fx, fy, cx, cy in pixels, and the bounds (left, right, top, bottom) of the slopes
-            x and y, beyond which the Jacobian stays the same.
+            x/z and y/z, beyond which the Jacobian stays the same.
         pose: [3, 4] world to camera.
         eps2d: added to xx and yy, in pixels².
     """
-    jacobian = projection_jacobian(x, y, nearness, lens)
+    jacobian = projection_jacobian(x_slope, y_slope, inverse_z, lens)
     factor = covariance_factor(jacobian, pose, rotation_matrix(quat), scale)
     return widened_covariance(factor, eps2d)
 
 
 @inlined_kernel
-def projection_jacobian(x: float, y: float, nearness: float, lens: Array) -> Numbers:
+def projection_jacobian(x_slope: float, y_slope: float, inverse_z: float, lens: Array) -> Numbers:
     """The Jacobian [[a, 0, b], [0, c, d]] of the projection to pixels, as (a, b, c, d).
 
-    It is taken at the point (x, y, 1) / nearness in the camera's frame. `lens` [8] has fx, fy, cx,
-    cy in pixels, and bounds (left, right, top, bottom); slopes x and y beyond them are moved to
-    them.
+    At a point (x, y, z) in the camera's frame it is [[fx/z, 0, -fx·x/z²], [0, fy/z, -fy·y/z²]].
+
+    Args:
+        x_slope, y_slope, inverse_z: x/z, y/z and 1/z of the point.
+        lens: [8] fx, fy, cx, cy in pixels, and bounds (left, right, top, bottom) of the slopes. As
+            in gsplat, a slope beyond its bound counts as the bound.
     """
-    a = lens[FX] * nearness
-    c = lens[FY] * nearness
-    b = -a * min(lens[MAX_X_SLOPE], max(lens[MIN_X_SLOPE], x))
-    d = -c * min(lens[MAX_Y_SLOPE], max(lens[MIN_Y_SLOPE], y))
+    a = lens[FX] * inverse_z
+    c = lens[FY] * inverse_z
+    b = -a * min(lens[MAX_X_SLOPE], max(lens[MIN_X_SLOPE], x_slope))
+    d = -c * min(lens[MAX_Y_SLOPE], max(lens[MIN_Y_SLOPE], y_slope))
     return a, b, c, d
 
 

@@ -86,7 +86,10 @@ def blank_images(view: KernelCamera, background: Rendering | None, keep_linear: 
     height, width = view.height, view.width
     linear = np.zeros((height, width, 3) if keep_linear else (0, 0, 3), np.float32)
     if background is not None:
-        rgb, depth, alpha = (np.array(as_array(image)) for image in background.tensors)
+        # `np.array` copies, because the images will be drawn over.
+        rgb = np.array(as_array(background.rgb))
+        depth = np.array(as_array(background.depth))
+        alpha = np.array(as_array(background.alpha))
         return rgb, depth, alpha, linear
     rgb = np.zeros((height, width, 3), np.float32)
     depth = np.zeros((height, width), np.float32)
@@ -128,6 +131,7 @@ def project(sets: Sequence[Gaussians], view: KernelCamera, drawn_tiles: Array) -
         scene = tuple(as_array(tensor) for tensor in part.tensors)
         offset = first_index
 
+        # As default values, this set's numbers are fixed; the loop changes the variables later.
         def project_some(
             start: int, stop: int, offset: int = offset, scene: Arrays = scene
         ) -> None:

@@ -105,8 +105,8 @@ def decode_srgb(encoded: np.float32) -> np.float32:
     """Convert sRGB to linear light, both clamped to 0..1; relative error 2e-6."""
     value = min(max(encoded, ZERO), ONE)
 
-    # The power y^2.4 = y²·q^1.6, with q = y^¼: q^1.6 by a polynomial with the
-    # coefficients D0 to D5, which has little left to approximate.
+    # sRGB's formula is y^2.4. With q = y^¼ this is y²·q^1.6, and q^1.6 is so nearly straight that a
+    # polynomial with the coefficients D0 to D5 approximates it well.
     y = (value + np.float32(0.055)) / np.float32(1.055)
     q = np.sqrt(np.sqrt(y))
     curve = y * y * (D0 + q * (D1 + q * (D2 + q * (D3 + q * (D4 + q * D5)))))

@@ -32,6 +32,7 @@ from spackle.runtime.kernels import Array
 
 FIELDS_PER_SET = 5  # tensors of a set: means, quats, scales, opacities, colors
 IMAGES = 3  # of a rendering: rgb, depth, alpha
+ARGUMENTS_BEFORE_TENSORS = 2  # of `DrawFunction.forward`: the camera and the tiles
 
 
 def draw_with_gradients(
@@ -113,8 +114,9 @@ class DrawFunction(torch.autograd.Function):
         """
         drawing: Drawing = ctx.drawing
         fields = ctx.saved_tensors[IMAGES:]  # the first ones are the images of the result
-        background_needs = ctx.needs_input_grad[2 : 2 + IMAGES]
-        field_needs = ctx.needs_input_grad[2 + IMAGES :]
+        tensor_needs = ctx.needs_input_grad[ARGUMENTS_BEFORE_TENSORS:]
+        background_needs = tensor_needs[:IMAGES]
+        field_needs = tensor_needs[IMAGES:]
         background_gradients = gradients_of_background(drawing, image_gradients, background_needs)
 
         # Sums are computed only for Gaussians of sets with at least one tensor that needs them.
@@ -123,6 +125,7 @@ class DrawFunction(torch.autograd.Function):
         ]
         set_needs = np.array([any(field_needs[set_slice]) for set_slice in set_slices], np.bool_)
         needs = np.repeat(set_needs, ctx.set_sizes)  # [N], of each Gaussian
+        # The rows of those that need sums are numbered from 0; all others have -1.
         table_rows = np.where(needs, np.cumsum(needs) - 1, -1).astype(np.int32)
         gradient_arrays = tuple(as_array(gradient) for gradient in image_gradients)
         table = pixel_sums(drawing, gradient_arrays, table_rows, int(needs.sum()))
@@ -140,6 +143,7 @@ class DrawFunction(torch.autograd.Function):
                 gradient if need else None
                 for gradient, need in zip(gradients, field_needs[set_slice], strict=True)
             ]
+        # The camera and the tiles have no gradients.
         return None, None, *background_gradients, *field_gradients
 
 
@@ -178,8 +182,9 @@ def pixel_sums(drawing: Drawing, gradients: Arrays, table_rows: Array, count: in
     # An entry is a Gaussian in a tile's list. Each that needs gradients has a row in `sums`.
     entry_rows = table_rows[lists.ids]  # [E] int32
     entry_needs = entry_rows >= 0  # [E] bool
-    rows_before = np.concatenate([[0], np.cumsum(entry_needs)])[lists.starts]  # [T + 1]
-    tiles = np.flatnonzero(np.diff(rows_before))  # those with such entries
+    needs_before_entry = np.concatenate([[0], np.cumsum(entry_needs)])  # [E + 1]
+    rows_before = needs_before_entry[lists.starts]  # [T + 1]: where a tile's rows start in `sums`
+    tiles = np.flatnonzero(np.diff(rows_before))  # those with entries that need gradients
     sums = np.zeros((rows_before[-1], SUMS), np.float32)
 
     parallel_for_chunks(

@@ -29,7 +29,7 @@ from spackle.runtime.device import report_memory_shortage
 from spackle.runtime.errors import InputError, as_input_error
 
 INSTALL_ADVICE = "pip install 'spackle-nvs[cuda]'"
-GSPLAT_VERSION = "1.5."  # of the interface; another version may also clamp alpha elsewhere
+GSPLAT_VERSION = "1.5"  # of the interface; another version may also clamp alpha elsewhere
 MAX_LIST_ENTRIES = 2**31 - 1  # in the lists of tiles, which gsplat counts in int32
 
 
@@ -44,10 +44,11 @@ class DeviceGaussians:
 
     @staticmethod
     def of(gaussians: Gaussians, device: torch.device) -> DeviceGaussians:
-        """Upload a set; Gaussians with a number that is not finite become transparent."""
+        """Upload a set of Gaussians; those with a number that is not finite become transparent."""
         fields = [
             tensor.to(device, torch.float32, non_blocking=True) for tensor in gaussians.tensors
         ]
+        # A field is [N] or [N, k]. The added axis makes it [N, 1] or [N, k, 1], flattened [N, k].
         finite_by_field = [
             field.detach().isfinite().unsqueeze(-1).flatten(1).all(1)  # [N]
             for field in fields
@@ -93,8 +94,11 @@ class UploadCache:
         self._uploads = WeakTensorKeyDictionary()
 
     def upload(self, gaussians: Gaussians) -> DeviceGaussians:
-        """The set on the GPU; it is uploaded again if a tensor was replaced or changed in place."""
-        # Inference tensors have no count of changes.
+        """The Gaussians on the GPU, uploaded only if a tensor is new or was changed in place.
+
+        Sets with gradients are uploaded every time.
+        """
+        # PyTorch counts the changes of a tensor, but not of those made in inference mode.
         if any(tensor.requires_grad or tensor.is_inference() for tensor in gaussians.tensors):
             return DeviceGaussians.of(gaussians, self.device)
 
@@ -258,11 +262,12 @@ class GsplatRenderer(Renderer):
         width, height = cameras[0].width, cameras[0].height
         rows, columns = tile_grid(height, width)
         batch = self._project(scenes, cameras, eps2d)
-        if batch is None:
+        if batch is None:  # no Gaussians: colour, depth and alpha are 0
             black = torch.zeros(len(cameras), height, width, 5, device=self.device)
             return [Rendering(image[..., :3], image[..., 3], image[..., 4]) for image in black]
 
-        # Lists of the Gaussians that each tile of each view shows, sorted by depth.
+        # Lists of the Gaussians that each tile of each view shows, sorted by depth. `gaussian_ids`
+        # are required but not read, so that any tensor of this length will do.
         _, list_keys, ids = self._gsplat.isect_tiles(
             batch.centers.detach(), batch.radii, batch.depths.detach(), TILE_PX, columns, rows,
             packed=True, n_images=len(cameras),
@@ -301,6 +306,7 @@ class GsplatRenderer(Renderer):
                 if not len(gaussians):  # gsplat 1.5.3 divides by the number of Gaussians
                     continue
                 uploaded = self._uploads.upload(gaussians)
+                # The covariances are given instead of the quaternions and scales (None, None).
                 # Results have a first axis for cameras, of which there is one in each call.
                 radii, centers, depths, conics, _ = self._gsplat.fully_fused_projection(
                     uploaded.means, uploaded.covariances, None, None,
@@ -354,8 +360,8 @@ def load_gsplat(device: torch.device) -> ModuleType:
     with as_input_error("`device` cuda", problem):
         import gsplat
 
-        if not gsplat.__version__.startswith(GSPLAT_VERSION):
-            raise RuntimeError(f"its version is {gsplat.__version__}, not 1.5")
+        if not gsplat.__version__.startswith(f"{GSPLAT_VERSION}."):
+            raise RuntimeError(f"its version is {gsplat.__version__}, not {GSPLAT_VERSION}")
         from gsplat.cuda import _backend
 
         if _backend._C is None:

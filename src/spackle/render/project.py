@@ -31,10 +31,6 @@ LEFT, RIGHT, TOP, BOTTOM = range(DEPTH + 1, DEPTH + 5)
 BLOCK_GAUSSIANS = 256  # the buffer of a block fits into the first-level cache
 BLOCK_BUFFER_FLOATS = (BOTTOM + 1) * BLOCK_GAUSSIANS
 
-# Offsets to the next numbers of a flat array, unsigned so that no check for negative indices is
-# compiled.
-ONE_ON, TWO_ON, THREE_ON = np.uint64(1), np.uint64(2), np.uint64(3)
-
 LOG2_E = math.log2(math.e)
 LOG_ALPHA_MIN = math.log(ALPHA_MIN)
 MAX_FINITE = 1e30  # larger values would later overflow float32
@@ -88,8 +84,9 @@ class Splats(NamedTuple):
 def in_tile(record: Array, left: int, top: int) -> Numbers:
     """The 12 numbers of a Gaussian's record, with its centre relative to a tile.
 
-    The centre (X, Y) counts from the centre of the tile's first pixel, which is the image's pixel
-    (left, top).
+    They are the centre (x, y), the shape of the ellipse (slope, across, fall), log2 of the opacity
+    (peak), half sizes in pixels, depth and colour. The centre is measured from the centre of the
+    tile's first pixel, which is the image's pixel (left, top).
     """
     x = record[X] - np.float32(left) - HALF
     y = record[Y] - np.float32(top) - HALF
@@ -112,10 +109,10 @@ def in_tile(record: Array, left: int, top: int) -> Numbers:
 def count_drawn_tiles(drawn_tiles: Array) -> Array:
     """[rows + 1, columns + 1] int32: the summed-area table of `drawn_tiles` [rows, columns] bool.
 
-    An element is the number of drawn tiles above and to the left of a tile's corner. Four of them
-    tell how many tiles of a box are drawn.
+    An element belongs to a corner between tiles: it is the number of drawn tiles that lie above and
+    to the left of it. From the four corners of a box follows how many of its tiles are drawn.
     """
-    # Above and to the left of the first row and column, there is no tile.
+    # Nothing lies above the first row of corners, or to the left of the first column: zeros.
     sums = drawn_tiles.astype(np.int32).cumsum(axis=0).cumsum(axis=1)
     return np.pad(sums, ((1, 0), (1, 0))).astype(np.int32)
 
@@ -146,7 +143,8 @@ def project_gaussians(
     block = np.empty(BLOCK_BUFFER_FLOATS, np.float32)
     for begin in range(start, stop, BLOCK_GAUSSIANS):
         end = min(begin + BLOCK_GAUSSIANS, stop)
-        # For flat arrays, the compiler knows the stride between a Gaussian's numbers.
+        # In flat arrays, a Gaussian's numbers have fixed distances that the compiler knows, which
+        # makes the loop over the block faster.
         flat_means = means[begin:end].reshape(-1)
         flat_quats = quats[begin:end].reshape(-1)
         flat_scales = scales[begin:end].reshape(-1)
@@ -179,22 +177,27 @@ def project_block(
 
         # The centre in the camera's frame, then divided by its depth.
         world_x = np.float64(means[i3])
-        world_y = np.float64(means[i3 + ONE_ON])
-        world_z = np.float64(means[i3 + TWO_ON])
+        world_y = np.float64(means[i3 + np.uint64(1)])
+        world_z = np.float64(means[i3 + np.uint64(2)])
         x = pose[0, 0] * world_x + pose[0, 1] * world_y + pose[0, 2] * world_z + pose[0, 3]
         y = pose[1, 0] * world_x + pose[1, 1] * world_y + pose[1, 2] * world_z + pose[1, 3]
         z = pose[2, 0] * world_x + pose[2, 1] * world_y + pose[2, 2] * world_z + pose[2, 3]
-        nearness = 1.0 / z
-        x = x * nearness
-        y = y * nearness
-        u = lens[FX] * x + lens[CX]
-        v = lens[FY] * y + lens[CY]
+        inverse_z = 1.0 / z
+        x_slope = x * inverse_z
+        y_slope = y * inverse_z
+        u = lens[FX] * x_slope + lens[CX]
+        v = lens[FY] * y_slope + lens[CY]
 
         # The ellipse, and the exponents of 2 along its rows: alpha = 2^(peak - …).
-        quat = (quats[i4], quats[i4 + ONE_ON], quats[i4 + TWO_ON], quats[i4 + THREE_ON])
-        scale = (scales[i3], scales[i3 + ONE_ON], scales[i3 + TWO_ON])
+        quat = (
+            quats[i4],
+            quats[i4 + np.uint64(1)],
+            quats[i4 + np.uint64(2)],
+            quats[i4 + np.uint64(3)],
+        )
+        scale = (scales[i3], scales[i3 + np.uint64(1)], scales[i3 + np.uint64(2)])
         cxx, cxy, cyy, det = projected_covariance(
-            x, y, nearness, quat, scale, lens, pose, camera.eps2d
+            x_slope, y_slope, inverse_z, quat, scale, lens, pose, camera.eps2d
         )
         inverse_cyy = 1.0 / cyy
         fall = 0.5 * LOG2_E * inverse_cyy
@@ -268,8 +271,8 @@ def write_records(
     """
     records, boxes = splats
     for k in range(len(colors) // 3):
-        # Until something else is written, the Gaussian is invisible. Indices are unsigned, so that
-        # no check for negative ones is compiled.
+        # An empty box means that the Gaussian is invisible. This holds until a box is written
+        # below. Indices are unsigned, so that no check for negative ones is compiled.
         i = np.uint64(k)
         i3 = np.uint64(3 * k)
         out = np.uint64(first_index + k)
@@ -281,8 +284,8 @@ def write_records(
         # A plane's numbers follow one another, so that plane p starts at p·256.
         right = np.uint32(block[i + np.uint64(RIGHT * BLOCK_GAUSSIANS)])
         red = colors[i3]
-        green = colors[i3 + ONE_ON]
-        blue = colors[i3 + TWO_ON]
+        green = colors[i3 + np.uint64(1)]
+        blue = colors[i3 + np.uint64(2)]
         # The comparison is false for NaN.
         if right == 0 or not abs(red) + abs(green) + abs(blue) < MAX_FINITE:
             continue

@@ -161,11 +161,9 @@ def paste(rendering: Rendering, tiles: Tensor, previous_rendering: Rendering | N
     """
     mask = tile_mask(tiles, *rendering.alpha.shape)  # [H, W]
     if previous_rendering is None:
-        others = tuple(torch.zeros_like(image) for image in rendering.tensors)
-    else:
-        others = previous_rendering.tensors
+        previous_rendering = Rendering(*(torch.zeros_like(image) for image in rendering.tensors))
     return Rendering(
-        rgb=torch.where(mask[..., None], rendering.rgb, others[0]),
-        depth=torch.where(mask, rendering.depth, others[1]),
-        alpha=torch.where(mask, rendering.alpha, others[2]),
+        rgb=torch.where(mask[..., None], rendering.rgb, previous_rendering.rgb),
+        depth=torch.where(mask, rendering.depth, previous_rendering.depth),
+        alpha=torch.where(mask, rendering.alpha, previous_rendering.alpha),
     )

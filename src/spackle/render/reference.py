@@ -60,6 +60,7 @@ class ReferenceRenderer(Renderer):
 
 def front_to_back(gaussians: Gaussians, camera: Camera) -> Gaussians:
     """The finite Gaussians at or beyond the near plane, sorted by their depth z."""
+    # A field is [N] or [N, k]. The added axis makes it [N, 1] or [N, k, 1], flattened [N, k].
     finite_by_field = [
         tensor.detach().isfinite().unsqueeze(-1).flatten(1).all(dim=1)  # [N]
         for tensor in gaussians.tensors

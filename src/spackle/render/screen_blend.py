@@ -48,6 +48,8 @@ def blend_screen_gaussians(spots: Array, colors: Tensor, height: int, width: int
 def blend_rows(start: int, stop: int, spots: Array, colors: Array, image: Array) -> None:
     """Blend Gaussians into the rows start..stop of a picture.
 
+    A row is blended in runs of 16 pixels, as many as a vector register has.
+
     Args:
         start, stop: the rows to draw.
         spots: [N, 5] float32, nearest first: centre x and y, standard deviations x and y, opacity.
@@ -71,7 +73,8 @@ def blend_rows(start: int, stop: int, spots: Array, colors: Array, image: Array)
         if top >= bottom or left >= right:
             continue
 
-        # The fall-off along the row is the same in all rows; 0 in the rest of the touched runs.
+        # The fall-off along the row is the same in all rows. Runs are blended as a whole. Therefore
+        # it must be 0 in the pixels of the first and the last run that are outside of left..right.
         first_run = left // RUN_PIXELS
         last_run = (right - 1) // RUN_PIXELS + 1
         row_falloff[first_run * RUN_PIXELS : last_run * RUN_PIXELS] = 0

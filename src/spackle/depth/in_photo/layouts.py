@@ -111,6 +111,7 @@ class CodedDepth:
 
     def upright(self, stored: Tensor) -> Tensor:
         """A map [H, W] in the orientation of the codes, turned as the photo is shown."""
+        # Axis 1 runs from left to right, axis 0 from top to bottom.
         for step in self.upright_steps:
             stored = stored.T if step == "t" else stored.flip(1 if step == "x" else 0)
         return stored
