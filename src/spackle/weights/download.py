@@ -174,7 +174,7 @@ def _network_errors(url: str) -> Iterator[None]:
     try:
         yield
     except HTTPError as error:
-        with error:
+        with error:  # closes the connection at the end
             name = responses.get(error.code, "")
             status = f"the server answers HTTP {error.code} {name}".rstrip()
         raise InputError(f"{url}: {status}: check the address, or try again later") from error
