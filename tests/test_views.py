@@ -33,7 +33,7 @@ def test_every_trajectory_is_filled_where_it_is_reported_and_shown(
     path = PathOptions(trajectory=trajectory, overscan=overscan, video=VideoOptions(fps=15))
     views = plan_views(prediction, path, Path("photo.png"))
     assert len(views.frames) == 60
-    assert set(views.measured.values()) <= views.always_filled <= set(views.views_to_fill)
+    assert set(views.reported_views.values()) <= views.always_filled <= set(views.views_to_fill)
 
     aux = fill_scene(
         FillContext(base, camera, RENDERER, None, None),

@@ -71,6 +71,7 @@ class Spackle:
         Raises:
             InputError: an unknown name, or weights that cannot be used.
         """
+        # A loaded network needs no file, so it is not part of the options.
         if isinstance(residual, ResidualNet):
             fill_options = FillOptions(fill=fill)
             network: ResidualNet | None = residual
@@ -82,11 +83,13 @@ class Spackle:
         if isinstance(base, str):
             base_settings = BaseSettings(name=base, device=device)
             opened_base = open_base(base_settings)
-            # A depth map replaces these two: `auto` chooses it anyway, and "rgbd" means it.
+            # A depth map does not contradict these two: "auto" prefers a depth map to all networks,
+            # and "rgbd" is the base that lifts a photo by its depth map.
             self._accepts_depth = base in (AUTO, RGBD)
         else:
             base_settings = BaseSettings(device=device)
             opened_base = wrap_loaded_base(base)
+            # A loaded base makes the Gaussians itself, so a depth map would have no effect.
             self._accepts_depth = False
 
         self._pipeline = Pipeline(
@@ -132,7 +135,8 @@ class Spackle:
         options = dataclasses.replace(self._pipeline.options, path=path)
         pipeline = dataclasses.replace(self._pipeline, options=options)
 
-        # Files of photo and depth have to be there until the scene is complete.
+        # Temporary files of photo and depth have to exist until the scene is complete, because the
+        # base reads them late.
         with contextlib.ExitStack() as open_files:
             if depth is not None:
                 depth_source = open_files.enter_context(_open_depth(depth, depth_kind))
@@ -199,6 +203,7 @@ def predict(
         InputError: a photo, a depth map, a name or weights that cannot be used; `base` together
             with `depth`, or a focal length for a loaded photo.
     """
+    # A session for this one photo; what it loads is freed with it.
     session = Spackle(base, residual=residual, fill=fill, device=device, renderer=renderer)
     return session.predict(
         photo,
@@ -216,6 +221,7 @@ def predict(
 
 def _with_depth(pipeline: Pipeline, depth: Path | DepthMap, depth_kind: DepthKind) -> Pipeline:
     """The same pipeline, with a base that lifts a photo by this depth."""
+    # The fill's network and the renderer stay open; only the base is opened anew, for this photo.
     base_settings = dataclasses.replace(pipeline.options.base, depth=depth, depth_kind=depth_kind)
     return dataclasses.replace(
         pipeline,
@@ -233,11 +239,12 @@ def _open_photo(
     focal_mm: float | None,
     fov: float | None,
 ) -> Iterator[Photo]:
-    """Load the photo.
+    """Give the loaded photo, during the block.
 
-    Bytes lie in a temporary file during the block, because a base may read the photo's depth from
-    its file.
+    Bytes lie in a temporary file until the block ends, because a base may read the depth that
+    phones store inside a photo's file. The options are those of `load_photo`.
     """
+    # The focal length of a loaded photo is known; the caller has refused another one.
     if isinstance(source, Photo):
         yield source
     elif isinstance(source, Image.Image | np.ndarray | Tensor):
@@ -253,10 +260,15 @@ def _open_photo(
 
 @contextlib.contextmanager
 def _open_depth(source: DepthSource, kind: DepthKind) -> Iterator[Path | DepthMap]:
-    """The path of a depth map, which the base will read, or the depth map from a value or bytes."""
+    """Give a depth map in the form that a base takes, during the block: its path, or a loaded map.
+
+    `kind` is the meaning of the numbers in an array or in bytes; a path's file is read, by the
+    base, with the kind of the base's settings.
+    """
     if isinstance(source, DepthMap):
         yield source
     elif isinstance(source, str | os.PathLike):
+        # Not loaded here, because the base also looks for the calibration beside the file.
         yield Path(source)
     elif isinstance(source, Tensor):
         yield depth_from_array(source.detach().cpu().numpy(), Path("depth"), kind)
@@ -269,17 +281,25 @@ def _open_depth(source: DepthSource, kind: DepthKind) -> Iterator[Path | DepthMa
 
 @contextlib.contextmanager
 def _as_file(source: str | os.PathLike[str] | bytes | BinaryIO, name: str) -> Iterator[Path]:
-    """The path of a file with the source's bytes, which may be temporary.
+    """Give the path of a file that holds the source's bytes, during the block.
 
-    An InputError of the block names the source as `name` instead of a temporary file. InputError
-    for a source of another type.
+    A path is given as it is; bytes, and the content of an open file, go into a temporary file.
+
+    Args:
+        source: a path, the bytes of a file, or a file opened in binary mode.
+        name: what an error message calls a source without a path; also the temporary file's name.
+
+    Raises:
+        InputError: the source is something else; or the block raised one, which then says `name`
+            where it said the temporary file's path.
     """
     if isinstance(source, str | os.PathLike):
         yield Path(source)
         return
 
-    # An open file is read from its current position.
+    # An open file is read from its current position, so a photo may lie inside a larger file.
     content = source.read() if hasattr(source, "read") else source
+    # A file opened as text gives a str.
     if not isinstance(content, bytes):
         raise InputError(
             f"{name}: {type(source).__name__} {short_repr(source)} is not accepted: "

@@ -62,8 +62,8 @@ class FillOptions:
         """Where the texture comes from, with "auto" decided; "none" if nothing is to be filled."""
         if self.residual == "none":
             return "none"
-        # Inpainting by LaMa takes seconds for each view; so without an explicit wish it is left to
-        # the one set of Gaussians for all views.
+        # LaMa takes seconds for a view. One set of Gaussians for all views needs it for the widest
+        # views only; sets of their own would need it for each view, so "auto" does without it.
         if self.mode == "view" and self.fill == "auto":
             return "exemplar"
         return resolve_texture(self.fill)
@@ -75,6 +75,7 @@ class FillOptions:
             return "none"
         if self.residual is not None:
             return self.residual
+        # A package that was built without weights fills by the initial Gaussians alone.
         return "shipped" if SHIPPED.is_file() else "initial"
 
     @property
@@ -121,9 +122,8 @@ class FilledHoles:
 
     aux: Gaussians  # for all views; in view mode, those of the view `saved_view`
     by_view: tuple[Gaussians, ...] | None = None  # in view mode: of each view
-    saved_view: str | None = (
-        None  # in view mode: the name of the view whose aux Gaussians are saved
-    )
+    # In view mode: the name, in the report, of the view whose aux Gaussians are saved.
+    saved_view: str | None = None
     # [H, W, 3] uint8 sRGB by the view's index: completed views that the fill has rendered already
     pictures: Mapping[int, Tensor] = dataclasses.field(default_factory=dict)
 
@@ -160,7 +160,8 @@ class Pipeline:
         options.base.check()
         options.path.check()
         network = options.fill.load_network()
-        open_texture(options.fill.texture)  # missing weights must be known before long work
+        # Only to find missing weights of LaMa before long work; `_fill_holes` opens it again.
+        open_texture(options.fill.texture)
         given_views, keyframes = options.path.load()
         return Pipeline(
             options=options,
@@ -193,6 +194,7 @@ class Pipeline:
         # render --> holes --> fill --> aux
         with reporter.stage("complete") as progress:
             filled = self._fill_holes(prediction, views, progress)
+        # Coordinates that are infinite or NaN come from views such as one with a tiny focal length.
         if not filled.aux.finite:
             source = self.options.path.cameras or photo.path
             raise InputError(f"{source}: views too extreme to complete: check their K")
@@ -252,10 +254,10 @@ class Pipeline:
             warn(f"{name}: {base.note}")
 
         # Views and keyframes that the user gives say themselves where the camera goes.
-        follows_trajectory = self._path_disparity(prediction) is not None
+        follows_trajectory = self.given_views is None and self.keyframes is None
         chooses_disparity = follows_trajectory and self.options.path.disparity is None
         if chooses_disparity:
-            with reporter.stage("move"):
+            with reporter.stage("move"):  # the stage's published name in the report's times
                 prediction = choose_disparity(prediction, self.renderer, photo.path)
 
         focal_source = prediction.lens_source or photo.focal_source.value
@@ -277,6 +279,8 @@ class Pipeline:
         missing_ratio = float(prediction.notes.get("depth_filled", 0))
         if missing_ratio:
             lines.append(f"{missing_ratio:.1%} of the depth was missing and has been filled")
+        # Depth inside a photo's file is usually coarser than the photo, which is no news. A map
+        # that the user gives should have the photo's size.
         map_size = prediction.notes.get("depth_resampled_from")
         if map_size and self.options.base.depth is not None:
             lines.append(f"the depth map is {map_size}, and was resampled to the photo's size")
@@ -297,11 +301,11 @@ class Pipeline:
             return FilledHoles(aux=Gaussians.empty(prediction.gaussians.means.device))
 
         context = FillContext(
-            prediction.gaussians,
-            prediction.camera,
-            self.renderer,
-            self.network,
-            open_texture(texture),
+            base=prediction.gaussians,
+            photo_camera=prediction.camera,
+            renderer=self.renderer,
+            network=self.network,
+            texture=open_texture(texture),
             precision=self.options.base.precision,
         )
         if self.options.fill.mode == "scene":
@@ -318,9 +322,9 @@ class Pipeline:
             views: the planned views; of these the fill gets `views_to_fill`.
             progress: called with (views done, all views).
         """
-        # The fill numbers the views that it gets from 0.
+        # The fill gets only some of the planned views, and names each by its position among them.
         cameras = [views.cameras[index] for index in views.views_to_fill]
-        always_filled = [
+        always_filled_positions = [
             position
             for position, index in enumerate(views.views_to_fill)
             if index in views.always_filled
@@ -328,14 +332,15 @@ class Pipeline:
         filled = fill_scene(
             context,
             cameras,
-            exact=self.given_views is not None,
+            exact=self.given_views is not None,  # between given views nothing will be rendered
             progress=progress,
-            always_filled=always_filled,
+            always_filled=always_filled_positions,
         )
+
+        # Some views the fill has rendered after the last Gaussians that they needed. If a frame of
+        # the video is just such a view, the video need not render it again.
         if not views.frame_maker.is_plain:
             return FilledHoles(aux=filled.aux)
-
-        # The fill has rendered some views in their final state; the video need not do so again.
         pictures = {
             views.views_to_fill[position]: picture for position, picture in filled.pictures.items()
         }
@@ -350,23 +355,25 @@ def _fill_each_view(context: FillContext, views: PlannedViews, progress: Progres
         views: the planned views, all of which are filled.
         progress: called with (views done, all views).
     """
-    # Added Gaussians must not hide what the photo shows.
+    # A guard is a view whose surfaces the added Gaussians must not cover: here, the photo.
     guards = [context.photo_guard()]
     by_view: list[Gaussians] = []
     for camera in views.cameras:
         by_view.append(fill_view(context, camera, guards).aux)
         progress(len(by_view), len(views.cameras))
 
-    # A file holds one set of aux Gaussians: that of the reported view farthest from the photo.
+    # A file of a scene has room for one set of aux Gaussians. The reported view farthest from the
+    # photo is chosen, because it shows the largest holes.
     photo_eye = context.photo_camera.position.double()
 
     def distance_from_photo(name: str) -> float:
-        camera = views.cameras[views.measured[name]]
+        """Distance of the reported view of this name, in units of the scene."""
+        camera = views.cameras[views.reported_views[name]]
         return float((camera.position.double() - photo_eye).norm())
 
-    saved_view = max(views.measured, key=distance_from_photo)
+    saved_view = max(views.reported_views, key=distance_from_photo)
     return FilledHoles(
-        aux=by_view[views.measured[saved_view]], by_view=tuple(by_view), saved_view=saved_view
+        aux=by_view[views.reported_views[saved_view]], by_view=tuple(by_view), saved_view=saved_view
     )
 
 
@@ -374,7 +381,7 @@ def _fill_each_view(context: FillContext, views: PlannedViews, progress: Progres
 def measure_holes(scene: Scene, views: PlannedViews, renderer: Renderer) -> tuple[ViewHoles, ...]:
     """The share of holes (eq. 11) in each reported view, before and after completion."""
     holes: list[ViewHoles] = []
-    for name, index in views.measured.items():
+    for name, index in views.reported_views.items():
         camera = views.cameras[index]
         before = renderer.render([scene.base], camera)
         after = renderer.render(scene.of_view(index), camera)
@@ -390,8 +397,9 @@ def measure_holes(scene: Scene, views: PlannedViews, renderer: Renderer) -> tupl
 
 def describe_movement(prediction: BasePrediction) -> str:
     """A line for the log about the size of the camera's movement that was chosen for a photo."""
+    # `choose_disparity` has replaced the base's usual disparity, and noted both facts.
     chosen = prediction.max_disparity
-    usual = prediction.notes["usual_disparity"]  # what the base allows for a photo without holes
+    usual = prediction.notes["usual_disparity"]
     hole_ratio = prediction.notes["uncovered"]
     if chosen == usual:
         return (
@@ -426,15 +434,15 @@ def complete(
         progress: called with (views done, all views).
     """
     context = FillContext(
-        prediction.gaussians,
-        prediction.camera,
-        renderer or get_renderer(),
-        shipped_network() if network == "shipped" else network,
-        open_texture(fill),
+        base=prediction.gaussians,
+        photo_camera=prediction.camera,
+        renderer=renderer or get_renderer(),
+        network=shipped_network() if network == "shipped" else network,
+        texture=open_texture(fill),
     )
     views_to_fill = cameras if fill != "none" else ()
     start = time.perf_counter()
-    filled = fill_scene(context, views_to_fill, exact, progress)
+    filled = fill_scene(context, views_to_fill, exact=exact, progress=progress)
     report = SceneReport(
         focal_px=prediction.camera.focal[0],
         focal_source=prediction.lens_source or None,

@@ -70,14 +70,14 @@ class SceneReport:
 
     @property
     def hole_ratio_before(self) -> float | None:
-        """The mean share of holes in the base, over the measured views; None if there are none."""
+        """The mean share of holes in the base, over the views in `holes`; None without views."""
         if not self.holes:
             return None
         return sum(view.before for view in self.holes) / len(self.holes)
 
     @property
     def hole_ratio_after(self) -> float | None:
-        """The mean share of holes that completion leaves; None if no view was measured."""
+        """The mean share of holes that completion leaves; None if `holes` has no views."""
         if not self.holes:
             return None
         return sum(view.after for view in self.holes) / len(self.holes)
@@ -181,16 +181,24 @@ class Scene:
         # A scene of another program does not say how far the camera may move.
         if disparity is None:
             disparity = DEFAULT_MAX_DISPARITY
+
+        # Even sides, because most video formats need them. The base's depths, not those of the aux
+        # Gaussians, set the length of the path, as when the scene was completed.
         depth_range = DepthRange.of(self.base)
         return trajectory_cameras(
             trajectory, self.camera.even(), disparity, depth_range, frames, looped
         )
 
     def along(self, keyframes: KeyframePath, frames: int | None = None) -> list[Camera]:
-        """Cameras through keyframes (see `spackle.formats.load_path`), by default 30 a second.
+        """Cameras at equal time steps on a path through keyframes, of even width and height.
+
+        Args:
+            keyframes: the path, as `spackle.formats.load_path` reads it from a file.
+            frames: number of cameras; by default 30 for each second of the path.
 
         Raises:
-            ValueError: a view between two keyframes is impossible.
+            ValueError: between two keyframes the camera would stand at the point that it looks at,
+                or look straight up or down.
         """
         frame_count = frames or keyframes.frame_count(KEYFRAMES_FPS)
         return keyframes.cameras(self.camera.even(), frame_count, DepthRange.of(self.base))
@@ -203,7 +211,11 @@ class Scene:
     def frames(
         self, cameras: Iterable[Camera], renderer: Renderer | None = None
     ) -> Iterator[Rendering]:
-        """Render the views one after the other."""
+        """Render the views one after the other, each when it is asked for.
+
+        So a long path needs the memory of one view.
+        """
+        # Opened here once, not in `render` for each view.
         renderer = renderer or get_renderer()
         for camera in cameras:
             yield self.render(camera, renderer)
@@ -212,6 +224,7 @@ class Scene:
         """Depth [H, W] of the base at the photo's camera, 0 in holes; metres for a metric base."""
         with torch.no_grad():
             view = (renderer or get_renderer()).render(self.base, self.camera)
+        # In a hole the depth is that of a few faint Gaussians, so it means nothing.
         return torch.where(hole_mask(view.alpha), 0, view.depth)
 
     def save(self, target: PathOrFile, disparity: float | None = None) -> None:
@@ -259,10 +272,18 @@ class Scene:
         """The bytes of a file called `name`, whose suffix is the format."""
 
         def encode_page(file: SceneFile) -> bytes:
+            """One HTML file with the viewer and this scene, titled by the file's name."""
             return single_html(self.page(file.path.stem))
 
+        # The encoders of formats do not know the page, whose title and camera come from the scene.
         encode = encoder_for(name, {".html": encode_page})
-        content = SceneFile(name, self.gaussians, self.camera, len(self.base), self.disparity)
+        content = SceneFile(
+            path=name,
+            gaussians=self.gaussians,
+            camera=self.camera,
+            base_count=len(self.base),
+            disparity=self.disparity,
+        )
         return encode(content)
 
     def show(self, height: int = 480) -> InlinePage:
@@ -316,6 +337,7 @@ class Scene:
         Raises:
             InputError: an option is impossible, or contradicts another one.
         """
+        # Numbers go the way of a text, too, because `parse_size` checks them.
         if size is not None and not isinstance(size, str):
             size = "x".join(map(str, size))
         video = VideoOptions(
@@ -338,40 +360,78 @@ class Scene:
             overscan=overscan,
         )
 
+        self._write_video(target, format, path, renderer)
+
+    def _write_video(
+        self,
+        target: PathOrFile,
+        format: str | None,
+        path: PathOptions,
+        renderer: Renderer | None,
+    ) -> None:
+        """Write a video along `path` to a path or an open file.
+
+        `format` is the name of a video format; None: that of the target's suffix, or mp4 for an
+        open file.
+        """
+        # The encoder writes to a path, and takes the format from its suffix.
         if format is None and isinstance(target, str | os.PathLike):
-            self._write_video(Path(target), Path(target), path, renderer)
+            file = Path(target)
+            self._encode_video(file, path, renderer, name_in_messages=file)
             return
 
-        # The encoder writes files; messages must not name this temporary one.
+        # In all other cases a temporary file has the right suffix. Messages must not name it by
+        # its folder, which the user does not know.
         with tempfile.TemporaryDirectory() as folder:
             name = Path(f"video.{format or 'mp4'}")
             file = Path(folder) / name
-            self._write_video(file, name, path, renderer)
+            self._encode_video(file, path, renderer, name_in_messages=name)
             write_atomic(target, file.read_bytes())
 
-    def _write_video(
-        self, file: Path, name: Path, path: PathOptions, renderer: Renderer | None
+    def _encode_video(
+        self,
+        file: Path,
+        path: PathOptions,
+        renderer: Renderer | None,
+        *,
+        name_in_messages: Path,
     ) -> None:
-        """Render the scene along a path to a video file; `name` stands for it in messages."""
+        """Render the scene along a path to a video file.
+
+        Args:
+            file: the video, whose suffix is its format.
+            path: the options of path and video.
+            renderer: None: the best renderer of this machine.
+            name_in_messages: stands for `file` in error messages.
+
+        Raises:
+            InputError: an option is impossible, or contradicts another one.
+        """
+        # All options are checked before the first frame is rendered.
         fps = path.video.frames_per_second
-        check_video(name, fps, path.video.loop)
+        check_video(name_in_messages, fps, path.video.loop)
         video = path.video.for_file(file)
         path = dataclasses.replace(path, video=video)
         path.check()
 
-        cameras = path.video_cameras(self.base, self.camera, None, self.disparity)
-        frame_maker = FrameMaker.of(video, self.base, cameras, name)
+        cameras = path.video_cameras(
+            self.base, self.camera, keyframes=None, disparity=self.disparity
+        )
+        frame_maker = FrameMaker.of(video, self.base, cameras, name_in_messages)
         used_renderer = renderer or get_renderer()
+
+        # A frame shows the scene; for a comparison, the base alone to the left of it.
         gaussian_sets = [[self.base, self.aux]]
         if video.compare:
             gaussian_sets.insert(0, [self.base])
 
         def render_frames() -> Iterator[Tensor]:
+            """Render each frame [H, W, 3] when the encoder asks for it, to save memory."""
             for camera in cameras:
                 frame, _ = frame_maker.render(gaussian_sets, camera, used_renderer)
                 yield frame
 
-        save_video(render_frames(), file, fps, video.loop, name_in_messages=name)
+        save_video(render_frames(), file, fps, video.loop, name_in_messages=name_in_messages)
 
 
 def _camera_with_lens(
@@ -389,7 +449,14 @@ def _camera_with_lens(
         height = file.camera.height
     else:
         width, height = DEFAULT_SIZE_PX
-    focal, _ = resolve_focal_length(file.path, width, height, {}, focal_px=focal_px, fov=fov)
+    focal, _ = resolve_focal_length(
+        file.path,
+        width,
+        height,
+        exif={},  # a scene has none; without `focal_px` and `fov` a usual lens is assumed
+        focal_px=focal_px,
+        fov=fov,
+    )
     camera = Camera.from_focal(focal, width, height)
     if file.camera is None:
         return camera

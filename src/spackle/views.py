@@ -36,10 +36,10 @@ from spackle.video.frames import FrameMaker
 from spackle.video.options import VideoOptions
 
 DEFAULT_FRAME_COUNT = 60  # cameras of `Scene.path`; of a longer path, 60 to 119 frames are filled
-MAX_FRAME_COUNT = 10_000
+MAX_FRAME_COUNT = 10_000  # of a video
 DEFAULT_VIDEO_SECONDS = 4.0  # duration of a video along a trajectory
-MAX_OVERSCAN = 0.5
-MAX_MEASURED_KEYFRAMES = 16  # the report measures the holes of at most so many keyframes
+MAX_OVERSCAN = 0.5  # focal length times 1.5, which leaves 44 % of the photo's area
+MAX_REPORTED_KEYFRAMES = 16  # the report measures the holes of at most so many keyframes
 
 COARSE_SIDE_PX = 240  # long side of the renderings in which `choose_disparity` measures holes
 DISPARITY_STEP = 0.01  # `choose_disparity` rounds the disparity down to a multiple of this step
@@ -64,6 +64,7 @@ class PathOptions:
 
     def check(self) -> None:
         """Raise an InputError for an impossible path or video, or for options that contradict."""
+        # Trajectories may be written with underscores, too, as SHARP's programs write them.
         check_name("trajectory", self.trajectory.replace("_", "-"), TRAJECTORIES)
         if self.disparity is not None:
             is_possible = math.isfinite(self.disparity) and 0 <= self.disparity <= MAX_DISPARITY
@@ -80,7 +81,10 @@ class PathOptions:
         self.video.check()
 
     def _check_length(self) -> None:
-        """Raise an InputError if the video would have no frame or too many, or two lengths."""
+        """Raise an InputError if the video would have no frame or too many.
+
+        Likewise if `frames` and `seconds` both set its length.
+        """
         if self.frames is not None and not 1 <= self.frames <= MAX_FRAME_COUNT:
             raise InputError(f"`frames` must be between 1 and {MAX_FRAME_COUNT}, got {self.frames}")
         if self.seconds is None:
@@ -96,7 +100,10 @@ class PathOptions:
             )
 
     def _check_files(self) -> None:
-        """Raise an InputError if a file of views is given together with what it already sets."""
+        """Raise an InputError if a file of views is given together with `path` or a size.
+
+        The file already says from where the scene is seen, and how large each view is.
+        """
         if self.cameras is None:
             return
         if self.path is not None:
@@ -139,18 +146,20 @@ class PathOptions:
     ) -> list[Camera]:
         """The cameras of the video's frames, through keyframes or along the trajectory.
 
-        Sides of odd size grow by one pixel, because video needs even sides.
+        Views of odd width or height grow by one pixel, because video needs even sides.
 
         Args:
-            gaussians: the scene, whose depths determine the length of a trajectory.
+            gaussians: the scene; the nearer it is, the shorter the trajectory.
             camera: the photo's camera.
             keyframes: the keyframes of `path`; None: follow the trajectory.
-            disparity: used if the options give no disparity; None: the usual one.
+            disparity: size of the camera's movement if the option `disparity` is not given; None:
+                DEFAULT_MAX_DISPARITY.
 
         Raises:
             PathError: the keyframes give no usable path.
             ValueError: the scene allows no such path.
         """
+        # Keyframes say themselves where the camera goes.
         if keyframes is not None:
             return self._keyframe_cameras(gaussians, camera, keyframes)
 
@@ -197,12 +206,17 @@ def choose_disparity(
 ) -> BasePrediction:
     """Choose how far the camera moves: as far as the photo allows without too many holes.
 
-    The size of the movement is a "disparity": 0 stays, 0.3 is large. It replaces the prediction's
-    disparity, which is the base's usual one, whatever the photo shows.
+    The size of the movement is a "disparity": 0 is no movement, 0.3 a large one. A base predicts
+    the same disparity for every photo, its usual one. If this disparity uncovers too many holes,
+    a smaller one is chosen.
 
-    The limit of the holes is `prediction.max_hole_ratio`. They are measured as the mean share of
-    the leftmost and rightmost view (hole-area ratio, eq. 11 of the paper), in coarse renderings.
-    This ratio and the usual disparity are added to the prediction's notes.
+    The hole ratio of a disparity is the share of holes in its leftmost and rightmost view, on
+    average (hole-area ratio, eq. 11 of the paper). It may be at most `prediction.max_hole_ratio`.
+    The views are rendered coarsely, because only the shares count.
+
+    Returns:
+        The prediction with the chosen disparity. Its notes also say the usual disparity, and, as
+        "uncovered", the hole ratio of the chosen one.
 
     Raises:
         InputError: the depths and the focal length of the photo `source` allow no camera path.
@@ -227,6 +241,7 @@ def choose_disparity(
     best = measure(usual_disparity)
     if best.hole_ratio > hole_limit:
         best = _largest_within(hole_limit, measure, too_far=best)
+    # A movement without any parallax is worth nothing, so the least one may exceed the limit.
     if best.disparity < MIN_CHOSEN_DISPARITY:
         best = measure(min(MIN_CHOSEN_DISPARITY, usual_disparity))
 
@@ -239,24 +254,30 @@ def choose_disparity(
 def _largest_within(
     hole_limit: float, measure: Callable[[float], DisparityTrial], too_far: DisparityTrial
 ) -> DisparityTrial:
-    """The largest disparity found whose holes stay within the limit; disparity 0 if none is found.
+    """Search for the largest disparity whose holes stay within the limit.
 
-    A few steps of false position: holes grow nearly linearly with the disparity, so the straight
-    line between a disparity within the limit and one beyond predicts where the limit is reached.
+    The method is false position. Holes grow nearly linearly with the disparity. So take a disparity
+    within the limit and one beyond it: the straight line between them predicts the disparity that
+    reaches the limit. This one is measured, and replaces one of the two.
 
     Args:
         hole_limit: the largest allowed hole ratio.
         measure: measures the holes of a disparity.
         too_far: a disparity that uncovers more than the limit.
+
+    Returns:
+        The largest disparity within the limit after MAX_TRIALS measurements; 0 if none was within.
     """
-    within = DisparityTrial(0.0, 0.0)
+    # Seen from the photo's own place, a base has no holes.
+    within = DisparityTrial(disparity=0.0, hole_ratio=0.0)
     for _ in range(MAX_TRIALS):
         share = (hole_limit - within.hole_ratio) / (too_far.hole_ratio - within.hole_ratio)
         disparity_at_limit = within.disparity + share * (too_far.disparity - within.disparity)
 
-        # Round down, but not a multiple that is itself a rounding error above the limit.
+        # Round down to whole steps. The 1e-6 keeps a step that a rounding error has made smaller:
+        # 28.999999999 steps are 29.
         whole_steps = math.floor(disparity_at_limit / DISPARITY_STEP + 1e-6)
-        disparity = round(DISPARITY_STEP * whole_steps, 4)
+        disparity = round(DISPARITY_STEP * whole_steps, 4)  # 0.29, not 0.29000000000000004
         if disparity <= max(within.disparity, MIN_CHOSEN_DISPARITY):
             break
 
@@ -277,10 +298,13 @@ class PlannedViews:
 
     cameras: list[Camera]
     frames: list[tuple[int, ...]]  # each video frame's view, or the two views of its eyes
-    measured: dict[str, int]  # the views whose holes are reported, by their names in the report
-    views_to_fill: list[int]  # further frames of a path would uncover nothing more
+    # The views whose holes are measured for the report, by their names in the report.
+    reported_views: dict[str, int]
+    views_to_fill: list[int]  # not every frame, because neighbours in a path show the same holes
     always_filled: frozenset[int]  # those that are filled even if views near them are filled
-    still_count: int  # so many of the first views are also saved as pictures
+    # The first views of `cameras` are this number of views that the user gave. They are also saved
+    # as pictures.
+    given_view_count: int
     frame_maker: FrameMaker  # makes a frame of the video from the renderings of its views
 
 
@@ -290,8 +314,8 @@ class _PathViews:
 
     frame_cameras: list[Camera]  # of the video's frames; of a stereo video, midway between the eyes
     filled_frame_step: int = 1  # every first, second, … of these frames is filled
-    measured_cameras: dict[str, Camera] = dataclasses.field(default_factory=dict)  # by name
-    cameras_without_overscan: Sequence[Camera] = ()  # filled besides the frames
+    reported_cameras: dict[str, Camera] = dataclasses.field(default_factory=dict)  # by name
+    cameras_without_overscan: Sequence[Camera] = ()  # filled besides the frames, for other viewers
 
 
 def plan_views(
@@ -320,6 +344,8 @@ def plan_views(
     if given_views:
         path_views = _PathViews(frame_cameras=given_views)
     else:
+        # A ValueError comes from the photo's depths; a PathError from the file of keyframes, and
+        # its own text ("{reason}") is the message.
         with (
             as_input_error(source, NO_PATH_MESSAGE, ValueError),
             as_input_error(path.path, "{reason}", PathError),
@@ -334,31 +360,38 @@ def plan_views(
 
 
 def _trajectory_views(prediction: BasePrediction, path: PathOptions) -> _PathViews:
-    """The views along a trajectory; its leftmost and rightmost view are measured.
+    """The views along a trajectory; the report measures its leftmost and rightmost view.
 
     ValueError if the scene allows no such path.
     """
     frame_cameras = path.video_cameras(
-        prediction.gaussians, prediction.camera, None, prediction.max_disparity
+        prediction.gaussians,
+        prediction.camera,
+        keyframes=None,
+        disparity=prediction.max_disparity,
     )
     camera = prediction.camera.even()
     disparity = path.disparity_or(prediction.max_disparity)
     depth_range = DepthRange.of(prediction.gaussians)
     leftmost, rightmost = leftmost_and_rightmost(camera, disparity, depth_range)
 
-    # Other programs show the scene without overscan, that is, with the photo's own focal length,
-    # and then show more beyond the photo's border. Left and right are measured, and therefore
-    # filled anyway; these trajectories also go up and down.
+    # Overscan, a little zoom of the video, hides what lies beyond the photo's border. Other programs
+    # show the scene without it, so the outermost views are filled without it, too. The leftmost and
+    # rightmost view are filled anyway, because they are reported. For trajectories that also go up
+    # and down, the lowest and the highest view are added.
     without_overscan: Sequence[Camera] = ()
     if path.trajectory in ("shake", "rotate", "vertical"):
+        # Five cameras on a circle are below, right, above, left and below again.
         circle = trajectory_cameras("rotate", camera, disparity, depth_range, frames=5)
-        # The five views are below, right, above, left and below again.
-        without_overscan = [circle[0], circle[2]]
+        lowest = circle[0]
+        highest = circle[2]
+        without_overscan = [lowest, highest]
 
     return _PathViews(
         frame_cameras=frame_cameras,
+        # Of a long path every second, third, … frame is filled, so that 60 to 119 frames are.
         filled_frame_step=max(1, len(frame_cameras) // DEFAULT_FRAME_COUNT),
-        measured_cameras={f"-{disparity:g}": leftmost, f"+{disparity:g}": rightmost},
+        reported_cameras={f"-{disparity:g}": leftmost, f"+{disparity:g}": rightmost},
         cameras_without_overscan=without_overscan,
     )
 
@@ -366,8 +399,9 @@ def _trajectory_views(prediction: BasePrediction, path: PathOptions) -> _PathVie
 def _keyframe_views(
     prediction: BasePrediction, path: PathOptions, keyframes: KeyframePath
 ) -> _PathViews:
-    """The views of a path through keyframes; the keyframes, or some of many, are measured.
+    """The views of a path through keyframes; the report measures the views at the keyframes.
 
+    If there are more than MAX_REPORTED_KEYFRAMES, it measures every second, third, … of them.
     PathError if the keyframes give no path; ValueError if the scene allows none.
     """
     frame_cameras = path.video_cameras(
@@ -378,18 +412,21 @@ def _keyframe_views(
         prediction.camera.even(),
         DepthRange.of(prediction.gaussians),
     )
-    key_step = math.ceil(len(key_cameras) / MAX_MEASURED_KEYFRAMES)
-    measured_keys = range(0, len(key_cameras), key_step)
+    key_step = math.ceil(len(key_cameras) / MAX_REPORTED_KEYFRAMES)
+    reported_keys = range(0, len(key_cameras), key_step)
     return _PathViews(
         frame_cameras=frame_cameras,
-        measured_cameras={f"keyframe {key}": key_cameras[key] for key in measured_keys},
+        reported_cameras={f"keyframe {key}": key_cameras[key] for key in reported_keys},
     )
 
 
 def _index_views(
     path_views: _PathViews, frame_maker: FrameMaker, given_views: list[Camera]
 ) -> PlannedViews:
-    """Put all views of a path into one list, and name each view's purpose by its index.
+    """Put all views of a path into one list, and say by indices which view serves what.
+
+    The order is: given views that are no frames, the frames' views, views without overscan,
+    reported views.
 
     Args:
         path_views: the cameras of the video's frames, and those that are filled besides.
@@ -398,38 +435,43 @@ def _index_views(
     """
     cameras: list[Camera] = []
 
-    # The pictures of given views are taken midway between the eyes of a stereo video.
+    # Without stereo, the given views are themselves the views of the frames. The frames of a stereo
+    # video show what the left and the right eye see; the given view lies midway between them, and
+    # is a view of its own, because it is saved as a picture.
     if frame_maker.stereo:
         cameras.extend(given_views)
-    middle_count = len(cameras)
+    middle_view_count = len(cameras)
 
     frames: list[tuple[int, ...]] = []
     for frame_camera in path_views.frame_cameras:
-        eyes = frame_maker.eyes(frame_camera)
+        eyes = frame_maker.eyes(frame_camera)  # one camera, or two for stereo
         frames.append(tuple(range(len(cameras), len(cameras) + len(eyes))))
         cameras.extend(eyes)
-    frame_end = len(cameras)
+    frame_view_end = len(cameras)  # index after the last frame's views
 
     cameras.extend(path_views.cameras_without_overscan)
-    measured = {
-        name: len(cameras) + position for position, name in enumerate(path_views.measured_cameras)
+    reported_views = {
+        name: len(cameras) + position for position, name in enumerate(path_views.reported_cameras)
     }
-    cameras.extend(path_views.measured_cameras.values())
-    if not measured:  # given views, which come first in the list
-        measured = {str(index): index for index in range(len(path_views.frame_cameras))}
+    cameras.extend(path_views.reported_cameras.values())
+    # Only given views have no cameras just for the report: the report measures all of them. They
+    # are the first views of the list.
+    if not reported_views:
+        reported_views = {str(index): index for index in range(len(path_views.frame_cameras))}
 
-    views_to_fill = list(range(middle_count))
+    views_to_fill = list(range(middle_view_count))
     for frame in frames[:: path_views.filled_frame_step]:
         views_to_fill.extend(frame)
-    views_to_fill.extend(range(frame_end, len(cameras)))
+    views_to_fill.extend(range(frame_view_end, len(cameras)))
 
     return PlannedViews(
         cameras=cameras,
         frames=frames,
-        measured=measured,
+        reported_views=reported_views,
         views_to_fill=views_to_fill,
-        # A frame from the same place hides, by its overscan, what these views show at their border.
-        always_filled=frozenset(range(frame_end, len(cameras))),
-        still_count=len(given_views),
+        # The fill leaves out views near those that it has filled. These views may stand where a
+        # frame stands, but without the frame's zoom (overscan) they show more at their border.
+        always_filled=frozenset(range(frame_view_end, len(cameras))),
+        given_view_count=len(given_views),
         frame_maker=frame_maker,
     )

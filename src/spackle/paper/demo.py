@@ -106,7 +106,7 @@ def _save_comparison(completed: CompletedPhoto, renderer: Renderer, path: Path) 
     """Write a picture of the leftmost and rightmost view: above the base, below the scene."""
     scene = completed.scene
     views = completed.views
-    widest_views = [views.cameras[index] for index in views.measured.values()]
+    widest_views = [views.cameras[index] for index in views.reported_views.values()]
     rows: list[list[Tensor]] = []  # of pictures [H, W, 3] sRGB
     for gaussians in ([scene.base], scene.of_view(0)):
         rows.append([renderer.render(gaussians, view).rgb for view in widest_views])

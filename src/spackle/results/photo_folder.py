@@ -263,7 +263,7 @@ def _write_files(
         with reporter.stage("video") as progress:
             save_planned_video(completed, folder / video_name, pipeline.renderer, progress)
 
-    if views.still_count:
+    if views.given_view_count:
         (folder / "views").mkdir()
         with reporter.stage("views") as progress:
             _save_pictures(completed, folder / "views", pipeline.renderer, progress)
@@ -313,7 +313,7 @@ def _save_pictures(
     """
     views = completed.views
     scene = completed.scene
-    for index in range(views.still_count):
+    for index in range(views.given_view_count):
         camera = views.cameras[index]
         before = renderer.render(scene.base, camera)
         after = renderer.render(scene.of_view(index), camera)
@@ -321,7 +321,7 @@ def _save_pictures(
         save_png(after.rgb, folder / f"{index:04d}.png")
         save_png(before.rgb, folder / f"{index:04d}_base.png")
         save_gray_png(holes, folder / f"{index:04d}_mask.png")
-        progress(index + 1, views.still_count)
+        progress(index + 1, views.given_view_count)
 
 
 def _report_of(
