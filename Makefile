@@ -38,7 +38,7 @@ hooks: $(VENV)/.installed
 pins: $(VENV)/.installed
 	test -x build/uv/bin/uv || { $(PYTHON) -m venv build/uv && build/uv/bin/pip install --quiet uv; }
 	build/uv/bin/uv pip compile pyproject.toml --universal --python-version 3.10 --upgrade --quiet \
-		$(foreach extra,demo dev eval hf opencv train,--extra $(extra)) \
+		$(foreach extra,demo dev eval exr hf opencv train,--extra $(extra)) \
 		--no-emit-index-url --no-annotate --no-header --output-file constraints.txt
 
 # In an environment that is empty but for the wheel: pip fetches what it asks for.
