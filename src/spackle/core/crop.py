@@ -175,7 +175,8 @@ def _cut_in_parts(blocks: Mask, crop: Crop, margin: int) -> list[Crop]:
     # rectangle (top, left, bottom, right) around its masked blocks.
     inside = blocks[crop.slices]
     row_cuts = _halves_of_row_cuts(inside)  # [cuts, 2 halves, 4]
-    # Transposed, columns are rows, and the order is (left, top, right, bottom); it is set right.
+    # A column of the mask is a row of the transposed mask, whose bounds are in another order: left,
+    # top, right, bottom.
     transposed_cuts = _halves_of_row_cuts(inside.T)
     column_cuts = transposed_cuts[..., [1, 0, 3, 2]]
     halves = np.concatenate([row_cuts, column_cuts])

@@ -29,7 +29,7 @@ def gaussian_blur(image: Tensor, sigma: float) -> Tensor:
         side = image.shape[dim]
         ones = image.new_ones(side)
         weight_sums = _weighted_sum_of_neighbors(ones, weights, dim=0)  # [side]
-        axes_after = -1 - dim
+        axes_after = -1 - dim  # number of axes behind the axis `dim`
         weight_sums = weight_sums.view(-1, *[1] * axes_after)  # aligned with the axis `dim`
         image = _weighted_sum_of_neighbors(image, weights, dim) / weight_sums
     return image
@@ -85,8 +85,9 @@ def maximum_filter(image: Tensor, radius: int) -> Tensor:
     image = pad(image, (radius, radius, radius, radius), value=smallest)
     full_width = 2 * radius + 1
     for dim in (-1, -2):
-        # The maximum of two neighbouring windows is that of a window of their joint width, so a few
-        # doublings suffice; on a CPU this is faster than pooling.
+        # Start with windows of one pixel, and join two windows to a wider one, whose maximum is the
+        # larger of theirs. Each round doubles the width, so few suffice; on a CPU this is faster
+        # than pooling.
         width = 1
         while width < full_width:
             step = min(width, full_width - width)

@@ -169,7 +169,8 @@ def focal_from_exif(tags: Mapping[int, object], width: int, height: int) -> floa
 
     # EXIF's density is often wrong, so the result must be plausible as a 35 mm equivalent.
     focal_px = _focal_from_pixel_density(tags, lens_mm, max(width, height))
-    if focal_px is not None and _is_plausible_mm(focal_px / focal_mm_to_px(1.0, width, height)):
+    px_per_film_mm = focal_mm_to_px(1.0, width, height)
+    if focal_px is not None and _is_plausible_mm(focal_px / px_per_film_mm):
         return focal_px
 
     # The sensor is unknown: a short lens belongs to a phone, any other to a full-frame camera.

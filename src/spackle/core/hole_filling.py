@@ -42,7 +42,7 @@ def fill_from_far_side(
     A moving camera uncovers the surface behind, so a hole between a near and a far surface belongs
     to the far surface. The work goes from coarse to fine. At each resolution, the hole begins with
     a guess, which the next coarser resolution gives; then each of its pixels is replaced, several
-    times, by the weighted mean of its four neighbours. The hole so becomes a smooth membrane that
+    times, by the weighted mean of its four neighbours. So the hole becomes a smooth membrane that
     hangs on its rim, the known pixels around it. A rim pixel of inverse depth r beside a hole pixel
     of inverse depth h has the weight min(1, h / r)^far_bias, so a nearer rim hardly counts.
 
@@ -215,7 +215,8 @@ def _far_weight(relative_depth: Any, bias: Any) -> Any:
     """
     if bias == 0:
         return np.float32(1)
-    # A power by its logarithm, which shows too large a weight early; 1e-6, as log 0 is infinite.
+    # The logarithm of the weight shows whether the weight would be too large or too small. 1e-6,
+    # because the logarithm of 0 is infinite.
     exponent = -bias * np.log(max(relative_depth, np.float32(1e-6)))
     if abs(exponent) < MAX_EXPONENT:
         return np.float32(np.exp(np.float64(exponent)))
@@ -224,7 +225,7 @@ def _far_weight(relative_depth: Any, bias: Any) -> Any:
 
 @kernel
 def _find_holes(known: Any, hole_count: int) -> Any:
-    """Number the unknown pixels and the known pixels around them, and link each hole pixel.
+    """Number the unknown pixels and the known ones beside them; list an unknown one's neighbours.
 
     Args:
         known: [H, W].
@@ -372,7 +373,8 @@ def _relax(samples: Any, buffer: Any, neighbors: Any, bias: Any, sweeps: int) ->
 def _rim_weight(fill_depth: Any, rim_depth: Any, bias: Any) -> Any:
     """The weight min(1, fill_depth / rim_depth)^bias, float32, of a rim sample for a hole's fill.
 
-    Both are inverse depths, so a rim that is nearer than the fill weighs less than 1.
+    Both are inverse depths, so a rim that is nearer than the fill weighs less than 1. It still
+    weighs a little, so that a hole which has only a near rim is filled from it.
     """
     if rim_depth <= fill_depth:
         return np.float32(1)

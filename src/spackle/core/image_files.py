@@ -90,6 +90,7 @@ def check_pixel_count(
     if file_bytes is None:
         max_pixels = MAX_PIXELS
     else:
+        # Up to a size that every computer bears, the file may be as small as it likes.
         max_pixels = min(MAX_PIXELS, max(HARMLESS_PIXELS, MAX_PIXELS_PER_BYTE * file_bytes))
 
     if width * height > max_pixels:

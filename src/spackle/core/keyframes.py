@@ -112,8 +112,8 @@ class KeyframePath:
             camera: the photo's camera.
             frames: number of views.
             depth_range: depths of the photo's Gaussians; if the path's unit is "disparity", lengths
-                are multiples of the camera offset that moves the nearest of these depths by the
-                image's diagonal.
+                are multiples of the camera offset at which the nearest surface moves across the
+                image's whole diagonal.
 
         Raises:
             PathError: between two keyframes the eye meets the target, or the view becomes parallel
@@ -142,7 +142,7 @@ class KeyframePath:
             unit_length = disparity_to_offset(camera, 1.0, depth_range)
 
         # Ten numbers of each keyframe are interpolated: eye, target and up, with three coordinates
-        # each, and the logarithm of the focal length, because zooming multiplies.
+        # each, and the logarithm of the focal length, because a steady zoom multiplies it.
         rows = []
         for key in self.keys:
             up = np.array(key.up) / np.linalg.norm(key.up)
@@ -240,8 +240,10 @@ def _inner_tangents(steps: Array, slopes: Array) -> Array:
     """Tangents [K − 2, C] of a curve through K values, at all but the first and last value.
 
     A tangent is the weighted harmonic mean of the slopes a and b before and after the value,
-    (v + w) / (v / a + w / b), and 0 where their signs differ, that is, at a maximum or minimum. So
-    the curve never leaves the range of two successive values (Fritsch and Butland).
+    (v + w) / (v / a + w / b). With the times s before and t after the value, the weights are
+    v = 2t + s and w = t + 2s. The tangent is 0 where the signs of the slopes differ, that is, at a
+    maximum or minimum. So the curve never leaves the range of two successive values (Fritsch and
+    Butland).
 
     Args:
         steps: [K − 1, 1] times between the values.

@@ -85,7 +85,7 @@ def match_patches(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> Patches
     """
     levels = _build_pyramid(guess.detach().float(), hole, inverse_depth.detach().float())
     matches = None
-    # The coarsest level comes first, because each level starts from the matches of the last one.
+    # The coarsest level comes first, because each level starts from the matches of the coarser one.
     for number in reversed(range(len(levels))):
         matches = _match_level(levels[number], matches, level_number=number)
 
@@ -134,8 +134,8 @@ def _build_pyramid(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> list[_
     while True:
         # At half the resolution, half as many pixels of blur are the same blur in the scene.
         tone_blur = max(TONE_BLUR_CELLS / 2 ** len(levels), MIN_TONE_BLUR_PX)
-        # Beside the pixels of a patch, its centre must agree in tone and depth: these traits are
-        # scaled so that their squared differences are costs.
+        # Two patches are compared not only by their pixels, but also by the tone and depth of their
+        # centres. These traits are scaled so that their squared differences are costs.
         traits = [TONE_WEIGHT * gaussian_blur(tone, tone_blur), DEPTH_WEIGHT * depth]
         level = _Level(
             rgb=rgb.contiguous().numpy(),
@@ -296,7 +296,7 @@ class _LevelSearch:
             distance_weight=np.float32(DISTANCE_WEIGHT / max(height, width) ** 2),
         )
 
-        # A number for each hole pixel, so that matches and costs are short lists.
+        # Matches and costs are kept for the hole's pixels only, in the order of these numbers.
         count = len(self._hole_pixels)
         numbers = np.full((height, width), -1, np.int32)
         numbers[level.hole] = np.arange(count)

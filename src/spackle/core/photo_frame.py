@@ -144,7 +144,7 @@ class _Side:
         is_straight = differing_ratio.max(initial=0.0) >= MIN_STRAIGHT_RATIO
         if uniform_width < MIN_FRAME_PX or not is_straight:
             return 0
-        # A blurred edge ends where the pixels that differ become no more: at the first line that
-        # has at least 95 % of the largest number.
+        # A blurred edge ends where the share of differing pixels stops growing: at the first line
+        # that has at least 95 % of the largest share.
         end_of_edge = int((differing_ratio >= 0.95 * differing_ratio.max()).argmax())
         return uniform_width + end_of_edge + 1

@@ -73,7 +73,9 @@ def make_surfels(
         spreads = spread.to(uv)[..., None].flatten(1)  # [N, 1], or [N, 2] along x and y
     else:
         spreads = uv.new_full((1, 1), spread)
-    rotation, scales = _ellipse_axes(move_along_x * spreads[:, :1], move_along_y * spreads[:, -1:])
+    spread_x = spreads[:, :1]
+    spread_y = spreads[:, -1:]  # the same column as for x if there is only one
+    rotation, scales = _ellipse_axes(move_along_x * spread_x, move_along_y * spread_y)
     thickness = SURFEL_THICKNESS_RATIO * scales.amin(dim=-1, keepdim=True)
     scales = torch.cat([scales, thickness], dim=-1)  # [N, 3]
 

@@ -69,8 +69,8 @@ def file_records(folder: Path, files: Iterable[Path]) -> dict[str, dict[str, obj
 def matches_records(folder: Path, report: str, records: object) -> bool:
     """Whether a folder still holds the files whose `file_records` a report contains.
 
-    Sizes are compared. Contents are compared, too, if a file is newer than the report, as in a
-    copied folder; hashing every file of every finished photo would take minutes.
+    Sizes are always compared, but contents only if a file is newer than the report, as the files of
+    a copied folder are: hashing every file of every finished photo would take minutes.
 
     Args:
         folder: the folder of the files.
@@ -100,7 +100,7 @@ def _matches_record(folder: Path, name: str, record: Any, report_time: int) -> b
     facts = (folder / name).stat()
     if facts.st_size != record["bytes"]:
         return False
-    # A copied file keeps the time of its content (mtime), but not that of its entry (ctime).
+    # A copied file may keep the time of its content (mtime), but not that of its entry (ctime).
     is_newer = max(facts.st_mtime_ns, facts.st_ctime_ns) > report_time
     if not is_newer:
         return True

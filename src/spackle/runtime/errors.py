@@ -27,8 +27,8 @@ def reason_in_a_line(error: object) -> str:
     is_pydantic = callable(getattr(error, "errors", None))
     if is_pydantic:
         return first_validation_problem(error)
-    # An error of the operating system also has a text without error number and file name.
-    # The caller names the file, so that shorter text is better.
+    # An error of the operating system also has a text without error number and file name, which is
+    # better here, because the caller's message names the file.
     text = str(getattr(error, "strerror", None) or error)
     without_line_breaks = " ".join(text.split())
     return printable_line(without_line_breaks)[:MAX_REASON_LENGTH] or type(error).__name__

@@ -124,7 +124,7 @@ class Reporter:
 
         def log_step(done: int, remark: str) -> None:
             """Log the steps done, and the time left if all steps take equally long."""
-            # Steps of an earlier run took no time in this one.
+            # Steps of an earlier run took no time in this one, so they do not count.
             seconds_per_step = (time.monotonic() - start_time) / max(1, done - start)
             time_left = timedelta(seconds=round(seconds_per_step * (total - done)))
             self.log(f"{name}: {done} of {total}, {remark}, {time_left} left")
@@ -225,7 +225,7 @@ def catch_stop_signals(single_process: bool) -> Iterator[Callable[[], bool]]:
     caught_signals: list[int] = []
 
     def remember(number: int, frame: object) -> None:
-        """Handle a signal."""
+        """Handle a signal: note it, and let a second Ctrl-C raise a KeyboardInterrupt."""
         caught_signals.append(number)
         if single_process:
             signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -55,7 +55,7 @@ def parallel_map(
         gpu: whether each process uses one GPU.
 
     Raises:
-        InputError: no job can be done, or a process has died.
+        InputError: no worker can be made, or a process has died.
     """
     process_count = min(count, len(jobs))
     if process_count < 2:
@@ -109,7 +109,7 @@ def _results_as_they_arrive(
             for future in done:
                 yield future.result()
     except BrokenProcessPool as error:
-        # If the user has stopped the command, Ctrl-C has ended the processes, too.
+        # A user who stops the command may have ended its processes, too; that is no error.
         if not stop():
             raise InputError(
                 "a worker process died, probably because memory ran out: give fewer `workers`; "
@@ -130,6 +130,7 @@ def _start_process(threads: int, open_worker: Callable[[], Any], gpu_numbers: An
         open_worker: makes the object that does the jobs.
         gpu_numbers: a queue that holds one number, or None for no GPU, for each process.
     """
+    # The worker is made at the first job, because only jobs can report errors to the main process.
     global _get_worker
     _get_worker = functools.cache(open_worker)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main process decides what Ctrl-C ends
