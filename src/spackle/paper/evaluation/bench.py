@@ -202,7 +202,7 @@ def time_case(
     measurements = [
         image_measurement(title, case.name, name, value) for name, value in facts.items()
     ]
-    # A view costs what the base costs, and what the method adds.
+    # To show a view needs the base, too, which was timed once: its seconds count for each view.
     for view in large_views(prediction, options.disparities, options.max_side):
         for method in _time_view(view, context, evaluation.renderer.device, runs):
             numbers = view_numbers(

@@ -147,7 +147,7 @@ def _report_missing_metrics(
 
 def _report_results(run: Run, output: Path, reporter: Reporter) -> None:
     """Log a table of means, and how many images were measured."""
-    # The means answer the first question; the files have the details.
+    # Users look for the means first; the files in `output` have the details.
     for line in to_plain_lines(means_table(run, run.measurements)):
         reporter.log(line)
 

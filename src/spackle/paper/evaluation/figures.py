@@ -245,14 +245,14 @@ def _figure_row(
         tag = ""
         if name == HOLE_PICTURE:
             _draw_frame(picture)
-        elif shows_hole:
-            pass  # beside the hole itself, no other marks are needed
-        elif name == "base":
-            boxes = find_hole_boxes(pictures[HOLE_PICTURE])
-        else:
-            tag = _added_share_tag(run, image, name)
+        # A figure with a picture of the hole itself needs no boxes and no tags.
+        elif not shows_hole:
+            if name == "base":
+                boxes = find_hole_boxes(pictures[HOLE_PICTURE])
+            else:
+                tag = _added_share_tag(run, image, name)
         row.append(GridPicture(picture, tag, boxes))
-    return GridRow("", row)
+    return GridRow(caption="", pictures=row)
 
 
 def _draw_frame(picture: Image.Image) -> None:

@@ -131,7 +131,9 @@ def image_file(output: Path, index: int, name: str, suffix: str) -> Path:
         suffix: the end of the file's name.
     """
     safe_name = re.sub(r"[^A-Za-z0-9.-]+", "_", name)
-    return output / IMAGES_FOLDER / f"{index:05d}-{safe_name[-MAX_NAME_LETTERS:]}{suffix}"
+    # Of a long name the end is kept, because the beginning is often the same for all images.
+    short_name = safe_name[-MAX_NAME_LETTERS:]
+    return output / IMAGES_FOLDER / f"{index:05d}-{short_name}{suffix}"
 
 
 def measure_images(plan: RunPlan, measure: MeasureImage, reporter: Reporter) -> Run | None:
@@ -251,7 +253,7 @@ def _measure_image(
 
 def _problem_of(case: Case, error: InputError, plan: RunPlan) -> Measurement:
     """The measurement of an image that could not be measured: its value is the reason."""
-    # Results hold no paths of this machine.
+    # Results go to other people, so the path of the dataset on this machine is cut off.
     reason = str(error).replace(f"{plan.root}/", "")
     reason = " ".join(reason.splitlines())
     # The reason may name a photo that several cases share, so the case is named, too.
@@ -267,6 +269,7 @@ def _open_folder(plan: RunPlan) -> None:
         InputError: the folder holds results of another command or with other options.
     """
     make_folder(plan.output / IMAGES_FOLDER)
+    # A killed run may have left files that were not yet renamed to their final names.
     remove_half_written(plan.output, plan.output / IMAGES_FOLDER)
 
     config_path = plan.output / CONFIG_FILE

@@ -83,7 +83,8 @@ def describe_method(name: str) -> MethodDescription:
     if name in METHODS:
         return METHODS[name]
 
-    # Without its module; a method of another version of Spackle has none.
+    # Of "package.module:Name" the title is what follows the colon. Without a colon, as in results
+    # of another version of Spackle, it is the whole name.
     _, _, plugin_name = name.rpartition(":")
     return MethodDescription(
         title=plugin_name,

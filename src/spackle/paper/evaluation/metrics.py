@@ -156,7 +156,7 @@ def psnr(image: Tensor, true_picture: Tensor, mask: Tensor | None = None) -> flo
 
 
 def sharpness(image: Tensor, true_picture: Tensor, mask: Tensor) -> float:
-    """The image's mean gradient magnitude in grey, divided by that of the true picture.
+    """The mean gradient magnitude of the image as grey, divided by that of the true picture.
 
     1 is as sharp as the true picture, 0 has no detail. Only pixels at least 3 pixels inside the
     mask count, because the mask's border is an edge of its own.

@@ -189,11 +189,11 @@ def _draw_tag(
         font_size: height of letters, in pixels.
     """
     x, y = corner
-    # The anchor "ra" (right, ascender) means that `place` is the text's upper right corner.
-    place = (x - gap, y + gap)
-    left, top, _, bottom = draw.textbbox(place, tag, font_size=font_size, anchor="ra")
+    # The anchor "ra" (right, ascender) means that `text_corner` is the text's upper right corner.
+    text_corner = (x - gap, y + gap)
+    left, top, _, bottom = draw.textbbox(text_corner, tag, font_size=font_size, anchor="ra")
     draw.rectangle((left - gap, top - gap, x, bottom + gap), fill="white")
-    draw.text(place, tag, "black", font_size=font_size, anchor="ra")
+    draw.text(text_corner, tag, "black", font_size=font_size, anchor="ra")
 
 
 def _resized_to_width(picture: Image.Image, width: int) -> Image.Image:

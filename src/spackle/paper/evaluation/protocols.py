@@ -86,7 +86,7 @@ def measure_views(
         dataset: the dataset's title, for the measurements.
         image: the image's name, for the measurements.
         context: the base's Gaussians (which all methods start from), the renderer and the network.
-        viewpoints: the views. A setting is a size of the camera move, or "near".
+        viewpoints: the views. Each has a setting: a size of the camera move as text, or "near".
         methods: for each name the method; it gets all cameras of a setting at once, because it may
             complete their views together.
         suite: the metrics.
@@ -142,9 +142,9 @@ def _measure_view(
         suite: the metrics.
     """
     # What the base alone shows; the hole is where its Gaussians cover too little.
-    before = context.renderer.render(context.base, view.camera)
-    hole = hole_mask(before.alpha)  # [H, W]
-    hole_ratio = hole_area_ratio(before.alpha)
+    base_rendering = context.renderer.render(context.base, view.camera)
+    hole = hole_mask(base_rendering.alpha)  # [H, W]
+    hole_ratio = hole_area_ratio(base_rendering.alpha)
     true_picture = None if view.read_true_picture is None else view.read_true_picture()
 
     white_hole = hole.cpu()[..., None].expand(-1, -1, 3).float()  # [H, W, 3]
@@ -152,12 +152,14 @@ def _measure_view(
     measurements = []
 
     for method, fill in fills.items():
-        filled = fill(view.camera, before)
+        filled = fill(view.camera, base_rendering)
         picture = filled.rgb.cpu()  # true pictures are on the CPU, too
         pictures[method] = picture
 
         # Pictures are compared as they are, in full size; only stored pictures are made smaller.
-        numbers = _hole_numbers(filled, hole_ratio, hole.numel(), len(context.base))
+        numbers = _hole_numbers(
+            filled, hole_ratio, pixel_count=hole.numel(), base_count=len(context.base)
+        )
         numbers += suite.measure(picture, true_picture, hole)
         for metric, value in numbers:
             if metric == REMARK_METRIC:
@@ -212,5 +214,6 @@ def _hole_numbers(
         numbers.append(("aux", added_count))
         numbers.append(("aux_share", added_count / base_count))
         numbers.append(("merged", base_count + added_count))
-        numbers.append(("hole_cells", hole_ratio * pixel_count / CELL**2))  # CELL: 2 pixels
+        cell_count = pixel_count / CELL**2  # a cell has 2×2 pixels
+        numbers.append(("hole_cells", hole_ratio * cell_count))
     return numbers

@@ -179,12 +179,13 @@ def _part_of_run(run: Run, folder: Path, max_images: int) -> ReportPart:
         position = "" if ranking is None else _position_text(index, len(names))
         images.append(_report_image(run, names[index], position, slider_files))
 
-    # A metric that fails leaves the same remark for each view.
+    # A metric that fails leaves the same remark for each view; each is listed once.
     remarks = [
         (measurement.image, measurement.value)
         for measurement in run.measurements
         if measurement.metric == REMARK_METRIC
     ]
+    distinct_remarks = list(dict.fromkeys(remarks))
     return ReportPart(
         run=run,
         paper_images=PAPER_IMAGE_COUNTS.get(run.title),
@@ -193,7 +194,7 @@ def _part_of_run(run: Run, folder: Path, max_images: int) -> ReportPart:
         plots=plots_of_run(run),
         ranking=ranking,
         images=images,
-        remarks=list(dict.fromkeys(remarks)),
+        remarks=distinct_remarks,
     )
 
 
@@ -298,8 +299,8 @@ def _report_image(run: Run, name: str, position: str, files: Mapping[str, Path])
 def _first_slider_pictures(names: Sequence[str]) -> tuple[str, str]:
     """The names of the pictures that a slider shows at first on the left and on the right.
 
-    On the left is the base, on the right "spackle", or else the last picture; a single picture is
-    on both sides.
+    On the left is the base, or if it is missing the first picture; on the right is "spackle", or if
+    it is missing the last picture. A single picture is on both sides.
     """
     left = "base" if "base" in names and len(names) > 1 else names[0]
     for name in ("spackle", *reversed(names)):

@@ -78,7 +78,7 @@ def mark_best(
         texts: the number's texts.
         lower_is_better: whether the smallest number is the best.
     """
-    # Readers compare texts, so the best is one that they can tell from the others.
+    # Readers see texts, not numbers: if all look alike, none is the best.
     text_of_value = {
         value: text for value, text in zip(values, texts, strict=True) if value is not None
     }

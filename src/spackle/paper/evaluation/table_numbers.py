@@ -189,7 +189,15 @@ def _entry_text(mean: Mean | None, column: Column, method: str) -> str:
 def texts_of_methods(
     measurements: Iterable[Measurement], columns: Sequence[Column], methods: Sequence[str]
 ) -> list[list[str]]:
-    """For each method a list of texts, one for each column; the best of a column is marked bold."""
+    """The texts of a table's entries: for each method a list with a text for each column.
+
+    In columns that say whether lower is better, the best text is marked bold.
+
+    Args:
+        measurements: the numbers; several for an entry are averaged.
+        columns: the table's columns of numbers.
+        methods: the names of the methods, one for each row.
+    """
     values = group_values(measurements, "method", "setting", "metric")
 
     texts_by_column = []
@@ -205,5 +213,5 @@ def texts_of_methods(
             texts = mark_best(numbers, texts, column.lower_is_better)
         texts_by_column.append(texts)
 
-    # From one list for each column to one for each method.
+    # Columns are filled one after the other, but the result is a list for each row.
     return [list(texts) for texts in zip(*texts_by_column, strict=True)]

@@ -48,8 +48,8 @@ def method_row_name(run: Run, method: str, title: str = "") -> str:
 def shown_methods(layout: TableLayout, run: Run) -> dict[str, str]:
     """The methods of a run that have a row in a table, each with the name of its row.
 
-    A layout with `row_titles` lists its methods. Any other layout shows all methods of the run; if
-    it has a `needed_metric`, only those that were measured by this metric, without the base.
+    A layout with `row_titles` names the methods that it shows. Any other layout shows all methods
+    of the run, or, with a `needed_metric`, all but the base that were measured by this metric.
     """
     if layout.row_titles is not None:
         return {
@@ -135,7 +135,7 @@ def _residual_note(run: Run) -> str:
     if residual["weights"] == "given":
         return f"Residual: given weights ({digest_start})."
 
-    # The paper's recipe trained neither the shipped weights nor a network without weights.
+    # The note says what differs from the paper, whose recipe did not make the shipped weights.
     if residual["sha256"]:
         weights = f"the residual has the weights that ship with Spackle ({digest_start})"
     else:

@@ -433,7 +433,7 @@ def _expanded_overhead_content(
 ) -> TableContent:
     """Heads and rows of the table of counts, times and rates.
 
-    A dataset's group has rows for each setting (size of the camera move), and of these one for each
+    Each dataset has a group of rows: for each setting (size of the camera move) a row for each
     method.
     """
     # "From" is the method that a row's numbers are from; "n" is the number of images.

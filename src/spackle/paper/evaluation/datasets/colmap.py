@@ -376,8 +376,9 @@ def _cameras_txt(path: Path) -> Iterator[CameraRecord]:
 def _images_txt(path: Path) -> Iterator[ImageRecord]:
     """Yield the photos of an images.txt.
 
-    Each photo has two lines: key, quaternion wxyz, translation, camera's key and name; and for each
-    observation x, y and the point's id. The second is empty if the photo sees no point.
+    Each photo has two lines. The first has key, quaternion wxyz, translation, the camera's key and
+    the photo's name. The second has x, y and the point's id for each observation; it is empty if
+    the photo sees no point.
     """
     lines = _lines(path)
     for line in lines:
@@ -385,6 +386,7 @@ def _images_txt(path: Path) -> Iterator[ImageRecord]:
             continue
         _, *pose, camera_key, name = line.split(maxsplit=9)  # 10 words; a name may have spaces
 
+        # The second line; at the file's end it may be missing instead of empty.
         words = next(lines, "").split()
         numbers = np.array(words, np.float64).reshape(-1, 3)
         observations = np.empty(len(numbers), OBSERVATION_DTYPE)

@@ -121,6 +121,7 @@ def _read_table(path: Path, photo_count: int) -> NDArray[Any]:
         has_shape = table.ndim == 2 and table.shape[1] == ROW_LENGTH
         has_floats = table.dtype.kind == "f"
         if not has_shape or not has_floats or not np.isfinite(table).all():
+            # The text becomes the reason in the InputError's message.
             raise ValueError(f"{table.dtype} of shape {table.shape}")
 
         positive_columns = [
@@ -156,7 +157,7 @@ def _camera_of_row(row: NDArray[Any], where: str) -> Camera:
     down, right, backwards, position, size_and_focal = matrix.unbind(1)
     height, width, focal = size_and_focal
 
-    # OpenCV's axes are right, down and forward.
+    # The file's axes are down, right and backwards, those of OpenCV right, down and forward.
     camera_to_world = torch.eye(4, dtype=torch.float64)
     camera_to_world[:3] = torch.stack([right, down, -backwards, position], dim=1)
     # The principal point is the image's middle.

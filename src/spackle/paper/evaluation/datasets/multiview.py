@@ -68,7 +68,7 @@ def camera_from_pose(
     Raises:
         InputError: intrinsics or pose are impossible.
     """
-    # The pose is checked as the file has it, because messages are about the file.
+    # The pose is checked before it is inverted, so that messages show the numbers of the file.
     camera = checked_camera(
         K,
         camera_to_world,
