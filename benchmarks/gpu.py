@@ -320,7 +320,7 @@ def completion(options: argparse.Namespace) -> Iterator[str]:
         f"{len(found[0]):,} and {len(found[1]):,} Gaussians; mean difference {apart:.1e}; "
         f"holes {hole_area_ratio(one.alpha):.3%} and {hole_area_ratio(other.alpha):.3%}"
     )
-    placed, guard = contexts[0].placed, contexts[0].photo_guard()
+    placed, guard = contexts[0].on_renderer_device, contexts[0].photo_guard()
     before = gpu.render(placed.base, view)
     places = counted_waits(lambda: fill_view(placed, view, [guard], before))
     yield f"{len(places)} waits: {', '.join(sorted(set(places)))}"

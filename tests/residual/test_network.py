@@ -20,7 +20,7 @@ from spackle.core.color import linear_to_srgb, srgb_to_linear
 from spackle.paper.training.residual import first_network
 from spackle.render.protocol import Rendering
 from spackle.residual import ViewFeatures, hole_area_ratio, hole_mask
-from spackle.residual.architectures import NOTE, load_residual, open_residual
+from spackle.residual.architectures import ARCHITECTURE_KEY, load_residual, open_residual
 from spackle.residual.composer import DELTA_CHANNELS
 from spackle.residual.initializer import sample_photo
 from spackle.residual.network import ResidualNet
@@ -122,7 +122,7 @@ def test_a_loaded_network_equals_the_saved_one(name: str, tmp_path: Path) -> Non
     )
     to_channels_last(network)  # the memory format of loaded networks, so that sums have one order
     tensors = {key: value.half().contiguous() for key, value in network.state_dict().items()}
-    save_file(tensors, path, {NOTE: name})
+    save_file(tensors, path, {ARCHITECTURE_KEY: name})
     loaded = load_residual(path)
     assert loaded.name == name
     context, camera = box_view()
@@ -143,7 +143,7 @@ def test_a_loaded_network_equals_the_saved_one(name: str, tmp_path: Path) -> Non
         ("os:remove", "not a subclass"),
         ("never_imported:Network", "unknown architecture"),
     ):
-        save_file(tensors, path, {NOTE: wrong})
+        save_file(tensors, path, {ARCHITECTURE_KEY: wrong})
         with pytest.raises(InputError, match=said):
             load_residual(path)
 
@@ -172,7 +172,7 @@ def test_a_network_of_another_package_is_trained_saved_and_read(
     vars(module).update(TwoLayers=TwoLayers, types=types)
     path = tmp_path / "weights.safetensors"
     tensors = {key: value.contiguous() for key, value in TwoLayers().state_dict().items()}
-    save_file(tensors, path, {NOTE: TwoLayers.name})
+    save_file(tensors, path, {ARCHITECTURE_KEY: TwoLayers.name})
     with pytest.raises(InputError, match="unknown architecture tests_own_network:TwoLayers"):
         load_residual(path)  # a file must not import modules
 

@@ -18,8 +18,8 @@ ARCHITECTURES = {
     "sharp-decoder": "spackle.residual.sharp_decoder:SharpDecoder",  # the paper's
 }
 SHIPPED = Path(__file__).parent.parent / "weights" / "residual.safetensors"
-NOTE = "spackle.residual"  # the metadata key of the architecture's name in a file of weights
-NAME_WITHOUT_NOTE = "unet"  # a file without this key is older than the second architecture
+ARCHITECTURE_KEY = "spackle.residual"  # in a file's metadata: the architecture's name
+NAME_IN_OLD_FILES = "unet"  # files without this key are older than the second architecture
 MAX_NAME_IN_MESSAGE = 60  # characters; the name comes from a stranger's file
 
 
@@ -29,10 +29,11 @@ def network_class(name: str) -> type[ResidualNet]:
 
     InputError if there is no such network. The module is imported, which runs its code.
     """
-    found = load_plugin(ARCHITECTURES.get(name, name), "network")
-    if not (isinstance(found, type) and issubclass(found, ResidualNet)):
+    path = ARCHITECTURES.get(name, name)  # "package.module:Class"
+    plugin = load_plugin(path, "network")
+    if not (isinstance(plugin, type) and issubclass(plugin, ResidualNet)):
         raise InputError(f"`network` {name}: not a subclass of spackle.residual.ResidualNet")
-    return found
+    return plugin
 
 
 def open_residual(name: str) -> ResidualNet:
@@ -47,21 +48,23 @@ def shipped_network() -> ResidualNet | None:
 
 
 def load_residual(path: str | os.PathLike[str]) -> ResidualNet:
-    """Read a network; InputError if the file is missing or broken, or holds another network.
+    """Read a residual network from a file of weights, whose metadata name the network's class.
 
     A network of another package is accepted only if its module was imported before, because a file
     must not choose which code runs.
+
+    InputError if the file is missing or broken, or if no such network is known.
     """
     advice = "give the residual's weights, 'initial' or 'none'"
     tensors = read_tensors(path, advice)
-    name = read_metadata(path, NOTE) or NAME_WITHOUT_NOTE
+    name = read_metadata(path, ARCHITECTURE_KEY) or NAME_IN_OLD_FILES
 
-    # "package.module:Class", for a network of another package.
+    # The name of another package's network has the form "package.module:Class".
     module, _, class_name = name.partition(":")
     is_imported = module in sys.modules and class_name.isidentifier()
     if name not in ARCHITECTURES and not is_imported:
-        shown = printable_line(name)[:MAX_NAME_IN_MESSAGE]
-        raise InputError(f"{path}: unknown architecture {shown}: {advice}")
+        short_name = printable_line(name)[:MAX_NAME_IN_MESSAGE]
+        raise InputError(f"{path}: unknown architecture {short_name}: {advice}")
     network = network_class(name).untrained_for(tensors)
 
     # Convolutions are faster on a CPU if the channels of a pixel are neighbours in memory.

@@ -132,13 +132,13 @@ class ViewCompletion:
         """[h, w, c] float32: the channels of one of the network's inputs, for each cell (2×2
         pixels).
 
-        Colours are moved to -0.5..0.5. Depths are log(inverse depth / median), so their unit does
-        not matter.
+        Colours are shifted from 0..1 to -0.5..0.5. Depths are log(inverse depth / median), so
+        their unit does not matter.
 
         Args:
             name: "rgb", "depth", "alpha": what was rendered; "mask": where holes are; "initial":
                 depth and colour of the initial Gaussians, the first guess of what fills a cell;
-                "photo": the photo's colour there.
+                "photo": the photo's colour at the initial Gaussians.
         """
         if name == "rgb":
             return self.features.rgb - 0.5
@@ -149,7 +149,7 @@ class ViewCompletion:
         if name == "alpha":
             return self.features.alpha[..., None]
         if name == "mask":
-            return self.mask.to(self.features.alpha)[..., None]
+            return self.mask.to(self.features.alpha.dtype)[..., None]  # 1 in holes
         if name == "initial":
             log_depth = self._log_depth(self.initial.inverse_depth)
             return torch.cat([log_depth[..., None], self.initial.rgb - 0.5], dim=-1)
@@ -194,7 +194,7 @@ class ViewCompletion:
         """
         chosen = self.initial.select(cells)
         if deltas is None:
-            return compose(chosen, None, self.camera)
+            return compose(chosen, deltas=None, camera=self.camera)
 
         index = cells
         if cells.dtype == torch.bool:
@@ -205,9 +205,10 @@ class ViewCompletion:
 def view_type_of(
     network: ResidualNet | None, default: type[ViewCompletion]
 ) -> type[ViewCompletion]:
-    """The class that computes the inputs which a network names.
+    """The class that completes views for a network, and computes the inputs that it names.
 
-    Most networks state no such class (`view_type`), and get `default`.
+    A network whose inputs need a class of their own states it as `view_type`; for all others, and
+    without a network, the class is `default`.
     """
     if network is None or network.view_type is None:
         return default
@@ -241,8 +242,8 @@ def complete_view(
         network: the residual network (f_res), on any device; None: holes are filled by the initial
             Gaussians, the first guess that a network would change.
         threshold: a pixel with a lower opacity is a hole (τ_α).
-        least: if fewer cells are holes, so many of the least opaque cells are filled (paper,
-            training details: 64).
+        least: the least number of cells to fill: if fewer are holes, the `least` least opaque cells
+            are filled (the paper trains with 64).
         rendering: the base as the view shows it, if already available.
         photo: [H, W, 3] sRGB, for a network that names the input "photo"; None: the base rendered
             from the photo's camera.

@@ -67,11 +67,13 @@ def compose(
             initial_opacities,
         )
 
-    # Colours and opacities change in the sigmoid's domain, so that they stay within 0..1.
+    # The 14 channels in SHARP's order: 2 of the pixel, 1, 3, 4 of the quaternion, 3, 1.
     shift_px, nearer, scale, turn, color, opacity = torch.split(deltas, DELTA_SIZES, dim=1)
     inverse_depth = _add_to_positive(
         initial.inverse_depth, SMALL_STEP * nearer.squeeze(1), initial.unit
     )
+
+    # Colours and opacities change in the sigmoid's domain, so that they stay within 0..1.
     colors = srgb_to_linear(torch.sigmoid(color_logit(initial.rgb) + color))
     opacities = torch.sigmoid(color_logit(initial_opacities) + opacity.squeeze(1))
     surfels = make_surfels(
@@ -100,7 +102,7 @@ def color_logit(value: Tensor) -> Tensor:
 
 
 def _add_to_positive(value: Tensor, delta: Tensor, unit: float) -> Tensor:
-    """Add to positive numbers in such a way that they stay positive.
+    """Add `delta` to positive numbers in such a way that they stay positive.
 
     The result is unit · softplus(softplus⁻¹(value / unit) + delta). Large values change by
     delta · unit, small values by a factor exp(delta).

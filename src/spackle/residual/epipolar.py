@@ -26,11 +26,11 @@ MIN_EPIPOLE_OFFSET = 1e-9 * CELL
 def trace_epipolar_lines(
     uv: Tensor, values: Tensor, inverse_depth: Tensor, mask: Tensor, camera: Camera, eye: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Values at the rim of a hole, for each cell of the hole, found along the cell's epipolar line.
+    """For each cell of a hole, the values where the cell's epipolar line meets the hole's rim.
 
-    From each hole cell, the line is followed in both directions to the first visible cells. Of
-    these two cells at the rim of the hole, the farther one counts, because a hole uncovers what
-    lies behind.
+    From each hole cell, the line is followed in both directions to the first visible cells. These
+    two cells lie at the rim of the hole. The one with the greater depth counts, because a hole
+    uncovers what lies behind.
 
     Args:
         uv: [h, w, 2] pixels (x, y) of the cells' centres.
@@ -42,10 +42,10 @@ def trace_epipolar_lines(
             epipole.
 
     Returns:
-        Values [h, w, c] at the rim; values [h, w, c] at the cell's mirror image beyond the rim, or
-        those at the rim if the mirror image lies on another surface; distance [h, w] to the rim in
-        cells. Visible cells, and cells whose line leaves the view before it meets a visible one,
-        have their own values and the distance 0.
+        Three grids: values [h, w, c] at the rim; values [h, w, c] at the cell's mirror image beyond
+        the rim, or those at the rim if the mirror image lies on another surface; distance [h, w] to
+        the rim in cells. Visible cells, and cells whose line leaves the view before it meets a
+        visible one, have their own values and the distance 0.
     """
     eye = eye.double()
     # Homogeneous coordinates, because the epipole may lie at infinity.
@@ -75,8 +75,10 @@ def _trace_lines(
     start: int, stop: int, uv: Any, values: Any, inverse_depth: Any, hole: Any, epipole: Any,
     same_surface_ratio: float, at_rim: Any, mirrored: Any, distance: Any,
 ) -> None:  # fmt: skip
-    """For the hole cells of the rows start..stop, write the values at the far rim along the
-    epipolar line.
+    """For the hole cells of the rows start..stop, write the values where the cell's epipolar line
+    meets the hole's rim.
+
+    The line meets the rim on two sides; the side with the greater depth counts.
 
     Args:
         start, stop: first row, and the row after the last.
@@ -85,9 +87,11 @@ def _trace_lines(
         inverse_depth: [h, w] 1/z.
         hole: [h, w] bool.
         epipole: [3] homogeneous pixel (x, y, w).
-        same_surface_ratio: cells with a smaller ratio of inverse depths lie on one surface.
+        same_surface_ratio: two cells whose inverse depths differ by a smaller factor lie on one
+            surface.
         at_rim: output [h, w, c], values at the rim; cells without a rim are left as they are.
-        mirrored: output [h, w, c], values at the mirror image of the cell beyond the rim.
+        mirrored: output [h, w, c], values at the mirror image of the cell beyond the rim, or those
+            at the rim if the mirror image lies on another surface.
         distance: output [h, w], steps of one cell to the rim.
     """
     height, width = inverse_depth.shape
@@ -97,7 +101,7 @@ def _trace_lines(
                 continue
             line_x, line_y = _line_direction(epipole, uv[y, x, 0], uv[y, x, 1])
 
-            # The smaller inverse depth is the farther side of the hole.
+            # Search in both directions; the side with the smaller inverse depth is the farther one.
             rim_inverse_depth = np.float32(np.inf)
             rim_steps = 0
             rim_sign = 0.0

@@ -24,9 +24,8 @@ MASK_THRESHOLD = 0.95  # τ_α of eq. 4: a pixel with a lower opacity is a hole
 CELL = 2  # pixels along a cell's side
 CELL_PIXELS = CELL * CELL
 RGB_CHANNELS = 3
-MIN_DIVISOR = (
-    1e-6  # depths and summed opacities are raised to this before something is divided by them
-)
+# Depths and summed opacities are raised to this before something is divided by them.
+MIN_DIVISOR = 1e-6
 
 
 def hole_mask(alpha: Tensor, threshold: float = MASK_THRESHOLD) -> Tensor:

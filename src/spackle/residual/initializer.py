@@ -83,20 +83,24 @@ def initialize(features: ViewFeatures, camera: Camera, photo_camera: Camera) -> 
     """
     uv = to_like(cell_centers(camera), features.rgb)
 
-    # If every cell touches a hole, cells with at least one visible pixel must do.
+    # Holes are filled from the cells without a hole pixel. If there is none, cells with at least one
+    # visible pixel take their place.
     known = ~features.mask
     if not bool(known.any()):
         known = features.inverse_depth > 0
     if not bool(known.any()):
         return _grey_wall(features, uv)
 
-    # A first fill, from all sides of a hole alike, tells which cells lie beyond the photo's border.
-    no_values = features.rgb.permute(2, 0, 1)[:0]
-    even_inverse_depth, _ = fill_from_far_side(
-        features.inverse_depth, no_values, known, far_bias=0.0
+    # A first fill, in which near and far sides of a hole count alike, tells which cells lie beyond
+    # the photo's border. It fills depths alone, and no colours.
+    no_colors = features.rgb.permute(2, 0, 1)[:0]  # [0, h, w]
+    unbiased_inverse_depth, _ = fill_from_far_side(
+        features.inverse_depth, no_colors, known, far_bias=0.0
     )
-    inside = inside_photo(even_inverse_depth, camera, photo_camera)
-    filled, rgb = fill_around(features, even_inverse_depth, uv, known, inside, camera, photo_camera)
+    inside = inside_photo(unbiased_inverse_depth, camera, photo_camera)
+    filled, rgb = fill_around(
+        features, unbiased_inverse_depth, uv, known, inside, camera, photo_camera
+    )
     inverse_depth = place_behind_surfaces(
         filled, features.mask, features.inverse_depth, GAUSSIAN_REACH_CELLS
     )
@@ -127,8 +131,7 @@ def _grey_wall(features: ViewFeatures, uv: Tensor) -> InitialGaussians:
 
 
 def inside_photo(inverse_depth: Tensor, camera: Camera, photo_camera: Camera) -> Tensor:
-    """[h, w] bool: whether the photo's camera sees the point of a cell, were nothing in front of
-    it.
+    """[h, w] bool: whether the point of a cell projects into the photo; it may be hidden there.
 
     `inverse_depth` [h, w] is 1/z of the cells' points as `camera` sees them.
     """
@@ -143,18 +146,20 @@ def sample_photo(
 
     Args:
         photo: [H', W', 3] sRGB.
-        elsewhere: [h, w, 3] sRGB for points that lie outside of the photo, or behind its camera.
+        elsewhere: [h, w, 3] sRGB, taken for points that lie outside of the photo, or behind its
+            camera.
         inverse_depth: [h, w] 1/z of the cells' points as `camera` sees them.
         camera: of the view.
         photo_camera: of the photo.
     """
     place, z = _project_into_photo(inverse_depth, camera, photo_camera)
 
-    # The photo is averaged over cells as well, since a cell has one colour.
+    # A cell has one colour, so the photo's pixels are averaged over 2×2 pixels as well.
     photo_channels_first = photo.cpu().movedim(-1, 0)[None]  # [1, 3, H', W']
     photo_cells = avg_pool2d(photo_channels_first, CELL, ceil_mode=True, count_include_pad=False)
 
-    # grid_sample counts from -1 to 1; the clamp keeps points near the camera's plane finite.
+    # grid_sample counts from -1 to 1 across the photo. The clamp to -2..2 keeps the places of points
+    # near the camera's plane finite; those outside are replaced below.
     grid = (2 * place / z.clamp_min(MIN_DIVISOR) - 1).clamp(-2, 2).to(photo_cells)[None]
     sampled = grid_sample(photo_cells, grid, padding_mode="border", align_corners=False)
     photo_colors = sampled[0].movedim(0, -1)  # [h, w, 3]
@@ -176,11 +181,12 @@ def _project_into_photo(
     """Project the points of a view's cells (2×2 pixels) into the photo, homogeneously.
 
     A point's place in the photo is (x, y), from 0 to 1 across the photo; its depth there is z. The
-    place is not divided by z, so points in the plane of the photo's camera do no harm.
+    result is (x·z, y·z) and z, because a division by z would fail for points in the plane of the
+    photo's camera.
 
     Args:
-        inverse_depth: [h, w] 1/z of the cells as `camera` sees them. Points are multiplied by it,
-            which changes neither x nor y nor the sign of z.
+        inverse_depth: [h, w] 1/z of the cells as `camera` sees them. The points are scaled by it
+            about the photo's camera, which changes neither x nor y nor the sign of z.
         camera: of the view.
         photo_camera: of the photo.
 
@@ -196,10 +202,10 @@ def _project_into_photo(
 
 
 def _rays_in_photo(uv: Tensor, camera: Camera, photo_camera: Camera) -> tuple[Tensor, Tensor]:
-    """Rays [h, w, 3] through a view's cells in the frame of the photo's camera, and the motion view
-    → photo [4, 4].
+    """Rays [h, w, 3] through a view's cells in the frame of the photo's camera, and the motion
+    [4, 4] from the view's frame to the photo's.
 
-    A point X at depth z in the view is X / z = ray + t / z in the photo's frame, with the motion's
+    The point of a cell at depth z in the view is z · ray + t in the photo's frame, with the motion's
     translation t. `uv` [h, w, 2] are the cells' pixels.
     """
     world_to_view = camera.world_to_camera.cpu().double()
@@ -207,7 +213,8 @@ def _rays_in_photo(uv: Tensor, camera: Camera, photo_camera: Camera) -> tuple[Te
     motion = to_like(world_to_photo @ world_to_view.inverse(), uv)
     K = to_like(camera.K, uv)
     directions = (uv - K[:2, 2]) / K.diagonal()[:2]  # x and y at z = 1
-    return directions @ motion[:3, :2].T + motion[:3, 2], motion
+    rays = directions @ motion[:3, :2].T + motion[:3, 2]  # rotated directions (x, y, 1)
+    return rays, motion
 
 
 # Depth of holes -----------------------------------------------------------------------------------
@@ -222,16 +229,16 @@ def place_behind_surfaces(filled: Tensor, cells: Tensor, visible: Tensor, radius
         visible: [h, w] inverse depth of visible surfaces; 0: none.
         radius: surfaces within so many rows and columns of a cell count.
     """
-    # The least inverse depth nearby, as a maximum of the negative. A little behind it, a Gaussian
-    # does not show through the surface.
+    # The least inverse depth nearby, as a maximum of the negative.
     farthest_nearby = -maximum_filter(-torch.where(visible > 0, visible, torch.inf), radius)
+    # A Gaussian at exactly this depth would show through the surface, so it goes a little farther.
     behind = torch.minimum(filled, farthest_nearby) * (1 - BEHIND_SURFACE_RATIO)
     return torch.where(cells, behind, filled)
 
 
 def fill_around(
     features: ViewFeatures,
-    even_inverse_depth: Tensor,
+    unbiased_inverse_depth: Tensor,
     uv: Tensor,
     known: Tensor,
     inside: Tensor,
@@ -240,13 +247,13 @@ def fill_around(
 ) -> tuple[Tensor, Tensor]:
     """Inverse depth [h, w] and sRGB [3, h, w] of all cells, with the holes filled.
 
-    Holes inside the photo are filled from the far side of their rim. Beyond the border, the surface
-    that ends at the border is extended; a hole there that lies behind a nearer surface is filled
-    like one inside.
+    A hole that a nearer object of the photo covered is filled from the far side of its rim. A hole
+    beyond the photo's border is filled by extending the surface that ends at the border.
 
     Args:
         features: the rendered view, in cells of 2×2 pixels.
-        even_inverse_depth: [h, w], holes filled from all sides alike.
+        unbiased_inverse_depth: [h, w] inverse depth of a first fill, in which the near and the far
+            side of a rim counted alike.
         uv: [h, w, 2] pixels of the cells.
         known: [h, w] bool: the cells whose depth and colour are continued into the holes.
         inside: [h, w] bool: the cells whose points project into the photo.
@@ -255,35 +262,38 @@ def fill_around(
     """
     colors = features.rgb.movedim(-1, 0)  # [3, h, w]
 
-    # Inside the photo, the far side of a rim decides; beyond the border (bias 0), all sides do.
+    # Inside the photo, the far side of a rim decides. Beyond the border the bias is 0, by which near
+    # and far side count alike.
     far_bias = FAR_SIDE_BIAS * inside
     beyond = features.mask & ~inside
     if not bool(beyond.any()):
         return fill_from_far_side(features.inverse_depth, colors, known, far_bias=far_bias)
 
     hidden, extended, extended_inverse_depth = _extend_border_surfaces(
-        features, even_inverse_depth, uv, beyond, known, camera, photo_camera
+        features, unbiased_inverse_depth, uv, beyond, known, camera, photo_camera
     )
 
-    # Cells behind a nearer surface belong to the far side of their hole, although they lie beyond
-    # the border.
+    # Beyond the border, too, a nearer object may have covered a cell: such cells are filled from the
+    # far side.
     far_bias = torch.where(hidden, FAR_SIDE_BIAS, far_bias)
     filled, filled_colors = fill_from_far_side(
         features.inverse_depth, colors, known, far_bias=far_bias
     )
     filled = torch.where(extended, extended_inverse_depth, filled)
 
-    # The other cells beyond the border continue the extended surfaces, which are known only now.
+    # The first of these fills did not know the extended surfaces. So the depths of the other cells
+    # beyond the border are filled again, now also from the extended surfaces; their colours stay.
     others = beyond & ~extended
     if bool(others.any()):
-        refilled, _ = fill_from_far_side(filled, colors[:0], extended | known, far_bias=far_bias)
+        no_colors = colors[:0]
+        refilled, _ = fill_from_far_side(filled, no_colors, extended | known, far_bias=far_bias)
         filled = torch.where(others, refilled, filled)
     return filled, filled_colors
 
 
 def _extend_border_surfaces(
     features: ViewFeatures,
-    even_inverse_depth: Tensor,
+    unbiased_inverse_depth: Tensor,
     uv: Tensor,
     beyond: Tensor,
     known: Tensor,
@@ -296,32 +306,44 @@ def _extend_border_surfaces(
     A surface is extended along epipolar lines, at constant depth z in the photo's frame; a floor
     thus stays a floor.
 
-    Args: as for `fill_around`.
+    Args:
+        features: the rendered view, in cells of 2×2 pixels.
+        unbiased_inverse_depth: [h, w] 1/z of a first fill, in which the near and the far side of a
+            hole counted alike.
+        uv: [h, w, 2] pixels of the cells.
+        beyond: [h, w] bool: hole cells whose points project outside of the photo.
+        known: [h, w] bool: cells whose depth was rendered.
+        camera: of the view.
+        photo_camera: of the photo.
 
     Returns:
         Three grids [h, w]: cells that lie behind a surface which ends inside the photo (bool);
         cells that continue a surface (bool); and the inverse depth of this surface.
     """
     rays, motion = _rays_in_photo(uv, camera, photo_camera)
-    points = rays + motion[:3, 3] * even_inverse_depth[..., None]  # X / z in the photo's frame
+    # The cells' points in the photo's frame, divided by their depth z in the view.
+    points = rays + motion[:3, 3] * unbiased_inverse_depth[..., None]  # [h, w, 3]
     relative_z = points[..., 2:].clamp_min(MIN_DIVISOR)  # z in the photo / z in the view
     photo_K = to_like(photo_camera.K, uv)
     photo_pixels = points[..., :2] / relative_z * photo_K.diagonal()[:2] + photo_K[:2, 2]
 
-    # Whether a surface ends at the photo's border, or inside because something nearer covers it.
+    # A surface ends either at the photo's border, or inside the photo, where something nearer covers
+    # the rest. Only the first kind is extended.
     photo_size = to_like(torch.tensor([photo_camera.width, photo_camera.height]), photo_pixels)
     to_border_px = torch.minimum(photo_pixels, photo_size - photo_pixels).amin(-1)
     ends_at_border = to_border_px < AT_BORDER_WIDTHS * photo_camera.width
-    photo_inverse_depth = even_inverse_depth / relative_z[..., 0]
-    values = torch.stack([photo_inverse_depth, ends_at_border.to(even_inverse_depth)], dim=-1)
+    photo_inverse_depth = unbiased_inverse_depth / relative_z[..., 0]
+
+    # Where the epipolar line of a cell meets the rim of its hole: the surface that ends there.
+    values = torch.stack([photo_inverse_depth, ends_at_border.to(unbiased_inverse_depth)], dim=-1)
     at_rim, _, steps = trace_epipolar_lines(
-        uv, values, even_inverse_depth, features.mask, camera, photo_camera.position
+        uv, values, unbiased_inverse_depth, features.mask, camera, photo_camera.position
     )
     rim_photo_inverse_depth = at_rim[..., 0]
-    rim_ends_inside = at_rim[..., 1] == 0
+    rim_ends_inside = at_rim[..., 1] == 0  # `ends_at_border` is false
 
     # z_photo = ray_z · z_view + t_z, solved for z_view = (z_photo − t_z) / ray_z.
-    ahead = 1 / rim_photo_inverse_depth.clamp_min(MIN_DIVISOR) - motion[2, 3]
+    ahead = 1 / rim_photo_inverse_depth.clamp_min(MIN_DIVISOR) - motion[2, 3]  # z_photo − t_z
     hidden = beyond & (steps > 0) & rim_ends_inside
     extended = beyond & ~hidden & (steps > 0) & (ahead > 0) & (rays[..., 2] > 0)
     inverse_depth = (rays[..., 2] / ahead.clamp_min(MIN_DIVISOR)).clamp_min(MIN_DIVISOR)

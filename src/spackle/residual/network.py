@@ -49,8 +49,11 @@ class ResidualNet(nn.Module):
 
 
 def channel_slices(names: Iterable[str], channels: Mapping[str, int]) -> dict[str, slice]:
-    """The place of each input among a network's channels, from the names in order and their numbers
-    of channels.
+    """Where the channels of each input lie among all channels of a network, by the input's name.
+
+    Args:
+        names: the network's inputs, in the order of their channels.
+        channels: the number of channels of each input, by name.
     """
     slices: dict[str, slice] = {}
     start = 0
@@ -74,8 +77,8 @@ def predict_deltas(
 ) -> Tensor:
     """Deltas [h, w, 14] of a view, float32 on the CPU; 0 outside of `cells`.
 
-    A network whose deltas depend only on nearby cells runs on a few rectangles around `cells`, any
-    other on the view.
+    A network whose deltas depend only on nearby cells (`network.local`) runs on a few rectangles
+    around `cells`; any other runs on the whole view.
 
     Args:
         network: f_res, on any device.
@@ -87,9 +90,11 @@ def predict_deltas(
     dtype = pick_dtype(precision, device)
     deltas = torch.zeros(*cells.shape, DELTA_CHANNELS)
     if network.local:
+        # Rectangles start and end at multiples of the stride: at cells of the coarsest grid.
         crops = crops_around_mask(cells, STRIDE)
     else:
-        whole_view = Crop(0, 0, *cells.shape)
+        height, width = cells.shape
+        whole_view = Crop(top=0, left=0, bottom=height, right=width)
         crops = [(whole_view, whole_view)]
 
     # One autocast block around all crops, so that the weights are converted once.
@@ -108,7 +113,7 @@ def predict_deltas(
                 crop_deltas = network(crop)
             crop_deltas = crop_deltas[0].permute(1, 2, 0).float().cpu()  # [rows, columns, 14]
 
-            # Rectangles also hold cells whose deltas nobody asked for.
-            wanted = cells[inner.slices][..., None]
-            deltas[inner.slices] = torch.where(wanted, crop_deltas, 0)
+            # A rectangle also holds cells whose deltas nobody asked for; these stay 0.
+            is_asked_for = cells[inner.slices][..., None]
+            deltas[inner.slices] = torch.where(is_asked_for, crop_deltas, 0)
     return deltas

@@ -37,14 +37,17 @@ class SharpDecoder(ResidualNet):
     local = False  # group norms make a cell depend on all others
 
     def __init__(self, config: SharpConfig = FULL_SIZE) -> None:
-        """Random weights, with heads at zero, for SHARP's published size or another `config`."""
+        """Make the layers, with random weights; the heads start at zero, so that an untrained network
+        changes nothing.
+
+        `config` is the size of SHARP, by default the published one.
+        """
         super().__init__()
         self.slices = channel_slices(self.inputs, ViewCompletion.INPUT_CHANNELS)
-        channels = self.slices[self.inputs[-1]].stop
-        widths = (
-            config.depth_width,
-            *config.pyramid_channels,
-        )  # channels of the decoder's maps, finest first
+        channels = self.slices[self.inputs[-1]].stop  # of all inputs: the end of the last one
+
+        # The channels of the decoder's maps, finest first.
+        widths = (config.depth_width, *config.pyramid_channels)
         self.stem = nn.Conv2d(channels, STEM_WIDTH, 3, padding=1)
         self.down = nn.ModuleList(
             nn.Conv2d(STEM_WIDTH, STEM_WIDTH, 3, stride=2, padding=1) for _ in widths[1:]
@@ -61,7 +64,8 @@ class SharpDecoder(ResidualNet):
         """
         for name, layer in self.feature_model.named_modules():
             if isinstance(layer, (nn.Conv2d, nn.ConvTranspose2d)):
-                # The last convolution of each of SHARP's residual blocks.
+                # The last convolution of a residual block of SHARP is its layer 3 or 5: a block has
+                # norms or not. Zero weights there make the block the identity.
                 ends_block = name.endswith(("residual.3", "residual.5"))
                 set_random_weights(layer, gain=0.0 if ends_block else 1.0)
         set_random_weights(self.stem, gain=STEM_GAIN)
@@ -85,13 +89,13 @@ class SharpDecoder(ResidualNet):
         height, width = features.shape[-2:]
         features = pad_to_stride(features)
 
-        # The decoder's maps, from one cell to 16 cells a side; each is half as large as the one
-        # before.
+        # The decoder's maps, from fine to coarse. In the finest, a place is one cell; in each further
+        # map it is twice as long and wide.
         x = torch.relu(self.stem(features))
         maps: list[Tensor] = []
         for to_map, down in itertools.zip_longest(self.maps, self.down):
             maps.append(to_map(x))
-            if down is not None:  # after the coarsest map
+            if down is not None:  # nothing comes after the coarsest map
                 x = torch.relu(down(x))
 
         # SHARP's decoder reads a picture of colours and disparities in -1..1. Here depths come as
@@ -99,33 +103,41 @@ class SharpDecoder(ResidualNet):
         view_depth = self.slices["depth"].start
         initial_depth = self.slices["initial"].start
         depths = torch.tanh(features[:, [view_depth, initial_depth]] / 2)
+        # The input "initial" is a depth followed by a colour in -0.5..0.5.
         initial_rgb = features[:, initial_depth + 1 : self.slices["initial"].stop]
         picture = torch.cat([2 * initial_rgb, depths], dim=1)  # [B, 5, h, w] in -1..1
 
-        # SHARP's picture has four pixels for each Gaussian.
+        # The decoder predicts one Gaussian for 2×2 pixels of its picture, so each cell is repeated.
         pixels = interpolate(picture, scale_factor=2, mode="nearest")
-        no_coarser_features = x.new_zeros(())  # is added to the coarsest map
+
+        # There are no features coarser than the coarsest map. Zero in their place lets this map, like
+        # the others, pass all layers that combine it with coarser features.
+        no_coarser_features = x.new_zeros(())
         texture, geometry = self.feature_model(pixels, maps, no_coarser_features)
         deltas = torch.cat([self.geometry(geometry), self.texture(texture)], dim=1)
         return deltas[..., :height, :width]
 
 
 def set_random_weights(layer: nn.Conv2d | nn.ConvTranspose2d, gain: float) -> None:
-    """Set random weights that scale the magnitude of a layer's input by about `gain`, and a bias of
-    zero.
+    """Set a layer's bias to zero, and its weights to random numbers by which its outputs are about
+    `gain` times as large as its inputs.
     """
     # The number of inputs that one output sums.
     inputs = layer.weight[0].numel()
     if isinstance(layer, nn.ConvTranspose2d):
-        inputs = layer.in_channels  # with stride 2 and a 2×2 kernel, one pixel
+        # Its 2×2 kernel has stride 2, so an output sums the channels of a single pixel.
+        inputs = layer.in_channels
     nn.init.normal_(layer.weight, std=gain / math.sqrt(inputs))
     if layer.bias is not None:
         nn.init.zeros_(layer.bias)
 
 
 def decoder_size(tensors: Mapping[str, Tensor]) -> SharpConfig:
-    """The size of the SHARP decoder in a file, from its tensors by name; the published size if
-    there is no decoder.
+    """The size of the SHARP decoder whose weights a file holds; the published size if the file
+    holds no such decoder.
+
+    `tensors` are the file's tensors by name. The sizes differ in the channels of the decoder's last
+    layer, and so in the length of its bias.
     """
     last_bias = tensors.get("feature_model.fusion.out_conv.bias")
     if last_bias is not None:

@@ -69,20 +69,22 @@ class FillContext:
     )
 
     @functools.cached_property
-    def placed(self) -> FillContext:
+    def on_renderer_device(self) -> FillContext:
         """The same context, with base and network on the renderer's device."""
         device = self.renderer.device
         if self.base.means.device.type == device.type:
             return self
 
-        # A copy, because a torch module is moved in place, and the given one belongs to the caller.
+        # `to` moves a torch module in place. The caller's network must stay where it is, so a copy
+        # is moved.
         network = None if self.network is None else copy.deepcopy(self.network).to(device)
         return dataclasses.replace(self, base=self.base.to(device), network=network)
 
     @property
     def photo_rendering(self) -> Rendering:
         """The base rendered from the photo's camera, on the renderer's device."""
-        return self.photo_cache.render(self.renderer, self.placed.base, self.photo_camera)
+        base = self.on_renderer_device.base
+        return self.photo_cache.render(self.renderer, base, self.photo_camera)
 
     @property
     def without_network(self) -> FillContext:
@@ -96,13 +98,13 @@ class FillContext:
         return OcclusionGuard.of(self.photo_rendering, self.photo_camera, self.threshold)
 
     def view(self, rendering: Rendering, camera: Camera) -> SceneViewCompletion:
-        """The completion of one view; its parts are computed when they are asked for.
+        """The object that completes one view; its parts are computed when they are asked for.
 
         Args:
             rendering: the base, and what was added to it before, as the view's camera sees them.
             camera: of the view.
         """
-        # A network with inputs of its own brings the class that computes them.
+        # A network that has inputs of its own also states the class that computes them.
         view_type = view_type_of(self.network, SceneViewCompletion)
         if not issubclass(view_type, SceneViewCompletion):
             raise TypeError(f"{view_type.__name__} must be a subclass of SceneViewCompletion")

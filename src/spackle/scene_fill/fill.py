@@ -71,14 +71,15 @@ def fill_view(
             photo alone.
         rendering: the base rendered from this view, if already available.
     """
+    # Everything is done on the renderer's device; the result returns to the base's device.
     device = context.base.means.device
-    placed = context.placed
+    context = context.on_renderer_device
     if guards is None:
-        guards = [placed.photo_guard()]
-    renderer = IncrementalRenderer(placed.renderer, placed.base)
+        guards = [context.photo_guard()]
+    renderer = IncrementalRenderer(context.renderer, context.base)
     view_rendering = renderer.render(camera, rendering)
     filled = _fill_in_passes(
-        placed, renderer, view_rendering, camera, guards, max_hole_ratio=0, with_underlays=False
+        context, renderer, view_rendering, camera, guards, max_hole_ratio=0, with_underlays=False
     )
     aux = Gaussians.cat([Gaussians.empty(), *filled.aux])
     return FilledView(aux.to(device), filled.rendering.to(device))
@@ -106,16 +107,16 @@ def fill_scene(
         exact: check every view, and complete every view that has a hole. Otherwise invisibly small
             holes may remain, and only half of a long path's frames are checked.
         progress: called with (number of visited views, number of views to visit).
-        always_filled: indices of cameras that are checked even if they are not in that half. Order
-            and half follow from the places of the eyes alone, so a view that shows more from the
-            same place would be left out.
+        always_filled: indices of cameras that are checked even if they are not in that half. The
+            half is chosen by the cameras' positions alone. So it may leave out a view that stands
+            at the place of another, but shows more (it is wider, or looks elsewhere).
     """
     device = context.base.means.device
     if not cameras:
         return FilledScene(Gaussians.empty(device), {})
 
     # Everything is done on the renderer's device; the result returns to the base's device.
-    filling = _SceneFilling(context.placed, cameras, exact, always_filled)
+    filling = _SceneFilling(context.on_renderer_device, cameras, exact, always_filled)
     for count, index in enumerate(filling.views_to_fill, start=1):
         filling.visit(index)
         if progress:
@@ -139,8 +140,8 @@ class _SceneFilling:
         Args:
             context: the photo's base and the settings of the fill, on the renderer's device.
             cameras: the views.
-            exact: visit every view, and leave no hole; otherwise half of the views, and holes that
-                are invisibly small stay open.
+            exact: visit every view, and leave no hole. Otherwise only half of the views are visited,
+                and invisibly small holes stay open.
             always_filled: indices of views that are visited in any case.
         """
         self.context = context
@@ -151,34 +152,40 @@ class _SceneFilling:
             self.views_to_fill = order
             self.max_hole_ratio = 0.0
         else:
-            # The views in between show hardly anything that their neighbours do not show.
-            checked = max(MIN_VIEWS_TO_FILL, len(order) // 2)
-            others = [index for index in order[checked:] if index in always_filled]
-            self.views_to_fill = [*order[:checked], *others]
+            # The first half is spread over the whole path. The views of the second half lie between
+            # them, and show hardly anything that their neighbours do not show.
+            first_half = max(MIN_VIEWS_TO_FILL, len(order) // 2)
+            others = [index for index in order[first_half:] if index in always_filled]
+            self.views_to_fill = [*order[:first_half], *others]
             self.max_hole_ratio = INVISIBLE_HOLE_RATIO
 
         # No new Gaussian may hide what the photo or one of the widest views shows.
         self.renderer = IncrementalRenderer(context.renderer, context.base)
         self.guards = {PHOTO: context.photo_guard()}
-        self.base_renders: dict[int, Rendering] = {}  # by view, until the view is visited
+        # Renderings of the base alone, by the view's index; dropped when the view is visited.
+        self.base_renderings: dict[int, Rendering] = {}
         for index in order[:GUARDED_VIEWS]:
-            self.base_renders[index] = self.renderer.render(cameras[index])
+            self.base_renderings[index] = self.renderer.render(cameras[index])
             self.guards[index] = OcclusionGuard.of(
-                self.base_renders[index], cameras[index], context.threshold
+                self.base_renderings[index], cameras[index], context.threshold
             )
 
         self.filled_views = 0
         self.aux = [Gaussians.empty()]  # everything that was added
 
-        # The views' indices, and the Gaussians beneath the rims of their holes, still at the place
-        # where the view wants them: one view may show, and fill better, what the other's rims hide.
+        # Pairs (view's index, Gaussians that it needs beneath the rims of its holes). They wait until
+        # the two widest views are filled, because one of these may show, and fill better, what lies
+        # beneath the rims of the other.
         self.pending_underlays: list[tuple[int, Gaussians]] = []
-        self.pictures: dict[int, Tensor] = {}  # of views that show the scene as it is now
+
+        # [H, W, 3] uint8 sRGB, by the view's index: final renderings, as long as nothing is added.
+        self.pictures: dict[int, Tensor] = {}
 
     def visit(self, index: int) -> None:
         """Render a view with everything added so far, and fill its holes if they are visible."""
         camera = self.cameras[index]
-        rendering = self.renderer.render(camera, self.base_renders.pop(index, None))
+        base_rendering = self.base_renderings.pop(index, None)  # no longer needed afterwards
+        rendering = self.renderer.render(camera, base_rendering)
         hole_ratio = hole_area_ratio(rendering.alpha, self.context.threshold)
         if hole_ratio <= self.max_hole_ratio:
             self.pictures[index] = to_uint8(rendering.rgb)
@@ -191,13 +198,16 @@ class _SceneFilling:
             camera,
             self._other_guards(index),
             max_hole_ratio=self.max_hole_ratio,
-            with_underlays=len(self.cameras) > 1,
+            with_underlays=len(self.cameras) > 1,  # a single view shows nothing beneath its rims
         )
         self.aux += filled.aux
         self.pending_underlays += [(index, underlay) for underlay in filled.underlays]
         self.filled_views += 1
         self.guards[index] = OcclusionGuard.of(filled.rendering, camera, self.context.threshold)
         self.pictures.clear()  # the added Gaussians may appear in them
+
+        # The two widest views show nearly all holes. When they are filled, what lies beneath the
+        # rims of their holes is known.
         if self.filled_views >= OPPOSITE_VIEWS:
             underlays = self._place_underlays()
             self.renderer.add(*underlays)
@@ -206,7 +216,7 @@ class _SceneFilling:
     def finish(self) -> FilledScene:
         """All added Gaussians, and the pictures that show them."""
         if self.pending_underlays:
-            self.pictures.clear()
+            self.pictures.clear()  # the underlays may appear in them
         aux = Gaussians.cat([*self.aux, *self._place_underlays()])
         return FilledScene(aux, self.pictures)
 
@@ -230,10 +240,11 @@ class _SceneFilling:
         return [guard for view, guard in self.guards.items() if view != index]
 
     def _place_underlays(self) -> list[Gaussians]:
-        """The pending underlays, moved behind the surfaces of all other views.
+        """The pending underlays, moved behind the surfaces of all other views; none is pending
+        afterwards.
 
-        An underlay are the Gaussians that one view has added beneath the rims of its holes. None is
-        pending afterwards.
+        An underlay consists of Gaussians beneath the rims of one view's holes. It closes the slits
+        that other views would show there.
         """
         placed = [
             move_behind_surfaces(underlay, self.cameras[index].position, self._other_guards(index))
@@ -263,8 +274,9 @@ def _fill_in_passes(
     max_hole_ratio: float,
     with_underlays: bool,
 ) -> _FilledHoles:
-    """Fill the holes of a view, render it, and fill what stayed open; `renderer` keeps the added
-    Gaussians.
+    """Fill the holes of a view, render it, and fill the holes that stayed open.
+
+    The added Gaussians are returned, and are also added to the scene of `renderer`.
 
     Args:
         context: network, texture and threshold for this view.
@@ -273,12 +285,13 @@ def _fill_in_passes(
         camera: of the view.
         guards: surfaces of other views, in front of which no new Gaussian may lie.
         max_hole_ratio: no further pass if at most this fraction of pixels are holes.
-        with_underlays: continue the filling beneath the rims of the holes.
+        with_underlays: also make Gaussians beneath the rims of the holes.
     """
     aux: list[Gaussians] = []
     underlays: list[Gaussians] = []
     for pass_index in range(PASSES):
-        # In the second pass, the network would predict the same faint Gaussians again.
+        # Where holes stayed open, the network predicted faint Gaussians. It would do so again, so the
+        # second pass goes without it.
         pass_context = context if pass_index == 0 else context.without_network
         view = pass_context.view(rendering, camera)
         if not bool(view.mask.any()):

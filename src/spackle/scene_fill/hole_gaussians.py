@@ -60,8 +60,8 @@ def fill_holes(
     deltas = view.deltas(context.network, context.precision)
     cells = view.gaussians(mask, deltas)
 
-    # Gaussians that would hide a guarded surface move away along their line of sight. Single cells
-    # that stayed near, between others that moved, would look like specks: they move along.
+    # Gaussians that would hide a guarded surface move away along their line of sight. A single cell
+    # that stayed near, between others that moved, would look like a speck, so it moves like them.
     depths = view.camera.to_camera(cells.means)[:, 2]
     scales = unoccluding_scales(cells, eye, guards)
     smooth_scales = without_pits(depths * scales, mask) / depths
@@ -75,13 +75,15 @@ def fill_holes(
         picture = context.texture(view, structure)
         pixels = _textured_pixels(view, deltas, picture, scales)
 
-        # As in a lifted photo, a cell's own Gaussian lies behind the Gaussians of its pixels.
+        # A cell's own Gaussian lies a little behind the Gaussians of its pixels, and has their mean
+        # colour. So it shows only where they leave gaps.
         scales = scales / (1 - BEHIND_SURFACE_RATIO)
         cell_pixels = group_by_cell(picture)[mask]
         linear_means = srgb_to_linear(cell_pixels.clamp(0, 1)).mean((1, 2))
         cells = dataclasses.replace(cells, colors=linear_means)
 
-    # Without network and texture, a later underlay continues the first guess as it is.
+    # Beneath the rims of the holes, these surfaces will be continued. Without network and texture,
+    # they are the first guess as it is.
     surfaces = view.initial
     if context.network is not None or context.texture is not None:
         surfaces = _follow_beyond_photo(view, depths * scales, scales > 0)
@@ -120,11 +122,12 @@ def _textured_pixels(
 def _follow_beyond_photo(
     view: SceneViewCompletion, depths: Tensor, is_kept: Tensor
 ) -> InitialGaussians:
-    """The surface points of all cells of a view, at the new Gaussians' depths beyond the photo.
+    """The view's initial Gaussians, but beyond the photo's border at the depths of the new
+    Gaussians.
 
-    The initial Gaussians are the first guess of such a point for each cell of 2×2 pixels. In hole
-    cells, new Gaussians may since have moved away from the camera. What is later placed beneath the
-    rims of holes continues these points, so beyond the photo's border they follow the Gaussians.
+    An initial Gaussian is the first guess of a surface point for a cell of 2×2 pixels. New
+    Gaussians started there, and may have moved away from the camera since. The result is later
+    continued beneath the rims of holes, so it must lie where the new Gaussians lie.
 
     Args:
         view: the view.
@@ -155,7 +158,8 @@ def pixel_gaussians(
         """The values of each cell, once for each of its pixels."""
         return field.repeat_interleave(pixels_a_cell, 0)
 
-    # The pixels lie on the cell's plane, but never more than twice as far as its centre.
+    # The pixels lie on the cell's plane. Their inverse depth is at least half that of the cell's
+    # centre, so that a steep plane does not carry them to infinity.
     cell_inverse_depth = repeat(initial.inverse_depth)
     rise = (initial.slope[:, None] * PIXEL_OFFSETS).sum(-1).flatten()
     inverse_depth = (cell_inverse_depth + rise).clamp_min(0.5 * cell_inverse_depth)
@@ -167,6 +171,8 @@ def pixel_gaussians(
         unit=initial.unit,
     )
     pixel_deltas = None if deltas is None else repeat(deltas)
-    composed = compose(pixels, pixel_deltas, camera, PIXEL_SIGMA_PX)
+    composed = compose(pixels, pixel_deltas, camera, spread_px=PIXEL_SIGMA_PX)
+
+    # The pixels' own colours replace those that the network predicts for the cell.
     linear_colors = srgb_to_linear(colors.flatten(0, 2).clamp(0, 1))
     return dataclasses.replace(composed, colors=linear_colors)

@@ -22,7 +22,7 @@ class IncrementalRenderer:
     """
 
     def __init__(self, renderer: Renderer, base: Gaussians) -> None:
-        """Start with the base alone; `base` is on the renderer's device."""
+        """Start with the base alone, and no rendering; `base` is on the renderer's device."""
         self._renderer = renderer
         self._device = renderer.device
         self._base = base
@@ -56,10 +56,12 @@ class IncrementalRenderer:
     def _redraw(self, changed: Sequence[Gaussians]) -> Rendering:
         """Draw the tiles of the last view that the Gaussians `changed` touch, and copy all
         others.
+
+        Tiles are squares of pixels that the renderer draws one by one.
         """
+        # A view must have been rendered before.
         assert self._camera is not None
         assert self._last is not None
-        # Tiles are squares of pixels that the renderer draws one by one.
         tiles = touched_tiles(changed, self._camera)
         if bool(tiles.any()):
             scene = [self._base, *self._added]

@@ -32,6 +32,10 @@ MAX_REACH_PX = 40.0  # a Gaussian is checked only up to this distance from its c
 # A near spot in the depths of a hole is removed if it is less than twice as wide, as a fraction of
 # the view's width.
 PIT_RADIUS_WIDTHS = 0.027
+# Where the rows of the extrinsics for x and y begin in a camera's 16 numbers: fx, fy, cx, cy, and
+# the 3×4 extrinsics row by row.
+X_ROW = 4
+Y_ROW = 8
 DEPTH_STEPS = 48  # candidate positions along the line of sight, evenly spaced in inverse depth
 
 
@@ -58,18 +62,22 @@ class OcclusionGuard:
         is_hole = view.alpha < threshold
         surface_depth = torch.where(is_hole, 0, view.depth).float()
 
-        # A Gaussian is tested at its centre, but it reaches some pixels around the centre.
+        # A Gaussian reaches some pixels around its centre, and may hide a surface at any of them. The
+        # greatest depth within a window tells this in one look: a Gaussian in front of it hides it.
         return OcclusionGuard(camera, maximum_filter(surface_depth, WINDOW_PX))
 
 
 def move_behind_surfaces(
     gaussians: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]
 ) -> Gaussians:
-    """Move Gaussians away from an eye until they hide no guarded surface; others are removed.
+    """Move Gaussians away from an eye until they hide no guarded surface.
+
+    They grow as they move, so the eye sees no change. A Gaussian that hides a surface wherever it
+    moves is removed.
 
     Args:
         gaussians: N Gaussians in the world's frame.
-        eye: [3] position of the camera for which they were made; it sees no change.
+        eye: [3] position of the camera for which the Gaussians were made.
         guards: the surfaces of other views.
     """
     return move_from_eye(gaussians, eye, unoccluding_scales(gaussians, eye, guards))
@@ -107,10 +115,10 @@ def unoccluding_scales(
     eye = to_like(eye, gaussians.means)
     eye_position = eye.cpu().double().numpy()
     rays = (gaussians.means - eye).detach().cpu().double().numpy()  # [N, 3]
-    exact = gaussians.detach().to(dtype=torch.float64)
-    covariances = exact.covariances().cpu().flatten(1).numpy()  # [N, 9]
+    double_gaussians = gaussians.detach().to(dtype=torch.float64)
+    covariances = double_gaussians.covariances().cpu().flatten(1).numpy()  # [N, 9]
 
-    # The guards' depth images, one behind the other.
+    # The guards' depth images differ in size, so their pixels are stored one image behind the other.
     cameras = np.stack([_camera_numbers(guard.camera) for guard in guards])
     depths = np.concatenate([guard.depth.numpy().ravel() for guard in guards])
     sizes = np.array([guard.depth.shape for guard in guards])  # [guards, 2]
@@ -138,8 +146,8 @@ def _camera_numbers(camera: Camera) -> Any:
 
 
 def without_pits(depths: Tensor, cells: Tensor) -> Tensor:
-    """Depths [n] of n cells, after a morphological closing: narrow near parts move to the depth
-    around them.
+    """Depths [n] of n cells, in which narrow parts that are nearer than what surrounds them have
+    moved to the depth around them (a morphological closing).
 
     Args:
         depths: [n] z of the cells.
@@ -160,14 +168,17 @@ def _find_scales(
     first: int, stop: int, eye: Any, rays: Any, covariances: Any,
     cameras: Any, depths: Any, sizes: Any, starts: Any, scales: Any,
 ) -> None:  # fmt: skip
-    """Write the least factor 1 / (1 − k / 48) by which each Gaussian hides no surface, or 0.
+    """For each Gaussian, write the least of 48 factors by which it must move away from an eye to
+    hide no guarded surface; 0 if it hides one at all of them.
+
+    The factors are 1 / (1 − step / 48), for step = 0 … 47.
 
     Args:
         first, stop: the Gaussians first..stop are done.
         eye: [3] position from which the Gaussians move away.
         rays: [N, 3] from the eye to the Gaussians' centres.
         covariances: [N, 9] in the world's frame.
-        cameras: [guards, 16], see `_camera_numbers`: fx, fy, cx, cy, 3×4 extrinsics.
+        cameras: [guards, 16]: fx, fy, cx, cy, and the 3×4 extrinsics row by row.
         depths: the pixels of all guards' depth images, one behind the other; 0 is no surface.
         sizes: [guards, 2] height and width of the images.
         starts: [guards + 1] the place of each image's first pixel in `depths`.
@@ -176,15 +187,15 @@ def _find_scales(
     for n in range(first, stop):
         scales[n] = 0
         for step in range(DEPTH_STEPS):
-            # Even steps in inverse depth: 1 / scale = 1 - step / DEPTH_STEPS.
+            # The steps are even in inverse depth: 1 / scale = 1 - step / DEPTH_STEPS.
             scale = 1.0 / (1.0 - step / DEPTH_STEPS)
             x = eye[0] + scale * rays[n, 0]
             y = eye[1] + scale * rays[n, 1]
             z = eye[2] + scale * rays[n, 2]
             hides_surface = False
-            for k in range(len(cameras)):
+            for guard in range(len(cameras)):
                 if _hides_surface(
-                    cameras[k], depths, starts[k], sizes[k, 0], sizes[k, 1],
+                    cameras[guard], depths, starts[guard], sizes[guard, 0], sizes[guard, 1],
                     x, y, z, covariances[n], scale,
                 ):  # fmt: skip
                     hides_surface = True
@@ -224,12 +235,13 @@ def _hides_surface(
         return False
     if u > width + MAX_REACH_PX or v > height + MAX_REACH_PX:
         return False
-    reach_u = _reach_px(camera, 4, camera[0] * scale / depth, tan_u, covariance)
-    reach_v = _reach_px(camera, 8, camera[1] * scale / depth, tan_v, covariance)
+    reach_u = _reach_px(camera, X_ROW, camera[0] * scale / depth, tan_u, covariance)
+    reach_v = _reach_px(camera, Y_ROW, camera[1] * scale / depth, tan_v, covariance)
     if u < -reach_u or v < -reach_v or u > width + reach_u or v > height + reach_v:
         return False
 
-    # A pixel of the guard stands for a window around it; adjacent windows cover the Gaussian.
+    # A depth of the guard is the greatest within a window around its pixel. So it is enough to look
+    # at pixels one window apart, from end to end of the Gaussian.
     window_px = 2 * WINDOW_PX
     steps_u = int(np.ceil(max(reach_u - WINDOW_PX, 0.0) / window_px))
     steps_v = int(np.ceil(max(reach_v - WINDOW_PX, 0.0) / window_px))
@@ -256,7 +268,8 @@ def _reach_px(
         tangent: x / z or y / z of the Gaussian's centre in the camera's frame.
         covariance: [9] of the Gaussian in the world's frame.
     """
-    # The derivative (a, b, c) of the pixel by the world's x, y, z; row 12 of `camera` gives z.
+    # The derivative (a, b, c) of the pixel by the world's x, y, z. From number 12 on, `camera` holds
+    # the row of the extrinsics for z.
     a = px_per_unit * (camera[axis_row] - tangent * camera[12])
     b = px_per_unit * (camera[axis_row + 1] - tangent * camera[13])
     c = px_per_unit * (camera[axis_row + 2] - tangent * camera[14])
@@ -264,5 +277,5 @@ def _reach_px(
     # The variance along the axis is (a, b, c) Σ (a, b, c)ᵀ; Σ is symmetric.
     variance = a * a * covariance[0] + b * b * covariance[4] + c * c * covariance[8]
     variance += 2 * (a * b * covariance[1] + a * c * covariance[2] + b * c * covariance[5])
-    reach = VISIBLE_SIGMAS * np.sqrt(max(variance, 0.0)) + 1.0  # a pixel's own width
+    reach = VISIBLE_SIGMAS * np.sqrt(max(variance, 0.0)) + 1.0  # one more, for a pixel's width
     return float(min(reach, MAX_REACH_PX))

@@ -62,13 +62,13 @@ def exemplar_texture(view: SceneViewCompletion, structure: Tensor) -> Tensor:
     copied = ungroup_cells(copy_patch_blocks(patches, rendered))
     texture = copied - gaussian_blur(copied, TEXTURE_SIGMA_PX)
 
-    # Patches that match badly, and texture stronger than that around the hole, would be
-    # conspicuous.
-    trust = (-patches.mismatch / FADED_MISMATCH).exp()
-    gain = trust * _gain_to_surroundings(texture, view)  # [h, w]
+    # Texture of a patch that matches badly, or stronger than the texture around the hole, would be
+    # conspicuous. Both are weakened.
+    match_quality = (-patches.mismatch / FADED_MISMATCH).exp()  # 1 for a perfect match
+    gain = match_quality * _gain_to_surroundings(texture, view)  # [h, w]
     pixel_gain = ungroup_cells(gain[..., None, None, None].expand(*gain.shape, CELL, CELL, 1))
 
-    # Outside of the hole, the picture is what was rendered.
+    # The picture without texture: smooth colours in the hole; elsewhere what was rendered.
     smooth = group_by_cell(_interpolate_cells(continue_border(view, structure), view.mask))
     in_hole = view.mask[..., None, None, None]
     picture = ungroup_cells(torch.where(in_hole, smooth, rendered))
@@ -91,19 +91,22 @@ def painted_texture(painter: Inpainter, view: SceneViewCompletion, structure: Te
 
 
 def copy_patch_blocks(patches: Patches, blocks: Tensor) -> Tensor:
-    """Fill the blocks of an image's hole cells with blocks from elsewhere in the image. Returns [h,
-    w, k, k, c].
+    """Blocks [h, w, k, k, c] of an image's cells, with those of hole cells copied from elsewhere in
+    the image.
 
-    The matching patches of a cell and of its eight neighbours each propose a block. The filled
-    block is the weighted mean of these blocks; better matches weigh more. `Patches.rgb`, a mean of
-    whole patches, loses fine detail.
+    The matching patches of a cell and of its eight neighbours each propose a block. The copied
+    block is the weighted mean of these blocks; better matches weigh more.
 
     Args:
-        patches: for each hole cell, the cell at the centre of its best patch.
-        blocks: [h, w, k, k, c] the pixels of each cell.
+        patches: for each hole cell, where the centre of its best patch lies in the image, and how
+            badly the patch matches.
+        blocks: [h, w, k, k, c] the k×k pixels of each cell.
     """
     height, width = patches.mismatch.shape
-    sources = torch.stack([blocks, blocks.flip(1, 3)])  # the image, and the image mirrored
+    # Patches come from the image, or from the image mirrored left to right.
+    sources = torch.stack([blocks, blocks.flip(1, 3)])  # [2, h, w, k, k, c]
+
+    # `matches` holds source, row and column of each cell's patch; -1 if the cell has no patch.
     is_matched = patches.matches[..., 0] >= 0
     y, x = is_matched.nonzero(as_tuple=True)  # of n cells
     costs = patches.mismatch.square()
@@ -112,14 +115,16 @@ def copy_patch_blocks(patches: Patches, blocks: Tensor) -> Tensor:
     weighted_sum = torch.zeros_like(blocks[y, x])  # [n, k, k, c]
     total_weight = torch.zeros_like(costs[y, x])  # [n]
     for dy, dx in itertools.product((-1, 0, 1), repeat=2):
+        # A neighbour outside of the image, or without a patch, has the weight 0.
         row = (y + dy).clamp(0, height - 1)
         column = (x + dx).clamp(0, width - 1)
         is_inside = (row == y + dy) & (column == x + dx)
-        is_neighbor = is_inside & is_matched[row, column]
-        weight = is_neighbor * ((-costs[row, column] / mean_cost).exp() + MIN_VOTE_WEIGHT)
+        has_patch = is_inside & is_matched[row, column]
+        weight = (-costs[row, column] / mean_cost).exp() + MIN_VOTE_WEIGHT
+        weight = torch.where(has_patch, weight, 0)
 
-        # The neighbour's patch covers the cell itself by the block one step back from the patch's
-        # centre.
+        # The neighbour lies at (dy, dx) from the cell. So in the neighbour's patch, the block for the
+        # cell itself lies at (-dy, -dx) from the patch's centre.
         source, source_row, source_column = patches.matches[row, column].long().unbind(-1)
         block = sources[
             source.clamp_min(0),
@@ -137,7 +142,8 @@ def copy_patch_blocks(patches: Patches, blocks: Tensor) -> Tensor:
 def _gain_to_surroundings(texture: Tensor, view: SceneViewCompletion) -> Tensor:
     """Factors [h, w] ≤ 1 that make a hole's texture no stronger than the texture around the hole.
 
-    The strength is the energy: the local mean of the squared high frequencies.
+    The strength of a texture is the root of its energy, the local mean of the squared high
+    frequencies.
 
     Args:
         texture: [2h, 2w, 3] the high frequencies of the view, filled in holes.
@@ -152,7 +158,8 @@ def _gain_to_surroundings(texture: Tensor, view: SceneViewCompletion) -> Tensor:
     hole_energy, hole_weight, visible_energy, visible_weight = sums.unbind(-1)
     log_energy_around = (visible_energy / visible_weight).log()
 
-    # Into the hole, the energy is continued from the far side, whose surface fills the hole.
+    # The energy around the hole is continued into it, from the far side of its rim, because the
+    # surface there fills the hole. Beyond the photo's border (bias 0) all sides count alike.
     known = ~view.mask
     if bool(known.any()):
         far_bias = FAR_SIDE_BIAS * ~view.beyond_photo
@@ -180,19 +187,21 @@ def _interpolate_cells(colors: Tensor, mask: Tensor) -> Tensor:
 
 
 def continue_border(view: SceneViewCompletion, structure: Tensor) -> Tensor:
-    """Colours [h, w, 3] that continue the nearest visible colour just beyond the photo's border.
+    """Smooth colours [h, w, 3] of all cells, in which the photo's border is no visible edge.
 
-    With the distance to the nearest visible cell, and with the difference in depth, that colour
-    fades to the given colour of the cell. Holes behind an object keep their given colour, because
-    their nearest visible cell may belong to the object.
+    Just beyond the photo's border, a cell gets the colour of the nearest visible cell. The farther
+    away that cell is, or the more its depth differs, the more the cell keeps its own colour.
+    Holes behind an object keep their own colours, because their nearest visible cell may belong to
+    the object.
 
     Args:
         view: a view with holes, in cells of 2×2 pixels.
-        structure: [h, w, 3] sRGB, the given smooth colours of all cells.
+        structure: [h, w, 3] sRGB, the smooth colours of all cells.
     """
     features = view.features
-    nearest = nearest_known_pixels(view.mask.numpy())  # [2, h, w] row and column
-    row, column = torch.from_numpy(nearest).long().clamp_min(0)  # negative if nothing is visible
+    # Row and column of the nearest visible cell; negative if nothing is visible.
+    nearest = nearest_known_pixels(view.mask.numpy())  # [2, h, w]
+    row, column = torch.from_numpy(nearest).long().clamp_min(0)
     nearest_inverse_depth = features.inverse_depth[row, column].clamp_min(MIN_INVERSE_DEPTH)
     log_depth_ratio = (view.initial.inverse_depth / nearest_inverse_depth).log()
 
@@ -208,8 +217,8 @@ def sharpen_for_overlap(target: Tensor) -> Tensor:
     """Colours [H, W, c] that Gaussians need to show the colours `target` [H, W, c] although they
     overlap.
 
-    Overlap blurs: what is seen is blur(colours). Jacobi steps solve blur(colours) = target
-    approximately.
+    Overlapping Gaussians show blur(colours). So the colours with blur(colours) = target are found,
+    approximately, by a few Jacobi steps.
     """
     colors = target
     for _ in range(SHARPENING_STEPS):

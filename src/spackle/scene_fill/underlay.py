@@ -29,31 +29,34 @@ UNDERLAY_REACH_CELLS = UNDERLAY_STRIDE * GAUSSIAN_REACH_CELLS
 
 
 def rim_underlay(mask: Tensor, surfaces: InitialGaussians, camera: Camera) -> Gaussians:
-    """Gaussians that continue the filling of holes beneath the surfaces around the holes.
+    """Gaussians behind the surfaces around a view's holes, which continue what fills the holes.
 
-    From another view, a slit appears between the rim of a hole and the hole's filling. The underlay
-    closes most slits in advance.
+    From another view, a slit appears between the rim of a hole and the hole's filling. These
+    Gaussians (the underlay) close most slits in advance.
 
     Args:
         mask: [h, w] bool: the cells (2×2 pixels) of the view that touch a hole.
-        surfaces: the surfaces of all cells: the filling inside of holes, the visible surface
-            elsewhere.
+        surfaces: a surface point and its colour for each cell: of the filling in holes, of the
+            visible surface elsewhere.
         camera: of the view.
     """
     # An underlay is smooth: one large Gaussian for every third row and column of cells is enough.
-    coarse = (slice(None, None, UNDERLAY_STRIDE), slice(None, None, UNDERLAY_STRIDE))
+    every_third = slice(None, None, UNDERLAY_STRIDE)
+    coarse = (every_third, every_third)
     around_holes = maximum_filter(mask, UNDERLAY_REACH_CELLS) & ~mask
     rim = around_holes[coarse]
     if not bool(rim.any()) or bool(rim.all()):
         return Gaussians.empty()  # no rim, or nothing that could be continued beneath it
 
-    # All cells that are not at a rim are known: the filling of the holes, and visible surfaces.
+    # The cells at a rim are filled anew, from all other cells: from the holes' filling on one side,
+    # from visible surfaces on the other. Of these two, the farther one counts.
     coarse_inverse_depth, coarse_rgb = fill_from_far_side(
         surfaces.inverse_depth[coarse], surfaces.rgb[coarse].permute(2, 0, 1), ~rim
     )
 
-    # The underlay must lie behind all fine cells that its Gaussians reach, so it is placed on the
-    # fine grid, and then read every third cell again.
+    # The underlay must lie behind the surfaces of all cells that its Gaussians reach, also of those
+    # that the coarse grid leaves out. So it is placed on the fine grid, of which then every third
+    # cell is read again.
     inverse_depth = surfaces.inverse_depth.clone()
     inverse_depth[coarse] = coarse_inverse_depth
     is_underlay = mask.new_zeros(mask.shape)
@@ -62,13 +65,15 @@ def rim_underlay(mask: Tensor, surfaces: InitialGaussians, camera: Camera) -> Ga
         inverse_depth, is_underlay, surfaces.inverse_depth, UNDERLAY_REACH_CELLS
     )[coarse]
 
-    inverse_depth_slopes = inverse_depth_slope(behind)  # per coarse cell
+    slope_per_coarse_cell = inverse_depth_slope(behind)
     cells = InitialGaussians(
         uv=surfaces.uv[coarse],
         inverse_depth=behind,
-        slope=inverse_depth_slopes / (UNDERLAY_STRIDE * CELL),  # per pixel
+        slope=slope_per_coarse_cell / (UNDERLAY_STRIDE * CELL),  # per pixel
         rgb=coarse_rgb.permute(1, 2, 0),
         unit=surfaces.unit,
     )
-    underlay = compose(cells.select(rim), None, camera)
+    underlay = compose(cells.select(rim), deltas=None, camera=camera)
+
+    # One Gaussian covers 3×3 cells, so it is three times as large as one for a single cell.
     return dataclasses.replace(underlay, scales=UNDERLAY_STRIDE * underlay.scales)

@@ -68,12 +68,13 @@ class UNet(ResidualNet):
         """
         super().__init__()
         slices = channel_slices(self.inputs, SceneViewCompletion.INPUT_CHANNELS)
-        channels = slices[self.inputs[-1]].stop
+        channels = slices[self.inputs[-1]].stop  # of all inputs: the end of the last one
         rim = slices["rim"].start
         patches = slices["patches"].start
 
-        # Channels of the colours that can be copied, as differences from the initial colour: at the
-        # rim, mirrored at the rim, and of patches.
+        # Where the colours that can be copied lie among the input's channels: the colour at the rim
+        # of the hole, the colour mirrored at the rim, and the colour of patches. Each has three
+        # channels, and is stored as a difference from the initial colour.
         self.copied_colors = (
             slice(rim, rim + 3),
             slice(rim + 3, rim + 6),
@@ -102,13 +103,16 @@ class UNet(ResidualNet):
         for name, layer in self.named_modules():
             if not isinstance(layer, nn.Conv2d):
                 continue
-            ends_block = name.endswith("second")
-            if ends_block or name in ("geometry.2", "texture.2"):
+            # A residual block has the convolutions `first` and `second`, and adds its input to the
+            # output of `second`. Layer 2 of a head is its last one.
+            if name.endswith("second") or name in ("geometry.2", "texture.2"):
                 gain = 0.0
             elif name == "stem":
                 gain = STEM_GAIN
+            elif name.endswith("first"):
+                gain = RELU_GAIN
             else:
-                gain = RELU_GAIN if name.endswith("first") else 1.0
+                gain = 1.0
             set_random_weights(layer, gain)
 
     def forward(self, features: Tensor, inner: Crop | None = None) -> Tensor:
@@ -118,7 +122,8 @@ class UNet(ResidualNet):
         `features` [B, 21, h, w] are the channels named in `inputs`.
         """
         if inner is None:
-            inner = Crop(0, 0, *features.shape[-2:])
+            height, width = features.shape[-2:]
+            inner = Crop(top=0, left=0, bottom=height, right=width)
         x = self.stem(pad_to_stride(features))
 
         # Encode: each level halves the grid. The decoder will need the features of each level.
@@ -131,7 +136,8 @@ class UNet(ResidualNet):
 
         # Decode: each level doubles the grid. The layers on the finest grid (level 0) are the most
         # expensive; they need only a few cells around `inner`.
-        near_inner = inner.grown(FINEST_CONTEXT_CELLS, 1, *skips[0].shape[-2:])
+        height, width = skips[0].shape[-2:]
+        near_inner = inner.grown(FINEST_CONTEXT_CELLS, step=1, height=height, width=width)
         for level in reversed(range(len(skips))):
             x = interpolate(self.up[level](x), scale_factor=2, mode="bilinear", align_corners=False)
             x = x.add_(skips[level])
@@ -148,7 +154,8 @@ class UNet(ResidualNet):
     def _add_copied_colors(self, outputs: Tensor, features: Tensor) -> Tensor:
         """Add weighted copies of known colours to the colour channels of the deltas.
 
-        The known colours are those at the rim of a hole, mirrored at the rim, and of patches.
+        For each cell three colours are known: the colour at the rim of its hole, the colour of its
+        mirror image beyond the rim, and the colour of a patch that matches.
 
         Args:
             outputs: [B, 17, h, w], 14 deltas and the weights of the three known colours.

@@ -22,9 +22,8 @@ from spackle.residual.initializer import inside_photo
 # A rim whose inverse depth exceeds the initial Gaussian's by more than this factor is a nearer
 # surface, which does not continue into the hole.
 NEARER_SURFACE_RATIO = 1.4
-TYPICAL_DISTANCE_CELLS = (
-    16.0  # from a cell to the rim of its hole; makes the network's input of order one
-)
+# From a cell to the rim of its hole; makes the network's input of order one.
+TYPICAL_DISTANCE_CELLS = 16.0
 TYPICAL_MISMATCH = 0.1  # of a patch, in sRGB; makes the network's input of order one
 
 
@@ -60,11 +59,11 @@ class SceneViewCompletion(ViewCompletion):
 
     @functools.cached_property
     def far_rim(self) -> FarRim:
-        """For each hole cell, the colours that lie at the far rim of its hole, along an epipolar
-        line.
+        """For each hole cell, the colours where the cell's epipolar line meets the far rim of its
+        hole.
 
-        Where there is no rim, or only that of a much nearer surface, which does not continue into
-        the hole, the cell keeps its initial colour.
+        A cell keeps its initial colour if its line meets no rim, or if the surface at the rim is
+        much nearer than the cell, and so does not continue into the hole.
         """
         rgb = self.initial.rgb.detach()
         inverse_depth = self.initial.inverse_depth.detach()
@@ -76,7 +75,7 @@ class SceneViewCompletion(ViewCompletion):
             self.camera,
             self.photo_camera.position,
         )
-        rim_inverse_depth = rim_values[..., 3]
+        rim_inverse_depth = rim_values[..., 3]  # the channel after the colour
         is_nearer = self.mask & (rim_inverse_depth > NEARER_SURFACE_RATIO * inverse_depth)
         return FarRim(
             rgb=torch.where(is_nearer[..., None], rgb, rim_values[..., :3]),
@@ -93,8 +92,9 @@ class SceneViewCompletion(ViewCompletion):
     def patches(self) -> Patches:
         """Patches of the view's visible part that match its holes.
 
-        Inside the photo, cells are matched by their initial colours. Beyond the photo's border
-        these are gaussian_blur, and the colours mirrored at the rim serve instead.
+        A patch is sought whose colours resemble a guess. Inside the photo, the guess are the
+        initial colours. Beyond the photo's border these are too blurred, and the colours mirrored
+        at the rim take their place.
         """
         guess = torch.where(
             self.beyond_photo[..., None], self.far_rim.mirrored, self._smooth_colors
@@ -105,8 +105,9 @@ class SceneViewCompletion(ViewCompletion):
     def patch_colors(self) -> Tensor:
         """[h, w, 3] sRGB: colours of patches elsewhere in the view that match its hole cells.
 
-        Beyond the photo's border, patches were found by mirrored colours. So their tone, the low
-        frequencies, may be wrong there, and is replaced by the tone of the initial colours.
+        Beyond the photo's border, patches were chosen for their likeness to mirrored colours. So
+        their tone (the low frequencies) may be wrong there, and is replaced by the tone of the
+        initial colours.
         """
         colors = self.patches.rgb
         tone_difference = approximate_gaussian_blur(colors - self._smooth_colors, TONE_BLUR_CELLS)
@@ -122,8 +123,10 @@ class SceneViewCompletion(ViewCompletion):
         """[h, w, c] float32: the channels of one input, by its name in `INPUT_CHANNELS`; 0 outside
         of holes.
 
-        The colours of "rim" and "patches" are differences from the initial colours, both as logits.
-        A network can thus add them to the initial colours.
+        "rim" has the colour at the rim, the colour mirrored at the rim, and the distance to the rim.
+        "patches" has the colour of matching patches, and how badly they match. These colours are
+        differences from the initial colours, as logits, so that a network can add them to the
+        initial colours.
         """
         if name == "rim":
             initial_logit = color_logit(self.initial.rgb[self.mask])

@@ -441,9 +441,9 @@ def complete_view_in_stages(
     Returns:
         The Gaussians that the method adds for the view.
     """
-    # `placed` has the Gaussians on the renderer's device. The cache of the photo's rendering starts
-    # empty, because each timed run must render the photo's view itself.
-    context = dataclasses.replace(context.placed, photo_cache=PhotoRendering())
+    # The cache of the photo's rendering starts empty, because each timed run must render the photo's
+    # view itself.
+    context = dataclasses.replace(context.on_renderer_device, photo_cache=PhotoRendering())
     base_rendering = context.renderer.render(context.base, camera)
     end_stage("view")
 

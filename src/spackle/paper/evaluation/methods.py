@@ -52,7 +52,7 @@ def make_method(
         direct_ft: needed by the method direct-ft; returns the fine-tuned base's Gaussians, and the
             factor that converts camera positions to the unit of these Gaussians.
     """
-    context = context.placed
+    context = context.on_renderer_device
     if name == "base":
         return _on_top_of_base(context, lambda camera, base_rendering: Gaussians.empty())
     if name == "paper":

@@ -25,7 +25,7 @@ from spackle.paper.training.task import Task
 from spackle.render import Renderer, get_renderer
 from spackle.render.protocol import Rendering
 from spackle.residual.architectures import (
-    NOTE,
+    ARCHITECTURE_KEY,
     load_residual,
     network_class,
     open_residual,
@@ -384,7 +384,7 @@ class ResidualTask(ViewTask):
             name: tensor.detach().half().cpu().contiguous()
             for name, tensor in network.state_dict().items()
         }
-        write_atomic(path, save(tensors, {NOTE: self.recipe.network}))
+        write_atomic(path, save(tensors, {ARCHITECTURE_KEY: self.recipe.network}))
 
 
 def _with_target_colors(sample: Sample) -> Sample:
