@@ -27,16 +27,18 @@ class RgbdBase:
         self.lens_source = lens_source
 
     def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
-        """Gaussians of the photo's pixels at its working size; InputError for a map of other shape.
+        """Gaussians of the photo's pixels, on the surfaces that the depth map gives.
 
-        The focal length and principal point are the map's, if it has them, else the photo's.
+        The photo is first resized to its working size (the long side is at most 1536 pixels). The
+        focal length and principal point are the map's, if it has them, else the photo's. InputError
+        if the map's aspect ratio is not that of the photo.
         """
-        # A measured map knows its lens better than the photo's file does.
         depth, camera = self._cropped_to(photo)
         resized = resize_photo(photo)
+        # A measured map's calibration is more exact than the focal length in the photo's file.
         if camera is None:
             camera = resized.camera
-            lens_source = ""
+            lens_source = ""  # the report then names the source of the photo's focal length
         else:
             camera = camera.resized(resized.width, resized.height)
             lens_source = self.lens_source
@@ -59,17 +61,21 @@ class RgbdBase:
         framed_width, framed_height = photo.framed_size
         depth.check_aspect_ratio(framed_height, framed_width, photo.path)
         rows, columns = depth.depth.shape
-        camera = None if depth.K is None else Camera(depth.K, torch.eye(4), columns, rows)
-        if photo.frame is None:
+        camera = None
+        if depth.K is not None:
+            camera = Camera(depth.K, torch.eye(4), columns, rows)  # at the world's origin
+        if photo.frame is None:  # no border was cropped
             return depth, camera
 
+        # The same border is cropped from the map.
         frame = photo.frame
         depth = dataclasses.replace(
             depth,
             depth=frame.inside(depth.depth, framed_width, framed_height),
             valid=frame.inside(depth.valid, framed_width, framed_height),
         )
-        # Cropping moves the principal point.
+        # Cropping moves the principal point. The border's widths are in pixels of the photo, so that
+        # the camera is first scaled to them.
         if camera is not None:
             camera = camera.resized(framed_width, framed_height)
             camera = camera.cropped(frame.left, frame.top, photo.width, photo.height)
@@ -90,8 +96,8 @@ def lift_rgbd(
 ) -> BasePrediction:
     """Turn a photo [H, W, 3] (sRGB in 0..1) and its depth map into Gaussians on the surfaces.
 
-    `camera` is the photo's camera. With `levels` = 0 each pixel gets its own Gaussian; with more
-    levels, flat areas share Gaussians. InputError if no pixel has a depth.
+    `camera` is the photo's camera. In flat areas, up to 2^levels × 2^levels pixels share a Gaussian;
+    with `levels` = 0, each pixel has its own. InputError if no pixel has a depth.
     """
     lifted = lift_depth_map(rgb, depth, camera, levels)
     return BasePrediction(lifted.gaussians, lifted.camera, lifted.notes)

@@ -68,6 +68,7 @@ STEM_CHANNELS = 32  # of the convolution before the first stage
 # The decoder gets the features of these stages: 1/2, 1/4, 1/8, 1/16 and 1/32 of the input.
 FEATURE_STAGES = (0, 1, 2, 4, 6)
 DECODER_CHANNELS = (24, 40, 64, 96, 160)  # the decoder's channels at these scales
+HEAD_CHANNELS = 16  # between the two last convolutions
 # The pretrained encoder's normalisation of its input.
 INPUT_MEAN = 127.0 / 255
 INPUT_STD = 128.0 / 255
@@ -84,10 +85,11 @@ class SameConv(nn.Conv2d):
     ) -> None:
         """Build a convolution from `inputs` to `outputs` channels."""
         super().__init__(inputs, outputs, kernel, stride, groups=groups)
-        # nn.Conv2d pads both sides alike, the pretrained network does not.
+        # Padding is done in `forward`: nn.Conv2d would pad both sides alike, but the pretrained
+        # network's sides differ if the margin is odd.
         total_margin = kernel - stride
         before = total_margin // 2
-        after = total_margin - before  # TensorFlow puts the odd pixel behind
+        after = total_margin - before  # of an odd margin, TensorFlow puts the extra pixel here
         self.margins = (before, after, before, after)  # left, right, top, bottom
 
     def forward(self, x: Tensor) -> Tensor:
@@ -172,44 +174,53 @@ class UpsampleAndAdd(nn.Module):
 
 
 class LiteNet(nn.Module):
-    """Predicts a photo's inverse depth, up to a factor."""
+    """Predicts the logarithm of a photo's inverse depth, up to a constant."""
 
     def __init__(self, size: EncoderSize = "lite2") -> None:
         """Build a network with an encoder of one size; its weights are random."""
         super().__init__()
         self.encoder = EfficientNetEncoder(size)
+        # Both lists begin with the finest of the five scales, and end with the coarsest.
         encoder_channels = [STAGES[size][stage].channels for stage in FEATURE_STAGES]
         *fine_channels, coarsest_channels = encoder_channels
-        *fine_outputs, top = DECODER_CHANNELS
-        self.top = nn.Conv2d(coarsest_channels + 2, top, 1)  # with x and y of each cell
-        # For the mean of the features over the whole picture.
+        *fine_outputs, top = DECODER_CHANNELS  # top: the decoder's channels at the coarsest scale
+
+        # First the coarsest scale. Two more inputs are the x and y of each cell.
+        self.top = nn.Conv2d(coarsest_channels + 2, top, 1)
+        # This layer gets the mean of the features over the whole picture.
         self.context = nn.Conv2d(coarsest_channels, top, 1)
-        # Each cell learns about cells two steps away.
+        # With a dilation of 2, each cell gets information from cells two steps away.
         self.spread = nn.Sequential(
             nn.Conv2d(top, top, 3, padding=2, dilation=2, groups=top),
             nn.ReLU(),
             nn.Conv2d(top, top, 1),
         )
+        # Then one block for each finer scale.
         self.fuse = nn.ModuleList(
             UpsampleAndAdd(DECODER_CHANNELS[level + 1], fine_channels[level], fine_outputs[level])
             for level in reversed(range(len(fine_outputs)))  # from coarse to fine
         )
-        # From the finest features to one number for each cell.
+        # Last, the finest features become one number for each cell, the log inverse depth.
+        finest_width = DECODER_CHANNELS[0]
         self.head = nn.Sequential(
-            nn.Conv2d(DECODER_CHANNELS[0], 16, 3, padding=1), nn.ReLU(), nn.Conv2d(16, 1, 1)
+            nn.Conv2d(finest_width, HEAD_CHANNELS, 3, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(HEAD_CHANNELS, 1, 1),
         )
 
     def forward(self, rgb: Tensor) -> Tensor:
-        """Log inverse depth [B, H/2, W/2] up to a constant, of [B, 3, H, W], sRGB in 0..1.
+        """Log inverse depth [B, H/2, W/2], up to a constant, of photos [B, 3, H, W].
 
-        H and W must be multiples of 32.
+        The photos are sRGB in 0..1. H and W must be multiples of 32.
         """
-        *finer, coarsest = self.encoder(rgb)
+        *finer, coarsest = self.encoder(rgb)  # feature maps of five scales, the finest first
         # The position of an object in the picture tells much about the object's distance.
         x = self.top(torch.cat([coarsest, _cell_positions(coarsest)], dim=1))
-        # What the whole picture shows tells whether it is a room or a landscape.
+        # The mean over the whole picture tells whether it shows a room or a landscape.
         x = x + self.context(coarsest.mean(dim=(2, 3), keepdim=True))
         x = x + self.spread(relu(x))
+
+        # From the second coarsest scale to the finest.
         for fuse, fine in zip(self.fuse, reversed(finer), strict=True):
             x = fuse(x, fine)
         log_inverse_depth: Tensor = self.head(relu(x))[:, 0]
@@ -239,28 +250,32 @@ _SIZE_TENSOR = f"encoder.stages.{len(STAGES['lite2']) - 1}.0.project.bias"
 def load_networks(path: str | os.PathLike[str]) -> list[LiteNet]:
     """Load the networks of a file for inference in float32.
 
-    The names of tensors begin with the network's number, unless the file holds a single network.
-    InputError for a missing or broken file, or for weights of another architecture.
+    If the file holds several networks, the name of each tensor begins with its network's number,
+    such as "1.encoder.stem.weight". InputError for a missing or broken file, or for weights of
+    another architecture.
     """
     tensors = _dequantised(read_tensors(path, ADVICE))
-    # A file with one network has no numbers before the names.
-    if _SIZE_TENSOR in tensors:
+    # A file with a single network has no numbers before the names. An empty file is loaded as one,
+    # too, which raises an error that says what is missing.
+    if _SIZE_TENSOR in tensors or not tensors:
         return [_load_network(tensors, path)]
 
     tensors_by_number: dict[str, dict[str, Tensor]] = {}
     for name, tensor in tensors.items():
-        number, _, rest = name.partition(".")
-        tensors_by_number.setdefault(number, {})[rest] = tensor
-    if not tensors_by_number:
-        return [_load_network({}, path)]  # which says what is missing
-    # Numbers are texts: 9 comes before 10.
+        number, _, name_in_network = name.partition(".")
+        tensors_by_number.setdefault(number, {})[name_in_network] = tensor
+    # The numbers are strings: sorted by length first, "9" comes before "10".
     numbers = sorted(tensors_by_number, key=lambda number: (len(number), number))
     return [_load_network(tensors_by_number[number], path) for number in numbers]
 
 
 def _load_network(tensors: dict[str, Tensor], path: str | os.PathLike[str]) -> LiteNet:
-    """A frozen network with these tensors; InputError, naming the file, if they do not fit."""
-    # A bias of the last stage, as long as that stage has channels, which tells the size.
+    """A frozen network with the weights `tensors`, which were read from the file `path`.
+
+    InputError, which names the file, if they are not the weights of a lite network.
+    """
+    # The number of channels of the encoder's last stage tells the network's size. It is the length
+    # of that stage's bias.
     size_tensor = tensors.get(_SIZE_TENSOR)
     for size, stages in STAGES.items():
         if size_tensor is not None and size_tensor.shape == (stages[-1].channels,):
@@ -274,15 +289,17 @@ def _load_network(tensors: dict[str, Tensor], path: str | os.PathLike[str]) -> L
 def _dequantised(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     """All tensors as floats: 8-bit weights are multiplied by their quantisation steps.
 
-    An 8-bit tensor without fitting steps is left out, so that it counts as missing.
+    The steps are a tensor of their own, one for each output channel. An 8-bit tensor without
+    fitting steps is left out, so that it counts as missing.
     """
     values: dict[str, Tensor] = {}
     for name, tensor in tensors.items():
         steps = tensors.get(name + SCALE_SUFFIX)
-        # Biases and small layers are stored as floats.
+        # Biases and small layers are stored as floats, and need no steps.
         if tensor.is_floating_point() and not name.endswith(SCALE_SUFFIX):
             values[name] = tensor
         elif steps is not None and tensor.dim() == 4 and steps.shape == tensor.shape[:1]:
+            # [outputs, inputs, kernel, kernel], times one step for each output
             values[name] = tensor.float() * steps[:, None, None, None]
     return values
 
@@ -304,7 +321,8 @@ class InputScale:
     pixels: int  # of the network's input, approximately
     network: int = 0  # index of the network in the file
     mirrored: bool = True  # whether the network also gets the mirror image
-    tilt: bool = True  # whether the output also contributes low frequencies, and not only outlines
+    # Whether the output also contributes low frequencies, and not only outlines.
+    gives_low_frequencies: bool = True
 
 
 # Both networks were trained at up to 256×320. Small inputs show whole objects at once, large inputs
@@ -316,7 +334,7 @@ INPUT_SCALES = (
     InputScale(192 * 256),
     InputScale(192 * 256, network=1),
     InputScale(256 * 320),
-    InputScale(448 * 608, mirrored=False, tilt=False),
+    InputScale(448 * 608, mirrored=False, gives_low_frequencies=False),
 )
 # An output's low frequencies are its means in 3×4 cells, with 4 cells along the longer side.
 COARSE_CELLS = (3, 4)
@@ -345,15 +363,17 @@ class LiteBase:
         return cls(load_networks(path or SHIPPED_WEIGHTS), pick_device(device))
 
     def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
-        """Gaussians of the photo's pixels at its working size, on the surfaces that lite guesses.
+        """Gaussians of the photo's pixels, on the surfaces that lite guesses.
 
-        The nearest surface is put at 1.5 m.
+        The photo is first resized to its working size (the long side is at most 1536 pixels). The
+        network knows no metres: the nearest surface is put at 1.5 m.
         """
         photo = resize_photo(photo)
         inverse_depth = self.inverse_depth(photo.rgb)
         # 1 at the nearest surface, towards 0 in the distance.
         nearness = inverse_depth / near_inverse_depth(inverse_depth.flatten())
         depth = RELATIVE_NEAR_M / nearness.clamp(1 / MAX_DEPTH_RATIO, 1)
+        # Every pixel has a depth. The network gives neither intrinsics nor quantisation steps.
         depth_map = DepthMap(
             depth,
             torch.ones_like(depth, dtype=torch.bool),
@@ -368,27 +388,30 @@ class LiteBase:
             "precision": "fp32",
             "depth_scale": f"relative, the nearest at {RELATIVE_NEAR_M:g} m",
         }
+        # The geometry is rough: lite allows smaller moves of the camera than other bases.
         return dataclasses.replace(
             prediction, notes=notes, max_disparity=MAX_DISPARITY, max_hole_ratio=MAX_HOLE_RATIO
         )
 
     def inverse_depth(self, rgb: Tensor) -> Tensor:
-        """Inverse depth of a photo [H, W, 3] (sRGB in 0..1): the mean logarithm of all outputs.
+        """Inverse depth of a photo [H, W, 3] (sRGB in 0..1), from the networks' merged outputs.
 
         Returns [h, w] float32 up to a factor, on the CPU: about 224×304, in the photo's aspect
         ratio.
         """
+        # A file of weights may hold only the first network: then the second one's scale is left out.
         scales = [scale for scale in INPUT_SCALES if scale.network < len(self.networks)]
         log_inverse_depths = self.at_scales(rgb, scales)
-        return merge_outputs(log_inverse_depths, [scale.tilt for scale in scales]).exp()
+        gives_low_frequencies = [scale.gives_low_frequencies for scale in scales]
+        return merge_outputs(log_inverse_depths, gives_low_frequencies).exp()
 
     @torch.no_grad()
     def at_scales(self, rgb: Tensor, scales: Sequence[InputScale]) -> Tensor:
-        """[n, h, w] log inverse depth of a photo [H, W, 3] from n input scales.
+        """[n, h, w] log inverse depth of a photo [H, W, 3], one map for each of n input scales.
 
-        All have the resolution of the last scale, and lie on the CPU.
+        All maps are resized to that of the last scale, and are on the CPU. Each is known only up to
+        a constant of its own.
         """
-        # The logarithms of the outputs have unknown constants, which the mean removes.
         picture = rgb.float().permute(2, 0, 1)[None].to(self.device)  # [1, 3, H, W]
         outputs = [self._run_network(picture, scale)[None, None] for scale in scales]
         finest_size = outputs[-1].shape[2:]
@@ -398,45 +421,53 @@ class LiteBase:
     def _run_network(self, picture: Tensor, scale: InputScale) -> Tensor:
         """[h/2, w/2] log inverse depth of a photo [1, 3, H, W], resized to (h, w) for the network.
 
-        If the scale asks for it, it is the mean with the output for the photo's mirror image.
+        With `scale.mirrored` the network also gets the photo's mirror image; the result is the mean
+        of both outputs, which errs less.
         """
         size = network_size(picture.shape[2], picture.shape[3], scale.pixels)
         resized = interpolate(picture, size=size, mode="bicubic", antialias=True).clamp(0, 1)
         inputs = torch.cat([resized, resized.flip(-1)]) if scale.mirrored else resized
         inputs = inputs.contiguous(memory_format=torch.channels_last)
         with without_autocast_or_tf32(self.device):
-            # [1 or 2, h/2, w/2], the second for the mirror image
+            # [1 or 2, h/2, w/2]; the second, if any, is for the mirror image
             outputs: Tensor = self.networks[scale.network](inputs).float()
         if not scale.mirrored:
             return outputs[0]
+        # The mirror image's output is mirrored back.
         return torch.stack([outputs[0], outputs[1].flip(-1)]).mean(0)
 
 
-def merge_outputs(outputs: Tensor, tilt: Sequence[bool]) -> Tensor:
-    """Mean [h, w] of n networks' outputs [n, h, w] for the same photo.
+def merge_outputs(outputs: Tensor, gives_low_frequencies: Sequence[bool]) -> Tensor:
+    """Mean [h, w] of n maps of log inverse depth [n, h, w] for the same photo.
 
-    An output is the sum of its low frequencies (its means in 3×4 cells, interpolated) and its
-    outlines. Outlines are averaged over all outputs, low frequencies only over those for which
-    `tilt` is true.
+    Each map is split into its low frequencies (its means in 3×4 cells, interpolated) and the rest,
+    its outlines. The mean outlines of all maps are added to the mean low frequencies of those maps
+    for which `gives_low_frequencies` (n values) is true.
     """
-    # Large inputs give sharp outlines, but their slopes over the whole picture are worse.
+    # A network's output for a large input has sharp outlines, but wrong slopes over the whole
+    # picture: only its outlines are of use.
     height, width = outputs.shape[1:]
+    # Four cells lie along the longer side.
     cells = COARSE_CELLS if height <= width else COARSE_CELLS[::-1]
     cell_means = interpolate(outputs[None], size=cells, mode="area")
     low_frequencies = interpolate(cell_means, size=(height, width), mode="bicubic")[0]
     outlines = outputs - low_frequencies
-    merged: Tensor = outlines.mean(0) + low_frequencies[torch.tensor(tilt)].mean(0)
+    contributing = low_frequencies[torch.tensor(gives_low_frequencies)]  # [≤ n, h, w]
+    merged: Tensor = outlines.mean(0) + contributing.mean(0)
     return merged
 
 
 def network_size(height: int, width: int, pixels: int) -> tuple[int, int]:
-    """(height, width) of a network's input: about the photo's aspect ratio, and about `pixels`."""
+    """(height, width) of a network's input for a photo of height × width pixels.
+
+    It has about the photo's aspect ratio, and about `pixels` pixels.
+    """
     return scaled_size(height, width, math.sqrt(pixels / (height * width)))
 
 
 def scaled_size(height: int, width: int, scale: float) -> tuple[int, int]:
     """The size closest to `scale` times (height, width) that a network accepts."""
-    # The encoder halves the resolution five times.
+    # The encoder halves the resolution five times: sides must be multiples of 2⁵.
     rows = max(SIDE_MULTIPLE, round(height * scale / SIDE_MULTIPLE) * SIDE_MULTIPLE)
     columns = max(SIDE_MULTIPLE, round(width * scale / SIDE_MULTIPLE) * SIDE_MULTIPLE)
     return rows, columns

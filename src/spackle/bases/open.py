@@ -69,16 +69,22 @@ class BaseError(InputError):
 
 
 def open_base(settings: BaseSettings) -> OpenedBase:
-    """A base whose network is loaded for the first photo; InputError for unsuitable settings."""
+    """Check a base's settings, and wrap the base for predictions; the first photo loads its network.
+
+    InputError for unsuitable settings.
+    """
     settings.check()
-    # The network is loaded by the first photo that needs it.
+    # Only the photo's own depth and the weights on this machine decide: each photo gets its base.
     if settings.resolved_name == AUTO:
         return OpenedBase(AUTO_CANDIDATES, settings)
 
+    # Otherwise the settings leave only one base. The reason goes into the report.
     if settings.name != AUTO:
         reason = "chosen by name"
+    elif settings.depth is not None:
+        reason = "a depth map is given"
     else:
-        reason = "a checkpoint is given" if settings.depth is None else "a depth map is given"
+        reason = "a checkpoint is given"
     return OpenedBase({settings.resolved_name: BaseCandidate(reason)}, settings)
 
 
@@ -130,9 +136,10 @@ def _open_rgbd(settings: BaseSettings, photo: Photo, depth: Depth) -> Base | Non
     """The base that lifts a photo by its depth; None if there is no depth.
 
     The depth is `depth`, else the settings' map, else the map in the photo's file. A focal length
-    that the user gives replaces the map's.
+    that the user gives replaces the map's. InputError if the settings ask for a depth map, and
+    there is none.
     """
-    # Depth of this call, then of all calls, then of the file.
+    # The caller's depth for this photo goes before the settings' depth, which is for all photos.
     source = settings.depth if depth is None else depth
     if source is None and photo.path.is_file():  # a photo that a program made has no file
         source = load_photo_depth(photo.path)
@@ -144,24 +151,27 @@ def _open_rgbd(settings: BaseSettings, photo: Photo, depth: Depth) -> Base | Non
         return None
 
     depth_map = source if isinstance(source, DepthMap) else _read_depth(settings, source, photo)
+    # The map's own intrinsics K, if any, are taken unless the user gave a focal length.
     if depth_map.K is None or not photo.focal_source.is_from_user:
         return RgbdBase(depth_map)
 
+    # The map covers the photo with the border that was cropped from it (its framed size).
     map_width = depth_map.depth.shape[1]
     framed_width, _ = photo.framed_size
     focal_px = photo.focal_px * (map_width / framed_width)  # in pixels of the map
     if isinstance(source, DepthMap):
-        return RgbdBase(source.with_focal(focal_px), lens_source="")
-    # The file is read again, because its disparities become metres by the focal length.
+        return RgbdBase(source.with_focal(focal_px), lens_source="")  # "": the user gave it
+    # The file is read again, because the focal length converts its disparities to metres.
     return RgbdBase(_read_depth(settings, source, photo, focal_px), lens_source="")
 
 
 def _read_depth(
     settings: BaseSettings, source: Path, photo: Photo, focal_px: float | None = None
 ) -> DepthMap:
-    """Read a photo's depth map from the file, or folder, `source`, as the settings say.
+    """Read a photo's depth map from `source`, with the settings for reading it.
 
-    `focal_px`, in pixels of the map, replaces the focal length of the map's calibration.
+    `source` is the map's file, or a folder with a map named like the photo. `focal_px`, in pixels
+    of the map, replaces the focal length in the map's calibration file.
     """
     return load_depth(
         find_depth_file(source, photo.path),
@@ -181,7 +191,8 @@ class ResolvedBase:
     reason: str
     failures: tuple[str, ...] = ()  # name and error of each candidate that failed before
     note: str = ""  # for the user, if `auto` chose this base for the first time
-    # False: memory was short for a better base, which may work in the next run.
+    # Whether the next run would choose this base, too. False if memory was short for a better base:
+    # with more free memory, that base may work.
     lasting: bool = True
 
 
@@ -206,20 +217,24 @@ class OpenedBase:
         settings: BaseSettings,
         loaded: dict[str, Base | None] | None = None,
     ) -> None:
-        """Choose among `candidates`, by their names, in their order.
+        """Prepare to predict with the first of the `candidates` that works for a photo.
 
-        `loaded` holds networks that are loaded already, by their names; None stands for a network
-        whose weights are missing.
+        Args:
+            candidates: the bases that may be used, by their names, the best first.
+            settings: the options that all candidates are loaded with.
+            loaded: bases that are loaded already, by their names; the value None means that a
+                base's weights are missing.
         """
         self.candidates = candidates
         self._settings = settings
         self._loaded = {} if loaded is None else loaded
+        # Files of weights that change during a run are noticed by their time of modification.
         self._weight_times_ns = {
             file: file.stat().st_mtime_ns
             for file in settings.model_files.values()
             if file.is_file()
         }
-        # Candidates that failed in a way that no other photo changes.
+        # Candidates that would fail for every other photo, too.
         self._unusable: dict[str, SkippedCandidate] = {}
         self._notes_given: set[str] = set()
 
@@ -231,16 +246,17 @@ class OpenedBase:
         log: LogLine = LOG.warning,
         stage: StageTimer = _untimed_stage,
     ) -> tuple[BasePrediction, ResolvedBase]:
-        """A photo's Gaussians by the first candidate that works, and which one it was.
+        """Predict a photo's Gaussians with the first candidate that works, and say which it was.
 
         The candidates are the bases that may be used, the best first.
 
         Args:
             photo: at its full size.
-            depth: this photo's depth, used instead of the settings' depth; for rgbd only.
-            log: gets a line for each candidate that fails.
-            stage: times the stages "prepare", in which a base is loaded, and "base", in which it
-                predicts.
+            depth: this photo's depth map, used instead of the settings' map. Only the base rgbd,
+                which lifts a photo by a depth map, uses it.
+            log: called with a line of text for each candidate that fails.
+            stage: called with "prepare" before a base is loaded, and with "base" before it
+                predicts; the result is a context manager that times this stage.
 
         Raises:
             BaseError: no photo can be used.
@@ -248,7 +264,7 @@ class OpenedBase:
         """
         skipped: list[SkippedCandidate] = []
         for name, candidate in self.candidates.items():
-            # It failed before in a way that this photo does not change.
+            # It failed for an earlier photo, and would fail for this photo, too.
             if name in self._unusable:
                 skipped.append(self._unusable[name])
                 continue
@@ -262,34 +278,39 @@ class OpenedBase:
                     continue
                 with stage("base") as progress:
                     prediction = _predict_finite(base, photo, progress)
-            # A problem of the code is no InputError, and ends the run.
+            # Other exceptions than InputError are defects of the code: they end the run.
             except InputError as error:
                 is_unusable = self._fails_for_every_photo(name, base, error)
                 if is_unusable and len(self.candidates) == 1:
                     raise BaseError(str(error)) from error
                 # After the last candidate nothing is left to try.
-                if name == list(self.candidates)[-1] or isinstance(error, BaseError):
+                is_last = name == list(self.candidates)[-1]
+                if is_last or isinstance(error, BaseError):
                     raise
                 skipped.append(self._skip(name, error, is_unusable))
                 log(f"{photo.path.name}: going on without {candidate.title}: {error}")
                 continue
             return prediction, self._resolved(name, skipped)
+        # The settings' check found the last candidate's weights: they were deleted since.
         raise BaseError(f"`base` {self._settings.resolved_name}: its weights are gone: start again")
 
     def _fails_for_every_photo(self, name: str, base: Base | None, error: InputError) -> bool:
-        """Whether a failure of the candidate `name` means that another photo fails, too.
+        """Whether the candidate `name`, which failed with `error`, would fail for every other photo.
 
-        It does if loading fails (then `base` is None) or memory is short. But a depth map belongs
-        to one photo: if it cannot be used, the next photo's may be usable.
+        A network would, if it cannot be loaded (then `base` is None) or memory is short. A photo's
+        depth map would not: the next photo has another map.
         """
-        # A base named rgbd that the program loaded has one depth map for all photos.
-        serves_all_photos = name != RGBD or name in self._loaded
-        return serves_all_photos and (base is None or isinstance(error, NotEnoughMemory))
+        # rgbd is among the loaded bases only if the calling program passed it, for all photos.
+        has_own_depth_map = name == RGBD and name not in self._loaded
+        if has_own_depth_map:
+            return False
+        return base is None or isinstance(error, NotEnoughMemory)
 
     def _skip(self, name: str, error: InputError, is_unusable: bool) -> SkippedCandidate:
-        """Describe a candidate that failed; if it `is_unusable`, remember it and free its memory.
+        """Describe why the candidate `name` was skipped: it failed with `error`.
 
-        `error` is why it failed.
+        If it `is_unusable`, that is, would fail for every photo, it is not tried again, and its
+        memory is freed.
         """
         title = self.candidates[name].title
         skipped = SkippedCandidate(
@@ -298,12 +319,19 @@ class OpenedBase:
             lacked_memory=isinstance(error, NotEnoughMemory),
         )
         if is_unusable:
+            # The report of a later photo gives the reason, but not a failure that was not its own.
             self._unusable[name] = dataclasses.replace(skipped, failure="")
             self._loaded.pop(name, None)
         return skipped
 
     def _resolved(self, name: str, skipped: Sequence[SkippedCandidate]) -> ResolvedBase:
-        """Why the candidate `name` was used: the better ones that were skipped, else its title."""
+        """Describe for the report which candidate was used, and why.
+
+        Args:
+            name: the candidate that was used.
+            skipped: the better candidates, which could not be used.
+        """
+        # The reason is that the better candidates were skipped; without any, the base's title.
         reasons = [candidate.reason for candidate in skipped]
         reason = ", ".join(reasons) or self.candidates[name].title
         note = f"base {name} ({reason})"
@@ -322,14 +350,22 @@ class OpenedBase:
         )
 
     def load(self, photo: Photo, depth: Depth = None, name: str | None = None) -> Base | None:
-        """Load the candidate `name`, or else the first; None without depth or weights.
+        """Load a base; None if it lifts depth and the photo has none, or if its weights are missing.
 
-        InputError if loading fails; BaseError if a file of weights has changed since the start.
+        Args:
+            photo: the photo for which the base is needed.
+            depth: the photo's depth map, for the base rgbd.
+            name: the candidate to load; None: the first candidate.
+
+        Raises:
+            InputError: loading fails.
+            BaseError: a file of weights has changed since the start.
         """
         name = name or next(iter(self.candidates))
-        # Each photo has its own depth, which is not kept.
+        # A base with a depth map is made anew for each photo, because each photo has its own map.
         if name == RGBD and name not in self._loaded:
             return _open_rgbd(self._settings, photo, depth)
+        # A network is loaded once, and kept for all photos.
         if name not in self._loaded:
             self._loaded[name] = _load_network(name, self._settings)
             self._check_weights_unchanged()

@@ -118,22 +118,26 @@ class BaseSettings:
     far: float | None = None  # farthest depth of a relative map in metres; None: 15
     checkpoint: Path | None = None  # weights of SHARP, MoGe or lite
     precision: Precision = "auto"  # of the network's arithmetic
-    # Of a photo's 35 windows, SHARP's transformer processes so many at once; 1 takes least memory.
+    # How many of a photo's 35 windows SHARP's transformer processes at once; 1 takes least memory.
     windows_per_batch: int | None = None
     device: str = "auto"  # "auto", "cpu" or a CUDA device
 
     @property
     def resolved_name(self) -> str:
-        """The base's name, where `auto` is decided by the other options as far as possible.
+        """The base's name; for `auto` it is the base that the other options ask for.
 
-        It becomes `rgbd` if a depth map is given, else `sharp` if a checkpoint is given.
+        `auto` stands for `rgbd` if a depth map is given, else for `sharp` if a checkpoint is given.
+        If neither is given, the name stays `auto`, and each photo decides.
         """
         # A name that the user gives is never changed.
         if self.name != AUTO:
             return self.name
         if self.depth is not None:
             return RGBD
-        return AUTO if self.checkpoint is None else "sharp"
+        # A checkpoint without a base's name is taken for SHARP's.
+        if self.checkpoint is not None:
+            return "sharp"
+        return AUTO
 
     @property
     def kind(self) -> str:
@@ -167,12 +171,12 @@ class BaseSettings:
 
     @property
     def model_files(self) -> dict[str, Path]:
-        """The files on this machine that predictions depend on.
+        """The files on this machine that predictions depend on: weights and their configuration.
 
-        Files of weights have their base's name as the key; files of a model's folder have their
-        own names.
+        The key of a file of weights is the name of its base. If the base is a folder of a Hugging
+        Face model, the key is the file's own name.
         """
-        # A folder's files are what transformers reads.
+        # transformers reads several files of a model's folder.
         if self.model_folder is not None:
             matches = [
                 file
@@ -181,7 +185,7 @@ class BaseSettings:
             ]
             return {file.name: file for file in matches if file.is_file()}
 
-        # Of `auto`, any of the networks may be used for the next photo.
+        # With `auto`, the next photo may need any of the networks, so that all their files count.
         names = AUTO_NETWORKS if self.resolved_name == AUTO else (self.resolved_name,)
         files: dict[str, Path] = {}
         for name in names:
@@ -201,13 +205,14 @@ class BaseSettings:
         check_window_batch(self.windows_per_batch)
         check_name("depth_kind", self.depth_kind, DEPTH_KINDS)
         self._check_depth_options()
-        # To find weights missing only at the first photo would waste the time until then.
+        # Missing weights are reported here, and not first when a photo needs them, because the work
+        # until then would be lost.
         if self.resolved_name in MISSING_WEIGHTS_ADVICE and not self.model_files:
             advice = MISSING_WEIGHTS_ADVICE[self.resolved_name]
             raise InputError(f"`base` {self.resolved_name}: {advice}")
 
     def _check_base_name(self, allow_auto: bool) -> None:
-        """InputError unless the name is known, `hf:` with a model, or package.module:Class."""
+        """InputError for an unknown base, for `hf:` without a model, or for a forbidden `auto`."""
         if self.name == AUTO and not allow_auto:
             raise InputError(
                 f"`base` {AUTO} is not allowed here, because the results name their base: "
@@ -218,13 +223,14 @@ class BaseSettings:
                 f"`base` {HF_PREFIX} names no model: "
                 "give a Hugging Face model as owner/name, or a folder"
             )
-        # A plug-in's module is imported, and refused, only when it is opened.
+        # A colon marks a Hugging Face model or a class of another package. Whether that exists shows
+        # only when it is loaded.
         if ":" not in self.name:
             check_name("base", self.name, (AUTO, RGBD, *NETWORK_BASES))
 
     def _given_options(self) -> dict[str, object]:
         """The options that only some bases take and that the user has set, with their values."""
-        # A value that is the default counts as not given.
+        # An option counts as set if its value is not the default, which is "auto" or None.
         options = {
             "depth": self.depth.path if isinstance(self.depth, DepthMap) else self.depth,
             "calib": self.calib,
@@ -239,7 +245,7 @@ class BaseSettings:
 
     def _check_option_of_other_bases(self) -> None:
         """InputError if an option is set that this base does not take."""
-        # An option without effect would make the user believe in it.
+        # An option that is silently ignored would make the user believe that it has an effect.
         for option, value in self._given_options().items():
             if option not in BASE_KINDS[self.kind].options:
                 raise InputError(
@@ -248,7 +254,11 @@ class BaseSettings:
                 )
 
     def _check_depth_options(self) -> None:
-        """InputError for options about a depth map that is missing, or is not relative."""
+        """InputError for options that tell how to read a depth map, but do not fit the map.
+
+        None of them may be set without a depth map. `near` and `far` are only for a relative map,
+        whose values have no unit.
+        """
         given = self._given_options()
         for option in ("calib", *DEPTH_READING_OPTIONS):
             if option not in given:
@@ -259,6 +269,7 @@ class BaseSettings:
                     "give the map with `depth`"
                 )
             if option in ("near", "far") and self.depth_kind not in RELATIVE_KINDS:
+                # They say at which depths the map's nearest and farthest points are placed.
                 raise InputError(
                     f"`{option}` {given[option]}: only for relative maps: "
                     f"add `depth_kind` {' or '.join(RELATIVE_KINDS)}"

@@ -48,8 +48,9 @@ OUTPUT_MEANINGS: dict[str, Meaning] = {
     "glpn": "metres",
     "zoedepth": "metres",
 }
-MIN_DISPARITY_PER_M = 1e-4  # 1/m, and the next one: Depth Pro's own limits of its output
-MAX_DISPARITY_PER_M = 1e4
+# Depth Pro's own limits of the inverse depth that it predicts, in 1/m.
+MIN_INVERSE_DEPTH_PER_M = 1e-4
+MAX_INVERSE_DEPTH_PER_M = 1e4
 # Relative disparity has no known unit and no known zero. A disparity of zero is put at FARTHEST_M,
 # the greatest at 1.5 m: the ratio of 20 gives a clear parallax, and noise far away makes no depth
 # edges. The smallest disparity is not stretched to FARTHEST_M, because a wall seen from the front
@@ -86,7 +87,15 @@ class HfBase:
         meaning: Meaning,
         precision: str,
     ) -> None:
-        """Use a loaded network; `precision` is its name in the report."""
+        """Use a loaded network.
+
+        Args:
+            name: the base's name in messages and reports, "hf:" and the model.
+            network: predicts depth or disparity.
+            preprocess: makes the network's input of a photo.
+            meaning: what the numbers of the network's output are.
+            precision: number type of the linear layers, for the report: fp32 or bf16.
+        """
         self.name = name
         self.network = network
         self.preprocess = preprocess
@@ -95,12 +104,18 @@ class HfBase:
 
     @staticmethod
     def load(model: str, *, device: str | None = None, precision: Precision = "auto") -> HfBase:
-        """Read a model from a folder, or by owner/name from the hub's cache or the hub.
+        """Load a depth model of the transformers library. No code of the model runs.
 
-        No code of the model runs. At the precision auto, matrix products are bf16 if the hardware
-        multiplies it natively. `device` is cpu or a CUDA device; None: CUDA if available.
-        InputError for a device, package, model or file that is missing, broken or unknown, and for
-        too little memory.
+        Args:
+            model: a folder, or owner/name of a model on the Hugging Face hub, which is downloaded
+                unless the hub's cache on this machine holds it.
+            device: cpu or a CUDA device; None: CUDA if available.
+            precision: number type of matrix products; auto is bf16 if the hardware multiplies it
+                natively.
+
+        Raises:
+            InputError: a device, package, model or file is missing, broken or unknown, or memory is
+                short.
         """
         target = pick_device(device)
         dtype = pick_dtype(precision, target)
@@ -112,9 +127,10 @@ class HfBase:
             "or give a folder with all the model's files"
         )
         with as_input_error(name, problem), report_memory_shortage(MEMORY_ADVICE):
+            # The hub is asked only for what is missing: a cached model loads without a network.
             try:
                 loaded = _load_model(transformers, source, name, from_hub=False)
-            except OSError:  # the hub's cache lacks a file
+            except OSError:  # the folder, or the hub's cache, lacks a file
                 if os.path.isdir(source):
                     raise
                 _check_hub(source)
@@ -126,10 +142,11 @@ class HfBase:
         return HfBase(name, network, preprocess, meaning, precision_name)
 
     def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
-        """Gaussians of the photo's pixels at its working size, on the surfaces that it shows.
+        """Gaussians of the photo's pixels, on the surfaces that it shows.
 
-        If the focal length is unknown, the model's estimate is used. InputError if the model fails
-        on this photo, its output is no depth, or memory is short.
+        The photo is first resized to its working size (the long side is at most 1536 pixels). If
+        its focal length is unknown, the model's estimate is used, if it makes one. InputError if
+        the model fails on this photo, its output is no depth, or memory is short.
         """
         photo = resize_photo(photo)
         problem = f"{self.name} fails ({{reason}}): give another photo or model"
@@ -137,14 +154,14 @@ class HfBase:
             output, fov_degrees = self._run_network(photo.rgb)
 
         camera = photo.camera
-        lens_source = ""
+        lens_source = ""  # the report then names the source of the photo's focal length
         if fov_degrees is not None and photo.focal_source.is_assumed:
             predicted_camera = _camera_of_fov(fov_degrees, photo)
             if predicted_camera is not None:
                 camera = predicted_camera
                 lens_source = "Depth Pro"  # the only model that predicts a field of view
+        # Needed for a model that predicts canonical disparity, focal length / width / depth.
         focal_per_width = camera.focal[0] / photo.width
-        # Canonical disparity needs the focal length: a true one makes the metres true.
         depth = to_depth_map(output, self.meaning, focal_per_width, self.name, photo.path)
         prediction = lift_predicted_depth(photo, depth, camera)
 
@@ -156,17 +173,18 @@ class HfBase:
 
     @torch.no_grad()
     def _run_network(self, rgb: Tensor) -> tuple[Tensor, float | None]:
-        """The network's output [h, w] for a photo [H, W, 3], sRGB in 0..1, without padding.
+        """The network's output for a photo [H, W, 3], sRGB in 0..1.
 
-        It is float32 on the CPU. The second value is the horizontal field of view in degrees, if
-        the network predicts one.
+        Returns:
+            The output [h, w] for the photo without padding, float32 on the CPU, and the horizontal
+            field of view in degrees, or None if the network predicts none.
         """
         pixels, window = self.preprocess(rgb)
         device = next(self.network.parameters()).device
         with without_autocast_or_tf32(device):
             output = self.network(pixel_values=pixels.to(device))
 
-        # Only the photo's part of a padded picture is wanted.
+        # Preprocessing may pad the photo: only the window that shows the photo is kept.
         depth = output.predicted_depth.float().cpu()  # [1, h, w]
         height, width = depth.shape[1:]
         rows = slice(round(window.top * height), round(window.bottom * height))
@@ -176,7 +194,7 @@ class HfBase:
 
 
 def _camera_of_fov(fov_degrees: float, photo: Photo) -> Camera | None:
-    """The camera with a horizontal field of view; None if that is no plausible one."""
+    """The photo's camera, if `fov_degrees` is its horizontal field of view; None if implausible."""
     if not 0 < fov_degrees < 180:
         return None
     # tan(fov / 2) = (width / 2) / focal length
@@ -187,20 +205,22 @@ def _camera_of_fov(fov_degrees: float, photo: Photo) -> Camera | None:
 
 
 def meaning_of(settings: Mapping[str, Any], name: str) -> Meaning:
-    """The meaning of a model's output by its config.json.
+    """What the numbers of a model's output are, according to its config.json (`settings`).
 
-    InputError, which names the model, if it is unknown: a guess may be wrong.
+    InputError, which calls the model `name`, if config.json does not tell: a guess may be wrong.
     """
-    # The file is untrusted: its values may have any type.
+    # The file is untrusted, and its values may have any type; hence `str`.
     kind = str(settings.get("model_type"))
     stated = str(settings.get("depth_estimation_type", "relative"))
     backbone = settings.get("backbone_config")
     has_dinov2 = isinstance(backbone, dict) and backbone.get("model_type") == "dinov2"
-    # A dpt with DINOv2 is not MiDaS, and may predict anything.
+    # Models of type dpt are MiDaS models, with a known output; but with DINOv2 as the backbone, such
+    # a model is another one, and may predict anything.
     is_other_dpt = kind == "dpt" and has_dinov2
     if kind not in OUTPUT_MEANINGS or is_other_dpt or stated not in ("relative", "metric"):
         known = ", ".join(OUTPUT_MEANINGS)
         raise InputError(
+            # At most 40 characters of the untrusted type, escaped to ASCII (!a).
             f"{name}: the output of {kind[:40]!a} has no known meaning: "
             f"give a model of type {known}"
         )
@@ -212,11 +232,21 @@ def meaning_of(settings: Mapping[str, Any], name: str) -> Meaning:
 def to_depth_map(
     output: Tensor, meaning: Meaning, focal_per_width: float, name: str, photo: Path
 ) -> DepthMap:
-    """Convert a model's output [h, w] float32 to metres.
+    """Convert a model's output [h, w] float32 to a depth map in metres.
 
-    Pixels without a positive finite depth are not valid. Canonical disparity depends on
-    `focal_per_width`, the photo's focal length over its width. InputError, which names the model
-    and the photo, if the output has no positive number or is constant.
+    Args:
+        output: metres; or relative disparity, which is inverse depth with unknown unit and zero; or
+            canonical disparity, which is focal length / width / metres.
+        meaning: which of these it is.
+        focal_per_width: the photo's focal length over its width.
+        name: the model, for messages.
+        photo: the photo's path, for messages.
+
+    Returns:
+        The map, in which only pixels with a positive finite depth are valid.
+
+    Raises:
+        InputError: the output has no positive number, or is constant.
     """
     known = torch.isfinite(output)
     greatest = _check_contrast(output[known], name, photo)
@@ -226,12 +256,12 @@ def to_depth_map(
         near_disparity = float(near_inverse_depth(output[known]))
         if not near_disparity > 0:  # nearly all values are negative
             near_disparity = greatest
-        # 0 at FARTHEST_M, 1 at the nearest surface.
+        # 1 at the nearest surface, which is put at RELATIVE_NEAR_M; 0 is put at FARTHEST_M.
         nearness = (output / near_disparity).clamp(0, 1)
         depth = 1 / ((1 - nearness) / FARTHEST_M + nearness / RELATIVE_NEAR_M)
     else:
-        disparity_per_m = output / focal_per_width
-        depth = 1 / disparity_per_m.clamp(MIN_DISPARITY_PER_M, MAX_DISPARITY_PER_M)
+        inverse_depth = output / focal_per_width  # 1/m
+        depth = 1 / inverse_depth.clamp(MIN_INVERSE_DEPTH_PER_M, MAX_INVERSE_DEPTH_PER_M)
 
     # A metric model may predict 0 or less for the sky.
     valid = known & is_valid_depth(depth)
@@ -246,27 +276,30 @@ def to_depth_map(
 
 
 def _check_contrast(values: Tensor, name: str, photo: Path) -> float:
-    """The greatest of a model's finite outputs [N].
+    """The greatest of the finite `values` [N] that the model `name` predicts for a photo.
 
-    InputError, which names the model and the photo, if there are none, none is positive, or all are
-    nearly equal.
+    InputError, which names the model and the photo, if there are no values, none is positive, or
+    all are nearly equal.
     """
-    found = "no finite number"
+    predicted_range = "no finite number"
     if len(values):
         least, greatest = (float(extreme) for extreme in values.aminmax())
         min_spread = MIN_RELATIVE_SPREAD * max(abs(least), abs(greatest))
         if greatest > 0 and greatest > least + min_spread:
             return greatest
-        found = f"{least:g} to {greatest:g}"
+        predicted_range = f"{least:g} to {greatest:g}"
     raise InputError(
-        f"{photo}: {name} predicts {found}, which cannot be depth: "
+        f"{photo}: {name} predicts {predicted_range}, which cannot be depth: "
         "its weights are broken or need `precision` fp32, or the photo is empty"
     )
 
 
 def _import_transformers() -> Any:
-    """The module transformers, silenced; InputError that says what to install if it is missing."""
-    # Otherwise it asks the hub to convert models of other formats.
+    """Import the library transformers, and switch off its messages.
+
+    InputError, which says what to install, if it is missing.
+    """
+    # Without this setting it would ask the hub to convert models of other formats.
     os.environ.setdefault("DISABLE_SAFETENSORS_CONVERSION", "1")
     try:
         import transformers
@@ -296,32 +329,36 @@ def _load_model(
 ) -> tuple[nn.Module, Preprocessing, Meaning]:
     """A float32 network from safetensors, its preprocessing, and its output's meaning.
 
-    `source` is a folder or owner/name; only `from_hub` may use the internet. OSError for a missing
-    file; InputError, which calls the model `name`, for weights that do not fit.
+    `source` is a folder or owner/name of a model on the hub. Files are downloaded only with
+    `from_hub`. OSError for a missing file; InputError, which calls the model `name`, for weights
+    that do not fit.
     """
     # A model's folder may hold Python code, which must not run.
-    files = {"local_files_only": not from_hub, "trust_remote_code": False}
-    settings, _ = transformers.PretrainedConfig.get_config_dict(source, **files)
+    file_options = {"local_files_only": not from_hub, "trust_remote_code": False}
+    settings, _ = transformers.PretrainedConfig.get_config_dict(source, **file_options)
     meaning = meaning_of(settings, name)  # before gigabytes of weights are loaded
     kind = str(settings["model_type"])
-    if kind == "depth_pro":  # its image processor needs torchvision
+    # Only Depth Pro's image processor needs torchvision: Spackle does its work instead.
+    if kind == "depth_pro":
         mixin = transformers.ImageProcessingMixin
-        processor_settings, _ = mixin.get_image_processor_dict(source, **files)
+        processor_settings, _ = mixin.get_image_processor_dict(source, **file_options)
         preprocess = _stretch_to_input(processor_settings)
     else:
-        # Always Pillow's: torchvision's results differ in the last digits, and torchvision does not
-        # fit every torch.
-        processor = transformers.AutoImageProcessor.from_pretrained(source, backend="pil", **files)
+        # Pictures are resized by Pillow ("pil") on every machine. torchvision's results differ in
+        # the last digits, and each version of it needs a certain version of torch.
+        processor = transformers.AutoImageProcessor.from_pretrained(
+            source, backend="pil", **file_options
+        )
         preprocess = _run_processor(processor, is_zoedepth=kind == "zoedepth")
 
     network, info = transformers.AutoModelForDepthEstimation.from_pretrained(
         source,
-        dtype=torch.float32,  # half precision is widened: only matrix products gain by it
+        dtype=torch.float32,  # also if the file has half precision
         use_safetensors=True,
         weights_only=True,
-        ignore_mismatched_sizes=True,  # they are reported below
+        ignore_mismatched_sizes=True,  # `_check_loading_info` reports them
         output_loading_info=True,
-        **files,
+        **file_options,
     )
     _check_loading_info(info, name)
     return network.eval().requires_grad_(False), preprocess, meaning
@@ -330,10 +367,12 @@ def _load_model(
 def _check_loading_info(info: Mapping[str, Any], name: str) -> None:
     """InputError if weights were missing or of another shape when transformers loaded a model.
 
-    `info` is what transformers says about it.
+    `info` is the "loading info" that transformers returns; `name` is the model, for the message.
     """
-    # transformers fills what is missing with random numbers, and goes on.
-    problems = [f"have another shape for {key}" for key, *_ in sorted(info["mismatched_keys"])]
+    # transformers gives such weights random values, and goes on.
+    mismatched_names = [key for key, *_ in sorted(info["mismatched_keys"])]  # without both shapes
+    problems = [f"have another shape for {key}" for key in mismatched_names]
+    # Some models have layers that they never use, and that no file holds.
     problems += [
         f"lack {key}"
         for key in sorted(info["missing_keys"])
@@ -368,9 +407,10 @@ def _lower_linear_layers(network: nn.Module, dtype: torch.dtype) -> None:
 
 
 def _run_processor(processor: Any, is_zoedepth: bool) -> Preprocessing:
-    """Preprocessing by an image processor of transformers.
+    """Make the preprocessing of a model by its image processor, which transformers loaded.
 
-    ZoeDepth's pads the photo with its mirror image, and resizes both together.
+    ZoeDepth's processor first pads the photo with its own mirror image, unless its `do_pad` is off.
+    Then the result also says where in the padded picture the photo lies.
     """
     is_padded = is_zoedepth and processor.do_pad
 
@@ -379,7 +419,8 @@ def _run_processor(processor: Any, is_zoedepth: bool) -> Preprocessing:
         inputs = processor(images=image, return_tensors="pt")
         pixels = torch.as_tensor(inputs["pixel_values"])
         height, width = rgb.shape[:2]
-        return pixels, _zoedepth_window(height, width) if is_padded else WHOLE_PICTURE
+        window = _zoedepth_window(height, width) if is_padded else WHOLE_PICTURE
+        return pixels, window
 
     return preprocess
 
@@ -387,7 +428,8 @@ def _run_processor(processor: Any, is_zoedepth: bool) -> Preprocessing:
 def _zoedepth_window(height: int, width: int) -> PhotoWindow:
     """Where a photo of this size in pixels lies in the picture that ZoeDepth's processor pads.
 
-    The margin is 3 · sqrt(side / 2) pixels on each side.
+    The processor's margin is 3 · sqrt(height / 2) pixels above and below, and 3 · sqrt(width / 2)
+    pixels on the left and right.
     """
     margin_y = int(math.sqrt(height / 2) * 3)
     margin_x = int(math.sqrt(width / 2) * 3)
@@ -402,15 +444,16 @@ def _zoedepth_window(height: int, width: int) -> PhotoWindow:
 
 
 def _stretch_to_input(settings: Mapping[str, Any]) -> Preprocessing:
-    """Preprocessing by preprocessor_config.json: normalise a photo, and stretch it to one size.
+    """Make Depth Pro's preprocessing: normalise a photo, and stretch it to the network's input size.
 
-    ValueError for a size that is impossible, or another filter than the bilinear one.
+    `settings` is the model's preprocessor_config.json. ValueError if they ask for an impossible
+    size, or for another filter than the bilinear one.
     """
     height = int(settings["size"]["height"])
     width = int(settings["size"]["width"])
-    # What Depth Pro's own processor does, and nothing else, is done here without torchvision.
-    filter_number = settings.get("resample", Image.Resampling.BILINEAR)
     is_possible = 1 <= min(height, width) <= max(height, width) <= MAX_INPUT_SIDE
+    # Depth Pro's own processor can use other filters; here there is only the bilinear one.
+    filter_number = settings.get("resample", Image.Resampling.BILINEAR)
     if filter_number != Image.Resampling.BILINEAR or not is_possible:
         raise ValueError(f"an input of {width}×{height}, or resized otherwise than bilinear")
     mean = torch.tensor(settings["image_mean"]).float()  # [3]

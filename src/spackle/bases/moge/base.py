@@ -58,19 +58,19 @@ class MogeView:
     shift: float  # of the network's points along z
 
     def depth_map(self, path: Path) -> DepthMap:
-        """The view as a depth map, in which the sky lies behind all surfaces; path: the photo.
+        """Make a depth map of the view, in which the sky lies behind all surfaces.
 
-        InputError if there is no surface with a depth.
+        `path` is the photo's, for messages. InputError if there is no surface with a depth.
         """
         known = self.surface & (self.depth > 0) & self.depth.isfinite()
         if not known.any():
             raise InputError(f"{path}: MoGe finds no surface: give another photo, or `base` lite")
-        # The sky has no depth, but must not leave a hole.
+        # The sky has no depth of its own: without one, the scene would have a hole there.
         sky_depth = SKY_DISTANCE_FACTOR * self.depth[known].max()
         depth = torch.where(self.surface, self.depth.where(known, 0.0), sky_depth)
-        return DepthMap(
-            depth, known | ~self.surface, K=None, quantum=None, quantity="depth", path=path
-        )
+        is_sky = ~self.surface
+        # Without intrinsics K and quantisation steps: MoGe's focal length is used apart from the map.
+        return DepthMap(depth, known | is_sky, K=None, quantum=None, quantity="depth", path=path)
 
 
 class MogeBase:
@@ -79,7 +79,7 @@ class MogeBase:
     name = "moge"
 
     def __init__(self, network: MogeNetwork, precision: str) -> None:
-        """Use a loaded network on its device; `precision` is its name in the report."""
+        """Use a loaded network on its device; `precision`, fp32 or bf16, is for the report."""
         self.network = network
         self.precision = precision
 
@@ -93,8 +93,9 @@ class MogeBase:
     ) -> MogeBase:
         """Read MoGe-2's model.pt.
 
-        `device` is cpu or a CUDA device; None: CUDA if available. InputError for a missing device,
-        a foreign or broken file, or too little memory.
+        `precision` is the number type of most of the arithmetic; auto is bf16 if the hardware
+        multiplies it natively. `device` is cpu or a CUDA device; None: CUDA if available.
+        InputError for a missing device, a foreign or broken file, or too little memory.
         """
         target = pick_device(device)
         dtype = pick_dtype(precision, target)
@@ -103,17 +104,21 @@ class MogeBase:
         return cls(network, "bf16" if dtype == torch.bfloat16 else "fp32")
 
     def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
-        """Gaussians of the photo's pixels at its working size, on the surfaces that MoGe sees.
+        """Gaussians of the photo's pixels, on the surfaces that MoGe sees.
 
-        The user's or the file's focal length is kept. Without one, MoGe's focal length is used if
-        it is plausible, else the assumed one. The sky lies behind all surfaces. InputError if the
-        network finds no surface, or memory is short.
+        The photo is first resized to its working size (the long side is at most 1536 pixels). The
+        user's or the file's focal length is kept. Without one, MoGe's focal length is used if it is
+        plausible, else the assumed one. The sky lies behind all surfaces. InputError if the network
+        finds no surface, or memory is short.
         """
         photo = resize_photo(photo)
+        # A checkpoint says how many tokens it was trained with.
         tokens = min(max(USUAL_TOKENS, self.network.least_tokens), self.network.most_tokens)
         rows, columns = token_grid(photo.height, photo.width, tokens)
-        # The maps need not be finer than the network's finest level: lifting enlarges them. Both
-        # sizes have the photo's aspect ratio, so that the smaller height is the smaller size.
+
+        # The network's finest level, or the photo's size if that is smaller: lifting resizes the
+        # maps to the photo's pixels. Both sizes, (height, width), have the photo's aspect ratio, so
+        # that `min`, which compares the heights first, gives the smaller size.
         finest_size = (PIXELS_PER_TOKEN * rows, PIXELS_PER_TOKEN * columns)
         size = min(finest_size, (photo.height, photo.width))
         with report_memory_shortage():
@@ -130,17 +135,20 @@ class MogeBase:
 
     @staticmethod
     def _choose_focal(output: MogeOutput, photo: Photo) -> tuple[MogeView, Camera, str]:
-        """The view and the camera with the best known focal length, and its source for the report.
+        """Take the photo's focal length, or else the network's.
 
-        The source is "MoGe", or "" if the photo's focal length is taken.
+        Returns:
+            The network's depth of the photo and the photo's camera, both with this focal length,
+            and the source of the focal length for the report: "MoGe", or "" if it is the photo's.
         """
-        # An assumed focal length is worth less than the network's.
+        # The network's focal length is used only if the photo's is a mere assumption.
         if photo.focal_source.is_assumed:
             view = to_view(output, photo.width, photo.height)
             if is_plausible_focal(view.focal_px, photo.width, photo.height):
                 camera = Camera.from_focal(view.focal_px, photo.width, photo.height)
                 return view, camera, "MoGe"
-        return to_view(output, photo.width, photo.height, photo.focal_px), photo.camera, ""
+        view = to_view(output, photo.width, photo.height, photo.focal_px)
+        return view, photo.camera, ""
 
     @torch.no_grad()
     def run_network(self, rgb: Tensor, tokens: int, size: tuple[int, int]) -> MogeOutput:
@@ -156,28 +164,34 @@ class MogeBase:
 
 
 def to_view(output: MogeOutput, width: int, height: int, focal_px: float | None = None) -> MogeView:
-    """Convert the network's output for a width×height photo to metres.
+    """Convert the network's output for a photo of width × height pixels to metres.
 
-    The depth is (z + shift) · metric scale, with the shift and the focal length that project the
-    points to their pixels best. A given `focal_px`, in pixels of the photo, is kept.
+    The network predicts points (x, y, z) up to a shift along z and a scale. The depth is
+    (z + shift) · metric scale, with the shift and the focal length with which the points project to
+    their pixels best. If `focal_px`, in pixels of the photo, is not None, it is the focal length.
     """
     rows, columns = output.mask_logits.shape
-    # Two unknowns need few points: 64 × 64 of them, evenly spread.
+    # Two unknowns need few points: a grid of 64 × 64 (SAMPLES_PER_SIDE), evenly spread.
     sampled_rows = (torch.arange(SAMPLES_PER_SIDE) * rows // SAMPLES_PER_SIDE)[:, None]
     sampled_columns = torch.arange(SAMPLES_PER_SIDE) * columns // SAMPLES_PER_SIDE
     points = output.points[sampled_rows, sampled_columns].double()  # [64, 64, 3]
     plane = view_plane(rows, columns, width / height)[0].permute(1, 2, 0)  # [h, w, 2]
     places = plane[sampled_rows, sampled_columns].double()  # [64, 64, 2]
-    # The sky's points are far away and arbitrary.
+    # The sky's points are left out: they are far away and arbitrary.
     is_surface = output.mask_logits[sampled_rows, sampled_columns] > 0
     usable = is_surface & points.isfinite().all(-1)
 
     half_diagonal = math.hypot(width, height) / 2  # the unit of places and of the focal length
     known_focal = None if focal_px is None else focal_px / half_diagonal
     focal, shift = focal_and_shift(points[usable].numpy(), places[usable].numpy(), known_focal)
-    # The shift is in the network's units, hence before the metric scale.
+    # The shift is in the network's units, hence it is added before the scale is applied.
     depth = (output.points[..., 2] + shift) * output.metric_scale
-    return MogeView(depth, output.mask_logits > 0, focal * half_diagonal, shift)
+    return MogeView(
+        depth=depth,
+        surface=output.mask_logits > 0,
+        focal_px=focal * half_diagonal,
+        shift=shift,
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -195,16 +209,20 @@ class _Fit:
 
 
 def _fit_at(shift: float, points: Floats, places: Floats, known_focal: float | None) -> _Fit:
-    """Project points [N, 3], shifted along z, by the best focal length or a known one.
+    """Project points [N, 3] that are shifted by `shift` along z, and compare with their places.
 
-    The best one for a shift has a closed form, because the residual is linear in it.
+    The places [N, 2] are where the points should project to. The focal length is the known one, or
+    else that with the least squared residuals, focal · projected - places. It has a closed form,
+    because the residuals are linear in the focal length.
     """
-    with np.errstate(all="ignore"):  # a shift may put a point into the camera
+    # A shift may put a point into the camera, where z + shift is zero.
+    with np.errstate(all="ignore"):
         projected = points[:, :2] / (points[:, 2:] + shift)
         focal = known_focal
         if focal is None:
             focal = float((projected * places).sum() / (projected * projected).sum())
-        return _Fit(focal, projected, focal * projected - places)
+        residual = focal * projected - places
+    return _Fit(focal, projected, residual)
 
 
 def focal_and_shift(
@@ -212,31 +230,33 @@ def focal_and_shift(
 ) -> tuple[float, float]:
     """The focal length f and the shift s along z with which points project to their places.
 
-    Gauss-Newton steps from s = 0 minimise the sum of |f (x, y) / (z + s) - place|²; a step is
-    halved until the error falls.
+    Gauss-Newton steps from s = 0 minimise the error, the sum of |f (x, y) / (z + s) - place|². A
+    step that would not reduce the error is halved until it does.
 
     Args:
-        points: [N, 3]; fewer than two points give f = 1 and s = 0.
+        points: [N, 3], x, y and z; fewer than two points give s = 0 and, unless it is known, f = 1.
         places: [N, 2] on the photo, from its centre.
-        known_focal: a focal length that is kept; None: it is found. Its unit, and that of `places`
+        known_focal: the focal length; None: it is searched for, too. Its unit, and that of `places`
             and of the result, is half the photo's diagonal.
     """
     if len(points) < 2:
         return known_focal or 1.0, 0.0
 
-    # The iteration needs a start; most photos need but a small shift.
+    # The search begins without a shift, because most photos need only a small one.
     shift = 0.0
     fit = _fit_at(shift, points, places, known_focal)
     for _ in range(MAX_SHIFT_STEPS):
         step = _gauss_newton_step(fit, shift, points, places, known_focal)
         shortest = SHIFT_TOLERANCE * (1 + abs(shift))
-        # An error that is not a number does not fall.
+        # The error is NaN if the step puts a point into the camera. NaN is not less than the
+        # present error, so that such a step is halved, too.
         while abs(step) > shortest:
             if _fit_at(shift + step, points, places, known_focal).error < fit.error:
                 break
             step /= 2
         shift += step
         fit = _fit_at(shift, points, places, known_focal)
+        # `not … >` also ends the search if the step is NaN.
         if not abs(step) > SHIFT_TOLERANCE * (1 + abs(shift)):
             break
     return fit.focal, shift
@@ -247,7 +267,9 @@ def _gauss_newton_step(
 ) -> float:
     """The change of the shift that would make the residuals smallest if they were linear in it.
 
-    points [N, 3] are shifted by `shift` so far; places [N, 2] are where they should project to.
+    The residuals, fit.focal · fit.projected - places, say how far the points [N, 3], which are
+    shifted by `shift` so far, project beside their places [N, 2]. Without a known focal length, it
+    is the best one for each shift.
     """
     projected_slope = -fit.projected / (points[:, 2:] + shift)  # d projected / d shift
     residual_slope = fit.focal * projected_slope  # d residual / d shift, at this focal length
@@ -258,6 +280,8 @@ def _gauss_newton_step(
             / (fit.projected * fit.projected).sum()
         )
         residual_slope += focal_slope * fit.projected
-    # All points on one line through the camera have slope 0: then the step is 0.
+    # All points on one line through the camera project to the same place whatever the shift: the
+    # slope is 0, and so is the step.
     squared_slope = (residual_slope * residual_slope).sum()
-    return -float((residual_slope * fit.residual).sum() / (squared_slope or 1.0))
+    divisor = squared_slope or 1.0
+    return -float((residual_slope * fit.residual).sum() / divisor)

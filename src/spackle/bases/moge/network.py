@@ -60,23 +60,29 @@ class DinoBackbone(nn.Module):
         super().__init__()
         self.cls_token = nn.Parameter(torch.zeros(1, 1, width))
         self.pos_embed = nn.Parameter(torch.zeros(1, 1 + TRAINED_GRID**2, width))
-        self.mask_token = nn.Parameter(torch.zeros(1, width))  # for training only
+        # Only DINOv2's training used this one; it is here because the checkpoint holds it.
+        self.mask_token = nn.Parameter(torch.zeros(1, width))
         patch_conv = nn.Conv2d(3, width, TOKEN_PX, stride=TOKEN_PX)
         self.patch_embed = nn.ModuleDict({"proj": patch_conv})
         self.blocks = nn.ModuleList(TransformerBlock(width, head_count) for _ in range(block_count))
         self.norm = nn.LayerNorm(width, eps=NORM_EPS)
 
     def forward(self, image: Tensor, layers: Sequence[int]) -> list[Tensor]:
-        """Normalised tokens [1, 1 + h·w, C], the class token first, after the blocks `layers`.
+        """Encode an image, and return the tokens after some of the transformer's blocks.
 
-        `image` is [1, 3, 14·h, 14·w], normalised as DINOv2 was trained.
+        Args:
+            image: [1, 3, 14·h, 14·w], normalised as in DINOv2's training.
+            layers: numbers of these blocks.
+
+        Returns:
+            For each of these blocks the normalised tokens [1, 1 + h·w, C], the class token first.
         """
         patches = self.patch_embed["proj"](image)  # [1, C, h, w]
         rows, columns = patches.shape[2:]
         tokens = patches.flatten(2).transpose(1, 2)  # [1, h·w, C]
         tokens = torch.cat([self.cls_token, tokens], dim=1) + self._positions(rows, columns)
 
-        # The encoder uses tokens of several depths.
+        # The caller chooses: early blocks keep details, late blocks know more of the whole image.
         tokens_after_block = []
         for block in self.blocks:
             tokens = block(tokens)
@@ -84,14 +90,16 @@ class DinoBackbone(nn.Module):
         return [self.norm(tokens_after_block[layer]) for layer in layers]
 
     def _positions(self, rows: int, columns: int) -> Tensor:
-        """The learned positions, interpolated to a grid of tokens: [1, 1 + rows·columns, C].
+        """Position embeddings for a grid of rows × columns tokens: [1, 1 + rows·columns, C].
 
-        The first is that of the class token.
+        They are interpolated from those of the grid of 37 × 37 tokens in training. The first one
+        belongs to the class token.
         """
         if (rows, columns) == (TRAINED_GRID, TRAINED_GRID):
             return self.pos_embed
         grid = self.pos_embed[:, 1:].reshape(1, TRAINED_GRID, TRAINED_GRID, -1)
-        # DINOv2 resizes by a factor of (n + 0.1) / 37, which puts positions a little off the grid.
+        # As in DINOv2's own code, the factor for n tokens is (n + 0.1) / 37 and not n / 37. This
+        # moves the positions a little, as in the published network.
         factors = ((rows + 0.1) / TRAINED_GRID, (columns + 0.1) / TRAINED_GRID)
         resized = interpolate(
             grid.permute(0, 3, 1, 2), scale_factor=factors, mode="bicubic", align_corners=False
@@ -109,8 +117,11 @@ class DinoEncoder(nn.Module):
         """Build the encoder for the part `encoder` of a checkpoint's `model_config`."""
         super().__init__()
         width, block_count, head_count = BACKBONES[config["backbone"]]
-        blocks = range(block_count)
-        self.layers = [blocks[layer] for layer in config["intermediate_layers"]]
+        # The transformer's blocks whose tokens become features. Looking a number up in the range
+        # of all numbers turns -1 into the last block, and refuses a number that is too large.
+        block_numbers = range(block_count)
+        self.layers = [block_numbers[layer] for layer in config["intermediate_layers"]]
+        # The checkpoint holds the mean and standard deviation of its training images.
         self.register_buffer("image_mean", torch.zeros(1, 3, 1, 1))
         self.register_buffer("image_std", torch.ones(1, 3, 1, 1))
         self.backbone = DinoBackbone(width, block_count, head_count)
@@ -123,7 +134,7 @@ class DinoEncoder(nn.Module):
 
         The image is sRGB in 0..1.
         """
-        # The photo gets the size of a whole number of tokens.
+        # The image is resized to a whole number of tokens of 14 pixels along each side.
         resized = interpolate(
             image,
             size=(TOKEN_PX * rows, TOKEN_PX * columns),
@@ -136,9 +147,11 @@ class DinoEncoder(nn.Module):
 
         features = []
         for project, tokens in zip(self.output_projections, tokens_by_layer, strict=True):
-            token_map = tokens[:, 1:].transpose(1, 2).unflatten(2, (rows, columns))
+            without_class = tokens[:, 1:]  # the class token is the first one
+            token_map = without_class.transpose(1, 2).unflatten(2, (rows, columns))
             features.append(project(token_map))  # [1, C, rows, columns]
-        class_token = tokens_by_layer[-1][:, 0]
+        last_tokens = tokens_by_layer[-1]
+        class_token = last_tokens[:, 0]
         return torch.stack(features).sum(0), class_token
 
 
@@ -153,7 +166,8 @@ class ConvBlock(nn.Module):
     def __init__(self, width: int) -> None:
         """Build the block for features with `width` channels."""
         super().__init__()
-        # The identities stand where other kinds of MoGe have norms: the checkpoint counts them.
+        # Other kinds of MoGe have normalisation layers in the places of the identities. The names
+        # in the checkpoint contain each layer's number, so that the identities must be counted.
         self.layers = nn.Sequential(
             nn.Identity(),
             nn.ReLU(),
@@ -195,12 +209,14 @@ class Pyramid(nn.Module):
     def __init__(self, config: Mapping[str, Any]) -> None:
         """Build the pyramid for a part of a checkpoint's `model_config`, such as `neck`.
 
-        A kind that was never published raises ValueError, or another exception.
+        The part may be damaged: then any exception may be raised, and for options that no published
+        checkpoint has, ValueError.
         """
         super().__init__()
         _check_pyramid_options(config)
         widths = config["dim_res_blocks"]  # channels of each level
-        output_channels = config["dim_out"] or [None] * LEVEL_COUNT  # None: as many as the level
+        # None: a level's output has as many channels as the level.
+        output_channels = config["dim_out"] or [None] * LEVEL_COUNT
 
         self.input_blocks = nn.ModuleList(
             nn.Conv2d(inputs, width, kernel_size=1)
@@ -214,6 +230,7 @@ class Pyramid(nn.Module):
             nn.Identity() if channels is None else nn.Conv2d(width, channels, 1)
             for width, channels in zip(widths, output_channels, strict=True)
         )
+        # One from each level to the next finer level.
         self.resamplers = nn.ModuleList(
             make_resampler(kind, coarse_width, fine_width)
             for kind, coarse_width, fine_width in zip(
@@ -238,8 +255,11 @@ class Pyramid(nn.Module):
 
 
 def _check_pyramid_options(config: Mapping[str, Any]) -> None:
-    """ValueError unless a pyramid has five levels, few blocks, and the published options."""
-    # Older configurations leave these two out.
+    """ValueError unless a pyramid has five levels, and the options of all published checkpoints.
+
+    The number of blocks is limited, too, because a damaged file may ask for millions.
+    """
+    # Older checkpoints leave out these two options, and mean the values here.
     defaults = {"dim_times_res_block_hidden": 1, "activation": "relu"}
     options = {**defaults, **config}
     for key, value in PUBLISHED_PYRAMID_OPTIONS.items():
@@ -256,12 +276,14 @@ class MogeNetwork(nn.Module):
     def __init__(self, config: Mapping[str, Any]) -> None:
         """Build the network for a checkpoint's `model_config`.
 
-        A kind that was never published raises ValueError, or another exception.
+        The configuration may be damaged: then any exception may be raised, and for options that no
+        published checkpoint has, ValueError.
         """
         super().__init__()
         least_tokens, most_tokens = config["num_tokens_range"]
         self.least_tokens = int(least_tokens)
         self.most_tokens = int(most_tokens)
+        # How numbers of the points' head become coordinates.
         if config["remap_output"] not in ("exp", "sinh_exp"):
             raise ValueError(f"remap_output is {short_repr(config['remap_output'])}")
         self.remap_output = config["remap_output"]
@@ -287,12 +309,12 @@ class MogeNetwork(nn.Module):
         """
         levels, metric_scale = self.features(image, tokens)
         x, y, log_z = self.decode(self.points_head, levels, size).unbind(-1)  # each [h, w]
+        # The logarithm gives near and far surfaces the same relative accuracy.
         z = log_z.exp()
-        # Exponentials give near and far surfaces the same relative accuracy.
-        if self.remap_output == "exp":  # the network predicts x / z, y / z and log z
+        if self.remap_output == "exp":  # the network predicts x / z and y / z
             x = x * z
             y = y * z
-        else:
+        else:  # it predicts the inverse hyperbolic sine of x and y, also a kind of logarithm
             x = x.sinh()
             y = y.sinh()
         mask_logits = self.decode(self.mask_head, levels, size)[..., 0]
@@ -306,13 +328,15 @@ class MogeNetwork(nn.Module):
         height, width = image.shape[2:]
         rows, columns = token_grid(height, width, tokens)
         features, class_token = self.encoder(image, rows, columns)
-        # Each level also gets the direction of its pixels, in which the aspect ratio shows.
+        # Each level also gets its pixels' places on the photo, which tell the aspect ratio.
         planes = [
-            view_plane(rows << level, columns << level, width / height).to(image)
+            view_plane(rows * 2**level, columns * 2**level, width / height).to(image)
             for level in range(LEVEL_COUNT)
         ]
+        # The encoder's features go into the coarsest level; the finer levels get only the places.
         inputs = [torch.cat([features, planes[0]], dim=1), *planes[1:]]
-        return self.neck(inputs), self.scale_head(class_token)[0, 0].exp()
+        metric_scale = self.scale_head(class_token)[0, 0].exp()
+        return self.neck(inputs), metric_scale
 
     @staticmethod
     def decode(head: Pyramid, levels: Sequence[Tensor], size: tuple[int, int]) -> Tensor:
@@ -332,15 +356,16 @@ def token_grid(height: int, width: int, tokens: int) -> tuple[int, int]:
 
 
 def view_plane(rows: int, columns: int, aspect: float) -> Tensor:
-    """[1, 2, rows, columns]: x and y of each cell's centre on the photo.
+    """Where the cells of a grid over the photo have their centres: x and y [1, 2, rows, columns].
 
-    They count from the photo's centre, in units of half its diagonal; `aspect` is width over
-    height.
+    They count from the photo's centre, in units of half its diagonal; `aspect` is the photo's width
+    over its height.
     """
-    # From -1 to 1 across the photo.
+    # First from -1 to 1 across the photo.
     x = (2 * torch.arange(columns, dtype=torch.float64) + 1) / columns - 1
     y = (2 * torch.arange(rows, dtype=torch.float64) + 1) / rows - 1
-    # Half the diagonal as the unit makes focal lengths of all aspect ratios alike.
+    # Then in units of half the diagonal: in this unit, a lens with a certain diagonal angle of view
+    # has the same focal length at every aspect ratio.
     diagonal = math.hypot(1, aspect)
     grid = torch.meshgrid(x * (aspect / diagonal), y / diagonal, indexing="xy")
     return torch.stack(grid)[None].float()
@@ -349,9 +374,9 @@ def view_plane(rows: int, columns: int, aspect: float) -> Tensor:
 def load_network(path: str | os.PathLike[str], dtype: torch.dtype) -> MogeNetwork:
     """A frozen network from MoGe-2's model.pt, on the CPU.
 
-    Residual blocks compute in `dtype`, float32 or bfloat16, and add to float32 features, because
-    bfloat16's eight bits would turn slanted surfaces into stairs. Nothing in the file is executed.
-    InputError for a wrong file or too little memory.
+    Residual blocks compute in `dtype`, float32 or bfloat16. The features that they add to are
+    float32, because bfloat16's eight bits would turn slanted surfaces into stairs. Nothing in the
+    file is executed. InputError for a wrong file or too little memory.
     """
     config, tensors = read_checkpoint(path, "model_config", ADVICE)
     unpublished = as_input_error(path, f"not a published kind of MoGe-2 ({{reason}}): {ADVICE}")
@@ -361,7 +386,7 @@ def load_network(path: str | os.PathLike[str], dtype: torch.dtype) -> MogeNetwor
     weights = {
         name.removeprefix("model."): tensor
         for name, tensor in tensors.items()
-        # Spackle does not use the head for normals.
+        # The head that predicts surface normals is left out: they are not needed.
         if name.startswith("model.") and not name.startswith("model.normal_head.")
     }
     convert = functools.partial(set_precision, dtype=dtype)
@@ -369,9 +394,10 @@ def load_network(path: str | os.PathLike[str], dtype: torch.dtype) -> MogeNetwor
 
 
 def set_precision(network: nn.Module, dtype: torch.dtype) -> None:
-    """Convert the layers of residual blocks to `dtype`, in place, and kernels to channels-last.
+    """Convert the layers of residual blocks to `dtype`, in place; the other layers stay float32.
 
-    These layers take most of the time; the others stay float32.
+    These blocks take most of the time. Kernels of all layers become channels-last, which is fast on
+    a CPU.
     """
     for block in network.modules():
         if isinstance(block, (TransformerBlock, ConvBlock)):

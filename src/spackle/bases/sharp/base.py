@@ -67,9 +67,9 @@ class SharpBase:
 
         Args:
             network: from `load_network`.
-            windows_per_batch: of a photo's 35 windows, so many go through the transformer at once;
-                None: 5 on a CPU, all on a GPU.
-            weights: the name of the weights in the report.
+            windows_per_batch: how many of a photo's 35 overlapping windows go through the
+                transformer at once; None: 5 on a CPU, all on a GPU.
+            weights: the name of the file of weights, for the report.
         """
         check_window_batch(windows_per_batch)
         self.network = network
@@ -87,12 +87,13 @@ class SharpBase:
         """Read a checkpoint.
 
         Args:
-            path: Apple's .pt file, a safetensors file with the same names, or a decoder that
-                `spackle train --method direct-ft` wrote; see `load_network`.
+            path: Apple's .pt file, a safetensors file with the same names of tensors, or a decoder
+                that `spackle train --method direct-ft` wrote.
             precision: number type of the heavy arithmetic; auto is bf16 if the hardware multiplies
                 it natively.
-            windows_per_batch: of a photo's 35 windows, so many go through the transformer at once;
-                None: 5 on a CPU, all on a GPU. The last bits of the result depend on this number.
+            windows_per_batch: how many of a photo's 35 overlapping windows go through the
+                transformer at once; None: 5 on a CPU, all on a GPU. The last bits of the result
+                depend on this number.
             device: cpu or a CUDA device; None: CUDA if available.
 
         Raises:
@@ -116,12 +117,13 @@ class SharpBase:
     def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
         """Two layers of Gaussians in metres, the nearer layer first, row by row.
 
-        InputError if memory is short. `progress` gets the number of windows of the picture that are
-        done, and that of all windows.
+        The network works on 35 overlapping windows of the picture: `progress` is called with the
+        number of windows done and that of all windows. InputError if memory is short.
         """
         with report_memory_shortage(MEMORY_ADVICE):
             gaussians = to_metric(self.infer(photo, progress), photo)
-        # SHARP has a resolution of its own; the scene's camera has the size at which it is shown.
+        # The number of Gaussians does not depend on the photo's size. The camera gets the size at
+        # which the scene is shown, the photo's working size.
         camera = Camera.from_focal(photo.focal_px, photo.width, photo.height)
         width, height = working_size(photo.width, photo.height)
         notes: dict[str, float | int | str] = {"precision": self.precision, "weights": self.weights}
@@ -129,7 +131,11 @@ class SharpBase:
 
     @torch.no_grad()
     def infer(self, photo: Photo, progress: Progress | None = None) -> SharpOutput:
-        """The network's output for a photo; `to_metric` turns it into Gaussians."""
+        """The network's output for a photo, which `to_metric` turns into Gaussians.
+
+        `progress` is called with the number of windows of the picture that are done, and that of
+        all windows.
+        """
         rgb = photo.rgb.to(self.device, non_blocking=True)
         image = resize_to_square(rgb, self.network.config.side)
         disparity_factor = photo.focal_px / photo.width
@@ -183,16 +189,18 @@ def load_network(
 ) -> SharpNetwork:
     """A frozen network on a device, from Apple's .pt file or safetensors with the same names.
 
-    The size, published or tiny, follows from the shapes. If a file holds only a trained Gaussian
-    decoder, the other weights come from the checkpoint that it names. The heavy arithmetic is in
-    `dtype`, float32 or bfloat16. Nothing in the file is executed. InputError for a missing, broken
-    or foreign file, or too little memory.
+    The shapes of the tensors tell the network's size, which is the published one or a tiny one for
+    tests. If the file holds only a trained Gaussian decoder, all other weights come from the
+    checkpoint that it names. The heavy arithmetic is in `dtype`, float32 or bfloat16. Nothing in
+    the file is executed. InputError for a missing, broken or foreign file, or too little memory.
     """
     tensors: Mapping[str, Tensor] = read_tensors(path, ADVICE)
-    # A decoder is 1 % of the weights; copies of the rest would fill a disk.
+    # A decoder's file holds 1 % of the weights, and names the checkpoint with the others: a copy of
+    # them in the file of each decoder would fill the disk.
     source = source_checkpoint_of(path)
     if source is not None:
         tensors = _completed_by_source(tensors, path, source)
+    # A checkpoint also holds weights that only its training used.
     used = {
         name: tensor for name, tensor in tensors.items() if not name.startswith(UNUSED_PREFIXES)
     }
@@ -208,10 +216,12 @@ def load_network(
 def _size_of(tensors: Mapping[str, Tensor]) -> SharpConfig:
     """The size of SHARP that a checkpoint belongs to, by the shape of its learned positions.
 
-    If none fits, it is the published size: loading then says what is wrong.
+    If no size fits, the published one is returned: loading then raises an error that says what is
+    wrong.
     """
     positions = tensors.get(f"{_ENCODER_PREFIX}patch_encoder.pos_embed", torch.empty(0))
-    # The tests' tiny sizes are read by the same function as the published one.
+    # Besides the published size there are tiny ones, for tests. There is a position for each token
+    # and one for the class token.
     for config in SIZES.values():
         if positions.shape == (1, 1 + config.tokens_per_side**2, config.embed_width):
             return config
@@ -243,9 +253,11 @@ class SourceCheckpoint:
 
 
 def encode_decoder(decoder: nn.Module, source: SourceCheckpoint) -> bytes:
-    """A `GaussianDecoder` as a safetensors file that names the checkpoint it was trained on.
+    """The bytes of a safetensors file with a decoder's weights and the name of its checkpoint.
 
-    Float32 restores unchanged weights bit for bit.
+    The `GaussianDecoder` is the part of SHARP that is trained; the checkpoint is where the training
+    began. Weights are stored as float32, like the checkpoint's, so that those which the training
+    leaves alone are the same to the bit.
     """
     tensors = {
         name: tensor.detach().float().cpu().contiguous()
@@ -256,9 +268,13 @@ def encode_decoder(decoder: nn.Module, source: SourceCheckpoint) -> bytes:
 
 
 def link_source_checkpoint(source: SourceCheckpoint, folder: Path) -> None:
-    """Put a link to a checkpoint into the folder of the decoders that were trained on it."""
+    """Put a link to a checkpoint into the folder of the decoders that were trained on it.
+
+    Where links cannot be made, nothing happens.
+    """
     link = folder / source.link_name
-    # The link exists, or the file system has none: then the user copies the file.
+    # An OSError means that the link exists already, or that the file system has no links: then the
+    # user copies the checkpoint into the folder, as the message about a missing one says.
     with contextlib.suppress(OSError):
         if link.is_symlink() and not link.exists():  # the checkpoint has moved
             link.unlink()
@@ -266,9 +282,9 @@ def link_source_checkpoint(source: SourceCheckpoint, folder: Path) -> None:
 
 
 def source_checkpoint_of(path: str | os.PathLike[str]) -> SourceCheckpoint | None:
-    """The checkpoint that a decoder's file names; None for another file.
+    """The checkpoint that a decoder's file names; None for a file that holds no decoder.
 
-    InputError if it is a decoder's file without the name.
+    InputError if a decoder's file names no checkpoint.
     """
     # Only files that `encode_decoder` wrote have this key.
     note = read_metadata(path, SOURCE_KEY)
@@ -276,17 +292,25 @@ def source_checkpoint_of(path: str | os.PathLike[str]) -> SourceCheckpoint | Non
         return None
     with as_input_error(path, "does not say which checkpoint it was trained on: train it again"):
         facts = json.loads(note)
-        file_name = Path(str(facts["checkpoint"])).name  # never a path: the file is untrusted
+        # Only the name and no folder: an untrusted file must not choose what is read.
+        file_name = Path(str(facts["checkpoint"])).name
         return SourceCheckpoint(Path(file_name), str(facts["sha256"]))
 
 
 def _completed_by_source(
     decoder: Mapping[str, Tensor], path: str | os.PathLike[str], source: SourceCheckpoint
 ) -> dict[str, Tensor]:
-    """A decoder's tensors, and all other tensors from the checkpoint in the decoder's folder.
+    """All tensors of a network of which a file holds only the trained decoder.
 
-    InputError if the checkpoint is missing, unreadable or changed, or if the decoder belongs to
-    another network.
+    Args:
+        decoder: the file's tensors.
+        path: the file.
+        source: the checkpoint that the decoder was trained on. The other tensors are read from it;
+            it must be in the file's folder.
+
+    Raises:
+        InputError: the checkpoint is missing, unreadable or changed, or the decoder belongs to
+            another network.
     """
     checkpoint = _find_source(path, source)
     tensors = read_tensors(checkpoint, ADVICE)
@@ -294,7 +318,7 @@ def _completed_by_source(
     trained_names = {name for name in tensors if name.startswith(DECODER_PREFIXES)}
     wrong_names = sorted(trained_names ^ decoder.keys())  # in one of the two files only
     if wrong_names:
-        example = printable_line(wrong_names[0])[:120]
+        example = printable_line(wrong_names[0])[:120]  # a name in a file may be very long
         raise InputError(
             f"{path}: not a decoder of {checkpoint}: {len(wrong_names)} names differ, "
             f"e.g. {example}"
@@ -303,12 +327,13 @@ def _completed_by_source(
 
 
 def _find_source(path: str | os.PathLike[str], source: SourceCheckpoint) -> Path:
-    """The file of the checkpoint that a decoder was trained on, in the decoder's folder.
+    """Find the checkpoint that a decoder was trained on, beside the decoder's file `path`.
 
-    It has the link's name, or its own. InputError if it is missing, unreadable or changed.
+    It is a link that the training made, or a file with the checkpoint's own name. InputError if it
+    is missing, unreadable or changed.
     """
     folder = Path(path).absolute().parent
-    # The name comes from an untrusted file, and goes to a terminal.
+    # The name comes from an untrusted file, and messages with it go to a terminal.
     shown_name = printable_line(source.path.name)
     candidates = [folder / source.link_name, folder / source.path.name]
     checkpoint = next((file for file in candidates if os.path.isfile(file)), None)
@@ -323,7 +348,7 @@ def _find_source(path: str | os.PathLike[str], source: SourceCheckpoint) -> Path
         sha256 = sha256_of(file)
     # Another checkpoint would load without an error and give a wrong scene.
     if sha256 != source.sha256:
-        shown_digest = printable_line(source.sha256)[:64]
+        shown_digest = printable_line(source.sha256)[:64]  # a true SHA-256 has 64 digits
         raise InputError(
             f"{path}: trained on a checkpoint with the SHA-256 {shown_digest}, "
             f"but {checkpoint} has another: put the right {shown_name} into the folder"

@@ -70,6 +70,7 @@ TINY_SIZE = SharpConfig(
 MICRO_SIZE = dataclasses.replace(TINY_SIZE, window=128)  # a ninth of the pixels
 SIZES = {"full": FULL_SIZE, "tiny": TINY_SIZE, "micro": MICRO_SIZE}
 
+# The layers that take most of the time; the others, such as layer norms, stay float32.
 _EXPENSIVE_LAYERS = (nn.Linear, nn.Conv2d, nn.ConvTranspose2d, nn.GroupNorm)
 
 
@@ -92,9 +93,10 @@ def to_precision_of(x: Tensor, module: nn.Module) -> Tensor:
 
 
 def set_precision(network: nn.Module, dtype: torch.dtype) -> None:
-    """Convert the expensive layers to `dtype`, in place.
+    """Convert the expensive layers (linear layers, convolutions, group norms) to `dtype`, in place.
 
-    Kernels become channels-last, which is fast on a CPU.
+    The other layers stay float32, and so does each `Float32Conv`. Kernels become channels-last,
+    which is fast on a CPU.
     """
     for module in network.modules():
         if isinstance(module, _EXPENSIVE_LAYERS) and not isinstance(module, Float32Conv):
@@ -113,6 +115,7 @@ class VisionTransformer(nn.Module):
         super().__init__()
         width = config.embed_width
         self.tokens_per_side = config.tokens_per_side
+        # The modules are named as in DINOv2's checkpoints.
         self.cls_token = nn.Parameter(torch.zeros(1, 1, width))
         self.pos_embed = nn.Parameter(torch.zeros(1, 1 + config.tokens_per_side**2, width))
         patch_conv = Float32Conv(3, width, config.patch, stride=config.patch)
@@ -206,12 +209,15 @@ class SlidingPyramid(nn.Module):
         super().__init__()
         self.early_blocks = config.early_blocks
         self.window = config.window
-        # In tokens, half of what neighbouring windows have in common.
+        # Neighbouring windows overlap by a quarter of their side at full size, and by a half at half
+        # size. When their maps are joined, each loses half of the overlap: so many tokens.
         self.full_size_trim = config.tokens_per_side // 8
         self.half_size_trim = config.tokens_per_side // 4
         self.patch_encoder = VisionTransformer(config)
         self.image_encoder = VisionTransformer(config)
 
+        # Each feature map gets its channels and its size by one of these, from the finest map (of
+        # an early block) to the coarsest. The names are the checkpoint's.
         embed = config.embed_width
         finest = config.depth_width
         fine, middle, coarse, coarsest = config.pyramid_channels
@@ -220,6 +226,7 @@ class SlidingPyramid(nn.Module):
         self.upsample0 = _project_and_upsample(embed, middle, middle, doublings=1)
         self.upsample1 = _project_and_upsample(embed, coarse, coarse, doublings=1)
         self.upsample2 = _project_and_upsample(embed, coarsest, coarsest, doublings=1)
+        # The coarsest map is made of the outputs of both transformers for the smallest picture.
         self.upsample_lowres = nn.ConvTranspose2d(embed, coarsest, 2, stride=2)
         self.fuse_lowres = nn.Conv2d(2 * coarsest, coarsest, 1)
 
@@ -228,14 +235,15 @@ class SlidingPyramid(nn.Module):
     ) -> list[Tensor]:
         """Encode a picture [1, 3, side, side] in -1..1, as published [1, 3, 1536, 1536].
 
-        `windows_per_batch` windows go through the transformer at once; `progress` gets the number
-        of windows done and that of all windows.
+        The picture is cut into 35 windows, of which `windows_per_batch` go through the transformer
+        at once. `progress` is called with the number of windows done and that of all windows.
 
         Returns:
             Five feature maps, fine to coarse; as published [1, 256, 768, 768], [1, 256, 384, 384],
             [1, 512, 192, 192], [1, 1024, 96, 96] and [1, 1024, 48, 48].
         """
-        # Large objects fill several windows at full size, and are seen whole at a smaller one.
+        # A large object fills several windows at full size; at a smaller size, one window shows all
+        # of it.
         half = interpolate(image, scale_factor=0.5, mode="bilinear")
         quarter = interpolate(image, scale_factor=0.25, mode="bilinear")
         windows = torch.cat(
@@ -245,6 +253,7 @@ class SlidingPyramid(nn.Module):
                 quarter,
             ]
         )  # [35, 3, window, window]
+        # Features after the last block, and after two earlier blocks.
         last, (early, later) = self._encode_windows(windows, windows_per_batch, progress)
         last_full, last_half, last_quarter = torch.split(
             last, [FULL_SIZE_WINDOWS**2, HALF_SIZE_WINDOWS**2, 1]
@@ -267,17 +276,20 @@ class SlidingPyramid(nn.Module):
     ) -> tuple[Tensor, list[Tensor]]:
         """Send windows [35, 3, window, window] through the transformer, a batch at a time.
 
+        `progress` is called after each batch with the number of windows done, and that of all.
+
         Returns:
-            The last block's features, as published [35, 1024, 24, 24], and for each early block the
-            features of the full-size windows, as published [25, 1024, 24, 24].
+            The last block's features, as published [35, 1024, 24, 24], and for each of the two
+            `early_blocks` the features of the full-size windows, as published [25, 1024, 24, 24].
         """
         last_batches: list[Tensor] = []
-        early_batches: list[list[Tensor]] = [[] for _ in self.early_blocks]
+        early_batches: list[list[Tensor]] = [[] for _ in self.early_blocks]  # a list for each block
         for start in range(0, len(windows), windows_per_batch):
             end = start + windows_per_batch
             last, early = self.patch_encoder(windows[start:end], self.early_blocks)
             last_batches.append(to_precision_of(last, self.fuse_lowres))
-            # Only the full-size windows, which come first, need early features.
+            # Early features are needed only of the full-size windows. These come first: so many are
+            # left at the start of this batch.
             full_size_count = max(0, FULL_SIZE_WINDOWS**2 - start)
             for batches, features in zip(early_batches, early, strict=True):
                 batches.append(to_precision_of(features[:full_size_count], self.fuse_lowres))
@@ -301,10 +313,13 @@ def cut_windows(image: Tensor, window: int, count: int) -> Tensor:
 def merge_windows(maps: Tensor, trim: int) -> Tensor:
     """Join feature maps [n², C, G, G] of n × n windows to one map [1, C, S, S].
 
-    It undoes `cut_windows`: `trim` cells, half of the overlap, are cut off beside each neighbour.
+    The windows overlap, as `cut_windows` cut them. On each side with a neighbour, `trim` cells are
+    cut off from a window's map: half of the overlap.
     """
-    count = int(len(maps) ** 0.5)
+    count = int(len(maps) ** 0.5)  # n
     size = maps.shape[-1]
+    # The part of a map that is kept is the same range of rows for all windows in a row, and the
+    # same range of columns for all windows in a column.
     spans = []
     for i in range(count):
         begin = trim if i > 0 else 0
@@ -322,9 +337,10 @@ def merge_windows(maps: Tensor, trim: int) -> Tensor:
 def _project_and_upsample(
     dim_in: int, dim_middle: int, dim_out: int, doublings: int
 ) -> nn.Sequential:
-    """Layers that change channels from `dim_in` to `dim_out`, and double the size several times.
+    """Layers that change channels from `dim_in` to `dim_out`, and double the size `doublings` times.
 
-    A 1×1 convolution projects to `dim_middle` channels; each doubling is a transposed convolution.
+    First a 1×1 convolution projects to `dim_middle` channels. Each doubling is a transposed
+    convolution.
     """
     layers: list[nn.Module] = [nn.Conv2d(dim_in, dim_middle, 1, bias=False)]
     channels = dim_middle

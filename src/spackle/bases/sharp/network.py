@@ -52,12 +52,14 @@ class GroupNorm(nn.GroupNorm):
 
     def forward(self, x: Tensor) -> Tensor:
         """Normalise [1, C, H, W] by the mean and variance of each group of channels."""
-        # GPUs sum in a tree, which is exact enough; bfloat16 is rough anyway.
+        # Only float32 on a CPU needs the exact sums. GPUs add in pairs, which is exact enough, and
+        # bfloat16 has but three digits anyway.
         if x.device.type != "cpu" or x.dtype != torch.float32 or len(x) != 1:
             return super().forward(x)
-        rows = x[0].permute(1, 2, 0)  # [H, W, C]
-        mean = self._mean_by_group(rows.sum(1), rows.numel())  # [groups]
-        mean_square = self._mean_by_group(rows.square().sum(1), rows.numel())
+        pixels = x[0].permute(1, 2, 0)  # [H, W, C]
+        # Float32 is exact enough for the sums of single rows [H, C]; their sum is float64.
+        mean = self._mean_by_group(pixels.sum(1), pixels.numel())  # [groups]
+        mean_square = self._mean_by_group(pixels.square().sum(1), pixels.numel())
         scale = torch.rsqrt(mean_square - mean.square() + self.eps)
 
         channels_per_group = self.num_channels // self.num_groups
@@ -66,10 +68,14 @@ class GroupNorm(nn.GroupNorm):
         # (x - mean) · scale · weight + bias, as one multiplication and one addition for each value.
         factor = (self.weight * scale).float()
         shift = (self.bias - self.weight * scale * mean).float()
-        return torch.addcmul(shift, rows, factor).permute(2, 0, 1)[None]
+        return torch.addcmul(shift, pixels, factor).permute(2, 0, 1)[None]
 
     def _mean_by_group(self, row_sums: Tensor, value_count: int) -> Tensor:
-        """Float64 means [groups] of all channels in a group, from float32 sums [H, C] of rows."""
+        """Float64 means [groups] of all values of the channels in each group.
+
+        `row_sums` are the float32 sums [H, C] of each row of pixels; `value_count` is the number of
+        values of all groups together.
+        """
         channel_sums = row_sums.double().sum(0)  # [C]
         return channel_sums.view(self.num_groups, -1).sum(1) / (value_count // self.num_groups)
 
@@ -103,8 +109,12 @@ class Fusion(nn.Module):
     """Adds finer features to coarser features, and doubles the size if `upsample` is set."""
 
     def __init__(self, dim: int, upsample: bool) -> None:
-        """Build the layers for features with `dim` channels."""
+        """Build the layers for features with `dim` channels.
+
+        With `upsample` the output has twice the width and height of the input.
+        """
         super().__init__()
+        # The names are the checkpoint's: `resnet1` is for the finer features, `resnet2` for the sum.
         self.resnet1 = plain_residual(dim)
         self.resnet2 = plain_residual(dim)
         self.deconv = (
@@ -113,9 +123,10 @@ class Fusion(nn.Module):
         self.out_conv = nn.Conv2d(dim, dim, 1)
 
     def forward(self, coarse: Tensor, fine: Tensor | None = None) -> Tensor:
-        """Fuse features [1, C, H, W] of equal size into features of the same or twice the size.
+        """Add features [1, C, H, W] of two levels, and process the sum.
 
-        The coarsest level has no finer features: there `fine` is None.
+        `fine` is None at the coarsest level, where there is nothing to add. The result has the size
+        H×W, or 2H×2W if the block upsamples.
         """
         x = coarse if fine is None else coarse + self.resnet1(fine)
         out: Tensor = self.out_conv(self.deconv(self.resnet2(x)))
@@ -126,11 +137,12 @@ class Decoder(nn.Module):
     """Fuses feature maps, from coarse to fine, into one map of the finest size."""
 
     def __init__(self, map_channels: Sequence[int], width: int) -> None:
-        """Build a decoder with `width` channels.
+        """Build a decoder that fuses feature maps into one map with `width` channels.
 
-        `map_channels` are the channels of the maps, fine to coarse.
+        `map_channels` are the channels of the feature maps, fine to coarse.
         """
         super().__init__()
+        # First each map is projected to `width` channels, unless the finest map has them already.
         finest_channels, *coarser_channels = map_channels
         finest: nn.Module = nn.Identity()
         if finest_channels != width:
@@ -139,16 +151,19 @@ class Decoder(nn.Module):
             nn.Conv2d(channels, width, 3, padding=1, bias=False) for channels in coarser_channels
         ]
         self.convs = nn.ModuleList([finest, *coarser])
+        # Each level's output has the size of the next finer map; the finest map keeps its size.
         self.fusions = nn.ModuleList(
             Fusion(width, upsample=level > 0) for level in range(len(map_channels))
         )
 
     def forward(self, maps: Sequence[Tensor], coarser: Tensor | None = None) -> Tensor:
-        """Fuse maps, fine to coarse, into [1, width, H, W], the size of the finest map.
+        """Fuse feature maps into one map [1, width, H, W] of the finest map's size.
 
-        Map i is [1, C, H/2^i, W/2^i]. `coarser` are features that are added to the coarsest map.
+        Args:
+            maps: fine to coarse; map i is [1, C, H/2^i, W/2^i].
+            coarser: features [1, width, h, w] of the coarsest map's size, which are added to it.
         """
-        # From the coarsest map to the finest.
+        # The work goes from the coarsest map to the finest.
         features = coarser
         for level in reversed(range(len(maps))):
             projected = self.convs[level](maps[level])
@@ -186,10 +201,15 @@ class SharpNetwork(nn.Module):
     """The whole network, without the parts that inference never uses."""
 
     def __init__(self, config: SharpConfig) -> None:
-        """Build the network of one size; its weights are zeros or random."""
+        """Build SHARP with the widths and depths of `config`; its weights are zeros or random.
+
+        The depth network encodes the picture and predicts two layers of depth; the feature model
+        and the prediction head then predict the Gaussians.
+        """
         super().__init__()
         self.config = config
-        self.monodepth_model = nn.Module()  # the checkpoint's names have this level
+        # The checkpoint's names of tensors begin with monodepth_model.monodepth_predictor.
+        self.monodepth_model = nn.Module()
         self.monodepth_model.monodepth_predictor = DepthNetwork(config)
         self.feature_model = FeatureNetwork(config)
         self.prediction_head = PredictionHead(config.feature_width)
@@ -206,9 +226,9 @@ class SharpNetwork(nn.Module):
         Args:
             image: the photo, stretched to [1, 3, side, side], sRGB in 0..1, float32.
             disparity_factor: focal length over width, both in the photo's pixels.
-            windows_per_batch: of 35 windows of the picture, so many go through the transformer at
-                once.
-            progress: gets the number of windows done and that of all windows.
+            windows_per_batch: how many of the picture's 35 overlapping windows go through the
+                transformer at once.
+            progress: called with the number of windows done and that of all windows.
         """
         encoded = self.encode(image, disparity_factor, windows_per_batch, progress)
         decoder = self.gaussian_decoder()
@@ -222,22 +242,24 @@ class SharpNetwork(nn.Module):
         windows_per_batch: int,
         progress: Progress | None = None,
     ) -> DecoderInput:
-        """Do everything before the Gaussian decoder: encode a photo, and predict its depth.
+        """Compute what the Gaussian decoder needs: feature maps of a photo, and two depth layers.
 
         Args:
             image: the photo, stretched to [1, 3, side, side], sRGB in 0..1, float32.
             disparity_factor: focal length over width, both in the photo's pixels.
-            windows_per_batch: of 35 windows of the picture, so many go through the transformer at
-                once.
-            progress: gets the number of windows done and that of all windows.
+            windows_per_batch: how many of the picture's 35 overlapping windows go through the
+                transformer at once.
+            progress: called with the number of windows done and that of all windows.
         """
         depth_network: DepthNetwork = self.monodepth_model.monodepth_predictor  # type: ignore[assignment]
         encoder_maps = depth_network.encoder(image * 2 - 1, windows_per_batch, progress)
-        # The network predicts canonical disparity, focal length / width / depth.
+        # The network predicts canonical disparity, which is focal length / width / depth: it cannot
+        # know the focal length.
         disparity = depth_network.disparity(encoder_maps)
         disparity = disparity.clamp(MIN_CANONICAL_DISPARITY, MAX_CANONICAL_DISPARITY)
         depth = disparity.reciprocal() * disparity_factor  # [1, 2, side, side] metres
         initial = make_initial_gaussians(image, depth)
+        # From 0..1 to -1..1, like the encoder's input.
         image_and_disparity = torch.cat([image, initial.disparity_map], dim=1) * 2 - 1
         return DecoderInput(initial, image_and_disparity, encoder_maps)
 
@@ -250,11 +272,16 @@ class DepthNetwork(nn.Module):
     """Predicts two layers of disparity, as Depth Pro does."""
 
     def __init__(self, config: SharpConfig) -> None:
-        """Build the network of one size; its weights are zeros or random."""
+        """Build the depth network with the widths and depths of `config`.
+
+        Its weights are zeros or random.
+        """
         super().__init__()
         width = config.depth_width
-        self.encoder = SlidingPyramid(config)
+        self.encoder = SlidingPyramid(config)  # feature maps of five scales
         self.decoder = Decoder((width, *config.pyramid_channels), width)
+        # From the decoder's map, of half the picture's size, to two layers of disparity of the
+        # picture's size, none of it negative.
         self.head = nn.Sequential(
             nn.Conv2d(width, width // 2, 3, padding=1),
             nn.ConvTranspose2d(width // 2, width // 2, 2, stride=2),
@@ -278,14 +305,16 @@ class FeatureNetwork(nn.Module):
     """Computes the features from which deltas of the Gaussians are predicted."""
 
     def __init__(self, config: SharpConfig) -> None:
-        """Build the network of one size; its weights are zeros or random."""
+        """Build the network with the widths of `config`; its weights are zeros or random."""
         super().__init__()
         width = config.gaussian_width
         self.decoder = Decoder((config.depth_width, *config.pyramid_channels), width)
-        self.image_encoder = nn.Module()  # the checkpoint's names have this level
-        # From the pixels' sRGB and the disparity of both layers to one value for each cell.
+        # The picture has five channels: sRGB, and the disparity of two layers. Each cell of 2×2
+        # pixels becomes one vector of features. The checkpoint calls this layer image_encoder.conv.
+        picture_channels = 3 + LAYER_COUNT
+        self.image_encoder = nn.Module()
         self.image_encoder.conv = Float32Conv(
-            3 + LAYER_COUNT, width, CELL_STRIDE, stride=CELL_STRIDE
+            picture_channels, width, CELL_STRIDE, stride=CELL_STRIDE
         )
         self.fusion = Fusion(width, upsample=False)
         self.texture_head = _feature_head(width, config.feature_width)
@@ -297,16 +326,18 @@ class FeatureNetwork(nn.Module):
         encoder_maps: list[Tensor],
         coarser: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Texture and geometry features, each [1, F, side/2, side/2].
+        """Features for the texture and the geometry of Gaussians, each [1, F, side/2, side/2].
 
         Args:
-            image_and_disparity: [1, 5, side, side] in -1..1: sRGB, the disparity of both layers.
+            image_and_disparity: [1, 5, side, side] in -1..1: sRGB, and the disparity of the visible
+                surface and of what may be behind it.
             encoder_maps: the encoder's features, fine to coarse, [1, C, side/2, side/2] to
                 [1, C, side/32, side/32].
-            coarser: features that are added to the coarsest map.
+            coarser: features of the coarsest map's size that are added to it.
         """
         features = self.decoder(encoder_maps, coarser)
         image_features = self.image_encoder.conv(image_and_disparity)  # type: ignore[operator]
+        # The pixels themselves add details that the encoder's maps have lost.
         features = self.fusion(features, image_features.to(features))
         return self.texture_head(features), self.geometry_head(features)
 
@@ -356,9 +387,9 @@ class GaussianDecoder(nn.Module):
         self.prediction_head = prediction_head
 
     def enable_training(self) -> GaussianDecoder:
-        """Enable gradients, except for unused weights: 295,168 in the published checkpoint."""
+        """Enable gradients of all weights but the unused ones (295,168 as published)."""
         self.requires_grad_()
-        # These layers are for finer features, which the coarsest level does not get.
+        # These layers are unused: they are for finer features, which the coarsest level does not get.
         coarsest: Fusion = self.feature_model.decoder.fusions[-1]  # type: ignore[assignment]
         coarsest.resnet1.requires_grad_(False)
         return self
@@ -380,7 +411,7 @@ class GaussianDecoder(nn.Module):
 NEAREST_DEPTH = 1.0
 FARTHEST_DEPTH = 100.0
 FARTHEST_INVERSE = 1e-3  # added to inverse depth, which keeps depth finite
-SMALLEST_INVERSE = 1e-6  # keeps logarithms and quotients finite
+EPSILON = 1e-6  # keeps logarithms and quotients finite
 COLOR_MARGIN = 0.01  # keeps the inverse sigmoid of a colour finite
 MAX_SCALE = 10.0  # largest scale of a Gaussian, relative to its initial scale
 
@@ -407,11 +438,13 @@ class InitialGaussians:
 def make_initial_gaussians(image: Tensor, depth: Tensor) -> InitialGaussians:
     """The initial Gaussians of a picture [1, 3, side, side] with depth layers [1, 2, side, side].
 
-    Depths are scaled so that the nearest is 1, because the network was trained so.
+    There is one for each layer and each cell of 2×2 pixels. Depths are scaled so that the nearest
+    is 1, because the network was trained so.
     """
-    # In float64, because the factor is undone later.
-    factor = NEAREST_DEPTH / (depth.min().double() + SMALLEST_INVERSE)
+    # In float64, so that dividing by the factor later restores the depths.
+    factor = NEAREST_DEPTH / (depth.min().double() + EPSILON)
     disparity = 1.0 / (depth * factor).clamp_max(FARTHEST_DEPTH)
+    # A cell gets the disparity of its nearest pixel, and its pixels' mean colour.
     return InitialGaussians(
         disparity_map=disparity,
         disparity=max_pool2d(disparity, CELL_STRIDE)[0],
@@ -439,13 +472,14 @@ def apply_deltas(initial: InitialGaussians, deltas: Tensor) -> Gaussians:
 
     # The offset changes inverse depth before a softplus, so that it stays positive.
     inverse = softplus(_inverse_softplus(initial.disparity) + Z_GAIN * offset[2])
-    z = 1.0 / (inverse + FARTHEST_INVERSE)  # [2, H, W]
+    z = 1.0 / (inverse + FARTHEST_INVERSE)  # [2, H, W], finite because of the summand
     moved_x = x + XY_GAIN * offset[0]
     moved_y = y[:, None] + XY_GAIN * offset[1]
     means = torch.stack([z * moved_x, z * moved_y, z])  # [3, 2, H, W]
 
-    # A cell's width at that depth, times a factor between 0 and MAX_SCALE, which has value 1 and
-    # slope 1 at zero.
+    # A Gaussian is as wide as its cell at that depth, times a factor between 0 and MAX_SCALE. The
+    # sigmoid is scaled and shifted so that a delta of 0 gives the factor 1, and a small delta
+    # changes it by just this delta.
     slope = MAX_SCALE / (MAX_SCALE - 1)
     shift = -math.log(MAX_SCALE - 1)
     scales = (2.0 / width) * z * (MAX_SCALE * torch.sigmoid(slope * scale + shift))
@@ -457,6 +491,7 @@ def apply_deltas(initial: InitialGaussians, deltas: Tensor) -> Gaussians:
     initial_color = torch.logit(clamped)
     srgb = torch.sigmoid(initial_color[:, None] + COLOR_GAIN * color)
     opacities = torch.sigmoid(opacity)
+    # `unscale` undoes the scaling of the depths to a nearest depth of 1.
     return Gaussians(
         _as_rows(means * initial.unscale),
         _as_rows(quats),
@@ -468,7 +503,7 @@ def apply_deltas(initial: InitialGaussians, deltas: Tensor) -> Gaussians:
 
 def _inverse_softplus(y: Tensor) -> Tensor:
     """log(eʸ - 1) for y > 0 without overflow."""
-    y = y.clamp_min(SMALLEST_INVERSE)
+    y = y.clamp_min(EPSILON)
     return y + torch.log(-torch.expm1(-y))
 
 

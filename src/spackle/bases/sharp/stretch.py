@@ -69,10 +69,11 @@ def stretch_chunk(
     quats [N, 4] (w, x, y, z) and scales [N, 3] are read; rows start..stop of new_quats [N, 4] and
     new_scales [N, 3] are written.
     """
-    block = np.zeros((9, BLOCK_SIZE))
+    block = np.zeros((9, BLOCK_SIZE))  # a matrix of 3 × 3 numbers for each Gaussian
     for first in range(start, stop, BLOCK_SIZE):
         count = min(BLOCK_SIZE, stop - first)
         _load_block(first, count, quats, scales, stretch, block)
+        # Each sweep makes the columns of the matrices more orthogonal.
         for _ in range(JACOBI_SWEEPS):
             _orthogonalise_block(block)
         _store_block(first, count, block, new_quats, new_scales)
@@ -80,10 +81,11 @@ def stretch_chunk(
 
 @kernel
 def _load_block(first: int, count: int, quats: Any, scales: Any, stretch: Any, block: Any) -> None:
-    """Write the matrices M = D R S of `count` Gaussians from `first` on to `block` [9, 64].
+    """Write a matrix M = D R S for each of `count` Gaussians, from number `first` on, to `block`.
 
-    D stretches (factors x, y, z), R is the rotation of a quaternion [N, 4] of any length, S holds
-    the scales [N, 3]. Rows 0 to 2 get the first column of M, and so on.
+    D is the diagonal matrix of `stretch` (x, y, z), R the rotation of a quaternion (w, x, y, z) in
+    quats [N, 4], of any length, and S the diagonal matrix of the scales [N, 3]. Gaussian i of the
+    block gets column i of `block` [9, BLOCK_SIZE]: the three columns of M, one below the other.
     """
     stretch_x, stretch_y, stretch_z = stretch
     for i in range(count):
@@ -111,10 +113,11 @@ def _load_block(first: int, count: int, quats: Any, scales: Any, stretch: Any, b
 
 @kernel
 def _orthogonalise_block(block: Any) -> None:
-    """Rotate each pair of columns of all matrices in `block` [9, 64] once, in place (a sweep).
+    """Rotate each pair of columns of all matrices in `block` once, in place (a sweep).
 
-    After a rotation the two columns are orthogonal; the next rotation disturbs this a little. There
-    are no branches, so that the compiler vectorises the loop.
+    `block` [9, BLOCK_SIZE] holds matrix i in its column i: the three columns of the matrix, one
+    below the other. After a rotation the two columns are orthogonal; the next rotation disturbs
+    this a little. There are no branches, so that the compiler vectorises the loop.
     """
     for i in range(BLOCK_SIZE):
         a = _column(block, 0, i)
@@ -130,7 +133,7 @@ def _orthogonalise_block(block: Any) -> None:
 
 @kernel
 def _column(block: Any, k: int, i: int) -> Any:
-    """Column k (0 to 2) of matrix i in `block` [9, 64], as three numbers."""
+    """Column k (0 to 2) of matrix i in `block` [9, BLOCK_SIZE], as three numbers."""
     return block[3 * k, i], block[3 * k + 1, i], block[3 * k + 2, i]
 
 
@@ -166,8 +169,9 @@ def _rotate_to_orthogonal(p: Any, q: Any) -> Any:
 def _store_block(first: int, count: int, block: Any, new_quats: Any, new_scales: Any) -> None:
     """Write scales and rotations of matrices with orthogonal columns, the longest axis first.
 
-    `block` [9, 64] holds the matrices of `count` Gaussians; their rows from `first` on of new_quats
-    [N, 4] and new_scales [N, 3] are written.
+    `block` [9, BLOCK_SIZE] holds the matrices of `count` Gaussians, matrix i in column i: the three
+    columns of the matrix, one below the other. Rows first to first + count of new_quats [N, 4] and
+    new_scales [N, 3] are written.
     """
     for i in range(count):
         a = _column(block, 0, i)
@@ -191,7 +195,8 @@ def _store_block(first: int, count: int, block: Any, new_quats: Any, new_scales:
         new_scales[n, 0] = length_a
         new_scales[n, 1] = length_b
         new_scales[n, 2] = length_c
-        # A Gaussian without any extent keeps the axes of the world.
+        # Scales are the columns' lengths, axes their directions. A Gaussian without any extent has
+        # no directions, and gets the axes of the world.
         a = _scaled(a, 1.0 / length_a) if length_a > 0.0 else (1.0, 0.0, 0.0)
         b, c = _other_axes(a, _scaled(b, 1.0 / max(length_b, TINY)))
         w, x, y, z = _quat_of_axes(a, b, c)
@@ -208,10 +213,11 @@ def _other_axes(a: Any, b: Any) -> Any:
     The second axis is the unit vector `b`, made orthogonal to `a`. If b is nearly parallel to a, or
     zero, any orthogonal axis is taken.
     """
-    # For unit vectors the squared length is the squared sine of their angle.
+    # The squared length of the vector product of two unit vectors is the squared sine of their
+    # angle. `not … >` is also true for NaN.
     c = _cross(a, b)
     if not _dot(c, c) > MIN_SQUARED_SINE:
-        # The world's axis that is most different from a.
+        # The axis of the world that is most nearly at a right angle to a.
         x = abs(a[0])
         y = abs(a[1])
         z = abs(a[2])
