@@ -230,10 +230,11 @@ class Pair:
         prediction = lift_rgbd(self.left, self.depth, self.camera)
         self.hole = hole_mask(RENDERER.render(prediction.gaussians, self.beside).alpha)
         self.near = maximum_filter(self.hole, BAND_PX)
-        seeds = spackle.complete(
+        without_network = spackle.complete(
             prediction, [self.beside], exact=True, network=None, fill="network"
         )
-        self.crossings = crossings(seeds.render(self.beside).depth, self.beside, self.camera)
+        depth_beside = without_network.render(self.beside).depth
+        self.crossings = crossings(depth_beside, self.beside, self.camera)
 
     def measure(self, run: str, perception: Perception | None) -> Row:
         """The figures of a run."""

@@ -238,7 +238,7 @@ def test_complete_fills_the_given_views(scene: spackle.Scene, tmp_path: Path) ->
     assert made.report is not None
     assert (made.report.focal_px, made.report.base) == (prediction.camera.focal[0], None)
     assert (made.report.hole_ratio_before, list(made.report.seconds)) == (None, ["complete"])
-    seeds = spackle.complete(prediction, cameras, exact=True, network=None)
+    unlearned = spackle.complete(prediction, cameras, exact=True, network=None)
     assert (
-        10 < psnr(made.render(cameras[0]).rgb, seeds.render(cameras[0]).rgb) < 60
+        10 < psnr(made.render(cameras[0]).rgb, unlearned.render(cameras[0]).rgb) < 60
     )  # the weights change the picture

@@ -252,9 +252,9 @@ def test_each_method_starts_from_the_same_base() -> None:
             assert float(hole_mask(view.alpha).float().mean()) < 0.12 * holes
             assert float((view.rgb - before.rgb).abs()[covered].mean()) < 0.01
         whole = before.alpha.numel() / 4
-        seeds, grid, cells, pixels = (count[index] for count in counts)
+        initial, grid, cells, pixels = (count[index] for count in counts)
         assert 0.97 * whole <= grid <= whole
-        assert seeds < 0.5 * whole
+        assert initial < 0.5 * whole
         assert cells == pytest.approx(holes * whole, rel=0.05)  # the paper's HAR × grid
         assert cells < pixels <= 6 * cells
     assert scene[0].aux is scene[1].aux  # both views share a set
