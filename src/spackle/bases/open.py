@@ -259,8 +259,8 @@ class OpenedBase:
                 predicts; the result is a context manager that times this stage.
 
         Raises:
-            BaseError: no photo can be used.
-            InputError: this photo or its depth cannot be used.
+            BaseError: the candidates cannot be used for any photo.
+            InputError: the candidates cannot be used for this photo or its depth.
         """
         skipped: list[SkippedCandidate] = []
         for name, candidate in self.candidates.items():
@@ -291,7 +291,8 @@ class OpenedBase:
                 log(f"{photo.path.name}: going on without {candidate.title}: {error}")
                 continue
             return prediction, self._resolved(name, skipped)
-        # The settings' check found the last candidate's weights: they were deleted since.
+        # The last candidate has no weights. The check of the settings found them, so that they must
+        # have been deleted since.
         raise BaseError(f"`base` {self._settings.resolved_name}: its weights are gone: start again")
 
     def _fails_for_every_photo(self, name: str, base: Base | None, error: InputError) -> bool:
@@ -338,7 +339,7 @@ class OpenedBase:
         if name == "lite":
             note += f": {ROUGH_GEOMETRY_ADVICE}"
 
-        # A base that the user named needs no note, and a note is given once.
+        # The user gets a note only if there was a choice, and each note only once.
         is_news = len(self.candidates) > 1 and note not in self._notes_given
         self._notes_given.add(note)
         return ResolvedBase(
@@ -346,6 +347,7 @@ class OpenedBase:
             reason=reason,
             failures=tuple(candidate.failure for candidate in skipped if candidate.failure),
             note=note if is_news else "",
+            # With more free memory, the next run may use a better base.
             lasting=not any(candidate.lacked_memory for candidate in skipped),
         )
 
@@ -378,7 +380,10 @@ class OpenedBase:
                 raise BaseError("a file of weights changed while this was running: start again")
 
     def only_chosen(self, choice: ResolvedBase) -> OpenedBase:
-        """The chosen base for all further photos, such as the frames of a clip, without others."""
+        """Wrap only the base that was chosen for one photo, for photos that must use the same base.
+
+        Such photos are the frames of a clip.
+        """
         candidates = {choice.name: self.candidates[choice.name]}
         return OpenedBase(candidates, self._settings, self._loaded)
 

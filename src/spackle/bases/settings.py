@@ -259,18 +259,18 @@ class BaseSettings:
         None of them may be set without a depth map. `near` and `far` are only for a relative map,
         whose values have no unit.
         """
-        given = self._given_options()
+        options = self._given_options()  # those that are set
         for option in ("calib", *DEPTH_READING_OPTIONS):
-            if option not in given:
+            if option not in options:
                 continue
             if self.depth is None:
                 raise InputError(
-                    f"`{option}` {given[option]}: there is no depth map to read: "
+                    f"`{option}` {options[option]}: there is no depth map to read: "
                     "give the map with `depth`"
                 )
             if option in ("near", "far") and self.depth_kind not in RELATIVE_KINDS:
                 # They say at which depths the map's nearest and farthest points are placed.
                 raise InputError(
-                    f"`{option}` {given[option]}: only for relative maps: "
+                    f"`{option}` {options[option]}: only for relative maps: "
                     f"add `depth_kind` {' or '.join(RELATIVE_KINDS)}"
                 )

@@ -400,7 +400,7 @@ def _lower_linear_layers(network: nn.Module, dtype: torch.dtype) -> None:
         return output.float()
 
     for module in network.modules():
-        if type(module) is nn.Linear:
+        if type(module) is nn.Linear:  # no subclass, which may use its weights in another way
             module.to(dtype)
             module.register_forward_pre_hook(lower_inputs)
             module.register_forward_hook(widen_output)
@@ -446,8 +446,8 @@ def _zoedepth_window(height: int, width: int) -> PhotoWindow:
 def _stretch_to_input(settings: Mapping[str, Any]) -> Preprocessing:
     """Make Depth Pro's preprocessing: normalise a photo, and stretch it to the network's input size.
 
-    `settings` is the model's preprocessor_config.json. ValueError if they ask for an impossible
-    size, or for another filter than the bilinear one.
+    `settings` are the values of the model's preprocessor_config.json. ValueError if they ask for an
+    impossible size, or for another filter than the bilinear one.
     """
     height = int(settings["size"]["height"])
     width = int(settings["size"]["width"])

@@ -112,7 +112,7 @@ class MogeBase:
         finds no surface, or memory is short.
         """
         photo = resize_photo(photo)
-        # A checkpoint says how many tokens it was trained with.
+        # The checkpoint says with which numbers of tokens it was trained.
         tokens = min(max(USUAL_TOKENS, self.network.least_tokens), self.network.most_tokens)
         rows, columns = token_grid(photo.height, photo.width, tokens)
 

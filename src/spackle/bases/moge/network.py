@@ -97,7 +97,7 @@ class DinoBackbone(nn.Module):
         """
         if (rows, columns) == (TRAINED_GRID, TRAINED_GRID):
             return self.pos_embed
-        grid = self.pos_embed[:, 1:].reshape(1, TRAINED_GRID, TRAINED_GRID, -1)
+        grid = self.pos_embed[:, 1:].reshape(1, TRAINED_GRID, TRAINED_GRID, -1)  # [1, 37, 37, C]
         # As in DINOv2's own code, the factor for n tokens is (n + 0.1) / 37 and not n / 37. This
         # moves the positions a little, as in the published network.
         factors = ((rows + 0.1) / TRAINED_GRID, (columns + 0.1) / TRAINED_GRID)

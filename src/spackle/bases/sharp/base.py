@@ -200,16 +200,16 @@ def load_network(
     source = source_checkpoint_of(path)
     if source is not None:
         tensors = _completed_by_source(tensors, path, source)
-    # A checkpoint also holds weights that only its training used.
-    used = {
+    # A checkpoint also holds weights that the network does not need for predictions.
+    needed_tensors = {
         name: tensor for name, tensor in tensors.items() if not name.startswith(UNUSED_PREFIXES)
     }
 
     with torch.device("meta"):  # without memory; the weights come from the file
-        network = SharpNetwork(_size_of(used))
+        network = SharpNetwork(_size_of(needed_tensors))
     with report_memory_shortage(MEMORY_ADVICE):
         convert = functools.partial(set_precision, dtype=dtype)
-        load_strict(network, used, path, ADVICE, prepare=convert)
+        load_strict(network, needed_tensors, path, ADVICE, prepare=convert)
         return network.to(device)
 
 
@@ -300,13 +300,12 @@ def source_checkpoint_of(path: str | os.PathLike[str]) -> SourceCheckpoint | Non
 def _completed_by_source(
     decoder: Mapping[str, Tensor], path: str | os.PathLike[str], source: SourceCheckpoint
 ) -> dict[str, Tensor]:
-    """All tensors of a network of which a file holds only the trained decoder.
+    """All tensors of a network: the decoder's from its file, the others from the source checkpoint.
 
     Args:
-        decoder: the file's tensors.
-        path: the file.
-        source: the checkpoint that the decoder was trained on. The other tensors are read from it;
-            it must be in the file's folder.
+        decoder: the tensors of a decoder that was trained alone.
+        path: the file that they were read from.
+        source: the checkpoint that the decoder was trained on; it must be in the file's folder.
 
     Raises:
         InputError: the checkpoint is missing, unreadable or changed, or the decoder belongs to

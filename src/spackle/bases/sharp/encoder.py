@@ -209,15 +209,16 @@ class SlidingPyramid(nn.Module):
         super().__init__()
         self.early_blocks = config.early_blocks
         self.window = config.window
-        # Neighbouring windows overlap by a quarter of their side at full size, and by a half at half
-        # size. When their maps are joined, each loses half of the overlap: so many tokens.
+        # Neighbouring windows overlap by a quarter of their side in the full-size picture, and by a
+        # half in the half-size one. Where their maps are joined, each loses half of the overlap.
+        # Its width in tokens:
         self.full_size_trim = config.tokens_per_side // 8
         self.half_size_trim = config.tokens_per_side // 4
         self.patch_encoder = VisionTransformer(config)
         self.image_encoder = VisionTransformer(config)
 
-        # Each feature map gets its channels and its size by one of these, from the finest map (of
-        # an early block) to the coarsest. The names are the checkpoint's.
+        # These layers give each feature map its number of channels and its size, from the finest
+        # map to the coarsest. `latent` maps come from early blocks. The names are the checkpoint's.
         embed = config.embed_width
         finest = config.depth_width
         fine, middle, coarse, coarsest = config.pyramid_channels
@@ -226,7 +227,7 @@ class SlidingPyramid(nn.Module):
         self.upsample0 = _project_and_upsample(embed, middle, middle, doublings=1)
         self.upsample1 = _project_and_upsample(embed, coarse, coarse, doublings=1)
         self.upsample2 = _project_and_upsample(embed, coarsest, coarsest, doublings=1)
-        # The coarsest map is made of the outputs of both transformers for the smallest picture.
+        # For the coarsest map, the outputs of both transformers for the smallest picture are joined.
         self.upsample_lowres = nn.ConvTranspose2d(embed, coarsest, 2, stride=2)
         self.fuse_lowres = nn.Conv2d(2 * coarsest, coarsest, 1)
 

@@ -398,7 +398,8 @@ class GaussianDecoder(nn.Module):
         """Deltas (changes) of the initial Gaussians, [14, 2, side/2, side/2] float32.
 
         Args:
-            image_and_disparity: [1, 5, side, side] in -1..1: sRGB, the disparity of both layers.
+            image_and_disparity: [1, 5, side, side] in -1..1: sRGB, and the disparity of the visible
+                surface and of what may be behind it.
             encoder_maps: the encoder's features, fine to coarse, [1, C, side/2, side/2] to
                 [1, C, side/32, side/32].
         """
@@ -472,7 +473,7 @@ def apply_deltas(initial: InitialGaussians, deltas: Tensor) -> Gaussians:
 
     # The offset changes inverse depth before a softplus, so that it stays positive.
     inverse = softplus(_inverse_softplus(initial.disparity) + Z_GAIN * offset[2])
-    z = 1.0 / (inverse + FARTHEST_INVERSE)  # [2, H, W], finite because of the summand
+    z = 1.0 / (inverse + FARTHEST_INVERSE)  # [2, H, W]; the summand keeps it finite
     moved_x = x + XY_GAIN * offset[0]
     moved_y = y[:, None] + XY_GAIN * offset[1]
     means = torch.stack([z * moved_x, z * moved_y, z])  # [3, 2, H, W]
