@@ -282,7 +282,7 @@ def _time_view(
     added_counts: dict[str, int] = {}
 
     def complete(method: str, end_stage: EndStage) -> None:
-        """The task of a method."""
+        """Complete the view by a method, and count the Gaussians that it adds."""
         aux = complete_view_in_stages(context, view.camera, end_stage, method)
         added_counts[method] = len(aux)
 

@@ -122,7 +122,7 @@ def _cases_to_evaluate(options: EvaluateOptions) -> list[Case]:
     if options.limit is not None and options.limit < len(cases):
         cases = evenly_spaced_items(cases, options.limit)
 
-    # Second photos that are not used are not read either.
+    # Second photos that are not compared are dropped, so that they are not read.
     chosen_cases = []
     for case in cases:
         if not options.compares_with_photos:  # large views are not compared with photos

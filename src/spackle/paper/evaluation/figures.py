@@ -190,7 +190,7 @@ def _draw_figure(
     if not rows:
         return None
 
-    # Usually all evaluations have one base.
+    # Each base is named once, because evaluations usually have the same.
     bases = ", ".join(dict.fromkeys(run.base_title for run, _ in runs))
     titles = [_column_title(column, bases) for column in columns]
     picture = draw_grid(

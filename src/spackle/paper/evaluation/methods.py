@@ -128,8 +128,8 @@ def _dense_aux(
 ) -> Gaussians:
     """Gaussians to add to a view: one for every 2×2 pixels, whether or not there is a hole.
 
-    The paper's table tab:mask_guided_init compares this with Gaussians in the hole alone. They are
-    moved behind the surfaces that the photo shows, of which `photo_guard` knows.
+    The paper's table tab:mask_guided_init compares this with Gaussians in the hole alone. All are
+    moved behind the surfaces that the photo shows, which `photo_guard` knows.
     """
     view = context.view(base_rendering, camera)
     # A cell, 2×2 pixels, gives one Gaussian. Deltas are what the network changes in it.

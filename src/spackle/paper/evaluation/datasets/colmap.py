@@ -247,7 +247,7 @@ def _max_distortion_shift(distortion: Sequence[float], squared_radius: float) ->
     shifts it by at most 3 (|p1| + |p2|) r².
 
     Args:
-        distortion: k1, k2, p1, p2, of which the last may be absent.
+        distortion: k1, k2, p1, p2. The list may end earlier; the numbers that are missing are 0.
         squared_radius: r², the point's squared distance from the optical axis.
     """
     radial = distortion[:2]

@@ -68,7 +68,14 @@ def _middlebury_case(folder: Path) -> Case:
     # The same file has the calibration that turns disparities into depth.
     read_depth = partial(load_depth, disparity, calib=path)
     size = size_of_photos([left])
-    return rectified_pair(folder.name, left, right, calibration, size, read_depth)
+    return rectified_pair(
+        name=folder.name,
+        left=left,
+        right=right,
+        calibration=calibration,
+        size=size,
+        read_depth=read_depth,
+    )
 
 
 MIDDLEBURY = EvalDataset(

@@ -133,7 +133,7 @@ def make_cases(
         photos=photos,
         poses=poses,
         positions=torch.stack([photo.camera.position for photo in photos]).numpy(),
-        axes=poses[:, 2, :3].numpy(),
+        axes=poses[:, 2, :3].numpy(),  # the third row of a rotation is the viewing direction
         cameras=[photo.camera.to(dtype=torch.float32) for photo in photos],
     )
     return [_make_case(scene, index) for index in case_indices]
@@ -160,7 +160,7 @@ def _make_case(scene: _PosedScene, index: int) -> Case:
     near_indices = _near_indices(scene, index, distances, other_indices)
 
     # The case's camera becomes the world's origin.
-    poses = (scene.poses @ torch.linalg.inv(scene.poses[index])).float()
+    poses = (scene.poses @ torch.linalg.inv(scene.poses[index])).float()  # world-to-camera
 
     second_views = []
     for other in other_indices:
@@ -197,6 +197,7 @@ def _near_indices(
     photo = scene.photos[index]
     min_distance = MIN_BASELINE_OVER_DEPTH * photo.middle_depth
     max_distance = MAX_BASELINE_OVER_DEPTH * photo.middle_depth
+    # If the middle depth is unknown (NaN), no distance is good.
     has_good_distance = (distances >= min_distance) & (distances <= max_distance)
 
     # Axes are unit vectors, so their product is the cosine of the angle between them.

@@ -114,12 +114,12 @@ def pair_of_2014(folder: Path) -> Case:
         return replace(depth_map, K=calibration.K)
 
     return rectified_pair(
-        folder.name,
-        folder / "im0.png",
-        folder / "im1.png",
-        calibration,
-        calibration.size,
-        read_depth,
+        name=folder.name,
+        left=folder / "im0.png",
+        right=folder / "im1.png",
+        calibration=calibration,
+        size=calibration.size,
+        read_depth=read_depth,
     )
 
 

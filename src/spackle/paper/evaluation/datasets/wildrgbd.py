@@ -112,7 +112,7 @@ def _frames_of_scene(name: str, folder: Path) -> list[PosedPhoto]:
         height = int(metadata["h"])
         # Transposed, because K is stored column by column.
         K = torch.tensor(metadata["K"], dtype=torch.float64).reshape(3, 3).T.clone()
-        K[:2, 2] += HALF_PIXEL
+        K[:2, 2] += HALF_PIXEL  # from pixel centres at integers to those at half-integers
 
     poses_path = folder / "cam_poses.txt"
     poses = _read_poses(poses_path)
