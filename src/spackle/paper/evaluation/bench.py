@@ -441,8 +441,8 @@ def complete_view_in_stages(
     Returns:
         The Gaussians that the method adds for the view.
     """
-    # The cache of the photo's rendering starts empty, because each timed run must render the photo's
-    # view itself.
+    # The cache of the photo's rendering starts empty, because each timed run must render the photo
+    # from its own camera again.
     context = dataclasses.replace(context.on_renderer_device, photo_cache=PhotoRendering())
     base_rendering = context.renderer.render(context.base, camera)
     end_stage("view")

@@ -179,8 +179,8 @@ def _reliable_points(records: Iterator[PointRecord]) -> tuple[Array, Array]:
     rows = [record for record in records if record.error_px <= MAX_REPROJECTION_ERROR_PX]
     table = np.array(rows, np.float64).reshape(-1, 5)  # key, x, y, z, error
 
-    # Beyond these limits for id, x, y and z a file is damaged: float64 does not hold the id exactly,
-    # or no camera is that far away.
+    # Beyond these limits for id, x, y and z a file is damaged: float64 does not hold the id
+    # exactly, or no camera is that far away.
     limits = [MAX_EXACT_INTEGER, MAX_CAMERA_NUMBER, MAX_CAMERA_NUMBER, MAX_CAMERA_NUMBER]
     table = table[(np.abs(table[:, :4]) <= limits).all(axis=1)]
 
