@@ -67,15 +67,19 @@ def compose(
             initial_opacities,
         )
 
-    # The 14 channels in SHARP's order: 2 of the pixel, 1, 3, 4 of the quaternion, 3, 1.
-    shift_px, nearer, scale, turn, color, opacity = torch.split(deltas, DELTA_SIZES, dim=1)
+    # 14 channels: pixel 2, inverse depth 1, scale 3, quaternion 4, colour 3, opacity 1.
+    shift_px, depth_delta, scale_delta, quat_delta, color_delta, opacity_delta = torch.split(
+        deltas, DELTA_SIZES, dim=1
+    )
+
+    # Deltas are of order one. Inverse depth and rotation should change less, so theirs are reduced.
     inverse_depth = _add_to_positive(
-        initial.inverse_depth, SMALL_STEP * nearer.squeeze(1), initial.unit
+        initial.inverse_depth, SMALL_STEP * depth_delta.squeeze(1), initial.unit
     )
 
     # Colours and opacities change in the sigmoid's domain, so that they stay within 0..1.
-    colors = srgb_to_linear(torch.sigmoid(color_logit(initial.rgb) + color))
-    opacities = torch.sigmoid(color_logit(initial_opacities) + opacity.squeeze(1))
+    colors = srgb_to_linear(torch.sigmoid(color_logit(initial.rgb) + color_delta))
+    opacities = torch.sigmoid(color_logit(initial_opacities) + opacity_delta.squeeze(1))
     surfels = make_surfels(
         camera,
         initial.uv + shift_px,
@@ -89,8 +93,8 @@ def compose(
     # A surfel is flat and lies in the surface; the network may turn it and change its size.
     return dataclasses.replace(
         surfels,
-        quats=surfels.quats + SMALL_STEP * turn,
-        scales=surfels.scales * _scale_factor(scale),
+        quats=surfels.quats + SMALL_STEP * quat_delta,
+        scales=surfels.scales * _scale_factor(scale_delta),
     )
 
 

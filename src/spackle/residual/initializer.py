@@ -281,8 +281,8 @@ def fill_around(
     )
     filled = torch.where(extended, extended_inverse_depth, filled)
 
-    # The first of these fills did not know the extended surfaces. So the depths of the other cells
-    # beyond the border are filled again, now also from the extended surfaces; their colours stay.
+    # The fill above did not know the extended surfaces. So the depths of the other cells beyond the
+    # border are filled again, now also from the extended surfaces; their colours stay.
     others = beyond & ~extended
     if bool(others.any()):
         no_colors = colors[:0]
@@ -300,8 +300,7 @@ def _extend_border_surfaces(
     camera: Camera,
     photo_camera: Camera,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Extend the surfaces that end at the photo's border to the cells `beyond` ([h, w] bool) the
-    border.
+    """Extend the surfaces that end at the photo's border to the hole cells beyond the border.
 
     A surface is extended along epipolar lines, at constant depth z in the photo's frame; a floor
     thus stays a floor.

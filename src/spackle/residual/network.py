@@ -90,7 +90,8 @@ def predict_deltas(
     dtype = pick_dtype(precision, device)
     deltas = torch.zeros(*cells.shape, DELTA_CHANNELS)
     if network.local:
-        # Rectangles start and end at multiples of the stride: at cells of the coarsest grid.
+        # Outer rectangles begin at multiples of the stride, so that the network's coarsest grid is
+        # the same in each of them.
         crops = crops_around_mask(cells, STRIDE)
     else:
         height, width = cells.shape

@@ -64,8 +64,8 @@ class SharpDecoder(ResidualNet):
         """
         for name, layer in self.feature_model.named_modules():
             if isinstance(layer, (nn.Conv2d, nn.ConvTranspose2d)):
-                # The last convolution of a residual block of SHARP is its layer 3 or 5: a block has
-                # norms or not. Zero weights there make the block the identity.
+                # The last convolution of one of SHARP's residual blocks is its layer 5 if the block
+                # has norms, otherwise its layer 3. With zero weights there, the block is the identity.
                 ends_block = name.endswith(("residual.3", "residual.5"))
                 set_random_weights(layer, gain=0.0 if ends_block else 1.0)
         set_random_weights(self.stem, gain=STEM_GAIN)

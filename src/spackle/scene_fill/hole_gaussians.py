@@ -64,7 +64,8 @@ def fill_holes(
     # that stayed near, between others that moved, would look like a speck, so it moves like them.
     depths = view.camera.to_camera(cells.means)[:, 2]
     scales = unoccluding_scales(cells, eye, guards)
-    smooth_scales = without_pits(depths * scales, mask) / depths
+    moved_depths = depths * scales
+    smooth_scales = without_pits(moved_depths, mask) / depths
     scales = torch.where(scales > 0, smooth_scales, 0)
 
     pixels = Gaussians.empty()
@@ -108,11 +109,14 @@ def _textured_pixels(
     cell_means = cell_pixels.mean((1, 2), keepdim=True)
     differs = (cell_pixels - cell_means).abs().amax((1, 2, 3)) > UNIFORM_CELL_RANGE
     textured = differs.nonzero()[:, 0]
+
+    # Overlapping Gaussians blur the picture, so it is sharpened in advance.
+    sharp_cell_pixels = group_by_cell(sharpen_for_overlap(picture))[mask]  # [n, 2, 2, 3]
     pixels = pixel_gaussians(
-        view.initial.select(mask).select(textured),
-        None if deltas is None else deltas[mask][textured],
-        view.camera,
-        group_by_cell(sharpen_for_overlap(picture))[mask][textured],
+        initial=view.initial.select(mask).select(textured),
+        deltas=None if deltas is None else deltas[mask][textured],
+        camera=view.camera,
+        colors=sharp_cell_pixels[textured],
     )
     return move_from_eye(
         pixels, view.camera.position, scales[textured].repeat_interleave(CELL_PIXELS)
@@ -127,7 +131,8 @@ def _follow_beyond_photo(
 
     An initial Gaussian is the first guess of a surface point for a cell of 2×2 pixels. New
     Gaussians started there, and may have moved away from the camera since. The result is later
-    continued beneath the rims of holes, so it must lie where the new Gaussians lie.
+    continued beneath the rims of holes, and there must fit the new Gaussians. Inside the photo, the
+    first guess is kept.
 
     Args:
         view: the view.

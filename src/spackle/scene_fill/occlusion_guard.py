@@ -153,6 +153,7 @@ def without_pits(depths: Tensor, cells: Tensor) -> Tensor:
         depths: [n] z of the cells.
         cells: [h, w] bool, where the n cells lie in the view's grid.
     """
+    # The radius is a fraction of the view's width; parts less than twice as wide are removed.
     radius = max(1, round(PIT_RADIUS_WIDTHS * cells.shape[1]))
     grid = depths.new_zeros(cells.shape)
     grid[cells] = depths

@@ -66,6 +66,7 @@ def exemplar_texture(view: SceneViewCompletion, structure: Tensor) -> Tensor:
     # conspicuous. Both are weakened.
     match_quality = (-patches.mismatch / FADED_MISMATCH).exp()  # 1 for a perfect match
     gain = match_quality * _gain_to_surroundings(texture, view)  # [h, w]
+    # The four pixels of a cell share its gain.
     pixel_gain = ungroup_cells(gain[..., None, None, None].expand(*gain.shape, CELL, CELL, 1))
 
     # The picture without texture: smooth colours in the hole; elsewhere what was rendered.
@@ -120,6 +121,7 @@ def copy_patch_blocks(patches: Patches, blocks: Tensor) -> Tensor:
         column = (x + dx).clamp(0, width - 1)
         is_inside = (row == y + dy) & (column == x + dx)
         has_patch = is_inside & is_matched[row, column]
+        # Otherwise its weight falls with the cost of its patch, but never to 0.
         weight = (-costs[row, column] / mean_cost).exp() + MIN_VOTE_WEIGHT
         weight = torch.where(has_patch, weight, 0)
 

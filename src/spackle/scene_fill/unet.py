@@ -168,7 +168,7 @@ class UNet(ResidualNet):
         copied = sum(
             weights[:, k : k + 1] * features[:, colors]
             for k, colors in enumerate(self.copied_colors)
-        )
+        )  # [B, 3, h, w]
         return torch.cat(
             [
                 deltas[:, : COLOR_DELTAS.start],
