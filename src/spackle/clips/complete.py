@@ -100,6 +100,7 @@ class ClipCompleter:
         if self.fill:
             view, memory = self._fill(frame, prediction.camera, camera, base_rendering)
         else:
+            # Holes stay open, so that nothing has to be remembered for the next frame.
             memory = None
             view = CompletedView(
                 camera=camera,

@@ -161,7 +161,7 @@ def _read_clip(path: str | os.PathLike[str], first: int | None, progress: Progre
         start=times_in_file[0] or Fraction(0),
         rate=Fraction(rate),
         audio=audio,
-        hdr=HDR_TRANSFERS.get(int(frame.color_trc)),
+        hdr=HDR_TRANSFERS.get(int(frame.color_trc)),  # by the number of the transfer function
     )
 
 

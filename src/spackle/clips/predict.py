@@ -116,7 +116,7 @@ def predict_clip(
     Args:
         path: the clip.
         folder: appears with its files once all of them are complete.
-        pipeline: the base network, renderer and options, as `clip_options` returns them.
+        pipeline: the base network, the renderer and the options for a clip.
         lens: `focal_px`, `focal_mm` and `fov`, as the user gave them; None for those not given.
         reporter: shows progress and messages.
 
@@ -186,7 +186,7 @@ class FrameMeasures:
 def clip_report(
     clip: Clip, measures: Sequence[FrameMeasures], disparity: float, sound_was_copied: bool
 ) -> dict[str, Any]:
-    """The fields of a clip's report that a photo's does not have, or has otherwise.
+    """The fields of a clip's report that a photo's report lacks, or that mean something else there.
 
     Args:
         clip: the facts about the clip.

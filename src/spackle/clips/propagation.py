@@ -226,9 +226,10 @@ def _exposure_gain(previous: FrameMemory, light: Tensor, tracked: Track, hole: T
 def _change_of_new_pixels(
     change: Tensor, hole: Tensor, weight: Tensor, inverse_depth: Tensor
 ) -> Tensor:
-    """[H, W, 3]: the change of propagated pixels, spread over the new pixels of holes.
+    """[H, W, 3]: the change of a hole's propagated pixels, spread over its new pixels.
 
-    It falls to 0 at the hole's rim, and is 0 at all pixels that are not new.
+    A hole's pixel is propagated if its colour comes mainly from the previous view, and else new.
+    The spread change falls to 0 at the hole's rim, and is 0 at all pixels that are not new.
 
     Args:
         change: [H, W, 3] of linear light, from the completed to the previous view's colour.
@@ -257,8 +258,8 @@ def _recolored(aux: Gaussians, camera: Camera, change: Tensor, weight: Tensor) -
         weight: [H, W] of each pixel's change in the mean.
     """
     weighted = torch.cat([change * weight[..., None], weight[..., None]], dim=-1)  # [H, W, 4]
-    cell_sums = avg_pool2d(weighted.permute(2, 0, 1)[None], CELL, ceil_mode=True)[0]  # [4, h, w]
-    mean_change = cell_sums[:3] / cell_sums[3:].clamp_min(1e-6)
+    cell_means = avg_pool2d(weighted.permute(2, 0, 1)[None], CELL, ceil_mode=True)[0]  # [4, h, w]
+    mean_change = cell_means[:3] / cell_means[3:].clamp_min(1e-6)
 
     uv, _ = camera.project(aux.means)
     column, row = (uv / CELL).floor().long().unbind(-1)  # [N]

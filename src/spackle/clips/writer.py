@@ -98,7 +98,8 @@ class _ClipEncoder(StreamEncoder):
     def _frame_time(self, index: int) -> Fraction:
         """The time of a frame in seconds.
 
-        Before the first and after the last frame, times follow the mean rate.
+        Before the first and after the last frame, times follow the mean rate: packets are decoded
+        some frames before they are shown, so that the index of the first ones may be negative.
         """
         times = self._clip.times
         if index < 0:

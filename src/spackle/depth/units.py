@@ -148,15 +148,9 @@ def relative_depth(
         raise InputError(
             f"`near` {near:g}, `far` {far:g}: give two distances in metres, the nearer one first"
         )
-    # Quantiles instead of the extremes, because a few pixels may be noise.
     known = np.isfinite(stored)
     values = stored.astype(np.float64)
-    low = 0.0
-    high = 0.0  # not above `low`, so that a map without a known pixel is refused, too
-    if known.any():
-        low, high = np.quantile(values[known], NEAR_AND_FAR_QUANTILES)
-    if not high > low:
-        raise InputError(f"{path}: the depth is the same nearly everywhere: give another depth map")
+    low, high = _low_and_high_quantile(values[known], path)
 
     # 0 at the low quantile, 1 at the high quantile. Numbers beyond the quantiles are outside of
     # 0..1, and their depths are limited below.
@@ -189,6 +183,19 @@ def relative_depth(
         quantity=quantity,
         path=Path(path),
     )
+
+
+def _low_and_high_quantile(known_values: Array, path: StrPath) -> tuple[float, float]:
+    """The 1 % and the 99 % quantile of the known numbers [N] of a map without scale.
+
+    InputError if there is no number, or if both quantiles are equal.
+    """
+    # Quantiles instead of the extremes, because a few pixels may be noise.
+    if known_values.size > 0:
+        low, high = np.quantile(known_values, NEAR_AND_FAR_QUANTILES)
+        if high > low:
+            return low, high
+    raise InputError(f"{path}: the depth is the same nearly everywhere: give another depth map")
 
 
 def near_inverse_depth(inverse_depth: Tensor) -> Tensor:

@@ -41,7 +41,7 @@ def save_depth(depth: Tensor, path: str | os.PathLike[str]) -> None:
     The suffix decides the format: .npy and .exr hold metres as float32, .png holds millimetres in
     16 bits. InputError for another suffix, and if the file cannot be written.
     """
-    # The name is checked first: a map may have taken minutes.
+    # An unknown suffix is refused before anything is written.
     encode = check_depth_name(path)
     write_atomic(path, encode(depth.cpu().numpy().astype(np.float32)))
 
@@ -70,6 +70,7 @@ def _encode_exr(depth: Metres) -> bytes:
     encoder.pix_fmt = "grayf32le"
     encoder.time_base = Fraction(1)  # a codec needs one, also for a single picture
     picture = av.VideoFrame.from_ndarray(depth, format="grayf32le")
+    # The second call, without a picture, says that no more follow.
     packets = [*encoder.encode(picture), *encoder.encode(None)]
     return b"".join(bytes(packet) for packet in packets)
 

@@ -72,6 +72,7 @@ def backing_surfels(
     single, tiles = tree.cut(gaussian_cost / VISIBLE_BACKING_SHARE)
 
     # The larger a backing Gaussian and the farther from a near surface's rim, the wider it may be.
+    # Single cells are tiles of 1×1 cells.
     inner_cells = Tiles(1, 1, *(single & backed & ~has_near).nonzero(as_tuple=True))
     rim_cells = Tiles(1, 1, *(single & backed & has_near).nonzero(as_tuple=True))
     parts = [(of_one_size, LARGE_SIGMA_SIDES) for of_one_size in tiles]

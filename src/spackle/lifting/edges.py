@@ -164,6 +164,7 @@ def _find_foot(gaps: Any, peak: int, direction: int) -> Any:
     # both edges. A peak without steep gaps beside it is a sharp edge, even if the rim of a round
     # object curves towards it.
     other_edge_is_close = abs(gaps[flattest_at + direction]) > FOOT_SLOPE_RATIO * steepest
+    # From the peak on, the edge takes in each gap that is still clearly steeper than the surface.
     foot = peak
     while (flattest_at - foot) * direction > 1:
         ends_early = other_edge_is_close or foot == peak

@@ -155,8 +155,9 @@ def _estimate_surfaces(
         variance: [2, H, W]: sum of the variances of the colour channels, written here.
     """
     width = image.shape[1]
-    # Sums over the window by surface. Of depths d at offsets (x, y): weight, x, y, d, xx, yy, xy,
-    # xd, yd. Of colours: weight, three channels, their three squares.
+    # Weighted sums over the pixels around, one row for each surface. For depths d at offsets (x, y)
+    # these are the sums of 1, x, y, d, xx, yy, xy, xd, yd. For colours, they are the sums of 1, of
+    # the three channels, and of their squares.
     depth_moments = np.zeros((2, 9), np.float64)
     color_moments = np.zeros((2, 7), np.float64)
     surface_depths = np.zeros(2, np.float32)
@@ -175,17 +176,7 @@ def _estimate_surfaces(
             near_share = _sum_window(
                 y, x, image, colors, rings, high, low, surface_depths, depth_moments, color_moments
             )
-
-            # Blurred by a normal distribution, a straight outline gives a share of near pixels that
-            # depends on the distance from the outline alone. A logistic function, which is easy to
-            # invert, is close to this dependence.
-            near_share = min(max(near_share, MIN_SHARE), MAX_SHARE)
-            log_odds = np.log(near_share / (1 - near_share))
-            distance = np.float32(OUTLINE_BLUR_PX * log_odds / LOGISTIC_SCALE)
-            if is_near:
-                inside[y, x] = max(distance, MIN_OUTLINE_DISTANCE_PX)
-            else:
-                inside[y, x] = min(distance, -MIN_OUTLINE_DISTANCE_PX)
+            inside[y, x] = _outline_distance(near_share, is_near)
 
             for side in range(2):
                 # A pixel of the near surface gets a fitted plane for both surfaces, because the map
@@ -199,6 +190,23 @@ def _estimate_surfaces(
                     slope[side, y, x, 0] = slope_x
                     slope[side, y, x, 1] = slope_y
                 variance[side, y, x] = _mean_color(color_moments[side], color[side, y, x])
+
+
+@kernel
+def _outline_distance(near_share: Any, is_near: bool) -> Any:
+    """How far a pixel lies inside of the near surface's outline, in pixels; negative outside.
+
+    `near_share` is the share of near pixels around the pixel, weighted by a normal distribution.
+    `is_near` tells on which side of the outline the pixel itself lies.
+    """
+    # For a straight outline, the share depends on the distance from the outline alone. A logistic
+    # function, which is easy to invert, is close to this dependence.
+    near_share = min(max(near_share, MIN_SHARE), MAX_SHARE)
+    log_odds = np.log(near_share / (1 - near_share))
+    distance = np.float32(OUTLINE_BLUR_PX * log_odds / LOGISTIC_SCALE)
+    if is_near:
+        return max(distance, MIN_OUTLINE_DISTANCE_PX)
+    return min(distance, -MIN_OUTLINE_DISTANCE_PX)
 
 
 @kernel

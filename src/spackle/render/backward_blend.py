@@ -70,7 +70,8 @@ def backward_tiles(
     notes = np.empty(NOTES_FLOATS, np.float32)
     first_notes = np.empty(CHUNK_GAUSSIANS, np.uint64)
     buffers = (work, notes, first_notes)
-    columns = (images[1].shape[1] + TILE_PX - 1) // TILE_PX
+    _, depth, _, _ = images
+    columns = (depth.shape[1] + TILE_PX - 1) // TILE_PX  # of tiles
     for k in range(first, last):
         tile = tiles[k]
         left = (tile % columns) * TILE_PX

@@ -78,7 +78,8 @@ def blend_tiles(
             pixels in these tiles are written. An empty linear colour is not written.
     """
     ids, starts = lists
-    columns = (images[1].shape[1] + TILE_PX - 1) // TILE_PX
+    _, depth, _, _ = images
+    columns = (depth.shape[1] + TILE_PX - 1) // TILE_PX  # of tiles
     state = np.empty(TILE_STATE_FLOATS, np.float32)
     next_records = np.empty((GAUSSIANS_PER_CHECK, RECORD_FLOATS), np.float32)
     for k in range(first, last):
@@ -262,7 +263,7 @@ def store_color(state: Array, left: int, top: int, rows: int, columns: int, imag
     for row in range(rows):
         for column in range(columns):
             i = pixel_index(row, column)
-            for channel in range(3):
+            for channel in range(3):  # the planes of colours follow that of transmittances
                 image[top + row, left + column, channel] = state[i + (1 + channel) * PLANE_FLOATS]
 
 

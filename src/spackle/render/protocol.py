@@ -144,6 +144,8 @@ def check_tiles(tiles: Tensor, height: int, width: int) -> None:
 def tile_mask(tiles: Tensor, height: int, width: int) -> Tensor:
     """[H, W] bool: the pixels that belong to the tiles marked in `tiles` [rows, columns] bool.
 
+    A tile has 16×16 pixels; those of the last row and column may reach beyond the image.
+
     ValueError if the shape of `tiles` does not fit an image of this size.
     """
     check_tiles(tiles, height, width)

@@ -58,8 +58,9 @@ def blend_rows(start: int, stop: int, spots: Array, colors: Array, image: Array)
     """
     width = image.shape[1]
     runs = (width + RUN_PIXELS - 1) // RUN_PIXELS  # in a row
-    state = np.zeros(((stop - start) * runs, 1 + image.shape[2], RUN_PIXELS), np.float32)
-    state[:, 0] = 1  # transmittances
+    # For each run four times 16 numbers: transmittances, which start at 1, red, green and blue.
+    state = np.zeros(((stop - start) * runs, 4, RUN_PIXELS), np.float32)
+    state[:, 0] = 1
     flat_state = state.reshape(-1)
     row_falloff = np.zeros(runs * RUN_PIXELS, np.float32)
 

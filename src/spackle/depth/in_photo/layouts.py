@@ -361,6 +361,7 @@ def android_scale(node: Element, namespace: str, layout: str) -> CodeScale:
     near *= _METRES_PER_UNIT.get(unit, 1.0)
     far *= _METRES_PER_UNIT.get(unit, 1.0)
     is_inverse = style == "rangeinverse"
+    # In metres, Near must be the smaller number; in diopters, the larger one.
     has_wrong_order = near == far or (near > far) != in_diopters
     divides_by_zero = is_inverse and min(near, far) == 0
     if has_wrong_order or min(near, far) < 0 or divides_by_zero:
@@ -405,8 +406,8 @@ def _appended_picture(data: bytes, tree: Element, address: str) -> bytes:
             if begin == latest_begin or data.endswith(_PICTURE_ENDS, begin, end):
                 return data[begin:end]
         # Without a length, the item reaches to the file's end. A thumbnail inside of a picture
-        # begins like an item, too; but just before an item, another picture ends, or zeros do that
-        # pad it.
+        # begins like an item, too. But only an item follows directly on the end of another picture,
+        # or on the zeros that pad it.
         elif data.endswith((*_PICTURE_ENDS, b"\0"), 0, begin):
             return data[begin:]
     raise ValueError(NO_PICTURE_IN_DIRECTORY)
@@ -479,4 +480,5 @@ def hevc_scale(stated: dict[str, Any]) -> CodeScale:
         raise ValueError(f"nothing can lie between near {first:g} and far {last:g}")
     if representation == HEVC_DEPTH:
         return CodeScale("depth", first, last, "HEIF depth")
+    # Else the inverse depth is linear in the codes, and its range is stated as near and far depth.
     return CodeScale("disparity", 1 / last, 1 / first, "HEIF inverse depth")
