@@ -87,7 +87,8 @@ def create_app(
     app.add_middleware(Guard, access=access, max_bytes=max_bytes)
 
     takes_photos = access is None or access.token is not None
-    # The work that completes photos knows which bases are there; another work need not.
+    # `SceneWork` lists the bases, the networks for a photo's geometry. With another function as
+    # `work`, clients have no choice.
     list_bases = getattr(work, "bases", lambda: [AUTO])
     handlers = SceneHandlers(jobs, list_bases, takes_photos, max_bytes)
     add_scene_routes(app, handlers)
@@ -196,7 +197,8 @@ class SceneHandlers:
         while last_sent is None or last_sent.ended is None:
             job = self.jobs.by_id.get(id)
             if job is None:
-                # The answer has begun, so a status of 404 is no longer possible.
+                # The answer has begun, so a status of 404 is no longer possible. A time of the end,
+                # here 0, tells the client that nothing more follows.
                 yield SceneState(
                     id=id, name="", state="failed", error="there is no such scene", ended=0
                 )
@@ -216,9 +218,9 @@ class SceneHandlers:
                 raise HTTPException(409, job.error or "this scene is not done yet")
             if file in get_args(PagePart):
                 raise HTTPException(404, "this file exists only for photos, and a scene was opened")
-            # The file is useful to other clients, too: its making goes on if this one leaves.
-            making = asyncio.wrap_future(self.jobs.make_file(job, file))
-            error = await asyncio.shield(making)
+            # If this client disconnects, the file is still made, because others may want it, too.
+            future_error = asyncio.wrap_future(self.jobs.make_file(job, file))
+            error = await asyncio.shield(future_error)
             if error is not None:
                 raise HTTPException(404, error)
         return FileResponse(path, filename=PurePosixPath(job.name).stem + path.suffix)
@@ -308,16 +310,18 @@ class PatientProtocol(H11Protocol):
     def _end_if_silent(self, idle_after: object) -> None:
         """Close the connection if no request has come since the last look; else look again later.
 
+        `MAX_HEAD_S` seconds lie between two looks.
+
         Args:
-            idle_after: the request after whose answer the connection was idle at the last look;
-                None: it was idle before its first request; BUSY: it was not idle.
+            idle_after: what the last look saw. BUSY: a request was not answered yet. A request: the
+                connection was idle after the answer to it. None: no request had come yet.
         """
         latest_request = self.cycle  # uvicorn's name for a request with its answer
         is_idle = latest_request is None or latest_request.response_complete
         is_silent = is_idle and latest_request is idle_after
         if self.transport.is_closing() or is_silent:
-            # `close` would first send data that nobody reads.
+            # Not `close`, which would first wait until the client has read what was sent.
             self.transport.abort()
         else:
-            state = latest_request if is_idle else BUSY
-            self.loop.call_later(MAX_HEAD_S, self._end_if_silent, state)
+            now_idle_after = latest_request if is_idle else BUSY
+            self.loop.call_later(MAX_HEAD_S, self._end_if_silent, now_idle_after)

@@ -90,7 +90,7 @@ class Access(NamedTuple):
         root = scope["root_path"]  # where another app has mounted this one
         path = scope["path"]
         parts = path.removeprefix(root).split("/")
-        first_part = parts[1] if path.count("/") > 1 else ""
+        first_part = parts[1] if path.count("/") > 1 else ""  # parts[0] is before the first slash
         if self._is_token(first_part):
             return {**scope, "root_path": f"{root}/{first_part}"}
 
@@ -99,8 +99,8 @@ class Access(NamedTuple):
         if self._is_token(bearer):
             return scope
 
-        # Without the token, a server that has none lets everybody read, another only asks for
-        # health.
+        # The request has no valid token. A server that was started without one lets everybody read,
+        # but nobody send photos. A server with a token only says whether it runs.
         if self.token is None:
             if scope["method"] not in ("GET", "HEAD"):
                 raise HTTPException(401, "this page takes no photos: it was opened without a token")
@@ -109,12 +109,14 @@ class Access(NamedTuple):
         return scope
 
     def _is_own_name(self, name: str) -> bool:
-        """Whether a host name without its port, in lower case, is one of this machine.
+        """Whether a host name or address, without a port and in lower case, leads to this server.
 
-        DNS rebinding needs a name, so a numeric address is safe; but a server that only this
-        machine can reach has no other address than loopback.
+        By DNS rebinding a stranger makes his own host name lead here, so only known names count.
+        That is impossible with a numeric address.
         """
         try:
+            # A server that only this machine can reach has no address but loopback. Others may have
+            # any address.
             return is_loopback(name.strip("[]")) or not self.local
         except ValueError:  # no numeric address
             return name.rstrip(".") in self.names
@@ -188,7 +190,7 @@ class Guard:
             admitted = scope
             if self.access is not None:
                 admitted = self.access.authorize(scope, headers)
-            # A body that announces its size is refused before it comes.
+            # A body that announces too large a size is refused before it comes.
             self._check_size(int(headers.get("content-length", 0)))
             await self.app(admitted, receive_limited, send_guarded)
         except HTTPException as error:
@@ -209,7 +211,7 @@ class Guard:
     def _limited(self, receive: Receive) -> Receive:
         """A `receive` that counts a body's bytes, and raises HTTPException 413 beyond the limit.
 
-        A body need not announce its size, and may be longer than announced.
+        The announced size is not enough, because a body may be longer, or announce none.
         """
         received_bytes = 0
 

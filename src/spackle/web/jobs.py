@@ -126,11 +126,12 @@ class Jobs:
         for folder in self.folder.iterdir():
             if folder.name.startswith(UPLOAD_PREFIX):
                 shutil.rmtree(folder, ignore_errors=True)
-            # Other folders without a readable record are none of ours.
+            # A folder without a readable record is no job, and is left alone.
             with contextlib.suppress(OSError, ValueError):
                 job = Job.model_validate_json((folder / RECORD_FILE).read_bytes())
                 self.by_id[job.id] = job.model_copy(update={"folder": folder})
 
+        # The photo that came first is completed first.
         for job in sorted(self.by_id.values(), key=lambda job: job.created):
             if job.ended is None:
                 self._change(job.id, state="queued")
@@ -190,13 +191,20 @@ class Jobs:
         return job
 
     def make_file(self, job: Job, file: str) -> Future[str | None]:
-        """Add a file to a finished scene.
+        """Add a file to a finished scene, in a thread; returns at once.
 
-        The result of the future is None, or the reason for failure.
+        The result of the future is None when the file is made, or the reason for failure.
+
+        Args:
+            job: of the scene.
+            file: the name of the file, such as "scene.glb".
         """
 
+        def ignore_event(event: TaskEvent) -> None:
+            """The progress of a single file is not shown."""
+
         def add_file() -> str | None:
-            return self._process().do((job, file), lambda event: None)
+            return self._process().do((job, file), ignore_event)
 
         return self._file_thread.submit(add_file)
 
@@ -222,7 +230,8 @@ class Jobs:
         self._folder_lock.close()  # another server may open the folder
 
     def _process(self) -> TaskProcess:
-        """The calling thread's process; a new one if there is none, or the old one died."""
+        """The worker process of the calling thread; a new one if there is none, or it died."""
+        # `_own_process` holds another value in each thread.
         process: TaskProcess | None = getattr(self._own_process, "process", None)
         with self._lock:
             # After `close`, which kills the processes, a dead one stays: its tasks fail.
@@ -248,16 +257,17 @@ class Jobs:
             job = self.by_id[id]
 
         try:
-            # Results of an earlier server may be incomplete.
+            # An earlier server may have been stopped in the middle of this job.
             shutil.rmtree(job.results, ignore_errors=True)
             job.results.mkdir()
             job.save()
-            error = process.do((job, None), lambda event: self._note_event(id, event))
+            task = (job, None)  # None: the scene, not a further file of it
+            error = process.do(task, lambda event: self._note_event(id, event))
         except (OSError, InputError) as problem:
             error = f"{job.name}: cannot be stored here: {reason_in_a_line(problem)}"
 
-        # A signal to end the whole service may reach the worker process first, and this one only
-        # a moment later.
+        # A signal to end the whole service may reach the worker process first. Up to a second
+        # passes until this process is closed, too, and then the job has not failed.
         if error == WORKER_DIED:
             self._is_closed.wait(1)
         self._process_of_job.pop(id, None)

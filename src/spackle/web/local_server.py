@@ -87,8 +87,8 @@ def show_page(
         with reporter.stage("load"):
             title = _check_target(target, options)
 
-    # The depth map, and the base "rgbd" that needs one, are for the first photo alone, not for
-    # those that the page sends later.
+    # A depth map belongs to the first photo alone. Photos that the page sends later have none, and
+    # so cannot use the base "rgbd", which needs one.
     base_name = AUTO if options.base.name == RGBD else options.base.name
     base_of_sent_photos = dataclasses.replace(
         options.base, name=base_name, depth=None, depth_kind="auto"
@@ -103,7 +103,14 @@ def show_page(
 
     with (
         tempfile.TemporaryDirectory(prefix="spackle-view-", ignore_cleanup_errors=True) as folder,
-        run_server(Path(folder), work, 1, RetentionLimits(), address, reporter) as (jobs, urls),
+        run_server(
+            folder=Path(folder),
+            work=work,
+            workers=1,  # one photo at a time, because one person watches
+            limits=RetentionLimits(),
+            address=address,
+            reporter=reporter,
+        ) as (jobs, urls),
     ):
         # The page shows the scene whose id follows the # in its address.
         if target is not None:
@@ -113,7 +120,10 @@ def show_page(
 
 
 def _check_target(target: Path, options: ViewOptions) -> str:
-    """The name of a scene or photo on the page; InputError if it or its depth cannot be read."""
+    """Check that a scene or photo can be shown; returns what the page calls it.
+
+    InputError if the scene, the photo or its depth cannot be read.
+    """
     check_file(target, "photo or scene")
     settings = options.base
     settings.check()
@@ -126,7 +136,7 @@ def _check_target(target: Path, options: ViewOptions) -> str:
             target, "cannot be viewed: {reason}: give the lens with `fov`", ValueError
         ):
             scene = Scene.load(target, focal_px=options.focal_px, fov=options.fov)
-            scene.page(target.name)
+            scene.page(target.name)  # fails if the page cannot show the scene
         return page_name(target)
 
     # A depth map belongs to the whole photo, so its frame must not be cropped.
@@ -136,7 +146,7 @@ def _check_target(target: Path, options: ViewOptions) -> str:
     if settings.checkpoint is not None:
         check_file(settings.checkpoint, "file of weights")
     if settings.depth is not None:
-        open_base(settings).load(photo)
+        open_base(settings).load(photo)  # fails if the depth map does not fit the photo
     return target.name
 
 
@@ -145,17 +155,19 @@ def _add_target(jobs: Jobs, target: Path, title: str, options: ViewOptions) -> s
     with jobs.reserve_place() as job_folder:
         if scene_suffix(target) is None:
             check_photo(target, title, job_folder / PREVIEW)
-        depth = options.base.depth
+        depth_file = None
+        if options.base.depth is not None:
+            depth_file = os.path.abspath(str(options.base.depth))
         job = jobs.add(
             job_folder,
-            title,
-            os.path.abspath(target),
-            None if depth is None else os.path.abspath(str(depth)),
-            {
+            name=title,
+            source=os.path.abspath(target),
+            depth=depth_file,
+            options={
                 "base": options.base.name,
                 "focal_px": options.focal_px,
                 "fov": options.fov,
-                "files": [],
+                "files": [],  # the page asks for further files when the user wants them
             },
         )
     return job.id
@@ -202,9 +214,20 @@ def run_server(
 ) -> Iterator[tuple[Jobs, list[str]]]:
     """Yield the app's jobs and the page's addresses; then answer requests until Ctrl-C or SIGTERM.
 
-    Arguments are those of `serve_programs`. InputError if nobody can or everybody could connect.
+    Args:
+        folder: the folder of photos and scenes.
+        work: what a worker process does with a photo.
+        workers: the number of worker processes.
+        limits: how long and how many scenes are kept.
+        address: where the server listens, and the token that a client must know.
+        reporter: gets messages.
+
+    Raises:
+        InputError: the server cannot listen at this address, or other machines could connect
+            without a token.
     """
     with (
+        # single_process: a second Ctrl-C ends the program at once.
         catch_stop_signals(single_process=True) as is_stopping,
         open_listener(address.host, address.port) as listener,
         log_jobs_to(reporter),
@@ -215,6 +238,8 @@ def run_server(
             raise InputError(
                 f"`host` {address.host}: other machines can connect: leave `no_token` out"
             )
+
+        # The page's address on this machine comes first, then the one for other machines.
         hosts = [LOOPBACK_OF_ANY_HOST.get(bound_host, bound_host)]
         if not access.local:
             hosts.append(address_in_network(address.host))
@@ -224,6 +249,7 @@ def run_server(
         with contextlib.closing(app.state.jobs) as jobs:
             # The socket accepts connections already, so the caller may announce the page now.
             yield jobs, urls
+            # A signal may have come meanwhile.
             if not is_stopping():
                 make_server(app).run(sockets=[listener])
 

@@ -169,7 +169,7 @@ class SceneWork:
         return scene
 
     def _complete_photo(self, job: Job, options: SceneOptions, reporter: JobReporter) -> str:
-        """Complete a photo: make the files of `predict_photo` in the job's folder of results.
+        """Complete a photo: write the scene and its report, and perhaps a video, into the results.
 
         Returns:
             A note for the user about the scene's quality; empty if there is nothing to say.
@@ -194,6 +194,7 @@ class SceneWork:
         )
         photo = job.folder / job.source
         report = predict_photo(photo, job.results, pipeline, reporter, photo_options)
+        # Without depth and without the weights of a better network, a small network guesses.
         return ROUGH_GEOMETRY_ADVICE if report.run.base == LiteBase.name else ""
 
     def _base_settings(self, job: Job, options: SceneOptions) -> BaseSettings:
@@ -218,13 +219,14 @@ class SceneWork:
     def _make_file(self, target: Path, scene: Scene, job: Job, options: SceneOptions) -> None:
         """Write a video, a page or another format of a scene; the name of `target` says which.
 
-        InputError for the report of a scene that no photo gave.
+        InputError if the report of a photo is wanted, but the job was a scene, not a photo.
         """
-        # Only a photo has a report, and it exists before anybody can ask for it.
+        # A photo's report was written with its scene. If it has to be made, there was no photo.
         if target.name == REPORT_NAME:
             raise InputError(f"{job.name}: has no report, because it was opened as a scene")
         if target.suffix == ".mp4":
-            # swipe.mp4, for example, shows the path of this name; video.mp4 the job's own path.
+            # swipe.mp4, for example, shows the camera path "swipe"; video.mp4 shows the path of the
+            # job's options.
             trajectory = options.trajectory
             for name in TRAJECTORIES:
                 if name == target.stem:
@@ -287,12 +289,15 @@ def check_photo(path: Path, name: str, preview: Path) -> None:
     """
 
     def write_preview(image: Image.Image) -> None:
-        """Check a photo that Pillow has opened, and write the small JPEG, turned upright."""
+        """Check the photo at `path`, which Pillow has opened, and write the small JPEG, upright.
+
+        `path` and `preview` are arguments of `check_photo`.
+        """
         if image.format not in PILLOW_FORMATS:
             raise InputError(f"{path}: a {image.format} picture: give {', '.join(PHOTO_SUFFIXES)}")
         check_photo_size(image.width, image.height, path)
         image.load()  # decodes all pixels, and so finds damage
-        upright = ImageOps.exif_transpose(image)
+        upright = ImageOps.exif_transpose(image)  # cameras note in EXIF how they were held
         upright.thumbnail((PREVIEW_SIDE_PX, PREVIEW_SIDE_PX))
         upright.convert("RGB").save(preview, quality=85)
 

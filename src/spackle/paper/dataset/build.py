@@ -112,7 +112,10 @@ class SampleMaker:
             return PhotoResult(photo.index, problem=str(error))
 
     def _make_sample(self, file: PhotoFile) -> bytes:
-        """A photo's part of a tar archive; InputError if the photo or its depth cannot be used."""
+        """A photo's sample: its Gaussians, views and targets, as bytes of a tar archive.
+
+        InputError if the photo or its depth cannot be used.
+        """
         options = self.options
         photo = load_photo(file.path)
         # The second result says which base it was; here it is always the same.
@@ -122,7 +125,7 @@ class SampleMaker:
         )
         with as_input_error(file.path, "no camera path: {reason}", ValueError):
             depth_range = DepthRange.of(prediction.gaussians)
-            photo_camera = prediction.camera.even()
+            photo_camera = prediction.camera.even()  # videos need even sides
             cameras = cameras_along_path(kind, disparity, photo_camera, depth_range, options.views)
         views = render_views(prediction, cameras, self.renderer)
         targets = complete_views(views, options.inpainter, self.inpainter, self.renderer)
@@ -220,6 +223,7 @@ class DatasetBuild:
         start_time = time.perf_counter()
         with (
             self.reporter.stage("photos") as progress,
+            # single_process: a second Ctrl-C ends the program at once.
             catch_stop_signals(single_process=True) as stop_requested,
         ):
             # A killed build may have left all parts of a shard, but not the shard.

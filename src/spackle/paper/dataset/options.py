@@ -66,6 +66,7 @@ class DatasetOptions:
 
         Inpainters check their own options when they are opened.
         """
+        # "auto" may take another network on another machine, so a dataset names its base.
         self.base.check(allow_auto=False)
         self._check_depth()
         self._check_completion()
@@ -84,7 +85,7 @@ class DatasetOptions:
                 f"`base` {self.base.name} needs depth: give `depth` FOLDER; "
                 f"{', '.join(NETWORK_BASES)} need no depth"
             )
-        # A single map would fit one photo only.
+        # A file would be the depth of a single photo.
         if isinstance(depth, Path) and not depth.is_dir():
             raise InputError(
                 f"`depth` {depth}: no such folder: give a folder with a depth map for each photo"
@@ -135,8 +136,13 @@ def dataset_configuration(
 ) -> dict[str, Any]:
     """Everything that determines the shards' bytes, ready for JSON, without paths of this machine.
 
-    The number of threads is included, because SHARP's last bits depend on it; the number of workers
-    is not. `inpainter` is what `options.open_inpainter` has opened.
+    The number of threads is included, because the last bits of SHARP's results depend on it. The
+    number of workers, that is, of processes, changes nothing.
+
+    Args:
+        options: of the build.
+        photos: the photos that were chosen.
+        inpainter: paints the holes; None if they are completed in another way.
     """
     base = options.base
     completion: dict[str, Any] = completion_facts(options, inpainter)
@@ -147,7 +153,12 @@ def dataset_configuration(
     inputs_digest = json_digest([options.input_digests(photo) for photo in photos])
     return {
         "spackle": spackle.__version__,
-        "photos": {"count": len(photos), "sample": options.sample, "sha256": inputs_digest},
+        "photos": {
+            "count": len(photos),
+            "sample": options.sample,  # the number of photos that the user asked for; None: all
+            "sha256": inputs_digest,
+        },
+        # What turned photos into Gaussians: a network, or depth maps.
         "base": {
             "name": base.public_name,
             "weights": weights_digests(base.model_files),
@@ -159,7 +170,7 @@ def dataset_configuration(
             "views": options.views,
             "trajectory": options.trajectory,
             "disparity": list(options.disparity),
-            "threshold": MASK_THRESHOLD,
+            "threshold": MASK_THRESHOLD,  # opacity below which a pixel is a hole
         },
         "inpainter": completion,
         "shard_size": options.shard_size,
@@ -169,5 +180,7 @@ def dataset_configuration(
 
 def completion_facts(options: DatasetOptions, inpainter: Inpainter | None) -> dict[str, str]:
     """How holes are completed: the name and version of the inpainter, or of another way."""
-    version = "1" if inpainter is None else inpainter.version
+    version = "1"  # of the ways without an inpainter, which have never changed
+    if inpainter is not None:
+        version = inpainter.version
     return {"name": options.inpainter, "version": version}

@@ -67,13 +67,22 @@ def find_photos(
 def find_coco_photos(
     source: Path, folder: Path | None, log: Callable[[str], None]
 ) -> tuple[Path, list[str]]:
-    """Find the photos that a COCO file names; arguments and result as of `find_photos`.
+    """Find the photos that a COCO file, a list of photos as JSON, names.
 
-    InputError if the file is no COCO file, names no photos, or none of them is there.
+    Args:
+        source: the COCO file.
+        folder: the folder of the photos; None: the file's own folder.
+        log: receives a line if some of the photos are missing.
+
+    Returns:
+        The folder, and the sorted names of the photos in it.
+
+    Raises:
+        InputError: the file is no COCO file, names no photos, or none of them is there.
     """
     names = read_coco_names(source)
     root = source.parent if folder is None else folder
-    # Lists name photos twice, or by different spellings of the same path.
+    # Some lists name a photo twice, or by two spellings of its path, such as a.jpg and ./a.jpg.
     unique_names = sorted({Path(name).as_posix() for name in names})
     present = [name for name in unique_names if os.path.isfile(root / name)]
     if not present:
@@ -138,7 +147,7 @@ def choose_photos(
     wanted_count = len(names) if count is None else count
     order = list(names)
     if count is not None:
-        # A random order that each name determines for itself: new photos do not change the others'.
+        # A random order by a digest of each name: when a photo joins, the others keep their order.
         order.sort(key=lambda name: hashlib.sha256(f"{seed}:{name}".encode()).digest())
 
     chosen: dict[str, str] = {}  # names by SHA-256 of the files
@@ -146,7 +155,7 @@ def choose_photos(
         if len(chosen) == wanted_count:
             break
         try:
-            # A copy of a photo, in training and in validation, would make validation worthless.
+            # If one copy were in training and another in validation, validation would be worthless.
             sha256 = check_photo_file(root / name)
             if sha256 in chosen:
                 raise InputError(f"{root / name}: the same photo as {chosen[sha256]}")

@@ -75,8 +75,9 @@ def cameras_along_path(
 ) -> list[Camera]:
     """Choose different cameras for a photo's views: first the photo's, then cameras along a path.
 
-    A path may pass through the photo's camera position, and a closed path ends where it begins. So
-    the path is sampled with extra frames, and repeated views are dropped.
+    Some cameras of a path may coincide: the path may pass through the photo's camera, and a closed
+    path ends where it begins. Repeated cameras are dropped, and replaced by more frames of the
+    path.
 
     Args:
         kind: the kind of path, such as "swipe".
@@ -155,14 +156,15 @@ def complete_views(
     """The targets of views, [V, H, W, 3] sRGB: new colours in the holes, elsewhere the views.
 
     Args:
-        views: the rendered views, which do not change outside of the holes, bit for bit.
-        completion: one of `COMPLETIONS`; "none" returns the views unchanged.
-        inpainter: paints the holes; None: one completed scene fills them.
-        renderer: renders that scene.
+        views: the rendered views. Outside of the holes the targets have the same bits.
+        completion: how holes are completed, one of `COMPLETIONS`; "none" leaves them black.
+        inpainter: paints the holes; None if `completion` is "none" or "geometry".
+        renderer: renders a scene whose holes were filled without an inpainter: its colours for
+            "geometry", its depth for inpainters.
     """
     if completion == "none":
         return views.rgb
-    if inpainter is None:
+    if inpainter is None:  # "geometry"
         completed, _ = render_completed(views, renderer)
         return torch.where(views.mask[..., None], completed, views.rgb)
     if inpainter.paints_views_together:
@@ -181,9 +183,15 @@ def render_completed(views: ViewStack, renderer: Renderer) -> tuple[Tensor, Tens
         Colours [V, H, W, 3] sRGB and inverse depth [V, H, W]. Views without holes stay as they are.
     """
     prediction = views.prediction
-    added = complete(
-        prediction, views.cameras, exact=True, network=None, fill="network", renderer=renderer
-    ).aux
+    completed_scene = complete(
+        prediction,
+        views.cameras,
+        exact=True,  # only these views are rendered
+        network=None,
+        fill="network",  # adds no texture from elsewhere in the picture
+        renderer=renderer,
+    )
+    added = completed_scene.aux  # the Gaussians in the holes
     colors = views.rgb.clone()
     inverse_depths = known_inverse_depth(views.depth, views.mask)
     for index, camera in enumerate(views.cameras):
@@ -193,7 +201,7 @@ def render_completed(views: ViewStack, renderer: Renderer) -> tuple[Tensor, Tens
         rgb = rendering.rgb
         inverse_depth = known_inverse_depth(rendering.depth, hole_mask(rendering.alpha))
 
-        # Pixels can be filled from their neighbours only if some are known, and some are not.
+        # Pixels can be filled only from known ones, and only if some are missing.
         known_count = int(inverse_depth.count_nonzero())
         if 0 < known_count < inverse_depth.numel():
             inverse_depth, filled_rgb = fill_from_far_side(
@@ -209,9 +217,9 @@ def render_completed(views: ViewStack, renderer: Renderer) -> tuple[Tensor, Tens
 def paint_view_by_view(inpainter: Inpainter, views: ViewStack, renderer: Renderer) -> Tensor:
     """Paint the views' holes with an inpainter of single pictures, so that all views agree.
 
-    The view farthest from the photo comes first, because it has the largest holes. Painted views
-    are reprojected into the next view's holes, and the inpainter paints the rest. The depth in the
-    holes comes from one completed scene.
+    The view farthest from the photo comes first, because it has the largest holes. What a painted
+    view shows is copied into the same places of the next views' holes; the inpainter paints only
+    the rest. Where these places are follows from the depth of a scene that is completed first.
 
     Returns:
         The completed views [V, H, W, 3] sRGB.
@@ -224,7 +232,7 @@ def paint_view_by_view(inpainter: Inpainter, views: ViewStack, renderer: Rendere
         target = targets[index]
         hole = views.mask[index].clone()
 
-        # What an earlier view shows at a hole's points is taken over.
+        # What an earlier view shows at a hole's points is copied. `target` shares the memory of `targets`.
         for other in painted:
             row, column = hole.nonzero(as_tuple=True)
             pixels = camera.pixel_centers().to(target)[row, column]
@@ -237,8 +245,11 @@ def paint_view_by_view(inpainter: Inpainter, views: ViewStack, renderer: Rendere
             hole[row[is_seen], column[is_seen]] = False
 
         if bool(hole.any()):
-            outside_depth = torch.where(hole, 0, inverse_depths[index])
-            targets[index] = inpainter.paint(target[None], hole[None], outside_depth[None])[0]
+            # An inpainter gets inverse depth 0, which means unknown, in the hole.
+            outside_inverse_depth = torch.where(hole, 0, inverse_depths[index])
+            targets[index] = inpainter.paint(target[None], hole[None], outside_inverse_depth[None])[
+                0
+            ]
         if bool(views.mask[index].any()):
             painted.append(index)
     return targets
