@@ -83,8 +83,8 @@ def initialize(features: ViewFeatures, camera: Camera, photo_camera: Camera) -> 
     """
     uv = to_like(cell_centers(camera), features.rgb)
 
-    # Holes are filled from the cells without a hole pixel. If there is none, cells with at least one
-    # visible pixel take their place.
+    # Holes are filled from the cells without a hole pixel. If there is none, cells with at least
+    # one visible pixel take their place.
     known = ~features.mask
     if not bool(known.any()):
         known = features.inverse_depth > 0
@@ -158,8 +158,8 @@ def sample_photo(
     photo_channels_first = photo.cpu().movedim(-1, 0)[None]  # [1, 3, H', W']
     photo_cells = avg_pool2d(photo_channels_first, CELL, ceil_mode=True, count_include_pad=False)
 
-    # grid_sample counts from -1 to 1 across the photo. The clamp to -2..2 keeps the places of points
-    # near the camera's plane finite; those outside are replaced below.
+    # grid_sample counts from -1 to 1 across the photo. The clamp to -2..2 keeps the places of
+    # points near the camera's plane finite; those outside are replaced below.
     grid = (2 * place / z.clamp_min(MIN_DIVISOR) - 1).clamp(-2, 2).to(photo_cells)[None]
     sampled = grid_sample(photo_cells, grid, padding_mode="border", align_corners=False)
     photo_colors = sampled[0].movedim(0, -1)  # [h, w, 3]
@@ -205,8 +205,8 @@ def _rays_in_photo(uv: Tensor, camera: Camera, photo_camera: Camera) -> tuple[Te
     """Rays [h, w, 3] through a view's cells in the frame of the photo's camera, and the motion
     [4, 4] from the view's frame to the photo's.
 
-    The point of a cell at depth z in the view is z · ray + t in the photo's frame, with the motion's
-    translation t. `uv` [h, w, 2] are the cells' pixels.
+    The point of a cell at depth z in the view is z · ray + t in the photo's frame, with the
+    motion's translation t. `uv` [h, w, 2] are the cells' pixels.
     """
     world_to_view = camera.world_to_camera.cpu().double()
     world_to_photo = photo_camera.world_to_camera.cpu().double()
@@ -262,8 +262,8 @@ def fill_around(
     """
     colors = features.rgb.movedim(-1, 0)  # [3, h, w]
 
-    # Inside the photo, the far side of a rim decides. Beyond the border the bias is 0, by which near
-    # and far side count alike.
+    # Inside the photo, the far side of a rim decides. Beyond the border the bias is 0, by which
+    # near and far side count alike.
     far_bias = FAR_SIDE_BIAS * inside
     beyond = features.mask & ~inside
     if not bool(beyond.any()):
@@ -273,8 +273,8 @@ def fill_around(
         features, unbiased_inverse_depth, uv, beyond, known, camera, photo_camera
     )
 
-    # Beyond the border, too, a nearer object may have covered a cell: such cells are filled from the
-    # far side.
+    # Beyond the border, too, a nearer object may have covered a cell: such cells are filled from
+    # the far side.
     far_bias = torch.where(hidden, FAR_SIDE_BIAS, far_bias)
     filled, filled_colors = fill_from_far_side(
         features.inverse_depth, colors, known, far_bias=far_bias
@@ -326,8 +326,8 @@ def _extend_border_surfaces(
     photo_K = to_like(photo_camera.K, uv)
     photo_pixels = points[..., :2] / relative_z * photo_K.diagonal()[:2] + photo_K[:2, 2]
 
-    # A surface ends either at the photo's border, or inside the photo, where something nearer covers
-    # the rest. Only the first kind is extended.
+    # A surface ends either at the photo's border, or inside the photo, where something nearer
+    # covers the rest. Only the first kind is extended.
     photo_size = to_like(torch.tensor([photo_camera.width, photo_camera.height]), photo_pixels)
     to_border_px = torch.minimum(photo_pixels, photo_size - photo_pixels).amin(-1)
     ends_at_border = to_border_px < AT_BORDER_WIDTHS * photo_camera.width

@@ -37,8 +37,8 @@ class SharpDecoder(ResidualNet):
     local = False  # group norms make a cell depend on all others
 
     def __init__(self, config: SharpConfig = FULL_SIZE) -> None:
-        """Make the layers, with random weights; the heads start at zero, so that an untrained network
-        changes nothing.
+        """Make the layers, with random weights; the heads start at zero, so that an untrained
+        network changes nothing.
 
         `config` is the size of SHARP, by default the published one.
         """
@@ -65,7 +65,8 @@ class SharpDecoder(ResidualNet):
         for name, layer in self.feature_model.named_modules():
             if isinstance(layer, (nn.Conv2d, nn.ConvTranspose2d)):
                 # The last convolution of one of SHARP's residual blocks is its layer 5 if the block
-                # has norms, otherwise its layer 3. With zero weights there, the block is the identity.
+                # has norms, otherwise its layer 3. With zero weights there, the block is the
+                # identity.
                 ends_block = name.endswith(("residual.3", "residual.5"))
                 set_random_weights(layer, gain=0.0 if ends_block else 1.0)
         set_random_weights(self.stem, gain=STEM_GAIN)
@@ -89,8 +90,8 @@ class SharpDecoder(ResidualNet):
         height, width = features.shape[-2:]
         features = pad_to_stride(features)
 
-        # The decoder's maps, from fine to coarse. In the finest, a place is one cell; in each further
-        # map it is twice as long and wide.
+        # The decoder's maps, from fine to coarse. In the finest, a place is one cell; in each
+        # further map it is twice as long and wide.
         x = torch.relu(self.stem(features))
         maps: list[Tensor] = []
         for to_map, down in itertools.zip_longest(self.maps, self.down):
@@ -110,8 +111,8 @@ class SharpDecoder(ResidualNet):
         # The decoder predicts one Gaussian for 2×2 pixels of its picture, so each cell is repeated.
         pixels = interpolate(picture, scale_factor=2, mode="nearest")
 
-        # There are no features coarser than the coarsest map. Zero in their place lets this map, like
-        # the others, pass all layers that combine it with coarser features.
+        # There are no features coarser than the coarsest map. Zero in their place lets this map,
+        # like the others, pass all layers that combine it with coarser features.
         no_coarser_features = x.new_zeros(())
         texture, geometry = self.feature_model(pixels, maps, no_coarser_features)
         deltas = torch.cat([self.geometry(geometry), self.texture(texture)], dim=1)

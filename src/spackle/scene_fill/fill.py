@@ -140,8 +140,8 @@ class _SceneFilling:
         Args:
             context: the photo's base and the settings of the fill, on the renderer's device.
             cameras: the views.
-            exact: visit every view, and leave no hole. Otherwise only half of the views are visited,
-                and invisibly small holes stay open.
+            exact: visit every view, and leave no hole. Otherwise only half of the views are
+                visited, and invisibly small holes stay open.
             always_filled: indices of views that are visited in any case.
         """
         self.context = context
@@ -173,9 +173,9 @@ class _SceneFilling:
         self.filled_views = 0
         self.aux = [Gaussians.empty()]  # everything that was added
 
-        # Pairs (view's index, Gaussians that it needs beneath the rims of its holes). They wait until
-        # the two widest views are filled, because one of these may show, and fill better, what lies
-        # beneath the rims of the other.
+        # Pairs (view's index, Gaussians that it needs beneath the rims of its holes). They wait
+        # until the two widest views are filled, because one of these may show, and fill better,
+        # what lies beneath the rims of the other.
         self.pending_underlays: list[tuple[int, Gaussians]] = []
 
         # [H, W, 3] uint8 sRGB, by the view's index: final renderings, as long as nothing is added.
@@ -290,8 +290,8 @@ def _fill_in_passes(
     aux: list[Gaussians] = []
     underlays: list[Gaussians] = []
     for pass_index in range(PASSES):
-        # Where holes stayed open, the network predicted faint Gaussians. It would do so again, so the
-        # second pass goes without it.
+        # Where holes stayed open, the network predicted faint Gaussians. It would do so again, so
+        # the second pass goes without it.
         pass_context = context if pass_index == 0 else context.without_network
         view = pass_context.view(rendering, camera)
         if not bool(view.mask.any()):

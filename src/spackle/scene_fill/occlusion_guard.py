@@ -62,8 +62,8 @@ class OcclusionGuard:
         is_hole = view.alpha < threshold
         surface_depth = torch.where(is_hole, 0, view.depth).float()
 
-        # A Gaussian reaches some pixels around its centre, and may hide a surface at any of them. The
-        # greatest depth within a window tells this in one look: a Gaussian in front of it hides it.
+        # A Gaussian reaches some pixels around its centre, and may hide a surface at any of them.
+        # So each pixel keeps the greatest depth within a window around it.
         return OcclusionGuard(camera, maximum_filter(surface_depth, WINDOW_PX))
 
 
@@ -118,7 +118,8 @@ def unoccluding_scales(
     double_gaussians = gaussians.detach().to(dtype=torch.float64)
     covariances = double_gaussians.covariances().cpu().flatten(1).numpy()  # [N, 9]
 
-    # The guards' depth images differ in size, so their pixels are stored one image behind the other.
+    # The guards' depth images differ in size, so their pixels are stored one image behind the
+    # other.
     cameras = np.stack([_camera_numbers(guard.camera) for guard in guards])
     depths = np.concatenate([guard.depth.numpy().ravel() for guard in guards])
     sizes = np.array([guard.depth.shape for guard in guards])  # [guards, 2]
@@ -269,8 +270,8 @@ def _reach_px(
         tangent: x / z or y / z of the Gaussian's centre in the camera's frame.
         covariance: [9] of the Gaussian in the world's frame.
     """
-    # The derivative (a, b, c) of the pixel by the world's x, y, z. From number 12 on, `camera` holds
-    # the row of the extrinsics for z.
+    # The derivative (a, b, c) of the pixel by the world's x, y, z. From number 12 on, `camera`
+    # holds the row of the extrinsics for z.
     a = px_per_unit * (camera[axis_row] - tangent * camera[12])
     b = px_per_unit * (camera[axis_row + 1] - tangent * camera[13])
     c = px_per_unit * (camera[axis_row + 2] - tangent * camera[14])

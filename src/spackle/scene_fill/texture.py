@@ -125,8 +125,8 @@ def copy_patch_blocks(patches: Patches, blocks: Tensor) -> Tensor:
         weight = (-costs[row, column] / mean_cost).exp() + MIN_VOTE_WEIGHT
         weight = torch.where(has_patch, weight, 0)
 
-        # The neighbour lies at (dy, dx) from the cell. So in the neighbour's patch, the block for the
-        # cell itself lies at (-dy, -dx) from the patch's centre.
+        # The neighbour lies at (dy, dx) from the cell. So in the neighbour's patch, the block for
+        # the cell itself lies at (-dy, -dx) from the patch's centre.
         source, source_row, source_column = patches.matches[row, column].long().unbind(-1)
         block = sources[
             source.clamp_min(0),

@@ -123,9 +123,9 @@ class SceneViewCompletion(ViewCompletion):
         """[h, w, c] float32: the channels of one input, by its name in `INPUT_CHANNELS`; 0 outside
         of holes.
 
-        "rim" has the colour at the rim, the colour mirrored at the rim, and the distance to the rim.
-        "patches" has the colour of matching patches, and how badly they match. These colours are
-        differences from the initial colours, as logits, so that a network can add them to the
+        "rim" has the colour at the rim, the colour mirrored at the rim, and the distance to the
+        rim. "patches" has the colour of matching patches, and how badly they match. These colours
+        are differences from the initial colours, as logits, so that a network can add them to the
         initial colours.
         """
         if name == "rim":
