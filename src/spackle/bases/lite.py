@@ -373,7 +373,8 @@ class LiteBase:
         # 1 at the nearest surface, towards 0 in the distance.
         nearness = inverse_depth / near_inverse_depth(inverse_depth.flatten())
         depth = RELATIVE_NEAR_M / nearness.clamp(1 / MAX_DEPTH_RATIO, 1)
-        # Every pixel has a depth. The network gives neither intrinsics nor quantisation steps.
+        # Every pixel has a depth. The map needs no intrinsics (K), because the camera is passed
+        # separately, and has no quantisation step (quantum), because nothing was rounded.
         depth_map = DepthMap(
             depth,
             torch.ones_like(depth, dtype=torch.bool),
@@ -388,7 +389,8 @@ class LiteBase:
             "precision": "fp32",
             "depth_scale": f"relative, the nearest at {RELATIVE_NEAR_M:g} m",
         }
-        # The geometry is rough: lite allows smaller moves of the camera than other bases.
+        # Because the geometry is rough, the camera may move less (max_disparity), and less of a view
+        # may be holes, than with other bases.
         return dataclasses.replace(
             prediction, notes=notes, max_disparity=MAX_DISPARITY, max_hole_ratio=MAX_HOLE_RATIO
         )
@@ -409,10 +411,11 @@ class LiteBase:
     def at_scales(self, rgb: Tensor, scales: Sequence[InputScale]) -> Tensor:
         """[n, h, w] log inverse depth of a photo [H, W, 3], one map for each of n input scales.
 
-        All maps are resized to that of the last scale, and are on the CPU. Each is known only up to
-        a constant of its own.
+        All maps are resized to the size of the last scale's map, which is the finest, and are on
+        the CPU. Each is known only up to a constant of its own.
         """
         picture = rgb.float().permute(2, 0, 1)[None].to(self.device)  # [1, 3, H, W]
+        # Each output is [1, 1, its height, its width], as `interpolate` needs it.
         outputs = [self._run_network(picture, scale)[None, None] for scale in scales]
         finest_size = outputs[-1].shape[2:]
         resized = [interpolate(output, size=finest_size, mode="bilinear")[0] for output in outputs]

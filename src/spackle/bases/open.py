@@ -74,7 +74,8 @@ def open_base(settings: BaseSettings) -> OpenedBase:
     InputError for unsuitable settings.
     """
     settings.check()
-    # Only the photo's own depth and the weights on this machine decide: each photo gets its base.
+    # Nothing in the settings decides. For each photo, the depth in its file and the weights on this
+    # machine do.
     if settings.resolved_name == AUTO:
         return OpenedBase(AUTO_CANDIDATES, settings)
 

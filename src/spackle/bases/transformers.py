@@ -189,8 +189,11 @@ class HfBase:
         height, width = depth.shape[1:]
         rows = slice(round(window.top * height), round(window.bottom * height))
         columns = slice(round(window.left * width), round(window.right * width))
+        # Only Depth Pro's output has a field of view.
         fov_degrees = getattr(output, "field_of_view", None)
-        return depth[0, rows, columns], None if fov_degrees is None else float(fov_degrees)
+        if fov_degrees is not None:
+            fov_degrees = float(fov_degrees)
+        return depth[0, rows, columns], fov_degrees
 
 
 def _camera_of_fov(fov_degrees: float, photo: Photo) -> Camera | None:
@@ -263,8 +266,10 @@ def to_depth_map(
         inverse_depth = output / focal_per_width  # 1/m
         depth = 1 / inverse_depth.clamp(MIN_INVERSE_DEPTH_PER_M, MAX_INVERSE_DEPTH_PER_M)
 
-    # A metric model may predict 0 or less for the sky.
+    # A metric model may predict 0 or less for the sky: there is no depth then.
     valid = known & is_valid_depth(depth)
+    # The map needs no intrinsics (K), because the camera is passed separately, and has no
+    # quantisation step (quantum), because nothing was rounded.
     return DepthMap(
         depth.where(valid, 0.0),
         valid,
@@ -415,6 +420,7 @@ def _run_processor(processor: Any, is_zoedepth: bool) -> Preprocessing:
     is_padded = is_zoedepth and processor.do_pad
 
     def preprocess(rgb: Tensor) -> tuple[Tensor, PhotoWindow]:
+        # Image processors are made for pictures of 8 bits.
         image = Image.fromarray((rgb * 255).round().to(torch.uint8).numpy())
         inputs = processor(images=image, return_tensors="pt")
         pixels = torch.as_tensor(inputs["pixel_values"])

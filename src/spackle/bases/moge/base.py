@@ -69,7 +69,8 @@ class MogeView:
         sky_depth = SKY_DISTANCE_FACTOR * self.depth[known].max()
         depth = torch.where(self.surface, self.depth.where(known, 0.0), sky_depth)
         is_sky = ~self.surface
-        # Without intrinsics K and quantisation steps: MoGe's focal length is used apart from the map.
+        # The map needs no intrinsics (K), because the camera is passed separately, and has no
+        # quantisation step (quantum), because nothing was rounded.
         return DepthMap(depth, known | is_sky, K=None, quantum=None, quantity="depth", path=path)
 
 
@@ -268,8 +269,8 @@ def _gauss_newton_step(
     """The change of the shift that would make the residuals smallest if they were linear in it.
 
     The residuals, fit.focal · fit.projected - places, say how far the points [N, 3], which are
-    shifted by `shift` so far, project beside their places [N, 2]. Without a known focal length, it
-    is the best one for each shift.
+    shifted by `shift` so far, miss their places [N, 2]. Without a known focal length, each shift
+    has its best one.
     """
     projected_slope = -fit.projected / (points[:, 2:] + shift)  # d projected / d shift
     residual_slope = fit.focal * projected_slope  # d residual / d shift, at this focal length

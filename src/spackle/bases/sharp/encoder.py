@@ -289,11 +289,11 @@ class SlidingPyramid(nn.Module):
             end = start + windows_per_batch
             last, early = self.patch_encoder(windows[start:end], self.early_blocks)
             last_batches.append(to_precision_of(last, self.fuse_lowres))
-            # Early features are needed only of the full-size windows. These come first: so many are
-            # left at the start of this batch.
-            full_size_count = max(0, FULL_SIZE_WINDOWS**2 - start)
+            # Early features are needed only of the full-size windows, which come first. In a batch
+            # after the last of them, the slice is empty.
+            full_size_left = max(0, FULL_SIZE_WINDOWS**2 - start)
             for batches, features in zip(early_batches, early, strict=True):
-                batches.append(to_precision_of(features[:full_size_count], self.fuse_lowres))
+                batches.append(to_precision_of(features[:full_size_left], self.fuse_lowres))
             if progress:
                 progress(min(end, len(windows)), len(windows))
         return torch.cat(last_batches), [torch.cat(batches) for batches in early_batches]

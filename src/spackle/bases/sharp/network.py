@@ -471,7 +471,8 @@ def apply_deltas(initial: InitialGaussians, deltas: Tensor) -> Gaussians:
     x = (2 * torch.arange(width, device=deltas.device) + 1) / width - 1  # of the cells' centres
     y = (2 * torch.arange(height, device=deltas.device) + 1) / height - 1
 
-    # The offset changes inverse depth before a softplus, so that it stays positive.
+    # The gains (XY_GAIN and others) say how much a delta of 1 changes an attribute. The offset in z
+    # changes inverse depth before a softplus, so that inverse depth stays positive.
     inverse = softplus(_inverse_softplus(initial.disparity) + Z_GAIN * offset[2])
     z = 1.0 / (inverse + FARTHEST_INVERSE)  # [2, H, W]; the summand keeps it finite
     moved_x = x + XY_GAIN * offset[0]

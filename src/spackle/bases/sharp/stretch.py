@@ -210,11 +210,11 @@ def _store_block(first: int, count: int, block: Any, new_quats: Any, new_scales:
 def _other_axes(a: Any, b: Any) -> Any:
     """The second and third axis of a right-handed frame whose first axis is the unit vector `a`.
 
-    The second axis is the unit vector `b`, made orthogonal to `a`. If b is nearly parallel to a, or
-    zero, any orthogonal axis is taken.
+    The second axis is the unit vector `b`, made orthogonal to `a`. If b is zero, or far from
+    orthogonal because it is mere noise, any orthogonal axis is taken.
     """
     # The squared length of the vector product of two unit vectors is the squared sine of their
-    # angle. `not … >` is also true for NaN.
+    # angle: 1 if they are orthogonal. `not … >` is also true for NaN.
     c = _cross(a, b)
     if not _dot(c, c) > MIN_SQUARED_SINE:
         # The axis of the world that is most nearly at a right angle to a.
