@@ -35,7 +35,7 @@ def encode_rgb(rgb: Tensor) -> bytes:
 
 def decode_rgb(data: bytes) -> Tensor:
     """The picture [H, W, 3] sRGB in 0..1 of a PNG."""
-    return torch.from_numpy(decode_png(data, 3)).float() / 255
+    return torch.from_numpy(decode_png(data, axis_count=3)).float() / 255
 
 
 def encode_mask(mask: Tensor) -> bytes:
@@ -45,14 +45,14 @@ def encode_mask(mask: Tensor) -> bytes:
 
 def decode_mask(data: bytes) -> Tensor:
     """The mask [H, W] bool of a PNG."""
-    return torch.from_numpy(decode_png(data, 2)) > 127
+    return torch.from_numpy(decode_png(data, axis_count=2)) > 127  # nearer to white than to black
 
 
 def encode_alpha(alpha: Tensor, mask: Tensor, threshold: float) -> bytes:
     """A 16-bit PNG of opacity [H, W] in 0..1.
 
-    Rounding must not change which pixels count as uncovered: exactly the pixels of `mask` [H, W]
-    bool stay below `threshold`.
+    Pixels whose opacity is below `threshold` count as uncovered; `mask` [H, W] bool marks them.
+    Rounding must not change that.
     """
     codes = (alpha.detach().cpu().double() * MAX_CODE).round().clamp(0, MAX_CODE)
     # Codes that rounding has moved to the other side of the threshold are moved back.
@@ -65,11 +65,12 @@ def encode_alpha(alpha: Tensor, mask: Tensor, threshold: float) -> bytes:
 
 def decode_alpha(data: bytes) -> Tensor:
     """The opacity [H, W] in 0..1 of a 16-bit PNG."""
-    return torch.from_numpy(decode_png(data, 2).astype(np.float64) / MAX_CODE).float()
+    codes = decode_png(data, axis_count=2).astype(np.float64)
+    return torch.from_numpy(codes / MAX_CODE).float()
 
 
 def encode_depth(depth: Tensor, alpha: Tensor) -> tuple[bytes, tuple[float, float]]:
-    """A 16-bit PNG of depth, in logarithmic steps, so that near and far lose the same share.
+    """A 16-bit PNG of depth, in logarithmic steps: the relative error is the same near and far.
 
     The code 0 means unknown; the codes 1 to 65535 are
 
@@ -89,7 +90,8 @@ def encode_depth(depth: Tensor, alpha: Tensor) -> tuple[bytes, tuple[float, floa
         near = float(z[is_known].min())
         far = float(z[is_known].max())
 
-    # The quotient grows from 0 at `near` to 1 at `far`.
+    # The quotient below grows from 0 at `near` to 1 at `far`. Its divisor must not be 0 if both are
+    # equal.
     log_range = max(math.log(far / near), MIN_RANGE)
     codes = np.zeros(z.shape, np.uint16)
     codes[is_known] = 1 + np.round((MAX_CODE - 1) * np.log(z[is_known] / near) / log_range)
@@ -98,7 +100,7 @@ def encode_depth(depth: Tensor, alpha: Tensor) -> tuple[bytes, tuple[float, floa
 
 def decode_depth(data: bytes, near: float, far: float) -> Tensor:
     """The depth z [H, W] of a PNG of `encode_depth`, with its `near` and `far`; 0 means unknown."""
-    codes = decode_png(data, 2).astype(np.float64)
+    codes = decode_png(data, axis_count=2).astype(np.float64)
     z = near * np.exp((codes - 1) / (MAX_CODE - 1) * math.log(far / near))
     return torch.from_numpy(np.where(codes > 0, z, 0.0)).float()
 

@@ -45,6 +45,7 @@ def draw_composite(
     height, width = COMPOSITE_SIZE_PX if is_landscape else COMPOSITE_SIZE_PX[::-1]
 
     def draw_photo(rng: np.random.Generator) -> Tensor:
+        """A random one of the photos, [h, w, 3] sRGB."""
         return load_photo(pick_random(rng, photos)).rgb
 
     rgb, inverse_depth = compose_cutouts(rng, draw_photo, height, width)

@@ -25,7 +25,9 @@ MIN_DIVISOR = 1e-6  # avoids division by zero
 
 
 def color_loss(rgb: Tensor, target: Tensor, hole: Tensor, blur: float = 0.0) -> Tensor:
-    """[] mean |rgb - target| over the pixels of a hole and the channels, then over images.
+    """The mean |rgb - target| over the pixels of a hole and the channels, then over images.
+
+    The result is a scalar tensor.
 
     Args:
         rgb: completed views [B, H, W, 3], sRGB 0..1.
@@ -44,13 +46,13 @@ def color_loss(rgb: Tensor, target: Tensor, hole: Tensor, blur: float = 0.0) -> 
 
 
 def alpha_loss(alpha: Tensor, hole: Tensor) -> Tensor:
-    """[] mean -log(max(alpha, 0.001)) over a hole: cross entropy towards 1."""
+    """The mean -log(max(alpha, 0.001)) over a hole, a scalar: cross entropy towards opacity 1."""
     hole_alpha = torch.where(hole, alpha, 1).clamp_min(MIN_ALPHA)
     return mean_of_images(-hole_alpha.log(), hole)
 
 
 def preserve_loss(rgb: Tensor, base_rgb: Tensor, hole: Tensor) -> Tensor:
-    """[] mean |rgb - base_rgb| over the pixels outside of the hole and the channels.
+    """The mean |rgb - base_rgb| over the pixels outside of the hole and the channels, a scalar.
 
     Completed views [B, H, W, 3] should not change there. `base_rgb`, the views before completion,
     gets no gradient; `hole` is [B, H, W] bool.
@@ -68,7 +70,10 @@ def perceptual_loss(
     size: int | None = 512,
     gram: float = 1.0,
 ) -> Tensor:
-    """[] differences of features and of Gram matrices near the hole, summed over layers.
+    """How much features and textures near the hole differ from the target's, a scalar tensor.
+
+    Features are the outputs of some layers of a network for images; Gram matrices of features
+    describe texture. The differences of both are summed over the layers.
 
     F and T are a layer's features [C, h, w] of prediction and target, divided by the root mean
     square of T. The weight w [h, w] is the fraction of each cell of the feature map that the
@@ -76,7 +81,7 @@ def perceptual_loss(
 
         sum(w |F - T|) / (C sum(w))  +  gram · mean |G(F) - G(T)|,
 
-    with the Gram matrix G(F) = (F w) F^T / sum(w), [C, C], which describes texture.
+    with the Gram matrix G(F) = (F w) F^T / sum(w), [C, C].
 
     Args:
         features: the network.
@@ -200,7 +205,7 @@ def covered_fraction(mask: Tensor, features: Tensor) -> Tensor:
 
 
 def mean_of_images(values: Tensor, mask: Tensor) -> Tensor:
-    """[] mean of values [B, H, W] over the mask [B, H, W] of each image, then over images.
+    """The mean of values [B, H, W] over the mask [B, H, W] of each image, then over images.
 
     The values must be 0 outside of the mask. An image with an empty mask counts as 0.
     """
@@ -223,7 +228,7 @@ def resize_for_network(images: Tensor, size: int | None) -> Tensor:
 
 
 def layer_terms(prediction: Tensor, target: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """The feature term [] and the Gram term [] of the perceptual loss for one layer.
+    """The feature term and the Gram term of the perceptual loss for one layer, two scalars.
 
     Both compare features of prediction and target [B, C, h, w], weighted by cell, with weights
     [B, 1, h, w]. The feature term is the mean difference; the Gram term is the mean difference of

@@ -31,6 +31,7 @@ def must_hold(message: str, condition: Callable[[Any], bool]) -> AfterValidator:
     """
 
     def check(value: Any) -> Any:
+        """The value itself; ValueError, which pydantic reports to the user, if it is refused."""
         if not condition(value):
             raise ValueError(message)
         return value
@@ -131,13 +132,13 @@ class LossRecipe(RecipePart):
 
     @property
     def features_file(self) -> Path | None:
-        """The file of the feature network's weights: `features_path`, if it is given.
+        """The file of the feature network's weights; None if there is none.
 
-        Else, for ResNet-50, the downloaded file; None if nothing was downloaded.
+        `features_path` comes first. Only the weights of ResNet-50 can have been downloaded.
         """
-        if self.features_path is not None or self.features != "resnet50":
-            return self.features_path
-        return installed_weights("features")
+        if self.features_path is None and self.features == "resnet50":
+            return installed_weights("features")
+        return self.features_path
 
 
 class OptimRecipe(RecipePart):

@@ -106,11 +106,11 @@ class ViewTask(Task):
         """Complete the views of a batch by the network that is trained."""
 
     def loss(self, network: nn.Module, batch: Any) -> tuple[Tensor, dict[str, Tensor]]:
-        """The loss [] of a batch, with gradients, and its terms [] by name."""
+        """The loss of a batch, a scalar with gradients, and its terms by name, detached scalars."""
         return self._loss_of(self.complete(network, batch))
 
     def _loss_of(self, views: ViewBatch) -> tuple[Tensor, dict[str, Tensor]]:
-        """The loss [] of completed views, and its terms [] by name."""
+        """The loss of completed views, and its terms by name; all of them are scalar tensors."""
         return total_loss(
             rgb=views.rgb.to(self.device),
             alpha=views.alpha.to(self.device),

@@ -116,7 +116,7 @@ def open_run(
         facts={
             **facts,
             "method": task.name,
-            "aim": task.selection_measure,
+            "aim": task.selection_measure,  # what decides which weights are the best
             "recipe": recipe.model_dump(mode="json"),
             "processes": rank_count(),
             "versions": package_versions(),

@@ -181,7 +181,7 @@ class Sample:
 
     @property
     def hole(self) -> Tensor:
-        """[H, W] bool: the hole, Q in eq. 6."""
+        """[H, W] bool: the hole, the pixels that the base leaves uncovered."""
         return hole_mask(self.rendering.alpha)
 
     @functools.cached_property

@@ -138,6 +138,7 @@ def stereo_sources(data: DataRecipe, folder: Path, renderer: Renderer) -> list[S
     scene_names = relative_names(scene_folders, folder)  # identify the samples
 
     def right_view_by_number(rng: np.random.Generator, index: int) -> Sample:
+        """A random view; its number `index` is not used, because `rng` alone determines it."""
         return random_right_view(rng, scene_folders, renderer)
 
     draw = partial(draw_left_photo, folders=scene_folders)
@@ -167,6 +168,7 @@ def dataset_source(data: DataRecipe, location: Path, *, validation: bool) -> Sou
     read_photo = lru_cache(maxsize=1)(dataset.__getitem__)
 
     def stored_view(rng: np.random.Generator, index: int) -> Sample:
+        """The dataset's view of this number; nothing is random."""
         photo_number, view_number = views[index]
         photo = read_photo(photo_number)
         view = photo.view(view_number)

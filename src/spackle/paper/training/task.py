@@ -61,7 +61,7 @@ class Task(Protocol):
         """
 
     def loss(self, network: nn.Module, batch: Any) -> tuple[Tensor, dict[str, Tensor]]:
-        """The loss [] of a batch, with gradients, and the terms [] of the loss by name."""
+        """The loss of a batch, a scalar with gradients, and the loss's terms by name."""
 
     def measure(self, network: nn.Module, batch: Any) -> dict[str, list[float]]:
         """Measure a network on validation items; returns the values of each measure by name."""

@@ -136,6 +136,7 @@ def run_steps(run: TrainingRun) -> str:
     )
 
     def load_pass(step_and_items: tuple[int, list[int]]) -> Any:
+        """The batch of a pass, which `prefetch` loads in a thread."""
         step, items = step_and_items
         return run.task.load_batch(step, items)
 
@@ -223,7 +224,8 @@ def accumulate_gradients(run: TrainingRun, batches: Iterator[Any]) -> dict[str, 
     over all items.
 
     Returns:
-        The mean loss [] of this process ("loss") and the means [] of its terms, in float64.
+        The mean loss of this process ("loss") and the means of its terms by name: scalar tensors
+            in float64.
     """
     means: dict[str, Tensor] = {}
     passes = items_of_passes(run, run.progress.step)
