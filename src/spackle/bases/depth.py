@@ -74,8 +74,8 @@ class RgbdBase:
             depth=frame.inside(depth.depth, framed_width, framed_height),
             valid=frame.inside(depth.valid, framed_width, framed_height),
         )
-        # Cropping moves the principal point. The border's widths are in pixels of the photo, so that
-        # the camera is first scaled to them.
+        # Cropping moves the principal point. The border's widths are in pixels of the photo: the
+        # camera is first scaled to them.
         if camera is not None:
             camera = camera.resized(framed_width, framed_height)
             camera = camera.cropped(frame.left, frame.top, photo.width, photo.height)
@@ -96,8 +96,8 @@ def lift_rgbd(
 ) -> BasePrediction:
     """Turn a photo [H, W, 3] (sRGB in 0..1) and its depth map into Gaussians on the surfaces.
 
-    `camera` is the photo's camera. In flat areas, up to 2^levels × 2^levels pixels share a Gaussian;
-    with `levels` = 0, each pixel has its own. InputError if no pixel has a depth.
+    `camera` is the photo's camera. In flat areas, up to 2^levels × 2^levels pixels share a
+    Gaussian; with `levels` = 0, each pixel has its own. InputError if no pixel has a depth.
     """
     lifted = lift_depth_map(rgb, depth, camera, levels)
     return BasePrediction(lifted.gaussians, lifted.camera, lifted.notes)

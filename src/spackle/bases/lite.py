@@ -389,8 +389,8 @@ class LiteBase:
             "precision": "fp32",
             "depth_scale": f"relative, the nearest at {RELATIVE_NEAR_M:g} m",
         }
-        # Because the geometry is rough, the camera may move less (max_disparity), and less of a view
-        # may be holes, than with other bases.
+        # Because the geometry is rough, the camera may move less (max_disparity), and less of a
+        # view may be holes, than with other bases.
         return dataclasses.replace(
             prediction, notes=notes, max_disparity=MAX_DISPARITY, max_hole_ratio=MAX_HOLE_RATIO
         )
@@ -401,7 +401,7 @@ class LiteBase:
         Returns [h, w] float32 up to a factor, on the CPU: about 224×304, in the photo's aspect
         ratio.
         """
-        # A file of weights may hold only the first network: then the second one's scale is left out.
+        # If the file of weights holds only the first network, the second one's scale is left out.
         scales = [scale for scale in INPUT_SCALES if scale.network < len(self.networks)]
         log_inverse_depths = self.at_scales(rgb, scales)
         gives_low_frequencies = [scale.gives_low_frequencies for scale in scales]

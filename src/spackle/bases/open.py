@@ -69,9 +69,9 @@ class BaseError(InputError):
 
 
 def open_base(settings: BaseSettings) -> OpenedBase:
-    """Check a base's settings, and wrap the base for predictions; the first photo loads its network.
+    """Check a base's settings, and wrap the base for predictions.
 
-    InputError for unsuitable settings.
+    Its network is loaded when the first photo needs it. InputError for unsuitable settings.
     """
     settings.check()
     # Nothing in the settings decides. For each photo, the depth in its file and the weights on this
@@ -297,7 +297,7 @@ class OpenedBase:
         raise BaseError(f"`base` {self._settings.resolved_name}: its weights are gone: start again")
 
     def _fails_for_every_photo(self, name: str, base: Base | None, error: InputError) -> bool:
-        """Whether the candidate `name`, which failed with `error`, would fail for every other photo.
+        """Whether the candidate `name`, which failed with `error`, would fail for every photo.
 
         A network would, if it cannot be loaded (then `base` is None) or memory is short. A photo's
         depth map would not: the next photo has another map.
@@ -353,7 +353,7 @@ class OpenedBase:
         )
 
     def load(self, photo: Photo, depth: Depth = None, name: str | None = None) -> Base | None:
-        """Load a base; None if it lifts depth and the photo has none, or if its weights are missing.
+        """Load a base; None if its weights are missing, or if it needs depth that a photo lacks.
 
         Args:
             photo: the photo for which the base is needed.

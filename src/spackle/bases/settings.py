@@ -223,8 +223,8 @@ class BaseSettings:
                 f"`base` {HF_PREFIX} names no model: "
                 "give a Hugging Face model as owner/name, or a folder"
             )
-        # A colon marks a Hugging Face model or a class of another package. Whether that exists shows
-        # only when it is loaded.
+        # A colon marks a Hugging Face model or a class of another package. Loading shows whether it
+        # exists.
         if ":" not in self.name:
             check_name("base", self.name, (AUTO, RGBD, *NETWORK_BASES))
 

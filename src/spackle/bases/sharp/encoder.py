@@ -227,7 +227,7 @@ class SlidingPyramid(nn.Module):
         self.upsample0 = _project_and_upsample(embed, middle, middle, doublings=1)
         self.upsample1 = _project_and_upsample(embed, coarse, coarse, doublings=1)
         self.upsample2 = _project_and_upsample(embed, coarsest, coarsest, doublings=1)
-        # For the coarsest map, the outputs of both transformers for the smallest picture are joined.
+        # For the coarsest map, both transformers' outputs for the smallest picture are joined.
         self.upsample_lowres = nn.ConvTranspose2d(embed, coarsest, 2, stride=2)
         self.fuse_lowres = nn.Conv2d(2 * coarsest, coarsest, 1)
 
@@ -338,10 +338,10 @@ def merge_windows(maps: Tensor, trim: int) -> Tensor:
 def _project_and_upsample(
     dim_in: int, dim_middle: int, dim_out: int, doublings: int
 ) -> nn.Sequential:
-    """Layers that change channels from `dim_in` to `dim_out`, and double the size `doublings` times.
+    """Layers that change channels from `dim_in` to `dim_out`, and double the size of a map.
 
-    First a 1×1 convolution projects to `dim_middle` channels. Each doubling is a transposed
-    convolution.
+    First a 1×1 convolution projects to `dim_middle` channels. Then come `doublings` transposed
+    convolutions, each of which doubles the width and height.
     """
     layers: list[nn.Module] = [nn.Conv2d(dim_in, dim_middle, 1, bias=False)]
     channels = dim_middle

@@ -114,7 +114,7 @@ class Fusion(nn.Module):
         With `upsample` the output has twice the width and height of the input.
         """
         super().__init__()
-        # The names are the checkpoint's: `resnet1` is for the finer features, `resnet2` for the sum.
+        # Named as in the checkpoint: `resnet1` is for the finer features, `resnet2` for the sum.
         self.resnet1 = plain_residual(dim)
         self.resnet2 = plain_residual(dim)
         self.deconv = (
@@ -389,7 +389,7 @@ class GaussianDecoder(nn.Module):
     def enable_training(self) -> GaussianDecoder:
         """Enable gradients of all weights but the unused ones (295,168 as published)."""
         self.requires_grad_()
-        # These layers are unused: they are for finer features, which the coarsest level does not get.
+        # These layers are unused: the coarsest level gets no finer features to process.
         coarsest: Fusion = self.feature_model.decoder.fusions[-1]  # type: ignore[assignment]
         coarsest.resnet1.requires_grad_(False)
         return self
