@@ -48,6 +48,8 @@ def run_demo(output: Path, reporter: Reporter) -> None:
         InputError: scikit-image, which brings the photos, is missing, or the folder `output` cannot
             be written to.
     """
+    # The left photo and its measured depth become the scene. Overscan, a zoom that hides the fill
+    # beyond the photo's border, is 0, because the comparison is to show all of the fill.
     pair = load_motorcycle()
     pipeline = Pipeline.open(
         PipelineOptions(
@@ -58,8 +60,12 @@ def run_demo(output: Path, reporter: Reporter) -> None:
     renderer = pipeline.renderer
     with results_folder(output, RESULT_FILES, locked=True):
         start = time.perf_counter()
-        focal_px = pair.left_camera.focal[0]
-        photo = Photo(pair.left, focal_px, FocalSource.CALIBRATION, Path("Motorcycle"))
+        photo = Photo(
+            rgb=pair.left,
+            focal_px=pair.left_camera.focal[0],
+            focal_source=FocalSource.CALIBRATION,
+            path=Path("Motorcycle"),  # no file, but a name for messages
+        )
         completed = pipeline.complete(photo, reporter)
         scene = completed.scene
 
@@ -73,26 +79,26 @@ def run_demo(output: Path, reporter: Reporter) -> None:
         _save_comparison(completed, renderer, output / "comparison.png")
         with reporter.stage("truth"):
             scores = _compare_truth(completed.predicted.prediction, pair, renderer, output)
-        seconds = round(time.perf_counter() - start, 3)
+        total_seconds = round(time.perf_counter() - start, 3)
 
-        assert scene.report is not None
-        before = scene.report.hole_ratio_before
-        after = scene.report.hole_ratio_after
+        assert scene.report is not None  # `Pipeline.complete` always makes one
+        hole_ratio_before = scene.report.hole_ratio_before
+        hole_ratio_after = scene.report.hole_ratio_after
         report: dict[str, Any] = {
             "disparity": DISPARITY,
             "base_gaussians": len(scene.base),
             "aux_gaussians": len(scene.aux),
-            "hole_area_ratio": {"before": before, "after": after},
+            "hole_area_ratio": {"before": hole_ratio_before, "after": hole_ratio_after},
             "right_camera": scores,
             "residual": {"weights": pipeline.options.fill.weights_name},
-            "seconds": {**reporter.seconds, "total": seconds},
+            "seconds": {**reporter.seconds, "total": total_seconds},
         }
         write_json(report, output / "report.json")
 
         reporter.console.print(_table(scores))
         reporter.log(
             f"{len(scene.aux):,} aux Gaussians; holes at disparity ±{DISPARITY:g}: "
-            f"{before:.1%} -> {after:.2%}; {seconds:.0f} s"
+            f"{hole_ratio_before:.1%} -> {hole_ratio_after:.2%}; {total_seconds:.0f} s"
         )
         reporter.log(
             f"Look at {output / 'video.mp4'} and {output / 'comparison.png'}: "
@@ -106,9 +112,10 @@ def _save_comparison(completed: CompletedPhoto, renderer: Renderer, path: Path) 
     """Write a picture of the leftmost and rightmost view: above the base, below the scene."""
     scene = completed.scene
     views = completed.views
+    # Of a trajectory the report measures the leftmost and the rightmost view.
     widest_views = [views.cameras[index] for index in views.reported_views.values()]
     rows: list[list[Tensor]] = []  # of pictures [H, W, 3] sRGB
-    for gaussians in ([scene.base], scene.of_view(0)):
+    for gaussians in ([scene.base], [scene.base, scene.aux]):
         rows.append([renderer.render(gaussians, view).rgb for view in widest_views])
     long_side = max(widest_views[0].width, widest_views[0].height)
     save_png(contact_sheet(rows, long_side), path)
@@ -118,14 +125,17 @@ def _save_comparison(completed: CompletedPhoto, renderer: Renderer, path: Path) 
 def _compare_truth(
     prediction: BasePrediction, pair: StereoPair, renderer: Renderer, output: Path
 ) -> dict[str, Any]:
-    """Compare four ways to draw the right camera's view with the true right photo.
+    """Draw the right camera's view in four ways, and compare each with the true right photo.
 
-    The ways are the base alone, its view inpainted as an image, and the scene, completed without
-    and with the network. The completed view and the photo are written to `output`.
+    The four ways are: the base alone; the base's view, with holes inpainted as an image; the scene
+    completed without the network; the scene completed with the network. The last one and the
+    photo are written to `output`, as right_view.png and right_photo.png.
 
     Returns:
-        Holes before and after completion, and for each way the PSNR in dB in the hole and outside.
+        "har_before" and "har_after", the view's share of holes before and after completion; and
+        "psnr", by the name of each way: the PSNR in dB "in_hole" and "outside" of the base's holes.
     """
+    # Imported here, because scikit-image is an optional package.
     from skimage.restoration import inpaint_biharmonic
 
     base_view = renderer.render(prediction.gaussians, pair.right_camera)
@@ -133,6 +143,7 @@ def _compare_truth(
     inpainted = inpaint_biharmonic(
         base_view.rgb.numpy(), hole.numpy(), split_into_regions=True, channel_axis=-1
     )
+    # Only this one view is rendered, so completion is exact: no hole of it may remain.
     views = [pair.right_camera]
     untrained = complete(prediction, views, exact=True, network=None, renderer=renderer)
     trained = complete(prediction, views, exact=True, network="shipped", renderer=renderer)
@@ -162,7 +173,10 @@ def _compare_truth(
 
 
 def _table(scores: dict[str, Any]) -> Table:
-    """The result of `_compare_truth` for the terminal."""
+    """The result of `_compare_truth`, the comparison with the true right photo, as a table.
+
+    It has a row for each way to draw the view, and the PSNR in dB in two columns.
+    """
     holes = f"{scores['har_before']:.1%} holes before, {scores['har_after']:.2%} after"
     table = Table(title=f"True right camera: {holes}")
     for header in ("PSNR against the true photo", "in the hole", "outside"):

@@ -57,6 +57,7 @@ class PredictOptions:
         self._check_depth_out()
         pipeline = Pipeline.open(self.scene)
         path = self.scene.path
+        # An option without effect is a mistake of the user, which he learns before the work.
         if not self.photo.render:
             for option in ("format", "fps", "loop"):
                 if getattr(path.video, option) is not None:
@@ -100,7 +101,10 @@ class PhotoResult(NamedTuple):
 
 
 def say_if_kernels_compile(pipeline: Pipeline, reporter: Reporter) -> None:
-    """Tell why the first run takes longer, if it does."""
+    """Log that the first run takes longer, if the renderer's functions are not yet compiled.
+
+    On a GPU there is nothing to compile.
+    """
     if pipeline.renderer.device.type == "cpu" and not is_compiled(blend_tiles):
         reporter.log(
             "first use: kernels are compiled for this processor, "
@@ -111,7 +115,8 @@ def say_if_kernels_compile(pipeline: Pipeline, reporter: Reporter) -> None:
 def find_photos(sources: Sequence[Path]) -> list[NamedPhoto]:
     """The photos that are given by name, by a pattern such as "*.png", or by folder.
 
-    A photo's results are named by its file, without the suffix where this is unique.
+    The folder of a photo's results is named by the photo's file without the suffix, or with the
+    suffix if another photo has the same name without it.
 
     Raises:
         InputError: a folder without photos, or two photos whose results would have the same name.
@@ -120,13 +125,14 @@ def find_photos(sources: Sequence[Path]) -> list[NamedPhoto]:
     for source in sources:
         photos += _photos_of(source)
 
-    # File systems of Windows and macOS do not distinguish upper and lower case.
+    # Names that differ only in upper and lower case count as equal, because the file systems of
+    # Windows and macOS do not distinguish them.
     stem_counts = Counter(photo.stem.casefold() for photo in photos)
     named: dict[str, NamedPhoto] = {}
     for photo in photos:
         is_unique = stem_counts[photo.stem.casefold()] == 1
-        is_dots = not photo.stem.strip(".")  # "...png" has the stem "..", the folder above
-        name = photo.stem if is_unique and not is_dots else photo.name
+        is_only_dots = not photo.stem.strip(".")  # "...png" has the stem "..", the folder above
+        name = photo.stem if is_unique and not is_only_dots else photo.name
         other = named.get(name.casefold())
         if other is not None:
             raise InputError(
@@ -150,11 +156,14 @@ def _photos_of(source: Path) -> list[Path]:
             )
         return photos
 
-    # A file whose name looks like a pattern is meant literally.
+    # Not every shell replaces a pattern by names. If a file has just this name, such as "a[1].png",
+    # the file is meant.
     if not os.path.lexists(source):
         matches = sorted(glob.glob(str(source)))
         if matches:
             return [Path(match) for match in matches]
+
+    # Whether the file exists is checked when it is read, where the message can say more.
     return [source]
 
 
@@ -189,6 +198,8 @@ def predict_photos(
     if is_single:
         check_file(photos[0].path, "photo")
 
+    # Two runs over many photos must not share a folder. A single photo locks only its own folder,
+    # so that several may be predicted at once.
     shared_digest = _shared_digest(options)
     with results_folder(output, locked=not is_single):
         predictor = Predictor(
@@ -200,29 +211,42 @@ def predict_photos(
             verbose=reporter.verbose,
         )
         unfinished = predictor.unfinished(photos, reporter)
-        failure_count = 0
-        # One photo after the other is predicted in this process, which needs less memory.
         if worker_count == 1:
-            with torch_threads(threads):
-                for photo in unfinished:
-                    if not predictor.predict(photo, reporter):
-                        failure_count += 1
+            failure_count = _predict_in_this_process(predictor, unfinished, threads, reporter)
         else:
+            # Each worker opens a predictor of its own, because networks do not travel between
+            # processes.
             failure_count = _predict_by_workers(
                 functools.partial(Predictor.open, output, options, shared_digest, reporter.verbose),
                 list(unfinished),
-                len(photos),
-                worker_count,
-                threads,
-                reporter,
+                photo_count=len(photos),
+                worker_count=worker_count,
+                threads=threads,
+                reporter=reporter,
                 uses_gpu=options.scene.base.device != "cpu",
             )
 
     if failure_count:
         reporter.log(f"{failure_count} of {len(photos)} photos failed")
     else:
+        # Of many photos the line says NAME, which stands for the name of any of them.
         folder = output / (photos[0].name if is_single else "NAME")
         _say_where_to_look(folder, options, reporter)
+    return failure_count
+
+
+def _predict_in_this_process(
+    predictor: Predictor, photos: Iterable[NamedPhoto], threads: int, reporter: Reporter
+) -> int:
+    """Predict one photo after the other with a number of threads; returns how many failed.
+
+    A second process would hold torch and the base's network in memory twice.
+    """
+    failure_count = 0
+    with torch_threads(threads):
+        for photo in photos:
+            if not predictor.predict(photo, reporter):
+                failure_count += 1
     return failure_count
 
 
@@ -263,6 +287,7 @@ def _predict_by_workers(
     Raises:
         KeyboardInterrupt: after Ctrl-C or SIGTERM, once the photos in progress are done.
     """
+    # Workers take seconds to start, so none is started for nothing.
     if not unfinished:
         return 0
     failure_count = 0
@@ -282,6 +307,8 @@ def _predict_by_workers(
     ):
         for result in results:
             finished_count += 1
+            # Workers keep their messages until a photo is done, so that those of two photos do not
+            # mix. A text is a line of the log; everything else is a result for --json.
             for message in result.messages:
                 if isinstance(message, str):
                     reporter.log(message)
@@ -318,7 +345,7 @@ class Predictor:
             output=output,
             options=options,
             shared_digest=shared_digest,
-            is_single=False,
+            is_single=False,  # a single photo is predicted by the main process
             pipeline=options.open_pipeline(),
             verbose=verbose,
         )
@@ -330,16 +357,18 @@ class Predictor:
         return PhotoResult(photo.path.name, not succeeded, reporter.said)
 
     def predict(self, photo: NamedPhoto, reporter: Reporter) -> bool:
-        """Predict a photo; returns whether this succeeded, and logs an error.
+        """Predict a photo and return True, or log the error and return False.
 
-        InputError for a single photo, or if no photo can succeed.
+        An error ends the run, as an InputError, if the photo is the only one, or if the base fails
+        for every photo.
         """
         folder = self.output / photo.name
         try:
             request = self.request_digest(photo)
             predict_photo(photo.path, folder, self.pipeline, reporter, self.options.photo, request)
         except InputError as error:
-            # A BaseError means that the base fails for every photo.
+            # A BaseError means that the base fails for every photo. Any other error is that of one
+            # photo, and must not cost the user the photos after it.
             if self.is_single or isinstance(error, BaseError):
                 raise
             reporter.log(f"error: {error}")
@@ -357,7 +386,8 @@ class Predictor:
                 yield photo
 
     def is_done(self, photo: NamedPhoto) -> bool:
-        """Whether an earlier run with the same input and options has left complete results."""
+        """Whether an earlier run with the same input and options has written all results."""
+        # Who names a single photo wants it predicted now.
         if self.is_single or self.options.overwrite:
             return False
         folder = self.output / photo.name
@@ -369,7 +399,8 @@ class Predictor:
         except InputError:
             return False  # a file is missing, which `predict` will report
 
-        # A damaged or half copied folder may hold a whole report, so its files are compared, too.
+        # A report may be whole although other files are damaged or were not copied. So each file is
+        # compared with the size and digest that the report says.
         has_same_request = earlier_report.get("request") == request
         return has_same_request and matches_records(
             folder, REPORT_NAME, earlier_report.get("files")
@@ -380,12 +411,14 @@ class Predictor:
 
         InputError if the photo or its depth map is missing.
         """
-        # A fingerprint changes with the content of a file.
+        # A fingerprint says which content a file has; the second argument names the file in an
+        # error message.
         fingerprints = [file_fingerprint(photo.path, "photo")]
         depth = self.options.scene.base.depth
         if isinstance(depth, Path):  # a depth map, or a folder with a map for each photo
             depth_file = find_depth_file(depth, photo.path)
             fingerprints.append(file_fingerprint(depth_file, "depth map"))
+            # The calibration beside a depth map gives its numbers their unit.
             for calibration in calibration_candidates(depth_file):
                 if calibration.is_file():
                     fingerprints.append(file_fingerprint(calibration, "calibration"))
@@ -393,9 +426,10 @@ class Predictor:
 
 
 def _shared_digest(options: PredictOptions) -> str:
-    """A digest of version, options and files that all photos share.
+    """A digest of everything that the results of all photos depend on, beside the photo itself.
 
-    InputError for a missing file.
+    These are Spackle's version, the options, and the content of the files that options name. If the
+    digest has changed, earlier results are out of date. InputError for a missing file.
     """
     base = options.scene.base
     path = options.scene.path
@@ -412,18 +446,21 @@ def _shared_digest(options: PredictOptions) -> str:
         kind: file_fingerprint(file, kind) for kind, file in files.items() if file is not None
     }
 
-    # Workers, threads and `overwrite` do not change results, so they are not part of the digest.
-    # Files are identified by their content, wherever they lie. The number of SHARP's windows in a
-    # batch changes only the last bits of results.
+    # A file counts by its content, which is in `fingerprints`, not by its path: a folder of photos
+    # and weights may be moved. So options that name a file are emptied here.
     base = dataclasses.replace(
         base,
+        # A base "hf:FOLDER" has a path in its name; "hf" is what remains without it.
         name=base.resolved_name if base.model_folder is None else "hf",
-        depth=None,
+        depth=None,  # each photo has its own depth map, which `request_digest` adds
         calib=None,
         checkpoint=None,
-        windows_per_batch=None,
+        windows_per_batch=None,  # changes only the last bits of SHARP's results
     )
     path = dataclasses.replace(path, cameras=None, path=None)
+
+    # `options` has more: `overwrite`, and the numbers of workers and threads. These do not change
+    # results.
     return json_digest(
         [
             spackle.__version__,

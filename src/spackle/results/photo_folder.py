@@ -72,6 +72,7 @@ class RunReport:
             "chosen": self.base_reason,
             "gaussians": self.base_gaussians,
         }
+        # Only a base chosen by "auto" can have had better ones before it.
         if self.passed_over:
             base["passed_over"] = list(self.passed_over)
         return {
@@ -96,7 +97,7 @@ class PhotoReport:
     mode: str  # "scene": one set of aux Gaussians for all views; "view": one set for each view
     disparity: float | None  # size of the camera's movement; None for given views and keyframes
     video: Mapping[str, object] | None  # file, frames and size of the video, if one was written
-    holes: tuple[ViewHoles, ...]  # of the measured views
+    holes: tuple[ViewHoles, ...]  # of the reported views: the widest, the keyframes, or the given
     request: str | None  # digest of the input and options; None: predict again in the next run
     photo_name: str
     photo_size: tuple[int, int]  # width and height of the scene's camera, in pixels
@@ -112,28 +113,31 @@ class PhotoReport:
 
     @property
     def hole_ratio_before(self) -> float:
-        """The mean share of holes in the base, over the measured views."""
+        """The mean share of holes in the base, over the reported views."""
         return sum(view.before for view in self.holes) / len(self.holes)
 
     @property
     def hole_ratio_after(self) -> float:
-        """The mean share of holes that completion leaves, over the measured views."""
+        """The mean share of holes that completion leaves, over the reported views."""
         return sum(view.after for view in self.holes) / len(self.holes)
 
     def to_json(self) -> dict[str, Any]:
-        """The content of report.json, whose fields and order are published."""
-        # Fields that reports of clips have, too, come first.
+        """The content of report.json.
+
+        Names and order of the fields are published, so other programs may rely on them.
+        """
+        # First the fields that the reports of photos and of clips have in common.
         report = self.run.to_json()
         report["base"] |= self.base_notes
         report["residual"]["fill"] = self.texture
-        report["merged"] = self.run.base_gaussians + self.aux_gaussians
+        report["merged"] = self.run.base_gaussians + self.aux_gaussians  # number in scene.ply
         report["mode"] = self.mode
         report["disparity"] = self.disparity
         report["video"] = self.video
         report["hole_area_ratio"] = [dataclasses.asdict(view) for view in self.holes]
         report["request"] = self.request
 
-        # The size is that at which the photo was processed, not that of its file.
+        # The size at which the photo was processed; its file may be larger.
         width, height = self.photo_size
         report["photo"] = {"file": self.photo_name, "width": width, "height": height}
         if self.frame_cut_off is not None:
@@ -171,13 +175,17 @@ def predict_photo(
     Raises:
         InputError: the photo, its depth map or the folder cannot be used.
     """
-    reporter = reporter.restarted()
+    reporter = reporter.restarted()  # the report's times are those of this photo alone
+
+    # A depth map or cameras that the user gives belong to the whole photo. So its uniform frame,
+    # such as a scan's margin, must not be cropped.
     keep_frame = options.keep_frame or pipeline.options.has_given_geometry
     with reporter.stage("load"):
         photo = load_photo(path, keep_frame=keep_frame, **options.lens)
 
     with contextlib.ExitStack() as folders:
-        # Whether all files can be written has to be known before minutes of work.
+        # Whether all files can be written has to be known before minutes of work. The lock keeps a
+        # second run out of this photo's folder.
         names = _result_names(pipeline, options)
         folders.enter_context(results_folder(folder, names, locked=True))
         picture_names = _picture_names(pipeline)
@@ -186,6 +194,8 @@ def predict_photo(
 
         completed = pipeline.complete(photo, reporter)
 
+        # The files are written into a temporary folder, and moved at the end, the report last: who
+        # sees a report sees complete results.
         new_folder = folders.enter_context(atomic_files(folder, REPORT_NAME))
         video = _write_files(completed, new_folder, pipeline, reporter, options)
         report = _report_of(completed, new_folder, pipeline, reporter, video, request)
@@ -202,7 +212,7 @@ def predict_photo(
 
 
 def _result_names(pipeline: Pipeline, options: PhotoOptions) -> list[str]:
-    """The names of a photo's files, without the pictures of given views."""
+    """The names of the files that `predict_photo` writes, without the pictures of given views."""
     names = ["scene.ply", REPORT_NAME]
     if options.keep_base:
         names.append("base.ply")
@@ -240,15 +250,15 @@ def _write_files(
     scene = completed.scene
     views = completed.views
     with reporter.stage("write"):
-        parts = {"scene.ply": scene.gaussians}
+        gaussians_by_file = {"scene.ply": scene.gaussians}
         if options.keep_base:
-            parts["base.ply"] = scene.base
-        # The number of base Gaussians tells other programs which ones completion has added.
-        for name, gaussians in parts.items():
+            gaussians_by_file["base.ply"] = scene.base
+        for name, gaussians in gaussians_by_file.items():
             save_ply(
                 gaussians,
                 folder / name,
                 camera=scene.camera,
+                # The Gaussians after this number are those that completion has added.
                 base_count=len(scene.base),
                 disparity=scene.disparity,
             )
@@ -258,6 +268,7 @@ def _write_files(
     video_entry = None
     if options.render:
         video_name = _video_name(pipeline)
+        # All views of a video have one size, so the first frame's first view tells it.
         first_view = views.cameras[views.frames[0][0]]
         video_entry = views.frame_maker.report_entry(video_name, first_view, len(views.frames))
         with reporter.stage("video") as progress:
@@ -282,9 +293,10 @@ def save_planned_video(
     frame_maker = views.frame_maker
 
     def render_frames() -> Iterator[Tensor]:
-        """Each frame as uint8 if the fill has rendered it already, else as floats in 0..1."""
+        """Each frame [H, W, 3] sRGB, as the encoder asks for it: uint8, or floats in 0..1."""
         for frame_index, eye_views in enumerate(views.frames):
-            # Completion has rendered some views in their final state.
+            # The fill keeps the uint8 picture of a view that was complete when it rendered it. It
+            # keeps pictures only if each frame is one view, so the first eye's view is the frame.
             picture = completed.filled.pictures.get(eye_views[0])
             if picture is not None:
                 yield picture
@@ -307,10 +319,11 @@ def save_planned_video(
 def _save_pictures(
     completed: CompletedPhoto, folder: Path, renderer: Renderer, progress: Progress
 ) -> None:
-    """Write each given view as PNG files.
+    """Write three PNG files for each view that the user gave.
 
     0000.png is the completed view, 0000_base.png the view before, 0000_mask.png its holes in white.
     """
+    # The given views are the first of the planned views.
     views = completed.views
     scene = completed.scene
     for index in range(views.given_view_count):
@@ -332,11 +345,20 @@ def _report_of(
     video: Mapping[str, object] | None,
     request: str | None,
 ) -> PhotoReport:
-    """The report of a completed photo, whose other files lie in `folder`."""
+    """The report of a completed photo.
+
+    Args:
+        completed: the scene, and all from which it was made.
+        folder: has all files but the report; their sizes and digests are part of the report.
+        pipeline: the pipeline, whose options are reported.
+        reporter: the reporter that timed the stages.
+        video: the report's entry for the video; None without a video.
+        request: a digest of the input and options, by which the next run knows finished photos.
+    """
     photo = completed.photo
     predicted = completed.predicted
     scene = completed.scene
-    assert scene.report is not None
+    assert scene.report is not None  # `Pipeline.complete` always makes one
     files = sorted(file for file in folder.rglob("*") if file.is_file())
     return PhotoReport(
         run=report_run(photo, predicted.prediction, predicted.base, pipeline, reporter),
@@ -346,10 +368,12 @@ def _report_of(
         disparity=scene.disparity,
         video=video,
         holes=scene.report.holes,
-        # A better base may have lacked memory by chance; then the next run has to try it again.
+        # If a better base only lacked memory, this result is not for good: without a request the
+        # next run does not take the photo as finished, and tries the better base again.
         request=request if predicted.base.lasting else None,
         photo_name=photo.path.name,
         photo_size=(scene.camera.width, scene.camera.height),
+        # Widths in pixels by side, from a named tuple.
         frame_cut_off=None if photo.frame is None else photo.frame._asdict(),
         aux_gaussians=len(scene.aux),
         saved_view=completed.filled.saved_view,
@@ -400,6 +424,7 @@ def report_run(
 
 def read_earlier_report(folder: Path) -> dict[str, Any]:
     """The content of an earlier run's report.json; empty if the file is missing or damaged."""
+    # A damaged report is no error, because the photo is then simply predicted again.
     try:
         report = json.loads((folder / REPORT_NAME).read_text(encoding="utf-8"))
     except (OSError, ValueError):

@@ -34,6 +34,7 @@ from spackle.runtime.progress import Progress, Reporter
 from spackle.scene import Scene
 from spackle.video.encoding import save_video
 from spackle.video.frames import FrameMaker, video_problem
+from spackle.video.options import VideoOptions
 from spackle.video.video_formats import VIDEO_FORMATS
 from spackle.views import PathOptions
 
@@ -55,7 +56,7 @@ class SceneVideo:
 
     cameras: list[Camera]  # of the frames; in a stereo video, midway between the eyes
     has_given_views: bool  # the cameras come from a file of views, not from a path
-    frame_maker: FrameMaker
+    frame_maker: FrameMaker  # makes a frame from the renderings of its eyes or sets
     # The scene as one list of sets of Gaussians; for a comparison two: the base, and the scene.
     gaussian_sets: list[list[Gaussians]]
     gaussian_count: int  # of the whole scene
@@ -63,13 +64,16 @@ class SceneVideo:
     hole_ratios: list[float] = dataclasses.field(default_factory=list)  # of the frames so far
 
     def frames(self, picture_files: Sequence[Path], progress: Progress) -> Iterator[Tensor]:
-        """Render each frame [H, W, 3] sRGB, and note its holes.
+        """Render each frame [H, W, 3] sRGB, and append its share of holes to `hole_ratios`.
 
-        `picture_files` has a file for each frame that is also saved as a picture, or is empty.
+        Args:
+            picture_files: a PNG file for each frame, which is also written; or none at all.
+            progress: called with (frames done, all frames).
         """
         for index, camera in enumerate(self.cameras):
             frame, renderings = self.frame_maker.render(self.gaussian_sets, camera, self.renderer)
-            # In a comparison the first rendering is the base alone, whose holes are no news.
+            # In a comparison the first rendering shows the base alone. Its holes do not count,
+            # because completion has filled them.
             completed = renderings[1:] if self.frame_maker.options.compare else renderings
             self.hole_ratios.append(max(hole_area_ratio(view.alpha) for view in completed))
             if picture_files:
@@ -102,25 +106,20 @@ def render_scene(
     Raises:
         InputError: a file or option cannot be used.
     """
-    is_single_file = output.suffix.lower() in VIDEO_FORMATS
-    if is_single_file:
+    is_video_file = output.suffix.lower() in VIDEO_FORMATS
+    if is_video_file:
         path = dataclasses.replace(path, video=path.video.for_file(output))
     else:
         _check_is_folder_name(output)
     path.check()
-    if path.cameras is not None and (focal_px is not None or fov is not None):
-        raise InputError(
-            f"`cameras` {path.cameras}: its views have their own lenses: "
-            "leave `fov` and `focal_px` out"
-        )
+    _check_lens(path, focal_px, fov)
     renderer = get_renderer(device)
     with reporter.stage("load"):
         video = _open_scene_video(scene_file, path, renderer, reporter, focal_px=focal_px, fov=fov)
 
-    # Given views may differ in size, which no video can show; pictures can.
-    sizes = [video.frame_maker.resized_camera(camera) for camera in video.cameras]
-    problem = video_problem(sizes)
-    makes_pictures = video.has_given_views and not is_single_file
+    # Given views may differ in size. No video can show them then, but pictures in a folder can.
+    makes_pictures = video.has_given_views and not is_video_file
+    problem = video_problem([video.frame_maker.resized_camera(camera) for camera in video.cameras])
     if problem and not makes_pictures:
         hint = "give `size`"
         if video.has_given_views:
@@ -129,19 +128,13 @@ def render_scene(
             f"{path.cameras or scene_file}: {problem}, so no video can be made: {hint}"
         )
 
-    video_file = output if is_single_file else output / f"{scene_file.stem}{path.video.suffix}"
+    video_file = output if is_video_file else output / f"{scene_file.stem}{path.video.suffix}"
     picture_names: list[str] = []
     if makes_pictures:
         picture_names = [f"{index:04d}.png" for index in range(len(video.cameras))]
-    file_names = [*picture_names, video_file.name]
-    with results_folder(video_file.parent, file_names), reporter.stage("video") as progress:
-        picture_files = [video_file.parent / name for name in picture_names]
-        frames = video.frames(picture_files, progress)
-        if problem is None:
-            save_video(frames, video_file, path.video.frames_per_second, path.video.loop)
-        else:
-            for _ in frames:  # only the pictures are written
-                pass
+    _write_frames(
+        video, video_file, picture_names, path.video, reporter, writes_video=problem is None
+    )
 
     most_holes = max(video.hole_ratios)
     if most_holes > MAX_UNMENTIONED_HOLES:
@@ -163,6 +156,47 @@ def render_scene(
     reporter.result({"file": video_file, **result})
 
 
+def _check_lens(path: PathOptions, focal_px: float | None, fov: float | None) -> None:
+    """InputError if a focal length is given for views of a file, which have their own."""
+    has_new_lens = focal_px is not None or fov is not None
+    if path.cameras is not None and has_new_lens:
+        raise InputError(
+            f"`cameras` {path.cameras}: its views have their own lenses: "
+            "leave `fov` and `focal_px` out"
+        )
+
+
+def _write_frames(
+    video: SceneVideo,
+    video_file: Path,
+    picture_names: Sequence[str],
+    options: VideoOptions,
+    reporter: Reporter,
+    *,
+    writes_video: bool,
+) -> None:
+    """Render all frames, and write them as a video, as pictures, or as both.
+
+    Args:
+        video: what the frames are made of; their holes are noted in it.
+        video_file: the video; the pictures lie beside it.
+        picture_names: a name for each frame's picture, or none for no pictures.
+        options: of the video.
+        reporter: gets the progress.
+        writes_video: False if the frames cannot be a video.
+    """
+    folder = video_file.parent
+    file_names = [*picture_names, video_file.name]
+    with results_folder(folder, file_names), reporter.stage("video") as progress:
+        frames = video.frames([folder / name for name in picture_names], progress)
+        if writes_video:
+            save_video(frames, video_file, options.frames_per_second, options.loop)
+        else:
+            # Frames are rendered, and their pictures written, only as somebody takes them.
+            for _ in frames:
+                pass
+
+
 def _open_scene_video(
     scene_file: Path,
     path: PathOptions,
@@ -181,11 +215,13 @@ def _open_scene_video(
     scene = Scene.of_file(loaded, path.video.size, focal_px=focal_px, fov=fov)
     gaussian_sets = _sets_to_render(scene, scene_file, compare=path.video.compare)
 
-    # Overscan crops the border of the fill. With another lens, or in a scene that was not completed
-    # for a path, there is no such border.
+    # Overscan, a little zoom, hides the fill beyond the photo's border. With another lens the border
+    # lies elsewhere, and a scene that was not completed for a path has no such fill.
     has_new_lens = focal_px is not None or fov is not None
     if has_new_lens or scene.disparity is None:
         path = dataclasses.replace(path, overscan=0)
+    # A ValueError comes from the scene's depths; a PathError from the file of keyframes, and its own
+    # text ("{reason}") is the message.
     with (
         as_input_error(scene_file, NO_PATH_MESSAGE, ValueError),
         as_input_error(path.path, "{reason}", PathError),
@@ -211,9 +247,12 @@ def _open_scene_video(
 
 
 def _check_is_folder_name(output: Path) -> None:
-    """InputError if a name is that of a video or picture which cannot be written."""
-    kind = mimetypes.guess_type(output.name)[0] or ""
-    if kind.startswith(("video/", "image/")):
+    """InputError if the name of a folder looks like that of a video or picture.
+
+    Who gives "scene.avi" wants a file of this kind, which cannot be written, and not a folder.
+    """
+    mime_type = mimetypes.guess_type(output.name)[0] or ""  # such as "video/x-msvideo"
+    if mime_type.startswith(("video/", "image/")):
         raise InputError(
             f"{output}: not a kind of video that can be written: "
             f"end the name with {', '.join(VIDEO_FORMATS)}"
@@ -221,9 +260,12 @@ def _check_is_folder_name(output: Path) -> None:
 
 
 def _sets_to_render(scene: Scene, scene_file: Path, *, compare: bool) -> list[list[Gaussians]]:
-    """The whole scene; for a comparison the base before it.
+    """What a frame shows, one entry for each picture in it.
 
-    InputError if there is nothing to compare, because the scene was never completed.
+    An entry is the list of sets of Gaussians that are rendered together. A frame shows one picture,
+    of the whole scene (base and aux Gaussians). For a comparison it shows two: first the base alone,
+    then the whole scene. InputError if there is nothing to compare, because the scene was never
+    completed.
     """
     if not compare:
         return [[scene.base, scene.aux]]
@@ -238,7 +280,11 @@ def _sets_to_render(scene: Scene, scene_file: Path, *, compare: bool) -> list[li
 def _say_if_beyond_completion(
     scene: Scene, scene_file: Path, path: PathOptions, reporter: Reporter
 ) -> None:
-    """Log a line if the camera moves farther than the scene was completed for."""
+    """Log a line if the camera moves farther than the scene was completed for.
+
+    Such views may show holes, which only a new prediction from the photo can fill.
+    """
+    # Not known for the scene of another program, or not given as an option.
     if scene.disparity is None or path.disparity is None or path.disparity <= scene.disparity:
         return
     option = f"`disparity` {path.disparity:g}"
@@ -281,7 +327,10 @@ def export_scene(scene_file: Path, outputs: Sequence[Path], reporter: Reporter) 
 
 
 def _report_file(scene: SceneFile, output: Path, seconds: float, reporter: Reporter) -> None:
-    """Log one line about a written file, and one about what its format cannot store."""
+    """Log a line about a written file; for SPZ another about Gaussians beyond its grid, if any.
+
+    `seconds` is the time that encoding and writing took.
+    """
     size = os.path.getsize(output)
     size_ratio = size / os.path.getsize(scene.path)
     count = len(scene.gaussians)
@@ -290,12 +339,14 @@ def _report_file(scene: SceneFile, output: Path, seconds: float, reporter: Repor
         f"{size_ratio:.0%} of the size of {scene.path.name}, {seconds:.1f} s"
     )
 
-    # SPZ rounds positions to a grid, which does not reach as far as some Gaussians of a sky lie.
+    # SPZ rounds positions to a grid, which does not reach as far as some Gaussians of a sky lie. The
+    # encoder moves them nearer and shrinks them alike, so from the photo's place they look the same.
     moved_count = 0
     if output.name.lower().endswith(".spz"):
         grid = spz_grid(scene.gaussians)
         moved_count = grid.outside_count
         if moved_count:
+            # The grid's step is 2 to the power of -fraction_bits.
             largest_coordinate = MAX_GRID_COORDINATE / 2**grid.fraction_bits
             reporter.log(
                 f"{output}: {moved_count:,} Gaussians beyond {largest_coordinate:,.0f} m were "
@@ -314,6 +365,7 @@ def _report_file(scene: SceneFile, output: Path, seconds: float, reporter: Repor
 
 def page_name(path: Path) -> str:
     """A scene's name on the page: its file's name, or its folder's for scene.ply and base.ply."""
+    # `spackle predict` calls every scene scene.ply; its folder has the photo's name.
     absolute_path = path.absolute()
     folder_name = absolute_path.parent.name
     if absolute_path.name in ("scene.ply", "base.ply") and folder_name:
