@@ -48,10 +48,16 @@ class GroupedCommands(TyperGroup):
     """Commands whose help lists those of the paper's experiments apart from all others."""
 
     def format_commands(self, context: Any, formatter: Any) -> None:
-        """Write one section of the help for each panel, in the order of the first commands."""
+        """Write the list of commands in the help, in one section for each panel.
+
+        A panel is the title under which a command is registered; commands without one come under
+        "Commands". Sections have the order of their first commands.
+        """
+        # The rows of each section: a command's name, and its help in one line.
         sections: dict[str, list[tuple[str, str]]] = {}
         for name in self.list_commands(context):
             command: Any = self.get_command(context, name)
+            # Typer keeps the panel's title for the library rich, which is switched off here.
             panel = getattr(command, "rich_help_panel", None)
             title = panel if isinstance(panel, str) else "Commands"
             help_text = command.get_short_help_str(limit=formatter.width)
@@ -136,10 +142,11 @@ def options_before_any_command(
 
 
 def main() -> None:
-    """Run the command; bad input prints one line and ends with exit code 2."""
+    """Run the command of `sys.argv`; bad input prints one line and ends with exit code 2."""
     # Otherwise idle threads of torch spin, which makes completion three to five times slower on
     # busy cores.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    # Each collection scans all objects of torch and numba, so there should be few.
     gc.set_threshold(OBJECTS_BETWEEN_COLLECTIONS)
     # SIGTERM then ends the process by an exception, so that every `finally` runs. Only the main
     # thread may set this.
@@ -147,7 +154,9 @@ def main() -> None:
         signal.signal(signal.SIGTERM, _exit_at_signal)
 
     try:
+        # Not in its standalone mode, typer lets errors through, and returns the code of typer.Exit.
         code = app(standalone_mode=False)
+        # Errors of the standard output should come here, not when Python ends.
         sys.stdout.flush()
     except InputError as error:
         _exit_with_error(str(error))
@@ -171,28 +180,36 @@ def main() -> None:
 
 
 def run() -> NoReturn:
-    """Run `main` and end the process at once, because Python needs half a second to free torch."""
+    """Run `main`, and end the process without Python's clean-up, which takes half a second.
+
+    Nearly all of this time goes into freeing torch, whose memory the system takes back anyway.
+    """
     code: object = 0
     try:
         main()
     except SystemExit as end:
-        code = end.code or 0
+        code = end.code or 0  # None means success
+
+    # `os._exit` skips what Python does at the end. These two steps of it are needed: functions that
+    # were registered for the exit, such as those that end workers, and the output in buffers.
     atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):
+        # The other end of a pipe may be closed already.
         with contextlib.suppress(OSError, ValueError):
             stream.flush()
-    os._exit(code if isinstance(code, int) else 1)
+    os._exit(code if isinstance(code, int) else 1)  # Python, too, ends with 1 for other values
 
 
 def _exit_at_signal(number: int, frame: object) -> NoReturn:
     """End the process with the exit code that shells give a process ended by this signal."""
-    sys.exit(128 + number)
+    sys.exit(128 + number)  # the shells' rule: 128 and the signal's number, such as 143 for SIGTERM
 
 
 def _exit_with_error(message: str) -> NoReturn:
     """Print an error in one line, and as JSON if the user asked for JSON; exit code 2."""
     line = with_flags(printable_line(message))
     print(f"error: {line}", file=sys.stderr)
+    # The error may have come before the options were parsed.
     if "--json" in sys.argv:
         print(json.dumps({"error": line}))
     sys.exit(BAD_INPUT)

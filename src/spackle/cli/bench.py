@@ -87,5 +87,6 @@ def bench(
         base_runs=base_runs,
     )
     results = output or Path(f"bench-{dataset}-{UNSAFE_IN_FOLDER_NAMES.sub('-', base)}")
+    # No result comes back from a run that the user has stopped.
     if run(options, results, CommandReporter(verbose, as_json=as_json)) is None:
         raise typer.Exit(INTERRUPTED)

@@ -139,6 +139,7 @@ def dataset_build(
     from spackle.paper.dataset.build import build_dataset
     from spackle.paper.dataset.options import DatasetOptions
 
+    # The base makes the views with holes; the inpainter makes from them what training aims at.
     settings = BaseSettings(
         name=base, depth=depth, checkpoint=checkpoint, precision=precision, device=device
     )
@@ -157,6 +158,7 @@ def dataset_build(
         threads=threads,
         shard_size=shard_size,
     )
+    # Ctrl-C or SIGTERM: finished photos are saved, and the same command resumes the build.
     if build_dataset(photos, output, options, CommandReporter(verbose)) == "stopped":
         raise typer.Exit(INTERRUPTED)
 
@@ -179,6 +181,7 @@ def dataset_verify(location: DatasetArgument) -> None:
     from spackle.cli.messages import CommandReporter
     from spackle.paper.dataset.inspect import verify_dataset
 
+    # The damaged samples have been named already; scripts see the exit code.
     if verify_dataset(location, CommandReporter()):
         raise typer.Exit(1)
 

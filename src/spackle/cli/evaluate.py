@@ -98,6 +98,10 @@ def evaluate(
     from spackle.paper.evaluation.evaluate import evaluate as run
     from spackle.paper.evaluation.options import EvaluateOptions, parse_disparities, split_words
 
+    # None stands for the protocol's own metrics; the word "none" asks for no metric at all.
+    metric_names: tuple[str, ...] | None = None
+    if metrics is not None:
+        metric_names = () if metrics == "none" else split_words(metrics)
     options = EvaluateOptions(
         dataset=dataset,
         root=folder,
@@ -106,7 +110,7 @@ def evaluate(
         disparities=parse_disparities(disparity),
         side=side,
         second_views=second_views,
-        metrics=None if metrics is None else () if metrics == "none" else split_words(metrics),
+        metrics=metric_names,
         base=BaseSettings(
             name=base,
             checkpoint=checkpoint,
@@ -121,6 +125,8 @@ def evaluate(
         limit=limit,
         download_metrics=download_metrics,
     )
+    # The folder has the protocol in its name, so that runs of both protocols do not meet in it.
     results = output or Path(f"evaluation-{dataset}-{protocol}")
+    # No result comes back from a run that the user has stopped.
     if run(options, results, CommandReporter(verbose, as_json=as_json), html) is None:
         raise typer.Exit(INTERRUPTED)

@@ -24,6 +24,7 @@ FactsOfFile = dict[str, object]  # by the name that the terminal shows
 def print_facts(path: Path, reporter: Reporter) -> None:
     """Describe a scene, photo, depth map or clip; InputError for other files."""
     check_file(path, "scene, photo, depth map or clip")
+    # A file that is none of the others is read as a photo; the reader of photos refuses all else.
     if scene_suffix(path):
         facts = scene_facts(path)
     elif is_clip(path):
@@ -40,6 +41,7 @@ def print_facts(path: Path, reporter: Reporter) -> None:
 
 def is_depth_map(path: Path) -> bool:
     """Whether a file is a depth map, by its suffix or, for a PNG, by 16 bits in one channel."""
+    # Photos, too, may be PNG files, so for these the suffix decides nothing.
     suffix = path.suffix.lower()
     if suffix != ".png":
         return suffix in DEPTH_SUFFIXES
@@ -54,6 +56,8 @@ def scene_facts(path: Path) -> FactsOfFile:
     """Counts, depths and camera of a scene; InputError for a file that cannot be read."""
     scene = load_scene(path)
     count = len(scene.gaussians)
+    # Only our own files say how many Gaussians come from the photo (base), before those that fill
+    # holes (aux).
     if scene.base_count is None:
         parts = "number of base Gaussians unknown"
     else:
@@ -63,6 +67,7 @@ def scene_facts(path: Path) -> FactsOfFile:
         "Gaussians": f"{count:,} ({parts})",
     }
 
+    # Quantiles instead of the extremes, because a few stray Gaussians lie far from all others.
     depths = scene.gaussians.means[:, 2].double().numpy()  # [N]
     near_quantile, far_quantile = NEAR_AND_FAR_QUANTILES
     near, median, far = np.quantile(depths, [near_quantile, 0.5, far_quantile])
@@ -85,6 +90,7 @@ def scene_facts(path: Path) -> FactsOfFile:
 
 def describe_camera(camera: Camera) -> str:
     """Size and focal length of a camera in words."""
+    # The horizontal focal length, because the field of view is that of the width.
     focal_px = camera.focal[0]
     fov_degrees = math.degrees(2 * math.atan(camera.width / 2 / focal_px))
     size = f"{camera.width}×{camera.height}"

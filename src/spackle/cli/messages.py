@@ -19,8 +19,8 @@ from spackle.runtime.progress import Reporter
 # The application whose commands' options are known; `spackle.cli` adds it once all commands exist.
 applications: list[typer.Typer] = []
 
-# Options whose flag is not made of their Python name.
-FLAGS_OF_OTHER_NAMES = {"windows_per_batch": "--sharp-windows"}
+# All other flags are the Python name with hyphens, such as --depth-kind for `depth_kind`.
+FLAGS_WITH_ANOTHER_NAME = {"windows_per_batch": "--sharp-windows"}
 
 
 def with_flags(message: str) -> str:
@@ -30,10 +30,12 @@ def with_flags(message: str) -> str:
     """
 
     def flag_of(match: re.Match[str]) -> str:
+        """The flag of the name in backticks, or the text as it is for any other name."""
         name = match[1]
-        flag = FLAGS_OF_OTHER_NAMES.get(name, "--" + name.replace("_", "-"))
+        flag = FLAGS_WITH_ANOTHER_NAME.get(name, "--" + name.replace("_", "-"))
         return flag if flag in _known_flags() else match[0]
 
+    # A Python name in lower case; the group in parentheses is the name without backticks.
     return re.sub(r"`([a-z][a-z0-9_]*)`", flag_of, message)
 
 
@@ -41,6 +43,7 @@ def with_flags(message: str) -> str:
 def _known_flags() -> set[str]:
     """All long flags, such as --fov, of all commands and of their subcommands."""
     flags: set[str] = set()
+    # A list that grows: a command with subcommands, such as `weights`, adds them.
     commands = [get_command(application) for application in applications]
     while commands:
         command = commands.pop()

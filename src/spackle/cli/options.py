@@ -203,9 +203,13 @@ ConvergenceOption = Annotated[
 
 
 def _print_full_help(context: typer.Context, asked: bool) -> None:
-    """Print the help of a command with its hidden options, and end the command."""
+    """Print the help of a command with its hidden options, and end the command.
+
+    Typer calls this with `asked` False if the user did not give --help-all.
+    """
     if not asked:
         return
+    # Options for few users are hidden, so that the usual help stays short.
     for parameter in context.command.params:
         if isinstance(parameter, TyperOption):
             parameter.hidden = False
@@ -254,6 +258,8 @@ def path_options(
     from spackle.video.options import VideoOptions, parse_size
     from spackle.views import PathOptions
 
+    # A file of keyframes or views says itself where the camera goes; a file of views also says how
+    # many frames there are.
     if path is not None or cameras is not None:
         without_effect: dict[str, object] = {
             "--trajectory": trajectory,
@@ -280,6 +286,8 @@ def path_options(
         convergence=convergence,
         compare=compare,
     )
+    # These defaults stand here, not at the options, so that above a value shows that the user has
+    # given it.
     return PathOptions(
         trajectory=trajectory or "rotate-forward",
         disparity=disparity,

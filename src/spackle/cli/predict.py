@@ -1,4 +1,7 @@
-"""`spackle predict`: turn photos, folders of photos or a clip into completed scenes."""
+"""`spackle predict`: turn photos, folders of photos or a clip into completed scenes.
+
+Options for few users are hidden; --help-all shows them.
+"""
 
 from __future__ import annotations
 
@@ -209,6 +212,8 @@ def predict(
     from spackle.results.many_photos import PredictOptions
     from spackle.results.photo_folder import PhotoOptions
 
+    # Each stage has its own options: the base, the camera path with its video, the fill, and the
+    # files that are written.
     base_settings = BaseSettings(
         name=base,
         depth=depth,
@@ -257,6 +262,7 @@ def predict(
         threads=threads,
     )
     failure_count = _predict_all(photos, output, options, CommandReporter(verbose, as_json=as_json))
+    # The errors have been printed already, one for each photo.
     if failure_count:
         raise typer.Exit(1)
 
@@ -279,12 +285,16 @@ def _predict_all(
     photos = find_photos(sources)
     clips = [photo for photo in photos if is_clip(photo.path)]
     if not clips:
+        # A folder with one photo is not a single photo: the next run may find more in it.
         is_single_photo = len(sources) == len(photos) == 1 and not sources[0].is_dir()
         return predict_photos(photos, output, options, reporter, is_single=is_single_photo)
 
+    # A clip takes minutes to hours and its results differ, so it is not part of a batch.
     clip = clips[0]
     if len(sources) > 1 or len(photos) > 1 or sources[0].is_dir():
         raise InputError(f"{clip.path}: is a clip: give it alone, without other photos or clips")
+
+    # `clip_options` refuses options that a clip cannot take.
     pipeline = Pipeline.open(clip_options(options.scene, options.photo, options.workers))
     say_if_kernels_compile(pipeline, reporter)
     check_file(clip.path, "clip")

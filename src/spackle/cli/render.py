@@ -76,6 +76,8 @@ def render(
     from spackle.cli.messages import CommandReporter
     from spackle.results.saved_scene import render_scene
 
+    # A new focal length is no option of the path: it changes the scene's camera, around which any
+    # path is laid.
     path_and_video = path_options(
         trajectory=trajectory,
         disparity=disparity,

@@ -78,6 +78,8 @@ def serve(
     from spackle.web.local_server import ServerAddress, serve_programs
     from spackle.web.work import SceneWork
 
+    # Without a token, or with an empty one, the server makes its own and prints it: it never runs
+    # open to everybody.
     base_settings = BaseSettings(name=base, checkpoint=checkpoint, device=device)
     serve_programs(
         output,
@@ -87,4 +89,5 @@ def serve(
         ServerAddress(host=host, port=port, token=token or secrets.token_urlsafe(TOKEN_BYTES)),
         CommandReporter(verbose, as_json=as_json),
     )
+    # The server returns only after Ctrl-C.
     raise typer.Exit(INTERRUPTED)

@@ -65,6 +65,7 @@ def train(
     from spackle.paper.training.train import train
     from spackle.runtime.errors import InputError
 
+    # The residual learns from finished training data, in which the base's work is already done.
     if method == "residual" and checkpoint is not None:
         raise InputError(
             f"`checkpoint` {checkpoint}: `method` residual learns without a base: "
@@ -78,5 +79,6 @@ def train(
         CommandReporter(verbose),
         overwrite,
     )
+    # Ctrl-C or SIGTERM: the run is saved, and the same command resumes it.
     if ended == "stopped":
         raise typer.Exit(INTERRUPTED)

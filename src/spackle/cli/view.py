@@ -81,8 +81,10 @@ def view(
         keep_frame=keep_frame,
         opens_browser=browser,
     )
+    # A new secret for each run, which only who sees the address knows.
     address = ServerAddress(
         host=host, port=port, token=secrets.token_urlsafe(TOKEN_BYTES) if token else None
     )
     show_page(target, options, address, CommandReporter(verbose, as_json=as_json))
+    # The server returns only after Ctrl-C.
     raise typer.Exit(INTERRUPTED)

@@ -55,11 +55,14 @@ def weights_get(
             reporter.transfer(name) as progress,
         ):
             download(url or entry.address, path, entry.bytes, entry.sha256, progress)
-        for line in entry.notice:  # without a download no licence applies
+        # The licence binds whoever has downloaded the weights just now.
+        for line in entry.notice:
             reporter.log(line)
-        advice = "" if output is None else f"; {entry.option}"
-        reporter.log(f"{summary} -> {path}{advice}")
+        # In the weights' folder they are found by themselves; elsewhere an option has to name them.
+        how_to_use = "" if output is None else f"; {entry.option}"
+        reporter.log(f"{summary} -> {path}{how_to_use}")
     else:
+        # The file may be another one of the same name, or damaged on the disk.
         with reporter.stage("check"):
             if weights_digest(path) != entry.sha256:
                 raise InputError(
@@ -79,13 +82,18 @@ def weights_get(
 
 
 def _target_file(entry: PublishedWeights, output: Path | None) -> Path:
-    """The file to which weights are downloaded: in the weights' folder, a folder, or a file."""
+    """The file to which weights are downloaded.
+
+    Without `output` it lies in the folder of all weights. `output` is the file itself if it ends as
+    weights do, else a folder.
+    """
     # Imported here, because the help must not wait for torch.
     from spackle.weights import weights_folder
 
     if output is None:
         return weights_folder() / entry.file
     has_suffix_of_weights = output.suffix.lower() == Path(entry.file).suffix
+    # A folder may have any name, even one that ends as weights do.
     if has_suffix_of_weights and not os.path.isdir(output):
         return output
     return output / entry.file
@@ -123,7 +131,8 @@ def weights_list(as_json: JsonOption = False) -> None:
 
 
 def _state_of(file: Path, entry: PublishedWeights) -> str:
-    """Whether weights are on this machine, by the size of their file."""
+    """Whether weights are on this machine, in a word or two."""
+    # The size is compared, not the digest, because to read gigabytes would take too long for a list.
     if not os.path.isfile(file):
         return "not here"
     size = os.path.getsize(file)
