@@ -375,10 +375,10 @@ def _trajectory_views(prediction: BasePrediction, path: PathOptions) -> _PathVie
     depth_range = DepthRange.of(prediction.gaussians)
     leftmost, rightmost = leftmost_and_rightmost(camera, disparity, depth_range)
 
-    # Overscan, a little zoom of the video, hides what lies beyond the photo's border. Other programs
-    # show the scene without it, so the outermost views are filled without it, too. The leftmost and
-    # rightmost view are filled anyway, because they are reported. For trajectories that also go up
-    # and down, the lowest and the highest view are added.
+    # Overscan, a little zoom of the video, hides what lies beyond the photo's border. Other
+    # programs show the scene without it, so the outermost views are filled without it, too. The
+    # leftmost and rightmost view are filled anyway, because they are reported. For trajectories
+    # that also go up and down, the lowest and the highest view are added.
     without_overscan: Sequence[Camera] = ()
     if path.trajectory in ("shake", "rotate", "vertical"):
         # Five cameras on a circle are below, right, above, left and below again.

@@ -132,7 +132,7 @@ def weights_list(as_json: JsonOption = False) -> None:
 
 def _state_of(file: Path, entry: PublishedWeights) -> str:
     """Whether weights are on this machine, in a word or two."""
-    # The size is compared, not the digest, because to read gigabytes would take too long for a list.
+    # Sizes are compared, not digests, because to read gigabytes would take too long for a list.
     if not os.path.isfile(file):
         return "not here"
     size = os.path.getsize(file)

@@ -215,13 +215,13 @@ def _open_scene_video(
     scene = Scene.of_file(loaded, path.video.size, focal_px=focal_px, fov=fov)
     gaussian_sets = _sets_to_render(scene, scene_file, compare=path.video.compare)
 
-    # Overscan, a little zoom, hides the fill beyond the photo's border. With another lens the border
-    # lies elsewhere, and a scene that was not completed for a path has no such fill.
+    # Overscan, a little zoom, hides the fill beyond the photo's border. With another lens the
+    # border lies elsewhere, and a scene that was not completed for a path has no such fill.
     has_new_lens = focal_px is not None or fov is not None
     if has_new_lens or scene.disparity is None:
         path = dataclasses.replace(path, overscan=0)
-    # A ValueError comes from the scene's depths; a PathError from the file of keyframes, and its own
-    # text ("{reason}") is the message.
+    # A ValueError comes from the scene's depths; a PathError from the file of keyframes, and its
+    # own text ("{reason}") is the message.
     with (
         as_input_error(scene_file, NO_PATH_MESSAGE, ValueError),
         as_input_error(path.path, "{reason}", PathError),
@@ -263,9 +263,9 @@ def _sets_to_render(scene: Scene, scene_file: Path, *, compare: bool) -> list[li
     """What a frame shows, one entry for each picture in it.
 
     An entry is the list of sets of Gaussians that are rendered together. A frame shows one picture,
-    of the whole scene (base and aux Gaussians). For a comparison it shows two: first the base alone,
-    then the whole scene. InputError if there is nothing to compare, because the scene was never
-    completed.
+    of the whole scene (base and aux Gaussians). For a comparison it shows two: first the base
+    alone, then the whole scene. InputError if there is nothing to compare, because the scene was
+    never completed.
     """
     if not compare:
         return [[scene.base, scene.aux]]
@@ -339,8 +339,9 @@ def _report_file(scene: SceneFile, output: Path, seconds: float, reporter: Repor
         f"{size_ratio:.0%} of the size of {scene.path.name}, {seconds:.1f} s"
     )
 
-    # SPZ rounds positions to a grid, which does not reach as far as some Gaussians of a sky lie. The
-    # encoder moves them nearer and shrinks them alike, so from the photo's place they look the same.
+    # SPZ rounds positions to a grid, which does not reach as far as some Gaussians of a sky lie.
+    # The encoder moves them nearer and shrinks them by the same factor, so they look the same from
+    # the photo's place.
     moved_count = 0
     if output.name.lower().endswith(".spz"):
         grid = spz_grid(scene.gaussians)
