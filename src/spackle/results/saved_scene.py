@@ -106,6 +106,7 @@ def render_scene(
     Raises:
         InputError: a file or option cannot be used.
     """
+    # Impossible options are refused before a scene, which may be large, is read.
     is_video_file = output.suffix.lower() in VIDEO_FORMATS
     if is_video_file:
         path = dataclasses.replace(path, video=path.video.for_file(output))
@@ -136,15 +137,7 @@ def render_scene(
         video, video_file, picture_names, path.video, reporter, writes_video=problem is None
     )
 
-    most_holes = max(video.hole_ratios)
-    if most_holes > MAX_UNMENTIONED_HOLES:
-        reporter.log(f"{scene_file.name}: holes take up to {most_holes:.1%} of a frame")
-    result = {
-        "gaussians": video.gaussian_count,
-        "frames": len(video.cameras),
-        "seconds": reporter.seconds["video"],
-        "open": round(most_holes, 5),
-    }
+    result = _report_frames(video, scene_file, reporter)
     if problem is not None:
         reporter.log(f"{path.cameras}: {problem}: pictures only, no video")
         reporter.result({"folder": output, **result})
@@ -154,6 +147,24 @@ def render_scene(
         f"in {reporter.seconds['video']:.1f} s -> {video_file}"
     )
     reporter.result({"file": video_file, **result})
+
+
+def _report_frames(video: SceneVideo, scene_file: Path, reporter: Reporter) -> dict[str, object]:
+    """Log a line if a rendered frame has large holes.
+
+    Returns:
+        The fields of the JSON result that do not depend on where the frames were written:
+        counts, duration, and as "open" the share of holes in the frame that has most of them.
+    """
+    most_holes = max(video.hole_ratios)
+    if most_holes > MAX_UNMENTIONED_HOLES:
+        reporter.log(f"{scene_file.name}: holes take up to {most_holes:.1%} of a frame")
+    return {
+        "gaussians": video.gaussian_count,
+        "frames": len(video.cameras),
+        "seconds": reporter.seconds["video"],
+        "open": round(most_holes, 5),
+    }
 
 
 def _check_lens(path: PathOptions, focal_px: float | None, fov: float | None) -> None:
