@@ -279,6 +279,7 @@ class Pipeline:
         missing_ratio = float(prediction.notes.get("depth_filled", 0))
         if missing_ratio:
             lines.append(f"{missing_ratio:.1%} of the depth was missing and has been filled")
+
         # Depth inside a photo's file is usually coarser than the photo, which is no news. A map
         # that the user gives should have the photo's size.
         map_size = prediction.notes.get("depth_resampled_from")

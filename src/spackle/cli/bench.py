@@ -28,7 +28,7 @@ from spackle.cli.options import (
     VerboseOption,
 )
 
-# A base such as hf:OWNER/NAME is part of the name of the folder with results.
+# Runs of characters that a folder's name should not have.
 UNSAFE_IN_FOLDER_NAMES = re.compile(r"[^\w.-]+")
 
 
@@ -86,7 +86,9 @@ def bench(
         runs=runs,
         base_runs=base_runs,
     )
-    results = output or Path(f"bench-{dataset}-{UNSAFE_IN_FOLDER_NAMES.sub('-', base)}")
+    # The slash and colon of a base such as hf:OWNER/NAME become hyphens.
+    base_in_name = UNSAFE_IN_FOLDER_NAMES.sub("-", base)
+    results = output or Path(f"bench-{dataset}-{base_in_name}")
     # No result comes back from a run that the user has stopped.
     if run(options, results, CommandReporter(verbose, as_json=as_json)) is None:
         raise typer.Exit(INTERRUPTED)

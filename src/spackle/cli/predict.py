@@ -289,7 +289,7 @@ def _predict_all(
         is_single_photo = len(sources) == len(photos) == 1 and not sources[0].is_dir()
         return predict_photos(photos, output, options, reporter, is_single=is_single_photo)
 
-    # A clip takes minutes to hours and its results differ, so it is not part of a batch.
+    # A clip has options and results of its own, so it is not predicted together with photos.
     clip = clips[0]
     if len(sources) > 1 or len(photos) > 1 or sources[0].is_dir():
         raise InputError(f"{clip.path}: is a clip: give it alone, without other photos or clips")

@@ -308,7 +308,7 @@ def _predict_by_workers(
         for result in results:
             finished_count += 1
             # Workers keep their messages until a photo is done, so that those of two photos do not
-            # mix. A text is a line of the log; everything else is a result for --json.
+            # mix. A text is a line of the log; everything else is a result to print as JSON.
             for message in result.messages:
                 if isinstance(message, str):
                     reporter.log(message)

@@ -231,6 +231,7 @@ def _open_scene_video(
     has_new_lens = focal_px is not None or fov is not None
     if has_new_lens or scene.disparity is None:
         path = dataclasses.replace(path, overscan=0)
+
     # A ValueError comes from the scene's depths; a PathError from the file of keyframes, and its
     # own text ("{reason}") is the message.
     with (
@@ -327,6 +328,8 @@ def export_scene(scene_file: Path, outputs: Sequence[Path], reporter: Reporter) 
                 f"{scene_file}: {loaded.unread_harmonics} spherical harmonics of each Gaussian, "
                 "above degree 0, are left out"
             )
+
+        # Each file is written whole before the next format is encoded, which saves memory.
         for output, encode in zip(outputs, encoders, strict=True):
             start = time.perf_counter()
             try:
