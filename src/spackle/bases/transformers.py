@@ -217,8 +217,8 @@ def meaning_of(settings: Mapping[str, Any], name: str) -> Meaning:
     stated = str(settings.get("depth_estimation_type", "relative"))
     backbone = settings.get("backbone_config")
     has_dinov2 = isinstance(backbone, dict) and backbone.get("model_type") == "dinov2"
-    # Models of type dpt are MiDaS models, with a known output. But with DINOv2 as the backbone, it is
-    # another model, and may predict anything.
+    # Models of type dpt are MiDaS models, with a known output. With DINOv2 as the backbone, such
+    # a model is no MiDaS, and may predict anything.
     is_other_dpt = kind == "dpt" and has_dinov2
     if kind not in OUTPUT_MEANINGS or is_other_dpt or stated not in ("relative", "metric"):
         known = ", ".join(OUTPUT_MEANINGS)
