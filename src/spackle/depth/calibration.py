@@ -57,8 +57,9 @@ class Calibration:
     ) -> DepthMap:
         """The depth map of stored disparities [H, W]: depth = baseline · focal / (d + doffs).
 
-        d, in pixels, is the stored value times `scale`. `invalid`, NaN and inf mean unknown; 0 does
-        only if `zero_is_unknown`. InputError, naming `path`, for negative numbers, for a map of
+        d, in pixels, is the stored value times `scale`, and doffs is how much larger the principal
+        point's x is in the right photo than in the left one. `invalid`, NaN and inf mean unknown;
+        0 does only if `zero_is_unknown`. InputError, naming `path`, for negative numbers, for a map of
         another size than the calibrated one, and if no pixel is known.
         """
         # A wrong file is refused before its numbers are used.
@@ -202,7 +203,11 @@ def _is_disparity_of_scene(depth_file: Path, scene_json: Path) -> bool:
 
 
 def _read_scene_json(path: StrPath) -> Calibration:
-    """Read a `scene.json`: an object with the fields of `Calibration`, two under other names."""
+    """Read a `scene.json`: an object with the fields of `Calibration`.
+
+    Two fields are optional: `disparity_scale` (1 if it is missing), with which a stored value gives
+    pixels, and `invalid` (infinite if it is missing), the stored value for "unknown".
+    """
     with as_input_error(path, SCENE_JSON_PROBLEM):
         scene = json.loads(read_short_text(path))
         calibration = Calibration(

@@ -86,7 +86,7 @@ def is_valid_depth(metres: Tensor) -> Tensor:
 def quantisation_step(values: Array) -> float | None:
     """The greatest common step of integers: any two of `values` [N] differ by a multiple of it.
 
-    None if a value is not an integer. Then no step is known.
+    None, for an unknown step, if a value is not an integer, or is too large to be exact.
     """
     are_integers = np.array_equal(values, np.round(values))
     if float(values.max()) > MAX_EXACT_INTEGER or not are_integers:
@@ -102,8 +102,9 @@ def quantisation_step(values: Array) -> float | None:
 
 
 def check_not_negative(stored: Array, path: StrPath) -> None:
-    """InputError, naming the file, if a number of `stored` [H, W] is negative; NaN, inf may be."""
-    # Negative depth means another convention, such as z that points backwards: no guess is safe.
+    """InputError, naming the file, if a number of `stored` [H, W] is negative. NaN and inf pass."""
+    # The program that wrote negative depths may mean that z points backwards, or that they are
+    # unknown. The file does not say which, so it is refused.
     negative_count = int((np.isfinite(stored) & (stored < 0)).sum())
     if negative_count:
         raise InputError(

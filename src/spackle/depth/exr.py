@@ -101,7 +101,8 @@ def _depth_channel(names: list[str]) -> str:
     """
 
     def preference(name: str) -> tuple[bool, int, int]:
-        # The position of the last letter in "RYVZ" tells how sure it is that this is depth.
+        # CHANNEL_LETTERS is "RYVZ". The later the name's last letter stands in it, the surer it is
+        # that the channel holds depth.
         return "depth" in name.lower(), CHANNEL_LETTERS.find(name[-1]), -len(name)
 
     # Renderers add layers in front: ViewLayer.Depth.Z.

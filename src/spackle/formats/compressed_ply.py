@@ -51,16 +51,20 @@ CHUNK_PROPERTIES = [*POSITION_BOUNDS, *SCALE_BOUNDS, *COLOR_BOUNDS]
 
 
 def encode_compressed_ply(scene: SceneFile) -> bytes:
-    """Encode a scene as a compressed PLY, with axes and comments as in a file of `save_ply`.
+    """Encode a scene as a compressed PLY, with y down and z forward.
 
-    The Gaussians are sorted, because the values of 256 consecutive ones (a chunk) are stored as
-    fractions between their bounds: neighbours in space become neighbours in the file. Gaussians
+    Comments in the header keep the photo's camera (if it is at the origin), how many Gaussians come
+    from the photo, and how far the camera may go to the side (`disparity`).
+
+    The values of 256 consecutive Gaussians (a chunk) are stored as fractions between their bounds.
+    So the Gaussians are sorted, and neighbours in space become neighbours in the file. Gaussians
     that come from the photo stay before those that fill holes.
 
     Raises:
         ValueError: a Gaussian is not finite.
     """
     columns = GaussianColumns.from_gaussians(scene.gaussians)
+    # If it is not known which Gaussians fill holes, all are sorted together.
     base_count = 0 if scene.base_count is None else scene.base_count
     base_order = morton_order(columns.means[:base_count])
     fill_order = base_count + morton_order(columns.means[base_count:])
@@ -81,8 +85,8 @@ def _encode_tables(columns: GaussianColumns) -> tuple[Floats, NDArray[np.uint32]
     """Encode N Gaussians as the two tables of the file.
 
     Returns:
-        The chunks [ceil(N / 256), 18], in the order of CHUNK_PROPERTIES, and the vertices
-        [N, 4], in the order of PACKED_PROPERTIES.
+        The chunks [ceil(N / 256), 18], one row for 256 consecutive Gaussians, with the columns
+        CHUNK_PROPERTIES; and the vertices [N, 4], with the columns PACKED_PROPERTIES.
     """
     count = len(columns.means)
     chunk_starts = np.arange(0, count, GAUSSIANS_PER_CHUNK)
@@ -91,6 +95,8 @@ def _encode_tables(columns: GaussianColumns) -> tuple[Floats, NDArray[np.uint32]
     if count == 0:
         return chunks, vertices
 
+    # A row of the chunks has the bounds of the positions, of the scales' logarithms and of the
+    # colours: three minima and three maxima of each.
     positions, chunks[:, 0:6] = _to_fractions(columns.means, chunk_starts)
     log_scales = np.clip(columns.log_scales, -MAX_LOG_SCALE, MAX_LOG_SCALE)
     scales, chunks[:, 6:12] = _to_fractions(log_scales, chunk_starts)
@@ -124,6 +130,7 @@ def morton_order(means: Floats) -> NDArray[np.int64]:
     last_cell = 2**MORTON_BITS - 1
     cells = ((log_positions - low) / span * last_cell).astype(np.uint32)  # [N, 3]
 
+    # The bits of x, y and z alternate, so each coordinate's bits are spread to every third place.
     place_on_curve = _spread_bits(cells[:, 0])
     place_on_curve |= _spread_bits(cells[:, 1]) << np.uint32(1)
     place_on_curve |= _spread_bits(cells[:, 2]) << np.uint32(2)

@@ -40,8 +40,8 @@ class GaussianColumns:
     def from_gaussians(gaussians: Gaussians) -> GaussianColumns:
         """Convert Gaussians to columns with values that every format can store.
 
-        Colours are clamped to 0..1 and scales to MIN_SCALE..MAX_SCALE. A quaternion of length 0
-        becomes (1, 0, 0, 0), the rotation by 0°.
+        Colours and opacities are clamped to 0..1, and scales to MIN_SCALE..MAX_SCALE. A quaternion
+        of length 0 becomes (1, 0, 0, 0), the rotation by 0°.
 
         Raises:
             ValueError: a value is not finite; only scales may be infinite.
@@ -53,14 +53,15 @@ class GaussianColumns:
             if not torch.isfinite(checked).all():
                 raise ValueError(f"{name} of these Gaussians are not all finite")
 
-        # NumPy's logarithm, because torch would start threads for every block of a PLY.
+        # NumPy's logarithm is used, because PyTorch's would start threads in each call, and a
+        # writer may call this function for many small blocks of Gaussians.
         scales = np.clip(gaussians.scales.numpy(), MIN_SCALE, MAX_SCALE)
         return GaussianColumns(
             means=gaussians.means.numpy(),
             quats=_unit_quats(gaussians.quats).numpy(),
             log_scales=np.log(scales),
             opacities=gaussians.opacities.clamp(0, 1).numpy(),
-            srgb=linear_to_srgb(gaussians.colors).numpy(),
+            srgb=linear_to_srgb(gaussians.colors).numpy(),  # clamps the colours
         )
 
     def to_gaussians(self) -> Gaussians:

@@ -145,7 +145,7 @@ def _describe_arrays(
     for name, array in attributes.items():
         buffer_views.append(
             {
-                "buffer": 0,
+                "buffer": 0,  # the only one
                 "byteOffset": byte_offset,
                 "byteLength": array.nbytes,
                 "target": GLTF_ARRAY_BUFFER,
@@ -154,7 +154,7 @@ def _describe_arrays(
         byte_offset += array.nbytes
 
         accessor: dict[str, Any] = {
-            "bufferView": len(accessors),
+            "bufferView": len(accessors),  # each array has its own one, of the same index
             "componentType": GLTF_FLOAT,
             "count": len(array),
             "type": "SCALAR" if array.ndim == 1 else f"VEC{array.shape[1]}",

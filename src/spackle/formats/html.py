@@ -88,8 +88,9 @@ def page_scene(
         base: the Gaussians that come from the photo.
         aux: the Gaussians that fill holes; may be empty.
         camera: the photo's camera, at the world's origin.
-        disparity: the camera movement, relative to the scene's depth, for which the scene was
-            completed; the page's camera goes no farther. None if it is not known.
+        disparity: how far to the side the camera may go, because the holes that it uncovers are
+            filled; a disparity of 1 shifts the nearest surface by the picture's diagonal. The
+            page's camera goes no farther. None if it is not known.
         note: a text for the user; empty for none. The page shows it for some seconds, and what
             stands before its first semicolon always.
 
@@ -120,7 +121,8 @@ def page_scene(
         },
         "focus": depths.focus,
         "zNear": depths.near,
-        # The page begins with a disparity of at most `free`, and offers up to `limit`.
+        # The page begins with a disparity of at most `free`, and its user can choose up to `limit`.
+        # Both are equal, because the scene can be shown everywhere within the limit.
         "orbit": {"unit": metres_per_disparity, "free": limit, "limit": limit},
         "paths": {kind: _path_positions(kind, camera, depths) for kind in SHARP_TRAJECTORIES},
         "layers": layers,
@@ -157,11 +159,12 @@ def _encode_layers(
 def _movement_limit(disparity: float | None, is_filled: bool) -> float:
     """Return the largest disparity to which the page's camera may go.
 
-    A disparity is the camera's movement relative to the scene's depth.
+    A disparity of 1 is a sideways movement that shifts the nearest surface by the picture's
+    diagonal.
 
     Args:
-        disparity: the disparity for which the scene was completed; None if the scene's file does
-            not say it.
+        disparity: the largest one for which the scene's holes are filled; None if the scene's file
+            does not say it.
         is_filled: whether the scene has Gaussians that fill holes.
     """
     limit = disparity
@@ -175,9 +178,9 @@ def _path_positions(
 ) -> dict[str, list[list[float]]]:
     """Return the camera positions along a path, split into two parts for the page.
 
-    For the disparity d (the camera's movement relative to the scene's depth), a position is
-    still + d · moving, because sideways motion grows with d and forward motion does not. The user
-    of the page chooses d, so the page gets both parts.
+    The user of the page chooses how far the camera goes to the side, as a disparity d: d = 1 shifts
+    the nearest surface by the picture's diagonal. A position is still + d · moving, because
+    sideways motion grows with d and forward motion does not. So the page gets both parts.
 
     Args:
         kind: the kind of path, such as "swipe".

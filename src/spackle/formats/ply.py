@@ -65,16 +65,16 @@ def save_ply(
     The one table, `vertex`, has float32 columns: the position x y z, a normal of zero, the
     sRGB colour as the coefficient f_dc of the constant spherical harmonic, the opacity as its
     logit, the scales as natural logarithms, and the rotation as a unit quaternion (w, x, y, z).
-    Each row depends only on its Gaussian. Comments in the header keep `camera`, `base_count`
-    and `disparity`.
+    A Gaussian gives the same bytes, whatever other Gaussians the scene has. Comments in the
+    header keep `camera`, `base_count` and `disparity`.
 
     Args:
         gaussians: the scene.
         path: the file to write, whole or not at all.
         camera: the photo's camera, at the world's origin.
         base_count: how many Gaussians come from the photo; those that fill holes come after.
-        disparity: the camera movement, relative to the scene's depth, for which the scene was
-            completed.
+        disparity: how far to the side the camera may go, because the holes that it uncovers are
+            filled; a disparity of 1 shifts the nearest surface by the picture's diagonal.
 
     Raises:
         InputError: `path` cannot be written.
@@ -105,8 +105,9 @@ def _encode_parts(
         gaussians: the scene.
         camera: the photo's camera, if it is known.
         base_count: how many Gaussians come from the photo, if it is known.
-        disparity: the camera movement, relative to the scene's depth, for which the scene was
-            completed, if it is known.
+        disparity: how far to the side the camera may go, because the holes that it uncovers are
+            filled; a disparity of 1 shifts the nearest surface by the picture's diagonal. None
+            if it is not known.
     """
     vertex = NewTable(
         name="vertex", row_count=len(gaussians), type="float", properties=WRITTEN_PROPERTIES
@@ -285,10 +286,11 @@ class PlyFile:
         return None if numbers is None else int(numbers[0])
 
     def disparity(self) -> float | None:
-        """Read the camera movement (relative to the scene's depth) that the scene was completed for.
+        """Read how far to the side the camera may go: so far are the holes it uncovers filled.
 
         Returns:
-            The disparity; None for files of other programs.
+            The distance as a disparity, of which 1 shifts the nearest surface by the picture's
+            diagonal; None for files of other programs.
 
         Raises:
             InputError: the stored value is not a number, or negative.

@@ -68,8 +68,8 @@ def ply_header(
         tables: the file's tables, in their order.
         camera: the photo's camera, at the world's origin.
         base_count: how many Gaussians come from the photo; those that fill holes come after.
-        disparity: the camera movement, relative to the scene's depth, for which the scene was
-            completed.
+        disparity: how far to the side the camera may go, because the holes that it uncovers are
+            filled; a disparity of 1 shifts the nearest surface by the picture's diagonal.
     """
     lines = ["ply", "format binary_little_endian 1.0"]
     if camera is not None:

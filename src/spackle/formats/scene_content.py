@@ -21,7 +21,8 @@ class SceneFile:
     camera: Camera | None = None
     # How many Gaussians come from the photo; the Gaussians that fill holes come after them.
     base_count: int | None = None
-    # The camera movement, relative to the scene's depth, for which the scene was completed.
+    # How far to the side the camera may go, because the holes that it uncovers are filled. A
+    # disparity of 1 shifts the nearest surface by the picture's diagonal.
     disparity: float | None = None
     # The coefficients of spherical harmonics above degree 0 that each Gaussian of the file has.
     # They are not read.

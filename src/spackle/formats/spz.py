@@ -242,7 +242,8 @@ def _encode_sections(
     opacity_steps = np.round(columns.opacities * (255 / rounding.opacity_step))
     opacities = np.minimum(255, opacity_steps * rounding.opacity_step).astype(np.uint8)
 
-    # srgb = 0.5 + SH_C0 · f_dc, and a byte stands for 0.5 + COLOR_SCALE · f_dc.
+    # A colour is srgb = 0.5 + SH_C0 · f_dc, where f_dc is the coefficient of the constant spherical
+    # harmonic. A byte, as a fraction of 255, is 0.5 + COLOR_SCALE · f_dc.
     byte_per_srgb = np.float32(COLOR_SCALE * 255 / SH_C0)
     color_bytes = (columns.srgb - np.float32(0.5)) * byte_per_srgb + np.float32(0.5 * 255)
     colors = np.clip(np.round(color_bytes), 0, 255).astype(np.uint8)
@@ -331,7 +332,8 @@ def decode_spz(data: bytes) -> GaussianColumns:
         zlib.error: the file is damaged.
     """
     header, (positions, opacities, colors, scales, rotations) = _inflate_sections(data)
-    # A byte stands for 0.5 + COLOR_SCALE · f_dc, and srgb = 0.5 + SH_C0 · f_dc.
+    # A byte, as a fraction of 255, is 0.5 + COLOR_SCALE · f_dc, where f_dc is the coefficient of
+    # the constant spherical harmonic. The colour is srgb = 0.5 + SH_C0 · f_dc.
     srgb_per_color = np.float32(SH_C0 / COLOR_SCALE)
     centered_colors = codes_to_fractions(colors, 255) - np.float32(0.5)
     srgb = centered_colors * srgb_per_color + np.float32(0.5)
@@ -416,7 +418,8 @@ def _decode_rotations(rotations: NDArray[np.uint8]) -> Floats:
     (x, y, z, w), and for each other component its sign and nine bits of its size.
     """
     words = rotations.copy().view("<u4")  # [N, 1]
-    # The ten bits of each component, below bits that belong to others and are masked out.
+    # After these shifts, the lowest ten bits belong to one component. The bits above belong to
+    # others; the masks below leave them out.
     codes = words >> np.array([20, 10, 0], np.uint32)  # [N, 3]
     sizes = (codes & MAX_COMPONENT_CODE).astype(np.float32)
     sizes = sizes / np.float32(MAX_COMPONENT_CODE * 2**0.5)

@@ -77,7 +77,8 @@ class LamaInpainter:
             raise InputError(f"inpainter lama: {problem}")
         self.weight_files: Mapping[str, Path] = {"lama": path}
         self._network = load_network(path).to(self._device)
-        # All that decides, beside the weights, which pixels are painted.
+        # Reports note the version: with the same weights, equal versions paint the same pixels. The
+        # number in front is raised when this code paints other pixels.
         self.version = f"{PAINTING_VERSION}, long side {self._input_side}"
 
     @torch.no_grad()

@@ -48,7 +48,8 @@ def expected_shapes(
         block_count: residual blocks of two Fourier layers each.
     """
     shapes: TensorShapes = {}
-    # The image is halved three times, and the channels double each time.
+    # The image is halved three times, and the channels double each time. The first of these deep
+    # channels are local (made by convolutions alone), the others pass through a Fourier transform.
     deep = 8 * width
     local = deep // LOCAL_CHANNEL_DIVISOR
     global_ = deep - local

@@ -106,6 +106,7 @@ class OpenCV:
             raise InputError(f"{needed_by} {advice}") from error
         self._cv2: Any = cv2
         self.version: str = cv2.__version__
+        # The optical flow between two images, by dense inverse search (DIS).
         self._flow = self._cv2.DISOpticalFlow_create(self._cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
 
     def inpaint(self, rgb: Tensor, mask: Tensor, radius_px: float) -> Tensor:

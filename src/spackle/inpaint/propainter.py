@@ -69,7 +69,8 @@ class PropainterInpainter:
         self.weight_files: Mapping[str, Path] = find_weight_files(options.weights)
         self._networks = [_load_network(name, file) for name, file in self.weight_files.items()]
         self._device = pick_device(options.device)
-        # All that decides, beside the weights, which pixels are painted.
+        # Reports note the version: with the same weights, equal versions paint the same pixels. The
+        # number in front is raised when this code paints other pixels.
         package = f"pytorchcv {pytorchcv.__version__}"
         self.version = f"{PAINTING_VERSION}, {package}, long side {self._input_side}"
 

@@ -261,7 +261,7 @@ class StreamEncoder:
             self._palette = PaletteFilter(width, height, 1 / rate)
 
     def _set_stream_size(self, width: int, height: int) -> None:
-        """Set the stream's pixel format, its size in pixels, and for yuv420p its kind of colours."""
+        """Set the stream's pixel format, its size in pixels, and for yuv420p its colour space."""
         self.stream.pix_fmt = self._format.pixel_format
         self.stream.width = width
         self.stream.height = height

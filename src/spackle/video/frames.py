@@ -105,22 +105,23 @@ class FrameMaker:
         return self.stereo.eyes(camera)
 
     def render(
-        self, parts: Sequence[list[Gaussians]], camera: Camera, renderer: Renderer
+        self, scenes: Sequence[list[Gaussians]], camera: Camera, renderer: Renderer
     ) -> tuple[Tensor, list[Rendering]]:
-        """Render a frame.
+        """Render a frame, which shows one scene, or compares two.
 
         Args:
-            parts: the scene as one list of sets of Gaussians; for a comparison two lists, without
-                and with the Gaussians that fill holes.
+            scenes: the scene; for a comparison, first the scene without the Gaussians that fill
+                holes, then the scene with them. The Gaussians of a scene are given as a list, such
+                as those from the photo and those that fill holes, and are rendered together.
             camera: the view.
-            renderer: renders each list of `parts` for each eye.
+            renderer: renders each scene for each eye.
 
         Returns:
             The frame [H, W, 3] sRGB, and the renderings from which it was made.
         """
         with torch.no_grad():
             eyes = [self.resized_camera(eye) for eye in self.eyes(camera)]
-            renderings = [renderer.render(part, eye) for part in parts for eye in eyes]
+            renderings = [renderer.render(scene, eye) for scene in scenes for eye in eyes]
             return self.frame(renderings), renderings
 
     def frame(self, renderings: Sequence[Rendering]) -> Tensor:
@@ -216,7 +217,10 @@ class FrameMaker:
 
 
 def _derive_stereo(options: VideoOptions, gaussians: Gaussians, camera: Camera) -> Stereo | None:
-    """Return the eyes of a stereo video, with defaults from the scene's depth.
+    """Return the eyes of a stereo video, or None if the options ask for no stereo.
+
+    If the options do not give the distance of the eyes (`ipd`) or the depth that appears at the
+    screen (`convergence`), they follow from the scene's depth.
 
     Args:
         options: what the video looks like.
@@ -237,6 +241,7 @@ def _derive_stereo(options: VideoOptions, gaussians: Gaussians, camera: Camera) 
         if convergence is None:
             convergence = depths.focus
 
+    # By so many pixels the two images are shifted, so that the depth `convergence` coincides.
     parallax_px = camera.focal[0] * ipd / convergence
     if parallax_px > camera.width:
         eyes = f"eyes {ipd:g} apart, screen at {convergence:g}"

@@ -143,6 +143,7 @@ def check_loop(subject: object, loop: int, video_format: VideoFormat) -> None:
         high = MAX_PLAY_COUNT
         hint = "0 is for ever"
     else:
+        # Such a file plays once. To play longer, it must hold the frames as often.
         low = 1
         high = MAX_STORED_REPETITIONS
         hint = "it holds every repetition; .gif and .webp can play for ever"

@@ -201,6 +201,7 @@ class _InertUnpickler(pickle._Unpickler):
         """
         _, storage_class, file_name, _, count = pid
         record = self._archive.getinfo(f"{self._data_folder}{file_name}")
+        # The class is a stand-in, which keeps the name of the class that the pickle asks for.
         if storage_class.replaced_name not in STORAGE_DTYPES:
             return None
         numbers = torch.empty(0, dtype=STORAGE_DTYPES[storage_class.replaced_name])

@@ -165,7 +165,8 @@ def check_finite(network: nn.Module, path: StrPath, advice: str) -> None:
 def _name_some(names: list[str]) -> str:
     """List the first names of tensors, and say how many more there are.
 
-    The names are a stranger's, so that they are shortened, and control characters are escaped.
+    The names come from a file of unknown origin. So they are shortened, and control characters are
+    escaped.
     """
     shortened_names = [
         # Shortened again, because escaping lengthens a name.

@@ -153,12 +153,12 @@ def _to_depth_map(coded: CodedDepth, path: Path) -> DepthMap:
     """
     stored, quantum = coded.decode()
     depth = coded.upright(torch.from_numpy(stored))
-    note = f"portrait depth of the photo ({coded.scale.source}"
+    origin = coded.scale.source
     # A stated unit is trusted, even if the photo shows a mountain.
     factor = 1.0 if coded.scale.unit_known else _factor_to_plausible(depth)
     if factor != 1:
         depth = depth * factor
-        note += f", scaled to a median of {USUAL_MEDIAN_M:g} m"
+        origin += f", scaled to a median of {USUAL_MEDIAN_M:g} m"
         # The step of a map that stores disparity is an inverse depth.
         quantum_factor = factor if coded.scale.quantity == "depth" else 1 / factor
         quantum *= quantum_factor
@@ -174,7 +174,7 @@ def _to_depth_map(coded: CodedDepth, path: Path) -> DepthMap:
         quantum=quantum,
         quantity=coded.scale.quantity,
         path=path,
-        note=f"{note})",
+        note=f"portrait depth of the photo ({origin})",
     )
 
 
@@ -440,7 +440,7 @@ def _find_in_heif(data: bytes) -> CodedDepth | None:
         return None
     # 10 and 12 bits are kept, so that the codes are those of the file.
     heif = pillow_heif.open_heif(io.BytesIO(data), hdr_to_16bit=False)
-    image = heif.info["depth_images"][0]
+    image = heif.info["depth_images"][0]  # the only one; with several, the steps are None
     width, height = image.size
     check_pixel_count(width, height, len(data), "the map")
     codes = np.array(image)
