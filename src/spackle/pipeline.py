@@ -364,7 +364,7 @@ def _fill_each_view(context: FillContext, views: PlannedViews, progress: Progres
         progress(len(by_view), len(views.cameras))
 
     # A file of a scene has room for one set of aux Gaussians. The reported view farthest from the
-    # photo is chosen, because it shows the largest holes.
+    # photo is chosen, because the holes grow with the distance.
     photo_eye = context.photo_camera.position.double()
 
     def distance_from_photo(name: str) -> float:

@@ -275,7 +275,8 @@ class Scene:
             """One HTML file with the viewer and this scene, titled by the file's name."""
             return single_html(self.page(file.path.stem))
 
-        # The encoders of formats do not know the page, whose title and camera come from the scene.
+        # A page is made of a scene with base and aux apart, not of the content of a file, so its
+        # encoder is added to those of the other formats.
         encode = encoder_for(name, {".html": encode_page})
         content = SceneFile(
             path=name,

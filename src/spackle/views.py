@@ -454,8 +454,8 @@ def _index_views(
         name: len(cameras) + position for position, name in enumerate(path_views.reported_cameras)
     }
     cameras.extend(path_views.reported_cameras.values())
-    # Only given views have no cameras just for the report: the report measures all of them. They
-    # are the first views of the list.
+    # Given views bring no cameras just for the report, because it measures all of them. They are
+    # the first views of the list.
     if not reported_views:
         reported_views = {str(index): index for index in range(len(path_views.frame_cameras))}
 

@@ -57,7 +57,7 @@ class PredictOptions:
         self._check_depth_out()
         pipeline = Pipeline.open(self.scene)
         path = self.scene.path
-        # An option without effect is a mistake of the user, which he learns before the work.
+        # An option without effect is a mistake of the user, so it is refused before the work.
         if not self.photo.render:
             for option in ("format", "fps", "loop"):
                 if getattr(path.video, option) is not None:

@@ -323,9 +323,9 @@ def _save_pictures(
 
     0000.png is the completed view, 0000_base.png the view before, 0000_mask.png its holes in white.
     """
-    # The given views are the first of the planned views.
     views = completed.views
     scene = completed.scene
+    # The given views are the first of the planned views.
     for index in range(views.given_view_count):
         camera = views.cameras[index]
         before = renderer.render(scene.base, camera)
@@ -400,8 +400,8 @@ def report_run(
     path = pipeline.options.path
     given_file = path.cameras or path.path
 
-    # Who decided how far the camera moves: nobody, because a file gives the views; the photo's
-    # content; or the option `disparity`.
+    # What decided how far the camera moves. With a file of views or keyframes there is no such
+    # choice; else it is the photo's content ("photo"), or the option `disparity`.
     if given_file is not None:
         disparity_source = None
     elif path.disparity is None:
