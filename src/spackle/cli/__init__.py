@@ -154,7 +154,8 @@ def main() -> None:
         signal.signal(signal.SIGTERM, _exit_at_signal)
 
     try:
-        # Not in its standalone mode, typer lets errors through, and returns the code of typer.Exit.
+        # In its standalone mode typer would print errors itself, and end the process. Without it,
+        # errors come here, and the code of a typer.Exit is returned.
         code = app(standalone_mode=False)
         # Errors of the standard output should come here, not when Python ends.
         sys.stdout.flush()

@@ -66,7 +66,7 @@ def bench(
     # Imported here, because the help must not wait for torch.
     from spackle.bases.settings import BaseSettings
     from spackle.cli.messages import CommandReporter
-    from spackle.paper.evaluation.bench import bench as run
+    from spackle.paper.evaluation.bench import bench as run_bench
     from spackle.paper.evaluation.options import BenchOptions, parse_disparities
 
     options = BenchOptions(
@@ -90,5 +90,5 @@ def bench(
     base_in_name = UNSAFE_IN_FOLDER_NAMES.sub("-", base)
     results = output or Path(f"bench-{dataset}-{base_in_name}")
     # No result comes back from a run that the user has stopped.
-    if run(options, results, CommandReporter(verbose, as_json=as_json)) is None:
+    if run_bench(options, results, CommandReporter(verbose, as_json=as_json)) is None:
         raise typer.Exit(INTERRUPTED)

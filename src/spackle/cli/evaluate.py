@@ -95,7 +95,7 @@ def evaluate(
     # Imported here, because the help must not wait for torch.
     from spackle.bases.settings import BaseSettings
     from spackle.cli.messages import CommandReporter
-    from spackle.paper.evaluation.evaluate import evaluate as run
+    from spackle.paper.evaluation.evaluate import evaluate as run_evaluation
     from spackle.paper.evaluation.options import EvaluateOptions, parse_disparities, split_words
 
     # None stands for the protocol's own metrics; the word "none" asks for no metric at all.
@@ -128,5 +128,5 @@ def evaluate(
     # The folder has the protocol in its name, so that runs of both protocols do not meet in it.
     results = output or Path(f"evaluation-{dataset}-{protocol}")
     # No result comes back from a run that the user has stopped.
-    if run(options, results, CommandReporter(verbose, as_json=as_json), html) is None:
+    if run_evaluation(options, results, CommandReporter(verbose, as_json=as_json), html) is None:
         raise typer.Exit(INTERRUPTED)
