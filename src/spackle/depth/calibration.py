@@ -59,8 +59,8 @@ class Calibration:
 
         d, in pixels, is the stored value times `scale`, and doffs is how much larger the principal
         point's x is in the right photo than in the left one. `invalid`, NaN and inf mean unknown;
-        0 does only if `zero_is_unknown`. InputError, naming `path`, for negative numbers, for a map of
-        another size than the calibrated one, and if no pixel is known.
+        0 does only if `zero_is_unknown`. InputError, naming `path`, for negative numbers, for a map
+        of another size than the calibrated one, and if no pixel is known.
         """
         # A wrong file is refused before its numbers are used.
         check_not_negative(stored, path)

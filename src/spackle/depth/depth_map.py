@@ -131,7 +131,7 @@ def build_depth_map(
         stored: [H, W] the file's numbers, whose common step becomes the quantisation step.
         depth: [H, W] metres, computed from `stored`.
         valid: [H, W] bool: the pixels that may be known.
-        quantity: what the file stores.
+        quantity: what the file stores, "depth" or "disparity".
         stored_unit: metres (for disparity, 1/m) that one unit of `stored` means; None if the
             numbers are floats, which have no common step.
         K: [3, 3] intrinsics of the map, None if they are not known.

@@ -194,7 +194,8 @@ def _grey_values(image: Image.Image, path: StrPath, grey: bool) -> Array:
     _check_shape((image.height, image.width), path)
     if image.mode == "L":
         return np.asarray(image)
-    if image.mode.startswith("I"):  # integers of 16 or 32 bits
+    # A PNG has at most 16 bits, for which Pillow uses integers of 16 or 32 bits.
+    if image.mode.startswith("I"):
         return np.asarray(image).astype(np.uint16)
     if not grey:
         raise InputError(

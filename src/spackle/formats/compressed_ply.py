@@ -210,7 +210,8 @@ def decode_compressed_ply(chunks: NDArray[Any], vertices: NDArray[Any]) -> Gauss
     )
     rgba = _unpack_fractions(colors, COLOR_BITS)  # [N, 4]
     srgb = rgba[:, :3]
-    if "min_r" in chunk_fields:
+    # In older files, the fractions are the colours themselves.
+    if COLOR_BOUNDS[0] in chunk_fields:
         srgb = _from_fractions(srgb, chunks, COLOR_BOUNDS)
 
     # The two highest bits hold the index of the largest component.

@@ -215,6 +215,7 @@ def decode_sog(data: bytes) -> GaussianColumns:
         scales_images = _read_images(archive, meta["scales"]["files"], count)
         quats_images = _read_images(archive, meta["quats"]["files"], count)
         colors_images = _read_images(archive, meta["sh0"]["files"], count)
+    # A position is in two images, which hold its lower and its upper bytes.
     low_bytes, high_bytes = means_images
     (scale_codes,) = scales_images
     (rotation_codes,) = quats_images

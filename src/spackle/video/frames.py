@@ -89,9 +89,10 @@ class FrameMaker:
 
     @property
     def image_size(self) -> tuple[int, int] | None:
-        """Width and height in pixels of one eye's image with its margins, both made even.
+        """Width and height in pixels of one eye's image with its margins.
 
-        None if the options give no size.
+        Both are made even, because in most videos each 2×2 pixels share a colour. None if the
+        options give no size.
         """
         if self.options.size is None:
             return None

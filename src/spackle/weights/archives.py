@@ -96,6 +96,7 @@ def tensors_in_tree(root: object) -> dict[str, Tensor]:
     tensors: dict[str, Tensor] = {}
     node_count = 0
     remaining: list[tuple[str, object]] = [("", root)]
+    # In a tree that contains itself, the loop ends because more and more nodes are counted.
     while remaining:
         name, node = remaining.pop()
         if isinstance(node, Tensor) and name:

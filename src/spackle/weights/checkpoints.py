@@ -208,8 +208,8 @@ def read_checkpoint(path: StrPath, name: str, advice: str) -> tuple[object, dict
         advice: what to do about a wrong file, at the end of messages.
 
     Returns:
-        The value, which is untrusted and consists of numbers, texts, lists, dicts and objects
-        without behaviour; and the tensors by name, as `read_tensors` returns them.
+        The value, which is untrusted and consists of numbers, texts, lists, dicts, and stand-ins
+        for objects of classes, none of which was run; and the tensors by name, as `read_tensors` returns them.
 
     Raises:
         InputError: the file is missing or broken, or has no such value.

@@ -251,7 +251,10 @@ def own_property(node: Element, name: str) -> str | None:
 
 
 def find_property(tree: Element, name: str) -> str | None:
-    """A property of this element, or of the first element below it that has the property."""
+    """A property of this element, or of the first element below it that has the property.
+
+    A property is called "{namespace}name". None if no element has it.
+    """
     for node in tree.iter():
         text = own_property(node, name)
         if text is not None:
@@ -262,7 +265,7 @@ def find_property(tree: Element, name: str) -> str | None:
 def find_number(tree: Element, name: str) -> float | None:
     """A property of this element, or of one below, as a number; None if it is missing.
 
-    ValueError if it is not a finite number.
+    A property is called "{namespace}name". ValueError if it is not a finite number.
     """
     text = find_property(tree, name)
     if text is None:

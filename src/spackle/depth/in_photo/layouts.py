@@ -168,8 +168,8 @@ def _to_depth_map(coded: CodedDepth, path: Path) -> DepthMap:
     if not valid.any():
         raise ValueError("no pixel has a depth")
     return DepthMap(
-        metres.where(valid, 0.0),
-        valid,
+        depth=metres.where(valid, 0.0),
+        valid=valid,
         K=None,
         quantum=quantum,
         quantity=coded.scale.quantity,
@@ -209,6 +209,7 @@ def _find_in_jpeg(data: bytes) -> CodedDepth | None:
     image = open_jpeg(data)
     if image is None:  # whoever decodes the photo will say what is wrong
         return None
+    # Which turns make the map upright, one letter each; none if the orientation is not known.
     upright_steps = ""
     with contextlib.suppress(Exception):  # unreadable EXIF says nothing about the orientation
         orientation = image.getexif().get(EXIF_TAG_ORIENTATION, 1)
@@ -431,7 +432,7 @@ ASSUMED_SCALE = CodeScale(  # usual in portraits
 def _find_in_heif(data: bytes) -> CodedDepth | None:
     """The depth map of a HEIF's primary picture; None if there is none.
 
-    Apple's XMP about its range takes precedence over HEVC's header.
+    What its codes mean is said by Apple's XMP, or else by HEVC's information about depth.
     """
     import pillow_heif
 
