@@ -14,6 +14,35 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 # Tests must not use downloaded weights.
 os.environ["SPACKLE_WEIGHTS"] = str(Path(__file__).with_name("no weights"))
 
+# Files whose tests walk commands, processes, a browser or a training, or compute for many seconds:
+# `make test-fast` leaves them out.
+JOURNEYS = (
+    "bases/test_lite.py",
+    "bases/test_moge.py",
+    "bases/test_sharp.py",
+    "cli",
+    "formats/test_export.py",
+    "fuzz",
+    "paper/dataset/test_dataset_build.py",
+    "paper/evaluation/test_evaluate.py",
+    "paper/training/test_direct_ft.py",
+    "paper/training/test_training.py",
+    "scene_fill/test_fill_scene.py",
+    "test_api.py",
+    "test_examples.py",
+    "test_quick_start.py",
+    "web",
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests of `JOURNEYS`."""
+    journeys = [Path(__file__).parent / name for name in JOURNEYS]
+    for item in items:
+        if any(item.path == journey or journey in item.path.parents for journey in journeys):
+            item.add_marker("journey")
+
+
 settings.register_profile("repeat", derandomize=True, deadline=None)
 settings.register_profile("explore", deadline=None)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "repeat"))

@@ -146,6 +146,7 @@ def test_each_optional_package_is_wrapped_by_one_file(package: str) -> None:
     assert len(users) <= (2 if package == "skimage" else 1), users
 
 
+@pytest.mark.journey
 def test_every_module_imports_without_optional_packages() -> None:
     command = [sys.executable, "-c", WITHOUT_OPTIONAL, *OPTIONAL]
     assert (
