@@ -202,9 +202,10 @@ def time_case(
     measurements = [
         image_measurement(title, case.name, name, value) for name, value in facts.items()
     ]
-    # To show a view needs the base, too, which was timed once: its seconds count for each view.
     for view in large_views(prediction, options.disparities, options.max_side):
         for method in _time_view(view, context, evaluation.renderer.device, runs):
+            # A user who sees a new view of a photo has also waited for the base. It was timed once, so
+            # its seconds are counted for each view.
             numbers = view_numbers(
                 base_count=len(context.base),
                 added_count=method.added_count,
@@ -356,7 +357,7 @@ def count_parameters(residual: ResidualNet | None) -> dict[str, float]:
         residual_count = sum(parameter.numel() for parameter in residual.parameters())
 
     return {
-        "base": PARAMETER_COUNT,
+        "base": PARAMETER_COUNT,  # of all networks in SHARP's published checkpoint
         "base_used": used_count,
         "residual": residual_count,
         "share": residual_count / PARAMETER_COUNT,
@@ -429,8 +430,8 @@ def complete_view_in_stages(
 ) -> Gaussians:
     """Complete a view of a scene, with a call of `end_stage` after each stage.
 
-    The stages are "view" (the base is rendered from the view), "photo" (and from the photo's
-    camera) and "completion" (from the mask to the completed view).
+    The stages are "view" (the base is rendered from the view), "photo" (the base is rendered from
+    the photo's camera) and "completion" (from the mask to the completed view).
 
     Args:
         context: the base's Gaussians, the renderer and the residual network.

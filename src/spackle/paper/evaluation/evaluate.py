@@ -329,11 +329,11 @@ def _predict_by_tuned_base(
         gaussians: in the fine-tuned base's own unit of length.
         unit: the factor that converts camera positions to this unit.
     """
-    # Fine-tuning may have changed the base's unit of length, so its scale is found anew.
     assert evaluation.tuned_base is not None
     prediction, _ = evaluation.tuned_base.predict(loaded.full_photo)
     if scale is None:  # large views are cameras of the base's scene, whatever its unit
         return prediction.gaussians, 1.0
+    # Fine-tuning may have changed the base's unit of length, so its scale is found anew.
     tuned_scale = _scale_of_base(loaded, prediction, evaluation)
     return prediction.gaussians, scale / tuned_scale
 

@@ -154,6 +154,7 @@ def _open_metrics(
     names = tuple(name for name in METRICS if name in chosen)  # in the order of the tables
     published_names = [name for name in names if name in PUBLISHED_METRICS]
 
+    # The metric "distance" compares features: what a network (SqueezeNet) finds in two pictures.
     features = None
     if options.features is not None:
         features = load_features("squeezenet", options.features)
@@ -162,7 +163,7 @@ def _open_metrics(
         published_names, options.device.type, options.download_metrics
     )
     states = dict.fromkeys(names, OWN_METRIC) | published_states
-    # The distance compares features of a network, whose weights have to be given.
+    # The weights of the features' network have to be given; without them there is no distance.
     if "distance" in names:
         if options.features is None:
             states["distance"] = f"{NOT_RUN}: weights: give SqueezeNet's with `features` FILE"
@@ -201,10 +202,10 @@ def _configuration(
         "spackle": spackle.__version__,
         "dataset": dataset.name,
         "title": dataset.title,
-        "terms": dataset.terms,
+        "terms": dataset.terms,  # of use of the photos
         "images": {"count": len(cases), "limit": options.limit, "names": names_digest},
         "protocol": options.protocol,
-        "side": options.max_side,
+        "side": options.max_side,  # the long side of views, in pixels
         "disparities": None if options.compares_with_photos else list(options.disparities),
         "second_views": options.second_views if options.compares_with_photos else None,
         "base": _base_configuration(options),
@@ -238,7 +239,7 @@ def _base_configuration(options: EvaluateOptions) -> dict[str, Any]:
 def _residual_configuration(options: EvaluateOptions, renderer: Renderer) -> dict[str, Any]:
     """What config.json records about the residual network: its weights and its precision."""
     weights_file = FillOptions(residual=options.residual).weights_file
-    if weights_file is None:  # the initial Gaussians fill holes as they are
+    if weights_file is None:  # no network changes the first guess of the Gaussians that fill holes
         return {"weights": "initial", "sha256": None, "precision": None}
 
     # "auto" becomes the number format that the hardware multiplies fastest.

@@ -38,7 +38,7 @@ FONT_POINTS = 7
 PDF_QUALITY = 95  # of the JPEG images inside
 
 MAX_BOXES = 2  # in a picture
-BOX_SIDE = 0.22  # over the picture's longer side
+BOX_SIDE_RATIO = 0.22  # over the picture's longer side
 # A box is drawn only if share of hole pixels × share of other pixels in it is above this.
 MIN_BOX_SCORE = 0.02
 
@@ -200,6 +200,7 @@ def _draw_figure(
         font_size=round(FONT_POINTS / POINTS_PER_INCH * DOTS_PER_INCH),
     )
 
+    # The caption says which of our own methods the figure shows.
     spackle_titles = [METHODS[name].title for name in columns if name in ("paper", "spackle")]
     latex = _figure_latex(figure, [run for run, _ in runs], bases, " and by ".join(spackle_titles))
     return DrawnFigure(picture, latex)
@@ -286,15 +287,16 @@ def _added_share_tag(run: Run, image: str, method: str) -> str:
 
 
 def find_hole_boxes(hole: Image.Image) -> list[Box]:
-    """At most two disjoint boxes in which hole pixels (white) and other pixels mix most evenly.
+    """At most two boxes, apart from each other, in which about half of the pixels are a hole.
 
-    There the reader sees what was filled, and what it was filled next to. A box's score is the
-    share of hole pixels times the share of other pixels, at most 1/4.
+    A hole is white in `hole`. In such a box the reader sees what was filled, and the surroundings
+    to which it has to fit. A box's score is the share of hole pixels times the share of other
+    pixels, which is largest (1/4) if both are one half.
     """
     # WebP blurs edges a little, so all pixels above half of white (255) count as white.
     is_hole = torch.from_numpy(np.asarray(hole.convert("L")) > 127).float()  # [H, W]
     height, width = is_hole.shape
-    side = min(round(BOX_SIDE * max(height, width)), height, width)
+    side = min(round(BOX_SIDE_RATIO * max(height, width)), height, width)
 
     # For each position of a square's upper left corner: [H - side + 1, W - side + 1].
     hole_share = avg_pool2d(is_hole[None], side, stride=1)[0]
@@ -323,6 +325,9 @@ def _figure_latex(figure: PaperFigure, runs: Sequence[Run], bases: str, methods:
     # The figure shows views with the largest hole, which are those of the largest disparity (size
     # of the camera move). Settings are disparities as text.
     largest_disparities = dict.fromkeys(max(run.settings, key=float) for run in runs)
+
+    # The caption says so if the residual network was not trained by the paper's recipe. Weights that
+    # the user gave have no sentence.
     weights = dict.fromkeys(run.config["residual"]["weights"] for run in runs)
     weights_sentences = [WEIGHTS_SENTENCES[name] for name in weights if name in WEIGHTS_SENTENCES]
 

@@ -292,7 +292,8 @@ def _check_same_config(config_path: Path, plan: RunPlan) -> None:
     if not is_same_kind:
         raise InputError(f"{config_path}: not written by `spackle {kind}`: choose another `output`")
 
-    # Versions and the machine may change between runs.
+    # Only options are compared. The plan's configuration has no format, and "about" has versions
+    # and the machine, which may change between runs.
     del earlier["format"]
     earlier.pop("about", None)
 
@@ -320,5 +321,6 @@ def _load_image_results(path: Path, inputs_digest: str) -> list[Measurement] | N
             path.parent, path.name, content["files"]
         )
         if pictures_match and content["inputs"] == inputs_digest:
+            # A row is a list of a measurement's fields, in the order of their declaration.
             return [Measurement(*values) for values in content["rows"]]
     return None

@@ -183,6 +183,7 @@ class Run:
             for measurement in self.measurements
             if measurement.image == image and measurement.metric == "har_before"
         ]
+        # A ratio that was no finite number is None, and counts as 0.
         largest = max(hole_ratios, key=lambda measurement: float(measurement.value or 0))
         return largest.setting, largest.view
 

@@ -102,15 +102,18 @@ def _paper_aux(context: FillContext, camera: Camera, base_rendering: Rendering) 
     `base_rendering` is the base, rendered by `camera`; it shows where the hole is.
     """
     view = context.view(base_rendering, camera)
+    # The network's changes to a first guess of a Gaussian for each cell of 2×2 pixels.
     deltas = view.deltas(context.network, context.precision)
-    aux = view.gaussians(view.cells(MIN_AUX_GAUSSIANS), deltas)
+    # A cell with a hole gets a Gaussian. If there are too few, the least opaque cells get one.
+    chosen_cells = view.cells(at_least=MIN_AUX_GAUSSIANS)
+    aux = view.gaussians(chosen_cells, deltas)
     return aux.to(context.base.means.device)
 
 
 def _fill_each_view(
     context: FillContext, photo_guard: OcclusionGuard, camera: Camera, base_rendering: Rendering
 ) -> MethodView:
-    """Complete one view, independently of other views, in two passes.
+    """Complete one view by itself: fill its holes, render it, and fill holes that are still open.
 
     Args:
         context: the base's Gaussians, the network and the renderer.
@@ -132,7 +135,8 @@ def _dense_aux(
     moved behind the surfaces that the photo shows, which `photo_guard` knows.
     """
     view = context.view(base_rendering, camera)
-    # A cell, 2×2 pixels, gives one Gaussian. Deltas are what the network changes in it.
+    # A cell of 2×2 pixels gives one Gaussian. Deltas are the network's changes to a first guess of
+    # this Gaussian.
     all_cells = torch.ones_like(view.mask)
     deltas = view.deltas(context.network, context.precision, dense=True)
     aux = view.gaussians(all_cells, deltas)

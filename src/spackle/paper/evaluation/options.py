@@ -178,7 +178,7 @@ class BenchOptions:
             root=self.root,
             methods=TIMED_METHODS,
             disparities=self.disparities,
-            metrics=(),
+            metrics=(),  # a benchmark measures times, not images
             base=self.base,
             residual=self.residual,
             side=self.side,

@@ -238,6 +238,7 @@ def stored_pictures(run: Run, folder: Path, image: str) -> dict[str, Path]:
     """
     # Files are numbered by the image's place in the dataset.
     index = run.images.index(image)
+    # `OTHER_PICTURES` are those that no method made: "truth", "input" and "hole".
     paths = {
         name: picture_file(folder, index, image, name) for name in (*run.methods, *OTHER_PICTURES)
     }
@@ -273,6 +274,7 @@ def ranking_of_run(run: Run) -> Ranking | None:
     for metric in RANKING_METRICS[str(run.config["protocol"])]:
         values = run.mean_by_image(metric, method)
         if values:
+            # Numbers such as the hole area ratio are no image metrics, so `METRICS` lacks their title.
             title = METRICS[metric].title if metric in METRICS else RANKING_TITLES[metric]
             criterion = f"{title} of {describe_method(method).title}"
             return Ranking(best_first(values, metric), criterion, values)

@@ -136,6 +136,7 @@ def make_report(sources: Sequence[tuple[Run, Path]], *, with_unmeasured: bool = 
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     environment.filters["group_widths"] = group_widths
     environment.filters["bold"] = _bold_markup
+    # The template is a file of this package, and has the name of the page that is made from it.
     template_file = resources.files("spackle.paper.evaluation").joinpath(REPORT_FILE)
     template = environment.from_string(template_file.read_text(encoding="utf-8"))
 

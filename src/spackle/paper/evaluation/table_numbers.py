@@ -148,13 +148,14 @@ def _ratio_of_means(values: GroupedValues, method: str, setting: str, ratio: Rat
         values: measured numbers by (method, setting, metric).
         method: the name of the numerator's method.
         setting: a disparity as text, or "near".
-        ratio: which two metrics.
+        ratio: the two metrics, and whether the result is 1 minus their ratio. The denominator is of
+            the same method, unless `ratio` names another one for it.
 
     Returns:
         The ratio; None if a mean is unknown, if the denominator is 0, or if the method would be
         compared with itself.
     """
-    # A method's reduction against itself would be 0, which tells nothing.
+    # A method compared with itself would always have the ratio 1, which tells nothing.
     if method == ratio.denominator_method:
         return None
     denominator_method = ratio.denominator_method or method
@@ -167,7 +168,8 @@ def _ratio_of_means(values: GroupedValues, method: str, setting: str, ratio: Rat
         return None
     quotient = numerator.value / denominator.value
     value = 1 - quotient if ratio.is_reduction else quotient
-    # Views without a number are reported where the two means are shown, not again here.
+    # The table shows how many views lack a number beside each of the two means. It is not repeated
+    # beside their ratio, so `missing` is 0.
     return Mean(value=value, missing=0)
 
 

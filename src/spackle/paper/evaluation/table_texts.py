@@ -32,7 +32,7 @@ def method_row_name(run: Run, method: str, title: str = "") -> str:
         For instance "Spackle‡ (SHARP)". The mark ‡ says that the residual network was not trained
         by the paper's recipe: it had the weights that ship with Spackle, or none.
     """
-    # The base is not a method on top of itself.
+    # The method "base" adds nothing to the base, so naming the base in brackets would repeat it.
     if method == "base":
         return f"{run.base_title} alone"
     description = describe_method(method)
@@ -177,7 +177,8 @@ def _timing_notes(run: Run) -> list[str]:
 
 def _machine_note(run: Run) -> str:
     """The note on a benchmark's machine, and on the number formats of the networks."""
-    # A base notes the number format of its network. None: it has no network.
+    # A base with a network stores the network's number format as a note with each image. None: the
+    # base has no network.
     base_precision = None
     for measurement in run.measurements:
         if measurement.metric == f"{NOTE_PREFIX}precision":

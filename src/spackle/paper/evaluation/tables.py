@@ -407,8 +407,8 @@ def _time_rows(
         settings: disparities (sizes of camera moves), as text.
         means: for each row's name the numbers of all datasets.
     """
-    # The heading stands in the first column. The second, of methods, and those of counts, below
-    # which the times will stand, are empty in its row.
+    # The heading is a row with a text in its first column only. All others are empty: the column of
+    # methods and the columns of counts. In the rows after it, times stand in the columns of counts.
     count_columns = len(layout.columns) * len(settings)
     rows: list[RowTexts] = [("Runtime efficiency", *[NO_NUMBER] * (1 + count_columns))]
 

@@ -52,7 +52,8 @@ def _cases_of_scene(folder: Path) -> list[Case]:
     Raises:
         InputError: the calibration or the disparity map is missing or damaged.
     """
-    # One of the photos may be damaged, so the size is that of any readable one.
+    # The left camera is number 00, the right one 02. All left photos have one size, which is read
+    # from the first photo that is not damaged.
     left_photos = list_files(folder / "camera_00", PHOTO_SUFFIXES)
     size = size_of_photos(left_photos)
     calibration = _read_opencv_calibration(folder / "calib_00-02.xml")

@@ -27,7 +27,7 @@ Array = NDArray[Any]
 
 # The greatest accepted distortion at a photo's corner, as a fraction of the long side. Smaller
 # distortion is ignored, because photos from close viewpoints are distorted alike.
-MAX_DISTORTION = 0.02
+MAX_DISTORTION_RATIO = 0.02
 MAX_REPROJECTION_ERROR_PX = 2.0  # of a point, as mean over photos
 MAX_EXACT_INTEGER = 2**53  # the largest id that float64 holds exactly
 MIN_QUATERNION_NORM = 1e-6
@@ -218,12 +218,12 @@ def _lens_of_record(path: Path, record: CameraRecord) -> Camera:
     )
 
     # Distortion grows outwards, so the corner that is farthest from the principal point decides.
-    # It is given at focal length 1.
+    # Divided by the focal lengths, its distance is in the units of the distortion's formulas.
     corner_x = max(cx, record.width - cx) / fx
     corner_y = max(cy, record.height - cy) / fy
     squared_radius = corner_x**2 + corner_y**2
     shift = _max_distortion_shift(distortion, squared_radius)
-    max_shift_px = MAX_DISTORTION * max(record.width, record.height)
+    max_shift_px = MAX_DISTORTION_RATIO * max(record.width, record.height)
     is_small = shift * max(fx, fy) <= max_shift_px  # false for NaN
     if not is_small:
         raise InputError(

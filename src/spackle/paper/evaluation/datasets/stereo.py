@@ -109,7 +109,8 @@ def pair_of_2014(folder: Path) -> Case:
 
     def read_depth() -> DepthMap:
         """Depth of the left photo, with the intrinsics of the calibration."""
-        # `load_depth` takes the principal point as the file has it, from the middle of a pixel.
+        # The file's principal point counts from the centre of the first pixel, and `load_depth`
+        # keeps it so. `calibration` counts from this pixel's corner, as all cameras here do.
         depth_map = load_depth(disparity_paths[0], calib=calibration_path)
         return replace(depth_map, K=calibration.K)
 
