@@ -256,6 +256,8 @@ def _frame_to_rgb(
     `pixel_aspect` is the width of a stored pixel over its height.
     """
     width, height = _square_pixel_size(frame, pixel_aspect)
+    # The colour matrix, which converts the video's YUV to RGB. Where a file declares none, it is
+    # chosen by the height, as players do.
     matrix = frame.colorspace
     if matrix == UNSPECIFIED_MATRIX:
         matrix = BT709 if frame.height >= HD_ROWS else BT601

@@ -117,11 +117,12 @@ def _trust(hole: Tensor, aux_share: Tensor, weight: Tensor) -> Tensor:
     Args:
         hole: [H, W] bool: pixels that the frame does not show; all others have trust 1.
         aux_share: [H, W] share of a pixel's light that comes from the Gaussians that fill holes.
-        weight: [H, W] share of a pixel's colour that was taken from the previous frame. It is the
-            lower, the less that colour was to be trusted.
+        weight: [H, W] share of a pixel's colour that was taken from the previous frame. The share
+            is the trust in that colour.
     """
-    # A colour in a hole was taken from the previous frame, or the completion made it up. Where the
-    # Gaussians are too faint, their colour cannot be measured, and has no trust.
+    # A colour in a hole was taken from the previous frame, and keeps its trust, or the completion
+    # made it up, and has a fixed trust (0.9). Where the Gaussians are too faint, their colour
+    # cannot be measured, and has no trust.
     trust_in_hole = weight.clamp_min(COMPLETED_TRUST)
     trust_in_hole = torch.where(aux_share < MIN_REMEMBERED_SHARE, 0.0, trust_in_hole)
     return torch.where(hole, trust_in_hole, 1.0)
@@ -175,12 +176,13 @@ def _recall(previous: FrameMemory, uv: Tensor, inverse_depth: Tensor) -> tuple[T
     Args:
         previous: the previous view.
         uv: [H, W, 2] positions (x, y) in its pixels, one for each pixel of this view.
-        inverse_depth: [H, W] of this view: surfaces of the previous one that are nearer hide what
-            is looked for.
+        inverse_depth: [H, W] of the surface that each pixel of this view shows. Where the previous
+            view has a nearer surface at the position, it does not show this one.
 
     Returns:
-        Linear light [H, W, 3] and trust [H, W]. The trust is 0 outside of the previous view, and
-        low where a nearer surface hides the one that is looked for.
+        Linear light [H, W, 3], the weighted mean of the four pixels around the position, and trust
+        [H, W] in 0..1: low where a nearer surface hides the one of this view, 0 outside of the
+        previous view.
     """
     height, width = previous.trust.shape
     corner = (uv - 0.5).floor()  # of the four pixels around, that with the lowest indices
@@ -194,12 +196,21 @@ def _recall(previous: FrameMemory, uv: Tensor, inverse_depth: Tensor) -> tuple[T
             row = (corner[..., 1].long() + dy).clamp(0, height - 1)
             weight_x = fraction[..., 0] if dx == 1 else 1 - fraction[..., 0]
             weight_y = fraction[..., 1] if dy == 1 else 1 - fraction[..., 1]
+
+            # By how much the previous view is nearer, relative to this one. Their depths can be
+            # compared, because those of a clip are aligned, and because the camera moves so little
+            # between two frames that the depth of a surface hardly changes.
             nearer = (previous.inverse_depth[row, column] / inverse_depth - 1).clamp_min(0)
-            is_same_surface = torch.exp(-((nearer / NEARER_SURFACE_RATIO) ** 2))
-            weight = weight_x * weight_y * is_same_surface * (previous.trust[row, column] > 0)
+            # From 1 for the same surface down to 0 for one that is clearly nearer.
+            same_surface_weight = torch.exp(-((nearer / NEARER_SURFACE_RATIO) ** 2))
+            has_trust = previous.trust[row, column] > 0
+            weight = weight_x * weight_y * same_surface_weight * has_trust
             light += weight[..., None] * previous.light[row, column]
             trust += weight * previous.trust[row, column]
             weight_sum += weight
+
+    # The light is divided by the sum of weights, so that hidden pixels do not darken it. The trust
+    # is not: without hidden pixels the weights add up to 1, and what is missing lowers the trust.
     mean_light = light / weight_sum.clamp_min(1e-6)[..., None]
     return mean_light, torch.where(inside(uv, height, width), trust, 0.0)
 
@@ -232,7 +243,8 @@ def _change_of_new_pixels(
     The spread change falls to 0 at the hole's rim, and is 0 at all pixels that are not new.
 
     Args:
-        change: [H, W, 3] of linear light, from the completed to the previous view's colour.
+        change: [H, W, 3] the previous view's linear light minus that of this view, as it was
+            completed without earlier frames.
         hole: [H, W] bool: pixels that the base does not cover.
         weight: [H, W] of the previous view's colour; where it is over ½, a pixel is propagated.
         inverse_depth: [H, W] of the view.
@@ -241,6 +253,10 @@ def _change_of_new_pixels(
     known = ~hole | is_propagated
     if not bool(is_propagated.any()) or bool(known.all()):
         return torch.zeros_like(change)
+
+    # The change is known at propagated pixels, and is 0 outside of the hole. Between them it is
+    # interpolated smoothly. `far_bias` is 0, because a change of colour belongs to neither surface
+    # at the rim, so that near and far pixels count alike.
     known_change = torch.where(is_propagated[..., None], change, 0.0).permute(2, 0, 1)
     _, spread = fill_from_far_side(inverse_depth, known_change, known, far_bias=0.0)
     return torch.where(known[..., None], 0.0, spread.permute(1, 2, 0))

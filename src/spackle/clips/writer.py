@@ -46,11 +46,11 @@ class _ClipEncoder(StreamEncoder):
 
     def __init__(self, path: Path, width: int, height: int, clip: Clip) -> None:
         """Open the file at `path` for frames of this size in pixels, and the clip for its sound."""
-        # The encoder gets evenly spaced frames, at this rate. Their packets then get the times of
-        # the clip, which may be uneven.
+        # The encoder gets evenly spaced frames, at the mean frame rate of the clip. Their packets
+        # then get the times of the clip, which may be uneven.
         rate = clip.rate.limit_denominator(MAX_RATE_DENOMINATOR)
-        self._even_rate = min(max(rate, MIN_FRAME_RATE), MAX_FRAME_RATE)
-        super().__init__(H264, path, width, height, self._even_rate, play_count=1)
+        self._encoder_rate = min(max(rate, MIN_FRAME_RATE), MAX_FRAME_RATE)
+        super().__init__(H264, path, width, height, self._encoder_rate, play_count=1)
         self._clip = clip
         self.sound_was_copied = False
 
@@ -83,29 +83,31 @@ class _ClipEncoder(StreamEncoder):
             assert packet.time_base is not None
             assert packet.pts is not None
             assert packet.dts is not None
-            # The encoder's times are evenly spaced, so that they tell the number of the frame. A
-            # packet has one when it is shown (pts) and one when it is decoded (dts).
-            shown_frame = round(packet.pts * packet.time_base * self._even_rate)
-            decoded_frame = round(packet.dts * packet.time_base * self._even_rate)
+            # A packet has the time at which its frame is shown (pts), and the time at which it is
+            # decoded (dts), which can be earlier. The encoder's times are evenly spaced, so that
+            # each of them tells the number of a frame, and is replaced by that frame's time.
+            shown_frame = round(packet.pts * packet.time_base * self._encoder_rate)
+            decoded_frame = round(packet.dts * packet.time_base * self._encoder_rate)
             decoding_time = self._frame_time(decoded_frame)
             packet.time_base = TIME_UNIT
             packet.pts = round(self._frame_time(shown_frame) / TIME_UNIT)
             packet.dts = round(decoding_time / TIME_UNIT)
-            packet.duration = 0  # until the next frame
+            packet.duration = 0  # means: until the next frame is shown
             self._copy_sound(decoding_time)
             self.container.mux(packet)
 
     def _frame_time(self, index: int) -> Fraction:
-        """The time of a frame in seconds.
+        """The time in seconds of the frame with this number, from the clip's own times.
 
-        Before the first and after the last frame, times follow the mean rate: packets are decoded
-        some frames before they are shown, so that the index of the first ones may be negative.
+        The number may lie beyond the clip's frames: a packet may be decoded some frames before its
+        frame is shown, so that the first packet is decoded at a frame such as -2. Beyond both ends,
+        times go on at the encoder's frame rate.
         """
         times = self._clip.times
         if index < 0:
-            return times[0] + index / self._even_rate
+            return times[0] + index / self._encoder_rate
         if index >= len(times):
-            return times[-1] + (index - len(times) + 1) / self._even_rate
+            return times[-1] + (index - len(times) + 1) / self._encoder_rate
         return times[index]
 
     def _copy_sound(self, until: Fraction) -> None:
@@ -118,19 +120,20 @@ class _ClipEncoder(StreamEncoder):
             if packet is None or packet.pts is None or packet.time_base is None:
                 return
 
-            # Times count from the first frame.
-            start_ticks = round(self._clip.start / packet.time_base)
-            begin_ticks = packet.pts - start_ticks
-            end_ticks = begin_ticks + (packet.duration or 0)
-            if begin_ticks * packet.time_base >= until:
+            # A packet's time is in ticks of its stream. From now on, it counts from the first
+            # frame of the video.
+            clip_start_ticks = round(self._clip.start / packet.time_base)
+            sound_start_ticks = packet.pts - clip_start_ticks
+            sound_end_ticks = sound_start_ticks + (packet.duration or 0)
+            if sound_start_ticks * packet.time_base >= until:
                 self._pending_sound = packet
                 return
             self._pending_sound = None
-            if end_ticks <= 0:  # before the first frame
+            if sound_end_ticks <= 0:  # before the first frame
                 continue
-            packet.pts = begin_ticks
+            packet.pts = sound_start_ticks
             if packet.dts is not None:
-                packet.dts -= start_ticks
+                packet.dts -= clip_start_ticks
             packet.stream = self._sound_stream
             self.container.mux(packet)
             self.sound_was_copied = True

@@ -294,28 +294,34 @@ def _interpolate_guess(
     rows, columns, channels = coarse_values.shape
     for n in range(len(hole_pixels)):
         y, x = hole_pixels[n] // width, hole_pixels[n] % width
-        # Bilinear weights. A fine pixel's centre lies a quarter of a coarse pixel beside the centre
-        # of the coarse pixel that covers it, so that one has the weight 0.75. Of two rows it is the
-        # lower one if y is even, and of two columns the right one if x is even.
+        # A fine pixel lies between two coarse rows and two coarse columns. The coarse pixel that
+        # covers it is a quarter of a coarse pixel away from it, the other one three quarters, so
+        # that the weights are 0.75 and 0.25. The covering pixel is in the lower row if y is even,
+        # and in the right column if x is even.
         upper_row, left_column = (y - 1) // 2, (x - 1) // 2
-        down = np.float32(0.75) if y % 2 == 0 else np.float32(0.25)  # weight of the lower row
-        across = np.float32(0.75) if x % 2 == 0 else np.float32(0.25)  # of the right column
+        lower_weight = np.float32(0.75) if y % 2 == 0 else np.float32(0.25)
+        right_weight = np.float32(0.75) if x % 2 == 0 else np.float32(0.25)
         top, bottom = max(upper_row, 0), min(upper_row + 1, rows - 1)
         left, right = max(left_column, 0), min(left_column + 1, columns - 1)
 
-        upper = coarse_depths[top, left] * (1 - across) + coarse_depths[top, right] * across
-        lower = coarse_depths[bottom, left] * (1 - across) + coarse_depths[bottom, right] * across
-        samples[n, 0] = upper * (1 - down) + lower * down
+        upper = (
+            coarse_depths[top, left] * (1 - right_weight) + coarse_depths[top, right] * right_weight
+        )
+        lower = (
+            coarse_depths[bottom, left] * (1 - right_weight)
+            + coarse_depths[bottom, right] * right_weight
+        )
+        samples[n, 0] = upper * (1 - lower_weight) + lower * lower_weight
         for channel in range(channels):
             upper = (
-                coarse_values[top, left, channel] * (1 - across)
-                + coarse_values[top, right, channel] * across
+                coarse_values[top, left, channel] * (1 - right_weight)
+                + coarse_values[top, right, channel] * right_weight
             )
             lower = (
-                coarse_values[bottom, left, channel] * (1 - across)
-                + coarse_values[bottom, right, channel] * across
+                coarse_values[bottom, left, channel] * (1 - right_weight)
+                + coarse_values[bottom, right, channel] * right_weight
             )
-            samples[n, 1 + channel] = upper * (1 - down) + lower * down
+            samples[n, 1 + channel] = upper * (1 - lower_weight) + lower * lower_weight
 
 
 @kernel

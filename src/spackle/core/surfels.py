@@ -70,11 +70,14 @@ def make_surfels(
 
     # A circle of `spread` pixels in the image is an ellipse on the surface, which is the Gaussian.
     if isinstance(spread, Tensor):
-        spreads = spread.to(uv)[..., None].flatten(1)  # [N, 1], or [N, 2] along x and y
+        spreads = spread.to(uv)
+        if spreads.ndim == 1:
+            spreads = spreads[:, None]  # [N, 1]: the same along x and y
     else:
         spreads = uv.new_full((1, 1), spread)
+    # The first column is for x, the last one for y. With a single column, both are the same.
     spread_x = spreads[:, :1]
-    spread_y = spreads[:, -1:]  # the same column as for x if there is only one
+    spread_y = spreads[:, -1:]
     rotation, scales = _ellipse_axes(move_along_x * spread_x, move_along_y * spread_y)
     thickness = SURFEL_THICKNESS_RATIO * scales.amin(dim=-1, keepdim=True)
     scales = torch.cat([scales, thickness], dim=-1)  # [N, 3]

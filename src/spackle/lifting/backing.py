@@ -57,14 +57,15 @@ def backing_surfels(
         return []
     surface = _cell_surface(deepest, cell_depths)
 
-    # Which cells have a backing. First those with pixels of the far side, then all others.
+    # Which cells have a backing: of the cells with pixels of the far side, those without pixels of
+    # the near side; of all other cells, those in which no pixel shows a little of the far surface.
     has_near = _cells(pixels.beside_step & pixels.near_is_main).any(-1)  # [h, w]
     has_far = _cells(pixels.beside_step & ~pixels.near_is_main).any(-1)
     has_hidden_far = _cells(hidden_far).any(-1)
     backed = torch.where(has_far, ~has_near, ~has_hidden_far)
 
-    # Away from steps, cells may share a Gaussian. Only a small share of its light passes the front,
-    # so that lost detail counts less, and a Gaussian must save more of it.
+    # Away from steps, cells may share a Gaussian. Only 2 % of its light passes the front, so that
+    # lost detail is less visible. So one more Gaussian must save 50 times as much of it.
     may_share = without_border(backed & ~_cells(pixels.beside_step).any(-1))
     picture = linear_to_srgb(surface.color)
     slope_by_cell = CELL_PX * surface.slope

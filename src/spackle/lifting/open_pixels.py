@@ -54,8 +54,8 @@ def assign_open_pixels(resampled: ResampledMap, rgb: Floats) -> Floats:
         if state == HOLE:
             # A hole has no smeared depths, so that only colours count.
             edge_height = np.full_like(edge_height, np.inf)
-            # The inverse depth of a hole's far side. (The second argument is for images that are
-            # filled with it, of which there are none here.)
+            # The inverse depth of a hole's far side. The function also fills other images, its
+            # second argument; here there are none, so that it gets the depth again.
             far_side, _ = fill_from_far_side(
                 torch.from_numpy(inverse_depth),
                 torch.from_numpy(inverse_depth[None]),

@@ -297,7 +297,9 @@ def _tile_loss(row: int, column: int, height: int, width: int, means: Any, pictu
     rows, columns, channels = means.shape
     total = np.float32(0)
     for y in range(height):
-        # The pixel lies between this tile's centre and that of a neighbour; v is the share.
+        # The pixel's row lies between the centre of this tile and that of the next tile below or
+        # above. v is the distance from this tile's centre in tile heights, and so the share of the
+        # other tile in the interpolation; u and the columns are the same along x.
         v = (y + np.float32(0.5)) / height - np.float32(0.5)
         other_row = min(max(row + (1 if v > 0 else -1), 0), rows - 1)
         v = abs(v)

@@ -55,18 +55,18 @@ def resample_map(
         height, width: of the photo.
     """
     # The depth of a pixel in a smeared edge belongs to no surface.
-    sound = known & (edges.smear_height == 0)
-    slope_x = _flattest_slopes(inverse_depth, sound, edges.right)
+    on_one_surface = known & (edges.smear_height == 0)
+    slope_x = _flattest_slopes(inverse_depth, on_one_surface, edges.right)
     slope_y = _flattest_slopes(
         np.ascontiguousarray(inverse_depth.T),
-        np.ascontiguousarray(sound.T),
+        np.ascontiguousarray(on_one_surface.T),
         np.ascontiguousarray(edges.below.T),
     )
     slope_y = np.ascontiguousarray(slope_y.T)
     rows, columns = inverse_depth.shape
 
     if (rows, columns) == (height, width):
-        state = np.where(known, np.where(sound, SETTLED, OPEN), HOLE).astype(np.uint8)
+        state = np.where(known, np.where(on_one_surface, SETTLED, OPEN), HOLE).astype(np.uint8)
         return ResampledMap(inverse_depth, state, edges.smear_height, (slope_x, slope_y))
 
     values, state, edge_height = _resample(
@@ -91,7 +91,7 @@ def resample_map(
 
 
 @kernel
-def _flattest_slopes(inverse_depth: Any, sound: Any, edge_right: Any) -> Any:
+def _flattest_slopes(inverse_depth: Any, on_one_surface: Any, edge_right: Any) -> Any:
     """[h, w]: the flattest slope near each pixel in its row, in inverse depth a pixel.
 
     Right beside a smeared edge the slope is too steep, because the smear reaches further than the
@@ -99,7 +99,7 @@ def _flattest_slopes(inverse_depth: Any, sound: Any, edge_right: Any) -> Any:
 
     Args:
         inverse_depth: [h, w] float32.
-        sound: [h, w] bool: pixels with a depth outside of smeared edges.
+        on_one_surface: [h, w] bool: pixels with a depth outside of smeared edges.
         edge_right: [h, w] bool: an edge runs between a pixel and its right neighbour.
     """
     height, width = inverse_depth.shape
@@ -113,7 +113,7 @@ def _flattest_slopes(inverse_depth: Any, sound: Any, edge_right: Any) -> Any:
                     left = x + n if direction > 0 else x - n - 1
                     if left < 0 or left + 1 >= width or edge_right[y, left]:
                         break
-                    if not (sound[y, left] and sound[y, left + 1]):
+                    if not (on_one_surface[y, left] and on_one_surface[y, left + 1]):
                         break
                     change = inverse_depth[y, left + 1] - inverse_depth[y, left]
                     if abs(change) < abs(flattest):
@@ -221,7 +221,9 @@ def _resample_pixel(
     mixed_sum = 0.0
     plane_sum = 0.0
     weight_sum = 0.0  # of all four
-    covered_depth = np.float32(0)  # of the closest sound map pixel, extended to this one
+    covered_depth = np.float32(
+        0
+    )  # of the closest map pixel outside of smeared edges, extended to this one
     covered_distance = np.inf  # of that map pixel, in pixels of the photo
     for k in range(4):
         r = y1 if k >= 2 else y0

@@ -101,8 +101,8 @@ def layered_gaussians(
         ]
     )
 
-    # Beside a step and at the border, colours stay as they are. There, a correction would make up
-    # for the light of Gaussians around, and be a visible ghost once the camera moves.
+    # Pixels that touch a step (`ring` 1) or the border keep their colours. There, a correction would
+    # make up for the light of Gaussians around, and be a visible ghost once the camera moves.
     correctable = without_border(ring != 1)[single]
     samples = _correct_colors(samples, colors, single, correctable, tiles)
     return make_surfels(camera, *samples)
@@ -160,7 +160,8 @@ def _correct_colors(
 ) -> SurfelSamples:
     """Correct the colours of single pixels and tiles until all samples blend to the photo.
 
-    A sample is a Gaussian, given in the photo. A tile is a rectangle of pixels that share one.
+    A sample describes one Gaussian by its position and size in the photo, its depth and its colour.
+    A tile is a rectangle of pixels that share one sample.
 
     Args:
         samples: first those of single pixels, then those of tiles, then all others.

@@ -26,17 +26,17 @@ from spackle.render.protocol import ALPHA_MIN, TILE_PX
 from spackle.render.tile_lists import TileLists
 from spackle.runtime.kernels import ONE, ZERO, Array, kernel, reordering_kernel
 
-# Number of sums over a tile's pixels for one Gaussian. With u = x - centre, dy = y - centre, and
-# v = ∂L/∂ln(alpha), they are the sums of v, v·u, v·u², v·dy, v·dy², v·u·dy, then the gradients of
-# red, green, blue and depth.
+# Number of sums over a tile's pixels for one Gaussian. With the offset (dx, dy) from the centre,
+# u = dx - slope·dy and v = ∂L/∂ln(alpha), they are the sums of v, v·u, v·u², v·dy, v·dy², v·u·dy,
+# then the gradients of red, green, blue and depth.
 SUMS = 10
 
-# The workspace of a tile is a flat buffer of planes with pixels in row order: the transmittance,
+# The images of a tile are planes of one flat buffer, with pixels in row order: the transmittance,
 # the contribution of all Gaussians behind the current one to the loss, and the gradients of red,
 # green, blue, depth and alpha.
 BEHIND_PLANE = 1 * PLANE_FLOATS
 GRADIENT_PLANES = 2 * PLANE_FLOATS
-WORKSPACE_FLOATS = 7 * PLANE_FLOATS
+ALL_PLANES_FLOATS = 7 * PLANE_FLOATS
 
 # While Gaussians are drawn again, a note is taken for each row of pixels: 16 alphas, then 16
 # transmittances. The notes of a chunk fit into the second-level cache.
@@ -66,10 +66,14 @@ def backward_tiles(
         rows_before: [T + 1] int64: where each tile's rows start in `sums`.
         sums: [M, 10] float32, zero at first: one row for each entry with `entry_needs`.
     """
-    work = np.empty(WORKSPACE_FLOATS, np.float32)
+    # Buffers for one tile, which are overwritten for the next one. First seven images of the tile,
+    # 256 floats each: transmittance, contribution of what lies behind, and five gradients.
+    planes = np.empty(ALL_PLANES_FLOATS, np.float32)
+    # Then the alphas and transmittances of a chunk of Gaussians, and the place in `notes` where
+    # those of each Gaussian start.
     notes = np.empty(NOTES_FLOATS, np.float32)
-    first_notes = np.empty(CHUNK_GAUSSIANS, np.uint64)
-    buffers = (work, notes, first_notes)
+    note_starts = np.empty(CHUNK_GAUSSIANS, np.uint64)
+    buffers = (planes, notes, note_starts)
     _, depth, _, _ = images
     columns = (depth.shape[1] + TILE_PX - 1) // TILE_PX  # of tiles
     for k in range(first, last):
@@ -77,8 +81,9 @@ def backward_tiles(
         left = (tile % columns) * TILE_PX
         top = (tile // columns) * TILE_PX
 
-        # First the gradients of the tile's pixels, then those of its Gaussians.
-        load_gradients(work, left, top, images, gradients)
+        # First the gradients of the tile's pixels are written to `planes`. From them, the second
+        # step computes the sums of the tile's Gaussians.
+        load_gradients(planes, left, top, images, gradients)
         entries = slice(lists.starts[tile], lists.starts[tile + 1])
         tile_sums = sums[rows_before[tile] : rows_before[tile + 1]]
         backward_tile(
@@ -87,15 +92,15 @@ def backward_tiles(
 
 
 @kernel
-def load_gradients(work: Array, left: int, top: int, images: Arrays, gradients: Arrays) -> None:
+def load_gradients(planes: Array, left: int, top: int, images: Arrays, gradients: Arrays) -> None:
     """Turn gradients of a tile's images into gradients of its blended sums, the last five planes.
 
     Blending sums weighted linear colours, depths and alphas; the images have sRGB, and depth
     divided by alpha. Pixels outside of the image get zeros.
 
     Args:
-        work: the tile's workspace, seven planes of 256 floats. The last five are written: the
-            gradients of red, green, blue, depth and alpha.
+        planes: seven images of the tile, 256 floats each, one after the other. The last five are
+            written: the gradients of red, green, blue, depth and alpha.
         left, top: the tile's first pixel in the image.
         images: rgb [H, W, 3], depth [H, W], alpha [H, W], linear colour [H, W, 3].
         gradients: of rgb, depth and alpha.
@@ -103,7 +108,7 @@ def load_gradients(work: Array, left: int, top: int, images: Arrays, gradients: 
     rgb, depth, alpha, linear = images
     rgb_grad, depth_grad, alpha_grad = gradients
     for i in range(GRADIENT_PLANES, GRADIENT_PLANES + 5 * PLANE_FLOATS):
-        work[i] = ZERO
+        planes[i] = ZERO
 
     for row in range(min(TILE_PX, depth.shape[0] - top)):
         for column in range(min(TILE_PX, depth.shape[1] - left)):
@@ -112,13 +117,13 @@ def load_gradients(work: Array, left: int, top: int, images: Arrays, gradients: 
             x = left + column
             for channel in range(3):
                 slope = srgb_slope(linear[y, x, channel], rgb[y, x, channel])
-                work[i + channel * PLANE_FLOATS] = rgb_grad[y, x, channel] * slope
-            work[i + 4 * PLANE_FLOATS] = alpha_grad[y, x]
+                planes[i + channel * PLANE_FLOATS] = rgb_grad[y, x, channel] * slope
+            planes[i + 4 * PLANE_FLOATS] = alpha_grad[y, x]
             # depth = sum / alpha, so that alpha changes it, too.
             if alpha[y, x] > ZERO:
                 depth_sum_grad = depth_grad[y, x] / alpha[y, x]
-                work[i + 3 * PLANE_FLOATS] = depth_sum_grad
-                work[i + 4 * PLANE_FLOATS] -= depth_sum_grad * depth[y, x]
+                planes[i + 3 * PLANE_FLOATS] = depth_sum_grad
+                planes[i + 4 * PLANE_FLOATS] -= depth_sum_grad * depth[y, x]
 
 
 @kernel
@@ -137,35 +142,39 @@ def backward_tile(
     notes of all alphas, and the Gaussians of each chunk are then visited back to front.
 
     Args:
-        buffers: (work, notes, first_notes) for one tile. Its workspace has seven planes of 256
-            floats: transmittance, contribution of what lies behind, gradients of red, green, blue,
-            depth and alpha, which are filled in. Then follow space for the notes, and [128] for the
-            place where each Gaussian's notes start.
+        buffers: (planes, notes, note_starts). `planes` are seven images of the tile, 256 floats
+            each: transmittance, contribution of what lies behind, and the gradients of red, green,
+            blue, depth and alpha. These five are an input; everything else is overwritten here.
+            `notes` is space for alphas and transmittances of one chunk, and `note_starts` [128] for
+            the place in it where each Gaussian's notes start.
         records: [N, 12] float32: centre, ellipse, opacity, depth and colour of each Gaussian.
         ids: [n] indices of the tile's Gaussians, front to back.
         entry_needs: [n] bool: those whose sums are wanted.
         left, top: the tile's first pixel in the image.
         sums: [m, 10] float32, zero at first: one row for each of these.
     """
-    work, notes, first_notes = buffers
+    planes, notes, note_starts = buffers
     chunks = (len(ids) + CHUNK_GAUSSIANS - 1) // CHUNK_GAUSSIANS
 
-    # Front to back: note the transmittance in front of each chunk.
+    # Front to back: draw all chunks but the last one, to know the transmittance in front of each.
+    # At first it is 1. The notes of this round are overwritten, as there is space for one chunk.
     chunk_transmittance = np.empty((chunks, PLANE_FLOATS), np.float32)
-    work[:PLANE_FLOATS] = ONE
-    work[BEHIND_PLANE : BEHIND_PLANE + PLANE_FLOATS] = ZERO
+    planes[:PLANE_FLOATS] = ONE
+    planes[BEHIND_PLANE : BEHIND_PLANE + PLANE_FLOATS] = ZERO  # nothing is behind the last one
     for chunk in range(chunks):
-        chunk_transmittance[chunk] = work[:PLANE_FLOATS]
+        chunk_transmittance[chunk] = planes[:PLANE_FLOATS]
         if chunk < chunks - 1:
             part = ids[chunk * CHUNK_GAUSSIANS : (chunk + 1) * CHUNK_GAUSSIANS]
-            redraw_chunk(work, notes, records, part, left, top, first_notes)
+            redraw_chunk(planes, notes, records, part, left, top, note_starts)
 
-    # Back to front: draw a chunk again with notes, and step back over its Gaussians.
+    # Back to front: draw each chunk once more, which writes its `notes`, and then visit its
+    # Gaussians from the last to the first, which reads them. `row` is the row of `sums` of the
+    # Gaussian that was visited last among those that need sums.
     row = len(sums)
     for chunk in range(chunks - 1, -1, -1):
-        work[:PLANE_FLOATS] = chunk_transmittance[chunk]
+        planes[:PLANE_FLOATS] = chunk_transmittance[chunk]
         part = ids[chunk * CHUNK_GAUSSIANS : (chunk + 1) * CHUNK_GAUSSIANS]
-        drawn = redraw_chunk(work, notes, records, part, left, top, first_notes)
+        drawn = redraw_chunk(planes, notes, records, part, left, top, note_starts)
         for k in range(len(part) - 1, -1, -1):
             if row == 0:  # no Gaussian further in front needs sums
                 return
@@ -177,12 +186,12 @@ def backward_tile(
                 # Without need, no sums are written, and any row will do.
                 own_sums = sums[row if need else 0]
                 record = records[part[k]]
-                step_back(work, notes, first_notes[k], record, left, top, need, own_sums)
+                step_back(planes, notes, note_starts[k], record, left, top, need, own_sums)
 
 
 @kernel
 def redraw_chunk(
-    work: Array, notes: Array, records: Array, ids: Array, left: int, top: int, first_notes: Array
+    planes: Array, notes: Array, records: Array, ids: Array, left: int, top: int, note_starts: Array
 ) -> int:
     """Draw up to 128 Gaussians of a tile again, noting alpha and transmittance of each pixel.
 
@@ -190,97 +199,104 @@ def redraw_chunk(
     to be drawn gets no note.
 
     Args:
-        work: the tile's workspace; its first plane, the transmittance, is changed.
+        planes: the tile's flat buffer, whose first 256 floats, the transmittances in front of the
+            chunk, become those behind it.
         notes: written here: for each row of each Gaussian 16 alphas, then 16 transmittances.
         records: [N, 12] float32: centre, ellipse, opacity, depth and colour of each Gaussian.
         ids: [n] indices of the Gaussians to draw, front to back.
         left, top: the tile's first pixel in the image.
-        first_notes: [128]: where each Gaussian's notes start, written here.
+        note_starts: [128]: where each Gaussian's notes start in `notes`, written here.
 
     Returns:
         The number of Gaussians that were drawn until the tile was full.
     """
-    note_begin = np.uint64(0)
+    note_start = np.uint64(0)
     for k in range(len(ids)):
-        first_notes[k] = note_begin
+        note_starts[k] = note_start
         x, y, slope, across, fall, peak, _, half_height, _, _, _, _ = in_tile(
             records[ids[k]], left, top
         )
+        # At the offset (dx, dy) from the centre, log2 of alpha is
+        # peak - fall·dy² - across·(dx - slope·dy)². In a row it is a parabola around x + slope·dy.
         first, last = touched_pixels(y, half_height)
         for row in range(first, last):
             dy = np.float32(row) - y
             row_peak = peak - fall * dy * dy
             if row_peak < INVISIBLE_LOG2_ALPHA:
                 continue
-            bell = (across, x + slope * dy)
-            redraw_row(work, np.uint64(row * TILE_PX), notes, note_begin, row_peak, bell)
-            note_begin += np.uint64(NOTE_FLOATS)
-        if k % GAUSSIANS_PER_CHECK == GAUSSIANS_PER_CHECK - 1 and is_full(work):
+            parabola = (across, x + slope * dy)  # its rate and its centre
+            redraw_row(planes, np.uint64(row * TILE_PX), notes, note_start, row_peak, parabola)
+            note_start += np.uint64(NOTE_FLOATS)
+        if k % GAUSSIANS_PER_CHECK == GAUSSIANS_PER_CHECK - 1 and is_full(planes):
             return k + 1
     return len(ids)
 
 
 @kernel
 def redraw_row(
-    work: Array,
+    planes: Array,
     offset: np.uint64,
     notes: Array,
-    note_begin: np.uint64,
+    note_start: np.uint64,
     peak: np.float32,
-    bell: Numbers,
+    parabola: Numbers,
 ) -> None:
     """Draw a row of 16 pixels of a Gaussian again, and note alphas and transmittances.
 
     The forward pass keeps neither; the backward pass needs them in reverse order.
 
     Args:
-        work: the tile's workspace; its first plane, the transmittance, is changed.
-        offset: where the row starts in a plane.
-        notes: at `note_begin`, 16 alphas (0 where nothing is drawn) and 16 transmittances are
+        planes: the tile's flat buffer, whose first 256 floats are the transmittances; those of the
+            row are changed.
+        offset: where the row starts in a plane of 256 floats.
+        notes: at `note_start`, 16 alphas (0 where nothing is drawn) and 16 transmittances are
             written.
-        note_begin: where the row's note starts.
+        note_start: where the row's note starts.
         peak: largest log2 of alpha in the row.
-        bell: (rate, centre): log2 of alpha is peak - rate·(x - centre)².
+        parabola: (rate, centre): log2 of alpha at pixel x is peak - rate·(x - centre)².
     """
-    rate, center = bell
+    rate, center = parabola
     for x in range(TILE_PX):
         i = offset + np.uint64(x)
-        n = note_begin + np.uint64(x)
+        n = note_start + np.uint64(x)
         distance = np.float32(x) - center
         alpha = alpha_from_log2(peak - rate * distance * distance)
-        transmittance = work[i]
+        transmittance = planes[i]
         after = transmittance * (ONE - alpha)
         full = after <= TRANSMITTANCE_STOP_F32
-        work[i] = ZERO if full else after
+        planes[i] = ZERO if full else after
         notes[n] = ZERO if full else alpha
         notes[n + np.uint64(TILE_PX)] = transmittance
 
 
 @kernel
 def step_back(
-    work: Array,
+    planes: Array,
     notes: Array,
-    note_begin: np.uint64,
+    note_start: np.uint64,
     record: Array,
     left: int,
     top: int,
     need: bool,
     sums: Array,
 ) -> None:
-    """Step back over a Gaussian: add its light to that behind the next one, and sum its gradients.
+    """Step back over a Gaussian: add it to what lies behind, and sum its gradients if needed.
+
+    The Gaussians of a tile are visited back to front, and this one lies behind the next one.
 
     Args:
-        work: the tile's workspace, seven planes of 256 floats: transmittance, contribution of what
-            lies behind (changed here), gradients of red, green, blue, depth and alpha.
-        notes: of the chunk, as `redraw_chunk` writes them.
-        note_begin: where this Gaussian's notes start.
+        planes: seven images of the tile, 256 floats each: transmittance, contribution of what lies
+            behind (changed here), gradients of red, green, blue, depth and alpha.
+        notes: alphas and transmittances: 16 of each for each row in which a Gaussian is drawn.
+        note_start: where this Gaussian's notes start in `notes`.
         record: [12] the Gaussian's centre, ellipse, opacity, depth and colour.
         left, top: the tile's first pixel in the image.
         need: whether the sums are wanted.
         sums: [10]: the Gaussian's sums, to which those of this tile are added if `need`. With
-            u = x - centre, dy = y - centre and v = ∂L/∂ln(alpha): of v, v·u, v·u², v·dy, v·dy²,
-            v·u·dy; then the gradients of red, green, blue and depth.
+            dx and dy the offset from the centre, u = dx - slope·dy, and v = ∂L/∂ln(alpha): of v,
+            v·u, v·u², v·dy, v·dy², v·u·dy; then the gradients of red, green, blue and depth.
     """
+    # At the offset (dx, dy) from the centre, log2 of alpha is peak - fall·dy² - across·u².
     x, y, slope, _, fall, peak, _, half_height, depth, red, green, blue = in_tile(record, left, top)
     color_and_depth = (red, green, blue, depth)
     first, last = touched_pixels(y, half_height)
@@ -292,7 +308,7 @@ def step_back(
         offset = np.uint64(row * TILE_PX)
         if need:
             v, vu, vuu, red_grad, green_grad, blue_grad, depth_grad = step_back_and_sum_row(
-                work, offset, notes, note_begin, x + slope * dy, color_and_depth
+                planes, offset, notes, note_start, x + slope * dy, color_and_depth
             )
             sums[0] += v
             sums[1] += vu
@@ -305,13 +321,13 @@ def step_back(
             sums[8] += blue_grad
             sums[9] += depth_grad
         else:
-            step_back_row(work, offset, notes, note_begin, color_and_depth)
-        note_begin += np.uint64(NOTE_FLOATS)
+            step_back_row(planes, offset, notes, note_start, color_and_depth)
+        note_start += np.uint64(NOTE_FLOATS)
 
 
 @kernel
 def step_back_row(
-    work: Array, offset: np.uint64, notes: Array, note_begin: np.uint64, color_and_depth: Numbers
+    planes: Array, offset: np.uint64, notes: Array, note_start: np.uint64, color_and_depth: Numbers
 ) -> None:
     """Step back over a row of a Gaussian whose own gradient nobody needs.
 
@@ -320,47 +336,48 @@ def step_back_row(
     blue, depth and 1 (for alpha), each multiplied by its gradient.
 
     Args:
-        work: the tile's workspace, seven planes of 256 floats: transmittance, contribution of what
-            lies behind (changed here), gradients of red, green, blue, depth and alpha.
+        planes: seven images of the tile, 256 floats each: transmittance, contribution of what lies
+            behind (changed here), gradients of red, green, blue, depth and alpha.
         offset: where the row starts in a plane.
-        notes: alphas and transmittances of the row, from `note_begin` on.
-        note_begin: where the row's note starts.
+        notes: alphas and transmittances of the row, from `note_start` on.
+        note_start: where the row's note starts.
         color_and_depth: the Gaussian's red, green, blue and depth.
     """
     red, green, blue, depth = color_and_depth
     for x in range(TILE_PX):
         i = offset + np.uint64(x)
-        n = note_begin + np.uint64(x)
+        n = note_start + np.uint64(x)
         g = i + np.uint64(GRADIENT_PLANES)
         # What one unit of this Gaussian's weight adds to the loss.
         value = (
-            red * work[g]
-            + green * work[g + np.uint64(PLANE_FLOATS)]
-            + blue * work[g + np.uint64(2 * PLANE_FLOATS)]
+            red * planes[g]
+            + green * planes[g + np.uint64(PLANE_FLOATS)]
+            + blue * planes[g + np.uint64(2 * PLANE_FLOATS)]
         )
         value += (
-            depth * work[g + np.uint64(3 * PLANE_FLOATS)] + work[g + np.uint64(4 * PLANE_FLOATS)]
+            depth * planes[g + np.uint64(3 * PLANE_FLOATS)]
+            + planes[g + np.uint64(4 * PLANE_FLOATS)]
         )
-        work[i + np.uint64(BEHIND_PLANE)] += notes[n] * notes[n + np.uint64(TILE_PX)] * value
+        planes[i + np.uint64(BEHIND_PLANE)] += notes[n] * notes[n + np.uint64(TILE_PX)] * value
 
 
 @reordering_kernel
 def step_back_and_sum_row(
-    work: Array,
+    planes: Array,
     offset: np.uint64,
     notes: Array,
-    note_begin: np.uint64,
+    note_start: np.uint64,
     center: np.float32,
     color_and_depth: Numbers,
 ) -> tuple[np.float32, np.float32, np.float32, np.float32, np.float32, np.float32, np.float32]:
     """Step back over a row of 16 pixels of a Gaussian, and sum its gradients over them.
 
     Args:
-        work: the tile's workspace, seven planes of 256 floats: transmittance, contribution of what
-            lies behind (changed here), gradients of red, green, blue, depth and alpha.
+        planes: seven images of the tile, 256 floats each: transmittance, contribution of what lies
+            behind (changed here), gradients of red, green, blue, depth and alpha.
         offset: where the row starts in a plane.
-        notes: alphas and transmittances of the row, from `note_begin` on.
-        note_begin: where the row's note starts.
+        notes: alphas and transmittances of the row, from `note_start` on.
+        note_start: where the row's note starts.
         center: the Gaussian's middle in this row, in pixels of the tile.
         color_and_depth: its red, green, blue and depth.
 
@@ -378,22 +395,22 @@ def step_back_and_sum_row(
     sum_depth = ZERO
     for x in range(TILE_PX):
         i = offset + np.uint64(x)
-        n = note_begin + np.uint64(x)
+        n = note_start + np.uint64(x)
         g = i + np.uint64(GRADIENT_PLANES)
-        red_grad = work[g]
-        green_grad = work[g + np.uint64(PLANE_FLOATS)]
-        blue_grad = work[g + np.uint64(2 * PLANE_FLOATS)]
-        depth_grad = work[g + np.uint64(3 * PLANE_FLOATS)]
-        alpha_grad = work[g + np.uint64(4 * PLANE_FLOATS)]
+        red_grad = planes[g]
+        green_grad = planes[g + np.uint64(PLANE_FLOATS)]
+        blue_grad = planes[g + np.uint64(2 * PLANE_FLOATS)]
+        depth_grad = planes[g + np.uint64(3 * PLANE_FLOATS)]
+        alpha_grad = planes[g + np.uint64(4 * PLANE_FLOATS)]
         # What one unit of this Gaussian's weight adds to the loss.
         value = (
             red * red_grad + green * green_grad + blue * blue_grad + depth * depth_grad + alpha_grad
         )
         alpha = notes[n]
         transmittance = notes[n + np.uint64(TILE_PX)]
-        behind = work[i + np.uint64(BEHIND_PLANE)]
+        behind = planes[i + np.uint64(BEHIND_PLANE)]
         weight = alpha * transmittance
-        work[i + np.uint64(BEHIND_PLANE)] = behind + weight * value
+        planes[i + np.uint64(BEHIND_PLANE)] = behind + weight * value
 
         # A larger alpha shows more of this Gaussian and less of those behind; a clamped alpha has
         # no gradient.

@@ -36,8 +36,8 @@ def project_backward(
         scene: the set's arrays: means [n, 3], quats [n, 4], scales [n, 3], opacities [n],
             colors [n, 3].
         camera: the view.
-        table: [n, 10] sums over pixels: with u = x - centre, dy = y - centre and
-            v = ∂L/∂ln(alpha) the sums of v, v·u, v·u², v·dy, v·dy², v·u·dy; then the gradients of
+        table: [n, 10] sums over pixels: with the offset (dx, dy) from the centre,
+            u = dx - slope·dy and v = ∂L/∂ln(alpha) the sums of v, v·u, v·u², v·dy, v·dy², v·u·dy; then the gradients of
             red, green, blue and depth. A row of zeros belongs to an invisible Gaussian, which gets
             no gradients.
         gradients: of the arrays of `scene`, of the same shapes, zero at first; written here.
@@ -105,9 +105,12 @@ def ellipse_backward(
 ) -> tuple[float, float]:
     """Turn sums over pixels into gradients of a projected Gaussian's shape and centre.
 
-    For a pixel at the offset d from the centre, ∂ln(alpha)/∂centre = p and
-    ∂ln(alpha)/∂Σ = ½ p pᵀ with p = Σ⁻¹ d = (A·u, D·dy - k·A·u), where A = Σyy/det, D = 1/Σyy, the
-    slope k = Σxy/Σyy, and u the pixel's distance from the middle of its row.
+    For a pixel at the offset d = (dx, dy) from the centre, alpha is the opacity times
+    exp(-½ (fall·dy² + across·u²)). Here u = dx - slope·dy is the distance from the place in the
+    pixel's row where alpha is largest, fall = 1/Σyy, across = Σyy/det Σ and slope = Σxy/Σyy.
+
+    With p = Σ⁻¹ d = (across·u, fall·dy - slope·across·u), the derivatives are
+    ∂ln(alpha)/∂centre = p and ∂ln(alpha)/∂Σ = ½ p pᵀ.
 
     Args:
         sums: [10] over pixels, with v = ∂L/∂ln(alpha): of v, v·u, v·u², v·dy, v·dy², v·u·dy; then
@@ -123,15 +126,16 @@ def ellipse_backward(
     _, xy, yy, det = widened_covariance(factor, eps2d)
     across = yy / det
     fall = 1.0 / yy
-    skew = xy / yy * across
+    skew = xy / yy * across  # slope·across
 
-    # Twice the gradient of Σ; the other half is the gradient by Mᵀ.
+    # The sums over pixels of v·p pᵀ, which are twice the gradient of Σ. In Σ = M Mᵀ + …, M occurs
+    # twice, so that the gradient of M is twice the gradient of Σ times M.
     xx_grad = across * across * sum_vuu
     xy_grad = across * fall * sum_vudy - across * skew * sum_vuu
     yy_grad = fall * fall * sum_vdydy - 2.0 * fall * skew * sum_vudy + skew * skew * sum_vuu
     for k in range(3):
-        m = factor[k]
-        n = factor[3 + k]
+        m = factor[k]  # M[0, k]
+        n = factor[3 + k]  # M[1, k]
         factor_grad[0, k] = xx_grad * m + xy_grad * n
         factor_grad[1, k] = xy_grad * m + yy_grad * n
     return across * sum_vu, fall * sum_vdy - skew * sum_vu
@@ -149,8 +153,11 @@ def factor_backward(
 ) -> None:
     """Turn the gradient of M = J W R S into gradients of J, of R and of the scales S.
 
+    Element by element, M[i, k] is the sum over j of (J W)[i, j]·R[j, k]·S[k]. Here i is pixel x or
+    y, j an axis of the world, and k an axis of the Gaussian.
+
     Args:
-        jacobian: J = [[a, 0, b], [0, c, d]] as (a, b, c, d).
+        jacobian: J = [[xx, 0, xz], [0, yy, yz]] as (xx, xz, yy, yz).
         pose: [3, 4] world to camera; W is its rotation.
         rotation: R, row by row.
         scale: [3] standard deviations.
@@ -159,21 +166,27 @@ def factor_backward(
         scale_grad: [3], written here.
     """
     jacobian_grad, rotation_grad = grads
+    xx, xz, yy, yz = jacobian
     jacobian_grad[:, :] = 0.0
     for k in range(3):
         scale_grad[k] = 0.0
-        for b in range(3):
-            # Column k of M is the sum over b of column b of J W, times R[b, k]·S[k]. So this is the
-            # gradient of R[b, k]·S[k].
-            h0 = jacobian[0] * pose[0, b] + jacobian[1] * pose[2, b]
-            h1 = jacobian[2] * pose[1, b] + jacobian[3] * pose[2, b]
-            scaled_axis_grad = h0 * factor_grad[0, k] + h1 * factor_grad[1, k]
-            axis = rotation[3 * b + k]
-            scale_grad[k] += scaled_axis_grad * axis
-            rotation_grad[b, k] = scaled_axis_grad * scale[k]
-            for a in range(2):
+        for j in range(3):
+            # The elements (J W)[0, j] for pixel x and (J W)[1, j] for pixel y.
+            jw_x = xx * pose[0, j] + xz * pose[2, j]
+            jw_y = yy * pose[1, j] + yz * pose[2, j]
+            # They are the factors of R[j, k]·S[k] in M[0, k] and M[1, k], which gives the gradient
+            # of this product, and so the gradients of both its factors.
+            product_grad = jw_x * factor_grad[0, k] + jw_y * factor_grad[1, k]
+            rotation_element = rotation[3 * j + k]
+            scale_grad[k] += product_grad * rotation_element
+            rotation_grad[j, k] = product_grad * scale[k]
+
+            # (J W)[i, j] is the sum over the camera's axes c of J[i, c]·W[c, j].
+            for i in range(2):
                 for c in range(3):
-                    jacobian_grad[a, c] += factor_grad[a, k] * scale[k] * axis * pose[c, b]
+                    jacobian_grad[i, c] += (
+                        factor_grad[i, k] * scale[k] * rotation_element * pose[c, j]
+                    )
 
 
 @kernel
@@ -245,22 +258,24 @@ def center_backward(
     # The Jacobian uses these limited slopes; at a limit they do not move with the centre.
     x_slope = min(lens[MAX_X_SLOPE], max(lens[MIN_X_SLOPE], x / z))
     y_slope = min(lens[MAX_Y_SLOPE], max(lens[MIN_Y_SLOPE], y / z))
-    fx = lens[FX] / z
-    fy = lens[FY] / z
+    fx_over_z = lens[FX] / z
+    fy_over_z = lens[FY] / z
 
     # By way of the pixel position u = fx·x/z, v = fy·y/z, and of the depth.
-    x_grad = fx * u_grad
-    y_grad = fy * v_grad
+    x_grad = fx_over_z * u_grad
+    y_grad = fy_over_z * v_grad
     z_grad = depth_grad - (x_grad * x + y_grad * y) / z
 
     # By way of the Jacobian [[fx/z, 0, -fx·slope/z], [0, fy/z, -fy·slope/z]]: first by its factor
     # 1/z, then by the slopes, where they move.
-    z_grad -= (fx * jacobian_grad[0, 0] + fy * jacobian_grad[1, 1]) / z
-    z_grad += (fx * x_slope * jacobian_grad[0, 2] + fy * y_slope * jacobian_grad[1, 2]) / z
+    z_grad -= (fx_over_z * jacobian_grad[0, 0] + fy_over_z * jacobian_grad[1, 1]) / z
+    z_grad += (
+        fx_over_z * x_slope * jacobian_grad[0, 2] + fy_over_z * y_slope * jacobian_grad[1, 2]
+    ) / z
     if lens[MIN_X_SLOPE] <= x / z <= lens[MAX_X_SLOPE]:
-        x_grad -= fx / z * jacobian_grad[0, 2]
-        z_grad += fx / z * x_slope * jacobian_grad[0, 2]
+        x_grad -= fx_over_z / z * jacobian_grad[0, 2]
+        z_grad += fx_over_z / z * x_slope * jacobian_grad[0, 2]
     if lens[MIN_Y_SLOPE] <= y / z <= lens[MAX_Y_SLOPE]:
-        y_grad -= fy / z * jacobian_grad[1, 2]
-        z_grad += fy / z * y_slope * jacobian_grad[1, 2]
+        y_grad -= fy_over_z / z * jacobian_grad[1, 2]
+        z_grad += fy_over_z / z * y_slope * jacobian_grad[1, 2]
     return x_grad, y_grad, z_grad

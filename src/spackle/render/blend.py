@@ -136,7 +136,8 @@ def blend_splat(state: Array, record: Array, left: int, top: int) -> None:
         state: the tile's flat buffer, six planes of 256 floats: transmittance, red, green, blue,
             depth, alpha. It is changed in place.
         record: [12] the Gaussian's centre (x, y), the shape of its ellipse (slope, across, fall),
-            log2 of its opacity (peak), half sizes in pixels, depth and colour.
+            log2 of its opacity (peak), half sizes in pixels, depth and colour. At the offset
+            (dx, dy) from the centre, log2 of alpha is peak - fall·dy² - across·(dx - slope·dy)².
         left, top: the tile's first pixel in the image.
     """
     x, y, slope, across, fall, peak, half_width, half_height, depth, red, green, blue = in_tile(
@@ -147,6 +148,8 @@ def blend_splat(state: Array, record: Array, left: int, top: int) -> None:
     first_column, last_column = touched_patches(x, half_width)
     for row in range(first_row, last_row):
         for column in range(first_column, last_column):
+            # A plane of the buffer holds the patches one after the other, row by row. The offset
+            # is unsigned, so that no check for negative indices is compiled.
             offset = np.uint64((row * PATCHES_PER_SIDE + column) * PATCH_PIXELS)
             patch_left = np.float32(column * PATCH_PX)
             patch_top = np.float32(row * PATCH_PX)
@@ -165,8 +168,8 @@ def blend_patch(
         offset: where the patch begins in each plane.
         left, top: the patch's first pixel, relative to the tile's.
         splat: the Gaussian's record, with the centre relative to the tile and without half sizes.
-            In a row at the distance dy from the centre, log2 of alpha is
-            peak - fall·dy² - across·(x of the pixel - x - slope·dy)².
+            At the offset (dx, dy) from the centre, log2 of alpha is peak - fall·dy² - across·u²
+            with u = dx - slope·dy.
     """
     x, y, slope, across, fall, peak, depth, red, green, blue = splat
     for lane in range(PATCH_PIXELS):  # pixels row by row

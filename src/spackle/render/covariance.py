@@ -50,20 +50,21 @@ def projected_covariance(
 
 @inlined_kernel
 def projection_jacobian(x_slope: float, y_slope: float, inverse_z: float, lens: Array) -> Numbers:
-    """The Jacobian [[a, 0, b], [0, c, d]] of the projection to pixels, as (a, b, c, d).
+    """The Jacobian [[xx, 0, xz], [0, yy, yz]] of the projection to pixels, as (xx, xz, yy, yz).
 
-    At a point (x, y, z) in the camera's frame it is [[fx/z, 0, -fx·x/z²], [0, fy/z, -fy·y/z²]].
+    Its rows are pixel x and y, its columns the coordinates of a point (x, y, z) in the camera's
+    frame, at which it is [[fx/z, 0, -fx·x/z²], [0, fy/z, -fy·y/z²]].
 
     Args:
         x_slope, y_slope, inverse_z: x/z, y/z and 1/z of the point.
         lens: [8] fx, fy, cx, cy in pixels, and bounds (left, right, top, bottom) of the slopes. As
             in gsplat, a slope beyond its bound counts as the bound.
     """
-    a = lens[FX] * inverse_z
-    c = lens[FY] * inverse_z
-    b = -a * min(lens[MAX_X_SLOPE], max(lens[MIN_X_SLOPE], x_slope))
-    d = -c * min(lens[MAX_Y_SLOPE], max(lens[MIN_Y_SLOPE], y_slope))
-    return a, b, c, d
+    xx = lens[FX] * inverse_z
+    yy = lens[FY] * inverse_z
+    xz = -xx * min(lens[MAX_X_SLOPE], max(lens[MIN_X_SLOPE], x_slope))
+    yz = -yy * min(lens[MAX_Y_SLOPE], max(lens[MIN_Y_SLOPE], y_slope))
+    return xx, xz, yy, yz
 
 
 @inlined_kernel
@@ -92,23 +93,23 @@ def covariance_factor(jacobian: Numbers, pose: Array, rotation: Numbers, scale: 
     """The two rows of M = J W R S, whose product M Mᵀ is the projected covariance, in float64.
 
     Args:
-        jacobian: J = [[a, 0, b], [0, c, d]] as (a, b, c, d).
+        jacobian: J = [[xx, 0, xz], [0, yy, yz]] as (xx, xz, yy, yz).
         pose: [3, 4] world to camera; W is its rotation.
         rotation: R, row by row.
         scale: [3] standard deviations, the diagonal of S.
     """
-    a, b, c, d = jacobian
+    xx, xz, yy, yz = jacobian
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation
 
     # The rows of J W: h for pixel x (horizontal), v for pixel y (vertical).
-    h0 = a * pose[0, 0] + b * pose[2, 0]
-    h1 = a * pose[0, 1] + b * pose[2, 1]
-    h2 = a * pose[0, 2] + b * pose[2, 2]
-    v0 = c * pose[1, 0] + d * pose[2, 0]
-    v1 = c * pose[1, 1] + d * pose[2, 1]
-    v2 = c * pose[1, 2] + d * pose[2, 2]
+    h0 = xx * pose[0, 0] + xz * pose[2, 0]
+    h1 = xx * pose[0, 1] + xz * pose[2, 1]
+    h2 = xx * pose[0, 2] + xz * pose[2, 2]
+    v0 = yy * pose[1, 0] + yz * pose[2, 0]
+    v1 = yy * pose[1, 1] + yz * pose[2, 1]
+    v2 = yy * pose[1, 2] + yz * pose[2, 2]
 
-    # Times the columns of R S.
+    # Times the columns of R S: the first row (m0, m1, m2) of M, and the second one (n0, n1, n2).
     s0 = np.float64(scale[0])
     s1 = np.float64(scale[1])
     s2 = np.float64(scale[2])
@@ -125,7 +126,7 @@ def covariance_factor(jacobian: Numbers, pose: Array, rotation: Numbers, scale: 
 def widened_covariance(factor: Numbers, eps2d: float) -> Numbers:
     """The covariance M Mᵀ + eps2d·I in pixels² as (xx, xy, yy, determinant).
 
-    `factor` has the two rows of M. The determinant of M Mᵀ is the squared cross product of these
+    `factor` has the two rows m and n of M, one after the other. The determinant of M Mᵀ is the squared cross product of these
     rows (Cauchy–Binet), which is exact also for a Gaussian that is seen edge-on.
     """
     m0, m1, m2, n0, n1, n2 = factor

@@ -167,7 +167,8 @@ def gradients_of_background(
 def pixel_sums(drawing: Drawing, gradients: Arrays, table_rows: Array, count: int) -> Array:
     """Sums over pixels for each Gaussian that needs gradients: a table [count, 10] float32.
 
-    With u = x - centre, dy = y - centre and v = ∂L/∂ln(alpha), the columns are the sums of v, v·u,
+    With a pixel's offset (dx, dy) from the centre, u = dx - slope·dy (the distance from the place
+    in its row where alpha is largest) and v = ∂L/∂ln(alpha), the columns are the sums of v, v·u,
     v·u², v·dy, v·dy², v·u·dy; then the gradients of red, green, blue and depth. Each tile sums on
     its own, and the sums of tiles are added in the order of tiles, so that the result does not
     depend on the number of threads.

@@ -48,11 +48,12 @@ class DeviceGaussians:
         fields = [
             tensor.to(device, torch.float32, non_blocking=True) for tensor in gaussians.tensors
         ]
-        # A field is [N] or [N, k]. The added axis makes it [N, 1] or [N, k, 1], flattened [N, k].
-        finite_by_field = [
-            field.detach().isfinite().unsqueeze(-1).flatten(1).all(1)  # [N]
-            for field in fields
-        ]
+        finite_by_field = []
+        for field in fields:
+            is_finite = field.detach().isfinite()  # [N], or [N, k] for a field with k numbers
+            if is_finite.ndim == 2:
+                is_finite = is_finite.all(1)  # [N]
+            finite_by_field.append(is_finite)
         finite = torch.stack(finite_by_field).all(0)
         cleaned = Gaussians(
             *(

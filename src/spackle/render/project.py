@@ -85,8 +85,9 @@ def in_tile(record: Array, left: int, top: int) -> Numbers:
     """The 12 numbers of a Gaussian's record, with its centre relative to a tile.
 
     They are the centre (x, y), the shape of the ellipse (slope, across, fall), log2 of the opacity
-    (peak), half sizes in pixels, depth and colour. The centre is measured from the centre of the
-    tile's first pixel, which is the image's pixel (left, top).
+    (peak), half sizes in pixels, depth and colour. At the offset (dx, dy) from the centre, log2 of
+    alpha is peak - fall·dy² - across·(dx - slope·dy)². The centre is measured from the centre of
+    the tile's first pixel, which is the image's pixel (left, top).
     """
     x = record[X] - np.float32(left) - HALF
     y = record[Y] - np.float32(top) - HALF
@@ -188,7 +189,8 @@ def project_block(
         u = lens[FX] * x_slope + lens[CX]
         v = lens[FY] * y_slope + lens[CY]
 
-        # The ellipse, and the exponents of 2 along its rows: alpha = 2^(peak - …).
+        # The ellipse. At the offset (dx, dy) from the centre, log2 of alpha is
+        # peak - fall·dy² - across·(dx - slope·dy)², with slope = cxy / cyy.
         quat = (
             quats[i4],
             quats[i4 + np.uint64(1)],

@@ -60,11 +60,12 @@ class ReferenceRenderer(Renderer):
 
 def front_to_back(gaussians: Gaussians, camera: Camera) -> Gaussians:
     """The finite Gaussians at or beyond the near plane, sorted by their depth z."""
-    # A field is [N] or [N, k]. The added axis makes it [N, 1] or [N, k, 1], flattened [N, k].
-    finite_by_field = [
-        tensor.detach().isfinite().unsqueeze(-1).flatten(1).all(dim=1)  # [N]
-        for tensor in gaussians.tensors
-    ]
+    finite_by_field = []
+    for tensor in gaussians.tensors:
+        is_finite = tensor.detach().isfinite()  # [N], or [N, k] for a field with k numbers
+        if is_finite.ndim == 2:
+            is_finite = is_finite.all(dim=1)  # [N]
+        finite_by_field.append(is_finite)
     finite = torch.stack(finite_by_field).all(dim=0)
     z = camera.to_camera(gaussians.means.detach())[:, 2]
     drawable = gaussians.select(finite & (z >= NEAR_PLANE))
@@ -114,8 +115,11 @@ def falloff(gaussians: Gaussians, camera: Camera, eps2d: float) -> Tensor:
 
     offsets = camera.pixel_centers().to(centers) - centers[:, None, None, :]  # [N, H, W, 2]
     dx, dy = offsets.unbind(-1)
-    distance = (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / torch.where(has_area, det, 1)
-    alphas = gaussians.opacities[:, None, None] * torch.exp(-0.5 * distance)
+    # Of each pixel from the centre, in standard deviations: dᵀ Σ⁻¹ d.
+    squared_distance = (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / torch.where(
+        has_area, det, 1
+    )
+    alphas = gaussians.opacities[:, None, None] * torch.exp(-0.5 * squared_distance)
     return torch.where(has_area, alphas, 0)
 
 

@@ -22,6 +22,8 @@ ROWS_PER_CHUNK = 128  # rows of the image that a thread blends at a time
 # Rows are blended in runs of as many pixels as a vector register has. The state of a run is four
 # times so many floats, one after the other: transmittances, then red, green and blue light.
 RUN_PIXELS = 16
+# Where red, green and blue begin in a run's state, and the size of the state. They are unsigned, so
+# that no check for negative indices is compiled.
 RUN_RED, RUN_GREEN, RUN_BLUE, RUN_FLOATS = (np.uint64(k * RUN_PIXELS) for k in range(1, 5))
 
 
@@ -58,7 +60,9 @@ def blend_rows(start: int, stop: int, spots: Array, colors: Array, image: Array)
     """
     width = image.shape[1]
     runs = (width + RUN_PIXELS - 1) // RUN_PIXELS  # in a row
-    # For each run four times 16 numbers: transmittances, which start at 1, red, green and blue.
+    # The state of a run is 64 numbers (RUN_FLOATS): 16 transmittances, which start at 1, then 16
+    # numbers each for red, green and blue. The state of a row is that of its runs from left to
+    # right, and the rows follow one another.
     state = np.zeros(((stop - start) * runs, 4, RUN_PIXELS), np.float32)
     state[:, 0] = 1
     flat_state = state.reshape(-1)
@@ -66,7 +70,8 @@ def blend_rows(start: int, stop: int, spots: Array, colors: Array, image: Array)
 
     for n in range(len(spots)):
         u, v, spread_x, spread_y, opacity = spots[n]
-        # The pixels, whose centres lie at half-integers, in which alpha can be large enough.
+        # The pixels top..bottom and left..right (exclusive) in which alpha can be large enough to
+        # be drawn. Pixel centres lie at half-integers.
         top = max(int(np.ceil(v - MAX_DRAWN_DEVIATIONS * spread_y - HALF)), start)
         bottom = min(int(np.floor(v + MAX_DRAWN_DEVIATIONS * spread_y - HALF)) + 1, stop)
         left = max(int(np.ceil(u - MAX_DRAWN_DEVIATIONS * spread_x - HALF)), 0)
@@ -74,11 +79,12 @@ def blend_rows(start: int, stop: int, spots: Array, colors: Array, image: Array)
         if top >= bottom or left >= right:
             continue
 
-        # The fall-off along the row is the same in all rows. Runs are blended as a whole. Therefore
-        # it must be 0 in the pixels of the first and the last run that are outside of left..right.
+        # The fall-off along the row is the same in all rows. Runs first_run..end_run (exclusive)
+        # are blended as a whole. Therefore the fall-off must be 0 in those of their pixels that lie
+        # outside of left..right.
         first_run = left // RUN_PIXELS
-        last_run = (right - 1) // RUN_PIXELS + 1
-        row_falloff[first_run * RUN_PIXELS : last_run * RUN_PIXELS] = 0
+        end_run = (right - 1) // RUN_PIXELS + 1
+        row_falloff[first_run * RUN_PIXELS : end_run * RUN_PIXELS] = 0
         for x in range(left, right):
             deviations_x = (np.float32(x) + HALF - u) / spread_x
             row_falloff[x] = np.exp(-HALF * deviations_x * deviations_x)
@@ -86,7 +92,8 @@ def blend_rows(start: int, stop: int, spots: Array, colors: Array, image: Array)
         for y in range(top, bottom):
             deviations_y = (np.float32(y) + HALF - v) / spread_y
             row_alpha = opacity * np.exp(-HALF * deviations_y * deviations_y)
-            for run in range(first_run, last_run):
+            for run in range(first_run, end_run):
+                # Where the run's state begins. Unsigned indices need no check for negative ones.
                 offset = np.uint64((y - start) * runs + run) * RUN_FLOATS
                 run_left = np.uint64(run * RUN_PIXELS)
                 blend_run(flat_state, offset, row_falloff, run_left, row_alpha, colors[n])
@@ -94,7 +101,7 @@ def blend_rows(start: int, stop: int, spots: Array, colors: Array, image: Array)
     for y in range(start, stop):
         for x in range(width):
             run_index = (y - start) * runs + x // RUN_PIXELS
-            for channel in range(3):
+            for channel in range(3):  # after the transmittance, which has the index 0
                 image[y, x, channel] = state[run_index, 1 + channel, x % RUN_PIXELS]
 
 
