@@ -87,8 +87,8 @@ def create_app(
     app.add_middleware(Guard, access=access, max_bytes=max_bytes)
 
     takes_photos = access is None or access.token is not None
-    # `SceneWork` lists the bases, the networks for a photo's geometry. With another function as
-    # `work`, clients have no choice.
+    # `SceneWork` has a method that lists the bases, the networks for a photo's geometry. Another
+    # function as `work` has none; clients can then only choose AUTO.
     list_bases = getattr(work, "bases", lambda: [AUTO])
     handlers = SceneHandlers(jobs, list_bases, takes_photos, max_bytes)
     add_scene_routes(app, handlers)
@@ -166,7 +166,8 @@ class SceneHandlers:
         # The place is reserved first, so that a refused photo is not even received.
         with self.jobs.reserve_place() as upload_folder:
             try:
-                reading = request.form(max_files=2, max_fields=1)  # photo and depth map, options
+                # Two files: the photo and its depth map. One text field: the options.
+                reading = request.form(max_files=2, max_fields=1)
                 form = await asyncio.wait_for(reading, MAX_UPLOAD_S)
             except asyncio.TimeoutError:
                 raise HTTPException(408, "the photo arrived too slowly") from None
@@ -216,6 +217,7 @@ class SceneHandlers:
         if not path.is_file():
             if job.state != "done":
                 raise HTTPException(409, job.error or "this scene is not done yet")
+            # What the page draws was written with the scene, so it cannot be made now.
             if file in get_args(PagePart):
                 raise HTTPException(404, "this file exists only for photos, and a scene was opened")
             # If this client disconnects, the file is still made, because others may want it, too.
@@ -283,10 +285,10 @@ def make_server(app: FastAPI) -> uvicorn.Server:
     """
     config = uvicorn.Config(
         app,
-        http=PatientProtocol,
-        ws="none",
-        log_config=None,
-        log_level="critical",
+        http=PatientProtocol,  # HTTP, with a limit on how long a connection may be silent
+        ws="none",  # no WebSocket
+        log_config=None,  # leaves the logging of this program as it is
+        log_level="critical",  # the app logs requests and errors itself
         server_header=False,  # strangers learn no versions
         proxy_headers=False,  # anybody could claim another address
         limit_concurrency=MAX_CONNECTIONS,
@@ -308,12 +310,12 @@ class PatientProtocol(H11Protocol):
         self._end_if_silent(BUSY)
 
     def _end_if_silent(self, idle_after: object) -> None:
-        """Close the connection if no request has come since the last look; else look again later.
+        """Close the connection if it was idle since the last call; otherwise check again later.
 
-        `MAX_HEAD_S` seconds lie between two looks.
+        `MAX_HEAD_S` seconds lie between two calls.
 
         Args:
-            idle_after: what the last look saw. BUSY: a request was not answered yet. A request: the
+            idle_after: what the last call saw. BUSY: a request was not answered yet. A request: the
                 connection was idle after the answer to it. None: no request had come yet.
         """
         latest_request = self.cycle  # uvicorn's name for a request with its answer

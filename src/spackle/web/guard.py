@@ -111,8 +111,8 @@ class Access(NamedTuple):
     def _is_own_name(self, name: str) -> bool:
         """Whether a host name or address, without a port and in lower case, leads to this server.
 
-        By DNS rebinding a stranger makes his own host name lead here, so only known names count.
-        That is impossible with a numeric address.
+        Only known names count, because a stranger can make his own host name lead here (DNS
+        rebinding). A numeric address always leads to the machine that has it.
         """
         try:
             # A server that only this machine can reach has no address but loopback. Others may have
@@ -180,7 +180,8 @@ class Guard:
         """
         if scope["type"] == "lifespan":  # the start and the end of the server
             await self.app(scope, receive, send)
-        if scope["type"] != "http":  # this app has no WebSocket
+            return
+        if scope["type"] != "http":  # a WebSocket, which this app does not have
             return
 
         headers = Headers(scope=scope)

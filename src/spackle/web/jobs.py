@@ -262,6 +262,7 @@ class Jobs:
             job.results.mkdir()
             job.save()
             task = (job, None)  # None: the scene, not a further file of it
+            # The reason why the scene could not be made; None if it is finished.
             error = process.do(task, lambda event: self._note_event(id, event))
         except (OSError, InputError) as problem:
             error = f"{job.name}: cannot be stored here: {reason_in_a_line(problem)}"

@@ -155,6 +155,7 @@ def _add_target(jobs: Jobs, target: Path, title: str, options: ViewOptions) -> s
     with jobs.reserve_place() as job_folder:
         if scene_suffix(target) is None:
             check_photo(target, title, job_folder / PREVIEW)
+        # Absolute paths tell a job that the files are the user's own, which it must not delete.
         depth_file = None
         if options.base.depth is not None:
             depth_file = os.path.abspath(str(options.base.depth))
@@ -341,7 +342,8 @@ def address_in_network(host: str) -> str:
     if host not in ("0.0.0.0", "::", ""):
         return host
     with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        # Connecting a UDP socket sends nothing, but chooses this machine's address.
+        # Connecting a UDP socket sends nothing, whatever the other address is, but chooses the
+        # address of this machine from which packets to the network would be sent.
         probe.connect(PROBED_ADDRESS)
         return str(probe.getsockname()[0])
     return socket.gethostname()  # no network

@@ -60,7 +60,7 @@ def accept_photo(form: FormData, upload_folder: Path, jobs: Jobs, bases: list[st
         raise HTTPException(
             422, "send one photo as the file `photo`, and the options as the text `options`"
         )
-    assert isinstance(photo, UploadFile)
+    assert isinstance(photo, UploadFile)  # tells the type checker what is already known
     photo_name = safe_display_name(photo.filename or "")
     options = read_options(options_text, bases)
 
@@ -76,8 +76,15 @@ def accept_photo(form: FormData, upload_folder: Path, jobs: Jobs, bases: list[st
         check_photo(upload_folder / photo_file, photo_name, upload_folder / PREVIEW)
     except InputError as error:
         raise HTTPException(415, str(error)) from error
+    # Options that the client has not set stay away, so that the server's defaults apply to them.
     given_options = options.model_dump(exclude_unset=True)
-    return jobs.add(upload_folder, photo_name, photo_file, depth_file, given_options)
+    return jobs.add(
+        upload_folder,
+        name=photo_name,
+        source=photo_file,
+        depth=depth_file,
+        options=given_options,
+    )
 
 
 def read_options(text: str, bases: list[str]) -> SceneOptions:
@@ -132,8 +139,9 @@ def store_upload(
 def safe_display_name(file_name: str) -> str:
     """The last part of a file's name, safe to show in terminals, pages and logs.
 
-    Control characters, for example, are left out: a terminal would obey them.
-    At most `MAX_NAME_CHARACTERS` characters are kept, those at the end, because of the suffix.
+    Characters that cannot be printed are left out, because a terminal would obey control
+    characters. Of a long name, the last `MAX_NAME_CHARACTERS` characters are kept: the end has the
+    suffix.
     """
     last_part = re.split(r"[/\\]", file_name)[-1]
     printable = "".join(character for character in last_part if character.isprintable())

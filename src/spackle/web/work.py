@@ -226,7 +226,7 @@ class SceneWork:
             raise InputError(f"{job.name}: has no report, because it was opened as a scene")
         if target.suffix == ".mp4":
             # swipe.mp4, for example, shows the camera path "swipe"; video.mp4 shows the path of the
-            # job's options.
+            # job's options. The loop tells the type checker that the name is one of the paths.
             trajectory = options.trajectory
             for name in TRAJECTORIES:
                 if name == target.stem:

@@ -137,6 +137,7 @@ class SampleMaker:
                 "sha256": file.sha256,
                 "width": photo.width,
                 "height": photo.height,
+                # Who gave the focal length: the base, or else the photo's file or the user.
                 "focal_source": prediction.lens_source or photo.focal_source.value,
             },
             "base": {"gaussians": len(prediction.gaussians), **prediction.notes},
@@ -310,6 +311,7 @@ class DatasetBuild:
         problems = []
         for index in indices:
             photo = self.photos[index]
+            # A photo with a problem has no sample.
             if index in self.problems:
                 problems.append(self._portable_problem(photo, self.problems[index]))
             else:

@@ -190,8 +190,9 @@ class PhotoGroup:
 def split_tar(data: bytes) -> dict[str, bytes]:
     """The contents of an archive's files by name; `data` has no end-of-archive mark.
 
-    Only plain files are accepted, as `pack_sample` writes no other: a stranger's links and sparse
-    files would need care. ValueError, or an exception of tarfile, if the data are damaged.
+    Only plain files are accepted, because `pack_sample` writes nothing else. Links and sparse files
+    could come only from somebody else, and might be dangerous to read. ValueError, or an exception
+    of tarfile, if the data are damaged.
     """
     files: dict[str, bytes] = {}
     position = 0

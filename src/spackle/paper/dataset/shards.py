@@ -149,7 +149,8 @@ def load_manifest(location: str | os.PathLike[str]) -> Manifest:
                 f"{FORMAT_VERSION}"
             )
 
-        # The digest must fit the file, and what was understood of the file.
+        # The recorded digest must be that of the file's content. It must also be that of the parsed
+        # manifest: otherwise parsing has dropped or changed something.
         recorded_digest = content.pop("sha256")
         manifest = Manifest.model_validate_json(text)
         if not json_digest(content) == manifest.digest == recorded_digest:
@@ -176,7 +177,7 @@ def write_shard(
     with atomic_path(target) as temporary, open(temporary, "wb") as file:
         for key, path in parts:
             data = path.read_bytes()
-            # A damaged part would make the whole shard useless, so it is read once more.
+            # Each part is checked now, because a damaged one would make the whole shard useless.
             try:
                 group = PhotoGroup.from_tar(key, data, str(path))
             except InputError as error:

@@ -59,7 +59,7 @@ def draw_random_path(
         photo_sha256: digest of the photo's file.
     """
     digest = hashlib.sha256(f"{seed}:{photo_sha256}".encode()).digest()
-    rng = np.random.default_rng(list(digest))
+    rng = np.random.default_rng(list(digest))  # the digest's 32 bytes are the seed
     # Drawn also if the kind is fixed, so that the disparity is the same in both cases.
     random_kind = SHARP_TRAJECTORIES[rng.integers(len(SHARP_TRAJECTORIES))]
     disparity = float(rng.uniform(*disparity_range))
@@ -159,8 +159,9 @@ def complete_views(
         views: the rendered views. Outside of the holes the targets have the same bits.
         completion: how holes are completed, one of `COMPLETIONS`; "none" leaves them black.
         inpainter: paints the holes; None if `completion` is "none" or "geometry".
-        renderer: renders a scene whose holes were filled without an inpainter: its colours for
-            "geometry", its depth for inpainters.
+        renderer: renders a scene whose holes were filled without an inpainter. Its colours are the
+            targets of "geometry"; its depth tells inpainters of single pictures which places of two
+            views show the same point.
     """
     if completion == "none":
         return views.rgb
@@ -186,9 +187,9 @@ def render_completed(views: ViewStack, renderer: Renderer) -> tuple[Tensor, Tens
     completed_scene = complete(
         prediction,
         views.cameras,
-        exact=True,  # only these views are rendered
-        network=None,
-        fill="network",  # adds no texture from elsewhere in the picture
+        exact=True,  # only these views will be rendered, and no views between them
+        network=None,  # the Gaussians stay as they are before a network changes them
+        fill="network",  # the kind of fill that copies no texture from elsewhere in the picture
         renderer=renderer,
     )
     added = completed_scene.aux  # the Gaussians in the holes
@@ -232,7 +233,8 @@ def paint_view_by_view(inpainter: Inpainter, views: ViewStack, renderer: Rendere
         target = targets[index]
         hole = views.mask[index].clone()
 
-        # What an earlier view shows at a hole's points is copied. `target` shares the memory of `targets`.
+        # What an earlier view shows at a hole's points is copied. `target` shares the memory of
+        # `targets`, so that the copied colours are in both.
         for other in painted:
             row, column = hole.nonzero(as_tuple=True)
             pixels = camera.pixel_centers().to(target)[row, column]
@@ -247,9 +249,9 @@ def paint_view_by_view(inpainter: Inpainter, views: ViewStack, renderer: Rendere
         if bool(hole.any()):
             # An inpainter gets inverse depth 0, which means unknown, in the hole.
             outside_inverse_depth = torch.where(hole, 0, inverse_depths[index])
-            targets[index] = inpainter.paint(target[None], hole[None], outside_inverse_depth[None])[
-                0
-            ]
+            # The inpainter takes a stack of pictures; this one holds a single picture.
+            painted_stack = inpainter.paint(target[None], hole[None], outside_inverse_depth[None])
+            targets[index] = painted_stack[0]
         if bool(views.mask[index].any()):
             painted.append(index)
     return targets

@@ -54,10 +54,10 @@ def draw_composite(
     depth = DepthMap(
         depth=1.0 / inverse_depth,
         valid=all_known,
-        K=None,
-        quantum=None,
+        K=None,  # no intrinsics: the camera below has them
+        quantum=None,  # depth in floating point has no quantisation step
         quantity="depth",
-        path=Path("composite"),
+        path=Path("composite"),  # no file, but messages need a name
     )
     return rgb, depth, Camera.from_focal(focal_px, width, height)
 
@@ -78,24 +78,26 @@ def compose_cutouts(
     """
     rgb = random_crop(rng, draw_photo(rng), height, width)
     inverse_depth = random_background(rng, height, width)
-    for _ in range(rng.integers(CUTOUT_COUNT[0], CUTOUT_COUNT[1] + 1)):
+    min_count, max_count = CUTOUT_COUNT
+    min_area, max_area = CUTOUT_AREA  # fractions of the image
+    for _ in range(rng.integers(min_count, max_count + 1)):
         picture = random_crop(rng, draw_photo(rng), height, width)
         coverage = random_outline(rng, picture)  # [H, W] in 0..1
         inside = coverage > 0.5
 
         # A speck would be no surface, and a huge cut-out would leave nothing of the background.
         area = float(inside.float().mean())
-        if not CUTOUT_AREA[0] < area < CUTOUT_AREA[1]:
+        if not min_area < area < max_area:
             continue
 
-        # The cut-out must lie in front of everything that it hides.
+        # The cut-out must lie in front of everything that it hides. Nearness is inverse depth, 1/m.
         hidden_nearness = float(inverse_depth[inside].max())
         nearness = hidden_nearness * rng.uniform(*CUTOUT_NEARNESS)
         if nearness > 1 / MIN_DEPTH_M:
             continue
 
         # Slightly tilted, because surfaces are seldom parallel to the picture.
-        plane = nearness * (1 + random_ramp(rng, height, width, 0.1))
+        plane = nearness * (1 + random_ramp(rng, height, width, max_value=0.1))
         rgb = torch.lerp(rgb, picture, coverage[..., None])
         inverse_depth = torch.where(inside, plane, inverse_depth)
     return rgb, inverse_depth
@@ -129,15 +131,16 @@ def random_crop(rng: np.random.Generator, photo: Tensor, height: int, width: int
 
 def random_background(rng: np.random.Generator, height: int, width: int) -> Tensor:
     """Inverse depth [H, W] in 1/m of a wall, in some cases with the ground or a second wall."""
-    far = 1.0 / rng.uniform(*BACKGROUND_DEPTH_M)  # 1/m
+    wall_nearness = 1.0 / rng.uniform(*BACKGROUND_DEPTH_M)  # inverse depth of its middle, 1/m
     # The wall is turned, so that its sides differ by up to 30 % from its middle.
-    plane = far * (1 + random_ramp(rng, height, width, 0.3))
+    plane = wall_nearness * (1 + random_ramp(rng, height, width, max_value=0.3))
 
     has_ground = rng.random() < 0.5
     if has_ground:
         # The inverse depth of the ground grows linearly below the horizon.
         rows = (torch.arange(height) + 0.5) / height  # 0 at the upper edge, 1 at the lower one
-        slope = far * rng.uniform(1.5, 4.0)  # the steeper, the lower the camera
+        # The lower the camera stands above the ground, the greater is the slope.
+        slope = wall_nearness * rng.uniform(1.5, 4.0)
         horizon = rng.uniform(0.2, 0.6)  # from a little below the upper edge to the middle
         ground = slope * (rows - horizon)[:, None].clamp_min(0)  # [H, 1]
         plane = torch.maximum(plane, ground.expand(height, width))
@@ -146,11 +149,11 @@ def random_background(rng: np.random.Generator, height: int, width: int) -> Tens
     # two meet in a corner.
     has_second_wall = rng.random() < 0.3
     if has_second_wall:
-        second_wall = far * (1 + random_ramp(rng, height, width, 1.0))
+        second_wall = wall_nearness * (1 + random_ramp(rng, height, width, max_value=1.0))
         plane = torch.maximum(plane, second_wall)
-    # A turned wall has inverse depths near 0, which would lie very far away: twice the depth of
-    # the first wall is the limit.
-    return plane.clamp(0.5 * far, 1 / MIN_DEPTH_M)
+    # Parts of a turned wall would lie very far away. Nothing lies beyond twice the depth of the
+    # first wall, that is, below half its inverse depth.
+    return plane.clamp(0.5 * wall_nearness, 1 / MIN_DEPTH_M)
 
 
 def random_ramp(rng: np.random.Generator, height: int, width: int, max_value: float) -> Tensor:

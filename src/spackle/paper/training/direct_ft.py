@@ -234,10 +234,10 @@ class DirectFt(ViewTask):
 
         The dataset's manifest records its base: the network that turned photos into Gaussians.
         """
-        # Views of another network have holes elsewhere.
         base = self.files.manifest.config.get("base", {})
         name = base.get("name")
         weights = base.get("weights")  # their SHA-256
+        # With another network the holes of the views would lie elsewhere.
         if name != "sharp" or weights != self.sharp_checkpoint.sha256:
             raise InputError(
                 f"{location}: built with the base {name}, weights {weights}: build a dataset with "

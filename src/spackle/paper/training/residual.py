@@ -158,7 +158,8 @@ class ViewTask(Task):
         for item in items:
             batch = self.load_batch(step=None, items=[item])  # None: a validation item
             views = self.complete(network, batch)
-            # A batch may hold all views of a photo; one of them is enough.
+            # A batch may hold all views of a photo. The last one is shown, because the first one is
+            # the photo's own view, which has the smallest holes.
             rows.append((views.base_rgb[-1], views.rgb[-1], views.target[-1]))
         return contact_sheet(rows, PICTURE_SIDE_PX)
 
@@ -182,9 +183,9 @@ def complete_samples(
     """
     device = renderer.device
 
-    # The cells that get a new Gaussian, and the renderer's tiles that these can touch. They are
-    # read before the samples move to the renderer's device: reading them later would wait for a
-    # GPU.
+    # The cells that get a new Gaussian (at least MIN_AUX_GAUSSIANS cells a view), and the renderer's
+    # tiles that these Gaussians can touch. They are read before the samples move to the renderer's
+    # device, because reading them there would wait for a GPU.
     cells = [
         sample.view.cells(MIN_AUX_GAUSSIANS).flatten().nonzero()[:, 0].to(device, non_blocking=True)
         for sample in samples
@@ -229,7 +230,8 @@ def first_network(name: str, init: Path | None = None) -> ResidualNet:
     """
     if init is None:
         return open_residual(name)
-    # `load_residual` accepts weights of another package's network only if this is imported already.
+    # If another package defines the network, this imports the package. Otherwise `load_residual`
+    # would not accept the weights.
     network_class(name)
     if name == SharpDecoder.name:
         tensors = read_tensors(init, "give init=FILE")
@@ -289,7 +291,8 @@ class ResidualTask(ViewTask):
     def prepare(self, output: Path, reporter: Reporter) -> dict[str, Any]:
         """Make the samples that do not exist yet; returns facts about all samples for run.json.
 
-        The facts are their numbers, and the PSNR of an untrained and of an ideal network.
+        The facts are how many samples there are, and the PSNR of an untrained and of an ideal
+        network.
         """
         data = self.recipe.data
         folder = data.cache or output / CACHE

@@ -128,7 +128,7 @@ def _plan_views(sources: Sequence[Source], seed: int, views: int) -> list[_Plann
     counts = [0] * len(sources)
     planned = []
     for index in range(views):
-        source_index, _ = _draw_source(sources, seed, index)
+        source_index, _ = _draw_source(sources, seed, index)  # the random generator is not needed
         planned.append(_PlannedView(source_index, counts[source_index]))
         counts[source_index] += 1
     return planned
@@ -146,8 +146,12 @@ def _draw_source(
 def _make_crops(
     data: DataRecipe, planned: _PlannedView, seed: int, index: int, sources: Sequence[Source]
 ) -> list[Sample]:
-    """The crops of the view `index`, of which `planned` says the source and its number there."""
-    # The draw of the source is repeated for the random generator that comes with it.
+    """The crops of the view `index`.
+
+    `planned` names the source that the view comes from, and the view's number in this source.
+    """
+    # The source is known, but drawing it again leaves the random generator in the state from which
+    # the view is to be made.
     _, rng = _draw_source(sources, seed, index)
     source = sources[planned.source_index]
     number = planned.number
@@ -168,7 +172,8 @@ def _count_file(folder: Path, index: int) -> Path:
 
 
 def _crop_files(folder: Path, index: int) -> list[Path] | None:
-    """The files of a view's crops; None if they are not complete."""
+    """The files of a view's crops, perhaps none; None if the crops are not complete."""
+    # The file with the number of crops is written last, so that it is missing after a killed run.
     try:
         count = int(_count_file(folder, index).read_text())
     except (FileNotFoundError, ValueError):

@@ -111,7 +111,7 @@ class Sample:
         photo: Tensor,
         target: Tensor,
     ) -> Sample:
-        """A sample of a whole view, with the inputs of all networks.
+        """A sample of a whole view; it holds what every kind of residual network needs as input.
 
         Args:
             base: the Gaussians predicted from a photo.
@@ -143,8 +143,9 @@ class Sample:
 
     @functools.cached_property
     def view(self) -> SceneViewCompletion:
-        """The completion of the view from the stored parts; only the features must be computed, on
-        the CPU.
+        """The completion of the view, made of the stored parts.
+
+        Only the features, the inputs of networks, are not stored; they are computed on the CPU.
         """
         # The camera of the photo is not stored, so the view's own camera takes its place. It is
         # never used, because every part that depends on it is stored, and set below.
@@ -215,7 +216,7 @@ class Sample:
         cells = (slice(row, row + height), slice(column, column + width))
         camera = self.camera.cropped(left, top, CELL * width, CELL * height)
 
-        # Copies, so that the whole view's memory can be freed.
+        # Copies instead of views into the whole images, whose memory can then be freed.
         def cut_pixels(image: Tensor) -> Tensor:
             return image[pixels].clone()
 
@@ -236,11 +237,12 @@ class Sample:
     def _with_visible_base(self) -> Sample:
         """The sample with only the base Gaussians that contribute most to the picture.
 
-        At most 1.35 for each pixel are kept. Only `tiles` count, the renderer's tiles that
-        Gaussians in the hole can touch, because training renders nothing else.
+        At most `MAX_GAUSSIANS_PER_PIXEL` times the number of pixels are kept. Contributions count
+        only in the renderer's tiles that Gaussians in the hole can touch, because training renders
+        nothing else.
         """
         # A Gaussian's contribution is the gradient of the picture's sum by the Gaussian's colour.
-        # It does not depend on the colours, so that all are the same grey.
+        # It does not depend on the colours, so any will do: here all are the same grey.
         with torch.enable_grad():
             grey = torch.full_like(self.base.colors, 0.5).requires_grad_()
             scene = dataclasses.replace(self.base, colors=grey)
@@ -323,8 +325,9 @@ def load_sample(path: str | os.PathLike[str]) -> Sample:
     ):
         tensors = {name: _to_float(name, tensor) for name, tensor in load_file(path).items()}
         tensors["base.colors"] = srgb_to_linear(tensors["base.colors"])
+        width, height = tensors["camera.size"].tolist()
         camera = Camera(
-            tensors["camera.K"], tensors["camera.world_to_camera"], *tensors["camera.size"].tolist()
+            tensors["camera.K"], tensors["camera.world_to_camera"], width=width, height=height
         )
 
         # The tensors by the sample's parts ("base", "rendering", …) and their fields.

@@ -290,9 +290,10 @@ def reverse_view_by_number(
     data: DataRecipe,
     renderer: Renderer,
 ) -> Sample:
-    """`random_reverse_view` with the arguments of a `Source`, which passes a view's number.
+    """A random training view whose holes are what a virtual camera does not see of a photo.
 
-    The number `index` is not used, because `rng` alone determines the view.
+    A `Source` of training views calls this with a random generator and the view's number `index`.
+    The number is not used, because `rng` alone determines the view.
     """
     return random_reverse_view(rng, draw, data.disparity, renderer)
 

@@ -196,12 +196,13 @@ def train_step(
     """
     step = run.progress.step
     run.optimizer.zero_grad(set_to_none=True)
-    sums = accumulate_gradients(run, batches)
+    own_means = accumulate_gradients(run, batches)  # of this process alone
     gradient_norm = clip_grad_norm_(run.network.parameters(), run.recipe.optim.clip)
-    sums["gradient"] = gradient_norm.double()
+    own_means["gradient"] = gradient_norm.double()
 
     # One transfer from the GPU, and one message between processes, for all numbers together.
-    own_numbers = dict(zip(sums, torch.stack(list(sums.values())).tolist(), strict=True))
+    own_values = torch.stack(list(own_means.values())).tolist()
+    own_numbers = dict(zip(own_means, own_values, strict=True))
     totals = sum_of_ranks({**own_numbers, "stop": float(stop_requested())}, run.device)
     run.is_stopped = totals.pop("stop") > 0
     numbers = {name: total / rank_count() for name, total in totals.items()}
@@ -232,7 +233,8 @@ def accumulate_gradients(run: TrainingRun, batches: Iterator[Any]) -> dict[str, 
     for number, items in enumerate(passes, 1):
         weight = len(items) * rank_count() / run.task.items_per_step
 
-        # Processes average their gradients once a step: only the last pass lets them communicate.
+        # `run.wrapped` is the network in a wrapper that averages the gradients of all processes. Once
+        # a step is enough, so only the last pass lets them communicate.
         communication: contextlib.AbstractContextManager[Any] = contextlib.nullcontext()
         if rank_count() > 1 and number < len(passes):
             communication = run.wrapped.no_sync()  # type: ignore[operator]
@@ -345,7 +347,8 @@ def validate(task: Task, network: nn.Module, device: torch.device) -> dict[str, 
     processes divide the items, and each process gets the same means.
     """
     own_items = range(rank(), task.validation_items, rank_count())
-    # As many items at a time as in training; without `micro_batch`, all of a step in one pass.
+    # As many items at a time as in training. `micro_batch` is their number; if it is None, a
+    # process takes all its items of a step at once.
     pass_size = task.micro_batch or task.items_per_step // rank_count()
     totals = dict.fromkeys(task.measures, 0.0)
     counts = dict.fromkeys(task.measures, 0.0)
