@@ -137,7 +137,7 @@ class SampleMaker:
                 "sha256": file.sha256,
                 "width": photo.width,
                 "height": photo.height,
-                # Who gave the focal length: the base, or else the photo's file or the user.
+                # Where the focal length is from: what the base says counts before the photo.
                 "focal_source": prediction.lens_source or photo.focal_source.value,
             },
             "base": {"gaussians": len(prediction.gaussians), **prediction.notes},
