@@ -112,7 +112,8 @@ def millimetre_depth(stored: Array, path: StrPath) -> DepthMap:
 
 def fills_16_bits(stored: Array) -> bool:
     """Whether a PNG's numbers reach from nearly 0 to nearly 65535, as relative depth does."""
-    # 0 and 65535 may stand for unknown pixels, and therefore say nothing about the range.
+    # 0 and UNKNOWN_MILLIMETRES, which is 65535, may stand for unknown pixels, and therefore say
+    # nothing about the range.
     known = stored[(stored > 0) & (stored < UNKNOWN_MILLIMETRES)]
     if not known.size:
         return False

@@ -192,7 +192,7 @@ def _describe_lens(camera: Camera) -> dict[str, Any]:
     lens = {
         "yfov": 2 * math.atan2(camera.height, 2 * fy),
         "aspectRatio": camera.width * fy / (camera.height * fx),
-        "znear": NEAR_PLANE,
+        "znear": NEAR_PLANE,  # glTF requires a number
     }
     extras = {"K": camera.K.tolist(), "width": camera.width, "height": camera.height}
     return {"type": "perspective", "perspective": lens, "extras": extras}

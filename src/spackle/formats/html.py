@@ -251,11 +251,11 @@ def _log_scale_steps(scales: Tensor) -> tuple[float, float]:
         scales: [N, 3] standard deviations.
     """
     if scales.numel() == 0:
-        return 0.0, 1.0
+        return 0.0, 1.0  # without Gaussians, any numbers will do
     smallest, largest = torch.aminmax(scales)
     low = math.log(min(max(float(smallest), MIN_SCALE), MAX_SCALE))
     high = math.log(min(max(float(largest), MIN_SCALE), MAX_SCALE))
-    return low, max(high - low, MIN_LOG_SCALE_RANGE) / 255
+    return low, max(high - low, MIN_LOG_SCALE_RANGE) / 255  # 255 steps from byte 0 to byte 255
 
 
 def _center_planes(means: Tensor) -> NDArray[np.uint8]:

@@ -160,6 +160,7 @@ def spz_grid(gaussians: Gaussians) -> SpzGrid:
     largest_coordinate = np.abs(means).max(axis=1)  # [N]
     distance = np.sqrt((means * means).sum(axis=1))  # [N]
 
+    # The distance within which the nearest 1 % of the Gaussians lie; the grid must be fine there.
     near_index = int(NEAR_QUANTILE * len(distance))
     near_distance = float(np.partition(distance, near_index)[near_index])
     farthest_coordinate = float(largest_coordinate.max())

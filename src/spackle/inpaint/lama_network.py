@@ -41,7 +41,8 @@ def expected_shapes(
 ) -> TensorShapes:
     """Return the shapes of the published network's tensors by their names.
 
-    Counts of training batches, which a batch norm also has, are left out.
+    In these names, model.N is the network's layer N. The counts of training batches, which a batch
+    norm also has, are left out.
 
     Args:
         width: channels after the first layer.

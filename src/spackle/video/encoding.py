@@ -382,6 +382,7 @@ class PaletteFilter:
         )
         split = graph.add("split")
         palette = graph.add("palettegen")
+        # A kind of dithering that spreads the error of a pixel's colour to the pixels around it.
         apply_palette = graph.add("paletteuse", "dither=sierra2_4a")
         self._sink = graph.add("buffersink")
         self._source.link_to(split)

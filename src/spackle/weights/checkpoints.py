@@ -209,7 +209,8 @@ def read_checkpoint(path: StrPath, name: str, advice: str) -> tuple[object, dict
 
     Returns:
         The value, which is untrusted and consists of numbers, texts, lists, dicts, and stand-ins
-        for objects of classes, none of which was run; and the tensors by name, as `read_tensors` returns them.
+        for objects of classes, none of which was run; and the tensors by name, as `read_tensors`
+        returns them.
 
     Raises:
         InputError: the file is missing or broken, or has no such value.

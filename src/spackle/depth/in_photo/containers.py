@@ -182,7 +182,8 @@ def _properties_of_items(iprp: memoryview) -> dict[int, list[Box]]:
     for kind, table in parts:
         if kind != b"ipma":
             continue
-        # Larger files have wider numbers.
+        # A table begins with its version (1 byte), its flags (3 bytes) and the count of its items
+        # (4 bytes). In larger files, version and flags say that numbers are wider.
         version = table[0]
         has_wide_numbers = table[3] & 1  # the last flag
         item_format = struct.Struct(">IB" if version else ">HB")  # item, count of its properties

@@ -128,6 +128,7 @@ def load_photo_depth(path: StrPath) -> DepthMap | None:
     check_file(path, "photo")
     try:
         with open(path, "rb") as file:
+            # A HEIF begins with a box: 4 bytes of its size, then 4 bytes of its type.
             start = file.read(8)
             # Photos of all other formats have no depth, and are not read to the end.
             is_jpeg = start.startswith(JPEG_MAGIC)
@@ -136,7 +137,7 @@ def load_photo_depth(path: StrPath) -> DepthMap | None:
                 return None
             data = start + file.read()
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # Pillow's warnings about untrusted bytes are no use
+            warnings.simplefilter("ignore")  # Pillow's, which would not help the user
             coded = _find_in_jpeg(data) if is_jpeg else _find_in_heif(data)
             return None if coded is None else _to_depth_map(coded, Path(path))
     except Exception as error:  # untrusted bytes can raise any exception in a decoder
@@ -262,6 +263,7 @@ def apple_scale(packet: bytes) -> CodeScale | None:
     # Only now is the packet parsed: most photos have XMP about other things.
     tree = parse_xmp(packet)
     quantity = _apple_quantity(tree)
+    # What the lowest and the highest code of the map mean.
     first = find_number(tree, f"{PIXEL_DATA}FloatMinValue")
     last = find_number(tree, f"{PIXEL_DATA}FloatMaxValue")
     if quantity is None or first is None or last is None:
@@ -363,18 +365,20 @@ def android_scale(node: Element, namespace: str, layout: str) -> CodeScale:
     far *= _METRES_PER_UNIT.get(unit, 1.0)
     is_inverse = style == "rangeinverse"
     # In metres, Near must be the smaller number; in diopters, the larger one.
-    has_wrong_order = near == far or (near > far) != in_diopters
+    has_wrong_order = near <= far if in_diopters else near >= far
     divides_by_zero = is_inverse and min(near, far) == 0
     if has_wrong_order or min(near, far) < 0 or divides_by_zero:
         raise ValueError(f"nothing can lie between near {near:g} and far {far:g}")
 
     source = f"{layout}, in {unit}" if unit_known else f"{layout}, unit unknown"
+    # Near and Far are depths or, in diopters, inverse depths, which are called disparity here.
+    quantity: Quantity = "disparity" if in_diopters else "depth"
+    # The codes are linear in Near and Far, or in their inverses. The inverse of a depth is a
+    # disparity, and the inverse of a disparity is a depth.
     if is_inverse:
+        quantity = "depth" if in_diopters else "disparity"
         near = 1 / near
         far = 1 / far
-    # The codes are linear in Near and Far, or in their inverses. Near and Far themselves are depths
-    # or, in diopters, inverse depths; and the inverse of an inverse depth is a depth.
-    quantity: Quantity = "disparity" if is_inverse != in_diopters else "depth"
     return CodeScale(quantity, near, far, source, unit_known)
 
 
