@@ -313,8 +313,10 @@ def view_numbers(
         seconds: for each stage of `BASE_STAGES` and `COMPLETION_STAGES` the seconds in each run.
 
     Returns:
-        Counts; times in milliseconds (sums of the stages' medians over runs); "aux_share" and
-        "overhead" as shares (not percent); "fps" in views per second.
+        "aux" counts the added Gaussians, "merged" all of the view; "aux_share" is added over base.
+        "base_ms" is the time for a view of the base alone, "spackle_ms" that for a completed view,
+        in milliseconds, each the sum of the medians of its stages. "overhead" is the time that
+        completion adds, as a fraction of "base_ms". "fps" are views per second.
     """
     # Medians, because a busy machine makes some runs far too long.
     base_ms = sum(_median_ms(seconds[stage]) for stage in BASE_STAGES)
@@ -349,7 +351,7 @@ def count_parameters(residual: ResidualNet | None) -> dict[str, float]:
     """
     # On the device "meta" parameters have shapes but no memory, which is enough to count them.
     with torch.device("meta"):
-        sharp = SharpNetwork(FULL_SIZE)
+        sharp = SharpNetwork(FULL_SIZE)  # with the widths of the published network
     used_count = sum(parameter.numel() for parameter in sharp.parameters())
 
     residual_count = 0

@@ -236,7 +236,7 @@ def measure_case(case: Case, evaluation: Evaluation) -> tuple[list[Measurement],
     facts: dict[str, Value] = {
         "width": loaded.photo.width,
         "height": loaded.photo.height,
-        "focal_px": round(prediction.camera.focal[0], 3),
+        "focal_px": round(prediction.camera.focal[0], 3),  # thousandths of a pixel are enough
         "base_gaussians": len(prediction.gaussians),
     }
     for name, value in prediction.notes.items():

@@ -143,7 +143,7 @@ def make_figures(folders: Sequence[Path], max_rows: int, output: Path, reporter:
                 f"no figure {figure.name}: no large-view run has the pictures of its methods"
             )
 
-    files = [f"{name}.{form}" for name in drawn_figures for form in ("pdf", "png")]
+    files = [f"{name}.{suffix}" for name in drawn_figures for suffix in ("pdf", "png")]
     files.append(CAPTIONS_FILE)
     with results_folder(output, files, locked=True):
         _write_figures(drawn_figures, output)

@@ -163,6 +163,7 @@ def measure_images(plan: RunPlan, measure: MeasureImage, reporter: Reporter) -> 
 
     with (
         reporter.stage("images") as progress,
+        # In a single process, unlike under torchrun, a second Ctrl-C can end the run at once.
         catch_stop_signals(single_process=True) as is_stopped,
     ):
         for index, case in enumerate(plan.cases):

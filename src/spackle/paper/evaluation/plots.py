@@ -203,11 +203,11 @@ def _hole_area_series(run: Run) -> list[Series]:
     published = paper_measurements(HOLE_AREA.label)
     paper_before = _mean_by_disparity(published, run.title, "har_before", PAPER_METHOD)
     paper_after = _mean_by_disparity(published, run.title, "har", PAPER_METHOD)
-    for title, method, points, line_style in (
-        ("before: SHARP (paper)", "base", paper_before, "--"),
-        (f"after: {PAPER_METHOD}", "spackle", paper_after, "-"),
-    ):
-        series.append(Series(title, method, points, is_hollow=True, line_style=line_style))
+    # The paper's series have the colours of ours, but hollow markers.
+    before_title = "before: SHARP (paper)"
+    series.append(Series(before_title, "base", paper_before, is_hollow=True, line_style="--"))
+    after_title = f"after: {PAPER_METHOD}"
+    series.append(Series(after_title, "spackle", paper_after, is_hollow=True, line_style="-"))
     return [method_series for method_series in series if method_series.points]
 
 
@@ -257,7 +257,7 @@ def scenes_plot(run: Run, metric: str) -> Plot | None:
 
     Args:
         run: an evaluation against second photos.
-        metric: a key of `SCENE_PLOTS`.
+        metric: a key of `SCENE_PLOTS`, which has the titles of the plot and of its x axis.
     """
     # A method may lack the metric, if it failed on all images.
     values_by_method = {}

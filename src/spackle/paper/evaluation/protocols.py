@@ -191,7 +191,7 @@ def _hole_numbers(
     HAR is the hole area ratio (paper, eq. 11), the fraction of pixels that are too transparent;
     coverage is 1 - HAR (eq. 10). "aux" counts the Gaussians that a method adds to the base's.
     "hole_cells" is HAR times the number of cells of 2×2 pixels; the paper's method adds a Gaussian
-    for each such cell.
+    for each such cell. "merged" counts the base's and the added Gaussians together.
 
     Args:
         filled: the view by a method. Methods that inpaint the flat picture have no opacity;

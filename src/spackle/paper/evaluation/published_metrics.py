@@ -109,7 +109,7 @@ def _metric_of_network(network: Callable[..., Any]) -> Metric:
     def measure(picture: Tensor, true_picture: Tensor | None = None) -> float:
         """The network's score for a picture, compared with the true one if given; it may be NaN."""
         pictures = [picture] if true_picture is None else [picture, true_picture]
-        # Published metrics expect 0..1.
+        # Published metrics expect batches [1, 3, H, W] of numbers 0..1.
         batches = [image.clamp(0, 1).permute(2, 0, 1)[None].float() for image in pictures]
 
         with torch.no_grad(), warnings.catch_warnings():

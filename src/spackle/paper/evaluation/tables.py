@@ -281,6 +281,8 @@ def _content_by_dataset(
         group_pattern="" if is_near_view else DISPARITY_PATTERN,
         marks_best=layout.marks_best,
     )
+    # A column has two heads: one that it shares with its neighbours ("" if none), and its own. "n" is
+    # the number of images.
     heads = [("", "Dataset"), ("", "Method"), ("", "n")]
     heads += [(column.group, column.title) for column in columns]
 
@@ -301,6 +303,7 @@ def _near_view_content(
     """
     columns = columns_of_layout(layout.columns, settings, marks_best=layout.marks_best)
     datasets = _datasets(runs)
+    # A column has two heads: one that it shares with its neighbours ("" if none), and its own.
     heads = [("", "Method")]
     heads += [(dataset, column.title) for dataset in datasets for column in columns]
 
@@ -339,6 +342,8 @@ def _overhead_content(
     medians; each stands in the first column of its setting.
     """
     columns = columns_of_layout(layout.columns, settings, group_pattern=DISPARITY_PATTERN)
+    # A column has two heads: one that it shares with its neighbours ("" if none), and its own. "From"
+    # is the method, or the paper, that a row's numbers are from.
     heads = [("", "Dataset"), ("", "From")]
     heads += [(column.group, column.title) for column in columns]
 
@@ -438,6 +443,7 @@ def _expanded_overhead_content(
     """
     # "From" is the method that a row's numbers are from; "n" is the number of images.
     titles = ["Dataset", "Setting", "From", *(column.title for column in layout.columns), "n"]
+    # No column shares a second head with its neighbours, so that one is empty.
     heads = [("", title) for title in titles]
 
     bodies = []

@@ -108,13 +108,13 @@ class Model:
 
     def points(self, view: ColmapView) -> Points:
         """The reliable points in front of a view that the view sees, with their depth."""
-        # Indices of the ids that both have, in the view's and in the model's list of points.
-        _, in_view, in_model = np.intersect1d(
+        # Where the ids that both have stand in the view's list of points, and in the model's.
+        _, view_indices, model_indices = np.intersect1d(
             view.point_ids, self.point_ids, assume_unique=True, return_indices=True
         )
-        positions = torch.from_numpy(self.xyz[in_model])  # [n, 3]
+        positions = torch.from_numpy(self.xyz[model_indices])  # [n, 3]
         z = view.camera.to_camera(positions)[:, 2]
-        uv = torch.from_numpy(view.uv[in_view])
+        uv = torch.from_numpy(view.uv[view_indices])
 
         is_in_front = z > 0
         return Points(uv.float()[is_in_front], z.float()[is_in_front])

@@ -30,7 +30,7 @@ PHOTO_FOLDERS = ("images_4", "images", "images_8")  # the first of these with ph
 # A row of poses_bounds.npy has 17 numbers: a matrix [3, 5] row by row, the nearest and the
 # farthest depth. The matrix's columns are down, right, backwards, position (camera to world), and
 # (height, width, focal length).
-ROW_LENGTH = 17
+NUMBERS_PER_ROW = 17
 HEIGHT_COLUMN = 4
 WIDTH_COLUMN = 9
 FOCAL_COLUMN = 14
@@ -118,7 +118,7 @@ def _read_table(path: Path, photo_count: int) -> NDArray[Any]:
     """
     with as_input_error(path, "not LLFF's table ({reason}): expected finite floats, [photos, 17]"):
         table: NDArray[Any] = np.load(path, allow_pickle=False)
-        has_shape = table.ndim == 2 and table.shape[1] == ROW_LENGTH
+        has_shape = table.ndim == 2 and table.shape[1] == NUMBERS_PER_ROW
         has_floats = table.dtype.kind == "f"
         if not has_shape or not has_floats or not np.isfinite(table).all():
             # The text becomes the reason in the InputError's message.

@@ -76,7 +76,7 @@ def camera_from_pose(
         height,
         where,
         dtype=torch.float64,
-        tolerance=ROTATION_TOLERANCE,
+        tolerance=ROTATION_TOLERANCE,  # published poses are rounded
     )
     return dataclasses.replace(camera, world_to_camera=torch.linalg.inv(camera_to_world))
 
@@ -202,13 +202,13 @@ def _near_indices(
 
     # Axes are unit vectors, so their product is the cosine of the angle between them.
     cosines = scene.axes @ scene.axes[index]
-    looks_alike = cosines >= math.cos(math.radians(MAX_TURN_DEGREES))
+    has_similar_direction = cosines >= math.cos(math.radians(MAX_TURN_DEGREES))
 
     near_indices: list[int] = []
     for other in other_indices:
         if len(near_indices) == MAX_NEAR_VIEWS:
             break
-        is_placed_well = has_good_distance[other] and looks_alike[other]
+        is_placed_well = has_good_distance[other] and has_similar_direction[other]
         if is_placed_well and _sees_the_same(photo, scene.photos[other]):
             near_indices.append(other)
     return near_indices

@@ -30,7 +30,7 @@ from spackle.runtime.errors import as_input_error
 MAX_POSES_BYTES = 1 << 24  # of cam_poses.txt; the published ones are far smaller
 
 # Objects are held this far in front of the phone, so second views are 4 to 20 cm away.
-MIDDLE_DEPTH_M = 0.8
+ASSUMED_MIDDLE_DEPTH_M = 0.8
 
 
 def wildrgbd_cases(scenes: Mapping[str, Path]) -> list[Case]:
@@ -126,8 +126,12 @@ def _frames_of_scene(name: str, folder: Path) -> list[PosedPhoto]:
             continue
         where = f"{poses_path}: {file.name}"
         camera = camera_from_pose(K, camera_to_world, width, height, where)
+        # The depth map is not read here: objects usually are at this distance from the phone.
         frame = PosedPhoto(
-            name=f"{name}/{file.stem}", photo=file, camera=camera, middle_depth=MIDDLE_DEPTH_M
+            name=f"{name}/{file.stem}",
+            photo=file,
+            camera=camera,
+            middle_depth=ASSUMED_MIDDLE_DEPTH_M,
         )
         frames.append(frame)
     return frames
