@@ -196,6 +196,7 @@ def time_case(
         "height": loaded.photo.height,
         "base_gaussians": len(prediction.gaussians),
     }
+    # A base may add notes, such as its network's number format.
     for name, value in prediction.notes.items():
         facts[f"{NOTE_PREFIX}{name}"] = value
 
@@ -204,8 +205,8 @@ def time_case(
     ]
     for view in large_views(prediction, options.disparities, options.max_side):
         for method in _time_view(view, context, evaluation.renderer.device, runs):
-            # A user who sees a new view of a photo has also waited for the base. It was timed once, so
-            # its seconds are counted for each view.
+            # A user who sees a new view of a photo has also waited for the base. The base was timed
+            # once for all views, so each view gets the same seconds of it.
             numbers = view_numbers(
                 base_count=len(context.base),
                 added_count=method.added_count,

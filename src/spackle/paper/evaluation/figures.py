@@ -326,8 +326,8 @@ def _figure_latex(figure: PaperFigure, runs: Sequence[Run], bases: str, methods:
     # of the camera move). Settings are disparities as text.
     largest_disparities = dict.fromkeys(max(run.settings, key=float) for run in runs)
 
-    # The caption says so if the residual network was not trained by the paper's recipe. Weights that
-    # the user gave have no sentence.
+    # The caption says so if the residual network was not trained by the paper's recipe. There is
+    # no sentence on weights that the user gave.
     weights = dict.fromkeys(run.config["residual"]["weights"] for run in runs)
     weights_sentences = [WEIGHTS_SENTENCES[name] for name in weights if name in WEIGHTS_SENTENCES]
 

@@ -274,7 +274,7 @@ def ranking_of_run(run: Run) -> Ranking | None:
     for metric in RANKING_METRICS[str(run.config["protocol"])]:
         values = run.mean_by_image(metric, method)
         if values:
-            # Numbers such as the hole area ratio are no image metrics, so `METRICS` lacks their title.
+            # Numbers such as the hole area ratio are no image metrics: `METRICS` lacks their title.
             title = METRICS[metric].title if metric in METRICS else RANKING_TITLES[metric]
             criterion = f"{title} of {describe_method(method).title}"
             return Ranking(best_first(values, metric), criterion, values)
@@ -312,6 +312,7 @@ def write_contact_sheets(run: Run, folder: Path) -> None:
     # The font has no arrows.
     heading = heading.replace("↑", "(higher is better)").replace("↓", "(lower is better)")
 
+    # The ranking is best first, so the reversed list begins with the worst image.
     for file, images in (
         (BEST_SHEET_FILE, ranking.names),
         (WORST_SHEET_FILE, ranking.names[::-1]),

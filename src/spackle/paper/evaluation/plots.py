@@ -198,8 +198,8 @@ def _hole_area_series(run: Run) -> list[Series]:
             title = f"after: {method_row_name(run, method)}"
             series.append(Series(title, method, after, line_style="-"))
 
-    # The paper's numbers, from its table of hole areas, are drawn beside the run's, so that a reader
-    # can compare them.
+    # The paper's numbers, from its table of hole areas, are drawn beside the run's, so that a
+    # reader can compare them.
     published = paper_measurements(HOLE_AREA.label)
     paper_before = _mean_by_disparity(published, run.title, "har_before", PAPER_METHOD)
     paper_after = _mean_by_disparity(published, run.title, "har", PAPER_METHOD)

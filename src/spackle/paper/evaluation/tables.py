@@ -281,8 +281,8 @@ def _content_by_dataset(
         group_pattern="" if is_near_view else DISPARITY_PATTERN,
         marks_best=layout.marks_best,
     )
-    # A column has two heads: one that it shares with its neighbours ("" if none), and its own. "n" is
-    # the number of images.
+    # A column has two heads: one that it shares with its neighbours ("" if none), and its own. "n"
+    # is the number of images.
     heads = [("", "Dataset"), ("", "Method"), ("", "n")]
     heads += [(column.group, column.title) for column in columns]
 
@@ -342,8 +342,8 @@ def _overhead_content(
     medians; each stands in the first column of its setting.
     """
     columns = columns_of_layout(layout.columns, settings, group_pattern=DISPARITY_PATTERN)
-    # A column has two heads: one that it shares with its neighbours ("" if none), and its own. "From"
-    # is the method, or the paper, that a row's numbers are from.
+    # A column has two heads: one that it shares with its neighbours ("" if none), and its own.
+    # "From" is the method, or the paper, that a row's numbers are from.
     heads = [("", "Dataset"), ("", "From")]
     heads += [(column.group, column.title) for column in columns]
 
