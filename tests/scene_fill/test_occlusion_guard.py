@@ -21,7 +21,7 @@ from spackle.scene_fill.occlusion_guard import (
     MAX_REACH_PX,
     PIT_RADIUS_WIDTHS,
     VISIBLE_SIGMAS,
-    WINDOW_PX,
+    WINDOW_RADIUS_PX,
     move_behind_surfaces,
     without_pits,
 )  # fmt: skip
@@ -54,9 +54,12 @@ def plain_push(
             (u, v), (height, width) = uv.tolist(), guard.depth.shape
             if not (-reach[0] <= u <= width + reach[0] and -reach[1] <= v <= height + reach[1]):
                 continue
-            across, down = (math.ceil(max(r - WINDOW_PX, 0) / (2 * WINDOW_PX)) for r in reach)
+            across, down = (
+                math.ceil(max(r - WINDOW_RADIUS_PX, 0) / (2 * WINDOW_RADIUS_PX)) for r in reach
+            )
             for j, i in itertools.product(range(-down, down + 1), range(-across, across + 1)):
-                row_, column = math.floor(v + 2 * WINDOW_PX * j), math.floor(u + 2 * WINDOW_PX * i)
+                row_ = math.floor(v + 2 * WINDOW_RADIUS_PX * j)
+                column = math.floor(u + 2 * WINDOW_RADIUS_PX * i)
                 seen = guard.depth[min(max(row_, 0), height - 1), min(max(column, 0), width - 1)]
                 if float(z) < float(seen) * (1 + BEHIND_SURFACE_RATIO):
                     return True

@@ -74,8 +74,8 @@ def open_base(settings: BaseSettings) -> OpenedBase:
     Its network is loaded when the first photo needs it. InputError for unsuitable settings.
     """
     settings.check()
-    # Nothing in the settings decides. For each photo, the depth in its file and the weights on this
-    # machine do.
+    # The settings leave the choice open. So each photo gets the best base that is possible with the
+    # depth in its file, if any, and the weights on this machine.
     if settings.resolved_name == AUTO:
         return OpenedBase(AUTO_CANDIDATES, settings)
 
@@ -284,7 +284,8 @@ class OpenedBase:
                 is_unusable = self._fails_for_every_photo(name, base, error)
                 if is_unusable and len(self.candidates) == 1:
                     raise BaseError(str(error)) from error
-                # After the last candidate nothing is left to try.
+                # After the last candidate nothing is left to try. A BaseError, such as changed
+                # weights, ends the run whatever else could be tried.
                 is_last = name == list(self.candidates)[-1]
                 if is_last or isinstance(error, BaseError):
                     raise
@@ -299,8 +300,9 @@ class OpenedBase:
     def _fails_for_every_photo(self, name: str, base: Base | None, error: InputError) -> bool:
         """Whether the candidate `name`, which failed with `error`, would fail for every photo.
 
-        A network would, if it cannot be loaded (then `base` is None) or memory is short. A photo's
-        depth map would not: the next photo has another map.
+        A network would fail again if it could not be loaded (then `base` is None), or if memory was
+        short. A depth map that belongs to this photo would not, because the next photo has another
+        map.
         """
         # rgbd is among the loaded bases only if the calling program passed it, for all photos.
         has_own_depth_map = name == RGBD and name not in self._loaded
@@ -321,7 +323,7 @@ class OpenedBase:
             lacked_memory=isinstance(error, NotEnoughMemory),
         )
         if is_unusable:
-            # The report of a later photo gives the reason, but not a failure that was not its own.
+            # A later photo's report only gives the reason: the failure belongs to this photo.
             self._unusable[name] = dataclasses.replace(skipped, failure="")
             self._loaded.pop(name, None)
         return skipped
@@ -348,7 +350,8 @@ class OpenedBase:
             reason=reason,
             failures=tuple(candidate.failure for candidate in skipped if candidate.failure),
             note=note if is_news else "",
-            # With more free memory, the next run may use a better base.
+            # Lasting: the next run would choose the same base. If memory was short, it may choose a
+            # better one.
             lasting=not any(candidate.lacked_memory for candidate in skipped),
         )
 

@@ -197,7 +197,8 @@ class BaseSettings:
     def check(self, *, allow_auto: bool = True) -> None:
         """InputError for an unknown base, an option that it does not take, or missing weights.
 
-        Without `allow_auto`, the base must be named, because the results name it.
+        A base is a method that predicts a photo's Gaussians. Without `allow_auto`, the name `auto`
+        is an error, too, where the results must say which base made them.
         """
         self._check_base_name(allow_auto)
         check_name("precision", self.precision, PRECISIONS)

@@ -214,20 +214,20 @@ def meaning_of(settings: Mapping[str, Any], name: str) -> Meaning:
     """
     # The file is untrusted, and its values may have any type; hence `str`.
     kind = str(settings.get("model_type"))
-    stated = str(settings.get("depth_estimation_type", "relative"))
+    depth_type = str(settings.get("depth_estimation_type", "relative"))
     backbone = settings.get("backbone_config")
     has_dinov2 = isinstance(backbone, dict) and backbone.get("model_type") == "dinov2"
     # Models of type dpt are MiDaS models, with a known output. With DINOv2 as the backbone, such
     # a model is no MiDaS, and may predict anything.
     is_other_dpt = kind == "dpt" and has_dinov2
-    if kind not in OUTPUT_MEANINGS or is_other_dpt or stated not in ("relative", "metric"):
+    if kind not in OUTPUT_MEANINGS or is_other_dpt or depth_type not in ("relative", "metric"):
         known = ", ".join(OUTPUT_MEANINGS)
         raise InputError(
             # At most 40 characters of the untrusted type, escaped to ASCII (!a).
             f"{name}: the output of {kind[:40]!a} has no known meaning: "
             f"give a model of type {known}"
         )
-    if kind == "depth_anything" and stated == "metric":
+    if kind == "depth_anything" and depth_type == "metric":
         return "metres"
     return OUTPUT_MEANINGS[kind]
 
@@ -252,10 +252,11 @@ def to_depth_map(
         InputError: the output has no positive number, or is constant.
     """
     known = torch.isfinite(output)
-    greatest = _check_contrast(output[known], name, photo)
+    greatest = _greatest_with_contrast(output[known], name, photo)
     if meaning == "metres":
         depth = output
     elif meaning == "relative disparity":
+        # A high quantile instead of the maximum, because the nearest pixels are often specks.
         near_disparity = float(near_inverse_depth(output[known]))
         if not near_disparity > 0:  # nearly all values are negative
             near_disparity = greatest
@@ -280,7 +281,7 @@ def to_depth_map(
     )
 
 
-def _check_contrast(values: Tensor, name: str, photo: Path) -> float:
+def _greatest_with_contrast(values: Tensor, name: str, photo: Path) -> float:
     """The greatest of the finite `values` [N] that the model `name` predicts for a photo.
 
     InputError, which names the model and the photo, if there are no values, none is positive, or
@@ -420,11 +421,13 @@ def _run_processor(processor: Any, is_zoedepth: bool) -> Preprocessing:
     is_padded = is_zoedepth and processor.do_pad
 
     def preprocess(rgb: Tensor) -> tuple[Tensor, PhotoWindow]:
+        """The network's input for a photo [H, W, 3], and where the photo lies in it."""
         # Image processors are made for pictures of 8 bits.
         image = Image.fromarray((rgb * 255).round().to(torch.uint8).numpy())
         inputs = processor(images=image, return_tensors="pt")
         pixels = torch.as_tensor(inputs["pixel_values"])
         height, width = rgb.shape[:2]
+        # Only ZoeDepth's processor pads; the others resize the photo alone.
         window = _zoedepth_window(height, width) if is_padded else WHOLE_PICTURE
         return pixels, window
 
@@ -466,6 +469,7 @@ def _stretch_to_input(settings: Mapping[str, Any]) -> Preprocessing:
     std = torch.tensor(settings["image_std"]).float()
 
     def preprocess(rgb: Tensor) -> tuple[Tensor, PhotoWindow]:
+        """The network's input for a photo [H, W, 3]; the photo fills the whole of it."""
         normalised = ((rgb - mean) / std).permute(2, 0, 1)[None]  # [1, 3, H, W]
         pixels = interpolate(normalised, size=(height, width), mode="bilinear")
         return pixels, WHOLE_PICTURE

@@ -19,7 +19,7 @@ ARCHITECTURES = {
 }
 SHIPPED = Path(__file__).parent.parent / "weights" / "residual.safetensors"
 ARCHITECTURE_KEY = "spackle.residual"  # in a file's metadata: the architecture's name
-NAME_IN_OLD_FILES = "unet"  # files without this key are older than the second architecture
+ARCHITECTURE_OF_OLD_FILES = "unet"  # files without this key are older than the second architecture
 MAX_NAME_IN_MESSAGE = 60  # characters; the name comes from a stranger's file
 
 
@@ -57,7 +57,8 @@ def load_residual(path: str | os.PathLike[str]) -> ResidualNet:
     """
     advice = "give the residual's weights, 'initial' or 'none'"
     tensors = read_tensors(path, advice)
-    name = read_metadata(path, ARCHITECTURE_KEY) or NAME_IN_OLD_FILES
+    # Files that name no class were written when there was only one.
+    name = read_metadata(path, ARCHITECTURE_KEY) or ARCHITECTURE_OF_OLD_FILES
 
     # The name of another package's network has the form "package.module:Class".
     module, _, class_name = name.partition(":")

@@ -90,9 +90,9 @@ class ViewCompletion:
     def cells(self, at_least: int = 0) -> Tensor:
         """[h, w] bool: the cells of 2×2 pixels that get a new Gaussian (eqs. 4 and 7).
 
-        These are the cells whose first pixel is a hole: the upper left one of the four.
-        About HAR · h · w cells are thus chosen, as in the paper's tables, where HAR is the fraction
-        of hole pixels. If these are fewer than `at_least`, the `at_least` least opaque cells are
+        These are the cells whose upper left pixel is a hole. Because one pixel of each cell
+        decides, about HAR · h · w cells are chosen, as in the paper's tables; HAR is the fraction
+        of hole pixels in the view. If fewer than `at_least`, the `at_least` least opaque cells are
         chosen instead.
         """
         hole = hole_mask(self.rendering.alpha, self.threshold)
@@ -132,8 +132,8 @@ class ViewCompletion:
         """[h, w, c] float32: the channels of one of the network's inputs, for each cell (2×2
         pixels).
 
-        Colours are shifted from 0..1 to -0.5..0.5. Depths are log(inverse depth / median), so
-        their unit does not matter.
+        Colours are shifted from 0..1 to -0.5..0.5. Depths are log(inverse depth / median inverse
+        depth of the view), so their unit does not matter.
 
         Args:
             name: "rgb", "depth", "alpha": what was rendered; "mask": where holes are; "initial":

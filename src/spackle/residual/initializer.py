@@ -123,7 +123,7 @@ def _grey_wall(features: ViewFeatures, uv: Tensor) -> InitialGaussians:
         inverse_depth=torch.full_like(features.alpha, EMPTY_VIEW_INVERSE_DEPTH),
         slope=torch.zeros_like(uv),
         rgb=torch.full_like(features.rgb, EMPTY_VIEW_GREY),
-        unit=EMPTY_VIEW_INVERSE_DEPTH,
+        unit=EMPTY_VIEW_INVERSE_DEPTH,  # the median inverse depth, as in other views
     )
 
 
@@ -140,14 +140,18 @@ def inside_photo(inverse_depth: Tensor, camera: Camera, photo_camera: Camera) ->
 
 
 def sample_photo(
-    photo: Tensor, elsewhere: Tensor, inverse_depth: Tensor, camera: Camera, photo_camera: Camera
+    photo: Tensor,
+    fallback_colors: Tensor,
+    inverse_depth: Tensor,
+    camera: Camera,
+    photo_camera: Camera,
 ) -> Tensor:
     """[h, w, 3] sRGB: the photo's colour at the point of each cell (2×2 pixels) of a view.
 
     Args:
         photo: [H', W', 3] sRGB.
-        elsewhere: [h, w, 3] sRGB, taken for points that lie outside of the photo, or behind its
-            camera.
+        fallback_colors: [h, w, 3] sRGB, taken for points that lie outside of the photo, or behind
+            its camera.
         inverse_depth: [h, w] 1/z of the cells' points as `camera` sees them.
         camera: of the view.
         photo_camera: of the photo.
@@ -163,7 +167,7 @@ def sample_photo(
     grid = (2 * place / z.clamp_min(MIN_DIVISOR) - 1).clamp(-2, 2).to(photo_cells)[None]
     sampled = grid_sample(photo_cells, grid, padding_mode="border", align_corners=False)
     photo_colors = sampled[0].movedim(0, -1)  # [h, w, 3]
-    return torch.where(_is_inside(place, z).all(-1, keepdim=True), photo_colors, elsewhere)
+    return torch.where(_is_inside(place, z).all(-1, keepdim=True), photo_colors, fallback_colors)
 
 
 def _is_inside(place: Tensor, z: Tensor) -> Tensor:
@@ -185,8 +189,7 @@ def _project_into_photo(
     photo's camera.
 
     Args:
-        inverse_depth: [h, w] 1/z of the cells as `camera` sees them. The points are scaled by it
-            about the photo's camera, which changes neither x nor y nor the sign of z.
+        inverse_depth: [h, w] 1/z of the cells' points as `camera` sees them.
         camera: of the view.
         photo_camera: of the photo.
 
@@ -194,6 +197,9 @@ def _project_into_photo(
         (x·z, y·z) as [h, w, 2], and z as [h, w, 1], float64.
     """
     rays, motion = _rays_in_photo(cell_centers(camera).double(), camera, photo_camera)
+
+    # A point is ray / inverse_depth + t in the photo's frame. Here it is multiplied by its inverse
+    # depth, so that points at infinity stay finite; x, y and the sign of z do not change.
     points = rays + inverse_depth[..., None] * motion[:3, 3]  # [h, w, 3]
     z = points[..., 2:]
     photo_K = photo_camera.K.cpu().double()
@@ -262,8 +268,8 @@ def fill_around(
     """
     colors = features.rgb.movedim(-1, 0)  # [3, h, w]
 
-    # Inside the photo, the far side of a rim decides. Beyond the border the bias is 0, by which
-    # near and far side count alike.
+    # Inside the photo, the far side of a rim decides. Beyond the border the bias is 0: near and far
+    # side count alike.
     far_bias = FAR_SIDE_BIAS * inside
     beyond = features.mask & ~inside
     if not bool(beyond.any()):
@@ -342,10 +348,10 @@ def _extend_border_surfaces(
     rim_ends_inside = at_rim[..., 1] == 0  # `ends_at_border` is false
 
     # z_photo = ray_z · z_view + t_z, solved for z_view = (z_photo − t_z) / ray_z.
-    ahead = 1 / rim_photo_inverse_depth.clamp_min(MIN_DIVISOR) - motion[2, 3]  # z_photo − t_z
+    z_minus_t = 1 / rim_photo_inverse_depth.clamp_min(MIN_DIVISOR) - motion[2, 3]  # z_photo − t_z
     hidden = beyond & (steps > 0) & rim_ends_inside
-    extended = beyond & ~hidden & (steps > 0) & (ahead > 0) & (rays[..., 2] > 0)
-    inverse_depth = (rays[..., 2] / ahead.clamp_min(MIN_DIVISOR)).clamp_min(MIN_DIVISOR)
+    extended = beyond & ~hidden & (steps > 0) & (z_minus_t > 0) & (rays[..., 2] > 0)
+    inverse_depth = (rays[..., 2] / z_minus_t.clamp_min(MIN_DIVISOR)).clamp_min(MIN_DIVISOR)
 
     # No extended surface comes nearer than the nearest visible one.
     nearest = torch.where(known, features.inverse_depth, 0).amax()

@@ -120,8 +120,8 @@ class SharpDecoder(ResidualNet):
 
 
 def set_random_weights(layer: nn.Conv2d | nn.ConvTranspose2d, gain: float) -> None:
-    """Set a layer's bias to zero, and its weights to random numbers by which its outputs are about
-    `gain` times as large as its inputs.
+    """Set a layer's bias to zero, and its weights to random numbers of such a size that its outputs
+    are about `gain` times as large as its inputs.
     """
     # The number of inputs that one output sums.
     inputs = layer.weight[0].numel()

@@ -35,7 +35,7 @@ class PhotoRendering:
     def render(self, renderer: Renderer, base: Gaussians, photo_camera: Camera) -> Rendering:
         """The base rendered from the photo's camera, or the same rendering as last time.
 
-        It is rendered anew only if one of the three is another object than last time.
+        It is rendered anew only if one of the three arguments is another object than last time.
         """
         inputs = (renderer, base, photo_camera)
         is_same = self._inputs is not None and all(

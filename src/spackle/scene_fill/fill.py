@@ -161,7 +161,7 @@ class _SceneFilling:
 
         # No new Gaussian may hide what the photo or one of the widest views shows.
         self.renderer = IncrementalRenderer(context.renderer, context.base)
-        self.guards = {PHOTO: context.photo_guard()}
+        self.guards = {PHOTO: context.photo_guard()}  # by the view's index; PHOTO: the photo's
         # Renderings of the base alone, by the view's index; dropped when the view is visited.
         self.base_renderings: dict[int, Rendering] = {}
         for index in order[:GUARDED_VIEWS]:
@@ -229,8 +229,8 @@ class _SceneFilling:
         if hole_ratio < MIN_HOLE_RATIO_FOR_NETWORK and not self.exact:
             return self.context.without_network
 
-        # The chosen texture may take seconds (an inpainter); the two widest views, which come
-        # first, show nearly all holes, so later views copy texture from the view itself.
+        # The chosen texture may take seconds, if an inpainter makes it. The two widest views, which
+        # come first, show nearly all holes; so later views do with texture copied from the view.
         if self.filled_views >= OPPOSITE_VIEWS and self.context.texture is not None:
             return dataclasses.replace(self.context, texture=exemplar_texture)
         return self.context
@@ -287,7 +287,7 @@ def _fill_in_passes(
         max_hole_ratio: no further pass if at most this fraction of pixels are holes.
         with_underlays: also make Gaussians beneath the rims of the holes.
     """
-    aux: list[Gaussians] = []
+    aux: list[Gaussians] = []  # the Gaussians that each pass adds in the holes
     underlays: list[Gaussians] = []
     for pass_index in range(PASSES):
         # Where holes stayed open, the network predicted faint Gaussians. It would do so again, so

@@ -83,8 +83,8 @@ def fill_holes(
         linear_means = srgb_to_linear(cell_pixels.clamp(0, 1)).mean((1, 2))
         cells = dataclasses.replace(cells, colors=linear_means)
 
-    # Beneath the rims of the holes, these surfaces will be continued. Without network and texture,
-    # they are the first guess as it is.
+    # The caller will continue `surfaces` beneath the rims of the holes. Without network and
+    # texture, they are the first guess, unchanged.
     surfaces = view.initial
     if context.network is not None or context.texture is not None:
         surfaces = _follow_beyond_photo(view, depths * scales, scales > 0)
@@ -95,7 +95,7 @@ def fill_holes(
 def _textured_pixels(
     view: SceneViewCompletion, deltas: Tensor | None, picture: Tensor, scales: Tensor
 ) -> Gaussians:
-    """Gaussians for the single pixels of the hole cells whose pixels differ in colour.
+    """One Gaussian for each pixel of those hole cells whose four pixels differ in colour.
 
     Args:
         view: the view.
@@ -129,10 +129,10 @@ def _follow_beyond_photo(
     """The view's initial Gaussians, but beyond the photo's border at the depths of the new
     Gaussians.
 
-    An initial Gaussian is the first guess of a surface point for a cell of 2×2 pixels. New
-    Gaussians started there, and may have moved away from the camera since. The result is later
-    continued beneath the rims of holes, and there must fit the new Gaussians. Inside the photo, the
-    first guess is kept.
+    An initial Gaussian is the first guess of a surface point for a cell of 2×2 pixels. The surfaces
+    of the result are later continued beneath the rims of holes. There they must meet the new
+    Gaussians, which started at the first guess but may have moved away from the camera since.
+    Inside the photo, the first guess is kept.
 
     Args:
         view: the view.

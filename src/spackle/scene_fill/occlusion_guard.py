@@ -25,7 +25,7 @@ from spackle.residual.features import MASK_THRESHOLD
 from spackle.runtime.device import parallel_for_chunks
 from spackle.runtime.kernels import kernel
 
-WINDOW_PX = 4  # radius of the guard's windows: most new Gaussians reach no farther
+WINDOW_RADIUS_PX = 4  # of the guard's windows: most new Gaussians reach no farther
 # A Gaussian is visible up to so many standard deviations from its centre: exp(-x² / 2) = ALPHA_MIN.
 VISIBLE_SIGMAS = math.sqrt(-2 * math.log(ALPHA_MIN))
 MAX_REACH_PX = 40.0  # a Gaussian is checked only up to this distance from its centre
@@ -44,7 +44,7 @@ class OcclusionGuard:
     """The farthest surface near each pixel of a view; no new Gaussian may lie in front of it."""
 
     camera: Camera
-    depth: Tensor  # [H, W] z of the farthest surface within WINDOW_PX pixels; 0 in holes
+    depth: Tensor  # [H, W] z of the farthest surface within WINDOW_RADIUS_PX; 0 in holes
 
     @staticmethod
     def of(
@@ -64,7 +64,7 @@ class OcclusionGuard:
 
         # A Gaussian reaches some pixels around its centre, and may hide a surface at any of them.
         # So each pixel keeps the greatest depth within a window around it.
-        return OcclusionGuard(camera, maximum_filter(surface_depth, WINDOW_PX))
+        return OcclusionGuard(camera, maximum_filter(surface_depth, WINDOW_RADIUS_PX))
 
 
 def move_behind_surfaces(
@@ -243,15 +243,16 @@ def _hides_surface(
         return False
 
     # A depth of the guard is the greatest within a window around its pixel. So it is enough to look
-    # at pixels one window apart, from end to end of the Gaussian.
-    window_px = 2 * WINDOW_PX
-    steps_u = int(np.ceil(max(reach_u - WINDOW_PX, 0.0) / window_px))
-    steps_v = int(np.ceil(max(reach_v - WINDOW_PX, 0.0) / window_px))
+    # at pixels whose windows touch, from end to end of the Gaussian.
+    spacing_px = 2 * WINDOW_RADIUS_PX
+    steps_u = int(np.ceil(max(reach_u - WINDOW_RADIUS_PX, 0.0) / spacing_px))
+    steps_v = int(np.ceil(max(reach_v - WINDOW_RADIUS_PX, 0.0) / spacing_px))
     for j in range(-steps_v, steps_v + 1):
-        row = min(max(int(np.floor(v + window_px * j)), 0), height - 1)
+        row = min(max(int(np.floor(v + spacing_px * j)), 0), height - 1)
         for i in range(-steps_u, steps_u + 1):
-            column = min(max(int(np.floor(u + window_px * i)), 0), width - 1)
+            column = min(max(int(np.floor(u + spacing_px * i)), 0), width - 1)
             surface_depth = depths[start + row * width + column]
+            # A Gaussian that lies just behind a surface would show through it.
             if depth < surface_depth * (1 + BEHIND_SURFACE_RATIO):
                 return True
     return False

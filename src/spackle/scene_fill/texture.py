@@ -161,7 +161,8 @@ def _gain_to_surroundings(texture: Tensor, view: SceneViewCompletion) -> Tensor:
     log_energy_around = (visible_energy / visible_weight).log()
 
     # The energy around the hole is continued into it, from the far side of its rim, because the
-    # surface there fills the hole. Beyond the photo's border (bias 0) all sides count alike.
+    # surface there fills the hole. Beyond the photo's border the bias is 0: all sides count
+    # alike.
     known = ~view.mask
     if bool(known.any()):
         far_bias = FAR_SIDE_BIAS * ~view.beyond_photo

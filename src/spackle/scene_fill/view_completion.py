@@ -92,9 +92,9 @@ class SceneViewCompletion(ViewCompletion):
     def patches(self) -> Patches:
         """Patches of the view's visible part that match its holes.
 
-        A patch is sought whose colours resemble a guess. Inside the photo, the guess are the
-        initial colours. Beyond the photo's border these are too blurred, and the colours mirrored
-        at the rim take their place.
+        Each hole cell gets a patch whose colours resemble a guess. Inside the photo, the guess
+        is the initial colours. Beyond the photo's border these are too blurred, so the guess is the
+        colours at the cells' mirror images beyond the rim.
         """
         guess = torch.where(
             self.beyond_photo[..., None], self.far_rim.mirrored, self._smooth_colors
@@ -123,10 +123,10 @@ class SceneViewCompletion(ViewCompletion):
         """[h, w, c] float32: the channels of one input, by its name in `INPUT_CHANNELS`; 0 outside
         of holes.
 
-        "rim" has the colour at the rim, the colour mirrored at the rim, and the distance to the
-        rim. "patches" has the colour of matching patches, and how badly they match. These colours
-        are differences from the initial colours, as logits, so that a network can add them to the
-        initial colours.
+        "rim" has the colour at the rim of the hole, the colour at the cell's mirror image beyond
+        the rim, and the distance to the rim. "patches" has the colour of matching patches, and how
+        badly they match. These colours are differences from the initial colours, as logits, so
+        that a network can add them to the initial colours.
         """
         if name == "rim":
             initial_logit = color_logit(self.initial.rgb[self.mask])

@@ -176,6 +176,7 @@ def to_view(output: MogeOutput, width: int, height: int, focal_px: float | None 
     sampled_rows = (torch.arange(SAMPLES_PER_SIDE) * rows // SAMPLES_PER_SIDE)[:, None]
     sampled_columns = torch.arange(SAMPLES_PER_SIDE) * columns // SAMPLES_PER_SIDE
     points = output.points[sampled_rows, sampled_columns].double()  # [64, 64, 3]
+    # Where the points must project to: the places of their pixels on the photo.
     plane = view_plane(rows, columns, width / height)[0].permute(1, 2, 0)  # [h, w, 2]
     places = plane[sampled_rows, sampled_columns].double()  # [64, 64, 2]
     # The sky's points are left out: they are far away and arbitrary.
@@ -248,10 +249,10 @@ def focal_and_shift(
     fit = _fit_at(shift, points, places, known_focal)
     for _ in range(MAX_SHIFT_STEPS):
         step = _gauss_newton_step(fit, shift, points, places, known_focal)
-        shortest = SHIFT_TOLERANCE * (1 + abs(shift))
+        shortest_step = SHIFT_TOLERANCE * (1 + abs(shift))
         # The error is NaN if the step puts a point into the camera. NaN is not less than the
         # present error, so that such a step is halved, too.
-        while abs(step) > shortest:
+        while abs(step) > shortest_step:
             if _fit_at(shift + step, points, places, known_focal).error < fit.error:
                 break
             step /= 2
@@ -270,7 +271,7 @@ def _gauss_newton_step(
 
     The residuals, fit.focal · fit.projected - places, say how far the points [N, 3], which are
     shifted by `shift` so far, miss their places [N, 2]. Without a known focal length, each shift
-    has its best one.
+    comes with the focal length that makes its residuals smallest.
     """
     projected_slope = -fit.projected / (points[:, 2:] + shift)  # d projected / d shift
     residual_slope = fit.focal * projected_slope  # d residual / d shift, at this focal length

@@ -218,6 +218,8 @@ class Pyramid(nn.Module):
         # None: a level's output has as many channels as the level.
         output_channels = config["dim_out"] or [None] * LEVEL_COUNT
 
+        # Surplus entries of `dim_in` and `resamplers` are ignored (strict=False). If entries are
+        # missing, so are layers, and the checkpoint's weights do not fit.
         self.input_blocks = nn.ModuleList(
             nn.Conv2d(inputs, width, kernel_size=1)
             for inputs, width in zip(config["dim_in"], widths, strict=False)

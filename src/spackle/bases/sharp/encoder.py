@@ -166,7 +166,8 @@ class TransformerBlock(nn.Module):
         """Build a block for tokens with `width` channels, which `head_count` must divide."""
         super().__init__()
         self.heads = head_count
-        # The names are those of DINOv2's checkpoints: `ls` is layer scale, a factor by channel.
+        # The names are those of DINOv2's checkpoints: `ls` is "layer scale", one factor
+        # for each channel.
         self.norm1 = nn.LayerNorm(width, eps=NORM_EPS)
         self.norm2 = nn.LayerNorm(width, eps=NORM_EPS)
         self.attn = nn.ModuleDict(
@@ -210,8 +211,8 @@ class SlidingPyramid(nn.Module):
         self.early_blocks = config.early_blocks
         self.window = config.window
         # Neighbouring windows overlap by a quarter of their side in the full-size picture, and by a
-        # half in the half-size one. Where their maps are joined, each loses half of the overlap.
-        # Its width in tokens:
+        # half in the half-size one. Where their maps are joined, half of the overlap is trimmed
+        # from each: an eighth or a quarter of the side, in tokens.
         self.full_size_trim = config.tokens_per_side // 8
         self.half_size_trim = config.tokens_per_side // 4
         self.patch_encoder = VisionTransformer(config)

@@ -208,7 +208,8 @@ class SharpNetwork(nn.Module):
         """
         super().__init__()
         self.config = config
-        # The checkpoint's names of tensors begin with monodepth_model.monodepth_predictor.
+        # The depth network is nested in an empty module, because its tensors' names in the
+        # checkpoint begin with monodepth_model.monodepth_predictor.
         self.monodepth_model = nn.Module()
         self.monodepth_model.monodepth_predictor = DepthNetwork(config)
         self.feature_model = FeatureNetwork(config)

@@ -211,7 +211,7 @@ def _other_axes(a: Any, b: Any) -> Any:
     """The second and third axis of a right-handed frame whose first axis is the unit vector `a`.
 
     The second axis is the unit vector `b`, made orthogonal to `a`. If b is zero, or far from
-    orthogonal because it is mere noise, any orthogonal axis is taken.
+    orthogonal to `a`, it is mere rounding noise: then any orthogonal axis is taken.
     """
     # The squared length of the vector product of two unit vectors is the squared sine of their
     # angle: 1 if they are orthogonal. `not … >` is also true for NaN.
