@@ -293,8 +293,8 @@ class OpenedBase:
                 log(f"{photo.path.name}: going on without {candidate.title}: {error}")
                 continue
             return prediction, self._resolved(name, skipped)
-        # The last candidate has no weights. The check of the settings found them, so that they must
-        # have been deleted since.
+        # The last candidate has no weights. The check of the settings found them, so they must have
+        # been deleted since.
         raise BaseError(f"`base` {self._settings.resolved_name}: its weights are gone: start again")
 
     def _fails_for_every_photo(self, name: str, base: Base | None, error: InputError) -> bool:

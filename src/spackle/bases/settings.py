@@ -185,7 +185,7 @@ class BaseSettings:
             ]
             return {file.name: file for file in matches if file.is_file()}
 
-        # With `auto`, the next photo may need any of the networks, so that all their files count.
+        # With `auto`, the next photo may need any of the networks, so all their files count.
         names = AUTO_NETWORKS if self.resolved_name == AUTO else (self.resolved_name,)
         files: dict[str, Path] = {}
         for name in names:

@@ -256,8 +256,8 @@ def encode_decoder(decoder: nn.Module, source: SourceCheckpoint) -> bytes:
     """The bytes of a safetensors file with a decoder's weights and the name of its checkpoint.
 
     The `GaussianDecoder` is the part of SHARP that is trained; the checkpoint is where the training
-    began. Weights are stored as float32, like the checkpoint's, so that those which the training
-    leaves alone are the same to the bit.
+    began. Weights are stored as float32, like the checkpoint's, so that weights which the training
+    does not change stay the same to the bit.
     """
     tensors = {
         name: tensor.detach().float().cpu().contiguous()
