@@ -208,7 +208,9 @@ def clip_report(
             "cuts": [index for index, frame in enumerate(measures) if frame.starts_shot],
             "sound": sound,
         },
-        "aux": {"gaussians": round(fmean(frame.aux_count for frame in measures))},  # of a frame
+        "aux": {
+            "gaussians": round(fmean(frame.aux_count for frame in measures))
+        },  # mean of a frame
         "disparity": disparity,
         "hole_area_ratio": {
             "before": fmean(frame.hole_ratio_before for frame in measures),

@@ -188,8 +188,9 @@ def start_matches(
         if k < 0:
             continue
         source = coarse_matches[k, 0]
-        # Halving an odd width adds a column at the right, which is the left of the mirror image.
-        # There, all columns must move back by this one.
+        # Halving an odd width rounds up, as if the picture had one more column at its right. In the
+        # mirror image, that column comes first, so that doubled columns are one too large there:
+        # `shift` is -1 for an odd width, and 0 for an even one.
         shift = width - 2 * coarse_width if source else 0
         row = 2 * coarse_matches[k, 1] + y % 2
         column = 2 * coarse_matches[k, 2] + x % 2 + shift

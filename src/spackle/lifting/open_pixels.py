@@ -131,6 +131,7 @@ def _find_cheapest_paths(
                 )
                 color = _color_change(rgb, y, x, v, u)
                 total = cost[v, u] + length + COLOR_CHANGE_COST * (color + climb)
+                # A neighbour without cost is a start, and only in a hole is the edge infinite.
                 if cost[v, u] == 0 and edge_height[y, x] == np.inf:
                     total += NEAR_START_COST * max(0.0, 1 - far[y, x] / inverse_depth[v, u])
                 if np.float32(total) < cost[y, x]:

@@ -196,8 +196,9 @@ def _measure_all_losses(
     A block is a square of side × side pixels. Its losses are the detail that it would lose as one
     tile, as two flat halves and as two tall halves, if the pixels of a tile share one Gaussian.
 
-    `arrays` are the last arguments of `_measure_losses`: the picture, the means of tiles, the
-    inverse depth, the means of blocks, and the free pixels.
+    `arrays` are the inputs, in the order of the kernel's last arguments: the picture; its means in
+    whole, flat and tall tiles; the inverse depth; the means of the inverse depth and of its slope
+    in blocks; and the pixels that may share a Gaussian.
     """
     parallel_for_chunks(
         lambda start, stop: _measure_losses(start, stop, side, steepest, losses, *arrays),

@@ -84,12 +84,12 @@ def find_layers(inverse_depth: Floats, slope: Floats, colors: Floats) -> Layers:
 
 
 @inlined_kernel
-def _closest_mixture(colors: Any, color: Any, y: int, x: int) -> Any:
+def _closest_mixture(photo: Any, surface_colors: Any, y: int, x: int) -> Any:
     """The mixture of near and far colour that is closest to a pixel's colour.
 
     Args:
-        colors: [H, W, 3] the photo.
-        color: [2, H, W, 3] near and far colour.
+        photo: [H, W, 3] the photo.
+        surface_colors: [2, H, W, 3] near and far colour.
         y, x: the pixel.
 
     Returns:
@@ -102,8 +102,8 @@ def _closest_mixture(colors: Any, color: Any, y: int, x: int) -> Any:
     along = np.float32(0)
     from_far = np.float32(0)
     for c in range(3):
-        difference = color[0, y, x, c] - color[1, y, x, c]
-        own = colors[y, x, c] - color[1, y, x, c]
+        difference = surface_colors[0, y, x, c] - surface_colors[1, y, x, c]
+        own = photo[y, x, c] - surface_colors[1, y, x, c]
         contrast += difference * difference
         along += difference * own
         from_far += own * own
@@ -115,10 +115,10 @@ def _closest_mixture(colors: Any, color: Any, y: int, x: int) -> Any:
 def _fit_coverage(
     start: int,
     stop: int,
-    colors: Any,
+    photo: Any,
     ring: Any,
     inside: Any,
-    color: Any,
+    surface_colors: Any,
     variance: Any,
     alpha: Any,
 ) -> None:
@@ -129,10 +129,10 @@ def _fit_coverage(
 
     Args:
         start, stop: the rows to do.
-        colors: [H, W, 3] the photo in linear RGB.
+        photo: [H, W, 3] the photo in linear RGB.
         ring: [H, W] uint8: distance to the nearest depth step, or 0.
         inside: [H, W] distance from the near surface's outline in the map, in pixels.
-        color: [2, H, W, 3] mean colours of the near and the far surface.
+        surface_colors: [2, H, W, 3] mean colours of the near and the far surface.
         variance: [2, H, W] their variances.
         alpha: [H, W]: the coverage, 0..1, of pixels in a ring is written here.
     """
@@ -150,7 +150,7 @@ def _fit_coverage(
                     if ring[v, u] == 0:
                         continue
                     # A pixel counts more, the better its colours tell both surfaces apart.
-                    share, off_mixture, contrast = _closest_mixture(colors, color, v, u)
+                    share, off_mixture, contrast = _closest_mixture(photo, surface_colors, v, u)
                     spread = variance[0, v, u] + variance[1, v, u]
                     spread = spread + OFF_MIXTURE_WEIGHT * off_mixture
                     weight = contrast / max(spread, MIN_SQUARED_CONTRAST)
@@ -175,7 +175,7 @@ def _fit_coverage(
 
 
 @inlined_kernel
-def _move_colors(y: int, x: int, a: Any, residual: Any, color: Any, variance: Any) -> Any:
+def _move_colors(y: int, x: int, a: Any, residual: Any, surface_colors: Any, variance: Any) -> Any:
     """Move the near and the far colour of a pixel so that their mixture changes by `residual`.
 
     A surface that covers the part p of the pixel changes its colour by residual·p²/(a³ + (1 - a)³),
@@ -187,7 +187,7 @@ def _move_colors(y: int, x: int, a: Any, residual: Any, color: Any, variance: An
         y, x: the pixel.
         a: the part that the near surface covers; the far one covers 1 - a.
         residual: [3] change of the mixture.
-        color: [2, H, W, 3] near and far colour, changed in place.
+        surface_colors: [2, H, W, 3] near and far colour, changed in place.
         variance: [2, H, W] of each surface's colours.
 
     Returns:
@@ -201,15 +201,19 @@ def _move_colors(y: int, x: int, a: Any, residual: Any, color: Any, variance: An
             part = a if side == 0 else 1 - a
             limit = MAX_COLOR_DEVIATIONS * np.sqrt(variance[side, y, x])
             change = min(max(residual[c] * part * part / cubes, -limit), limit)
-            new_color = min(max(color[side, y, x, c] + change, np.float32(0)), np.float32(1))
-            missing -= part * (new_color - color[side, y, x, c])
-            color[side, y, x, c] = new_color
+            new_color = min(
+                max(surface_colors[side, y, x, c] + change, np.float32(0)), np.float32(1)
+            )
+            missing -= part * (new_color - surface_colors[side, y, x, c])
+            surface_colors[side, y, x, c] = new_color
         unexplained += missing * missing
     return unexplained
 
 
 @kernel
-def _unmix(colors: Any, ring: Any, inside: Any, alpha: Any, color: Any, variance: Any) -> None:
+def _unmix(
+    photo: Any, ring: Any, inside: Any, alpha: Any, surface_colors: Any, variance: Any
+) -> None:
     """Change both colours so that they mix to the photo's colour, as far as they may.
 
     A colour may move by 1.5 standard deviations of its surface's colours. If that allows no exact
@@ -219,11 +223,11 @@ def _unmix(colors: Any, ring: Any, inside: Any, alpha: Any, color: Any, variance
     on the background.
 
     Args:
-        colors: [H, W, 3] the photo in linear RGB.
+        photo: [H, W, 3] the photo in linear RGB.
         ring: [H, W] uint8: distance to the nearest depth step; pixels with 0 are left alone.
         inside: [H, W] distance from the near surface's outline in the map, negative outside.
         alpha: [H, W] coverage by the near surface, changed in place.
-        color: [2, H, W, 3] near and far colour, changed in place.
+        surface_colors: [2, H, W, 3] near and far colour, changed in place.
         variance: [2, H, W] of each surface's colours.
     """
     height, width = ring.shape
@@ -234,7 +238,7 @@ def _unmix(colors: Any, ring: Any, inside: Any, alpha: Any, color: Any, variance
             if ring[y, x] == 0:
                 continue
             a = alpha[y, x]
-            share, off_mixture, contrast = _closest_mixture(colors, color, y, x)
+            share, off_mixture, contrast = _closest_mixture(photo, surface_colors, y, x)
             # A fringe overshoots: seen from the near colour, its colour lies clearly beyond the far
             # one, so that the near share is negative. `from_far` is its squared distance from the
             # far colour: along the line through both colours, plus across this line.
@@ -245,11 +249,11 @@ def _unmix(colors: Any, ring: Any, inside: Any, alpha: Any, color: Any, variance
 
             # Move both colours by what their mixture lacks.
             for c in range(3):
-                unchanged[0, c] = color[0, y, x, c]
-                unchanged[1, c] = color[1, y, x, c]
-                residual[c] = colors[y, x, c] - (a * unchanged[0, c] + (1 - a) * unchanged[1, c])
+                unchanged[0, c] = surface_colors[0, y, x, c]
+                unchanged[1, c] = surface_colors[1, y, x, c]
+                residual[c] = photo[y, x, c] - (a * unchanged[0, c] + (1 - a) * unchanged[1, c])
 
-            unexplained = _move_colors(y, x, a, residual, color, variance)
+            unexplained = _move_colors(y, x, a, residual, surface_colors, variance)
             if inside[y, x] <= 0 and is_fringe:
                 alpha[y, x] = 1
                 continue
@@ -261,7 +265,7 @@ def _unmix(colors: Any, ring: Any, inside: Any, alpha: Any, color: Any, variance
             if off_mixture <= MAX_UNEXPLAINED and 0 < share < 1:
                 alpha[y, x] = share
                 for c in range(3):
-                    color[0, y, x, c] = unchanged[0, c]
-                    color[1, y, x, c] = unchanged[1, c]
+                    surface_colors[0, y, x, c] = unchanged[0, c]
+                    surface_colors[1, y, x, c] = unchanged[1, c]
             else:
                 alpha[y, x] = 1 if inside[y, x] > 0 else 0

@@ -227,7 +227,8 @@ def _subtract_neighbors(alpha: Any, ring: Any, opacities: Any) -> None:
             for k in range(9):  # the 3×3 pixels around, row by row; the border repeats
                 v = min(max(y + k // 3 - 1, 0), height - 1)
                 u = min(max(x + k % 3 - 1, 0), width - 1)
-                if k != 4 and ring[v, u] > 0:
+                if k != 4 and ring[v, u] > 0:  # 4 is the pixel itself
+                    # The alpha of this neighbour's Gaussian at the pixel's centre is subtracted.
                     transmittance *= 1 - SURFEL_OPACITY * NEIGHBOR_FALLOFF[k] * opacities[v, u]
             opacity = 1 - (1 - alpha[y, x]) / transmittance
             opacities[y, x] = min(max(opacity, np.float32(0)), np.float32(1))

@@ -118,7 +118,8 @@ def estimate_surfaces(
         side_depths: [H, W, 2] inverse depths on the near and the far side of a step, for pixels
             that touch it.
         depth, slope, color: [2, H, W], [2, H, W, 2] and [2, H, W, 3]: inverse depth, its derivative
-            by pixel x and y, and mean colour of both surfaces. Pixels in a ring are written here.
+            by pixel x and y, and mean colour of the near and the far surface. At first both have
+            the values of the map and the photo; pixels in a ring are overwritten here.
 
     Returns:
         [H, W]: how far a pixel lies inside of the near surface's outline in the map, in pixels;
@@ -204,6 +205,7 @@ def _outline_distance(near_share: Any, is_near: bool) -> Any:
     near_share = min(max(near_share, MIN_SHARE), MAX_SHARE)
     log_odds = np.log(near_share / (1 - near_share))
     distance = np.float32(OUTLINE_BLUR_PX * log_odds / LOGISTIC_SCALE)
+    # The smoothed outline may run on the wrong side of the pixel, whose own side is known.
     if is_near:
         return max(distance, MIN_OUTLINE_DISTANCE_PX)
     return min(distance, -MIN_OUTLINE_DISTANCE_PX)

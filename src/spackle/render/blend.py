@@ -246,6 +246,7 @@ def store_tile(state: Array, left: int, top: int, images: Arrays) -> None:
     for row in range(rows):
         for column in range(columns):
             i = pixel_index(row, column)
+            # Depths were summed with their weights, whose sum is alpha. The mean is stored.
             opacity = state[i + 5 * PLANE_FLOATS]
             depth_sum = state[i + 4 * PLANE_FLOATS]
             alpha[top + row, left + column] = opacity

@@ -232,10 +232,11 @@ class GsplatRenderer(Renderer):
         tiles: Tensor | None,
         previous_rendering: Rendering | None,
     ) -> Rendering:
-        """A drawn view with the tiles that were not drawn, on the device of the first set.
+        """A drawn view in which all other tiles are filled, on the device of the view's first set.
 
-        Where `tiles` [rows, columns] bool is false, pixels come from `previous_rendering`, or are
-        black if it is None. A view without sets comes back on the CPU.
+        Where `tiles` [rows, columns] bool is false, nothing was drawn. There, pixels come from
+        `previous_rendering`, or are black if it is None. If `tiles` is None, all tiles were drawn.
+        A view without sets comes back on the CPU.
         """
         if tiles is not None:
             if previous_rendering is not None:

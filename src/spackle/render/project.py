@@ -315,10 +315,11 @@ def has_drawn_tile(
 ) -> bool:
     """Whether any tile of a box (columns left..right, rows top..bottom, exclusive) is drawn.
 
-    `drawn_before` [rows + 1, columns + 1] has the number of drawn tiles above and to the left of
-    each tile's corner. A box has no drawn tile if its columns have as many of them above the box's
-    bottom as above its top.
+    `drawn_before`[r, c], of the shape [rows + 1, columns + 1], is the number of drawn tiles above
+    row r and to the left of column c.
     """
+    # The drawn tiles in the box's columns, counted from the image's top to the box's bottom, and to
+    # the box's top. The difference of both numbers would be that of drawn tiles in the box.
     above_bottom = drawn_before[bottom, right] - drawn_before[bottom, left]
     above_top = drawn_before[top, right] - drawn_before[top, left]
     return bool(above_bottom != above_top)

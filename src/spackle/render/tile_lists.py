@@ -69,7 +69,8 @@ def count_entries(
         first, last: the parts first..last (exclusive) are counted; part k has the Gaussians from
             k·part_size on.
         part_size: Gaussians in a part.
-        boxes: [N, 4] uint16: each Gaussian's first and last tile column, first and last row.
+        boxes: [N, 4] uint16: the tiles that each Gaussian may touch, as first column, last column,
+            first row, last row (last exclusive).
         drawn_tiles: [rows, columns] bool; other tiles are not counted.
         counts: [parts, rows·columns] int64, zero at first: the counts are added here.
     """
@@ -101,7 +102,8 @@ def write_entries(
     Args:
         first, last: the parts of the Gaussians to write; part k has those from k·part_size on.
         part_size: Gaussians in a part.
-        boxes: [N, 4] uint16: each Gaussian's first and last tile column, first and last row.
+        boxes: [N, 4] uint16: the tiles that each Gaussian may touch, as first column, last column,
+            first row, last row (last exclusive).
         drawn_tiles: [rows, columns] bool; other tiles have no list.
         positions: [parts, rows·columns] int64: where a part's next entry for a tile goes. Each
             entry moves its position on.
